@@ -21,6 +21,7 @@ from morgs_mi.codec.container import Packet
 from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, residual_packet
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.threads import in_background
@@ -33,6 +34,7 @@ from morgs_mi.fit.initialise import MIN_POINTS
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.view import View
+from morgs_mi.loop.image_status import image_status
 from morgs_mi.loop.observation import FrameObservation, Images, Recorded, Seen, Setup, observe_frame, prepare, see_frame
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.active_set import ActiveSet, find_active_set, full_active_set
@@ -105,6 +107,7 @@ class StreamState:
         return self.coded.gaussians if self.coded else None
 
 
+@interrupts_raised()
 def step(
     setup: Setup,
     state: StreamState,
@@ -132,6 +135,7 @@ def step(
     packet, about = fit(setup, state, observed, Progress(progress, f"Frame {state.frame}"))
     coded, seen = decode(state.coded, packet), observed.seen
     balance = about.pop("balance", state.balance)
+    about["status"] = _status(setup, state, seen.images, about["status"])
     report = FrameReport(
         state.frame,
         time.perf_counter() - start,
@@ -142,6 +146,14 @@ def step(
         **about,
     )
     return StreamState(state.frame + 1, coded, seen, balance), packet, report
+
+
+def _status(setup: Setup, state: StreamState, images: Images, status: str) -> str:
+    """Return the status of a frame with the problems of its images, which are logged in the first frame."""
+    problems = image_status([camera.name for camera in setup.cameras], state.seen.images, images)
+    for problem in problems if state.coded is None else ():
+        _LOG.warning("frame 0: %s", problem)
+    return "; ".join([*([] if status == "ok" else [status]), *problems]) or "ok"
 
 
 def _fit_later_frame(
@@ -337,6 +349,7 @@ class StreamLoop:
         """The decoded Gaussians of the last frame, None before the first."""
         return self.state.gaussians
 
+    @interrupts_raised()
     def push(
         self,
         images: Sequence[np.ndarray | None],

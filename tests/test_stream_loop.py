@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import gc
 import json
 import threading
 from itertools import pairwise
@@ -40,6 +41,7 @@ QUICK = StreamConfig(  # from all points, as the images were made of them, and w
     ),
     motion=MotionConfig(key_views=2),
 )
+REPRODUCIBLE = dataclasses.replace(QUICK, render=RenderConfig(reproducible=True))
 TRIALS = dataclasses.replace(QUICK.fit, first_frame_steps=20, dropping=None)
 
 
@@ -583,3 +585,57 @@ def test_push__has_the_same_bytes_with_exposures_where_cameras_are_equal(clip, p
     monkeypatch.setattr("morgs_mi.fit.balance._LEAST_DIFFERENCE", 0.1)
     loop = new_loop(dataclasses.replace(EXPOSED, fit=dataclasses.replace(EXPOSED.fit, exposure="auto")))
     assert [loop.push(images[:4])[0].encoded for images in clip[:3]] == plain
+
+
+def garbage_of(action) -> list[object]:
+    """Return what only a garbage collection frees after an action."""
+    gc.collect()
+    gc.disable()
+    gc.set_debug(gc.DEBUG_SAVEALL)
+    try:
+        action()
+        gc.collect()
+        return list(gc.garbage)
+    finally:
+        gc.set_debug(0)
+        gc.garbage.clear()
+        gc.enable()
+
+
+def test_push__leaves_no_arrays_to_the_garbage_collection(clip):
+    """It may run in any thread, where freeing arrays of Dr.Jit can end the process."""
+    loop = StreamLoop(cameras()[:4], *points_and_colors(), QUICK)
+    loop.push(clip[0][:4])
+    assert garbage_of(lambda: loop.push(clip[1][:4])) == []
+
+
+def test_push__is_interrupted_in_a_callback_and_continues(clip, monkeypatch):
+    """Dr.Jit turns the interruption into a RuntimeError; the loop is as it was before the frame."""
+    loop, other = (StreamLoop(cameras()[:4], *points_and_colors(), REPRODUCIBLE) for _ in range(2))
+    packets = [encode_packet(other.push(images[:4])[0]) for images in clip[:2]]
+    first, _ = loop.push(clip[0][:4])
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    def interrupted() -> None:
+        with pytest.raises(KeyboardInterrupt):
+            loop.push(clip[1][:4])
+
+    with monkeypatch.context() as patch:
+        patch.setattr("morgs_mi.render.compositing._Blend.backward", interrupt)
+        assert garbage_of(interrupted) == []
+    assert [encode_packet(first), encode_packet(loop.push(clip[1][:4])[0])] == packets
+
+
+def test_push__reports_a_black_first_frame_and_a_cut(clip):
+    loop = StreamLoop(cameras()[:4], *points_and_colors(), dataclasses.replace(QUICK, fit=TRIALS))
+    black = [np.zeros_like(image) for image in clip[0][:4]]
+    cut = [np.ascontiguousarray(image[::-1, ::-1, ::-1]) for image in clip[1][:4]]
+    statuses = [loop.push(images)[1].status for images in (black, clip[0][:4], clip[1][:4], cut)]
+    assert [status.split(";")[0] for status in statuses] == [
+        "cam00, cam01, cam02, cam03: the image is black",
+        "ok",
+        "ok",
+        "the images show another scene than in the frame before",
+    ]

@@ -35,7 +35,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.core.documentation import with_pages
-from morgs_mi.core.ranges import arms_of, check_ranges, check_value, types_of
+from morgs_mi.core.ranges import AtLeast, arms_of, check_ranges, check_value, types_of
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.io.bounded import read_toml
 from morgs_mi.method.motion_config import MotionConfig
@@ -75,7 +75,7 @@ class StreamConfig:
     """Rasteriser."""
     codec: CodecConfig = field(default_factory=CodecConfig)
     """Precision and size of the stream."""
-    seed: int = 0
+    seed: Annotated[int, AtLeast(0)] = 0
     """Seed of every random choice: order of the views, added points."""
 
     def __post_init__(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
+from morgs_mi.core.checks import check_number
 from morgs_mi.core.ranges import Above, AtLeast, Below, MultipleOf, check_ranges
 from morgs_mi.synth.disturbances import Disturbances
 
@@ -12,6 +13,9 @@ if TYPE_CHECKING:
     from morgs_mi.synth.scene import RecordingDefaults
 
 __all__ = ["SynthConfig"]
+# Frame rates that the encoders of videos take, and numbers of samples that a sampler of Mitsuba takes.
+_FPS = "(0, 1000]"
+_SPP = "[1, 1e6]"
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,9 @@ class SynthConfig:
             ValueError: they are not.
         """
         check_ranges(self, "synthesize()")
+        check_number("synthesize()", "fps", self.fps, _FPS)
+        if self.spp is not None:
+            check_number("synthesize()", "spp", self.spp, _SPP)
 
     def completed(self, recording: RecordingDefaults) -> SynthConfig:
         """Return the settings, with the scene's own values for missing ones."""

@@ -138,7 +138,7 @@ def test_rates_at__decays_the_rate_of_the_means_and_raises_the_others_for_fewer_
             motion=MotionConfig(mask_method="none", cohesion_weight=1e22),
             render=RenderConfig(block_width=4, block_height=None, reproducible=True),
             codec=CodecConfig(quality=0.1 + 0.2),
-            seed=-1,
+            seed=3,
         ),
         Leaf(),
         Leaf(number=1e308, name='"quoted" \\ \n\t\x00\x1b\x7f é 漢 🙂', sizes=(), limit=None, mode="exact"),
@@ -235,7 +235,7 @@ def test_apply_values__builds_and_removes_an_optional_config() -> None:
         (StreamConfig(), "[motion]\nflow_method = 1979-05-27", "`motion.flow_method` must be a string, got "),
         (StreamConfig(), "fit = 1", "`fit` must be a table (FitConfig), got 1."),
         (StreamConfig(), "[[fit]]\nepochs = 1", "`fit` must be a table (FitConfig), got [{'epochs': 1}]."),
-        (StreamConfig(), "[seed]\na = 1", "`seed` must be a whole number below 2^64, got {'a': 1}."),
+        (StreamConfig(), "[seed]\na = 1", "`seed` must be a whole number below 2^64, at least 0, got {'a': 1}."),
         (
             StreamConfig(),
             "[render]\nblock_width = 'wide'",

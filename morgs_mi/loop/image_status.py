@@ -1,0 +1,84 @@
+"""Problems that the images of a frame alone show: views of one colour, and a cut to another scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import cv2
+import numpy as np
+
+__all__ = ["image_status"]
+
+# px: thumbnails of this width keep the layout of a scene, without noise and the motion between two frames.
+_WIDTH = 16
+# Standard deviation of the thumbnail of an image of one colour, in grey levels.
+_PLAIN = 2.0
+# Mean of a black image, in grey levels.
+_BLACK = 16.0
+# Correlation of the thumbnails of successive frames; it is 0.95 and more in recordings, and 0.7 and less at cuts.
+_SAME_SCENE = 0.8
+# Share of a thumbnail that changes by more than some grey levels: a few percent in recordings, half of it at cuts. A
+# bright object alone, in fast motion before a dull scene, changes the correlation and less of the thumbnail.
+_LEAST_CHANGED = 0.4
+_CHANGE = 8.0
+
+
+def image_status(
+    names: Sequence[str], before: Mapping[int, np.ndarray], images: Mapping[int, np.ndarray]
+) -> tuple[str, ...]:
+    """Return a sentence with advice for each problem of a frame's images.
+
+    Args:
+        names: of the views.
+        before: images of the frame before, uint8 [H, W, 3], by view index; empty for the first frame.
+        images: of this frame, likewise.
+    """
+    now = {v: _thumbnail(image) for v, image in images.items()}
+    plain = [v for v, image in now.items() if image.std((0, 1)).max() < _PLAIN]
+    others = [v for v in now.keys() & before.keys() if v not in plain and _is_cut(_thumbnail(before[v]), now[v])]
+    return (*_plain_status(names, now, plain), *_cut_status(names, len(now), others))
+
+
+def _plain_status(names: Sequence[str], images: Mapping[int, np.ndarray], plain: Sequence[int]) -> tuple[str, ...]:
+    if not plain:
+        return ()
+    color = "black" if max(images[v].mean() for v in plain) < _BLACK else "of one colour"
+    return (
+        f"{_list(names, plain)}: the image is {color}; cut such frames off the recording, or leave the camera out "
+        "(--without)",
+    )
+
+
+def _cut_status(names: Sequence[str], count: int, views: Sequence[int]) -> tuple[str, ...]:
+    if not views:
+        return ()
+    if 2 * len(views) >= count:
+        return (
+            "the images show another scene than in the frame before; end the fit before this frame (--frames), and fit "
+            "the rest as another recording",
+        )
+    return (
+        f"{_list(names, views)}: the image shows something else than in the frame before; if the camera was moved, or "
+        "its clip has a cut, leave it out (--without)",
+    )
+
+
+def _list(names: Sequence[str], views: Sequence[int]) -> str:
+    return ", ".join(names[v] or f"view {v}" for v in sorted(views))
+
+
+def _thumbnail(image: np.ndarray) -> np.ndarray:
+    """Return an image at a width of a few pixels [h, w, 3], in grey levels."""
+    height = max(1, round(_WIDTH * image.shape[0] / image.shape[1]))
+    return cv2.resize(image, (_WIDTH, height), interpolation=cv2.INTER_AREA).astype(np.float64)
+
+
+def _is_cut(a: np.ndarray, b: np.ndarray) -> bool:
+    """Return whether two thumbnails show different scenes; another exposure, or light after black, is no cut."""
+    if a.std((0, 1)).max() < _PLAIN:
+        return False
+    a = a - a.mean((0, 1))
+    b = b - b.mean((0, 1))
+    scale = np.sqrt((a * a).sum() * (b * b).sum())
+    changed = np.abs(a - b).max(axis=-1) > _CHANGE
+    return bool((a * b).sum() < _SAME_SCENE * scale and changed.mean() > _LEAST_CHANGED)

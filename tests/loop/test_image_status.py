@@ -1,0 +1,78 @@
+"""Problems of images: of one colour, and cuts; motion, noise, light and exposure are none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from morgs_mi.loop.image_status import image_status
+
+H, W = 48, 64
+NAMES = ("a", "b", "c")
+
+
+def scene(seed: int) -> np.ndarray:
+    """A picture of coarse structure, uint8 [H, W, 3]."""
+    coarse = np.random.default_rng(seed).integers(20, 220, (6, 8, 3))
+    return np.uint8(np.repeat(np.repeat(coarse, 8, 0), 8, 1))
+
+
+def noisy(image: np.ndarray, sigma: float, seed: int = 0) -> np.ndarray:
+    return np.uint8(np.clip(image + np.random.default_rng(seed).normal(0, sigma, image.shape), 0, 255))
+
+
+def views(*images: np.ndarray) -> dict[int, np.ndarray]:
+    return dict(enumerate(images))
+
+
+RIG = views(scene(0), scene(1), scene(2))
+
+
+@pytest.mark.parametrize(
+    ("image", "words"),
+    [
+        (np.zeros((H, W, 3), np.uint8), "b: the image is black; "),
+        (noisy(np.zeros((H, W, 3)), 4), "b: the image is black; "),
+        (np.full((H, W, 3), 255, np.uint8), "b: the image is of one colour; "),
+        (np.full((H, W, 3), (200, 30, 30), np.uint8), "b: the image is of one colour; "),
+    ],
+)
+def test_image_status__names_views_of_one_colour(image: np.ndarray, words: str) -> None:
+    for before in ({}, RIG):
+        (problem,) = image_status(NAMES, before, {**RIG, 1: image})
+        assert problem.startswith(words)
+        assert "--without" in problem
+
+
+def test_image_status__names_a_cut_of_all_views_or_of_one() -> None:
+    (problem,) = image_status(NAMES, RIG, views(scene(3), scene(4), scene(5)))
+    assert problem.startswith("the images show another scene than in the frame before; end the fit before this frame")
+    (problem,) = image_status(NAMES, RIG, {**RIG, 2: scene(6)})
+    assert problem.startswith("c: the image shows something else than in the frame before")
+
+
+def with_object(column: int) -> np.ndarray:
+    """A dull wall with a bright object."""
+    image = noisy(np.full((H, W, 3), 100.0), 5)
+    image[10:34, column : column + 16] = (255, 240, 200)
+    return image
+
+
+@pytest.mark.parametrize(
+    ("before", "now"),
+    [
+        (scene(0), scene(0)),
+        (scene(0), noisy(scene(0), 12)),
+        (scene(0), np.uint8(scene(0) * 0.5)),  # the light goes out
+        (np.uint8(scene(0) * 0.4), np.uint8(scene(0) * 0.4 + 100)),
+        (with_object(0), with_object(40)),
+        (np.zeros((H, W, 3), np.uint8), scene(0)),
+    ],
+)
+def test_image_status__is_empty_for_motion_noise_and_light(before: np.ndarray, now: np.ndarray) -> None:
+    assert image_status(NAMES, views(before, before, before), views(now, now, now)) == ()
+
+
+def test_image_status__compares_views_that_have_both_images() -> None:
+    assert image_status(NAMES, {0: RIG[0]}, {1: RIG[1]}) == ()
+    assert image_status(NAMES, {}, {}) == ()
