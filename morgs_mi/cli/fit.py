@@ -14,6 +14,7 @@ from tyro.conf import DisallowNone, Positional, arg
 from morgs_mi.cli.console import print_result, print_warning, progress
 from morgs_mi.cli.settings import Flag, GivenReading, GivenSettings, HeldOut, Reading, Settings, held_out, optional
 from morgs_mi.core.documentation import page
+from morgs_mi.core.ranges import AtLeast, check_value
 from morgs_mi.loop.stream_config import StreamConfig, config_toml
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ class Fit:
     print_config: Flag = False
     """Print all settings as TOML and exit."""
 
-    arguments: ClassVar[Mapping[str, str]] = {"max_frames": "--frames", "count": "--segments"}
+    arguments: ClassVar[Mapping[str, str]] = {"max_frames": "--frames"}
 
     def run(self) -> None:
         from morgs_mi.calibration.checks.deep import check_exposures
@@ -71,6 +72,8 @@ class Fit:
                 "morgs-mi fit: expected the folders CAPTURE and OUT, got fewer; give them before options with several "
                 "values, such as --test-view, and see morgs-mi fit --help."
             )
+        if self.segments is not None:
+            check_value("fit()", "segments", self.segments, Annotated[int, AtLeast(1)])
         self.settings.check_methods(config)
         capture = load_capture(
             self.capture, self.downscale, held_out(self.test_view), self.frames, self.reading.read_config()
@@ -93,7 +96,7 @@ class Fit:
         from morgs_mi.runs.cluster.segments import SegmentedRun, noting_segments
 
         assert self.out is not None
-        segments = SegmentConfig(1 if self.segments is None else self.segments)
+        segments = SegmentConfig(self.segments or 1)
         workers = min(segments.count, cores())
         with noting_segments(self.out), progress() as report, open_workers(self.scheduler, workers) as opened:
             run = SegmentedRun(capture, self.out, opened, config, segments, report)

@@ -185,9 +185,12 @@ class Recording:
                 StreamWriter(partial, self._capture.cameras, self._capture.fps, self._metadata) as writer,
             ):
                 writer.write(keyframe)
-        except OSError as error:
+        except OSError:
             self._shows_provisional = False
-            _LOG.warning("the fit goes on without a provisional first frame: %s", error)
+            _LOG.warning(
+                "%s: a provisional first frame cannot be written, perhaps for lack of room; the fit goes on without it",
+                self._files.provisional,
+            )
 
     def push(self, packet: Packet, report: FrameReport, coded: CodedFrame | None, **entries: Any) -> None:
         """Add a frame, and the keyframe that is due after it.

@@ -211,6 +211,12 @@ def test_calibrate__of_a_full_disk_leaves_no_model(tmp_path: Path, monkeypatch: 
     assert not (clips / "sparse").exists()
 
 
+@pytest.mark.parametrize("seed", [-1, 10**23])
+def test_calibrate__refuses_a_seed_that_colmap_does_not_take(tmp_path: Path, seed: int) -> None:
+    with pytest.raises(ValueError, match=rf"`seed` must be a number in \[0, 2147483647\], got {seed}"):
+        calibrate(tmp_path, CalibrateConfig(seed=seed))
+
+
 def test_calibrate__finds_no_features_in_transparent_pixels(tmp_path: Path) -> None:
     planes = textured.textures()
     for camera in (camera.resized(240, 180) for camera in textured.rig(2)):

@@ -74,7 +74,7 @@ _ATTRIBUTES = ("means", "quats", "log_scales", "logit_opacities", "sh_coeffs")
 class SegmentConfig:
     """Segments of a fit, and the seams between them."""
 
-    count: Annotated[int, AtLeast(1)] = 1
+    count: int = 1
     """Number of segments of about the same length, of two frames at least; with one, the stream equals
     `stream_capture`'s."""
     passes: Annotated[int, AtLeast(1)] = 24

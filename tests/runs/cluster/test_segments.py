@@ -250,6 +250,25 @@ def test_SegmentedRun__does_not_resume_other_settings(capture: Capture, workers:
         fit(capture, tmp_path, workers, segments=replace(SEGMENTS, count=2), resume=True)
 
 
+def test_SegmentedRun__keeps_an_earlier_fit_until_the_segments_are_joined(
+    capture: Capture, workers: Workers, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = shutil.copytree(whole, tmp_path / "out")
+    other = replace(SETTINGS, seed=1)
+    with pytest.raises(KeyboardInterrupt):
+        fit(capture, out, workers, config=other, on_stage=when_fitted(FRAMES, interrupt))
+    assert {name: (out / name).read_bytes() for name in FILES} == {name: (whole / name).read_bytes() for name in FILES}
+    rmtree = shutil.rmtree
+    monkeypatch.setattr(shutil, "rmtree", lambda path, **options: path.exists() and interrupt())
+    with pytest.raises(KeyboardInterrupt):
+        fit(capture, out, workers, config=other, resume=True)
+    monkeypatch.setattr(shutil, "rmtree", rmtree)
+    assert json.loads((out / "report.json").read_text())["config"]["seed"] == 1
+    fit(capture, out, workers, config=other, resume=True)
+    assert StreamReader(out / "stream.morgs").metadata["config"]["seed"] == 1
+    assert len(rows_of(out)) == FRAMES
+
+
 def test_SegmentedRun__triangulates_points_where_there_are_few(
     capture: Capture, workers: Workers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
