@@ -47,7 +47,6 @@ SETTINGS = {
     "target_size": "codec.target_size",
     "refine_cameras": "fit.refine_cameras",
     "exposure": "fit.exposure",
-    "validate": "fit.validate",
     "reproducible": "render.reproducible",
 }
 
@@ -194,8 +193,6 @@ class Settings:
     """Refinement of the cameras: off, on, or auto (if withheld pixels gain)."""
     exposure: Annotated[Estimation | None, setting("exposure"), one_of(get_args(Estimation))] = None
     """Estimation of exposures and white balances: off, on, or auto (between cameras if withheld pixels gain)."""
-    validate: Flag = False
-    """Long trials of the first frame that choose how strongly it is regularised."""
     reproducible: Flag = False
     """Same bytes on every run; about half as fast."""
 

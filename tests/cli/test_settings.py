@@ -71,7 +71,7 @@ def test_fit__overrides_defaults_by_preset_by_file_by_options(tmp_path: Path, ru
                 "--target-size",
                 99,
             ),
-            *("--refine-cameras", "auto", "--exposure", "on", "--validate", "--reproducible"),
+            *("--refine-cameras", "auto", "--exposure", "on", "--reproducible"),
         ),
     ],
 )
