@@ -80,5 +80,5 @@ def _is_cut(a: np.ndarray, b: np.ndarray) -> bool:
     a = a - a.mean((0, 1))
     b = b - b.mean((0, 1))
     scale = np.sqrt((a * a).sum() * (b * b).sum())
-    changed = np.abs(a - b).max(axis=-1) > _CHANGE
-    return bool((a * b).sum() < _SAME_SCENE * scale and changed.mean() > _LEAST_CHANGED)
+    change = np.abs(a - b).max(axis=-1) > _CHANGE
+    return bool((a * b).sum() < _SAME_SCENE * scale and change.mean() > _LEAST_CHANGED)

@@ -104,11 +104,11 @@ class FitFiles(NamedTuple):
         Raises:
             OSError: a file cannot be renamed.
         """
-        replaced = not self.next.stream.exists()
+        has_begun = not self.next.stream.exists()
         for path, successor in reversed([*zip(self, self.next, strict=True)]):
             if path is None or successor is None:
                 continue
-            if replaced and successor.exists():
+            if has_begun and successor.exists():
                 successor.replace(path)
             successor.unlink(missing_ok=True)
 
@@ -146,8 +146,8 @@ class Recording:
         self.reports: list[FrameReport] = []
         files.provisional.unlink(missing_ok=True)
         files.settle()
-        begins_anew = earlier is None and files.stream.exists()
-        self._written_files = files.next if begins_anew else files
+        has_predecessor = earlier is None and files.stream.exists()
+        self._written_files = files.next if has_predecessor else files
         if earlier is None:
             self._writer = StreamWriter(self._written_files.stream, capture.cameras, capture.fps, metadata)
         else:
@@ -158,8 +158,8 @@ class Recording:
                     self._writer.write(packet)
         self._written = os.stat(self._written_files.stream)
         if self._written_files.description is not None:
-            described = described_capture(capture, files.description if earlier else None)
-            write_json(self._written_files.description, described)
+            description = described_capture(capture, files.description if earlier else None)
+            write_json(self._written_files.description, description)
 
     def __enter__(self) -> Recording:
         return self
