@@ -49,11 +49,11 @@ def trained_cameras(path: Path, gaussians: Gaussians) -> tuple[Path | None, tupl
         return None, ()
     some = thinned(gaussians)
     cameras = with_near_planes(cameras, some.numpy()["means"])
-    seen = np.stack([_seen(some, camera) for camera in cameras])
+    visible = np.stack([_seen(some, camera) for camera in cameras])
     opacities = np.asarray(some.opacities, np.float64)
     weights = opacities / opacities.sum()
-    shares = seen @ weights
-    share = seen.any(axis=0) @ weights
+    shares = visible @ weights
+    share = visible.any(axis=0) @ weights
     if share < _LEAST_SEEN:
         _log.warning(
             "%s: its cameras see %.1f %% of the Gaussians of %s and are not used, as they seem to be of another scene; "

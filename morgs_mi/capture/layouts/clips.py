@@ -126,8 +126,8 @@ def view_of_image(views: Collection[str], image: str, by_folder: bool = False) -
     """
     place = PurePosixPath(image.replace("\\", "/"))
     folders = place.parts[-2::-1]
-    own = (place.stem, place.name)
-    names = (*folders, *own) if by_folder else (*own, *folders)
+    file_names = (place.stem, place.name)
+    names = (*folders, *file_names) if by_folder else (*file_names, *folders)
     return next((name for text in names for name in (text, text.strip()) if name in views), None)
 
 

@@ -272,8 +272,8 @@ def _images_named(source: Path, split: str, given: Sequence[str], names: Sequenc
 def _parts(name: str) -> tuple[str, ...]:
     """Return the parts of an image's path without the suffix of its format."""
     place = PurePosixPath(name.replace("\\", "/"))
-    known = place.suffix.lower() in (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES)
-    return (place.with_suffix("") if known else place).parts
+    has_suffix = place.suffix.lower() in (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES)
+    return (place.with_suffix("") if has_suffix else place).parts
 
 
 LAYOUT = Layout(
