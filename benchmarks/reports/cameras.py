@@ -121,7 +121,8 @@ def scores(capture: Capture, config: StreamConfig) -> dict[str, float]:
     """Fit the first frame; return the PSNR of the training views, and of the held-out one in both ways."""
     loop, images, train = new_loop(capture, config), next(capture.frames(0, 1)).images, capture.train_views
     loop.push([images[v] for v in train])
-    gaussians, test = loop.gaussians, capture.reference_view
+    gaussians = loop.gaussians
+    test = capture.reference_view
     assert gaussians is not None
     view = View(capture.cameras[test], images[test], capture.masks[test])
     registered = register_camera(gaussians, view, loop.setup.extent, config.fit, config.render)

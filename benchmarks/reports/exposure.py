@@ -69,7 +69,10 @@ class Options(ClipOptions):
 def measure(source: Source, config: StreamConfig) -> dict[str, Any]:
     """Return the scores of a fit."""
     capture = source.open()
-    test, loop, rows, still = capture.reference_view, new_loop(capture, config), [], StillVariation(None, 0)
+    test = capture.reference_view
+    loop = new_loop(capture, config)
+    rows = []
+    still = StillVariation(None, 0)
     assert capture.truth is not None
     camera, reports = capture.cameras[test], []
     for frame in capture.frames():

@@ -125,7 +125,8 @@ class Clip:
             raise ValueError(
                 f"{source.path}: expected a capture with a held-out view and ground truth; make one with synth."
             )
-        self.test_view, self.truth = self.capture.reference_view, self.capture.truth
+        self.test_view = self.capture.reference_view
+        self.truth = self.capture.truth
         self.held_out = self.capture.cameras[self.test_view]
         self.frames = list(self.capture.frames())
         loop = self._loop(MotionConfig())

@@ -133,7 +133,9 @@ def offset_errors(recorded: Capture) -> tuple[dict[str, float], dict[str, float]
 
 def scores(capture: Capture, frames: range, first: int, config: StreamConfig) -> dict[str, Any]:
     """Return the scores of a fit of some instants, of which the first is frame `first` of the held-out clip."""
-    test, loop, rows = capture.reference_view, new_loop(capture, config), []
+    test = capture.reference_view
+    loop = new_loop(capture, config)
+    rows = []
     camera = capture.cameras[test]
     for k, frame in enumerate(capture.partial_frames(frames.start, frames.stop)):
         push_frame(loop, frame, capture.train_views)

@@ -21,9 +21,9 @@ import numpy as np
 
 from morgs_mi.calibration.checks.mistakes import same_poses
 from morgs_mi.calibration.checks.rig_check import MAX_ERROR, CameraCheck
-from morgs_mi.capture.capture import opaque_pixels
 from morgs_mi.capture.layouts.clips import EXAMPLE, clips_by_camera, names_without, photos
 from morgs_mi.capture.layouts.colmap import write_reconstruction
+from morgs_mi.capture.masks import opaque_pixels
 from morgs_mi.capture.timeline import nearest_frames
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_number

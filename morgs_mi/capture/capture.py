@@ -16,23 +16,21 @@ import numpy as np
 
 from morgs_mi.capture.camera_source import CameraSource, at_clip_size
 from morgs_mi.capture.color_correction import ColorFit, fit_colors
-from morgs_mi.capture.layouts.calibration import Calibration
+from morgs_mi.capture.held_out import TestViews, held_out_by, held_out_views
 from morgs_mi.capture.layouts.clips import EXAMPLE
 from morgs_mi.capture.layouts.layout_registry import find_layout
 from morgs_mi.capture.lens import Lens, undistortion
-from morgs_mi.capture.masks import used_pixels
+from morgs_mi.capture.masks import used_in_clip
 from morgs_mi.capture.timeline import ReadConfig, read_settings, timeline
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_points
 from morgs_mi.core.rig import with_near_planes
 from morgs_mi.io.prefetch import prefetched
 from morgs_mi.io.remote import is_url, mirrored
-from morgs_mi.io.video import Clip, FolderReader, FrameReader, ImageOrError, open_clips
+from morgs_mi.io.video import Clip, ImageOrError, open_clips
 
-__all__ = ["Capture", "Frame", "PartialFrame", "TestViews", "load_capture", "opaque_pixels"]
+__all__ = ["Capture", "Frame", "PartialFrame", "load_capture"]
 
-TestViews = int | str | Sequence[int | str] | None
-"""Held-out cameras: an index, a name, several of these, None for none, or "auto"."""
 
 _LOG = logging.getLogger(__name__)
 # Pixels of the shorter side that a downscaled image needs.
@@ -170,7 +168,7 @@ class Capture:
         Raises:
             ValueError: there is no such camera, or none is left for training.
         """
-        return replace(self, test_views=_held_out(self.path, _views_called(self.path, views, self.names), self.names))
+        return replace(self, test_views=held_out_views(self.path, views, self.names))
 
     def process(self, view: int, image: np.ndarray) -> np.ndarray:
         """Return a recorded image of a camera undistorted, downscaled and colour-corrected, like its frames."""
@@ -318,7 +316,7 @@ def load_capture(
     names = [camera.name for camera in recorded]
     common = timeline(path, names, readers, reading, max_frames, settings.get("fps"))
     masks = calibration.masks or ((),) * len(readers)
-    used = [_used(*each) for each in zip(readers, masks, names, strict=True)]
+    used = [used_in_clip(*each) for each in zip(readers, masks, names, strict=True)]
     sources = tuple(
         CameraSource(
             reader,
@@ -346,7 +344,7 @@ def load_capture(
         points=calibration.points,
         point_colors=calibration.point_colors,
         masks=tuple(s.mask(c) for s, c in zip(sources, cameras, strict=True)),
-        test_views=_test_views(path, test_view, settings, every, calibration),
+        test_views=held_out_by(path, test_view, settings, every, calibration),
         # The frames of the ground truth are numbered like the frames of the clips.
         truth=path / "truth" if common.unchanged and (path / "truth").is_dir() else None,
         _sources=sources,
@@ -371,39 +369,6 @@ def _readouts(path: Path, every: Sequence[str], names: Sequence[str], settings: 
         where = path / "capture.json"
         raise ValueError(f"{where}: `readout` must name cameras of {', '.join(every)}, got {', '.join(unknown)}.")
     return [readout.get(name, 0.0) for name in names]
-
-
-def _used(reader: FrameReader, masks: Sequence[Path], name: str) -> tuple[np.ndarray | None, list[str]]:
-    """Return the mask of the pixels of a clip that are opaque and in no mask black, None if all are, and notes.
-
-    Raises:
-        FileNotFoundError: a mask is missing.
-        ValueError: a mask cannot be read, or no pixel is left.
-    """
-    opaque, *notes = opaque_pixels(reader, name)
-    used, note = used_pixels(masks, reader.width, reader.height, name)
-    both = opaque if used is None else used if opaque is None else used & opaque
-    if both is not None and not both.any():
-        raise ValueError(f"{masks[0]}: expected pixels that are used, got a mask of transparent ones; correct it.")
-    return both, [text for text in (*notes, note) if text]
-
-
-def opaque_pixels(reader: FrameReader, name: str) -> tuple[np.ndarray | None, str]:
-    """Return the mask of the opaque pixels, None if all are opaque or the mask varies, and a note.
-
-    Raises:
-        ValueError: no pixel is opaque.
-    """
-    if not isinstance(reader, FolderReader):
-        return None, ""
-    mask, constant = reader.opaque()
-    if not constant:
-        return None, f"{name}: the alpha channel of its images changes over time and is ignored."
-    if mask is None:
-        return None, ""
-    if not mask.any():
-        raise ValueError(f"{reader.path}: expected opaque pixels, got an alpha channel without any; remove it.")
-    return mask, f"{name}: {100 * (1 - mask.mean()):.1f} % of its pixels are transparent and masked out."
 
 
 def _photos(clips: Sequence[Clip]) -> tuple[str, ...]:
@@ -443,62 +408,3 @@ def _resized(camera: Camera, downscale: float) -> Camera:
     if downscale == 1:
         return camera
     return camera.resized(max(1, round(camera.width / downscale)), max(1, round(camera.height / downscale)))
-
-
-def _test_views(
-    path: Path, requested: TestViews, settings: dict[str, Any], every: Calibration, used: Calibration
-) -> tuple[int, ...]:
-    """Return the indices of the held-out cameras among the used ones; a setting of the capture counts all cameras.
-
-    Raises:
-        ValueError: a camera is unknown, or none is left for training.
-    """
-    if requested != "auto":
-        return _held_out(path, _views_called(path, requested, used.names), used.names)
-    return _held_out(path, _default_test_views(path, settings, every, used), used.names)
-
-
-def _held_out(path: Path, views: tuple[int, ...], names: Sequence[str]) -> tuple[int, ...]:
-    """Return the held-out views if a camera is left for training."""
-    if len(views) == len(names):
-        raise ValueError(
-            f"{path}: `test_view` must leave a camera for training, got all {len(views)} cameras; name fewer of them."
-        )
-    return views
-
-
-def _default_test_views(path: Path, settings: dict[str, Any], every: Calibration, used: Calibration) -> tuple[int, ...]:
-    """Return the held-out cameras by the capture's settings, by its layout, or by the number of cameras."""
-    if "test_view" in settings:
-        views = _views_called(path / "capture.json", settings["test_view"], every.names)
-        if not views:
-            return ()
-    else:
-        views = every.test_views or ()
-    names = [every.names[view] for view in views if every.names[view] in used.names]
-    if names or every.test_views == ():
-        return tuple(used.names.index(name) for name in names)
-    return (0,) if len(used.names) >= 6 else ()
-
-
-def _views_called(place: Path, views: int | str | Sequence[int | str] | None, names: Sequence[str]) -> tuple[int, ...]:
-    """Return the ascending indices of cameras given by indices or names.
-
-    Raises:
-        ValueError: there is no such camera; `place` is where it was requested.
-    """
-    if views is None:
-        return ()
-    requested = [views] if isinstance(views, int | str) else list(views)
-    return tuple(sorted({_view_called(place, view, names) for view in requested}))
-
-
-def _view_called(place: Path, view: int | str, names: Sequence[str]) -> int:
-    """Return the index of a camera given by index or name."""
-    index = names.index(view) if view in names else view
-    if str(index).isdecimal() and int(index) < len(names):
-        return int(index)
-    raise ValueError(
-        f"{place}: `test_view` must be an index in 0..{len(names) - 1}, one of {', '.join(names)}, or none for no "
-        f"held-out camera, got {view}."
-    )

@@ -1,4 +1,4 @@
-"""Masks of the pixels of a camera's clip that are not used, from images whose black pixels mark them."""
+"""Masks of the pixels of a camera's clip that are used: opaque, and black in no image that masks them out."""
 
 from __future__ import annotations
 
@@ -9,9 +9,42 @@ import cv2
 import numpy as np
 
 from morgs_mi.io.remote import fetched
-from morgs_mi.io.video import decode_image
+from morgs_mi.io.video import FolderReader, FrameReader, decode_image
 
-__all__ = ["used_pixels"]
+__all__ = ["opaque_pixels", "used_in_clip", "used_pixels"]
+
+
+def used_in_clip(reader: FrameReader, masks: Sequence[Path], name: str) -> tuple[np.ndarray | None, list[str]]:
+    """Return the mask of the pixels of a clip that are opaque and in no mask black, None if all are, and notes.
+
+    Raises:
+        FileNotFoundError: a mask is missing.
+        ValueError: a mask cannot be read, or no pixel is left.
+    """
+    opaque, *notes = opaque_pixels(reader, name)
+    used, note = used_pixels(masks, reader.width, reader.height, name)
+    both = opaque if used is None else used if opaque is None else used & opaque
+    if both is not None and not both.any():
+        raise ValueError(f"{masks[0]}: expected pixels that are used, got a mask of transparent ones; correct it.")
+    return both, [text for text in (*notes, note) if text]
+
+
+def opaque_pixels(reader: FrameReader, name: str) -> tuple[np.ndarray | None, str]:
+    """Return the mask of the opaque pixels, None if all are opaque or the mask varies, and a note.
+
+    Raises:
+        ValueError: no pixel is opaque.
+    """
+    if not isinstance(reader, FolderReader):
+        return None, ""
+    mask, constant = reader.opaque()
+    if not constant:
+        return None, f"{name}: the alpha channel of its images changes over time and is ignored."
+    if mask is None:
+        return None, ""
+    if not mask.any():
+        raise ValueError(f"{reader.path}: expected opaque pixels, got an alpha channel without any; remove it.")
+    return mask, f"{name}: {100 * (1 - mask.mean()):.1f} % of its pixels are transparent and masked out."
 
 
 def used_pixels(files: Sequence[Path], width: int, height: int, name: str) -> tuple[np.ndarray | None, str]:

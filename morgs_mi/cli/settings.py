@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, get_args
 from tyro.conf import DisallowNone, FlagCreatePairsOff, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
-from morgs_mi.capture.capture import TestViews
+from morgs_mi.capture.held_out import TestViews
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.documentation import page
 from morgs_mi.loop.stream_config import PresetName, StreamConfig, apply_preset, apply_values, read_config, relocated

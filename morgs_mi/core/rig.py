@@ -30,7 +30,7 @@ _GRID = 16
 # Depth of a near plane relative to what a camera sees. A subject may come this much closer than the scene's points, and
 # what is nearer than that is a splat that hides another camera's lens (see `docs/experiments/real.md`).
 _NEAR_SHARE = 0.2
-# The first per cent of the depths may be wrong matches. A view with fewer points has no reliable depth.
+# One per cent of the points may be wrong matches. A view with fewer points has no reliable depth.
 _RELIABLE_QUANTILE = 0.01
 _RELIABLE_POINTS = 20
 # Before the near planes are known, every point in front of a camera counts.

@@ -153,7 +153,7 @@ def _shown(path: Path, stream: cv2.VideoCapture, movie: Movie | None, packets: n
     first = seconds(stream)
     times = np.sort(packets + (_clock_difference(stream, packets) if parts else 0.0))
     if (np.diff(times) <= 0).any():
-        return times  # a packet without a time has that of another
+        return times  # a packet without a time repeats another time
     times = times[times >= first - SAME_TIME]
     if len(times) < 2 or not parts or not parts[0]:
         return times

@@ -11,7 +11,7 @@ Key = TypeVar("Key")
 
 
 def counting_together(numbers: Mapping[Key, Sequence[int]]) -> list[list[Key]]:
-    """Return the cameras in groups: the numbers of a group overlap, those of different groups do not.
+    """Return groups of cameras whose numbers overlap; numbers of different groups do not overlap.
 
     Args:
         numbers: numbers of the images of each camera, ascending and not empty.

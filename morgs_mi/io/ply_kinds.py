@@ -1,4 +1,4 @@
-"""Kinds of Gaussians that other methods store in PLY files, beside those of 3D Gaussian Splatting.
+"""Kinds of Gaussians in PLY files of methods other than 3D Gaussian Splatting.
 
 | kind | recognised by | read |
 |---|---|---|
@@ -79,7 +79,7 @@ def _refuse_instants(path: str | Path, vertices: Vertices) -> None:
     moving = [name for name, values in vertices.items() if _MOTION.fullmatch(name) and (values != 0).any()]
     if evidence := [*varying, *moving, *_matching(vertices, _FOURTH)]:
         raise ValueError(
-            f"{path}: expected the Gaussians of one instant, got those of several, as of Spacetime Gaussians or 4D "
+            f"{path}: expected the Gaussians of one instant, got several instants, as of Spacetime Gaussians or 4D "
             f"Gaussian Splatting ({_listed(evidence)}); export a .ply of each instant with the program that trained "
             "them, which `morgs-mi import` turns into a stream."
         )

@@ -35,7 +35,7 @@ class PlayableStream(StreamReader):
 class SplatFile(PlayableStream):
     """File with the Gaussians of one frame, of any tool, as a stream.
 
-    Its cameras are those of its training, if it has any (see `trained_cameras`), or a `default_rig`.
+    Its cameras are the training cameras, if it has any (see `trained_cameras`), or a `default_rig`.
 
     Args:
         path: ``.ply``, ``.compressed.ply`` or ``.splat``.

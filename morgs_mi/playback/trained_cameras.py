@@ -1,4 +1,4 @@
-"""The cameras of a file of Gaussians: those of its training, if they see it.
+"""The training cameras of a file of Gaussians, if they see the Gaussians.
 
 Nothing in a `cameras.json` names its Gaussians. It may be of another scene in the same folder, or of the same scene
 before it was moved or scaled.

@@ -103,7 +103,7 @@ class AttachedCamera(Camera):
     """Camera with intrinsics that get gradients.
 
     Attributes:
-        intrinsics: fx, fy, cx and cy in pixels, equal to those of `K`.
+        intrinsics: fx, fy, cx and cy in pixels, with the values of `K`.
     """
 
     intrinsics: tuple[Float, ...] = ()

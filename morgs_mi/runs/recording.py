@@ -99,7 +99,7 @@ class FitFiles(NamedTuple):
     def settle(self) -> None:
         """Finish a replacement that was cut off, or remove the `next` files of one that had not begun.
 
-        The stream is the first that is replaced and the last that is removed, so it tells the two apart.
+        The stream is replaced first and removed last, which distinguishes the two.
 
         Raises:
             OSError: a file cannot be renamed.

@@ -60,11 +60,11 @@ def clips_by_camera(path: Path) -> dict[str, Path]:
     if (path / "images").is_dir():
         inner = [f for f in inner if not _COPIES.fullmatch(f.name)]
     inner.sort(key=lambda f: f.name in _USUAL)
-    # The last clip found for a camera takes precedence.
-    found = _merged(path, map(_folders, inner)) | _merged(path, map(_videos, inner)) | _folders(path) | _videos(path)
+    # The last clip of a camera takes precedence.
+    clips = _merged(path, map(_folders, inner)) | _merged(path, map(_videos, inner)) | _folders(path) | _videos(path)
     if (path / "frames").is_dir():
-        found |= _videos(path / "frames") | _folders(path / "frames")
-    return {name: found[name] for name in sorted(found, key=natural_key)}
+        clips |= _videos(path / "frames") | _folders(path / "frames")
+    return {name: clips[name] for name in sorted(clips, key=natural_key)}
 
 
 def photos(path: Path) -> dict[str, tuple[Path]]:

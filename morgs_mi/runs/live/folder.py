@@ -196,7 +196,7 @@ class FolderFeed:
         return f", with {numbers}" if numbers else ""
 
     def _found(self, after: int, before: Mapping[str, float]) -> dict[str, _Images]:
-        """Return the images of each camera with numbers larger than `after`, without those of the time of `before`.
+        """Return the images of each camera with numbers larger than `after`, without images of the time of `before`.
 
         Args:
             after: number.

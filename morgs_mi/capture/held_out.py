@@ -1,0 +1,83 @@
+"""Selection of the held-out cameras of a capture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from morgs_mi.capture.layouts.calibration import Calibration
+
+__all__ = ["TestViews", "held_out_by", "held_out_views"]
+
+TestViews = int | str | Sequence[int | str] | None
+"""Held-out cameras: an index, a name, several of these, None for none, or "auto"."""
+# Number of cameras from which one is held out by default, as in N3DV.
+_MANY = 6
+
+
+def held_out_by(
+    path: Path, requested: TestViews, settings: dict[str, Any], every: Calibration, used: Calibration
+) -> tuple[int, ...]:
+    """Return the indices of the held-out cameras among the used ones.
+
+    Args:
+        path: the capture folder.
+        requested: as for `load_capture`; "auto": by the settings, by the layout, or by the number of cameras.
+        settings: content of the capture's `capture.json`, whose indices count all cameras.
+        every: all cameras.
+        used: the cameras that are not left out.
+
+    Raises:
+        ValueError: a camera is unknown, or none is left for training.
+    """
+    if requested != "auto":
+        return held_out_views(path, requested, used.names)
+    if "test_view" in settings:
+        views = _indices(path / "capture.json", settings["test_view"], every.names)
+        if not views:
+            return ()
+    else:
+        views = every.test_views or ()
+    names = [every.names[view] for view in views if every.names[view] in used.names]
+    if not names and every.test_views != () and len(used.names) >= _MANY:
+        return (0,)
+    return held_out_views(path, names, used.names)
+
+
+def held_out_views(path: Path, views: int | str | Sequence[int | str] | None, names: Sequence[str]) -> tuple[int, ...]:
+    """Return the ascending indices of cameras that are held out.
+
+    Args:
+        path: the capture folder.
+        views: an index, a name, several of these, or None for none.
+        names: of all cameras.
+
+    Raises:
+        ValueError: there is no such camera, or none is left for training.
+    """
+    indices = _indices(path, views, names)
+    if len(indices) == len(names):
+        raise ValueError(
+            f"{path}: `test_view` must leave a camera for training, got all {len(names)} cameras; name fewer of them."
+        )
+    return indices
+
+
+def _indices(place: Path, views: int | str | Sequence[int | str] | None, names: Sequence[str]) -> tuple[int, ...]:
+    """Return the ascending indices of cameras; `place` is where they were requested."""
+    if views is None:
+        return ()
+    requested = [views] if isinstance(views, int | str) else list(views)
+    return tuple(sorted({_index(place, view, names) for view in requested}))
+
+
+def _index(place: Path, view: int | str, names: Sequence[str]) -> int:
+    """Return the index of a camera given by index or name."""
+    index = names.index(view) if view in names else view
+    if str(index).isdecimal() and int(index) < len(names):
+        return int(index)
+    raise ValueError(
+        f"{place}: `test_view` must be an index in 0..{len(names) - 1}, one of {', '.join(names)}, or none for no "
+        f"held-out camera, got {view}."
+    )
