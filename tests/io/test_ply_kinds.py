@@ -64,7 +64,7 @@ INSTANTS = {
 def test_read_ply__refuses_several_instants(tmp_path, kind):
     path = write(tmp_path / "a.ply", **INSTANTS[kind])
     with pytest.raises(
-        ValueError, match=r"a\.ply: expected the Gaussians of one instant, got those of several.*import"
+        ValueError, match=r"a\.ply: expected the Gaussians of one instant, got several instants.*import"
     ):
         read_ply(path)
 
