@@ -17,6 +17,7 @@ from morgs_mi.runs.live.playing import ClipClock, play
 from tests.scenes.captures import write_timed_video
 from tests.scenes.edit_lists import show_parts
 
+CLIPS = Path(__file__).parent / "clips"
 FPS = 20
 COUNT = 140
 # Parts in s, and the frames that players show.
@@ -41,6 +42,14 @@ def clip(count: int = COUNT) -> list[np.ndarray]:
 def number(image: np.ndarray) -> int:
     """Return the frame's number in an image of `clip`."""
     return int(((image[8:24, 3::8].mean(axis=(0, 2)) > 120) * 2 ** np.arange(8)).sum())
+
+
+@pytest.mark.parametrize("name", ["hevc.mp4", "hevc.mov", "h264.mp4"])
+def test_video_reader__has_the_shown_frames_of_hevc_with_sound(name: str) -> None:
+    reader = VideoReader.open(CLIPS / name)
+    levels = np.array([image.mean() for image in reader.frames()])
+    assert reader.num_frames == len(levels) == 19
+    np.testing.assert_allclose(levels, 98 + 8 * np.arange(19), atol=4)  # half a step: lossy compression
 
 
 @pytest.mark.parametrize("part", PARTS)

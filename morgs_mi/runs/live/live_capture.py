@@ -5,6 +5,7 @@ It is a capture like any other: a stream can be evaluated on it, and its frames 
 
 from __future__ import annotations
 
+import logging
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,6 +26,8 @@ from morgs_mi.runs.live.live_config import LiveConfig
 
 __all__ = ["begin_capture", "read_calibration", "write_images"]
 
+_LOG = logging.getLogger(__name__)
+
 
 def read_calibration(folder: Path) -> Calibration:
     """Return the cameras of an earlier capture of the same rig.
@@ -34,7 +37,10 @@ def read_calibration(folder: Path) -> Calibration:
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: expected a calibrated capture of the cameras, found none; check the path.")
-    return find_layout(folder).read(folder)
+    calibration = find_layout(folder).read(folder)
+    if any(calibration.masks):
+        _LOG.warning("%s: its masks are not used by a live fit.", folder)
+    return calibration
 
 
 def begin_capture(
