@@ -2,12 +2,17 @@
 
 Brightness and two differences of colours are compared, the latter at half the resolution, as video stores them. Each is
 averaged over a window, which removes noise and preserves visible changes. The threshold follows from the larger of two
-estimates of the noise:
+estimates of the noise, which is normal in both:
 
 - of the whole image: the median absolute deviation of the averaged change, at most a grey level. It holds while most of
   the image is static.
 - of the surroundings, e.g. in penumbrae of a path tracer: the median absolute deviation of mixed differences,
   (a - b) - (c - d) of 2 x 2 pixels, to which motion and shadows hardly contribute.
+
+The noise of JPEG and of video codecs is not normal: whole blocks of 8 x 8 pixels, and of 16 x 16 pixels in colour,
+change by one step at a time, which no average over a window removes. A connected change therefore counts only if it
+exceeds a second, larger threshold somewhere, as in the hysteresis of Canny (1986). A faint change that does not is
+compared with the same reference again, so it counts once it has grown.
 """
 
 from __future__ import annotations
@@ -46,6 +51,9 @@ class ChangeConfig:
     """Threshold in standard deviations of the noise: normal noise exceeds 5 at less than one of 1.4 million pixels."""
     min_change: Annotated[float, AtLeast(0)] = _GREY_LEVEL
     """Least threshold and bound of the noise of the whole image, of 1: a grey level."""
+    min_peak: Annotated[float, AtLeast(0)] = 4 * _GREY_LEVEL
+    """Change that a connected change must exceed in one of its pixels, of 1: four grey levels; 0: none. Blocks of
+    compressed video change by less."""
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -69,16 +77,22 @@ def change_mask(
     else:
         difference, unit = np.subtract(after, before, dtype=np.float32), 1.0
     # Integers as long as possible: these images are large.
-    mask = _exceeds_noise(cv2.transform(difference, _SUM) * np.float32(unit / 3), 1, config)
+    levels = _levels(cv2.transform(difference, _SUM) * np.float32(unit / 3), 1, config)
     half = cv2.resize(difference, (max(W // 2, 1), max(H // 2, 1)), interpolation=cv2.INTER_AREA).astype(np.float32)
     for channel in cv2.split(cv2.transform(half, unit * _COLORS)):
-        exceeds = _exceeds_noise(channel, 2, config).astype(np.uint8)
-        mask |= cv2.resize(exceeds, (W, H), interpolation=cv2.INTER_NEAREST).astype(bool)
-    return mask if valid is None else mask & valid
+        enlarged = cv2.resize(_levels(channel, 2, config), (W, H), interpolation=cv2.INTER_NEAREST)
+        levels = np.maximum(levels, enlarged)
+    return _with_peaks(levels if valid is None else levels * valid)
 
 
-def _exceeds_noise(change: np.ndarray, scale: int, config: ChangeConfig) -> np.ndarray:
-    """Return where a change [H, W], of 1, at 1 / scale of the resolution exceeds its noise on average, bool [H, W]."""
+def _levels(change: np.ndarray, scale: int, config: ChangeConfig) -> np.ndarray:
+    """Return 1 where a change [H, W], of 1, exceeds its noise on average, 2 where also `min_peak`, else 0, uint8.
+
+    Args:
+        change: at 1 / scale of the resolution.
+        scale: of the resolution.
+        config: settings.
+    """
     window = max(_WINDOW // scale, 1) | 1
     # Zero padding: reflection would double the noise at the border.
     average = cv2.blur(change, (window, window), borderType=cv2.BORDER_CONSTANT)
@@ -86,7 +100,18 @@ def _exceeds_noise(change: np.ndarray, scale: int, config: ChangeConfig) -> np.n
     everywhere = min(_NORMAL * float(np.median(np.abs(sample - np.median(sample)))), config.min_change)
     noise = np.maximum(_noise_of_surroundings(change, _NOISE_STEP // scale) / window, everywhere)
     threshold = np.maximum(config.sigmas * noise, config.min_change).astype(np.float32)
-    return np.abs(average) > cv2.resize(threshold, change.shape[::-1])
+    size = np.abs(average)
+    exceeds = size > cv2.resize(threshold, change.shape[::-1])
+    return exceeds * np.where(size > config.min_peak, np.uint8(2), np.uint8(1))
+
+
+def _with_peaks(levels: np.ndarray) -> np.ndarray:
+    """Return the connected changes that have a peak, bool [H, W]; `levels` as from `_levels`."""
+    mask = levels > 0
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8))
+    has_peak = np.zeros(count, bool)
+    has_peak[np.asarray(labels)[levels > 1]] = True
+    return has_peak[labels]
 
 
 def _noise_of_surroundings(change: np.ndarray, step: int) -> np.ndarray:

@@ -6,20 +6,20 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.method.change import box_around, change_mask, moving_region, update_reference
+from morgs_mi.method.change import ChangeConfig, box_around, change_mask, moving_region, update_reference
 from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FramePair
 
 H, W, NOISE = 120, 160, 3.0
 
 
-def noisy_image(rng, level=0.0, disc=None):
-    """Return a textured image with camera noise of 3 grey levels, and perhaps a disc that is 40 levels brighter."""
+def noisy_image(rng, level=0.0, disc=None, noise=NOISE):
+    """Return a textured image with camera noise in grey levels, and perhaps a disc that is 40 levels brighter."""
     y, x = np.mgrid[:H, :W]
     image = 120 + 60 * np.sin(x / 7)[..., None] * np.cos(y / 9)[..., None] * np.ones(3) + level
     if disc is not None:
         image[(x - disc[0]) ** 2 + (y - disc[1]) ** 2 < 15**2] += 40
-    return np.clip(image + rng.normal(0, NOISE, image.shape), 0, 255).astype(np.uint8)
+    return np.clip(image + rng.normal(0, noise, image.shape), 0, 255).astype(np.uint8)
 
 
 def test_change_mask__ignores_noise():
@@ -71,6 +71,27 @@ def test_change_mask__takes_floats_like_bytes():
     before, after = noisy_image(rng), noisy_image(rng, disc=(70, 50))
     floats = change_mask(before / np.float32(255), after / np.float32(255))
     assert np.mean(floats != change_mask(before, after)) < 0.01
+
+
+@pytest.mark.parametrize(("size", "step"), [(8, (2, 2, 2)), (16, (3, -3, 0))])
+def test_change_mask__ignores_blocks_of_compressed_video(size: int, step: tuple[int, int, int]):
+    rng = np.random.default_rng(9)
+    before, after = noisy_image(rng, noise=1), noisy_image(rng, noise=1)
+    flips = rng.random((-(-H // size), -(-W // size))) < 0.1
+    after += (np.kron(flips, np.ones((size, size)))[:H, :W, None] * step).astype(np.int8).view(np.uint8)
+    assert not change_mask(before, after).any()
+    assert change_mask(before, after, config=ChangeConfig(min_peak=0)).mean() > 0.02
+
+
+def test_change_mask__has_the_faint_parts_of_a_clear_change():
+    """A shadow that fades from 8 grey levels to none, and another of 2."""
+    before = np.full((H, W, 3), 120.0)
+    after = before.copy()
+    after[30:50, 40:120] -= np.linspace(8, 0, 80)[:, None]
+    after[80:100, 40:120] -= 2
+    mask = change_mask(before / 255, after / 255)
+    assert mask[32:48, 42:105].all()
+    assert not mask[70:].any()
 
 
 def test_moving_region__includes_what_changes_enclose():
