@@ -1,9 +1,9 @@
 """The active set of a frame: the Gaussians that may change, and the pixels of the views where they are visible.
 
-A Gaussian is active if its responsibility for the changes of all views exceeds a threshold (see `responsibility`), or
-if it moved in the previous frame, because its confidence must be able to fall. A view is rendered where an active
-Gaussian is visible or the image changed. Active Gaussians that hardly changed are rendered only in some views, spread
-over the rig, which suffice to hold them in place. All other Gaussians are static splats.
+A Gaussian is active if its responsibility for the changes of all views and its overlap with them exceed thresholds (see
+`responsibility`), or if it moved in the previous frame, because its confidence must be able to fall. A view is rendered
+where an active Gaussian is visible or the image changed. Active Gaussians that hardly changed are rendered only in some
+views, spread over the rig, which suffice to hold them in place. All other Gaussians are static splats.
 
 An object that appears in front of a static background hides a different part of it in each view, and no Gaussian is
 responsible. If active Gaussians cover less than half of a connected change, the Gaussians that lie in it by more than
@@ -27,7 +27,7 @@ from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.ranges import AtLeast, check_ranges
 from morgs_mi.core.rig import choose_key_views
 from morgs_mi.method.boxes import boxes_around
-from morgs_mi.method.responsibility import ChangedView, responsibility
+from morgs_mi.method.responsibility import ChangedView, overlap, responsibility
 from morgs_mi.render.active_view import ActiveView, make_active_view
 from morgs_mi.render.region import Region, summed_area
 from morgs_mi.render.render_config import RenderConfig
@@ -53,6 +53,8 @@ class ActiveSetConfig:
 
     min_responsibility: Annotated[float, AtLeast(0)] = 0.05
     """Responsibility above which a Gaussian is active."""
+    min_overlap: Annotated[float, AtLeast(0)] = 0.35
+    """Overlap above which a Gaussian is active: walls behind moving objects have less, and what moves has more."""
     min_weight: Annotated[float, AtLeast(0)] = 0.2
     """Blend weight in changed blocks, summed over all views in px, below which a Gaussian counts as hidden. One inside
     an object that moves is nearly hidden: it would stay behind, and be uncovered later."""
@@ -126,7 +128,7 @@ def find_active_set(
         for v, camera in cameras.items()
     }
     shares = responsibility(gaussians, changed.values(), config.min_weight)
-    active = shares > config.min_responsibility
+    active = (shares > config.min_responsibility) & (overlap(changed.values()) > config.min_overlap)
     if gaussians.logit_confidence is not None:
         active |= np.asarray(gaussians.logit_confidence) > 0
     for found in changed.values():

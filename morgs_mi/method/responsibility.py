@@ -1,4 +1,4 @@
-"""Responsibility: the share of a Gaussian's visible surface that has changed.
+"""Responsibility and overlap of a Gaussian: how much of its visible surface changed, and in how many of the views.
 
 With the change mask c_v of view v and the blend weights w_iv(x) of frame t-1's Gaussians,
 
@@ -11,11 +11,16 @@ of pixels with changes are rendered, and a Gaussian counts as equally visible el
     r_i = (sum_v sum_{R_v} w_iv c_v / sum_v sum_{R_v} w_iv) (sum_v |b_iv and R_v| / sum_v |b_iv|) .
 
 Large views are rendered at a fraction of their resolution, where c_v is the changed share of a pixel.
+
+A wall behind moving objects changes at their edges, in those views in which they are in front of it. What moves itself
+lies within the changes of all views V_i in which it is, hidden or not. The overlap is the mean over these views,
+
+    o_i = 1/|V_i| sum_{v in V_i} |b_iv and R_v| / |b_iv| .
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -28,10 +33,10 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.method.boxes import Boxes
 from morgs_mi.render.active_view import ActiveView
-from morgs_mi.render.region import Region
+from morgs_mi.render.region import Region, summed_area
 from morgs_mi.render.view_group import ViewGroup
 
-__all__ = ["ChangedView", "responsibility"]
+__all__ = ["ChangedView", "overlap", "responsibility"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +94,19 @@ def responsibility(
     # At least 1: the box of a Gaussian beside the view may be empty, although it reaches into the view.
     elsewhere = np.maximum(np.asarray(area / dr.maximum(near, 1)), 1)
     return np.where(seen, changed / np.where(seen, weight * elsewhere, 1), 0)
+
+
+def overlap(views: Collection[ChangedView]) -> np.ndarray:
+    """Return the overlap o [N] of each Gaussian with the changes, from 0 to 1; 0 for one that is in no view."""
+    shares = np.zeros(len(next(iter(views)).boxes.area))
+    counts = np.zeros_like(shares)
+    for changed_view in views:
+        area = np.asarray(changed_view.boxes.area)
+        counts += area > 0
+        if changed_view.change.any():
+            table = from_numpy(mi.UInt32, summed_area(changed_view.counts > 0))
+            shares += np.asarray(changed_view.boxes.within(table, changed_view.view.grid)) / np.maximum(area, 1)
+    return shares / np.maximum(counts, 1)
 
 
 def _reduced(mask: np.ndarray, factor: int) -> np.ndarray:

@@ -7,7 +7,7 @@ import pytest
 
 from morgs_mi import RenderConfig
 from morgs_mi.method.boxes import boxes_around
-from morgs_mi.method.responsibility import ChangedView, responsibility
+from morgs_mi.method.responsibility import ChangedView, overlap, responsibility
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.view_group import backproject
 from tests.scenes.cameras import arc, look_at_cameras
@@ -26,11 +26,15 @@ def gaussians():
     return isotropic(means, sizes, 0.95, np.zeros((len(means), 1, 3)))
 
 
+def changed_views(gaussians, changes):
+    return [
+        ChangedView(ActiveView(camera), changes[view], boxes_around(gaussians, camera, RENDER, CORE))
+        for view, camera in CAMERAS.items()
+    ]
+
+
 def responsibility_for(gaussians, changes, width=640):
-    views = (
-        ChangedView(ActiveView(c), changes[v], boxes_around(gaussians, c, RENDER, CORE)) for v, c in CAMERAS.items()
-    )
-    return responsibility(gaussians, views, 0.2, width)
+    return responsibility(gaussians, changed_views(gaussians, changes), 0.2, width)
 
 
 def exact_ratio(gaussians, changes):
@@ -70,3 +74,17 @@ def test_responsibility__is_one_where_everything_changed_and_zero_where_nothing_
     assert (everything > 0).mean() > 0.5
     np.testing.assert_allclose(everything[everything > 0], 1, atol=1e-5)
     assert not nothing.any()
+
+
+def test_overlap__distinguishes_a_ball_from_the_wall_behind_it(gaussians):
+    result = overlap(changed_views(gaussians, ball_moves()))
+    assert result[WALL:].min() > 0.6
+    assert np.median(result[:WALL]) < 0.15
+
+
+def test_overlap__counts_hidden_gaussians_and_only_views_in_which_they_are(gaussians):
+    changes = {view: np.full((SIDE, SIDE), view == 0) for view in CAMERAS}
+    views = changed_views(gaussians, changes)
+    areas = np.array([np.asarray(changed_view.boxes.area) for changed_view in views])
+    expected = np.where(areas[0] > 0, 1 / np.maximum((areas > 0).sum(axis=0), 1), 0)
+    np.testing.assert_allclose(overlap(views), expected, atol=1e-5)
