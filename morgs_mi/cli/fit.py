@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tyro.conf import DisallowNone, Positional, arg
 
-from morgs_mi.cli.console import print_result, print_warning, progress
+from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.settings import Flag, GivenReading, GivenSettings, HeldOut, Reading, Settings, held_out, optional
 from morgs_mi.core.documentation import page
 from morgs_mi.core.ranges import AtLeast, check_value
@@ -59,7 +59,6 @@ class Fit:
     arguments: ClassVar[Mapping[str, str]] = {"max_frames": "--frames"}
 
     def run(self) -> None:
-        from morgs_mi.calibration.checks.deep import check_exposures
         from morgs_mi.capture.capture import load_capture
         from morgs_mi.runs.recorder import stream_capture
 
@@ -78,9 +77,6 @@ class Fit:
         capture = load_capture(
             self.capture, self.downscale, held_out(self.test_view), self.frames, self.reading.read_config()
         )
-        if config.fit.exposure == "off" and not self.resume:
-            for finding in check_exposures(capture):
-                print_warning(f"Warning: {finding.sentence}")
         if any(option is not None for option in (self.segments, self.scheduler)):
             self._fit_in_segments(capture, config)
             return

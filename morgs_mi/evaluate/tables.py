@@ -43,6 +43,8 @@ def evaluation_tables(result: Evaluation) -> Iterator[Table]:
         values = [getattr(mean, name + region) for region in REGIONS]
         if any(value == value for value in values):
             regions.add_row(title, *(figure(value, digits) for value in values))
+        if name == "psnr" and mean.psnr_matched == mean.psnr_matched:
+            regions.add_row("PSNR, colours matched", figure(mean.psnr_matched, digits), "", "")
     if result.variation.render == result.variation.render:
         regions.add_row("mTV x100", "", "", figure(result.variation.render, 3))
         regions.add_row("mTV x100 of the recording", "", "", figure(result.variation.input, 3))

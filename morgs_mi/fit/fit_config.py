@@ -171,7 +171,7 @@ class FitConfig:
     on (always taken)."""
     camera_priors: CameraPriors = field(default_factory=CameraPriors)
     """Errors that the calibration may have."""
-    exposure: Literal["off", "auto", "on"] = "off"
+    exposure: Literal["off", "auto", "on"] = "auto"
     """Estimate gain and bias of each camera and frame: off, auto (differences between the cameras are taken if withheld
     pixels show that they are real) or on (always taken)."""
     short_fits: ShortFitConfig = field(default_factory=ShortFitConfig)

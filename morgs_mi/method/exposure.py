@@ -38,6 +38,8 @@ _WIDTH = 160  # px, of the thumbnails on which changes over time are measured: m
 # sRGB is 1.055 l^(1/2.4) - 0.055: a gain g of the light's root comes with the bias 0.055 (g - 1).
 _TOE = 0.055
 _TONES = np.array([0.1, 0.5, 0.9])[:, None]
+# Tones between which most of an image lies: cameras are to agree there.
+_MIDDLE_TONES = np.repeat([[0.2], [0.6]], 3, axis=1)
 
 
 @dataclass(frozen=True)
@@ -128,15 +130,16 @@ def _line(x: np.ndarray, y: np.ndarray, prior: Sequence[float], weights: tuple[f
 
 
 def centred(exposures: Mapping[int, Exposure]) -> dict[int, Exposure]:
-    """Return the exposures of all cameras such that their mean log gain and mean bias are 0.
+    """Return the exposures of all cameras relative to the one that most of them agree on.
 
-    Which of them are right is unknown: all could be brighter and the scene darker.
+    Which of them are right is unknown: all could be brighter and the scene darker. The reference shows a dark and a
+    bright tone as their medians over the cameras. A few dark cameras would move a mean away from all others, and the
+    rendering of a view between those with it.
     """
-    gains = np.array([exposure.gain for exposure in exposures.values()])
-    biases = np.array([exposure.bias for exposure in exposures.values()])
-    gains = gains / np.exp(np.log(gains).mean(axis=0))
-    biases = biases - gains * biases.mean(axis=0) / gains.mean(axis=0)
-    return {v: _exposure(*pair) for v, *pair in zip(exposures, gains, biases, strict=True)}
+    dark, bright = (np.median([exposure(tone) for exposure in exposures.values()], axis=0) for tone in _MIDDLE_TONES)
+    gain = (bright - dark) / (_MIDDLE_TONES[1] - _MIDDLE_TONES[0])
+    reference = _exposure(gain, dark - gain * _MIDDLE_TONES[0])
+    return {view: exposure.without(reference) for view, exposure in exposures.items()}
 
 
 def common_change(exposures: Sequence[Exposure]) -> Exposure:

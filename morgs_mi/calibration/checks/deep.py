@@ -39,7 +39,7 @@ _ERROR, _TIMES_ERROR = 0.7, 3.0
 _OFFSET, _OFFSET_CHANGE, _MIN_HALF = 0.65, 0.75, 24
 # Differences of log gains: about 10 % of exposure, and 5 % of one channel against the mean of all.
 _EXPOSURE, _BALANCE, _MIN_SAMPLES = 0.1, 0.05, 16
-_CORRECTIONS = "--exposure auto or --color linear"
+_CORRECTION = "; fit corrects it (not with --exposure off)"
 # Quick check of the exposures: width of the reduced images, px, and number of near views that each is matched with.
 _QUICK_WIDTH, _QUICK_NEIGHBOURS = 480, 3
 # Error of a median log ratio that no number of points removes, because surfaces look different from two sides.
@@ -231,11 +231,11 @@ def _exposures(gains: np.ndarray) -> Iterator[_Found]:
     for view, (own, mean) in enumerate(zip(gains, gains.mean(axis=1), strict=True)):
         if abs(mean) > _EXPOSURE:
             amount = f"{100 * abs(np.expm1(mean)):.0f} % {'brighter' if mean > 0 else 'darker'}"
-            yield [view], f"is {amount} than the other cameras: set the same exposure and gain, or use {_CORRECTIONS}"
+            yield [view], f"is {amount} than the other cameras: set the same exposure and gain{_CORRECTION}"
         if np.abs(own - mean).max() > _BALANCE:
             channels = ", ".join(f"{n} {100 * np.expm1(g - mean):+.0f} %" for n, g in zip("RGB", own, strict=True))
             what = f"has another white balance than the other cameras ({channels}): set a fixed one"
-            yield [view], f"{what}, or use {_CORRECTIONS}"
+            yield [view], f"{what}{_CORRECTION}"
 
 
 def _flicker(check: DeepCheck) -> Iterator[_Found]:
@@ -246,8 +246,8 @@ def _flicker(check: DeepCheck) -> Iterator[_Found]:
         yield (
             list(lamps),
             f"flicker by {100 * amplitude:.1f} % at {alias:.1f} Hz, as lamps on {' or '.join(map(str, mains))} Hz "
-            f"mains do: expose for a multiple of {exposure} s, use lamps without flicker, or --exposure auto, which "
-            "corrects what the cameras do not have in common",
+            f"mains do: expose for a multiple of {exposure} s, or use lamps without flicker; fit corrects "
+            "what the cameras do not have in common",
         )
 
 
@@ -270,7 +270,7 @@ def _variations(check: DeepCheck) -> Iterator[_Found]:
             yield (
                 [view],
                 f"changes its brightness by {100 * np.expm1(own):.0f} % over time, up to {100 * np.expm1(jump):.0f} % "
-                "from frame to frame: fix the exposure, or use --exposure auto",
+                "from frame to frame: fix the exposure" + _CORRECTION,
             )
 
 

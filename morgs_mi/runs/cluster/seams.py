@@ -37,7 +37,7 @@ from morgs_mi.core.ranges import AtLeast, check_ranges
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.evaluate.results import VariationScores
 from morgs_mi.evaluate.temporal import StillVariation, recorded_change
-from morgs_mi.loop.observation import Images, Seen, Setup
+from morgs_mi.loop.observation import Setup
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.player import render, render_config, truth_for_camera
 from morgs_mi.playback.visualise import to_uint8
@@ -129,16 +129,15 @@ class SeamScores:
 
 
 class Moment(NamedTuple):
-    """A frame and its images, by view index."""
+    """A frame and its images, in the order of the views; None where a view has none."""
 
     frame: int
-    images: Images
+    images: Sequence[np.ndarray | None]
 
 
 def fit_seam_frame(
     setup: Setup,
-    base: CodedFrame,
-    earlier: Images,
+    common: StreamState,
     now: Moment,
     config: SegmentConfig,
     progress: Report | None = None,
@@ -147,21 +146,25 @@ def fit_seam_frame(
 
     Args:
         setup: what all frames share.
-        base: the common model.
-        earlier: images of its last frame, by view index.
+        common: the common model, after its last frame.
         now: the frame.
         config: settings.
         progress: called with (stage, steps done, steps) of each pass.
     """
     # Motion over many frames is no speed.
     setup = replace(setup, cameras=tuple(camera.without_delays() for camera in setup.cameras))
-    (frame, images), coded, last, seconds = now, base, earlier, 0.0
+    coded = common.coded
+    assert coded is not None
+    seen = common.seen
+    seconds = 0.0
     for number in range(config.passes):
         repeated = replace(setup, config=config.fit_config(setup.config, number))
-        state = StreamState(frame, replace(coded, frame=frame - 1), Seen(last, earlier))
-        state, _, report = step(repeated, state, [images.get(view) for view in range(len(setup.cameras))], progress)
-        assert state.coded is not None
-        coded, last, seconds = state.coded, images, seconds + report.seconds
+        state = replace(common, frame=now.frame, coded=replace(coded, frame=now.frame - 1), seen=seen)
+        state, _, report = step(repeated, state, now.images, progress)
+        coded = state.coded
+        assert coded is not None
+        seen = replace(common.seen, images=state.seen.images)  # changes are relative to the common model again
+        seconds += report.seconds
     return coded, replace(report, seconds=seconds)
 
 

@@ -135,7 +135,7 @@ class SegmentedRun:
         >>> fit = wait_for(SegmentedRun(capture, out, workers, config, SegmentConfig(3)).fit())
 
     Raises:
-        ValueError: there are more segments than pairs of frames, or exposures are to be estimated.
+        ValueError: there are more segments than pairs of frames.
     """
 
     def __init__(
@@ -147,12 +147,6 @@ class SegmentedRun:
         segments: SegmentConfig | None = None,
         on_stage: Report | None = None,
     ) -> None:
-        if config.fit.exposure != "off":
-            raise ValueError(
-                f"SegmentedRun(): `fit.exposure` must be off, got {config.fit.exposure!r}: exposures follow from all "
-                "frames before; fit without segments, or match the colours of the cameras as the capture is read "
-                "(--color)."
-            )
         segments = segments or SegmentConfig()
         self.capture, self.out, self.workers = capture, Path(out), workers
         self.on_stage: Report = on_stage or (lambda *_: None)
@@ -313,6 +307,7 @@ class _Segment:
                 frames = FrameRange(0, self.num_fitted, common)
                 part = await self.run.run(fit_frames, frames, self.restart, None, points)
                 self._add(part if self.num_fitted else self._completed(part))
+            self.run.task = replace(self.run.task, balance=self.reports[0].exposures)
             coded = seek(StreamReader(self.files.stream), common - 1)
             self.run.base.set_result((reemitted_keyframe(coded).encoded, coded.next_id))
         overlap = takewhile(lambda packet: packet.frame < self.start, StreamReader(self.files.stream))

@@ -16,7 +16,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import chain, islice
 from typing import Any
 
 import cv2
@@ -32,6 +32,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.environment import versions
 from morgs_mi.io.remote import url_of
 from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.method.exposure import Exposure
 from morgs_mi.runs.cluster.executor import share_of_machine
 from morgs_mi.runs.cluster.seams import Moment, Overlap, SegmentConfig, cross_fade, fit_seam_frame
 from morgs_mi.runs.recorder import push_frame, with_next
@@ -92,6 +93,7 @@ class Fit:
         variant: Mitsuba variant.
         versions: as `installed` returns them to the client.
         rig: refined cameras and distortions, as `Capture.with_cameras` takes them; None: the recording's.
+        balance: exposures in the first frame of the recording, by view; empty before it is fitted.
     """
 
     source: Source
@@ -100,6 +102,7 @@ class Fit:
     variant: str
     versions: tuple[tuple[str, str], ...]
     rig: Rig | None = None
+    balance: tuple[Exposure, ...] = ()
 
     def open(self) -> Capture:
         """Return the recording, with the refined cameras."""
@@ -215,9 +218,10 @@ def fit_segment_start(fit: Fit, base: bytes, frame: int) -> Part:
         capture, coded = fit.open(), decode(None, decode_packet(base))
         loop = StreamLoop.of(capture, fit.segments.overlap_config(fit.config))
         first = max(frame - fit.segments.overlap, coded.frame + 1)
-        earlier, now = _images(capture, coded.frame), Moment(first, _images(capture, first))
-        coded, report = fit_seam_frame(loop.setup, coded, earlier, now, fit.segments, _check_memory)
-        loop.resume(coded, [[now.images.get(view) for view in range(len(loop.setup.cameras))]])
+        loop.resume(coded, _images(capture, 0, coded.frame + 1), fit.balance)
+        now = Moment(first, *_images(capture, first, first + 1))
+        coded, report = fit_seam_frame(loop.setup, loop.state, now, fit.segments, _check_memory)
+        loop.resume(coded, [*_images(capture, 0, 1), now.images], fit.balance)
         before, packets, seconds = None, [reemitted_keyframe(coded)], report.seconds
         for recorded, upcoming in with_next(capture.partial_frames(first + 1, frame + 1)):
             before = loop.state.coded
@@ -314,8 +318,10 @@ def _opened(
         capture = replace(capture, points=points[0], point_colors=points[1])
     loop, recorded = StreamLoop.of(capture, fit.config), capture.partial_frames(frames.segment)
     if restart:
-        past = islice(recorded, frames.start - frames.segment)
-        loop.resume(_decoded(restart), (frame.comparable(capture.train_views) for frame in past))
+        # Exposures are relative to the first frame of the recording.
+        first = _images(capture, 0, 1) if frames.segment else []
+        past = (frame.comparable(capture.train_views) for frame in islice(recorded, frames.start - frames.segment))
+        loop.resume(_decoded(restart), chain(first, past), fit.balance)
     return loop, capture, recorded
 
 
@@ -331,10 +337,9 @@ def _decoded(packets: tuple[bytes, ...]) -> CodedFrame:
     return coded
 
 
-def _images(capture: Capture, frame: int) -> dict[int, np.ndarray]:
-    """Return the images of a frame, by training view."""
-    images = next(capture.partial_frames(frame, frame + 1)).comparable(capture.train_views)
-    return {view: image for view, image in enumerate(images) if image is not None}
+def _images(capture: Capture, start: int, stop: int) -> list[list[np.ndarray | None]]:
+    """Return the images of some frames, of the training views."""
+    return [frame.comparable(capture.train_views) for frame in capture.partial_frames(start, stop)]
 
 
 def _faded(

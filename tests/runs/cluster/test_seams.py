@@ -93,13 +93,13 @@ def test_fit_seam_frame__leaves_what_is_static_as_it_is() -> None:
     capture = recording()
     settings = replace(CONFIG, fit=replace(CONFIG.fit, num_gaussians=400))
     loop = StreamLoop(capture.cameras, capture.points, capture.point_colors, settings)
-    images = [dict(enumerate(frame.images)) for frame in capture.partial_frames(0, 5)]
+    images = [frame.images for frame in capture.partial_frames(0, 5)]
     for frame in images[:2]:
-        loop.push(list(frame.values()))
+        loop.push(frame)
     base = loop.state.coded
     assert base is not None
     config = SegmentConfig(passes=2, epochs=1)
-    coded, report = fit_seam_frame(loop.setup, base, images[1], Moment(4, images[4]), config)
+    coded, report = fit_seam_frame(loop.setup, loop.state, Moment(4, images[4]), config)
     assert (coded.frame, report.frame) == (4, 4)
     _, then, now = np.intersect1d(base.ids, coded.ids, return_indices=True)
     same = np.all(base.grid.values[then] == coded.grid.values[now], axis=1)

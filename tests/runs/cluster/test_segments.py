@@ -294,7 +294,15 @@ def test_SegmentedRun__refines_cameras_once(capture: Capture, workers: Workers, 
     assert np.array_equal(first[0].means, first[1].means)
 
 
-def test_SegmentedRun__refuses_to_estimate_exposures(capture: Capture, workers: Workers, tmp_path: Path) -> None:
-    config = replace(CONFIG, fit=replace(CONFIG.fit, exposure="on"))
-    with pytest.raises(ValueError, match=r"`fit\.exposure` must be off, got 'on'"):
-        SegmentedRun(capture, tmp_path / "out", workers, config, SegmentConfig(2))
+def test_SegmentedRun__has_the_same_balance_of_the_cameras_in_all_segments(
+    capture: Capture, workers: Workers, tmp_path: Path
+) -> None:
+    how = ShortFitConfig(gaussians=40, steps=4, rounds=1)
+    config = replace(SETTINGS, fit=replace(SETTINGS.fit, exposure="on", short_fits=how))
+    fit(capture, tmp_path / "three", workers, config=config)
+    rows = rows_of(tmp_path / "three")
+    balance = [exposure["gain"] for exposure in rows[0]["exposures"]]
+    assert max(max(gain) for gain in balance) > 1.001
+    for row in rows[1:]:
+        for exposure, first in zip(row["exposures"], balance, strict=True):
+            np.testing.assert_allclose(exposure["gain"], first, atol=0.05, err_msg=f"frame {row['frame']}")
