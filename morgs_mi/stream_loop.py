@@ -27,12 +27,13 @@ from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.threads import in_background
 from morgs_mi.fit.balance import Balance, balance_cameras, balance_config
 from morgs_mi.fit.budget import plan_first_frame
+from morgs_mi.fit.dropping import adapted_to_images
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
-from morgs_mi.fit.first_settings import Expected, first_settings
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.initialise import MIN_POINTS
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.fit.problem import FirstFrameProblem
+from morgs_mi.fit.unseen_views import unseen_views
 from morgs_mi.fit.view import View
 from morgs_mi.loop.image_status import image_status
 from morgs_mi.loop.observation import FrameObservation, Images, Recorded, Seen, Setup, observe_frame, prepare, see_frame
@@ -63,10 +64,9 @@ class FrameReport:
         status: "ok", or a sentence about a problem and how it was handled.
         missing_views: names of the views without an image.
         active: fractions that took part, by name: gaussians, views, pixels, epochs.
-        validation: of the first frame, a `sentence` on views between the cameras and their `expected_psnr` in dB, with
-            the result of cross-validation (see `fit.cross_validation`) or a forecast (see `fit.forecast`), for which
-            that PSNR is None; empty with a single view.
-        steps: number of optimisation steps, without the steps of trials.
+        validation: of the first frame, a `sentence` on views between the cameras, with the fields of `UnseenViews`
+            (see `fit.unseen_views`); empty with a single view.
+        steps: number of optimisation steps.
         exposures: gain and bias of each view; empty if they are not estimated.
     """
 
@@ -194,17 +194,17 @@ def _fit_first_frame(
     views, rng = _views(setup, _balanced(images, balance)), rng_of(config.seed, Stream.FIRST_FRAME)
     plan = plan_first_frame(views, setup.cloud, config.fit, config.render, config.seed)
     problem = FirstFrameProblem.of(views, setup.cloud, plan.config, config.render, rng)
-    chosen = first_settings(problem, plan.config, config.seed, progress)
+    fit_config = adapted_to_images(plan.config, problem)
 
     def packed(gaussians: Gaussians) -> Packet:
         return keyframe_packet(gaussians, 0, setup.cameras, config.codec)
 
     on_round = None if on_provisional is None else lambda gaussians: on_provisional(packed(gaussians))
-    fitted = fit_first_frame(problem, chosen.config, rng, progress.of(plan.stage), on_round)
+    fitted = fit_first_frame(problem, fit_config, rng, progress.of(plan.stage), on_round)
     return packed(fitted.gaussians), {
         "losses": fitted.losses,
         "status": _start_status(setup, plan.config),
-        "validation": _about_expected(chosen.expected, problem.psnr(fitted.gaussians)) | _about_balance(found),
+        "validation": _about_unseen_views(problem, fitted.gaussians) | _about_balance(found),
         "steps": fitted.steps,
         "balance": balance,
     }
@@ -247,12 +247,13 @@ def _balanced(images: Images, balance: Sequence[Exposure]) -> dict[int, np.ndarr
     return {v: balance[v].corrected(image) if balance else image for v, image in images.items()}
 
 
-def _about_expected(expected: Expected | None, training_psnr: float) -> dict[str, Any]:
+def _about_unseen_views(problem: FirstFrameProblem, gaussians: Gaussians) -> dict[str, Any]:
     """Return the entries of the first frame's report on views between the cameras."""
-    if expected is None:
+    if len(problem.views) < 2:
         return {}
-    known = replace(expected, training_psnr=training_psnr)
-    return {"sentence": known.sentence, "expected_psnr": known.expected_psnr, **asdict(known)}
+    forecast = unseen_views(problem, gaussians)
+    figures = {"quality": forecast.quality, "expected_psnr": forecast.expected_psnr, "interval": forecast.interval}
+    return {"sentence": forecast.sentence, **figures, **asdict(forecast)}
 
 
 def _about_balance(found: Balance | None) -> dict[str, Any]:

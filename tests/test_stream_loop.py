@@ -29,7 +29,7 @@ from tests.scenes.cameras import QUAD, look_at_cameras
 from tests.scenes.gaussians import isotropic
 
 SHIFT = np.array([0.06, 0.02, 0.0])  # about 3 px a frame
-QUICK = StreamConfig(  # from all points, as the images were made of them, and without trials
+QUICK = StreamConfig(  # from all points, as the images were made of them
     fit=FitConfig(
         sh_degree=0,
         num_gaussians=600,
@@ -42,7 +42,7 @@ QUICK = StreamConfig(  # from all points, as the images were made of them, and w
     motion=MotionConfig(key_views=2),
 )
 REPRODUCIBLE = dataclasses.replace(QUICK, render=RenderConfig(reproducible=True))
-TRIALS = dataclasses.replace(QUICK.fit, first_frame_steps=20, dropping=None)
+SHORT = dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, first_frame_steps=20))
 
 
 def scene(frame: float) -> tuple[Gaussians, np.ndarray]:
@@ -222,42 +222,19 @@ def test_push__replaces_too_few_points_and_reports_it(clip):
     assert 590 < len(loop.gaussians) <= 600  # those pruned in the last round are not replaced
 
 
-def test_push__reports_what_cross_validation_of_the_first_frame_found(clip, monkeypatch):
-    monkeypatch.setattr("morgs_mi.fit.cross_validation.MANY_VIEWS", 4)
-    ticks, fit = [], dataclasses.replace(TRIALS, validate=True)
-    given = dataclasses.replace(QUICK, fit=dataclasses.replace(fit, dropping=0.0))
-    _, report = new_loop(dataclasses.replace(QUICK, fit=fit)).push(clip[0][:4], lambda *tick: ticks.append(tick))
-    found = report.validation
-    assert "Views between the cameras" in found["sentence"]
-    assert len(found["withheld"]) == 1
-    assert [trial["dropping"] for trial in found["trials"]][:2] == [0.0, 0.2]
-    trials = [f"Trial {number} of 3" for number in range(1, len(found["trials"]) + 1)]
-    assert list(dict.fromkeys(stage for stage, *_ in ticks)) == [*trials, "First frame"]
-    assert ticks[-1] == ("First frame", 20, 20)
-    assert "trials" not in new_loop(given).push(clip[0][:4])[1].validation
-
-
-def test_push__withholds_one_of_few_views(clip):
+def test_push__forecasts_other_views(clip):
     ticks = []
-    _, report = new_loop(dataclasses.replace(QUICK, fit=TRIALS)).push(clip[0][:4], lambda *tick: ticks.append(tick))
-    assert report.validation["sentence"].startswith("Views between the cameras will ")
-    assert len(report.validation["withheld"]) == 1
-    assert 0 < report.validation["expected_psnr"] <= report.validation["training_psnr"] + 1e-9
-    steps = {"Trial": 3, "First frame": 20}
-    assert ticks == [(stage, done, total) for stage, total in steps.items() for done in range(1, total + 1)]
+    _, report = new_loop(SHORT).push(clip[0][:4], lambda *tick: ticks.append(tick))
+    validation = report.validation
+    assert validation["sentence"].startswith(f"Views between the cameras will be {validation['quality']}")
+    assert 0 < validation["training_psnr"] < 60
+    assert ticks == [("First frame", done, 20) for done in range(1, 21)], "there is no second fit"
+    assert {"quality", "expected_psnr", "interval", "loss", "margin", "is_outside", "rig"} < validation.keys()
 
 
-def test_push__bounds_what_to_expect_between_two_views(clip):
-    loop = StreamLoop(cameras()[:2], *points_and_colors(), dataclasses.replace(QUICK, fit=TRIALS))
-    validation = loop.push(clip[0][:2])[1].validation
-    assert validation["expected_psnr"] is None
-    assert validation["sentence"].endswith(f"They have at most {validation['training_psnr']:.0f} dB.")
-
-
-def test_push__forecasts_other_views_without_trials(clip):
-    _, report = new_loop(dataclasses.replace(QUICK, fit=dataclasses.replace(TRIALS, dropping=0.0))).push(clip[0][:4])
-    assert report.validation["sentence"].startswith("Views between the cameras will be ")
-    assert "reach" in report.validation
+def test_push__forecasts_nothing_of_a_single_camera(clip):
+    loop = StreamLoop(cameras()[:1], *points_and_colors(), QUICK)
+    assert loop.push(clip[0][:1])[1].validation == {}
 
 
 def test_push__fits_the_first_frame_in_the_steps_that_a_time_allows(clip):
@@ -629,7 +606,7 @@ def test_push__is_interrupted_in_a_callback_and_continues(clip, monkeypatch):
 
 
 def test_push__reports_a_black_first_frame_and_a_cut(clip):
-    loop = StreamLoop(cameras()[:4], *points_and_colors(), dataclasses.replace(QUICK, fit=TRIALS))
+    loop = StreamLoop(cameras()[:4], *points_and_colors(), SHORT)
     black = [np.zeros_like(image) for image in clip[0][:4]]
     cut = [np.ascontiguousarray(image[::-1, ::-1, ::-1]) for image in clip[1][:4]]
     statuses = [loop.push(images)[1].status for images in (black, clip[0][:4], clip[1][:4], cut)]

@@ -6,9 +6,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from benchmarks.pages.results import CHOSEN_ON, Scores, committed, span
+from benchmarks.pages.results import Scores, committed, span
 from benchmarks.reports.cameras import recovered
 from benchmarks.reports.plots import Column, grouped, markdown, plus_minus, scores_table
+from benchmarks.reports.unseen import out_of_capture
+from morgs_mi.fit.unseen_views import WIDEST
 
 __all__ = [
     "cameras",
@@ -16,7 +18,6 @@ __all__ = [
     "clocks_mean",
     "disturbances",
     "dropping",
-    "estimates",
     "exposure",
     "far_views",
     "first_frame_captures",
@@ -26,8 +27,9 @@ __all__ = [
     "photos_over_time",
     "points",
     "principal_points",
-    "real_estimates",
     "real_motion",
+    "unseen_groups",
+    "unseen_views",
 ]
 
 
@@ -66,17 +68,14 @@ def far_views() -> str:
 
 
 def first_frames() -> str:
-    """Return the held-out PSNR, its estimate and the processor time of first frames, before and now."""
+    """Return the held-out PSNR and the processor time of first frames, before and now."""
     rows = []
     for (clip, views, noise), own in grouped(committed("generalise")["fits"], "clip", "views", "noise").items():
         fits = [next(fit for fit in own if fit["variant"] == variant) for variant in ("before", "default")]
-        digits = {"held_out": 2, "estimate": 1, "cpu_s": 0}
-        pairs = {key: " / ".join(f"{fit[key]:.{count}f}" for fit in fits) for key, count in digits.items()}
-        pairs |= {"estimate": ""} if noise else {}  # it is of images with the noise
-        rows.append(
-            (f"`{clip}`", f"{views}", f"{noise:g}", *pairs.values(), f"{fits[1]['cpu_s'] / fits[0]['cpu_s']:.2f}")
-        )
-    titles = "held out, dB", "estimate, dB", "processor time, s", "ratio"
+        digits = {"held_out": 2, "cpu_s": 0}
+        pairs = (" / ".join(f"{fit[key]:.{count}f}" for fit in fits) for key, count in digits.items())
+        rows.append((f"`{clip}`", f"{views}", f"{noise:g}", *pairs, f"{fits[1]['cpu_s'] / fits[0]['cpu_s']:.2f}"))
+    titles = "held out, dB", "processor time, s", "ratio"
     return markdown(("clip", "views", "noise", *titles), rows)
 
 
@@ -99,19 +98,6 @@ def noise_aware() -> str:
         for case in dict.fromkeys(case for case, _ in found)
     )
     return markdown(("capture", "L1 and D-SSIM, dB", "L1 alone, dB"), rows)
-
-
-def estimates() -> str:
-    """Return how many estimates are within 1.5 dB by number of views, on both groups of scenes."""
-    fits, rows = committed("estimates")["fits"], []
-    for (views,), own in sorted(grouped(fits, "views").items()):
-        row = [f"{views}"]
-        for some in ([fit for fit in own if (fit["seed"] in CHOSEN_ON) == chosen] for chosen in (True, False)):
-            errors = np.array([fit["estimate"] - fit["held_out"] for fit in some])
-            row += [f"{(abs(errors) <= 1.5).sum()} of {len(errors)}", span(errors)]
-        rows.append(row)
-    titles = "chosen on: within 1.5 dB", "error, dB", "fresh: within 1.5 dB", "error, dB"
-    return markdown(("views", *titles), rows)
 
 
 def disturbances() -> str:
@@ -162,24 +148,34 @@ def photos_over_time() -> str:
             f"{fit['gaussians']:,}",
             f"{fit['steps']:,}",
             *(f"{fit[score]:.2f}" for score in ("training", "held_out", "registered")),
-            f"{fit['estimate']:.1f}",
         )
         for fit in committed("real_seconds")["fits"]
     )
     titles = "may take, s", "processor time of two cores, s", "Gaussians", "steps", "training views, dB"
-    return markdown(("photos", *titles, "held out", "registered", "estimate"), rows)
+    return markdown(("photos", *titles, "held out", "registered"), rows)
 
 
-def real_estimates() -> str:
-    """Return the estimates of the quality between the cameras of real images, and how far off they are."""
+def unseen_views() -> str:
+    """Return the forecasts of views between the cameras on captures that the regression has not seen."""
     rows = []
-    for (name,), own in grouped(committed("real_estimates")["fits"], "set").items():
-        errors = np.array([fit["estimate"] - fit["held_out"] for fit in own])
-        views = f"{own[0]['views']} + {own[0]['held_out_views']}"
-        scores = (span(fit[score] for fit in own) for score in ("training", "held_out", "estimate"))
-        rows.append((name, views, f"{len(own)}", *scores, span(errors), f"{(abs(errors) <= 1.5).sum()} of {len(own)}"))
-    titles = "training views, dB", "held out", "estimate", "error", "within 1.5 dB"
-    return markdown(("images", "views", "fits", *titles), rows)
+    for (name,), own in grouped(out_of_capture(committed("unseen")["fits"]), "set").items():
+        figures = (span(row[score] for row in own) for score in ("training", "mean", "forecast", "width"))
+        views = span((row["views"] for row in own), 0)
+        rows.append((name, views, f"{len(own)}", *figures, f"{sum(row['within'] for row in own)} of {len(own)}"))
+    titles = "training views, dB", "held-out views, dB", "forecast, dB", "interval, dB", "in it"
+    return markdown(("capture", "views", "fits", *titles), rows)
+
+
+def unseen_groups() -> str:
+    """Return coverage and width of the intervals by kind of capture, of all fits and of those with a number."""
+    rows, fits = [], list(out_of_capture(committed("unseen")["fits"]))
+    for kind, own in [*((kind, own) for (kind,), own in grouped(fits, "kind").items()), ("all", fits)]:
+        narrow = [row for row in own if row["width"] <= WIDEST]
+        widths = f"{np.median([row['width'] for row in narrow]):.1f}"
+        shares = (f"{sum(row['within'] for row in some)} of {len(some)}" for some in (own, narrow))
+        rows.append((kind, f"{len(grouped(own, 'set'))}", *shares, widths))
+    titles = "fits in the interval", "of those with a number", "median width of these, dB"
+    return markdown(("kind", "captures", *titles), rows)
 
 
 def real_motion() -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from benchmarks.pages.results import CHOSEN_ON, committed
+from benchmarks.pages.results import committed
 from benchmarks.reports.plots import blank_figure, grouped
 
 if TYPE_CHECKING:
@@ -30,27 +30,6 @@ def drift() -> Figure:
     return figure
 
 
-def estimates() -> Figure:
-    """Return the estimated PSNR of views between the cameras over the measured one, by number of cameras."""
-    figure = blank_figure(7.5, 3.6)
-    fits = committed("estimates")["fits"]
-    for axis, chosen in zip(figure.subplots(1, 2, sharey=True), (True, False), strict=True):
-        some = [fit for fit in fits if (fit["seed"] in CHOSEN_ON) == chosen]
-        for views in sorted({fit["views"] for fit in some}):
-            own = [(fit["held_out"], fit["estimate"]) for fit in some if fit["views"] == views]
-            axis.plot(*np.transpose(own), ".", label=f"{views} views")
-        ends = np.array([34, 47])
-        axis.plot(ends, ends, color="0.5", lw=0.8)
-        axis.fill_between(ends, ends - 1.5, ends + 1.5, color="0.5", alpha=0.15, lw=0)
-        title = "scenes that rules were chosen on" if chosen else "scenes that nothing was chosen on"
-        axis.set(xlabel="held-out views, dB", aspect="equal", title=title)
-        axis.title.set_size(9)
-        axis.grid(alpha=0.3)
-    figure.axes[0].set(ylabel="estimate, dB")
-    figure.axes[1].legend(fontsize=8)
-    return figure
-
-
 def photos_over_time() -> Figure:
     """Return the held-out PSNR of first frames of photos over the processor time that they took."""
     figure = blank_figure(5.5, 3)
@@ -70,6 +49,5 @@ def photos_over_time() -> Figure:
 # Every plot by the name of its file.
 PLOTS: Mapping[str, Callable[[], Figure]] = {
     "drift": drift,
-    "estimates": estimates,
     "photos_over_time": photos_over_time,
 }

@@ -10,14 +10,12 @@ from typing import Any
 import numpy as np
 
 from benchmarks.reports.study import StudyOptions
-from morgs_mi import StreamLoop, rasterize
+from morgs_mi import StreamLoop
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.core.camera import Camera
-from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.stream_loop import FrameReport
 from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
@@ -26,9 +24,9 @@ __all__ = [
     "Clip",
     "ClipOptions",
     "RandomOptions",
-    "first_frame",
     "new_loop",
     "random_capture",
+    "spread_views",
     "synthetic",
 ]
 
@@ -102,25 +100,21 @@ def random_capture(clips: Path, seed: int, downscale: float = 1) -> Capture:
     return synthetic("random", clips / f"random-{seed}", SynthConfig(frames=8, seed=seed), downscale)
 
 
+def spread_views(cameras: Sequence[Camera], count: int, among: Sequence[int]) -> tuple[int, ...]:
+    """Return the indices of `count` of the cameras `among` all that are far from each other."""
+    positions = np.array([cameras[v].position for v in among])
+    chosen = [int(np.argmax(np.linalg.norm(positions - positions.mean(axis=0), axis=1)))]
+    while len(chosen) < count:
+        distance = np.linalg.norm(positions[:, None] - positions[chosen], axis=-1).min(axis=1)
+        chosen.append(int(np.argmax(distance)))
+    return tuple(sorted(among[k] for k in chosen))
+
+
 def new_loop(capture: Capture, config: StreamConfig, train: Sequence[int] | None = None) -> StreamLoop:
     """Return a loop over the views `train` of a capture, its training views if they are None."""
     train = capture.train_views if train is None else train
     cameras, masks = [capture.cameras[v] for v in train], [capture.masks[v] for v in train]
     return StreamLoop(cameras, capture.points, capture.point_colors, config, masks)
-
-
-def first_frame(capture: Capture, train: Sequence[int], config: StreamConfig) -> tuple[np.ndarray, FrameReport]:
-    """Fit the first frame to the views `train`; return the PSNR of each view of the capture [C], and the report."""
-    loop, images = new_loop(capture, config, train), next(capture.frames(0, 1)).images
-    _, report = loop.push([images[v] for v in train])
-    gaussians = loop.gaussians
-    assert gaussians is not None
-
-    def score(camera: Camera, image: np.ndarray, mask: np.ndarray | None) -> float:
-        found, valid = np.asarray(rasterize(gaussians, camera, ("color",)).color), slice(None) if mask is None else mask
-        return psnr(np.clip(found, 0, 1)[valid], image[valid] / 255.0)
-
-    return np.array([score(*view) for view in zip(capture.cameras, images, capture.masks, strict=True)]), report
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""First frames of clips that no setting was chosen on: quality of the held-out views, the estimate of it, and the time.
+"""First frames of clips that no setting was chosen on: quality of the held-out views, and the time.
 
     python -m benchmarks.reports.generalise --scenes random-201 random-202 random-203 spheres --json out.json
 
@@ -10,15 +10,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import tyro
 
-from benchmarks.reports.estimates import spread_views
-from benchmarks.reports.fits import new_loop, synthetic
+from benchmarks.reports.fits import new_loop, spread_views, synthetic
 from benchmarks.reports.plots import Column, scores_table
 from benchmarks.reports.study import Row, Scene, Study, StudyOptions, Variant
 from morgs_mi.capture.capture import Capture
@@ -31,7 +30,6 @@ from morgs_mi.synth.synth_config import SynthConfig
 
 COLUMNS = (
     Column("held-out views", "held_out", unit=" dB"),
-    Column("estimate", "estimate", 1, unit=" dB"),
     Column("processor time", "cpu_s", 0, unit=" s"),
 )
 _CAMERAS = 10
@@ -55,7 +53,7 @@ class Options(StudyOptions):
     """Steps of the first frame; default: until it has converged."""
 
     def study(self) -> Study:
-        """Return the study of the clips by default and with cross-validation."""
+        """Return the study of the clips."""
         scenes = []
         for name in self.scenes:
             scene, _, seed = name.partition("-")
@@ -68,33 +66,24 @@ class Options(StudyOptions):
                     scenes.append(Scene(keys, (Source.of(capture), train, noise)))
         fit = FitConfig(num_gaussians=self.gaussians, first_frame_steps=self.steps)
         variants = [Variant({"variant": "default"}, StreamConfig(fit))]
-        variants.append(Variant({"variant": "validated"}, StreamConfig(replace(fit, validate=True))))
         return Study(measure, scenes, variants, self.fit_seeds)
 
     def table(self, rows: Sequence[Row]) -> str:
-        """Return the quality, its estimate and the time of each clip and variant."""
+        """Return the quality and the time of each clip and variant."""
         return scores_table(rows, {name: name for name in ("clip", "views", "noise", "variant")}, COLUMNS)
 
 
 def measure(source: Source, train: Sequence[int], noise: float, config: StreamConfig) -> dict[str, Any]:
-    """Fit the first frame; return the PSNR of held-out and training views, the estimate, and the work.
-
-    `dropping` is the probability with the best withheld views; None: there was no trial.
-    """
+    """Fit the first frame; return the PSNR of held-out and training views, and the work."""
     capture = source.open()
     images = next(capture.frames(0, 1)).images
     loop = new_loop(capture, config, train)
     start = time.process_time()
     _, report = loop.push([_noisy(images[v], noise, v) for v in train])
-    seconds, found = time.process_time() - start, report.validation
-    trials = found.get("trials", ())
-    best = max(trials, key=lambda trial: trial["withheld_psnr"], default={"dropping": None})
+    seconds = time.process_time() - start
     return {
         "held_out": _psnr(loop.gaussians, capture, images, sorted({*range(len(images))} - {*train})),
         "training": _psnr(loop.gaussians, capture, images, train),
-        "estimate": found.get("expected_psnr"),
-        "dropping": best["dropping"],
-        "trials": len(trials),
         "steps": report.steps,
         "gaussians": report.num_gaussians,
         "cpu_s": seconds,

@@ -37,7 +37,6 @@ COLUMNS = (
     Column("training views", "training", unit=" dB"),
     Column("held out, as calibrated", "held_out", unit=" dB"),
     Column("registered", "registered", unit=" dB"),
-    Column("estimate", "estimate", 1, unit=" dB"),
     Column("processor time", "cpu_s", 0, unit=" s"),
 )
 _FIRST, _EVERY, _FEW = 4, 8, 6
@@ -117,7 +116,6 @@ def measure(source: Source, test: Sequence[int], pictures: Path | None, config: 
     scores = {name: mean_psnr(gaussians, given, config.render) for name, given in compared.items()}
     announced = float(found[1]) if (found := re.search(r"about (\d+) s", stages[-1])) else None
     return scores | {
-        "estimate": report.validation.get("expected_psnr"),
         "views": len(train),
         "held_out_views": len(test),
         "gaussians": len(gaussians),

@@ -28,9 +28,8 @@ class Stream(IntEnum):
     """Fits of the estimate of time offsets."""
     BUDGET = auto()
     """Timed steps."""
-    TRIALS = auto()
-    """Trials of the first frame."""
-    FIRST_FRAME = auto()
+    # 9 is left out: a number never changes, or all fits would.
+    FIRST_FRAME = 10
     """First frame."""
     LATER_FRAMES = auto()
     """Later frames, by their index."""

@@ -31,7 +31,7 @@ def evaluate_stream(
     """Decode a stream and compare it with its recording: in the held-out view, or otherwise in all training views.
 
     Args:
-        out: stream file or its folder; seconds, and the estimate of other views, come from the ``report.json`` beside
+        out: stream file or its folder; seconds, and the forecast of other views, come from the ``report.json`` beside
             it.
         capture: recording; default is the capture that the stream was fitted to.
         progress: called with (frames done, frames in all).
@@ -48,7 +48,7 @@ def evaluate_stream(
     """
     stream = open_stream(out)
     clip = ComparedClip.of(stream, capture, any_recording)
-    recording, (seconds, estimate) = clip.recording, _of_fit(stream.path)
+    recording, (seconds, of_fit) = clip.recording, _of_fit(stream.path)
     measures = (Quality(lpips), Variation(clip), Motion3D(clip), Registration(), Tracking(clip))
     rows: list[FrameScores] = []
     for frame in clip.frames():
@@ -68,7 +68,7 @@ def evaluate_stream(
         sizes=_sizes(stream.path.stat().st_size, rows),
         playback=PlaybackTimes(**playback_speed(stream, stream.cameras[clip.views[0]])),
         frames=tuple(rows),
-        **(estimate or {"expected": _forecast(recording)}),
+        **(of_fit or {"expected": _forecast(recording)}),
         **_merged(measure.result() for measure in measures),
     )
 
@@ -89,7 +89,7 @@ def _sizes(num_bytes: int, rows: list[FrameScores]) -> Sizes:
 
 
 def _of_fit(stream: Path) -> tuple[dict[int, float], dict[str, Any]]:
-    """Return seconds by frame, and the estimate of other views as fields of `Evaluation`.
+    """Return seconds by frame, and the forecast of other views as fields of `Evaluation`.
 
     They come from the report beside the stream. Without one they are empty.
     """

@@ -255,7 +255,7 @@ class Evaluation:
     """Expected quality of views between the cameras, a sentence from the report of the fit; without one, a forecast
     from the rig; empty with a single training view."""
     expected_psnr: float = float("nan")
-    """Their PSNR as the fit estimates it, dB; NaN without an estimate."""
+    """Their PSNR as the fit forecasts it, dB; NaN where it does not."""
 
     @property
     def num_frames(self) -> int:

@@ -88,7 +88,7 @@ def evaluation_summary(result: Evaluation) -> Iterator[str]:
         f"Drift: PSNR {figure(first, 2)} dB in the first frame, {figure(last, 2)} dB in the last, "
         f"{figure(result.psnr_slope, 4)} dB per frame."
     )
-    if result.held_out:  # a measurement, beside which an estimate would only confuse
+    if result.held_out:  # a measurement, beside which a forecast would only confuse
         held_out = "Held-out views" if len(result.views) > 1 else "Held-out view"
         yield (
             f"{held_out} in the first frame: {figure(first, 2)} dB as calibrated, "

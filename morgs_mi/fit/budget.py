@@ -28,7 +28,6 @@ import numpy as np
 
 from morgs_mi.core.progress import Progress
 from morgs_mi.core.random_streams import Stream, rng_of
-from morgs_mi.fit.cross_validation import trial_steps
 from morgs_mi.fit.detail import with_num_gaussians
 from morgs_mi.fit.first_frame import LAST_ROUND, fit_first_frame
 from morgs_mi.fit.fit_config import FitConfig
@@ -55,19 +54,16 @@ class _Work:
         pixels: mean number of pixels of a view.
         half_pixels: the same at half the size, up to the last round of density control.
         views: number of views.
-        trials: steps of the trials, relative to the steps of the first frame.
     """
 
     pixels: float
     half_pixels: float
     views: int
-    trials: float
 
     @classmethod
-    def of(cls, problem: FirstFrameProblem, config: FitConfig) -> _Work:
+    def of(cls, problem: FirstFrameProblem) -> _Work:
         """Return the work of a problem."""
-        trials = trial_steps(problem, config)
-        return cls(_pixels(problem), _pixels(problem.halved()), len(problem.views), trials)
+        return cls(_pixels(problem), _pixels(problem.halved()), len(problem.views))
 
 
 @dataclass(frozen=True)
@@ -82,15 +78,13 @@ class _StepTime:
         return self.gaussian * count + self.pixel * pixels
 
     def of_all(self, work: _Work, config: FitConfig) -> float:
-        """Return the time of a first frame with its trials; a round of density control is a step in every view."""
+        """Return the time of a first frame; a round of density control is a step in every view."""
         count, steps, rounds = config.planned_gaussians, config.planned_steps, config.density.rounds
         late = self.of(count, work.pixels)
         if not rounds:
-            return (1 + work.trials) * steps * late
+            return steps * late
         early = self.of(_GROWING * count, work.half_pixels)
-        return (1 + work.trials) * (
-            steps * (LAST_ROUND * early + (1 - LAST_ROUND) * late) + rounds * work.views * early
-        )
+        return steps * (LAST_ROUND * early + (1 - LAST_ROUND) * late) + rounds * work.views * early
 
 
 # Of the reference machine, two cores of a server.
@@ -103,7 +97,7 @@ class Plan:
 
     Attributes:
         config: settings with both numbers.
-        seconds: expected time of the first frame with its trials; None if both numbers were given.
+        seconds: expected time of the first frame; None if both numbers were given.
     """
 
     config: FitConfig
@@ -128,7 +122,7 @@ def plan_first_frame(views: Sequence[View], points: Points, config: FitConfig, r
     if None not in (config.num_gaussians, config.first_frame_steps):
         return Plan(config)
     begin, wanted = _clock(), with_num_gaussians(config, views, points[0])
-    work = _Work.of(FirstFrameProblem.of(views, points, wanted, render, rng_of(seed, Stream.BUDGET)), wanted)
+    work = _Work.of(FirstFrameProblem.of(views, points, wanted, render, rng_of(seed, Stream.BUDGET)))
     time, left = _REFERENCE, config.first_frame_seconds
     if not render.reproducible:
         time = _measured(views, points, wanted, render, seed)

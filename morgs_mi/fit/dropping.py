@@ -2,8 +2,7 @@
 
 Where training views are few or noisy, Gaussians overfit them together: one compensates for another in a single view. In
 every step of the first frame, each Gaussian is left out with probability p, and the opacities of the others are scaled
-by 1 / (1 - p). p follows from the number of views, their noise and the angles between them, or is chosen by
-cross-validation (see `cross_validation`).
+by 1 / (1 - p). p follows from the number of views, their noise and the angles between them.
 """
 
 from __future__ import annotations
@@ -17,15 +16,15 @@ import numpy as np
 from morgs_mi.core.attributes import sigmoid
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
+from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.forecast import forecast
 from morgs_mi.fit.noise import is_noisy
 from morgs_mi.fit.problem import FirstFrameProblem
 
-__all__ = ["MANY_VIEWS", "default_dropping", "dropped"]
+__all__ = ["adapted_to_images", "default_dropping", "dropped"]
 
-MANY_VIEWS = 6
-"""Number of views of which one is hardly missed, and that are fitted without dropping."""
-
+# Number of views that are fitted without dropping.
+_MANY_VIEWS = 6
 # Logit of an opacity that no cut-off of the renderer lets pass, and the largest opacity.
 _INVISIBLE, _MOST = -30.0, 0.999
 # Probability with which few views are fitted that are noisy or far apart, and the least `Forecast.reach` of the latter,
@@ -51,7 +50,17 @@ def dropped(gaussians: Gaussians, probability: float, rng: np.random.Generator) 
 
 def default_dropping(problem: FirstFrameProblem) -> float:
     """Return the probability of dropping of a first frame: above 0 for few views that are noisy or far apart."""
-    if len(problem.views) >= MANY_VIEWS:
+    if len(problem.views) >= _MANY_VIEWS:
         return 0.0
     far = len(problem.views) > 1 and forecast(problem.cameras, problem.points).reach >= _FAR
     return _DROPPING if far or is_noisy(problem.images) else 0.0
+
+
+def adapted_to_images(config: FitConfig, problem: FirstFrameProblem) -> FitConfig:
+    """Return the settings of the first frame with what follows from its images: dropping, and the loss of noisy ones.
+
+    Noisy images are fitted by L1 alone if `noise_aware`. A dropping that is given stays.
+    """
+    if config.noise_aware and is_noisy(problem.images):
+        config = replace(config, objective=replace(config.objective, dssim_weight=0.0))
+    return replace(config, dropping=default_dropping(problem)) if config.dropping is None else config

@@ -157,13 +157,10 @@ class FitConfig:
     first_frame_steps: Annotated[int, AtLeast(1)] | None = None
     """Steps of the first frame, one view each; None: from its Gaussians and its time (see `budget`)."""
     first_frame_seconds: Annotated[float, Above(0)] = 120.0
-    """Time that the first frame may take with its trials: it limits those numbers of Gaussians and of steps that are
-    not given."""
+    """Time that the first frame may take: it limits those numbers of Gaussians and of steps that are not given."""
     dropping: Annotated[float, AtLeast(0), Below(1)] | None = None
     """Probability with which each step of the first frame leaves a Gaussian out (see `dropping`); None: from the noise
-    of the images and the angles between the views, or with `validate` chosen by cross-validation."""
-    validate: bool = False
-    """Choose the dropping among six views and more by cross-validation, in long trials (see `cross_validation`)."""
+    of the images and the angles between the views."""
     noise_aware: bool = True
     """Fit the first frame to noisy images by L1 alone: SSIM makes the fit follow their noise."""
     refine_cameras: Literal["off", "auto", "on"] = "off"

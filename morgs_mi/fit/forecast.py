@@ -16,7 +16,7 @@ from morgs_mi.core.rig import (
     surface_of,
 )
 
-__all__ = ["Forecast", "forecast", "quality_of", "verdict"]
+__all__ = ["Forecast", "forecast", "quality_of"]
 
 _WORDS = ("good", "fair", "poor")
 # Limits of good and of fair views between the cameras: loss against the training views in dB, PSNR in dB, and the angle
@@ -35,18 +35,12 @@ class Forecast:
         spacing: mean angle from a camera to its nearest one, seen from the scene, degrees.
         overlap: mean share of a camera's image that its nearest one sees as well.
         reach: mean angle from a camera to the nearest one that sees the same point, degrees, 90 where there is none.
-        training_psnr: mean PSNR of the first frame in the training views, dB; None: not fitted yet.
     """
 
     cameras: int
     spacing: float
     overlap: float
     reach: float
-    training_psnr: float | None = None
-
-    @property
-    def expected_psnr(self) -> None:
-        """PSNR of these views: unknown."""
 
     @property
     def quality(self) -> str:
@@ -54,42 +48,27 @@ class Forecast:
         return _WORDS[sum(self.reach > limit for limit in _ANGLES)]
 
     @property
+    def description(self) -> str:
+        """Number, angles and overlap of the cameras, in words."""
+        share = f"neighbours share {100 * self.overlap:.0f} % of what they see"
+        return f"{self.cameras} cameras, {self.spacing:.0f} degrees apart, {share}"
+
+    @property
     def sentence(self) -> str:
         """Sentence on the expected quality of views between the cameras."""
-        bound = "" if self.training_psnr is None else f" They have at most {self.training_psnr:.0f} dB."
-        return (
-            f"Views between the cameras will be {self.quality}: {self.cameras} cameras, {self.spacing:.0f} degrees "
-            f"apart, neighbours share {100 * self.overlap:.0f} % of what they see.{bound}"
-        )
+        return f"Views between the cameras will be {self.quality}: {self.description}."
 
 
-def verdict(expected_psnr: float, training_psnr: float, spacing: float, source: str) -> str:
-    """Return the sentence on views between the cameras.
-
-    Args:
-        expected_psnr: of these views, dB.
-        training_psnr: of the training views, dB.
-        spacing: mean angle from a camera to its nearest one, degrees.
-        source: how the PSNR was estimated, in words.
-    """
-    loss = max(training_psnr - expected_psnr, 0.0)
-    return (
-        f"Views between the cameras will be {quality_of(expected_psnr, loss, spacing)}: about {expected_psnr:.0f} dB, "
-        f"{source}, {loss:.0f} dB below the training views; the cameras are {spacing:.0f} degrees apart."
-    )
-
-
-def quality_of(psnr: float, loss: float, spacing: float) -> str:
-    """Return the quality of views between the cameras: the worst that their PSNR, their loss and the angle allow.
+def quality_of(psnr: float, loss: float) -> str:
+    """Return the quality of views between the cameras: the worse that their PSNR and their loss allow.
 
     Args:
         psnr: of these views, dB.
         loss: difference from the training views, dB.
-        spacing: mean angle from a camera to its nearest one, degrees.
     """
     by_psnr = sum(psnr < limit for limit in _LEAST_PSNR)
-    by_loss, by_angle = (sum(x > limit for limit in limits) for x, limits in ((loss, _LOSSES), (spacing, _ANGLES)))
-    return _WORDS[max(by_psnr, by_loss, by_angle)]
+    by_loss = sum(loss > limit for limit in _LOSSES)
+    return _WORDS[max(by_psnr, by_loss)]
 
 
 def forecast(cameras: Sequence[Camera], points: np.ndarray) -> Forecast:

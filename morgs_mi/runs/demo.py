@@ -52,10 +52,9 @@ class DemoConfig:
     plain_frames: int = 5
     """Number of frames of the second fit, without learned motion, offset and confidence, for comparison."""
     stream: StreamConfig = field(
-        default_factory=lambda: StreamConfig(fit=FitConfig(num_gaussians=20_000, first_frame_steps=750, dropping=0.0))
+        default_factory=lambda: StreamConfig(fit=FitConfig(num_gaussians=20_000, first_frame_steps=750))
     )
-    """The fit, with a shortened, smaller first frame, and without a trial, because a view is held out; its seed is also
-    the clip's."""
+    """The fit, with a shortened, smaller first frame; its seed is also the clip's."""
 
 
 @dataclass(frozen=True)

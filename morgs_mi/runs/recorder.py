@@ -56,7 +56,7 @@ def stream_capture(
         config: settings.
         resume: continue after the last complete packet of the stream in `out`, if there is one. With
             `RenderConfig(reproducible=True)` the stream has the same bytes as without an interruption.
-        progress: called with (stage, done, total): matching views, trials, the first frame, later frames.
+        progress: called with (stage, done, total): matching views, the first frame, later frames.
 
     Returns:
         The reports of all frames, including those before an interruption.

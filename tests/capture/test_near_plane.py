@@ -26,7 +26,7 @@ from tests.scenes.cameras import circle, look_at_cameras
 
 RADIUS = 0.08  # of the dark ball around camera 0
 CONFIG = StreamConfig(
-    fit=FitConfig(sh_degree=0, num_gaussians=600, first_frame_steps=150, validate=False, dropping=0.0),
+    fit=FitConfig(sh_degree=0, num_gaussians=600, first_frame_steps=150, dropping=0.0),
     render=RenderConfig(reproducible=True),
 )
 SHORT = replace(CONFIG, fit=replace(CONFIG.fit, num_gaussians=60, first_frame_steps=2))

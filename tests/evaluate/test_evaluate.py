@@ -113,7 +113,7 @@ def test_evaluate_stream__scores_the_held_out_view_registered_too(fitted_clip: P
 
 
 @pytest.mark.parametrize("test_view", [None, 0])
-def test_evaluate_stream__repeats_the_estimate_of_the_fit_without_a_held_out_view(
+def test_evaluate_stream__repeats_the_forecast_of_the_fit_without_a_held_out_view(
     fitted_clip: Path, tmp_path: Path, test_view: int | None
 ) -> None:
     write_stream(tmp_path / "stream.morgs", {"test_view": test_view})

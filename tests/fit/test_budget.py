@@ -63,12 +63,6 @@ def test_plan_first_frame__has_fewer_gaussians_and_steps_in_less_time(plan):
     assert numbers(plan(1e-3)) == (6_250, 100), "an eighth"
 
 
-def test_plan_first_frame__leaves_time_for_the_trials(plan):
-    with_trial = plan(60, replace(CONFIG, dropping=None))
-    assert numbers(with_trial) < numbers(plan(60))
-    assert with_trial.seconds <= 60
-
-
 def test_plan_first_frame__changes_no_number_that_is_given(plan):
     gaussians, steps = numbers(plan(10, replace(CONFIG, num_gaussians=20_000)))
     assert gaussians == 20_000

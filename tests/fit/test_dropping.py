@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
 from morgs_mi import RenderConfig
-from morgs_mi.fit.dropping import default_dropping, dropped
+from morgs_mi.fit.dropping import adapted_to_images, default_dropping, dropped
+from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.view import View
-from tests.scenes.ball import images_of, opaque_ball
+from tests.scenes.ball import bytes_of, images_of, opaque_ball, problem
 from tests.scenes.cameras import arc, look_at_cameras
 from tests.scenes.gaussians import isotropic
 
 COUNT = 4000
+GREY = [0.2 + 0.6 * image for image in images_of(opaque_ball())]
 GAUSSIANS = isotropic(np.zeros((COUNT, 3)), 0.1, 0.3, np.zeros((COUNT, 1, 3)))
 
 
@@ -51,10 +55,10 @@ def test_dropped__returns_the_same_without_probability():
 
 
 def test_default_dropping__is_for_few_views_that_are_noisy_or_far_apart():
-    clean, rng = [0.2 + 0.6 * image for image in images_of(opaque_ball())], np.random.default_rng(0)
+    rng = np.random.default_rng(0)
 
     def dropping(noise: float, degrees: float, times: int = 1) -> float:
-        noisy = [255 * (image + rng.normal(0, noise, image.shape)) for image in times * clean]
+        noisy = [255 * (image + rng.normal(0, noise, image.shape)) for image in times * GREY]
         cameras = look_at_cameras(arc(np.deg2rad(degrees) * np.arange(len(noisy)), 3.5), 40)
         images = [np.uint8(np.clip(image + 0.5, 0, 255)) for image in noisy]
         views = tuple(map(View, cameras, images))
@@ -63,3 +67,17 @@ def test_default_dropping__is_for_few_views_that_are_noisy_or_far_apart():
     assert [dropping(noise, 8) for noise in (0.0, 0.008, 0.02)] == [0, 0, 0.2]
     assert [dropping(0.0, degrees) for degrees in (8, 40)] == [0, 0.2]
     assert dropping(0.02, 40, times=2) == 0
+
+
+@pytest.mark.parametrize("views", [1, 2, 4])
+@pytest.mark.parametrize(("noise", "dropping", "dssim_weight"), [(0.0, 0.0, 0.2), (0.008, 0.0, 0.2), (0.05, 0.2, 0.0)])
+def test_adapted_to_images__follows_the_noise(views: int, noise: float, dropping: float, dssim_weight: float):
+    config = FitConfig(sh_degree=0)
+    adapted = adapted_to_images(config, problem(bytes_of(GREY[:views], noise)))
+    objective = replace(config.objective, dssim_weight=dssim_weight)
+    assert adapted == replace(config, dropping=dropping, objective=objective)
+
+
+def test_adapted_to_images__keeps_what_is_given():
+    config = FitConfig(dropping=0.1, noise_aware=False)
+    assert adapted_to_images(config, problem(bytes_of(GREY, 0.05))) == config

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from benchmarks.pages.__main__ import PAGES, with_tables
 from benchmarks.pages.plots import PLOTS
-from benchmarks.pages.results import CHOSEN_ON, committed
+from benchmarks.pages.results import committed
 from benchmarks.pages.tables import TABLES
+from benchmarks.reports.unseen import out_of_capture
+from morgs_mi.fit.forecast import quality_of
+from morgs_mi.fit.unseen_views import REGRESSION, WIDEST
 
 TEXTS = {path.name: path.read_text(encoding="utf-8") for path in PAGES.glob("*.md")}
 WORDS = {name: " ".join(text.split()) for name, text in TEXTS.items()}
@@ -113,21 +116,39 @@ def test_index__quotes_the_field_and_the_drift():
     )
 
 
-def test_pages__quote_the_estimates():
-    fits = committed("estimates")["fits"]
+def test_pages__quote_the_forecasts_of_unseen_views():
+    fits = list(out_of_capture(committed("unseen")["fits"]))
+    narrow = [fit for fit in fits if fit["width"] <= WIDEST]
+    fresh = [fit for fit in fits if fit["set"] in ("flame_steak", "kitchen", "spheres", "random-406", "random-407")]
+    in_all, in_narrow, in_fresh = (sum(fit["within"] for fit in some) for some in (fits, narrow, fresh))
 
-    def right(fresh: bool, *views: int) -> tuple[int, int]:
-        some = [fit for fit in fits if (fit["seed"] not in CHOSEN_ON) == fresh and fit["views"] in views]
-        return sum(abs(fit["estimate"] - fit["held_out"]) <= 1.5 for fit in some), len(some)
+    def word(fit: Mapping[str, float], name: str) -> str:
+        return quality_of(fit[name], fit["training"] - fit[name])
 
-    of_all, of_choice = right(True, 4, 6, 8, 10), right(False, 4, 6, 8, 10)
-    assert right(True, 8, 10) == (8, 8)
-    quoted = (
-        f"{of_all[0]} of {of_all[1]} are within 1.5 dB: all 8 with 8 and 10 views, {right(True, 6)[0]} of "
-        f"{right(True, 6)[1]} with 6 views, and {right(True, 4)[0]} of {right(True, 4)[1]} with 4 views"
+    right = sum(word(fit, "forecast") == word(fit, "mean") for fit in fits)
+    off = [abs(fit["forecast"] - fit["mean"]) for fit in fits]
+    single = np.mean([abs(psnr - fit["forecast"]) <= fit["width"] / 2 for fit in fits for psnr in fit["held_out"]])
+    counts = f"{in_all} of {len(fits)}"
+    assert not missing(
+        "index.md",
+        [
+            f"{counts} are within their interval, and the word (good, fair, poor) is right for {right}. `fit` prints a "
+            f"number for {len(narrow)} of them, of which {in_narrow} are within the interval",
+            f"{in_fresh} of {len(fresh)} fits within their interval",
+        ],
     )
-    assert not missing("index.md", [quoted])
-    assert not missing("first-frame.md", ["{} of {} estimates".format(*of_choice), "{} of {} are".format(*of_all)])
+    assert not missing(
+        "real.md",
+        [
+            f"{np.mean(off):.1f} dB in the mean of all fits, to {max(off):.1f} dB at worst",
+            f"within the interval of the mean in {100 * single:.0f} % of all cases",
+            f"by the forecast {right}.",
+            f"loss = {REGRESSION.intercept:.2f} + {REGRESSION.slopes[0]:.3f} d - {-REGRESSION.slopes[1]:.3f} t",
+            f"in nine fits of ten within {REGRESSION.spread:.2f} (1 + loss)",
+        ],
+    )
+    checks = " ".join((PAGES.parent / "checks.md").read_text(encoding="utf-8").split())
+    assert f"{counts} fits were within their interval, and the word was right for {right}" in checks
 
 
 def test_index__quotes_the_renderer_and_the_fuzzers():
