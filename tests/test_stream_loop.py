@@ -167,15 +167,17 @@ def test_push__same_seed_gives_the_same_bytes_and_no_frame_looks_ahead(clip):
 
 
 def test_push__stream_carries_births_and_deaths(clip):
-    """At the limit as many are pruned as added, ids are never reused, and the decoder has them all."""
-    density = DensityConfig(rounds=0, births=0.05, max_gaussians=610, min_error=0)
+    """Faint ones are pruned, no more are added than the limit allows, ids are never reused, and the decoder has all."""
+    density = DensityConfig(rounds=0, births=0.05, max_gaussians=590, min_error=0, min_opacity=0.3)
     loop, packets, reports = run(clip, dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, density=density)))
-    assert [r.num_gaussians for r in reports] == [600, 610, 610]
     frames = list(coded_frames(packets))
-    for before, after in pairwise(frames):
-        born = np.setdiff1d(after.ids, before.ids)
-        assert born.tolist() == list(range(before.next_id, before.next_id + 30))
-    assert len(np.intersect1d(frames[0].ids, frames[2].ids)) < 600
+    for before, after, report in zip(frames, frames[1:], reports[1:], strict=False):
+        births = np.setdiff1d(after.ids, before.ids)
+        survivors = len(np.intersect1d(after.ids, before.ids))
+        assert births.tolist() == list(range(before.next_id, before.next_id + len(births)))
+        assert 0 < len(births) == min(round(0.05 * len(before.ids)), 590 - survivors)
+        assert report.num_gaussians == survivors + len(births)
+    assert len(np.intersect1d(frames[0].ids, frames[2].ids)) < 590
     for name, value in frames[-1].gaussians.numpy().items():
         assert np.array_equal(value, loop.gaussians.numpy()[name]), name
 
@@ -228,7 +230,8 @@ def test_push__forecasts_other_views(clip):
     validation = report.validation
     assert validation["sentence"].startswith(f"Views between the cameras will be {validation['quality']}")
     assert 0 < validation["training_psnr"] < 60
-    assert ticks == [("First frame", done, 20) for done in range(1, 21)], "there is no second fit"
+    steps = [tick for tick in ticks if tick[0] != "Balancing cameras"]
+    assert steps == [("First frame", done, 20) for done in range(1, 21)], "there is no second fit"
     assert {"quality", "expected_psnr", "interval", "loss", "margin", "is_outside", "rig"} < validation.keys()
 
 
@@ -531,7 +534,7 @@ def test_push__reports_the_exposure_of_each_view_over_time(auto_exposed):
 
 def test_push__changes_no_static_gaussian_where_only_the_exposure_changes(auto_exposed):
     _, frames, _, reports = auto_exposed
-    plain = new_loop(dataclasses.replace(EXPOSED, fit=QUICK.fit))
+    plain = new_loop(dataclasses.replace(EXPOSED, fit=dataclasses.replace(EXPOSED.fit, exposure="off")))
     without = [plain.push(images)[1] for images in frames]
     assert max(report.num_bytes for report in reports[1:]) < 0.1 * min(report.num_bytes for report in without[1:])
     assert without[0].exposures == ()

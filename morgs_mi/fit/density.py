@@ -126,18 +126,15 @@ def _select(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices of the survivors, and the indices of the parents: survivors with the largest error.
 
-    Gaussians fainter than `min_opacity` are pruned, and so are those that cover least where births would exceed
-    the limit.
+    Gaussians fainter than `min_opacity` are pruned. At the limit, others are not: a later frame draws a part of the
+    pixels, in which it cannot see what a Gaussian contributes elsewhere.
     """
     visible = np.asarray(gaussians.opacities) >= config.min_opacity
     # Without any Gaussian, the scene could not recover.
     survivors = np.flatnonzero(visible) if visible.any() else np.arange(len(visible))
     candidates = survivors[scores.error[survivors] > min_error]
-    parents = candidates[np.argsort(-scores.error[candidates], kind="stable")][: room.births]
-    excess = min(max(len(survivors) + len(parents) - room.limit, 0), len(parents))
-    others = np.setdiff1d(survivors, parents)
-    pruned = others[np.argsort(scores.weight[others], kind="stable")][:excess]
-    return np.setdiff1d(survivors, pruned), np.sort(parents[: len(parents) - (excess - len(pruned))])
+    births = min(room.births, max(room.limit - len(survivors), 0))
+    return survivors, np.sort(candidates[np.argsort(-scores.error[candidates], kind="stable")][:births])
 
 
 def _plan(

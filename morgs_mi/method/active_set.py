@@ -128,7 +128,7 @@ def find_active_set(
         for v, camera in cameras.items()
     }
     shares = responsibility(gaussians, changed.values(), config.min_weight)
-    active = (shares > config.min_responsibility) & (overlap(changed.values()) > config.min_overlap)
+    active = (shares > config.min_responsibility) & (overlap(len(gaussians), changed.values()) > config.min_overlap)
     if gaussians.logit_confidence is not None:
         active |= np.asarray(gaussians.logit_confidence) > 0
     for found in changed.values():

@@ -20,7 +20,7 @@ lies within the changes of all views V_i in which it is, hidden or not. The over
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -96,9 +96,9 @@ def responsibility(
     return np.where(seen, changed / np.where(seen, weight * elsewhere, 1), 0)
 
 
-def overlap(views: Collection[ChangedView]) -> np.ndarray:
-    """Return the overlap o [N] of each Gaussian with the changes, from 0 to 1; 0 for one that is in no view."""
-    shares = np.zeros(len(next(iter(views)).boxes.area))
+def overlap(count: int, views: Iterable[ChangedView]) -> np.ndarray:
+    """Return the overlap o [N] of `count` Gaussians with the changes, from 0 to 1; 0 for one that is in no view."""
+    shares = np.zeros(count)
     counts = np.zeros_like(shares)
     for changed_view in views:
         area = np.asarray(changed_view.boxes.area)

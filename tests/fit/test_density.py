@@ -62,12 +62,11 @@ def test_plan_additions__births_stay_within_budget_and_limit(births, limit, expe
     assert len(additions(cloud(), np.arange(1, 7), births=births, max_gaussians=limit).source) == expected
 
 
-def test_plan_additions__prunes_the_least_visible_at_the_limit():
-    found = additions(cloud(), [0, 1, 2, 3, 4, 5], [3, 9, 1, 2, 9, 0], births=1 / 3, max_gaussians=6)
-    assert found.source.tolist() == [0, 1, 4, 5, -1, -1]  # parents survive, however little they cover
-    assert found.parent[-2:].tolist() == [4, 5]
-    beyond = additions(cloud(), [0, 1, 2, 3, 4, 5], births=1 / 3, max_gaussians=3)
-    assert (beyond.num_births, beyond.num_survivors) == (2, 4)  # no more are pruned than added
+@pytest.mark.parametrize(("limit", "births"), [(3, 0), (6, 0), (7, 1)])
+def test_plan_additions__leaves_all_visible_gaussians_at_the_limit(limit, births):
+    plan = additions(cloud(), [0, 1, 2, 3, 4, 5], births=1 / 3, max_gaussians=limit)
+    assert (plan.num_births, plan.num_survivors) == (births, 6)
+    assert plan.parent[6:].tolist() == [5][:births]
 
 
 def test_plan_additions__adds_none_without_error_and_never_prunes_all():

@@ -77,7 +77,7 @@ def test_responsibility__is_one_where_everything_changed_and_zero_where_nothing_
 
 
 def test_overlap__distinguishes_a_ball_from_the_wall_behind_it(gaussians):
-    result = overlap(changed_views(gaussians, ball_moves()))
+    result = overlap(len(gaussians), changed_views(gaussians, ball_moves()))
     assert result[WALL:].min() > 0.6
     assert np.median(result[:WALL]) < 0.15
 
@@ -87,4 +87,4 @@ def test_overlap__counts_hidden_gaussians_and_only_views_in_which_they_are(gauss
     views = changed_views(gaussians, changes)
     areas = np.array([np.asarray(changed_view.boxes.area) for changed_view in views])
     expected = np.where(areas[0] > 0, 1 / np.maximum((areas > 0).sum(axis=0), 1), 0)
-    np.testing.assert_allclose(overlap(views), expected, atol=1e-5)
+    np.testing.assert_allclose(overlap(len(gaussians), views), expected, atol=1e-5)
