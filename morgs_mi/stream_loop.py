@@ -192,7 +192,7 @@ def _fit_first_frame(
     found = _balance(setup, images, progress)
     balance = _exposures_of(setup, images, found)
     views, rng = _views(setup, _balanced(images, balance)), rng_of(config.seed, Stream.FIRST_FRAME)
-    plan = plan_first_frame(views, setup.cloud, config.fit, config.render, config.seed)
+    plan = plan_first_frame(views, setup.points, config.fit)
     problem = FirstFrameProblem.of(views, setup.cloud, plan.config, config.render, rng)
     fit_config = adapted_to_images(plan.config, problem)
 

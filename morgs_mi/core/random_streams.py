@@ -26,9 +26,7 @@ class Stream(IntEnum):
     """Blocks of pixels that are withheld from a fit."""
     TIMING = auto()
     """Fits of the estimate of time offsets."""
-    BUDGET = auto()
-    """Timed steps."""
-    # 9 is left out: a number never changes, or all fits would.
+    # 8 and 9 are left out: a number never changes, or all fits would.
     FIRST_FRAME = 10
     """First frame."""
     LATER_FRAMES = auto()

@@ -157,7 +157,8 @@ class FitConfig:
     first_frame_steps: Annotated[int, AtLeast(1)] | None = None
     """Steps of the first frame, one view each; None: from its Gaussians and its time (see `budget`)."""
     first_frame_seconds: Annotated[float, Above(0)] = 120.0
-    """Time that the first frame may take: it limits those numbers of Gaussians and of steps that are not given."""
+    """Time that the first frame may take on two cores of a server: it limits those numbers of Gaussians and of steps
+    that are not given."""
     dropping: Annotated[float, AtLeast(0), Below(1)] | None = None
     """Probability with which each step of the first frame leaves a Gaussian out (see `dropping`); None: from the noise
     of the images and the angles between the views."""

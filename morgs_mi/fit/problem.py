@@ -12,13 +12,11 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.rig import scene_depths, scene_extent
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.initialise import Points, from_points, initial_points
-from morgs_mi.fit.view import View, mean_psnr
+from morgs_mi.fit.view import View, half_sized, mean_psnr
 from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["FirstFrameProblem"]
 
-# Least width of the images that `halved` returns, px.
-_COARSE_WIDTH = 160
 # Least scene extent, relative to the median depth: of means that move by fractions of the extent.
 _DEPTH = 1 / 6
 # Opacity of the Gaussians at the start: most can become opaque or vanish within the steps of a first frame.
@@ -81,9 +79,8 @@ class FirstFrameProblem:
         return replace(self, views=tuple(view.reduced(width) for view in self.views))
 
     def halved(self) -> FirstFrameProblem:
-        """Return the problem with views of half the size; a view narrower than 320 px keeps its own."""
-        widths = (max(view.camera.width // 2, _COARSE_WIDTH) for view in self.views)
-        return replace(self, views=tuple(map(View.reduced, self.views, widths)))
+        """Return the problem with views of half the size, see `half_sized`."""
+        return replace(self, views=tuple(half_sized(self.views)))
 
     def only(self, indices: Sequence[int]) -> FirstFrameProblem:
         """Return the problem of some of the views."""

@@ -14,12 +14,14 @@ from morgs_mi.method.ssim import Target
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["LEAST_GAIN", "View", "decibels", "mean_psnr", "rendered", "squared_errors", "withheld_blocks"]
+__all__ = ["LEAST_GAIN", "View", "decibels", "half_sized", "mean_psnr", "rendered", "squared_errors", "withheld_blocks"]
 
 LEAST_GAIN = 0.1
 """Increase of the PSNR of withheld pixels from which a change of the cameras is taken, dB: less is chance."""
 
 _MIN_SIDE = 32  # px, of a reduced image
+# Least width of views of half the size, px.
+_COARSE_WIDTH = 160
 # Withheld blocks: side in px, and one of how many.
 _BLOCK, _SHARE = 12, 8
 
@@ -56,6 +58,11 @@ class View(NamedTuple):
             return View(self.camera.resized(*size), image)
         share = cv2.resize(self.mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         return View(self.camera.resized(*size), image, share > 0.999)
+
+
+def half_sized(views: Sequence[View]) -> list[View]:
+    """Return views of half the size; a view narrower than 320 px keeps its own."""
+    return [view.reduced(max(view.camera.width // 2, _COARSE_WIDTH)) for view in views]
 
 
 def withheld_blocks(views: Sequence[View], width: int, rng: np.random.Generator) -> tuple[list[View], list[View]]:
