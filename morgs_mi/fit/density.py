@@ -14,7 +14,7 @@ Parents are the Gaussians with the largest densification scores (see `method.att
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -22,7 +22,9 @@ import drjit as dr
 import numpy as np
 from drjit.opt import Adam
 
+from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.fit.empty_space import in_empty_space
 from morgs_mi.fit.fit_config import DensityConfig
 from morgs_mi.fit.optimise import replace_parameter
 from morgs_mi.method.attribution import DensificationScores
@@ -76,8 +78,11 @@ def plan_growth(
     extent: float,
     config: DensityConfig,
     rng: np.random.Generator,
+    cameras: Sequence[Camera] = (),
 ) -> DensityPlan:
     """Return the plan of a round in the first frame: which Gaussians are pruned, cloned and split.
+
+    Gaussians in the empty space before the cameras are pruned; a birth there takes the mean of its parent instead.
 
     Args:
         gaussians: N Gaussians.
@@ -86,14 +91,20 @@ def plan_growth(
         extent: of the scene, world units.
         config: thresholds.
         rng: draws the means of the births.
+        cameras: the training cameras.
     """
-    survivors, parents = _select(gaussians, scores, room, 0, config)
+    means = np.asarray(gaussians.means)
+    visible = (np.asarray(gaussians.opacities) >= config.min_opacity) & ~in_empty_space(cameras, means)
+    survivors, parents = _select(visible, scores, room, 0)
     parent, opacity = np.concatenate([survivors, parents]), np.asarray(gaussians.opacities)
     touched, scales = np.isin(parent, parents), np.asarray(gaussians.scales).max(axis=1)[parent]
     split = touched & (scales > config.split_scale * extent)
     half = 1 - np.sqrt(1 - np.minimum(opacity[parent], _MAX_OPACITY))
     logits = np.where(touched & ~split, _logit(half) - np.asarray(gaussians.logit_opacities)[parent], 0)
-    return _plan(gaussians, survivors, parents, np.where(split, _LOG_SHRINK, 0), logits, rng)
+    plan = _plan(gaussians, survivors, parents, np.where(split, _LOG_SHRINK, 0), logits, rng)
+    shift = plan.edits["means"]
+    shift[in_empty_space(cameras, means[parent] + shift)] = 0
+    return plan
 
 
 def plan_additions(
@@ -114,7 +125,8 @@ def plan_additions(
     """
     births = round(config.births * (len(gaussians) + num_static))
     room = Room(births, max(config.max_gaussians - num_static, 0))
-    survivors, parents = _select(gaussians, scores, room, config.min_error, config)
+    visible = np.asarray(gaussians.opacities) >= config.min_opacity
+    survivors, parents = _select(visible, scores, room, config.min_error)
     born = np.arange(len(survivors) + len(parents)) >= len(survivors)
     logits = np.asarray(gaussians.logit_opacities)[np.concatenate([survivors, parents])]
     fainter = np.where(born, _logit(_BIRTH_OPACITY) - logits, 0)
@@ -122,14 +134,13 @@ def plan_additions(
 
 
 def _select(
-    gaussians: Gaussians, scores: DensificationScores, room: Room, min_error: float, config: DensityConfig
+    visible: np.ndarray, scores: DensificationScores, room: Room, min_error: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices of the survivors, and the indices of the parents: survivors with the largest error.
 
-    Gaussians fainter than `min_opacity` are pruned, and so are those that cover least where births would exceed
-    the limit.
+    Gaussians that are not `visible` [N] are pruned, and so are those that cover least where births would exceed the
+    limit.
     """
-    visible = np.asarray(gaussians.opacities) >= config.min_opacity
     # Without any Gaussian, the scene could not recover.
     survivors = np.flatnonzero(visible) if visible.any() else np.arange(len(visible))
     candidates = survivors[scores.error[survivors] > min_error]

@@ -40,9 +40,9 @@ def scores(error, weight=None):
     )
 
 
-def growth(gaussians, error):
+def growth(gaussians, error, cameras=()):
     n = len(gaussians)
-    return plan_growth(gaussians, scores(error), Room(n, 2 * n), 10.0, CONFIG, np.random.default_rng(1))
+    return plan_growth(gaussians, scores(error), Room(n, 2 * n), 10.0, CONFIG, np.random.default_rng(1), cameras)
 
 
 def additions(gaussians, error, weight=None, **settings):
@@ -91,6 +91,19 @@ def test_plan_growth__splits_large_gaussians_and_keeps_means():
     assert_close(after.opacities, np.full(7, 0.6), rtol=1e-5)
     assert np.array_equal(np.asarray(after.means)[:6], np.asarray(before.means))
     assert np.asarray(after.logit_confidence)[6] == 5
+
+
+def test_plan_growth__leaves_the_space_before_near_planes_empty():
+    camera = Camera.look_at((0, 0, -4), (0, 0, 0), (0, -1, 0), 40, 64, 48, near=3.0)
+    z = np.where(np.arange(400) < 100, -2.0, -0.99)  # before and close behind the near plane at -1
+    crowd = isotropic(np.stack([0 * z, 0 * z, z], 1), 0.05, 0.6, 0.5)
+    plan = growth(crowd, np.ones(400), [camera])
+    after = apply_plan(crowd, plan)
+    assert plan.num_survivors == 300
+    assert plan.source[:300].tolist() == list(range(100, 400))
+    assert plan.num_births == 300
+    assert np.asarray(after.means)[:, 2].min() >= -1
+    assert np.asarray(apply_plan(crowd, growth(crowd, np.ones(400))).means)[:, 2].min() < -2
 
 
 def test_plan_additions__births_are_faint_and_parents_unchanged():
