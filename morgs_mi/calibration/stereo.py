@@ -55,8 +55,7 @@ def stereo_points(
     for i, j in _neighbours(cameras, known):
         points = _matched(views[i], views[j], _depth_range(cameras, i, known))
         others = [view for k, view in enumerate(views) if k not in (i, j)]
-        points = points[_confirmed(points, others)] if others else points
-        found.append(rng.permutation(points)[:_POINTS])
+        found.append(_some_confirmed(rng.permutation(points), others))
     points, colors = np.split(np.concatenate(found), 2, axis=1)
     return points.astype(np.float32), colors.astype(np.float32)
 
@@ -68,11 +67,13 @@ class _View:
     Attributes:
         camera: camera of the image's size.
         image: uint8 [H, W, 3].
+        blurred: the image, averaged over 3 x 3 pixels.
         valid: uint8 [H, W], 255 where the pixel is valid.
     """
 
     camera: Camera
     image: np.ndarray
+    blurred: np.ndarray
     valid: np.ndarray
 
     @classmethod
@@ -81,7 +82,8 @@ class _View:
         size = round(camera.width * scale), round(camera.height * scale)
         valid = np.full(image.shape[:2], 255, np.uint8) if mask is None else np.uint8(255) * mask.astype(np.uint8)
         valid = cv2.resize(valid, size, interpolation=cv2.INTER_NEAREST)
-        return cls(camera.resized(*size), cv2.resize(image, size, interpolation=cv2.INTER_AREA), valid)
+        reduced = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        return cls(camera.resized(*size), reduced, cv2.blur(reduced, (3, 3)), valid)
 
 
 def _neighbours(cameras: Sequence[Camera], known: np.ndarray) -> list[tuple[int, int]]:
@@ -205,13 +207,28 @@ def _disparity(left: np.ndarray, right: np.ndarray, lowest: int, count: int) -> 
     return matcher.compute(*wide)[:, pad:-pad] / 16.0
 
 
+def _some_confirmed(points: np.ndarray, others: Sequence[_View]) -> np.ndarray:
+    """Return the first points [at most `_POINTS`, 6] that other views confirm; all count if there are none."""
+    if not others:
+        return points[:_POINTS]
+    parts = []
+    count = 0
+    for start in range(0, len(points), _POINTS):
+        part = points[start : start + _POINTS]
+        parts.append(part[_confirmed(part, others)])
+        count += len(parts[-1])
+        if count >= _POINTS:
+            break
+    return np.concatenate([points[:0], *parts])[:_POINTS]
+
+
 def _confirmed(points: np.ndarray, others: Sequence[_View]) -> np.ndarray:
     """Return the mask of points with colours [P, 6] that have their colour in a valid pixel of another view."""
     confirmed = np.zeros(len(points), bool)
     for view in others:
         seen, pixels, _ = seen_points(view.camera, points[:, :3])
         columns, rows = pixels.astype(int).T
-        shown = cv2.blur(view.image, (3, 3))[rows, columns] / 255.0
+        shown = view.blurred[rows, columns] / 255.0
         same = np.abs(shown - points[seen, 3:]).max(axis=1) < _MAX_COLOR
         confirmed[seen] |= same & (view.valid[rows, columns] > 0)
     return confirmed

@@ -1,20 +1,20 @@
 """Density control: cloning, splitting, adding and pruning Gaussians, and resizing the optimiser's state.
 
 N Gaussians become M. `parent` [M] is the index among the N of the Gaussian that each one is or was made from; `source`
-[M] is the same for survivors, which come first in ascending order, and -1 for births, which come last. Survivors keep
-their means, as their tracks must not jump. Births are drawn from the density of their parents.
+[M] is the same for survivors, which come first in ascending order, and -1 for births, which come last.
 
-In the first frame, `plan_growth` (Kerbl et al. 2023): a large parent is split, and both shrink by 1.6; a small one is
-cloned, and both get the opacity 1 - sqrt(1 - o), with which they cover as much as the parent (Bulo et al. 2024). In a
-later frame, `plan_additions` (Sun et al. 2024): parents stay unchanged, because the few remaining steps could not
-repair them; births are small and faint, and gain opacity or are pruned.
+In the first frame, `plan_growth` (Kerbl et al. 2023): a large parent is split into two along its longest axis
+(arXiv 2508.12313); a small one is cloned, and both get the opacity 1 - sqrt(1 - o), with which they cover as much as
+the parent (Bulo et al. 2024). In a later frame, `plan_additions` (Sun et al. 2024): parents stay unchanged, because
+their tracks must not jump and the few remaining steps could not repair them; births are small and faint, and gain
+opacity or are pruned. Births that are not from splits are drawn from the density of their parents.
 
 Parents are the Gaussians with the largest densification scores (see `method.attribution`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -22,7 +22,9 @@ import drjit as dr
 import numpy as np
 from drjit.opt import Adam
 
+from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.fit.empty_space import in_empty_space
 from morgs_mi.fit.fit_config import DensityConfig
 from morgs_mi.fit.optimise import replace_parameter
 from morgs_mi.method.attribution import DensificationScores
@@ -33,8 +35,15 @@ __all__ = ["DensityPlan", "Room", "apply_plan", "plan_additions", "plan_growth",
 _MAX_OPACITY = 1 - 1e-6
 # Opacity of a birth in a later frame: low, because unnecessary births are then pruned soon.
 _BIRTH_OPACITY = 0.1
-# Logarithm of the factor by which a split Gaussian, and a birth in a later frame, is smaller than its parent (3DGS).
+# Logarithm of the factor by which a birth in a later frame is smaller than its parent (3DGS).
 _LOG_SHRINK = -float(np.log(1.6))
+# Distance of the two parts of a split Gaussian from its mean, in scales along its longest axis (arXiv 2508.12313).
+_SPLIT_SHIFT = 1.35
+# Scales of the parts relative to those of the whole, along its longest axis and along the others.
+_SPLIT_LONGEST = 0.55
+_SPLIT_OTHERS = 0.893
+# Opacity of the parts relative to the whole.
+_SPLIT_OPACITY = 0.6
 
 
 @dataclass(frozen=True)
@@ -76,8 +85,11 @@ def plan_growth(
     extent: float,
     config: DensityConfig,
     rng: np.random.Generator,
+    cameras: Sequence[Camera] = (),
 ) -> DensityPlan:
     """Return the plan of a round in the first frame: which Gaussians are pruned, cloned and split.
+
+    Gaussians in the empty space before the cameras are pruned; a birth there takes the mean of its parent instead.
 
     Args:
         gaussians: N Gaussians.
@@ -86,14 +98,26 @@ def plan_growth(
         extent: of the scene, world units.
         config: thresholds.
         rng: draws the means of the births.
+        cameras: the training cameras.
     """
-    survivors, parents = _select(gaussians, scores, room, 0, config)
-    parent, opacity = np.concatenate([survivors, parents]), np.asarray(gaussians.opacities)
-    touched, scales = np.isin(parent, parents), np.asarray(gaussians.scales).max(axis=1)[parent]
-    split = touched & (scales > config.split_scale * extent)
-    half = 1 - np.sqrt(1 - np.minimum(opacity[parent], _MAX_OPACITY))
-    logits = np.where(touched & ~split, _logit(half) - np.asarray(gaussians.logit_opacities)[parent], 0)
-    return _plan(gaussians, survivors, parents, np.where(split, _LOG_SHRINK, 0), logits, rng)
+    means = np.asarray(gaussians.means)
+    visible = (np.asarray(gaussians.opacities) >= config.min_opacity) & ~in_empty_space(cameras, means)
+    survivors, parents = _select(visible, scores, room, 0)
+    parent = np.concatenate([survivors, parents])
+    touched = np.isin(parent, parents)
+    quats, scales = (np.asarray(values)[parent] for values in (gaussians.quats, gaussians.scales))
+    split = touched & (scales.max(axis=1) > config.split_scale * extent)
+    opacity = np.minimum(np.asarray(gaussians.opacities)[parent], _MAX_OPACITY)
+    changed = np.where(split, _SPLIT_OPACITY * opacity, 1 - np.sqrt(1 - opacity))
+    logits = np.where(touched, _logit(changed) - np.asarray(gaussians.logit_opacities)[parent], 0)
+    plan = _plan(gaussians, survivors, parents, np.zeros(len(parent)), logits, rng)
+    is_longest = np.eye(3, dtype=bool)[scales.argmax(axis=1)]
+    side = np.where(plan.source < 0, _SPLIT_SHIFT, -_SPLIT_SHIFT)[:, None]
+    plan.edits["means"][split] = _rotated(quats, side * is_longest * scales)[split]
+    plan.edits["log_scales"][split] = np.log(np.where(is_longest, _SPLIT_LONGEST, _SPLIT_OTHERS))[split]
+    shift = plan.edits["means"]
+    shift[in_empty_space(cameras, means[parent] + shift)] = 0
+    return plan
 
 
 def plan_additions(
@@ -114,7 +138,8 @@ def plan_additions(
     """
     births = round(config.births * (len(gaussians) + num_static))
     room = Room(births, max(config.max_gaussians - num_static, 0))
-    survivors, parents = _select(gaussians, scores, room, config.min_error, config)
+    visible = np.asarray(gaussians.opacities) >= config.min_opacity
+    survivors, parents = _select(visible, scores, room, config.min_error)
     born = np.arange(len(survivors) + len(parents)) >= len(survivors)
     logits = np.asarray(gaussians.logit_opacities)[np.concatenate([survivors, parents])]
     fainter = np.where(born, _logit(_BIRTH_OPACITY) - logits, 0)
@@ -122,14 +147,13 @@ def plan_additions(
 
 
 def _select(
-    gaussians: Gaussians, scores: DensificationScores, room: Room, min_error: float, config: DensityConfig
+    visible: np.ndarray, scores: DensificationScores, room: Room, min_error: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices of the survivors, and the indices of the parents: survivors with the largest error.
 
-    Gaussians fainter than `min_opacity` are pruned. At the limit, others are not: a later frame draws a part of the
+    Gaussians that are not `visible` [N] are pruned. At the limit, others are not: a later frame draws a part of the
     pixels, in which it cannot see what a Gaussian contributes elsewhere.
     """
-    visible = np.asarray(gaussians.opacities) >= config.min_opacity
     # Without any Gaussian, the scene could not recover.
     survivors = np.flatnonzero(visible) if visible.any() else np.arange(len(visible))
     candidates = survivors[scores.error[survivors] > min_error]
@@ -155,12 +179,15 @@ def _plan(
 
 def _draw(quats: np.ndarray, scales: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return one displacement [M, 3] from the density of each Gaussian."""
+    return _rotated(quats, rng.standard_normal(scales.shape) * scales)
+
+
+def _rotated(quats: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    """Return the vectors [M, 3], rotated by quaternions [M, 4] of any length (Rodrigues)."""
     w, v = quats[:, :1], quats[:, 1:]
-    n = rng.standard_normal(scales.shape) * scales
-    # Rodrigues: the rotation of n by a quaternion of any length
-    t = 2 * np.cross(v, n)
+    t = 2 * np.cross(v, vectors)
     square = np.maximum((quats**2).sum(axis=1, keepdims=True), 1e-30)
-    return n + (w * t + np.cross(v, t)) / square
+    return vectors + (w * t + np.cross(v, t)) / square
 
 
 def _logit(x: np.ndarray | float) -> np.ndarray:

@@ -153,7 +153,8 @@ class _Fit:
         now, config = self.gaussians, self._config
         room = Room(-(-max(config.planned_gaussians - len(now), 0) // rounds), config.planned_gaussians)
         scores = densification_scores(now, self._views, self._targets)
-        plan = plan_growth(now, scores, room, self._problem.extent, config.density, self._rng)
+        problem = self._problem
+        plan = plan_growth(now, scores, room, problem.extent, config.density, self._rng, problem.cameras)
         resize_optimizer(self._optimizer, plan, plan.edits)
         self._base = self._base.select(plan.parent)
 

@@ -13,6 +13,7 @@ from morgs_mi.core.checks import check_points
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.rig import focus_depths, scene_extent, seen_points
+from morgs_mi.fit.empty_space import in_empty_space
 from morgs_mi.fit.view import View
 
 __all__ = [
@@ -76,15 +77,15 @@ def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int, opacity:
 
 
 def initial_points(views: Sequence[View], points: Points, count: int, rng: np.random.Generator) -> Points:
-    """Return `count` points [count, 3] that Gaussians start from, and their colours [count, 3] in [0, 1].
+    """Return the points that Gaussians start from, at most [count, 3], and their colours in [0, 1].
 
     Fewer than `MIN_POINTS` given ones are replaced by random points inside the views; where there are few, random ones
-    are added where the views show none.
+    are added where the views show none. Points in the empty space before the cameras are left out.
 
     Args:
         views: V views, at least one.
         points: P points and their colours.
-        count: number of points.
+        count: number of points; those in the empty space are not replaced.
         rng: draws points.
     """
     known = len(points[0])
@@ -92,7 +93,15 @@ def initial_points(views: Sequence[View], points: Points, count: int, rng: np.ra
         points = seed_points(views, count, rng)
     elif known < _MANY_POINTS:
         points = fill_points(points, views, count, rng)
-    return resample_points(points, count, rng)
+    cameras = [view.camera for view in views]
+    points = resample_points(_outside_empty_space(cameras, points), count, rng)
+    return _outside_empty_space(cameras, points)  # points between two others may lie there
+
+
+def _outside_empty_space(cameras: Sequence[Camera], points: Points) -> Points:
+    """Return the points that are not in the empty space before the cameras; all, if all are."""
+    is_empty = in_empty_space(cameras, points[0])
+    return points if is_empty.all() else (points[0][~is_empty], points[1][~is_empty])
 
 
 def resample_points(points: Points, count: int, rng: np.random.Generator) -> Points:

@@ -8,6 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from morgs_mi import Camera, Gaussians, rasterize
 from morgs_mi.fit.density import DensityPlan, Room, apply_plan, plan_additions, plan_growth, resize_optimizer
@@ -40,9 +41,9 @@ def scores(error, weight=None):
     )
 
 
-def growth(gaussians, error):
+def growth(gaussians, error, cameras=()):
     n = len(gaussians)
-    return plan_growth(gaussians, scores(error), Room(n, 2 * n), 10.0, CONFIG, np.random.default_rng(1))
+    return plan_growth(gaussians, scores(error), Room(n, 2 * n), 10.0, CONFIG, np.random.default_rng(1), cameras)
 
 
 def additions(gaussians, error, weight=None, **settings):
@@ -83,13 +84,31 @@ def test_plan_growth__clones_small_gaussians_with_the_same_coverage():
     assert scales[6] == pytest.approx(np.asarray(before.scales)[5], rel=1e-5)
 
 
-def test_plan_growth__splits_large_gaussians_and_keeps_means():
+def test_plan_growth__splits_large_gaussians_along_their_longest_axis():
     before = cloud(scale=1.0)
     after = apply_plan(before, growth(before, [0, 0, 0, 0, 0, 1]))
-    assert np.asarray(after.scales)[5:] == pytest.approx(np.tile([1, 2, 3], (2, 1)) / 1.6, rel=1e-5)
-    assert_close(after.opacities, np.full(7, 0.6), rtol=1e-5)
-    assert np.array_equal(np.asarray(after.means)[:6], np.asarray(before.means))
+    means, whole = np.asarray(after.means), np.asarray(before.means)
+    apart = means[6] - means[5]
+    axes = Rotation.from_quat(np.asarray(before.quats)[5], scalar_first=True).as_matrix()
+    assert np.asarray(after.scales)[5:] == pytest.approx(np.tile([0.893, 2 * 0.893, 3 * 0.55], (2, 1)), rel=1e-5)
+    assert_close(after.opacities, [0.6] * 5 + [0.36] * 2, rtol=1e-5)
+    assert np.array_equal(means[:5], whole[:5])
+    assert (means[5] + means[6]) / 2 == pytest.approx(whole[5], abs=1e-5)
+    assert np.abs(apart @ axes) == pytest.approx([0, 0, 2 * 1.35 * 3], abs=1e-4)
     assert np.asarray(after.logit_confidence)[6] == 5
+
+
+def test_plan_growth__leaves_the_space_before_near_planes_empty():
+    camera = Camera.look_at((0, 0, -4), (0, 0, 0), (0, -1, 0), 40, 64, 48, near=3.0)
+    z = np.where(np.arange(400) < 100, -2.0, -0.99)  # before and close behind the near plane at -1
+    crowd = isotropic(np.stack([0 * z, 0 * z, z], 1), 0.05, 0.6, 0.5)
+    plan = growth(crowd, np.ones(400), [camera])
+    after = apply_plan(crowd, plan)
+    assert plan.num_survivors == 300
+    assert plan.source[:300].tolist() == list(range(100, 400))
+    assert plan.num_births == 300
+    assert np.asarray(after.means)[:, 2].min() >= -1
+    assert np.asarray(apply_plan(crowd, growth(crowd, np.ones(400))).means)[:, 2].min() < -2
 
 
 def test_plan_additions__births_are_faint_and_parents_unchanged():

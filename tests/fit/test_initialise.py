@@ -9,6 +9,7 @@ import pytest
 
 from morgs_mi import Camera
 from morgs_mi.core.rig import focus_point, scene_extent, seen_points
+from morgs_mi.fit.empty_space import in_empty_space
 from morgs_mi.fit.initialise import MIN_POINTS, fill_points, initial_points, seed_points
 from morgs_mi.fit.view import View
 from tests.scenes.cameras import arc, look_at_cameras
@@ -56,6 +57,17 @@ def test_initial_points__are_given_ones_with_random_ones_where_these_are_few(kno
     expected = 1 if known < MIN_POINTS else 0.3 if known < 1000 else 0
     assert random.mean() >= expected
     assert (random.mean() > 0) == (expected > 0)
+
+
+@pytest.mark.parametrize("known", [0, 40, 2000])
+def test_initial_points__leave_the_space_before_near_planes_empty(known: int):
+    (points, colors), views = few_points()
+    views = [view._replace(camera=replace(view.camera, near=5.0)) for view in views]
+    points = np.concatenate([points, points - (0, 0, 4)])
+    given = np.resize(points, (known, 3)), np.resize(colors, (known, 3))
+    chosen, _ = initial_points(views, given, 1000, np.random.default_rng(1))
+    assert len(chosen) > 950
+    assert not in_empty_space([view.camera for view in views], chosen).any()
 
 
 def moved(camera: Camera, shift: np.ndarray) -> Camera:
