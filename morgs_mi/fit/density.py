@@ -27,7 +27,6 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.empty_space import in_empty_space
 from morgs_mi.fit.fit_config import DensityConfig
 from morgs_mi.fit.optimise import replace_parameter
-from morgs_mi.method.attribution import DensificationScores
 
 __all__ = ["DensityPlan", "Room", "apply_plan", "plan_additions", "plan_growth", "resize_optimizer"]
 
@@ -80,7 +79,7 @@ class Room(NamedTuple):
 
 def plan_growth(
     gaussians: Gaussians,
-    scores: DensificationScores,
+    scores: np.ndarray,
     room: Room,
     extent: float,
     config: DensityConfig,
@@ -93,7 +92,7 @@ def plan_growth(
 
     Args:
         gaussians: N Gaussians.
-        scores: their densification scores.
+        scores: their densification scores [N].
         room: for births.
         extent: of the scene, world units.
         config: thresholds.
@@ -122,7 +121,7 @@ def plan_growth(
 
 def plan_additions(
     gaussians: Gaussians,
-    scores: DensificationScores,
+    scores: np.ndarray,
     config: DensityConfig,
     rng: np.random.Generator,
     num_static: int = 0,
@@ -131,7 +130,7 @@ def plan_additions(
 
     Args:
         gaussians: N active Gaussians.
-        scores: their densification scores.
+        scores: their densification scores [N].
         config: thresholds.
         rng: draws the means of the births.
         num_static: number of the other Gaussians, which stay unchanged.
@@ -146,9 +145,7 @@ def plan_additions(
     return _plan(gaussians, survivors, parents, np.where(born, _LOG_SHRINK, 0), fainter, rng)
 
 
-def _select(
-    visible: np.ndarray, scores: DensificationScores, room: Room, min_error: float
-) -> tuple[np.ndarray, np.ndarray]:
+def _select(visible: np.ndarray, scores: np.ndarray, room: Room, min_error: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices of the survivors, and the indices of the parents: survivors with the largest error.
 
     Gaussians that are not `visible` [N] are pruned. At the limit, others are not: a later frame draws a part of the
@@ -156,9 +153,9 @@ def _select(
     """
     # Without any Gaussian, the scene could not recover.
     survivors = np.flatnonzero(visible) if visible.any() else np.arange(len(visible))
-    candidates = survivors[scores.error[survivors] > min_error]
+    candidates = survivors[scores[survivors] > min_error]
     births = min(room.births, max(room.limit - len(survivors), 0))
-    return survivors, np.sort(candidates[np.argsort(-scores.error[candidates], kind="stable")][:births])
+    return survivors, np.sort(candidates[np.argsort(-scores[candidates], kind="stable")][:births])
 
 
 def _plan(

@@ -1,16 +1,15 @@
 """Attribution of the rendering error to Gaussians, by their blend weights.
 
 With the error e(x) of a rendered view, E_i = sum_x w_i(x) e(x) is the error attributed to Gaussian i there (Bulo et al.
-2024), and W_i = sum_x w_i(x) the number of pixels that it covers.
+2024), in pixels of full contrast. Its densification score is the largest one over the views.
 
-Both are the gradients of sum_x f(x) e(x) and of sum_x f(x) for a feature that is blended like a colour and is 0
-everywhere: the adjoint of a step gives them along with the gradients of its losses.
+It is the gradient of sum_x f(x) e(x) for a feature that is blended like a colour and is 0 everywhere: the adjoint of a
+step gives it along with the gradients of its losses.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -24,24 +23,11 @@ from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.rasterize import Image
 from morgs_mi.render.region import Region
 
-__all__ = ["Attribution", "DensificationScores", "densification_scores"]
+__all__ = ["Attribution", "densification_scores"]
 
 # Error that counts as noise, in typical errors of the image: normal noise, independent in three colours, exceeds 3 at
 # 3 of 10,000 pixels.
 _NOISE = 3.0
-
-
-@dataclass(frozen=True)
-class DensificationScores:
-    """Densification scores of N Gaussians.
-
-    Attributes:
-        error: attributed error E [N], in pixels of full contrast, of the view where it is largest.
-        weight: covered pixels W [N], of the view where they are most; 0 for a Gaussian that no view sees.
-    """
-
-    error: np.ndarray
-    weight: np.ndarray
 
 
 class Attribution:
@@ -53,16 +39,16 @@ class Attribution:
 
     def __init__(self, count: int) -> None:
         self._count, self._probe = count, None
-        self._largest = dr.zeros(mi.Float, 2 * count)
+        self._largest = dr.zeros(mi.Float, count)
 
     def features(self) -> Tensor:
-        """Return the features [N, 2] to render in the next step, with detached weights."""
-        self._probe = probe = dr.zeros(mi.TensorXf, (self._count, 2))
+        """Return the features [N, 1] to render in the next step, with detached weights."""
+        self._probe = probe = dr.zeros(mi.TensorXf, (self._count, 1))
         dr.enable_grad(probe)
         return probe
 
     def loss(self, image: Image, target: Target, region: Region | None) -> Tensor:
-        """Return a loss of 0, of which the gradients of the features are E and W.
+        """Return a loss of 0, of which the gradients of the features are E.
 
         Errors below three times the typical error of the image do not count: they are noise.
 
@@ -75,9 +61,7 @@ class Attribution:
         pixel = dr.arange(mi.UInt32, dr.width(difference) // 3) * 3
         error = sum(dr.gather(mi.Float, difference, pixel + c) for c in range(3)) / 3
         error = dr.maximum(error - _NOISE * _typical(error), 0)
-        maps = dr.zeros(mi.Float, 2 * dr.width(error)) + 1
-        dr.scatter(maps, error, 2 * dr.arange(mi.UInt32, dr.width(error)))
-        return dr.sum(image.features * mi.TensorXf(maps, image.features.shape), axis=None)
+        return dr.sum(image.features * mi.TensorXf(error, image.features.shape), axis=None)
 
     def collect(self) -> None:
         """Take the scores of a step, if its features were rendered, after its gradients have been computed."""
@@ -86,10 +70,9 @@ class Attribution:
             dr.eval(self._largest)
             self._probe = None
 
-    def scores(self) -> DensificationScores:
-        """Return the scores of the steps so far."""
-        error, weight = np.asarray(self._largest).reshape(-1, 2).T
-        return DensificationScores(error, weight)
+    def scores(self) -> np.ndarray:
+        """Return the scores [N] of the steps so far."""
+        return np.asarray(self._largest)
 
 
 def _typical(error: Float) -> Float:
@@ -99,10 +82,8 @@ def _typical(error: Float) -> Float:
     return dr.sum(dr.select(small, error, 0)) / dr.maximum(mi.Float(dr.count(small)), 1)
 
 
-def densification_scores(
-    gaussians: Gaussians, views: Sequence[ActiveView], targets: Sequence[Target]
-) -> DensificationScores:
-    """Render every view and return the densification scores of the Gaussians.
+def densification_scores(gaussians: Gaussians, views: Sequence[ActiveView], targets: Sequence[Target]) -> np.ndarray:
+    """Render every view and return the densification scores [N] of the Gaussians.
 
     Args:
         gaussians: N Gaussians.
@@ -110,8 +91,7 @@ def densification_scores(
         targets: their images.
     """
     gaussians = gaussians.detached()
-    error, weight = np.zeros((2, len(gaussians)), np.float32)
+    scores = np.zeros(len(gaussians), np.float32)
     for view, target in zip(views, targets, strict=True):
-        sums = KeyImages({0: view}, {0: target}).sums(gaussians, ("error", "weight"))
-        error, weight = np.maximum(error, sums["error"][0]), np.maximum(weight, sums["weight"][0])
-    return DensificationScores(error, weight)
+        scores = np.maximum(scores, KeyImages({0: view}, {0: target}).sums(gaussians, ("error",))["error"][0])
+    return scores
