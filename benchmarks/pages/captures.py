@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from benchmarks.pages.results import Scores, committed, span
+from benchmarks.reports import held_out
 from benchmarks.reports.cameras import recovered
 from benchmarks.reports.plots import Column, grouped, markdown, plus_minus, scores_table
 from benchmarks.reports.unseen import out_of_capture
@@ -22,6 +23,8 @@ __all__ = [
     "far_views",
     "first_frame_captures",
     "first_frames",
+    "held_out_views",
+    "held_out_views_over_time",
     "live",
     "noise_aware",
     "photos_over_time",
@@ -176,6 +179,16 @@ def unseen_groups() -> str:
         rows.append((kind, f"{len(grouped(own, 'set'))}", *shares, widths))
     titles = "fits in the interval", "of those with a number", "median width of these, dB"
     return markdown(("kind", "captures", *titles), rows)
+
+
+def held_out_views() -> str:
+    """Return the PSNR of the held-out views of recordings in the first frame."""
+    return held_out.first_frames(committed("held_out")["fits"])
+
+
+def held_out_views_over_time() -> str:
+    """Return the scores of the held-out views of recordings over the frames."""
+    return held_out.later_frames(committed("held_out")["fits"])
 
 
 def real_motion() -> str:

@@ -108,9 +108,10 @@ def _levels(change: np.ndarray, scale: int, config: ChangeConfig) -> np.ndarray:
 def _with_peaks(levels: np.ndarray) -> np.ndarray:
     """Return the connected changes that have a peak, bool [H, W]; `levels` as from `_levels`."""
     mask = levels > 0
-    count, labels = cv2.connectedComponents(mask.astype(np.uint8))
+    count, components = cv2.connectedComponents(mask.astype(np.uint8))
+    labels = np.asarray(components, np.int32)
     has_peak = np.zeros(count, bool)
-    has_peak[np.asarray(labels)[levels > 1]] = True
+    has_peak[labels[levels > 1]] = True
     return has_peak[labels]
 
 

@@ -1,0 +1,120 @@
+"""Held-out views of recordings: the scores that `morgs-mi eval` wrote for fits at the settings of the commands.
+
+    morgs-mi fit RECORDING OUT
+    morgs-mi eval OUT --json OUT/eval.json
+    python -m benchmarks.reports.held_out OUT ... --json held_out.json
+
+Each folder OUT has the name of its recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from benchmarks.reports.plots import markdown
+from benchmarks.speed.output import Output
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.io.bounded import read_json
+
+__all__ = ["first_frames", "later_frames"]
+
+# Frames of a table over time, at most.
+_ROWS = 7
+
+
+@dataclass(frozen=True)
+class Options(Output):
+    """Folders of fits, and output."""
+
+    outs: Annotated[tuple[Path, ...], tyro.conf.Positional] = ()
+    """Folders of the fits, each with its eval.json."""
+
+    def run(self) -> None:
+        """Print the tables, and write the scores."""
+        fits = [scores_of(out) for out in self.outs]
+        print(first_frames(fits))
+        print(later_frames(fits))
+        self.write({"fits": fits})
+
+
+def scores_of(out: Path) -> dict[str, Any]:
+    """Return the scores of a fit: its settings, the first frame by view, and all frames in the mean of the views."""
+    result = read_json(out / "eval.json")
+    report = read_json(out / "report.json")
+    stream = StreamReader(out / "stream.morgs")
+    first = report["frames"][0]
+    frames = result["frames"]
+    return {
+        "recording": out.name,
+        "training_views": len(report["train_views"]),
+        "gaussians": first["num_gaussians"],
+        "steps": first["steps"],
+        "is_balanced": bool(first["validation"].get("exposure", {}).get("taken", False)),
+        "forecast": first["validation"].get("sentence", ""),
+        "epochs": stream.metadata["config"]["fit"]["epochs"],
+        "views": {
+            name: {key: round(scores[key], 3) for key in ("psnr", "psnr_matched", "ssim")}
+            for name, scores in frames[0]["views"].items()
+        },
+        "frames": [
+            {
+                "psnr": _rounded(frame["psnr"]),
+                "psnr_matched": _rounded(frame["psnr_matched"]),
+                "psnr_moving": _rounded(frame["psnr_moving"]),
+                "psnr_still": _rounded(frame["psnr_still"]),
+                "active": _rounded(row["active"].get("gaussians")),
+                "num_bytes": row["num_bytes"],
+                "seconds": _rounded(row["seconds"]),
+            }
+            for frame, row in zip(frames, report["frames"], strict=True)
+        ],
+    }
+
+
+def first_frames(fits: Sequence[dict[str, Any]]) -> str:
+    """Return the PSNR of each held-out view in the first frame, as recorded and with matched colours."""
+    rows = []
+    for fit in fits:
+        about = f"{fit['training_views']}", f"{fit['gaussians']:,}", "yes" if fit["is_balanced"] else "no"
+        scores = list(fit["views"].values())
+        for key, title in (("psnr", "as recorded"), ("psnr_matched", "matched")):
+            values = [score[key] for score in scores]
+            cells = ", ".join(f"{value:.1f}" for value in values)
+            rows.append((fit["recording"], *about, title, cells, f"{sum(values) / len(values):.2f}"))
+    titles = "recording", "training views", "Gaussians", "balanced", "colours", "held-out views, dB", "mean"
+    return markdown(titles, rows, left=1)
+
+
+def later_frames(fits: Sequence[dict[str, Any]]) -> str:
+    """Return the scores of some frames of the recordings that have several."""
+    rows = []
+    for fit in fits:
+        frames = fit["frames"]
+        if len(frames) == 1:
+            continue
+        step = max(1, (len(frames) - 1) // (_ROWS - 1))
+        for index in sorted({0, 1, *range(step, len(frames), step), len(frames) - 1}):
+            frame = frames[index]
+            scores = (_cell(frame[key], 2) for key in ("psnr", "psnr_matched", "psnr_moving", "psnr_still"))
+            active = "" if frame["active"] is None else f"{100 * frame['active']:.0f} %"
+            costs = f"{frame['num_bytes'] / 1e3:.0f}", _cell(frame["seconds"], 1)
+            rows.append((fit["recording"], f"{index}", *scores, active, *costs))
+    titles = "PSNR, dB", "matched", "moving", "still", "active Gaussians", "kB", "s"
+    return markdown(("recording", "frame", *titles), rows, left=1)
+
+
+def _cell(value: float | None, digits: int) -> str:
+    return "" if value is None else f"{value:.{digits}f}"
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None else round(value, 3)
+
+
+if __name__ == "__main__":
+    tyro.cli(Options).run()
