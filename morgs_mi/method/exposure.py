@@ -27,8 +27,10 @@ LEAST_CHANGE = 3e-3
 _WEIGHTS = (1e-4, 0.02)
 # Values, of 1, that are neither nearly black nor nearly white.
 _DARK, _BRIGHT = 0.03, 0.97
-# Steps of the reweighted least squares, and the least scale of its errors, of 1.
+# Most steps of the reweighted least squares, and the least scale of its errors, of 1.
 _STEPS, _LEAST_SCALE = 13, 1e-3
+# Change of gain and bias in a step at which it ends, of 1: a hundredth of a grey level.
+_CONVERGED = 4e-5
 _MIN_PIXELS = 30
 # Gains beyond 4, and inverse ones, are no exposures: the images do not show the same.
 _MAX_LOG_GAIN = np.log(4)
@@ -121,8 +123,12 @@ def _line(x: np.ndarray, y: np.ndarray, prior: Sequence[float], weights: tuple[f
     # The change of the gain, and of the bias beyond the bias of a factor on the light.
     rows, rest = np.stack([x + _TOE, np.ones_like(x)]), y - prior[0] * x - prior[1]
     regular, counts = len(x) * np.diag(weights), np.ones_like(x)
+    change = np.zeros(2)
     for _ in range(_STEPS):
+        last = change
         change = np.linalg.solve((rows * counts) @ rows.T + regular, (rows * counts) @ rest)
+        if np.abs(change - last).max() < _CONVERGED:
+            break
         errors = rest - change @ rows
         scale = 2 * max(_NORMAL * float(np.median(np.abs(errors))), _LEAST_SCALE)
         counts = (1 + (errors / scale) ** 2) ** -2.0

@@ -145,7 +145,7 @@ def test_fit_first_frame__prunes_what_is_invisible(images):
 
 
 def test_fit_first_frame__sees_images_of_half_the_size_until_it_has_grown(images, monkeypatch):
-    monkeypatch.setattr("morgs_mi.fit.problem._COARSE_WIDTH", 32)
+    monkeypatch.setattr("morgs_mi.fit.view._COARSE_WIDTH", 32)
     monkeypatch.setattr("morgs_mi.fit.view._MIN_SIDE", 24)
     widths, render = [], ActiveView.render
 
