@@ -36,7 +36,7 @@ _MIN_PIXELS = 30
 _MAX_LOG_GAIN = np.log(4)
 # Normal standard deviations in a median absolute deviation.
 _NORMAL = 1.4826
-_WIDTH = 160  # px, of the thumbnails on which changes over time are measured: means of pixels have less noise
+_WIDTH = 96  # px, of the thumbnails on which changes over time are measured: means of pixels have less noise
 # sRGB is 1.055 l^(1/2.4) - 0.055: a gain g of the light's root comes with the bias 0.055 (g - 1).
 _TOE = 0.055
 _TONES = np.array([0.1, 0.5, 0.9])[:, None]
