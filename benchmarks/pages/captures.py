@@ -171,12 +171,13 @@ def unseen_views() -> str:
 
 def unseen_groups() -> str:
     """Return coverage and width of the intervals by kind of capture, of all fits and of those with a number."""
-    rows, fits = [], list(out_of_capture(committed("unseen")["fits"]))
-    for kind, own in [*((kind, own) for (kind,), own in grouped(fits, "kind").items()), ("all", fits)]:
-        narrow = [row for row in own if row["width"] <= WIDEST]
+    rows = []
+    fits = list(out_of_capture(committed("unseen")["fits"]))
+    for kind, group in [*((kind, group) for (kind,), group in grouped(fits, "kind").items()), ("all", fits)]:
+        narrow = [row for row in group if row["width"] <= WIDEST]
         widths = f"{np.median([row['width'] for row in narrow]):.1f}"
-        shares = (f"{sum(row['within'] for row in some)} of {len(some)}" for some in (own, narrow))
-        rows.append((kind, f"{len(grouped(own, 'set'))}", *shares, widths))
+        shares = (f"{sum(row['within'] for row in part)} of {len(part)}" for part in (group, narrow))
+        rows.append((kind, f"{len(grouped(group, 'set'))}", *shares, widths))
     titles = "fits in the interval", "of those with a number", "median width of these, dB"
     return markdown(("kind", "captures", *titles), rows)
 

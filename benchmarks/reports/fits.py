@@ -103,11 +103,11 @@ def random_capture(clips: Path, seed: int, downscale: float = 1) -> Capture:
 def spread_views(cameras: Sequence[Camera], count: int, among: Sequence[int]) -> tuple[int, ...]:
     """Return the indices of `count` of the cameras `among` all that are far from each other."""
     positions = np.array([cameras[v].position for v in among])
-    chosen = [int(np.argmax(np.linalg.norm(positions - positions.mean(axis=0), axis=1)))]
-    while len(chosen) < count:
-        distance = np.linalg.norm(positions[:, None] - positions[chosen], axis=-1).min(axis=1)
-        chosen.append(int(np.argmax(distance)))
-    return tuple(sorted(among[k] for k in chosen))
+    selection = [int(np.argmax(np.linalg.norm(positions - positions.mean(axis=0), axis=1)))]
+    while len(selection) < count:
+        distance = np.linalg.norm(positions[:, None] - positions[selection], axis=-1).min(axis=1)
+        selection.append(int(np.argmax(distance)))
+    return tuple(sorted(among[k] for k in selection))
 
 
 def new_loop(capture: Capture, config: StreamConfig, train: Sequence[int] | None = None) -> StreamLoop:

@@ -80,12 +80,12 @@ def first_frames(fits: Sequence[dict[str, Any]]) -> str:
     """Return the PSNR of each held-out view in the first frame, as recorded and with matched colours."""
     rows = []
     for fit in fits:
-        about = f"{fit['training_views']}", f"{fit['gaussians']:,}", "yes" if fit["is_balanced"] else "no"
-        scores = list(fit["views"].values())
+        balance = "yes" if fit["is_balanced"] else "no"
+        fit_cells = [fit["recording"], f"{fit['training_views']}", f"{fit['gaussians']:,}", balance]
         for key, title in (("psnr", "as recorded"), ("psnr_matched", "matched")):
-            values = [score[key] for score in scores]
-            cells = ", ".join(f"{value:.1f}" for value in values)
-            rows.append((fit["recording"], *about, title, cells, f"{sum(values) / len(values):.2f}"))
+            values = [scores[key] for scores in fit["views"].values()]
+            views = ", ".join(f"{value:.1f}" for value in values)
+            rows.append([*fit_cells, title, views, f"{sum(values) / len(values):.2f}"])
     titles = "recording", "training views", "Gaussians", "balanced", "colours", "held-out views, dB", "mean"
     return markdown(titles, rows, left=1)
 
@@ -102,8 +102,8 @@ def later_frames(fits: Sequence[dict[str, Any]]) -> str:
             frame = frames[index]
             scores = (_cell(frame[key], 2) for key in ("psnr", "psnr_matched", "psnr_moving", "psnr_still"))
             active = "" if frame["active"] is None else f"{100 * frame['active']:.0f} %"
-            costs = f"{frame['num_bytes'] / 1e3:.0f}", _cell(frame["seconds"], 1)
-            rows.append((fit["recording"], f"{index}", *scores, active, *costs))
+            size = f"{frame['num_bytes'] / 1e3:.0f}"
+            rows.append((fit["recording"], f"{index}", *scores, active, size, _cell(frame["seconds"], 1)))
     titles = "PSNR, dB", "matched", "moving", "still", "active Gaussians", "kB", "s"
     return markdown(("recording", "frame", *titles), rows, left=1)
 

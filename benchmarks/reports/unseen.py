@@ -40,8 +40,10 @@ from morgs_mi.runs.recorder import with_points
 _RIDGE = 1.0
 # Share of the fits whose held-out views have their mean in the interval.
 _HELD = 0.9
-# Most cameras of which each is held out in turn, and most held-out views of a fit that are measured.
-_FEW, _MOST_VIEWS = 6, 6
+# Most cameras of which each is held out in turn.
+_FEW = 6
+# Most held-out views of a fit that are measured.
+_MOST_VIEWS = 6
 
 COLUMNS = (
     Column("training views", "training", 1, unit=" dB", spread=False),
@@ -116,16 +118,16 @@ def row_of(
     exposures: Sequence[Exposure],
 ) -> dict[str, Any]:
     """Return the row of a fit; held-out views are compared in the colours of the scene if it is balanced."""
-    balanced = any(exposure != Exposure() for exposure in exposures)
+    is_balanced = any(exposure != Exposure() for exposure in exposures)
     views = [View(*view) for view in zip(capture.cameras, images, capture.masks, strict=True)]
     trained = [views[index] for index in capture.train_views]
     test = [views[index] for index in capture.test_views[:: -(-len(capture.test_views) // _MOST_VIEWS)]]
     render = setup.config.render
-    if balanced:
+    if is_balanced:
         pairs = zip(trained, exposures, strict=True)
         trained = [view._replace(image=exposure.corrected(view.image)) for view, exposure in pairs]
-        shown = [fit_exposure(rendered(gaussians, view.camera, render), view.image / 255, view.mask) for view in test]
-        test = [view._replace(image=exposure.corrected(view.image)) for view, exposure in zip(test, shown, strict=True)]
+        fits = [fit_exposure(rendered(gaussians, view.camera, render), view.image / 255, view.mask) for view in test]
+        test = [view._replace(image=exposure.corrected(view.image)) for view, exposure in zip(test, fits, strict=True)]
     rig = forecast([view.camera for view in trained], setup.points)
     features = features_of(gaussians, trained, setup.points, render)
     psnrs = [mean_psnr(gaussians, [view], render) for view in test]
@@ -137,19 +139,20 @@ def regression_of(rows: Sequence[Row]) -> Regression:
 
     Rigs that are too wide do not count, because `fit` prints the word alone.
     """
-    rows, errors = _near(rows), []
-    for (name,), own in grouped(rows, "set").items():
+    rows = _near(rows)
+    errors = []
+    for (name,), group in grouped(rows, "set").items():
         others = _regression([row for row in rows if row["set"] != name])
-        scaled = [abs(_loss(row) - others.loss(row["features"])) / others.scale(row["features"]) for row in own]
-        errors.append(np.array(scaled))
+        ratios = [abs(_loss(row) - others.loss(row["features"])) / others.scale(row["features"]) for row in group]
+        errors.append(np.array(ratios))
     return _regression(rows, _conformal(errors))
 
 
 def out_of_capture(rows: Sequence[Row]) -> Iterator[dict[str, Any]]:
     """Yield the rows of rigs that are not too wide, with forecasts by regressions without the rows of their capture."""
-    for (name,), own in grouped(_near(rows), "set").items():
+    for (name,), group in grouped(_near(rows), "set").items():
         regression = regression_of([row for row in rows if row["set"] != name])
-        for row in own:
+        for row in group:
             yield forecast_row(row, regression)
 
 
@@ -169,10 +172,12 @@ def _near(rows: Sequence[Row]) -> list[Row]:
 
 def _regression(rows: Sequence[Row], spread: float = 0.0) -> Regression:
     """Return the ridge regression of the loss, in which every capture has the same weight."""
-    X, y = np.array([row["features"] for row in rows]), np.array([_loss(row) for row in rows])
-    sizes = {name: len(own) for (name,), own in grouped(rows, "set").items()}
+    X = np.array([row["features"] for row in rows])
+    y = np.array([_loss(row) for row in rows])
+    sizes = {name: len(group) for (name,), group in grouped(rows, "set").items()}
     weights = np.array([1 / sizes[row["set"]] for row in rows])
-    mean, middle = weights @ X / len(sizes), weights @ y / len(sizes)
+    mean = weights @ X / len(sizes)
+    middle = weights @ y / len(sizes)
     deviation = np.sqrt(weights @ (X - mean) ** 2 / len(sizes))
     Z = (X - mean) / deviation
     normal = (Z.T * weights) @ Z + _RIDGE * np.eye(len(mean))
@@ -198,7 +203,7 @@ def _conformal(errors: Sequence[np.ndarray]) -> float:
     This is rank 0.9 (m + 1) of the errors of m captures, of which each has the weight of one.
     """
     values = np.concatenate(errors)
-    weights = np.concatenate([np.full(len(own), 1 / len(own)) for own in errors])
+    weights = np.concatenate([np.full(len(group), 1 / len(group)) for group in errors])
     order = values.argsort()
     reached = weights[order].cumsum() >= _HELD * (len(errors) + 1) - 1e-9
     return float(values[order][reached.argmax()]) if reached.any() else float("inf")

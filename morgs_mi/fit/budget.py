@@ -75,12 +75,12 @@ def plan_first_frame(views: Sequence[View], points: np.ndarray, config: FitConfi
 
     def seconds(plan: FitConfig) -> float:
         """Return the time of a plan. A round of density control is a step in every view, at half the size."""
-        count, steps, rounds = plan.planned_gaussians, plan.planned_steps, plan.density.rounds
-        late = _step_seconds(count, pixels)
-        if not rounds:
-            return steps * late
-        early = _step_seconds(_GROWING * count, half_pixels)
-        return steps * (LAST_ROUND * early + (1 - LAST_ROUND) * late) + rounds * len(views) * early
+        late = _step_seconds(plan.planned_gaussians, pixels)
+        if not plan.density.rounds:
+            return plan.planned_steps * late
+        early = _step_seconds(_GROWING * plan.planned_gaussians, half_pixels)
+        mean = LAST_ROUND * early + (1 - LAST_ROUND) * late
+        return plan.planned_steps * mean + plan.density.rounds * len(views) * early
 
     if config.num_gaussians is None:
         most = wanted.planned_gaussians

@@ -38,10 +38,11 @@ _BIRTH_OPACITY = 0.1
 _LOG_SHRINK = -float(np.log(1.6))
 # Distance of the two parts of a split Gaussian from its mean, in scales along its longest axis (arXiv 2508.12313).
 _SPLIT_SHIFT = 1.35
-# Scales of the parts relative to those of the whole, along its longest axis and along the others.
+# Factor on the scale of both parts along the longest axis (arXiv 2508.12313).
 _SPLIT_LONGEST = 0.55
+# Factor on their other two scales.
 _SPLIT_OTHERS = 0.893
-# Opacity of the parts relative to the whole.
+# Factor on their opacity.
 _SPLIT_OPACITY = 0.6
 
 

@@ -1,7 +1,7 @@
 """Forecast of views between the cameras of a fitted first frame, without a second fit.
 
-Views that nobody filmed have more error than the training views. Their mean loss, in dB, is a linear function of two
-features that need no further image: the PSNR of the training views, and their
+The PSNR of novel views is lower than that of the training views. The mean difference, the loss in dB, is modelled as a
+linear function of two features that need no further image: the PSNR of the training views, and their
 
     disagreement    10 log10(1 + d / e) ,
 
@@ -40,8 +40,10 @@ WIDEST_REACH = 20.0
 
 # Nearest cameras whose images a view is compared with.
 _NEAREST = 4
-# Training views that are compared, and pixels of a row: more take time and change little.
-_VIEWS, _COLUMNS = 8, 320
+# Training views that are compared: more take time and change little.
+_VIEWS = 8
+# Pixels of a row that are compared, for the same reason.
+_COLUMNS = 320
 # Factor on the interval where a feature lies outside the range of the regression.
 _OUTSIDE = 2.0
 
@@ -174,8 +176,10 @@ def features_of(
         points: [P, 3] of the scene, world units, or none.
         render: cut-offs.
     """
-    psnr, cameras = mean_psnr(gaussians, views, render), [view.camera for view in views]
-    depths, squares = scene_depths(cameras, points), []
+    psnr = mean_psnr(gaussians, views, render)
+    cameras = [view.camera for view in views]
+    depths = scene_depths(cameras, points)
+    squares = []
     for index in np.linspace(0, len(views) - 1, min(len(views), _VIEWS)).round().astype(int):
         angles = angles_to(cameras[index], depths[index], cameras)
         angles[index] = np.inf
@@ -189,7 +193,8 @@ def _disagreement(gaussians: Gaussians, view: View, others: Sequence[View], rend
 
     A pixel whose point none of them has recorded does not count; 1 where all are such.
     """
-    camera, image = view.camera, rasterize(gaussians, view.camera, ("color", "depth"), config=render)
+    camera = view.camera
+    image = rasterize(gaussians, camera, ("color", "depth"), config=render)
     step = max(1, camera.width // _COLUMNS)
     color = np.clip(np.asarray(image.color)[::step, ::step], 0, 1)
     depth = np.asarray(image.depth)[::step, ::step, 0].astype(float)

@@ -155,15 +155,15 @@ def fit_seam_frame(
     setup = replace(setup, cameras=tuple(camera.without_delays() for camera in setup.cameras))
     coded = common.coded
     assert coded is not None
-    seen = common.seen
+    history = common.seen
     seconds = 0.0
     for number in range(config.passes):
         repeated = replace(setup, config=config.fit_config(setup.config, number))
-        state = replace(common, frame=now.frame, coded=replace(coded, frame=now.frame - 1), seen=seen)
+        state = replace(common, frame=now.frame, coded=replace(coded, frame=now.frame - 1), seen=history)
         state, _, report = step(repeated, state, now.images, progress)
         coded = state.coded
         assert coded is not None
-        seen = replace(common.seen, images=state.seen.images)  # changes are relative to the common model again
+        history = replace(common.seen, images=state.seen.images)  # changes are relative to the common model again
         seconds += report.seconds
     return coded, replace(report, seconds=seconds)
 
