@@ -136,6 +136,9 @@ class FolderFeed:
             common -= {max(number for images in found.values() for number in images.files)} if found else set()
         bundle = _bundle([found.get(name, _NONE) for name in names], common)
         if bundle is not None:
+            if not self.names and not late and set(self._found(-1, self._before)) - set(names):
+                # The first image of a camera came while the folders were read.
+                return None
             if silent := [name for name in self._cameras() if name not in names and not self.names]:
                 _LOG.warning("%s is left out: no image in %s", ", ".join(silent), self._folder)
             self.names = names

@@ -63,6 +63,24 @@ def test_FolderFeed__begins_when_all_cameras_do(tmp_path: Path) -> None:
     assert first.numbers == (0, 0, 0)
 
 
+def test_FolderFeed__waits_for_a_camera_that_begins_while_the_folders_are_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fill(tmp_path, range(1), "a", "b")
+    files_of = module._files
+
+    def files_meanwhile(folder: Path, after: int) -> dict[int, Path]:
+        if not (tmp_path / "c").exists():
+            fill(tmp_path, range(1), "c")
+            fill(tmp_path, range(1, 2), "a", "b", "c")
+        return files_of(folder, after)
+
+    monkeypatch.setattr(module, "_files", files_meanwhile)
+    first = FolderFeed(tmp_path, 5).newest()
+    assert first is not None
+    assert len(first.images) == 3
+
+
 def test_FolderFeed__of_given_cameras_ignores_the_others(tmp_path: Path) -> None:
     first = FolderFeed(fill(tmp_path, range(2), "a", "b", "c"), 1, ["c", "a"]).newest()
     assert first is not None
