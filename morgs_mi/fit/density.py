@@ -3,9 +3,9 @@
 N Gaussians become M. `parent` [M] is the index among the N of the Gaussian that each one is or was made from; `source`
 [M] is the same for survivors, which come first in ascending order, and -1 for births, which come last.
 
-In the first frame, `plan_growth` (Kerbl et al. 2023): a large parent is split into two along its longest axis
-(arXiv 2508.12313); a small one is cloned, and both get the opacity 1 - sqrt(1 - o), with which they cover as much as
-the parent (Bulo et al. 2024). In a later frame, `plan_additions` (Sun et al. 2024): parents stay unchanged, because
+In the first frame, `plan_growth` (Kerbl et al. 2023): a small parent is cloned, and both get the opacity
+1 - sqrt(1 - o), with which they cover as much as the parent (Bulo et al. 2024). A large parent is split into two: a
+long one along its longest axis (arXiv 2508.12313), another one into two smaller ones. In a later frame, `plan_additions` (Sun et al. 2024): parents stay unchanged, because
 their tracks must not jump and the few remaining steps could not repair them; births are small and faint, and gain
 opacity or are pruned. Births that are not from splits are drawn from the density of their parents.
 
@@ -34,8 +34,11 @@ __all__ = ["DensityPlan", "Room", "apply_plan", "plan_additions", "plan_growth",
 _MAX_OPACITY = 1 - 1e-6
 # Opacity of a birth in a later frame: low, because unnecessary births are then pruned soon.
 _BIRTH_OPACITY = 0.1
-# Logarithm of the factor by which a birth in a later frame is smaller than its parent (3DGS).
+# Logarithm of the factor by which both parts of a large Gaussian that is not long, and a birth in a later frame, are
+# smaller than their parent (3DGS).
 _LOG_SHRINK = -float(np.log(1.6))
+# Least ratio of the longest scale to the second one of a long Gaussian.
+_LONG = 2.0
 # Distance of the two parts of a split Gaussian from its mean, in scales along its longest axis (arXiv 2508.12313).
 _SPLIT_SHIFT = 1.35
 # Factor on the scale of both parts along the longest axis (arXiv 2508.12313).
@@ -106,15 +109,18 @@ def plan_growth(
     parent = np.concatenate([survivors, parents])
     touched = np.isin(parent, parents)
     quats, scales = (np.asarray(values)[parent] for values in (gaussians.quats, gaussians.scales))
-    split = touched & (scales.max(axis=1) > config.split_scale * extent)
+    large = touched & (scales.max(axis=1) > config.split_scale * extent)
+    _, second, longest = np.sort(scales, axis=1).T
+    halved = large & (longest > _LONG * second)
+    shrunk = large & ~halved
     opacity = np.minimum(np.asarray(gaussians.opacities)[parent], _MAX_OPACITY)
-    changed = np.where(split, _SPLIT_OPACITY * opacity, 1 - np.sqrt(1 - opacity))
-    logits = np.where(touched, _logit(changed) - np.asarray(gaussians.logit_opacities)[parent], 0)
-    plan = _plan(gaussians, survivors, parents, np.zeros(len(parent)), logits, rng)
+    changed = np.where(halved, _SPLIT_OPACITY * opacity, 1 - np.sqrt(1 - opacity))
+    logits = np.where(touched & ~shrunk, _logit(changed) - np.asarray(gaussians.logit_opacities)[parent], 0)
+    plan = _plan(gaussians, survivors, parents, np.where(shrunk, _LOG_SHRINK, 0), logits, rng)
     is_longest = np.eye(3, dtype=bool)[scales.argmax(axis=1)]
     side = np.where(plan.source < 0, _SPLIT_SHIFT, -_SPLIT_SHIFT)[:, None]
-    plan.edits["means"][split] = _rotated(quats, side * is_longest * scales)[split]
-    plan.edits["log_scales"][split] = np.log(np.where(is_longest, _SPLIT_LONGEST, _SPLIT_OTHERS))[split]
+    plan.edits["means"][halved] = _rotated(quats, side * is_longest * scales)[halved]
+    plan.edits["log_scales"][halved] = np.log(np.where(is_longest, _SPLIT_LONGEST, _SPLIT_OTHERS))[halved]
     shift = plan.edits["means"]
     shift[in_empty_space(cameras, means[parent] + shift)] = 0
     return plan

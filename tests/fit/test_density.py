@@ -23,11 +23,11 @@ from tests.scenes.gaussians import isotropic
 CONFIG = DensityConfig(max_gaussians=100, split_scale=0.1, min_opacity=0.005, births=1.0)
 
 
-def cloud(n=6, opacity=0.6, scale=0.05):
+def cloud(n=6, opacity=0.6, scale=0.05, shape=(1, 2, 3)):
     rng = np.random.default_rng(0)
     return Gaussians.from_activated(
         rng.uniform(-1, 1, (n, 3)),
-        np.full((n, 3), scale) * (1, 2, 3),
+        np.full((n, 3), scale) * shape,
         rng.normal(size=(n, 4)),
         np.full(n, opacity),
         rng.normal(size=(n, 1, 3)),
@@ -80,17 +80,25 @@ def test_plan_growth__clones_small_gaussians_with_the_same_coverage():
     assert scales[6] == pytest.approx(np.asarray(before.scales)[5], rel=1e-5)
 
 
-def test_plan_growth__splits_large_gaussians_along_their_longest_axis():
-    before = cloud(scale=1.0)
+def test_plan_growth__splits_large_round_gaussians_and_keeps_means():
+    before = cloud(scale=1.0, shape=(1, 2, 3.9))
+    after = apply_plan(before, growth(before, [0, 0, 0, 0, 0, 1]))
+    assert np.asarray(after.scales)[5:] == pytest.approx(np.tile([1, 2, 3.9], (2, 1)) / 1.6, rel=1e-5)
+    assert_close(after.opacities, np.full(7, 0.6), rtol=1e-5)
+    assert np.array_equal(np.asarray(after.means)[:6], np.asarray(before.means))
+
+
+def test_plan_growth__splits_large_long_gaussians_along_their_longest_axis():
+    before = cloud(scale=1.0, shape=(1, 2, 4.1))
     after = apply_plan(before, growth(before, [0, 0, 0, 0, 0, 1]))
     means, whole = np.asarray(after.means), np.asarray(before.means)
     apart = means[6] - means[5]
     axes = Rotation.from_quat(np.asarray(before.quats)[5], scalar_first=True).as_matrix()
-    assert np.asarray(after.scales)[5:] == pytest.approx(np.tile([0.893, 2 * 0.893, 3 * 0.55], (2, 1)), rel=1e-5)
+    assert np.asarray(after.scales)[5:] == pytest.approx(np.tile([0.893, 2 * 0.893, 4.1 * 0.55], (2, 1)), rel=1e-5)
     assert_close(after.opacities, [0.6] * 5 + [0.36] * 2, rtol=1e-5)
     assert np.array_equal(means[:5], whole[:5])
     assert (means[5] + means[6]) / 2 == pytest.approx(whole[5], abs=1e-5)
-    assert np.abs(apart @ axes) == pytest.approx([0, 0, 2 * 1.35 * 3], abs=1e-4)
+    assert np.abs(apart @ axes) == pytest.approx([0, 0, 2 * 1.35 * 4.1], abs=1e-4)
     assert np.asarray(after.logit_confidence)[6] == 5
 
 
