@@ -6,6 +6,8 @@ import ast
 import inspect
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -23,6 +25,26 @@ WITH_EXAMPLE = (
     "open_stream",
     "rasterize",
 )
+
+
+# Prints the modules that `import morgs_mi` loads and `import mitsuba` does not.
+IMPORT = """
+import sys
+import mitsuba
+before = set(sys.modules)
+import morgs_mi
+print(*(set(sys.modules) - before))
+"""
+
+
+def test_front_door__is_lazy():
+    names = subprocess.run([sys.executable, "-c", IMPORT], capture_output=True, text=True, check=True).stdout.split()
+    assert sum(name.startswith("morgs_mi") for name in names) <= 15
+    assert not {"cv2", "scipy", "pycolmap", "colour", "rich", "tyro", "OpenEXR"} & set(names)
+
+
+def test_front_door__completes_the_public_names():
+    assert dir(morgs_mi) == sorted(morgs_mi.__all__)
 
 
 def test_front_door__names_are_documented():

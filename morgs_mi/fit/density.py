@@ -5,9 +5,10 @@ N Gaussians become M. `parent` [M] is the index among the N of the Gaussian that
 
 In the first frame, `plan_growth` (Kerbl et al. 2023): a small parent is cloned, and both get the opacity
 1 - sqrt(1 - o), with which they cover as much as the parent (Bulo et al. 2024). A large parent is split into two: a
-long one along its longest axis (arXiv 2508.12313), another one into two smaller ones. In a later frame, `plan_additions` (Sun et al. 2024): parents stay unchanged, because
-their tracks must not jump and the few remaining steps could not repair them; births are small and faint, and gain
-opacity or are pruned. Births that are not from splits are drawn from the density of their parents.
+long one along its longest axis (arXiv 2508.12313), another one into two smaller ones. In a later frame,
+`plan_additions` (Sun et al. 2024): parents stay unchanged, because their tracks must not jump and the few remaining
+steps could not repair them; births are small and faint, and gain opacity or are pruned. Births that are not from splits
+along an axis are drawn from the density of their parents.
 
 Parents are the Gaussians with the largest densification scores (see `method.attribution`).
 """

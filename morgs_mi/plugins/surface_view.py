@@ -19,10 +19,18 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.types import Bool, Float, Tensor, UInt32
-from morgs_mi.plugins.splat_path import rays_for, traced
 from morgs_mi.plugins.splat_rays import SplatRays
 
-__all__ = ["SampledPixels", "SurfaceView", "coverage_and_depth", "lights", "shared_scene", "surface_scene"]
+__all__ = [
+    "SampledPixels",
+    "SurfaceView",
+    "coverage_and_depth",
+    "lights",
+    "rays_for",
+    "shared_scene",
+    "surface_scene",
+    "traced",
+]
 
 _log = logging.getLogger(__name__)
 
@@ -30,6 +38,30 @@ _log = logging.getLogger(__name__)
 _GRID = 3
 # Rays of the grid that are cast in every pixel, and the others, row by row.
 _FIRST, _OTHERS = (1, 5, 6), (0, 2, 3, 4, 7, 8)
+
+
+def rays_for(integrator: Any, gaussians: ActivatedGaussians) -> SplatRays | None:
+    """Return N Gaussians prepared for a `splat_path`; None for other integrators."""
+    return SplatRays(gaussians) if hasattr(integrator, "splats") else None
+
+
+@contextmanager
+def traced(integrator: Any, splats: SplatRays | None, srgb: bool) -> Iterator[None]:
+    """Let an integrator trace rays through Gaussians inside the context.
+
+    Args:
+        integrator: any integrator.
+        splats: the Gaussians, see `rays_for`; None: the integrator is left as it is.
+        srgb: whether their colours are sRGB-encoded.
+    """
+    if splats is None:
+        yield
+        return
+    integrator.splats, integrator.srgb = splats, srgb
+    try:
+        yield
+    finally:
+        integrator.splats = None
 
 
 def surface_scene(scene: Any) -> Any:

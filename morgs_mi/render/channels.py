@@ -1,14 +1,22 @@
 """The renderer's channels.
 
 `color`, `depth`, `motion` and `guided_motion` have a rule of their own. Every attribute with a `channel` in the table
-of attributes is a further channel, blended like a colour. `alpha` is blended with every call that needs it.
+of attributes is a further channel, blended like a colour. `alpha` is blended with every call that needs it. A shape of
+a Mitsuba scene has the attributes that the channels require.
 """
 
 from __future__ import annotations
 
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME, Attribute
 
-__all__ = ["NORMALISED", "attribute_channels", "channel_sizes", "exr_names"]
+__all__ = [
+    "NORMALISED",
+    "aov_attributes",
+    "attribute_channels",
+    "attribute_widths",
+    "channel_sizes",
+    "exr_names",
+]
 
 _OWN_RULE = {"color": 3, "depth": 1, "motion": 2, "guided_motion": 2}
 
@@ -31,3 +39,19 @@ def exr_names(channel: str) -> tuple[str, ...]:
     size = channel_sizes()[channel]
     suffixes = "Y" if size == 1 else "XYZ"[:size] if size <= 3 else [str(k) for k in range(size)]
     return tuple(f"{channel}.{suffix}" for suffix in suffixes)
+
+
+def aov_attributes() -> dict[str, str | None]:
+    """Return the shape attribute that each AOV requires, by the name of the AOV; None: no attribute."""
+    names = {channel: attribute.activated_name for channel, attribute in attribute_channels().items()}
+    return {"motion": "motion", **names, "depth": None}
+
+
+def attribute_widths() -> dict[str, tuple[int, ...]]:
+    """Return the admissible numbers of floats per Gaussian of every shape attribute beside `data`, by name."""
+    names = [name for name in aov_attributes().values() if name]
+    return {
+        "opacities": (1,),
+        "sh_coeffs": (3, 12, 27, 48),
+        **{name: (BY_ACTIVATED_NAME[name].width,) for name in names},
+    }

@@ -36,8 +36,7 @@ from morgs_mi.playback.player import available_channels
 from morgs_mi.plugins.light_probe import light_probe
 from morgs_mi.plugins.mattes import mattes
 from morgs_mi.plugins.shadows import shadow_ratio, shadowed
-from morgs_mi.plugins.splat_path import rays_for, traced
-from morgs_mi.plugins.surface_view import lights
+from morgs_mi.plugins.surface_view import lights, rays_for, traced
 from morgs_mi.render.channels import exr_names
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.synth.scene import failures_in

@@ -1,0 +1,72 @@
+"""The public names, each of which is loaded when it is first used."""
+
+from .capture.capture import Capture, load_capture
+from .capture.truth import load_tracks, load_truth
+from .codec.codec_config import CodecConfig
+from .core.camera import Camera
+from .core.color_space import SH_C0
+from .core.gaussians import Gaussians
+from .core.progress import ProgressBar
+from .core.rig import with_near_planes
+from .evaluate.evaluate import evaluate_stream
+from .evaluate.point_tracks import PointTracks, track_points
+from .fit.fit_config import FitConfig
+from .gaussian_integrator import ellipsoids
+from .loop.stream_config import StreamConfig
+from .method.motion_config import MotionConfig
+from .playback.export.tracks import extract_tracks
+from .playback.player import channel_image, render_stream
+from .playback.streams import open_stream
+from .playback.visualise import confidence_image, depth_image, motion_image
+from .plugins.light_probe import light_probe
+from .plugins.shadows import shadow_ratio, shadowed
+from .plugins.splat_rays import SplatRays
+from .render.kernel_recording import render_lock
+from .render.rasterize import Image, rasterize
+from .render.render_config import RenderConfig
+from .runs.live.live_frames import live_frames
+from .runs.recorder import stream_capture
+from .stream_loop import FrameReport, StreamLoop
+from .synth.synth_config import SynthConfig
+from .synth.synthesize import synthesize
+
+__all__ = [
+    "SH_C0",
+    "Camera",
+    "Capture",
+    "CodecConfig",
+    "FitConfig",
+    "FrameReport",
+    "Gaussians",
+    "Image",
+    "MotionConfig",
+    "PointTracks",
+    "ProgressBar",
+    "RenderConfig",
+    "SplatRays",
+    "StreamConfig",
+    "StreamLoop",
+    "SynthConfig",
+    "channel_image",
+    "confidence_image",
+    "depth_image",
+    "ellipsoids",
+    "evaluate_stream",
+    "extract_tracks",
+    "light_probe",
+    "live_frames",
+    "load_capture",
+    "load_tracks",
+    "load_truth",
+    "motion_image",
+    "open_stream",
+    "rasterize",
+    "render_lock",
+    "render_stream",
+    "shadow_ratio",
+    "shadowed",
+    "stream_capture",
+    "synthesize",
+    "track_points",
+    "with_near_planes",
+]
