@@ -11,7 +11,7 @@ import logging
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -25,7 +25,6 @@ from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.threads import in_background
-from morgs_mi.fit.balance import Balance, balance_cameras, balance_config
 from morgs_mi.fit.budget import plan_first_frame
 from morgs_mi.fit.dropping import adapted_to_images
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
@@ -34,9 +33,19 @@ from morgs_mi.fit.initialise import MIN_POINTS
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.unseen_views import unseen_views
-from morgs_mi.fit.view import View
+from morgs_mi.loop.correction import Correction, estimate_correction
 from morgs_mi.loop.image_status import image_status
-from morgs_mi.loop.observation import FrameObservation, Images, Recorded, Seen, Setup, observe_frame, prepare, see_frame
+from morgs_mi.loop.observation import (
+    FrameObservation,
+    Images,
+    Recorded,
+    Seen,
+    Setup,
+    observe_frame,
+    prepare,
+    see_frame,
+    views_of,
+)
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.active_set import ActiveSet, find_active_set, full_active_set
 from morgs_mi.method.confidence import motion_mask
@@ -93,18 +102,31 @@ class StreamState:
         frame: index of the next frame.
         coded: state of a decoder after the last frame; None before the first.
         seen: images up to the last frame.
-        balance: exposures of the first frame, by view; empty if they are not estimated.
+        correction: of the images to the colours of the scene.
     """
 
     frame: int = 0
     coded: CodedFrame | None = None
     seen: Seen = field(default_factory=Seen)
-    balance: tuple[Exposure, ...] = ()
+    correction: Correction = field(default_factory=Correction)
 
     @property
     def gaussians(self) -> Gaussians | None:
         """The decoded Gaussians of the last frame, None before the first."""
         return self.coded.gaussians if self.coded else None
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """Result of the fit of a frame: its packet, entries of its `FrameReport`, and the correction of its images."""
+
+    packet: Packet
+    correction: Correction
+    losses: dict[str, float]
+    steps: int
+    status: str
+    active: dict[str, float] = field(default_factory=dict)
+    validation: dict[str, Any] = field(default_factory=dict)
 
 
 @interrupts_raised()
@@ -128,24 +150,29 @@ def step(
     Raises:
         ValueError: an image has another size or type than its camera, or the first frame has no image at all.
     """
-    start, observed = time.perf_counter(), images
-    if not isinstance(observed, FrameObservation):
-        observed = observe_frame(setup, state.frame, state.seen, observed)
-    fit = partial(_fit_first_frame, on_provisional) if state.coded is None else _fit_later_frame
-    packet, about = fit(setup, state, observed, Progress(progress, f"Frame {state.frame}"))
-    coded, seen = decode(state.coded, packet), observed.seen
-    balance = about.pop("balance", state.balance)
-    about["status"] = _status(setup, state, seen.images, about["status"])
+    start = time.perf_counter()
+    frame_progress = Progress(progress, f"Frame {state.frame}")
+    observed = images if isinstance(images, FrameObservation) else observe_frame(setup, state.frame, state.seen, images)
+    if state.coded is None:
+        fitted = _fit_first_frame(setup, observed, frame_progress, on_provisional)
+    else:
+        fitted = _fit_later_frame(setup, state, observed, frame_progress)
+    coded = decode(state.coded, fitted.packet)
+    seen = observed.seen
     report = FrameReport(
-        state.frame,
-        time.perf_counter() - start,
-        packet.num_bytes,
+        frame=state.frame,
+        seconds=time.perf_counter() - start,
+        num_bytes=fitted.packet.num_bytes,
+        losses=fitted.losses,
         num_gaussians=len(coded),
+        status=_status(setup, state, seen.images, fitted.status),
         missing_views=tuple(camera.name for v, camera in enumerate(setup.cameras) if v not in seen.images),
-        exposures=tuple(seen.exposures.get(v, Exposure()).after(first) for v, first in enumerate(balance)),
-        **about,
+        active=fitted.active,
+        validation=fitted.validation,
+        steps=fitted.steps,
+        exposures=fitted.correction.followed_by(seen.exposures),
     )
-    return StreamState(state.frame + 1, coded, seen, balance), packet, report
+    return StreamState(state.frame + 1, coded, seen, fitted.correction), fitted.packet, report
 
 
 def _status(setup: Setup, state: StreamState, images: Images, status: str) -> str:
@@ -156,42 +183,41 @@ def _status(setup: Setup, state: StreamState, images: Images, status: str) -> st
     return "; ".join([*([] if status == "ok" else [status]), *problems]) or "ok"
 
 
-def _fit_later_frame(
-    setup: Setup, state: StreamState, observed: FrameObservation, progress: Progress
-) -> tuple[Packet, dict[str, Any]]:
-    """Return a later frame's packet and the entries of its report; numbers refer to the paper's equations."""
+def _fit_later_frame(setup: Setup, state: StreamState, observed: FrameObservation, progress: Progress) -> _Fitted:
+    """Return the fit of a later frame; numbers refer to the paper's equations."""
     assert state.coded is not None
     config, motion, images, flows = setup.config, setup.config.motion, observed.seen.images, observed.flows
     rng = rng_of(config.seed, Stream.LATER_FRAMES, state.frame)  # of its own for each frame: it is no state
     previous = _first_confidence(setup, state, flows, rng)  # frame 0's confidence (11)
     observations = observe(observed.key_views, motion, config.fit.objective)
     active = _active_set(setup, previous, images, observed.changes, observations)
-    balanced = _balanced({view: images[view] for view in active.views}, state.balance)
-    targets = {view: Target(image, setup.masks[view]) for view, image in balanced.items()}
+    corrected = state.correction.corrected({view: images[view] for view in active.views})
+    targets = {view: Target(image, setup.masks[view]) for view, image in corrected.items()}
     initial = initial_motion(previous, active, flows, targets, motion, rng)  # motion (5)
     problem = FrameProblem(previous, active, targets, observations, initial, setup.extent)
     fitted = fit_later_frame(problem, config.fit, motion, rng, progress)  # residual (6-8, 12), objective (13)
     packet = residual_packet(state.coded, fitted.gaussians, fitted.source, setup.cameras, config.codec)  # (3)
-    return packet, {
-        "losses": fitted.losses,
-        "status": "ok" if images else "no view has an image",
-        "active": {**active.fractions, "epochs": fitted.epochs / config.fit.epochs},
-        "steps": fitted.epochs * len(active.views),
-    }
+    return _Fitted(
+        packet=packet,
+        correction=state.correction,
+        losses=fitted.losses,
+        steps=fitted.epochs * len(active.views),
+        status="ok" if images else "no view has an image",
+        active={**active.fractions, "epochs": fitted.epochs / config.fit.epochs},
+    )
 
 
 def _fit_first_frame(
-    on_provisional: Callable[[Packet], None] | None,
     setup: Setup,
-    state: StreamState,
     observed: FrameObservation,
     progress: Progress,
-) -> tuple[Packet, dict[str, Any]]:
-    """Return the first frame's packet and the entries of its report."""
-    config, images = setup.config, observed.seen.images
-    found = _balance(setup, images, progress)
-    balance = _exposures_of(setup, images, found)
-    views, rng = _views(setup, _balanced(images, balance)), rng_of(config.seed, Stream.FIRST_FRAME)
+    on_provisional: Callable[[Packet], None] | None,
+) -> _Fitted:
+    """Return the fit of the first frame."""
+    config = setup.config
+    correction, correction_entry = estimate_correction(setup, observed.seen.images, progress)
+    views = views_of(setup, correction.corrected(observed.seen.images))
+    rng = rng_of(config.seed, Stream.FIRST_FRAME)
     plan = plan_first_frame(views, setup.points, config.fit)
     problem = FirstFrameProblem.of(views, setup.cloud, plan.config, config.render, rng)
     fit_config = adapted_to_images(plan.config, problem)
@@ -201,18 +227,15 @@ def _fit_first_frame(
 
     on_round = None if on_provisional is None else lambda gaussians: on_provisional(packed(gaussians))
     fitted = fit_first_frame(problem, fit_config, rng, progress.of(plan.stage), on_round)
-    return packed(fitted.gaussians), {
-        "losses": fitted.losses,
-        "status": _start_status(setup, plan.config),
-        "validation": _about_unseen_views(problem, fitted.gaussians) | _about_balance(found),
-        "steps": fitted.steps,
-        "balance": balance,
-    }
-
-
-def _views(setup: Setup, images: Images) -> list[View]:
-    """Return the views that have an image."""
-    return [View(setup.cameras[v], image, setup.masks[v]) for v, image in images.items()]
+    forecast = unseen_views(problem, fitted.gaussians).entries if len(views) > 1 else {}
+    return _Fitted(
+        packet=packed(fitted.gaussians),
+        correction=correction,
+        losses=fitted.losses,
+        steps=fitted.steps,
+        status=_start_status(setup, plan.config),
+        validation=forecast | correction_entry,
+    )
 
 
 def _start_status(setup: Setup, config: FitConfig) -> str:
@@ -222,46 +245,6 @@ def _start_status(setup: Setup, config: FitConfig) -> str:
     status = f"the capture has {count} points, too few: seeded {config.first_count} random ones inside the views"
     _LOG.warning("frame 0: %s", status)
     return status
-
-
-def _balance(setup: Setup, images: Images, progress: Progress) -> Balance | None:
-    """Return the balance of the cameras in the first frame; None if it is not estimated, or of a single view."""
-    config = setup.config
-    if config.fit.exposure == "off" or len(images) < 2:
-        return None
-    rng, short = rng_of(config.seed, Stream.BALANCED_POINTS), balance_config(config.fit)
-    problem = FirstFrameProblem.of(_views(setup, images), setup.cloud, short, config.render, rng)
-    return balance_cameras(problem, config.fit, config.seed, progress)
-
-
-def _exposures_of(setup: Setup, images: Images, found: Balance | None) -> tuple[Exposure, ...]:
-    """Return the exposure of each view in the first frame: none of one without an image; empty if not estimated."""
-    if setup.config.fit.exposure == "off":
-        return ()
-    known = dict(zip(images, found.exposures, strict=True)) if found is not None and found.taken else {}
-    return tuple(known.get(v, Exposure()) for v in range(len(setup.cameras)))
-
-
-def _balanced(images: Images, balance: Sequence[Exposure]) -> dict[int, np.ndarray]:
-    """Return images in the colours of the scene, which all views share."""
-    return {v: balance[v].corrected(image) if balance else image for v, image in images.items()}
-
-
-def _about_unseen_views(problem: FirstFrameProblem, gaussians: Gaussians) -> dict[str, Any]:
-    """Return the entries of the first frame's report on views between the cameras."""
-    if len(problem.views) < 2:
-        return {}
-    forecast = unseen_views(problem, gaussians)
-    figures = {"quality": forecast.quality, "expected_psnr": forecast.expected_psnr, "interval": forecast.interval}
-    return {"sentence": forecast.sentence, **figures, **asdict(forecast)}
-
-
-def _about_balance(found: Balance | None) -> dict[str, Any]:
-    """Return the entries of the first frame's report on the balance of the cameras."""
-    if found is None:
-        return {}
-    scores = {"recorded_psnr": found.recorded_psnr, "balanced_psnr": found.balanced_psnr}
-    return {"exposure": {"sentence": found.sentence, "taken": found.taken, **scores}}
 
 
 def _first_confidence(
@@ -393,7 +376,7 @@ class StreamLoop:
         self,
         coded: CodedFrame,
         frames: Iterable[Sequence[np.ndarray | None]],
-        balance: Sequence[Exposure] = (),
+        exposures: Sequence[Exposure] = (),
     ) -> None:
         """Continue after a frame of a stream, as if it had just been pushed.
 
@@ -401,9 +384,10 @@ class StreamLoop:
             coded: state of the stream after that frame.
             frames: images of all frames up to it, as for `push`; the last frame suffices without `skip_static` and
                 `exposure`.
-            balance: exposures in the report of the first frame.
+            exposures: in the report of the first frame.
         """
         seen = Seen()
         for images in frames:
             seen, _ = see_frame(self.setup, coded.frame, seen, images)
-        self.state, self._ahead = StreamState(coded.frame + 1, coded, seen, tuple(balance)), None
+        self.state = StreamState(coded.frame + 1, coded, seen, Correction(tuple(exposures)))
+        self._ahead = None

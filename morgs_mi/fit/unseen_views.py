@@ -18,7 +18,8 @@ conformal: nine tenths of the scaled errors on captures that the regression has 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -146,6 +147,12 @@ class UnseenViews:
             f"Views between the cameras will be {self.quality}: {self.expected_psnr:.0f} dB in the mean, nine times in "
             f"ten between {low:.0f} and {high:.0f}{wider}; {self.rig.description}."
         )
+
+    @property
+    def entries(self) -> dict[str, Any]:
+        """Entries of the first frame's report: the attributes and the properties."""
+        figures = {"quality": self.quality, "expected_psnr": self.expected_psnr, "interval": self.interval}
+        return {"sentence": self.sentence, **figures, **asdict(self)}
 
 
 def unseen_views(problem: FirstFrameProblem, gaussians: Gaussians) -> UnseenViews:

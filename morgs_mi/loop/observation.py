@@ -18,6 +18,7 @@ from morgs_mi.core.rig import check_near_planes, choose_key_views, scene_extent
 from morgs_mi.core.threads import map_in_threads
 from morgs_mi.fit.capacity import check_capacity
 from morgs_mi.fit.initialise import Points
+from morgs_mi.fit.view import View
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.change import box_around, change_mask, moving_region, update_reference
 from morgs_mi.method.exposure import LEAST_CHANGE, Exposure, common_change, follow_exposure
@@ -25,7 +26,17 @@ from morgs_mi.method.flow import FlowObservation, observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FramePair
 from morgs_mi.method.objective import KeyView
 
-__all__ = ["FrameObservation", "Images", "Recorded", "Seen", "Setup", "observe_frame", "prepare", "see_frame"]
+__all__ = [
+    "FrameObservation",
+    "Images",
+    "Recorded",
+    "Seen",
+    "Setup",
+    "observe_frame",
+    "prepare",
+    "see_frame",
+    "views_of",
+]
 
 # By view index: the images of those views that have one.
 Images = Mapping[int, np.ndarray]
@@ -153,6 +164,11 @@ def prepare(
     key_views = choose_key_views(cameras, config.motion.key_views)
     extent = scene_extent(cameras)
     return Setup(tuple(cameras), copies, points.copy(), point_colors.copy(), key_views, extent, config)
+
+
+def views_of(setup: Setup, images: Images) -> list[View]:
+    """Return the views that have an image."""
+    return [View(setup.cameras[v], image, setup.masks[v]) for v, image in images.items()]
 
 
 def observe_frame(setup: Setup, frame: int, before: Seen, images: Sequence[np.ndarray | None]) -> FrameObservation:
