@@ -23,7 +23,6 @@ __all__ = [
     "DEFAULT",
     "Clip",
     "ClipOptions",
-    "RandomOptions",
     "new_loop",
     "random_capture",
     "spread_views",
@@ -32,26 +31,6 @@ __all__ = [
 
 
 DEFAULT = "default"  # name of the settings without a preset
-
-
-@dataclass(frozen=True)
-class RandomOptions(StudyOptions):
-    """Base of the options of studies of the first frame on random scenes."""
-
-    seeds: tuple[int, ...] = (3, 4, 5, 6, 7, 8)
-    """Seeds of the scenes."""
-    clips: Path = Path("out/random")
-    """Folder of the clips, which are made where they are missing."""
-    downscale: float = 2
-    """Factor by which the clips are reduced."""
-    gaussians: int | None = None
-    """Number of Gaussians; default: by the detail of the images."""
-    steps: int = 600
-    """Steps of the first frame."""
-
-    def config(self, **fit: Any) -> StreamConfig:
-        """Return the settings of a fit, with further ones of `FitConfig`."""
-        return StreamConfig(FitConfig(num_gaussians=self.gaussians, first_frame_steps=self.steps, **fit))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,7 +22,7 @@ import numpy as np
 import tyro
 
 from benchmarks.reports.fits import new_loop
-from benchmarks.reports.plots import Column, scores_table
+from benchmarks.reports.plots import Column, markdown, scores_table
 from benchmarks.reports.study import Row, Scene, Study, StudyOptions, Variant
 from morgs_mi import Gaussians, rasterize
 from morgs_mi.calibration.refine import register_camera
@@ -37,10 +37,10 @@ from morgs_mi.runs.cluster.tasks import Source
 from morgs_mi.runs.recorder import with_points
 
 COLUMNS = (
-    Column("training views", "training", unit=" dB"),
-    Column("held out, as calibrated", "held_out", unit=" dB"),
-    Column("registered", "registered", unit=" dB"),
-    Column("processor time", "cpu_s", 0, unit=" s"),
+    Column("training views, dB", "training"),
+    Column("held out, as calibrated", "held_out"),
+    Column("registered", "registered"),
+    Column("difference", lambda fit: fit["registered"] - fit["held_out"], spread=False),
 )
 _FIRST, _EVERY, _FEW = 4, 8, 6
 
@@ -79,9 +79,27 @@ class Options(StudyOptions):
         return Study(measure, scenes, variants, self.fit_seeds)
 
     def table(self, rows: Sequence[Row]) -> str:
-        """Return the scores by set and calibration."""
-        key = {"seconds": "seconds"} if self.seconds else {"principal points": "principal_points"}
-        return scores_table(rows, {"set": "set"} | key, [column for column in COLUMNS if column.score in rows[0]])
+        """Return the scores by set, and by the time of the first frame or by the calibration."""
+        if rows[0].get("seconds"):
+            return over_time_table(rows)
+        keys = {"photos": "set", "principal points": "principal_points", "held out": "held_out_views"}
+        return scores_table(rows, keys, COLUMNS, left=2)
+
+
+def over_time_table(rows: Sequence[Row]) -> str:
+    """Return the quality and the work of first frames by the time that they may take."""
+    lines = (
+        (
+            row["set"],
+            f"{row['seconds']:.0f}",
+            f"{row['cpu_s'] / 2:.0f}",
+            f"{row['gaussians']:,}",
+            *(f"{row[score]:.2f}" for score in ("training", "held_out", "registered")),
+        )
+        for row in rows
+    )
+    titles = "may take, s", "time of two cores, s", "Gaussians", "training views, dB", "held out", "registered"
+    return markdown(("photos", *titles), lines)
 
 
 def principal_points(cameras: Sequence[Camera]) -> str:
