@@ -11,7 +11,7 @@ import numpy as np
 from benchmarks.pages.results import committed
 from benchmarks.reports import cameras, codec, drift, field, held_out, random_scenes, real, renderer, seams, timing
 from benchmarks.reports.method_tables import best_rows
-from benchmarks.reports.plots import grouped, markdown, span
+from benchmarks.reports.plots import grouped, markdown
 from benchmarks.reports.unseen import out_of_capture
 from morgs_mi.fit.unseen_views import WIDEST
 
@@ -76,17 +76,6 @@ def frame_times() -> str:
             shares = (f"{100 * run[key]:.0f} %" for key in ("gaussians", "pixels"))
             rows.append((name, f"{epochs}", *scores, *shares))
     return markdown(("Gaussians", "epochs", "s", "PSNR, dB", "kB", "active Gaussians", "drawn pixels"), rows)
-
-
-def unseen_views() -> str:
-    """Return the forecasts of views between the cameras on captures that the regression has not seen."""
-    rows = []
-    for (name,), group in grouped(out_of_capture(committed("unseen")["fits"]), "set").items():
-        figures = (span(row[score] for row in group) for score in ("training", "mean", "forecast", "width"))
-        views = span((row["views"] for row in group), 0)
-        rows.append((name, views, *figures, f"{sum(row['within'] for row in group)} of {len(group)}"))
-    titles = "training views, dB", "held-out views, dB", "forecast, dB", "interval, dB", "in it"
-    return markdown(("capture", "views", *titles), rows)
 
 
 def unseen_groups() -> str:
@@ -171,13 +160,11 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "held_out_views": lambda: held_out.first_frames(committed("held_out")["fits"]),
     "held_out_views_over_time": lambda: held_out.later_frames(committed("held_out")["fits"]),
     "parts": parts,
-    "photos_over_time": partial(study_table, real, "real_seconds"),
     "principal_points": partial(study_table, real, "real"),
     "seams": partial(study_table, seams, "seams"),
     "splat_files": splat_files,
     "steps": steps,
     "unseen": partial(study_table, random_scenes, "random_scenes"),
     "unseen_groups": unseen_groups,
-    "unseen_views": unseen_views,
     "workers": workers,
 }
