@@ -9,11 +9,9 @@ of the held-out view, scores of tracks are over the whole clip, all against the 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import mitsuba as mi
@@ -25,9 +23,7 @@ from benchmarks.reports.cells import OnWorkers, run_cells
 from benchmarks.reports.fits import DEFAULT, Clip, random_capture
 from benchmarks.reports.plots import Column, blank_figure, means_over, save_figure, scores_table
 from benchmarks.speed.output import Output
-from morgs_mi.codec.packets import coded_frames
 from morgs_mi.core.files import json_finite
-from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.results import Evaluation, known_mean
 from morgs_mi.loop.stream_config import StreamConfig, apply_preset, apply_values
 from morgs_mi.runs.cluster.tasks import Source
@@ -121,23 +117,7 @@ def measure(source: Source, methods: Mapping[str, StreamConfig]) -> dict[str, di
     clip = Clip.read(source.open())
     loop = clip.loop(next(iter(methods.values())))
     keyframe, _ = loop.push(clip.images[0])
-    (coded,) = coded_frames([keyframe])
-    found = {}
-    for method, config in methods.items():
-        loop, reports, seconds = clip.loop(config), list[FrameReport](), list[float]()
-        loop.resume(coded, clip.images[:1])
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / "stream.morgs"
-            with clip.writer(path, config) as writer:
-                writer.write(keyframe)
-                for images in clip.images[1:]:
-                    start = time.process_time()
-                    packet, report = loop.push(images)
-                    seconds.append(time.process_time() - start)
-                    writer.write(packet)
-                    reports.append(report)
-            found[method] = scores_of(evaluate_stream(path, clip.capture.path), reports, seconds)
-    return found
+    return {method: scores_of(*clip.continued(keyframe, config)) for method, config in methods.items()}
 
 
 def scores_of(found: Evaluation, reports: Sequence[FrameReport], seconds: Sequence[float]) -> dict[str, Any]:

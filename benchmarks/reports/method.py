@@ -19,7 +19,6 @@ from dataclasses import asdict, dataclass, field, replace
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -33,11 +32,9 @@ from benchmarks.reports.study import Row, Scene, Study, Variant, method_version
 from benchmarks.speed.output import Output
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.truth import load_truth
-from morgs_mi.codec.container import Packet, decode_packet, encode_packet
-from morgs_mi.codec.packets import coded_frames
+from morgs_mi.codec.container import decode_packet, encode_packet
 from morgs_mi.core.files import json_finite
 from morgs_mi.core.rig import choose_key_views
-from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.results import Evaluation, known_mean
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import PRESETS, StreamConfig, apply_preset
@@ -263,23 +260,8 @@ def later_frames(source: Source, first: str, config: StreamConfig) -> dict[str, 
         ``seconds``, the median of a later frame; ``by_frame``, lists of some of them. None if unknown.
     """
     clip = Clip.read(source.open())
-    return summary(*continued(clip, decode_packet(b64decode(first)), config))
-
-
-def continued(clip: Clip, packet: Packet, config: StreamConfig) -> tuple[Evaluation, list[FrameReport]]:
-    """Fit all later frames of a clip after its first packet; return the evaluation of the stream, and the reports."""
-    loop, reports = clip.loop(config), list[FrameReport]()
-    (coded,) = coded_frames([packet])
-    loop.resume(coded, clip.images[:1])
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "stream.morgs"
-        with clip.writer(path, config) as writer:
-            writer.write(packet)
-            for images in clip.images[1:]:
-                packet, report = loop.push(images)
-                writer.write(packet)
-                reports.append(report)
-        return evaluate_stream(path, clip.capture.path), reports
+    continuation = clip.continued(decode_packet(b64decode(first)), config)
+    return summary(continuation.evaluation, continuation.reports)
 
 
 def summary(found: Evaluation, reports: Sequence[FrameReport]) -> dict[str, Any]:
