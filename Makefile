@@ -10,8 +10,9 @@ STAMP := $(VENV)/.installed
 demo: setup
 	$(BIN)/morgs-mi demo out/demo
 
+# Two processes: compiling kernels, which takes most of the time, uses one core.
 test: setup
-	$(BIN)/pytest
+	$(BIN)/pytest -n 2 --dist loadfile
 
 test-slow: setup
 	$(BIN)/pytest -m "slow and not gpu"
