@@ -17,7 +17,6 @@ __all__ = [
     "cameras",
     "clocks",
     "clocks_mean",
-    "disturbances",
     "dropping",
     "exposure",
     "far_views",
@@ -101,17 +100,6 @@ def noise_aware() -> str:
         for case in dict.fromkeys(case for case, _ in found)
     )
     return markdown(("capture", "L1 and D-SSIM, dB", "L1 alone, dB"), rows)
-
-
-def disturbances() -> str:
-    """Return the loss of quality by each kind of disturbance."""
-    columns = (
-        Column("PSNR, dB", "psnr"),
-        Column("moving, dB", "psnr_moving"),
-        Column("motion error, px", "motion_error_moving"),
-        Column("IoU of the confidence", "confidence_iou"),
-    )
-    return scores_table(committed("disturbances")["fits"], {"disturbance": "disturbance"}, columns)
 
 
 def cameras() -> str:

@@ -13,7 +13,6 @@ import pytest
 from benchmarks.reports import (
     cameras,
     cells,
-    disturbances,
     drift,
     exposure,
     fits,
@@ -40,7 +39,6 @@ from morgs_mi.runs.cluster.tasks import Source
 from morgs_mi.synth.disturbances import load_disturbances
 from tests.benchmarks.reports.here import Here
 from tests.benchmarks.reports.pages import ROOT
-from tests.scenes.animated_gltf import write_glb
 
 TINY = StreamConfig(
     fit=FitConfig(num_gaussians=60, first_frame_steps=3, epochs=1, dropping=0.0),
@@ -61,7 +59,6 @@ STUDIES = {
     drift: ({**SMALL, "scenes": ("spheres",)}, 2),
     live: ({**SMALL, "scenes": ("spheres",), "strides": (1,), "gap": 1, "gap_epochs": (2,)}, 6),
     exposure: ({**SMALL, "seeds": (3,)}, 8),
-    disturbances: ({**SMALL, "animation": "bend", "cameras": 3}, 10),
     timing: ({**SMALL, "seeds": (3,), "frames": 6, "fitted": 2, "time_offset": 0.4}, 2),
     seams: ({**SMALL, "scenes": (("spheres", 0, 4),), "cameras": 3, "segment_frames": 2, "fit_seeds": (0,)}, 1),
 }
@@ -99,8 +96,6 @@ def test_study_options__of_workers_write_the_rows_of_one_process(report, clip: P
         (tmp_path / name).symlink_to(clip)
     given, num_rows = STUDIES[report]
     place = {"captures": (clip,)} if report in (masks, real, unseen) else {"clips": tmp_path}
-    if report is disturbances:
-        place["model"] = write_glb(tmp_path / "model.glb")
     workers, found = Here(), {}
     monkeypatch.setattr(fits, "StreamLoop", tiny_loop)
     monkeypatch.setattr(cameras, "refine_cameras", lambda capture, *_: (capture, Scene({}, ())))  # needs larger images
@@ -174,7 +169,7 @@ def test_rounded__has_five_digits_of_what_is_no_integer():
 def test_study_options__have_tables_of_the_committed_results():
     names = {masks: ("masks", "masks_fresh"), drift: ("drift", "drift_fresh"), cameras: ("cameras", "cameras_true")}
     for report in STUDIES:
-        needed = {masks: {"captures": ()}, disturbances: {"model": Path()}}.get(report, {})
+        needed = {"captures": ()} if report is masks else {}
         for name in names.get(report, (report.__name__.rpartition(".")[2],)):
             text = (ROOT / "benchmarks" / "results" / f"{name}.json").read_text(encoding="utf-8")
             table = report.Options(**needed).table(json.loads(text)["fits"])
