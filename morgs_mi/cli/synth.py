@@ -20,8 +20,7 @@ class Synth:
     """Path-trace a moving scene into a multi-view capture with exact ground truth."""
 
     scene: Positional[str]
-    """Name of a scene (spheres, arm, thin, flicker, random), or path of an animated glTF file (.glb, .gltf) or of a
-    Python file with a function build(seed)."""
+    """Name of a scene (spheres, arm, thin, flicker, random), or path of a Python file with a function build(seed)."""
     out: Positional[Path]
     """New folder for the capture."""
     config: Annotated[SynthConfig, arg(name=""), OmitArgPrefixes, DisallowNone] = field(default_factory=SynthConfig)

@@ -23,9 +23,8 @@ from morgs_mi.codec.packets import CodedFrame
 from morgs_mi.core.rig import scene_extent
 from morgs_mi.evaluate.comparison import ComparedClip, ComparedFrame, ComparedView
 from morgs_mi.evaluate.lpips import Lpips
-from morgs_mi.evaluate.metrics import WINDOW, endpoint_error, iou, mean_over, psnr_of, ssim_map, unit_pair
+from morgs_mi.evaluate.metrics import WINDOW, delta_e_map, endpoint_error, iou, mean_over, psnr_of, ssim_map, unit_pair
 from morgs_mi.evaluate.motion3d import evaluate_motion
-from morgs_mi.evaluate.perception import delta_e_map, flip_map
 from morgs_mi.evaluate.results import Motion3DScores, VariationScores, ViewScores
 from morgs_mi.evaluate.temporal import StillVariation, slope
 from morgs_mi.evaluate.tracking import evaluate_tracks
@@ -45,7 +44,7 @@ __all__ = [
 ]
 
 REGIONS = ("", "_moving", "_still")
-IMAGE_SCORES = ("psnr", "ssim", "flip", "delta_e", "lpips")
+IMAGE_SCORES = ("psnr", "ssim", "delta_e", "lpips")
 # Compression flickers: after a hundred frames half the pixels of a real recording have changed once.
 _FALSE_ALARMS = 0.02
 
@@ -183,7 +182,7 @@ def _image_scores(view: ComparedView, lpips: Lpips | None) -> dict[str, float]:
     nothing = np.zeros_like(whole)
     regions = (whole, *((nothing, nothing) if moving is None else (whole & moving, whole & ~moving)))
     a, b = unit_pair("evaluate_stream", rendered, view.recorded)
-    maps = {"psnr": np.square(a - b), "flip": flip_map(a, b), "delta_e": delta_e_map(a, b)}
+    maps = {"psnr": np.square(a - b), "delta_e": delta_e_map(a, b)}
     if min(whole.shape) >= WINDOW:
         maps["ssim"] = ssim_map(a, b)
     matched = follow_exposure(rendered, view.recorded, view.valid)(a).clip(0, 1)

@@ -8,11 +8,16 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import correlate1d
 
-__all__ = ["endpoint_error", "iou", "mean_over", "psnr", "psnr_of", "ssim", "ssim_map", "unit_pair"]
+from morgs_mi.core.color_space import srgb_to_linear
+from morgs_mi.core.threads import map_in_threads
+
+__all__ = ["delta_e_map", "endpoint_error", "iou", "mean_over", "psnr", "psnr_of", "ssim", "ssim_map", "unit_pair"]
 
 # Wang, Bovik, Sheikh and Simoncelli, "Image quality assessment", TIP 2004.
 WINDOW, SIGMA = 11, 1.5
 C1, C2 = 0.01**2, 0.03**2
+# Rows of an image whose colours are compared at once; the temporaries of a whole image exceed the cache.
+_ROWS = 32
 
 
 def psnr(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
@@ -67,6 +72,40 @@ def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     covariance = _blur(image * truth) - x * y
     similarity = (2 * x * y + C1) * (2 * covariance + C2) / ((x**2 + y**2 + C1) * (var_x + var_y + C2))
     return similarity.reshape(*similarity.shape[:2], -1).mean(-1)
+
+
+def delta_e_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Return the colour difference CIE dE2000 per pixel [H, W], by colour-science; a value of about 1 is just visible.
+
+    Colours are decoded from sRGB and compared under its white point, D65. Values outside [0, 1] are clipped, as on
+    a display.
+
+    Args:
+        image: [H, W, 3].
+        truth: likewise.
+
+    Raises:
+        ValueError: the sizes differ or an image does not have three channels.
+    """
+    # The import takes a second, for which other commands should not wait.
+    from colour import XYZ_to_Lab
+    from colour.difference import delta_E_CIE2000
+    from colour.models import RGB_COLOURSPACE_sRGB
+
+    if np.ndim(image) != 3 or np.shape(image)[2] != 3:
+        raise ValueError(f"delta_e_map(): images must be [H, W, 3], got {np.shape(image)}; give them three channels.")
+    a, b = (np.clip(each, 0, 1) for each in unit_pair("delta_e_map", image, truth))
+
+    def lab(colours: np.ndarray) -> np.ndarray:
+        xyz = srgb_to_linear(colours) @ RGB_COLOURSPACE_sRGB.matrix_RGB_to_XYZ.T
+        return XYZ_to_Lab(xyz, RGB_COLOURSPACE_sRGB.whitepoint)
+
+    def rows(start: int) -> np.ndarray:
+        band = slice(start, start + _ROWS)
+        return delta_E_CIE2000(lab(a[band]), lab(b[band]))
+
+    # NumPy alone uses one core.
+    return np.concatenate(map_in_threads(rows, range(0, len(a), _ROWS)))
 
 
 def endpoint_error(motion: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:

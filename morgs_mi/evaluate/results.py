@@ -67,10 +67,6 @@ class ViewScores(_Scores):
     """SSIM, at most 1."""
     ssim_moving: float = _NAN
     ssim_still: float = _NAN
-    flip: float = _NAN
-    """FLIP, in [0, 1]."""
-    flip_moving: float = _NAN
-    flip_still: float = _NAN
     delta_e: float = _NAN
     """Colour difference CIE dE2000."""
     delta_e_moving: float = _NAN

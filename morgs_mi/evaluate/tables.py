@@ -13,9 +13,9 @@ from morgs_mi.evaluate.results import Evaluation
 
 __all__ = ["evaluation_summary", "evaluation_tables", "figure"]
 
-_METRICS = (("PSNR, dB", "psnr", 2), ("SSIM", "ssim", 4), ("FLIP", "flip", 4), ("dE2000", "delta_e", 2))
+_METRICS = (("PSNR, dB", "psnr", 2), ("SSIM", "ssim", 4), ("dE2000", "delta_e", 2))
 _METRICS += (("LPIPS", "lpips", 4), ("flow error, px", "motion_error", 2))
-_FRAME = (("PSNR, dB", "psnr", 2), ("moving", "psnr_moving", 2), ("SSIM", "ssim", 4), ("FLIP", "flip", 4))
+_FRAME = (("PSNR, dB", "psnr", 2), ("moving", "psnr_moving", 2), ("SSIM", "ssim", 4))
 _FRAME += (("flow error", "motion_error", 2), ("moving", "motion_error_moving", 2))
 _VIEW = (("PSNR, dB", "psnr", 2), ("colours matched", "psnr_matched", 2), ("SSIM", "ssim", 4))
 _VIEW += (("flow error", "motion_error", 2), ("registered", "registered", 2))

@@ -62,19 +62,18 @@ _TOKEN = re.compile(f"(?P<comment>{_COMMENT})|(?:{_STRING})", re.DOTALL)
 _WORD = re.compile(r"([^\s.=,\[\]{}]++(?:[ \t]*+\.[ \t]*+[^\s.=,\[\]{}]++)*+)[ \t]*+([=\]]?)")
 
 
-def check_claim(path: str | Path, claimed: int, content: str, beside: int = 0) -> None:
+def check_claim(path: str | Path, claimed: int, content: str) -> None:
     """Check that decoding a file takes no more memory than its size allows.
 
     Args:
         path: the file.
         claimed: bytes that the decoded content takes.
         content: claimed content of the file, for the message, e.g. ``an image of 20000x20000 pixels``.
-        beside: bytes of further files that it names.
 
     Raises:
         ValueError: it takes more.
     """
-    size = Path(path).stat().st_size + beside
+    size = Path(path).stat().st_size
     if claimed > _FACTOR * size + _ALLOWANCE:
         raise ValueError(
             f"{path}: expected content that fits its {size} bytes, got a claim of {content}, which takes "

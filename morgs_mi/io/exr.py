@@ -18,10 +18,8 @@ __all__ = ["read_exr", "write_exr"]
 _MAGIC, _MULTIPART = 20000630, 1 << 12
 
 
-def write_exr(
-    path: str | Path, channels: Mapping[str, np.ndarray], attributes: Mapping[str, str] | None = None
-) -> None:
-    """Write `channels`, each [H, W], as one float32 EXR file with text `attributes` in its header, atomically.
+def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
+    """Write `channels`, each [H, W], as one float32 EXR file, atomically.
 
     Raises:
         ValueError: there is no channel, or the channels differ in shape.
@@ -30,7 +28,7 @@ def write_exr(
     shapes = {name: np.shape(channel) for name, channel in channels.items()}
     if len(set(shapes.values())) != 1 or any(len(shape) != 2 for shape in shapes.values()):
         raise ValueError(f"write_exr(): `channels` must share one shape [H, W], got {shapes}; pass one image each.")
-    header = {**(attributes or {}), "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     pixels = {name: np.ascontiguousarray(channel, np.float32) for name, channel in channels.items()}
     with atomic_path(path, "write_exr()") as partial:
         try:

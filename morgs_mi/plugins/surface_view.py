@@ -286,9 +286,7 @@ class SurfaceView:
         return np.array(self.coverage > 0).reshape(self.image.shape[:2])
 
 
-def coverage_and_depth(
-    scene: Any, sensor: Any, camera: Camera, crop: tuple[int, int, int, int], shape: Any = None
-) -> tuple[Float, Float]:
+def coverage_and_depth(scene: Any, sensor: Any, camera: Camera, crop: tuple[int, int, int, int]) -> tuple[Float, Float]:
     """Return the coverage and the mean depth z of surfaces in every pixel [P], by rays through a regular grid.
 
     Three rays, one in each row and column of the grid, decide where all are cast: where they or the next pixels differ.
@@ -298,9 +296,8 @@ def coverage_and_depth(
         sensor: a camera's sensor, with a film of the pixels of `crop`.
         camera: the same camera.
         crop: pixels of the camera's image, (x, y, width, height), P in all.
-        shape: the surface that counts, where the others do not hide it; None: all.
     """
-    first, (across, down) = _rectangle(scene.bbox() if shape is None else shape.bbox(), camera, crop)
+    first, (across, down) = _rectangle(scene.bbox(), camera, crop)
     coverage, depth = dr.zeros(mi.Float, crop[2] * crop[3]), dr.full(mi.Float, dr.inf, crop[2] * crop[3])
     if not across * down:
         return coverage, depth
@@ -319,7 +316,7 @@ def coverage_and_depth(
             k = dr.gather(mi.UInt32, cells, i)
             rays = _rays(sensor, pixel, (mi.Vector2f(k % _GRID, k // _GRID) + 0.5) / _GRID)
             found = scene.ray_intersect_preliminary(rays, coherent=True)
-            hit = found.is_valid() if shape is None else found.is_valid() & (found.shape == mi.ShapePtr(shape))
+            hit = found.is_valid()
             z = (to_camera @ rays(dr.select(hit, found.t, 0))).z
             return i + 1, count + dr.select(hit, mi.Float(1), 0), total + dr.select(hit, z, 0)
 

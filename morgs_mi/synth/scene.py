@@ -192,8 +192,7 @@ def load_scene(scene: str | Path, seed: int = 0) -> Scene:
     path = Path(scene) if Path(scene).suffix == ".py" else known.get(str(scene))
     if path is None or not path.is_file():
         raise ValueError(
-            f"load_scene(): no scene {str(scene)!r}; name one of {sorted(known)} or pass the path of a .py, .glb or "
-            ".gltf file."
+            f"load_scene(): no scene {str(scene)!r}; name one of {sorted(known)} or pass the path of a .py file."
         )
     spec = importlib.util.spec_from_file_location(f"morgs_mi_scene_{path.stem}", path)
     assert spec

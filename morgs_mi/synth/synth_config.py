@@ -39,8 +39,6 @@ class SynthConfig:
     """Frames per second."""
     lossless: bool = True
     """Also write the frames as PNG files, which are read in place of the compressed videos."""
-    animation: str | None = None
-    """Animation of a glTF file; its first, if not given."""
     disturbances: Disturbances = field(default_factory=Disturbances)
     """Disturbances of the recording."""
     seed: Annotated[int, AtLeast(0)] = 0

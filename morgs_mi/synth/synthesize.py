@@ -34,7 +34,6 @@ from morgs_mi.synth.disturbances import (
     draw_disturbances,
     save_disturbances,
 )
-from morgs_mi.synth.gltf_scene import gltf_scene
 from morgs_mi.synth.ground_truth import compute_ground_truth, move_with_objects
 from morgs_mi.synth.path_tracer import PathTracer, developed
 from morgs_mi.synth.scene import DeformingObject, Scene, check_scene, load_scene
@@ -69,7 +68,7 @@ def synthesize(
     Tracks are at the times of the frames of ``cam00``, the other ground truth at the times of each camera.
 
     Args:
-        scene: a scene, its name, or the path of its Python file or of an animated glTF file (see `gltf_scene`).
+        scene: a scene, its name, or the path of its Python file.
         out: the folder to write.
         config: settings.
         overwrite: replace an earlier capture in `out`.
@@ -94,7 +93,7 @@ def synthesize(
     pixels = config.width * config.height
     size = f"images of {config.width}x{config.height} pixels"
     check_memory("synthesize()", _PIXEL_BYTES * pixels, size, "make them smaller (`width`, `height`)")
-    scene = _loaded(scene, config)
+    scene = scene if isinstance(scene, Scene) else load_scene(scene, config.seed)
     rig = _Rig.of(scene, config.completed(scene.recording))
     check_lenses(rig.cameras, rig.disturbed)
     check_scene(scene, rig.times())
@@ -178,15 +177,6 @@ def _images(tracer: PathTracer, rig: _Rig, index: int) -> Iterator[np.ndarray]:
         seed = int(np.random.SeedSequence([config.seed, index, frame]).generate_state(1)[0])
         light = record_light(tracer, rig.cameras[index], own, frame, replace(config, seed=seed))
         yield compressed(developed(own.gains[frame] * light, config.noise, seed), own.jpeg_quality)
-
-
-def _loaded(scene: str | Path | Scene, config: SynthConfig) -> Scene:
-    """Return a scene, or load it by its file or name."""
-    if not isinstance(scene, Scene) and Path(scene).suffix.lower() in (".glb", ".gltf"):
-        return gltf_scene(scene, config.animation, config.seed)
-    if config.animation is not None:
-        raise ValueError("synthesize(): `animation` is for glTF files, got another scene; leave it out.")
-    return scene if isinstance(scene, Scene) else load_scene(scene, config.seed)
 
 
 def _check_views(tracer: PathTracer, cameras: Sequence[Camera]) -> None:

@@ -154,7 +154,7 @@ def test_evaluate_stream__reports_every_score_by_region(fitted_clip: Path) -> No
         scores = {name: getattr(result.scores, name + region) for name in IMAGE_SCORES}
         assert scores["psnr"] == np.inf
         assert scores["ssim"] == pytest.approx(1)
-        assert scores["flip"] == scores["delta_e"] == 0
+        assert scores["delta_e"] == 0
     assert result.variation.render == pytest.approx(result.variation.input)
     assert 0 < result.variation.still_share < 1
     assert np.isnan(result.psnr_slope), "there is no line through infinite values"
@@ -188,7 +188,7 @@ def test_evaluate_stream__uses_the_recorded_change_as_regions_without_truth(fitt
     result = evaluate_stream(fitted_clip, tmp_path / "capture")
     assert result.regions == "recorded change"
     assert result.scores.psnr_moving == result.scores.psnr_still == np.inf
-    assert np.isnan(result.frames[0].scores.flip_moving), "no frame before it"
+    assert np.isnan(result.frames[0].scores.delta_e_moving), "no frame before it"
     assert result.motion_3d is None
     assert result.as_dict()["motion_3d"] == {}
     assert np.isnan(result.scores.confidence_iou)
@@ -235,7 +235,7 @@ def test_evaluation__as_dict_holds_the_scores_under_the_keys_of_the_json(fitted_
         assert found[name].keys() == keys, name
     assert {"frame", "kind", "num_bytes", "seconds", "motion_3d", "views"} <= row.keys()
     assert row["views"]["cam0"]["psnr"] == result.frames[1].views["cam0"].psnr
-    assert found["views"]["cam0"]["flip"] == result.views["cam0"].flip
+    assert found["views"]["cam0"]["delta_e"] == result.views["cam0"].delta_e
 
 
 def test_known_mean__ignores_nan() -> None:

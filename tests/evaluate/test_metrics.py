@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morgs_mi.evaluate.metrics import endpoint_error, iou, mean_over, psnr, ssim, ssim_map
+from morgs_mi.evaluate.metrics import delta_e_map, endpoint_error, iou, mean_over, psnr, ssim, ssim_map
 
 rng = np.random.default_rng(0)
 TRUTH = rng.random((24, 31, 3))
@@ -57,10 +57,35 @@ def test_ssim__is_symmetric_and_one_for_equal_images_only():
     assert ssim(1 - TRUTH, TRUTH) < 0 < ssim(NOISY, TRUTH) < 1
 
 
-def test_psnr_and_ssim__bytes_and_floats_agree():
+def test_psnr_ssim_and_delta_e_map__bytes_and_floats_agree():
     a, b = ((x * 255 + 0.5).astype(np.uint8) for x in (NOISY, TRUTH))
     assert psnr(a, b) == pytest.approx(psnr(a / 255, b / 255))
     assert ssim(a, b) == pytest.approx(ssim(a / 255, b / 255))
+    np.testing.assert_allclose(delta_e_map(a, b), delta_e_map(a / 255, b / 255))
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "expected"),
+    [
+        ((255, 0, 0), (0, 0, 255), 52.88),
+        ((255, 0, 0), (0, 255, 0), 86.61),
+        ((0, 0, 0), (255, 255, 255), 100),
+        ((9, 99, 199), (9, 99, 199), 0),
+    ],
+)
+def test_delta_e_map__of_the_corners_of_the_gamut(a, b, expected):
+    """Values that calculators of CIE dE2000 agree on for sRGB, to their two digits."""
+    result = delta_e_map(np.full((1, 1, 3), a, np.uint8), np.full((1, 1, 3), b, np.uint8))
+    assert result == pytest.approx(expected, abs=0.005)
+
+
+def test_delta_e_map__is_per_pixel():
+    truth = np.tile(TRUTH, (2, 1, 1))  # more rows than are compared at once
+    image = truth.copy()
+    image[37, 5] = 1 - image[37, 5]
+    error = delta_e_map(image, truth)
+    assert error.shape == (48, 31)
+    assert np.argwhere(error).tolist() == [[37, 5]]
 
 
 def test_endpoint_error__is_a_mean_length():
@@ -99,6 +124,8 @@ def test_mean_over__centres_a_smaller_map_in_the_mask():
         (lambda: psnr(TRUTH, TRUTH, np.ones((24, 31))), "must be bool .* float64"),
         (lambda: ssim(TRUTH[:10], TRUTH[:10]), "at least 11x11"),
         (lambda: endpoint_error(TRUTH, TRUTH), r"\[H, W, 2\]"),
+        (lambda: delta_e_map(TRUTH, TRUTH[:5]), r"delta_e_map\(\): .* \(5, 31, 3\)"),
+        (lambda: delta_e_map(TRUTH[..., :2], TRUTH[..., :2]), r"must be \[H, W, 3\]"),
     ],
 )
 def test_metrics__refuse_bad_input(call, message):

@@ -36,7 +36,9 @@ def test_evaluation_tables__fit_eighty_columns(result: Evaluation) -> None:
     assert rows["PSNR, dB"] == [
         figure(v, 2) for v in (result.scores.psnr, result.scores.psnr_moving, result.scores.psnr_still)
     ]
-    assert rows["FLIP"] == [figure(getattr(result.scores, "flip" + region), 4) for region in ("", "_moving", "_still")]
+    assert rows["dE2000"] == [
+        figure(v, 2) for v in (result.scores.delta_e, result.scores.delta_e_moving, result.scores.delta_e_still)
+    ]
     assert "LPIPS" not in rows, "no network was given"
     assert any(line.endswith(figure(result.variation.input, 3)) for line in lines)
 

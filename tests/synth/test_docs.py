@@ -13,7 +13,6 @@ from morgs_mi import cli
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.truth import load_truth
 from morgs_mi.synth.disturbances import Disturbances, load_disturbances
-from tests.scenes.animated_gltf import model, write_glb
 
 TEXT = (Path(__file__).parents[2] / "docs" / "scenes.md").read_text(encoding="utf-8")
 BLOCK = re.compile(r"<!-- (file [^ ]+|run) -->\n```\w+\n(.*?)```", re.DOTALL)
@@ -54,9 +53,6 @@ COMMANDS = [line.split() for line in re.findall(r"^    morgs-mi (synth .+)", TEX
 @pytest.mark.parametrize("command", [c for c in COMMANDS if "gem.py" not in c[1]], ids=" ".join)
 def test_scenes_page__commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: list[str]) -> None:
     monkeypatch.chdir(tmp_path)
-    fox = model()
-    fox.document["animations"] = [{**fox.document["animations"][0], "name": name} for name in ("Run", "Walk")]
-    write_glb(tmp_path / "fox.glb", fox)
     (tmp_path / "out").mkdir()
     assert cli.main([*command, *SMALL]) == 0
     assert load_disturbances(Path(command[2]) / "truth")

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from morgs_mi.capture.truth import load_truth
-from morgs_mi.synth.random_scene import MOTIONS, Body, RandomScene, draw_scene
 from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
+from scenes.random import MOTIONS, Body, RandomScene, draw_scene
 from tests.assertions import assert_close
 
 NUM_SEEDS = 50

@@ -11,17 +11,13 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import srgb_to_linear
 from morgs_mi.core.files import atomic_folder, atomic_path
-from morgs_mi.io.cryptomatte import cryptomatte
 from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import playable_format, write_video
 from morgs_mi.playback.export.formats import IMAGES, choose_format
 from morgs_mi.playback.player import channel_image, render_stream
 from morgs_mi.playback.visualise import side_by_side, write_png
 
-__all__ = ["MATTE", "exr_channels", "exr_layers", "pad_to_even", "write_frames", "write_images"]
-
-MATTE = "matte:"
-"""Beginning of the name of a matte among rendered images."""
+__all__ = ["exr_channels", "pad_to_even", "write_frames", "write_images"]
 
 
 def write_frames(
@@ -99,17 +95,7 @@ def _write_png(path: Path, images: Mapping[str, np.ndarray]) -> None:
 
 
 def _write_exr(path: Path, images: Mapping[str, np.ndarray]) -> None:
-    write_exr(path, *exr_layers(images))
-
-
-def exr_layers(images: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Return the channels of an EXR file, see `exr_channels`, and its attributes; images ``matte:NAME`` are mattes."""
-    mattes = {key.removeprefix(MATTE): image[..., 0] for key, image in images.items() if key.startswith(MATTE)}
-    channels = exr_channels({key: image for key, image in images.items() if not key.startswith(MATTE)})
-    if not mattes:
-        return channels, {}
-    ids, attributes = cryptomatte(mattes)
-    return {**channels, **ids}, attributes
+    write_exr(path, exr_channels(images))
 
 
 def exr_channels(images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -31,10 +31,8 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.ranges import check_ranges
 from morgs_mi.gaussian_integrator import ellipsoids
 from morgs_mi.playback.export.clips import frame_numbers
-from morgs_mi.playback.export.frames import MATTE
 from morgs_mi.playback.player import available_channels
 from morgs_mi.plugins.light_probe import light_probe
-from morgs_mi.plugins.mattes import mattes
 from morgs_mi.plugins.shadows import shadow_ratio, shadowed
 from morgs_mi.plugins.surface_view import lights, rays_for, traced
 from morgs_mi.render.channels import exr_names
@@ -52,9 +50,9 @@ __all__ = [
     "selected",
 ]
 
-LAYERS = ("splats", "surfaces", "shadow", "mattes")
-"""Further channels, for compositing: the splats alone and the surfaces alone, in linear light with alpha, the shadow of
-the surfaces on the splats, a factor of their linear light, and ``matte:NAME`` for every shape and the splats."""
+LAYERS = ("splats", "surfaces", "shadow")
+"""Further channels, for compositing: the splats alone and the surfaces alone, in linear light with alpha, and the
+shadow of the surfaces on the splats, a factor of their linear light."""
 
 Light = Literal["probe", "traced"]
 
@@ -162,7 +160,7 @@ def render_inserted(
         config: settings.
 
     Yields:
-        (frame, images) as `render_stream` does; the layer ``mattes`` is one image per name.
+        (frame, images) as `render_stream` does.
 
     Raises:
         ValueError: a broken packet, or a scene that Mitsuba or `gaussian_splat` refuses.
@@ -226,7 +224,7 @@ def _render(
 ) -> dict[str, np.ndarray]:
     entries = {name: value for name, value in entries.items() if name not in ("type", "sensor")}
     nested = _integrator(entries.pop("integrator", None), config.light)
-    ratio, found = np.ones(len(gaussians), np.float32), {}
+    ratio = np.ones(len(gaussians), np.float32)
     try:
         inserted: Any = mi.load_dict({"type": "scene", **entries})
         if not (inserted.shapes() or inserted.emitters()):
@@ -241,9 +239,6 @@ def _render(
             lamp = captured_light(gaussians, camera, np.array(inserted.bbox().center()).ravel())
             lit = mi.load_dict({"type": "scene", **entries, "captured light": lamp})
             inserted = lit if config.light == "probe" else _in_background_light(entries, gaussians, camera)
-        if "mattes" in channels:
-            # Before other scenes rename the shapes.
-            found = mattes(gaussians, camera, inserted)
         if config.shadows:
             ratio = shadow_ratio(gaussians, lit, camera.position)
         dark = shadowed(gaussians, ratio)
@@ -258,9 +253,7 @@ def _render(
         bright, less = (srgb_to_linear(np.asarray(image.color)) for image in (alone, less))
         images["splats"] = np.concatenate([bright, np.asarray(alone.alpha)], axis=2)
         images["shadow"] = np.where(bright > 0, less / np.maximum(bright, 1e-6), 1)
-    images |= {f"{MATTE}{name}": part[..., None] for name, part in found.items()}
-    names = [name for name in channels if name != "mattes"] + [f"{MATTE}{name}" for name in found]
-    return {name: images[name].astype(np.float32) for name in names}
+    return {name: images[name].astype(np.float32) for name in channels}
 
 
 def _plugin_images(

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
-import OpenEXR
 import pytest
 
 from morgs_mi import open_stream
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.core.color_space import srgb_to_linear
-from morgs_mi.playback.export.frames import exr_layers, write_images
+from morgs_mi.io.exr import read_exr
+from morgs_mi.playback.export.frames import write_images
 from morgs_mi.playback.export.insert import InsertConfig, inserted_channels, load_insert, render_inserted, selected
 from morgs_mi.playback.player import render_stream
 from tests.scenes.surfaces import camera, cloud
@@ -111,53 +110,15 @@ def test_render_inserted__layers_compose_to_the_image_where_surfaces_cover_nothi
         '            "sun": {"type": "directional", "direction": [0, 0.8, 0.8], "irradiance": 2.0}}\n'
     )
     channels = inserted_channels(stream)
-    assert channels == ("color", "alpha", "motion", "depth", "splats", "surfaces", "shadow", "mattes")
+    assert channels == ("color", "alpha", "motion", "depth", "splats", "surfaces", "shadow")
     images = dict(render_inserted(stream, camera(), load_insert(tmp_path / "ball.py"), [0], channels))[0]
     outside = images["surfaces"][..., 3] == 0
     assert images["shadow"].min() < 0.7 < images["shadow"].max() == pytest.approx(1)
     shadowed = images["splats"][..., :3] * images["shadow"]
     np.testing.assert_allclose(srgb_to_linear(images["color"])[outside], shadowed[outside], atol=1e-4)
-    names, _ = exr_layers(images)
-    assert {"R", "A", "depth.Y", "splats.R", "surfaces.A", "shadow.R", "motion.X", "crypto_object00.R"} <= names.keys()
-
-
-def test_render_inserted__mattes_are_read_back_by_the_names_of_the_shapes(stream, tmp_path):
-    """Of the mattes in an EXR file, each name selects its shape, behind or beside which the splats have the rest."""
-    (tmp_path / "two.py").write_text(
-        "def build(frame, time):\n"
-        '    left, right = ({"type": "sphere", "center": [x, 0, 0], "radius": 0.5} for x in (-0.8, 0.8))\n'
-        '    return {"left ball": left, "rechts": right, "sun": {"type": "directional"}}\n'
-    )
-    images = render_inserted(stream, camera(), load_insert(tmp_path / "two.py"), [0], ("color", "mattes"))
-    write_images(images, 10, tmp_path / "exr")
-    found = read_mattes(tmp_path / "exr" / "0000.exr")
-    assert found.keys() == {"splats", "left ball", "rechts"}
-    centers = {"left ball": 10, "rechts": 21}
-    for name, column in centers.items():
-        assert found[name][12, column] == 1
-        assert found[name].sum() == pytest.approx(np.pi * (0.5 * 0.25 * camera().K[0, 0]) ** 2, rel=0.1)
-    assert found["splats"].max() > 0.5
-    assert found["splats"][12, list(centers.values())].max() == 0
-    total = sum(found.values())
-    assert total.max() <= 1 + 1e-5
-    np.testing.assert_allclose(total[found["splats"] == 0].max(), 1, atol=1e-5)
-
-
-def read_mattes(path: Path) -> dict[str, np.ndarray]:
-    """Return the mattes of a Cryptomatte file [H, W] by name, as a compositing program finds them."""
-    with OpenEXR.File(str(path), separate_channels=True) as file:
-        header = dict(file.header())
-        planes = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-    (key,) = (name.removesuffix("/manifest") for name in header if name.endswith("/manifest"))
-    assert header[f"{key}/hash"] == "MurmurHash3_32"
-    assert header[f"{key}/conversion"] == "uint32_to_float32"
-    result, layer = {}, header[f"{key}/name"]
-    for name, code in json.loads(header[f"{key}/manifest"]).items():
-        ranks = [(f"{layer}{i:02d}.{a}", f"{layer}{i:02d}.{b}") for i in range(3) for a, b in ("RG", "BA")]
-        wanted = np.uint32(int(code, 16))
-        parts = [(planes[i].view(np.uint32) == wanted) * planes[c] for i, c in ranks if i in planes]
-        result[name] = np.sum(parts, axis=0)
-    return result
+    write_images([(0, images)], 10, tmp_path / "exr")
+    names = read_exr(tmp_path / "exr" / "0000.exr").keys()
+    assert {"R", "A", "depth.Y", "splats.R", "surfaces.A", "shadow.R", "motion.X"} <= names
 
 
 def test_selected__refuses_missing_frames(stream):
