@@ -1,6 +1,6 @@
 """Command line, the package's only argument parser.
 
-`morgs-mi synth`, `info`, `calibrate`, `fit`, `live`, `batch`, `render`, `export`, `import`, `view`, `eval`, `salvage`
+`morgs-mi synth`, `info`, `calibrate`, `fit`, `live`, `render`, `export`, `import`, `view`, `eval`, `salvage`
 and `demo`.
 
 Results go to standard output; progress, warnings and errors to standard error. An error that the user can correct is
@@ -25,7 +25,6 @@ from typing import Annotated, Any, Literal
 import tyro
 from tyro.conf import arg
 
-from morgs_mi.cli.batch import Batch
 from morgs_mi.cli.calibrate import Calibrate
 from morgs_mi.cli.completion import completion_script, suggesting_command
 from morgs_mi.cli.console import ERR, LogHandler, naming_output, print_result, print_warning, sentence_of
@@ -51,7 +50,6 @@ Command = (
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[Fit, tyro.conf.subcommand("fit")]
     | Annotated[Live, tyro.conf.subcommand("live")]
-    | Annotated[Batch, tyro.conf.subcommand("batch")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Import, tyro.conf.subcommand("import")]

@@ -118,7 +118,7 @@ def test_main__names_options_not_arguments(tmp_path: Path, run, args, parts) -> 
     assert not out.exists()
 
 
-COMMANDS = ("synth", "info", "calibrate", "fit", "batch", "render", "import", "view", "eval", "salvage", "demo")
+COMMANDS = ("synth", "info", "calibrate", "fit", "render", "import", "view", "eval", "salvage", "demo")
 EXPORTS = ("ply", "gltf", "usd", "video", "tracks", "web")
 
 
