@@ -3,8 +3,8 @@
     python -m benchmarks.speed.forged_memory --json out.json
 
 Each stream is a keyframe of equal Gaussians, which an entropy code stores in almost no bytes, with as few words of code
-as a decoder accepts. It is played, and salvaged to another file, each in a process of its own. Memory is the largest
-resident set beyond that for a stream of one Gaussian, in MB.
+as a decoder accepts. It is played in a process of its own. Memory is the largest resident set beyond that for a stream
+of one Gaussian, in MB.
 """
 
 from __future__ import annotations
@@ -27,10 +27,7 @@ from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import CodedFrame, coded_frames, reemitted_keyframe
 from morgs_mi.codec.quantisation import Grid
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.codec.salvage import write_salvaged
 from morgs_mi.core.camera import Camera
-
-COMMANDS = ("play", "salvage")
 
 
 @dataclass(frozen=True)
@@ -55,21 +52,17 @@ def write_forged(path: Path, count: int, degree: int) -> None:
         writer.write(reemitted_keyframe(state))
 
 
-def read(command: str, path: str) -> None:
-    """Play or salvage a stream, and print the largest resident set of this process in MB."""
+def play(path: str) -> None:
+    """Play a stream, and print the largest resident set of this process in MB."""
     mi.set_variant("llvm_ad_rgb")
-    stream = StreamReader(Path(path))
-    if command == "play":
-        assert sum(1 for _ in coded_frames(stream)) == 1
-    else:
-        assert write_salvaged(stream, stream.path.with_name("salvaged"))[0] == [0]
+    assert sum(1 for _ in coded_frames(StreamReader(Path(path)))) == 1
     print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6)
 
 
-def memory(command: str, path: Path) -> float:
-    """Return the largest resident set of a process that reads a stream, MB."""
-    code = "import sys; from benchmarks.speed.forged_memory import read; read(*sys.argv[1:])"
-    arguments = [sys.executable, "-c", code, command, str(path)]
+def memory(path: Path) -> float:
+    """Return the largest resident set of a process that plays a stream, MB."""
+    code = "import sys; from benchmarks.speed.forged_memory import play; play(sys.argv[1])"
+    arguments = [sys.executable, "-c", code, str(path)]
     return float(subprocess.run(arguments, check=True, capture_output=True, text=True).stdout)
 
 
@@ -79,12 +72,12 @@ def measure(options: Options) -> list[dict[str, Any]]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "stream.morgs"
         write_forged(path, 1, 0)
-        before = {command: memory(command, path) for command in COMMANDS}
+        before = memory(path)
         for count, degree in options.streams:
             write_forged(path, count, degree)
             size = path.stat().st_size / 1e6
-            taken = {f"{command}_mb": memory(command, path) - before[command] for command in COMMANDS}
-            rows.append({"gaussians": count, "degree": degree, "file_mb": size, **taken, "aim_mb": 10 * size + 200})
+            figures = {"file_mb": size, "play_mb": memory(path) - before, "aim_mb": 10 * size + 200}
+            rows.append({"gaussians": count, "degree": degree, **figures})
     return rows
 
 

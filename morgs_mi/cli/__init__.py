@@ -1,7 +1,6 @@
 """Command line, the package's only argument parser.
 
-`morgs-mi synth`, `info`, `calibrate`, `fit`, `live`, `render`, `export`, `import`, `view`, `eval`, `salvage`
-and `demo`.
+`morgs-mi synth`, `info`, `calibrate`, `fit`, `live`, `render`, `export`, `import`, `view`, `eval` and `demo`.
 
 Results go to standard output; progress, warnings and errors to standard error. An error that the user can correct is
 one sentence and exit status 1, an interruption by Ctrl-C or SIGTERM is status 130; `--debug` adds the traceback.
@@ -36,7 +35,6 @@ from morgs_mi.cli.import_frames import Import
 from morgs_mi.cli.info import Info
 from morgs_mi.cli.live import Live
 from morgs_mi.cli.render import Render
-from morgs_mi.cli.salvage import Salvage
 from morgs_mi.cli.settings import Flag, Settings
 from morgs_mi.cli.synth import Synth
 from morgs_mi.cli.view import View
@@ -55,7 +53,6 @@ Command = (
     | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
-    | Annotated[Salvage, tyro.conf.subcommand("salvage")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
 )
 
