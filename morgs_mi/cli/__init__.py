@@ -16,7 +16,6 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
-from functools import partial
 from importlib.metadata import version
 from io import TextIOWrapper
 from typing import Annotated, Any, Literal
@@ -25,7 +24,6 @@ import tyro
 from tyro.conf import arg
 
 from morgs_mi.cli.calibrate import Calibrate
-from morgs_mi.cli.completion import completion_script, suggesting_command
 from morgs_mi.cli.console import ERR, LogHandler, naming_output, print_result, print_warning, sentence_of
 from morgs_mi.cli.demo import Demo
 from morgs_mi.cli.evaluate import Eval
@@ -36,6 +34,7 @@ from morgs_mi.cli.info import Info
 from morgs_mi.cli.live import Live
 from morgs_mi.cli.render import Render
 from morgs_mi.cli.settings import Flag, Settings
+from morgs_mi.cli.suggestion import suggesting_command
 from morgs_mi.cli.synth import Synth
 from morgs_mi.cli.view import View
 from morgs_mi.core.interrupts import INTERRUPTED, interruptible, is_interruption
@@ -71,7 +70,7 @@ class Common:
 class Options(Common):
     """Dynamic Gaussian splatting in Mitsuba 3: from a multi-view clip to a stream of moving Gaussians.
 
-    Alone, --version prints the version, and --completion bash, zsh or fish the completion of commands for this shell.
+    Alone, --version prints the version, and --tyro-write-completion bash FILE writes the completion of a shell.
     """
 
     command: Annotated[Command, arg(name="")] = tyro.MISSING
@@ -89,8 +88,8 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
     if isinstance(sys.stdout, TextIOWrapper):  # a character that the encoding does not have is printed as a code
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
-        if options_type is Options and (answer := _answer(prog, args)):
-            print_result(answer)
+        if options_type is Options and args == ["--version"]:
+            print_result(f"{prog} {version('morgs-mi')}")
             with naming_output():
                 sys.stdout.flush()
             return 0
@@ -115,16 +114,6 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
             ERR.print_exception()
         _drop_output()
         return INTERRUPTED if interrupted else 1
-
-
-def _answer(prog: str, args: Sequence[str]) -> str:
-    """Return the output of --version or --completion; nothing with other arguments."""
-    match args:
-        case ["--version"]:
-            return f"{prog} {version('morgs-mi')}"
-        case ["--completion", ("bash" | "zsh" | "fish") as shell]:
-            return completion_script(partial(_parse, Options, prog), shell)
-    return ""
 
 
 def _parse(options_type: type[Common], prog: str, args: Sequence[str]) -> Any:
