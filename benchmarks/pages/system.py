@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from benchmarks.pages.results import Scores, committed, span
-from benchmarks.reports.plots import Column, grouped, markdown, plus_minus, scores_table
+from benchmarks.reports.plots import grouped, markdown, plus_minus
 
 __all__ = [
     "accuracy",
@@ -20,7 +20,6 @@ __all__ = [
     "modelled",
     "peer_photos",
     "peers",
-    "seams",
     "splat_files",
     "stages",
     "steps",
@@ -142,19 +141,6 @@ def modelled() -> str:
         for row in committed("scaling")["model"]
     )
     return markdown(("workers", "time", "efficiency", "bottleneck"), rows)
-
-
-def seams() -> str:
-    """Return quality and size of segmented fits: at a seam, around it, and in one piece."""
-    columns = (
-        Column("around, dB", "psnr_around", spread=False),
-        Column("in one piece, dB", lambda seam: seam["whole"]["psnr"], spread=False),
-        Column("seam - around, dB", lambda seam: seam["psnr"] - seam["psnr_around"]),
-        Column("mTV, ratio", lambda seam: seam["mtv"] / seam["mtv_around"]),
-        Column("size, ratio", lambda seam: seam["num_bytes"] / seam["num_bytes_whole"], spread=False),
-    )
-    keys = {"clip": lambda seam: f"`{seam['scene']}` {seam['seed']}", "frame": "frame"}
-    return scores_table(committed("seams")["fits"], keys, columns)
 
 
 def steps() -> str:

@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from tyro.conf import Positional
@@ -39,9 +39,11 @@ from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.results import Evaluation, known_mean
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import PRESETS, StreamConfig, apply_preset
-from morgs_mi.runs.cluster.executor import Workers
 from morgs_mi.runs.cluster.tasks import Source
 from morgs_mi.stream_loop import FrameReport, StreamState
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 # Rows of the paper's table of key views.
 _WITHOUT_OFFSET, _WITH_OFFSET = "ml", "ml-mo"
@@ -125,9 +127,9 @@ class Options(OnWorkers):
             )
         clips, settings = [], {n: v for n, v in asdict(self).items() if n not in _WORK}
         about = {"table_epochs": self.table_epochs, "version": self.version or method_version()}
-        with self.opened() as workers:
+        with self.opened() as client:
             for path in self.captures:
-                clips.append(measure(path, self, workers))
+                clips.append(measure(path, self, client))
                 page = method_page(clips, self.table_epochs)
                 (self.out / "method.md").write_text(page, encoding="utf-8")
                 result = {"clips": clips, **about, "settings": settings}
@@ -137,13 +139,13 @@ class Options(OnWorkers):
         print(f"{page}\nAll figures: {self.out / 'method.json'}")
 
 
-def measure(path: Path, options: Options, workers: Workers | None) -> dict[str, Any]:
+def measure(path: Path, options: Options, client: Client | None) -> dict[str, Any]:
     """Return the results of one clip."""
     capture = load_capture(path, max_frames=options.frames)
     if capture.num_frames < 2:
         raise ValueError(f"{capture.path}: expected a capture of two frames or more, got {capture.num_frames}.")
     presets, key_views = variants_of(options, len(capture.train_views))
-    rows = fitted(capture, [*presets, *(v for v in key_views if v not in presets)], presets, options, workers)
+    rows = fitted(capture, [*presets, *(v for v in key_views if v not in presets)], presets, options, client)
     camera = capture.cameras[0]
     return {
         "name": capture.path.resolve().name,
@@ -153,7 +155,7 @@ def measure(path: Path, options: Options, workers: Workers | None) -> dict[str, 
         "height": camera.height,
         "held_out": bool(capture.test_views),
         "cue": flow_error(capture, options.stream) if capture.truth is not None else None,
-        "scratch": from_scratch(capture, options, workers),
+        "scratch": from_scratch(capture, options, client),
         "rows": aggregate(rows, presets),
         "key_view_rows": aggregate(rows, key_views),
     }
@@ -195,13 +197,13 @@ def fitted(
     variants: Sequence[Variant],
     presets: Sequence[Variant],
     options: Options,
-    workers: Workers | None,
+    client: Client | None,
 ) -> list[Row]:
     """Return the rows of all variants with the first seed, and of the others at the best rates and all key views."""
     source, rows = Source.of(capture), list[Row]()
     start = Study(first_frame, [Scene({"frame": 0}, (replace(source, num_frames=1),))], [Variant({}, options.base)])
     start = replace(start, seeds=range(options.seeds), version=options.version)
-    firsts = {row["fit_seed"]: row["packet"] for row in start.run(workers, options.out)}
+    firsts = {row["fit_seed"]: row["packet"] for row in start.run(client, options.out)}
     # Seed by seed: after an interruption, a report with fewer seeds is complete.
     for seed in range(options.seeds):
         if seed:
@@ -210,7 +212,7 @@ def fitted(
         else:
             chosen = variants
         scenes = [Scene({}, (source, firsts[seed]))]
-        rows += Study(later_frames, scenes, chosen, (seed,), version=options.version).run(workers, options.out)
+        rows += Study(later_frames, scenes, chosen, (seed,), version=options.version).run(client, options.out)
     return rows
 
 
@@ -299,7 +301,7 @@ def summary(found: Evaluation, reports: Sequence[FrameReport]) -> dict[str, Any]
     }
 
 
-def from_scratch(capture: Capture, options: Options, workers: Workers | None) -> list[dict[str, Any]]:
+def from_scratch(capture: Capture, options: Options, client: Client | None) -> list[dict[str, Any]]:
     """Return the image scores of some frames that are fitted from scratch like a first frame."""
     steps = _SCRATCH * _PAPER_EPOCHS * len(capture.train_views)
     chosen = np.linspace(capture.num_frames - 1, 1, options.scratch + 1)[: options.scratch].round().astype(int)
@@ -307,7 +309,7 @@ def from_scratch(capture: Capture, options: Options, workers: Workers | None) ->
     frames = dict.fromkeys(chosen.tolist())
     scenes = [Scene({"frame": frame, "steps": steps}, (Source.of(capture), frame)) for frame in frames]
     rows = Study(scratch_frame, scenes, [Variant({}, config)], (config.seed,), version=options.version)
-    return [{n: v for n, v in row.items() if n != "fit_seed"} for row in rows.run(workers, options.out)]
+    return [{n: v for n, v in row.items() if n != "fit_seed"} for row in rows.run(client, options.out)]
 
 
 def scratch_frame(source: Source, frame: int, config: StreamConfig) -> dict[str, float]:

@@ -16,7 +16,6 @@ another:
     frames    later frames of a segment, with the measured efficiency
     tasks     round trips of a segment's tasks
     client    packets through the client's link, their files and the join, one after the other
-    seams     scores of the seams in the client
 
 Times that depend on the images are scaled with the number of cameras. The bottleneck is the longest of the stages that
 more workers do not shorten.
@@ -24,15 +23,14 @@ more workers do not shorten.
 
 from __future__ import annotations
 
-import asyncio
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 import numpy as np
@@ -45,11 +43,15 @@ from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.runs.cluster.executor import Workers, open_workers, wait_for
-from morgs_mi.runs.cluster.seams import COMMON_FRAMES, SegmentConfig, score_seam
-from morgs_mi.runs.cluster.segments import TASK_FRAMES, SegmentedFit, SegmentedRun
+from morgs_mi.runs.cluster.seams import COMMON_FRAMES, SegmentConfig
+from morgs_mi.runs.cluster.segments import TASK_FRAMES, SegmentedRun
+from morgs_mi.runs.cluster.workers import open_client
+from morgs_mi.stream_loop import FrameReport
 from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 _SHORTENED = {"reading", "frames", "tasks"}
 
@@ -119,13 +121,11 @@ class Costs:
         trip: of a task without work.
         read: of a frame's images.
         client: of a frame's packet, written and joined.
-        score: of a seam.
     """
 
     trip: float
     read: float
     client: float
-    score: float
 
 
 def measure(capture: Capture, options: Options, folder: Path) -> tuple[list[Run], Costs]:
@@ -133,13 +133,13 @@ def measure(capture: Capture, options: Options, folder: Path) -> tuple[list[Run]
     runs, costs = [], None
     for count in options.workers:
         out, begin = folder / f"{count}", time.perf_counter()
-        with _limited_to(count), open_workers(count=count) as workers:
-            asyncio.run(workers.run(os.getpid))
+        with _limited_to(count), open_client(count=count) as client:
+            client.submit(os.getpid, pure=False).result()
             start = time.perf_counter() - begin
             begin = time.perf_counter()
-            fit = wait_for(SegmentedRun(capture, out, workers, _config(options), SegmentConfig(options.segments)).fit())
-            runs.append(_run(count, start, time.perf_counter() - begin, fit))
-            costs = costs or _costs(capture, workers, out / "stream.morgs", fit)
+            reports = SegmentedRun(capture, out, client, _config(options), SegmentConfig(options.segments)).fit()
+            runs.append(_run(count, start, time.perf_counter() - begin, reports, out / "stream.morgs"))
+            costs = costs or _costs(capture, client, out / "stream.morgs")
     assert costs is not None
     return runs, costs
 
@@ -161,9 +161,9 @@ def _config(options: Options) -> StreamConfig:
     return StreamConfig(fit=fit)
 
 
-def _run(workers: int, start: float, seconds: float, fit: SegmentedFit) -> Run:
-    starts = {seam.frame for seam in fit.seams}
-    common, others = fit.reports[:COMMON_FRAMES], fit.reports[COMMON_FRAMES:]
+def _run(workers: int, start: float, seconds: float, reports: Sequence[FrameReport], stream: Path) -> Run:
+    starts = StreamReader(stream).metadata["segments"]["starts"]
+    common, others = reports[:COMMON_FRAMES], reports[COMMON_FRAMES:]
     seams = [report.seconds for report in others if report.frame in starts]
     later = [report for report in others if report.frame not in starts]
     return Run(
@@ -177,7 +177,7 @@ def _run(workers: int, start: float, seconds: float, fit: SegmentedFit) -> Run:
     )
 
 
-def _costs(capture: Capture, workers: Workers, stream: Path, fit: SegmentedFit) -> Costs:
+def _costs(capture: Capture, client: Client, stream: Path) -> Costs:
     def seconds_of(work: Any) -> float:
         begin = time.perf_counter()
         work()
@@ -191,10 +191,9 @@ def _costs(capture: Capture, workers: Workers, stream: Path, fit: SegmentedFit) 
 
     frames = capture.num_frames
     return Costs(
-        trip=float(np.median([seconds_of(lambda: asyncio.run(workers.run(os.getpid))) for _ in range(9)])),
+        trip=float(np.median([seconds_of(lambda: client.submit(os.getpid, pure=False).result()) for _ in range(9)])),
         read=seconds_of(lambda: list(capture.partial_frames())) / frames,
         client=2 * seconds_of(write) / frames,  # into the segment, and into the joined stream
-        score=seconds_of(lambda: score_seam(StreamReader(stream), capture, fit.seams[0].frame)),
     )
 
 
@@ -218,7 +217,6 @@ def stages(workers: int, run: Run, costs: Costs, efficiency: float, views: float
         "frames": views * run.later * share / efficiency,
         "tasks": costs.trip * share / TASK_FRAMES,
         "client": (run.num_bytes / options.link + costs.client) * options.long_frames,
-        "seams": views * costs.score * (workers - 1),
     }
 
 

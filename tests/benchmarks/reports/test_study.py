@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,7 +21,6 @@ from benchmarks.reports import (
     masks,
     random_scenes,
     real,
-    seams,
     study,
     timing,
     unseen,
@@ -35,10 +33,10 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.render.render_config import RenderConfig
-from morgs_mi.runs.cluster.executor import open_workers
 from morgs_mi.runs.cluster.tasks import Source
+from morgs_mi.runs.cluster.workers import open_client
 from morgs_mi.synth.disturbances import load_disturbances
-from tests.benchmarks.reports.here import Here
+from tests.benchmarks.reports.here import client_here
 from tests.benchmarks.reports.pages import ROOT
 from tests.scenes.animated_gltf import write_glb
 
@@ -63,7 +61,6 @@ STUDIES = {
     exposure: ({**SMALL, "seeds": (3,)}, 8),
     disturbances: ({**SMALL, "animation": "bend", "cameras": 3}, 10),
     timing: ({**SMALL, "seeds": (3,), "frames": 6, "fitted": 2, "time_offset": 0.4}, 2),
-    seams: ({**SMALL, "scenes": (("spheres", 0, 4),), "cameras": 3, "segment_frames": 2, "fit_seeds": (0,)}, 1),
 }
 FAST = (random_scenes, unseen)
 
@@ -101,18 +98,16 @@ def test_study_options__of_workers_write_the_rows_of_one_process(report, clip: P
     place = {"captures": (clip,)} if report in (masks, real, unseen) else {"clips": tmp_path}
     if report is disturbances:
         place["model"] = write_glb(tmp_path / "model.glb")
-    workers, found = Here(), {}
+    found = {}
     monkeypatch.setattr(fits, "StreamLoop", tiny_loop)
     monkeypatch.setattr(cameras, "refine_cameras", lambda capture, *_: (capture, Scene({}, ())))  # needs larger images
     monkeypatch.setattr(timing, "estimate_time_offsets", true_offsets)
-    monkeypatch.setattr(cells, "open_workers", contextmanager(lambda scheduler, count: iter([workers])))
-    counts = (None,) if report is seams else (None, 2)  # seams have workers of their own
-    for count in counts:
+    monkeypatch.setattr(cells, "open_client", lambda scheduler, count: client_here())
+    for count in (None, 2):
         options = report.Options(json=tmp_path / "out.json", workers=count, **place, **given)
         options.run()
         result = json.loads((tmp_path / "out.json").read_text())
         found[count] = result["fits"]
-    assert workers.left < 99 or report is seams, "a worker was at work"
     assert len(found[None]) == num_rows
     assert {"settings", "commit", "date", "machine", "versions"} <= result.keys()
     assert "clips" not in result["settings"]
@@ -186,6 +181,7 @@ def test_study_options__have_tables_of_the_committed_results():
 def test_run_cells__of_processes_gives_the_scores_of_one_process(clip: Path):
     capture = load_capture(clip)
     args = {seed: (Source.of(capture), capture.train_views, 0.0, replace(TINY, seed=seed)) for seed in (0, 1)}
-    with open_workers(count=2) as workers:
-        ours, theirs = (run_cells(measure, args, each, lambda *_: None) for each in (workers, None))
+    pytest.importorskip("distributed", reason="comes with the extra `cluster`")
+    with open_client(count=2) as client:
+        ours, theirs = (run_cells(measure, args, each, lambda *_: None) for each in (client, None))
     assert without_times(list(ours.values())) == without_times(list(theirs.values()))

@@ -14,7 +14,7 @@ from tests.scenes.recording import write_recording
 
 ONE = Run(workers=1, seconds=100.0, start=3.0, common=10.0, seam=5.0, later=2.0, num_bytes=1000.0)
 TWO = Run(workers=2, seconds=60.0, start=3.0, common=11.0, seam=5.5, later=2.2, num_bytes=1000.0)
-COSTS = Costs(trip=0.01, read=0.0, client=1e-4, score=1.0)
+COSTS = Costs(trip=0.01, read=0.0, client=0.01)
 
 
 def test_efficiencies__compare_with_one_worker() -> None:
@@ -29,7 +29,6 @@ def test_stages__of_frames_fall_with_the_workers_and_others_do_not() -> None:
     assert few["frames"] == pytest.approx(1000)
     assert many["frames"] == pytest.approx(100)
     assert few["client"] == many["client"]
-    assert (few["seams"], many["seams"]) == (1, 19)
     assert list(few) == [line.split()[0] for line in scaling.__doc__.splitlines() if line.startswith("    ")][1:]
 
 
@@ -38,7 +37,7 @@ def test_model__draws_every_number_of_workers(tmp_path: Path) -> None:
     capture = load_capture(write_recording(tmp_path / "clip", 2))
     rows = scaling.model([ONE, TWO], COSTS, capture, Options())
     assert [row["workers"] for row in rows] == [8, 64, 512]
-    assert rows[-1]["bottleneck"] == "seams"
+    assert rows[-1]["bottleneck"] == "client"
     assert rows[0]["efficiency"] > rows[-1]["efficiency"]
     scaling.draw({"efficiency": scaling.efficiencies([ONE, TWO]), "model": rows}, tmp_path / "plot.png")
     assert (tmp_path / "plot.png").stat().st_size > 1000
@@ -46,6 +45,7 @@ def test_model__draws_every_number_of_workers(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_main__measures_a_tiny_clip(tmp_path: Path) -> None:
+    pytest.importorskip("distributed", reason="comes with the extra `cluster`")
     size = {"cameras": 3, "frames": 6, "width": 64, "gaussians": 100, "first_frame_steps": 8, "epochs": 1}
     scaling.main(Options(json=tmp_path / "scaling.json", segments=2, **size))
     found = json.loads((tmp_path / "scaling.json").read_text())

@@ -69,11 +69,11 @@ def test_cluster_page__commands_run(workplace: Path) -> None:
                 assert cli.main([*args, *(QUICK if args[0] == "fit" else [])]) == 0, command
     streams = sorted(str(path.parent.relative_to("out")) for path in Path("out").rglob("stream.morgs"))
     qualities = [f"codec/capture/{quality}" for quality in (1, 1000)]
-    assert streams == ["cluster", *qualities, "dask", "segments", "url"]
+    assert streams == ["cluster", *qualities, "segments", "url"]
     for name in streams:
         assert {frame for _, frame, _ in StreamReader(f"out/{name}/stream.morgs").index()} == set(range(FRAMES))
 
 
 def test_cluster_page__has_commands() -> None:
-    kinds = ["run", "run", "run", "start", "start", "run", "run"]
+    kinds = ["run", "run", "start", "start", "run", "run"]
     assert [kind for kind, _ in BLOCKS] == kinds
