@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.pages.results import committed
-from benchmarks.reports import cameras, codec, drift, field, held_out, random_scenes, real, renderer, seams, timing
+from benchmarks.reports import cameras, codec, drift, field, held_out, random_scenes, real, renderer, timing
 from benchmarks.reports.method_tables import best_rows
 from benchmarks.reports.plots import grouped, markdown
 from benchmarks.reports.unseen import out_of_capture
@@ -161,7 +161,6 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "held_out_views_over_time": lambda: held_out.later_frames(committed("held_out")["fits"]),
     "parts": parts,
     "principal_points": partial(study_table, real, "real"),
-    "seams": partial(study_table, seams, "seams"),
     "splat_files": splat_files,
     "steps": steps,
     "unseen": partial(study_table, random_scenes, "random_scenes"),

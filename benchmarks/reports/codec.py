@@ -14,18 +14,17 @@ values that were rounded to zero; in the reference stream there are none.
 
 from __future__ import annotations
 
-import asyncio
 import lzma
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from tyro.conf import Positional
 
-from benchmarks.reports.cells import OnWorkers
+from benchmarks.reports.cells import OnWorkers, run_cells
 from benchmarks.reports.plots import Column, blank_figure, label_points, save_figure, scores_table
 from benchmarks.reports.study import Row
 from benchmarks.speed.output import Output
@@ -34,9 +33,11 @@ from morgs_mi.codec.packets import CodedFrame, coded_frames, decode, residual_pa
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.streams import open_stream
-from morgs_mi.runs.cluster.executor import Workers, wait_for
-from morgs_mi.runs.cluster.segments import SegmentedRun
+from morgs_mi.runs.cluster.tasks import Source
 from morgs_mi.runs.recorder import stream_capture
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 # The best preset of lzma takes several times as long and saves a few percent.
 _LZMA_PRESET = 6
@@ -75,8 +76,8 @@ class Options(Output, OnWorkers):
         if not self.captures:
             raise ValueError("codec: `captures` must name at least one folder, got none.")
         recordings = [load_capture(path, max_frames=self.frames) for path in self.captures]
-        with self.opened() as workers:
-            clips = [measure(recording, self, workers) for recording in recordings]
+        with self.opened() as client:
+            clips = [measure(recording, self, client) for recording in recordings]
         print(quality_table(clips))
         if self.plot is not None:
             plot_codec(clips, self.plot)
@@ -85,7 +86,7 @@ class Options(Output, OnWorkers):
         self.write({"clips": clips, "settings": settings}, unprinted=["clips", "settings"])
 
 
-def measure(capture: Capture, options: Options, workers: Workers | None) -> dict[str, Any]:
+def measure(capture: Capture, options: Options, client: Client | None) -> dict[str, Any]:
     """Fit a capture with every quality, side by side on workers, and return the figures of the streams.
 
     Raises:
@@ -97,12 +98,11 @@ def measure(capture: Capture, options: Options, workers: Workers | None) -> dict
     qualities, codec = (*options.qualities, options.reference), options.stream.codec
     settings = {quality: replace(options.stream, codec=replace(codec, quality=quality)) for quality in qualities}
     folders = {quality: options.out / name / f"{quality:g}" for quality in qualities}
-    if workers is not None:
-        wait_for(_fit_all(capture, {folders[q]: settings[q] for q in qualities}, workers, options.resume))
+    source = Source.of(capture)
+    cells = {q: (source, folders[q].resolve(), settings[q], options.resume) for q in qualities}
+    run_cells(_fit, cells, client, lambda quality, _: print(f"{name} at quality {quality:g}", flush=True))
     rows = []
     for quality, folder in folders.items():
-        print(f"{name} at quality {quality:g}", flush=True)
-        stream_capture(capture, folder, settings[quality], resume=options.resume or workers is not None)
         rows.append({"quality": quality, **_evaluated(folder, capture), **_measured(folder, settings[quality])})
     best = rows[-1]["psnr"]["later"]
     return {"name": name, "rows": [{**row, "loss": best - row["psnr"]["later"]} for row in rows]}
@@ -144,10 +144,9 @@ def plot_codec(clips: Sequence[Row], path: Path) -> None:
     save_figure(figure, path)
 
 
-async def _fit_all(capture: Capture, fits: Mapping[Path, StreamConfig], workers: Workers, resume: bool) -> None:
-    """Fit a capture into several folders, side by side."""
-    fit = (SegmentedRun(capture, folder, workers, config).fit(resume) for folder, config in fits.items())
-    await asyncio.gather(*fit)
+def _fit(source: Source, folder: Path, config: StreamConfig, resume: bool) -> None:
+    """Fit a capture into a folder, which workers share with this process."""
+    stream_capture(source.open(), folder, config, resume)
 
 
 def _evaluated(folder: Path, capture: Capture) -> dict[str, Any]:

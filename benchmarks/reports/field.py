@@ -189,8 +189,8 @@ def plot_field(cells: Cells, path: Path) -> None:
 def main(options: Options) -> None:
     """Run the report."""
     mi.set_variant("llvm_ad_rgb")
-    with options.opened() as workers:
-        cells = run_cells(measure, options.cells(), workers, lambda name, _: print(f"{name} is done", flush=True))
+    with options.opened() as client:
+        cells = run_cells(measure, options.cells(), client, lambda name, _: print(f"{name} is done", flush=True))
     print(field_table(cells))
     if options.plot is not None:
         plot_field(cells, options.plot)

@@ -19,7 +19,7 @@ from dataclasses import asdict, dataclass, field, replace
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from tyro.conf import Positional
@@ -40,9 +40,11 @@ from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import PRESETS, StreamConfig, apply_preset
 from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FramePair
-from morgs_mi.runs.cluster.executor import Workers
 from morgs_mi.runs.cluster.tasks import Source
 from morgs_mi.stream_loop import FrameReport
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 # Rows of the paper's table of key views.
 _WITHOUT_OFFSET, _WITH_OFFSET = "ml", "ml-mo"
@@ -122,9 +124,9 @@ class Options(OnWorkers):
             )
         clips, settings = [], {n: v for n, v in asdict(self).items() if n not in _WORK}
         about = {"table_epochs": self.table_epochs, "version": self.version or method_version()}
-        with self.opened() as workers:
+        with self.opened() as client:
             for path in self.captures:
-                clips.append(measure(path, self, workers))
+                clips.append(measure(path, self, client))
                 page = method_page(clips, self.table_epochs)
                 (self.out / "method.md").write_text(page, encoding="utf-8")
                 result = {"clips": clips, **about, "settings": settings}
@@ -134,13 +136,13 @@ class Options(OnWorkers):
         print(f"{page}\nAll figures: {self.out / 'method.json'}")
 
 
-def measure(path: Path, options: Options, workers: Workers | None) -> dict[str, Any]:
+def measure(path: Path, options: Options, client: Client | None) -> dict[str, Any]:
     """Return the results of one clip."""
     capture = load_capture(path, max_frames=options.frames)
     if capture.num_frames < 2:
         raise ValueError(f"{capture.path}: expected a capture of two frames or more, got {capture.num_frames}.")
     presets, key_views = variants_of(options, len(capture.train_views))
-    rows = fitted(capture, [*presets, *(v for v in key_views if v not in presets)], presets, options, workers)
+    rows = fitted(capture, [*presets, *(v for v in key_views if v not in presets)], presets, options, client)
     camera = capture.cameras[0]
     return {
         "name": capture.path.resolve().name,
@@ -191,13 +193,13 @@ def fitted(
     variants: Sequence[Variant],
     presets: Sequence[Variant],
     options: Options,
-    workers: Workers | None,
+    client: Client | None,
 ) -> list[Row]:
     """Return the rows of all variants with the first seed, and of the others at the best rates and all key views."""
     source, rows = Source.of(capture), list[Row]()
     start = Study(first_frame, [Scene({"frame": 0}, (replace(source, num_frames=1),))], [Variant({}, options.base)])
     start = replace(start, seeds=range(options.seeds), version=options.version)
-    firsts = {row["fit_seed"]: row["packet"] for row in start.run(workers, options.out)}
+    firsts = {row["fit_seed"]: row["packet"] for row in start.run(client, options.out)}
     # Seed by seed: after an interruption, a report with fewer seeds is complete.
     for seed in range(options.seeds):
         if seed:
@@ -206,7 +208,7 @@ def fitted(
         else:
             chosen = variants
         scenes = [Scene({}, (source, firsts[seed]))]
-        rows += Study(later_frames, scenes, chosen, (seed,), version=options.version).run(workers, options.out)
+        rows += Study(later_frames, scenes, chosen, (seed,), version=options.version).run(client, options.out)
     return rows
 
 

@@ -20,7 +20,7 @@ from functools import cache
 from itertools import product
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 
@@ -29,7 +29,9 @@ from benchmarks.reports.cells import OnWorkers, run_cells
 from benchmarks.speed.output import Output
 from morgs_mi.core.files import json_finite, write_json
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.runs.cluster.executor import Workers
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 __all__ = ["Row", "Scene", "Study", "StudyOptions", "Variant", "method_version", "rounded"]
 
@@ -86,11 +88,11 @@ class Study:
     seed_key: str = "fit_seed"
     version: str | None = None
 
-    def run(self, workers: Workers | None, store: Path | None = None) -> list[Row]:
+    def run(self, client: Client | None, store: Path | None = None) -> list[Row]:
         """Return the rows of all cells, in the order of scenes, variants and seeds.
 
         Args:
-            workers: from `open_workers`; None: this process fits one cell after the other.
+            client: from `open_client`; None: this process fits one cell after the other.
             store: folder of the scores of finished cells, which are not fitted again while the version of the method,
                 the settings and the files of the scene stay as they are; None: all cells are fitted.
 
@@ -111,7 +113,7 @@ class Study:
             if store:
                 write_json(files[name], found[name])
 
-        run_cells(self.measure, {n: args for n, args in cells.items() if n not in found}, workers, arrived)
+        run_cells(self.measure, {n: args for n, args in cells.items() if n not in found}, client, arrived)
         results = {name: found[name] if isinstance(found[name], list) else [found[name]] for name in cells}
         return [{**keys[name], **row} for name, rows in results.items() for row in rows]
 
@@ -143,8 +145,8 @@ class StudyOptions(Output, OnWorkers):
     def run(self) -> None:
         """Run the study, print its table, and write its rows."""
         mi.set_variant("llvm_ad_rgb")
-        with self.opened() as workers:
-            rows = self.study().run(workers, self.store)
+        with self.opened() as client:
+            rows = self.study().run(client, self.store)
         print(self.table(rows))
         self.write({"settings": self.settings(), "fits": rows}, unprinted=["settings", "fits"])
 

@@ -9,10 +9,9 @@ and of the whole fit.
 
 from __future__ import annotations
 
-import asyncio
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -24,11 +23,13 @@ import tyro
 
 from benchmarks.speed.output import Output
 from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.codec.reader import StreamReader
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.runs.cluster.executor import open_workers, wait_for
 from morgs_mi.runs.cluster.seams import COMMON_FRAMES, SegmentConfig
-from morgs_mi.runs.cluster.segments import SegmentedFit, SegmentedRun
+from morgs_mi.runs.cluster.segments import SegmentedRun
+from morgs_mi.runs.cluster.workers import open_client
+from morgs_mi.stream_loop import FrameReport
 from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
@@ -84,14 +85,14 @@ def measure(capture: Capture, options: Options, folder: Path) -> list[Run]:
     """Return the measured fits."""
     runs = []
     for count in options.workers:
+        out = folder / f"{count}"
         begin = time.perf_counter()
-        with _limited_to(count), open_workers(count=count) as workers:
-            asyncio.run(workers.run(os.getpid))
+        with _limited_to(count), open_client(count=count) as client:
+            client.submit(os.getpid, pure=False).result()
             start = time.perf_counter() - begin
             begin = time.perf_counter()
-            segments = SegmentConfig(options.segments)
-            fit = wait_for(SegmentedRun(capture, folder / f"{count}", workers, _config(options), segments).fit())
-            runs.append(_run(count, start, time.perf_counter() - begin, fit))
+            reports = SegmentedRun(capture, out, client, _config(options), SegmentConfig(options.segments)).fit()
+            runs.append(_run(count, start, time.perf_counter() - begin, reports, out / "stream.morgs"))
     return runs
 
 
@@ -112,9 +113,9 @@ def _config(options: Options) -> StreamConfig:
     return StreamConfig(fit=fit)
 
 
-def _run(workers: int, start: float, seconds: float, fit: SegmentedFit) -> Run:
-    starts = {seam.frame for seam in fit.seams}
-    common, others = fit.reports[:COMMON_FRAMES], fit.reports[COMMON_FRAMES:]
+def _run(workers: int, start: float, seconds: float, reports: Sequence[FrameReport], stream: Path) -> Run:
+    starts = StreamReader(stream).metadata["segments"]["starts"]
+    common, others = reports[:COMMON_FRAMES], reports[COMMON_FRAMES:]
     seams = [report.seconds for report in others if report.frame in starts]
     later = [report for report in others if report.frame not in starts]
     return Run(

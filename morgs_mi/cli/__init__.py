@@ -1,7 +1,6 @@
 """Command line, the package's only argument parser.
 
-`morgs-mi synth`, `info`, `calibrate`, `fit`, `live`, `batch`, `render`, `export`, `import`, `view`, `eval`, `salvage`
-and `demo`.
+`morgs-mi synth`, `info`, `calibrate`, `fit`, `live`, `render`, `export`, `import`, `view`, `eval` and `demo`.
 
 Results go to standard output; progress, warnings and errors to standard error. An error that the user can correct is
 one sentence and exit status 1, an interruption by Ctrl-C or SIGTERM is status 130; `--debug` adds the traceback.
@@ -17,7 +16,6 @@ import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
-from functools import partial
 from importlib.metadata import version
 from io import TextIOWrapper
 from typing import Annotated, Any, Literal
@@ -25,9 +23,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from tyro.conf import arg
 
-from morgs_mi.cli.batch import Batch
 from morgs_mi.cli.calibrate import Calibrate
-from morgs_mi.cli.completion import completion_script, suggesting_command
 from morgs_mi.cli.console import ERR, LogHandler, naming_output, print_result, print_warning, sentence_of
 from morgs_mi.cli.demo import Demo
 from morgs_mi.cli.evaluate import Eval
@@ -37,8 +33,8 @@ from morgs_mi.cli.import_frames import Import
 from morgs_mi.cli.info import Info
 from morgs_mi.cli.live import Live
 from morgs_mi.cli.render import Render
-from morgs_mi.cli.salvage import Salvage
 from morgs_mi.cli.settings import Flag, Settings
+from morgs_mi.cli.suggestion import suggesting_command
 from morgs_mi.cli.synth import Synth
 from morgs_mi.cli.view import View
 from morgs_mi.core.interrupts import INTERRUPTED, interruptible, is_interruption
@@ -51,13 +47,11 @@ Command = (
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[Fit, tyro.conf.subcommand("fit")]
     | Annotated[Live, tyro.conf.subcommand("live")]
-    | Annotated[Batch, tyro.conf.subcommand("batch")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
-    | Annotated[Salvage, tyro.conf.subcommand("salvage")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
 )
 
@@ -76,7 +70,7 @@ class Common:
 class Options(Common):
     """Dynamic Gaussian splatting in Mitsuba 3: from a multi-view clip to a stream of moving Gaussians.
 
-    Alone, --version prints the version, and --completion bash, zsh or fish the completion of commands for this shell.
+    Alone, --version prints the version, and --tyro-write-completion bash FILE writes the completion of a shell.
     """
 
     command: Annotated[Command, arg(name="")] = tyro.MISSING
@@ -94,8 +88,8 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
     if isinstance(sys.stdout, TextIOWrapper):  # a character that the encoding does not have is printed as a code
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
-        if options_type is Options and (answer := _answer(prog, args)):
-            print_result(answer)
+        if options_type is Options and args == ["--version"]:
+            print_result(f"{prog} {version('morgs-mi')}")
             with naming_output():
                 sys.stdout.flush()
             return 0
@@ -120,16 +114,6 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
             ERR.print_exception()
         _drop_output()
         return INTERRUPTED if interrupted else 1
-
-
-def _answer(prog: str, args: Sequence[str]) -> str:
-    """Return the output of --version or --completion; nothing with other arguments."""
-    match args:
-        case ["--version"]:
-            return f"{prog} {version('morgs-mi')}"
-        case ["--completion", ("bash" | "zsh" | "fish") as shell]:
-            return completion_script(partial(_parse, Options, prog), shell)
-    return ""
 
 
 def _parse(options_type: type[Common], prog: str, args: Sequence[str]) -> Any:

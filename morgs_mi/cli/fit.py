@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Fit"]
 
-_SCHEDULER = f"Dask scheduler whose workers fit them, such as tcp://host:8786, or local ({page('cluster')})."
+_SCHEDULER = f"Dask scheduler whose workers fit them, such as tcp://host:8786 ({page('cluster')})."
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,8 @@ class Fit:
     resume: Flag = False
     """Continue an interrupted fit in OUT; capture and settings must be the same."""
     segments: Annotated[int | None, DisallowNone, optional("INT", "(default: 1)")] = None
-    """Number of stretches of the recording that are fitted side by side; each begins with a keyframe."""
+    """Number of stretches of the recording that are fitted side by side, by the extra cluster; each begins with a
+    keyframe."""
     scheduler: Annotated[str | None, DisallowNone, optional("ADDRESS", text=_SCHEDULER)] = None
     print_config: Flag = False
     """Print all settings as TOML and exit."""
@@ -77,29 +78,25 @@ class Fit:
         capture = load_capture(
             self.capture, self.downscale, held_out(self.test_view), self.frames, self.reading.read_config()
         )
-        if any(option is not None for option in (self.segments, self.scheduler)):
-            self._fit_in_segments(capture, config)
-            return
         stream = self.out / "stream.morgs"
-        with progress() as report, _noting_frames(stream, capture.num_frames, self.resume):
-            reports = stream_capture(capture, self.out, config, self.resume, report)
+        if self.segments is not None or self.scheduler is not None:
+            reports = self._fit_in_segments(capture, config)
+        else:
+            with progress() as report, _noting_frames(stream, capture.num_frames, self.resume):
+                reports = stream_capture(capture, self.out, config, self.resume, report)
         _print_summary(stream, reports)
 
-    def _fit_in_segments(self, capture: Capture, config: StreamConfig) -> None:
-        """Fit a capture in segments, and print the scores of the seams."""
-        from morgs_mi.runs.cluster.executor import cores, open_workers, wait_for
+    def _fit_in_segments(self, capture: Capture, config: StreamConfig) -> list[FrameReport]:
+        """Fit a capture in segments."""
         from morgs_mi.runs.cluster.seams import SegmentConfig
         from morgs_mi.runs.cluster.segments import SegmentedRun, noting_segments
+        from morgs_mi.runs.cluster.workers import cores, open_client
 
         assert self.out is not None
         segments = SegmentConfig(self.segments or 1)
         workers = min(segments.count, cores())
-        with noting_segments(self.out), progress() as report, open_workers(self.scheduler, workers) as opened:
-            run = SegmentedRun(capture, self.out, opened, config, segments, report)
-            fit = wait_for(run.fit(self.resume))
-        _print_summary(self.out / "stream.morgs", fit.reports)
-        for seam in fit.seams:
-            print_result(f"Seam before {seam}.")
+        with noting_segments(self.out), progress() as report, open_client(self.scheduler, workers) as client:
+            return SegmentedRun(capture, self.out, client, config, segments, report).fit(self.resume)
 
 
 def _print_summary(stream: Path, reports: Sequence[FrameReport]) -> None:

@@ -32,20 +32,21 @@ def most_invalid(drop_invalid: bool, drawn: bool = True) -> float:
     return 1.0 if drop_invalid else DRAWN if drawn else 0.0
 
 
-def opened(out: Path, drop_invalid: bool, drawn: bool = True) -> PlayableStream:
+def opened(out: Path, drop_invalid: bool, drawn: bool = True, skip_damaged: bool = False) -> PlayableStream:
     """Return the stream that a command reads, and print which cameras a file of Gaussians has.
 
     Args:
         out: folder of a fit, a stream file, or a file of Gaussians.
         drop_invalid: as for `most_invalid`.
         drawn: as for `most_invalid`.
+        skip_damaged: as for `open_stream`.
 
     Raises:
         FileNotFoundError, ValueError: as for `open_stream`.
     """
     from morgs_mi.playback.streams import open_stream
 
-    stream = open_stream(out, most_invalid(drop_invalid, drawn))
+    stream = open_stream(out, most_invalid(drop_invalid, drawn), skip_damaged)
     if drawn:
         print_cameras(stream)
     return stream

@@ -11,7 +11,7 @@ from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.opening import DropInvalid, opened
-from morgs_mi.cli.settings import ChannelName, one_of, optional
+from morgs_mi.cli.settings import ChannelName, Flag, one_of, optional
 from morgs_mi.core.documentation import page
 from morgs_mi.playback.export.formats import IMAGES, destination
 
@@ -80,6 +80,8 @@ class Render:
     """Light of an inserted scene: an environment map at its middle, or rays traced through the Gaussians, for their
     shadows and reflections."""
     drop_invalid: DropInvalid = False
+    skip_damaged: Flag = False
+    """Skip damaged frames of a stream, and those after them up to the next intact keyframe."""
 
     def run(self) -> None:
         from morgs_mi.playback.export.clips import frame_numbers, named_path, num_images
@@ -87,7 +89,7 @@ class Render:
         from morgs_mi.playback.player import find_camera
 
         self._check()
-        stream = opened(self.out, self.drop_invalid)
+        stream = opened(self.out, self.drop_invalid, skip_damaged=self.skip_damaged)
         view = find_camera(stream, 0 if self.camera is None else self.camera)
         stem = Path(self.path or "orbit").stem if self.camera is None and self.insert is None else view.name
         output, chosen = destination(stream.path, self.output, IMAGES, self.format, stem)

@@ -30,6 +30,8 @@ __all__ = ["StreamReader"]
 
 _CHUNK = 2**20
 
+_Entry = tuple[int, int, int]
+
 
 class StreamReader:
     """Reader of a stream.
@@ -39,21 +41,25 @@ class StreamReader:
 
     Args:
         source: path of the file, or a binary file object, such as a pipe or the file of a socket.
+        skip_damaged: leave out damaged packets of a file, and all that follow one up to the next intact keyframe. A
+            damaged length hides the packets after it, unless the file ends with an intact index.
 
     Attributes:
         path: the file.
         cameras: the rig.
         fps: frames per second.
         metadata: metadata that was passed to the writer.
+        skipped: frames that are left out as damaged, ascending.
 
     Raises:
         FileNotFoundError: there is no such file.
         TruncatedStreamError: the stream ends inside a packet (while iterating: after the complete ones).
-        ValueError: it is not a stream, has another version, or a packet is broken. The message names the
-            file, the packet's number and byte offset and the number of intact packets before it.
+        ValueError: it is not a stream, has another version, or a packet is broken. The message names the file, the
+            packet's number and byte offset, the number of intact packets before it and the frame of the last of them;
+            or damage is to be skipped in a pipe.
     """
 
-    def __init__(self, source: str | Path | BinaryIO) -> None:
+    def __init__(self, source: str | Path | BinaryIO, skip_damaged: bool = False) -> None:
         self._pipe = None if isinstance(source, str | Path) else source
         self.path = Path(source if isinstance(source, str | Path) else str(getattr(source, "name", "stream")))
         with self._opened() as file:
@@ -76,6 +82,10 @@ class StreamReader:
                     raise ValueError(f"the first packet must be the header, got kind {kind}")
                 self.cameras, self.fps, self.metadata = header_fields(payload)
         self._first = PREAMBLE.size + len(data)
+        self._kept: list[_Entry] | None = None
+        self.skipped: list[int] = []
+        if skip_damaged:
+            self._kept, self.skipped = self._playable()
 
     def __iter__(self) -> Iterator[Packet]:
         return self._packets(1, self._first)
@@ -106,12 +116,16 @@ class StreamReader:
         with open(self.path, "rb") as file:
             return self._last_index(file) is not None
 
-    def index(self) -> list[tuple[int, int, int]]:
+    def index(self) -> list[_Entry]:
         """Return (kind, frame, offset) of every complete packet except the header, from the index if there is one.
+
+        Those that are left out as damaged have no entry.
 
         Raises:
             TruncatedStreamError: the file is now shorter than the header that was read from it.
         """
+        if self._kept is not None:
+            return list(self._kept)
         with open(self.path, "rb") as file:
             if (entries := self._last_index(file)) is not None:
                 return entries
@@ -124,7 +138,35 @@ class StreamReader:
                 at += PAYLOAD + length
             return entries
 
-    def _last_index(self, file: BinaryIO) -> list[tuple[int, int, int]] | None:
+    def _playable(self) -> tuple[list[_Entry], list[int]]:
+        """Return the entries of the packets that play without the damaged ones, and the frames that do not play."""
+        if self._pipe is not None:
+            raise ValueError(f"{self.path}: expected a file to skip damage in, got a pipe; save it first.")
+        kept = list[_Entry]()
+        frames = [-1]
+        plays = False
+        with open(self.path, "rb") as file:
+            for number, (kind, frame, offset) in enumerate(self.index(), start=1):
+                if self._is_intact(file, number, offset):
+                    frames.append(frame)
+                    plays = plays or kind == PacketKind.KEYFRAME
+                    if plays:
+                        kept.append((kind, frame, offset))
+                else:
+                    # A damaged head may name any frame. A keyframe that repeats the state of a frame is not needed.
+                    frames.append(frame if frame == frames[-1] else frames[-1] + 1)
+                    plays = plays and kept[-1][1] == frames[-1]
+        return kept, sorted({*frames[1:]} - {frame for _, frame, _ in kept})
+
+    def _is_intact(self, file: BinaryIO, number: int, at: int) -> bool:
+        file.seek(at)
+        try:
+            decode_packet(self._packet(file, number, at) or b"")
+        except ValueError:
+            return False
+        return True
+
+    def _last_index(self, file: BinaryIO) -> list[_Entry] | None:
         """Return the entries of the index at the file's end, None if there is none."""
         size = file.seek(0, 2)
         if size < self._first:
@@ -141,13 +183,13 @@ class StreamReader:
                     return entries
         return None
 
-    def _plausible(self, entries: list[tuple[int, int, int]], end: int) -> bool:
+    def _plausible(self, entries: list[_Entry], end: int) -> bool:
         """Return whether entries name keyframes and residuals at ascending offsets of the packets before byte `end`."""
         offsets = [self._first - 1, *(offset for *_, offset in entries), end]
         kinds = {kind for kind, *_ in entries}
         return kinds <= {PacketKind.KEYFRAME, PacketKind.RESIDUAL} and all(a < b for a, b in pairwise(offsets))
 
-    def check(self) -> tuple[list[tuple[int, int, int]], int]:
+    def check(self) -> tuple[list[_Entry], int]:
         """Check every packet and return (kind, frame, offset) of all except the header, and the end of the last one.
 
         An index at the file's end, and a packet that is truncated there, lie after that byte.
@@ -167,12 +209,26 @@ class StreamReader:
         return entries, end
 
     def _packets(self, number: int, at: int) -> Iterator[Packet]:
-        for offset, data in self._checked(number, at):
+        last = None
+        for offset, data in self._checked(number, at) if self._kept is None else self._undamaged(number, at):
             if HEAD.unpack_from(data)[0] != PacketKind.INDEX:
-                with self._located(number, offset):
+                with self._located(number, offset, last):
                     packet = decode_packet(data, self._place(number, offset))
                 yield packet
                 number += 1
+                last = packet.frame
+
+    def _undamaged(self, number: int, at: int) -> Iterator[tuple[int, bytes]]:
+        """Yield (offset, bytes) of the packets that are not left out, from byte `at` on."""
+        with open(self.path, "rb") as file:
+            for *_, offset in self.index():
+                if offset >= at:
+                    file.seek(offset)
+                    data = self._packet(file, number, offset) or b""
+                    with self._located(number, offset):  # it may have been replaced
+                        open_packet(data)
+                    yield offset, data
+                    number += 1
 
     def _checked(self, number: int, at: int) -> Iterator[tuple[int, bytes]]:
         """Yield (offset, bytes) of every packet with a correct CRC, from packet `number` at byte `at` on.
@@ -182,14 +238,17 @@ class StreamReader:
         with self._opened() as file:
             if self._pipe is None:
                 file.seek(at)
-            while (data := self._packet(file, number, at)) is not None:
-                with self._located(number, at):
-                    kind, *_ = open_packet(data)
+            last = None
+            while (data := self._packet(file, number, at, last)) is not None:
+                with self._located(number, at, last):
+                    kind, frame, _ = open_packet(data)
                 yield at, data
                 at += len(data)
-                number += kind != PacketKind.INDEX
+                if kind != PacketKind.INDEX:
+                    number += 1
+                    last = frame
 
-    def _packet(self, file: BinaryIO, number: int, at: int) -> bytes | None:
+    def _packet(self, file: BinaryIO, number: int, at: int, last: int | None = None) -> bytes | None:
         """Return the bytes of the next packet, None at the stream's end."""
         head = _read(file, PAYLOAD)
         if not head:
@@ -198,7 +257,7 @@ class StreamReader:
         data = head + _read(file, size - PAYLOAD)
         if len(head) < PAYLOAD or len(data) < size:
             problem = f"at least {size} bytes expected, got {len(data)}: truncated or still written"
-            raise TruncatedStreamError(self._sentence(number, at, problem))
+            raise TruncatedStreamError(self._sentence(number, at, problem, last))
         return data
 
     @contextlib.contextmanager
@@ -210,14 +269,16 @@ class StreamReader:
                 yield file
 
     @contextlib.contextmanager
-    def _located(self, number: int, at: int) -> Iterator[None]:
+    def _located(self, number: int, at: int, last: int | None = None) -> Iterator[None]:
         try:
             yield
         except ValueError as error:
-            raise ValueError(self._sentence(number, at, str(error))) from None
+            raise ValueError(self._sentence(number, at, str(error), last)) from None
 
-    def _sentence(self, number: int, at: int, problem: str) -> str:
-        return f"{self._place(number, at)}: {problem}; {number} packets before it are intact."
+    def _sentence(self, number: int, at: int, problem: str, last: int | None = None) -> str:
+        """Return the message of a problem; `last` is the frame of the packet before it."""
+        frames = "" if last is None else f", up to frame {last}"
+        return f"{self._place(number, at)}: {problem}; {number} packets before it are intact{frames}."
 
     def _place(self, number: int, at: int) -> str:
         return f"{self.path}: packet {number} at byte {at}"

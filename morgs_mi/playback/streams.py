@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from itertools import groupby
 from pathlib import Path
 
 from morgs_mi.codec.container import MAGIC, Packet, PacketKind
@@ -103,7 +104,7 @@ def stream_path(out: str | Path) -> Path:
     return path
 
 
-def open_stream(out: str | Path, most_invalid: float = DRAWN) -> PlayableStream:
+def open_stream(out: str | Path, most_invalid: float = DRAWN, skip_damaged: bool = False) -> PlayableStream:
     """Open a stream file, the ``stream.morgs`` in the folder of a fit, or a file with Gaussians as one frame.
 
     Files with Gaussians are ``.ply`` files in the layout of 3D Gaussian Splatting, ``.compressed.ply`` and ``.splat``.
@@ -113,6 +114,8 @@ def open_stream(out: str | Path, most_invalid: float = DRAWN) -> PlayableStream:
         out: the file or folder.
         most_invalid: share of Gaussians of such a file that may have numbers that are not finite or above 1e12; they
             are left out with a warning. 0: none.
+        skip_damaged: leave out the damaged frames of a stream, and those up to the next intact keyframe, with a warning
+            that names them.
 
     Example:
         >>> stream = morgs_mi.open_stream("out/arm_fit")
@@ -130,4 +133,26 @@ def open_stream(out: str | Path, most_invalid: float = DRAWN) -> PlayableStream:
             "%s: a provisional first frame of a fit that is still running or was killed; its Gaussians are not final.",
             path,
         )
-    return SplatFile(path, most_invalid) if suffix_of(path) else PlayableStream(path)
+    if suffix_of(path):
+        return SplatFile(path, most_invalid)
+    stream = PlayableStream(path, skip_damaged)
+    if skip_damaged:
+        _warn_of_damage(stream)
+    return stream
+
+
+def _warn_of_damage(stream: StreamReader) -> None:
+    """Log the frames that a reader leaves out as damaged, and the end of a stream that was not closed."""
+    problems = []
+    if stream.skipped:
+        problems.append(f"the damaged frames {_spans(stream.skipped)} are skipped")
+    if not stream.closed():
+        problems.append(f"it ends after {len(stream.index())} packets without an index, and may lack later frames")
+    if problems:
+        _LOG.warning("%s: %s.", stream.path, "; ".join(problems))
+
+
+def _spans(numbers: Sequence[int]) -> str:
+    """Return ascending numbers as text, such as ``0 to 3, 7``."""
+    spans = [[n for _, n in span] for _, span in groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])]
+    return ", ".join(f"{span[0]} to {span[-1]}" if len(span) > 1 else f"{span[0]}" for span in spans)

@@ -22,7 +22,7 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.visualise import write_png
 from morgs_mi.runs.cluster.seams import SegmentConfig
-from morgs_mi.runs.cluster.segments import _Segment
+from morgs_mi.runs.cluster.segments import SegmentedRun
 from morgs_mi.runs.cluster.tasks import Part
 from morgs_mi.stream_loop import StreamLoop
 from tests.calibration.checks.test_signals import brighter
@@ -329,26 +329,27 @@ def test_fit__resumes_a_stream_to_the_same_bytes(capture: Path, tmp_path: Path, 
 
 
 def test_fit__fits_segments_side_by_side(tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed", reason="comes with the extra `cluster`")
     short = SegmentConfig(passes=1, epochs=1)
     monkeypatch.setattr(SegmentConfig.__init__, "__defaults__", astuple(short))
     clip, out = write_recording(tmp_path / "clip", 4), tmp_path / "out"
     status, output, _ = run("fit", clip, out, *QUICK, "--segments", 2)
     assert status == 0
     assert "stream.morgs: 4 frames" in output
-    assert "Seam before frame 2: PSNR " in output
     assert len({frame for _, frame, _ in StreamReader(out / "stream.morgs").index()}) == 4
     assert_refused(run("fit", clip, out, *QUICK, "--segments", 3), "--segments must be 1 to 2 for 4 frames", "got 3")
 
 
 def test_fit__names_what_segments_stand_when_interrupted(tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed", reason="comes with the extra `cluster`")
     clip, out = write_recording(tmp_path / "clip", 4), tmp_path / "out"
-    add = _Segment._add
+    add = SegmentedRun._add
 
-    def add_and_stop(segment: _Segment, part: Part) -> None:
-        add(segment, part)
+    def add_and_stop(fit: SegmentedRun, part: Part) -> None:
+        add(fit, part)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(_Segment, "_add", add_and_stop)
+    monkeypatch.setattr(SegmentedRun, "_add", add_and_stop)
     args = ["fit", str(clip), str(out), *QUICK, "--segments", "2"]
     status, _, error = run(*args)
     again = shlex.join(["morgs-mi", *args, "--resume"])

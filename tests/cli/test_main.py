@@ -118,7 +118,7 @@ def test_main__names_options_not_arguments(tmp_path: Path, run, args, parts) -> 
     assert not out.exists()
 
 
-COMMANDS = ("synth", "info", "calibrate", "fit", "batch", "render", "import", "view", "eval", "salvage", "demo")
+COMMANDS = ("synth", "info", "calibrate", "fit", "render", "import", "view", "eval", "demo")
 EXPORTS = ("ply", "gltf", "usd", "video", "tracks", "web")
 
 
@@ -155,7 +155,6 @@ def test_main__names_an_output_that_cannot_be_written(capture: Path, stream: Pat
             ("export", "ply", stream, folder / "ply"),
             ("export", "tracks", stream, folder / "a.npz"),
             ("export", "web", stream, folder / "page.html"),
-            ("salvage", stream, folder / "a.morgs"),
             ("info", capture, "--no-check", "--plot", folder / "rig.png"),
             ("demo", folder / "out"),
         ):
@@ -193,7 +192,6 @@ def test_main__writes_nothing_into_a_capture(capture: Path, stream: Path, tmp_pa
         ("eval", stream, "--capture", capture, "--json", place / "capture.json"),
         ("eval", stream, "--capture", capture, "--figures", place / "figures"),
         ("info", capture, "--plot", place / "cam0.png"),
-        ("salvage", stream, place / "capture.json"),
     ):
         assert_refused(
             run(*args), "expected an output outside of captures, which stay as they were recorded, got one in"

@@ -27,7 +27,7 @@ SMALLER = {
 GUIDES = ("quickstart", "splat-files", "captures", "cameras", "colours", "checks")
 PAGES = ("README.md", *(f"docs/{name}.md" for name in GUIDES))
 # Commands that never end, or write outside of the folder.
-LEFT_OUT = ("morgs-mi view", "morgs-mi --completion")
+LEFT_OUT = ("morgs-mi view", "morgs-mi --tyro-write-completion")
 
 
 def commands(page: str) -> list[str]:

@@ -9,9 +9,11 @@ import pytest
 
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
+from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.exr import read_exr
 from tests.cli.commands import assert_one_sentence, assert_refused, interrupt
+from tests.scenes.changing_splats import write_stream
 from tests.scenes.full_disk import files_end_at
 from tests.scenes.noise_capture import rig
 
@@ -75,3 +77,26 @@ def test_render__removes_its_output_when_interrupted(
     assert status == 130
     assert_one_sentence(error, "Interrupted")
     assert list(tmp_path.iterdir()) == [stream]
+
+
+def test_render__skips_damaged_frames_when_asked(tmp_path: Path, run, caplog) -> None:
+    path = tmp_path / "stream.morgs"
+    write_stream(path, 6, keyframe_interval=3)
+    _, _, offset = next(entry for entry in StreamReader(path).index() if entry[1] == 1)
+    data = bytearray(path.read_bytes())
+    data[offset + 40] ^= 1
+    path.write_bytes(data)
+    render = ("render", path, tmp_path / "png", "--camera", 0, "--width", 32)
+    assert_refused(run(*render), f"packet 2 at byte {offset}: ", "the bytes are damaged", "up to frame 0")
+    assert run(*render, "--skip-damaged")[0] == 0
+    assert sorted(image.name for image in (tmp_path / "png").iterdir()) == [
+        "0000.png",
+        *(f"000{k}.png" for k in (3, 4, 5)),
+    ]
+    assert caplog.messages == [f"{path}: the damaged frames 1 to 2 are skipped."]
+
+
+def test_render__warns_of_the_end_of_a_stream_that_was_not_closed(stream: Path, tmp_path: Path, run, caplog) -> None:
+    stream.write_bytes(stream.read_bytes()[: StreamReader(stream).index()[1][2] + 30])
+    assert run("render", stream, tmp_path / "png", "--camera", 0, "--width", 32, "--skip-damaged")[0] == 0
+    assert caplog.messages == [f"{stream}: it ends after 1 packets without an index, and may lack later frames."]

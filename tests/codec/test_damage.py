@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
-import struct
 import subprocess
 import sys
-import time
 import tracemalloc
 from pathlib import Path
 
@@ -15,13 +14,12 @@ import numpy as np
 import pytest
 
 from morgs_mi.codec.container import Packet, PacketKind
-from morgs_mi.codec.packets import CodedFrame, coded_frames, decode, keyframe_packet, reemitted_keyframe, seek
+from morgs_mi.codec.packets import CodedFrame, coded_frames, decode, reemitted_keyframe, seek
 from morgs_mi.codec.quantisation import Grid
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.codec.salvage import DamagedRange, salvage, write_salvaged
 from tests.codec.forge import forged_streams
 from tests.codec.fuzz import FUZZERS, check_intact_frames, differs
-from tests.scenes.coded_clip import CAMERAS, cloud
+from tests.scenes.coded_clip import cloud
 from tests.scenes.short_clip import FRAMES, Clip, short_clip
 
 FUZZ_SECONDS = float(os.environ.get("MORGS_FUZZ_SECONDS", "600"))
@@ -53,70 +51,78 @@ def test_readers__survive_minutes_of_damaged_and_forged_streams(name: str) -> No
     fuzz(FUZZ_SECONDS, name)
 
 
-def test_salvage__plays_what_a_truncated_file_has(clip: Clip, tmp_path: Path) -> None:
+def test_stream_reader__plays_what_a_truncated_file_has(clip: Clip, tmp_path: Path) -> None:
     for length in (*range(0, 40, 3), len(clip.data) - 1):
         (tmp_path / "s").write_bytes(clip.data[:length])
         check_intact_frames(clip, clip.data[:length], tmp_path / "s")
 
 
-def rearranged(clip: Clip, *pieces: int) -> bytes:
-    """Return the preamble, the header, and then packets of the clip by their place."""
-    parts = (clip.pieces[k] for k in (0, 1, *pieces))
-    return b"".join(clip.data[part.start : part.stop] for part in parts)
+def flipped(clip: Clip, *frames: int, kind: int = 2) -> bytes:
+    """Return the clip with a flipped bit in the packets of a kind of some frames."""
+    data = bytearray(clip.data)
+    for piece in clip.pieces:
+        if (piece.kind, piece.frame) in {(kind, frame) for frame in frames}:
+            data[(piece.start + piece.stop) // 2] ^= 1
+    return bytes(data)
 
 
-def salvaged(path: Path) -> tuple[list[CodedFrame], list[DamagedRange]]:
-    found = list(salvage(path))
-    return [e for e in found if isinstance(e, CodedFrame)], [e for e in found if isinstance(e, DamagedRange)]
+def test_stream_reader__names_packet_byte_and_frame_of_damage(clip: Clip, tmp_path: Path) -> None:
+    (tmp_path / "s").write_bytes(flipped(clip, 2))
+    place = f"s: packet 3 at byte {clip.pieces[4].start}: its CRC should be "
+    with pytest.raises(
+        ValueError, match=f"{place}.*: the bytes are damaged; 3 packets before it are intact, up to frame 1"
+    ):
+        list(coded_frames(StreamReader(tmp_path / "s")))
 
 
 @pytest.mark.parametrize(
-    ("pieces", "problem"),
+    ("frames", "kind", "skipped"),
     [
-        ((2, 3, 4, 5, 6, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12), "it repeats frame 1"),
-        ((9, 10, 11, 12, 2, 3, 4, 5, 6, 7, 8), None),
-        ((12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2), None),
-        ((2, 3, 4, 5, 6, 6, 7, 8, 9, 10, 11, 12), "intact packet 6, frame 3: it repeats frame 3"),
+        ((1,), 2, [1, 2]),  # frames 3 and 6 have a keyframe beside their residual
+        ((3,), 2, []),
+        ((3,), 1, []),
+        ((7,), 2, [7]),
+        ((1, 5), 2, [1, 2, 5]),
+        ((0,), 1, [0, 1, 2]),
     ],
-    ids=["repeated", "swapped", "reversed", "repeated keyframe"],
 )
-def test_write_salvaged__restores_the_order_of_packets(
-    clip: Clip, tmp_path: Path, pieces: tuple[int, ...], problem: str | None
+def test_stream_reader__continues_at_the_next_intact_keyframe(
+    clip: Clip, tmp_path: Path, frames: tuple[int, ...], kind: int, skipped: list[int]
 ) -> None:
-    (tmp_path / "s").write_bytes(rearranged(clip, *pieces))
-    frames, ranges = write_salvaged(StreamReader(tmp_path / "s"), tmp_path / "new")
-    assert frames == list(range(FRAMES))
-    assert (tmp_path / "new").read_bytes() == clip.data
-    assert (problem is None) == (not ranges)
-    assert problem is None or problem in ranges[0].problem
+    (tmp_path / "s").write_bytes(flipped(clip, *frames, kind=kind))
+    stream = StreamReader(tmp_path / "s", skip_damaged=True)
+    assert stream.skipped == skipped
+    states = list(coded_frames(stream))
+    assert [state.frame for state in states] == sorted({*range(FRAMES)} - {*skipped})
+    assert {frame for _, frame, _ in stream.index()} == {state.frame for state in states}
+    for state in states:
+        assert not differs(state, clip)
+        assert not differs(seek(stream, state.frame), clip)
 
 
-def test_salvage__prefers_the_packet_whose_state_is_continued(clip: Clip, tmp_path: Path) -> None:
-    """A forged keyframe in front of the true one does not cost the frames that follow."""
-    forged = keyframe_packet(cloud(9, 0), 3, CAMERAS).encoded
-    data = rearranged(clip) + forged + rearranged(clip, *range(6, len(clip.pieces)))[clip.pieces[1].stop :]
+def test_stream_reader__skips_the_rest_behind_a_damaged_length_without_an_index(clip: Clip, tmp_path: Path) -> None:
+    damaged = clip.pieces[4]
+    data = bytearray(clip.data)
+    data[damaged.start + 8] ^= 1  # the lowest byte of its length
     (tmp_path / "s").write_bytes(data)
-    states, ranges = salvaged(tmp_path / "s")
-    assert [state.frame for state in states] == list(range(3, FRAMES))
-    assert not any(differs(state, clip) for state in states)
-    assert ranges == [
-        DamagedRange(
-            clip.pieces[1].stop,
-            clip.pieces[1].stop + len(forged),
-            "intact packet 1, frame 3: another packet of frame 3 leads to another state",
-        )
-    ]
+    assert StreamReader(tmp_path / "s", skip_damaged=True).skipped == [2], "the index leads to the others"
+    (tmp_path / "s").write_bytes(data[: clip.pieces[-1].start])
+    stream = StreamReader(tmp_path / "s", skip_damaged=True)
+    assert [state.frame for state in coded_frames(stream)] == [0, 1]
+    assert stream.skipped[0] == 2
+    assert not stream.closed()
 
 
-def test_salvage__continues_behind_a_packet_that_takes_too_much_memory(clip: Clip, tmp_path: Path) -> None:
-    words = np.zeros(1000, np.uint32)
-    bomb = Packet(PacketKind.KEYFRAME, 2, {"head": np.array([2**29, 3, 0, 2**29], np.uint32), "code": words}).encoded
-    at = clip.pieces[4].start
-    (tmp_path / "s").write_bytes(clip.data[:at] + bomb + clip.data[at:])
-    states, ranges = salvaged(tmp_path / "s")
-    assert [state.frame for state in states] == list(range(FRAMES))
-    assert len(ranges) == 1
-    assert "take at least 2248146944 words of code, got 1000" in ranges[0].problem
+def test_stream_reader__skips_nothing_of_an_intact_stream(clip: Clip, tmp_path: Path) -> None:
+    (tmp_path / "s").write_bytes(clip.data)
+    stream = StreamReader(tmp_path / "s", skip_damaged=True)
+    assert stream.skipped == []
+    assert stream.index() == StreamReader(tmp_path / "s").index()
+
+
+def test_stream_reader__skips_no_damage_in_a_pipe(clip: Clip) -> None:
+    with pytest.raises(ValueError, match="expected a file to skip damage in, got a pipe; save it first"):
+        StreamReader(io.BytesIO(clip.data), skip_damaged=True)
 
 
 def test_seek__plays_from_the_start_where_a_keyframe_or_the_index_is_forged(clip: Clip, tmp_path: Path) -> None:
@@ -154,42 +160,3 @@ def test_decode__refuses_a_count_before_it_allocates(tmp_path: Path) -> None:
         decode(None, packet)
     assert tracemalloc.get_traced_memory()[1] < 2**20
     tracemalloc.stop()
-
-
-def test_salvage__takes_linear_time_for_overlapping_false_packets(clip: Clip, tmp_path: Path) -> None:
-    """Each of 30,000 heads claims that its packet ends near the file's end; all are refused by their CRC at once."""
-    count, size = 30_000, 48
-    length = count * size
-    heads = (struct.pack("<IIQI", 1, 0, length - k * size, 7).ljust(size, b"\xff") for k in range(count))
-    data = clip.data + b"".join(heads) + bytes(200)
-    (tmp_path / "s").write_bytes(data)
-    start = time.process_time()
-    states, ranges = salvaged(tmp_path / "s")
-    assert time.process_time() - start < 5  # one CRC for each takes 20 s
-    assert [state.frame for state in states] == list(range(FRAMES))
-    assert ranges == [DamagedRange(len(clip.data), len(data), "the bytes are damaged or truncated")]
-
-
-def test_write_salvaged__copies_an_intact_stream(clip: Clip, tmp_path: Path) -> None:
-    (tmp_path / "s").write_bytes(clip.data)
-    assert write_salvaged(StreamReader(tmp_path / "s"), tmp_path / "new") == (list(range(FRAMES)), [])
-    assert (tmp_path / "new").read_bytes() == clip.data
-
-
-def test_write_salvaged__raises_and_writes_nothing_if_no_frame_plays(clip: Clip, tmp_path: Path) -> None:
-    (tmp_path / "s").write_bytes(clip.data[: clip.pieces[2].start + 50])
-    reader = StreamReader(tmp_path / "s")
-    with pytest.raises(ValueError, match="expected at least one frame that plays, got none"):
-        write_salvaged(reader, tmp_path / "new")
-    with pytest.raises(ValueError, match="expected a new file, got the damaged stream itself"):
-        write_salvaged(reader, tmp_path / "." / "s")
-    assert [path.name for path in tmp_path.iterdir()] == ["s"]
-
-
-def test_salvage__reports_an_empty_file_and_a_file_of_zeros(tmp_path: Path) -> None:
-    (tmp_path / "s").write_bytes(b"")
-    assert [entry.problem for entry in salvage(tmp_path / "s") if isinstance(entry, DamagedRange)] == [
-        "the file is empty"
-    ]
-    (tmp_path / "s").write_bytes(bytes(10_000))
-    assert list(salvage(tmp_path / "s")) == [DamagedRange(0, 10_000, "the bytes are damaged or truncated")]

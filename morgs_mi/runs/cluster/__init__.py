@@ -1,1 +1,1 @@
-"""Fits in many processes, on one machine or on a Dask cluster: segments of a recording, and batches of fits."""
+"""Fits in many processes, on one machine or on a Dask cluster: segments of a recording."""

@@ -6,39 +6,30 @@ added. They are joined into OUT/stream.morgs at the end. Resuming continues ever
 
 from __future__ import annotations
 
-import asyncio
+import logging
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass, field, replace
-from itertools import dropwhile, takewhile
+from dataclasses import asdict, replace
+from itertools import islice, pairwise
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import mitsuba as mi
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
-from morgs_mi.codec.container import Packet, PacketKind, StreamWriter, TruncatedStreamError, decode_packet
+from morgs_mi.codec.container import StreamWriter, TruncatedStreamError, decode_packet
 from morgs_mi.codec.packets import decode, reemitted_keyframe, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.files import locked_folder, write_json
+from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.source import about_lenses, as_fitted
-from morgs_mi.runs.cluster.executor import Workers
-from morgs_mi.runs.cluster.seams import COMMON_FRAMES, SeamScores, SegmentConfig, score_seam
-from morgs_mi.runs.cluster.tasks import (
-    Fit,
-    Following,
-    FrameRange,
-    Part,
-    Points,
-    Source,
-    fit_frames,
-    fit_segment_start,
-    installed,
-)
+from morgs_mi.runs.cluster.seams import COMMON_FRAMES, SegmentConfig
+from morgs_mi.runs.cluster.tasks import Fit, Part, Segment, Source, fit_frames
+from morgs_mi.runs.cluster.workers import installed, num_workers
 from morgs_mi.runs.recorder import Prepared
 from morgs_mi.runs.recording import (
     Entry,
@@ -55,28 +46,16 @@ from morgs_mi.runs.recording import (
 )
 from morgs_mi.stream_loop import FrameReport
 
-__all__ = ["SegmentedFit", "SegmentedRun", "noting_segments"]
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+__all__ = ["SegmentedRun", "noting_segments"]
 
 FOLDER = "segments"
-# Frames of a task: a few tasks are lost if a worker dies, and the progress is known that finely.
+# Frames of a task, two at least: they are lost if a worker dies, and the progress is known that finely.
 TASK_FRAMES = 10
 _MIN_FRAMES = 2  # of a segment
-_POLL = 0.1  # seconds between two looks for a worker that is free; their number may grow
-
-
-@dataclass(frozen=True)
-class SegmentedFit:
-    """Result of a fit in segments.
-
-    Attributes:
-        reports: of all frames.
-        seams: scores of the seams.
-        workers: peak memory of the workers by their names, bytes.
-    """
-
-    reports: tuple[FrameReport, ...]
-    seams: tuple[SeamScores, ...] = ()
-    workers: Mapping[str, int] = field(default_factory=dict)
+_LOG = logging.getLogger(__name__)
 
 
 @contextmanager
@@ -87,17 +66,10 @@ def noting_segments(out: Path) -> Iterator[None]:
     except (KeyboardInterrupt, OSError, MemoryError) as error:
         streams = sorted((out / FOLDER).glob("[0-9]*.morgs"))
         with suppress(OSError, ValueError):
-            count = sum(map(_num_finished, streams))
+            count = sum(len({frame for _, frame, _ in StreamReader(path).index()}) for path in streams)
             if count:
                 error.add_note(f"{out / FOLDER} holds {count} frames; continue with `--resume`.")
         raise
-
-
-def _num_finished(path: Path) -> int:
-    """Return the number of frames in the stream of a segment, without the overlap before it."""
-    stream = StreamReader(path)
-    start = stream.metadata.get("segments", {"starts": [0]})["starts"][int(path.stem)]
-    return len({frame for _, frame, _ in stream.index() if frame >= start})
 
 
 def _remove(folder: Path) -> None:
@@ -126,13 +98,14 @@ class SegmentedRun:
     Args:
         capture: a capture from `load_capture`, at a path that all workers see.
         out: folder, made if missing.
-        workers: from `open_workers`; several runs may share them.
+        client: from `open_client`.
         config: settings.
         segments: their number and the settings of the seams; None: one segment.
         on_stage: called with (name of the stage, done, total).
 
     Example:
-        >>> fit = wait_for(SegmentedRun(capture, out, workers, config, SegmentConfig(3)).fit())
+        >>> with open_client() as client:
+        ...     reports = SegmentedRun(capture, out, client, config, SegmentConfig(3)).fit()
 
     Raises:
         ValueError: there are more segments than pairs of frames.
@@ -142,26 +115,28 @@ class SegmentedRun:
         self,
         capture: Capture,
         out: str | Path,
-        workers: Workers,
+        client: Client,
         config: StreamConfig,
         segments: SegmentConfig | None = None,
         on_stage: Report | None = None,
     ) -> None:
         segments = segments or SegmentConfig()
-        self.capture, self.out, self.workers = capture, Path(out), workers
+        self.capture = capture
+        self.out = Path(out)
+        self.client = client
         self.on_stage: Report = on_stage or (lambda *_: None)
         self.starts = _starts(capture.num_frames, segments.count)
         self.task = Fit(Source.of(capture), config, segments, str(mi.variant()), installed())
         self.metadata = stream_metadata(capture, next(capture.partial_frames(0, 1)), config)
         if segments.count > 1:
             self.metadata["segments"] = {"starts": self.starts[:-1], **asdict(segments)}
-        self.prepared: Prepared | None = None  # where this run begins the recording
+        self.recordings: dict[int, Recording] = {}  # by the first frame of the segment
         self.peaks: dict[str, int] = {}
-        self.active = 0  # segments with later frames being fitted
-        self.starting = 0  # segments with a start that is being fitted, or waits for a worker
+        self.messages: set[str] = set()
 
-    async def fit(self, resume: bool = False) -> SegmentedFit:
-        """Fit, or continue, all segments and join them.
+    @interrupts_raised()
+    def fit(self, resume: bool = False) -> list[FrameReport]:
+        """Fit, or continue, all segments and join them; return the reports of all frames.
 
         Args:
             resume: continue the segments in `out`. With `RenderConfig(reproducible=True)` the stream has the same bytes
@@ -174,59 +149,116 @@ class SegmentedRun:
         """
         check_outputs(self.out)
         with locked_folder(self.out, "SegmentedRun.fit()"):
-            with ExitStack() as self.recordings:
-                if (reports := await self._fit_all(resume)) is not None:
-                    return SegmentedFit(tuple(reports))
+            folder = self.out / FOLDER
+            if resume and not folder.exists() and (reports := self._complete()):
+                return reports
+            if not resume:
+                _remove(folder)
+            folder.mkdir(exist_ok=True)
+            with ExitStack() as self.open_files:
+                self._fit_side_by_side(self._begun(Progress(self.on_stage)))
             return self._joined(FitFiles.of(self.out))
 
-    async def _fit_all(self, resume: bool) -> list[FrameReport] | None:
-        """Fit what is missing of the segments; return the reports of all frames if they had been joined before."""
-        folder, path = self.out / FOLDER, self.out / "stream.morgs"
-        if resume and not folder.exists() and (reports := self._complete(path)):
-            return reports
-        if not resume:
-            _remove(folder)
-        folder.mkdir(exist_ok=True)
-        self.segments = [_Segment(self, k) for k in range(len(self.starts) - 1)]
-        points = None
-        if not self.segments[0].num_fitted:
-            self.prepared = Prepared.of(self.capture, self.task.config, Progress(self.on_stage))
-            capture = self.prepared.capture
-            points = None if capture is self.capture else (capture.points, capture.point_colors)
-            self._use(capture)
-        elif self.task.config.fit.refine_cameras != "off":
-            self._use(as_fitted(self.capture, StreamReader(self.segments[0].files.stream)))
-        loop = asyncio.get_running_loop()
-        self.base: asyncio.Future[tuple[bytes, int]] = loop.create_future()  # common model and number of its ids
-        self.begun: list[asyncio.Future[tuple[bytes, ...]]] = [loop.create_future() for _ in self.segments]
-        self.show_progress()
-        try:
-            async with asyncio.TaskGroup() as group:
-                for segment in self.segments:
-                    group.create_task(segment.fit(points))
-        except BaseExceptionGroup as errors:
-            raise errors.exceptions[0] from None
-        return None
+    def _begun(self, progress: Progress) -> list[Segment]:
+        """Return the segments after the common model, which is fitted if it is missing."""
+        segments = [self._earlier(start, stop) for start, stop in pairwise(self.starts)]
+        first = segments[0]
+        stop = min(COMMON_FRAMES, first.stop)
+        prepared = None
+        if not first.frame:
+            prepared = Prepared.of(self.capture, self.task.config, progress)
+            if prepared.capture is not self.capture:
+                self.task = replace(self.task, points=(prepared.capture.points, prepared.capture.point_colors))
+            self._use(prepared.capture)
+        else:
+            self._use(as_fitted(self.capture, StreamReader(self._files(0).stream)))
+        self._show_progress()
+        if first.frame < stop:
+            part = self._submitted([replace(first, stop=stop)])[0].result()
+            self._add(part if prepared is None else self._completed(part, prepared))
+            first = replace(part.segment, stop=first.stop)
+        self.task = replace(self.task, points=None, balance=self.recordings[0].reports[0].exposures)
+        common = reemitted_keyframe(seek(StreamReader(self._files(0).stream), stop - 1)).encoded
+        return [first, *(s if s.restart else replace(s, restart=(common,)) for s in segments[1:])]
+
+    def _fit_side_by_side(self, segments: Iterable[Segment]) -> None:
+        """Fit what is missing of segments. Each worker continues the loop of one of them, until it is fitted."""
+        from distributed import as_completed
+
+        waiting = (segment for segment in segments if segment.frame < segment.stop)
+        begun = self._submitted(islice(waiting, num_workers(self.client)))
+        running = as_completed(begun, loop=self.client.loop)
+        for future in running:
+            part = future.result()
+            self._add(part)
+            if part.segment.frame < part.segment.stop:
+                running.update(self._submitted([part.segment], part.worker))
+            idle = max(1, num_workers(self.client)) - running.count()
+            running.update(self._submitted(islice(waiting, max(0, idle))))
+
+    def _submitted(self, segments: Iterable[Segment], worker: str | None = None) -> list[Future[Part]]:
+        """Return the tasks of the next frames of segments, if possible on a worker."""
+        segments = list(segments)
+        stops = [min(segment.frame + TASK_FRAMES, segment.stop) for segment in segments]
+        place = {} if worker is None else {"workers": worker, "allow_other_workers": True}
+        return self.client.map(fit_frames, len(segments) * [self.task], segments, stops, pure=False, **place)
 
     def _use(self, capture: Capture) -> None:
         """Fit with the cameras of a capture."""
         if self.task.config.fit.refine_cameras != "off":
             self.task = replace(self.task, rig=(capture.cameras, capture.distortions))
-            self.capture, self.metadata = capture, self.metadata | about_lenses(capture)
+            self.capture = capture
+            self.metadata |= about_lenses(capture)
 
-    async def run(self, function: Callable[..., Part], *args: Any) -> Part:
-        """Return the result of a task on a worker."""
-        part = await self.workers.run(function, self.task, *args)
+    def _files(self, start: int) -> FitFiles:
+        """Return stream and report of the segment that begins with a frame."""
+        return FitFiles(self.out / FOLDER / f"{start}.morgs", self.out / FOLDER / f"{start}.json")
+
+    def _earlier(self, start: int, stop: int) -> Segment:
+        """Return a segment as an interrupted fit left it."""
+
+        def finished(index: Sequence[Entry], end: int) -> tuple[Sequence[Entry], int]:
+            # After the first frame of a segment alone, a fit would continue without its displacements.
+            return ([], 0) if start and index and index[-1][1] == start else (index, end)
+
+        earlier = interrupted_fit(self._files(start), self.capture, self.metadata, finished, start)
+        if earlier is None:
+            return Segment(start, stop, start)
+        self._open(start, earlier)
+        return Segment(start, stop, start + len(earlier.reports), restart_of(earlier.before, earlier.last))
+
+    def _open(self, start: int, earlier: Interrupted | None) -> None:
+        """Open the files of a segment."""
+        recording = Recording(self._files(start), self.capture, self.metadata, earlier)
+        self.recordings[start] = self.open_files.enter_context(recording)
+
+    def _completed(self, part: Part, prepared: Prepared) -> Part:
+        """Return the first part of the recording, with what was found about the cameras in its first report."""
+        gaussians = decode(None, decode_packet(part.packets[0])).gaussians
+        frame = next(prepared.capture.partial_frames(0, 1))
+        first = prepared.completed(part.reports[0], gaussians, frame, self.task.config)
+        return replace(part, reports=(first, *part.reports[1:]))
+
+    def _add(self, part: Part) -> None:
+        """Add the frames of a task to the files of their segment."""
+        start = part.segment.start
+        if start not in self.recordings:
+            self._open(start, None)
+        self.recordings[start].extend(map(decode_packet, part.packets), part.reports)
         self.peaks[part.worker] = max(part.peak_bytes, self.peaks.get(part.worker, 0))
-        return part
+        for message in {*part.messages} - self.messages:
+            _LOG.warning(message)
+        self.messages |= {*part.messages}
+        self._show_progress()
 
-    def show_progress(self) -> None:
-        self.on_stage("Fitting frames", sum(s.num_fitted for s in self.segments), self.capture.num_frames)
+    def _show_progress(self) -> None:
+        num_fitted = sum(len(recording.reports) for recording in self.recordings.values())
+        self.on_stage("Fitting frames", num_fitted, self.capture.num_frames)
 
-    def _complete(self, path: Path) -> list[FrameReport] | None:
+    def _complete(self) -> list[FrameReport] | None:
         """Return the reports of an earlier fit that was finished, None if there is none."""
         try:
-            stream = StreamReader(path)
+            stream = StreamReader(self.out / "stream.morgs")
         except (FileNotFoundError, TruncatedStreamError):
             return None
         check_same_fit(stream, self.capture, self.metadata)
@@ -235,135 +267,23 @@ class SegmentedRun:
             return None
         return read_reports(self.out / "report.json", range(frames))
 
-    def _joined(self, files: FitFiles) -> SegmentedFit:
-        """Join the segments into one stream, with its report and the scores of the seams."""
-        reports = [report for segment in self.segments for report in segment.reports]
+    def _joined(self, files: FitFiles) -> list[FrameReport]:
+        """Join the segments into one stream with its report."""
+        starts = self.starts[:-1]
+        reports = [report for start in starts for report in self.recordings[start].reports]
         new = files.next
         assert new.description is not None
         files.settle()
         try:
             with StreamWriter(new.stream, self.capture.cameras, self.capture.fps, self.metadata) as writer:
-                for segment in self.segments:
-                    for packet in segment.packets():
+                for start in starts:
+                    for packet in StreamReader(self._files(start).stream):
                         writer.write(packet)
-            scores = []
-            for done, frame in enumerate(self.starts[1:-1]):
-                self.on_stage("Evaluating seams", done, len(self.starts) - 2)
-                scores.append(score_seam(StreamReader(new.stream), self.capture, frame))
-            report: dict[str, Any] = {**self.metadata, "frames": [asdict(r) for r in reports]}
-            if scores:
-                report |= {"seams": [asdict(s) for s in scores], "workers": self.peaks}
-            write_json(new.report, report)
+            workers = {"workers": self.peaks} if len(starts) > 1 else {}
+            write_json(new.report, {**self.metadata, "frames": [asdict(report) for report in reports], **workers})
             write_json(new.description, described_capture(self.capture, None))
             files.replace_by_next()
         finally:
             files.settle()
         _remove(self.out / FOLDER)
-        return SegmentedFit(tuple(reports), tuple(scores), self.peaks)
-
-
-class _Segment:
-    """One segment of a fit: its stream, its report, and the tasks that fit it."""
-
-    def __init__(self, run: SegmentedRun, number: int) -> None:
-        self.run, self.number = run, number
-        self.start, self.stop = run.starts[number], run.starts[number + 1]
-        self.files = FitFiles(run.out / FOLDER / f"{number}.morgs", run.out / FOLDER / f"{number}.json")
-        self.restart: tuple[bytes, ...] = ()
-        self.recording: Recording | None = None
-        earlier = interrupted_fit(self.files, run.capture, run.metadata, self._finished, self.start)
-        if earlier is not None:
-            self.restart = restart_of(earlier.before, earlier.last)
-            self._open(earlier)
-
-    @property
-    def reports(self) -> list[FrameReport]:
-        """Reports of the frames that are fitted."""
-        return [] if self.recording is None else self.recording.reports
-
-    @property
-    def num_fitted(self) -> int:
-        """Number of frames that are fitted."""
-        return len(self.reports)
-
-    @property
-    def fade(self) -> int:
-        """First of the frames in which the stream fades to the next segment; the end of the last segment."""
-        if self.stop == self.run.starts[-1]:
-            return self.stop
-        first = self.start + 1 if self.number else COMMON_FRAMES
-        return min(max(self.stop - self.run.task.segments.overlap, first), self.stop)
-
-    async def fit(self, points: Points | None) -> None:
-        """Fit what is missing of the segment, task after task."""
-        common = min(COMMON_FRAMES, self.stop)
-        if self.number and not self.reports:
-            self.run.starting += 1
-            keyframe, _ = await self.run.base
-            self._add(await self.run.run(fit_segment_start, keyframe, self.start))
-            self.run.starting -= 1
-        elif not self.number:
-            if self.num_fitted < common:
-                frames = FrameRange(0, self.num_fitted, common)
-                part = await self.run.run(fit_frames, frames, self.restart, None, points)
-                self._add(part if self.num_fitted else self._completed(part))
-            self.run.task = replace(self.run.task, balance=self.reports[0].exposures)
-            coded = seek(StreamReader(self.files.stream), common - 1)
-            self.run.base.set_result((reemitted_keyframe(coded).encoded, coded.next_id))
-        overlap = takewhile(lambda packet: packet.frame < self.start, StreamReader(self.files.stream))
-        self.run.begun[self.number].set_result(tuple(packet.encoded for packet in overlap))
-        # A worker continues the loop of one segment, not of many.
-        await self._until(lambda: self.run.active < self.run.workers.count)
-        self.run.active += 1
-        while (at := self.start + self.num_fitted) < self.stop:
-            stop, following = min(at + TASK_FRAMES, self.fade), None
-            if at == self.fade:  # one task, which alone knows both the faded Gaussians and those that it fits
-                _, shared_ids = await self.run.base
-                stop, following = self.stop, Following(await self.run.begun[self.number + 1], shared_ids)
-            # Starts are the longest tasks, and what other segments wait for: a late one would be fitted last and alone.
-            await self._until(lambda: self.run.starting < self.run.workers.count)
-            frames = FrameRange(self.start, at, stop)
-            self._add(await self.run.run(fit_frames, frames, self.restart, following))
-        self.run.active -= 1
-
-    @staticmethod
-    async def _until(condition: Callable[[], bool]) -> None:
-        while not condition():
-            await asyncio.sleep(_POLL)
-
-    def packets(self) -> Iterator[Packet]:
-        """Yield the packets of the segment, without the overlap before it."""
-        return dropwhile(
-            lambda p: (p.kind, p.frame) != (PacketKind.KEYFRAME, self.start), StreamReader(self.files.stream)
-        )
-
-    def _finished(self, index: Sequence[Entry], end: int) -> tuple[Sequence[Entry], int]:
-        """Return the index and the end of the file without a beginning or a cross-fade that is incomplete."""
-        if (PacketKind.KEYFRAME, self.start) not in {(kind, frame) for kind, frame, _ in index}:
-            return [], 0
-        if not self.fade <= index[-1][1] < self.stop - 1:
-            return index, end
-        kept = [entry for entry in index if entry[1] < self.fade]
-        return kept, index[len(kept)][2]
-
-    def _completed(self, part: Part) -> Part:
-        """Return the first part of the recording, with what was found about the cameras in its first report."""
-        prepared, config = self.run.prepared, self.run.task.config
-        if prepared is None or prepared.refinement is None:
-            return part
-        coded, frame = decode(None, decode_packet(part.packets[0])), next(prepared.capture.partial_frames(0, 1))
-        first = prepared.completed(part.reports[0], coded.gaussians, frame, config)
-        return replace(part, reports=(first, *part.reports[1:]))
-
-    def _open(self, earlier: Interrupted | None) -> Recording:
-        """Open the files of the segment, which the run closes."""
-        recording = Recording(self.files, self.run.capture, self.run.metadata, earlier)
-        self.recording = self.run.recordings.enter_context(recording)
-        return recording
-
-    def _add(self, part: Part) -> None:
-        """Add the frames of a task."""
-        recording = self.recording or self._open(None)
-        recording.extend(map(decode_packet, part.packets), part.reports)
-        self.restart = part.restart
-        self.run.show_progress()
+        return reports

@@ -1,24 +1,19 @@
-"""Workers without processes."""
+"""A worker without a process."""
 
 from __future__ import annotations
 
-import pickle
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
 
-from morgs_mi.runs.cluster.executor import Workers
+import pytest
 
 
-class Here(Workers):
-    """A worker that is this process, and gets its tasks as bytes; it dies at a task with a number."""
-
-    place = "here"
-    count = 1  # pyright: ignore[reportAssignmentType]
-
-    def __init__(self, dies_at: int = 99) -> None:
-        self.left = dies_at
-
-    async def run(self, function, *args):
-        self.left -= 1
-        if not self.left:
-            raise ChildProcessError("it died.")
-        function, args = pickle.loads(pickle.dumps((function, args)))
-        return function(*args)
+@contextmanager
+def client_here() -> Iterator[Any]:
+    """Yield the client of a worker that is a thread of this process."""
+    distributed = pytest.importorskip("distributed", reason="comes with the extra `cluster`")
+    with distributed.Client(
+        processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None, set_as_default=False
+    ) as client:
+        yield client

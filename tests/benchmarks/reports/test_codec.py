@@ -15,7 +15,7 @@ from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.render.render_config import RenderConfig
-from tests.benchmarks.reports.here import Here
+from tests.benchmarks.reports.here import client_here
 
 QUICK = Options(
     captures=(),
@@ -67,8 +67,9 @@ def test_options__reuse_complete_streams_and_write_tables_json_and_plot(
 def test_measure__of_workers_is_that_of_one_process(fitted_clip: Path, tmp_path: Path) -> None:
     stream = replace(QUICK.stream, render=RenderConfig(reproducible=True))
     capture = load_capture(fitted_clip / "capture", max_frames=2)
-    for name, workers in (("alone", None), ("workers", Here())):
-        measure(capture, replace(QUICK, qualities=(4,), stream=stream, out=tmp_path / name), workers)
+    with client_here() as here:
+        for name, client in (("alone", None), ("workers", here)):
+            measure(capture, replace(QUICK, qualities=(4,), stream=stream, out=tmp_path / name), client)
     alone, found = (
         {path.relative_to(folder): path.read_bytes() for path in folder.rglob("stream.morgs")}
         for folder in (tmp_path / "alone", tmp_path / "workers")

@@ -24,7 +24,7 @@ from benchmarks.reports.method_tables import (
 from benchmarks.reports.study import Variant
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
-from tests.benchmarks.reports.here import Here
+from tests.benchmarks.reports.here import client_here
 from tests.benchmarks.reports.pages import ROOT, page
 
 ARGS = ["--presets", "baseline", "default", "--epochs", "1", "2", "--key-views", "1", "2", "99", "--rates", "1", "2"]
@@ -50,8 +50,15 @@ def tiny(clip: Path, out: Path) -> Options:
     )
 
 
+MANY = 1000
+LEFT = [MANY]  # calls of `made_up` up to the one that fails
+
+
 def made_up(source, first, config):
     """Return scores in place of a fit's; more epochs and key views are better."""
+    LEFT[0] -= 1
+    if not LEFT[0]:
+        raise ChildProcessError("it died.")
     score = 20.0 + config.fit.epochs + 0.1 * config.motion.key_views + 100 * config.fit.rates.means
     names = ("psnr", "psnr_moving", "psnr_still", "ssim", "motion_error_moving", "motion_error_still")
     names += ("true_motion_moving", "num_bytes", *(f"motion_3d_{name}" for name in method._MOTION_3D))
@@ -164,14 +171,16 @@ def test_measure__of_workers_is_that_of_one_process(clip, tmp_path, monkeypatch)
     monkeypatch.setattr(method, "later_frames", made_up)
     options = replace(tiny(clip, tmp_path / "alone"), seeds=2)
     alone, options = method.measure(clip, options, None), replace(options, out=tmp_path / "workers")
-    with pytest.raises(ChildProcessError):
-        method.measure(clip, options, Here(dies_at=5))
+    LEFT[0] = 3
+    with client_here() as client, pytest.raises(ChildProcessError):
+        method.measure(clip, options, client)
+    LEFT[0] = MANY
     before = len(list((tmp_path / "workers").glob("*made_up-*.json")))
     assert before > 1
-    workers = Here()
-    found = method.measure(clip, options, workers)
+    with client_here() as client:
+        found = method.measure(clip, options, client)
     after = len(list((tmp_path / "workers").glob("*made_up-*.json")))
-    assert 99 - workers.left == after - before
+    assert MANY - LEFT[0] == after - before
     assert len(list((tmp_path / "alone").glob("*made_up-*.json"))) == after
     assert all(found[name] == alone[name] for name in ("rows", "key_view_rows"))
 

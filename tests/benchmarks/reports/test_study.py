@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from benchmarks.reports import cameras, cells, drift, fits, random_scenes, real, seams, study, timing, unseen
+from benchmarks.reports import cameras, cells, drift, fits, random_scenes, real, study, timing, unseen
 from benchmarks.reports.cells import run_cells
 from benchmarks.reports.study import Scene, Study, Variant, method_version, rounded
 from morgs_mi import StreamLoop
@@ -18,10 +17,10 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.render.render_config import RenderConfig
-from morgs_mi.runs.cluster.executor import open_workers
 from morgs_mi.runs.cluster.tasks import Source
+from morgs_mi.runs.cluster.workers import open_client
 from morgs_mi.synth.disturbances import load_disturbances
-from tests.benchmarks.reports.here import Here
+from tests.benchmarks.reports.here import client_here
 
 TINY = StreamConfig(
     fit=FitConfig(num_gaussians=60, first_frame_steps=3, epochs=1, dropping=0.0),
@@ -39,7 +38,6 @@ STUDIES = {
     real: ({"width": 64, "gaussians": 60, "steps": 3}, 5),
     drift: ({**SMALL, "scenes": ("spheres",)}, 2),
     timing: ({**SMALL, "seeds": (3,), "frames": 6, "fitted": 2, "time_offset": 0.4}, 2),
-    seams: ({**SMALL, "scenes": (("spheres", 0, 4),), "cameras": 3, "segment_frames": 2, "fit_seeds": (0,)}, 1),
 }
 FAST = (random_scenes, unseen)
 
@@ -75,18 +73,16 @@ def test_study_options__of_workers_write_the_rows_of_one_process(report, clip: P
         (tmp_path / name).symlink_to(clip)
     given, num_rows = STUDIES[report]
     place = {"captures": (clip,)} if report in (real, unseen) else {"clips": tmp_path}
-    workers, found = Here(), {}
+    found = {}
     monkeypatch.setattr(fits, "StreamLoop", tiny_loop)
     monkeypatch.setattr(cameras, "refine_cameras", lambda capture, *_: (capture, Scene({}, ())))  # needs larger images
     monkeypatch.setattr(timing, "estimate_time_offsets", true_offsets)
-    monkeypatch.setattr(cells, "open_workers", contextmanager(lambda scheduler, count: iter([workers])))
-    counts = (None,) if report is seams else (None, 2)  # seams have workers of their own
-    for count in counts:
+    monkeypatch.setattr(cells, "open_client", lambda scheduler, count: client_here())
+    for count in (None, 2):
         options = report.Options(json=tmp_path / "out.json", workers=count, **place, **given)
         options.run()
         result = json.loads((tmp_path / "out.json").read_text())
         found[count] = result["fits"]
-    assert workers.left < 99 or report is seams, "a worker was at work"
     assert len(found[None]) == num_rows
     assert {"settings", "commit", "date", "machine", "versions"} <= result.keys()
     assert "clips" not in result["settings"]
@@ -149,6 +145,7 @@ def test_rounded__has_five_digits_of_what_is_no_integer():
 def test_run_cells__of_processes_gives_the_scores_of_one_process(clip: Path):
     capture = load_capture(clip)
     args = {seed: (Source.of(capture), 2, replace(TINY, seed=seed)) for seed in (0, 1)}
-    with open_workers(count=2) as workers:
-        ours, theirs = (run_cells(random_scenes.measure, args, each, lambda *_: None) for each in (workers, None))
+    pytest.importorskip("distributed", reason="comes with the extra `cluster`")
+    with open_client(count=2) as client:
+        ours, theirs = (run_cells(random_scenes.measure, args, each, lambda *_: None) for each in (client, None))
     assert without_times(list(ours.values())) == without_times(list(theirs.values()))

@@ -231,7 +231,7 @@ def test_page__decodes_the_same_integers(page, clip):
     assert all(decodes(page, position, clip[1][position]) for position in (0, 3, 1, 2))
 
 
-def test_page__plays_a_salvaged_stream(browser, clip, tmp_path):
+def test_page__plays_a_stream_with_a_missing_frame(browser, clip, tmp_path):
     states, packets = clip[1], list(open_stream(clip[0]))
     # Frame 1 is lost; keyframes were re-emitted at frames 2 and 3.
     kept = [packets[0], reemitted_keyframe(states[2]), packets[3], reemitted_keyframe(states[3])]

@@ -17,11 +17,11 @@ from benchmarks.reports import __main__ as reports
 from morgs_mi import cli
 from morgs_mi.codec.reader import StreamReader
 from tests.cli.commands import QUICK
-from tests.scenes.recording import CONFIG, write_recording
+from tests.scenes.recording import write_recording
 
 ROOT = Path(__file__).parents[3]
 TEXT = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
-BLOCKS = re.findall(r"<!-- (run|start|file [^ ]+) -->\n```\w+\n(.*?)```", TEXT, re.DOTALL)
+BLOCKS = re.findall(r"<!-- (run|start) -->\n```\w+\n(.*?)```", TEXT, re.DOTALL)
 FRAMES = 4
 REPORT = ("--stream.fit.num-gaussians", "80", "--stream.fit.first-frame-steps", "8", "--stream.fit.epochs", "1")
 
@@ -44,7 +44,6 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PWD", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr("morgs_mi.runs.cluster.jobs.StreamConfig", lambda: CONFIG)
     return tmp_path
 
 
@@ -56,28 +55,25 @@ def test_cluster_page__commands_run(workplace: Path) -> None:
         port = str(free.getsockname()[1])
     with contextlib.ExitStack() as stack:
         for kind, text in BLOCKS:
-            command = text.strip().replace("8786", port).replace("40000", "100")
+            command = text.strip().replace("8786", port)
             if kind == "start":
                 process = started(command)
                 stack.callback(process.wait)
                 stack.callback(process.terminate)
-            elif kind == "run":
+            else:
                 program, *args = shlex.split(os.path.expandvars(command))
                 if program == "python":
                     assert reports.main([*args[2:], *REPORT]) == 0, command
                     continue
                 assert program == "morgs-mi"
                 assert cli.main([*args, *(QUICK if args[0] == "fit" else [])]) == 0, command
-            else:
-                (workplace / kind.removeprefix("file ")).write_text(command)
     streams = sorted(str(path.parent.relative_to("out")) for path in Path("out").rglob("stream.morgs"))
-    jobs = [f"sweep/capture-{name}-s{seed}" for name in ("detailed", "small") for seed in (0, 1)]
     qualities = [f"codec/capture/{quality}" for quality in (1, 1000)]
-    assert streams == ["cluster", *qualities, "dask", "segments", *jobs, "url"]
+    assert streams == ["cluster", *qualities, "segments", "url"]
     for name in streams:
         assert {frame for _, frame, _ in StreamReader(f"out/{name}/stream.morgs").index()} == set(range(FRAMES))
 
 
 def test_cluster_page__has_commands() -> None:
-    kinds = ["run", "run", "file sweep.toml", "run", "run", "start", "start", "run", "run"]
+    kinds = ["run", "run", "start", "start", "run", "run"]
     assert [kind for kind, _ in BLOCKS] == kinds

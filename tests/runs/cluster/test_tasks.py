@@ -9,10 +9,12 @@ import mitsuba as mi
 import pytest
 
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.runs.cluster import tasks
-from morgs_mi.runs.cluster.executor import cores
+from morgs_mi.codec.codec_config import CodecConfig
+from morgs_mi.codec.container import PacketKind, decode_packet
+from morgs_mi.codec.packets import reemitted_keyframe
 from morgs_mi.runs.cluster.seams import SegmentConfig
-from morgs_mi.runs.cluster.tasks import Fit, FrameRange, Source, fit_frames, installed
+from morgs_mi.runs.cluster.tasks import Fit, Segment, Source, fit_frames
+from morgs_mi.runs.cluster.workers import installed
 from tests.scenes.recording import CONFIG, write_recording
 
 
@@ -25,26 +27,34 @@ def fit(tmp_path_factory: pytest.TempPathFactory) -> Fit:
 def test_fit_frames__continues_the_loop_of_the_last_task_or_reads_it_again(
     fit: Fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = fit_frames(fit, FrameRange(0, 0, 3), ())
+    first = fit_frames(fit, Segment(0, 5, 0), 3)
+    assert first.segment == replace(first.segment, start=0, stop=5, frame=3)
     monkeypatch.setattr(Source, "open", None)
-    kept = fit_frames(fit, FrameRange(0, 3, 5), first.restart)
+    kept = fit_frames(fit, first.segment, 5)
     monkeypatch.undo()
-    again = fit_frames(fit, FrameRange(0, 3, 5), first.restart)
+    again = fit_frames(fit, first.segment, 5)
     assert again.packets == kept.packets
-    assert again.restart == kept.restart
+    assert again.segment == kept.segment
     assert [report.frame for report in again.reports] == [3, 4]
+
+
+def test_fit_frames__begins_a_segment_with_a_keyframe_after_the_common_model(fit: Fit) -> None:
+    common = fit_frames(fit, Segment(0, 2, 0), 2)
+    assert common.segment.coded is not None
+    start = (reemitted_keyframe(common.segment.coded).encoded,)
+    config = replace(fit.config, codec=CodecConfig(keyframe_interval=0))
+    fit = replace(fit, config=config, segments=SegmentConfig(2, passes=1, epochs=1, overlap=1))
+    part = fit_frames(fit, Segment(3, 5, 3, start), 5)
+    kinds = [(packet.kind, packet.frame) for packet in map(decode_packet, part.packets)]
+    assert kinds == [(PacketKind.KEYFRAME, 3), (PacketKind.RESIDUAL, 4)]
+    assert [report.frame for report in part.reports] == [3, 4]
+    assert [report.num_bytes for report in part.reports] == [len(packet) for packet in part.packets]
 
 
 def test_fit_frames__refuses_other_versions(fit: Fit) -> None:
     versions = tuple((name, "0.1" if name == "drjit" else version) for name, version in installed())
     with pytest.raises(ValueError, match=r"expected a worker with drjit 0\.1 like the client, got 1\.5\.0; install"):
-        fit_frames(replace(fit, versions=versions), FrameRange(0, 0, 1), ())
-
-
-def test_fit_frames__ends_where_its_memory_ends(fit: Fit, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tasks, "share_of_machine", lambda: (cores(), 1000))
-    with pytest.raises(MemoryError, match=r"expected a worker with at most 0\.0 GB, its share, got .* fewer workers"):
-        fit_frames(fit, FrameRange(0, 0, 1), ())
+        fit_frames(replace(fit, versions=versions), Segment(0, 1, 0), 1)
 
 
 def test_source__opens_the_capture_as_it_is(tmp_path: Path) -> None:

@@ -1,13 +1,11 @@
-"""Completion of commands in a shell, and the command that a mistyped one resembles."""
+"""Suggestion of the command that a mistyped one resembles."""
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import is_dataclass
 from difflib import get_close_matches
-from functools import reduce
 from itertools import takewhile
 from typing import Any, get_args, get_type_hints
 
@@ -15,30 +13,9 @@ from tyro.conf import subcommand
 
 from morgs_mi.cli.console import print_warning
 
-__all__ = ["completion_script", "near_command", "suggesting_command"]
+__all__ = ["near_command", "suggesting_command"]
 
 _SUBCOMMAND: Any = type(subcommand())
-# Changes of tyro's scripts: they complete no positional arguments, though most are files, and in bash they take the
-# words before the current one for a part of it.
-_FOUND = "get_completions(words, current_index, COMPLETION_SPEC)"
-_CHANGES = {
-    _FOUND: f"{_FOUND} or ['__TYRO_COMPLETE_FILES__']",
-    'compgen -f -- "$cur"': 'compgen -f -- "${COMP_WORDS[COMP_CWORD]}"',
-    "complete -F": "complete -o filenames -F",
-}
-
-
-def completion_script(parse: Callable[[Sequence[str]], Any], shell: str) -> str:
-    """Return the script with which a shell completes commands, options and their values, otherwise names of files.
-
-    Args:
-        parse: parser of the arguments, by tyro.
-        shell: bash, zsh or fish.
-    """
-    printed = io.StringIO()
-    with redirect_stdout(printed), suppress(SystemExit):
-        parse(["--tyro-write-completion", shell, "-"])
-    return reduce(lambda script, change: script.replace(*change), _CHANGES.items(), printed.getvalue())
 
 
 @contextmanager

@@ -1,0 +1,179 @@
+"""Workers: processes of a Dask cluster, on this machine or on several, and the conditions in which they run a task.
+
+A task is a function of the package without side effects. If its worker dies, Dask runs it again with the same result.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import platform
+import socket
+import threading
+from collections.abc import Iterator
+from concurrent.futures import CancelledError
+from contextlib import ExitStack, contextmanager, suppress
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import drjit as dr
+import mitsuba as mi
+
+from morgs_mi.core.environment import versions
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+__all__ = ["cores", "installed", "num_workers", "open_client", "prepared", "worker_name"]
+
+# Seconds after which a scheduler that does not answer counts as lost.
+_TIMEOUT = 10
+_SETTINGS = {
+    "distributed.comm.timeouts.connect": _TIMEOUT,
+    "distributed.admin.large-graph-warning-threshold": "1GB",  # a task has the Gaussians before it
+    "distributed.worker.memory.pause": False,  # a worker that waits keeps its memory; one with too much is ended
+}
+_BUSY = threading.Lock()  # Dask runs several tasks at once in a worker with several threads
+
+
+@contextmanager
+def open_client(scheduler: str | None = None, count: int | None = None) -> Iterator[Client]:
+    """Start workers on this machine, or connect to those of a scheduler.
+
+    Args:
+        scheduler: address of a Dask scheduler, such as ``tcp://host:8786``; None: workers are started.
+        count: number of workers to start, with equal shares of cores and memory; None: one per core.
+
+    Raises:
+        ValueError: the number or the address is not one, Dask is missing, or the workers have another version of it.
+        ConnectionError: the scheduler does not answer, has no worker, or is lost later.
+        ChildProcessError: the workers died that ran a task.
+    """
+    if count is not None and count < 1:
+        raise ValueError(f"open_client(): `workers` must be at least 1, got {count}.")
+    if scheduler is not None and "://" not in scheduler:
+        raise ValueError(f"open_client(): `scheduler` must be an address such as tcp://host:8786, got {scheduler}.")
+    try:
+        import dask.config
+        from distributed import Client, LocalCluster
+    except ImportError:
+        raise ValueError(
+            "open_client(): several workers need the package distributed; pip install 'morgs-mi[cluster]'."
+        ) from None
+    with ExitStack() as stack:
+        stack.enter_context(dask.config.set(_SETTINGS))
+        address: Any = scheduler
+        if scheduler is None:
+            count = count or cores()
+            threads = max(1, cores() // count)
+            address = LocalCluster(
+                n_workers=count, threads_per_worker=threads, dashboard_address=":0", silence_logs=logging.CRITICAL
+            )
+            stack.enter_context(address)
+        problem = "none"
+        try:
+            client = stack.enter_context(Client(address, timeout=_TIMEOUT, set_as_default=False))
+            problem = "no worker"
+            client.wait_for_workers(1, timeout=_TIMEOUT)
+        except (OSError, ValueError):
+            raise ConnectionError(
+                f"{scheduler}: expected a scheduler with workers, got {problem}; start it first."
+            ) from None
+        with _in_sentences(scheduler or "this machine"):
+            yield client
+
+
+@contextmanager
+def _in_sentences(place: str) -> Iterator[None]:
+    """Raise the errors of Dask as sentences about workers at a place."""
+    try:
+        yield
+    except (Exception, CancelledError) as error:
+        name = type(error).__name__
+        if name == "KilledWorker":
+            raise ChildProcessError(
+                f"{place}: expected the workers to stay alive, but all died that ran one task, perhaps for lack of "
+                "memory; use fewer workers, or process smaller images."
+            ) from None
+        if name in ("CommClosedError", "ClosedClientError", "FutureCancelledError"):
+            raise ConnectionError(
+                f"{place}: expected a scheduler that answers, but the connection was lost; start it again."
+            ) from None
+        if isinstance(error, RuntimeError) and "deserialization" in str(error):
+            raise ValueError(
+                f"{place}: expected a scheduler and workers with the versions of this client, got others that cannot "
+                "read its tasks; install the same versions on all machines."
+            ) from None
+        raise
+
+
+def num_workers(client: Client) -> int:
+    """Return the number of workers, which may change."""
+    return len(client.scheduler_info(n_workers=-1).get("workers", ()))
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def worker_name() -> str:
+    """Return the address of the worker that runs this task; without one, the name of this machine."""
+    worker = _worker()
+    return socket.gethostname() if worker is None else worker.address
+
+
+def _worker() -> Any:
+    with suppress(ImportError, ValueError):
+        from distributed import get_worker
+
+        return get_worker()
+    return None
+
+
+def installed() -> tuple[tuple[str, str], ...]:
+    """Return the versions that must be the same in client and workers."""
+    python = ".".join(platform.python_version_tuple()[:2])
+    return tuple({**versions(), "python": python}.items())
+
+
+@contextmanager
+def prepared(variant: str, versions: tuple[tuple[str, str], ...]) -> Iterator[list[str]]:
+    """Run a task alone in this process, with its variant and threads; the context is a list of its warnings.
+
+    Args:
+        variant: Mitsuba variant of the client.
+        versions: as `installed` returned them to the client.
+
+    Raises:
+        ValueError: the worker has other versions than the client.
+    """
+    for (name, expected), (_, version) in zip(versions, installed(), strict=True):
+        if expected != version:
+            raise ValueError(
+                f"{socket.gethostname()}: expected a worker with {name} {expected} like the client, got {version}; "
+                "install the same versions on both."
+            )
+    messages: list[str] = []
+    with _BUSY, _logged(messages):
+        if mi.variant() != variant:
+            mi.set_variant(variant)
+        worker = _worker()
+        threads = cores() if worker is None else worker.state.nthreads
+        if dr.thread_count() != threads:
+            dr.set_thread_count(threads)
+            cv2.setNumThreads(threads)
+        yield messages
+
+
+@contextmanager
+def _logged(messages: list[str]) -> Iterator[None]:
+    """Collect the warnings of the package."""
+    handler = logging.Handler(logging.WARNING)
+    handler.emit = lambda record: messages.append(record.getMessage())
+    log = logging.getLogger("morgs_mi")
+    log.addHandler(handler)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)

@@ -1,0 +1,93 @@
+"""Workers: what they run, what happens when they die, and the sentences of what cannot be."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from morgs_mi.runs.cluster.workers import cores, num_workers, open_client, prepared, worker_name
+
+distributed = pytest.importorskip("distributed", reason="comes with the extra `cluster`")
+
+
+def die() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def fail() -> None:
+    raise ValueError("fail(): expected more.")
+
+
+def threads(*about) -> tuple[int, str]:
+    import drjit as dr
+
+    with prepared(*about):
+        return dr.thread_count(), worker_name()
+
+
+def test_open_client__starts_workers_that_share_the_cores() -> None:
+    import mitsuba as mi
+
+    from morgs_mi.runs.cluster.workers import installed
+
+    with open_client(count=2) as client:
+        assert num_workers(client) == 2
+        count, name = client.submit(threads, str(mi.variant()), installed()).result()
+        assert count == max(1, cores() // 2)
+        assert name in client.scheduler_info(n_workers=-1)["workers"]
+        with pytest.raises(ValueError, match=r"^fail\(\): expected more\.$"):
+            client.submit(fail).result()
+
+
+def test_open_client__names_workers_that_die() -> None:
+    import dask.config
+
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
+        pytest.raises(ChildProcessError, match="this machine: expected the workers to stay alive, but all died that"),
+        open_client(count=1) as client,
+    ):
+        client.submit(die).result()
+
+
+def test_open_client__has_workers_that_end_with_their_parent() -> None:
+    script = (
+        "import os, signal\n"
+        "from morgs_mi.runs.cluster.workers import open_client\n"
+        "if __name__ == '__main__':\n"
+        "    with open_client(count=1) as client:\n"
+        "        print(client.submit(os.getpid).result(), flush=True)\n"
+        "        os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    result = subprocess.run([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, check=False)
+    deadline = time.monotonic() + 20
+    while Path(f"/proc/{result.stdout.strip()}").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize(
+    ("scheduler", "count", "message"),
+    [
+        (None, 0, r"`workers` must be at least 1, got 0"),
+        ("here", None, r"`scheduler` must be an address such as tcp://host:8786, got here"),
+        ("nothing://here", None, r"nothing://here: expected a scheduler with workers, got none"),
+        ("tcp://127.0.0.1:1", None, r"tcp://127\.0\.0\.1:1: expected a scheduler with workers, got none"),
+    ],
+)
+def test_open_client__refuses_in_one_sentence(scheduler, count, message, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("morgs_mi.runs.cluster.workers._TIMEOUT", 1)
+    with pytest.raises((ValueError, ConnectionError), match=message), open_client(scheduler, count):
+        pass
+
+
+def test_open_client__names_the_extra_that_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ValueError, match=r"need the package distributed; pip .*morgs-mi\[cluster\]"), open_client():
+        pass
