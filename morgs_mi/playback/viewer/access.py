@@ -39,8 +39,9 @@ def refusal(headers: Headers, name: str) -> str | None:
         return f"expected a request for localhost or an address in digits, got the host {hostname!r}"
     if page.lower() != host.lower():
         return f"expected a request of the viewer's own page at {host}, got one of {origin!r}"
-    if headers.get("sec-fetch-site") == "cross-site" and headers.get("sec-fetch-mode") != "navigate":
-        return "expected a request of the viewer's own page, got one of another site"
+    site = headers.get("sec-fetch-site", "none")
+    if site not in ("same-origin", "none") and headers.get("sec-fetch-mode") != "navigate":
+        return "expected a request of the viewer's own page, got one of another page"
     return None
 
 

@@ -90,7 +90,8 @@ def test_refusal__accepts_the_viewers_own_page(host, origin):
         ({}, "got the host ''"),
         ({"host": "[evil"}, "expected a host and an origin, got '[evil'"),
         ({"host": "localhost", "origin": "http://[evil"}, "expected a host and an origin"),
-        ({"host": "localhost", "sec-fetch-site": "cross-site", "sec-fetch-mode": "no-cors"}, "one of another site"),
+        ({"host": "localhost", "sec-fetch-site": "cross-site", "sec-fetch-mode": "no-cors"}, "one of another page"),
+        ({"host": "localhost", "sec-fetch-site": "same-site"}, "one of another page"),  # of another port
     ],
 )
 def test_refusal__names_a_foreign_page_or_host(headers, message):
