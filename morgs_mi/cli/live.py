@@ -51,7 +51,7 @@ class Live:
     live: Annotated[LiveConfig, arg(name=""), DisallowNone] = field(default_factory=LiveConfig)
     view: Flag = False
     """Show the stream in the viewer, which follows it."""
-    open_browser: bool = True
+    browser: bool = True
     """Open the viewer in the browser of this machine."""
     settings: Annotated[LiveSettings, arg(name=""), DisallowNone] = field(default_factory=LiveSettings)
 
@@ -70,7 +70,7 @@ class Live:
                 nonlocal is_shown
                 if not is_shown:
                     is_shown = True
-                    viewer.callback(_stop, _start_viewer(out, self.open_browser))
+                    viewer.callback(_stop, _start_viewer(out, self.browser))
 
             def on_frame(row: LiveFrame, *_: Any) -> None:
                 lines.add(row)
@@ -116,10 +116,10 @@ def _summary(out: Path, rows: Sequence[LiveFrame]) -> str:
     return f"{text}, mean latency of the others {latency:.2f} s, largest skew {1e3 * skew:.0f} ms."
 
 
-def _start_viewer(out: Path, open_browser: bool) -> subprocess.Popen[bytes]:
+def _start_viewer(out: Path, browser: bool) -> subprocess.Popen[bytes]:
     """Start the viewer in a process of its own: in one process it would wait for the renderings of the fit."""
-    browser = "--open-browser" if open_browser else "--no-open-browser"
-    command = [sys.executable, "-m", "morgs_mi", "view", str(out), "--follow", browser, "--variant", mi.variant()]
+    opening = "--browser" if browser else "--no-browser"
+    command = [sys.executable, "-m", "morgs_mi", "view", str(out), "--follow", opening, "--variant", mi.variant()]
     return subprocess.Popen(command, start_new_session=True)  # Ctrl-C is for the fit, which ends the viewer
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import LARGEST
 
-__all__ = ["header_fields", "header_json", "load_json"]
+__all__ = ["camera_of_fields", "header_fields", "header_json", "load_json"]
 
 _MAX_BYTES = 2**22
 _MAX_LEVELS = 32  # of JSON; recursive programs must be able to visit it
@@ -69,7 +69,7 @@ def header_fields(payload: bytes | memoryview) -> tuple[tuple[Camera, ...], floa
         ValueError: an entry is missing, or has another type or range than it must have.
     """
     header = _typed(load_json(payload, _MAX_BYTES), dict, "header")
-    cameras = [_camera(fields, f"cameras[{k}]") for k, fields in enumerate(_entry(header, "cameras", list))]
+    cameras = [camera_of_fields(fields, f"cameras[{k}]") for k, fields in enumerate(_entry(header, "cameras", list))]
     if not cameras:
         raise ValueError("`cameras` must name at least one camera, got none")
     fps = _within(_entry(header, "fps", float), 1 / _MAX_FPS, _MAX_FPS, "fps")
@@ -122,7 +122,12 @@ def _short(text: str) -> int:
     return value
 
 
-def _camera(fields: Any, where: str) -> Camera:
+def camera_of_fields(fields: Any, where: str) -> Camera:
+    """Return the camera of a JSON object from a header; `where` names it in messages.
+
+    Raises:
+        ValueError: an entry is missing, or has another type or range than it must have.
+    """
     fields = _typed(fields, dict, where)
     name = _entry(fields, "name", str, where)
     if not name.isprintable():

@@ -1,4 +1,4 @@
-"""Gaussians in NumPy, as other programs need them: covariances, colours seen from a point, rotated axes.
+"""Gaussians in NumPy, as other programs need them: covariances, spherical harmonics, rotated axes.
 
 N Gaussians, K = (degree + 1)^2 SH coefficients; R [3, 3] is a rotation that takes column vectors, x' = R x.
 """
@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from morgs_mi.core.gaussians import Gaussians
 
-__all__ = ["colors_seen_from", "covariances", "rotated", "sh_basis", "unit_quats"]
+__all__ = ["covariances", "rotated", "sh_basis", "unit_quats"]
 
 
 def unit_quats(gaussians: Gaussians) -> np.ndarray:
@@ -35,15 +35,6 @@ def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
     """Return the spherical harmonics of unit directions [M, 3] with 3DGS's signs, [M, K]."""
     basis = [np.asarray(values) for values in dr.sh_eval(mi.Vector3f(directions.T), degree)]
     return np.stack([np.broadcast_to(values, len(directions)) for values in basis], axis=1)
-
-
-def colors_seen_from(gaussians: Gaussians, eye: np.ndarray) -> np.ndarray:
-    """Return the display-referred colours [N, 3] that a camera at `eye` [3] sees, not clamped from above."""
-    raw = gaussians.numpy()
-    directions = raw["means"] - np.asarray(eye, np.float32)
-    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-30)
-    basis = sh_basis(directions, gaussians.sh_degree)
-    return np.maximum(0.5 + np.einsum("nk,nkc->nc", basis, raw["sh_coeffs"]), 0)
 
 
 def rotated(gaussians: Gaussians, R: np.ndarray) -> Gaussians:

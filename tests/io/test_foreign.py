@@ -57,7 +57,7 @@ def test_refuse_foreign__names_format_and_remedy_at_every_door(tmp_path, name):
 
 
 @pytest.mark.parametrize(
-    "command", [("render",), ("export", "ply"), ("export", "web"), ("view", "--no-open-browser")], ids=" ".join
+    "command", [("render",), ("export", "ply"), ("export", "web"), ("view", "--no-browser")], ids=" ".join
 )
 def test_commands__name_a_compressed_format(tmp_path, capsys, command):
     (tmp_path / "a.spz").write_bytes(SPZ)

@@ -20,7 +20,6 @@ from morgs_mi.io.ply import write_ply
 from morgs_mi.io.splats import read_splats
 from morgs_mi.playback.export.web import write_web_folder
 from morgs_mi.playback.streams import open_stream
-from morgs_mi.playback.viewer.frame_cache import FrameCache
 from morgs_mi.render.rasterize import rasterize
 from tests.assertions import assert_close
 from tests.scenes.cameras import look_at_cameras
@@ -62,7 +61,6 @@ def test_splat_file__has_the_gaussians_of_the_file_in_one_frame(file):
     for gaussians in (
         next(gaussians for _, gaussians in play(stream)),
         seek(stream, 0).gaussians,
-        FrameCache(file).at(0).gaussians,
     ):
         found = gaussians.numpy()
         for name, values in expected.items():
@@ -173,7 +171,7 @@ def test_render__orbits_a_file_of_gaussians(tmp_path, run):
     ],
     ids=["mesh", "no vertices", "empty", "other", "truncated header"],
 )
-@pytest.mark.parametrize("command", [("render",), ("view", "--no-open-browser"), ("export", "web")], ids=" ".join)
+@pytest.mark.parametrize("command", [("render",), ("view", "--no-browser"), ("export", "web")], ids=" ".join)
 def test_commands__name_what_is_no_file_of_gaussians(tmp_path, run, content, message, command):
     (tmp_path / "scene.ply").write_text(content)
     status, _, error = run(*command, tmp_path / "scene.ply")

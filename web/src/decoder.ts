@@ -12,7 +12,7 @@ const SPACING = 16;
 
 export class Decoder {
   /** Frame numbers in order; a position is an index into them. */
-  readonly frames: number[];
+  readonly frames: number[] = [];
   /** For each position the packet that leads to it from the one before. */
   private readonly packets: PacketPlace[] = [];
   /** Keyframes by position, re-emitted ones included. */
@@ -25,12 +25,20 @@ export class Decoder {
   private position = -1;
 
   constructor(private readonly stream: Stream) {
-    for (const packet of stream.packets) {
-      if (packet.frame !== this.packets.at(-1)?.frame) this.packets.push(packet);
+    if (stream.packets.length === 0) throw new Error("the stream has no frame yet");
+    if (stream.packets[0].kind !== KEYFRAME) throw new Error("the stream has no keyframe to start from");
+    this.extend(stream.packets);
+  }
+
+  /** Add packets that follow those before. */
+  extend(packets: PacketPlace[]): void {
+    for (const packet of packets) {
+      if (packet.frame !== this.packets.at(-1)?.frame) {
+        this.packets.push(packet);
+        this.frames.push(packet.frame);
+      }
       if (packet.kind === KEYFRAME) this.keyframes.set(this.packets.length - 1, packet);
     }
-    if (this.packets[0]?.kind !== KEYFRAME) throw new Error("the stream has no keyframe to start from");
-    this.frames = this.packets.map((packet) => packet.frame);
   }
 
   /** Decode a position; the update continues the last one, unless it is a reset, as it is if it shall be `fresh`. */

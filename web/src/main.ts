@@ -3,6 +3,7 @@
 import { positionOf } from "./cameras";
 import { CONFIDENCE_GRADIENT } from "./colors";
 import { Playback } from "./playback";
+import { Overlay, type Part, Server } from "./server";
 import { type Mode, MODES, Splats } from "./splats";
 import { type CameraFields, download } from "./stream";
 import { View } from "./view";
@@ -14,6 +15,12 @@ const PLAY = "M7 4v16l13-8z";
 const PAUSE = "M6 4h4v16H6zM14 4h4v16h-4z";
 /** The controls fade after so many milliseconds without input while the clip plays. */
 const IDLE = 3000;
+/** Period in which the server is asked whether the stream has grown, milliseconds. */
+const POLL = 1000;
+/** The view rests after so many milliseconds without a change. */
+const REST = 200;
+/** Share of the page that shows the recording at first, percent. */
+const HALF = 50;
 
 const element = <T extends HTMLElement>(id: string) => document.getElementById(id) as T;
 const canvas = element<HTMLCanvasElement>("canvas");
@@ -31,9 +38,41 @@ function sayFailure(error: unknown): void {
   say(`This page could not start: ${error instanceof Error ? error.message : error}.`);
 }
 
-async function streamBytes(): Promise<Uint8Array<ArrayBuffer>> {
-  const address = element("stream").dataset.address;
-  return address === undefined ? embedded("stream") : download(address);
+function unsay(): void {
+  element("message").hidden = true;
+}
+
+/** Show short notes, one for each topic; the text of an empty one is "". */
+function note(topic: string, text: string): void {
+  const notes = element("notes");
+  const line = notes.querySelector(`[data-topic=${topic}]`) ?? notes.appendChild(document.createElement("div"));
+  (line as HTMLElement).dataset.topic = topic;
+  line.textContent = text;
+  notes.hidden = notes.textContent === "";
+}
+
+async function begin(): Promise<void> {
+  const { address, server } = element("stream").dataset;
+  const served = server === undefined ? null : new Server(address!);
+  const player = new Player(served !== null, server === "recorded");
+  Object.assign(window, { player }); // for tests
+  if (served !== null) await player.follow(served);
+  else player.playback.open(address === undefined ? embedded("stream") : await download(address));
+}
+
+function sameRig(a: Opened, b: Opened): boolean {
+  const settings = ({ cameras, metadata }: Opened) => JSON.stringify([cameras, (metadata as Metadata).config?.render]);
+  return settings(a) === settings(b);
+}
+
+/** Set or remove an attribute, unless it is so: every change costs a new layout. */
+function setFlag(id: string, name: string, value: boolean): void {
+  if (element(id).hasAttribute(name) !== value) element(id).toggleAttribute(name, value);
+}
+
+/** Whether a button that stays pressed is. */
+function pressed(id: string): boolean {
+  return element(id).ariaPressed === "true";
 }
 
 /** Scale of the page's units: the rig spans four, as Spark's thresholds are absolute. */
@@ -41,6 +80,12 @@ function unitOf(cameras: CameraFields[]): number {
   const positions = cameras.map(positionOf);
   const span = Math.max(...positions.map((position) => position.distanceTo(positions[0])));
   return 4 / (span || positions[0].length() || 4);
+}
+
+interface Metadata {
+  config?: { render?: object };
+  motion_scale?: number;
+  default_rig?: boolean;
 }
 
 class Player {
@@ -57,15 +102,46 @@ class Player {
   /** Mode of the legend. */
   private legend: Mode = "color";
   private lastInput = 0;
+  /** The stream, if it was opened. */
+  private stream: Opened | null = null;
+  /** Description of the end of a stream that may still grow. */
+  private damage: string | null = null;
+  /** Time of the last change of what is shown. */
+  private changed = 0;
+  private readonly recorded = new Overlay(
+    element<HTMLImageElement>("recording"),
+    (address) => address.slice(0, address.lastIndexOf("/")),
+    (reason) => note("recording", reason === null ? "" : `No recorded image: ${reason}`),
+  );
+  private readonly exact = new Overlay(
+    element<HTMLImageElement>("rendering"),
+    (address) => address,
+    (reason) => note("rendering", reason === null ? "" : `No exact image: ${reason}`),
+  );
 
-  constructor(bytes: Uint8Array<ArrayBuffer>) {
-    this.playback = new Playback(bytes, {
+  /**
+   * @param served whether a server renders images, and adds to the stream
+   * @param hasRecording whether it has recorded images
+   */
+  constructor(private readonly served: boolean, hasRecording: boolean) {
+    element("player").classList.toggle("served", served);
+    element("wipe").hidden = !hasRecording;
+    this.playback = new Playback({
       opened: (stream) => this.open(stream),
+      grown: ({ frames, damage }) => {
+        const follows = !this.playback.playing && this.playback.aim === this.frames.length - 1;
+        this.damage = damage;
+        this.setFrames(frames);
+        unsay();
+        if (follows) this.playback.seek(this.playback.last);
+      },
       show: (update, position) => {
         this.splats.apply(update);
         slider.value = String(position);
+        modeButtons.find(({ dataset }) => dataset.mode === "confidence")!.hidden = !update.confidence;
+        this.changed = performance.now();
         this.count();
-        if (!this.started) this.start(update.confidence);
+        if (!this.started) this.start();
       },
       failed: (message) => {
         if (this.started) say(`This stream is damaged: ${message}. The frames before that play.`);
@@ -80,39 +156,91 @@ class Player {
 
   /** Whether the page shows a frame completely. */
   get settled(): boolean {
-    return this.started && !this.playback.busy && this.splats.settled;
+    return this.started && !this.playback.busy && this.splats.settled && this.recorded.settled && this.exact.settled;
+  }
+
+  /** Show the stream of a server, also what it adds later. */
+  async follow(server: Server): Promise<never> {
+    for (let lost = false; ; await new Promise((resume) => setTimeout(resume, POLL))) {
+      try {
+        const part = await server.poll();
+        if (lost) unsay();
+        lost = false;
+        if (part !== null) this.take(part, server);
+        else if (this.damage !== null) this.sayDamage(this.damage); // what is still being written grows within a second
+      } catch {
+        lost = true;
+        say("The server of this page does not answer: start morgs-mi view again, or wait.");
+      }
+    }
+  }
+
+  private take({ bytes, whole, provisional }: Part, server: Server): void {
+    if (whole) {
+      this.damage = null;
+      note("provisional", provisional ? "Provisional first frame: it is still being fitted." : "");
+      this.playback.open(bytes);
+    } else if (this.stream === null) {
+      server.forget(); // the bytes before could not be opened
+    } else {
+      this.playback.extend(bytes);
+    }
+  }
+
+  private sayDamage(damage: string): void {
+    say(`This stream is damaged: ${damage}. The frames before that play.`);
   }
 
   private open(stream: Opened): void {
-    ({ cameras: this.cameras, frames: this.frames } = stream);
-    if (stream.damage !== null) say(`This stream is damaged: ${stream.damage}. The frames before that play.`);
+    const { stream: before, playback } = this;
+    if (before !== null && !sameRig(before, stream)) return location.reload();
+    const follows = !playback.playing && playback.position === this.frames.length - 1;
+    this.stream = stream;
+    unsay();
+    if (this.served) this.damage = stream.damage;
+    else if (stream.damage !== null) this.sayDamage(stream.damage);
+    if (before === null) this.setUp(stream);
+    this.setFrames(stream.frames);
+    playback.seek(before === null ? 0 : follows ? playback.last : playback.position);
+  }
+
+  private setFrames(frames: number[]): void {
+    this.frames = frames;
+    slider.max = String(frames.length - 1);
+    element("player").classList.toggle("still", frames.length === 1);
+    if (this.started) this.count();
+  }
+
+  /** Set up what depends on the cameras and the settings of the stream. */
+  private setUp(stream: Opened): void {
+    this.cameras = stream.cameras;
     const unit = unitOf(this.cameras);
-    const metadata = stream.metadata as { motion_scale?: number; default_rig?: boolean };
+    const metadata = stream.metadata as Metadata;
     this.motionScale = metadata.motion_scale ?? 0.03;
     this.splats = new Splats(canvas, stream.metadata, unit);
     this.view = new View(this.cameras, unit, canvas, () => this.followView());
     if (metadata.default_rig === true) this.bound(); // no recorded views to stay near
     cameraList.replaceChildren(...this.cameras.map(({ name }, i) => new Option(name, String(i))));
-    slider.max = String(this.frames.length - 1);
-    element("player").classList.toggle("still", this.frames.length === 1);
-    this.playback.seek(0);
   }
 
   /** Begin with the first frame that is shown. */
-  private start(confidence: boolean): void {
+  private start(): void {
     this.started = true;
-    modeButtons.find(({ dataset }) => dataset.mode === "confidence")!.hidden = !confidence;
     new ResizeObserver(() => this.resize()).observe(canvas);
     this.resize();
     const wished = this.cameras.findIndex(({ name }) => name === this.wishes.get("camera"));
     this.selectCamera(Math.max(0, wished));
-    if (this.wishes.has("frame")) this.playback.seek(this.frames.indexOf(Number(this.wishes.get("frame"))));
+    if (this.wishes.has("follow")) this.playback.seek(this.playback.last);
+    else if (this.wishes.has("frame")) this.playback.seek(this.frames.indexOf(Number(this.wishes.get("frame"))));
     else this.leaveFirst();
     this.selectMode(MODES.find((mode) => mode === this.wishes.get("mode")) ?? "color");
     this.listen();
     this.lastInput = performance.now();
+    if (this.wishes.has("recorded")) this.wipe(Number(this.wishes.get("recorded")));
+    if (this.wishes.has("exact")) this.render();
     const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
-    this.playback.play(!still && !this.wishes.has("pause") && this.frames.length > 1);
+    const paused = still || this.wishes.has("pause") || this.wishes.has("follow");
+    this.playback.play(!paused && this.frames.length > 1);
     requestAnimationFrame((now) => this.tick(now));
   }
 
@@ -121,6 +249,7 @@ class Player {
     this.view.update();
     this.splats.draw(this.view.camera);
     if (this.legend !== this.splats.shown) this.showLegend(this.splats.shown);
+    if (this.served) this.compare(now);
     element("player").classList.toggle("idle", this.playback.playing && now - this.lastInput > IDLE);
     requestAnimationFrame((next) => this.tick(next));
   }
@@ -131,7 +260,28 @@ class Player {
     element("player").classList.toggle("first", position === 0);
   }
 
+  /** Show what the server has: the recorded image of the camera, and the exact image of a view that rests. */
+  private compare(now: number): void {
+    const { playback, view } = this;
+    const frame = this.frames[playback.position];
+    const wipes = pressed("wipe") && view.atCamera;
+    this.recorded.show(wipes ? `recorded/${cameraList.value}/${frame}` : null);
+    const splits = wipes && !element("recording").hidden;
+    setFlag("split", "hidden", !splits);
+    setFlag("share", "hidden", !splits);
+    const rests = !playback.playing && !playback.busy && now - this.changed > REST;
+    this.exact.show(pressed("exact") && rests ? this.exactAddress(frame) : null);
+    setFlag("exact", "data-busy", !this.exact.settled);
+  }
+
+  private exactAddress(frame: number): string {
+    const camera = this.view.fields(canvas.width, canvas.height);
+    const scale = this.view.tangent(this.motionScale) * camera.K[0][0];
+    return `exact/${frame}/${this.splats.mode}?${new URLSearchParams({ camera: JSON.stringify(camera), scale: String(scale) })}`;
+  }
+
   private followView(): void {
+    this.changed = performance.now();
     this.splats.setView(this.view.camera, this.view.tangent(this.motionScale));
   }
 
@@ -149,6 +299,7 @@ class Player {
   }
 
   private selectMode(mode: Mode): void {
+    this.changed = performance.now();
     this.splats.setMode(mode);
     this.followView();
     for (const button of modeButtons) button.ariaPressed = String(button.dataset.mode === mode);
@@ -197,6 +348,22 @@ class Player {
     element("bound").ariaPressed = String(this.view.bounded);
   }
 
+  /** Show the recorded image on a share of the page in percent, or no more. */
+  private wipe(share = HALF): void {
+    if (element("wipe").hidden) return;
+    element("wipe").ariaPressed = String(!pressed("wipe"));
+    this.split(share);
+    element<HTMLInputElement>("share").value = String(share);
+  }
+
+  private split(share: number): void {
+    element("player").style.setProperty("--share", `${share}%`);
+  }
+
+  private render(): void {
+    if (this.served) element("exact").ariaPressed = String(!pressed("exact"));
+  }
+
   private fullScreen(): void {
     if (document.fullscreenElement) void document.exitFullscreen();
     else void element("player").requestFullscreen().catch(() => {});
@@ -208,6 +375,10 @@ class Player {
     on("play", () => this.toggle());
     on("loop", () => this.repeat());
     on("bound", () => this.bound());
+    on("wipe", () => this.wipe());
+    on("exact", () => this.render());
+    const share = element<HTMLInputElement>("share");
+    share.addEventListener("input", () => this.split(Number(share.value)));
     on("full", () => this.fullScreen());
     on("about", () => help.showModal());
     on("close", () => help.close());
@@ -229,7 +400,8 @@ class Player {
 
   private key(event: KeyboardEvent): void {
     const { key, target } = event;
-    const onControl = target instanceof HTMLSelectElement || (target instanceof HTMLButtonElement && key === " ");
+    const onButton = target instanceof HTMLButtonElement && key === " ";
+    const onControl = onButton || target instanceof HTMLSelectElement || target === element("share");
     if (onControl || event.ctrlKey || event.altKey || event.metaKey || element<HTMLDialogElement>("help").open) return;
     const camera = Number(cameraList.value);
     const angle = Math.PI / 36;
@@ -257,6 +429,8 @@ class Player {
       ">": () => this.selectSpeed(speedList.selectedIndex + 1),
       l: () => this.repeat(),
       b: () => this.bound(),
+      v: () => this.wipe(),
+      x: () => this.render(),
       f: () => this.fullScreen(),
       "?": () => element<HTMLDialogElement>("help").showModal(),
     };
@@ -267,7 +441,4 @@ class Player {
   }
 }
 
-// Tests read `player`.
-streamBytes()
-  .then((bytes) => Object.assign(window, { player: new Player(bytes) }))
-  .catch(sayFailure);
+begin().catch(sayFailure);

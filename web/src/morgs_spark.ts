@@ -35,7 +35,7 @@ export class MorgsSplats {
     const bytes = await download(address);
     return new Promise((resolve, reject) => {
       let splats: MorgsSplats | null = null;
-      const playback = new Playback(bytes, {
+      const playback = new Playback({
         opened: (stream) => {
           splats = new MorgsSplats(playback, mesh, stream);
           playback.seek(0);
@@ -54,6 +54,7 @@ export class MorgsSplats {
         },
         playing: () => {},
       });
+      playback.open(bytes);
     });
   }
 

@@ -3,7 +3,7 @@
 import type { State } from "./state";
 import type { Update } from "./update";
 import source from "worker:decoder";
-import type { Opened, Reply, Request } from "./worker";
+import type { Grown, Opened, Reply, Request } from "./worker";
 
 /** Frames that are decoded ahead. */
 const AHEAD = 3;
@@ -12,6 +12,8 @@ type Shown = Extract<Reply, { kind: "shown" }>;
 
 export interface Events {
   opened(stream: Opened): void;
+  /** Frames were added at the end. */
+  grown?(stream: Grown): void;
   show(update: Update, position: number): void;
   failed(message: string): void;
   playing(playing: boolean): void;
@@ -34,16 +36,26 @@ export class Playback {
   private requested = -1;
   /** Where the jump leads. */
   private target = -1;
-  private waiting = 0;
+  /** Positions that are requested or ready, in the order in which they will be shown. */
+  private queue: number[] = [];
   private jumping = false;
   private broken = false;
   private answers: ((state: State) => void)[] = [];
 
-  constructor(bytes: Uint8Array<ArrayBuffer>, private readonly events: Events) {
+  constructor(private readonly events: Events) {
     this.worker = new Worker(URL.createObjectURL(new Blob([source], { type: "text/javascript" })));
     this.worker.onmessage = ({ data }: MessageEvent<Reply>) => this.receive(data);
     this.worker.onerror = ({ message }) => events.failed(message);
+  }
+
+  /** Open a stream, in place of the one before if there is one. */
+  open(bytes: Uint8Array<ArrayBuffer>): void {
     this.send({ kind: "open", bytes }, [bytes.buffer]);
+  }
+
+  /** Add the bytes by which the stream has grown. */
+  extend(bytes: Uint8Array<ArrayBuffer>): void {
+    this.send({ kind: "extend", bytes }, [bytes.buffer]);
   }
 
   get last(): number {
@@ -65,22 +77,22 @@ export class Playback {
     return this.jumping;
   }
 
+  /** Position that is shown, or to which a jump leads. */
+  get aim(): number {
+    return this.jumping ? this.target : this.position;
+  }
+
   /** Show a position as soon as it is decoded. */
   seek(position: number): void {
     const target = Math.max(0, Math.min(this.last, position));
-    const ahead = (this.requested - this.position + this.length) % this.length;
-    const steps = (target - this.position + this.length) % this.length;
-    const underWay = steps > 0 && steps <= ahead && !this.jumping && !this.broken;
+    const underWay = target !== this.position && this.queue.includes(target) && !this.jumping && !this.broken;
     this.target = target;
     this.jumping = true;
     if (underWay) {
       while (this.jumping && this.ready.length > 0) this.accept(this.ready.shift()!);
       return;
     }
-    this.ready = [];
-    this.waiting = 0;
-    this.ticket++;
-    this.broken = false;
+    this.drop();
     this.request(target, true);
   }
 
@@ -119,26 +131,37 @@ export class Playback {
 
   private present({ update, position, milliseconds }: Shown): void {
     this.position = position;
+    this.queue.shift();
     this.decodeTimes.push(milliseconds);
     this.events.show(update, position);
     this.prefetch();
   }
 
   private prefetch(): void {
-    while (!this.broken && this.waiting + this.ready.length < AHEAD) {
+    while (!this.broken && this.queue.length < AHEAD) {
       if (this.requested === this.last && !this.loops) return;
       this.request(this.requested === this.last ? 0 : this.requested + 1, false);
     }
   }
 
+  /** Forget the frames that were requested. */
+  private drop(): void {
+    this.ready = [];
+    this.queue = [];
+    this.ticket++;
+    this.broken = false;
+  }
+
   private request(position: number, fresh: boolean): void {
     this.requested = position;
-    this.waiting++;
+    this.queue.push(position);
     this.send({ kind: "show", position, fresh, ticket: this.ticket });
   }
 
   private receive(reply: Reply): void {
     if (reply.kind === "opened") {
+      this.drop();
+      this.jumping = false;
       this.length = reply.frames.length;
       this.fps = reply.fps > 0 ? reply.fps : 30;
       try {
@@ -146,12 +169,14 @@ export class Playback {
       } catch (error) {
         this.events.failed(error instanceof Error ? error.message : String(error));
       }
+    } else if (reply.kind === "grown") {
+      this.length = reply.frames.length;
+      this.events.grown?.(reply);
     } else if (reply.kind === "state") {
       this.answers.shift()?.(reply.state);
     } else if (reply.kind === "failed" && reply.ticket === -1) {
       this.events.failed(reply.message);
     } else if (reply.ticket === this.ticket) {
-      this.waiting--;
       if (reply.kind === "failed") this.fail(reply.message);
       else this.accept(reply);
     }

@@ -7,6 +7,8 @@ const MAGIC = "MORGS-MI";
 const VERSION = 2;
 const PREAMBLE = 12;
 const HEAD = 20;
+/** Memory of a stream that grows, as a multiple of its bytes: it is copied only now and then. */
+const SPARE = 1.25;
 
 export interface CameraFields {
   name: string;
@@ -31,6 +33,8 @@ export interface Stream {
   metadata: Record<string, unknown>;
   /** Keyframes and residuals in the order of the file. */
   packets: PacketPlace[];
+  /** Byte after the last complete packet. */
+  end: number;
   /** Description of what ends the file before its end, if anything does. */
   damage: string | null;
 }
@@ -49,22 +53,48 @@ export function openStream(bytes: Uint8Array): Stream {
   if (magic !== MAGIC || bytes.length < PREAMBLE) throw new Error("this is not a .morgs stream");
   const version = view.getUint32(8, true);
   if (version !== VERSION) throw new Error(`expected format version ${VERSION}, found ${version}`);
-  const packets: PacketPlace[] = [];
-  let damage: string | null = null;
-  for (let start = PREAMBLE; start < bytes.length; ) {
+  const stream: Stream = { bytes, cameras: [], fps: 0, metadata: {}, packets: [], end: PREAMBLE, damage: null };
+  const header = scan(stream)[0];
+  if (header?.kind !== HEADER) throw new Error("the header of the stream is missing");
+  const { cameras, fps, metadata } = JSON.parse(new TextDecoder().decode(openPacket(bytes, header)));
+  return { ...stream, cameras, fps, metadata: metadata ?? {} };
+}
+
+/** Add the bytes by which a stream has grown, and return the places of their keyframes and residuals. */
+export function extend(stream: Stream, more: Uint8Array): PacketPlace[] {
+  const { bytes, packets } = stream;
+  const size = bytes.length + more.length;
+  let buffer = bytes.buffer;
+  if (size > buffer.byteLength) {
+    buffer = new ArrayBuffer(Math.ceil(SPARE * size));
+    new Uint8Array(buffer).set(bytes);
+  }
+  stream.bytes = new Uint8Array(buffer, 0, size);
+  stream.bytes.set(more, bytes.length);
+  const count = packets.length;
+  scan(stream);
+  return packets.slice(count);
+}
+
+/** Find the complete packets after `end` and return their places. */
+function scan(stream: Stream): PacketPlace[] {
+  const { bytes, packets } = stream;
+  const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+  const places: PacketPlace[] = [];
+  stream.damage = null;
+  while (stream.end < bytes.length) {
+    const start = stream.end;
     const complete = start + HEAD <= bytes.length;
     const stop = complete ? start + HEAD + Number(view.getBigUint64(start + 8, true)) : Infinity;
     if (stop > bytes.length) {
-      damage = `the stream is truncated or damaged at byte ${start} of ${bytes.length}`;
+      stream.damage = `the stream is truncated or damaged at byte ${start} of ${bytes.length}`;
       break;
     }
-    packets.push({ kind: view.getUint32(start, true), frame: view.getUint32(start + 4, true), start, stop });
-    start = stop;
+    places.push({ kind: view.getUint32(start, true), frame: view.getUint32(start + 4, true), start, stop });
+    stream.end = stop;
   }
-  if (packets.length === 0 || packets[0].kind !== HEADER) throw new Error("the header of the stream is missing");
-  const fields = JSON.parse(new TextDecoder().decode(openPacket(bytes, packets[0])));
-  const metadata = fields.metadata ?? {};
-  return { ...fields, metadata, bytes, damage, packets: packets.filter((p) => p.kind === KEYFRAME || p.kind === RESIDUAL) };
+  packets.push(...places.filter(({ kind }) => kind === KEYFRAME || kind === RESIDUAL));
+  return places;
 }
 
 /** Return the payload of a packet after checking its CRC. */

@@ -13,6 +13,8 @@ import type { CameraFields } from "./stream";
 const REACH = THREE.MathUtils.degToRad(8);
 /** Share of the angle beyond it by which a frame turns the view back. */
 const PULL = 0.5;
+/** Distance, in units of the page, and angle up to which the view is at a camera: rounding of the controls. */
+const AT_CAMERA = 1e-4;
 
 export class View {
   readonly camera = new THREE.PerspectiveCamera();
@@ -20,6 +22,8 @@ export class View {
   bounded = true;
   private controls: OrbitControls | null = null;
   private current: CameraFields;
+  /** Pose of the view at the selected camera. */
+  private readonly home = new THREE.Object3D();
   private size = { width: 1, height: 1 };
   /** Positions of the rig's cameras. */
   private readonly positions: THREE.Vector3[];
@@ -53,7 +57,40 @@ export class View {
     this.controls.zoomSpeed = 0.7;
     this.controls.addEventListener("change", this.onChange);
     this.controls.update();
+    this.home.position.copy(camera.position);
+    this.home.quaternion.copy(camera.quaternion);
     this.onChange();
+  }
+
+  /** Whether the view is the one of the selected camera. */
+  get atCamera(): boolean {
+    const { position, quaternion } = this.camera;
+    const distance = position.distanceTo(this.home.position);
+    return distance < AT_CAMERA && quaternion.angleTo(this.home.quaternion) < AT_CAMERA;
+  }
+
+  /** The view as a camera with an image of a size in pixels. */
+  fields(width: number, height: number): CameraFields {
+    const { K, near } = this.current;
+    const { size, unit } = this;
+    this.camera.updateMatrixWorld();
+    const m = this.camera.matrixWorldInverse.elements;
+    const [right, up, back] = [0, 1, 2].map((i) => [m[i], m[4 + i], m[8 + i], m[12 + i] / unit]);
+    const flipped = (row: number[]) => row.map((value) => -value);
+    const [x, y] = [width / size.width, height / size.height];
+    const { scale } = this;
+    const [cx, cy] = [K[0][2] - this.current.width / 2, K[1][2] - this.current.height / 2];
+    // prettier-ignore
+    return {
+      name: "page",
+      K: [
+        [x * scale * K[0][0], 0, width / 2 + x * scale * cx],
+        [0, y * scale * K[1][1], height / 2 + y * scale * cy],
+        [0, 0, 1],
+      ],
+      viewmat: [right, flipped(up), flipped(back), [0, 0, 0, 1]],
+      width, height, near,
+    };
   }
 
   resize(width: number, height: number): void {
@@ -110,12 +147,16 @@ export class View {
     return (fraction * this.current.width) / this.current.K[0][0];
   }
 
+  /** Pixels of the page per pixel of the camera's image. */
+  private get scale(): number {
+    return Math.min(this.size.width / this.current.width, this.size.height / this.current.height);
+  }
+
   /** Fit the camera's image into the page: the whole image is visible, and more beside it. */
   private project(): void {
     const { K, width: w, height: h } = this.current;
     const { width, height } = this.size;
-    const scale = Math.min(width / w, height / h);
-    const { camera } = this;
+    const { camera, scale } = this;
     const { near, far } = camera;
     // prettier-ignore
     camera.projectionMatrix.set(

@@ -2,7 +2,7 @@
 
 import { Decoder } from "./decoder";
 import type { State } from "./state";
-import { type CameraFields, openStream, type Stream } from "./stream";
+import { type CameraFields, extend, openStream, type Stream } from "./stream";
 import type { Update } from "./update";
 
 export interface Opened {
@@ -14,13 +14,17 @@ export interface Opened {
   damage: string | null;
 }
 
+export type Grown = { kind: "grown" } & Pick<Opened, "frames" | "damage">;
+
 export type Request =
   | { kind: "open"; bytes: Uint8Array<ArrayBuffer> }
+  | { kind: "extend"; bytes: Uint8Array<ArrayBuffer> }
   | { kind: "show"; position: number; fresh: boolean; ticket: number }
   | { kind: "state"; position: number };
 
 export type Reply =
   | Opened
+  | Grown
   | { kind: "shown"; position: number; ticket: number; milliseconds: number; update: Update }
   | { kind: "state"; state: State }
   | { kind: "failed"; ticket: number; message: string };
@@ -31,10 +35,14 @@ let decoder: Decoder | null = null;
 onmessage = ({ data }: MessageEvent<Request>) => {
   try {
     if (data.kind === "open") {
-      stream = openStream(data.bytes);
-      decoder = new Decoder(stream);
+      const opened = openStream(data.bytes);
+      decoder = new Decoder(opened);
+      stream = opened;
       const { cameras, fps, metadata, damage } = stream;
       reply({ kind: "opened", cameras, fps, metadata, damage, frames: decoder.frames });
+    } else if (data.kind === "extend") {
+      decoder!.extend(extend(stream!, data.bytes));
+      reply({ kind: "grown", frames: decoder!.frames, damage: stream!.damage });
     } else if (data.kind === "show") {
       const { position, fresh, ticket } = data;
       const start = performance.now();

@@ -28,7 +28,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.playback.default_rig import DEFAULT_RIG
 from morgs_mi.playback.player import MOTION_SCALE, metadata_entry, stream_name
 
-__all__ = ["text_of_bytes", "web_page", "write_web_folder", "write_web_page"]
+__all__ = ["published_bytes", "served_page", "text_of_bytes", "web_page", "write_web_folder", "write_web_page"]
 
 Progress = Callable[[int], None]
 
@@ -68,7 +68,7 @@ def write_web_page(
 
 def web_page(stream: StreamReader, title: str | None = None, progress: Progress | None = None) -> bytes:
     """Return the page that `write_web_page` writes; arguments and errors are the same."""
-    data = _script("stream", _published(stream, progress))
+    data = _script("stream", published_bytes(stream, progress))
     return _page(title or stream_name(stream), data, "data: blob:")
 
 
@@ -90,7 +90,7 @@ def write_web_folder(
         ValueError: a packet of the stream or its metadata is broken.
         OSError: the folder cannot be written.
     """
-    data = _published(stream, progress)
+    data = published_bytes(stream, progress)
     place = f'<i id="stream" data-address="{_STREAM}" hidden></i>'
     page = _page(title or stream_name(stream), place, "'self' data: blob:")
     contents = {"index.html": page, _STREAM: data, _MODULE: (_player() / _MODULE).read_bytes()}
@@ -98,6 +98,18 @@ def write_web_folder(
         for name, content in contents.items():
             (partial / name).write_bytes(content)
     return sum(map(len, contents.values()))
+
+
+def served_page(title: str, has_recording: bool) -> bytes:
+    """Return the page for the server of `playback.viewer`, which has the stream as a file.
+
+    Args:
+        title: its title.
+        has_recording: whether the server has recorded images.
+    """
+    server = "recorded" if has_recording else ""
+    place = f'<i id="stream" data-address="{_STREAM}" data-server="{server}" hidden></i>'
+    return _page(title, place, "'self' data: blob:")
 
 
 def text_of_bytes(data: bytes) -> str:
@@ -113,8 +125,8 @@ def text_of_bytes(data: bytes) -> str:
     return (codes + np.uint8(128) * np.isin(codes, _UNSAFE)).tobytes().decode("latin-1")
 
 
-def _published(stream: StreamReader, progress: Progress | None) -> bytes:
-    """Return the stream with the metadata that the page reads, after decoding it once."""
+def published_bytes(stream: StreamReader, progress: Progress | None = None) -> bytes:
+    """Return the stream with the metadata that the page reads, after decoding it once; errors as `write_web_page`."""
     render = metadata_entry(stream, "config.render", {}, dict)
     packets, speeds = list(stream), []
     for coded in coded_frames(packets):

@@ -1,1 +1,1 @@
-"""Browser viewer of streams."""
+"""Web server that shows a stream, even while it is written, in the page of `export.web`."""

@@ -1,94 +1,80 @@
-"""Access control of the viewer: it accepts connections only from its own page, under a name of this machine.
+"""Access control of the viewer: it answers only its own page, under a name of this machine, and to holders of a token.
 
-A web page of another site can open a WebSocket to a server on this machine; browsers report it in `Origin` but do not
-prevent it. By DNS rebinding, such a page can also point its own name at this machine, and so share its origin; then
+A web page of another site can send requests to a server on this machine; browsers report it in `Origin` and
+`Sec-Fetch-Site` but do not prevent it. By DNS rebinding, such a page can also point its own name at this machine; then
 `Host` is a foreign name. An address in digits or `localhost` cannot be rebound.
 """
 
 from __future__ import annotations
 
-import asyncio
-import ipaddress
-import logging
-from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
-from http import HTTPStatus
-from threading import Event, Lock
-from typing import Any
+import secrets
+from ipaddress import ip_address
 from urllib.parse import urlsplit
 
-__all__ = ["checked_connections", "refusal"]
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import PlainTextResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-_PATCHING = Lock()
-_WAIT = 0.01  # seconds between two looks at whether the scene is ready
-_LOG = logging.getLogger(__name__)
-# websockets logs a traceback for a connection that is closed before its first request.
-_LOG.addFilter(lambda record: record.getMessage() != "opening handshake failed")
+__all__ = ["Access", "refusal"]
+
+_HEADERS = {
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",  # the address has the token
+    "X-Content-Type-Options": "nosniff",
+}
 
 
-def refusal(host: str | None, origin: str | None, names: Collection[str] = ()) -> str | None:
-    """Return why a request is refused, None if it is accepted.
-
-    Args:
-        host: the request's `Host`, the address that the browser believes to be talking to.
-        origin: the request's `Origin`; programs other than browsers send none.
-        names: allowed names in addition to `localhost` and addresses in digits.
-    """
-    name = urlsplit(f"//{host or ''}").hostname or ""
-    if not (_is_address(name) or name in {"localhost", *map(str.lower, names)}):
-        return (
-            f"morgs-mi view: expected a request for localhost or an address in digits, got the host {name!r}; "
-            f"if it is a name of this machine, add --allowed-names {name or 'NAME'}."
-        )
-    if origin is not None and urlsplit(origin).netloc.lower() != (host or "").lower():
-        return (
-            f"morgs-mi view: expected a connection from the viewer's own page at {host}, got one from {origin!r}; "
-            "open the viewer's address itself."
-        )
+def refusal(headers: Headers, name: str) -> str | None:
+    """Return why a request is refused, None if it is accepted; `name` may be the host, as may an address in digits."""
+    host = headers.get("host", "")
+    origin = headers.get("origin")
+    try:
+        hostname = urlsplit(f"//{host}").hostname or ""
+        page = host if origin is None else urlsplit(origin).netloc
+    except ValueError:  # brackets that hold no address
+        return f"expected a host and an origin, got {host!r} and {origin!r}"
+    if hostname not in ("localhost", name.lower()) and not _is_address(hostname):
+        return f"expected a request for localhost or an address in digits, got the host {hostname!r}"
+    if page.lower() != host.lower():
+        return f"expected a request of the viewer's own page at {host}, got one of {origin!r}"
+    site = headers.get("sec-fetch-site", "none")
+    if site not in ("same-origin", "none") and headers.get("sec-fetch-mode") != "navigate":
+        return "expected a request of the viewer's own page, got one of another page"
     return None
 
 
-@contextmanager
-def checked_connections(names: Collection[str] = (), ready: Event | None = None) -> Iterator[None]:
-    """Refuse connections according to `refusal` in the viser server that is started in this context.
+class Access:
+    """ASGI middleware that answers 403 unless `token`, if there is one, is the first part of the path, and cuts it off.
 
-    Until `ready` is set, pages load but do not connect. viser passes no options to the `serve` of websockets.
-    Therefore that function is replaced while viser starts.
-
-    Raises:
-        RuntimeError: no server was started through `serve`, so its connections would not be checked.
+    Requests must also pass `refusal`.
     """
-    import websockets.asyncio.server as server
 
-    original, started = server.serve, []
+    def __init__(self, app: ASGIApp, name: str, token: str) -> None:
+        self._app = app
+        self._name = name
+        self._prefix = f"/{token}" if token else ""
 
-    def serve(*args: Any, process_request: Callable[..., Any], **options: Any) -> Any:
-        async def process(connection: Any, request: Any) -> Any:
-            # `get` raises for a header that is sent twice, which websockets answers with an error.
-            reason = refusal(request.headers.get("Host"), request.headers.get("Origin"), names)
-            if reason is not None:
-                return connection.respond(HTTPStatus.FORBIDDEN, reason + "\n")
-            response = process_request(connection, request)
-            while response is None and ready is not None and not ready.is_set():
-                await asyncio.sleep(_WAIT)
-            return response
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        start = len(self._prefix)
+        path = scope["path"]
+        reason = refusal(Headers(scope=scope), self._name)
+        if reason is None and not secrets.compare_digest(path[: start + 1].encode(), f"{self._prefix}/".encode()):
+            reason = "expected the token of the printed link in the address"
 
-        started.append(True)
-        return original(*args, process_request=process, logger=_LOG, **options)
+        async def secured(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                MutableHeaders(scope=message).update(_HEADERS)
+            await send(message)
 
-    with _PATCHING:
-        server.serve = serve
-        try:
-            yield
-        finally:
-            server.serve = original
-    if not started:
-        raise RuntimeError("checked_connections(): expected viser to serve through websockets; install viser 1.1.")
+        app = self._app if reason is None else PlainTextResponse(f"morgs-mi view: {reason}.\n", 403)
+        await app({**scope, "path": path[start:]}, receive, secured)
 
 
 def _is_address(name: str) -> bool:
     try:
-        ipaddress.ip_address(name)
+        ip_address(name)
     except ValueError:
         return False
     return True

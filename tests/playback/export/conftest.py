@@ -9,22 +9,8 @@ import pytest
 from morgs_mi.codec.packets import CodedFrame
 from morgs_mi.playback.export.web import write_web_page
 from morgs_mi.playback.streams import open_stream
-from tests.playback.export.pages import CHROMIUM, HEIGHT, WIDTH
+from tests.playback.export.pages import HEIGHT, WIDTH
 from tests.scenes.changing_splats import rig, splats, write_stream
-
-
-@pytest.fixture(scope="module", params=[pytest.param("chromium", marks=pytest.mark.slow)])
-def browser():
-    playwright = pytest.importorskip(
-        "playwright.sync_api", reason="install it with pip install 'morgs-mi[viewer-test]'"
-    )
-    if CHROMIUM is None:
-        pytest.skip("no Chromium found; install it with tools/setup_browser.sh (apt-get install chromium)")
-    with playwright.sync_playwright() as driver:
-        options = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=options)
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")

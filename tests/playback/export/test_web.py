@@ -284,6 +284,13 @@ def test_page__steps_to_frames_that_are_being_decoded(page):
     assert page.page.evaluate("player.playback.decodeTimes.length") <= decoded + 3
 
 
+def test_page__has_no_controls_that_need_a_server(page):
+    page.page.keyboard.press("v")
+    page.page.keyboard.press("x")
+    page.wait("player.settled")
+    assert page.page.locator(".of-server, #recording, #rendering, #share, #split").locator("visible=true").count() == 0
+
+
 def test_page__opens_on_the_first_frame_with_motion(browser, clip):
     with Player(browser, (clip[0] / "page.html").as_uri() + "#pause") as page:
         assert page.text("#count") == f"1 / {FRAMES - 1}"

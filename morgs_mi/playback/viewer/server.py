@@ -1,0 +1,128 @@
+"""A stream in the browser: the page of `export.web`, which follows a fit that is running, with images of this machine.
+
+- `/`: the page.
+- `/stream.morgs`: the stream, or the provisional first frame beside it; also ranges of its bytes.
+- `/recorded/VIEW/FRAME`: recorded image of a camera, JPEG.
+- `/exact/FRAME/CHANNEL`: image of the renderer, PNG, for the camera in the query, as JSON of a stream's header; 204 if
+  a newer image was requested meanwhile.
+"""
+
+from __future__ import annotations
+
+import secrets
+import socket
+from ipaddress import ip_address
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import cv2
+import uvicorn
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, PlainTextResponse, Response
+from starlette.routing import Route
+
+from morgs_mi.codec.header import camera_of_fields, load_json
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.playback.export.web import published_bytes, served_page
+from morgs_mi.playback.player import PROVISIONAL, STREAM, stream_name
+from morgs_mi.playback.streams import SplatFile
+from morgs_mi.playback.viewer.access import Access
+from morgs_mi.playback.viewer.exact import ExactImages
+from morgs_mi.playback.viewer.recorded import RecordedImages
+from morgs_mi.playback.viewer.stream_bytes import stream_response
+
+__all__ = ["Viewer"]
+
+_GRACE = 1  # seconds for answers that are under way at the end
+_MOST_CAMERA_BYTES = 4096
+
+
+class Viewer:
+    """Server of a page that shows a stream.
+
+    Args:
+        stream: stream, which may still be written, or file of Gaussians, as `open_stream` returns it.
+        host: address or name of the server. If other machines can reach it, the link has a random token.
+        port: port of the server; 0: a free one.
+        capture: folder of the capture with the recorded images; None: the one that was fitted.
+
+    Attributes:
+        url: link to the page.
+        is_public: whether other machines can reach it.
+
+    Raises:
+        ValueError: the address cannot be used, or the file of Gaussians is broken.
+    """
+
+    def __init__(
+        self, stream: StreamReader, host: str = "127.0.0.1", port: int = 0, capture: Path | None = None
+    ) -> None:
+        self._stream = stream
+        self._path = stream.path
+        if isinstance(stream, SplatFile):
+            self._folder = TemporaryDirectory()
+            self._path = Path(self._folder.name) / STREAM
+            self._path.write_bytes(published_bytes(stream))
+        self._recorded = RecordedImages(capture)
+        self._exact = ExactImages(self._opened)
+        try:
+            family = socket.AF_INET6 if ":" in host else socket.AF_INET
+            self._socket = socket.create_server((host, port), family=family)
+        except (OSError, OverflowError) as error:
+            raise ValueError(f"{host}:{port}: cannot serve the page there ({error}); choose another --port.") from None
+        address, port = self._socket.getsockname()[:2]
+        self.is_public = not ip_address(address).is_loopback
+        token = secrets.token_urlsafe() if self.is_public else ""
+        name = "localhost" if ip_address(address).is_unspecified else f"[{host}]" if ":" in host else host
+        self.url = f"http://{name}:{port}/{token and token + '/'}"
+        options = {"lifespan": "off", "ws": "none", "proxy_headers": False, "timeout_graceful_shutdown": _GRACE}
+        config = uvicorn.Config(Access(self._app(), host, token), log_level="warning", **options)
+        self._server = uvicorn.Server(config)
+
+    def run(self) -> None:
+        """Serve the page until `stop` is called, or a signal, which is raised again after the server has ended."""
+        with self._socket:
+            self._server.run(sockets=[self._socket])
+
+    def stop(self) -> None:
+        """End `run`."""
+        self._server.should_exit = True
+
+    def _app(self) -> Starlette:
+        routes = [
+            Route("/", self._send_page),
+            Route(f"/{STREAM}", self._send_stream),
+            Route("/recorded/{view:int}/{frame:int}", self._send_recorded),
+            Route("/exact/{frame:int}/{channel}", self._send_exact),
+        ]
+        return Starlette(routes=routes, exception_handlers={OSError: _failed, ValueError: _failed})
+
+    def _newest(self) -> Path:
+        """Return the path of the stream, or of the provisional first frame beside it while it has no frame."""
+        provisional = self._path.with_name(PROVISIONAL)
+        return provisional if provisional.is_file() and not StreamReader(self._path).index() else self._path
+
+    def _opened(self) -> StreamReader:
+        """Return the stream as it is now; a file of Gaussians stays as it was opened."""
+        return self._stream if isinstance(self._stream, SplatFile) else StreamReader(self._newest())
+
+    def _send_page(self, _: Request) -> Response:
+        return HTMLResponse(served_page(stream_name(self._stream), self._recorded.are_present(self._stream)))
+
+    def _send_stream(self, request: Request) -> Response:
+        return stream_response(self._newest(), request)
+
+    def _send_recorded(self, request: Request) -> Response:
+        image = self._recorded.at(StreamReader(self._path), **request.path_params)
+        return Response(cv2.imencode(".jpg", image[..., ::-1])[1].tobytes(), media_type="image/jpeg")
+
+    async def _send_exact(self, request: Request) -> Response:
+        query = request.query_params
+        camera = camera_of_fields(load_json(query.get("camera", "").encode(), _MOST_CAMERA_BYTES), "camera")
+        png = await self._exact.png(**request.path_params, camera=camera, motion_scale=float(query.get("scale", "nan")))
+        return Response(status_code=204) if png is None else Response(png, media_type="image/png")
+
+
+async def _failed(_: Request, error: Exception) -> Response:
+    return PlainTextResponse(str(error), 404 if isinstance(error, FileNotFoundError) else 400)

@@ -1,0 +1,61 @@
+"""The bytes of a stream file that may grow, in answers to requests of ranges of them."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from starlette.requests import Request
+from starlette.responses import PlainTextResponse, Response, StreamingResponse
+
+from morgs_mi.codec.container import HEAD, PAYLOAD, PREAMBLE
+
+__all__ = ["stream_response"]
+
+_CHUNK = 2**20
+# One range of bytes; others are ignored, as HTTP allows. 15 digits: more than any file has bytes.
+_RANGE = re.compile(r"bytes=(\d{1,15})-(\d{0,15})", re.ASCII)
+
+
+def stream_response(path: Path, request: Request) -> Response:
+    """Return the answer to a request of a file, or of a range of its bytes.
+
+    Bytes that are written meanwhile are left out. The entity tag stays the same while the stream grows.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    file = open(path, "rb")  # noqa: SIM115 (`_chunks` closes it)
+    size = os.fstat(file.fileno()).st_size
+    etag = _etag(file, size)
+    headers = {"ETag": etag, "Accept-Ranges": "bytes", "Content-Location": path.name}
+    match = _RANGE.fullmatch(request.headers.get("range", ""))
+    part = range(size)
+    status = 200
+    if match is not None and request.headers.get("if-range", etag) == etag:
+        part = part[int(match[1]) : int(match[2]) + 1 if match[2] else None]
+        status = 206
+        headers["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{size}"
+    if status == 206 and not part:
+        file.close()
+        return PlainTextResponse("", 416, {"Content-Range": f"bytes */{size}"})
+    headers["Content-Length"] = str(len(part))
+    return StreamingResponse(_chunks(file, part), status, headers, "application/octet-stream")
+
+
+def _etag(file: BinaryIO, size: int) -> str:
+    """Return an entity tag of a file's inode and the checksums of its header and its first frame."""
+    start = file.read(PREAMBLE.size + PAYLOAD)
+    length = HEAD.unpack_from(start, PREAMBLE.size)[2] if len(start) == PREAMBLE.size + PAYLOAD else 0
+    file.seek(min(len(start) + length, size))
+    return f'"{os.fstat(file.fileno()).st_ino:x}-{start.hex()}-{file.read(PAYLOAD).hex()}"'
+
+
+def _chunks(file: BinaryIO, part: range) -> Iterator[bytes]:
+    with file:
+        file.seek(part.start)
+        for start in range(part.start, part.stop, _CHUNK):
+            yield file.read(min(_CHUNK, part.stop - start))

@@ -1,0 +1,472 @@
+"""The server of the viewer without a browser: bytes of a growing file, images, and hostile requests."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import webbrowser
+from concurrent.futures import ThreadPoolExecutor
+from threading import Lock
+
+import cv2
+import numpy as np
+import pytest
+from starlette.datastructures import Headers
+
+from morgs_mi import cli
+from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.codec.container import StreamWriter
+from morgs_mi.codec.packets import keyframe_packet
+from morgs_mi.io.ply import write_ply
+from morgs_mi.playback.player import PROVISIONAL, channel_image
+from morgs_mi.playback.player import render as render_channels
+from morgs_mi.playback.streams import open_stream
+from morgs_mi.playback.viewer import exact as exact_images
+from morgs_mi.playback.viewer.access import refusal
+from morgs_mi.playback.viewer.recorded import RecordedImages
+from morgs_mi.playback.viewer.server import Viewer
+from morgs_mi.render.rasterize import rasterize
+from morgs_mi.runs.live.live_capture import write_images
+from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, with_forged_packets
+from tests.playback.viewer.serving import exact, get, raw, viewing
+from tests.scenes import noise_capture
+from tests.scenes.changing_splats import rig, splats, write_stream
+from tests.scenes.gaussians import isotropic
+from tests.scenes.short_clip import FRAMES, short_clip
+
+CONNECTIONS = 200
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    """Return the folder of a stream and its states."""
+    folder = tmp_path_factory.mktemp("clip")
+    return folder, write_stream(folder / "stream.morgs")
+
+
+@pytest.fixture(scope="module")
+def url(clip):
+    with viewing(clip[0]) as url:
+        yield url
+
+
+# --------------------------------------------------------------------------------------------------
+#  Access
+# --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("host", "origin"),
+    [
+        ("127.0.0.1:8080", "http://127.0.0.1:8080"),
+        ("localhost:9000", "http://localhost:9000"),  # a forwarded port
+        ("LOCALHOST:8080", "http://localhost:8080"),
+        ("[::1]:8080", "http://[::1]:8080"),
+        ("192.168.0.7:8080", "http://192.168.0.7:8080"),
+        ("lab.example:8080", "http://lab.example:8080"),
+        ("localhost:8080", None),  # a request of the page itself, or no browser
+    ],
+)
+def test_refusal__accepts_the_viewers_own_page(host, origin):
+    headers = {"host": host} | ({} if origin is None else {"origin": origin})
+    assert refusal(Headers(headers), "Lab.Example") is None
+
+
+@pytest.mark.parametrize(
+    ("headers", "message"),
+    [
+        ({"host": "localhost:8080", "origin": "https://evil.example"}, "got one of 'https://evil.example'"),
+        ({"host": "localhost:8080", "origin": "http://localhost:3000"}, "got one of 'http://localhost:3000'"),
+        ({"host": "localhost:8080", "origin": "null"}, "the viewer's own page at localhost:8080"),
+        ({"host": "evil.example:8080", "origin": "http://evil.example:8080"}, "got the host 'evil.example'"),
+        ({"host": "localhost.evil.example"}, "got the host 'localhost.evil.example'"),
+        ({"host": "127.0.0.1.evil.example"}, "got the host"),
+        ({"host": "user@localhost@evil.example"}, "got the host 'evil.example'"),
+        ({}, "got the host ''"),
+        ({"host": "[evil"}, "expected a host and an origin, got '[evil'"),
+        ({"host": "localhost", "origin": "http://[evil"}, "expected a host and an origin"),
+        ({"host": "localhost", "sec-fetch-site": "cross-site", "sec-fetch-mode": "no-cors"}, "one of another page"),
+        ({"host": "localhost", "sec-fetch-site": "same-site"}, "one of another page"),  # of another port
+    ],
+)
+def test_refusal__names_a_foreign_page_or_host(headers, message):
+    assert message in str(refusal(Headers(headers), "127.0.0.1"))
+
+
+@pytest.mark.parametrize("path", ["/", "/stream.morgs", "/exact/0/color", "/recorded/0/0", "/nothing"])
+def test_viewer__refuses_other_pages_and_rebound_names(url, path):
+    port = url.rstrip("/").rpartition(":")[2]
+    foreign = raw(url, f"GET {path} HTTP/1.1", f"Host: localhost:{port}", "Origin: https://evil.example")
+    rebound = raw(url, f"GET {path} HTTP/1.1", f"Host: evil.example:{port}", f"Origin: http://evil.example:{port}")
+    assert foreign.startswith("HTTP/1.1 403 ")
+    assert rebound.startswith("HTTP/1.1 403 ")
+    assert "got the host 'evil.example'" in rebound
+    assert raw(url, f"GET {path} HTTP/1.1").startswith(("HTTP/1.1 400 ", "HTTP/1.1 403 ")), "no host"
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "../secret",
+        "..%2fsecret",
+        "%2e%2e/secret",
+        "..\\secret",
+        "/etc/passwd",
+        "stream.morgs/../secret",
+        "stream.morgs/../../secret",
+        "stream.morgs%00",
+        "recorded/../secret",
+        "recorded/0/..%2f..%2fsecret",
+        "exact/0/..%2fsecret",
+        "capture.json",
+    ],
+)
+def test_viewer__serves_no_other_files(url, clip, path):
+    (clip[0].parent / "secret").write_text("secret")
+    (clip[0] / "secret").write_text("secret")
+    (clip[0] / "capture.json").write_text('{"capture": "secret"}')
+    response, content = get(url, path)
+    assert response.status in (400, 404)
+    assert b"secret" not in content or response.status == 400, "at most a sentence with the path itself"
+    assert b"root:" not in content
+
+
+def test_viewer__requires_the_token_where_other_machines_can_reach_it(clip):
+    with viewing(clip[0], host="0.0.0.0") as url, viewing(clip[0], host="0.0.0.0") as other:
+        start, token, _ = url.rsplit("/", 2)
+        assert len(token) >= 40
+        assert token not in other
+        assert re.fullmatch(r"http://localhost:\d+", start)
+        for path in ("", "stream.morgs"):
+            assert get(url, path)[0].status == 200
+            for wrong in ("/", f"/{token[:-1]}/", f"/{token}x/", f"/{token.lower()}/", "/%FF/", f"/?token={token}/"):
+                response, content = get(start + wrong, path)
+                assert response.status == 403
+                assert b"expected the token" in content
+        assert get(start + "/" + token)[0].status == 403
+
+
+@pytest.mark.parametrize(
+    "lines", [("GET / HTTP/1.1\x00",), ("\x16\x03\x01",), ("GET / HTTP/1.1", "Range bytes"), ("A" * 99999,)]
+)
+def test_viewer__survives_what_is_no_http(url, lines):
+    assert raw(url, *lines).startswith("HTTP/1.1 400 ")
+    assert get(url)[0].status == 200
+
+
+def test_viewer__answers_many_connections_at_once(url, clip):
+    idle = [
+        socket.create_connection(("127.0.0.1", int(url.rstrip("/").rpartition(":")[2]))) for _ in range(CONNECTIONS)
+    ]
+    with ThreadPoolExecutor(CONNECTIONS) as pool:
+        answers = list(pool.map(lambda _: get(url, "stream.morgs")[1], range(CONNECTIONS)))
+    assert set(answers) == {(clip[0] / "stream.morgs").read_bytes()}
+    for connection in idle:
+        connection.close()
+    assert get(url)[0].status == 200
+
+
+# --------------------------------------------------------------------------------------------------
+#  Bytes of the stream
+# --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("header", "status", "part"),
+    [
+        ("bytes=0-", 206, slice(None)),
+        ("bytes=10-19", 206, slice(10, 20)),
+        ("bytes=100-999999999", 206, slice(100, None)),
+        ("bytes=0-0", 206, slice(1)),
+        ("bytes=999999999999999-", 416, slice(0)),
+        ("bytes=20-10", 416, slice(0)),
+        # Ignored: malformed, or more than one.
+        *((header, 200, slice(None)) for header in ("bytes=a-b", "bytes=-", "bytes", "bytes=-5", "octets=0-1", "")),
+        *(
+            (header, 200, slice(None))
+            for header in ("bytes=0-1,3-4", "bytes=--5", f"bytes={'9' * 5000}-", "bytes=\xb2-")
+        ),
+    ],
+)
+def test_stream_response__returns_ranges_of_bytes(url, clip, header, status, part):
+    response, content = get(url, "stream.morgs", Range=header)
+    assert response.status == status
+    assert content == (clip[0] / "stream.morgs").read_bytes()[part]
+
+
+def test_stream_response__continues_a_growing_file_and_restarts_with_a_replaced_one(tmp_path):
+    write_stream(tmp_path / "stream.morgs")
+    complete = (tmp_path / "stream.morgs").read_bytes()
+    ends = [offset for _, _, offset in open_stream(tmp_path).index()]
+    (tmp_path / "stream.morgs").write_bytes(complete[: ends[2]])
+    with viewing(tmp_path) as url:
+        response, content = get(url, "stream.morgs")
+        tag = response.headers["ETag"]
+        with (tmp_path / "stream.morgs").open("ab") as file:
+            file.write(complete[ends[2] : ends[3]])
+        response, more = get(url, "stream.morgs", Range=f"bytes={len(content)}-", If_Range=tag)
+        assert (response.status, response.headers["ETag"]) == (206, tag)
+        assert content + more == complete[: ends[3]]
+        write_stream(tmp_path / "stream.morgs", start=splats(30, seed=3))  # with the same header
+        response, content = get(url, "stream.morgs", Range=f"bytes={len(content)}-", If_Range=tag)
+        assert response.status == 200
+        assert content == (tmp_path / "stream.morgs").read_bytes()
+        (tmp_path / "stream.morgs").write_bytes(b"")
+        assert get(url, "stream.morgs")[1] == b""
+        assert get(url, "stream.morgs", Range="bytes=5-")[0].status == 416
+        (tmp_path / "stream.morgs").unlink()
+        response, content = get(url, "stream.morgs")
+        assert response.status == 404
+        assert b"No such file" in content
+
+
+def test_viewer__serves_a_provisional_first_frame_until_the_stream_has_one(tmp_path):
+    stream = tmp_path / "stream.morgs"
+    states = write_stream(stream)
+    complete = stream.read_bytes()
+    (_, _, start), (_, _, end) = open_stream(stream).index()[:2]
+    stream.write_bytes(complete[:start])
+    write_stream(tmp_path / PROVISIONAL, 1, splats(30, seed=3))
+    camera = rig()[0]
+
+    def shown(url: str) -> tuple[str | None, bytes, bytes]:
+        response, content = get(url, "stream.morgs")
+        return response.headers["Content-Location"], content, get(url, exact(0, "color", camera))[1]
+
+    with viewing(tmp_path) as url:
+        location, content, image = shown(url)
+        assert (location, content) == (PROVISIONAL, (tmp_path / PROVISIONAL).read_bytes())
+        stream.write_bytes(complete[:end])
+        location, content, final = shown(url)
+        assert (location, content) == ("stream.morgs", complete[:end])
+        assert image != final
+        assert_image(final, states[0].gaussians, camera, "color")
+        (tmp_path / PROVISIONAL).unlink()
+        assert shown(url) == (location, content, final)
+
+
+# --------------------------------------------------------------------------------------------------
+#  Images
+# --------------------------------------------------------------------------------------------------
+
+
+def decoded(content: bytes) -> np.ndarray:
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), 1)
+    assert image is not None
+    return image[..., ::-1]
+
+
+def assert_image(content: bytes, gaussians, camera, channel: str) -> None:
+    image = rasterize(gaussians, camera, (channel,))[channel]
+    np.testing.assert_array_equal(decoded(content), channel_image(channel, np.array(image), 10))
+
+
+@pytest.mark.parametrize("channel", ["color", "motion", "confidence", "depth"])
+def test_exact_images__are_those_of_rasterize(url, clip, channel):
+    for frame, camera in ((1, rig(90, 50)[1]), (3, rig()[2])):
+        response, content = get(url, exact(frame, channel, camera))
+        assert (response.status, response.headers["Content-Type"]) == (200, "image/png")
+        assert_image(content, clip[1][frame].gaussians, camera, channel)
+
+
+def test_exact_images__of_a_file_of_gaussians_are_not_quantised(tmp_path):
+    write_ply(tmp_path / "scene.ply", splats())
+    with viewing(tmp_path / "scene.ply") as url:
+        (tmp_path / "served.morgs").write_bytes(get(url, "stream.morgs")[1])
+        assert open_stream(tmp_path / "served.morgs").metadata["default_rig"] is True
+        assert_image(get(url, exact(0, "color", rig()[0]))[1], splats(), rig()[0], "color")
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("exact/9/color", "expected a frame of the stream, got 9"),
+        ("exact/1/quats", "expected a channel of the stream, got 'quats'"),
+        (f"exact/{'9' * 5000}/color", "Exceeds the limit"),
+    ],
+)
+def test_exact_images__refuse_what_the_stream_has_not(url, path, message):
+    _, _, query = exact(1, "color", rig()[0]).partition("?")
+    response, content = get(url, f"{path}?{query}")
+    assert response.status == 400
+    assert message in content.decode()
+
+
+@pytest.mark.parametrize(
+    ("query", "message"),
+    [
+        ("", "the JSON is broken"),
+        ("camera={}", "`camera.name` is missing"),
+        ("camera=" + "9" * 5000, "the JSON must have at most 4096 bytes"),
+        ("camera=[[[[NaN]]]]", "numbers must be finite, got NaN"),
+        (exact(1, "color", rig(4096, 4097)[0]).partition("?")[2], "at most 16777216 pixels"),
+        (exact(1, "color", rig()[0], float("nan")).partition("?")[2], "expected a motion above 0"),
+        (exact(1, "color", rig()[0]).partition("?")[2].replace("near", "far"), "`camera.near` is missing"),
+    ],
+)
+def test_exact_images__refuse_a_broken_view(url, query, message):
+    response, content = get(url, f"exact/1/color?{query}")
+    assert response.status == 400
+    assert message in content.decode()
+
+
+def test_exact_images__render_one_at_a_time_and_the_newest_wins(url, monkeypatch):
+    running = Lock()
+
+    def render(*args):
+        assert running.acquire(blocking=False), "two at once"
+        try:
+            return render_channels(*args)
+        finally:
+            running.release()
+
+    monkeypatch.setattr(exact_images, "render", render)
+    cameras = [rig(200 + n, 200)[0] for n in range(20)]
+    with ThreadPoolExecutor(len(cameras)) as pool:
+        answers = list(pool.map(lambda camera: get(url, exact(1, "color", camera)), cameras))
+    images = {decoded(content).shape[1] for response, content in answers if response.status == 200}
+    assert {response.status for response, _ in answers} == {200, 204}
+    assert images
+    assert sum(response.status == 204 for response, _ in answers) > len(cameras) // 2
+
+
+@pytest.mark.parametrize("forge", [damaged, with_forged_bytes, with_forged_packets, with_forged_header])
+def test_viewer__shows_or_refuses_hostile_streams(tmp_path, forge):
+    path = tmp_path / "s"
+    camera = rig()[0]
+    wrong = []
+    for seed in range(6):
+        forged = forge(short_clip(), np.random.default_rng(seed))
+        path.write_bytes(forged if isinstance(forged, bytes) else forged.data)
+        try:
+            viewer = Viewer(open_stream(path))
+        except ValueError as error:
+            wrong += [] if str(error).startswith(f"{path}: ") else [str(error)]
+            continue
+        viewer._socket.close()
+        for frame in range(FRAMES):
+            try:
+                viewer._exact._render(frame, "color", camera, 10.0)
+            except ValueError as error:
+                wrong += [] if str(error).startswith(f"{path}: ") else [str(error)]
+    assert not wrong
+
+
+@pytest.fixture
+def live(tmp_path):
+    """Return a stream and its capture, which grow by a frame with each call of `add`, and the images."""
+    capture = tmp_path / "capture"
+    images = noise_capture.clip(3)
+    write_colmap(capture / "sparse" / "0", noise_capture.rig())
+    (tmp_path / "capture.json").write_text(json.dumps({"capture": str(capture)}))
+    splat = isotropic([[0, 0, 0]], 0.3, 0.9, (1.0, 0, 0))
+    about = {"reading": {"gaps": True}, "test_view": None}
+    with StreamWriter(tmp_path / "stream.morgs", noise_capture.rig(), 25, about) as writer:
+
+        def add(frame: int) -> None:
+            write_images(capture, noise_capture.NAMES, [images[frame]] * 3, frame)
+            writer.write(keyframe_packet(splat, frame))
+
+        add(0)
+        yield tmp_path, add, images
+
+
+def test_recorded_images__follow_a_live_fit_in_any_order(live):
+    folder, add, images = live
+    recorded = RecordedImages(None)
+    np.testing.assert_array_equal(recorded.at(open_stream(folder), 1, 0), images[0])
+    with pytest.raises(ValueError, match="expected a camera and a frame of the stream, got 1 and 1"):
+        recorded.at(open_stream(folder), 1, 1)
+    add(1)
+    add(2)
+    for view, frame in ((1, 2), (1, 2), (0, 0), (0, 1), (2, 1), (0, 2)):
+        np.testing.assert_array_equal(recorded.at(open_stream(folder), view, frame), images[frame])
+    for file in folder.glob("capture/**/*cam0*/*0001*"):
+        file.unlink()
+    with pytest.raises(ValueError, match="camera 0 has no image of frame 1"):
+        RecordedImages(None).at(open_stream(folder), 0, 1)
+
+
+def test_viewer__sends_recorded_images_as_jpeg(live):
+    folder, _, images = live
+    with viewing(folder) as url:
+        assert b'data-server="recorded"' in get(url)[1]
+        response, content = get(url, "recorded/1/0")
+        assert (response.status, response.headers["Content-Type"]) == (200, "image/jpeg")
+        expected = decoded(cv2.imencode(".jpg", images[0][..., ::-1])[1].tobytes())
+        np.testing.assert_array_equal(decoded(content), expected)
+        for path in ("recorded/3/0", "recorded/0/1", "recorded/999999999/999999999"):
+            response, content = get(url, path)
+            assert response.status == 400
+            assert b"expected a camera and a frame of the stream" in content
+
+
+def test_viewer__names_a_capture_that_is_missing(clip, url, tmp_path):
+    (clip[0] / "capture.json").write_text(json.dumps({"capture": str(tmp_path / "moved")}))
+    assert b'data-server=""' in get(url)[1]
+    response, content = get(url, "recorded/0/0")
+    assert response.status == 404
+    assert b"if it has moved, name its folder with --capture" in content
+
+
+@pytest.mark.parametrize("capture", [5, ["a"], {"a": 1}, "\0", None])
+def test_viewer__starts_whatever_a_header_calls_its_capture(tmp_path, capture):
+    write_stream(tmp_path / "stream.morgs", 1, metadata={"capture": capture})
+    with viewing(tmp_path) as url:
+        assert b'data-server=""' in get(url)[1]
+
+
+# --------------------------------------------------------------------------------------------------
+#  The command
+# --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("args", "opens"), [((), ""), (("--follow",), "#follow"), (("--no-browser",), None)])
+def test_view__prints_and_opens_the_link(clip, monkeypatch, capsys, args, opens):
+    opened = []
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    monkeypatch.setattr(Viewer, "run", lambda viewer: viewer._socket.close())
+    assert cli.main(["view", str(clip[0]), *args]) == 0
+    url = re.search(r"http://127\.0\.0\.1:\d+/", capsys.readouterr().out)
+    assert url is not None
+    assert opened == ([] if opens is None else [url[0] + opens])
+
+
+def test_view__prints_a_link_with_a_token_where_other_machines_can_reach_it(clip, monkeypatch, capsys):
+    monkeypatch.setattr(Viewer, "run", lambda viewer: viewer._socket.close())
+    assert cli.main(["view", str(clip[0]), "--host", "0.0.0.0", "--no-browser"]) == 0
+    output = " ".join(capsys.readouterr().out.split())
+    assert re.search(r"http://localhost:\d+/[\w-]{40,}/ \(Ctrl-C to stop\)", output)
+    assert "Other machines open the same link with the address of this machine in digits." in output
+
+
+def test_view__refuses_a_port_that_is_taken(clip, capsys):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        assert cli.main(["view", str(clip[0]), "--port", str(port), "--no-browser"]) == 1
+    assert f"127.0.0.1:{port}: cannot serve the page there" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+def test_view__ends_on_ctrl_c(clip):
+    code = "import sys; from morgs_mi.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", code, "view", str(clip[0]), "--no-browser"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None
+        link = next(line for line in server.stdout if "http://" in line)
+        assert get(link.split()[0], exact(0, "color", rig()[0]))[0].status == 200
+        server.send_signal(signal.SIGINT)
+        _, errors = server.communicate(timeout=60)
+    assert server.returncode == 130, errors
+    assert "Traceback" not in errors
+
+
+def test_starlette__is_not_imported_by_the_other_commands():
+    code = "import sys, morgs_mi.cli; sys.exit('starlette' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
