@@ -61,7 +61,7 @@ class Info:
     arguments: ClassVar[Mapping[str, str]] = {"max_frames": "morgs-mi fit --frames"}
 
     def run(self) -> None:
-        from morgs_mi.calibration.checks.rig_plot import check_plot, write_rig
+        from morgs_mi.calibration.checks.plots import check_plot, write_rig
 
         if self.deep and not self.check:
             raise ValueError("--deep: expected the check of the poses, on which it builds; leave out --no-check.")

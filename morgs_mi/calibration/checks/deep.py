@@ -1,12 +1,13 @@
 """Check of a whole recording: cameras that differ from the others in time, exposure, sharpness or position.
 
 `rig_check` checks the poses on the first frame; this module reads many frames. A finding is a sentence with numbers and
-advice. The limits are far above the values of clips without faults.
+advice. Each row of `_QUESTIONS` has a question, its measure, its limit and its sentence. The limits are far above the
+values of clips without faults.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -19,38 +20,33 @@ from morgs_mi.calibration.checks.signals import (
     brightness,
     known_median,
     lamp_flicker,
+    others_median,
     repeated_frames,
-    shrunk_mask,
 )
 from morgs_mi.calibration.checks.synchrony import consensus, time_offsets
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.color_correction import matched_colors
-from morgs_mi.capture.features import detect, match_views
-from morgs_mi.core.camera import Camera
 from morgs_mi.core.rig import overlaps
 
 __all__ = ["MAX_FRAMES", "DeepCheck", "Finding", "check_deep", "check_exposures"]
 
 # Largest number of frames that are read: the start of a longer recording shows its faults.
 MAX_FRAMES = 120
-# px, and multiple of the rig's median, above which a reprojection error is a finding.
-_ERROR, _TIMES_ERROR = 0.7, 3.0
-# Frames. A time offset is a finding if it is nearer to a whole frame than to zero, by more than its error.
-_OFFSET, _OFFSET_CHANGE, _MIN_HALF = 0.65, 0.75, 24
-# Differences of log gains: about 10 % of exposure, and 5 % of one channel against the mean of all.
-_EXPOSURE, _BALANCE, _MIN_SAMPLES = 0.1, 0.05, 16
-_CORRECTION = "; fit corrects it (not with --exposure off)"
-# Quick check of the exposures: width of the reduced images, px, and number of near views that each is matched with.
-_QUICK_WIDTH, _QUICK_NEIGHBOURS = 480, 3
+# Multiple of the other cameras' reprojection error from which an error is a finding.
+_TIMES_ERROR = 3.0
+# Frames. Half a recording has at least this many, and its time offset differs from the other half's by less than this.
+_MIN_HALF = 24
+_OFFSET_CHANGE = 0.75
+# Least number of matches of a pair of views whose gains are compared.
+_MIN_SAMPLES = 16
 # Error of a median log ratio that no number of points removes, because surfaces look different from two sides.
 _LOG_ERROR = 0.02
-# Threshold on the range of the log brightness over time, about 8 %: people walking through a room cause up to 5 %.
-_VARIATION = 0.08
-# Octaves by which an image is less sharp than the images of the rig, and than the others of its camera.
-_BLUR, _BLURRED_FRAME, _SPREADS = 1.0, 0.5, 6.0
-# Share of a camera's image that the camera with the largest overlap sees.
-_OVERLAP = 0.3
+# Octaves, and multiples of the usual deviation, by which a blurred image is less sharp than the others of its camera.
+_BLURRED_FRAME = 0.5
+_SPREADS = 6.0
+# Number of frames that a sentence lists.
 _MAX_LISTED = 6
+_CORRECTION = "; fit corrects it (not with --exposure off)"
 
 
 @dataclass(frozen=True)
@@ -105,11 +101,21 @@ class DeepCheck:
     findings: tuple[Finding, ...] = ()
 
     @property
+    def largest_overlaps(self) -> np.ndarray:
+        """Share of each camera's image that the camera with the largest overlap sees [C]."""
+        shares = np.where(np.eye(len(self.names), dtype=bool), np.nan, self.overlaps)
+        return np.fmax.reduce(shares, axis=1)
+
+    @property
     def unmeasured(self) -> str:
         """The missing measurements and their cameras, in a sentence; empty if none is missing."""
         values = {"time offsets": self.offsets, "exposure against the other cameras": self.gains.mean(axis=1)}
-        missing = {what: [self.names[view] for view in np.flatnonzero(np.isnan(v))] for what, v in values.items()}
-        parts = [f"{what} of {_listed(names, len(self.names))}" for what, names in missing.items() if names]
+        parts = []
+        for quantity, value in values.items():
+            cameras = [name for name, missing in zip(self.names, np.isnan(value), strict=True) if missing]
+            if cameras:
+                listed = "all cameras" if len(cameras) == len(self.names) else ", ".join(cameras)
+                parts.append(f"{quantity} of {listed}")
         return f"Not measured, without enough common motion or matches: {'; '.join(parts)}." if parts else ""
 
     def as_dict(self) -> dict[str, Any]:
@@ -128,225 +134,276 @@ def check_deep(capture: Capture, shared: SharedFeatures, rig: RigCheck, signals:
     """
     bands = brightness(signals)
     half = len(bands) // 2
-    parts = ([t[:half] for t in signals.thumbs], [t[half:] for t in signals.thumbs]) if half >= _MIN_HALF else ()
-    measured = DeepCheck(
+    parts = ([t[:half] for t in signals.thumbs], [t[half:] for t in signals.thumbs])
+    halves = [time_offsets(capture.cameras, part) for part in parts] if half >= _MIN_HALF else []
+    check = DeepCheck(
         names=capture.names,
         frames=len(bands),
         fps=capture.fps,
         given=tuple(capture.reading.offset.get(name, 0) for name in capture.names),
         errors=np.array([camera.error for camera in rig.cameras]),
         offsets=time_offsets(capture.cameras, signals.thumbs),
-        halves=np.array([time_offsets(capture.cameras, part) for part in parts]).reshape(-1, len(capture.cameras)),
-        gains=_gains(capture.cameras, next(capture.partial_frames(0, 1)).images, shared),
+        halves=np.array(halves or np.full((2, len(capture.cameras)), np.nan)),
+        gains=_gains(capture, shared),
         brightness=known_median(bands, axis=2),
         sharpness=signals.sharpness,
         repeated=repeated_frames(signals),
         lamps=tuple(lamp_flicker(bands[:, c], capture.fps) for c in range(len(capture.cameras))),
         overlaps=overlaps(capture.cameras, capture.points),
     )
-    findings = [_finding(capture.names, q, found) for q, find in _QUESTIONS.items() for found in find(measured)]
-    return replace(measured, findings=tuple(findings))
+    findings = [f for question in _QUESTIONS for f in question.findings(check.names, check)]
+    findings += [f for question in (_EXPOSURE, _BALANCE) for f in question.findings(check.names, check.gains)]
+    return replace(check, findings=tuple(findings))
 
 
-def check_exposures(capture: Capture, shared: SharedFeatures | None = None) -> list[Finding]:
+def check_exposures(capture: Capture, shared: SharedFeatures) -> list[Finding]:
     """Return a finding for each camera with a different exposure or white balance in the first frame.
 
     Args:
         capture: a capture.
-        shared: features of its first frame in its size; None: features of reduced images, in about 0.3 s per view.
+        shared: features of its first frame in its size.
     """
-    capture = _reduced(capture) if shared is None else capture
-    images = next(capture.partial_frames(0, 1)).images
-    if shared is None:
-        features = tuple(detect(image, mask) for image, mask in zip(images, capture.masks, strict=True))
-        shared = SharedFeatures(features, tuple(match_views(features, capture.cameras, _QUICK_NEIGHBOURS)))
-    gains = _gains(capture.cameras, images, shared)
-    return [_finding(capture.names, "exposure", found) for found in _exposures(gains)]
+    gains = _gains(capture, shared)
+    return [*_EXPOSURE.findings(capture.names, gains), *_BALANCE.findings(capture.names, gains)]
 
 
-def _reduced(capture: Capture) -> Capture:
-    """Return a capture with images that are at most `_QUICK_WIDTH` wide."""
-    sizes = [(min(c.width, _QUICK_WIDTH), round(c.height * min(1, _QUICK_WIDTH / c.width))) for c in capture.cameras]
-    cameras = tuple(camera.resized(*size) for camera, size in zip(capture.cameras, sizes, strict=True))
-    masks = tuple(None if m is None else shrunk_mask(m, s) for m, s in zip(capture.masks, sizes, strict=True))
-    return replace(capture, cameras=cameras, masks=masks)
-
-
-def _gains(cameras: Sequence[Camera], images: Sequence[np.ndarray | None], shared: SharedFeatures) -> np.ndarray:
+def _gains(capture: Capture, shared: SharedFeatures) -> np.ndarray:
     """Return the log gains of all cameras [C, 3] that explain the colours of points in two views."""
-    pairs, colors = matched_colors(cameras, images, shared.features, shared.matches)
-    pairs = [pair for pair in pairs if len(pair.features) >= _MIN_SAMPLES]
-    ratios = []
+    images = next(capture.partial_frames(0, 1)).images
+    pairs, colors = matched_colors(capture.cameras, images, shared.features, shared.matches)
+    views = []
+    middles = []
+    weights = []
     for pair in pairs:
-        a, b = (colors[view][pair.features[:, k]] for k, view in enumerate(pair.views))
-        ratios.append(np.log(b / a))
-    middles = np.array([np.median(ratio, axis=0) for ratio in ratios]).reshape(-1, 3)
-    deviations = np.array([np.abs(r - m).mean() / np.sqrt(len(r)) for r, m in zip(ratios, middles, strict=True)])
-    views, weights = np.array([pair.views for pair in pairs]).reshape(-1, 2), 1 / (deviations**2 + _LOG_ERROR**2)
-    return np.stack([consensus(len(colors), views, channel, weights) for channel in middles.T], axis=1)
+        if len(pair.features) >= _MIN_SAMPLES:
+            a, b = (colors[view][pair.features[:, k]] for k, view in enumerate(pair.views))
+            ratio = np.log(b / a)
+            middle = np.median(ratio, axis=0)
+            views.append(pair.views)
+            middles.append(middle)
+            weights.append(1 / (np.abs(ratio - middle).mean() ** 2 / len(ratio) + _LOG_ERROR**2))
+    channels = np.reshape(middles, (-1, 3)).T
+    return np.stack([consensus(len(colors), views, x, np.array(weights)) for x in channels], axis=1)
 
 
-# The cameras that a finding concerns, and their fault.
-_Found = tuple[Sequence[int], str]
+# Values of each camera [C] by name: `value` is compared with the limit, the others stand in the sentence.
+_Values = Mapping[str, Sequence[Any] | np.ndarray]
 
 
-def _finding(names: Sequence[str], question: str, found: _Found) -> Finding:
-    views, text = found
-    cameras = tuple(names[view] for view in views)
-    return Finding(question, cameras, f"{', '.join(cameras)} {text}.")
+@dataclass(frozen=True)
+class _Question:
+    """Row of the table of questions.
+
+    Attributes:
+        name: as in `Finding.question`.
+        measure: returns the values of each camera.
+        limit: a camera with a larger `value` has a fault.
+        sentence: follows the name of the camera, with values in braces.
+        common: whether cameras with the same sentence share a finding.
+    """
+
+    name: str
+    measure: Callable[[Any], _Values]
+    limit: float
+    sentence: str
+    common: bool = False
+
+    def findings(self, names: Sequence[str], measured: Any) -> list[Finding]:
+        """Return the faults of the cameras `names` in what the question measures."""
+        values = self.measure(measured)
+        groups: dict[Any, list[str]] = {}
+        for view in np.flatnonzero(np.asarray(values["value"], float) > self.limit).tolist():
+            text = self.sentence.format(**{key: column[view] for key, column in values.items()}).replace("%", " %")
+            groups.setdefault((text, None if self.common else view), []).append(names[view])
+        return [Finding(self.name, tuple(n), f"{', '.join(n)} {text}.") for (text, _), n in groups.items()]
 
 
-def _errors(check: DeepCheck) -> Iterator[_Found]:
-    for view, error in enumerate(check.errors):
-        usual = _usual(np.delete(check.errors, view))
-        if np.isfinite(error) and error > max(_ERROR, _TIMES_ERROR * usual):
-            yield (
-                [view],
-                f"has a reprojection error of {error:.2f} px, the others {usual:.2f} px: check its lens model and "
-                "focal length, or calibrate again (morgs-mi calibrate)",
-            )
+def _errors(check: DeepCheck) -> _Values:
+    usual = others_median(check.errors)
+    return {"value": np.where(check.errors > _TIMES_ERROR * usual, check.errors, np.nan), "usual": usual}
 
 
-def _times(check: DeepCheck) -> Iterator[_Found]:
-    for view, offset in enumerate(check.offsets.tolist()):
-        halves = check.halves[:, view]
-        if len(halves) and abs(change := halves[1] - halves[0]) >= _OFFSET_CHANGE:
-            yield (
-                [view],
-                f"moves {abs(change):.1f} frames {'ahead of' if change > 0 else 'behind'} the other cameras during "
-                f"the first {check.frames} frames: frames were lost or its clock runs at another rate; copy the clip "
-                "again, or convert it with its true time stamps",
-            )
-        elif abs(offset) >= _OFFSET and not (np.abs(halves - offset) > _OFFSET_CHANGE).any():
-            side, milliseconds = "ahead of" if offset > 0 else "behind", 1e3 / check.fps * abs(offset)
-            yield (
-                [view],
-                f"is {abs(offset):.1f} frames ({milliseconds:.0f} ms) {side} the other cameras: use --offset "
-                f"{check.names[view]} {check.given[view] - round(offset)}, or record with synchronised cameras",
-            )
+def _drifts(check: DeepCheck) -> _Values:
+    change = check.halves[1] - check.halves[0]
+    return {"value": np.abs(change), "side": _sides(change), "frames": [check.frames] * len(change)}
 
 
-def _exposures(gains: np.ndarray) -> Iterator[_Found]:
-    """Yield the cameras with a different exposure or white balance; `gains` are log gains per channel [C, 3]."""
-    for view, (own, mean) in enumerate(zip(gains, gains.mean(axis=1), strict=True)):
-        if abs(mean) > _EXPOSURE:
-            amount = f"{100 * abs(np.expm1(mean)):.0f} % {'brighter' if mean > 0 else 'darker'}"
-            yield [view], f"is {amount} than the other cameras: set the same exposure and gain{_CORRECTION}"
-        if np.abs(own - mean).max() > _BALANCE:
-            channels = ", ".join(f"{n} {100 * np.expm1(g - mean):+.0f} %" for n, g in zip("RGB", own, strict=True))
-            what = f"has another white balance than the other cameras ({channels}): set a fixed one"
-            yield [view], f"{what}{_CORRECTION}"
+def _times(check: DeepCheck) -> _Values:
+    changes = np.vstack([check.halves - check.offsets, check.halves[1] - check.halves[0]])
+    value = np.where((np.abs(changes) >= _OFFSET_CHANGE).any(axis=0), np.nan, np.abs(check.offsets))
+    option = np.array(check.given) - np.round(np.nan_to_num(check.offsets))
+    seconds = value / check.fps
+    return {"value": value, "ms": 1e3 * seconds, "side": _sides(check.offsets), "name": check.names, "option": option}
 
 
-def _flicker(check: DeepCheck) -> Iterator[_Found]:
-    for mains in sorted({lamp.mains for lamp in check.lamps if lamp}):
-        lamps = {view: lamp for view, lamp in enumerate(check.lamps) if lamp and lamp.mains == mains}
-        amplitude, alias = max((lamp.amplitude, lamp.alias) for lamp in lamps.values())
-        exposure = " or ".join(f"1/{2 * frequency}" for frequency in mains)
-        yield (
-            list(lamps),
-            f"flicker by {100 * amplitude:.1f} % at {alias:.1f} Hz, as lamps on {' or '.join(map(str, mains))} Hz "
-            f"mains do: expose for a multiple of {exposure} s, or use lamps without flicker; fit corrects "
-            "what the cameras do not have in common",
-        )
+def _sides(offsets: np.ndarray) -> np.ndarray:
+    return np.where(offsets > 0, "ahead of", "behind")
 
 
-def _variations(check: DeepCheck) -> Iterator[_Found]:
+def _exposures(gains: np.ndarray) -> _Values:
+    change = np.expm1(gains.mean(axis=1))
+    return {"value": np.abs(change), "side": np.where(change > 0, "brighter", "darker")}
+
+
+def _balances(gains: np.ndarray) -> _Values:
+    balance = np.expm1(gains - gains.mean(axis=1, keepdims=True))
+    return {"value": np.abs(balance).max(axis=1), **dict(zip("RGB", balance.T, strict=True))}
+
+
+def _flickers(check: DeepCheck) -> _Values:
+    strongest = {lamp.mains: lamp for lamp in sorted(filter(None, check.lamps), key=lambda lamp: lamp.amplitude)}
+    lamps = [strongest[lamp.mains] if lamp else Lamp((), 0.0, 0.0) for lamp in check.lamps]
+    return {
+        "value": [lamp.amplitude for lamp in lamps],
+        "alias": [lamp.alias for lamp in lamps],
+        "mains": [" or ".join(map(str, lamp.mains)) for lamp in lamps],
+        "exposure": [" or ".join(f"1/{2 * mains}" for mains in lamp.mains) for lamp in lamps],
+    }
+
+
+def _lights(check: DeepCheck) -> _Values:
+    return {"value": _changes(check, np.broadcast_to(_common_brightness(check), check.brightness.shape))}
+
+
+def _variations(check: DeepCheck) -> _Values:
+    values = check.brightness - _common_brightness(check)
+    jump = np.fmax.reduce(np.abs(np.diff(values, axis=0)), axis=0, initial=np.nan)
+    return {"value": _changes(check, values), "jump": np.expm1(jump)}
+
+
+def _common_brightness(check: DeepCheck) -> np.ndarray:
+    """Return the log brightness over time [T, 1] if it changes alike in all cameras, otherwise zeros."""
     common = known_median(check.brightness, axis=1)[:, None]
-    span, rest = _span(common)[0], _usual(_span(check.brightness - common))
+    rest = known_median(_range(check.brightness - common), axis=0)
+    alike = len(check.names) > 2 and rest < 0.5 * _range(common)[0]
+    return common if alike else np.zeros_like(common)
+
+
+def _changes(check: DeepCheck, values: np.ndarray) -> np.ndarray:
+    """Return the relative change of each camera's log brightness [T, C], NaN if its flicker explains it."""
     # The range of a flicker is twice its amplitude; twice that range has another cause as well.
-    limits = np.array([max(_VARIATION, 4 * lamp.amplitude if lamp else 0) for lamp in check.lamps])
-    lit = len(check.names) > 2 and span > limits.max() and rest < 0.5 * span
-    if lit:
-        yield (
-            range(len(check.names)),
-            f"change their brightness alike, by {100 * np.expm1(span):.0f} % over time: the light of the scene "
-            "changes; use constant light",
-        )
-    for view, values in enumerate((check.brightness - common if lit else check.brightness).T):
-        known = values[np.isfinite(values)]
-        if len(known) and (own := np.ptp(known)) > limits[view]:
-            jump = np.abs(np.diff(known)).max()
-            yield (
-                [view],
-                f"changes its brightness by {100 * np.expm1(own):.0f} % over time, up to {100 * np.expm1(jump):.0f} % "
-                "from frame to frame: fix the exposure" + _CORRECTION,
-            )
+    flicker = np.array([4 * lamp.amplitude if lamp else 0 for lamp in check.lamps])
+    return np.where(_range(values) > flicker, np.expm1(_range(values)), np.nan)
 
 
-def _span(values: np.ndarray) -> np.ndarray:
+def _range(values: np.ndarray) -> np.ndarray:
     """Return the range over time of the known values of [T, C], NaN without any [C]."""
-    known = np.isfinite(values)
-    spans = np.where(known, values, -np.inf).max(axis=0) - np.where(known, values, np.inf).min(axis=0)
-    return np.where(known.any(axis=0), spans, np.nan)
+    return np.fmax.reduce(values, axis=0) - np.fmin.reduce(values, axis=0)
 
 
-def _blur(check: DeepCheck) -> Iterator[_Found]:
+def _blurs(check: DeepCheck) -> _Values:
     levels = known_median(check.sharpness, axis=0)
-    for view, level in enumerate(levels):
-        loss = _usual(np.delete(levels, view)) - level
-        if loss > _BLUR:
-            yield (
-                [view],
-                f"is less sharp than the other cameras, with {100 * 2.0**-loss:.0f} % of their fine detail: "
-                "check focus and lens, and that its clip is not enlarged or strongly compressed",
-            )
-    relative = check.sharpness - levels
-    for view, values in enumerate(relative.T):
-        # Compression changes from frame to frame, equally in all cameras if they share an encoder.
-        dips = values - known_median(np.delete(relative, view, axis=1), axis=1)
-        dips = dips if np.isfinite(dips).any() else values
-        spread = 1.5 * _usual(np.abs(dips - _usual(dips)))
-        frames = np.flatnonzero(dips < -max(_BLURRED_FRAME, _SPREADS * spread))
-        if len(frames):
-            yield [view], f"is blurred in {_frames(frames)}: see whether it was touched, or focuses automatically"
+    loss = others_median(levels) - levels
+    return {"value": loss, "detail": 2.0**-loss}
 
 
-def _repeats(check: DeepCheck) -> Iterator[_Found]:
-    for view, frames in enumerate(check.repeated):
-        if frames:
-            yield (
-                [view],
-                f"repeats its last image in {_frames(frames)} while the other cameras see motion: frames were lost; "
-                "copy or record the clip again, without converting its frame rate",
-            )
+def _blurred_frames(check: DeepCheck) -> _Values:
+    relative = check.sharpness - known_median(check.sharpness, axis=0)
+    # Compression changes from frame to frame, equally in all cameras if they share an encoder.
+    dips = relative - np.nan_to_num(others_median(relative))
+    spread = 1.5 * known_median(np.abs(dips - known_median(dips, axis=0)), axis=0)
+    return _listed([np.flatnonzero(blurred) for blurred in (dips < -np.fmax(_BLURRED_FRAME, _SPREADS * spread)).T])
 
 
-def _overlap(check: DeepCheck) -> Iterator[_Found]:
-    for view, shares in enumerate(check.overlaps):
-        others = np.delete(shares, view)
-        if len(others) and others.max() < _OVERLAP:
-            yield (
-                [view],
-                f"shares at most {100 * others.max():.0f} % of its image with another camera: turn it towards what the "
-                "others see, or add a camera in between",
-            )
+def _listed(frames: Sequence[Sequence[int] | np.ndarray]) -> _Values:
+    """Return the number of frames of each camera, and the frames as text, shortened if they are many."""
+    counts = [len(camera) for camera in frames]
+    texts = [", ".join(map(str, camera[:_MAX_LISTED])) for camera in frames]
+    ends = [", ..." if count > _MAX_LISTED else "" for count in counts]
+    return {"value": counts, "frames": [text + end for text, end in zip(texts, ends, strict=True)]}
 
 
-_QUESTIONS: dict[str, Callable[[DeepCheck], Iterator[_Found]]] = {
-    "error": _errors,
-    "time": _times,
-    "exposure": lambda check: _exposures(check.gains),
-    "flicker": _flicker,
-    "variation": _variations,
-    "blur": _blur,
-    "repeats": _repeats,
-    "overlap": _overlap,
-}
+def _overlaps(check: DeepCheck) -> _Values:
+    return {"value": 1 - check.largest_overlaps, "share": check.largest_overlaps}
 
 
-def _usual(values: np.ndarray) -> float:
-    """Return the median of the values that are not NaN, or NaN."""
-    return float(known_median(values, axis=0))
-
-
-def _frames(frames: Sequence[int] | np.ndarray) -> str:
-    """Return frame numbers as text, shortened if there are many."""
-    listed = ", ".join(str(frame) for frame in frames[:_MAX_LISTED])
-    if len(frames) > _MAX_LISTED:
-        return f"{len(frames)} frames ({listed}, ...)"
-    return f"{'frame' if len(frames) == 1 else 'frames'} {listed}"
-
-
-def _listed(names: Sequence[str], count: int) -> str:
-    return "all cameras" if len(names) == count else ", ".join(names)
+# These two rows measure the gains [C, 3], which `check_exposures` has without the rest of a check.
+_EXPOSURE = _Question(
+    "exposure",
+    _exposures,
+    0.1,
+    "is {value:.0%} {side} than the other cameras: set the same exposure and gain" + _CORRECTION,
+)
+_BALANCE = _Question(
+    "exposure",
+    _balances,
+    0.05,
+    "has another white balance than the other cameras (R {R:+.0%}, G {G:+.0%}, B {B:+.0%}): set a fixed one"
+    + _CORRECTION,
+)
+# Limits: px; frames that are nearer to a whole frame than to zero; a change of brightness above the 5 % that people who
+# walk through a room cause; octaves; a share of the image that no other camera sees. Where the limit is 0, the measure
+# has its own.
+_QUESTIONS = (
+    _Question(
+        "error",
+        _errors,
+        0.7,
+        "has a reprojection error of {value:.2f} px, the others {usual:.2f} px: check its lens model and focal length, "
+        "or calibrate again (morgs-mi calibrate)",
+    ),
+    _Question(
+        "time",
+        _drifts,
+        _OFFSET_CHANGE,
+        "moves {value:.1f} frames {side} the other cameras during the first {frames} frames: frames were lost or its "
+        "clock runs at another rate; copy the clip again, or convert it with its true time stamps",
+    ),
+    _Question(
+        "time",
+        _times,
+        0.65,
+        "is {value:.1f} frames ({ms:.0f} ms) {side} the other cameras: use --offset {name} {option:g}, or record with "
+        "synchronised cameras",
+    ),
+    _Question(
+        "flicker",
+        _flickers,
+        0,
+        "flicker by {value:.1%} at {alias:.1f} Hz, as lamps on {mains} Hz mains do: expose "
+        "for a multiple of {exposure} s, or use lamps without flicker; fit corrects what the cameras do not have in "
+        "common",
+        common=True,
+    ),
+    _Question(
+        "variation",
+        _lights,
+        0.08,
+        "change their brightness alike, by {value:.0%} over time: the light of the scene changes; use constant light",
+        common=True,
+    ),
+    _Question(
+        "variation",
+        _variations,
+        0.08,
+        "changes its brightness by {value:.0%} over time, up to {jump:.0%} from frame to frame: fix the exposure"
+        + _CORRECTION,
+    ),
+    _Question(
+        "blur",
+        _blurs,
+        1.0,
+        "is less sharp than the other cameras, with {detail:.0%} of their fine detail: check focus and lens, and that "
+        "its clip is not enlarged or strongly compressed",
+    ),
+    _Question(
+        "blur",
+        _blurred_frames,
+        0,
+        "is blurred in frames {frames}: see whether it was touched, or focuses automatically",
+    ),
+    _Question(
+        "repeats",
+        lambda check: _listed(check.repeated),
+        0,
+        "repeats its last image in frames {frames} while the other cameras see motion: frames were lost; copy or "
+        "record the clip again, without converting its frame rate",
+    ),
+    _Question(
+        "overlap",
+        _overlaps,
+        0.7,
+        "shares at most {share:.0%} of its image with another camera: turn it towards what the others see, or add a "
+        "camera in between",
+    ),
+)

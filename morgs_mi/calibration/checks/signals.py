@@ -6,6 +6,7 @@ which all but the sharpness is measured. Missing values are NaN.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -21,9 +22,9 @@ __all__ = [
     "brightness",
     "known_median",
     "lamp_flicker",
+    "others_median",
     "read_signals",
     "repeated_frames",
-    "shrunk_mask",
 ]
 
 _WIDTH = 128  # of a thumbnail, px
@@ -82,15 +83,16 @@ def read_signals(capture: Capture, max_frames: int, progress: Callable[[int, int
     thumbs = [np.full((count, *size[::-1]), np.nan, np.float32) for size in sizes]
     sharpness = np.full((count, len(sizes)), np.nan)
     inner = [None if m is None else cv2.erode(m.astype(np.uint8), np.ones((9, 9))) > 0 for m in capture.masks]
-    hidden = [None if m is None else ~shrunk_mask(m, size) for m, size in zip(capture.masks, sizes, strict=True)]
     for t, frame in enumerate(capture.partial_frames(0, count)):
         for c, image in enumerate(frame.images):
             if image is None:
                 continue
             grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
             thumbs[c][t] = cv2.resize(grey, sizes[c], interpolation=cv2.INTER_AREA)
-            if hidden[c] is not None:
-                thumbs[c][t][hidden[c]] = np.nan
+            mask = capture.masks[c]
+            if mask is not None:
+                valid = cv2.resize(mask.astype(np.float32), sizes[c], interpolation=cv2.INTER_AREA)
+                thumbs[c][t][valid <= 0.999] = np.nan
             sharpness[t, c] = _sharpness(grey, inner[c])
         if progress is not None:
             progress(t + 1, count)
@@ -102,26 +104,23 @@ def brightness(signals: Signals) -> np.ndarray:
 
     It is the median over the well-exposed pixels, most of which show a static surface.
     """
-    found = [_brightness(thumbs) for thumbs in signals.thumbs]
-    return np.stack(found, axis=1)
+    return np.stack([_brightness(thumbs) for thumbs in signals.thumbs], axis=1)
 
 
 def repeated_frames(signals: Signals) -> tuple[tuple[int, ...], ...]:
     """Return per camera the frames that repeat the previous one while the other cameras' images change."""
-    changes = np.stack([_mean_change(thumbs) for thumbs in signals.thumbs], axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with warnings.catch_warnings(), np.errstate(invalid="ignore", divide="ignore"):
+        # The mean or the quartile of no value is NaN.
+        warnings.simplefilter("ignore", RuntimeWarning)
+        steps = [np.nanmean(np.abs(np.diff(thumbs, axis=0)), axis=(1, 2)) for thumbs in signals.thumbs]
+        changes = np.stack(steps, axis=1)
         # The upper quartile is the usual change even if every second frame is repeated.
-        usual = np.nanpercentile(changes, 75, axis=0) if len(changes) else np.zeros(len(signals.thumbs))
-        relative = changes / usual
-    found = []
-    for camera, own in enumerate(relative.T):
-        others = np.delete(relative, camera, axis=1)
-        moving = known_median(others, axis=1) > _CHANGING
-        # Motion in a view pauses gradually.
-        before, after = np.append(np.nan, own[:-1]), np.append(own[1:], np.nan)
-        isolated = np.fmax(before, after) > _CHANGING
-        found.append(tuple((np.flatnonzero((own < _REPEATED) & moving & isolated) + 1).tolist()))
-    return tuple(found)
+        relative = changes / np.nanpercentile(changes, 75, axis=0)
+    # Motion in a view pauses gradually, so a frame before or after a repeated one has changed.
+    padded = np.pad(relative, ((1, 1), (0, 0)), constant_values=np.nan)
+    isolated = np.fmax(padded[:-2], padded[2:]) > _CHANGING
+    repeated = (relative < _REPEATED) & (others_median(relative) > _CHANGING) & isolated
+    return tuple(tuple((np.flatnonzero(camera) + 1).tolist()) for camera in repeated.T)
 
 
 def lamp_flicker(bands: np.ndarray, fps: float) -> Lamp | None:
@@ -155,21 +154,20 @@ def lamp_flicker(bands: np.ndarray, fps: float) -> Lamp | None:
 
 def known_median(values: np.ndarray, axis: int) -> np.ndarray:
     """Return the median of the values that are not NaN; NaN, without a warning, where all are NaN."""
-    empty = np.isnan(values).all(axis=axis)
-    if empty.all():
-        return np.full(empty.shape, np.nan)
-    found = np.nanmedian(np.where(np.expand_dims(empty, axis), 0, values), axis=axis)
-    return np.where(empty, np.nan, found)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return np.nanmedian(values, axis=axis)
+
+
+def others_median(values: np.ndarray) -> np.ndarray:
+    """Return for each camera the median of the other cameras' known values [..., C]."""
+    medians = [known_median(np.delete(values, view, axis=-1), axis=-1) for view in range(values.shape[-1])]
+    return np.stack(medians, axis=-1)
 
 
 def _rms(amplitudes: np.ndarray) -> np.ndarray:
     """Return the root mean square of complex amplitudes over the bands of rows, the last axis."""
     return np.sqrt((np.abs(amplitudes) ** 2).mean(axis=-1))
-
-
-def shrunk_mask(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Return the pixels of a thumbnail that contain only valid pixels."""
-    return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
 
 
 def _sharpness(grey: np.ndarray, mask: np.ndarray | None) -> float:
@@ -186,16 +184,6 @@ def _brightness(thumbs: np.ndarray) -> np.ndarray:
     with np.errstate(invalid="ignore", divide="ignore"):
         ratios = np.log(srgb_to_linear(thumbs / 255) / srgb_to_linear(reference / 255))
     ratios = np.where(good, ratios, np.nan)
-    found = np.full((len(thumbs), _BANDS), np.nan)
-    for band, rows in enumerate(np.array_split(np.arange(thumbs.shape[1]), _BANDS)):
-        values = ratios[:, rows].reshape(len(thumbs), -1)
-        enough = np.isfinite(values).sum(axis=1) >= _MIN_PIXELS
-        found[enough, band] = known_median(values[enough], axis=1)
-    return found
-
-
-def _mean_change(thumbs: np.ndarray) -> np.ndarray:
-    """Return the mean absolute difference of successive thumbnails [T - 1]."""
-    steps = np.abs(np.diff(thumbs, axis=0))
-    valid = np.isfinite(steps).sum(axis=(1, 2))
-    return np.where(valid, np.nansum(steps, axis=(1, 2)) / np.maximum(valid, 1), np.nan)
+    bands = [band.reshape(len(thumbs), -1) for band in np.array_split(ratios, _BANDS, axis=1)]
+    columns = [np.where(np.isfinite(x).sum(axis=1) < _MIN_PIXELS, np.nan, known_median(x, axis=1)) for x in bands]
+    return np.stack(columns, axis=1)

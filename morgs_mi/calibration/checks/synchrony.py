@@ -10,11 +10,11 @@ Notation: frame k of camera i shows the time k + o_i, with o_i its time offset i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from morgs_mi.calibration.checks.signals import known_median
 from morgs_mi.core.camera import Camera
@@ -35,23 +35,6 @@ _AGREEING, _MIN_AGREEMENT = 0.5, 0.75
 _ITERATIONS = 30
 
 
-@dataclass(frozen=True)
-class _PairShift:
-    """Difference of the time offsets of two cameras.
-
-    Attributes:
-        views: indices of the two cameras i and j.
-        frames: o_j - o_i.
-        correlation: correlation of the epipolar profiles at this shift.
-        weight: difference from the correlation at other shifts.
-    """
-
-    views: tuple[int, int]
-    frames: float
-    correlation: float
-    weight: float
-
-
 def time_offsets(cameras: Sequence[Camera], thumbs: Sequence[np.ndarray]) -> np.ndarray:
     """Return the time offset of each camera from the others' median [C], frames; NaN where it is not determined.
 
@@ -62,51 +45,48 @@ def time_offsets(cameras: Sequence[Camera], thumbs: Sequence[np.ndarray]) -> np.
         cameras: C views.
         thumbs: per camera thumbnails [T, h, w] of the same instants, values in [0, 255], NaN where missing.
     """
-    shifts = _pair_shifts(cameras, thumbs)
-    views = np.array([shift.views for shift in shifts]).reshape(-1, 2).astype(int)
-    frames, weights = (np.array([getattr(shift, key) for shift in shifts]) for key in ("frames", "weight"))
-    offsets = consensus(len(cameras), views, frames, weights)
+    pairs = np.reshape(list(_pair_shifts(cameras, thumbs)), (-1, 4))
+    views = pairs[:, :2].astype(int)
+    frames = pairs[:, 2]
+    offsets = consensus(len(cameras), views, frames, pairs[:, 3])
     agreeing = np.abs(offsets[views[:, 1]] - offsets[views[:, 0]] - frames) <= _AGREEING
-    for view in range(len(cameras)):
-        own = (views == view).any(axis=1)
-        if (own & agreeing).sum() < _MIN_AGREEMENT * own.sum():
-            offsets[view] = np.nan
-    return offsets
+    of_camera = (views[:, :, None] == np.arange(len(cameras))).any(axis=1)
+    enough = (of_camera & agreeing[:, None]).sum(axis=0) >= _MIN_AGREEMENT * of_camera.sum(axis=0)
+    return np.where(enough, offsets, np.nan)
 
 
-def consensus(count: int, views: np.ndarray, differences: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def consensus(count: int, views: ArrayLike, differences: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return values x [count] that best explain differences x_j - x_i [P] of pairs (i, j) [P, 2], by weighted L1.
 
     The median of x, or the lower one of two, is zero; x is NaN for an index in no pair.
     """
     values = np.full(count, np.nan)
-    if not len(views):
+    pairs = np.reshape(views, (-1, 2)).astype(int)
+    if not len(pairs):
         return values
-    system = np.zeros((len(views), count))
-    rows = np.arange(len(views))
-    system[rows, views[:, 0]], system[rows, views[:, 1]] = -1, 1
+    system = np.eye(count)[pairs[:, 1]] - np.eye(count)[pairs[:, 0]]
     scale = np.sqrt(weights)
     for _ in range(_ITERATIONS):
         solution = np.linalg.lstsq(system * scale[:, None], differences * scale, rcond=None)[0]
         scale = np.sqrt(weights / np.maximum(np.abs(system @ solution - differences), 1e-2))
-    seen = np.unique(views)
-    values[seen] = solution[seen] - np.quantile(solution[seen], 0.5, method="lower")
+    paired = np.unique(pairs)
+    values[paired] = solution[paired] - np.quantile(solution[paired], 0.5, method="lower")
     return values
 
 
-def _pair_shifts(cameras: Sequence[Camera], thumbs: Sequence[np.ndarray]) -> list[_PairShift]:
-    """Return the shifts of all pairs of cameras with distinct common motion."""
-    changes = [_changes(own) for own in thumbs]
-    rays = [_rays(camera, own.shape[1:]) for camera, own in zip(cameras, thumbs, strict=True)]
-    found = []
+def _pair_shifts(cameras: Sequence[Camera], thumbs: Sequence[np.ndarray]) -> Iterator[tuple[int, int, float, float]]:
+    """Yield i, j, o_j - o_i and a weight for each pair of cameras with distinct common motion."""
+    changes = [_changes(frames) for frames in thumbs]
+    rays = [_rays(camera, frames.shape[1:]) for camera, frames in zip(cameras, thumbs, strict=True)]
     for i, j in combinations(range(len(cameras)), 2):
         angles = _plane_angles(cameras[i], cameras[j], rays[i], rays[j])
-        low, high = max(np.percentile(a, 2) for a in angles), min(np.percentile(a, 98) for a in angles)
+        low = max(np.percentile(a, 2) for a in angles)
+        high = min(np.percentile(a, 98) for a in angles)
         if high > low:
             a, b = (_profile(changes[v], x, low, high) for v, x in zip((i, j), angles, strict=True))
-            shift = _best_shift((i, j), a, b)
-            found += [] if shift is None else [shift]
-    return found
+            frames, weight = _best_shift(a, b)
+            if weight >= _MIN_PROMINENCE:
+                yield i, j, frames, weight
 
 
 def _changes(thumbs: np.ndarray) -> np.ndarray:
@@ -145,24 +125,25 @@ def _profile(changes: np.ndarray, angles: np.ndarray, low: float, high: float) -
     return np.sqrt(np.array(sums).reshape(len(changes), _PLANES) / pixels)
 
 
-def _best_shift(views: tuple[int, int], a: np.ndarray, b: np.ndarray) -> _PairShift | None:
-    """Return the shift of the largest correlation, between frames by a parabola; None if it is not distinct."""
+def _best_shift(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
+    """Return the shift of the largest correlation, between frames by a parabola, and its height above other shifts.
+
+    The height is zero if the correlation is low, or largest at the longest shift, or if the clip is short.
+    """
     largest = min(_MAX_SHIFT, int(_MAX_SHARE * len(a)))
     if largest < 2:
-        return None
+        return 0.0, 0.0
     shifts = np.arange(-largest, largest + 1)
     curve = np.array(
         [_correlation(a[max(0, s) : len(a) + min(0, s)], b[max(0, -s) : len(b) - max(0, s)]) for s in shifts]
     )
     k = int(curve.argmax())
     if k in (0, len(curve) - 1) or curve[k] < _MIN_CORRELATION:
-        return None
+        return 0.0, 0.0
     left, top, right = curve[k - 1 : k + 2]
     beside = max(curve[x] for x in (max(0, k - _BESIDE), min(len(curve) - 1, k + _BESIDE)))
-    if top - beside < _MIN_PROMINENCE:
-        return None
     peak = shifts[k] + 0.5 * (left - right) / (left - 2 * top + right)
-    return _PairShift(views, float(peak), float(top), float(top - beside))
+    return float(peak), float(top - beside)
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> float:

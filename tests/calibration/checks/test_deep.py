@@ -14,7 +14,7 @@ from matplotlib.colors import same_color
 from matplotlib.figure import Figure
 
 from morgs_mi.calibration.checks.deep import DeepCheck, Finding, check_deep
-from morgs_mi.calibration.checks.deep_plot import draw_deep
+from morgs_mi.calibration.checks.plots import draw_deep
 from morgs_mi.calibration.checks.rig_check import check_rig, match_capture
 from morgs_mi.calibration.checks.signals import read_signals
 from morgs_mi.core.files import json_finite

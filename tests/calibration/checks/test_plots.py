@@ -11,7 +11,7 @@ import pytest
 from matplotlib.colors import same_color
 from matplotlib.figure import Figure
 
-from morgs_mi.calibration.checks.rig_plot import check_plot, draw_rig, write_rig
+from morgs_mi.calibration.checks.plots import check_plot, draw_rig, write_rig
 from morgs_mi.capture.capture import Capture
 from morgs_mi.core.camera import Camera
 from tests.assertions import assert_close
