@@ -36,7 +36,7 @@ from morgs_mi.synth.disturbances import (
 )
 from morgs_mi.synth.ground_truth import compute_ground_truth, move_with_objects
 from morgs_mi.synth.path_tracer import PathTracer, developed
-from morgs_mi.synth.scene import DeformingObject, Scene, check_scene, load_scene
+from morgs_mi.synth.scene import Scene, check_scene, load_scene
 from morgs_mi.synth.sensor import check_lenses, record_light
 from morgs_mi.synth.synth_config import SynthConfig
 
@@ -225,7 +225,7 @@ def _sample_tracks(
     """
     starts = sorted({0, len(times) // 2, len(times) - 1})
     objects = tracer.scene.objects.values()
-    can_move = np.array([isinstance(item, DeformingObject) or item.pose is not None for item in objects])
+    can_move = np.array([item.pose is not None for item in objects])
     share = -(-_NUM_TRACKS // (2 * len(starts) * len(cameras)))
     points, owners, poses = [], [], [tracer.poses(time) for time in times]
     for start in starts:
