@@ -19,7 +19,7 @@ import numpy as np
 from morgs_mi.io.bounded import check_claim
 from morgs_mi.io.frame_times import SAME_TIME, clock, read_header, seconds, true_rate
 from morgs_mi.io.image_size import image_size
-from morgs_mi.io.listing import listed
+from morgs_mi.io.listing import IMAGE_SUFFIXES, listed
 from morgs_mi.io.numbering import counting_together
 from morgs_mi.io.remote import fetched
 
@@ -37,8 +37,6 @@ __all__ = [
     "open_frames",
 ]
 
-VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".mov", ".webm")
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 # Bytes of memory that a pixel takes, in BGR and RGB.
 _BYTES_PER_PIXEL = 6
 # First frame that is worth a search, and the frames before it at which the search aims: those shown right after a
