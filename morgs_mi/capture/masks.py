@@ -32,15 +32,18 @@ def used_in_clip(reader: FrameReader, masks: Sequence[Path], name: str) -> tuple
 def opaque_pixels(reader: FrameReader, name: str) -> tuple[np.ndarray | None, str]:
     """Return the mask of the opaque pixels, None if all are opaque or the mask varies, and a note.
 
+    The first, the middle and the last image are compared.
+
     Raises:
         ValueError: no pixel is opaque.
     """
     if not isinstance(reader, FolderReader):
         return None, ""
-    mask, constant = reader.opaque()
-    if not constant:
+    chosen = sorted({0, reader.num_frames // 2, reader.num_frames - 1})
+    mask, *others = (_opaque(reader.files[i], (reader.height, reader.width)) for i in chosen)
+    if any(not np.array_equal(mask, other) for other in others):
         return None, f"{name}: the alpha channel of its images changes over time and is ignored."
-    if mask is None:
+    if mask.all():
         return None, ""
     if not mask.any():
         raise ValueError(f"{reader.path}: expected opaque pixels, got an alpha channel without any; remove it.")
@@ -78,10 +81,34 @@ def _not_black(file: Path) -> np.ndarray:
     """Return the mask [H, W] of the pixels of an image that are neither black nor transparent."""
     if not file.is_file():
         raise FileNotFoundError(f"{file}: expected a mask, found none; copy it, or drop `mask_path`.")
-    image = decode_image(file, np.fromfile(fetched(file), np.uint8), cv2.IMREAD_UNCHANGED)
+    image = _decoded(file)
     if image.ndim == 2:
         return image > 0
     return np.any(image[..., :3] > 0, axis=2) & np.all(image[..., 3:] > 0, axis=2)
+
+
+def _opaque(file: Path, shape: tuple[int, int]) -> np.ndarray:
+    """Return the mask of an image's opaque pixels [H, W]: all without an alpha channel, or if it is not readable."""
+    try:
+        with fetched(file).open("rb") as opened:
+            header = opened.read(26)
+        image = _decoded(file) if _may_be_transparent(header) else None
+    except (ValueError, OSError):
+        image = None
+    if image is None or image.shape != (*shape, 4):
+        return np.ones(shape, bool)
+    return image[..., 3] == np.iinfo(image.dtype).max
+
+
+def _may_be_transparent(header: bytes) -> bool:
+    """Return whether an image may have an alpha channel, from the first 26 bytes of its file."""
+    if header.startswith(b"\x89PNG"):
+        return header[25:] in (b"\3", b"\4", b"\6")  # with a palette, grey and alpha, or RGB and alpha
+    return not header.startswith((b"\xff\xd8", b"BM"))  # JPEG has none, and BMP's has no meaning
+
+
+def _decoded(file: Path) -> np.ndarray:
+    return decode_image(file, np.fromfile(fetched(file), np.uint8), cv2.IMREAD_UNCHANGED)
 
 
 def _at_size(file: Path, mask: np.ndarray, width: int, height: int) -> np.ndarray:

@@ -172,15 +172,9 @@ class FrameScores:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the frame's row of the JSON."""
-        return {
-            "frame": self.frame,
-            "kind": self.kind,
-            "num_bytes": self.num_bytes,
-            "seconds": self.seconds,
-            **asdict(self.scores),
-            "motion_3d": _optional(self.motion_3d),
-            "views": {name: asdict(scores) for name, scores in self.views.items()},
-        }
+        row = asdict(self)
+        scores, motion, views = (row.pop(name) for name in ("scores", "motion_3d", "views"))
+        return {**row, **scores, "motion_3d": motion or {}, "views": views}
 
 
 @dataclass(frozen=True)
@@ -250,7 +244,7 @@ class Evaluation:
     expected: str = ""
     """Expected quality of views between the cameras, a sentence from the report of the fit; without one, a forecast
     from the rig; empty with a single training view."""
-    expected_psnr: float = float("nan")
+    expected_psnr: float = _NAN
     """Their PSNR as the fit forecasts it, dB; NaN where it does not."""
 
     @property
@@ -277,8 +271,8 @@ class Evaluation:
     @property
     def motion_3d(self) -> Motion3DScores | None:
         """Mean over the frames; None if no frame has any."""
-        found = [frame.motion_3d for frame in self.frames if frame.motion_3d is not None]
-        return Motion3DScores.mean(found) if found else None
+        scores = [frame.motion_3d for frame in self.frames if frame.motion_3d is not None]
+        return Motion3DScores.mean(scores) if scores else None
 
     @property
     def seconds(self) -> Timings:
@@ -288,36 +282,23 @@ class Evaluation:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the evaluation as JSON can hold it, apart from scores that are infinite or NaN."""
-        means, ends = asdict(self.scores), (self.frames[0].scores, self.frames[-1].scores)
+        means = asdict(self.scores)
         for name in ("psnr", "ssim"):
-            first, last = (getattr(scores, name) for scores in ends)
+            first, last = (getattr(frame.scores, name) for frame in (self.frames[0], self.frames[-1]))
             means[name] = {"mean": means[name], "first": first, "last": last}
+        views = self.views.items()
+        names = ("stream", "capture", "held_out", "num_frames", "complete", "regions")
+        figures = ("psnr_slope", "registered_psnr", "expected", "expected_psnr")
         return {
-            "stream": self.stream,
-            "capture": self.capture,
-            "held_out": self.held_out,
-            "num_frames": self.num_frames,
-            "complete": self.complete,
-            "regions": self.regions,
+            **{name: getattr(self, name) for name in names},
             **means,
-            "psnr_slope": self.psnr_slope,
-            "registered_psnr": self.registered_psnr,
-            "expected": self.expected,
-            "expected_psnr": self.expected_psnr,
-            "motion_3d": _optional(self.motion_3d),
+            **{name: getattr(self, name) for name in figures},
+            "motion_3d": {} if self.motion_3d is None else asdict(self.motion_3d),
             "tracking": [asdict(row) for row in self.tracking],
             "seconds": {**asdict(self.seconds), "definition": _SECONDS},
             "bytes": asdict(self.sizes),
             "mtv": asdict(self.variation),
             "playback": asdict(self.playback),
-            "views": {
-                name: {**asdict(scores), "registered_psnr": self.registered.get(name, float("nan"))}
-                for name, scores in self.views.items()
-            },
+            "views": {n: {**asdict(scores), "registered_psnr": self.registered.get(n, _NAN)} for n, scores in views},
             "frames": [frame.as_dict() for frame in self.frames],
         }
-
-
-def _optional(scores: Motion3DScores | None) -> dict[str, float]:
-    """Return the scores as a dict, empty without any."""
-    return {} if scores is None else asdict(scores)

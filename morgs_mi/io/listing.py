@@ -1,10 +1,13 @@
-"""Content of folders, without the files that operating systems and file servers add."""
+"""Content of folders, without the files that operating systems and file servers add, and kinds of files."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-__all__ = ["is_added", "is_listed", "listed"]
+__all__ = ["IMAGE_SUFFIXES", "VIDEO_SUFFIXES", "is_added", "is_listed", "listed"]
+
+VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".mov", ".webm")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 
 # In lower case: of macOS and its archives, Windows (thumbnails, settings, bins), Synology, and ext4.
 _ADDED = {

@@ -23,7 +23,7 @@ from typing import Any
 
 from morgs_mi.core.files import write_json
 from morgs_mi.core.llvm import cache_folder
-from morgs_mi.io.listing import is_listed
+from morgs_mi.io.listing import IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_listed
 
 __all__ = ["fetched", "is_url", "mirrored", "url_of"]
 
@@ -33,14 +33,6 @@ _VERSION = (
     *("Last-Modified", "Content-MD5", "Digest"),  # http
     *("modify", "modificationTime", "date_time", "sha"),  # ftp, webhdfs, archives, GitHub
 )
-# One of these is among the first bytes of an image, a video or another file of a suffix.
-_IMAGE = (b"\x89PNG", b"\xff\xd8", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+", b"RIFF", b"BM")
-_VIDEO = (b"ftyp", b"moov", b"mdat", b"free", b"wide", b"\x1aE\xdf\xa3", b"RIFF")
-_FETCHED_LATER = {
-    **dict.fromkeys((".mp4", ".mkv", ".avi", ".mov", ".webm"), _VIDEO),
-    **dict.fromkeys((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp"), _IMAGE),
-}
-_MAGIC = {**_FETCHED_LATER, ".npy": (b"\x93NUMPY",), ".npz": (b"PK",), ".ply": (b"ply",)}
 _PAGE = (b"<!doctype html", b"<html")
 _IGNORED = "truth"
 _INDEX = ".remote.json"  # file in a mirrored folder: its URL, and the sizes of the files
@@ -81,7 +73,7 @@ def mirrored(url: str) -> Path:
     for name, size in sizes.items():
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)
-        if file.suffix.lower() in _FETCHED_LATER:
+        if file.suffix.lower() in (*VIDEO_SUFFIXES, *IMAGE_SUFFIXES):
             file.touch()
         elif not file.exists():
             _fetch(system, url, f"{base}/{name}", file, size)
@@ -185,28 +177,21 @@ def _fetch(system: Any, url: str, remote: str, file: Path, size: int | None) -> 
     try:
         with _failures(place):
             system.get_file(remote, str(partial))
-        _check_content(place, partial, file.suffix.lower(), size)
+        _check_content(place, partial, size)
         partial.replace(file)
     finally:
         partial.unlink(missing_ok=True)
 
 
-def _check_content(place: str, file: Path, suffix: str, size: int | None) -> None:
-    """Check that a fetched file has its size and the first bytes of its kind.
-
-    Raises:
-        ConnectionError: it has another size, or is a page of HTML.
-        ValueError: it is of another kind.
-    """
+def _check_content(place: str, file: Path, size: int | None) -> None:
+    """Raise `ConnectionError` if a fetched file has another size, or is a page of HTML, such as one to log in."""
     with file.open("rb") as opened:
-        head = opened.read(512)
-    got, kinds = file.stat().st_size, _MAGIC.get(suffix)
-    if any(mark in head.lower() for mark in _PAGE):
+        head = opened.read(512).lower()
+    got = file.stat().st_size
+    if any(mark in head for mark in _PAGE):
         raise ConnectionError(f"{place}: expected a file, got a page of HTML; check the URL, or log in, and try again.")
     if size is not None and got != size:
         raise ConnectionError(f"{place}: expected {size} bytes, got {got}; it has changed or was cut short, try again.")
-    if head and kinds and not any(kind in head[:12] for kind in kinds):
-        raise ValueError(f"{place}: expected a {suffix} file, got {got} bytes of another kind; copy it there again.")
 
 
 @contextmanager
@@ -219,9 +204,8 @@ def _failures(place: str) -> Iterator[None]:
     except PermissionError as error:
         raise PermissionError(f"{place}: expected to be allowed to read it, got {error}; check the rights.") from None
     except TimeoutError:
-        raise ConnectionError(
-            f"{place}: expected an answer, got none in time; check the connection, try again."
-        ) from None
+        message = f"{place}: expected an answer, got none in time; check the connection, try again."
+        raise ConnectionError(message) from None
     except (ImportError, ValueError):
         raise
     except Exception as error:  # the libraries of the protocols have errors of their own

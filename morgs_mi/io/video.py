@@ -19,7 +19,7 @@ import numpy as np
 from morgs_mi.io.bounded import check_claim
 from morgs_mi.io.frame_times import SAME_TIME, clock, read_header, seconds, true_rate
 from morgs_mi.io.image_size import image_size
-from morgs_mi.io.listing import listed
+from morgs_mi.io.listing import IMAGE_SUFFIXES, listed
 from morgs_mi.io.numbering import counting_together
 from morgs_mi.io.remote import fetched
 
@@ -37,8 +37,6 @@ __all__ = [
     "open_frames",
 ]
 
-VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".mov", ".webm")
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 # Bytes of memory that a pixel takes, in BGR and RGB.
 _BYTES_PER_PIXEL = 6
 # First frame that is worth a search, and the frames before it at which the search aims: those shown right after a
@@ -103,24 +101,25 @@ class VideoReader:
         held = header.num_held
         fps = header.fps
         times = header.times
+        positions = None
         # Some containers do not store the number, and a frame takes more than a byte.
         declared = header.num_frames if 0 < header.num_frames <= path.stat().st_size else held
         if times is not None and len(times) > 1:
-            fps = true_rate(fps, len(times) - 1, float(times[-1] - times[0]))
-        regular = None if times is None else clock(times)
-        if times is None or regular is None:
-            return cls(path, declared, fps if fps > 0 else None, header.width, header.height, held, times=times)
-        positions, rate = regular
-        if positions[-1] > 10 * held + _MAX_PAUSE:
-            raise ValueError(
-                f"{path}: expected {held} frames at about {rate:.3g} per second, got time stamps that span "
-                f"{times[-1]:.3g} s; they are broken, convert the clip."
-            )
-        # Where the number is not stored, it is the duration times the mean rate; a clip that lasts so long is complete.
-        if header.fps > 0 and declared / header.fps <= times[-1] + 1.5 / rate:
-            declared = held
-        rate = true_rate(header.fps, float(positions[-1] - positions[0]), float(times[-1] - times[0]))
-        return cls(path, declared, rate, header.width, header.height, held, positions, times)
+            periods = len(times) - 1.0
+            if (regular := clock(times)) is not None:
+                positions, rate = regular
+                periods = float(positions[-1] - positions[0])
+                if positions[-1] > 10 * held + _MAX_PAUSE:
+                    raise ValueError(
+                        f"{path}: expected {held} frames at about {rate:.3g} per second, got time stamps that span "
+                        f"{times[-1]:.3g} s; they are broken, convert the clip."
+                    )
+                # Where the number is not stored, it is the duration times the mean rate; a clip of this length is
+                # complete.
+                if fps > 0 and declared / fps <= times[-1] + 1.5 / rate:
+                    declared = held
+            fps = true_rate(fps, periods, float(times[-1] - times[0]))
+        return cls(path, declared, fps if fps > 0 else None, header.width, header.height, held, positions, times)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
         """Yield frames start..stop-1, by default up to `num_frames`.
@@ -229,28 +228,12 @@ class FolderReader:
         first = _read_image(next(readable, files[0]))
         return cls(files[0].parent, tuple(files), first.shape[1], first.shape[0])
 
-    def opaque(self) -> tuple[np.ndarray | None, bool]:
-        """Return the mask of the pixels that no alpha channel makes transparent, and whether it is constant.
-
-        The first, the middle and the last image are compared. The mask [H, W] belongs to the first one; it is None
-        without transparent pixels.
-        """
-        chosen = {0, self.num_frames // 2, self.num_frames - 1}
-        masks = [_opaque(self.files[i]) for i in sorted(chosen)]
-        full = np.ones((self.height, self.width), bool)
-        masks = [full if mask is None or mask.shape != full.shape else mask for mask in masks]
-        constant = all(np.array_equal(mask, masks[0]) for mask in masks)
-        return None if masks[0].all() else masks[0], constant
-
     @property
     def num_frames(self) -> int:
         """Number of images."""
         return len(self.files)
 
-    @property
-    def num_held(self) -> int:
-        """Number of images."""
-        return len(self.files)
+    num_held = num_frames
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
         """Yield frames start..stop-1.
@@ -292,18 +275,16 @@ def open_clips(clips: Sequence[Clip], gaps: bool = False) -> list[FrameReader]:
         FileNotFoundError: a clip is missing, or one of its images.
         ValueError: as `VideoReader.open` and `FolderReader.open`.
     """
-    folders = [clip for clip in clips if isinstance(clip, Path) and clip.is_dir()]
-    if not gaps or not folders:
-        return [FolderReader.of_files(c, gaps) if isinstance(c, tuple) else open_frames(c) for c in clips]
+    folders = [clip for clip in clips if gaps and isinstance(clip, Path) and clip.is_dir()]
     numbered = {folder: {image_number(file): file for file in _images(folder)} for folder in folders}
-    groups = counting_together({folder: sorted(files) for folder, files in numbered.items()})
-    instants = {folder: _instants([numbered[key] for key in group]) for group in groups for folder in group}
-    return [
-        _open_with_gaps(clip, numbered[clip], instants[clip])
-        if isinstance(clip, Path) and clip in numbered
-        else open_clips([clip], gaps)[0]
-        for clip in clips
-    ]
+    readers: dict[Clip, FrameReader] = {}
+    for group in counting_together({folder: sorted(files) for folder, files in numbered.items()}):
+        numbers = _instants([numbered[folder] for folder in group])
+        for folder in group:
+            files = numbered[folder]
+            images = [files.get(number, _missing_name(folder, files, number)) for number in numbers]
+            readers[folder] = replace(FolderReader.of_files(images, gaps), numbers=numbers)
+    return [readers[clip] if clip in readers else open_frames(clip, gaps) for clip in clips]
 
 
 def _instants(group: Sequence[Mapping[int, Path]]) -> range:
@@ -324,16 +305,13 @@ def _instants(group: Sequence[Mapping[int, Path]]) -> range:
     return range(numbers[0], numbers[-1] + 1, step)
 
 
-def _open_with_gaps(folder: Path, files: Mapping[int, Path], numbers: range) -> FolderReader:
-    """Return the reader of the images with `numbers`, which may be missing."""
-    images = [files.get(number, _missing_name(folder, files, number)) for number in numbers]
-    return replace(FolderReader.of_files(images, gaps=True), numbers=numbers)
+def open_frames(path: str | Path | tuple[Path, ...], gaps: bool = False) -> FrameReader:
+    """Return the reader of a video file, a folder of images or a list of images; raises the errors of their `open`.
 
-
-def open_frames(path: str | Path | tuple[Path, ...]) -> FrameReader:
-    """Return the reader of a video file, a folder of images or a list of images; raises the errors of their `open`."""
+    With `gaps`, images of a list may be missing or broken.
+    """
     if isinstance(path, tuple):
-        return FolderReader.of_files(path)
+        return FolderReader.of_files(path, gaps)
     return FolderReader.open(path) if Path(path).is_dir() else VideoReader.open(path)
 
 
@@ -401,12 +379,8 @@ def _read_image(file: Path) -> np.ndarray:
     if not file.is_file():
         raise _no_image(file)
     # The stored pixels, without EXIF's rotation: calibrations refer to them.
-    image = _decoded(file, cv2.IMREAD_COLOR)
+    image = decode_image(file, np.fromfile(fetched(file), np.uint8), cv2.IMREAD_COLOR)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-
-
-def _decoded(file: Path, mode: int) -> np.ndarray:
-    return decode_image(file, np.fromfile(fetched(file), np.uint8), mode)
 
 
 def decode_image(file: Path, data: np.ndarray, mode: int) -> np.ndarray:
@@ -426,25 +400,3 @@ def decode_image(file: Path, data: np.ndarray, mode: int) -> np.ndarray:
     if image is None:
         raise ValueError(f"{file}: expected an image, got {len(data)} bytes that cannot be decoded.")
     return image
-
-
-def _opaque(file: Path) -> np.ndarray | None:
-    """Return the mask of an image's opaque pixels [H, W], None if it has no alpha channel or is not readable."""
-    if not file.is_file():
-        return None
-    try:
-        with fetched(file).open("rb") as opened:
-            header = opened.read(26)
-        if not _may_be_transparent(header):
-            return None
-        image = _decoded(file, cv2.IMREAD_UNCHANGED)
-    except (ValueError, OSError):
-        return None
-    return image[..., 3] == np.iinfo(image.dtype).max if image.ndim == 3 and image.shape[2] == 4 else None
-
-
-def _may_be_transparent(header: bytes) -> bool:
-    """Return whether an image may have an alpha channel, from the first 26 bytes of its file."""
-    if header.startswith(b"\x89PNG"):
-        return header[25:] in (b"\3", b"\4", b"\6")  # with a palette, grey and alpha, or RGB and alpha
-    return not header.startswith((b"\xff\xd8", b"BM"))  # JPEG has none, and BMP's has no meaning

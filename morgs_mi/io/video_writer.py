@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterable, Iterator
-from functools import cache
 from pathlib import Path
 
 import cv2
@@ -12,23 +10,10 @@ import numpy as np
 
 from morgs_mi.core.files import atomic_folder, atomic_path
 
-__all__ = ["playable_format", "write_video"]
+__all__ = ["PLAYABLE", "write_video"]
 
-
-@cache
-def playable_format() -> tuple[str, str]:
-    """Return the suffix and codec of videos that browsers and players open: VP9, otherwise H.264, in .mp4.
-
-    OpenCV's wheels have VP9. Builds of OpenCV with neither encoder get lossless FFV1 in .mkv, which no browser plays.
-    """
-    for codec in ("vp09", "avc1"):
-        with tempfile.TemporaryDirectory() as folder:
-            encoder = _encoder(Path(folder) / "trial.mp4", codec, 30, 64, 64)
-            works = encoder.isOpened()
-            encoder.release()
-        if works:
-            return ".mp4", codec
-    return ".mkv", "FFV1"
+PLAYABLE = "vp09"
+"""Codec of videos in .mp4 that browsers and players open: VP9, which OpenCV's wheels have."""
 
 
 def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float, codec: str = "FFV1") -> None:
@@ -40,10 +25,10 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float, code
         path: ``.mp4``, ``.mkv``, ``.avi``, ... or a folder that does not exist yet.
         frames: at least one, all of one even width and height (any size in a folder).
         fps: frames per second; not stored in a folder.
-        codec: OpenCV's four-character code. ``FFV1`` is lossless, in .mp4 too, but no browser plays it;
-            `playable_format` has one that does. On a path-traced box at 304x224, 4:2:0 chroma alone allows 42.4 dB;
-            ``vp09`` reaches 39.2 dB at 37 ms a frame, ``mp4v`` 37.6 dB at 0.6 ms. OpenCV has no setting of the quality
-            (opencv issue 24570), and its wheels have no ``avc1``.
+        codec: OpenCV's four-character code. ``FFV1`` is lossless, in .mp4 too, but no browser plays it, unlike
+            `PLAYABLE`. On a path-traced box at 304x224, 4:2:0 chroma alone allows 42.4 dB; ``vp09`` reaches 39.2 dB at
+            37 ms a frame, ``mp4v`` 37.6 dB at 0.6 ms. OpenCV has no setting of the quality (opencv issue 24570), and
+            its wheels have no ``avc1``.
 
     Raises:
         ValueError: there are no frames, or a frame is not as described.
@@ -73,7 +58,9 @@ def _write_file(partial: Path, path: Path, frames: Iterable[np.ndarray], fps: fl
                         f"write_video({path}): the width and height must be even, because OpenCV drops an odd "
                         f"column or row, got {width}x{height}; crop, or write a folder of PNGs."
                     )
-                encoder = _encoder(partial, codec, fps, width, height)
+                encoder = cv2.VideoWriter(
+                    str(partial), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), fps, (width, height)
+                )
                 if not encoder.isOpened():
                     raise OSError(f"OpenCV could not open it with the encoder {codec!r}; try the codec FFV1 or mp4v")
             encoder.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
@@ -89,10 +76,6 @@ def _write_file(partial: Path, path: Path, frames: Iterable[np.ndarray], fps: fl
     stream.release()
     if readable != count:
         raise OSError(f"{count} frames were written but {readable} can be read back")
-
-
-def _encoder(path: Path, codec: str, fps: float, width: int, height: int) -> cv2.VideoWriter:
-    return cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), fps, (width, height))
 
 
 def _checked(path: Path, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:

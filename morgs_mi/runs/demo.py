@@ -20,7 +20,7 @@ from morgs_mi.evaluate.figures import motion_scale
 from morgs_mi.evaluate.results import Evaluation
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.io.bounded import read_json
-from morgs_mi.io.video_writer import playable_format, write_video
+from morgs_mi.io.video_writer import PLAYABLE, write_video
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.export.frames import pad_to_even
 from morgs_mi.playback.player import channel_image, render_stream, truth_for_camera
@@ -210,7 +210,7 @@ def _draw(out: Path, capture: Capture, report: Callable[[float, float], None]) -
     shown = ("truth", "render", "motion", "confidence")
     rows = [side_by_side([panels[name] for name in shown if name in panels]) for panels in full]
     fps = min(capture.fps, len(rows) / _LEAST_SECONDS)
-    write_video(out / "side_by_side.mp4", map(pad_to_even, rows), fps, playable_format()[1])
+    write_video(out / "side_by_side.mp4", map(pad_to_even, rows), fps, PLAYABLE)
     report(1, 2)
     last = len(plain) - 1
     frames = sorted({min(1, len(full) - 1), last, len(full) - 1})

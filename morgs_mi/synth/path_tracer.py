@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -15,8 +14,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import linear_to_srgb
 from morgs_mi.synth.disturbances import undistorted
 from morgs_mi.synth.ground_truth import SurfacePoints
-from morgs_mi.synth.mitsuba_mesh import move_mesh, new_mesh
-from morgs_mi.synth.scene import Deformed, DeformingObject, Object, Scene
+from morgs_mi.synth.scene import Scene
 
 __all__ = ["PathTracer", "developed", "srgb_bytes"]
 
@@ -55,27 +53,10 @@ def _load(name: str, content: dict[str, Any]) -> Any:
         raise ValueError(f"scene {name!r}: Mitsuba cannot load it: {reason}; correct the dictionary.") from error
 
 
-def _pose_of(item: Object | DeformingObject, time: float) -> np.ndarray | Deformed:
-    if isinstance(item, DeformingObject):
-        return item.shape(time)
-    return np.eye(4) if item.pose is None else item.pose(time)
-
-
-@dataclass(frozen=True)
-class _Part:
-    """A mesh of a deforming object in Mitsuba: its name, its object, and the indices of its vertices [V]."""
-
-    name: str
-    owner: str
-    used: np.ndarray
-    smooth: bool
-
-
 class PathTracer:
     """Path tracer of a scene at one time.
 
-    The scene is loaded once. Only the transforms of instances and the vertices of deforming meshes change, so all views
-    and frames run the same kernels.
+    The scene is loaded once. Only the transforms of instances change, so all views and frames run the same kernels.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -87,18 +68,8 @@ class PathTracer:
         self.scene = scene
         content: dict[str, Any] = {"type": "scene", **{name: light.shape for name, light in scene.lights.items()}}
         owners: dict[str, int] = {}
-        faces: dict[str, np.ndarray] = {}
-        self._parts: list[_Part] = []
         for index, (name, item) in enumerate(scene.objects.items()):
-            if isinstance(item, DeformingObject):
-                shapes, vertices = {}, item.shape(0.0).vertices
-                for part, mesh in item.meshes.items():
-                    used, known = np.unique(mesh.faces), f"{name}_{part}"
-                    self._parts.append(_Part(known, name, used, mesh.smooth))
-                    faces[known] = mesh.faces
-                    bsdf = _load(scene.name, mesh.bsdf)
-                    shapes[known] = new_mesh(known, bsdf, mesh, used, vertices)
-            elif item.pose is None:
+            if item.pose is None:
                 shapes = {f"{name}_{part}": shape for part, shape in item.shapes.items()}
             else:
                 content[f"{name}_group"] = {"type": "shapegroup", **item.shapes}
@@ -108,7 +79,7 @@ class PathTracer:
         # The optimisation would merge meshes that share a material, even meshes of different objects.
         self._scene: Any = _load(scene.name, content)
         shapes = [shape for shape in self._scene.shapes() if shape.id() in owners]
-        self._owners = [(mi.ShapePtr(shape), owners[shape.id()], faces.get(shape.id())) for shape in shapes]
+        self._owners = [(mi.ShapePtr(shape), owners[shape.id()]) for shape in shapes]
         self._params: Any = mi.traverse(self._scene)
         moving = {name: light.pose for name, light in scene.lights.items() if light.pose is not None}
         self._lamps = {f"{name}.to_world": (pose, self._lamp_transform(name)) for name, pose in moving.items()}
@@ -131,26 +102,19 @@ class PathTracer:
             )
         return np.array(self._params[f"{light}.to_world"].matrix, float).reshape(4, 4)
 
-    def poses(self, time: float) -> list[np.ndarray | Deformed]:
-        """Return each object's pose [4, 4], or its vertices, at `time` in seconds."""
-        return [_pose_of(item, time) for item in self.scene.objects.values()]
+    def poses(self, time: float) -> list[np.ndarray]:
+        """Return each object's pose [4, 4] at `time` in seconds."""
+        return [np.eye(4) if item.pose is None else item.pose(time) for item in self.scene.objects.values()]
 
     def set_time(self, time: float) -> None:
         """Set the poses of all objects and lamps, and the exposure, to `time` in seconds."""
         for name, item in self.scene.objects.items():
-            if isinstance(item, DeformingObject):
-                self._set_shape(name, item.shape(time))
-            elif item.pose is not None:
+            if item.pose is not None:
                 self._params[f"{name}.to_world"] = mi.Transform4f(item.pose(time))
         for name, (pose, transform) in self._lamps.items():
             self._params[name] = mi.Transform4f(pose(time) @ transform)
         self._params.update()
         self._exposure = 1.0 if self.scene.exposure is None else self.scene.exposure(time)
-
-    def _set_shape(self, name: str, shape: Deformed) -> None:
-        for part in self._parts:
-            if part.owner == name:
-                move_mesh(self._params, part.name, part.used, part.smooth, shape)
 
     def render(self, camera: Camera, spp: int, seed: int, noise: float = 0.0) -> np.ndarray:
         """Return the path-traced view, sRGB-encoded [H, W, 3], uint8.
@@ -201,18 +165,12 @@ class PathTracer:
         position, directions = camera.rays(pixels.reshape(-1, 2))
         origins = np.repeat(position[:, None], len(directions), axis=1)
         ray = mi.Ray3f(mi.Point3f(origins), mi.Vector3f(directions.T))
-        found: Any = self._scene.ray_intersect_preliminary(ray)
-        hit = found.compute_surface_interaction(ray)
-        dr.eval(found, hit)  # otherwise every array below would trace the rays again
-        triangles, (u, v) = np.array(found.prim_index), np.array(found.prim_uv, float)
-        points = SurfacePoints.rigid(np.array(hit.p, float).T.copy(), np.full(len(directions), -1, np.int32))
-        for pointer, index, faces in self._owners:
-            own = np.array((hit.shape == pointer) | (hit.instance == pointer))
-            points.ids[own] = index
-            if faces is not None:
-                points.corners[own] = faces[triangles[own]]
-                points.weights[own] = np.stack([1 - u - v, u, v], axis=1)[own]
-        return points.reshaped(camera.height, camera.width)
+        hit: Any = self._scene.ray_intersect(ray)
+        dr.eval(hit)  # otherwise every array below would trace the rays again
+        ids = np.full(len(directions), -1, np.int32)
+        for pointer, index in self._owners:
+            ids[np.array((hit.shape == pointer) | (hit.instance == pointer))] = index
+        return SurfacePoints(np.array(hit.p, float).T.copy(), ids).reshaped(camera.height, camera.width)
 
     def sees(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         """Return the mask of the surface points [P, 3] that a camera sees: inside its image, with nothing in front."""

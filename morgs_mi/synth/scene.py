@@ -1,4 +1,4 @@
-"""Descriptions of moving scenes: rigid objects with a pose at each time, deforming meshes, lights and a rig.
+"""Descriptions of moving scenes: rigid objects with a pose at each time, lights and a rig.
 
 A scene is a Python file with a function ``build(seed: int) -> Scene``. Poses are functions of the time in
 seconds, so a clip may have any frame rate and length. World space has y up; lengths are world units.
@@ -24,17 +24,13 @@ from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.core.documentation import page
 
 __all__ = [
-    "Deformed",
-    "DeformingObject",
     "Light",
-    "Mesh",
     "Object",
     "RecordingDefaults",
     "Rig",
     "Scene",
     "check_scene",
     "failures_in",
-    "item_ids",
     "load_scene",
     "rotate",
     "translate",
@@ -54,49 +50,6 @@ class Object:
 
     shapes: Mapping[str, dict[str, Any]]
     pose: Pose | None = None
-
-
-@dataclass(frozen=True)
-class Deformed:
-    """Vertices of an object at one time.
-
-    Attributes:
-        vertices: [V, 3], world units.
-        normals: unit normals of smooth meshes [V, 3]; None if all are flat.
-    """
-
-    vertices: np.ndarray
-    normals: np.ndarray | None = None
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """Triangles with one material.
-
-    Attributes:
-        faces: indices of vertices of the object [F, 3].
-        bsdf: Mitsuba dictionary of the material.
-        uvs: texture coordinates of the object's vertices [V, 2]; None without a texture.
-        smooth: whether it is shaded with the normals of the vertices; otherwise its triangles are flat.
-    """
-
-    faces: np.ndarray
-    bsdf: dict[str, Any]
-    uvs: np.ndarray | None = None
-    smooth: bool = False
-
-
-@dataclass(frozen=True)
-class DeformingObject:
-    """An object of triangles with moving vertices.
-
-    Attributes:
-        meshes: meshes by name.
-        shape: seconds -> its vertices, in constant number.
-    """
-
-    meshes: Mapping[str, Mesh]
-    shape: Callable[[float], Deformed]
 
 
 @dataclass(frozen=True)
@@ -174,7 +127,7 @@ class Scene:
     """
 
     name: str
-    objects: Mapping[str, Object | DeformingObject]
+    objects: Mapping[str, Object]
     lights: Mapping[str, Light]
     rig: Rig = field(default_factory=Rig)
     exposure: Callable[[float], float] | None = None
@@ -243,7 +196,7 @@ def _check_signature(path: Path, build: Callable[..., Any]) -> None:
 
 
 def check_scene(scene: Scene, times: Sequence[float]) -> None:
-    """Check the contents of a scene, and its poses and shapes at `times` in seconds.
+    """Check the contents of a scene, and its poses at `times` in seconds.
 
     Raises:
         ValueError: an object, a lamp or a pose is not as described, or a name is used twice.
@@ -251,38 +204,28 @@ def check_scene(scene: Scene, times: Sequence[float]) -> None:
     """
     place = f"scene {scene.name!r}"
     names: set[str] = set()
-    objects = (Object, DeformingObject)
-    for kind, types, items in (("object", objects, scene.objects), ("light", (Light,), scene.lights)):
+    for kind, expected, items in (("object", Object, scene.objects), ("light", Light, scene.lights)):
         for name, item in items.items():
             where = f"{place}, {kind} {name!r}"
-            if not isinstance(item, types):
-                expected, found = f"{types[0].__name__}(...)", type(item).__name__
-                raise ValueError(f"{where}: expected {expected}, got a value of type {found}; see {page('scenes')}.")
-            for used in item_ids(name, item):
+            if not isinstance(item, expected):
+                raise ValueError(
+                    f"{where}: expected {expected.__name__}(...), got a value of type {type(item).__name__}; see "
+                    f"{page('scenes')}."
+                )
+            for used in _ids(name, item):
                 if used in names:
                     raise ValueError(f"{where}: the name {used!r} is used twice; rename one of the two.")
                 names.add(used)
-            for shape_name, shape in _nodes(item).items():
+            shapes = item.shapes if isinstance(item, Object) else {"": item.shape}
+            for shape_name, shape in shapes.items():
                 _check_node(f"{where}, shape {shape_name!r}" if shape_name else where, shape)
-            if isinstance(item, DeformingObject):
-                for time in times:
-                    _check_shape(where, item, time)
-            elif item.pose is not None:
+            if item.pose is not None:
                 for time in times:
                     _check_pose(where, item.pose, time)
 
 
-def _nodes(item: Object | DeformingObject | Light) -> Mapping[str, Any]:
-    """Return the Mitsuba dictionaries of an object or a lamp by name."""
-    if isinstance(item, DeformingObject):
-        return {name: mesh.bsdf for name, mesh in item.meshes.items()}
-    return item.shapes if isinstance(item, Object) else {"": item.shape}
-
-
-def item_ids(name: str, item: Object | DeformingObject | Light) -> list[str]:
+def _ids(name: str, item: Object | Light) -> list[str]:
     """Return the names of an object's or a lamp's shapes in Mitsuba."""
-    if isinstance(item, DeformingObject):
-        return [f"{name}_{part}" for part in item.meshes]
     if isinstance(item, Object):
         return [f"{name}_{part}" for part in item.shapes] if item.pose is None else [name, f"{name}_group"]
     return [name]
@@ -307,38 +250,12 @@ def _check_node(where: str, node: Any) -> None:
             _check_node(f"{where}, {key}", value)
 
 
-@contextmanager
-def _failures_at(where: str, what: str, time: float) -> Iterator[None]:
-    """Raise `ValueError` for any error of a scene's function of the time."""
+def _check_pose(where: str, pose: Pose, time: float) -> None:
     try:
-        yield
+        matrix = np.asarray(pose(time), np.float64)
     except Exception as error:
         reason = f"{type(error).__name__}: {error}".rstrip(".")
-        raise ValueError(f"{where}: its {what} at {time:.4g} s fails with {reason}; correct the function.") from error
-
-
-def _check_shape(where: str, item: DeformingObject, time: float) -> None:
-    with _failures_at(where, "shape", time):
-        shape = item.shape(time)
-        vertices = np.asarray(shape.vertices, np.float64)
-        normals = None if shape.normals is None else np.asarray(shape.normals, np.float64)
-    count = 1 + max((int(mesh.faces.max(initial=-1)) for mesh in item.meshes.values()), default=0)
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or len(vertices) < count or not np.isfinite(vertices).all():
-        got = f"the shape {vertices.shape}" if np.isfinite(vertices).all() else "NaN or infinity"
-        raise ValueError(
-            f"{where}: its vertices at {time:.4g} s must be finite [V, 3] with V of at least {count}, got {got}; "
-            "correct the function."
-        )
-    if any(mesh.smooth for mesh in item.meshes.values()) and (normals is None or normals.shape != vertices.shape):
-        got = None if normals is None else normals.shape
-        raise ValueError(
-            f"{where}: its normals at {time:.4g} s must be {vertices.shape} for smooth meshes, got {got}; return them."
-        )
-
-
-def _check_pose(where: str, pose: Pose, time: float) -> None:
-    with _failures_at(where, "pose", time):
-        matrix = np.asarray(pose(time), np.float64)
+        raise ValueError(f"{where}: its pose at {time:.4g} s fails with {reason}; correct the function.") from error
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         got = f"the shape {matrix.shape}" if matrix.shape != (4, 4) else "NaN or infinity"
         raise ValueError(

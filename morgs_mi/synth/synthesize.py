@@ -27,7 +27,7 @@ from morgs_mi.core.memory import check_memory
 from morgs_mi.io.bounded import read_json
 from morgs_mi.io.listing import is_added
 from morgs_mi.io.video import open_frames
-from morgs_mi.io.video_writer import playable_format, write_video
+from morgs_mi.io.video_writer import PLAYABLE, write_video
 from morgs_mi.synth.disturbances import (
     CameraDisturbance,
     compressed,
@@ -36,7 +36,7 @@ from morgs_mi.synth.disturbances import (
 )
 from morgs_mi.synth.ground_truth import compute_ground_truth, move_with_objects
 from morgs_mi.synth.path_tracer import PathTracer, developed
-from morgs_mi.synth.scene import DeformingObject, Scene, check_scene, load_scene
+from morgs_mi.synth.scene import Scene, check_scene, load_scene
 from morgs_mi.synth.sensor import check_lenses, record_light
 from morgs_mi.synth.synth_config import SynthConfig
 
@@ -59,9 +59,9 @@ def synthesize(
 ) -> Path:
     """Path-trace a moving scene into a multi-view capture in N3DV's layout, with exact ground truth.
 
-    Writes ``frames/cam00/0000.png`` ..., ``cam00.mp4`` ... for players (see `playable_format`), ``poses_bounds.npy``, a
-    COLMAP text model ``sparse/0`` with points as from structure from motion, ``capture.json`` and ``truth/`` (see
-    `ground_truth` and `disturbances`). ``cam00`` is the central camera of the rig and the held-out test view, as in
+    Writes ``frames/cam00/0000.png`` ..., ``cam00.mp4`` ... for players, ``poses_bounds.npy``, a COLMAP text
+    model ``sparse/0`` with points as from structure from motion, ``capture.json`` and ``truth/`` (see `ground_truth`
+    and `disturbances`). ``cam00`` is the central camera of the rig and the held-out test view, as in
     N3DV. With lens distortion there is no ``poses_bounds.npy``, which cannot represent it. The folder is written
     atomically.
 
@@ -149,7 +149,6 @@ def _write_clips(
 ) -> list[Path]:
     """Write the images of all cameras; return the clips that `load_capture` reads."""
     config, count = rig.config, itertools.count(1)
-    suffix, codec = playable_format()
 
     def render_view(index: int) -> Iterator[np.ndarray]:
         for image in _images(tracer, rig, index):
@@ -159,11 +158,11 @@ def _write_clips(
 
     clips = []
     for index, camera in enumerate(rig.cameras):
-        video, png = folder / f"{camera.name}{suffix}", folder / "frames" / camera.name
+        video, png = folder / f"{camera.name}.mp4", folder / "frames" / camera.name
         if config.lossless:
             write_video(png, render_view(index), config.fps)
         images = open_frames(png).frames() if config.lossless else render_view(index)
-        write_video(video, images, config.fps, codec)
+        write_video(video, images, config.fps, PLAYABLE)
         clips.append(png if config.lossless else video)
     return clips
 
@@ -225,7 +224,7 @@ def _sample_tracks(
     """
     starts = sorted({0, len(times) // 2, len(times) - 1})
     objects = tracer.scene.objects.values()
-    can_move = np.array([isinstance(item, DeformingObject) or item.pose is not None for item in objects])
+    can_move = np.array([item.pose is not None for item in objects])
     share = -(-_NUM_TRACKS // (2 * len(starts) * len(cameras)))
     points, owners, poses = [], [], [tracer.poses(time) for time in times]
     for start in starts:

@@ -47,7 +47,7 @@ def test_spheres__balls_roll_without_slipping(name, radius):
     for time in (0.0, 0.4, 2.0):
         here = pose(time)
         contact = here[:3, 3] - [0, radius, 0]
-        point = SurfacePoints.rigid(contact[None], np.zeros(1, int))
+        point = SurfacePoints(contact[None], np.zeros(1, int))
         ahead, behind = (move_with_objects(point, [here], [pose(time + s)])[0] for s in (step, -step))
         assert abs(contact[1]) < 1e-12
         assert np.linalg.norm(ahead - behind) / (2 * step) < 1e-6

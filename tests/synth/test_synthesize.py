@@ -242,10 +242,3 @@ def test_synthesize__without_lossless_frames_records_the_videos(tmp_path):
     assert not (out / "frames").exists()
     played = np.array(list(open_frames(out / "cam01.mp4").frames()))
     np.testing.assert_array_equal(np.array([f.images[1] for f in load_capture(out).frames()]), played)
-
-
-def test_synthesize__writes_lossless_videos_where_opencv_has_no_playable_encoder(tmp_path, monkeypatch):
-    monkeypatch.setattr("morgs_mi.synth.synthesize.playable_format", lambda: (".mkv", "FFV1"))
-    out = synthesize("spheres", tmp_path / "clip", TINY)
-    played, stored = (np.array(list(open_frames(out / name).frames())) for name in ("cam01.mkv", "frames/cam01"))
-    np.testing.assert_array_equal(played, stored)

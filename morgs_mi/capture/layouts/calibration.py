@@ -26,8 +26,8 @@ from morgs_mi.capture.layouts.clips import (
 )
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
-from morgs_mi.io.listing import listed
-from morgs_mi.io.video import VIDEO_SUFFIXES, Clip, natural_key
+from morgs_mi.io.listing import VIDEO_SUFFIXES, listed
+from morgs_mi.io.video import Clip, natural_key
 
 __all__ = [
     "NO_POINTS",

@@ -21,9 +21,9 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from morgs_mi.io.image_size import image_size
-from morgs_mi.io.listing import listed
+from morgs_mi.io.listing import IMAGE_SUFFIXES, VIDEO_SUFFIXES, listed
 from morgs_mi.io.remote import fetched
-from morgs_mi.io.video import IMAGE_SUFFIXES, VIDEO_SUFFIXES, Clip, natural_key, numbering_gap, open_frames
+from morgs_mi.io.video import Clip, natural_key, numbering_gap, open_frames
 
 __all__ = [
     "EXAMPLE",

@@ -30,9 +30,10 @@ from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.core.checks import LARGEST, bounded
 from morgs_mi.io.bounded import read_json
+from morgs_mi.io.listing import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from morgs_mi.io.ply import read_vertices
 from morgs_mi.io.unread import warn_unread
-from morgs_mi.io.video import IMAGE_SUFFIXES, VIDEO_SUFFIXES, Clip
+from morgs_mi.io.video import Clip
 
 __all__ = ["LAYOUT", "Transforms", "read_points_ply", "read_transforms"]
 

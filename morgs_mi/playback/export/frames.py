@@ -12,7 +12,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import srgb_to_linear
 from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.io.exr import write_exr
-from morgs_mi.io.video_writer import playable_format, write_video
+from morgs_mi.io.video_writer import PLAYABLE, write_video
 from morgs_mi.playback.export.formats import IMAGES, choose_format
 from morgs_mi.playback.player import channel_image, render_stream
 from morgs_mi.playback.visualise import side_by_side, write_png
@@ -75,7 +75,7 @@ def write_images(
 
     if chosen == "mp4":
         padded = (pad_to_even(_combined_image(images)) for _, images in frames())
-        write_video(output, padded, fps, playable_format()[1])
+        write_video(output, padded, fps, PLAYABLE)
         return
     write = _write_png if chosen == "png" else _write_exr
     if Path(output).name.lower().endswith(f".{chosen}"):
