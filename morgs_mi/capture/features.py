@@ -119,18 +119,16 @@ def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features
     return Features(points, descriptors, image[rows, columns].astype(np.float32) / 255, axes)
 
 
-def match_views(features: Sequence[Features], cameras: Sequence[Camera], neighbours: int | None = None) -> list[Match]:
-    """Return the matches between all pairs of views, or between near views if there are many cameras.
+def match_views(features: Sequence[Features], cameras: Sequence[Camera]) -> list[Match]:
+    """Return the matches between all pairs of up to 24 views, or of each view and its 8 nearest ones.
 
     Only matches that are consistent with a common epipolar geometry are returned, for any such geometry.
 
     Args:
         features: per view.
         cameras: per view.
-        neighbours: number of nearest views with which each is matched; None: all of up to 24 views, 8 of more.
     """
-    if neighbours is None:
-        neighbours = len(cameras) if len(cameras) <= _ALL_PAIRS else _NEIGHBOURS
+    neighbours = len(cameras) if len(cameras) <= _ALL_PAIRS else _NEIGHBOURS
     matches = (Match((i, j), _matches(features[i], features[j])) for i, j in _pairs(cameras, neighbours))
     return [match for match in matches if len(match.features)]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations, permutations
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -20,12 +20,15 @@ from morgs_mi.capture.layouts.layout_registry import layout_called
 from morgs_mi.core.camera import Camera
 
 __all__ = [
-    "best_focal_factor",
     "camera_candidates",
+    "focal_candidates",
     "rig_candidates",
     "same_poses",
     "with_focal_factor",
 ]
+
+# A camera or the cameras of a rig.
+T = TypeVar("T")
 
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -35,10 +38,22 @@ _UPRIGHT = np.array([[0, 1.0, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 _AXES = {"OpenCV": "OpenCV's axes (x right, y down, z forward)", "OpenGL": "OpenGL's axes (x right, y up, z backward)"}
 # Share of the rig's radius, and entries of a rotation: neighbours of a dense rig differ by far more than this.
 _SAME = 1e-3
+# Rotations of a single wrong pose, and what is wrong with it.
+_UPSIDE_DOWN = "its images are upside down relative to its pose: turn the clip or the pose by 180 degrees"
+_SIDEWAYS = "its pose is turned by 90 degrees about the optical axis: check the order and signs of its axes"
+_CAMERA_MISTAKES = (
+    (_HALF_TURN, _UPSIDE_DOWN),
+    (_UPRIGHT, _SIDEWAYS),
+    (_UPRIGHT.T, _SIDEWAYS),
+    (_ABOUT_FACE, "its pose looks backward: turn it by 180 degrees about its vertical axis"),
+    (_FLIP, "its pose is in other axes than those of the rest: negate its y and z axes"),
+)
 # Every exchange of poses is compared with all matches, so their number is limited.
 _MAX_EXCHANGED, _MAX_PERMUTED = 12, 4
 # Factors of the focal length that are tried, and their step: at a wrong focal length the error has several minima.
 _FACTOR_OCTAVES, _FACTOR_STEP = 2.0, 0.25
+# Factors nearer to 1 than this are no mistake in the calibration's image size or field of view.
+_LEAST_FACTOR = 0.1
 
 
 def same_poses(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
@@ -87,39 +102,43 @@ def rig_candidates(capture: Capture, wrong: Sequence[int]) -> Iterator[tuple[Seq
 
 def camera_candidates(camera: Camera) -> Iterator[tuple[Camera, str]]:
     """Yield the corrected camera for each mistake that concerns a single pose."""
-
-    def moved(matrix: np.ndarray) -> Camera:
-        return replace(camera, viewmat=matrix @ np.asarray(camera.viewmat, np.float64))
-
-    mirrored = np.array([[0, 0, camera.width], [0, 0, camera.height], [0, 0, 2]])
-    upside_down = "its images are upside down relative to its pose: turn the clip or the pose by 180 degrees"
+    pose = np.asarray(camera.viewmat, np.float64)
+    for rotation, sentence in _CAMERA_MISTAKES:
+        yield replace(camera, viewmat=rotation @ pose), sentence
     # A turned pose keeps the principal point; a turned image has the opposite one.
-    yield moved(_HALF_TURN), upside_down
-    turned_image = np.concatenate([camera.K[:, :2], (mirrored - camera.K)[:, 2:]], axis=1)
-    yield replace(moved(_HALF_TURN), K=turned_image), upside_down
-    sideways = "its pose is turned by 90 degrees about the optical axis: check the order and signs of its axes"
-    yield moved(_UPRIGHT), sideways
-    yield moved(_UPRIGHT.T), sideways
-    yield moved(_ABOUT_FACE), "its pose looks backward: turn it by 180 degrees about its vertical axis"
-    yield moved(_FLIP), "its pose is in other axes than those of the rest: negate its y and z axes"
-    inverse = np.linalg.inv(np.asarray(camera.viewmat, np.float64))
-    yield replace(camera, viewmat=inverse), "its pose is inverted, unlike those of the rest: invert it"
+    opposite = (camera.width, camera.height, 2) - camera.K[:, 2]
+    turned_image = np.column_stack([camera.K[:, :2], opposite])
+    yield replace(camera, viewmat=_HALF_TURN @ pose, K=turned_image), _UPSIDE_DOWN
+    yield replace(camera, viewmat=np.linalg.inv(pose)), "its pose is inverted, unlike those of the rest: invert it"
 
 
-def best_focal_factor(error: Callable[[float], float]) -> float:
-    """Return the factor on a focal length, from 1/4 to 4, that minimises `error`."""
+def focal_candidates(what: str, scaled: Callable[[float], T], error: Callable[[T], float]) -> list[tuple[T, str]]:
+    """Return what a factor from 1/4 to 4 on focal lengths corrects, if the best factor differs from 1.
+
+    Args:
+        what: start of the sentence on the mistake.
+        scaled: returns what has a factor on its focal lengths.
+        error: error of what is scaled, px.
+    """
 
     def of_octaves(octaves: float) -> float:
         # The search cannot compare infinite errors.
-        return min(error(float(2.0**octaves)), 1e9)
+        return min(error(scaled(float(2.0**octaves))), 1e9)
 
     steps = np.arange(-_FACTOR_OCTAVES, _FACTOR_OCTAVES + _FACTOR_STEP, _FACTOR_STEP)
     start = min(steps, key=of_octaves)
     bounds = (start - _FACTOR_STEP, start + _FACTOR_STEP)
     from scipy.optimize import minimize_scalar  # imported here because it slows down the start of every command
 
-    found: Any = minimize_scalar(of_octaves, bounds=bounds, method="bounded", options={"xatol": 3e-3})
-    return float(2.0**found.x)
+    minimum: Any = minimize_scalar(of_octaves, bounds=bounds, method="bounded", options={"xatol": 3e-3})
+    factor = float(2.0**minimum.x)
+    if abs(factor - 1) <= _LEAST_FACTOR:
+        return []
+    sentence = (
+        f"{what} to be wrong by a factor, {factor:.2g} times the given value fits: check the image size of the "
+        "calibration, and whether its field of view is horizontal or vertical"
+    )
+    return [(scaled(factor), sentence)]
 
 
 def with_focal_factor(camera: Camera, factor: float) -> Camera:

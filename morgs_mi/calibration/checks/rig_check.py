@@ -17,8 +17,8 @@ from itertools import combinations
 import numpy as np
 
 from morgs_mi.calibration.checks.mistakes import (
-    best_focal_factor,
     camera_candidates,
+    focal_candidates,
     rig_candidates,
     same_poses,
     with_focal_factor,
@@ -50,8 +50,6 @@ _SAME_IMAGE = 0.5
 # A correction must lower the error by this factor, and to less than twice the error of the poses that fit or to this
 # many pixels: among many candidates, a wrong one may be slightly better than the given poses.
 _GAIN, _GOOD_ERROR = 3.0, 0.5
-# Factors nearer to 1 than this are no mistake in the calibration's image size or field of view.
-_LEAST_FACTOR = 0.1
 # Number of matches of a pair, and of pairs, to compare candidates with: more are slower, but not more accurate.
 _SAMPLE, _FACTOR_PAIRS = 40, 8
 # A view that matches fewer others without its pose is also matched with it, which takes longer.
@@ -160,8 +158,11 @@ def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
         ]
         advice = f"the poses do not fit the images: {explanation}."
     else:
-        reasons = _copies(shared, checks, capture.cameras)
-        checks = [_with_reason(view, check, pairs.sampled(), group, reasons) for view, check in enumerate(checks)]
+        copies = _copies(shared, checks, capture.cameras)
+        checks = [replace(c, fits=False, advice=copies[view]) if view in copies else c for view, c in enumerate(checks)]
+        for view, check in enumerate(checks):
+            if check.fits is False and not check.advice:
+                checks[view] = replace(check, advice=_explain_camera(view, check, pairs.sampled(), group))
         advice = _summary(checks)
     fits = False if any(c.fits is False for c in checks) else None if any(c.fits is None for c in checks) else True
     return RigCheck(len(errors), len(shared.matches), _median(errors), tuple(checks), fits, advice)
@@ -302,18 +303,18 @@ def _check(view: int, pairs: _Pairs, group: set[int]) -> CameraCheck:
 def _correct_rig(capture: Capture, pairs: _Pairs, checks: Sequence[CameraCheck]) -> tuple[Sequence[Camera], str] | None:
     """Return the cameras corrected for a mistake in several poses, and its description; None if none explains all."""
     wrong = [view for view, check in enumerate(checks) if check.fits is False]
-    largest, given = pairs.sampled(_FACTOR_PAIRS), pairs.worst()
-
-    def cameras_of(factor: float) -> list[Camera]:
-        return [with_focal_factor(camera, factor) for camera in capture.cameras]
-
-    factor = best_focal_factor(lambda f: _median(np.concatenate(largest.with_cameras(cameras_of(f)).errors)))
-    candidates = [*rig_candidates(capture, wrong)] if given > _GOOD_ERROR else []
-    if abs(factor - 1) > _LEAST_FACTOR:
-        candidates.append((cameras_of(factor), _focal_mistake("the focal lengths of all cameras seem", factor)))
-    scored = [(pairs.with_cameras(cameras).worst(), index) for index, (cameras, _) in enumerate(candidates)]
-    error, index = min(scored, default=(np.inf, 0))
-    return candidates[index] if error <= min(given / _GAIN, MAX_ERROR) else None
+    largest = pairs.sampled(_FACTOR_PAIRS)
+    given = pairs.worst()
+    candidates = focal_candidates(
+        "the focal lengths of all cameras seem",
+        lambda factor: [with_focal_factor(camera, factor) for camera in capture.cameras],
+        lambda cameras: _median(np.concatenate(largest.with_cameras(cameras).errors)),
+    )
+    if given > _GOOD_ERROR:
+        candidates = [*rig_candidates(capture, wrong), *candidates]
+    errors = [pairs.with_cameras(cameras).worst() for cameras, _ in candidates]
+    index = int(np.argmin([*errors, np.inf]))
+    return candidates[index] if min(errors, default=np.inf) <= min(given / _GAIN, MAX_ERROR) else None
 
 
 def _copies(shared: SharedFeatures, checks: Sequence[CameraCheck], cameras: Sequence[Camera]) -> dict[int, str]:
@@ -337,43 +338,29 @@ def _copies(shared: SharedFeatures, checks: Sequence[CameraCheck], cameras: Sequ
     return found
 
 
-def _with_reason(view: int, check: CameraCheck, pairs: _Pairs, group: set[int], reasons: dict[int, str]) -> CameraCheck:
-    """Return the result with the reason for a pose that does not fit, from `reasons` or from the common mistakes."""
-    if view in reasons:
-        return replace(check, fits=False, advice=reasons[view])
-    if check.fits is not False:
-        return check
-    return replace(check, advice=_explain_camera(view, check, pairs, group))
-
-
 def _explain_camera(view: int, check: CameraCheck, pairs: _Pairs, group: set[int]) -> str:
     """Return the common mistake that explains the matches of a view, and a remedy."""
     # Without views that agree, a correction can only be compared with all others.
     partners = group or set(range(len(pairs.cameras)))
     given = pairs.cameras[view]
-    factor = best_focal_factor(lambda f: pairs.of_replaced(view, with_focal_factor(given, f), partners))
-    candidates = [*camera_candidates(given)]
-    if abs(factor - 1) > _LEAST_FACTOR:
-        candidates.append((with_focal_factor(given, factor), _focal_mistake("its focal length seems", factor)))
-    scored = [(pairs.of_replaced(view, camera, partners), index) for index, (camera, _) in enumerate(candidates)]
-    error, index = min(scored)
+    candidates = [
+        *camera_candidates(given),
+        *focal_candidates(
+            "its focal length seems",
+            lambda factor: with_focal_factor(given, factor),
+            lambda camera: pairs.of_replaced(view, camera, partners),
+        ),
+    ]
+    errors = [pairs.of_replaced(view, camera, partners) for camera, _ in candidates]
     of_group = [_median(pairs.of_view(other, group)) for other in group]
-    if error <= min(check.error / _GAIN, MAX_ERROR, max(_GOOD_ERROR, 2 * max(of_group, default=MAX_ERROR))):
-        return candidates[index][1]
+    if min(errors) <= min(check.error / _GAIN, MAX_ERROR, max(_GOOD_ERROR, 2 * max(of_group, default=MAX_ERROR))):
+        return candidates[int(np.argmin(errors))][1]
     cause = "no common mistake explains it"
     if np.isinf(check.error):
         cause = "the points in its images lie behind it, so it looks away from them"
     return (
         f"{cause}: check its place in the order of the cameras, its axes and the image size of the calibration, or "
         "calibrate again (morgs-mi calibrate)"
-    )
-
-
-def _focal_mistake(what: str, factor: float) -> str:
-    """Return the sentence on a focal length that has to be multiplied by `factor`."""
-    return (
-        f"{what} to be wrong by a factor, {factor:.2g} times the given value fits: check the image size of the "
-        "calibration, and whether its field of view is horizontal or vertical"
     )
 
 
