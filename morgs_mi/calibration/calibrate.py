@@ -231,7 +231,7 @@ def _frames(
     short = [name for name, reader in readers.items() if not 0 <= config.frame <= _last_position(reader)]
     if short:
         raise ValueError(f"{path}: frame {config.frame} is not in the clips of {', '.join(short)}; choose another.")
-    at = {name: int(nearest_frames(reader, np.array([config.frame]))[0][0]) for name, reader in readers.items()}
+    at = {name: int(nearest_frames(reader, np.array([config.frame]))[0]) for name, reader in readers.items()}
     images = {name: next(reader.frames(at[name], at[name] + 1)) for name, reader in readers.items()}
     masks = {name: opaque_pixels(reader, name)[0] for name, reader in readers.items()}
     return images, {name: mask for name, mask in masks.items() if mask is not None}

@@ -134,23 +134,24 @@ def timeline(
         clocks = replace(exact, rates=np.ones(len(readers)))
         _check_rates(path, readers, exact, instants)
     positions = clocks.offsets[:, None] + clocks.rates[:, None] * instants
-    indices = [nearest_frames(reader, own)[0] for reader, own in zip(readers, positions, strict=True)]
+    indices = [nearest_frames(reader, places) for reader, places in zip(readers, positions, strict=True)]
+    shown = np.array([_positions(reader, index) for reader, index in zip(readers, indices, strict=True)])
     shares: list[np.ndarray | None] = [None] * len(readers)
     delays = [0.0] * len(readers)
     for c, (name, reader) in enumerate(zip(names, readers, strict=True)):
-        if not _is_fractional(reader, config.offset.get(name, 0)):
+        if reader.positions is not None or reader.num_frames < 2 or config.offset.get(name, 0) % 1 == 0:
             continue
-        if clocks.rates[c] == round(clocks.rates[c]):
+        if clocks.rates[c] % 1 == 0:
             delays[c] = float(np.floor(positions[c][0] + 0.5) - positions[c][0])  # the same for all of its frames
             indices[c] = np.rint(positions[c] + delays[c]).astype(int)
+            shown[c] = indices[c] - delays[c]
         else:
             indices[c] = np.clip(np.floor(positions[c]).astype(int), 0, reader.num_frames - 2)
             shares[c] = positions[c] - indices[c]
-    frames = zip(readers, indices, delays, shares, strict=True)
-    shown = np.array([_positions(r, k) - delay + (0 if share is None else share) for r, k, delay, share in frames])
+            shown[c] = positions[c]
     if config.gaps:
         far = np.abs(shown - positions) > _NEAR
-        indices = [np.where(own, -1, index) for own, index in zip(far, indices, strict=True)]
+        indices = list(np.where(far, -1, indices))
     _warn_apart(path, (shown - exact.offsets[:, None]) / exact.rates[:, None], indices, exact.fps)
     unchanged = all(np.array_equal(index, np.arange(len(instants))) for index in indices)
     unchanged = unchanged and not any(config.offset.values())
@@ -226,11 +227,6 @@ def _common_instants(
     raise ValueError(f"{path}: the clips have no instant in common, {table}; check `offset`.")
 
 
-def _is_fractional(reader: FrameReader, offset: float) -> bool:
-    """Return whether the offset of a clip of constant frame rate is not whole."""
-    return reader.positions is None and offset != round(offset) and reader.num_frames > 1
-
-
 def _position(reader: FrameReader, offset: float) -> float:
     """Return the position of a frame of a clip, which may lie before its first or after its last."""
     if reader.positions is None:
@@ -240,14 +236,11 @@ def _position(reader: FrameReader, offset: float) -> float:
     return round(reader.positions[held]) + index - held
 
 
-def nearest_frames(reader: FrameReader, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the frames nearest to ascending positions, int [T], and their distances in frames [T]."""
+def nearest_frames(reader: FrameReader, positions: np.ndarray) -> np.ndarray:
+    """Return the frames nearest to ascending positions, int [T]."""
     if reader.positions is None:
-        indices = np.rint(positions).astype(int)
-        return indices, np.abs(indices - positions)
-    between = (reader.positions[1:] + reader.positions[:-1]) / 2
-    indices = np.searchsorted(between, positions)
-    return indices, np.abs(reader.positions[indices] - positions)
+        return np.rint(positions).astype(int)
+    return np.searchsorted((reader.positions[1:] + reader.positions[:-1]) / 2, positions)
 
 
 def _positions(reader: FrameReader, indices: np.ndarray) -> np.ndarray:
@@ -314,8 +307,8 @@ def _num_frames(path: Path, readers: Sequence[FrameReader], max_frames: int | No
         longest = max(_periods(reader) for reader in readers)
         return min(longest, max_frames or longest)
     lengths = [reader.num_frames for reader in readers]
-    for reader in readers:
-        required = min(reader.num_frames, max_frames or reader.num_frames)
+    for reader, length in zip(readers, lengths, strict=True):
+        required = min(length, max_frames or length)
         _check_complete(reader, required)
         _check_even(reader, required)
     shortest = min(lengths)
