@@ -138,7 +138,7 @@ def test_page__wipes_between_the_rendered_and_the_recorded_image(browser, url):
         page.page.locator("#canvas").focus()
         page.press("ArrowRight", RECORDING)
         assert np.abs(page.image().astype(int)[:90, : column - 3] - RECORDED[2]).max() < 12
-        page.page.mouse.move(60, 300)
+        page.page.mouse.move(60, 60)  # above the controls
         page.page.mouse.wheel(0, 500)
         page.page.locator("#recording").wait_for(state="hidden")
         page.press("r", RECORDING)
@@ -156,9 +156,9 @@ def test_page__shows_the_image_of_rasterize_when_the_view_rests(browser, clip, u
             expected = channel_image(mode, image, 0.03 * WIDTH)
             assert np.abs(page.exact_image() - expected.astype(int)).max() <= 3, "the page rounds the camera"
         assert np.array_equal(page.image(), page.exact_image()), "the page shows it pixel by pixel"
-        page.page.mouse.move(WIDTH / 2, HEIGHT / 2)
+        page.page.mouse.move(WIDTH / 2, 60)
         page.page.mouse.down()
-        page.page.mouse.move(WIDTH / 2 + 20, HEIGHT / 2, steps=2)
+        page.page.mouse.move(WIDTH / 2 + 20, 60, steps=2)
         page.page.locator("#rendering").wait_for(state="hidden")
         page.page.mouse.up()
         page.wait(f"player.settled && {RENDERING}")
