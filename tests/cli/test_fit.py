@@ -328,7 +328,9 @@ def test_fit__resumes_a_stream_to_the_same_bytes(capture: Path, tmp_path: Path, 
     assert_refused(run(*fit, "--resume", "--seed", 1), "stream.morgs: expected to resume", "config.seed = 0, got 1")
 
 
-def test_fit__fits_segments_side_by_side(tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fit__fits_segments_side_by_side(
+    tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     pytest.importorskip("distributed", reason="comes with the extra `cluster`")
     short = SegmentConfig(passes=1, epochs=1)
     monkeypatch.setattr(SegmentConfig.__init__, "__defaults__", astuple(short))
@@ -336,6 +338,7 @@ def test_fit__fits_segments_side_by_side(tmp_path: Path, run, monkeypatch: pytes
     status, output, _ = run("fit", clip, out, *QUICK, "--segments", 2)
     assert status == 0
     assert "stream.morgs: 4 frames" in output
+    assert not any(record.name.startswith("distributed") for record in caplog.records)
     assert len({frame for _, frame, _ in StreamReader(out / "stream.morgs").index()}) == 4
     assert_refused(run("fit", clip, out, *QUICK, "--segments", 3), "--segments must be 1 to 2 for 4 frames", "got 3")
 

@@ -60,6 +60,8 @@ def open_client(scheduler: str | None = None, count: int | None = None) -> Itera
         raise ValueError(
             "open_client(): several workers need the package distributed; pip install 'morgs-mi[cluster]'."
         ) from None
+    for name in ("distributed", "distributed.client"):  # what concerns a fit is raised
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     with ExitStack() as stack:
         stack.enter_context(dask.config.set(_SETTINGS))
         address: Any = scheduler
