@@ -46,10 +46,7 @@ def refusal(headers: Headers, name: str) -> str | None:
 
 
 class Access:
-    """ASGI middleware that answers 403 unless `token`, if there is one, is the first part of the path, and cuts it off.
-
-    Requests must also pass `refusal`.
-    """
+    """ASGI middleware: 403 unless `token`, if any, is the first part of the path, and `refusal` accepts the request."""
 
     def __init__(self, app: ASGIApp, name: str, token: str) -> None:
         self._app = app

@@ -20,10 +20,7 @@ _NEAR = 8
 
 
 class RecordedImages:
-    """Recorded images by camera and frame, from the capture in `folder` or, where it is None, the one of the fit.
-
-    Successive frames of one camera are decoded in order.
-    """
+    """Recorded images by camera and frame, from the capture in `folder` or, where it is None, the one of the fit."""
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder
