@@ -7,7 +7,6 @@ import os
 from pathlib import Path
 
 import cv2
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -28,7 +27,6 @@ from tests.scenes.moving_splats import CAMERAS, DISTANCE, FRAMES, PIXELS, STEP, 
 mi.set_variant("llvm_ad_rgb")  # one for all tests, which then share its kernels
 
 if "PYTEST_XDIST_WORKER" in os.environ:  # several processes share the cores
-    dr.set_thread_count(1)
     cv2.setNumThreads(1)
 
 
