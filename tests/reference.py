@@ -124,7 +124,8 @@ def rasterize(
         values = {"color": np.where(color.real > 0, color, 0), "depth": np.array([z])}
         if "motion" in raw:
             mx, my, mz = R @ raw["motion"][i]
-            values["motion"] = np.array([fx / z * (mx - x / z * mz), fy / z * (my - y / z * mz)])
+            x0, y0, z0 = cam[i] - (mx, my, mz)
+            values["motion"] = np.array([fx * (x / z - x0 / z0), fy * (y / z - y0 / z0)])
         if "logit_confidence" in raw:
             values["confidence"] = np.array([1 / (1 + np.exp(-raw["logit_confidence"][i]))])
         for name, value in values.items():

@@ -205,7 +205,7 @@ def project(
             blended[name] = (z,)
         elif name in ("motion", "guided_motion"):
             motion = gaussians.rows("motion", rows) if name == "motion" else _guided_motion(gaussians, rows)
-            blended[name] = _screen_motion(motion, x * rz, y * rz, fx * rz, fy * rz, R)
+            blended[name] = _screen_motion(motion, (x * rz, y * rz, z), (fx, fy), near, R, config.first_order_motion)
         elif name == "features":
             blended[name] = tuple(tensor_rows(features, rows))
         elif name in attributes:
@@ -366,8 +366,29 @@ def _colors(direction: Jit, coeffs: list[Float]) -> tuple[Float, ...]:
 
 
 def _screen_motion(
-    motion: list[Float], tan_x: Float, tan_y: Float, jx: Float, jy: Float, R: list[list[Float]]
+    motion: list[Float],
+    point: tuple[Float, Float, Float],
+    focal: tuple[Float, Float],
+    near: Float,
+    R: list[list[Float]],
+    first_order: bool,
 ) -> tuple[Float, Float]:
-    """Return pi(motion) in px: the first-order projection of a displacement (eq. 6), J R motion."""
-    mx, my, mz = (sum(R[i][k] * motion[k] for k in range(3)) for i in range(3))
-    return jx * (mx - tan_x * mz), jy * (my - tan_y * mz)
+    """Return the displacement pi(x) - pi(x - v) in px, where v = R motion: fx (vx - x/z vz) / (z - vz), likewise for y.
+
+    With z instead of z - vz it is J v, the first-order projection (eq. 6). It is returned on request, and where x - v
+    is behind the near plane.
+
+    Args:
+        motion: displacement in the world since the last frame.
+        point: x/z, y/z and z in camera space.
+        focal: fx and fy, px.
+        near: near plane, world units.
+        R: rotation of the camera.
+        first_order: whether J v is requested.
+    """
+    vx, vy, vz = (sum(R[i][k] * motion[k] for k in range(3)) for i in range(3))
+    tan_x, tan_y, z = point
+    earlier = z - vz
+    depth = z if first_order else dr.select(earlier >= near, earlier, z)
+    fx, fy = focal
+    return fx * (vx - tan_x * vz) / depth, fy * (vy - tan_y * vz) / depth

@@ -22,6 +22,9 @@ class RenderConfig:
     """Upper limit of alpha; it bounds 1 / (1 - alpha) in the adjoint."""
     stop_transmittance: Annotated[float, AtLeast(0), Below(1)] = 1e-4
     """Transmittance of its most transparent pixel below which a block ends; bounds the error of the colour."""
+    first_order_motion: bool = False
+    """Draw motion to first order, J(mean) * motion, as in the MoRGS paper (eq. 6), instead of the difference of two
+    projections. The relative difference is motion in depth / depth."""
     block_width: Annotated[int, AtLeast(4), AtMost(16), MultipleOf(4)] | None = None
     """Width in pixels of the block of one SIMD lane; pixels are read and written in packets of 4. None: 8 on the CPU, 4
     on the GPU."""
