@@ -3,11 +3,168 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
 
-from benchmarks.pages import captures, method, system
+import numpy as np
+
+from benchmarks.pages.results import committed
+from benchmarks.reports import cameras, codec, drift, field, held_out, random_scenes, real, renderer, seams, timing
+from benchmarks.reports.method_tables import best_rows
+from benchmarks.reports.plots import grouped, markdown
+from benchmarks.reports.unseen import out_of_capture
+from morgs_mi.fit.unseen_views import WIDEST
 
 __all__ = ["TABLES"]
 
+
+def study_table(report: Any, *names: str) -> str:
+    """Return the table of a study over the committed fits of some results."""
+    return report.Options().table([fit for name in names for fit in committed(name)["fits"]])
+
+
+def demo() -> str:
+    """Return the scores of the demo, with and without motion, offset and confidence."""
+    comparison = committed("demo")["comparison"]
+    rows = (
+        (title, f"{row['psnr']:.2f} dB", f"{row['motion_error_moving']:.2f} px", f"{row['motion_error_still']:.2f} px")
+        for title, row in (("default", comparison["full"]), ("residuals alone", comparison["plain"]))
+    )
+    return markdown(("", "PSNR", "motion error, moving", "still"), rows)
+
+
+def gains() -> str:
+    """Return the gains of the default over the tuned baseline, and over the paper's scheme."""
+    rows = []
+    for clip in committed("method_report")["clips"]:
+        best = {(row["preset"], row["epochs"]): row["mean"] for row in best_rows(clip)}
+        for epochs in (2, 8):
+            ours, theirs, paper = (best[preset, epochs] for preset in ("default", "baseline", "paper"))
+            added = (f"{ours[name] - theirs[name]:.2f}" for name in ("psnr", "psnr_moving"))
+            share = ours["motion_error_moving"] / theirs["motion_error_moving"]
+            over_paper = ours["psnr_moving"] - paper["psnr_moving"]
+            rows.append((f"`{clip['name']}`", f"{epochs}", *added, f"{share:.2f}", f"{over_paper:.2f}"))
+    titles = "PSNR, dB", "moving, dB", "motion error, share", "moving, over `paper`, dB"
+    return markdown(("clip", "epochs", *titles), rows)
+
+
+def parts() -> str:
+    """Return the scores of the presets with one part more each, at 2 and 8 epochs."""
+    (clip,) = committed("method_parts")["clips"]
+    best = {(row["preset"], row["epochs"]): row["mean"] for row in best_rows(clip)}
+    rows = []
+    for preset in ("baseline", "paper", "ml", "ml-mo", "ml-mo-mc"):
+        short = best[preset, 2]
+        long = best[preset, 8]
+        psnrs = (f"{scores[name]:.2f}" for scores in (short, long) for name in ("psnr", "psnr_moving"))
+        iou = "-" if long["confidence_iou"] is None else f"{long['confidence_iou']:.2f}"
+        rows.append((f"`{preset}`", *psnrs, f"{long['motion_error_moving']:.2f}", iou))
+    titles = "2 epochs: PSNR, dB", "moving", "8 epochs: PSNR, dB", "moving", "motion error, px", "IoU"
+    return markdown(("preset", *titles), rows)
+
+
+def frame_times() -> str:
+    """Return time, quality and bytes of a later frame of a large and a small scene."""
+    result = committed("frame_speed")
+    rows = []
+    for size in ("n3dv", "small"):
+        rig = result[size]["size"]
+        name = f"{rig['gaussians']:,}, {rig['views']} views of {rig['width']}x{rig['height']}"
+        for epochs in (1, 2):
+            run = result[size]["runs"][f"default, {epochs} epochs"]
+            scores = f"{run['seconds']:.1f}", f"{run['psnr']:.2f}", f"{run['bytes'] / 1000:.0f}"
+            shares = (f"{100 * run[key]:.0f} %" for key in ("gaussians", "pixels"))
+            rows.append((name, f"{epochs}", *scores, *shares))
+    return markdown(("Gaussians", "epochs", "s", "PSNR, dB", "kB", "active Gaussians", "drawn pixels"), rows)
+
+
+def unseen_groups() -> str:
+    """Return coverage and width of the intervals by kind of capture, of all fits and of those with a number."""
+    rows = []
+    fits = list(out_of_capture(committed("unseen")["fits"]))
+    for kind, group in [*((kind, group) for (kind,), group in grouped(fits, "kind").items()), ("all", fits)]:
+        narrow = [row for row in group if row["width"] <= WIDEST]
+        widths = f"{np.median([row['width'] for row in narrow]):.1f}"
+        shares = (f"{sum(row['within'] for row in part)} of {len(part)}" for part in (group, narrow))
+        rows.append((kind, f"{len(grouped(group, 'set'))}", *shares, widths))
+    titles = "fits in the interval", "of those with a number", "median width of these, dB"
+    return markdown(("kind", "captures", *titles), rows)
+
+
+def splat_files() -> str:
+    """Return the times of the commands for files of Gaussians by number of Gaussians."""
+    rows = (
+        (
+            f"{row['gaussians']:,}",
+            f"{row['file_megabytes']:.0f}",
+            *(f"{row[name]:.1f}" for name in ("open_seconds", "first_image_seconds", "image_seconds", "page_seconds")),
+            f"{row['page_megabytes']:.0f}",
+        )
+        for row in committed("splat_files")["rows"]
+    )
+    titles = "Gaussians", "file, MB", "open, s", "first image, s", "image, s", "web page, s", "page, MB"
+    return markdown(titles, rows, left=0)
+
+
+def fuzz() -> str:
+    """Return the number of damaged streams and of refusals by fuzzer."""
+    changes = {
+        "damage": "truncated, flipped bits, overwritten ranges",
+        "bytes": "up to three bytes of a packet, CRC made right",
+        "packets": "tables, codes, kinds, order and index, CRC made right",
+        "header": "entries of other types and ranges, or none",
+    }
+    rows = (
+        (name, changes[name], f"{counts['streams']:,}", f"{sum(counts['refusals'].values()):,}")
+        for name, counts in committed("fuzz")["fuzzers"].items()
+    )
+    return markdown(("fuzzer", "what is changed", "streams", "refusals"), rows, left=2)
+
+
+def workers() -> str:
+    """Return wall time and efficiency by number of workers."""
+    result = committed("scaling")
+    rows = (
+        (f"{run['workers']}", f"{run['seconds']:.0f} s", f"{share['frames']:.2f}", f"{share['whole']:.2f}")
+        for run, share in zip(result["runs"], result["efficiency"], strict=True)
+    )
+    return markdown(("workers", "whole fit", "efficiency, later frames", "efficiency, whole fit"), rows)
+
+
+def steps() -> str:
+    """Return the time of an optimisation step, and its ratio to hand-written code."""
+    names = {
+        "W1": "20k Gaussians, 512x384",
+        "W2b": "100k Gaussians, 1352x1014",
+        "W2": "the same, splats twice as large",
+    }
+    rows = []
+    for workload, name in names.items():
+        run = committed(f"render_speed_{workload}")
+        volprim = f"{run['volprim_step_ms']:.0f} ms" if "volprim_step_ms" in run else "not run"
+        rows.append((name, f"{run['step_ms']:.0f} ms", f"{run['ratio_to_yardstick']:.2f}", volprim))
+    return markdown(("", "step", "ratio to tuned C++", "`volprim_rf_basic`"), rows)
+
+
 TABLES: Mapping[str, Callable[[], str]] = {
-    name: getattr(module, name) for module in (method, captures, system) for name in module.__all__
+    "accuracy": lambda: renderer.errors_table(committed("renderer_report")["rows"]),
+    "cameras": partial(study_table, cameras, "cameras"),
+    "clocks": partial(study_table, timing, "timing"),
+    "codec": lambda: codec.quality_table(committed("codec_report")["clips"]),
+    "demo": demo,
+    "drift": partial(study_table, drift, "drift", "drift_fresh"),
+    "field": lambda: field.field_table(committed("field")["cells"]),
+    "frame_times": frame_times,
+    "fuzz": fuzz,
+    "gains": gains,
+    "held_out_views": lambda: held_out.first_frames(committed("held_out")["fits"]),
+    "held_out_views_over_time": lambda: held_out.later_frames(committed("held_out")["fits"]),
+    "parts": parts,
+    "principal_points": partial(study_table, real, "real"),
+    "seams": partial(study_table, seams, "seams"),
+    "splat_files": splat_files,
+    "steps": steps,
+    "unseen": partial(study_table, random_scenes, "random_scenes"),
+    "unseen_groups": unseen_groups,
+    "workers": workers,
 }

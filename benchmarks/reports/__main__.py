@@ -1,7 +1,6 @@
-"""Reports on error and run time of the renderer, optical flow, the codec and the method.
+"""Reports on error and run time of the renderer, the codec and the method.
 
     python -m benchmarks.reports renderer --json out.json
-    python -m benchmarks.reports flow CAPTURE... --json out.json
     python -m benchmarks.reports codec CAPTURE... --out out/codec
     python -m benchmarks.reports method CAPTURE... --out out/method --workers 2
 
@@ -19,12 +18,11 @@ from typing import Annotated
 import tyro
 from tyro.conf import arg
 
-from benchmarks.reports import codec, flow, method, renderer
+from benchmarks.reports import codec, method, renderer
 from morgs_mi.cli import Common, run
 
 Subject = (
     Annotated[renderer.Options, tyro.conf.subcommand("renderer")]
-    | Annotated[flow.Options, tyro.conf.subcommand("flow")]
     | Annotated[codec.Options, tyro.conf.subcommand("codec")]
     | Annotated[method.Options, tyro.conf.subcommand("method")]
 )

@@ -25,9 +25,9 @@ import cv2
 import numpy as np
 import tyro
 
-from benchmarks.reports.fits import RandomOptions, new_loop, random_capture, synthetic
-from benchmarks.reports.plots import Column, scores_table
-from benchmarks.reports.study import Row, Scene, Study, Variant
+from benchmarks.reports.fits import new_loop, random_capture, synthetic
+from benchmarks.reports.plots import grouped, markdown, span
+from benchmarks.reports.study import Row, Scene, Study, StudyOptions, Variant
 from morgs_mi.calibration.bundle import changed_camera, distorted
 from morgs_mi.calibration.refine import refine_cameras, register_camera
 from morgs_mi.capture.capture import Capture, load_capture
@@ -35,6 +35,7 @@ from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.rig import scene_extent
+from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.view import View, mean_psnr
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.cluster.tasks import Source
@@ -42,17 +43,11 @@ from morgs_mi.synth.disturbances import Disturbances, load_disturbances
 from morgs_mi.synth.synth_config import SynthConfig
 
 _FOCAL_ERROR = 0.01
-COLUMNS = (
-    *(Column(f"{name} cameras", lambda fit, name=name: fit[name]["registered"]) for name in ("true", "disturbed")),
-    Column("refined", lambda fit: fit["refined"]["registered"]),
-    Column("recovered", lambda fit: recovered(fit), 0, 100, " %"),
-    Column("rotation, degrees", lambda fit: fit["disturbed"]["rotation"], 3),
-    Column("refined", lambda fit: fit["refined"]["rotation"], 3),
-)
+_RIGS = "true", "disturbed", "refined"
 
 
 @dataclass(frozen=True)
-class Options(RandomOptions):
+class Options(StudyOptions):
     """Clips, disturbances and output."""
 
     seeds: tuple[int, ...] = (3, 6, 7)
@@ -63,10 +58,14 @@ class Options(RandomOptions):
     """Seeds of the disturbances."""
     lens: float = 0.0
     """Largest distortion of lenses that the calibration denies; 0: none."""
+    clips: Path = Path("out/random")
+    """Folder of the clips, which are made where they are missing."""
     downscale: float = 1
     """Factor by which the clips are reduced."""
-    gaussians: int | None = 4000
+    gaussians: int = 4000
     """Number of Gaussians."""
+    steps: int = 600
+    """Steps of the first frame."""
 
     def study(self) -> Study:
         """Return the study of the disturbances."""
@@ -80,11 +79,25 @@ class Options(RandomOptions):
                 true, denied = (Source.of(load_capture(c, self.downscale)) for c in lens_clips(self, seed))
                 keys = {"seed": seed, "degrees": 0.0, "disturbance": 0, "lens": self.lens}
                 scenes.append(Scene(keys, (true, denied, 0.0, 0)))
-        return Study(measure, scenes, [Variant({}, self.config(dropping=0.0, refine_cameras="auto"))], self.fit_seeds)
+        fit = FitConfig(num_gaussians=self.gaussians, first_frame_steps=self.steps, dropping=0.0, refine_cameras="auto")
+        return Study(measure, scenes, [Variant({}, StreamConfig(fit))], self.fit_seeds)
 
     def table(self, rows: Sequence[Row]) -> str:
-        """Return the registered PSNR, dB, and the errors of the rotations by clip and disturbance."""
-        return scores_table(rows, {"seed": "seed", "degrees": "degrees", "lens": "lens"}, COLUMNS)
+        """Return the registered PSNR, its recovered share and the errors of the rotations by the error of the rig."""
+        groups = {
+            f"poses off by {degrees:g} degrees": group
+            for (degrees,), group in sorted(grouped((row for row in rows if not row["lens"]), "degrees").items())
+        }
+        groups["lenses ignored"] = [row for row in rows if row["lens"]]
+        lines = []
+        for name, group in groups.items():
+            if not group:
+                continue
+            psnrs = (f"{np.mean([row[rig]['registered'] for row in group]):.1f}" for rig in _RIGS)
+            shares = f"{span((100 * recovered(row) for row in group), 0)} %"
+            lines.append((name, *psnrs, shares, span((row["refined"]["rotation"] for row in group), 2)))
+        titles = "true cameras, dB", "disturbed", "refined", "recovered", "rotation after, degrees"
+        return markdown(("error", *titles), lines)
 
 
 def disturbed(cameras: Sequence[Camera], degrees: float, seed: int) -> tuple[Camera, ...]:

@@ -7,10 +7,9 @@ differ by some hundredths of a dB; smaller differences are not significant.
 
 A clip of the JSON has one row per `quality`, the reference last: the PSNR of the `first` and of the `later` frames in
 dB; the bytes of the `file`, of the `first` and of a `later` frame, and of the float32 residual of a later frame, `raw`
-and with `lzma`; the Gaussians that a later frame writes (`moved`); the median times to encode and decode a later frame,
-and of lzma, in ms; the entropy of a later frame by group of attributes in bytes (`bytes_by_group`); and the `loss` of
-PSNR against the reference in dB. Figures of later frames are means. `raw` and `lzma` lead to the same frames, so lzma
-benefits from values that were rounded to zero; in the reference stream there are none.
+and with `lzma`; the median times to encode and decode a later frame, and of lzma, in ms; and the `loss` of PSNR against
+the reference in dB. Figures of later frames are means. `raw` and `lzma` lead to the same frames, so lzma benefits from
+values that were rounded to zero; in the reference stream there are none.
 """
 
 from __future__ import annotations
@@ -31,9 +30,7 @@ from benchmarks.reports.plots import Column, blank_figure, label_points, save_fi
 from benchmarks.reports.study import Row
 from benchmarks.speed.output import Output
 from morgs_mi.capture.capture import Capture, load_capture
-from morgs_mi.codec.entropy import column_bits
 from morgs_mi.codec.packets import CodedFrame, coded_frames, decode, residual_packet
-from morgs_mi.codec.quantisation import step_sizes
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.streams import open_stream
@@ -44,13 +41,11 @@ from morgs_mi.runs.recorder import stream_capture
 # The best preset of lzma takes several times as long and saves a few percent.
 _LZMA_PRESET = 6
 COLUMNS = (
-    Column("dB later", lambda row: row["psnr"]["later"], spread=False),
-    Column("loss", "loss", spread=False),
-    Column("kB first", "first", 1, 1e-3, spread=False),
-    Column("kB later", "later", 1, 1e-3, spread=False),
-    Column("lzma", "lzma", 1, 1e-3, spread=False),
-    Column("moved", "moved", 0, spread=False),
-    *(Column(f"{name} ms", f"{name}_ms", 0, spread=False) for name in ("encode", "decode", "lzma")),
+    Column("PSNR, dB", lambda row: row["psnr"]["later"], spread=False),
+    Column("loss, dB", lambda row: round(row["loss"], 2) + 0.0, spread=False),
+    Column("kB", "later", 1, 1e-3, spread=False),
+    Column("kB by lzma", "lzma", 1, 1e-3, spread=False),
+    *(Column(f"{name} ms", f"{name}_ms", 0, spread=False) for name in ("encode", "decode")),
 )
 
 
@@ -82,8 +77,7 @@ class Options(Output, OnWorkers):
         recordings = [load_capture(path, max_frames=self.frames) for path in self.captures]
         with self.opened() as workers:
             clips = [measure(recording, self, workers) for recording in recordings]
-        for clip in clips:
-            print(f"{clip['name']}\n\n{quality_table(clip['rows'])}")
+        print(quality_table(clips))
         if self.plot is not None:
             plot_codec(clips, self.plot)
         names = "qualities", "reference", "frames", "resume"
@@ -114,9 +108,11 @@ def measure(capture: Capture, options: Options, workers: Workers | None) -> dict
     return {"name": name, "rows": [{**row, "loss": best - row["psnr"]["later"]} for row in rows]}
 
 
-def quality_table(rows: Sequence[Row]) -> str:
-    """Return one clip's rows as a table."""
-    return scores_table(rows, {"quality": lambda row: f"{row['quality']:g}"}, COLUMNS, left=0)
+def quality_table(clips: Sequence[Row]) -> str:
+    """Return quality, bytes and times of a later frame by clip and quality, in Markdown."""
+    rows = [{"clip": clip["name"], **row} for clip in clips for row in clip["rows"]]
+    keys = {"clip": lambda row: f"`{row['clip']}`", "quality": lambda row: f"{row['quality']:g}"}
+    return scores_table(rows, keys, COLUMNS)
 
 
 def plot_codec(clips: Sequence[Row], path: Path) -> None:
@@ -174,14 +170,9 @@ def _measured(folder: Path, settings: StreamConfig) -> dict[str, Any]:
         if before is not None:
             rows.append(_frame(before, state, cameras, settings))
         before = state
-    means = {name: float(np.mean([row[name] for row in rows])) for name in ("raw", "lzma", "moved")}
+    means = {name: float(np.mean([row[name] for row in rows])) for name in ("raw", "lzma")}
     medians = {name: float(np.median([row[name] for row in rows])) for name in ("encode_ms", "decode_ms", "lzma_ms")}
-    groups = rows[0]["bytes_by_group"]
-    return {
-        **means,
-        **medians,
-        "bytes_by_group": {name: float(np.mean([row["bytes_by_group"][name] for row in rows])) for name in groups},
-    }
+    return means | medians
 
 
 def _frame(before: CodedFrame, now: CodedFrame, cameras: Sequence[Any], settings: StreamConfig) -> dict[str, Any]:
@@ -195,8 +186,6 @@ def _frame(before: CodedFrame, now: CodedFrame, cameras: Sequence[Any], settings
     decode(before, packet)
     decoded = time.perf_counter()
     survivors = source[~born]
-    change = now.grid.values[~born].astype(np.int64) - before.grid.values[survivors]
-    wrote = (change != 0).any(1)
     old, new = before.gaussians.numpy(), now.gaussians.numpy()
     raw = b"".join(
         np.concatenate([new[name][~born] - old[name][survivors], new[name][born]]).tobytes()
@@ -205,24 +194,10 @@ def _frame(before: CodedFrame, now: CodedFrame, cameras: Sequence[Any], settings
     )
     started = time.perf_counter()
     packed = lzma.compress(raw, preset=_LZMA_PRESET)
-    written = np.rint(change / step_sizes(packet.arrays["head"][1].astype(int))).astype(np.int64)
-    groups = {name: _bytes(*written[written[:, at].any(1), at].T) for name, at in now.grid.columns.items()}
     return {
         "encode_ms": 1e3 * (encoded - start),
         "decode_ms": 1e3 * (decoded - encoded),
         "lzma_ms": 1e3 * (time.perf_counter() - started),
         "raw": len(raw),
         "lzma": len(packed),
-        "moved": int(wrote.sum()),
-        "bytes_by_group": {**groups, "births": _birth_bytes(now, born) if born.any() else 0.0},
     }
-
-
-def _birth_bytes(state: CodedFrame, born: np.ndarray) -> float:
-    new = state.grid.select(np.flatnonzero(born))
-    columns = np.concatenate([new.largest_components[:, None], new.exponents, new.values], axis=1, dtype=np.int64)
-    return _bytes(*(columns - np.median(columns, axis=0).astype(np.int64)).T)
-
-
-def _bytes(*columns: np.ndarray) -> float:
-    return sum(map(column_bits, columns)) / 8

@@ -30,13 +30,12 @@ def known(row: Row, score: str) -> np.ndarray:
 
 
 COLUMNS = (
-    Column("PSNR, dB", lambda row: known(row, "psnr").mean()),
-    Column("moving: first", lambda row: known(row, "psnr_moving")[0]),
-    Column("last", lambda row: known(row, "psnr_moving")[-1]),
-    Column("mean", lambda row: known(row, "psnr_moving").mean()),
-    Column("slope, dB a frame", "slope_moving_db_a_frame", 3),
-    Column("IoU", lambda row: known(row, "confidence_iou").mean()),
-    Column("kB", lambda row: known(row, "bytes").mean(), 1, 1e-3),
+    Column("PSNR, dB", lambda row: known(row, "psnr").mean(), spread=False),
+    Column("moving: first", lambda row: known(row, "psnr_moving")[0], spread=False),
+    Column("last", lambda row: known(row, "psnr_moving")[-1], spread=False),
+    Column("mean", lambda row: known(row, "psnr_moving").mean(), spread=False),
+    Column("slope, dB a frame", "slope_moving_db_a_frame", 3, spread=False),
+    Column("IoU", lambda row: known(row, "confidence_iou").mean(), spread=False),
 )
 
 
@@ -64,8 +63,8 @@ class Options(ClipOptions):
         return Study(measure, scenes, [Variant({}, self.config())], self.fit_seeds)
 
     def table(self, rows: Sequence[Row]) -> str:
-        """Return mean and standard deviation over the fits of each clip."""
-        return scores_table(rows, {"clip": "clip"}, COLUMNS)
+        """Return the means over the fits of each clip."""
+        return scores_table(rows, {"clip": lambda row: f"`{row['clip']}`"}, COLUMNS)
 
 
 def measure(source: Source, num_frames: int, config: StreamConfig) -> dict[str, Any]:

@@ -9,11 +9,9 @@ of the held-out view, scores of tracks are over the whole clip, all against the 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import mitsuba as mi
@@ -23,11 +21,9 @@ import tyro
 from benchmarks.field import anchors, hicom, motion_grid, transformation_cache  # noqa: F401, they register models
 from benchmarks.reports.cells import OnWorkers, run_cells
 from benchmarks.reports.fits import DEFAULT, Clip, random_capture
-from benchmarks.reports.plots import blank_figure, markdown, save_figure
+from benchmarks.reports.plots import Column, blank_figure, means_over, save_figure, scores_table
 from benchmarks.speed.output import Output
-from morgs_mi.codec.packets import coded_frames
 from morgs_mi.core.files import json_finite
-from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.results import Evaluation, known_mean
 from morgs_mi.loop.stream_config import StreamConfig, apply_preset, apply_values
 from morgs_mi.runs.cluster.tasks import Source
@@ -60,21 +56,14 @@ _PLOTTED = (
     ("motion_error_moving", "motion error where things move, px"),
 )
 _OVER_TIME = ("psnr", "psnr_moving", "motion_error_moving")
-# Scores with their standard deviation over the fits in the table.
-_SPREAD = ("psnr", "psnr_moving", "Dynamic 3D Gaussians average_jaccard", "Dynamic 3D Gaussians median_error")
-# Of the columns: title, name of the score, factor, decimals.
-_COLUMNS = (
-    ("PSNR, dB", "psnr", 1, 2),
-    ("moving", "psnr_moving", 1, 2),
-    ("motion error, px", "motion_error_moving", 1, 2),
-    ("still", "motion_error_still", 1, 3),
-    ("in 3D, %", "motion_3d_relative_error", 100, 0),
-    ("AJ, %", "Dynamic 3D Gaussians average_jaccard", 100, 1),
-    ("<d avg, %", "Dynamic 3D Gaussians delta_avg", 100, 1),
-    ("MTE, cm", "Dynamic 3D Gaussians median_error", 100, 2),
-    ("kB", "num_bytes", 1e-3, 1),
-    ("CPU s", "cpu_s", 1, 1),
-    ("steps", "steps", 1, 0),
+COLUMNS = (
+    Column("PSNR, dB", "psnr", spread=False),
+    Column("moving, dB", "psnr_moving"),
+    Column("motion error, px", "motion_error_moving", spread=False),
+    Column("in 3D, %", "motion_3d_relative_error", 0, 100, spread=False),
+    Column("AJ, %", "Dynamic 3D Gaussians average_jaccard", 1, 100),
+    Column("kB", "num_bytes", 1, 1e-3, spread=False),
+    Column("CPU s", "cpu_s", 1, spread=False),
 )
 
 
@@ -128,23 +117,7 @@ def measure(source: Source, methods: Mapping[str, StreamConfig]) -> dict[str, di
     clip = Clip.read(source.open())
     loop = clip.loop(next(iter(methods.values())))
     keyframe, _ = loop.push(clip.images[0])
-    (coded,) = coded_frames([keyframe])
-    found = {}
-    for method, config in methods.items():
-        loop, reports, seconds = clip.loop(config), list[FrameReport](), list[float]()
-        loop.resume(coded, clip.images[:1])
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / "stream.morgs"
-            with clip.writer(path, config) as writer:
-                writer.write(keyframe)
-                for images in clip.images[1:]:
-                    start = time.process_time()
-                    packet, report = loop.push(images)
-                    seconds.append(time.process_time() - start)
-                    writer.write(packet)
-                    reports.append(report)
-            found[method] = scores_of(evaluate_stream(path, clip.capture.path), reports, seconds)
-    return found
+    return {method: scores_of(*clip.continued(keyframe, config)) for method, config in methods.items()}
 
 
 def scores_of(found: Evaluation, reports: Sequence[FrameReport], seconds: Sequence[float]) -> dict[str, Any]:
@@ -173,26 +146,15 @@ def mean_scores(cells: Cells, method: str) -> dict[str, float]:
     return {name: known_mean([row[name] for row in rows]) for name in rows[0] if name != "by_frame"}
 
 
-def spread_of_scores(cells: Cells, method: str) -> dict[str, float]:
-    """Return the standard deviation over the fits, of the means over the clips; {} for a single fit of each clip."""
-    fits = sorted({name.split("/")[1] for name in cells})
-    means = [mean_scores({n: c for n, c in cells.items() if n.split("/")[1] == fit}, method) for fit in fits]
-    return {} if len(fits) == 1 else {name: float(np.std([m[name] for m in means], ddof=1)) for name in _SPREAD}
-
-
 def field_table(cells: Cells) -> str:
-    """Return the scores of the methods, means over the cells and their spread, as a table in Markdown."""
+    """Return the scores at the most epochs in Markdown: means over the clips, and the spread over the fits of some."""
+    names = next(iter(cells.values()))
+    most = max(int(name.split("/")[1]) for name in names)
     rows = []
-    for name in next(iter(cells.values())):
-        method, epochs = name.split("/")
-        scores, spread = mean_scores(cells, name), spread_of_scores(cells, name)
-        values = (
-            f"{factor * scores[score]:.{decimals}f}"
-            + (f" ± {factor * spread[score]:.{decimals}f}" if score in spread else "")
-            for _, score, factor, decimals in _COLUMNS
-        )
-        rows.append((f"`{method}`", epochs, *values))
-    return markdown(("method", "epochs", *(title for title, *_ in _COLUMNS)), rows)
+    for method in dict.fromkeys(name.split("/")[0] for name in names):
+        scores = [{"fit": cell.split("/")[1], **by_name[f"{method}/{most}"]} for cell, by_name in cells.items()]
+        rows += means_over(scores, "fit", method=f"`{method}`")
+    return scores_table(rows, {"method": "method"}, COLUMNS)
 
 
 def plot_field(cells: Cells, path: Path) -> None:

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from benchmarks.reports.study import StudyOptions
 from morgs_mi import StreamLoop
 from morgs_mi.capture.capture import Capture, load_capture
-from morgs_mi.codec.container import StreamWriter
+from morgs_mi.codec.container import Packet, StreamWriter
+from morgs_mi.codec.packets import coded_frames
 from morgs_mi.core.camera import Camera
+from morgs_mi.evaluate.evaluate import evaluate_stream
+from morgs_mi.evaluate.results import Evaluation
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.stream_loop import FrameReport
 from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
@@ -23,7 +29,7 @@ __all__ = [
     "DEFAULT",
     "Clip",
     "ClipOptions",
-    "RandomOptions",
+    "Continuation",
     "new_loop",
     "random_capture",
     "spread_views",
@@ -32,26 +38,6 @@ __all__ = [
 
 
 DEFAULT = "default"  # name of the settings without a preset
-
-
-@dataclass(frozen=True)
-class RandomOptions(StudyOptions):
-    """Base of the options of studies of the first frame on random scenes."""
-
-    seeds: tuple[int, ...] = (3, 4, 5, 6, 7, 8)
-    """Seeds of the scenes."""
-    clips: Path = Path("out/random")
-    """Folder of the clips, which are made where they are missing."""
-    downscale: float = 2
-    """Factor by which the clips are reduced."""
-    gaussians: int | None = None
-    """Number of Gaussians; default: by the detail of the images."""
-    steps: int = 600
-    """Steps of the first frame."""
-
-    def config(self, **fit: Any) -> StreamConfig:
-        """Return the settings of a fit, with further ones of `FitConfig`."""
-        return StreamConfig(FitConfig(num_gaussians=self.gaussians, first_frame_steps=self.steps, **fit))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,3 +129,36 @@ class Clip:
         about = {"capture": str(self.capture.path.resolve()), "downscale": self.capture.downscale}
         about |= {"test_view": list(self.capture.test_views), "config": asdict(config)}
         return StreamWriter(path, self.capture.cameras, self.capture.fps, about)
+
+    def continued(self, keyframe: Packet, config: StreamConfig) -> Continuation:
+        """Fit all later frames after the packet of the first one."""
+        (coded,) = coded_frames([keyframe])
+        loop = self.loop(config)
+        loop.resume(coded, self.images[:1])
+        reports = []
+        seconds = []
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "stream.morgs"
+            with self.writer(path, config) as writer:
+                writer.write(keyframe)
+                for images in self.images[1:]:
+                    start = time.process_time()
+                    packet, report = loop.push(images)
+                    seconds.append(time.process_time() - start)
+                    writer.write(packet)
+                    reports.append(report)
+            return Continuation(evaluate_stream(path, self.capture.path), reports, seconds)
+
+
+class Continuation(NamedTuple):
+    """The later frames of a clip.
+
+    Attributes:
+        evaluation: scores of the whole stream.
+        reports: of the later frames.
+        seconds: processor times of the later frames, s.
+    """
+
+    evaluation: Evaluation
+    reports: list[FrameReport]
+    seconds: list[float]

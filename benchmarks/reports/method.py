@@ -14,17 +14,16 @@ docs/experiments/method.md explains the JSON.
 from __future__ import annotations
 
 from base64 import b64decode, b64encode
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib.util import find_spec
+from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from tyro.conf import Positional
 
-from benchmarks.reports import flow
 from benchmarks.reports.cells import OnWorkers
 from benchmarks.reports.fits import DEFAULT, Clip
 from benchmarks.reports.method_tables import method_page, plot_method
@@ -32,21 +31,22 @@ from benchmarks.reports.plots import grouped
 from benchmarks.reports.study import Row, Scene, Study, Variant, method_version
 from benchmarks.speed.output import Output
 from morgs_mi.capture.capture import Capture, load_capture
-from morgs_mi.codec.container import Packet, decode_packet, encode_packet
-from morgs_mi.codec.packets import coded_frames
+from morgs_mi.capture.truth import load_truth
+from morgs_mi.codec.container import decode_packet, encode_packet
 from morgs_mi.core.files import json_finite
-from morgs_mi.evaluate.evaluate import evaluate_stream
+from morgs_mi.core.rig import choose_key_views
 from morgs_mi.evaluate.results import Evaluation, known_mean
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import PRESETS, StreamConfig, apply_preset
+from morgs_mi.method.flow import observe_key_views
+from morgs_mi.method.flow_sources.flow_registry import FramePair
 from morgs_mi.runs.cluster.executor import Workers
 from morgs_mi.runs.cluster.tasks import Source
-from morgs_mi.stream_loop import FrameReport, StreamState
+from morgs_mi.stream_loop import FrameReport
 
 # Rows of the paper's table of key views.
 _WITHOUT_OFFSET, _WITH_OFFSET = "ml", "ml-mo"
 _PAPER_EPOCHS = 8
-_SCRATCH = 20
 _WORK = "captures", "out", "workers", "scheduler"  # options on which no figure depends
 _SETTING = "preset", "epochs", "key_views", "rates"
 # Scores that are averaged over the later frames; `by_frame` has those that are plotted over time.
@@ -54,7 +54,6 @@ _MEANS = ("psnr", "psnr_moving", "psnr_still", "ssim", "motion_error_moving", "m
 _MEANS += ("true_motion_moving", "confidence_iou")
 _BY_FRAME = ("psnr", "psnr_moving", "motion_error_moving")
 _MOTION_3D = ("error", "relative_error", "length_ratio", "angle")
-_IMAGES = ("psnr", "psnr_moving", "psnr_still", "ssim")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,8 +83,6 @@ class Options(OnWorkers):
     """Maximum number of frames from the start."""
     num_gaussians: int = 10_000
     """Number of Gaussians of the first frame; overrides stream.fit."""
-    scratch: int = 0
-    """Number of frames of each clip that are also fitted from scratch, with 20 times the steps of 8 epochs."""
     version: str | None = None
     """Version of the method, default a digest of its sources; stored results of the same version are reused."""
     stream: StreamConfig = field(default_factory=StreamConfig)
@@ -153,7 +150,6 @@ def measure(path: Path, options: Options, workers: Workers | None) -> dict[str, 
         "height": camera.height,
         "held_out": bool(capture.test_views),
         "cue": flow_error(capture, options.stream) if capture.truth is not None else None,
-        "scratch": from_scratch(capture, options, workers),
         "rows": aggregate(rows, presets),
         "key_view_rows": aggregate(rows, key_views),
     }
@@ -264,23 +260,8 @@ def later_frames(source: Source, first: str, config: StreamConfig) -> dict[str, 
         ``seconds``, the median of a later frame; ``by_frame``, lists of some of them. None if unknown.
     """
     clip = Clip.read(source.open())
-    return summary(*continued(clip, decode_packet(b64decode(first)), config))
-
-
-def continued(clip: Clip, packet: Packet, config: StreamConfig) -> tuple[Evaluation, list[FrameReport]]:
-    """Fit all later frames of a clip after its first packet; return the evaluation of the stream, and the reports."""
-    loop, reports = clip.loop(config), list[FrameReport]()
-    (coded,) = coded_frames([packet])
-    loop.resume(coded, clip.images[:1])
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "stream.morgs"
-        with clip.writer(path, config) as writer:
-            writer.write(packet)
-            for images in clip.images[1:]:
-                packet, report = loop.push(images)
-                writer.write(packet)
-                reports.append(report)
-        return evaluate_stream(path, clip.capture.path), reports
+    continuation = clip.continued(decode_packet(b64decode(first)), config)
+    return summary(continuation.evaluation, continuation.reports)
 
 
 def summary(found: Evaluation, reports: Sequence[FrameReport]) -> dict[str, Any]:
@@ -299,32 +280,15 @@ def summary(found: Evaluation, reports: Sequence[FrameReport]) -> dict[str, Any]
     }
 
 
-def from_scratch(capture: Capture, options: Options, workers: Workers | None) -> list[dict[str, Any]]:
-    """Return the image scores of some frames that are fitted from scratch like a first frame."""
-    steps = _SCRATCH * _PAPER_EPOCHS * len(capture.train_views)
-    chosen = np.linspace(capture.num_frames - 1, 1, options.scratch + 1)[: options.scratch].round().astype(int)
-    config = replace(options.base, fit=replace(options.base.fit, first_frame_steps=steps))
-    frames = dict.fromkeys(chosen.tolist())
-    scenes = [Scene({"frame": frame, "steps": steps}, (Source.of(capture), frame)) for frame in frames]
-    rows = Study(scratch_frame, scenes, [Variant({}, config)], (config.seed,), version=options.version)
-    return [{n: v for n, v in row.items() if n != "fit_seed"} for row in rows.run(workers, options.out)]
-
-
-def scratch_frame(source: Source, frame: int, config: StreamConfig) -> dict[str, float]:
-    """Return the image scores of one frame that is fitted from scratch."""
-    clip = Clip.read(source.open())
-    loop = clip.loop(config)
-    loop.state = StreamState(frame)
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "stream.morgs"
-        with clip.writer(path, config) as writer:
-            packet, report = loop.push(clip.images[frame])
-            writer.write(packet)
-        found = evaluate_stream(path, clip.capture.path).frames[0].scores
-    return {**{name: getattr(found, name) for name in _IMAGES}, "seconds": report.seconds}
-
-
-def flow_error(capture: Capture, config: StreamConfig) -> Mapping[str, float]:
-    """Return the error of the flow that guides the motion on the key views where the surface moves, px."""
-    moving = flow.measure(capture, (config.motion.flow_method,), config.motion.key_views)["rows"][0]["moving"]
-    return {name: moving[name] for name in ("error", "reliable_error")}
+def flow_error(capture: Capture, config: StreamConfig) -> dict[str, float]:
+    """Return the mean error of the flow that guides the motion on the key views where the surface moves, px."""
+    assert capture.truth is not None
+    errors = []
+    for previous, frame in pairwise(capture.frames()):
+        for view in choose_key_views(capture.cameras, config.motion.key_views):
+            camera = capture.cameras[view].name
+            pair = FramePair(frame.images[view], previous.images[view], camera, frame.index, capture.masks[view])
+            flow = observe_key_views({view: pair}, config.motion.flow_method, flow=config.motion.flow)[view]
+            truth = load_truth(capture.truth, camera, frame.index)
+            errors.append(np.linalg.norm(flow.motion - truth.motion, axis=-1)[truth.mask])
+    return {"error": float(np.concatenate(errors).mean())}

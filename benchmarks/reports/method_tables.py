@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from math import nan
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.reports.fits import DEFAULT
 from benchmarks.reports.plots import blank_figure, label_points, markdown, save_figure
 from benchmarks.reports.study import Row
 from morgs_mi.evaluate.tables import figure
@@ -17,7 +16,6 @@ from morgs_mi.evaluate.tables import figure
 __all__ = [
     "ablation_table",
     "best_rows",
-    "comparison_table",
     "epochs_table",
     "gains_table",
     "key_views_rows",
@@ -54,8 +52,6 @@ _GAINS = (
     ("`paper`, to `baseline`", "paper", "baseline"),
     ("`ml-mo-mc`, to `paper`", "ml-mo-mc", "paper"),
 )
-# Has all parts, like the default.
-_WHOLE = "ml-mo-mc"
 _GAINED = ("psnr", "psnr_moving", "motion_error_moving")
 
 
@@ -103,13 +99,6 @@ def gains_table(clips: Sequence[Row]) -> str:
     return markdown(("clip", "epochs", *(title for title, *_ in _GAINS)), table, 2)
 
 
-def comparison_table(clips: Sequence[Row]) -> str:
-    """Return the default, or the preset with all parts, compared with `baseline`, `paper` and the recording."""
-    columns = [list(_comparisons(clip)) for clip in clips]
-    rows = [(row[0][0], *(figure(found, 2) for _, found in row)) for row in zip(*columns, strict=True)]
-    return markdown(("", *(clip["name"] for clip in clips)), rows, 1)
-
-
 def method_page(clips: Sequence[Row], epochs: int) -> str:
     """Return all tables of all clips in Markdown; the page on the method explains them.
 
@@ -117,7 +106,7 @@ def method_page(clips: Sequence[Row], epochs: int) -> str:
         clips: results of the clips.
         epochs: number of epochs of the tables on parts and on key views.
     """
-    parts = [f"## What the parts add\n\n{gains_table(clips)}", f"## Comparison\n\n{comparison_table(clips)}"]
+    parts = [f"## What the parts add\n\n{gains_table(clips)}"]
     for clip in clips:
         size = "{views} views of {width}x{height}, {frames} frames".format(**clip)
         seeds = best_rows(clip)[0]["runs"]
@@ -127,8 +116,6 @@ def method_page(clips: Sequence[Row], epochs: int) -> str:
         if clip["key_view_rows"]:
             parts.append(f"### Key views, {epochs} epochs\n\n{key_views_table(clip)}")
         parts.append(f"### Quality against run time\n\n{epochs_table(clip)}")
-        if clip["scratch"]:
-            parts.append(f"### Frames fitted from scratch\n\n{_scratch_table(clip, epochs)}")
     return "\n".join(parts)
 
 
@@ -158,44 +145,10 @@ def plot_method(clips: Sequence[Row], path: Path) -> None:
     save_figure(drawing, path)
 
 
-def _comparisons(clip: Row) -> Iterator[tuple[str, float]]:
-    """Yield title and figure of each comparison, NaN if unknown; without a number of epochs it is at 8."""
-    rows = {(row["preset"], row["epochs"]): row["mean"] for row in best_rows(clip)}
-    whole = DEFAULT if any(preset == DEFAULT for preset, _ in rows) else _WHOLE
-
-    def score(name: str, epochs: int = 8, preset: str = whole) -> float:
-        return _score(rows, (preset, epochs), name)
-
-    def share(name: str) -> float:
-        return _ratio(score(name), score(name, preset="baseline"))
-
-    metrics = (("PSNR", "psnr"), ("PSNR where things move", "psnr_moving"))
-    for epochs in (2, 8):
-        for title, name in metrics:
-            yield (
-                f"{title} at {epochs} epochs over `baseline`, dB",
-                score(name, epochs) - score(name, epochs, "baseline"),
-            )
-    for title, name in metrics:
-        yield f"{title} at 2 epochs over `paper` at 8, dB", score(name, 2) - score(name, 8, "paper")
-    flow = nan if clip["cue"] is None else clip["cue"]["error"]
-    yield "motion error as a share of the flow's own", _ratio(score("motion_error_moving"), flow)
-    yield "motion error as a share of `baseline`'s", share("motion_error_moving")
-    yield "motion error in 3D as a share of `baseline`'s", share("motion_3d_error")
-    yield "IoU of confidence", score("confidence_iou")
-    yield "mTV as a share of `baseline`'s", share("mtv")
-    yield "mTV as a share of the recording's", _ratio(score("mtv"), score("mtv_input"))
-    yield "slope, dB per frame", score("psnr_slope")
-
-
 def _score(rows: Mapping[tuple[str, int], Mapping[str, float]], setting: tuple[str, int], name: str) -> float:
     """Return a setting's mean, NaN if it is unknown."""
     value = rows.get(setting, {}).get(name)
     return nan if value is None else value
-
-
-def _ratio(value: float, other: float) -> float:
-    return value / other if other else nan
 
 
 def _draw_line(axis: Any, preset: str, name: str, rows: Sequence[Row]) -> None:
@@ -210,22 +163,6 @@ def _table(titles: Sequence[str], rows: Sequence[Row], name: Any) -> str:
     columns = [column for column in _COLUMNS if any(_known(row["mean"][column[1]]) for row in rows)]
     cells = [(*name(row), *(_spread(row, key, digits, unit) for _, key, digits, unit in columns)) for row in rows]
     return markdown((*titles, *(column[0] for column in columns)), cells, len(titles))
-
-
-def _scratch_table(clip: Row, epochs: int) -> str:
-    titles = ("frame", "preset", "steps", "PSNR, dB", "moving")
-    rows = []
-    for found in clip["scratch"]:
-        frame = str(found["frame"])
-        rows.append(
-            (frame, "from scratch", str(found["steps"]), figure(found["psnr"], 2), figure(found["psnr_moving"], 2))
-        )
-        for row in best_rows(clip):
-            if row["epochs"] == epochs:
-                values = (row["by_frame"][name][found["frame"] - 1] for name in ("psnr", "psnr_moving"))
-                steps = epochs * (clip["views"] - clip["held_out"])
-                rows.append((frame, f"`{row['preset']}`", str(steps), *(figure(value, 2) for value in values)))
-    return markdown(titles, rows, 2)
 
 
 def _references(clip: Row) -> str:

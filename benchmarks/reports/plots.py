@@ -24,6 +24,7 @@ __all__ = [
     "plus_minus",
     "save_figure",
     "scores_table",
+    "span",
 ]
 
 
@@ -109,6 +110,13 @@ def plus_minus(values: Sequence[float], digits: int = 2) -> str:
     """Return the mean and the standard deviation of some fits, which is 0 for a single one."""
     deviation = np.std(values, ddof=1) if len(values) > 1 else 0.0
     return f"{np.mean(values):.{digits}f} ± {deviation:.{digits}f}"
+
+
+def span(values: Iterable[float], digits: int = 1) -> str:
+    """Return the smallest and the largest value, or the only one."""
+    ordered = sorted(values)
+    low, high = f"{ordered[0]:.{digits}f}", f"{ordered[-1]:.{digits}f}"
+    return low if low == high else f"{low} to {high}"
 
 
 def blank_figure(width: float, height: float) -> Figure:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -29,15 +29,11 @@ from morgs_mi.runs.cluster.tasks import Source
 
 COLUMNS = (
     Column("PSNR, dB", "psnr"),
-    Column("moving", "psnr_moving"),
-    Column("IoU of the confidence", "confidence_iou", 3),
+    Column("moving, dB", "psnr_moving"),
+    Column("IoU of the confidence", "confidence_iou"),
     Column("motion error, px", "motion_error_moving"),
-    Column("still", "motion_error_still", 3),
-    Column("kB", "bytes", 1, 1e-3),
+    Column("kB", "bytes", 0, 1e-3, spread=False),
 )
-
-
-EPOCHS = Column("epochs, %", "epochs", 0, 100)
 
 
 @dataclass(frozen=True)
@@ -51,28 +47,17 @@ class Options(StudyOptions):
     frames: int = 6
     """Number of frames that are fitted, the first included."""
     epochs: int = 2
-    """Most epochs of a later frame."""
-    tolerances: tuple[float, ...] = ()
-    """Tolerances with which a frame ends early (`FitConfig.early_stopping_tolerance`) that are compared."""
+    """Epochs of a later frame."""
 
     def study(self) -> Study:
         """Return the study of the clips."""
         sources = {seed: Source.of(random_capture(self.clips, seed)) for seed in self.seeds}
         scenes = [Scene({"seed": seed}, (source, self.frames)) for seed, source in sources.items()]
-        fit = FitConfig(epochs=self.epochs)
-        compared = (replace(fit, early_stopping_tolerance=tolerance) for tolerance in self.tolerances)
-        variants = [Variant({"tolerance": f.early_stopping_tolerance}, StreamConfig(f)) for f in compared]
-        return Study(measure, scenes, variants or [Variant({}, StreamConfig(fit))], self.fit_seeds)
+        return Study(measure, scenes, [Variant({}, StreamConfig(FitConfig(epochs=self.epochs)))], self.fit_seeds)
 
     def table(self, rows: Sequence[Row]) -> str:
         """Return the scores of each scene and of their means."""
-        keys = {"seed": "seed", **({"tolerance": "tolerance"} if self.tolerances else {})}
-        means = [
-            mean
-            for tolerance in self.tolerances or (None,)
-            for mean in means_over([r for r in rows if r.get("tolerance") == tolerance], "fit_seed", seed="mean")
-        ]
-        return scores_table([*rows, *means], keys, (*COLUMNS, *((EPOCHS,) if self.tolerances else ())))
+        return scores_table([*rows, *means_over(rows, "fit_seed", seed="mean")], {"seed": "seed"}, COLUMNS)
 
 
 def measure(source: Source, num_frames: int, config: StreamConfig) -> dict[str, float]:

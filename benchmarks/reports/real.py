@@ -4,7 +4,8 @@
     python -m benchmarks.reports.real --captures sets/fern sets/flower --seconds 60 120 300 --width 720 --json out.json
 
 Each capture is a folder of photos with the model of `morgs-mi calibrate`, or a recording. Views 5, 13, 21 and so on are
-held out together; of six views and fewer, each one in turn.
+held out together; of six views and fewer, each one in turn. A capture with few points starts from those that
+`morgs-mi fit` finds in its training views.
 """
 
 from __future__ import annotations
@@ -21,23 +22,25 @@ import numpy as np
 import tyro
 
 from benchmarks.reports.fits import new_loop
-from benchmarks.reports.plots import Column, scores_table
+from benchmarks.reports.plots import Column, markdown, scores_table
 from benchmarks.reports.study import Row, Scene, Study, StudyOptions, Variant
 from morgs_mi import Gaussians, rasterize
 from morgs_mi.calibration.refine import register_camera
-from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.capture import load_capture
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.progress import Progress
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.view import View, mean_psnr
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.visualise import label, side_by_side
 from morgs_mi.runs.cluster.tasks import Source
+from morgs_mi.runs.recorder import with_points
 
 COLUMNS = (
-    Column("training views", "training", unit=" dB"),
-    Column("held out, as calibrated", "held_out", unit=" dB"),
-    Column("registered", "registered", unit=" dB"),
-    Column("processor time", "cpu_s", 0, unit=" s"),
+    Column("training views, dB", "training"),
+    Column("held out, as calibrated", "held_out"),
+    Column("registered", "registered"),
+    Column("difference", lambda fit: fit["registered"] - fit["held_out"], spread=False),
 )
 _FIRST, _EVERY, _FEW = 4, 8, 6
 
@@ -67,7 +70,7 @@ class Options(StudyOptions):
             capture = load_capture(path, max(1.0, full.cameras[0].width / self.width), None)
             keys = {"set": path.name.partition("-")[0], "principal_points": principal_points(capture.cameras)}
             scenes += [
-                Scene(keys | {"test": test}, (Source.of(capture), test, self.pictures))
+                Scene(keys | {"test": test}, (Source.of(capture.holding_out(test)), self.pictures))
                 for test in held_out(len(full.cameras))
             ]
         given = FitConfig(num_gaussians=self.gaussians, first_frame_steps=self.steps)
@@ -76,9 +79,27 @@ class Options(StudyOptions):
         return Study(measure, scenes, variants, self.fit_seeds)
 
     def table(self, rows: Sequence[Row]) -> str:
-        """Return the scores by set and calibration."""
-        key = {"seconds": "seconds"} if self.seconds else {"principal points": "principal_points"}
-        return scores_table(rows, {"set": "set"} | key, [column for column in COLUMNS if column.score in rows[0]])
+        """Return the scores by set, and by the time of the first frame or by the calibration."""
+        if rows[0].get("seconds"):
+            return over_time_table(rows)
+        keys = {"photos": "set", "principal points": "principal_points", "held out": "held_out_views"}
+        return scores_table(rows, keys, COLUMNS, left=2)
+
+
+def over_time_table(rows: Sequence[Row]) -> str:
+    """Return the quality and the work of first frames by the time that they may take."""
+    lines = (
+        (
+            row["set"],
+            f"{row['seconds']:.0f}",
+            f"{row['cpu_s'] / 2:.0f}",
+            f"{row['gaussians']:,}",
+            *(f"{row[score]:.2f}" for score in ("training", "held_out", "registered")),
+        )
+        for row in rows
+    )
+    titles = "may take, s", "time of two cores, s", "Gaussians", "training views, dB", "held out", "registered"
+    return markdown(("photos", *titles), lines)
 
 
 def principal_points(cameras: Sequence[Camera]) -> str:
@@ -92,35 +113,37 @@ def held_out(count: int) -> list[list[int]]:
     return [[v] for v in range(count)] if count <= _FEW else [[*range(_FIRST, count, _EVERY)]]
 
 
-def measure(source: Source, test: Sequence[int], pictures: Path | None, config: StreamConfig) -> dict[str, Any]:
+def measure(source: Source, pictures: Path | None, config: StreamConfig) -> dict[str, Any]:
     """Fit the views that are not held out; return the mean PSNR of both, of the held-out ones in both ways."""
-    capture, stages = source.open(), []
-    train = [v for v in range(len(capture.cameras)) if v not in test]
-    views = _views(capture)
-    loop, start = new_loop(capture, config, train), time.process_time()
-    _, report = loop.push([views[v].image for v in train], lambda stage, *_: stages.append(stage))
-    seconds, gaussians = time.process_time() - start, loop.gaussians
+    capture = with_points(source.open(), config.seed, Progress())
+    images = next(capture.frames(0, 1)).images
+    views = [View(*view) for view in zip(capture.cameras, images, capture.masks, strict=True)]
+    trained = [views[v] for v in capture.train_views]
+    test = [views[v] for v in capture.test_views]
+    stages: list[str] = []
+    loop = new_loop(capture, config)
+    start = time.process_time()
+    _, report = loop.push([view.image for view in trained], lambda stage, *_: stages.append(stage))
+    seconds = time.process_time() - start
+    gaussians = loop.gaussians
     assert gaussians is not None
-
-    def registered(view: View) -> View:
-        found = register_camera(gaussians, view, loop.setup.extent, config.fit, config.render)
-        return view._replace(camera=found)
-
+    extent = loop.setup.extent
+    cameras = [register_camera(gaussians, view, extent, config.fit, config.render) for view in test]
     compared = {
-        "training": [views[v] for v in train],
-        "held_out": [views[v] for v in test],
-        "registered": [registered(views[v]) for v in test],
+        "training": trained,
+        "held_out": test,
+        "registered": [view._replace(camera=camera) for view, camera in zip(test, cameras, strict=True)],
     }
     if pictures is not None:
-        _write_picture(pictures / f"{capture.path.name}.jpg", gaussians, views[test[0]])
+        _write_picture(pictures / f"{capture.path.name}.jpg", gaussians, test[0])
     scores = {name: mean_psnr(gaussians, given, config.render) for name, given in compared.items()}
-    announced = float(found[1]) if (found := re.search(r"about (\d+) s", stages[-1])) else None
+    announcement = re.search(r"about (\d+) s", stages[-1])
     return scores | {
-        "views": len(train),
+        "views": len(trained),
         "held_out_views": len(test),
         "gaussians": len(gaussians),
         "steps": report.steps,
-        "announced_s": announced,
+        "announced_s": float(announcement[1]) if announcement else None,
         "cpu_s": seconds,
     }
 
@@ -131,12 +154,6 @@ def _write_picture(path: Path, gaussians: Gaussians, view: View) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     picture = side_by_side([label(view.image, "held-out image"), label(rendered, "rendered")])
     cv2.imwrite(str(path), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
-
-
-def _views(capture: Capture) -> list[View]:
-    """Return the views of the first frame."""
-    images = next(capture.frames(0, 1)).images
-    return [View(*view) for view in zip(capture.cameras, images, capture.masks, strict=True)]
 
 
 if __name__ == "__main__":

@@ -27,11 +27,11 @@ from morgs_mi.runs.cluster.segments import SegmentedRun
 from morgs_mi.runs.cluster.tasks import Source
 
 COLUMNS = (
-    Column("PSNR around, dB", "psnr_around"),
-    Column("at the seam, against that", lambda seam: seam["psnr"] - seam["psnr_around"]),
-    Column("PSNR in one piece", lambda seam: seam["whole"]["psnr"]),
-    Column("mTV, ratio to around", lambda seam: seam["mtv"] / seam["mtv_around"]),
-    Column("size, ratio", lambda seam: seam["num_bytes"] / seam["num_bytes_whole"]),
+    Column("around, dB", "psnr_around", spread=False),
+    Column("in one piece, dB", lambda seam: seam["whole"]["psnr"], spread=False),
+    Column("seam - around, dB", lambda seam: seam["psnr"] - seam["psnr_around"]),
+    Column("mTV, ratio", lambda seam: seam["mtv"] / seam["mtv_around"]),
+    Column("size, ratio", lambda seam: seam["num_bytes"] / seam["num_bytes_whole"], spread=False),
 )
 
 
@@ -70,9 +70,8 @@ class Options(ClipOptions):
 
     def table(self, rows: Sequence[Row]) -> str:
         """Return the seams: each against the frames around, and beside the fit in one piece."""
-        return scores_table(
-            rows, {"clip, seam": lambda seam: "`{scene}` {seed}, frame {frame}".format(**seam)}, COLUMNS
-        )
+        keys = {"clip": lambda seam: f"`{seam['scene']}` {seam['seed']}", "frame": "frame"}
+        return scores_table(rows, keys, COLUMNS)
 
 
 def measure(source: Source, num_segments: int, config: StreamConfig) -> list[dict[str, Any]]:

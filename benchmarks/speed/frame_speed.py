@@ -1,4 +1,4 @@
-"""Time the stages of a later frame of the loop at two sizes, and report bytes and PSNR.
+"""Time a later frame of the loop at two sizes, and report bytes and PSNR.
 
     python -m benchmarks.speed.frame_speed --json out.json [--sizes small n3dv] [--frames 3]
 
@@ -11,12 +11,9 @@ parts, and the paper's scheme.
 
 from __future__ import annotations
 
-import cProfile
 import json
-import pstats
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -32,21 +29,6 @@ from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.loop.stream_config import StreamConfig, apply_preset
 from morgs_mi.stream_loop import StreamLoop
 
-# Stages of a frame: file and function that are timed.
-STAGES = {
-    "change": ("loop/observation.py", "_seen"),
-    "flow": ("loop/observation.py", "_flows"),
-    "part": ("stream_loop.py", "_active_set"),
-    "targets": ("method/ssim.py", "__init__"),
-    "lift": ("method/lift.py", "lift_flow"),
-    "propagation": ("method/propagation.py", "propagate_motion"),
-    "search": ("method/search.py", "search_motion"),
-    "refinement": ("method/photometric.py", "refine_start"),
-    "steps": ("fit/optimise.py", "optimise"),
-    "density": ("fit/later_frame.py", "densify"),
-    "packet": ("codec/packets.py", "residual_packet"),
-    "decoding": ("codec/packets.py", "decode"),
-}
 NOISE = 2.0  # grey levels
 
 
@@ -158,10 +140,9 @@ def config_of(size: Size, **fit: Any) -> StreamConfig:
 
 
 def measure(scene: Scene, config: StreamConfig, recorded: list[list[np.ndarray]], live: bool = True) -> dict[str, Any]:
-    """Fit the later frames but the last; return seconds by stage, shares of what is processed, bytes, held-out PSNR.
+    """Fit the later frames but the last; return seconds, shares of what is processed, bytes, held-out PSNR.
 
-    Unless they arrive `live`, the next frame is observed while one is fitted, in another thread. The stages of that
-    thread are not timed.
+    Unless they arrive `live`, the next frame is observed while one is fitted, in another thread.
     """
     cameras = scene.cameras()
     loop = StreamLoop(cameras[1:], np.zeros((200, 3)), np.zeros((200, 3)), config)
@@ -169,33 +150,20 @@ def measure(scene: Scene, config: StreamConfig, recorded: list[list[np.ndarray]]
     loop.resume(decode(None, keyframe_packet(start, 0, cameras, config.codec)), [recorded[0][1:]])
     rows = []
     for images, upcoming in pairwise(recorded[1:]):
-        profile = cProfile.Profile()
         dr.sync_thread()
-        _, report = profile.runcall(loop.push, images[1:], upcoming=None if live else upcoming[1:])
+        _, report = loop.push(images[1:], upcoming=None if live else upcoming[1:])
         assert loop.gaussians is not None
         found = np.asarray(rasterize(loop.gaussians, cameras[0], ("color",)).color)
         squares = (np.clip(found, 0, 1) - images[0] / 255.0) ** 2
         rows.append(
             {
                 "seconds": report.seconds,
-                **{f"{name}_s": value for name, value in stages(profile).items()},
                 **report.active,
                 "bytes": report.num_bytes,
                 "psnr": -10 * np.log10(squares.mean()),
             }
         )
     return {name: float(f"{median(row[name] for row in rows[1:]):.4g}") for name in rows[0]}
-
-
-def stages(profile: cProfile.Profile) -> dict[str, float]:
-    """Return the cumulative seconds of each stage."""
-    timed = pstats.Stats(profile).stats  # type: ignore[attr-defined]
-    seconds = dict.fromkeys(STAGES, 0.0)
-    for (path, _, function), (_, _, _, cumulative, _) in timed.items():
-        for name, (file, timed_function) in STAGES.items():
-            if Path(path).as_posix().endswith(f"morgs_mi/{file}") and function == timed_function:
-                seconds[name] += cumulative
-    return seconds
 
 
 def settings(options: Options, name: str) -> dict[str, StreamConfig]:

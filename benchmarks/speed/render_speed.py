@@ -44,7 +44,7 @@ class Options:
     variant: str = "llvm_ad_rgb"
     """Mitsuba variant."""
     baselines: bool = False
-    """Whether to also time Mitsuba's volprim_rf_basic and a renderer with one lane per pixel."""
+    """Whether to also time Mitsuba's volprim_rf_basic."""
     seed: int = 1
     """Seed of the pixels for measuring the error."""
 
@@ -65,7 +65,7 @@ def figures(gaussians: Gaussians, camera: Camera, options: Options) -> dict[str,
         rounds.append(row)
 
     result: dict[str, Any] = {f"{key}_ms": round(median(r[key] for r in rounds), 3) for key in rounds[0]}
-    for key in ("yardstick_step", "plain_step", "volprim_step"):
+    for key in ("yardstick_step", "volprim_step"):
         if key in rounds[0]:
             ratios = [r["step"] / r[key] for r in rounds]
             # Ratios to the slow baselines need four decimals.

@@ -18,7 +18,6 @@ import numpy as np
 from drjit.opt import Adam
 
 from benchmarks.reports.reference64 import Reference64
-from benchmarks.speed import plain
 from benchmarks.workloads import TARGET, write_bin
 from morgs_mi import Camera, Gaussians, RenderConfig, ellipsoids, rasterize
 from morgs_mi.fit.optimise import adam
@@ -174,15 +173,6 @@ def error(gaussians: Gaussians, camera: Camera, seed: int) -> dict[str, float]:
     return {name: float(f"{value:.3g}") for name, value in figures.items()}
 
 
-def plain_stages(gaussians: Gaussians, camera: Camera) -> dict[str, Callable[[], Any]]:
-    """Return forward and whole step of the one-lane-per-pixel renderer."""
-    config = RenderConfig()
-    return {
-        "plain_forward": lambda: plain.render(gaussians, camera, config),
-        "plain_step": lambda: plain.step(gaussians, camera, TARGET, config),
-    }
-
-
 def volprim_stages(gaussians: Gaussians, camera: Camera) -> dict[str, Callable[[], Any]]:
     """Return forward and whole step of Mitsuba's `volprim_rf_basic` on the same Gaussians, one sample per pixel."""
     scene: Any = mi.load_dict(
@@ -216,11 +206,10 @@ def volprim_stages(gaussians: Gaussians, camera: Camera) -> dict[str, Callable[[
 
 def baselines(gaussians: Gaussians, camera: Camera) -> tuple[dict[str, Any], dict[str, str]]:
     """Return the stages of the baselines, and the reasons for which others are omitted."""
-    works = plain_stages(gaussians, camera)
     if len(gaussians) > VOLPRIM_GAUSSIANS or camera.width * camera.height > VOLPRIM_PIXELS:
         reason = f"a step beyond {VOLPRIM_GAUSSIANS} Gaussians or {VOLPRIM_PIXELS} pixels takes many seconds"
-        return works, {"volprim": reason}
-    return works | volprim_stages(gaussians, camera), {}
+        return {}, {"volprim": reason}
+    return volprim_stages(gaussians, camera), {}
 
 
 class Yardstick:

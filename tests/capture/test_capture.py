@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
+import weakref
 from dataclasses import replace
 from pathlib import Path
 
@@ -48,6 +49,19 @@ def test_load_capture__reads_n3dv(tmp_path: Path) -> None:
         assert frame.index == t
         assert [tuple(image[5, 5]) for image in frame.images] == [(0, t, 0), (1, t, 0), (2, t, 0)]
     assert [f.index for f in capture.frames(1, 2)] == [1]
+
+
+def test_frames__releases_the_images_of_past_frames(tmp_path: Path) -> None:
+    """Memory does not grow with the length of a clip."""
+    folder = n3dv(tmp_path)
+    for i in range(3):
+        write_video(folder / f"cam{i:02d}.mp4", frames(i, count=40), FPS)
+    references = []
+    for frame in load_capture(folder).frames():
+        references.append(weakref.ref(frame.images[0]))
+        del frame
+        assert sum(reference() is not None for reference in references) <= 3
+    assert len(references) == 40
 
 
 def test_load_capture__orders_cameras_by_number(tmp_path: Path) -> None:

@@ -41,16 +41,11 @@ def test_measure__finds_coarser_streams_smaller_and_lzma_larger(reported) -> Non
         assert row["file"] == (options.out / "capture" / f"{row['quality']:g}" / "stream.morgs").stat().st_size
         assert row["later"] < row["lzma"] < row["raw"]
         assert row["loss"] == pytest.approx(rows[-1]["psnr"]["later"] - row["psnr"]["later"])
-        # The contents of a packet without its flags; the entropy of a few numbers is only approximate.
-        assert 0 <= sum(row["bytes_by_group"].values()) < 1.1 * row["later"]
-        assert 0 <= row["moved"] < 300
         assert min(row["encode_ms"], row["decode_ms"], row["lzma_ms"]) > 0
     for name in ("first", "later", "file"):
         sizes = [row[name] for row in rows]
         assert sizes == sorted(sizes), name
     assert np.isfinite(rows[0]["loss"])
-    assert rows[-1]["moved"] > 0
-    assert sum(rows[-1]["bytes_by_group"].values()) > 0.3 * rows[-1]["later"]
 
 
 def test_options__reuse_complete_streams_and_write_tables_json_and_plot(
@@ -65,7 +60,7 @@ def test_options__reuse_complete_streams_and_write_tables_json_and_plot(
     (again,) = result["clips"]
     assert [row["psnr"] for row in again["rows"]] == [row["psnr"] for row in found["rows"]]
     assert {"settings", "machine", "versions", "commit"} <= result.keys()
-    assert quality_table(again["rows"]) in capsys.readouterr().out
+    assert quality_table([again]) in capsys.readouterr().out
     assert plot.stat().st_size > 10_000
 
 

@@ -19,6 +19,9 @@ import pytest
 from benchmarks.pages.results import committed
 from benchmarks.reports import real
 from morgs_mi import cli
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.runs.cluster.tasks import Source
 
 FOLDER = os.environ.get("MORGS_MI_PHOTOS")
 # Number of photos, and whether each has a principal point of its own.
@@ -29,6 +32,16 @@ def test_held_out__is_every_eighth_view_or_each_of_a_few_in_turn():
     assert real.held_out(20) == [[4, 12]]
     assert real.held_out(7) == [[4]]
     assert real.held_out(3) == [[0], [1], [2]]
+
+
+def test_measure__starts_from_points_of_the_training_views(clip: Path, monkeypatch: pytest.MonkeyPatch):
+    def stop(capture, seed, progress):
+        raise InterruptedError(str(capture.test_views))
+
+    monkeypatch.setattr(real, "with_points", stop)
+    source = Source.of(load_capture(clip, test_view=None).holding_out([1]))
+    with pytest.raises(InterruptedError, match=r"\(1,\)"):
+        real.measure(source, None, StreamConfig())
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""The speed benchmark of the renderer: figures, yardstick, baselines, and the plain renderer."""
+"""The speed benchmark of the renderer: figures, yardstick and baselines."""
 
 from __future__ import annotations
 
@@ -8,16 +8,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import drjit as dr
-import mitsuba as mi
-import numpy as np
 import pytest
 
 from benchmarks import workloads
-from benchmarks.speed import plain, render_speed, timing
-from benchmarks.workloads import ball
-from morgs_mi import RenderConfig, rasterize
-from tests.assertions import assert_close
+from benchmarks.speed import render_speed, timing
 
 ROOT = Path(__file__).parents[3]
 # Output of a yardstick, from a program that checks its input: 60 Gaussians on 40x24 pixels.
@@ -50,7 +44,7 @@ def test_figures__are_times_memory_and_error(workload: Path):
         assert result[stage] > 0, stage
     assert result["tenth_share"] > 0
     assert result["error_rms"] <= result["error_max"] < 2e-4
-    assert not any("yardstick" in name or "plain" in name for name in result)
+    assert not any("yardstick" in name for name in result)
 
 
 def test_yardstick__passes_the_workload_and_reads_the_median(workload: Path, yardstick: Path):
@@ -61,7 +55,7 @@ def test_yardstick__passes_the_workload_and_reads_the_median(workload: Path, yar
 def test_baselines__are_omitted_for_large_workloads(workload: Path):
     gaussians, camera = workloads.load(workload)
     works, omitted = timing.baselines(gaussians, camera.resized(1024, 768))
-    assert set(works) == {"plain_forward", "plain_step"}
+    assert works == {}
     assert set(omitted) == {"volprim"}
 
 
@@ -87,20 +81,5 @@ def test_render_speed__times_baselines(workload: Path):
     done = run("--workload", workload, "--baselines", "--repeats", 1, "--rounds", 1)
     assert done.returncode == 0, done.stderr
     result = json.loads(done.stdout)
-    for name in ("plain_forward_ms", "plain_step_ms", "volprim_forward_ms", "volprim_step_ms", "ratio_to_plain"):
+    for name in ("volprim_forward_ms", "volprim_step_ms", "ratio_to_volprim"):
         assert result[name] > 0, name
-
-
-def test_plain__renders_the_same_image_and_gradients():
-    gaussians, camera = ball(2, 300, 50, 38, 0.1)
-    config = RenderConfig(stop_transmittance=0)
-    target = (3.0, 4.0, 5.0)  # above any colour: signs are certain
-    dr.enable_grad(*gaussians.items().values())
-    image = rasterize(gaussians, camera, ("color",), config=config).color
-    assert_close(plain.render(gaussians, camera, config), image, atol=2e-5)
-    found = [np.asarray(grad) for grad in plain.step(gaussians, camera, target, config)]
-    dr.backward(dr.mean(dr.abs(image - mi.TensorXf(np.tile(np.float32(target), (38, 50, 1)))), axis=None))
-    for (name, value), grad in zip(gaussians.items().items(), found, strict=True):
-        expected = np.asarray(dr.grad(value))
-        assert np.abs(expected).max() > 0
-        assert_close(grad, expected, rtol=1e-3, name=name)
