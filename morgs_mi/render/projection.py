@@ -43,6 +43,8 @@ _HALF_LOG2E = 0.5 * log2(2.718281828459045)
 
 # World units, or units of a channel; squares of what is farther or larger overflow.
 FARTHEST = 1e18
+# Opacities below are drawn as this one, below any `alpha_min`: its logarithm is finite.
+_FAINTEST = 1e-9
 # A float32 rotation orients a needle to 1e-7 of its length at best: aspects below this are clamped.
 _THINNEST = 1e-6
 
@@ -184,11 +186,14 @@ def project(
     eps = dr.maximum(config.eps2d * dr.square(r_size), _THINNEST**2)
     xx, yy, xy = dr.dot(u0, u0), dr.dot(u1, u1), dr.dot(u0, u1)
     # Lagrange's identity: det(U U' + eps I) without the cancellation that xx yy - xy^2 has for needles.
-    det = dr.squared_norm(dr.cross(u0, u1)) + eps * (xx + yy) + eps * eps
+    det_exact = dr.squared_norm(dr.cross(u0, u1))
+    det = det_exact + eps * (xx + yy) + eps * eps
     xx, yy = xx + eps, yy + eps
     r_det, r_yy, s = dr.rsqrt(det), dr.rsqrt(yy), sqrt(_HALF_LOG2E) * r_size
     a, b, c = s * yy * r_yy * r_det, -s * xy * r_yy * r_det, s * r_yy
-    log2_opacity = dr.log2(dr.maximum(opacities, 1e-9))
+    log2_opacity = dr.log2(dr.maximum(opacities, _FAINTEST))
+    if config.antialiased:
+        log2_opacity += 0.5 * dr.log2(dr.maximum(det_exact / det, _FAINTEST**2))
     shape = (mean_x, mean_y, a, b, c, log2_opacity)
     line = _depth_profile(z, (u0, u1, w), (xx, xy, yy), det, eps, r_focal, r_scale) if "profile" in channels else ()
 

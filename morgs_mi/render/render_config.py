@@ -16,6 +16,9 @@ class RenderConfig:
 
     eps2d: Annotated[float, AtLeast(0), AtMost(1e18)] = 0.3  # beyond, float32 overflows
     """Low-pass filter in px^2, added to the projected covariance; it prevents splats from falling between pixels."""
+    antialiased: bool = False
+    """Reduce the opacity by what the low-pass filter adds to a splat's area, sqrt(det S / det (S + eps2d I)) (Yu et al.
+    2024): small splats fade instead of growing. For models that were trained so."""
     alpha_min: Annotated[float, Above(0)] = 1.0 / 255.0
     """Alpha below which a Gaussian is skipped at a pixel: it cannot change an 8-bit image."""
     alpha_max: Annotated[float, Above(0), Below(1)] = 0.99

@@ -148,6 +148,8 @@ def test_gaussian_splat__refuses_films_other_than_rgb():
         ({"aovs": "normal"}, "`aovs` must be out of motion, confidence, depth, got 'normal'"),
         ({"max_depth": 3}, "unreferenced property"),
         ({"background": [0.5, 0.5]}, "background"),
+        ({"alpha_min": 2.0}, "gaussian_splat: RenderConfig.*`alpha_min` must be below"),
+        ({"eps2d": -1.0}, "`eps2d` must be"),
     ],
 )
 def test_gaussian_splat__refuses_bad_props_when_the_scene_is_loaded(props, message):
