@@ -39,7 +39,7 @@ from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.render.channels import attribute_widths
 
-__all__ = ["ellipsoids"]
+__all__ = ["ellipsoids", "integrator"]
 
 # By the name of a plugin, its module and class. The base classes exist once per variant.
 _PLUGINS = {
@@ -77,8 +77,8 @@ def ellipsoids(gaussians: ActivatedGaussians) -> dict[str, Any]:
     return {"type": "ellipsoids", "data": from_numpy(mi.TensorXf, data), **attributes}
 
 
-def _integrator(plugin: str, props: Any) -> Any:
-    """Return an integrator of the active variant.
+def integrator(plugin: str, props: Any) -> Any:
+    """Return an integrator of the active variant; `plugin` is its type, `props` are its properties.
 
     Raises:
         ValueError: the variant has no derivatives.
@@ -96,7 +96,7 @@ def _register(*_arguments: Any) -> None:
     """Register the plugins with the active variant."""
     for plugin, (module, _) in _PLUGINS.items():
         sys.modules.pop(module, None)
-        mi.register_integrator(plugin, partial(_integrator, plugin))
+        mi.register_integrator(plugin, partial(integrator, plugin))
 
 
 mi.detail.add_variant_callback(_register)

@@ -68,6 +68,7 @@ def rasterize(
     alpha_min: float = 1 / 255,
     alpha_max: float = 0.99,
     depth_limit: NDArray | None = None,
+    antialiased: bool = False,
 ) -> dict[str, NDArray]:
     """Blend raw Gaussian attributes (as `Gaussians.numpy()` returns them) over every pixel, nearest first.
 
@@ -105,7 +106,8 @@ def rasterize(
         det = cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2
         dx, dy = gx - (fx * x / z + cx), gy - (fy * y / z + cy)
         sigma = 0.5 * (cov[1, 1] * dx * dx - 2 * cov[0, 1] * dx * dy + cov[0, 0] * dy * dy) / det
-        full = opacities[i] * np.exp(-sigma)
+        faded = np.sqrt(np.linalg.det(M @ M.T) / det) if antialiased else 1
+        full = opacities[i] * faded * np.exp(-sigma)
         drawn, capped = full.real >= alpha_min, full.real > alpha_max
         margin = min(margin, np.abs(full.real / alpha_min - 1).min(), np.abs(full.real / alpha_max - 1).min())
         alpha = np.where(drawn, np.where(capped, alpha_max, full), 0)
@@ -124,7 +126,8 @@ def rasterize(
         values = {"color": np.where(color.real > 0, color, 0), "depth": np.array([z])}
         if "motion" in raw:
             mx, my, mz = R @ raw["motion"][i]
-            values["motion"] = np.array([fx / z * (mx - x / z * mz), fy / z * (my - y / z * mz)])
+            x0, y0, z0 = cam[i] - (mx, my, mz)
+            values["motion"] = np.array([fx * (x / z - x0 / z0), fy * (y / z - y0 / z0)])
         if "logit_confidence" in raw:
             values["confidence"] = np.array([1 / (1 + np.exp(-raw["logit_confidence"][i]))])
         for name, value in values.items():
@@ -152,11 +155,14 @@ def rasterize_view(
     background: tuple[float, float, float] | None = None,
     viewmat: NDArray | None = None,
     depth_limit: NDArray | None = None,
+    antialiased: bool = False,
 ) -> dict[str, NDArray]:
     """Return `rasterize` for a camera rounded to float32, as the renderer reads it; `viewmat` replaces its pose."""
     viewmat = np.float32(camera.viewmat).astype(np.float64) if viewmat is None else viewmat
     K = np.float32(camera.K).astype(np.float64)
-    return rasterize(raw, K, viewmat, camera.width, camera.height, background, depth_limit=depth_limit)
+    return rasterize(
+        raw, K, viewmat, camera.width, camera.height, background, depth_limit=depth_limit, antialiased=antialiased
+    )
 
 
 def complex_step(function, inputs: dict[str, NDArray], names: list[str], step: float = 1e-30) -> dict[str, NDArray]:

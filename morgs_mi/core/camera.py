@@ -130,6 +130,33 @@ class Camera:
         K = np.array([[f, 0, 0.5 * width], [0, f, 0.5 * height], [0, 0, 1.0]])
         return cls(K, viewmat, width, height, name, min(0.01, distance / 100) if near is None else near)
 
+    @classmethod
+    def from_sensor(cls, sensor: Any) -> Camera:
+        """Return the view of a Mitsuba `perspective` sensor, without gradients: the inverse of `sensor`.
+
+        It has the size of the whole film, and the sensor's id as its name.
+
+        Raises:
+            ValueError: it is a sensor of another kind, or scales the world.
+        """
+        import mitsuba as mi
+
+        if not isinstance(sensor, mi.Sensor) or sensor.class_name() != "PerspectiveCamera":
+            kind = sensor.class_name() if isinstance(sensor, mi.Sensor) else f"a {type(sensor).__name__}"
+            raise ValueError(
+                f"Camera.from_sensor(): `sensor` must be a `perspective` sensor, got {kind}; splats are drawn only by "
+                "pinhole cameras without lens distortion."
+            )
+        params: Any = mi.traverse(sensor)
+        width, height = (int(size) for size in sensor.film().size())
+        names = ("x_fov", "principal_point_offset_x", "principal_point_offset_y", "near_clip")
+        fov, offset_x, offset_y, near = (float(np.asarray(params[name]).item()) for name in names)
+        f = 0.5 * width / np.tan(np.deg2rad(0.5 * fov))
+        # Mitsuba adds its offset to the pixel's position, so the principal point moves the other way.
+        K = np.array([[f, 0, width * (0.5 - offset_x)], [0, f, height * (0.5 - offset_y)], [0, 0, 1.0]])
+        to_world = np.asarray(params["to_world"].matrix, float).reshape(4, 4)
+        return cls(K, _OPENCV_FROM_MITSUBA @ np.linalg.inv(to_world), width, height, sensor.id(), near)
+
     @property
     def position(self) -> np.ndarray:
         """The camera's centre [3] in world units."""

@@ -95,6 +95,7 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
     "ml-mo-mc": {"motion": _modules(True, True, True)},
     "paper": {
         "fit": {"epochs": 8, "decay_means_rate": False},
+        "render": {"first_order_motion": True},
         "motion": {
             "lift_flow": False,
             "propagate_motion": False,

@@ -24,6 +24,7 @@ from morgs_mi.plugins.surface_view import SurfaceView
 from morgs_mi.render.channels import NORMALISED
 from morgs_mi.render.rasterize import Image, rasterize
 from morgs_mi.render.region import Region
+from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["composite", "cropped"]
 
@@ -32,7 +33,11 @@ Columns = dict[str, list[Float]]
 
 
 def composite(
-    gaussians: ActivatedGaussians, channels: Sequence[str], background: Sequence[float] | None, view: SurfaceView
+    gaussians: ActivatedGaussians,
+    channels: Sequence[str],
+    background: Sequence[float] | None,
+    view: SurfaceView,
+    config: RenderConfig | None = None,
 ) -> Columns:
     """Return the channels of splats and surfaces, differentiable in both, each a list of floats [P].
 
@@ -44,12 +49,13 @@ def composite(
         channels: as for `rasterize`.
         background: colour [3] behind all splats where no surface and no environment is seen, encoded like the splats.
         view: the surfaces on P pixels of a camera's image.
+        config: settings of the rasteriser.
     """
     encode, decode = (mi.math.linear_to_srgb, mi.math.srgb_to_linear) if view.srgb else (_unchanged, _unchanged)
     channels = tuple(dict.fromkeys(("color", "alpha", *channels)))
-    image, crop = rasterize(gaussians, view.pixels.camera, channels), view.pixels.crop
+    image, crop = rasterize(gaussians, view.pixels.camera, channels, config=config), view.pixels.crop
     whole = _blended(image, channels, lambda image: cropped(image, crop))
-    front = _in_front(gaussians, channels, view) or whole
+    front = _in_front(gaussians, channels, view, config) or whole
     f, covered = view.coverage, view.coverage > 0
     t_front, t_whole = (1 - part["alpha"][0] for part in (front, whole))
 
@@ -78,7 +84,9 @@ def composite(
     return {**splats, "color": color, "alpha": [opaque]}
 
 
-def _in_front(gaussians: ActivatedGaussians, channels: tuple[str, ...], view: SurfaceView) -> Columns | None:
+def _in_front(
+    gaussians: ActivatedGaussians, channels: tuple[str, ...], view: SurfaceView, config: RenderConfig | None
+) -> Columns | None:
     """Return the blended sums of the splats in front of the surfaces [P], 0 where there are none; None: nowhere.
 
     Only the blocks of pixels in which a surface is seen are drawn.
@@ -93,7 +101,8 @@ def _in_front(gaussians: ActivatedGaussians, channels: tuple[str, ...], view: Su
     inside = dr.fma(row + y, dr.opaque(mi.UInt32, camera.width), pixel - row * dr.opaque(mi.UInt32, width) + x)
     dr.scatter(limit, view.depth, inside, mode=dr.ReduceMode.Permute)
     region = Region(mask)
-    part = rasterize(gaussians, camera, channels, region=region, depth_limit=mi.TensorXf(limit, mask.shape))
+    depth_limit = mi.TensorXf(limit, mask.shape)
+    part = rasterize(gaussians, camera, channels, region=region, config=config, depth_limit=depth_limit)
     place = region.paste(
         np.arange(int(np.prod(region.shape(1)))).reshape(region.shape(1)[:3]), np.zeros(mask.shape, int)
     )

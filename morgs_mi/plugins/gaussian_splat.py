@@ -22,10 +22,14 @@ from morgs_mi.render.channels import aov_attributes, attribute_widths, exr_names
 from morgs_mi.render.kernel_recording import render_lock
 from morgs_mi.render.projection import AttachedCamera
 from morgs_mi.render.rasterize import rasterize
+from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["GaussianSplatIntegrator"]
 
 _log = logging.getLogger(__name__)
+
+# Settings of the rasteriser that are properties of the plugin.
+_SETTINGS = ("eps2d", "alpha_min", "stop_transmittance", "antialiased", "first_order_motion", "reproducible")
 
 
 class _SceneGaussians:
@@ -115,6 +119,14 @@ def _sensor_camera(sensor: Any, border: int) -> Camera:
     return AttachedCamera(K, viewmat, *size, sensor.id(), near, intrinsics=(f, f, cx, cy))
 
 
+def _render_config(props: Any) -> RenderConfig:
+    """Return the settings of the rasteriser that the properties give."""
+    try:
+        return RenderConfig(**{name: props[name] for name in _SETTINGS if name in props})
+    except ValueError as error:
+        raise ValueError(f"gaussian_splat: {error}") from None
+
+
 class GaussianSplatIntegrator(mi.CppADIntegrator):
     r"""Gaussian splatting integrator (:monosp:`gaussian_splat`).
 
@@ -134,6 +146,22 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
        - Further channels, a comma-separated list of `motion` (`motion.X`, `motion.Y`: displacement since the
          last frame, px), `depth` (`depth.Y`: expected z, world units) and the channels of attributes such as
          `confidence` (`confidence.Y`). Channels that are not listed are not computed. (Default: none)
+
+     * - eps2d, alpha_min, stop_transmittance
+       - |float|
+       - Cut-offs of the rasteriser, see `RenderConfig`. (Default: 0.3, 1/255, 1e-4)
+
+     * - antialiased
+       - |bool|
+       - Whether small splats fade instead of growing, for models that were trained so. (Default: False)
+
+     * - first_order_motion
+       - |bool|
+       - Whether `motion` is linear in the displacement, as in the MoRGS paper. (Default: False)
+
+     * - reproducible
+       - |bool|
+       - Whether gradients are summed in a fixed order, at twice the time. (Default: False)
 
      * - surfaces
        - |integrator|
@@ -155,6 +183,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
     def __init__(self, props: Any) -> None:
         super().__init__(props)
         self.srgb_primitives = bool(props.get("srgb_primitives", True))
+        self.config = _render_config(props)
         background = props.get("background", None)
         self.background = None if background is None else np.broadcast_to(np.array(background, float), 3).tolist()
         names = (name.strip() for name in props.get("aovs", "").split(","))
@@ -254,7 +283,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
             self._warn_about_emitters(scene)
             columns = self._splats(gaussians, camera, channels, crop)
         else:
-            columns = composite(gaussians, channels, self.background, surfaces)
+            columns = composite(gaussians, channels, self.background, surfaces, self.config)
         values = [*columns["color"], *(columns["alpha"] if has_alpha else [])]
         values += [mi.Float(1)]  # the sample's weight
         values += [value for name in self.aovs for value in columns[name]]
@@ -270,7 +299,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         self, gaussians: Any, camera: Camera, channels: tuple[str, ...], crop: tuple[int, int, int, int]
     ) -> dict[str, list[Float]]:
         """Return the channels of a scene without surfaces, colour in linear light."""
-        image = rasterize(gaussians, camera, channels, self.background)
+        image = rasterize(gaussians, camera, channels, self.background, config=self.config)
         columns = {name: cropped(image[name], crop) for name in channels}
         if self.srgb_primitives:
             columns["color"] = [mi.math.srgb_to_linear(value) for value in columns["color"]]

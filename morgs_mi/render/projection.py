@@ -43,6 +43,8 @@ _HALF_LOG2E = 0.5 * log2(2.718281828459045)
 
 # World units, or units of a channel; squares of what is farther or larger overflow.
 FARTHEST = 1e18
+# Opacities below are drawn as this one, below any `alpha_min`: its logarithm is finite.
+_FAINTEST = 1e-9
 # A float32 rotation orients a needle to 1e-7 of its length at best: aspects below this are clamped.
 _THINNEST = 1e-6
 
@@ -184,11 +186,14 @@ def project(
     eps = dr.maximum(config.eps2d * dr.square(r_size), _THINNEST**2)
     xx, yy, xy = dr.dot(u0, u0), dr.dot(u1, u1), dr.dot(u0, u1)
     # Lagrange's identity: det(U U' + eps I) without the cancellation that xx yy - xy^2 has for needles.
-    det = dr.squared_norm(dr.cross(u0, u1)) + eps * (xx + yy) + eps * eps
+    det_exact = dr.squared_norm(dr.cross(u0, u1))
+    det = det_exact + eps * (xx + yy) + eps * eps
     xx, yy = xx + eps, yy + eps
     r_det, r_yy, s = dr.rsqrt(det), dr.rsqrt(yy), sqrt(_HALF_LOG2E) * r_size
     a, b, c = s * yy * r_yy * r_det, -s * xy * r_yy * r_det, s * r_yy
-    log2_opacity = dr.log2(dr.maximum(opacities, 1e-9))
+    log2_opacity = dr.log2(dr.maximum(opacities, _FAINTEST))
+    if config.antialiased:
+        log2_opacity += 0.5 * dr.log2(dr.maximum(det_exact / det, _FAINTEST**2))
     shape = (mean_x, mean_y, a, b, c, log2_opacity)
     line = _depth_profile(z, (u0, u1, w), (xx, xy, yy), det, eps, r_focal, r_scale) if "profile" in channels else ()
 
@@ -205,7 +210,7 @@ def project(
             blended[name] = (z,)
         elif name in ("motion", "guided_motion"):
             motion = gaussians.rows("motion", rows) if name == "motion" else _guided_motion(gaussians, rows)
-            blended[name] = _screen_motion(motion, x * rz, y * rz, fx * rz, fy * rz, R)
+            blended[name] = _screen_motion(motion, (x * rz, y * rz, z), (fx, fy), near, R, config.first_order_motion)
         elif name == "features":
             blended[name] = tuple(tensor_rows(features, rows))
         elif name in attributes:
@@ -366,8 +371,29 @@ def _colors(direction: Jit, coeffs: list[Float]) -> tuple[Float, ...]:
 
 
 def _screen_motion(
-    motion: list[Float], tan_x: Float, tan_y: Float, jx: Float, jy: Float, R: list[list[Float]]
+    motion: list[Float],
+    point: tuple[Float, Float, Float],
+    focal: tuple[Float, Float],
+    near: Float,
+    R: list[list[Float]],
+    first_order: bool,
 ) -> tuple[Float, Float]:
-    """Return pi(motion) in px: the first-order projection of a displacement (eq. 6), J R motion."""
-    mx, my, mz = (sum(R[i][k] * motion[k] for k in range(3)) for i in range(3))
-    return jx * (mx - tan_x * mz), jy * (my - tan_y * mz)
+    """Return the displacement pi(x) - pi(x - v) in px, where v = R motion: fx (vx - x/z vz) / (z - vz), likewise for y.
+
+    With z instead of z - vz it is J v, the first-order projection (eq. 6). It is returned on request, and where x - v
+    is behind the near plane.
+
+    Args:
+        motion: displacement in the world since the last frame.
+        point: x/z, y/z and z in camera space.
+        focal: fx and fy, px.
+        near: near plane, world units.
+        R: rotation of the camera.
+        first_order: whether J v is requested.
+    """
+    vx, vy, vz = (sum(R[i][k] * motion[k] for k in range(3)) for i in range(3))
+    tan_x, tan_y, z = point
+    earlier = z - vz
+    depth = z if first_order else dr.select(earlier >= near, earlier, z)
+    fx, fy = focal
+    return fx * (vx - tan_x * vz) / depth, fy * (vy - tan_y * vz) / depth

@@ -16,12 +16,18 @@ class RenderConfig:
 
     eps2d: Annotated[float, AtLeast(0), AtMost(1e18)] = 0.3  # beyond, float32 overflows
     """Low-pass filter in px^2, added to the projected covariance; it prevents splats from falling between pixels."""
+    antialiased: bool = False
+    """Reduce the opacity by what the low-pass filter adds to a splat's area, sqrt(det S / det (S + eps2d I)) (Yu et al.
+    2024): small splats fade instead of growing. For models that were trained so."""
     alpha_min: Annotated[float, Above(0)] = 1.0 / 255.0
     """Alpha below which a Gaussian is skipped at a pixel: it cannot change an 8-bit image."""
     alpha_max: Annotated[float, Above(0), Below(1)] = 0.99
     """Upper limit of alpha; it bounds 1 / (1 - alpha) in the adjoint."""
     stop_transmittance: Annotated[float, AtLeast(0), Below(1)] = 1e-4
     """Transmittance of its most transparent pixel below which a block ends; bounds the error of the colour."""
+    first_order_motion: bool = False
+    """Draw motion to first order, J(mean) * motion, as in the MoRGS paper (eq. 6), instead of the difference of two
+    projections. The relative difference is motion in depth / depth."""
     block_width: Annotated[int, AtLeast(4), AtMost(16), MultipleOf(4)] | None = None
     """Width in pixels of the block of one SIMD lane; pixels are read and written in packets of 4. None: 8 on the CPU, 4
     on the GPU."""

@@ -43,6 +43,24 @@ def test_project__inverts_the_rays_of_the_mitsuba_sensor(camera):
     assert_close(camera.project(points)[0], np.stack([x, y], axis=1), atol=2e-3)
 
 
+def test_from_sensor__inverts_sensor(camera):
+    K = camera.K + np.array([[0, 0, 3.5], [0, 0, -2.25], [0, 0, 0]])
+    off_centre = replace(camera, K=K, name="cam07", near=0.3)
+    crop = {"crop_offset_x": 5, "crop_offset_y": 4, "crop_width": 20, "crop_height": 10}
+    view = Camera.from_sensor(mi.load_dict({**off_centre.sensor(**crop), "id": "cam07"}))
+    assert_close(view.K, K, atol=1e-4)
+    assert_close(view.viewmat, camera.viewmat, atol=1e-6)
+    assert (view.width, view.height, view.name) == (camera.width, camera.height, "cam07")
+    assert view.near == pytest.approx(0.3)
+
+
+def test_from_sensor__refuses_other_sensors(camera):
+    with pytest.raises(ValueError, match=r"Camera\.from_sensor\(\): .* got ThinLensCamera; splats are drawn only by"):
+        Camera.from_sensor(mi.load_dict({"type": "thinlens", "aperture_radius": 0.1}))
+    with pytest.raises(ValueError, match="got a dict"):
+        Camera.from_sensor(camera.sensor())
+
+
 @pytest.mark.parametrize("ratio", [0.8, 0.99, 1.3])
 def test_sensor__refuses_two_focal_lengths(camera, ratio):
     K = np.diag([1, ratio, 1]) @ camera.K

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi import Camera, Gaussians, ellipsoids, rasterize
+from morgs_mi import Camera, Gaussians, RenderConfig, ellipsoids, rasterize
 from tests import tolerances as tol
 from tests.assertions import assert_close
 from tests.gaussian_integrator.expected import expected_image, to_linear
@@ -25,6 +25,26 @@ def test_gaussian_splat__image_is_the_rasterisers_in_linear_light(raw, srgb_prim
     color = np.asarray(rasterize(gaussians, make_sensor_camera()).color, np.float64)
     expected = to_linear(color) if srgb_primitives else color
     assert_close(image, expected, atol=tol.IMAGE_ABS)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"eps2d": 1.5},
+        {"alpha_min": 0.2},
+        {"stop_transmittance": 0.999},
+        {"antialiased": True},
+        {"first_order_motion": True},
+    ],
+    ids=lambda settings: next(iter(settings)),
+)
+def test_gaussian_splat__has_the_settings_of_the_rasteriser(raw, settings):
+    gaussians = to_gaussians(raw)
+    image = np.asarray(mi.render(make_mitsuba_scene(gaussians, srgb_primitives=False, aovs="motion", **settings)))
+    by_default = np.asarray(mi.render(make_mitsuba_scene(gaussians, srgb_primitives=False, aovs="motion")))
+    expected = rasterize(gaussians, make_sensor_camera(), ("color", "motion"), config=RenderConfig(**settings))
+    assert_close(image, np.concatenate([expected.color, expected.motion], axis=2), atol=tol.IMAGE_ABS)
+    assert np.abs(image - by_default).max() > 1e-3
 
 
 def test_gaussian_splat__channels_agree_with_the_reference_under_their_exr_names(raw):

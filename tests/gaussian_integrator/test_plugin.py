@@ -77,6 +77,29 @@ for variant in ("scalar_rgb", "llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
     ]
 
 
+def test_entry_point__registers_the_integrators_without_the_package():
+    """Mitsuba imports the module after the variant is set, and reloads it after each change."""
+    script = r"""
+import importlib, sys
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+import morgs_mi_plugins
+print("\n>", any(name.startswith("morgs_mi.") for name in sys.modules))
+for variant in ("llvm_ad_rgb", "scalar_rgb", "llvm_ad_rgb"):
+    mi.set_variant(variant)
+    importlib.reload(morgs_mi_plugins)
+    try:
+        print("\n>", mi.load_dict({"type": "gaussian_splat", "aovs": "depth"}).aov_names())
+    except RuntimeError as error:
+        print("\n>", "expected a variant such as 'llvm_ad_rgb'" in str(error))
+"""
+    lines = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    ).stdout.splitlines()
+    shown = [line for line in lines if line.startswith(">")]
+    assert shown == ["> False", "> ['depth.Y']", "> True", "> ['depth.Y']"]
+
+
 def test_gaussian_splat__renders_a_shape_after_density_control(raw):
     """All attributes of a shape may change their length together."""
     scene = make_mitsuba_scene(to_gaussians(raw))
@@ -148,6 +171,8 @@ def test_gaussian_splat__refuses_films_other_than_rgb():
         ({"aovs": "normal"}, "`aovs` must be out of motion, confidence, depth, got 'normal'"),
         ({"max_depth": 3}, "unreferenced property"),
         ({"background": [0.5, 0.5]}, "background"),
+        ({"alpha_min": 2.0}, "gaussian_splat: RenderConfig.*`alpha_min` must be below"),
+        ({"eps2d": -1.0}, "`eps2d` must be"),
     ],
 )
 def test_gaussian_splat__refuses_bad_props_when_the_scene_is_loaded(props, message):

@@ -45,6 +45,25 @@ def test_rasterize__backward_agrees_with_the_reference_for_every_attribute(scene
             assert_close(found, expected[name], rtol=tol.GRADIENT_REL, name=name)
 
 
+def test_rasterize__antialiased_image_and_gradient_agree_with_the_reference(scene):
+    raw, camera = scene
+    raw = {**raw, "log_scales": raw["log_scales"] - 1.5}  # about a pixel, where the filter matters
+    weight = np.random.default_rng(5).normal(size=(camera.height, camera.width, 3))
+
+    def image_of(values):
+        return rasterize_view(values, camera, antialiased=True)["color"]
+
+    gaussians = to_gaussians(raw, grad=True)
+    color = rasterize(gaussians, camera, ("color",), config=RenderConfig(antialiased=True)).color
+    dr.backward(dr.sum(color * mi.TensorXf(np.float32(weight)), axis=None))
+    assert_close(color, image_of(raw), atol=tol.IMAGE_ABS)
+    assert np.abs(image_of(raw) - rasterize_view(raw, camera)["color"]).max() > 0.1
+    names = ["means", "log_scales", "quats", "logit_opacities"]
+    expected = reference.complex_step(lambda values: np.sum(image_of(values) * weight), raw, names)
+    for name in names:
+        assert_close(dr.grad(getattr(gaussians, name)), expected[name], rtol=tol.GRADIENT_REL, name=name)
+
+
 def test_rasterize__forward_mode_agrees_with_the_reference(scene):
     raw, camera = scene
     rng = np.random.default_rng(2)

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi import Gaussians, RenderConfig, rasterize
+from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.render.region import Region
 from tests import tolerances as tol
 from tests.assertions import assert_close
@@ -18,6 +18,7 @@ from tests.scenes.cameras import make_camera
 from tests.scenes.gaussians import (
     CHANNELS,
     as_float32,
+    isotropic,
     make_scene,
     to_gaussians,
 )
@@ -38,6 +39,22 @@ def test_rasterize__agrees_with_the_reference_in_every_channel(scene):
         # Where alpha is small, a normalised channel divides rounding errors by it.
         solid, scale = expected["alpha"] > 0.02, max(1.0, np.abs(expected[name]).max())
         assert_close(image[name], expected[name], atol=tol.IMAGE_ABS * scale, where=solid, name=name)
+
+
+@pytest.mark.parametrize(
+    ("motion", "first_order", "expected"),
+    [
+        ((0.1, 0.05, 0.2), False, (5.643, 2.822)),
+        ((0.1, 0.05, 0.2), True, (5.361, 2.681)),
+        ((0.1, 0.05, 4.2), False, (5.361, 2.681)),  # behind the camera one frame ago: to first order
+    ],
+)
+def test_rasterize__motion_of_one_gaussian_has_the_closed_form(motion, first_order, expected):
+    K = np.array([[214.44, 0, 8], [0, 214.44, 8], [0, 0, 1]])
+    gaussian = replace(isotropic([[0, 0, 4.0]], 0.05, 0.9, 0.5), motion=np.float32([motion]))
+    config = RenderConfig(first_order_motion=first_order)
+    image = rasterize(gaussian, Camera(K, np.eye(4), 16, 16), ("motion",), config=config)
+    assert np.asarray(image.motion)[8, 8] == pytest.approx(expected, abs=6e-4)
 
 
 def test_rasterize__blends_features_like_the_confidence(scene):
