@@ -127,7 +127,10 @@ def rasterize(
         if "motion" in raw:
             mx, my, mz = R @ raw["motion"][i]
             x0, y0, z0 = cam[i] - (mx, my, mz)
-            values["motion"] = np.array([fx * (x / z - x0 / z0), fy * (y / z - y0 / z0)])
+            if z0.real >= near:
+                values["motion"] = np.array([fx * (x / z - x0 / z0), fy * (y / z - y0 / z0)])
+            else:  # to first order
+                values["motion"] = np.array([fx / z * (mx - x / z * mz), fy / z * (my - y / z * mz)])
         if "logit_confidence" in raw:
             values["confidence"] = np.array([1 / (1 + np.exp(-raw["logit_confidence"][i]))])
         for name, value in values.items():
