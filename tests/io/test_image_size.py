@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from morgs_mi.capture.masks import opaque_pixels
 from morgs_mi.io.image_size import image_size
 from morgs_mi.io.video import FolderReader
 
@@ -45,14 +46,14 @@ def test_folder_reader__reads_every_format_and_upper_case(tmp_path: Path, suffix
         (tmp_path / f"{t}{suffix}").write_bytes(cv2.imencode(suffix.lower(), image)[1].tobytes())
     reader = FolderReader.open(tmp_path)
     assert [round(image.mean()) for image in reader.frames()] == [100, 101]
-    assert reader.opaque() == (None, True)
+    assert opaque_pixels(reader, "cam") == (None, "")
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".webp", ".png"])
 def test_folder_reader__masks_transparent_pixels_of_every_format(tmp_path: Path, suffix: str) -> None:
     file = tmp_path / f"0{suffix}"
     file.write_bytes(cv2.imencode(suffix, RGBA)[1].tobytes())
-    mask, constant = FolderReader.of_files([file]).opaque()
+    mask, note = opaque_pixels(FolderReader.of_files([file]), "cam")
     assert mask is not None
-    assert constant
+    assert "cam" in note
     np.testing.assert_array_equal(mask, RGBA[..., 3] == 255)
