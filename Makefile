@@ -10,9 +10,8 @@ STAMP := $(VENV)/.installed
 demo: setup
 	$(BIN)/morgs-mi demo out/demo
 
-# Two processes: compiling kernels, which takes most of the time, uses one core.
 test: setup
-	$(BIN)/pytest -n 2 --dist loadfile
+	$(BIN)/pytest
 
 test-slow: setup
 	$(BIN)/pytest -m "slow and not gpu"

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
-import cv2
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -25,9 +23,6 @@ from tests.scenes.gaussians import NEW_ATTRIBUTES
 from tests.scenes.moving_splats import CAMERAS, DISTANCE, FRAMES, PIXELS, STEP, moved, write_stream
 
 mi.set_variant("llvm_ad_rgb")  # one for all tests, which then share its kernels
-
-if "PYTEST_XDIST_WORKER" in os.environ:  # several processes share the cores
-    cv2.setNumThreads(1)
 
 
 @pytest.fixture(autouse=True)
