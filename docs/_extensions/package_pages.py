@@ -16,6 +16,8 @@ from sphinx.pycode import ModuleAnalyzer
 
 import morgs_mi
 
+# Modules of the integrators, which can be imported once a variant is set; Mitsuba's users read their docstrings.
+PER_VARIANT = {"morgs_mi.plugins.gaussian_splat", "morgs_mi.plugins.splat_path"}
 NOTEBOOK = re.compile(r"\]\((?:\.\./)+notebooks/(\w+)\.ipynb\)")
 
 
@@ -47,7 +49,7 @@ def modules_of(name: str) -> list[str]:
     """Return a module and, of a subpackage, all modules in it, by name."""
     package = import_module(name)
     inside = pkgutil.walk_packages(getattr(package, "__path__", []), f"{name}.")
-    return [name, *sorted(module.name for module in inside)]
+    return [name, *sorted(module.name for module in inside if module.name not in PER_VARIANT)]
 
 
 def chapter(module: str, page: str) -> str:
