@@ -1,6 +1,6 @@
 """The class of the integrator `gaussian_splat`, see `gaussian_integrator`.
 
-Its base class exists once per variant, so this module is imported anew after the variant has changed.
+Mitsuba has a base class for every variant, so this module is imported again after mi.set_variant().
 """
 
 from __future__ import annotations
@@ -79,16 +79,16 @@ def _shape_gaussians(shape: Any, attributes: list[str]) -> dict[str, Tensor]:
     data = mi.TensorXf(params["data"], (dr.width(params["data"]) // 10, 10))
     N = data.shape[0]
     part = {"means": data[:, :3], "scales": data[:, 3:6], "quats": data[:, mi.UInt32(9, 6, 7, 8)]}
-    allowed = attribute_widths()
+    all_widths = attribute_widths()
     for name in attributes:
-        widths = allowed[name]
+        widths = all_widths[name]
         size = dr.width(params[name]) if name in params else 0
         if size not in [N * width for width in widths]:
             expected = " or ".join(map(str, widths))
-            found = f"{size} values" if name in params else f"only {sorted(params.keys())}"
+            content = f"{size} values" if name in params else f"only {sorted(params.keys())}"
             raise ValueError(
                 f"gaussian_splat: the {shape.class_name()} {shape.id()!r} must have `{name}` [N, {expected}] with "
-                f"N={N}, got {found}; set it where the shape is defined."
+                f"N={N}, got {content}; set it where the shape is defined."
             )
         tail = (size // N // 3, 3) if name == "sh_coeffs" else BY_ACTIVATED_NAME[name].shape
         part[name] = mi.TensorXf(params[name], (N, *tail))
@@ -200,11 +200,11 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
                 "call mi.set_variant() before the scene is loaded, because Gaussians have RGB colours."
             )
         self.warned = False
-        known = aov_attributes()
+        names = aov_attributes()
         for name in self.aovs:
-            if name not in known:
+            if name not in names:
                 raise ValueError(
-                    f"gaussian_splat: `aovs` must be out of {', '.join(known)}, got {name!r}; separate them by commas."
+                    f"gaussian_splat: `aovs` must be out of {', '.join(names)}, got {name!r}; separate them by commas."
                 )
 
     def sample(self, *_: Any, **__: Any) -> Any:
@@ -278,7 +278,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         surfaces = None
         if self.surfaces is not None:
             pixels = SampledPixels(camera, crop, sensor, seed, spp)
-            surfaces = SurfaceView.of(scene, self.surfaces, pixels, gaussians, self.srgb_primitives)
+            surfaces = SurfaceView.of(scene, self.surfaces, pixels, gaussians, self.srgb_primitives, self.config)
         if surfaces is None:
             self._warn_about_emitters(scene)
             columns = self._splats(gaussians, camera, channels, crop)

@@ -13,7 +13,7 @@ there, `gaussian_splat` blends the splats.
 
 Derivatives are computed by path replay (Vicini et al. 2021), with the layers as constants.
 
-The base class exists once per variant, so this module is imported anew after the variant has changed.
+Mitsuba has a base class for every variant, so this module is imported again after mi.set_variant().
 """
 
 from __future__ import annotations

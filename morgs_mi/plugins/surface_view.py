@@ -20,6 +20,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.types import Bool, Float, Tensor, UInt32
 from morgs_mi.plugins.splat_rays import SplatRays
+from morgs_mi.render.render_config import RenderConfig
 
 __all__ = [
     "SampledPixels",
@@ -40,9 +41,9 @@ _GRID = 3
 _FIRST, _OTHERS = (1, 5, 6), (0, 2, 3, 4, 7, 8)
 
 
-def rays_for(integrator: Any, gaussians: ActivatedGaussians) -> SplatRays | None:
+def rays_for(integrator: Any, gaussians: ActivatedGaussians, config: RenderConfig | None = None) -> SplatRays | None:
     """Return N Gaussians prepared for a `splat_path`; None for other integrators."""
-    return SplatRays(gaussians) if hasattr(integrator, "splats") else None
+    return SplatRays(gaussians, config) if hasattr(integrator, "splats") else None
 
 
 @contextmanager
@@ -206,7 +207,12 @@ class SurfaceView:
 
     @staticmethod
     def of(
-        whole: Any, integrator: Any, pixels: SampledPixels, splats: ActivatedGaussians, srgb: bool
+        whole: Any,
+        integrator: Any,
+        pixels: SampledPixels,
+        splats: ActivatedGaussians,
+        srgb: bool,
+        config: RenderConfig | None = None,
     ) -> SurfaceView | None:
         """Render the surfaces of a scene, or return None if it has neither surfaces nor an environment.
 
@@ -216,6 +222,7 @@ class SurfaceView:
             pixels: pixels that are rendered, and their samples.
             splats: the Gaussians of the scene.
             srgb: whether their colours are sRGB-encoded.
+            config: cut-offs of rays through them.
 
         Raises:
             ValueError: as for `surface_scene`.
@@ -225,7 +232,7 @@ class SurfaceView:
             return None
         gaussians = [shape for shape in whole.shapes() if shape.is_ellipsoids()]
         sensor = pixels.sensor()
-        rays = rays_for(integrator, splats)
+        rays = rays_for(integrator, splats, config)
         with dr.suspend_grad(), traced(integrator, rays, srgb):
             image = mi.TensorXf(integrator.render(scene, sensor, seed=pixels.seed, spp=pixels.samples()))
             coverage, depth = coverage_and_depth(scene, sensor, pixels.camera, pixels.crop)

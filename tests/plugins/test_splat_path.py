@@ -69,6 +69,14 @@ def test_splat_path__shadow_of_one_gaussian_is_its_transmittance():
     assert_close(found, 1 - np.where(alpha < 1 / 255, 0, alpha), atol=0.02)
 
 
+def test_splat_path__shadows_have_the_cut_off_of_the_plugin():
+    image = ratio(isotropic([ASIDE], 0.3, 0.8, BLACK), props={"alpha_min": 0.5})
+    alpha = 0.8 * np.exp(-0.5 * (distance_to_aside() / 0.3) ** 2)
+    clear = np.abs(alpha - 0.5) > 0.15  # in other pixels, a part of the rays is above the cut-off
+    assert ((alpha > 0.1) & (alpha < 0.35)).any()
+    assert_close(image[clear], np.where(alpha < 0.5, 1, 1 - alpha)[clear], atol=0.03)
+
+
 def test_splat_path__shadow_of_a_dense_shell_is_that_of_the_mesh():
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(3000, 3))
