@@ -115,8 +115,9 @@ def plus_minus(values: Sequence[float], digits: int = 2) -> str:
 def span(values: Iterable[float], digits: int = 1) -> str:
     """Return the smallest and the largest value, or the only one."""
     ordered = sorted(values)
-    low, high = f"{ordered[0]:.{digits}f}", f"{ordered[-1]:.{digits}f}"
-    return low if low == high else f"{low} to {high}"
+    least = f"{ordered[0]:.{digits}f}"
+    most = f"{ordered[-1]:.{digits}f}"
+    return least if least == most else f"{least} to {most}"
 
 
 def blank_figure(width: float, height: float) -> Figure:

@@ -115,9 +115,10 @@ def _config(options: Options) -> StreamConfig:
 
 def _run(workers: int, start: float, seconds: float, reports: Sequence[FrameReport], stream: Path) -> Run:
     starts = StreamReader(stream).metadata["segments"]["starts"]
-    common, others = reports[:COMMON_FRAMES], reports[COMMON_FRAMES:]
-    seams = [report.seconds for report in others if report.frame in starts]
-    later = [report for report in others if report.frame not in starts]
+    common = reports[:COMMON_FRAMES]
+    frames = reports[COMMON_FRAMES:]
+    seams = [report.seconds for report in frames if report.frame in starts]
+    later = [report for report in frames if report.frame not in starts]
     return Run(
         workers,
         seconds,

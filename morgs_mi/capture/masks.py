@@ -39,8 +39,8 @@ def opaque_pixels(reader: FrameReader, name: str) -> tuple[np.ndarray | None, st
     """
     if not isinstance(reader, FolderReader):
         return None, ""
-    chosen = sorted({0, reader.num_frames // 2, reader.num_frames - 1})
-    mask, *others = (_opaque(reader.files[i], (reader.height, reader.width)) for i in chosen)
+    indices = sorted({0, reader.num_frames // 2, reader.num_frames - 1})
+    mask, *others = (_opaque(reader.files[i], (reader.height, reader.width)) for i in indices)
     if any(not np.array_equal(mask, other) for other in others):
         return None, f"{name}: the alpha channel of its images changes over time and is ignored."
     if mask.all():

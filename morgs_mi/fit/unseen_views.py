@@ -1,7 +1,7 @@
 """Forecast of views between the cameras of a fitted first frame, without a second fit.
 
-The PSNR of novel views is lower than that of the training views. The mean difference, the loss in dB, is modelled as a
-linear function of two features that need no further image: the PSNR of the training views, and their
+Novel views have a lower PSNR than training views. The mean difference, the loss in dB, is modelled as a linear function
+of two features that need no further image: the PSNR of the training views, and their
 
     disagreement    10 log10(1 + d / e) ,
 

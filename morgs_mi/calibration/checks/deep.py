@@ -331,14 +331,12 @@ _BALANCE = _Question(
     "has another white balance than the other cameras (R {R:+.0%}, G {G:+.0%}, B {B:+.0%}): set a fixed one"
     + _CORRECTION,
 )
-# Limits: px; frames that are nearer to a whole frame than to zero; a change of brightness above the 5 % that people who
-# walk through a room cause; octaves; a share of the image that no other camera sees. Where the limit is 0, the measure
-# has its own.
+# Where the limit is 0, the measure has its own.
 _QUESTIONS = (
     _Question(
         "error",
         _errors,
-        0.7,
+        0.7,  # px
         "has a reprojection error of {value:.2f} px, the others {usual:.2f} px: check its lens model and focal length, "
         "or calibrate again (morgs-mi calibrate)",
     ),
@@ -352,7 +350,7 @@ _QUESTIONS = (
     _Question(
         "time",
         _times,
-        0.65,
+        0.65,  # frames, nearer to a whole frame than to none
         "is {value:.1f} frames ({ms:.0f} ms) {side} the other cameras: use --offset {name} {option:g}, or record with "
         "synchronised cameras",
     ),
@@ -368,21 +366,21 @@ _QUESTIONS = (
     _Question(
         "variation",
         _lights,
-        0.08,
+        0.08,  # people who walk through a room change it by 5 %
         "change their brightness alike, by {value:.0%} over time: the light of the scene changes; use constant light",
         common=True,
     ),
     _Question(
         "variation",
         _variations,
-        0.08,
+        0.08,  # people who walk through a room change it by 5 %
         "changes its brightness by {value:.0%} over time, up to {jump:.0%} from frame to frame: fix the exposure"
         + _CORRECTION,
     ),
     _Question(
         "blur",
         _blurs,
-        1.0,
+        1.0,  # octaves
         "is less sharp than the other cameras, with {detail:.0%} of their fine detail: check focus and lens, and that "
         "its clip is not enlarged or strongly compressed",
     ),
@@ -402,7 +400,7 @@ _QUESTIONS = (
     _Question(
         "overlap",
         _overlaps,
-        0.7,
+        0.7,  # px
         "shares at most {share:.0%} of its image with another camera: turn it towards what the others see, or add a "
         "camera in between",
     ),

@@ -46,7 +46,7 @@ _CAMERA_MISTAKES = (
     (_UPRIGHT, _SIDEWAYS),
     (_UPRIGHT.T, _SIDEWAYS),
     (_ABOUT_FACE, "its pose looks backward: turn it by 180 degrees about its vertical axis"),
-    (_FLIP, "its pose is in other axes than those of the rest: negate its y and z axes"),
+    (_FLIP, "its pose is in other axes, unlike the other cameras: negate its y and z axes"),
 )
 # Every exchange of poses is compared with all matches, so their number is limited.
 _MAX_EXCHANGED, _MAX_PERMUTED = 12, 4
@@ -109,7 +109,7 @@ def camera_candidates(camera: Camera) -> Iterator[tuple[Camera, str]]:
     opposite = (camera.width, camera.height, 2) - camera.K[:, 2]
     turned_image = np.column_stack([camera.K[:, :2], opposite])
     yield replace(camera, viewmat=_HALF_TURN @ pose, K=turned_image), _UPSIDE_DOWN
-    yield replace(camera, viewmat=np.linalg.inv(pose)), "its pose is inverted, unlike those of the rest: invert it"
+    yield replace(camera, viewmat=np.linalg.inv(pose)), "its pose is inverted, the other poses are not: invert it"
 
 
 def focal_candidates(what: str, scaled: Callable[[float], T], error: Callable[[T], float]) -> list[tuple[T, str]]:

@@ -19,9 +19,15 @@ from morgs_mi.core.files import atomic_path
 __all__ = ["check_plot", "draw_deep", "draw_rig", "write_rig"]
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".svg", ".pdf")
-# Inches, and dots per inch.
-_WIDTH, _RIG_HEIGHT, _DEEP_HEIGHT, _DPI = 14.4, 7.6, 7.0, 100
-_USUAL, _MARKED = "tab:blue", "tab:red"
+# Inches.
+_WIDTH = 14.4
+_RIG_HEIGHT = 7.6
+_DEEP_HEIGHT = 7.0
+# Dots per inch.
+_DPI = 100
+# Colour of a camera, and of one with a finding.
+_USUAL = "tab:blue"
+_MARKED = "tab:red"
 # Colours of the channels of an image, and of the axes of the world.
 _THREE_COLORS = ("indianred", "seagreen", "royalblue")
 _MAX_POINTS = 20_000
@@ -29,8 +35,10 @@ _MAX_POINTS = 20_000
 _EDGES = [0, 1, 2, 3, 4, 1, 0, 2, 0, 3, 0, 4]
 # Width of a group of bars, as a share of its slot.
 _BAR = 0.7
-# Number of lines of the findings, and of characters of each.
-_MAX_LINES, _LINE = 16, 140
+# Number of lines of the findings.
+_MAX_LINES = 16
+# Characters of a line.
+_LINE_LENGTH = 140
 
 
 def check_plot(path: Path) -> None:
@@ -145,8 +153,7 @@ def _first_direction(vectors: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
 
 def _frustum(camera: Camera, depth: float) -> np.ndarray:
     """Return the camera's centre and the four corners of its image at `depth` [5, 3], world units."""
-    w, h = camera.width, camera.height
-    corners = np.array([[0, 0], [w, 0], [w, h], [0, h]])
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (camera.width, camera.height)
     return np.vstack([camera.position, camera.unproject(corners, np.full(4, depth))])
 
 
@@ -183,7 +190,7 @@ def draw_deep(figure: Any, check: DeepCheck) -> None:
     _label(panels["repeats"], "Repeated frames (red) and missing ones (grey)", "frame")
     _label(panels["findings"], f"Findings: {len(check.findings)}")
     sentences = [*(finding.sentence for finding in check.findings), check.unmeasured]
-    lines = "\n".join(fill(sentence, _LINE, subsequent_indent="  ") for sentence in sentences).splitlines()
+    lines = "\n".join(fill(sentence, _LINE_LENGTH, subsequent_indent="  ") for sentence in sentences).splitlines()
     lines = lines if len(lines) <= _MAX_LINES else [*lines[: _MAX_LINES - 1], "..."]
     panels["findings"].set_axis_off()
     text = panels["findings"].text(0, 1, "\n".join(lines), va="top", fontsize=8, transform=panels["findings"].transAxes)

@@ -304,17 +304,17 @@ def _correct_rig(capture: Capture, pairs: _Pairs, checks: Sequence[CameraCheck])
     """Return the cameras corrected for a mistake in several poses, and its description; None if none explains all."""
     wrong = [view for view, check in enumerate(checks) if check.fits is False]
     largest = pairs.sampled(_FACTOR_PAIRS)
-    given = pairs.worst()
+    error = pairs.worst()
     candidates = focal_candidates(
         "the focal lengths of all cameras seem",
         lambda factor: [with_focal_factor(camera, factor) for camera in capture.cameras],
         lambda cameras: _median(np.concatenate(largest.with_cameras(cameras).errors)),
     )
-    if given > _GOOD_ERROR:
+    if error > _GOOD_ERROR:
         candidates = [*rig_candidates(capture, wrong), *candidates]
     errors = [pairs.with_cameras(cameras).worst() for cameras, _ in candidates]
     index = int(np.argmin([*errors, np.inf]))
-    return candidates[index] if min(errors, default=np.inf) <= min(given / _GAIN, MAX_ERROR) else None
+    return candidates[index] if min(errors, default=np.inf) <= min(error / _GAIN, MAX_ERROR) else None
 
 
 def _copies(shared: SharedFeatures, checks: Sequence[CameraCheck], cameras: Sequence[Camera]) -> dict[int, str]:

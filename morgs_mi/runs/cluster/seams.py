@@ -45,7 +45,7 @@ class SegmentConfig:
     epochs: Annotated[int, AtLeast(1)] = 4
     """Passes over all training views in each of them."""
     overlap: Annotated[int, AtLeast(0)] = 10
-    """Frames before a segment that are fitted too: its Gaussians then follow the recording as those of others do."""
+    """Frames before a segment that are fitted as well: its Gaussians then follow the recording from its first frame."""
 
     def __post_init__(self) -> None:
         check_ranges(self)

@@ -99,7 +99,7 @@ class Segment:
         start, stop: its frames.
         frame: the next one to fit.
         restart: encoded packets that lead a decoder to the state before that frame, a keyframe and perhaps a residual.
-            Before the first frame of a segment it is the common model; nothing before that of the recording.
+            Before a segment begins, they lead to the common model; before the recording begins, there are none.
     """
 
     start: int
