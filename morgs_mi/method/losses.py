@@ -1,7 +1,5 @@
 """The terms of eq. 13: L_recon (eq. 2), L_flow (eq. 7), L_mask (eq. 11) and L_off, each a scalar Dr.Jit tensor.
 
-The depth term of the first frame, which is not in the paper, is here as well.
-
 Every loss is a mean over pixels or Gaussians. Its weight does not depend on the size of the image.
 """
 
@@ -17,7 +15,7 @@ from morgs_mi.core.types import Float, Tensor
 from morgs_mi.method.ssim import OnRegion, Target, WholeView
 from morgs_mi.render.region import Region
 
-__all__ = ["depth_loss", "flow_loss", "mask_loss", "offset_loss", "recon_loss"]
+__all__ = ["flow_loss", "mask_loss", "offset_loss", "recon_loss"]
 
 
 def recon_loss(image: Tensor, target: Target, dssim_weight: float = 0.2, region: Region | None = None) -> Tensor:
@@ -79,28 +77,6 @@ def mask_loss(confidence: Tensor, mask: Tensor, num_pixels: int | None = None) -
     _check_shape("mask_loss()", "confidence", confidence, (*pixels, 1))
     _check_shape("mask_loss()", "mask", mask, pixels)
     return _mean(dr.abs(confidence.array - mask.array), num_pixels)
-
-
-def depth_loss(depth: Tensor, target: Tensor, weights: Tensor, unit: float) -> Tensor:
-    """Return the mean absolute error of the rendered inverse depth, weighted per pixel and relative to a unit.
-
-    The inverse of the expected depth is compared, as networks estimate inverse depth; the far background has little
-    weight in it.
-
-    Args:
-        depth: rendered depth [H, W, 1], world units; pixels where it is 0 do not count.
-        target: inverse depth [H, W], 1 / world units.
-        weights: [H, W], e.g. the rendered alpha, or 0 where the target is unknown. The mean is over all pixels.
-        unit: inverse depth by which errors are divided, 1 / world units. The scene's scale then does not matter.
-    """
-    pixels = _shape_of(depth)[:-1]
-    _check_shape("depth_loss()", "depth", depth, (*pixels, 1))
-    _check_shape("depth_loss()", "target", target, pixels)
-    _check_shape("depth_loss()", "weights", weights, pixels)
-    check_number("depth_loss()", "unit", unit, "(0, inf)")
-    drawn = depth.array > 0
-    error = dr.abs(dr.rcp(dr.select(drawn, depth.array, 1)) - target.array)
-    return _mean(dr.select(drawn, error * weights.array, 0) * dr.opaque(mi.Float, 1 / unit), None)
 
 
 def offset_loss(offset: Tensor, extent: float, num_gaussians: int | None = None) -> Tensor:

@@ -9,7 +9,7 @@ import pytest
 
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.evaluate.metrics import ssim
-from morgs_mi.method.losses import depth_loss, flow_loss, mask_loss, offset_loss, recon_loss
+from morgs_mi.method.losses import flow_loss, mask_loss, offset_loss, recon_loss
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.region import Region
 from tests import tolerances as tol
@@ -130,42 +130,6 @@ def test_mask_loss__is_the_mean_absolute_difference():
     assert found == pytest.approx(np.abs(confidence[..., 0] - mask).mean(), rel=1e-5)
 
 
-def depth_images():
-    """Return a rendered depth with undrawn pixels, inverse depth to match, and weights."""
-    rng = np.random.default_rng(5)
-    depth, target, weights = rng.uniform(1, 4, (7, 8, 1)), rng.uniform(0.2, 1, (7, 8)), rng.uniform(0, 1, (7, 8))
-    depth[2:4, 3:6] = 0
-    return depth.astype(np.float32), target.astype(np.float32), weights.astype(np.float32)
-
-
-def slow_depth(depth, target, weights, unit):
-    """The depth term in float64."""
-    depth = depth[..., 0].astype(np.float64)
-    error = np.abs(1 / np.where(depth > 0, depth, 1) - target) * weights / unit
-    return np.where(depth > 0, error, 0).mean()
-
-
-def test_depth_loss__agrees_with_the_reference():
-    depth, target, weights = depth_images()
-    found = item(depth_loss(*(mi.TensorXf(each) for each in (depth, target, weights)), 0.4))
-    assert found == pytest.approx(slow_depth(depth, target, weights, 0.4), rel=1e-5)
-
-
-def test_depth_loss__gradient_agrees_with_central_differences():
-    depth, target, weights = depth_images()
-    x = mi.TensorXf(depth)
-    dr.enable_grad(x)
-    dr.backward(depth_loss(x, mi.TensorXf(target), mi.TensorXf(weights), 0.4))
-    grad, rng = np.asarray(dr.grad(x), np.float64), np.random.default_rng(6)
-    assert np.all(grad[2:4, 3:6] == 0)
-    # Steps that cross neither the kink of the absolute value nor the limit of what is drawn.
-    free = (depth > 0) & (np.abs(1 / np.maximum(depth, 1) - target[..., None]) > 1e-3)
-    for _ in range(3):
-        v, h = rng.normal(size=depth.shape) * free, 1e-4
-        up, down = (slow_depth(depth + s * h * v, target, weights, 0.4) for s in (1, -1))
-        assert np.vdot(grad, v) == pytest.approx((up - down) / (2 * h), rel=tol.LOSS_GRADIENT_REL)
-
-
 def test_offset_loss__is_the_mean_l1_norm_in_scene_extents():
     offset = np.random.default_rng(4).normal(size=(7, 3)).astype(np.float32)
     assert item(offset_loss(mi.TensorXf(offset), 2.0)) == pytest.approx(np.abs(offset).sum(1).mean() / 2, rel=1e-5)
@@ -270,8 +234,6 @@ def tensor(*shape):
         (lambda: flow_loss(tensor(4, 5, 2), tensor(4, 5, 2), tensor(5, 4)), r"`reliable` must be \[4, 5\]"),
         (lambda: flow_loss(np.ones((4, 5, 2)), tensor(4, 5, 2), tensor(4, 5)), "`motion` must be a .*TensorXf"),
         (lambda: mask_loss(tensor(4, 5, 1), tensor(1, 1)), r"`mask` must be \[4, 5\]"),
-        (lambda: depth_loss(tensor(4, 5, 1), tensor(4, 5), tensor(4, 4), 1.0), r"`weights` must be \[4, 5\]"),
-        (lambda: depth_loss(tensor(4, 5, 1), tensor(4, 5), tensor(4, 5), 0.0), "`unit` must be a number"),
         (lambda: offset_loss(tensor(4, 2), 1.0), r"`offset` must be \[4, 3\]"),
         (lambda: offset_loss(tensor(4, 3), np.nan), r"`extent` must be a number in \(0, inf\), got nan"),
         (lambda: recon_loss(tensor(4, 5, 3), Target(np.ones((4, 5, 3))), np.nan), "`dssim_weight` must be a number"),
