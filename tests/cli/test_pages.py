@@ -58,7 +58,7 @@ def test_commands__of_a_page_run_to_the_end(page: str, recordings: Path, tmp_pat
     monkeypatch.chdir(tmp_path / "there")
     cameras = " ".join(str(clip) for clip in sorted(Path("CAPTURE").glob("*.mp4")))
     found = commands(page)
-    assert len(found) >= 2
+    assert found, f"{page} has no commands"
     for command in found:
         given = command.replace("--camera 0 1 2 3", f"--camera {cameras}").replace(" > settings.toml", "")
         if given.startswith("morgs-mi import frames"):

@@ -33,7 +33,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("demo")
     steps: list[str] = []
     run_demo(folder, SMALL, lambda step, done, total: steps.append(step))
-    fits = [f"Fitting: {stage}" for stage in ("trial", "first frame", "later frames")]
+    fits = [f"Fitting: {stage}" for stage in ("balancing cameras", "first frame", "later frames")]
     plain = [f"Fitting without ML, MO, MC: {stage}" for stage in ("reading the fitted frames", "later frames")]
     assert list(dict.fromkeys(steps))[:6] == ["Path-tracing the clip", *fits, *plain]
     return folder
