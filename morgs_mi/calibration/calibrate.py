@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -95,19 +95,12 @@ class CalibrationResult:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A model of COLMAP.
+    """A model of COLMAP."""
 
-    Attributes:
-        mapper: the mapper that made it.
-        model: pycolmap's reconstruction.
-        checks: result of every camera, including the ones without a pose.
-        principal_points: whether each image has a principal point of its own.
-    """
-
-    mapper: Mapper
-    model: Any
-    checks: tuple[CameraCheck, ...]
-    principal_points: bool = False
+    mapper: Mapper  # the mapper that made it
+    model: Any  # pycolmap's reconstruction
+    checks: tuple[CameraCheck, ...]  # result of every camera, including the ones without a pose
+    principal_points: bool = False  # whether each image has a principal point of its own
 
     @property
     def error(self) -> float:
@@ -371,7 +364,9 @@ def _median_error(model: Any) -> float:
 
 
 def _check_features(path: Path, database: Path) -> None:
-    with _opened(database) as db:
+    import pycolmap
+
+    with closing(pycolmap.Database.open(database)) as db:
         counts = {Path(i.name).stem: db.num_keypoints_for_image(i.image_id) for i in db.read_all_images()}
     if poor := {name: count for name, count in counts.items() if count < _MIN_FEATURES}:
         table = ", ".join(f"{count} in {name}" for name, count in poor.items())
@@ -382,7 +377,9 @@ def _check_features(path: Path, database: Path) -> None:
 
 
 def _check_pairs(path: Path, database: Path) -> None:
-    with _opened(database) as db:
+    import pycolmap
+
+    with closing(pycolmap.Database.open(database)) as db:
         count = len(db.read_all_images())
         _, geometries = db.read_two_view_geometries()
     if not any(len(geometry.inlier_matches) for geometry in geometries):
@@ -390,17 +387,6 @@ def _check_pairs(path: Path, database: Path) -> None:
             f"{path}: no two of the {count} views match: they may show different objects, be too far apart (more than "
             f"about 30 degrees), or not be simultaneous; move the cameras closer, or {_MORE_TEXTURE}."
         )
-
-
-@contextmanager
-def _opened(database: Path) -> Iterator[Any]:
-    import pycolmap
-
-    db = pycolmap.Database.open(database)
-    try:
-        yield db
-    finally:
-        db.close()
 
 
 @contextmanager

@@ -157,27 +157,16 @@ def refine_cameras(
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Cameras to refine, and the images that evaluate them.
+    """Cameras to refine, and the images that evaluate them."""
 
-    Attributes:
-        capture: capture with the calibrated cameras.
-        indices: indices of the V training views with an image.
-        views: these views, reduced, without the withheld blocks.
-        unseen: their withheld blocks.
-        extent: scene extent, world units.
-        config: settings of the fit.
-        render: cut-offs.
-        seed: seed of all random choices.
-    """
-
-    capture: Capture
-    indices: tuple[int, ...]
-    views: tuple[View, ...]
-    unseen: tuple[View, ...]
-    extent: float
-    config: FitConfig
-    render: RenderConfig
-    seed: int
+    capture: Capture  # capture with the calibrated cameras
+    indices: tuple[int, ...]  # indices of the V training views with an image
+    views: tuple[View, ...]  # these views, reduced, without the withheld blocks
+    unseen: tuple[View, ...]  # their withheld blocks
+    extent: float  # scene extent, world units
+    config: FitConfig  # settings of the fit
+    render: RenderConfig  # cut-offs
+    seed: int  # seed of all random choices
 
     @classmethod
     def of(cls, capture: Capture, config: FitConfig, render: RenderConfig, seed: int) -> _Problem:

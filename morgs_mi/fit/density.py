@@ -69,11 +69,6 @@ class DensityPlan:
         """Number of births."""
         return int((self.source < 0).sum())
 
-    @property
-    def num_survivors(self) -> int:
-        """Number of survivors."""
-        return len(self.source) - self.num_births
-
 
 class Room(NamedTuple):
     """Largest number of births of a round, and of Gaussians after it."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -233,11 +233,7 @@ def _panels(capture: Capture, stream: Path, scale: float, note: str = "") -> lis
         panels = {"truth": recorded.images[view], "render": rendered, "error": channel_image("color", error)}
         if truth is not None:
             panels["true motion"] = channel_image("motion", truth.motion, scale)
-        panels |= {name: channel_image(name, images[name], scale) for name in _motion_channels(images)}
+        panels |= {n: channel_image(n, images[n], scale) for n in ("motion", "confidence") if n in images}
         labels = {"truth": f"truth, frame {index}", "error": f"error x{_ERROR_GAIN}", "true motion": "true motion"}
         frames.append({name: label(panel, labels.get(name, name + note)) for name, panel in panels.items()})
     return frames
-
-
-def _motion_channels(images: Mapping[str, np.ndarray]) -> Sequence[str]:
-    return [name for name in ("motion", "confidence") if name in images]

@@ -213,17 +213,11 @@ def _unmatched(views: Sequence[int], matches: Sequence[Match]) -> list[tuple[int
 
 @dataclass(frozen=True)
 class _Pairs:
-    """Reprojection errors of all pairs of views with matches.
+    """Reprojection errors of all pairs of views with matches."""
 
-    Attributes:
-        shared: the matches.
-        cameras: the poses.
-        errors: per match of a pair [M], px.
-    """
-
-    shared: SharedFeatures
-    cameras: tuple[Camera, ...]
-    errors: tuple[np.ndarray, ...]
+    shared: SharedFeatures  # the matches
+    cameras: tuple[Camera, ...]  # the poses
+    errors: tuple[np.ndarray, ...]  # per match of a pair [M], px
 
     @classmethod
     def of(cls, shared: SharedFeatures, cameras: Sequence[Camera]) -> _Pairs:
@@ -248,10 +242,6 @@ class _Pairs:
         few = (replace(m, features=m.features[:: -(-len(m.features) // _SAMPLE)]) for m in largest)
         return self.of(replace(self.shared, matches=tuple(few)), self.cameras)
 
-    def with_cameras(self, cameras: Sequence[Camera]) -> _Pairs:
-        """Return the errors with other poses."""
-        return self.of(self.shared, cameras)
-
     def worst(self) -> float:
         """Return the largest median error of a view, px; NaN without matches."""
         medians = [_median(errors) for view in range(len(self.cameras)) if len(errors := self.of_view(view))]
@@ -265,9 +255,10 @@ class _Pairs:
         """
         group = {view for match in self.shared.matches for view in match.views}
         while group:
-            bad = {view: _share_of_large(self.of_view(view, group)) for view in sorted(group)}
-            worst = max(bad, key=lambda view: bad[view])
-            if bad[worst] <= 0.5:
+            errors = {view: self.of_view(view, group) for view in sorted(group)}
+            shares = {view: np.mean(own > MAX_ERROR) if len(own) else 1.0 for view, own in errors.items()}
+            worst = max(shares, key=lambda view: shares[view])
+            if shares[worst] <= 0.5:
                 break
             group = group - {worst}
         return group
@@ -276,10 +267,6 @@ class _Pairs:
 def _is_shared(match: Match, view: int, partners: Collection[int] | None) -> bool:
     """Return whether a match is between a view and one of its `partners`, which are all views if None."""
     return view in match.views and (partners is None or (set(match.views) - {view}) <= set(partners))
-
-
-def _share_of_large(errors: np.ndarray) -> float:
-    return float((errors > MAX_ERROR).mean()) if len(errors) else 1.0
 
 
 def _median(errors: np.ndarray) -> float:
@@ -308,34 +295,32 @@ def _correct_rig(capture: Capture, pairs: _Pairs, checks: Sequence[CameraCheck])
     candidates = focal_candidates(
         "the focal lengths of all cameras seem",
         lambda factor: [with_focal_factor(camera, factor) for camera in capture.cameras],
-        lambda cameras: _median(np.concatenate(largest.with_cameras(cameras).errors)),
+        lambda cameras: _median(np.concatenate(_Pairs.of(largest.shared, cameras).errors)),
     )
     if error > _GOOD_ERROR:
         candidates = [*rig_candidates(capture, wrong), *candidates]
-    errors = [pairs.with_cameras(cameras).worst() for cameras, _ in candidates]
+    errors = [_Pairs.of(pairs.shared, cameras).worst() for cameras, _ in candidates]
     index = int(np.argmin([*errors, np.inf]))
     return candidates[index] if min(errors, default=np.inf) <= min(error / _GAIN, MAX_ERROR) else None
 
 
 def _copies(shared: SharedFeatures, checks: Sequence[CameraCheck], cameras: Sequence[Camera]) -> dict[int, str]:
     """Return the reason for each camera with the pose or the clip of another one."""
-    found: dict[int, str] = {}
+    reasons: dict[int, str] = {}
     for pair in same_poses(cameras):
         # If one of the two fits, the pose is its own.
-        wrong = [view for view in pair if not checks[view].fits] or pair
-        for view in wrong:
-            other = checks[pair[0] + pair[1] - view].name
-            found.setdefault(
-                view, f"it has the same pose as {other}: give each camera its own, or leave the copy out (--without)"
-            )
+        for view in [view for view in pair if not checks[view].fits] or pair:
+            other = checks[sum(pair) - view].name
+            remedy = "give each camera its own, or leave the copy out (--without)"
+            reasons.setdefault(view, f"it has the same pose as {other}: {remedy}")
     for match in shared.matches:
         a, b = (shared.features[view].points[match.features[:, k]] for k, view in enumerate(match.views))
         if np.median(np.linalg.norm(a - b, axis=1)) < _SAME_IMAGE:
             for view in match.views:
-                if view in found or not checks[view].fits:
+                if view in reasons or not checks[view].fits:
                     other = checks[sum(match.views) - view].name
-                    found[view] = f"its images are those of {other}: one clip is a copy of the other; replace it"
-    return found
+                    reasons[view] = f"its images are those of {other}: one clip is a copy of the other; replace it"
+    return reasons
 
 
 def _explain_camera(view: int, check: CameraCheck, pairs: _Pairs, group: set[int]) -> str:

@@ -213,17 +213,11 @@ def match_clips(
 
 @dataclass(frozen=True)
 class _NamedMatch:
-    """Clips and the cameras that they belong to.
+    """Clips and the cameras that they belong to."""
 
-    Attributes:
-        clips: clips by name.
-        images: indices of the cameras of each clip that has some, by the clip's name.
-        without: names of the cameras that have no clip.
-    """
-
-    clips: Mapping[str, Clip]
-    images: dict[str, list[int]]
-    without: list[str]
+    clips: Mapping[str, Clip]  # clips by name
+    images: dict[str, list[int]]  # indices of the cameras of each clip that has some, by the clip's name
+    without: list[str]  # names of the cameras that have no clip
 
 
 def _best_match(
