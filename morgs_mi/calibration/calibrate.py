@@ -70,27 +70,17 @@ class CalibrateConfig:
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """Result of `calibrate`.
+    """Result of `calibrate`."""
 
-    Attributes:
-        model: folder of the COLMAP model.
-        cameras: names of the calibrated cameras.
-        left_out: names of the cameras that could not be calibrated.
-        points: number of points.
-        error: mean reprojection error of the points, px.
-        checks: result of every camera, including the ones left out; `matches` is the number of its points.
-        mapper: COLMAP's mapper of the model, ``"incremental"`` or ``"global"``.
-        principal_points: whether each image has a principal point of its own.
-    """
-
-    model: Path
-    cameras: tuple[str, ...]
-    left_out: tuple[str, ...]
-    points: int
-    error: float
+    model: Path  #: Folder of the COLMAP model.
+    cameras: tuple[str, ...]  #: Names of the calibrated cameras.
+    left_out: tuple[str, ...]  #: Names of the cameras that could not be calibrated.
+    points: int  #: Number of points.
+    error: float  #: Mean reprojection error of the points, px.
+    #: Result of every camera, including the ones left out; `matches` is the number of its points.
     checks: tuple[CameraCheck, ...]
-    mapper: Mapper
-    principal_points: bool
+    mapper: Mapper  #: COLMAP's mapper of the model, ``"incremental"`` or ``"global"``.
+    principal_points: bool  #: Whether each image has a principal point of its own.
 
 
 @dataclass(frozen=True)

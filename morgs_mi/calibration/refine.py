@@ -80,27 +80,17 @@ _LATER_RATES = {"means": 0.25, "scales": 0.5, "quats": 0.5, "opacities": 0.25}
 
 @dataclass(frozen=True)
 class Refinement:
-    """Result of refining cameras.
+    """Result of refining cameras."""
 
-    Attributes:
-        taken: whether the refined cameras are used.
-        calibrated_psnr: PSNR of withheld pixels in a fit with the calibrated cameras, dB; NaN without a comparison.
-        refined_psnr: PSNR of the same pixels in a fit with the refined cameras, dB.
-        tracks: number of points in the bundle adjustment; 0 if there were too few.
-        rotation: largest change of a rotation, degrees.
-        position: largest change of a position, world units.
-        focal: largest relative change of a focal length.
-        distortion: largest shift of a pixel by the remaining distortion, in image widths.
-    """
-
-    taken: bool
+    taken: bool  #: Whether the refined cameras are used.
+    #: PSNR of withheld pixels in a fit with the calibrated cameras, dB; NaN without a comparison.
     calibrated_psnr: float
-    refined_psnr: float
-    tracks: int
-    rotation: float
-    position: float
-    focal: float
-    distortion: float = 0.0
+    refined_psnr: float  #: PSNR of the same pixels in a fit with the refined cameras, dB.
+    tracks: int  #: Number of points in the bundle adjustment; 0 if there were too few.
+    rotation: float  #: Largest change of a rotation, degrees.
+    position: float  #: Largest change of a position, world units.
+    focal: float  #: Largest relative change of a focal length.
+    distortion: float = 0.0  #: Largest shift of a pixel by the remaining distortion, in image widths.
 
     @property
     def sentence(self) -> str:

@@ -71,22 +71,16 @@ _MOVED, _LEAST_FOUND = 0.5, 0.05
 
 @dataclass(frozen=True)
 class TimeOffsets:
-    """Time offsets of the cameras.
+    """Time offsets of the cameras."""
 
-    Attributes:
-        offsets: by name, the frame of each camera's clip that is simultaneous with frame 0 of the reference's, as in
-            `ReadConfig.offset`; negative for a camera that began later.
-        errors: by name, standard errors of the offsets, frames: large where the images hardly depend on the offset.
-        reference: name of the held-out camera, or of the first one; its offset does not change.
-        change: largest change in the last round, frames.
-        converged: whether `change` is within the tolerance; the accuracy of the offsets is in `errors`.
-    """
-
+    #: By name, the frame of each camera's clip that is simultaneous with frame 0 of the reference's, as in
+    #: `ReadConfig.offset`; negative for a camera that began later.
     offsets: dict[str, float]
+    #: By name, standard errors of the offsets, frames: large where the images hardly depend on the offset.
     errors: dict[str, float]
-    reference: str
-    change: float
-    converged: bool
+    reference: str  #: Name of the held-out camera, or of the first one; its offset does not change.
+    change: float  #: Largest change in the last round, frames.
+    converged: bool  #: Whether `change` is within the tolerance; the accuracy of the offsets is in `errors`.
 
 
 def estimate_time_offsets(

@@ -43,19 +43,13 @@ _MOVING = 0.1
 
 @dataclass(frozen=True)
 class Protocol:
-    """A published way to score 3D point tracks.
+    """A published way to score 3D point tracks."""
 
-    Attributes:
-        name: name in tables.
-        thresholds: of the distance: pixels if `per_view`, otherwise centimetres.
-        survival: distance at which a track fails, cm; None if the protocol defines neither survival nor MTE.
-        per_view: whether each view is a video of its own, with its points counted together in all frames.
-    """
-
-    name: str
-    thresholds: tuple[float, ...]
+    name: str  #: Name in tables.
+    thresholds: tuple[float, ...]  #: Of the distance: pixels if `per_view`, otherwise centimetres.
+    #: Distance at which a track fails, cm; None if the protocol defines neither survival nor MTE.
     survival: float | None
-    per_view: bool = False
+    per_view: bool = False  #: Whether each view is a video of its own, with its points counted together in all frames.
 
     @property
     def description(self) -> str:
@@ -71,25 +65,17 @@ MVTRACKER = Protocol("MVTracker", (5, 10, 20, 40), 100)
 
 @dataclass(frozen=True)
 class Comparison:
-    """Tracks of P points through T frames beside the true ones, in one video: one view, or several that see as one.
+    """Tracks of P points through T frames beside the true ones, in one video: one view, or several that see as one."""
 
-    Attributes:
-        truth: true positions [P, T, 3], world units.
-        found: tracked positions [P, T, 3].
-        visible: bool [P, T], whether the true point is visible; None if unknown, which counts as visible.
-        found_visible: bool [P, T], whether the tracked point is predicted to be visible.
-        alive: bool [P, T], whether the tracked point is bound to a living Gaussian.
-        queries: int [P], the index of each track's query frame.
-        pixel: [P, T], width of a pixel at the true point in world units, for an image with a shorter side of 256;
-            None for several views.
-    """
-
-    truth: np.ndarray
-    found: np.ndarray
+    truth: np.ndarray  #: True positions [P, T, 3], world units.
+    found: np.ndarray  #: Tracked positions [P, T, 3].
+    #: bool [P, T], whether the true point is visible; None if unknown, which counts as visible.
     visible: np.ndarray | None
-    found_visible: np.ndarray
-    alive: np.ndarray
-    queries: np.ndarray
+    found_visible: np.ndarray  #: bool [P, T], whether the tracked point is predicted to be visible.
+    alive: np.ndarray  #: bool [P, T], whether the tracked point is bound to a living Gaussian.
+    queries: np.ndarray  #: int [P], the index of each track's query frame.
+    #: [P, T], width of a pixel at the true point in world units, for an image with a shorter side of 256; None for
+    #: several views.
     pixel: np.ndarray | None = None
 
     def select(self, rows: np.ndarray) -> Comparison:

@@ -19,21 +19,13 @@ __all__ = ["FlowObservation", "observe_key_views"]
 
 @dataclass(frozen=True, eq=False)
 class FlowObservation:
-    """Optical flow of one key view at one frame.
+    """Optical flow of one key view at one frame."""
 
-    Attributes:
-        motion: x_t - x_{t-1} [H, W, 2] in px on frame t's grid: the negative of the flow to frame t - 1.
-        reliable: [H, W] bool, where forward and backward flow agree.
-        forward_flow: x_t - x_{t-1} [H, W, 2] in px on frame t - 1's grid: the flow to frame t.
-        forward_reliable: [H, W] bool, likewise.
-        mask: motion mask [H, W] bool (eq. 10), or None if it was not requested.
-    """
-
-    motion: np.ndarray
-    reliable: np.ndarray
-    forward_flow: np.ndarray
-    forward_reliable: np.ndarray
-    mask: np.ndarray | None = None
+    motion: np.ndarray  #: x_t - x_{t-1} [H, W, 2] in px on frame t's grid: the negative of the flow to frame t - 1.
+    reliable: np.ndarray  #: [H, W] bool, where forward and backward flow agree.
+    forward_flow: np.ndarray  #: x_t - x_{t-1} [H, W, 2] in px on frame t - 1's grid: the flow to frame t.
+    forward_reliable: np.ndarray  #: [H, W] bool, likewise.
+    mask: np.ndarray | None = None  #: Motion mask [H, W] bool (eq. 10), or None if it was not requested.
 
 
 def observe_key_views(

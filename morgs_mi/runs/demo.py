@@ -59,27 +59,17 @@ class DemoConfig:
 
 @dataclass(frozen=True)
 class DemoReport:
-    """Results of the demonstration.
+    """Results of the demonstration."""
 
-    Attributes:
-        config: the settings.
-        full: evaluation of the fit with motion, offset and confidence.
-        plain: evaluation of the fit without.
-        compared_frames: indices of the frames that both fits have, without the first.
-        comparison: mean scores over these frames, by fit (``full``, ``plain``) and by name.
-        seconds: wall time by step, and ``total``.
-        machine: the machine, see `core.environment`.
-        versions: of the libraries, likewise.
-    """
-
-    config: DemoConfig
-    full: Evaluation
-    plain: Evaluation
-    compared_frames: list[int]
+    config: DemoConfig  #: The settings.
+    full: Evaluation  #: Evaluation of the fit with motion, offset and confidence.
+    plain: Evaluation  #: Evaluation of the fit without.
+    compared_frames: list[int]  #: Indices of the frames that both fits have, without the first.
+    #: Mean scores over these frames, by fit (``full``, ``plain``) and by name.
     comparison: dict[str, dict[str, float | None]]
-    seconds: dict[str, float]
-    machine: dict[str, Any]
-    versions: dict[str, str]
+    seconds: dict[str, float]  #: Wall time by step, and ``total``.
+    machine: dict[str, Any]  #: The machine, see `core.environment`.
+    versions: dict[str, str]  #: Of the libraries, likewise.
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content of ``report.json``."""

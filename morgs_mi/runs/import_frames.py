@@ -44,19 +44,12 @@ _LEAST_SURVIVORS = 0.8
 
 @dataclass(frozen=True)
 class Imported:
-    """Result of an import.
+    """Result of an import."""
 
-    Attributes:
-        path: the stream.
-        num_frames: number of its frames.
-        num_keyframes: number of the frames that start a new set of Gaussians.
-        num_bytes: size of the stream.
-    """
-
-    path: Path
-    num_frames: int
-    num_keyframes: int
-    num_bytes: int
+    path: Path  #: The stream.
+    num_frames: int  #: Number of its frames.
+    num_keyframes: int  #: Number of the frames that start a new set of Gaussians.
+    num_bytes: int  #: Size of the stream.
 
 
 def import_frames(

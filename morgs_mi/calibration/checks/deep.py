@@ -51,54 +51,31 @@ _CORRECTION = "; fit corrects it (not with --exposure off)"
 
 @dataclass(frozen=True)
 class Finding:
-    """A fault of a recording.
+    """A fault of a recording."""
 
-    Attributes:
-        question: name of the check: error, time, exposure, variation, flicker, blur, repeats or overlap.
-        cameras: names of the cameras that it concerns.
-        sentence: numbers and advice.
-    """
-
-    question: str
-    cameras: tuple[str, ...]
-    sentence: str
+    question: str  #: Name of the check: error, time, exposure, variation, flicker, blur, repeats or overlap.
+    cameras: tuple[str, ...]  #: Names of the cameras that it concerns.
+    sentence: str  #: Numbers and advice.
 
 
 @dataclass(frozen=True)
 class DeepCheck:
-    """Result of checking a recording; missing measurements are NaN.
+    """Result of checking a recording; missing measurements are NaN."""
 
-    Attributes:
-        names: names of the C cameras.
-        frames: number T of frames that were read.
-        fps: frames per second.
-        given: time offset with which each camera was read, frames.
-        errors: median reprojection error of each camera [C], px.
-        offsets: time offset of each camera from the median [C], frames.
-        halves: the same in the first and the last half of the frames [2, C].
-        gains: log gain of each camera's channels in linear light, relative to the median [C, 3].
-        brightness: log brightness of each camera over time, relative to its median [T, C].
-        sharpness: per image [T, C], octaves.
-        repeated: per camera the frames that repeat the previous one.
-        lamps: per camera the flicker of lamps, or None.
-        overlaps: share of each camera's image that each other camera sees [C, C].
-        findings: faults.
-    """
-
-    names: tuple[str, ...]
-    frames: int
-    fps: float
-    given: tuple[float, ...]
-    errors: np.ndarray
-    offsets: np.ndarray
-    halves: np.ndarray
-    gains: np.ndarray
-    brightness: np.ndarray
-    sharpness: np.ndarray
-    repeated: tuple[tuple[int, ...], ...]
-    lamps: tuple[Lamp | None, ...]
-    overlaps: np.ndarray
-    findings: tuple[Finding, ...] = ()
+    names: tuple[str, ...]  #: Names of the C cameras.
+    frames: int  #: Number T of frames that were read.
+    fps: float  #: Frames per second.
+    given: tuple[float, ...]  #: Time offset with which each camera was read, frames.
+    errors: np.ndarray  #: Median reprojection error of each camera [C], px.
+    offsets: np.ndarray  #: Time offset of each camera from the median [C], frames.
+    halves: np.ndarray  #: The same in the first and the last half of the frames [2, C].
+    gains: np.ndarray  #: Log gain of each camera's channels in linear light, relative to the median [C, 3].
+    brightness: np.ndarray  #: Log brightness of each camera over time, relative to its median [T, C].
+    sharpness: np.ndarray  #: Per image [T, C], octaves.
+    repeated: tuple[tuple[int, ...], ...]  #: Per camera the frames that repeat the previous one.
+    lamps: tuple[Lamp | None, ...]  #: Per camera the flicker of lamps, or None.
+    overlaps: np.ndarray  #: Share of each camera's image that each other camera sees [C, C].
+    findings: tuple[Finding, ...] = ()  #: Faults.
 
     @property
     def largest_overlaps(self) -> np.ndarray:

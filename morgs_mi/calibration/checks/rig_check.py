@@ -62,22 +62,15 @@ _NO_OVERLAP = (
 
 @dataclass(frozen=True)
 class CameraCheck:
-    """Result of checking the pose of one camera.
+    """Result of checking the pose of one camera."""
 
-    Attributes:
-        name: name of the camera.
-        matches: number of its matches with other cameras.
-        error: median reprojection error of its matches with the cameras that fit, or of all its matches if there are
-            none, px. NaN without matches, infinite if most of the points lie behind a camera.
-        fits: whether the pose fits the images; None if that could not be checked.
-        advice: the reason and a remedy; empty if the pose fits.
-    """
-
-    name: str
-    matches: int
+    name: str  #: Name of the camera.
+    matches: int  #: Number of its matches with other cameras.
+    #: Median reprojection error of its matches with the cameras that fit, or of all its matches if there are none, px.
+    #: NaN without matches, infinite if most of the points lie behind a camera.
     error: float
-    fits: bool | None
-    advice: str = ""
+    fits: bool | None  #: Whether the pose fits the images; None if that could not be checked.
+    advice: str = ""  #: The reason and a remedy; empty if the pose fits.
 
     @property
     def verdict(self) -> str:
@@ -87,36 +80,23 @@ class CameraCheck:
 
 @dataclass(frozen=True)
 class RigCheck:
-    """Result of checking the poses on the first frame.
+    """Result of checking the poses on the first frame."""
 
-    Attributes:
-        matches: number of matches, over all pairs of views.
-        pairs: number of pairs of views with matches.
-        error: median reprojection error, px; NaN without matches.
-        cameras: result of each camera.
-        fits: whether all poses fit the images; None if no pose is known to be wrong but some could not be checked.
-        advice: one sentence with the result, and the remedy if it is the same for all cameras.
-    """
-
-    matches: int
-    pairs: int
-    error: float
-    cameras: tuple[CameraCheck, ...]
+    matches: int  #: Number of matches, over all pairs of views.
+    pairs: int  #: Number of pairs of views with matches.
+    error: float  #: Median reprojection error, px; NaN without matches.
+    cameras: tuple[CameraCheck, ...]  #: Result of each camera.
+    #: Whether all poses fit the images; None if no pose is known to be wrong but some could not be checked.
     fits: bool | None
-    advice: str
+    advice: str  #: One sentence with the result, and the remedy if it is the same for all cameras.
 
 
 @dataclass(frozen=True)
 class SharedFeatures:
-    """Features of a capture's first frame and their matches between views.
+    """Features of a capture's first frame and their matches between views."""
 
-    Attributes:
-        features: per camera, in pixels of the recorded size.
-        matches: per pair of cameras with matches.
-    """
-
-    features: tuple[Features, ...]
-    matches: tuple[Match, ...]
+    features: tuple[Features, ...]  #: Per camera, in pixels of the recorded size.
+    matches: tuple[Match, ...]  #: Per pair of cameras with matches.
 
 
 def match_capture(capture: Capture, progress: Callable[[int, int], None] | None = None) -> SharedFeatures:
