@@ -15,8 +15,6 @@ from benchmarks.reports.plots import grouped, markdown
 from benchmarks.reports.unseen import out_of_capture
 from morgs_mi.fit.unseen_views import WIDEST
 
-__all__ = ["TABLES"]
-
 
 def study_table(report: Any, *names: str) -> str:
     """Return the table of a study over the committed fits of some results."""

@@ -14,8 +14,6 @@ from morgs_mi.capture.lens import Lens, Undistortion
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.video import FrameReader, ImageOrError
 
-__all__ = ["CameraSource", "at_clip_size"]
-
 
 @dataclass(frozen=True)
 class CameraSource:

@@ -28,8 +28,6 @@ from morgs_mi.io.bounded import read_json
 from morgs_mi.io.unread import warn_unread
 from morgs_mi.io.video import FrameReader
 
-__all__ = ["ReadConfig", "Timeline", "nearest_frames", "read_settings", "timeline"]
-
 _LOG = logging.getLogger(__name__)
 _DEFAULT_FPS = 30.0
 _SETTINGS = {"fps", "test_view", "meters_per_unit", "readout"}

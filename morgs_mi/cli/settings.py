@@ -16,23 +16,6 @@ from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.documentation import page
 from morgs_mi.loop.stream_config import PresetName, StreamConfig, apply_preset, apply_values, read_config, relocated
 
-__all__ = [
-    "SETTINGS",
-    "ChannelName",
-    "Flag",
-    "GivenReading",
-    "GivenSettings",
-    "HeldOut",
-    "Reading",
-    "Settings",
-    "Without",
-    "held_out",
-    "one_of",
-    "optional",
-    "place",
-    "setting",
-]
-
 # The setting of every option. All others are set in a file.
 SETTINGS = {
     "seed": "seed",

@@ -7,8 +7,6 @@ from typing import Annotated
 
 from morgs_mi.core.ranges import Above, AtLeast, AtMost, check_ranges
 
-__all__ = ["CodecConfig"]
-
 
 @dataclass(frozen=True)
 class CodecConfig:

@@ -11,8 +11,6 @@ from rich.table import Table
 from morgs_mi.evaluate.measures import REGIONS
 from morgs_mi.evaluate.results import Evaluation
 
-__all__ = ["evaluation_summary", "evaluation_tables", "figure"]
-
 _METRICS = (("PSNR, dB", "psnr", 2), ("SSIM", "ssim", 4), ("dE2000", "delta_e", 2))
 _METRICS += (("LPIPS", "lpips", 4), ("flow error, px", "motion_error", 2))
 _FRAME = (("PSNR, dB", "psnr", 2), ("moving", "psnr_moving", 2), ("SSIM", "ssim", 4))

@@ -23,8 +23,6 @@ from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.view import LEAST_GAIN, View, mean_psnr, rendered, withheld_blocks
 from morgs_mi.method.exposure import Exposure, centred, fit_exposure
 
-__all__ = ["Balance", "balance_cameras", "balance_config"]
-
 # Fits that are compared: to the images as recorded and to the balanced ones.
 _COMPARED = 2
 # Difference of tones, of 1, below which `auto` takes cameras as alike. The first round measures up to 0.002 on

@@ -26,8 +26,6 @@ from morgs_mi.fit.first_frame import LAST_ROUND
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.view import View, half_sized
 
-__all__ = ["Plan", "plan_first_frame"]
-
 # Seconds of a step per Gaussian, and per pixel of its view.
 _GAUSSIAN_SECONDS = 2.2e-7
 _PIXEL_SECONDS = 0.5e-7

@@ -29,8 +29,6 @@ from morgs_mi.fit.empty_space import in_empty_space
 from morgs_mi.fit.fit_config import DensityConfig
 from morgs_mi.fit.optimise import replace_parameter
 
-__all__ = ["DensityPlan", "Room", "apply_plan", "plan_additions", "plan_growth", "resize_optimizer"]
-
 # float32 has no opacity closer to 1.
 _MAX_OPACITY = 1 - 1e-6
 # Opacity of a birth in a later frame: low, because unnecessary births are then pruned soon.

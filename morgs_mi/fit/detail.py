@@ -19,8 +19,6 @@ from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.noise import noise_of
 from morgs_mi.fit.view import View
 
-__all__ = ["count_details", "with_num_gaussians"]
-
 # A value of a block follows from its mean and the other three.
 _INDEPENDENT = 3 / 4
 # Difference from the mean of a block, relative to white, from which a value is a detail, and the same in standard

@@ -21,8 +21,6 @@ from morgs_mi.fit.forecast import forecast
 from morgs_mi.fit.noise import is_noisy
 from morgs_mi.fit.problem import FirstFrameProblem
 
-__all__ = ["adapted_to_images", "default_dropping", "dropped"]
-
 # Number of views that are fitted without dropping.
 _MANY_VIEWS = 6
 # Logit of an opacity that no cut-off of the renderer lets pass, and the largest opacity.

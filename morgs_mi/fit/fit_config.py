@@ -9,15 +9,6 @@ from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.ranges import Above, AtLeast, AtMost, Below, check_ranges
 from morgs_mi.method.objective import ObjectiveConfig
 
-__all__ = [
-    "CameraPriors",
-    "DensityConfig",
-    "DetailConfig",
-    "FitConfig",
-    "LearningRates",
-    "ShortFitConfig",
-]
-
 # Epochs of a later frame before the learning rate of the means begins to decay.
 _CONSTANT_EPOCHS = 2
 # Epochs of a later frame that its learning rates were chosen for: they are larger in fewer epochs.

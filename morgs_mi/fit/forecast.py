@@ -16,8 +16,6 @@ from morgs_mi.core.rig import (
     surface_of,
 )
 
-__all__ = ["Forecast", "forecast", "quality_of"]
-
 _WORDS = ("good", "fair", "poor")
 # Limits of good and of fair views between the cameras: loss against the training views in dB, PSNR in dB, and the angle
 # in degrees, of `Forecast.reach`, at which the loss is about as large (`docs/experiments/first-frame.md`).

@@ -16,16 +16,6 @@ from morgs_mi.core.rig import focus_depths, scene_extent, seen_points
 from morgs_mi.fit.empty_space import in_empty_space
 from morgs_mi.fit.view import View
 
-__all__ = [
-    "MIN_POINTS",
-    "Points",
-    "fill_points",
-    "from_points",
-    "initial_points",
-    "resample_points",
-    "seed_points",
-]
-
 Points = tuple[np.ndarray, np.ndarray]
 """Points [P, 3] in world units, and their colours [P, 3] in [0, 1], display-referred."""
 MIN_POINTS = 20

@@ -28,8 +28,6 @@ from morgs_mi.method.rigidity import find_neighbours
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 
-__all__ = ["FrameProblem", "LaterFrame", "fit_later_frame"]
-
 _SCORES = "scores"  # name of the loss of the densification scores, which is 0
 # The round of density control is due when the loss hardly falls, and at this fraction of the epochs at the latest: the
 # residual has shown by then where Gaussians are missing, and enough steps are left to fit the births.

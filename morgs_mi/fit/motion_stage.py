@@ -15,8 +15,6 @@ from morgs_mi.method.losses import recon_loss
 from morgs_mi.method.motion_model import MotionModel, moved
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 
-__all__ = ["fit_motion"]
-
 # Learning rates at the end, as a fraction of those at the start.
 _FINAL_RATE = 0.1
 

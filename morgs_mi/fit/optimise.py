@@ -15,8 +15,6 @@ from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Tensor
 from morgs_mi.render.kernel_recording import render_lock
 
-__all__ = ["Losses", "Steps", "adam", "optimise", "replace_parameter", "values_of", "view_order"]
-
 Losses = dict[str, Tensor]
 
 

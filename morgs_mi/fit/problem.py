@@ -15,8 +15,6 @@ from morgs_mi.fit.initialise import Points, from_points, initial_points
 from morgs_mi.fit.view import View, half_sized, mean_psnr
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["FirstFrameProblem"]
-
 # Least scene extent, relative to the median depth: of means that move by fractions of the extent.
 _DEPTH = 1 / 6
 # Opacity of the Gaussians at the start: most can become opaque or vanish within the steps of a first frame.

@@ -32,8 +32,6 @@ from morgs_mi.fit.view import View, mean_psnr
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["REGRESSION", "WIDEST", "WIDEST_REACH", "Regression", "UnseenViews", "features_of", "unseen_views"]
-
 WIDEST = 6.0
 """Width of an interval in dB beyond which only the word is certain."""
 WIDEST_REACH = 20.0

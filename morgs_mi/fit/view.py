@@ -14,8 +14,6 @@ from morgs_mi.method.ssim import Target
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["LEAST_GAIN", "View", "decibels", "half_sized", "mean_psnr", "rendered", "squared_errors", "withheld_blocks"]
-
 LEAST_GAIN = 0.1
 """Increase of the PSNR of withheld pixels from which a change of the cameras is taken, dB: less is chance."""
 

@@ -15,8 +15,6 @@ from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.loop.observation import Images, Setup, views_of
 from morgs_mi.method.exposure import Exposure
 
-__all__ = ["Correction", "estimate_correction"]
-
 
 @dataclass(frozen=True)
 class Correction:

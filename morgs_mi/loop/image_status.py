@@ -7,8 +7,6 @@ from collections.abc import Mapping, Sequence
 import cv2
 import numpy as np
 
-__all__ = ["image_status"]
-
 # px: thumbnails of this width keep the layout of a scene, without noise and the motion between two frames.
 _WIDTH = 16
 # Standard deviation of the thumbnail of an image of one colour, in grey levels.

@@ -7,8 +7,6 @@ from typing import Annotated
 
 from morgs_mi.core.ranges import Above, AtLeast, AtMost, Below, MultipleOf, check_ranges
 
-__all__ = ["RenderConfig"]
-
 
 @dataclass(frozen=True)
 class RenderConfig:

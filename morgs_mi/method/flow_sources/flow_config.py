@@ -7,8 +7,6 @@ from typing import Annotated
 
 from morgs_mi.core.ranges import AtLeast, check_ranges
 
-__all__ = ["FlowConfig"]
-
 
 @dataclass(frozen=True)
 class FlowConfig:

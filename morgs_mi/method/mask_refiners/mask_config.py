@@ -7,8 +7,6 @@ from typing import Annotated
 
 from morgs_mi.core.ranges import AtLeast, check_ranges
 
-__all__ = ["MaskConfig"]
-
 
 @dataclass(frozen=True)
 class MaskConfig:

@@ -17,18 +17,6 @@ from morgs_mi.playback.default_rig import DEFAULT_RIG
 from morgs_mi.playback.export.paths import CameraPath, focus, load_path, orbit, through_cameras
 from morgs_mi.playback.player import available_channels, render, render_config
 
-__all__ = [
-    "flight",
-    "flight_views",
-    "frame_numbers",
-    "named_path",
-    "num_images",
-    "repeated_frames",
-    "repeated_seconds",
-    "select_frames",
-    "write_each",
-]
-
 Progress = Callable[[int, int], None] | None
 # Angle of an orbit around Gaussians without a recording. Scenes fall apart from behind, and may be tilted.
 _SWING = 60.0

@@ -28,8 +28,6 @@ from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import rotated, unit_quats
 
-__all__ = ["glb", "write_gltf"]
-
 _NAME = "KHR_gaussian_splatting"
 _FLOAT, _ARRAY_BUFFER, _POINTS = 5126, 34962, 0
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}

@@ -39,17 +39,6 @@ from morgs_mi.render.channels import exr_names
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.synth.scene import failures_in
 
-__all__ = [
-    "LAYERS",
-    "InsertConfig",
-    "Light",
-    "captured_light",
-    "inserted_channels",
-    "load_insert",
-    "render_inserted",
-    "selected",
-]
-
 LAYERS = ("splats", "surfaces", "shadow")
 """Further channels, for compositing: the splats alone and the surfaces alone, in linear light with alpha, and the
 shadow of the surfaces on the splats, a factor of their linear light."""

@@ -13,8 +13,6 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.files import atomic_path
 from morgs_mi.playback.export.formats import TRACKS, choose_format
 
-__all__ = ["Tracks", "extract_tracks", "write_tracks"]
-
 
 @dataclass(frozen=True)
 class Tracks:

@@ -28,8 +28,6 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.playback.default_rig import DEFAULT_RIG
 from morgs_mi.playback.player import MOTION_SCALE, metadata_entry, stream_name
 
-__all__ = ["published_bytes", "served_page", "text_of_bytes", "web_page", "write_web_folder", "write_web_page"]
-
 Progress = Callable[[int], None]
 
 # What an HTML parser replaces (NUL, carriage return) or could take for the end of a script (<).
