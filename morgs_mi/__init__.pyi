@@ -12,6 +12,8 @@ from .evaluate.evaluate import evaluate_stream
 from .evaluate.point_tracks import PointTracks, track_points
 from .fit.fit_config import FitConfig
 from .gaussian_integrator import ellipsoids
+from .io.ply import write_ply
+from .io.splats import read_splats
 from .loop.stream_config import StreamConfig
 from .method.motion_config import MotionConfig
 from .playback.export.tracks import extract_tracks
@@ -61,6 +63,7 @@ __all__ = [
     "motion_image",
     "open_stream",
     "rasterize",
+    "read_splats",
     "render_lock",
     "render_stream",
     "shadow_ratio",
@@ -69,4 +72,5 @@ __all__ = [
     "synthesize",
     "track_points",
     "with_near_planes",
+    "write_ply",
 ]

@@ -88,7 +88,8 @@ def _shape_gaussians(shape: Any, attributes: list[str]) -> dict[str, Tensor]:
             content = f"{size} values" if name in params else f"only {sorted(params.keys())}"
             raise ValueError(
                 f"gaussian_splat: the {shape.class_name()} {shape.id()!r} must have `{name}` [N, {expected}] with "
-                f"N={N}, got {content}; set it where the shape is defined."
+                f"N={N}, got {content}; set it where the shape is defined, or write its file by "
+                "morgs_mi.write_ply(path, gaussians, layout='mitsuba')."
             )
         tail = (size // N // 3, 3) if name == "sh_coeffs" else BY_ACTIVATED_NAME[name].shape
         part[name] = mi.TensorXf(params[name], (N, *tail))

@@ -131,7 +131,7 @@ BAD_SCENES = {
     "no motion": (
         lambda: with_shape(motion=None),
         {"aovs": "motion"},
-        r"`motion` \[N, 3\] with N=10, got only \['",
+        r"`motion` \[N, 3\] with N=10, got only \['.*write_ply\(path, gaussians, layout='mitsuba'\)",
     ),
     "nan": (lambda: with_shape(opacities=ones(10, 1) * dr.nan), {}, r"`opacities` must be finite, got nan at \[0\]"),
     "thin lens": (
@@ -221,6 +221,22 @@ SCENE_FILE = """<scene version="3.0.0">
         <film type="hdrfilm"><integer name="width" value="32"/><integer name="height" value="16"/></film>
     </sensor>
 </scene>"""
+
+
+@pytest.mark.parametrize("shape", ["ellipsoids", "ellipsoidsmesh"])
+def test_gaussian_splat__renders_the_same_channels_from_a_file_as_from_a_dictionary(tmp_path, raw, shape):
+    expected = np.asarray(mi.render(make_mitsuba_scene(to_gaussians(raw), aovs=AOVS)))
+    write_ply(tmp_path / "gaussians.ply", to_gaussians(raw), layout="mitsuba")
+    text = SCENE_FILE.replace(
+        '<integrator type="gaussian_splat"/>',
+        f"""<integrator type="gaussian_splat">
+        <string name="aovs" value="{AOVS}"/></integrator>""",
+    ).replace("ellipsoids", shape)
+    (tmp_path / "scene.xml").write_text(text)
+    scene = mi.load_file(str(tmp_path / "scene.xml"))
+    image = np.asarray(mi.render(scene, sensor=mi.load_dict(make_sensor_camera().sensor())))
+    assert image.shape[2] == 3 + 4
+    assert_close(image, expected, atol=tol.IMAGE_ABS)
 
 
 def test_gaussian_splat__renders_a_scene_file_as_the_limits_describe(tmp_path, raw):
