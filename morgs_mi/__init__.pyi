@@ -16,6 +16,7 @@ from .io.ply import write_ply
 from .io.splats import read_splats
 from .loop.stream_config import StreamConfig
 from .method.motion_config import MotionConfig
+from .method.objective import ObjectiveConfig, loss_term
 from .playback.export.tracks import extract_tracks
 from .playback.player import channel_image, render_stream
 from .playback.streams import open_stream
@@ -42,6 +43,7 @@ __all__ = [
     "Gaussians",
     "Image",
     "MotionConfig",
+    "ObjectiveConfig",
     "PointTracks",
     "ProgressBar",
     "RenderConfig",
@@ -60,6 +62,7 @@ __all__ = [
     "load_capture",
     "load_tracks",
     "load_truth",
+    "loss_term",
     "motion_image",
     "open_stream",
     "rasterize",

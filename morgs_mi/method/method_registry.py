@@ -82,5 +82,5 @@ class Registry(Generic[Made, Config]):
         name, colon, argument = text.partition(":")
         takes_argument = bool(self._arguments.get(name))
         if name not in self._factories or not (takes_argument == bool(colon) == bool(argument)):
-            usages = ", ".join(self.usages)
+            usages = ", ".join(self.usages) or "the registered names, of which there are none"
             raise ValueError(f"{place or self._place}: `{self._setting}` must be one of {usages}, got {text!r}.")

@@ -340,11 +340,16 @@ def stream_metadata(capture: Capture, first: PartialFrame, config: StreamConfig)
         "train_views": list(train),
         "num_frames": capture.num_frames,
         "key_views": [train[v] for v in key_views],
-        "config": asdict(config),
+        "config": asdict(config, dict_factory=_given),
         "versions": {"mitsuba": mi.__version__},
         "variant": mi.variant(),
     }
     return _without_folders(metadata)
+
+
+def _given(items: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a table of settings without empty lists, such as terms that no module registers."""
+    return {name: value for name, value in items if value != ()}
 
 
 def _without_folders(metadata: Mapping[str, Any]) -> dict[str, Any]:
