@@ -91,6 +91,10 @@ class FrameReport:
     steps: int = 0
     exposures: tuple[Exposure, ...] = ()
 
+    def __repr__(self) -> str:
+        size = f"{self.num_gaussians} Gaussians, {self.num_bytes} bytes, {self.seconds:.1f} s"
+        return f"FrameReport(frame {self.frame}, {size}, {self.status})"
+
 
 @dataclass(frozen=True, eq=False)
 class StreamState:
@@ -327,6 +331,9 @@ class StreamLoop:
         views = capture.train_views
         cameras, masks = [capture.cameras[v] for v in views], [capture.masks[v] for v in views]
         return cls(cameras, capture.points, capture.point_colors, config, masks)
+
+    def __repr__(self) -> str:
+        return f"StreamLoop({len(self.setup.cameras)} cameras, frame {self.state.frame} is next, {self.gaussians})"
 
     @property
     def gaussians(self) -> Gaussians | None:

@@ -115,6 +115,11 @@ class Capture:
     def __post_init__(self) -> None:
         check_points(str(self.path), self.points, self.point_colors)
 
+    def __repr__(self) -> str:
+        held_out = ", ".join(self.names[view] for view in self.test_views) or "none"
+        size = f"{len(self.cameras)} cameras, {self.num_frames} frames, {self.fps:g} frames per second"
+        return f"Capture('{self.path}', {self.layout}, {size}, held out: {held_out})"
+
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the cameras."""

@@ -97,6 +97,9 @@ class Packet:
             array.setflags(write=False)
         object.__setattr__(self, "arrays", MappingProxyType(arrays))
 
+    def __repr__(self) -> str:
+        return f"Packet({self.kind.name}, frame {self.frame}, {len(self.arrays)} arrays)"
+
     @cached_property
     def encoded(self) -> bytes:
         """The packet as bytes of the file; they are computed once.

@@ -87,6 +87,12 @@ class StreamReader:
         if skip_damaged:
             self._kept, self.skipped = self._playable()
 
+    def __repr__(self) -> str:
+        frames = f"{self.metadata['num_frames']} frames, " if "num_frames" in self.metadata else ""
+        return (
+            f"{type(self).__name__}('{self.path}', {frames}{len(self.cameras)} cameras, {self.fps:g} frames per second)"
+        )
+
     def __iter__(self) -> Iterator[Packet]:
         return self._packets(1, self._first)
 

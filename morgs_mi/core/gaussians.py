@@ -172,6 +172,12 @@ class Gaussians:
     def __len__(self) -> int:
         return int(self.means.shape[0])
 
+    def __repr__(self) -> str:
+        means = np.asarray(dr.detach(self.means))
+        size = " x ".join(f"{side:.3g}" for side in np.ptp(means, axis=0)) if len(self) else "0"
+        more = [name for name in self.items() if name in ("motion", "logit_confidence", "offset")]
+        return f"Gaussians({', '.join([f'N={len(self)}', f'SH degree {self.sh_degree}', f'box of {size}', *more])})"
+
     @classmethod
     def from_activated(
         cls,

@@ -23,7 +23,9 @@ from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.change import box_around, change_mask, moving_region, update_reference
 from morgs_mi.method.exposure import LEAST_CHANGE, Exposure, common_change, follow_exposure
 from morgs_mi.method.flow import FlowObservation, observe_key_views
-from morgs_mi.method.flow_sources.flow_registry import FramePair
+from morgs_mi.method.flow_sources.flow_registry import FramePair, flow_source
+from morgs_mi.method.mask_refiners.mask_registry import mask_refiner
+from morgs_mi.method.motion_model import motion_model
 from morgs_mi.method.objective import KeyView
 
 __all__ = [
@@ -160,6 +162,10 @@ def prepare(
             check_mask(f"StreamLoop(): view {camera.name or view!r}", mask, camera.height, camera.width)
     check_near_planes("StreamLoop()", cameras, points)
     check_capacity("StreamLoop()", cameras, config.fit)
+    # A file that they name and that is missing is reported now, not at the second frame.
+    flow_source(config.motion.flow_method, config.motion.flow)
+    mask_refiner(config.motion.mask_method, config.motion.masks)
+    motion_model(config.motion)
     copies = tuple(None if mask is None else mask.copy() for mask in masks)
     key_views = choose_key_views(cameras, config.motion.key_views)
     extent = scene_extent(cameras)

@@ -22,6 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.documentation import documented
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.ranges import AtLeast, check_ranges
@@ -47,6 +48,7 @@ _CORE = 0.6
 _QUIET = 0.2
 
 
+@documented
 @dataclass(frozen=True)
 class ActiveSetConfig:
     """Settings of the selection, see the module."""

@@ -23,6 +23,7 @@ from typing import Annotated
 import cv2
 import numpy as np
 
+from morgs_mi.core.documentation import documented
 from morgs_mi.core.ranges import AtLeast, check_ranges
 
 __all__ = ["ChangeConfig", "box_around", "change_mask", "moving_region", "update_reference"]
@@ -43,6 +44,7 @@ _SUM = np.ones((1, 3), np.float32)
 _COLORS = np.array([[0.5, -0.5, 0], [0.25, 0.25, -0.5]])
 
 
+@documented
 @dataclass(frozen=True)
 class ChangeConfig:
     """Settings of the change detection."""

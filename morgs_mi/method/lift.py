@@ -35,6 +35,7 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.documentation import documented
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.ranges import Above, AtLeast, check_ranges
@@ -62,6 +63,7 @@ _HALF_WEIGHT_PIXELS = 1.0
 _CONFIDENCE_SLOPE = 4.0
 
 
+@documented
 @dataclass(frozen=True)
 class LiftConfig:
     """Settings of the lifted flow."""

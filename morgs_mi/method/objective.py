@@ -20,6 +20,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from morgs_mi.core.checks import check_number
+from morgs_mi.core.documentation import documented
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.ranges import AtLeast, AtMost, check_ranges
 from morgs_mi.core.types import Tensor
@@ -49,6 +50,7 @@ __all__ = [
 Observations = Mapping[str, Any]
 
 
+@documented
 @dataclass(frozen=True)
 class ObjectiveConfig:
     """Weights of the terms; 0 switches one off.

@@ -26,6 +26,7 @@ from scipy.sparse.csgraph import connected_components
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import SH_C0
+from morgs_mi.core.documentation import documented
 from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.core.ranges import Above, AtLeast, AtMost, check_ranges
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
@@ -48,6 +49,7 @@ _ERROR_RATIO = 0.8
 _LOGIT = 0.3
 
 
+@documented
 @dataclass(frozen=True)
 class SearchConfig:
     """Settings of the coarse search."""
