@@ -129,16 +129,17 @@ class Region:
         self._build(grid, grid.covering(mask))
 
     @classmethod
-    def of(cls, grid: BlockGrid, blocks: np.ndarray, whole: bool = False) -> Region:
+    def of(cls, grid: BlockGrid, blocks: np.ndarray, whole: bool = False, views: int = 1) -> Region:
         """Return the region of some blocks of a view, at least one.
 
         Args:
             grid: all blocks of the view.
             blocks: the requested ones, bool [rows, columns].
             whole: whether images are [H, W, C]; all blocks must be requested.
+            views: number of equal views, one below the other; several must be whole.
         """
         region = cls.__new__(cls)
-        region._build(grid, blocks, whole)
+        region._build(grid, blocks, whole, views)
         return region
 
     # Per block: slot of its tile, its bit there, its first pixel (x, y), that pixel's packet in memory, its rows.
@@ -159,16 +160,17 @@ class Region:
     weights: Float | None  # per pixel: 1 in the view, 0 outside; None: all pixels are in the view
     _blocks: tuple[np.ndarray, np.ndarray]  # per block: its row and column in the grid
 
-    def _build(self, grid: BlockGrid, blocks: np.ndarray, whole: bool = False) -> None:
-        self.grid, self.width, self.height, self.block, self.whole = grid, grid.width, grid.height, grid.block, whole
+    def _build(self, grid: BlockGrid, blocks: np.ndarray, whole: bool = False, views: int = 1) -> None:
+        self.grid, self.width, self.block, self.whole = grid, grid.width, grid.block, whole
+        self.height = views * grid.height
         self.across, self.down = grid.tiles
-        self._lay_out(blocks)
+        self._lay_out(np.tile(blocks, (views, 1)))
         inside = None if whole else self.inside()
         self.weights = None if inside is None or inside.all() else from_numpy(mi.Float, inside)
 
     def _lay_out(self, blocks: np.ndarray) -> None:
         """Number the blocks of a grid bool [rows, columns]; a second view begins after `down` rows of tiles."""
-        (bw, bh), H, W, whole = self.block, self.height, self.width, self.whole
+        (bw, bh), W, whole = self.block, self.width, self.whole
         active = blocks.reshape(-1, DOWN, self.across, ACROSS).transpose(0, 2, 1, 3)
         active = active.reshape(-1, ACROSS * DOWN)  # [tiles, blocks of a tile]
         tiles = np.flatnonzero(active.any(1))
@@ -177,15 +179,17 @@ class Region:
             tiles[tile] % self.across * ACROSS + bit % ACROSS,
             tiles[tile] // self.across * DOWN + bit // ACROSS,
         )
-        x, y = column * bw, row % (self.down * DOWN) * bh
+        view, row_in_view = np.divmod(row, self.down * DOWN)
+        x, y = column * bw, row_in_view * bh
         self.drawn, self._blocks = blocks, (row, column)
         slot_of = np.full(len(active), NO_SLOT, np.uint32)
         slot_of[tiles] = np.arange(len(tiles))
         pitch = -(-W // bw) * bw if whole else bw
-        place = y * pitch + x if whole else np.arange(len(x)) * (bw * bh)
+        H = self.grid.height if whole else 0
+        place = (view * H + y) * pitch + x if whole else np.arange(len(x)) * (bw * bh)
 
         self.num_blocks, self.num_tiles = len(x), len(tiles)
-        self.row, self.num_pixels = pitch, pitch * H if whole else len(x) * bw * bh
+        self.row, self.num_pixels = pitch, pitch * self.height if whole else len(x) * bw * bh
         # Pixels are read and written in packets of 4 floats: places and pitch count packets.
         arrays = {
             "tile": tile,
@@ -323,12 +327,12 @@ def on_region(values: Float, region: Region) -> Float:
     return image
 
 
-def full_view(width: int, height: int, config: RenderConfig) -> Region:
-    """Return the region of all blocks of a view; its images are [H, W, C]."""
-    return _whole_view(width, height, block_shape(config), mi.variant())
+def full_view(width: int, height: int, config: RenderConfig, views: int = 1) -> Region:
+    """Return the region of all blocks of equal views, one below the other; its images are [views * H, W, C]."""
+    return _whole_view(width, height, block_shape(config), views, mi.variant())
 
 
 @lru_cache(maxsize=8)
-def _whole_view(width: int, height: int, block: tuple[int, int], variant: str) -> Region:
+def _whole_view(width: int, height: int, block: tuple[int, int], views: int, variant: str) -> Region:
     grid = BlockGrid(width, height, block)
-    return Region.of(grid, grid.covering(np.ones((height, width), bool)), whole=True)
+    return Region.of(grid, grid.covering(np.ones((height, width), bool)), whole=True, views=views)
