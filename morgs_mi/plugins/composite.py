@@ -19,7 +19,7 @@ import numpy as np
 
 from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.memory import from_numpy
-from morgs_mi.core.types import Float, Tensor
+from morgs_mi.core.types import Float, Jit, Tensor
 from morgs_mi.plugins.surface_view import SurfaceView
 from morgs_mi.render.channels import NORMALISED
 from morgs_mi.render.rasterize import Image, rasterize
@@ -35,7 +35,7 @@ Columns = dict[str, list[Float]]
 def composite(
     gaussians: ActivatedGaussians,
     channels: Sequence[str],
-    background: Sequence[float] | None,
+    background: Sequence[float] | Jit | None,
     view: SurfaceView,
     config: RenderConfig | None = None,
 ) -> Columns:
