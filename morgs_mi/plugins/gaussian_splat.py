@@ -368,7 +368,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         """Return the channels of a scene without surfaces, colour in linear light; several views beside each other."""
         camera = cameras if len(cameras) > 1 else cameras[0]
         image = rasterize(gaussians, camera, channels, self.background, config=self.config)
-        images = {name: image[name] for name in channels}
+        images: dict[str, Any] = {name: image[name] for name in channels}
         if len(cameras) > 1:
             count = range(len(cameras))
             images = {name: dr.concat([stack[v] for v in count], axis=1) for name, stack in images.items()}
