@@ -382,7 +382,8 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         if scene.emitters() and self.surfaces is None:
             self._warn_once("gaussian_splat ignores the scene's emitters; set its `background` colour instead.")
         opacities = dr.detach(gaussians.opacities.array)
-        if count := int(dr.count((opacities < 0) | (opacities > 1))[0]):
+        outside: Any = dr.count((opacities < 0) | (opacities > 1))
+        if count := int(outside[0]):
             self._warn_once(
                 f"gaussian_splat: `opacities` must be in [0, 1], got {count} values outside: those below 0 are "
                 "not drawn and get no gradient, those above 1 are cut off at full coverage; clamp them after each step."
