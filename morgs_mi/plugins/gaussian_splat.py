@@ -140,7 +140,8 @@ def _sensor_camera(sensor: Any, border: int) -> Camera:
     fov, offset_x, offset_y = (params[name] for name in names)
     f = 0.5 * W / dr.tan(dr.deg2rad(0.5 * fov))
     # Mitsuba adds its offset to the pixel's position: the principal point moves the other way.
-    cx, cy = W * (0.5 - offset_x) + border, H * (0.5 - offset_y) + border
+    cx = W * (0.5 - offset_x) + border
+    cy = H * (0.5 - offset_y) + border
     K = np.diag([float(f[0]), float(f[0]), 1.0])
     K[:2, 2] = cx[0], cy[0]
     world_to_sensor = mi.TensorXf(dr.rcp(params["to_world"].matrix))[..., 0]
@@ -294,10 +295,12 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
     def render_backward(
         self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
     ) -> None:
-        kept, self.kept = self.kept, None
+        kept = self.kept
+        self.kept = None
         with dr.resume_grad():
             if kept is not None and kept.fits(self._inputs(scene, sensor)):
-                image, surfaces = kept.image, None
+                image = kept.image
+                surfaces = None
             else:
                 film, surfaces = self._expose(scene, sensor, seed, spp)
                 image = film.develop()
@@ -339,7 +342,8 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         gaussians = _scene_gaussians(scene, attributes, self.surfaces is not None)
         channels = ("color", *(["alpha"] if has_alpha else []), *self.aovs)
         # Cropped after rendering: the projection's linearisation depends on the extent of the whole view.
-        (x0, y0), (w, h) = film.crop_offset(), film.crop_size() + 2 * border
+        x0, y0 = film.crop_offset()
+        w, h = film.crop_size() + 2 * border
         crop = (int(x0), int(y0), int(w), int(h))
 
         self._warn(scene, gaussians)
@@ -356,7 +360,8 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         values += [value for name in self.aovs for value in columns[name]]
 
         film.prepare(self.aov_names())
-        block, index = film.create_block(), dr.arange(mi.UInt32, w * h)
+        block = film.create_block()
+        index = dr.arange(mi.UInt32, w * h)
         block.set_coalesce(False)  # useful for many samples per pixel only
         block.put(mi.Point2f(index % w, index // w) + mi.Point2f(x0, y0) + (0.5 - border), values)
         film.put_block(block)

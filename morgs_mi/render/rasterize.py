@@ -154,7 +154,8 @@ def rasterize(
     for name, value, kind in (("region", region, Region), ("static_splats", static_splats, Splats)):
         if value is not None:
             check_type("rasterize()", name, value, kind)
-    channels, sizes = tuple(dict.fromkeys(channels)), {**channel_sizes(), "alpha": 1}
+    channels = tuple(dict.fromkeys(channels))
+    sizes = {**channel_sizes(), "alpha": 1}
     _check(gaussians, cameras, channels, background, detach_weights)
     if isinstance(camera, Sequence):
         _check_alone({"region": region, "static_splats": static_splats, "depth_limit": depth_limit})
@@ -379,7 +380,9 @@ def _check(
             f"rasterize(): `background` must be three finite numbers of at most 1e18, got {background!r}; "
             "pass a colour or None."
         )
-    V, W, H = len(cameras), cameras[0].width, cameras[0].height
+    V = len(cameras)
+    W = cameras[0].width
+    H = cameras[0].height
     pixels = V * W * H
     if pixels > 2**28:
         size = f"{W}x{H}" if V == 1 else f"{V} times {W}x{H}"
@@ -394,7 +397,8 @@ def _check(
 def _checked_features(features: Tensor | np.ndarray, gaussians: ActivatedGaussians) -> tuple[Tensor, int]:
     """Return the features as a tensor [N, F], and F."""
     features = float_tensor("rasterize()", "features", features)
-    shape, N = tuple(features.shape), int(gaussians.means.shape[0])
+    shape = tuple(features.shape)
+    N = int(gaussians.means.shape[0])
     if len(shape) != 2 or shape[0] != N or not 1 <= shape[1] <= _MOST_FEATURES:
         raise ValueError(
             f"rasterize(): `features` must be [N, F] with N={N} and F from 1 to {_MOST_FEATURES}, got {list(shape)}; "
