@@ -134,7 +134,8 @@ def find_active_set(
     if gaussians.logit_confidence is not None:
         active |= np.asarray(gaussians.logit_confidence) > 0
     for found in changed.values():
-        grid, boxes = found.view.grid, found.boxes
+        grid = found.view.grid
+        boxes = found.boxes
         unexplained = _unexplained(found.counts, boxes.union(active, grid), grid.block)
         if unexplained.any():
             table = from_numpy(mi.UInt32, summed_area(unexplained))

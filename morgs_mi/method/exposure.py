@@ -26,9 +26,11 @@ LEAST_CHANGE = 3e-3
 # a change there.
 _WEIGHTS = (1e-4, 0.02)
 # Values, of 1, that are neither nearly black nor nearly white.
-_DARK, _BRIGHT = 0.03, 0.97
+_DARK = 0.03
+_BRIGHT = 0.97
 # Most steps of the reweighted least squares, and the least scale of its errors, of 1.
-_STEPS, _LEAST_SCALE = 13, 1e-3
+_STEPS = 13
+_LEAST_SCALE = 1e-3
 # Change of gain and bias in a step at which it ends, of 1: a hundredth of a grey level.
 _CONVERGED = 4e-5
 _MIN_PIXELS = 30
@@ -121,8 +123,10 @@ def fit_exposure(
 def _line(x: np.ndarray, y: np.ndarray, prior: Sequence[float], weights: tuple[float, float]) -> tuple[float, float]:
     """Return slope and intercept of y over x [P] by reweighted least squares (Geman and McClure 1987)."""
     # The change of the gain, and of the bias beyond the bias of a factor on the light.
-    rows, rest = np.stack([x + _TOE, np.ones_like(x)]), y - prior[0] * x - prior[1]
-    regular, counts = len(x) * np.diag(weights), np.ones_like(x)
+    rows = np.stack([x + _TOE, np.ones_like(x)])
+    rest = y - prior[0] * x - prior[1]
+    regular = len(x) * np.diag(weights)
+    counts = np.ones_like(x)
     change = np.zeros(2)
     for _ in range(_STEPS):
         last = change

@@ -22,7 +22,8 @@ class Registry(Generic[Made, Config]):
     """
 
     def __init__(self, place: str, setting: str) -> None:
-        self._place, self._setting = place, setting
+        self._place = place
+        self._setting = setting
         self._factories: dict[str, Callable[[str, Config], Made]] = {}
         self._arguments: dict[str, str] = {}
 

@@ -49,7 +49,8 @@ _Read = Callable[[Float], list[Float]]  # plane -> its numbers around the lane's
 
 # Noise and rendered colours exceed [0, 1] by less, 8-bit values by more.
 _MARGIN = 1.0
-_C1, _C2 = 0.01**2, 0.03**2
+_C1 = 0.01**2
+_C2 = 0.03**2
 _TAPS = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / 1.5) ** 2)
 _TAPS = (_TAPS / _TAPS.sum()).astype(np.float32).tolist()
 
@@ -212,7 +213,8 @@ class OnRegion(_Recon):
     def eval(self, x: Float, target: Target, weight: float, region: Region) -> Float:
         if target.surroundings is None:
             target.surroundings = target.pixels + 0
-        image, (places, inside) = target.surroundings, target.places_on(region)
+        image = target.surroundings
+        places, inside = target.places_on(region)
         dr.scatter(image, target.masked(x, places), places, active=inside, mode=dr.ReduceMode.NoConflicts)
         gradient, loss = _passes(image, target, weight, target.windows_on(region))
         return self.finish(target.masked(dr.gather(mi.Float, gradient, places, active=inside), places), loss)
@@ -220,7 +222,8 @@ class OnRegion(_Recon):
 
 def _passes(image: Float, target: Target, weight: float, on: _Windows) -> tuple[Float, Float]:
     """Return dL/dx in planes, defined on the runs of `on.pixels`, and L over the runs of `on`."""
-    planes, scale = target.planes, dr.opaque(mi.Float, 1 / int(np.prod(target.shape)))
+    planes = target.planes
+    scale = dr.opaque(mi.Float, 1 / int(np.prod(target.shape)))
     height = dr.opaque(mi.Int32, planes.height)
     dr.eval(image)
     arguments = (on.windows.lanes, height, image, target.pixels, on.mean, on.variance)
@@ -251,7 +254,8 @@ def _similarity_pass(
     """Return the planes of SSIM's derivatives by M x, M xx and M xy, and the sum of SSIM over each run."""
 
     def products(read: _Read) -> list[list[Float]]:
-        x, y = read(image), read(target)
+        x = read(image)
+        y = read(target)
         return [x, [v * v for v in x], [v * w for v, w in zip(x, y, strict=True)]]
 
     def similarity(read: _Read, blurred: list[list[Float]]) -> tuple[list[list[Float]], list[Float]]:
@@ -264,9 +268,12 @@ def _similarity_pass(
 
 def _similarity(mx: Float, xx: Float, xy: Float, my: Float, variance: Float) -> tuple[Float, Float, Float, Float]:
     """Return SSIM of a window and its derivatives by M x, M xx and M xy."""
-    a1, a2 = dr.fma(2 * mx, my, _C1), dr.fma(2.0, dr.fma(-mx, my, xy), _C2)
-    b1, b2 = dr.fma(mx, mx, dr.fma(my, my, _C1)), dr.fma(-mx, mx, xx) + (variance + _C2)
-    r1, r2 = dr.rcp(b1), dr.rcp(b2)
+    a1 = dr.fma(2 * mx, my, _C1)
+    a2 = dr.fma(2.0, dr.fma(-mx, my, xy), _C2)
+    b1 = dr.fma(mx, mx, dr.fma(my, my, _C1))
+    b2 = dr.fma(-mx, mx, xx) + (variance + _C2)
+    r1 = dr.rcp(b1)
+    r2 = dr.rcp(b2)
     r12 = r1 * r2
     ssim = a1 * a2 * r12
     d_x = 2 * dr.fma(my * r12, a2 - a1, mx * ssim * (r2 - r1))
@@ -289,9 +296,11 @@ def _gradient_pass(
         return [read(plane) for plane in derivatives]
 
     def gradient(read: _Read, blurred: list[list[Float]]) -> tuple[list[list[Float]], list[Float]]:
-        row, errors = [], []
+        row = []
+        errors = []
         for x, y, d_x, d_xx, d_xy in zip(read(image), read(target), *blurred, strict=True):
-            error, structure = x - y, dr.fma(y, d_xy, dr.fma(2 * x, d_xx, d_x))
+            error = x - y
+            structure = dr.fma(y, d_xy, dr.fma(2 * x, d_xx, d_x))
             sign = dr.select(error > 0, 1.0, dr.select(error < 0, -1.0, 0.0))
             row.append(scale * ((1 - weight) * sign - weight * structure))
             errors.append(dr.abs(error))
@@ -327,7 +336,8 @@ def _walk(
     targets = [dr.empty(mi.Float, size) for _ in range(outputs)]
 
     def blurred(row: Int32, height: Int32, places: tuple[UInt32, UInt32, UInt32]) -> Jit:
-        inside, down = (row >= 0) & (row < height), mi.UInt32(row) * COLUMN
+        inside = (row >= 0) & (row < height)
+        down = mi.UInt32(row) * COLUMN
 
         def wide(plane: Float) -> list[Float]:
             numbers = [v for place in places for v in read_packet(plane, place + down, inside)]
@@ -344,7 +354,9 @@ def _walk(
 
     def body(row, end, first, places, columns, height, windows, total, targets):
         # Two rows per turn: the windows are read and written half as often. Window k ends k rows further down.
-        a, b, w = blurred(row, height, places), blurred(row + 1, height, places), _TAPS
+        a = blurred(row, height, places)
+        b = blurred(row + 1, height, places)
+        w = _TAPS
         done = dr.fma(a, w[0], windows[0]), dr.fma(b, w[0], dr.fma(a, w[1], windows[1]))
         windows = [dr.fma(a, w[k], dr.fma(b, w[k - 1], windows[k])) for k in range(2, 2 * RADIUS)]
         windows += [dr.fma(a, w[-1], b * w[-2]), b * w[-1]]
@@ -352,7 +364,8 @@ def _walk(
         inside = [columns > k for k in range(STRIP)]
         for k in range(2):
             at = row + k - RADIUS
-            center, ready = places[1] + mi.UInt32(at) * COLUMN, (at >= first) & (at < end)
+            center = places[1] + mi.UInt32(at) * COLUMN
+            ready = (at >= first) & (at < end)
 
             def narrow(plane: Float, center: UInt32 = center, ready: Bool = ready) -> list[Float]:
                 return list(read_packet(plane, center, ready))

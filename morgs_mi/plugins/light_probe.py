@@ -91,7 +91,8 @@ def _directions(height: int) -> np.ndarray:
     """Return the directions [H, 2 H, 3] of the texels of an `envmap`; its first and last rows are the poles."""
     theta = np.pi * np.arange(height)[:, None] / (height - 1)
     phi = 2 * np.pi * (np.arange(2 * height) + 0.5) / (2 * height)
-    x, z = np.sin(theta) * np.sin(phi), -np.sin(theta) * np.cos(phi)
+    x = np.sin(theta) * np.sin(phi)
+    z = -np.sin(theta) * np.cos(phi)
     return np.stack([x, np.broadcast_to(np.cos(theta), x.shape), z], axis=-1)
 
 

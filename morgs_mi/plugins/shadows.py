@@ -54,7 +54,8 @@ def shadow_ratio(gaussians: Gaussians, scene: Any, viewpoint: ArrayLike, samples
     eye = numbers(place, "viewpoint", viewpoint)
     if eye.shape != (3,) or not np.isfinite(eye).all():
         raise ValueError(f"{place}: `viewpoint` must be [3] and finite, got {eye.tolist()}; pass a camera's position.")
-    emitters, shapes = scene.emitters(), [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
+    emitters = scene.emitters()
+    shapes = [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
     if not emitters:
         raise ValueError(
             f"{place}: expected a scene with an emitter, got none; add one, such as an `envmap` of "
@@ -63,11 +64,13 @@ def shadow_ratio(gaussians: Gaussians, scene: Any, viewpoint: ArrayLike, samples
     if not len(gaussians) or not shapes:
         return np.ones(len(gaussians), np.float32)
     with dr.suspend_grad():
-        receivers, blockers = _Receivers(gaussians, eye), shared_scene(shapes, scene)
+        receivers = _Receivers(gaussians, eye)
+        blockers = shared_scene(shapes, scene)
         blocked, total = (mi.Float(0) for _ in range(2))
         for emitter in emitters:
             some, every = _irradiance(emitter, receivers, blockers, int(samples))
-            blocked, total = blocked + some, total + every
+            blocked = blocked + some
+            total = total + every
         return np.array(1 - dr.select(total > 0, blocked / total, 0))
 
 
@@ -115,7 +118,8 @@ def _orientation(gaussians: Gaussians, means: np.ndarray) -> tuple[np.ndarray, n
 
     Single Gaussians of a fitted surface lie in it, but are not all flat.
     """
-    scales, quats = np.array(dr.detach(gaussians.scales)), np.array(dr.detach(gaussians.quats), np.float64)
+    scales = np.array(dr.detach(gaussians.scales))
+    quats = np.array(dr.detach(gaussians.quats), np.float64)
     quats = np.where(np.linalg.norm(quats, axis=1, keepdims=True) > 0, quats, [1, 0, 0, 0])
     axes = Rotation.from_quat(quats, scalar_first=True).as_matrix() * scales[:, None]
     _, near = KDTree(means).query(means, min(_NEIGHBOURS, len(means)), workers=-1)
@@ -138,7 +142,8 @@ def _irradiance(emitter: Any, receivers: _Receivers, blockers: Any, samples: int
     far = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
     it = dr.zeros(mi.Interaction3f, dr.width(receivers.centers))
     it.p = receivers.centers
-    count, step_size = dr.opaque(mi.UInt32, samples), dr.opaque(mi.Float, 1 / samples)
+    count = dr.opaque(mi.UInt32, samples)
+    step_size = dr.opaque(mi.Float, 1 / samples)
     no_scramble: Any = 0
 
     def step(k: UInt32, blocked: Float, total: Float) -> tuple[UInt32, Float, Float]:

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 import textwrap
+from dataclasses import replace
 from pathlib import Path
 
 import drjit as dr
@@ -40,7 +41,7 @@ def test_gaussian_splat__reads_props_of_an_xml_scene(raw):
         <rgb name="background" value="0.1, 0.2, 0.3"/>
     </integrator>"""
     integrator = mi.load_string(text)
-    assert integrator.background == pytest.approx([0.1, 0.2, 0.3])
+    np.testing.assert_allclose(np.array(integrator.background).ravel(), [0.1, 0.2, 0.3], rtol=1e-6)
     image = np.asarray(mi.render(make_mitsuba_scene(to_gaussians(raw)), integrator=integrator))
     expected = np.asarray(rasterize(to_gaussians(raw), make_sensor_camera(), background=(0.1, 0.2, 0.3)).color)
     assert_close(image[..., :3], expected, atol=tol.IMAGE_ABS)
@@ -138,9 +139,9 @@ BAD_SCENES = {
     "thin lens": (
         lambda: {"sensor": {"type": "thinlens", "aperture_radius": 0.1}},
         {},
-        "expected a `perspective` sensor, got ThinLensCamera",
+        "expected a `perspective` sensor or a `batch` of them, got ThinLens",
     ),
-    "orthographic": (lambda: {"sensor": {"type": "orthographic"}}, {}, "sensor, got OrthographicCamera"),
+    "orthographic": (lambda: {"sensor": {"type": "orthographic"}}, {}, "a `batch` of them, got OrthographicCamera"),
 }
 
 
@@ -156,6 +157,72 @@ def test_gaussian_splat__refuses_bad_scenes(case):
     with pytest.raises(RuntimeError) as error:
         mi.render(scene, integrator=integrator)
     assert isinstance(error.value.__cause__, ValueError)
+
+
+def test_gaussian_splat__warns_once_about_opacities_outside_the_unit_interval(caplog):
+    opacities = mi.TensorXf(np.float32([-1, 2, -0.1, *[0.5] * 7])[:, None])
+    scene = mi.load_dict({"type": "scene", "sensor": make_sensor_camera().sensor(), **with_shape(opacities=opacities)})
+    integrator = mi.load_dict({"type": "gaussian_splat"})
+    with caplog.at_level(logging.WARNING):
+        for _ in range(2):
+            assert np.isfinite(np.array(mi.render(scene, integrator=integrator))).all()
+    (record,) = caplog.records
+    assert "`opacities` must be in [0, 1], got 3 values outside" in record.message
+
+
+def test_gaussian_splat__is_refused_under_freeze(raw):
+    scene = make_mitsuba_scene(to_gaussians(raw))
+    frozen = dr.freeze(lambda image: image + mi.render(scene))
+    with pytest.raises(RuntimeError) as error:
+        frozen(mi.render(scene))
+    causes = [str(error.value.__cause__), str(error.value.__cause__ and error.value.__cause__.__cause__)]
+    assert any("gaussian_splat: expected a call outside dr.freeze" in cause for cause in causes)
+
+
+def batch_scene(raw, film: dict, **props):
+    """Return a scene of a `batch` of three cameras, and the same sensors, each with a film of its own."""
+    camera = make_sensor_camera()
+    sensors = []
+    for v in range(3):
+        viewmat = np.array(camera.viewmat, np.float64)
+        viewmat[0, 3] += 0.1 * v
+        sensors.append(replace(camera, viewmat=viewmat, name=f"view{2 - v}").sensor())
+    apart = [mi.load_dict({**sensor, "film": {**sensor["film"], **film}}) for sensor in sensors]
+    inner = {f"view{2 - v}": {k: x for k, x in sensor.items() if k != "film"} for v, sensor in enumerate(sensors)}
+    whole = {**sensors[0]["film"], **film, "width": 3 * camera.width}
+    scene = {
+        "type": "scene",
+        "gaussians": ellipsoids(to_gaussians(raw)),
+        "sensor": {"type": "batch", **inner, "film": whole},
+        "integrator": {"type": "gaussian_splat", "aovs": AOVS, **props},
+    }
+    return mi.load_dict(scene), apart
+
+
+def test_gaussian_splat__renders_a_batch_of_sensors_beside_each_other(raw):
+    scene, apart = batch_scene(raw, {"pixel_format": "rgba"}, background=[0.1, 0.2, 0.3])
+    image = np.array(mi.render(scene))
+    expected = np.concatenate([np.array(mi.render(scene, sensor=sensor)) for sensor in apart], axis=1)
+    np.testing.assert_array_equal(image, expected)
+
+
+def test_gaussian_splat__differentiates_a_batch_of_sensors(raw):
+    scene, apart = batch_scene(raw, {}, reproducible=True)
+    params = mi.traverse(scene)
+    data = params["gaussians.data"]
+    dr.enable_grad(data)
+    dr.backward(dr.sum(dr.square(mi.render(scene, params)), axis=None))
+    together = np.array(dr.grad(data))
+    dr.set_grad(data, 0)
+    for sensor in apart:
+        dr.backward(dr.sum(dr.square(mi.render(scene, params, sensor=sensor)), axis=None))
+    assert_close(together, np.array(dr.grad(data)), rtol=1e-5)
+
+
+def test_gaussian_splat__refuses_a_batch_with_a_border(raw):
+    scene, _ = batch_scene(raw, {"sample_border": True, "rfilter": {"type": "gaussian"}})
+    with pytest.raises(ValueError, match="expected a `batch` sensor without `sample_border`"):
+        scene.integrator().render(scene)
 
 
 def test_gaussian_splat__refuses_films_other_than_rgb():

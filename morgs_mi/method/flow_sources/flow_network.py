@@ -44,7 +44,9 @@ class FlowNetwork:
     """
 
     def __init__(self, path: str | Path, low: float = 0.0, high: float = 255.0) -> None:
-        self.path, self.low, self.high = Path(path), low, high
+        self.path = Path(path)
+        self.low = low
+        self.high = high
         self._net = OnnxNetwork(path, " or use its flow from files")
         shapes = list(self._net.inputs.values())
         images = all(len(s) == 4 and s[0] in (1, None) and s[1] in (3, None) for s in shapes)
@@ -83,8 +85,10 @@ class FlowNetwork:
 
     def _padded(self, image: np.ndarray, other: np.ndarray) -> np.ndarray:
         height, width = image.shape[:2]
-        down, right = -height % _MULTIPLE, -width % _MULTIPLE
-        top, left = down // 2, right // 2
+        down = -height % _MULTIPLE
+        right = -width % _MULTIPLE
+        top = down // 2
+        left = right // 2
         padded = (
             cv2.copyMakeBorder(each, top, down - top, left, right - left, cv2.BORDER_REPLICATE)
             for each in (image, other)
