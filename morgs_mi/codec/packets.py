@@ -23,6 +23,7 @@ import numpy as np
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import Packet, PacketKind
 from morgs_mi.codec.entropy import LIMIT, ColumnReader, ColumnWriter, column_bits
+from morgs_mi.codec.frame_source import FrameState
 from morgs_mi.codec.quantisation import (
     KNOWN_OPTIONAL,
     Grid,
@@ -37,24 +38,17 @@ from morgs_mi.codec.quantisation import (
     split_groups,
     stored_fields,
 )
-from morgs_mi.codec.reader import StreamReader
 from morgs_mi.codec.residuals import Coder, offset_steps, take_change
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 
 __all__ = [
     "CodedFrame",
-    "WholeFrame",
     "coded_frames",
     "decode",
-    "frames_near",
-    "frames_with_first_id",
-    "frames_with_lasting_ids",
     "keyframe_packet",
-    "play",
     "reemitted_keyframe",
     "residual_packet",
-    "seek",
 ]
 
 # An entropy code stores a column of one value in almost no bytes. A small packet must not request much memory: it
@@ -67,26 +61,16 @@ _COARSEST = 80  # quarter octaves: a million times the step
 
 
 @dataclass(frozen=True, eq=False)
-class CodedFrame:
+class CodedFrame(FrameState):
     """State of a stream after a packet, the same in encoder and decoder to the bit.
 
     Attributes:
-        frame: index of the video frame.
-        grid: its N Gaussians as integers.
-        ids: uint32 [N], ascending: the number of each Gaussian from its birth to its death.
+        grid: its N Gaussians as integers, for which `gaussians` stand.
         next_id: number of the next birth.
-        gaussians: the Gaussians that the integers stand for; `motion` is the displacement since the frame before, zero
-            where there is none, `offset` its learned part, None if the packet does not contain it.
     """
 
-    frame: int
     grid: Grid
-    ids: np.ndarray
     next_id: int
-    gaussians: Gaussians
-
-    def __len__(self) -> int:
-        return len(self.ids)
 
     @cached_property
     def digest(self) -> np.ndarray:
@@ -105,40 +89,6 @@ class CodedFrame:
         return np.frombuffer(hashed.digest(), np.uint8)
 
 
-class WholeFrame(Packet):
-    """Keyframe of Gaussians in memory: it decodes without loss, and is coded where its integers or bytes are needed.
-
-    Args:
-        gaussians: N Gaussians; a missing `motion` is zero.
-        cameras: cameras in which the error of its integers is measured.
-    """
-
-    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
-        for name, value in (("kind", PacketKind.KEYFRAME), ("frame", 0), ("place", "")):
-            object.__setattr__(self, name, value)
-        self.coded = _WholeState(gaussians, cameras)
-
-    @cached_property
-    def arrays(self) -> Mapping[str, np.ndarray]:
-        return reemitted_keyframe(self.coded).arrays
-
-
-class _WholeState(CodedFrame):
-    """State after a `WholeFrame`: its Gaussians are not rounded, and its integers follow when they are needed."""
-
-    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
-        N = len(gaussians)
-        motion = np.zeros((N, 3), np.float32) if gaussians.motion is None else gaussians.motion
-        fields = {"frame": 0, "ids": np.arange(N, dtype=np.uint32), "next_id": N}
-        for name, value in (*fields.items(), ("gaussians", replace(gaussians, motion=motion))):
-            object.__setattr__(self, name, value)
-        self.cameras = cameras
-
-    @cached_property
-    def grid(self) -> Grid:
-        return new_grid(split_groups(finite_fields(self.gaussians)), self.cameras, CodecConfig())
-
-
 def keyframe_packet(
     gaussians: Gaussians, frame: int, cameras: Sequence[Camera] = (), config: CodecConfig | None = None
 ) -> Packet:
@@ -154,7 +104,7 @@ def keyframe_packet(
         ValueError: an attribute is not finite.
     """
     grid = new_grid(split_groups(finite_fields(gaussians)), cameras, config or CodecConfig())
-    return reemitted_keyframe(CodedFrame(frame, grid, np.arange(len(grid), dtype=np.uint32), len(grid), gaussians))
+    return reemitted_keyframe(CodedFrame(frame, np.arange(len(grid), dtype=np.uint32), gaussians, grid, len(grid)))
 
 
 def reemitted_keyframe(coded: CodedFrame) -> Packet:
@@ -221,8 +171,6 @@ def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
         ValueError: a residual without the state that it continues, a packet that contradicts itself, or a packet
             of a frame that is not after the frame of `previous`.
     """
-    if isinstance(packet, WholeFrame):
-        return packet.coded
     where = packet.place or f"packet of frame {packet.frame}"
     names = {"head", "code"} | ({"parent"} if packet.kind == PacketKind.RESIDUAL else set())
     optional = {"offset"} if packet.kind == PacketKind.RESIDUAL else set()
@@ -235,7 +183,7 @@ def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
         if previous is not None and packet.frame <= previous.frame:
             raise ValueError(f"its frame must be above {previous.frame}, that of the state before, got {packet.frame}")
         if packet.kind == PacketKind.KEYFRAME:
-            return _decoded_keyframe(packet)
+            return _decoded_keyframe(packet, 0 if previous is None else previous.first_id + max(previous.next_id, 1))
         if previous is None:
             raise ValueError("a residual needs the frame before it, got none; start from a keyframe")
         if not np.array_equal(packet.arrays["parent"], previous.digest):
@@ -254,67 +202,7 @@ def coded_frames(packets: Iterable[Packet]) -> Iterator[CodedFrame]:
             yield coded  # a re-emitted keyframe is for readers that start there
 
 
-def frames_with_first_id(packets: Iterable[Packet]) -> Iterator[tuple[int, CodedFrame]]:
-    """Decode packets in order and yield (first_id, state) after each frame; `first_id` is added to the state's ids.
-
-    It changes where a keyframe starts a new set of Gaussians with ids from 0; no two Gaussians have one id.
-    """
-    first_id, coded = 0, None
-    for packet in packets:
-        if coded is not None and packet.kind == PacketKind.KEYFRAME:
-            if packet.frame == coded.frame:
-                continue  # a re-emitted keyframe is for readers that start there
-            first_id += max(coded.next_id, 1)  # also after a set without Gaussians
-        coded = decode(coded, packet)
-        yield first_id, coded
-
-
-def frames_with_lasting_ids(packets: Iterable[Packet]) -> Iterator[tuple[np.ndarray, CodedFrame]]:
-    """Decode packets in order and yield (ids, state) after each frame; ids int64 [N] are unique in the whole stream."""
-    return ((coded.ids.astype(np.int64) + first_id, coded) for first_id, coded in frames_with_first_id(packets))
-
-
-def play(packets: Iterable[Packet]) -> Iterator[tuple[int, Gaussians]]:
-    """Decode packets in order and yield (frame, Gaussians), once for each frame."""
-    return ((coded.frame, coded.gaussians) for coded in coded_frames(packets))
-
-
-def seek(stream: StreamReader, frame: int) -> CodedFrame:
-    """Return the state at a frame; decoding starts as in `frames_near`.
-
-    Raises:
-        ValueError: the stream has no such frame, is not a file, or a packet is broken.
-    """
-    last = next((coded for coded in frames_near(stream, frame) if coded.frame >= frame), None)
-    if last is None or last.frame != frame:
-        raise ValueError(f"{stream.path}: expected a frame of the stream, got {frame}; choose one that it contains.")
-    return last
-
-
-def frames_near(stream: StreamReader, frame: int) -> Iterator[CodedFrame]:
-    """Yield the states from the last keyframe before a frame on.
-
-    Where the frame cannot be reached from there, because that keyframe or the index is forged, those from the start of
-    the stream follow.
-
-    Raises:
-        ValueError: the stream is not a file, or a packet is broken.
-    """
-    near, reached = stream.near(frame), False
-    try:
-        for coded in coded_frames(near):
-            if coded.frame > frame and not reached:
-                break
-            reached = reached or coded.frame == frame
-            yield coded
-    except ValueError:
-        if reached:
-            raise
-    if not reached:
-        yield from coded_frames(stream)
-
-
-def _decoded_keyframe(packet: Packet) -> CodedFrame:
+def _decoded_keyframe(packet: Packet, first_id: int) -> CodedFrame:
     code = packet.arrays["code"]
     N, degree, optional, next_id = _head(packet, 4)
     if unknown := optional & ~KNOWN_OPTIONAL:
@@ -330,7 +218,7 @@ def _decoded_keyframe(packet: Packet) -> CodedFrame:
     grid = _taken_grid(reader, N, degree, optional)
     if np.any(np.diff(ids, prepend=-1) < 1) or (N and ids[-1] >= next_id):
         raise ValueError("its ids do not ascend")
-    return CodedFrame(packet.frame, grid, ids.astype(np.uint32), next_id, grid.gaussians())
+    return CodedFrame(packet.frame, ids.astype(np.uint32), grid.gaussians(), grid, next_id, first_id=first_id)
 
 
 def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
@@ -356,7 +244,14 @@ def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
         new = new.concatenate(_taken_grid(reader, births, grid.degree, grid.optional))
     ids = np.concatenate([previous.ids[survivors], previous.next_id + np.arange(births, dtype=np.uint32)])
     gaussians = new.gaussians(motion, offset)
-    return CodedFrame(packet.frame, new, ids.astype(np.uint32), previous.next_id + births, gaussians)
+    return replace(
+        previous,
+        frame=packet.frame,
+        ids=ids.astype(np.uint32),
+        gaussians=gaussians,
+        grid=new,
+        next_id=previous.next_id + births,
+    )
 
 
 def _words(columns: Iterable[np.ndarray]) -> np.ndarray:

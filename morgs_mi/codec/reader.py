@@ -24,7 +24,9 @@ from morgs_mi.codec.container import (
     decode_packet,
     open_packet,
 )
+from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.codec.header import header_fields
+from morgs_mi.codec.packets import CodedFrame, coded_frames
 
 __all__ = ["StreamReader"]
 
@@ -33,7 +35,7 @@ _CHUNK = 2**20
 _Entry = tuple[int, int, int]
 
 
-class StreamReader:
+class StreamReader(FrameSource):
     """Reader of a stream.
 
     Iterating yields its packets from the first. A file may be read again, e.g. when it has grown; a pipe yields each
@@ -89,6 +91,30 @@ class StreamReader:
 
     def __iter__(self) -> Iterator[Packet]:
         return self._packets(1, self._first)
+
+    def frame_numbers(self) -> list[int]:
+        return list(dict.fromkeys(frame for _, frame, _ in self.index()))
+
+    def states(self, near: int | None = None) -> Iterator[CodedFrame]:
+        """Decode the packets and yield the state after each frame; see `FrameSource.states`.
+
+        Near a frame, decoding starts at the last keyframe before it. Where the frame cannot be reached from there,
+        because that keyframe or the index is forged, the states from the start of the stream follow.
+        """
+        reached = False
+        if near is not None:
+            packets = self.near(near)
+            try:
+                for coded in coded_frames(packets):
+                    if coded.frame > near and not reached:
+                        break
+                    reached = reached or coded.frame == near
+                    yield coded
+            except ValueError:
+                if reached:
+                    raise
+        if not reached:
+            yield from coded_frames(self)
 
     def near(self, frame: int) -> Iterator[Packet]:
         """Yield the packets from the last keyframe before `frame` on, or from the first.

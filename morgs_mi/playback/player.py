@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
@@ -23,9 +23,8 @@ from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.fingerprint import fingerprint
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.capture.truth import GroundTruth, load_truth
-from morgs_mi.codec.container import PacketKind
-from morgs_mi.codec.packets import play
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.container import Packet, PacketKind
+from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
@@ -84,7 +83,7 @@ _JSON_TYPES = {
 }
 
 
-def stream_name(stream: StreamReader) -> str:
+def stream_name(stream: FrameSource) -> str:
     """Return the name of a stream: the name of its folder or file, without `.morgs`.
 
     Bytes of the name that are not UTF-8 are replaced, because pages and messages to a browser cannot contain them.
@@ -94,7 +93,7 @@ def stream_name(stream: StreamReader) -> str:
     return os.fsencode(name).decode(errors="replace")
 
 
-def find_camera(stream: StreamReader, camera: int | str) -> Camera:
+def find_camera(stream: FrameSource, camera: int | str) -> Camera:
     """Return a camera of the stream's rig by name or index.
 
     Raises:
@@ -111,7 +110,7 @@ def find_camera(stream: StreamReader, camera: int | str) -> Camera:
 
 
 def render_stream(
-    stream: StreamReader, camera: Camera, channels: Sequence[str] | None = None
+    stream: FrameSource, camera: Camera, channels: Sequence[str] | None = None
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     """Render every frame of a stream for one camera, with the cut-offs of the fit.
 
@@ -132,7 +131,7 @@ def render_stream(
         yield frame, render(gaussians, camera, channels or available_channels(gaussians), config)
 
 
-def has_confidence(stream: StreamReader) -> bool:
+def has_confidence(stream: FrameSource) -> bool:
     """Return whether a stream stores a confidence, and the fit has learned it.
 
     Raises:
@@ -142,9 +141,9 @@ def has_confidence(stream: StreamReader) -> bool:
     return learned and any(gaussians.logit_confidence is not None for _, gaussians in islice(play(stream), 1))
 
 
-def has_offset(stream: StreamReader) -> bool:
-    """Return whether a stream's residuals store the learned offset, which is off by default."""
-    residuals = (packet for packet in stream if packet.kind == PacketKind.RESIDUAL)
+def has_offset(packets: Iterable[Packet]) -> bool:
+    """Return whether the residuals of a stream store the learned offset, which is off by default."""
+    residuals = (packet for packet in packets if packet.kind == PacketKind.RESIDUAL)
     return any("offset" in packet.arrays for packet in islice(residuals, 1))
 
 
@@ -164,7 +163,7 @@ def channel_image(name: str, image: np.ndarray, motion_scale: float | None = Non
     return draw.get(name, grey_image)(image)
 
 
-def playback_speed(stream: StreamReader, camera: Camera) -> dict[str, float]:
+def playback_speed(stream: FrameSource, camera: Camera) -> dict[str, float]:
     """Return the speed at which this machine plays a stream: decode a frame, render its colour, copy it to the host.
 
     At most the first 30 frames are measured. The first one compiles kernels and is excluded if there are others.
@@ -230,7 +229,7 @@ def render(
     return {name: np.array(images[name]) for name in channels}
 
 
-def render_config(stream: StreamReader) -> RenderConfig:
+def render_config(stream: FrameSource) -> RenderConfig:
     """Return the renderer settings of the fit.
 
     Raises:
@@ -240,7 +239,7 @@ def render_config(stream: StreamReader) -> RenderConfig:
     return apply_values(RenderConfig(), values, _place(stream, "config.render"))
 
 
-def num_frames(stream: StreamReader) -> int:
+def num_frames(stream: FrameSource) -> int:
     """Return the number of frames of the capture that was fitted, zero if the stream's header does not state it.
 
     Raises:
@@ -249,7 +248,7 @@ def num_frames(stream: StreamReader) -> int:
     return metadata_entry(stream, "num_frames", 0, int)
 
 
-def metadata_entry(stream: StreamReader, key: str, default: Any, *kinds: type) -> Any:
+def metadata_entry(stream: FrameSource, key: str, default: Any, *kinds: type) -> Any:
     """Return an entry of a stream's metadata, `default` where there is none.
 
     A stream may come from anybody, and its metadata may be any JSON object.
@@ -274,12 +273,12 @@ def metadata_entry(stream: StreamReader, key: str, default: Any, *kinds: type) -
     return value
 
 
-def _place(stream: StreamReader, key: str) -> str:
+def _place(stream: FrameSource, key: str) -> str:
     return f"{stream.path}: packet 0: `{key}` of the header's metadata"
 
 
 def open_stream_capture(
-    stream: StreamReader, capture: str | Path | None, frames: Sequence[int], any_recording: bool = False
+    stream: FrameSource, capture: str | Path | None, frames: Sequence[int], any_recording: bool = False
 ) -> Capture:
     """Open the capture to which a stream was fitted, with the settings of the fit.
 
@@ -320,7 +319,7 @@ def open_stream_capture(
     return as_fitted(recording, stream) if "distortions" in stream.metadata else recording
 
 
-def _check_recording(stream: StreamReader, recording: Capture) -> None:
+def _check_recording(stream: FrameSource, recording: Capture) -> None:
     """Raise `ValueError` if a recording has not the fingerprint in a stream's header; imported streams have none."""
     expected = metadata_entry(stream, "fingerprint", None, str, NoneType)
     if expected is None:
@@ -333,7 +332,7 @@ def _check_recording(stream: StreamReader, recording: Capture) -> None:
         )
 
 
-def fitted_capture(stream: StreamReader) -> str:
+def fitted_capture(stream: FrameSource) -> str:
     """Return the path of a stream's capture, which is in the `capture.json` beside it; in the header of older streams.
 
     Raises:

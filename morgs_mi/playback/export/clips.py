@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.codec.packets import CodedFrame, frames_near, play, seek
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.frame_source import FrameSource, FrameState, play
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.core.gaussians import Gaussians
@@ -34,19 +33,19 @@ Progress = Callable[[int, int], None] | None
 _SWING = 60.0
 
 
-def frame_numbers(stream: StreamReader) -> list[int]:
+def frame_numbers(stream: FrameSource) -> list[int]:
     """Return the indices of a stream's frames, without decoding them.
 
     Raises:
         ValueError: the stream has no frame.
     """
-    numbers = list(dict.fromkeys(frame for _, frame, _ in stream.index()))
+    numbers = stream.frame_numbers()
     if not numbers:
         raise ValueError(f"{stream.path}: at least one frame was expected, got none; the stream has only a header.")
     return numbers
 
 
-def select_frames(stream: StreamReader, span: str | None) -> list[int]:
+def select_frames(stream: FrameSource, span: str | None) -> list[int]:
     """Return the frames of a stream that `span` selects: ``12``, ``10:20`` (without 20), ``::5``; None selects all.
 
     Raises:
@@ -112,7 +111,7 @@ def write_each(
 
 
 def flight(
-    stream: StreamReader,
+    stream: FrameSource,
     path: CameraPath,
     channels: Sequence[str] | None = ("color",),
     clip: Iterator[Gaussians] | None = None,
@@ -137,7 +136,7 @@ def flight(
 
 
 def flight_views(
-    stream: StreamReader, path: CameraPath, clip: Iterator[Gaussians] | None = None
+    stream: FrameSource, path: CameraPath, clip: Iterator[Gaussians] | None = None
 ) -> Iterator[tuple[int, Gaussians, Camera]]:
     """Yield the number, the Gaussians and the camera of each image of `flight`.
 
@@ -149,13 +148,13 @@ def flight_views(
     return ((i, gaussians, path.at(i / stream.fps)) for i, gaussians in frames)
 
 
-def num_images(stream: StreamReader, path: CameraPath) -> int:
+def num_images(stream: FrameSource, path: CameraPath) -> int:
     """Return the number of images of `flight`."""
     return max(1, round(path.seconds * stream.fps))
 
 
 def named_path(
-    stream: StreamReader, name: str = "orbit", degrees: float | None = None, least_seconds: float = 5.0
+    stream: FrameSource, name: str = "orbit", degrees: float | None = None, least_seconds: float = 5.0
 ) -> CameraPath:
     """Return the camera path `between` or `orbit`, as long as the clip, or the path in a JSON file.
 
@@ -191,7 +190,7 @@ def repeated_seconds(clip: float, least: float) -> float:
 
 
 def repeated_frames(
-    stream: StreamReader, freeze: int | None = None, back_and_forth: bool = False
+    stream: FrameSource, freeze: int | None = None, back_and_forth: bool = False
 ) -> Iterator[Gaussians]:
     """Yield the frames of a stream without end.
 
@@ -204,22 +203,22 @@ def repeated_frames(
     Raises:
         ValueError: the stream has no such frame, or a packet is broken.
     """
-    frozen = None if freeze is None else seek(stream, freeze).gaussians
+    frozen = None if freeze is None else stream.seek(freeze).gaussians
     while True:
         yield from (frozen,) if frozen is not None else (gaussians for _, gaussians in play(stream))
         if frozen is None and back_and_forth:
             yield from _frames_backwards(stream)
 
 
-def _frames_backwards(stream: StreamReader) -> Iterator[Gaussians]:
+def _frames_backwards(stream: FrameSource) -> Iterator[Gaussians]:
     """Yield the frames between the first and the last one backwards, decoded from one keyframe to the next."""
     between = frame_numbers(stream)[1:-1]
     while between:
-        block: list[CodedFrame] = []
-        for coded in frames_near(stream, between[-1]):
-            block = [*(before for before in block if before.frame < coded.frame), coded]
-            if coded.frame == between[-1]:
+        block: list[FrameState] = []
+        for state in stream.states(between[-1]):
+            block = [*(earlier for earlier in block if earlier.frame < state.frame), state]
+            if state.frame == between[-1]:
                 break
         # A keyframe has no motion of its own: it follows from the residual, in the block before.
-        yield from (coded.gaussians for coded in block[:0:-1])
+        yield from (state.gaussians for state in block[:0:-1])
         between = [frame for frame in between if frame <= block[0].frame]

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import srgb_to_linear
 from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import PLAYABLE, write_video
+from morgs_mi.playback.export.clips import frame_numbers
 from morgs_mi.playback.export.formats import IMAGES, choose_format
 from morgs_mi.playback.player import channel_image, render_stream
 from morgs_mi.playback.visualise import side_by_side, write_png
@@ -21,7 +22,7 @@ __all__ = ["exr_channels", "pad_to_even", "write_frames", "write_images"]
 
 
 def write_frames(
-    stream: StreamReader,
+    stream: FrameSource,
     camera: Camera,
     output: str | Path,
     channels: Sequence[str] | None = None,
@@ -45,8 +46,7 @@ def write_frames(
             that is truncated, broken or has no frame.
         OSError: the folder exists, or a file cannot be written.
     """
-    if not stream.index():
-        raise ValueError(f"{stream.path}: at least one frame was expected, got none; the stream has only a header.")
+    frame_numbers(stream)  # refuses a stream without frames
     chosen = choose_format(IMAGES, output, format).name
     channels = channels or (None if chosen == "exr" else ("color",))
     write_images(render_stream(stream, camera, channels), stream.fps, output, progress, chosen)

@@ -22,8 +22,7 @@ import cv2
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.codec.packets import play
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import LARGEST, bounded, check_number
 from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
@@ -113,7 +112,7 @@ def load_insert(path: str | Path) -> Build:
     return checked
 
 
-def inserted_channels(stream: StreamReader) -> tuple[str, ...]:
+def inserted_channels(stream: FrameSource) -> tuple[str, ...]:
     """Return all channels of a stream with an inserted scene, for EXR files.
 
     Raises:
@@ -124,7 +123,7 @@ def inserted_channels(stream: StreamReader) -> tuple[str, ...]:
     return ("color", "alpha", *(name for name in available_channels(gaussians) if name != "color"), *LAYERS)
 
 
-def selected(stream: StreamReader, frames: Sequence[int]) -> list[int]:
+def selected(stream: FrameSource, frames: Sequence[int]) -> list[int]:
     """Return `frames` in ascending order, each once.
 
     Raises:
@@ -140,7 +139,7 @@ def selected(stream: StreamReader, frames: Sequence[int]) -> list[int]:
 
 
 def render_inserted(
-    stream: StreamReader,
+    stream: FrameSource,
     camera: Camera,
     build: Build,
     frames: Sequence[int] | None = None,

@@ -5,8 +5,7 @@ from __future__ import annotations
 import base64
 import html
 
-from morgs_mi.codec.packets import play
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.io.png import png_bytes
 from morgs_mi.playback.export.web import web_page
 from morgs_mi.playback.player import channel_image, render, render_config, stream_name
@@ -22,7 +21,7 @@ _PLAYER = '<iframe sandbox="allow-scripts" allow="fullscreen" title="{title}" st
 _POSTER = '<img alt="{title}" style="{style}" src="data:image/png;base64,{image}"><div>{text}</div>'
 
 
-def stream_html(stream: StreamReader) -> str:
+def stream_html(stream: FrameSource) -> str:
     """Return a stream as HTML: the player of `morgs-mi export web`, or the first frame where it would be too large.
 
     A stream that cannot be read becomes the sentence that describes why.

@@ -20,8 +20,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.codec.packets import play
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_number
 from morgs_mi.core.gaussians import Gaussians
@@ -106,7 +105,7 @@ def _strip(
 
 
 def panoramas(
-    stream: StreamReader, view: Camera | CameraPath, width: int = 2048, stereo: float = 0.0
+    stream: FrameSource, view: Camera | CameraPath, width: int = 2048, stereo: float = 0.0
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     """Render the panoramas of a stream at a camera, or of the images of `flight` along a path, with a level horizon.
 

@@ -38,8 +38,7 @@ from typing import Any
 import numpy as np
 from scipy.special import expit
 
-from morgs_mi.codec.packets import CodedFrame, frames_with_first_id
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.frame_source import FrameSource, FrameState
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import covariances, rotated, unit_quats
@@ -63,7 +62,7 @@ _UNSAVED_BYTES = 2**28  # of samples in memory
 
 
 def write_usd(
-    stream: StreamReader,
+    stream: FrameSource,
     path: str | Path,
     frames: Sequence[int],
     half: bool = False,
@@ -99,24 +98,26 @@ def write_usd(
 
 def _write_stage(
     pxr: Any,
-    stream: StreamReader,
+    stream: FrameSource,
     path: Path,
     frames: Sequence[int],
     half: bool,
     progress: Callable[[int, int], None] | None,
 ) -> None:
     """Write a file that is not a package; the arguments are the same as for `write_usd`."""
-    axes, wanted, unsaved = gltf_axes(stream.cameras), set(frames), 0
+    axes = gltf_axes(stream.cameras)
+    wanted = set(frames)
+    unsaved = 0
 
-    def selected() -> Iterator[tuple[int, CodedFrame]]:
-        return ((first_id, coded) for first_id, coded in frames_with_first_id(stream) if coded.frame in wanted)
+    def selected() -> Iterator[FrameState]:
+        return (state for state in stream.states() if state.frame in wanted)
 
     sets = _sets(selected(), axes)
     stage = pxr.Usd.Stage.CreateNew(str(path))
     _describe(pxr, stage, stream, frames, axes)
     fields = _fields(pxr, stage, sets, frames, half)
-    for done, (first_id, coded) in enumerate(selected(), start=1):
-        unsaved += fields[first_id].put(coded, axes)
+    for done, state in enumerate(selected(), start=1):
+        unsaved += fields[state.first_id].put(state, axes)
         # A binary file is appended to, which bounds the memory; a text would be written again.
         if unsaved > _UNSAVED_BYTES and path.suffix.lower() != ".usda":
             stage.Save()
@@ -143,17 +144,17 @@ class _Set:
     births: dict[str, np.ndarray]
 
 
-def _sets(clip: Iterator[tuple[int, CodedFrame]], axes: np.ndarray) -> dict[int, _Set]:
+def _sets(states: Iterator[FrameState], axes: np.ndarray) -> dict[int, _Set]:
     """Return the sets of Gaussians by the number that is added to their ids."""
     found: dict[int, list[tuple[np.ndarray, dict[str, np.ndarray]]]] = {}
     starts: dict[int, tuple[int, int]] = {}
-    for first_id, coded in clip:
-        parts = found.setdefault(first_id, [])
-        starts.setdefault(first_id, (coded.frame, coded.gaussians.sh_degree))
-        known = parts[-1][0][-1] if parts else -1
-        born = coded.ids.astype(np.int64) > known
+    for state in states:
+        parts = found.setdefault(state.first_id, [])
+        starts.setdefault(state.first_id, (state.frame, state.gaussians.sh_degree))
+        last_id = parts[-1][0][-1] if parts else -1
+        born = state.ids.astype(np.int64) > last_id
         if born.any():
-            parts.append((coded.ids[born], _values(rotated(coded.gaussians.select(born), axes))))
+            parts.append((state.ids[born], _values(rotated(state.gaussians.select(born), axes))))
     return {
         first_id: _Set(
             *starts[first_id],
@@ -189,16 +190,17 @@ class _Field:
             array = getattr(pxr.Vt, small if as_half and small else single)
             self._samples[name] = _Samples(attribute, array, np.float16 if as_half else np.float32)
 
-    def put(self, coded: CodedFrame, axes: np.ndarray) -> int:
+    def put(self, state: FrameState, axes: np.ndarray) -> int:
         """Write a frame and return the number of bytes of its samples."""
         if not len(self._ids):
             return 0
-        gaussians, rows = rotated(coded.gaussians, axes), np.searchsorted(self._ids, coded.ids)
+        gaussians = rotated(state.gaussians, axes)
+        rows = np.searchsorted(self._ids, state.ids)
         self._state["opacities"][:] = 0
         for name, value in _values(gaussians).items():
             self._state[name][rows] = value
         values = {**self._state, "extent": _extent(gaussians)}
-        return sum(self._samples[name].put(coded.frame, value) for name, value in values.items())
+        return sum(self._samples[name].put(state.frame, value) for name, value in values.items())
 
 
 @dataclass
@@ -240,7 +242,7 @@ def _extent(gaussians: Gaussians) -> np.ndarray:
     return np.stack([(means - reach).min(axis=0), (means + reach).max(axis=0)]).astype(np.float32)
 
 
-def _describe(pxr: Any, stage: Any, stream: StreamReader, frames: Sequence[int], axes: np.ndarray) -> None:
+def _describe(pxr: Any, stage: Any, stream: FrameSource, frames: Sequence[int], axes: np.ndarray) -> None:
     """Write the metadata of the stage and its root prim."""
     pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.y)
     pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)

@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.codec.container import StreamWriter
+from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.codec.packets import coded_frames
-from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.core.gaussians import Gaussians
@@ -43,7 +43,7 @@ _LEAST_SCALE = 0.001
 
 
 def write_web_page(
-    stream: StreamReader, path: str | Path, title: str | None = None, progress: Progress | None = None
+    stream: FrameSource, path: str | Path, title: str | None = None, progress: Progress | None = None
 ) -> int:
     """Write a self-contained page that plays a stream, and return its number of bytes.
 
@@ -66,14 +66,14 @@ def write_web_page(
     return len(page)
 
 
-def web_page(stream: StreamReader, title: str | None = None, progress: Progress | None = None) -> bytes:
+def web_page(stream: FrameSource, title: str | None = None, progress: Progress | None = None) -> bytes:
     """Return the page that `write_web_page` writes; arguments and errors are the same."""
     data = _script("stream", published_bytes(stream, progress))
     return _page(title or stream_name(stream), data, "data: blob:")
 
 
 def write_web_folder(
-    stream: StreamReader, path: str | Path, title: str | None = None, progress: Progress | None = None
+    stream: FrameSource, path: str | Path, title: str | None = None, progress: Progress | None = None
 ) -> int:
     """Write a folder for a web server and return its number of bytes.
 
@@ -125,7 +125,7 @@ def text_of_bytes(data: bytes) -> str:
     return (codes + np.uint8(128) * np.isin(codes, _UNSAFE)).tobytes().decode("latin-1")
 
 
-def published_bytes(stream: StreamReader, progress: Progress | None = None) -> bytes:
+def published_bytes(stream: FrameSource, progress: Progress | None = None) -> bytes:
     """Return the stream with the metadata that the page reads, after decoding it once; errors as `write_web_page`."""
     render = metadata_entry(stream, "config.render", {}, dict)
     packets, speeds = list(stream), []
