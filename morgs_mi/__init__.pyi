@@ -12,6 +12,7 @@ from .evaluate.evaluate import evaluate_stream
 from .evaluate.point_tracks import PointTracks, track_points
 from .fit.fit_config import FitConfig
 from .gaussian_integrator import ellipsoids
+from .loop.frame_report import FrameReport
 from .loop.stream_config import StreamConfig
 from .method.motion_config import MotionConfig
 from .playback.export.tracks import extract_tracks
@@ -26,7 +27,7 @@ from .render.rasterize import Image, rasterize
 from .render.render_config import RenderConfig
 from .runs.live.live_frames import live_frames
 from .runs.recorder import stream_capture
-from .stream_loop import FrameReport, StreamLoop
+from .stream_loop import StreamLoop
 from .synth.synth_config import SynthConfig
 from .synth.synthesize import synthesize
 

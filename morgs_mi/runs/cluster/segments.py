@@ -25,7 +25,7 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.files import locked_folder, write_json
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
-from morgs_mi.stream_loop import FrameReport
+from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.source import about_lenses, as_fitted
 from morgs_mi.runs.cluster.seams import COMMON_FRAMES, SegmentConfig

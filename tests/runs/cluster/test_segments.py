@@ -23,7 +23,7 @@ from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.fit.fit_config import ShortFitConfig
-from morgs_mi.stream_loop import FrameReport
+from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.cluster.seams import SegmentConfig
 from morgs_mi.runs.cluster.segments import SegmentedRun
