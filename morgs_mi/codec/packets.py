@@ -75,7 +75,8 @@ class CodedFrame(FrameState):
     @cached_property
     def digest(self) -> np.ndarray:
         """BLAKE2b of all integers, uint8 [8], by which a residual names its parent."""
-        grid, hashed = self.grid, blake2b(digest_size=8)
+        grid = self.grid
+        hashed = blake2b(digest_size=8)
         for array, dtype in (
             (self.ids, "<u4"),
             (grid.largest_components, "u1"),
@@ -109,7 +110,8 @@ def keyframe_packet(
 
 def reemitted_keyframe(coded: CodedFrame) -> Packet:
     """Return the keyframe that decodes to exactly `coded`: an entry point for readers, without any loss."""
-    grid, writer = coded.grid, ColumnWriter()
+    grid = coded.grid
+    writer = ColumnWriter()
     writer.put(np.diff(coded.ids.astype(np.int64), prepend=-1) - 1)
     _put_grid(writer, grid)
     head = np.array([len(grid), grid.degree, grid.optional, coded.next_id], np.uint32)
@@ -140,22 +142,25 @@ def residual_packet(
     Raises:
         ValueError: `source` or the attributes do not fit, or an attribute is not finite.
     """
-    config, grid = config or CodecConfig(), previous.grid
+    config = config or CodecConfig()
+    grid = previous.grid
     _check_attributes(previous, gaussians.sh_degree, optional_mask(gaussians.items()))
     source = _checked(np.arange(len(grid)) if source is None else source, len(grid), len(gaussians))
-    stored, survivors = finite_fields(gaussians), source[source >= 0]
+    fields = finite_fields(gaussians)
+    survivors = source[source >= 0]
     offset = np.zeros((len(gaussians), 3)) if gaussians.offset is None else np.asarray(gaussians.offset)
-    coder = _coder(previous, stored, survivors, offset if config.offset else None)
-    births, born = len(gaussians) - len(survivors), None
+    coder = _coder(previous, fields, survivors, offset if config.offset else None)
+    births = len(gaussians) - len(survivors)
+    birth_grid = None
     if births:
-        born = new_grid({n: v[len(survivors) :] for n, v in split_groups(stored).items()}, cameras, config)
+        birth_grid = new_grid({n: v[len(survivors) :] for n, v in split_groups(fields).items()}, cameras, config)
     coarseness = round(4 * np.log2(config.birth_precision))
     if config.target_size:
         coarseness = _fitting(coder, coarseness, config.target_size)
-    codes = _codes(coder, coarseness, born)
+    codes = _codes(coder, coarseness, birth_grid)
     while config.target_size and coarseness < _COARSEST and sum(c.nbytes for c in codes.values()) > config.target_size:
         coarseness += 1
-        codes = _codes(coder, coarseness, born)
+        codes = _codes(coder, coarseness, birth_grid)
     arrays = {"parent": previous.digest, "head": np.array([births, coarseness], np.uint32), **codes}
     return Packet(PacketKind.RESIDUAL, previous.frame + 1, arrays)
 
@@ -223,7 +228,8 @@ def _decoded_keyframe(packet: Packet, first_id: int) -> CodedFrame:
 
 def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
     births, coarseness = _head(packet, 2)
-    code, grid = packet.arrays["code"], previous.grid
+    code = packet.arrays["code"]
+    grid = previous.grid
     _check_most(coarseness, _COARSEST, "its coarseness")
     _check_most(previous.next_id + births, LIMIT - 1, "its next id")
     reader = ColumnReader(code)
@@ -232,26 +238,32 @@ def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
     _check_words(code, births, len(survivors) + births, grid.degree, grid.optional)
     new = replace(grid, values=values).select(survivors)
     motion = np.zeros((len(survivors) + births, 3), np.float32)
-    before = np.asarray(previous.gaussians.means)[survivors]
-    motion[: len(survivors)] = new.real("means").astype(np.float32) - before
+    starts = np.asarray(previous.gaussians.means)[survivors]
+    motion[: len(survivors)] = new.real("means").astype(np.float32) - starts
     offset = None
     if "offset" in packet.arrays:
-        offset, at, words = np.zeros_like(motion), grid.columns["means"], ColumnReader(packet.arrays["offset"])
-        moved = np.flatnonzero(np.any(new.values[:, at] != grid.values[survivors, at], axis=1))
-        r = np.stack([words.take(len(moved)) for _ in range(3)], axis=1)
-        offset[moved] = r * offset_steps(new.select(moved), coarseness)
+        offset = np.zeros_like(motion)
+        at = grid.columns["means"]
+        rows = np.flatnonzero(np.any(new.values[:, at] != grid.values[survivors, at], axis=1))
+        offset[rows] = _taken_offsets(packet.arrays["offset"], new.select(rows), coarseness)
     if births:
         new = new.concatenate(_taken_grid(reader, births, grid.degree, grid.optional))
     ids = np.concatenate([previous.ids[survivors], previous.next_id + np.arange(births, dtype=np.uint32)])
-    gaussians = new.gaussians(motion, offset)
     return replace(
         previous,
         frame=packet.frame,
         ids=ids.astype(np.uint32),
-        gaussians=gaussians,
+        gaussians=new.gaussians(motion, offset),
         grid=new,
         next_id=previous.next_id + births,
     )
+
+
+def _taken_offsets(code: np.ndarray, grid: Grid, coarseness: int) -> np.ndarray:
+    """Return the offsets [M, 3] of the Gaussians whose means change, which `Coder.offsets` yields."""
+    reader = ColumnReader(code)
+    r = np.stack([reader.take(len(grid)) for _ in range(3)], axis=1)
+    return r * offset_steps(grid, coarseness)
 
 
 def _words(columns: Iterable[np.ndarray]) -> np.ndarray:
@@ -276,7 +288,8 @@ def _taken_grid(reader: ColumnReader, N: int, degree: int, optional: int) -> Gri
     largest = reader.take(N) + middle[0]
     if np.any((largest < 0) | (largest > 3)):
         raise ValueError("the largest component of a quaternion must be 0 to 3")
-    exponents, values = np.empty((N, first - 1), np.int8), np.empty((N, len(middle) - first), np.int32)
+    exponents = np.empty((N, first - 1), np.int8)
+    values = np.empty((N, len(middle) - first), np.int32)
     for column, shift in zip(exponents.T, middle[1:first], strict=True):
         column[:] = bounded(reader.take(N) + shift, 128, "exponent")
     for column, shift in zip(values.T, middle[first:], strict=True):
@@ -285,27 +298,31 @@ def _taken_grid(reader: ColumnReader, N: int, degree: int, optional: int) -> Gri
 
 
 def _coder(
-    previous: CodedFrame, now: Mapping[str, np.ndarray], survivors: np.ndarray, offset: np.ndarray | None
+    previous: CodedFrame, fields: Mapping[str, np.ndarray], survivors: np.ndarray, offset: np.ndarray | None
 ) -> Coder:
-    """Return the coder of the changes to the stored fields `now`; survivors without any difference are skipped."""
-    grid, before, differs = previous.grid, stored_fields(previous.gaussians), np.zeros(len(survivors), bool)
-    for name, value in now.items():
-        different = value[: len(survivors)] != before[name][survivors]
-        differs |= different.reshape(len(survivors), prod(value.shape[1:])).any(1)
-    touched = np.flatnonzero(differs)
-    rows = survivors[touched]
-    change = real_values({name: value[touched] for name, value in split_groups(now).items()}, grid.select(rows))
+    """Return the coder of the changes to the next stored `fields`; survivors without any difference are skipped."""
+    grid = previous.grid
+    previous_fields = stored_fields(previous.gaussians)
+    differs = np.zeros(len(survivors), bool)
+    for name, value in fields.items():
+        differences = value[: len(survivors)] != previous_fields[name][survivors]
+        differs |= differences.reshape(len(survivors), prod(value.shape[1:])).any(1)
+    indices = np.flatnonzero(differs)
+    rows = survivors[indices]
+    change = real_values({name: value[indices] for name, value in split_groups(fields).items()}, grid.select(rows))
     change -= grid.values[rows].T
     return Coder(grid, survivors, rows, change, offset)
 
 
-def _codes(coder: Coder, coarseness: int, born: Grid | None) -> dict[str, np.ndarray]:
+def _codes(coder: Coder, coarseness: int, birth_grid: Grid | None) -> dict[str, np.ndarray]:
     """Return the words of the changes in steps of a coarseness, and of the births."""
-    r, writer, births = coder.rounded(coarseness), ColumnWriter(), 0 if born is None else len(born)
+    r = coder.rounded(coarseness)
+    writer = ColumnWriter()
+    births = 0 if birth_grid is None else len(birth_grid)
     for column in coder.columns(r):
         writer.put(column)
-    if born is not None:
-        _put_grid(writer, born)
+    if birth_grid is not None:
+        _put_grid(writer, birth_grid)
     codes = {"code": _padded(writer.words(), births, len(coder.survivors) + births, coder.grid)}
     if coder.offset is not None:
         codes["offset"] = _words(coder.offsets(r, coarseness))
@@ -329,21 +346,22 @@ def _fitting(coder: Coder, low: int, target: int) -> int:
 def _check_attributes(previous: CodedFrame, degree: int, optional: int) -> None:
     grid = previous.grid
     if (degree, optional) != (grid.degree, grid.optional):
-        expected, got = (list(optional_names(mask)) for mask in (grid.optional, optional))
+        names, new_names = (list(optional_names(mask)) for mask in (grid.optional, optional))
         raise ValueError(
             f"residual_packet(): frame {previous.frame + 1} must have SH of degree {grid.degree} and the optional "
-            f"attributes {expected} as the frame before, got degree {degree} and {got}; write a keyframe instead."
+            f"attributes {names} as the frame before, got degree {degree} and {new_names}; write a keyframe instead."
         )
 
 
-def _checked(source: np.ndarray, before: int, now: int) -> np.ndarray:
+def _checked(source: np.ndarray, N: int, next_N: int) -> np.ndarray:
+    """Return the sources of the next Gaussians, if they are in order and refer to N Gaussians."""
     source = np.asarray(source)
-    born = source < 0
-    survivors = source[~born]
-    sound = source.shape == (now,) and np.all(np.diff(survivors) > 0) and np.all(np.diff(born.astype(int)) >= 0)
-    if not sound or np.any(survivors >= before):
+    births = source < 0
+    survivors = source[~births]
+    is_ordered = np.all(np.diff(survivors) > 0) and np.all(np.diff(births.astype(int)) >= 0)
+    if source.shape != (next_N,) or not is_ordered or np.any(survivors >= N):
         raise ValueError(
-            f"residual_packet(): `source` must be [{now}] with survivors of 0..{before - 1} in ascending order, then "
+            f"residual_packet(): `source` must be [{next_N}] with survivors of 0..{N - 1} in ascending order, then "
             f"-1 for each birth, got {source.shape}; sort the Gaussians in this order."
         )
     return source

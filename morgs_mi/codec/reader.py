@@ -84,10 +84,10 @@ class StreamReader(FrameSource):
                     raise ValueError(f"the first packet must be the header, got kind {kind}")
                 self.cameras, self.fps, self.metadata = header_fields(payload)
         self._first = PREAMBLE.size + len(data)
-        self._kept: list[_Entry] | None = None
+        self._playable_entries: list[_Entry] | None = None
         self.skipped: list[int] = []
         if skip_damaged:
-            self._kept, self.skipped = self._playable()
+            self._playable_entries, self.skipped = self._playable()
 
     def __iter__(self) -> Iterator[Packet]:
         return self._packets(1, self._first)
@@ -101,19 +101,19 @@ class StreamReader(FrameSource):
         Near a frame, decoding starts at the last keyframe before it. Where the frame cannot be reached from there,
         because that keyframe or the index is forged, the states from the start of the stream follow.
         """
-        reached = False
+        has_frame = False
         if near is not None:
             packets = self.near(near)
             try:
                 for coded in coded_frames(packets):
-                    if coded.frame > near and not reached:
+                    if coded.frame > near and not has_frame:
                         break
-                    reached = reached or coded.frame == near
+                    has_frame = has_frame or coded.frame == near
                     yield coded
             except ValueError:
-                if reached:
+                if has_frame:
                     raise
-        if not reached:
+        if not has_frame:
             yield from coded_frames(self)
 
     def near(self, frame: int) -> Iterator[Packet]:
@@ -127,10 +127,12 @@ class StreamReader(FrameSource):
         """
         if self._pipe is not None:
             raise ValueError(f"{self.path}: expected a file to seek in, got a pipe; save it first.")
-        number, at = 1, self._first
-        for k, (kind, known, offset) in enumerate(self.index()):
-            if kind == PacketKind.KEYFRAME and known < frame:
-                number, at = k + 1, offset
+        number = 1
+        at = self._first
+        for k, (kind, packet_frame, offset) in enumerate(self.index(), start=1):
+            if kind == PacketKind.KEYFRAME and packet_frame < frame:
+                number = k
+                at = offset
         return self._packets(number, at)
 
     def closed(self) -> bool:
@@ -150,12 +152,14 @@ class StreamReader(FrameSource):
         Raises:
             TruncatedStreamError: the file is now shorter than the header that was read from it.
         """
-        if self._kept is not None:
-            return list(self._kept)
+        if self._playable_entries is not None:
+            return list(self._playable_entries)
         with open(self.path, "rb") as file:
             if (entries := self._last_index(file)) is not None:
                 return entries
-            entries, at, size = [], self._first, file.seek(0, 2)
+            entries = []
+            size = file.seek(0, 2)
+            at = self._first
             while at + PAYLOAD <= size:
                 file.seek(at)
                 kind, frame, length = HEAD.unpack(file.read(HEAD.size))
@@ -168,7 +172,7 @@ class StreamReader(FrameSource):
         """Return the entries of the packets that play without the damaged ones, and the frames that do not play."""
         if self._pipe is not None:
             raise ValueError(f"{self.path}: expected a file to skip damage in, got a pipe; save it first.")
-        kept = list[_Entry]()
+        entries = list[_Entry]()
         frames = [-1]
         plays = False
         with open(self.path, "rb") as file:
@@ -177,12 +181,12 @@ class StreamReader(FrameSource):
                     frames.append(frame)
                     plays = plays or kind == PacketKind.KEYFRAME
                     if plays:
-                        kept.append((kind, frame, offset))
+                        entries.append((kind, frame, offset))
                 else:
                     # A damaged head may name any frame. A keyframe that repeats the state of a frame is not needed.
                     frames.append(frame if frame == frames[-1] else frames[-1] + 1)
-                    plays = plays and kept[-1][1] == frames[-1]
-        return kept, sorted({*frames[1:]} - {frame for _, frame, _ in kept})
+                    plays = plays and entries[-1][1] == frames[-1]
+        return entries, sorted({*frames[1:]} - {frame for _, frame, _ in entries})
 
     def _is_intact(self, file: BinaryIO, number: int, at: int) -> bool:
         file.seek(at)
@@ -225,7 +229,8 @@ class StreamReader(FrameSource):
         """
         if self._pipe is not None:
             raise ValueError(f"{self.path}: expected a file that is read twice, got a pipe; save it first.")
-        entries, end = [], self._first
+        entries = []
+        end = self._first
         with contextlib.suppress(TruncatedStreamError):
             for at, data in self._checked(1, self._first):
                 kind, frame, _ = HEAD.unpack_from(data)
@@ -236,7 +241,8 @@ class StreamReader(FrameSource):
 
     def _packets(self, number: int, at: int) -> Iterator[Packet]:
         last = None
-        for offset, data in self._checked(number, at) if self._kept is None else self._undamaged(number, at):
+        read = self._checked if self._playable_entries is None else self._undamaged
+        for offset, data in read(number, at):
             if HEAD.unpack_from(data)[0] != PacketKind.INDEX:
                 with self._located(number, offset, last):
                     packet = decode_packet(data, self._place(number, offset))

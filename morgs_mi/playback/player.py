@@ -175,7 +175,8 @@ def playback_speed(stream: FrameSource, camera: Camera) -> dict[str, float]:
     Raises:
         ValueError: a broken packet.
     """
-    config, times = render_config(stream), []
+    config = render_config(stream)
+    times = []
     frames = islice(play(stream), _MOST_TIMED_FRAMES)
     while True:
         start = time.perf_counter()
@@ -268,8 +269,8 @@ def metadata_entry(stream: FrameSource, key: str, default: Any, *kinds: type) ->
             return default
         value = value[name] if isinstance(value, dict) else None
     if type(value) not in kinds:
-        expected = " or ".join(_JSON_TYPES[kind] for kind in kinds)
-        raise ValueError(f"{_place(stream, key)} must be {expected}, got {shortened(value)}; fit the capture again.")
+        names = " or ".join(_JSON_TYPES[kind] for kind in kinds)
+        raise ValueError(f"{_place(stream, key)} must be {names}, got {shortened(value)}; fit the capture again.")
     return value
 
 
@@ -300,10 +301,11 @@ def open_stream_capture(
     if not frames:
         raise ValueError(f"{stream.path}: expected at least one frame, got a header alone; fit the capture again.")
     recording = load_capture(path, downscale, "auto" if test_view == "auto" else None, frames[-1] + 1, reading)
-    expected, found = _sizes(stream.cameras), _sizes(recording.cameras)
-    if found != expected:
+    sizes = _sizes(stream.cameras)
+    recorded_sizes = _sizes(recording.cameras)
+    if recorded_sizes != sizes:
         raise ValueError(
-            f"{path}: expected the cameras that {stream.path} was fitted to, {expected}, got {found}; "
+            f"{path}: expected the cameras that {stream.path} was fitted to, {sizes}, got {recorded_sizes}; "
             "pass that capture (--capture)."
         )
     if test_view != "auto":
@@ -321,11 +323,11 @@ def open_stream_capture(
 
 def _check_recording(stream: FrameSource, recording: Capture) -> None:
     """Raise `ValueError` if a recording has not the fingerprint in a stream's header; imported streams have none."""
-    expected = metadata_entry(stream, "fingerprint", None, str, NoneType)
-    if expected is None:
+    stream_fingerprint = metadata_entry(stream, "fingerprint", None, str, NoneType)
+    if stream_fingerprint is None:
         return
     refines = metadata_entry(stream, "config.fit.refine_cameras", "off", str) != "off"
-    if fingerprint(recording, next(recording.partial_frames(0, 1)).images, refines) != expected:
+    if fingerprint(recording, next(recording.partial_frames(0, 1)).images, refines) != stream_fingerprint:
         raise ValueError(
             f"{recording.path}: expected the recording that {stream.path} was fitted to, got other images in its first "
             "frame, or other points; pass that capture (--capture), or compare with any recording (--any-recording)."
@@ -339,17 +341,18 @@ def fitted_capture(stream: FrameSource) -> str:
         FileNotFoundError: it is not there any more.
         ValueError: no path is stored.
     """
-    beside = None
+    capture_file = None
     with suppress(OSError, ValueError):
-        beside = read_json(stream.path.with_name("capture.json"))
-    stored = [about.get("capture") for about in (stream.metadata, beside) if isinstance(about, dict)]
-    paths, remedy = [path for path in stored if isinstance(path, str)], "name its folder with --capture"
+        capture_file = read_json(stream.path.with_name("capture.json"))
+    entries = [fields.get("capture") for fields in (stream.metadata, capture_file) if isinstance(fields, dict)]
+    paths = [path for path in entries if isinstance(path, str)]
+    remedy = "name its folder with --capture"
     if not paths:
         raise ValueError(
             f"{stream.path}: expected the path of its capture in the capture.json beside it, found none; {remedy}."
         )
-    if found := next((path for path in paths if Path(path).is_dir()), None):
-        return found
+    if folder := next((path for path in paths if Path(path).is_dir()), None):
+        return folder
     raise FileNotFoundError(
         f"{paths[0]}: expected the capture of {stream.path}, found none; if it has moved, {remedy}."
     )

@@ -57,14 +57,15 @@ class SplatFile(FrameSource):
     def __init__(self, path: Path, most_invalid: float = DRAWN) -> None:
         gaussians = read_splats(path, most_invalid)
         self.cameras_file, trained = trained_cameras(path, gaussians)
-        self.path, self.fps, self.metadata = path, 30.0, {"num_frames": 1, DEFAULT_RIG: not trained}
+        self.path = path
+        self.fps = 30.0
+        self.metadata = {"num_frames": 1, DEFAULT_RIG: not trained}
         try:
             self.cameras = trained or default_rig([gaussians])
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
-        N = len(gaussians)
-        still = replace(gaussians, motion=np.zeros((N, 3), np.float32))
-        self._state = FrameState(0, np.arange(N, dtype=np.uint32), still)
+        still = replace(gaussians, motion=np.zeros((len(gaussians), 3), np.float32))
+        self._state = FrameState(0, np.arange(len(gaussians), dtype=np.uint32), still)
 
     def frame_numbers(self) -> list[int]:
         return [0]

@@ -61,10 +61,11 @@ def select_frames(stream: FrameSource, span: str | None) -> list[int]:
     except ValueError:
         raise ValueError(f"select_frames(): `span` must be like 12, 10:20 or 0:100:5, got {span!r}.") from None
     if ":" not in span:
-        start, stop = start, None if start is None else start + 1
-    low, high = numbers[0] if start is None else start, numbers[-1] + 1 if stop is None else stop
-    wanted = set(range(low, high, step or 1))
-    if not (selected := [number for number in numbers if number in wanted]):
+        stop = None if start is None else start + 1
+    low = numbers[0] if start is None else start
+    high = numbers[-1] + 1 if stop is None else stop
+    indices = range(low, high, step or 1)
+    if not (selected := [number for number in numbers if number in indices]):
         raise ValueError(
             f"select_frames(): `span` must select frames of {stream.path}, {numbers[0]} to {numbers[-1]}, got {span!r}."
         )
@@ -93,20 +94,21 @@ def write_each(
         ValueError: a broken packet, or several frames for one file.
         OSError: the folder exists, or a file cannot be written.
     """
-    wanted, done = set(frames), 0
-    single = Path(output).name.lower().endswith(suffix)
-    if single and len(wanted) > 1:
+    selection = set(frames)
+    count = 0
+    is_file = Path(output).name.lower().endswith(suffix)
+    if is_file and len(selection) > 1:
         raise ValueError(
-            f"{output}: expected one frame for one file, got {len(wanted)}; select one (--frames), or name a folder."
+            f"{output}: expected one frame for one file, got {len(selection)}; select one (--frames), or name a folder."
         )
-    with (atomic_path if single else atomic_folder)(output, "write_each()") as partial:
+    with (atomic_path if is_file else atomic_folder)(output, "write_each()") as partial:
         for frame, gaussians in clip:
-            if frame in wanted:
-                write(partial if single else partial / f"{frame:04d}{suffix}", gaussians)
-                done += 1
+            if frame in selection:
+                write(partial if is_file else partial / f"{frame:04d}{suffix}", gaussians)
+                count += 1
                 if progress is not None:
-                    progress(done, len(wanted))
-            if done == len(wanted):
+                    progress(count, len(selection))
+            if count == len(selection):
                 break
 
 

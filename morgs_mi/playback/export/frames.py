@@ -47,9 +47,9 @@ def write_frames(
         OSError: the folder exists, or a file cannot be written.
     """
     frame_numbers(stream)  # refuses a stream without frames
-    chosen = choose_format(IMAGES, output, format).name
-    channels = channels or (None if chosen == "exr" else ("color",))
-    write_images(render_stream(stream, camera, channels), stream.fps, output, progress, chosen)
+    kind = choose_format(IMAGES, output, format).name
+    channels = channels or (None if kind == "exr" else ("color",))
+    write_images(render_stream(stream, camera, channels), stream.fps, output, progress, kind)
 
 
 def write_images(
@@ -65,20 +65,20 @@ def write_images(
         ValueError: another type of video.
         OSError: the folder exists, or a file cannot be written.
     """
-    chosen = choose_format(IMAGES, output, format).name
+    kind = choose_format(IMAGES, output, format).name
 
     def frames() -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:
-        for done, (frame, images) in enumerate(rendered, start=1):
+        for count, (frame, images) in enumerate(rendered, start=1):
             yield frame, images
             if progress is not None:
-                progress(done)
+                progress(count)
 
-    if chosen == "mp4":
+    if kind == "mp4":
         padded = (pad_to_even(_combined_image(images)) for _, images in frames())
         write_video(output, padded, fps, PLAYABLE)
         return
-    write = _write_png if chosen == "png" else _write_exr
-    if Path(output).name.lower().endswith(f".{chosen}"):
+    write = _write_png if kind == "png" else _write_exr
+    if Path(output).name.lower().endswith(f".{kind}"):
         with atomic_path(output, "write_frames()") as partial:
             for count, (_, images) in enumerate(frames()):
                 if count:
@@ -87,7 +87,7 @@ def write_images(
         return
     with atomic_folder(output, "write_frames()") as folder:
         for frame, images in frames():
-            write(folder / f"{frame:04d}.{chosen}", images)
+            write(folder / f"{frame:04d}.{kind}", images)
 
 
 def _write_png(path: Path, images: Mapping[str, np.ndarray]) -> None:

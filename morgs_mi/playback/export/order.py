@@ -22,15 +22,17 @@ def by_place(stream: FrameSource) -> Iterator[tuple[int, Gaussians]]:
     Raises:
         ValueError: a broken packet.
     """
-    known_ids, known_keys, cells = np.zeros(0, np.int64), np.zeros(0, np.int64), None
+    all_ids = np.zeros(0, np.int64)
+    all_keys = np.zeros(0, np.int64)
+    cells = None
     for state in stream.states():
         ids = state.lasting_ids
         means = state.gaussians.numpy()["means"]
-        if len(ids) and (cells is None or not np.isin(ids, known_ids).any()):
+        if len(ids) and (cells is None or not np.isin(ids, all_ids).any()):
             cells = equal_cells(means)
-        born = ~np.isin(ids, known_ids)
-        if cells is not None and born.any():
-            known_ids = np.concatenate([known_ids, ids[born]])
-            known_keys = np.concatenate([known_keys, z_order(means[born], cells)])
-        keys = known_keys[np.searchsorted(known_ids, ids)]
+        births = ~np.isin(ids, all_ids)
+        if cells is not None and births.any():
+            all_ids = np.concatenate([all_ids, ids[births]])
+            all_keys = np.concatenate([all_keys, z_order(means[births], cells)])
+        keys = all_keys[np.searchsorted(all_ids, ids)]
         yield state.frame, state.gaussians.select(np.argsort(keys, kind="stable"))

@@ -44,7 +44,9 @@ def extract_tracks(stream: FrameSource, progress: Callable[[int], None] | None =
     Raises:
         ValueError: a broken packet, or a stream without a frame.
     """
-    ids_of_frames, rows, frames = [], [], []
+    ids_of_frames = []
+    rows = []
+    frames = []
     for state in stream.states():
         gaussians = state.gaussians
         has_confidence = gaussians.confidence is not None
@@ -61,7 +63,8 @@ def extract_tracks(stream: FrameSource, progress: Callable[[int], None] | None =
     confidences = np.full((len(frames), len(ids)), np.nan, np.float32)
     for t, (present, (means, confidence)) in enumerate(zip(ids_of_frames, rows, strict=True)):
         columns = np.searchsorted(ids, present)
-        positions[t, columns], confidences[t, columns] = means, confidence
+        positions[t, columns] = means
+        confidences[t, columns] = confidence
     return Tracks(ids.astype(np.uint32), np.asarray(frames), positions, confidences)
 
 
