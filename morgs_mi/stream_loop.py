@@ -13,27 +13,21 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from morgs_mi.codec.container import Packet
-from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, residual_packet
+from morgs_mi.codec.packets import CodedFrame, decode, residual_packet
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.threads import in_background
-from morgs_mi.fit.budget import plan_first_frame
-from morgs_mi.fit.dropping import adapted_to_images
-from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
-from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.fit.initialise import MIN_POINTS
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
-from morgs_mi.fit.problem import FirstFrameProblem
-from morgs_mi.fit.unseen_views import unseen_views
-from morgs_mi.loop.correction import Correction, estimate_correction
+from morgs_mi.loop.correction import Correction
+from morgs_mi.loop.first_frame import fitted_first_frame, with_first_confidence
+from morgs_mi.loop.frame_report import FittedFrame, FrameReport
 from morgs_mi.loop.image_status import image_status
 from morgs_mi.loop.observation import (
     FrameObservation,
@@ -44,56 +38,17 @@ from morgs_mi.loop.observation import (
     observe_frame,
     prepare,
     see_frame,
-    views_of,
 )
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.active_set import ActiveSet, find_active_set, full_active_set
-from morgs_mi.method.confidence import motion_mask
 from morgs_mi.method.exposure import Exposure
-from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.motion import initial_motion
 from morgs_mi.method.objective import Observations, channels_of, observe
 from morgs_mi.method.ssim import Target
 
-__all__ = ["FrameReport", "StreamLoop", "StreamState", "step"]
+__all__ = ["StreamLoop", "StreamState", "step"]
 
 _LOG = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class FrameReport:
-    """Report of one frame.
-
-    Attributes:
-        frame: its index.
-        seconds: wall time from the images to the packet, optical flow and optimisation included.
-        num_bytes: size of the packet in the stream.
-        losses: means over the last steps, by the names of the terms.
-        num_gaussians: number of Gaussians of the frame.
-        status: "ok", or a sentence about a problem and how it was handled.
-        missing_views: names of the views without an image.
-        active: fractions that took part, by name: gaussians, views, pixels, epochs.
-        validation: of the first frame, a `sentence` on views between the cameras, with the fields of `UnseenViews`
-            (see `fit.unseen_views`); empty with a single view.
-        steps: number of optimisation steps.
-        exposures: gain and bias of each view; empty if they are not estimated.
-    """
-
-    frame: int
-    seconds: float
-    num_bytes: int
-    losses: dict[str, float]
-    num_gaussians: int
-    status: str = "ok"
-    missing_views: tuple[str, ...] = ()
-    active: dict[str, float] = field(default_factory=dict)
-    validation: dict[str, Any] = field(default_factory=dict)
-    steps: int = 0
-    exposures: tuple[Exposure, ...] = ()
-
-    def __repr__(self) -> str:
-        size = f"{self.num_gaussians} Gaussians, {self.num_bytes} bytes, {self.seconds:.1f} s"
-        return f"FrameReport(frame {self.frame}, {size}, {self.status})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,19 +73,6 @@ class StreamState:
     def gaussians(self) -> Gaussians | None:
         """The decoded Gaussians of the last frame, None before the first."""
         return self.coded.gaussians if self.coded else None
-
-
-@dataclass(frozen=True)
-class _Fitted:
-    """Result of the fit of a frame: its packet, entries of its `FrameReport`, and the correction of its images."""
-
-    packet: Packet
-    correction: Correction
-    losses: dict[str, float]
-    steps: int
-    status: str
-    active: dict[str, float] = field(default_factory=dict)
-    validation: dict[str, Any] = field(default_factory=dict)
 
 
 @interrupts_raised()
@@ -158,9 +100,9 @@ def step(
     frame_progress = Progress(progress, f"Frame {state.frame}")
     observed = images if isinstance(images, FrameObservation) else observe_frame(setup, state.frame, state.seen, images)
     if state.coded is None:
-        fitted = _fit_first_frame(setup, observed, frame_progress, on_provisional)
+        fitted = fitted_first_frame(setup, observed, frame_progress, on_provisional)
     else:
-        fitted = _fit_later_frame(setup, state, observed, frame_progress)
+        fitted = _fitted_later_frame(setup, state, observed, frame_progress)
     coded = decode(state.coded, fitted.packet)
     seen = observed.seen
     report = FrameReport(
@@ -187,21 +129,27 @@ def _status(setup: Setup, state: StreamState, images: Images, status: str) -> st
     return "; ".join([*([] if status == "ok" else [status]), *problems]) or "ok"
 
 
-def _fit_later_frame(setup: Setup, state: StreamState, observed: FrameObservation, progress: Progress) -> _Fitted:
-    """Return the fit of a later frame; numbers refer to the paper's equations."""
+def _fitted_later_frame(
+    setup: Setup, state: StreamState, observed: FrameObservation, progress: Progress
+) -> FittedFrame:
+    """Return the fit of a later frame; numbers in brackets are the paper's equations."""
     assert state.coded is not None
-    config, motion, images, flows = setup.config, setup.config.motion, observed.seen.images, observed.flows
+    config = setup.config
+    motion = config.motion
+    images = observed.seen.images
     rng = rng_of(config.seed, Stream.LATER_FRAMES, state.frame)  # of its own for each frame: it is no state
-    previous = _first_confidence(setup, state, flows, rng)  # frame 0's confidence (11)
+    previous = state.coded.gaussians
+    if state.frame == 1:  # the masks of frame 0 need the flow to this frame
+        previous = with_first_confidence(setup, previous, state.seen.images, observed.flows, rng)  # (9-11)
     observations = observe(observed.key_views, motion, config.fit.objective)
     active = _active_set(setup, previous, images, observed.changes, observations)
     corrected = state.correction.corrected({view: images[view] for view in active.views})
     targets = {view: Target(image, setup.masks[view]) for view, image in corrected.items()}
-    initial = initial_motion(previous, active, flows, targets, motion, rng)  # motion (5)
+    initial = initial_motion(previous, active, observed.flows, targets, motion, rng)  # motion (5)
     problem = FrameProblem(previous, active, targets, observations, initial, setup.extent)
     fitted = fit_later_frame(problem, config.fit, motion, rng, progress)  # residual (6-8, 12), objective (13)
     packet = residual_packet(state.coded, fitted.gaussians, fitted.source, setup.cameras, config.codec)  # (3)
-    return _Fitted(
+    return FittedFrame(
         packet=packet,
         correction=state.correction,
         losses=fitted.losses,
@@ -209,65 +157,6 @@ def _fit_later_frame(setup: Setup, state: StreamState, observed: FrameObservatio
         status="ok" if images else "no view has an image",
         active={**active.fractions, "epochs": fitted.epochs / config.fit.epochs},
     )
-
-
-def _fit_first_frame(
-    setup: Setup,
-    observed: FrameObservation,
-    progress: Progress,
-    on_provisional: Callable[[Packet], None] | None,
-) -> _Fitted:
-    """Return the fit of the first frame."""
-    config = setup.config
-    correction, correction_entry = estimate_correction(setup, observed.seen.images, progress)
-    views = views_of(setup, correction.corrected(observed.seen.images))
-    rng = rng_of(config.seed, Stream.FIRST_FRAME)
-    plan = plan_first_frame(views, setup.points, config.fit)
-    problem = FirstFrameProblem.of(views, setup.cloud, plan.config, config.render, rng)
-    fit_config = adapted_to_images(plan.config, problem)
-
-    def packed(gaussians: Gaussians) -> Packet:
-        return keyframe_packet(gaussians, 0, setup.cameras, config.codec)
-
-    on_round = None if on_provisional is None else lambda gaussians: on_provisional(packed(gaussians))
-    fitted = fit_first_frame(problem, fit_config, rng, progress.of(plan.stage), on_round)
-    forecast = unseen_views(problem, fitted.gaussians).entries if len(views) > 1 else {}
-    return _Fitted(
-        packet=packed(fitted.gaussians),
-        correction=correction,
-        losses=fitted.losses,
-        steps=fitted.steps,
-        status=_start_status(setup, plan.config),
-        validation=forecast | correction_entry,
-    )
-
-
-def _start_status(setup: Setup, config: FitConfig) -> str:
-    """Return a status about the points that the first frame starts from."""
-    if (count := len(setup.points)) >= MIN_POINTS:
-        return "ok"
-    status = f"the capture has {count} points, too few: seeded {config.first_count} random ones inside the views"
-    _LOG.warning("frame 0: %s", status)
-    return status
-
-
-def _first_confidence(
-    setup: Setup, state: StreamState, flows: Mapping[int, FlowObservation], rng: np.random.Generator
-) -> Gaussians:
-    """Return the previous Gaussians; in frame 1 with a confidence learned from the masks of frame 0 (eq. 11).
-
-    The masks of the first frame need the flow to the second one.
-    """
-    previous, config = state.gaussians, setup.config
-    assert previous is not None
-    if state.frame != 1 or not flows or not config.motion.learn_confidence:
-        return previous
-    motion, images = config.motion, state.seen.images
-    masks = {
-        v: motion_mask(images[v], flow.forward_flow, flow.forward_reliable, motion.mask_method, motion.masks)
-        for v, flow in flows.items()
-    }
-    return fit_confidence(previous, dict(enumerate(setup.cameras)), masks, config.fit, config.render, rng)[0]
 
 
 def _active_set(
@@ -329,7 +218,8 @@ class StreamLoop:
             config: settings.
         """
         views = capture.train_views
-        cameras, masks = [capture.cameras[v] for v in views], [capture.masks[v] for v in views]
+        cameras = [capture.cameras[v] for v in views]
+        masks = [capture.masks[v] for v in views]
         return cls(cameras, capture.points, capture.point_colors, config, masks)
 
     def __repr__(self) -> str:
@@ -360,9 +250,11 @@ class StreamLoop:
                 frame, where `images` are interpolated because cameras have delays.
             on_provisional: as for `step`.
         """
-        start, frame, before = time.perf_counter(), self.state.frame, self.state.seen
-        observed = self._observed_ahead(images) or observe_frame(self.setup, frame, before, images)
-        seen = observed.seen if recorded is None else see_frame(self.setup, frame, before, recorded)[0]
+        start = time.perf_counter()
+        frame = self.state.frame
+        past = self.state.seen
+        observed = self._observed_ahead(images) or observe_frame(self.setup, frame, past, images)
+        seen = observed.seen if recorded is None else see_frame(self.setup, frame, past, recorded)[0]
         if upcoming is not None:
             copies = [None if image is None else np.array(image) for image in upcoming]
             self._ahead = frame + 1, in_background(partial(observe_frame, self.setup, frame + 1, seen, copies))
@@ -372,12 +264,15 @@ class StreamLoop:
 
     def _observed_ahead(self, images: Sequence[np.ndarray | None]) -> FrameObservation | None:
         """Return the observation made ahead of time, if its images are the same."""
-        ahead, self._ahead = self._ahead, None
+        ahead = self._ahead
+        self._ahead = None
         if ahead is None or ahead[0] != self.state.frame:
             return None
-        observed, given = ahead[1].result(), {v: image for v, image in enumerate(images) if image is not None}
-        same = given.keys() == observed.recorded.keys()
-        return observed if same and all(np.array_equal(given[v], observed.recorded[v]) for v in given) else None
+        observed = ahead[1].result()
+        present = {v: image for v, image in enumerate(images) if image is not None}
+        same_views = present.keys() == observed.recorded.keys()
+        same = same_views and all(np.array_equal(image, observed.recorded[v]) for v, image in present.items())
+        return observed if same else None
 
     def resume(
         self,

@@ -15,7 +15,7 @@ import pytest
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize, stream_loop
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.codec.container import PacketKind, encode_packet
-from morgs_mi.codec.packets import coded_frames, decode, play
+from morgs_mi.codec.packets import coded_frames, decode
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.evaluate.metrics import endpoint_error, psnr
@@ -140,10 +140,10 @@ def test_push__confidence_is_high_where_things_move(full):
 
 def test_push__decoder_has_the_encoders_state_to_the_bit(full):
     loop, packets, _ = full
-    *_, (frame, decoded) = play(packets)
-    assert frame == 2
+    *_, decoded = coded_frames(packets)
+    assert decoded.frame == 2
     state = loop.gaussians.numpy()
-    for name, value in decoded.numpy().items():
+    for name, value in decoded.gaussians.numpy().items():
         assert np.array_equal(value, state[name]), name
 
 
@@ -326,7 +326,7 @@ def test_stream_capture__writes_a_file(clip, tmp_path):
     reader = StreamReader(path)
     assert [c.name for c in reader.cameras] == [c.name for c in cameras()]
     assert (reader.metadata["train_views"], reader.metadata["downscale"]) == ([0, 1, 2, 3], 2)
-    assert [frame for frame, _ in play(reader)] == [0, 1]
+    assert [state.frame for state in reader.states()] == [0, 1]
     assert sum(r.num_bytes for r in reports) < path.stat().st_size
     assert ticks[-1] == ("Later frames", 1, 1)
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["capture.json", "report.json", "stream.morgs"]

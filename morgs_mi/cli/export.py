@@ -18,7 +18,7 @@ from morgs_mi.core.documentation import page
 from morgs_mi.playback.export.formats import GLTF, PLY, TRACKS, USD, VIDEO, WEB, Format, destination
 
 if TYPE_CHECKING:
-    from morgs_mi.playback.streams import PlayableStream
+    from morgs_mi.codec.frame_source import FrameSource
 
 __all__ = ["Export"]
 
@@ -46,8 +46,8 @@ class Ply:
 
     arguments: ClassVar[Mapping[str, str]] = {"span": "--frames"}
 
-    def run(self, stream: PlayableStream) -> None:
-        from morgs_mi.codec.packets import play
+    def run(self, stream: FrameSource) -> None:
+        from morgs_mi.codec.frame_source import play
         from morgs_mi.io.compressed_ply import write_compressed_ply
         from morgs_mi.io.ply import write_ply
         from morgs_mi.playback.export.clips import select_frames, write_each
@@ -77,8 +77,8 @@ class Gltf:
 
     arguments: ClassVar[Mapping[str, str]] = {"span": "--frames"}
 
-    def run(self, stream: PlayableStream) -> None:
-        from morgs_mi.codec.packets import play
+    def run(self, stream: FrameSource) -> None:
+        from morgs_mi.codec.frame_source import play
         from morgs_mi.playback.export.axes import gltf_axes
         from morgs_mi.playback.export.clips import select_frames, write_each
         from morgs_mi.playback.export.gltf_export import write_gltf
@@ -109,7 +109,7 @@ class Usd:
 
     arguments: ClassVar[Mapping[str, str]] = {"span": "--frames"}
 
-    def run(self, stream: PlayableStream) -> None:
+    def run(self, stream: FrameSource) -> None:
         from morgs_mi.playback.export.clips import select_frames
         from morgs_mi.playback.export.usd import write_usd
 
@@ -146,7 +146,7 @@ class Flight:
 
     arguments: ClassVar[Mapping[str, str]] = {"least": "--least-seconds"}
 
-    def run(self, stream: PlayableStream) -> None:
+    def run(self, stream: FrameSource) -> None:
         from morgs_mi.playback.export.clips import flight, frame_numbers, named_path, num_images, repeated_frames
         from morgs_mi.playback.export.frames import write_images
 
@@ -174,7 +174,7 @@ class Tracks:
     output: Annotated[Positional[Path | None], DisallowNone, place("FILE.npz")] = None
     """File for the tracks; by default OUT/tracks.npz."""
 
-    def run(self, stream: PlayableStream) -> None:
+    def run(self, stream: FrameSource) -> None:
         from morgs_mi.playback.export.clips import frame_numbers
         from morgs_mi.playback.export.tracks import extract_tracks, write_tracks
 
@@ -201,7 +201,7 @@ class Web:
     title: Annotated[str | None, DisallowNone, optional("TEXT")] = None
     """Title of the page; by default the name of the stream's folder or file."""
 
-    def run(self, stream: PlayableStream) -> None:
+    def run(self, stream: FrameSource) -> None:
         from morgs_mi.playback.export.clips import frame_numbers
         from morgs_mi.playback.export.web import write_web_folder, write_web_page
 

@@ -16,7 +16,7 @@ from morgs_mi.core.documentation import page
 from morgs_mi.playback.export.formats import IMAGES, destination
 
 if TYPE_CHECKING:
-    from morgs_mi.codec.reader import StreamReader
+    from morgs_mi.codec.frame_source import FrameSource
     from morgs_mi.core.camera import Camera
     from morgs_mi.playback.export.paths import CameraPath
 
@@ -122,7 +122,7 @@ class Render:
             raise ValueError("--projection equirectangular renders the colour of a stream alone; leave out the others.")
 
     def _seen(
-        self, stream: StreamReader, view: Camera | CameraPath, format: str
+        self, stream: FrameSource, view: Camera | CameraPath, format: str
     ) -> Iterator[tuple[int, dict[str, Any]]]:
         """Return the rendered images of a camera or along a path."""
         from morgs_mi.core.camera import Camera
@@ -139,7 +139,7 @@ class Render:
         return flight(stream, view, channels)
 
     def _inserted(
-        self, stream: StreamReader, view: Camera, format: str
+        self, stream: FrameSource, view: Camera, format: str
     ) -> tuple[Iterator[tuple[int, dict[str, Any]]], int]:
         """Return the rendered frames with the inserted scene, and their number."""
         from morgs_mi.playback.export.clips import frame_numbers

@@ -12,8 +12,7 @@ import numpy as np
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.truth import GroundTruth
 from morgs_mi.codec.container import PacketKind, encode_packet
-from morgs_mi.codec.packets import CodedFrame, coded_frames
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.frame_source import FrameSource, FrameState
 from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.temporal import recorded_change
 from morgs_mi.playback.player import has_confidence, open_stream_capture, render, render_config, truth_for_camera
@@ -31,24 +30,22 @@ class ComparedClip:
         stream: the stream.
         recording: its capture.
         packets: kind and size of each frame's packet.
-        num_packets: number of packets, re-emitted keyframes included.
         views: the evaluated views: the held-out ones, or otherwise all training views.
         cameras: of all views, with the delays of the recording.
         channels: rendered channels.
         render: settings of the renderer, as in the fit.
     """
 
-    stream: StreamReader
+    stream: FrameSource
     recording: Capture
     packets: Mapping[int, tuple[PacketKind, int]]
-    num_packets: int
     views: Sequence[int]
     cameras: Sequence[Camera]
     channels: Sequence[str]
     render: RenderConfig
 
     @classmethod
-    def of(cls, stream: StreamReader, capture: str | Path | None, any_recording: bool = False) -> ComparedClip:
+    def of(cls, stream: FrameSource, capture: str | Path | None, any_recording: bool = False) -> ComparedClip:
         """Return a stream beside `capture`; None: the capture that it was fitted to.
 
         The sizes are read from the file and not from the fit's report, because a receiver has only the file. The
@@ -58,28 +55,25 @@ class ComparedClip:
             FileNotFoundError: the capture is missing.
             ValueError: the stream is truncated, broken or empty, or was fitted to another capture.
         """
-        packets, count = dict[int, tuple[PacketKind, int]](), 0
+        packets = dict[int, tuple[PacketKind, int]]()
         for packet in stream:
             # Later packets of a frame are re-emitted keyframes.
             packets.setdefault(packet.frame, (packet.kind, len(encode_packet(packet))))
-            count += 1
-        if not packets:
-            raise ValueError(f"{stream.path}: expected at least one frame, got a header alone; fit the capture again.")
         recording = open_stream_capture(stream, capture, list(packets), any_recording)
         views = recording.test_views or recording.train_views
         channels = ("color", "motion", *(("confidence",) if has_confidence(stream) else ()))
         cameras = recording.with_delays(stream.cameras)
-        return cls(stream, recording, packets, count, views, cameras, channels, render_config(stream))
+        return cls(stream, recording, packets, views, cameras, channels, render_config(stream))
 
     def frames(self) -> Iterator[ComparedFrame]:
         """Yield the decoded frames beside the recorded ones."""
         last = None
         # The file may have grown since it was read.
-        decoded = coded_frames(islice(self.stream, self.num_packets))
+        decoded = islice(self.stream.states(), len(self.packets))
         recorded = self.recording.partial_frames(min(self.packets), max(self.packets) + 1)
-        for coded, frame in zip(decoded, recorded, strict=True):
-            kind, num_bytes = self.packets[coded.frame]
-            yield ComparedFrame(self, coded, kind, num_bytes, frame.images, last)
+        for state, frame in zip(decoded, recorded, strict=True):
+            kind, num_bytes = self.packets[state.frame]
+            yield ComparedFrame(self, state, kind, num_bytes, frame.images, last)
             last = frame.images
 
 
@@ -89,7 +83,7 @@ class ComparedFrame:
 
     Attributes:
         clip: their clip.
-        coded: state of the decoder.
+        state: its Gaussians.
         kind: kind of the frame's packet.
         num_bytes: its size.
         images: recorded images of all views; None: missing.
@@ -97,7 +91,7 @@ class ComparedFrame:
     """
 
     clip: ComparedClip
-    coded: CodedFrame
+    state: FrameState
     kind: PacketKind
     num_bytes: int
     images: Sequence[np.ndarray | None]
@@ -109,8 +103,8 @@ class ComparedFrame:
         for index in clip.views:
             camera, image = clip.cameras[index], self.images[index]
             if image is not None:
-                maps = render(self.coded.gaussians, camera, clip.channels, clip.render)
-                truth = truth_for_camera(clip.recording, camera, self.coded.frame)
+                maps = render(self.state.gaussians, camera, clip.channels, clip.render)
+                truth = truth_for_camera(clip.recording, camera, self.state.frame)
                 moving = self._changed(index) if truth is None else truth.mask
                 yield ComparedView(self, index, maps, image, clip.recording.masks[index], moving, truth)
 

@@ -68,9 +68,7 @@ def draw_stream(
         ValueError: as `open_stream_capture`, or the stream is broken or has no frame.
     """
     stream = open_stream(out)
-    frames = [packet.frame for packet in stream]
-    if not frames:
-        raise ValueError(f"{stream.path}: expected at least one frame, got a header alone; fit the capture again.")
+    frames = stream.frame_numbers()
     recording = open_stream_capture(stream, capture, frames, any_recording)
     view = recording.reference_view
     camera = recording.with_delays(stream.cameras)[view]

@@ -34,10 +34,10 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.files import atomic_path, is_same_file, write_json
 from morgs_mi.core.rig import choose_key_views
 from morgs_mi.io.bounded import read_json
+from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.exposure import Exposure
 from morgs_mi.playback.player import PROVISIONAL
-from morgs_mi.stream_loop import FrameReport
 
 __all__ = [
     "FILES",

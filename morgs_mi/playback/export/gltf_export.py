@@ -31,7 +31,9 @@ from morgs_mi.core.geometry import rotated, unit_quats
 __all__ = ["glb", "write_gltf"]
 
 _NAME = "KHR_gaussian_splatting"
-_FLOAT, _ARRAY_BUFFER, _POINTS = 5126, 34962, 0
+_FLOAT = 5126
+_ARRAY_BUFFER = 34962
+_POINTS = 0
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 

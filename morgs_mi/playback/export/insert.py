@@ -22,8 +22,7 @@ import cv2
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.codec.packets import play
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import LARGEST, bounded, check_number
 from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
@@ -85,8 +84,8 @@ def load_insert(path: str | Path) -> Build:
     """
     path = Path(path)
     if path.suffix not in (".xml", ".py") or not path.is_file():
-        found = f"{path.suffix!r}" if path.is_file() else "none"
-        raise ValueError(f"{path}: expected a scene to insert, FILE.xml or FILE.py, got {found}; check the path.")
+        kind = f"{path.suffix!r}" if path.is_file() else "none"
+        raise ValueError(f"{path}: expected a scene to insert, FILE.xml or FILE.py, got {kind}; check the path.")
     if path.suffix == ".xml":
         entries = _xml_entries(path)
         return lambda frame, time: entries
@@ -113,7 +112,7 @@ def load_insert(path: str | Path) -> Build:
     return checked
 
 
-def inserted_channels(stream: StreamReader) -> tuple[str, ...]:
+def inserted_channels(stream: FrameSource) -> tuple[str, ...]:
     """Return all channels of a stream with an inserted scene, for EXR files.
 
     Raises:
@@ -124,7 +123,7 @@ def inserted_channels(stream: StreamReader) -> tuple[str, ...]:
     return ("color", "alpha", *(name for name in available_channels(gaussians) if name != "color"), *LAYERS)
 
 
-def selected(stream: StreamReader, frames: Sequence[int]) -> list[int]:
+def selected(stream: FrameSource, frames: Sequence[int]) -> list[int]:
     """Return `frames` in ascending order, each once.
 
     Raises:
@@ -140,7 +139,7 @@ def selected(stream: StreamReader, frames: Sequence[int]) -> list[int]:
 
 
 def render_inserted(
-    stream: StreamReader,
+    stream: FrameSource,
     camera: Camera,
     build: Build,
     frames: Sequence[int] | None = None,
@@ -202,19 +201,19 @@ def _in_background_light(entries: dict[str, Any], gaussians: Gaussians, camera: 
     return mi.load_dict({"type": "scene", **entries, "captured light": lamp})
 
 
-def _integrator(chosen: Any, light: Light) -> Any:
-    """Return the integrator of the surfaces: the inserted scene's own, if it has one.
+def _integrator(entry: Any, light: Light) -> Any:
+    """Return the integrator of the surfaces: the one of the inserted scene, if it has one.
 
     Raises:
         ValueError: it does not light them as the option demands.
     """
-    chosen = chosen or {"type": "splat_path" if light == "traced" else "path"}
-    nested = mi.load_dict(chosen) if isinstance(chosen, dict) else chosen
+    entry = entry or {"type": "splat_path" if light == "traced" else "path"}
+    nested = mi.load_dict(entry) if isinstance(entry, dict) else entry
     if hasattr(nested, "splats") != (light == "traced"):
-        found = type(nested).__name__ if hasattr(nested, "splats") else nested.class_name()
+        name = type(nested).__name__ if hasattr(nested, "splats") else nested.class_name()
         raise ValueError(
             f"The inserted scene: with light {light!r}, expected {'an' if light == 'traced' else 'no'} integrator "
-            f"`splat_path`, got {found}; remove `integrator` from the scene, or choose the other light."
+            f"`splat_path`, got {name}; remove `integrator` from the scene, or choose the other light."
         )
     return nested
 
@@ -226,14 +225,7 @@ def _render(
     nested = _integrator(entries.pop("integrator", None), config.light)
     ratio = np.ones(len(gaussians), np.float32)
     try:
-        inserted: Any = mi.load_dict({"type": "scene", **entries})
-        if not (inserted.shapes() or inserted.emitters()):
-            raise ValueError("The inserted scene: expected at least one shape, got none; add one.")
-        if inserted.shapes() and not bounded(np.array([inserted.bbox().min, inserted.bbox().max])):
-            raise ValueError(
-                f"The inserted scene: expected shapes within {LARGEST:g} world units, got {inserted.bbox().min} to "
-                f"{inserted.bbox().max}; correct their places and sizes."
-            )
+        inserted = _inserted_scene(entries)
         lit = inserted
         if not inserted.emitters():
             lamp = captured_light(gaussians, camera, np.array(inserted.bbox().center()).ravel())
@@ -249,11 +241,37 @@ def _render(
     except RuntimeError as error:
         raise ValueError(f"The inserted scene: {_reason(error)}; correct it.") from error
     if {"splats", "shadow"} & set(channels):
-        alone, less = (rasterize(part, camera) for part in (gaussians, dark))
-        bright, less = (srgb_to_linear(np.asarray(image.color)) for image in (alone, less))
-        images["splats"] = np.concatenate([bright, np.asarray(alone.alpha)], axis=2)
-        images["shadow"] = np.where(bright > 0, less / np.maximum(bright, 1e-6), 1)
+        images |= _splat_layers(gaussians, dark, camera)
     return {name: images[name].astype(np.float32) for name in channels}
+
+
+def _inserted_scene(entries: dict[str, Any]) -> Any:
+    """Return the scene of the entries, with the light that it has itself.
+
+    Raises:
+        ValueError: it has no shapes, or they are not finite.
+    """
+    scene: Any = mi.load_dict({"type": "scene", **entries})
+    if not (scene.shapes() or scene.emitters()):
+        raise ValueError("The inserted scene: expected at least one shape, got none; add one.")
+    box = scene.bbox()
+    if scene.shapes() and not bounded(np.array([box.min, box.max])):
+        raise ValueError(
+            f"The inserted scene: expected shapes within {LARGEST:g} world units, got {box.min} to {box.max}; correct "
+            "their places and sizes."
+        )
+    return scene
+
+
+def _splat_layers(gaussians: Gaussians, shadowed_gaussians: Gaussians, camera: Camera) -> dict[str, np.ndarray]:
+    """Return the layers `splats` [H, W, 4] and `shadow` [H, W, 3], in linear light."""
+    image = rasterize(gaussians, camera)
+    bright = srgb_to_linear(np.asarray(image.color))
+    dark = srgb_to_linear(np.asarray(rasterize(shadowed_gaussians, camera).color))
+    return {
+        "splats": np.concatenate([bright, np.asarray(image.alpha)], axis=2),
+        "shadow": np.where(bright > 0, dark / np.maximum(bright, 1e-6), 1),
+    }
 
 
 def _plugin_images(
@@ -271,7 +289,8 @@ def _plugin_images(
         }
     )
     image = np.asarray(scene.integrator().render(scene, spp=samples))
-    images, first = {"color": linear_to_srgb(image[..., :3]), "alpha": image[..., 3:4]}, 4
+    images = {"color": linear_to_srgb(image[..., :3]), "alpha": image[..., 3:4]}
+    first = 4
     for name in aovs:
         size = len(exr_names(name))
         images[name] = image[..., first : first + size]
@@ -291,8 +310,8 @@ def _xml_entries(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path}: {_reason(error)}; correct the scene file.") from error
     parts = {part.id() or f"part{i}": part for i, part in enumerate(_parts(scene))}
     # Mitsuba adds an integrator to files without one.
-    chosen = ElementTree.parse(path).find("integrator") is not None
-    return {**parts, "integrator": scene.integrator()} if chosen else parts
+    has_integrator = ElementTree.parse(path).find("integrator") is not None
+    return {**parts, "integrator": scene.integrator()} if has_integrator else parts
 
 
 def _reason(error: RuntimeError) -> str:

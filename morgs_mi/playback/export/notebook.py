@@ -5,8 +5,7 @@ from __future__ import annotations
 import base64
 import html
 
-from morgs_mi.codec.packets import play
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.io.png import png_bytes
 from morgs_mi.playback.export.web import web_page
 from morgs_mi.playback.player import channel_image, render, render_config, stream_name
@@ -16,19 +15,21 @@ __all__ = ["stream_html"]
 # Largest stream that is stored in a notebook, in bytes; the player adds a bit more than a megabyte.
 _LARGEST = 4_000_000
 # Width and height of the player in pixels, unless the output of the cell is narrower.
-_WIDTH, _HEIGHT = 800, 600
+_WIDTH = 800
+_HEIGHT = 600
 _STYLE = "width:100%;max-width:{width:.0f}px;aspect-ratio:{aspect:.4f};border:0;border-radius:8px"
 _PLAYER = '<iframe sandbox="allow-scripts" allow="fullscreen" title="{title}" style="{style}" srcdoc="{page}"></iframe>'
 _POSTER = '<img alt="{title}" style="{style}" src="data:image/png;base64,{image}"><div>{text}</div>'
 
 
-def stream_html(stream: StreamReader) -> str:
+def stream_html(stream: FrameSource) -> str:
     """Return a stream as HTML: the player of `morgs-mi export web`, or the first frame where it would be too large.
 
     A stream that cannot be read becomes the sentence that describes why.
     """
     try:
-        camera, size = stream.cameras[0], stream.path.stat().st_size
+        camera = stream.cameras[0]
+        size = stream.path.stat().st_size
         aspect = camera.width / camera.height
         style = _STYLE.format(width=min(_WIDTH, _HEIGHT * aspect), aspect=aspect)
         title = html.escape(stream_name(stream))
