@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -70,44 +70,27 @@ class CalibrateConfig:
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """Result of `calibrate`.
+    """Result of `calibrate`."""
 
-    Attributes:
-        model: folder of the COLMAP model.
-        cameras: names of the calibrated cameras.
-        left_out: names of the cameras that could not be calibrated.
-        points: number of points.
-        error: mean reprojection error of the points, px.
-        checks: result of every camera, including the ones left out; `matches` is the number of its points.
-        mapper: COLMAP's mapper of the model, ``"incremental"`` or ``"global"``.
-        principal_points: whether each image has a principal point of its own.
-    """
-
-    model: Path
-    cameras: tuple[str, ...]
-    left_out: tuple[str, ...]
-    points: int
-    error: float
+    model: Path  #: Folder of the COLMAP model.
+    cameras: tuple[str, ...]  #: Names of the calibrated cameras.
+    left_out: tuple[str, ...]  #: Names of the cameras that could not be calibrated.
+    points: int  #: Number of points.
+    error: float  #: Mean reprojection error of the points, px.
+    #: Result of every camera, including the ones left out; `matches` is the number of its points.
     checks: tuple[CameraCheck, ...]
-    mapper: Mapper
-    principal_points: bool
+    mapper: Mapper  #: COLMAP's mapper of the model, ``"incremental"`` or ``"global"``.
+    principal_points: bool  #: Whether each image has a principal point of its own.
 
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A model of COLMAP.
+    """A model of COLMAP."""
 
-    Attributes:
-        mapper: the mapper that made it.
-        model: pycolmap's reconstruction.
-        checks: result of every camera, including the ones without a pose.
-        principal_points: whether each image has a principal point of its own.
-    """
-
-    mapper: Mapper
-    model: Any
-    checks: tuple[CameraCheck, ...]
-    principal_points: bool = False
+    mapper: Mapper  # the mapper that made it
+    model: Any  # pycolmap's reconstruction
+    checks: tuple[CameraCheck, ...]  # result of every camera, including the ones without a pose
+    principal_points: bool = False  # whether each image has a principal point of its own
 
     @property
     def error(self) -> float:
@@ -371,7 +354,9 @@ def _median_error(model: Any) -> float:
 
 
 def _check_features(path: Path, database: Path) -> None:
-    with _opened(database) as db:
+    import pycolmap
+
+    with closing(pycolmap.Database.open(database)) as db:
         counts = {Path(i.name).stem: db.num_keypoints_for_image(i.image_id) for i in db.read_all_images()}
     if poor := {name: count for name, count in counts.items() if count < _MIN_FEATURES}:
         table = ", ".join(f"{count} in {name}" for name, count in poor.items())
@@ -382,7 +367,9 @@ def _check_features(path: Path, database: Path) -> None:
 
 
 def _check_pairs(path: Path, database: Path) -> None:
-    with _opened(database) as db:
+    import pycolmap
+
+    with closing(pycolmap.Database.open(database)) as db:
         count = len(db.read_all_images())
         _, geometries = db.read_two_view_geometries()
     if not any(len(geometry.inlier_matches) for geometry in geometries):
@@ -390,17 +377,6 @@ def _check_pairs(path: Path, database: Path) -> None:
             f"{path}: no two of the {count} views match: they may show different objects, be too far apart (more than "
             f"about 30 degrees), or not be simultaneous; move the cameras closer, or {_MORE_TEXTURE}."
         )
-
-
-@contextmanager
-def _opened(database: Path) -> Iterator[Any]:
-    import pycolmap
-
-    db = pycolmap.Database.open(database)
-    try:
-        yield db
-    finally:
-        db.close()
 
 
 @contextmanager

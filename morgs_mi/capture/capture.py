@@ -52,18 +52,12 @@ class Frame:
 
 @dataclass(frozen=True)
 class PartialFrame:
-    """One instant in the views that have an image of it.
+    """One instant in the views that have an image of it."""
 
-    Attributes:
-        index: position in the recording, from 0.
-        images: as in `Frame`, None for a missing image.
-        problems: one sentence per missing image.
-        recorded: reference images for the next frame's images; None if these are `images`.
-    """
-
-    index: int
-    images: tuple[np.ndarray | None, ...]
-    problems: tuple[str, ...] = ()
+    index: int  #: Position in the recording, from 0.
+    images: tuple[np.ndarray | None, ...]  #: As in `Frame`, None for a missing image.
+    problems: tuple[str, ...] = ()  #: One sentence per missing image.
+    #: Reference images for the next frame's images; None if these are `images`.
     recorded: tuple[np.ndarray | None, ...] | None = None
 
     def comparable(self, views: Sequence[int]) -> list[np.ndarray | None]:

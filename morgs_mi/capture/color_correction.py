@@ -36,22 +36,15 @@ _ENCODED = np.rint(255 * linear_to_srgb(np.arange(65536) / 65535)).astype(np.uin
 
 @dataclass(frozen=True)
 class ColorFit:
-    """Colour correction of all cameras towards a reference camera.
+    """Colour correction of all cameras towards a reference camera."""
 
-    Attributes:
-        reference: index of the reference camera, which is not changed.
-        matrices: per camera [3, 3]; None for the reference, and for a camera that shares too few points with the
-            others.
-        samples: per camera, number of points shared with others.
-        before: per camera, mean dE2000 of its points against the other views' colours; NaN without points.
-        after: the same after the correction.
-    """
-
-    reference: int
+    reference: int  #: Index of the reference camera, which is not changed.
+    #: Per camera [3, 3]; None for the reference, and for a camera that shares too few points with the others.
     matrices: tuple[np.ndarray | None, ...]
-    samples: tuple[int, ...]
+    samples: tuple[int, ...]  #: Per camera, number of points shared with others.
+    #: Per camera, mean dE2000 of its points against the other views' colours; NaN without points.
     before: tuple[float, ...]
-    after: tuple[float, ...]
+    after: tuple[float, ...]  #: The same after the correction.
 
     def correction(self, view: int) -> ColorCorrection | None:
         """Return the correction of a view, None if it is not changed."""
@@ -61,13 +54,9 @@ class ColorFit:
 
 @dataclass(frozen=True)
 class ColorCorrection:
-    """Colour correction of one camera's images, towards the other cameras.
+    """Colour correction of one camera's images, towards the other cameras."""
 
-    Attributes:
-        matrix: matrix on linear (R, G, B) [3, 3].
-    """
-
-    matrix: np.ndarray
+    matrix: np.ndarray  #: Matrix on linear (R, G, B) [3, 3].
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Return the corrected image, uint8 [H, W, 3]."""

@@ -74,26 +74,17 @@ class ReadConfig:
 
 @dataclass(frozen=True)
 class Timeline:
-    """Frames of each clip that show the instants of the recording.
+    """Frames of each clip that show the instants of the recording."""
 
-    Attributes:
-        frame_indices: per camera the clip's frames in ascending order, -1 for none, int [T].
-        shares: per camera the share of the time to the next frame that has passed at each instant [T]; None: no image
-            is interpolated.
-        delays: per camera the time from an instant to the frame that shows it, in frames of its clip.
-        rates: per camera the frames of its clip per instant.
-        fps: instants per second.
-        unchanged: whether instant t is frame t of every clip.
-        notes: a sentence for each clip of variable frame rate, and on the numbers of images.
-    """
-
-    frame_indices: tuple[np.ndarray, ...]
+    frame_indices: tuple[np.ndarray, ...]  #: Per camera the clip's frames in ascending order, -1 for none, int [T].
+    #: Per camera the share of the time to the next frame that has passed at each instant [T]; None: no image is
+    #: interpolated.
     shares: tuple[np.ndarray | None, ...]
-    delays: tuple[float, ...]
-    rates: tuple[float, ...]
-    fps: float
-    unchanged: bool
-    notes: tuple[str, ...] = ()
+    delays: tuple[float, ...]  #: Per camera the time from an instant to the frame that shows it, in frames of its clip.
+    rates: tuple[float, ...]  #: Per camera the frames of its clip per instant.
+    fps: float  #: Instants per second.
+    unchanged: bool  #: Whether instant t is frame t of every clip.
+    notes: tuple[str, ...] = ()  #: A sentence for each clip of variable frame rate, and on the numbers of images.
 
 
 def timeline(

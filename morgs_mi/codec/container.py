@@ -78,19 +78,13 @@ class TruncatedStreamError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Packet:
-    """Data of one frame.
+    """Data of one frame."""
 
-    Attributes:
-        kind: `KEYFRAME` (self-contained) or `RESIDUAL` (changes since the frame before).
-        frame: index of the video frame.
-        arrays: float32, uint32 or uint8 arrays of any shape, by name; read-only copies of those that are passed.
-        place: description of where the packet was read, for messages; empty for a new one.
-    """
-
-    kind: PacketKind
-    frame: int
+    kind: PacketKind  #: `KEYFRAME` (self-contained) or `RESIDUAL` (changes since the frame before).
+    frame: int  #: Index of the video frame.
+    #: float32, uint32 or uint8 arrays of any shape, by name; read-only copies of those that are passed.
     arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
-    place: str = ""
+    place: str = ""  #: Description of where the packet was read, for messages; empty for a new one.
 
     def __post_init__(self) -> None:
         arrays = {name: np.array(array) for name, array in self.arrays.items()}

@@ -74,21 +74,13 @@ _MAX_VALUE = LIMIT - 2**20  # stays within the limit when it is rounded to the c
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """N Gaussians as integers.
+    """N Gaussians as integers."""
 
-    Attributes:
-        values: int32 [N, C].
-        exponents: int8 [N, E].
-        largest_components: uint8 [N], the component of each quaternion that is not stored.
-        degree: of the spherical harmonics, 0 to 3.
-        optional: bit mask of the optional attributes, see `optional_mask`.
-    """
-
-    values: np.ndarray
-    exponents: np.ndarray
-    largest_components: np.ndarray
-    degree: int
-    optional: int
+    values: np.ndarray  #: int32 [N, C].
+    exponents: np.ndarray  #: int8 [N, E].
+    largest_components: np.ndarray  #: uint8 [N], the component of each quaternion that is not stored.
+    degree: int  #: Of the spherical harmonics, 0 to 3.
+    optional: int  #: Bit mask of the optional attributes, see `optional_mask`.
 
     def __len__(self) -> int:
         return len(self.values)

@@ -28,20 +28,13 @@ _THRESHOLD_DC = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Coder:
-    """Coder of the changes from a state to the next Gaussians, in steps of any coarseness.
+    """Coder of the changes from a state to the next Gaussians, in steps of any coarseness."""
 
-    Attributes:
-        grid: the N Gaussians of the state.
-        survivors: their indices in the state [S], ascending; the others die.
-        rows: indices of the M survivors that differ.
-        change: their differences by integer, in multiples of the grid's steps [C, M].
-        offset: offsets of the next Gaussians, survivors first [N', 3], world units; None: they are not stored.
-    """
-
-    grid: Grid
-    survivors: np.ndarray
-    rows: np.ndarray
-    change: np.ndarray
+    grid: Grid  #: The N Gaussians of the state.
+    survivors: np.ndarray  #: Their indices in the state [S], ascending; the others die.
+    rows: np.ndarray  #: Indices of the M survivors that differ.
+    change: np.ndarray  #: Their differences by integer, in multiples of the grid's steps [C, M].
+    #: Offsets of the next Gaussians, survivors first [N', 3], world units; None: they are not stored.
     offset: np.ndarray | None
 
     def rounded(self, coarseness: int) -> np.ndarray:

@@ -36,18 +36,13 @@ _LEAST_SHARE = 4
 
 @dataclass(frozen=True)
 class Balance:
-    """Result of balancing cameras.
+    """Result of balancing cameras."""
 
-    Attributes:
-        exposures: estimated exposure of each camera, used or not.
-        taken: whether they are used.
-        recorded_psnr: of withheld pixels in a fit to the images as recorded, dB; NaN where they were not compared.
-        balanced_psnr: of the same pixels in a fit to the balanced images, dB; NaN where they were not compared.
-    """
-
-    exposures: tuple[Exposure, ...]
-    taken: bool
+    exposures: tuple[Exposure, ...]  #: Estimated exposure of each camera, used or not.
+    taken: bool  #: Whether they are used.
+    #: Of withheld pixels in a fit to the images as recorded, dB; NaN where they were not compared.
     recorded_psnr: float = float("nan")
+    #: Of the same pixels in a fit to the balanced images, dB; NaN where they were not compared.
     balanced_psnr: float = float("nan")
 
     @property

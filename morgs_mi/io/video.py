@@ -183,9 +183,6 @@ class FolderReader:
     `positions` being None.
 
     The images may also be a list of files in any folders; `path` is then the folder of the first.
-
-    Attributes:
-        numbers: numbers of the images, None of a list of files and of a single image without a number.
     """
 
     path: Path
@@ -194,6 +191,7 @@ class FolderReader:
     height: int
     fps: float | None = None
     positions: np.ndarray | None = None
+    #: Numbers of the images, None of a list of files and of a single image without a number.
     numbers: range | None = None
 
     @classmethod

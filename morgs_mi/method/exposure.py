@@ -48,15 +48,10 @@ _MIDDLE_TONES = np.repeat([[0.2], [0.6]], 3, axis=1)
 
 @dataclass(frozen=True)
 class Exposure:
-    """Exposure and white balance of an image: recorded = gain * scene + bias, display-referred in [0, 1].
+    """Exposure and white balance of an image: recorded = gain * scene + bias, display-referred in [0, 1]."""
 
-    Attributes:
-        gain: of R, G and B.
-        bias: of R, G and B.
-    """
-
-    gain: tuple[float, ...] = (1.0, 1.0, 1.0)
-    bias: tuple[float, ...] = (0.0, 0.0, 0.0)
+    gain: tuple[float, ...] = (1.0, 1.0, 1.0)  #: Of R, G and B.
+    bias: tuple[float, ...] = (0.0, 0.0, 0.0)  #: Of R, G and B.
 
     def __call__(self, colors: np.ndarray) -> np.ndarray:
         """Return how the camera shows colours [..., 3] of the scene; not clipped."""

@@ -57,19 +57,12 @@ _TAPS = (_TAPS / _TAPS.sum()).astype(np.float32).tolist()
 
 @dataclass(frozen=True, eq=False)
 class _Windows:
-    """The windows that pixels of a region lie in, and the target's statistics there.
+    """The windows that pixels of a region lie in, and the target's statistics there."""
 
-    Attributes:
-        windows: runs of the centres of the windows.
-        pixels: runs of the pixels.
-        mean: planes of M y, defined on `windows`.
-        variance: planes of M yy - (M y)^2, likewise.
-    """
-
-    windows: Runs
-    pixels: Runs
-    mean: Float
-    variance: Float
+    windows: Runs  # runs of the centres of the windows
+    pixels: Runs  # runs of the pixels
+    mean: Float  # planes of M y, defined on `windows`
+    variance: Float  # planes of M yy - (M y)^2, likewise
 
 
 class Target:

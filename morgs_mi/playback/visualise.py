@@ -24,7 +24,6 @@ __all__ = [
     "label",
     "motion_image",
     "motion_legend",
-    "motion_wheel",
     "side_by_side",
     "time_slice",
     "to_uint8",
@@ -91,17 +90,12 @@ def motion_image(motion: np.ndarray, scale_px: float) -> np.ndarray:
     return image
 
 
-def motion_wheel(scale_px: float, size: int = 96) -> np.ndarray:
-    """Return the colours of `motion_image` as a disc [size, size, 3] with `scale_px` at its rim."""
+def motion_legend(scale_px: float, size: int = 96) -> np.ndarray:
+    """Return the legend [size, size, 3] of `motion_image`: a disc of its colours with the speed at the rim."""
     axis = np.linspace(-scale_px, scale_px, size, dtype=np.float32)
     motion = np.stack(np.meshgrid(axis, axis), -1)
     motion[np.hypot(*np.moveaxis(motion, -1, 0)) > scale_px] = 0
-    return motion_image(motion, scale_px)
-
-
-def motion_legend(scale_px: float, size: int = 96) -> np.ndarray:
-    """Return the legend [size, size, 3] of `motion_image`: `motion_wheel`, labelled with the speed at its rim."""
-    return label(motion_wheel(scale_px, size), f"{scale_px:.3g} px")
+    return label(motion_image(motion, scale_px), f"{scale_px:.3g} px")
 
 
 def confidence_image(confidence: np.ndarray) -> np.ndarray:

@@ -113,15 +113,10 @@ def _resumed(loop: StreamLoop, capture: Capture, earlier: Interrupted, progress:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A capture that is ready to be fitted.
+    """A capture that is ready to be fitted."""
 
-    Attributes:
-        capture: with enough points, and with refined cameras where the settings ask for them.
-        refinement: of the cameras; None if they are the calibration's.
-    """
-
-    capture: Capture
-    refinement: Refinement | None = None
+    capture: Capture  #: With enough points, and with refined cameras where the settings ask for them.
+    refinement: Refinement | None = None  #: Of the cameras; None if they are the calibration's.
 
     @classmethod
     def of(cls, capture: Capture, config: StreamConfig, progress: Progress) -> Prepared:

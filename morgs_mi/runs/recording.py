@@ -235,25 +235,15 @@ class Recording:
 
 @dataclass(frozen=True, eq=False)
 class Interrupted:
-    """An interrupted fit, up to its last complete packet.
+    """An interrupted fit, up to its last complete packet."""
 
-    Attributes:
-        stream: its stream.
-        index: the complete packets.
-        end: offset of the end of the last one.
-        coded: state after it.
-        before: state before the last frame; None if there is none.
-        last: first packet of the last frame.
-        reports: of the frames.
-    """
-
-    stream: StreamReader
-    index: Sequence[Entry]
-    end: int
-    coded: CodedFrame
-    before: CodedFrame | None
-    last: Packet
-    reports: list[FrameReport]
+    stream: StreamReader  #: Its stream.
+    index: Sequence[Entry]  #: The complete packets.
+    end: int  #: Offset of the end of the last one.
+    coded: CodedFrame  #: State after it.
+    before: CodedFrame | None  #: State before the last frame; None if there is none.
+    last: Packet  #: First packet of the last frame.
+    reports: list[FrameReport]  #: Of the frames.
 
 
 def interrupted_fit(

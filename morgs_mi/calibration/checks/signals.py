@@ -44,30 +44,19 @@ _MIN_FLICKER_FRAMES, _MIN_PERIODS = 20, 2
 
 @dataclass(frozen=True)
 class Signals:
-    """Measurements taken while the frames of a capture are read.
+    """Measurements taken while the frames of a capture are read."""
 
-    Attributes:
-        thumbs: per camera float32 [T, h, w], NaN where no pixel was recorded.
-        sharpness: per image [T, C], octaves: log2 of the detail at the finest scale relative to the next one.
-    """
-
-    thumbs: tuple[np.ndarray, ...]
-    sharpness: np.ndarray
+    thumbs: tuple[np.ndarray, ...]  #: Per camera float32 [T, h, w], NaN where no pixel was recorded.
+    sharpness: np.ndarray  #: Per image [T, C], octaves: log2 of the detail at the finest scale relative to the next one
 
 
 @dataclass(frozen=True)
 class Lamp:
-    """Flicker of lamps in a camera's images.
+    """Flicker of lamps in a camera's images."""
 
-    Attributes:
-        mains: frequencies of the mains that explain the flicker, Hz.
-        alias: the frequency at which the images become brighter and darker, Hz.
-        amplitude: amplitude of the brightness, as a share.
-    """
-
-    mains: tuple[int, ...]
-    alias: float
-    amplitude: float
+    mains: tuple[int, ...]  #: Frequencies of the mains that explain the flicker, Hz.
+    alias: float  #: The frequency at which the images become brighter and darker, Hz.
+    amplitude: float  #: Amplitude of the brightness, as a share.
 
 
 def read_signals(capture: Capture, max_frames: int, progress: Callable[[int, int], None] | None = None) -> Signals:

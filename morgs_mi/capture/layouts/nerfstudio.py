@@ -63,21 +63,13 @@ _HARMLESS = {
 
 @dataclass(frozen=True)
 class Transforms:
-    """Content of a `transforms.json`.
+    """Content of a `transforms.json`."""
 
-    Attributes:
-        cameras: one per frame, named by its `file_path`.
-        lenses: one per frame.
-        masks: per frame the image whose black pixels are not used, or None.
-        points: the points' PLY file, or None.
-        splits: names of images by split; empty if the file does not split them.
-    """
-
-    cameras: list[Camera]
-    lenses: list[Lens]
-    masks: list[Path | None]
-    points: Path | None
-    splits: Mapping[str, list[str]]
+    cameras: list[Camera]  #: One per frame, named by its `file_path`.
+    lenses: list[Lens]  #: One per frame.
+    masks: list[Path | None]  #: Per frame the image whose black pixels are not used, or None.
+    points: Path | None  #: The points' PLY file, or None.
+    splits: Mapping[str, list[str]]  #: Names of images by split; empty if the file does not split them.
 
 
 def read_transforms(path: Path, clips: Mapping[str, Clip] | None = None) -> Transforms:

@@ -14,19 +14,13 @@ __all__ = ["GLTF", "IMAGES", "PLY", "TRACKS", "USD", "VIDEO", "WEB", "Format", "
 
 @dataclass(frozen=True)
 class Format:
-    """A format of an export.
+    """A format of an export."""
 
-    Attributes:
-        name: of the format.
-        ending: end of the names of its outputs; empty: of names without a suffix.
-        default: name of the output beside a stream; ``{}`` stands for the name of a camera or a path.
-        folder: whether it is a folder with a file per frame, or for a web server. With an `ending`, the file of a
-            single frame is one, too.
-    """
-
-    name: str
-    ending: str
-    default: str
+    name: str  #: Of the format.
+    ending: str  #: End of the names of its outputs; empty: of names without a suffix.
+    default: str  #: Name of the output beside a stream; ``{}`` stands for the name of a camera or a path.
+    #: Whether it is a folder with a file per frame, or for a web server. With an `ending`, the file of a single frame
+    #: is one, too.
     folder: bool = False
 
     @property

@@ -25,7 +25,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_number
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import check_memory
-from morgs_mi.playback.export.axes import up_direction
+from morgs_mi.core.rig import up_direction
 from morgs_mi.playback.export.clips import flight_views
 from morgs_mi.playback.export.paths import CameraPath
 from morgs_mi.playback.player import render_config

@@ -16,8 +16,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from morgs_mi.core.camera import Camera, rigid
+from morgs_mi.core.rig import up_direction
 from morgs_mi.io.bounded import read_json
-from morgs_mi.playback.export.axes import up_direction
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline

@@ -130,19 +130,12 @@ def _write_stage(
 
 @dataclass
 class _Set:
-    """The Gaussians that begin with one keyframe.
+    """The Gaussians that begin with one keyframe."""
 
-    Attributes:
-        start: the first frame.
-        degree: of the spherical harmonics.
-        ids: uint32 [M], ascending.
-        births: attributes [M, ...] at birth, by the names of the schema.
-    """
-
-    start: int
-    degree: int
-    ids: np.ndarray
-    births: dict[str, np.ndarray]
+    start: int  # the first frame
+    degree: int  # of the spherical harmonics
+    ids: np.ndarray  # uint32 [M], ascending
+    births: dict[str, np.ndarray]  # attributes [M, ...] at birth, by the names of the schema
 
 
 def _sets(states: Iterator[FrameState], axes: np.ndarray) -> dict[int, _Set]:

@@ -38,23 +38,14 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class LiveFrame:
-    """Report of one frame of a live fit.
+    """Report of one frame of a live fit."""
 
-    Attributes:
-        frame: its index in the stream.
-        time: between the first images and its images, s.
-        latency: between its images and the end of its fit, s.
-        skew: largest difference in time between two of its images, s.
-        dropped: number of images of each camera that were dropped after the frame before.
-        problems: one sentence per missing image.
-    """
-
-    frame: int
-    time: float
-    latency: float
-    skew: float
-    dropped: int
-    problems: tuple[str, ...] = ()
+    frame: int  #: Its index in the stream.
+    time: float  #: Between the first images and its images, s.
+    latency: float  #: Between its images and the end of its fit, s.
+    skew: float  #: Largest difference in time between two of its images, s.
+    dropped: int  #: Number of images of each camera that were dropped after the frame before.
+    problems: tuple[str, ...] = ()  #: One sentence per missing image.
 
 
 @interrupts_raised()
