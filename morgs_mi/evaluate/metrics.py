@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import correlate1d
 
-from morgs_mi.core.color_space import srgb_to_linear
+from morgs_mi.core.color_space import decode_light
 from morgs_mi.core.threads import map_in_threads
 
 __all__ = ["delta_e_map", "endpoint_error", "iou", "mean_over", "psnr", "psnr_of", "ssim", "ssim_map", "unit_pair"]
@@ -97,7 +97,7 @@ def delta_e_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     a, b = (np.clip(each, 0, 1) for each in unit_pair("delta_e_map", image, truth))
 
     def lab(colours: np.ndarray) -> np.ndarray:
-        xyz = srgb_to_linear(colours) @ RGB_COLOURSPACE_sRGB.matrix_RGB_to_XYZ.T
+        xyz = decode_light(colours) @ RGB_COLOURSPACE_sRGB.matrix_RGB_to_XYZ.T
         return XYZ_to_Lab(xyz, RGB_COLOURSPACE_sRGB.whitepoint)
 
     def rows(start: int) -> np.ndarray:

@@ -14,6 +14,7 @@ import numpy as np
 
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.color_space import decode_traced
 from morgs_mi.core.gaussians import tensor_rows
 from morgs_mi.core.types import Float, Tensor, UInt32
 from morgs_mi.plugins.composite import composite, cropped
@@ -302,7 +303,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         image = rasterize(gaussians, camera, channels, self.background, config=self.config)
         columns = {name: cropped(image[name], crop) for name in channels}
         if self.srgb_primitives:
-            columns["color"] = [mi.math.srgb_to_linear(value) for value in columns["color"]]
+            columns["color"] = [decode_traced(value) for value in columns["color"]]
         return columns
 
     def _warn_about_emitters(self, scene: Any) -> None:

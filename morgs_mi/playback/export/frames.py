@@ -9,7 +9,7 @@ import numpy as np
 
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.color_space import srgb_to_linear
+from morgs_mi.core.color_space import decode_light
 from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import PLAYABLE, write_video
@@ -104,7 +104,7 @@ def exr_channels(images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     Colour is R, G, B in linear light, as EXR readers expect, and alpha is A. Other channels are called ``depth.Y`` if
     they have one component, ``motion.X``, ``motion.Y`` if they have several. Motion is in pixels, depth in world units.
     """
-    planes = {**images, **({"color": srgb_to_linear(images["color"])} if "color" in images else {})}
+    planes = {**images, **({"color": decode_light(images["color"])} if "color" in images else {})}
     return {
         name: plane[..., i] for key, plane in planes.items() for i, name in enumerate(_exr_names(key, plane.shape[2]))
     }

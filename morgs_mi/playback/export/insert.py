@@ -26,7 +26,7 @@ from morgs_mi.codec.packets import play
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import LARGEST, bounded, check_number
-from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
+from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.ranges import check_ranges
 from morgs_mi.gaussian_integrator import ellipsoids
@@ -197,7 +197,7 @@ def _mean_color(gaussians: Gaussians, camera: Camera) -> list[float]:
 
 def _in_background_light(entries: dict[str, Any], gaussians: Gaussians, camera: Camera) -> Any:
     """Return the inserted scene with the light that comes from behind all Gaussians, as for `captured_light`."""
-    radiance = srgb_to_linear(np.array(_mean_color(gaussians, camera))).tolist()
+    radiance = decode_light(np.array(_mean_color(gaussians, camera))).tolist()
     lamp = {"type": "constant", "radiance": {"type": "rgb", "value": radiance}}
     return mi.load_dict({"type": "scene", **entries, "captured light": lamp})
 
@@ -250,7 +250,7 @@ def _render(
         raise ValueError(f"The inserted scene: {_reason(error)}; correct it.") from error
     if {"splats", "shadow"} & set(channels):
         alone, less = (rasterize(part, camera) for part in (gaussians, dark))
-        bright, less = (srgb_to_linear(np.asarray(image.color)) for image in (alone, less))
+        bright, less = (decode_light(np.asarray(image.color)) for image in (alone, less))
         images["splats"] = np.concatenate([bright, np.asarray(alone.alpha)], axis=2)
         images["shadow"] = np.where(bright > 0, less / np.maximum(bright, 1e-6), 1)
     return {name: images[name].astype(np.float32) for name in channels}
@@ -271,7 +271,7 @@ def _plugin_images(
         }
     )
     image = np.asarray(scene.integrator().render(scene, spp=samples))
-    images, first = {"color": linear_to_srgb(image[..., :3]), "alpha": image[..., 3:4]}, 4
+    images, first = {"color": encode_light(image[..., :3]), "alpha": image[..., 3:4]}, 4
     for name in aovs:
         size = len(exr_names(name))
         images[name] = image[..., first : first + size]
