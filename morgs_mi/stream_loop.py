@@ -35,6 +35,7 @@ from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.unseen_views import unseen_views
 from morgs_mi.loop.correction import Correction, estimate_correction
 from morgs_mi.loop.image_status import image_status
+from morgs_mi.loop.input_images import Given, as_array
 from morgs_mi.loop.observation import (
     FrameObservation,
     Images,
@@ -133,7 +134,7 @@ class _Fitted:
 def step(
     setup: Setup,
     state: StreamState,
-    images: Sequence[np.ndarray | None] | FrameObservation,
+    images: Sequence[Given | None] | FrameObservation,
     progress: Report | None = None,
     on_provisional: Callable[[Packet], None] | None = None,
 ) -> tuple[StreamState, Packet, FrameReport]:
@@ -142,7 +143,8 @@ def step(
     Args:
         setup: data that all frames share, as from `prepare`.
         state: as returned for the last frame; `StreamState()` before the first.
-        images: per training view uint8 [H, W, 3], RGB, or None where the view has no image. They are copied.
+        images: per training view an image [H, W, 3], RGB, or None where the view has none: uint8 in sRGB, linear light
+            as a float array or a `mi.TensorXf`, or a `mi.Bitmap`, whose flag `srgb_gamma` counts. They are copied.
             Alternatively, the result of `observe_frame` for them.
         progress: called with (stage, done, total): the stages of the first frame, or the steps of a later one.
         on_provisional: called with provisional keyframes while the first frame is fitted.
@@ -191,7 +193,7 @@ def _fit_later_frame(setup: Setup, state: StreamState, observed: FrameObservatio
     previous = _first_confidence(setup, state, flows, rng)  # frame 0's confidence (11)
     observations = observe(observed.key_views, motion, config.fit.objective)
     active = _active_set(setup, previous, images, observed.changes, observations)
-    corrected = state.correction.corrected({view: images[view] for view in active.views})
+    corrected = state.correction.corrected({view: observed.encoded[view] for view in active.views})
     targets = {view: Target(image, setup.masks[view]) for view, image in corrected.items()}
     initial = initial_motion(previous, active, flows, targets, motion, rng)  # motion (5)
     problem = FrameProblem(previous, active, targets, observations, initial, setup.extent)
@@ -215,8 +217,8 @@ def _fit_first_frame(
 ) -> _Fitted:
     """Return the fit of the first frame."""
     config = setup.config
-    correction, correction_entry = estimate_correction(setup, observed.seen.images, progress)
-    views = views_of(setup, correction.corrected(observed.seen.images))
+    correction, correction_entry = estimate_correction(setup, observed.encoded, progress)
+    views = views_of(setup, correction.corrected(observed.encoded))
     rng = rng_of(config.seed, Stream.FIRST_FRAME)
     plan = plan_first_frame(views, setup.points, config.fit)
     problem = FirstFrameProblem.of(views, setup.cloud, plan.config, config.render, rng)
@@ -293,14 +295,16 @@ class StreamLoop:
         point_colors: [P, 3] in [0, 1].
         config: settings.
         masks: per view [H, W] bool of valid pixels, or None.
+        display_exposure: stops by which images in linear light are brightened where flow and changes are computed,
+            which see 8 bits; None: if any light of the first frame exceeds 1, the 99th percentile becomes 1.
 
     Example:
         >>> loop = morgs_mi.StreamLoop(cameras, points, point_colors)
-        >>> for images in frames:  # per frame one uint8 image [H, W, 3] per camera
+        >>> for images in frames:  # per frame one image [H, W, 3] per camera: uint8, or linear light in floats
         ...     packet, report = loop.push(images)
 
     Raises:
-        ValueError: no cameras, points that are not finite, colours outside [0, 1] or of another shape, or a mask of
+        ValueError: no cameras, points that are not finite, colours of another range or shape, or a mask of
             another shape than its view.
     """
 
@@ -311,8 +315,9 @@ class StreamLoop:
         point_colors: np.ndarray,
         config: StreamConfig | None = None,
         masks: Sequence[np.ndarray | None] | None = None,
+        display_exposure: float | None = None,
     ) -> None:
-        self.setup = prepare(cameras, points, point_colors, config, masks)
+        self.setup = prepare(cameras, points, point_colors, config, masks, display_exposure)
         self.state = StreamState()
         self._ahead: tuple[int, Future[FrameObservation]] | None = None  # of the next frame, with its index
 
@@ -326,7 +331,7 @@ class StreamLoop:
         """
         views = capture.train_views
         cameras, masks = [capture.cameras[v] for v in views], [capture.masks[v] for v in views]
-        return cls(cameras, capture.points, capture.point_colors, config, masks)
+        return cls(cameras, capture.points, capture.point_colors, config, masks, capture.display_exposure)
 
     @property
     def gaussians(self) -> Gaussians | None:
@@ -336,10 +341,10 @@ class StreamLoop:
     @interrupts_raised()
     def push(
         self,
-        images: Sequence[np.ndarray | None],
+        images: Sequence[Given | None],
         progress: Report | None = None,
-        upcoming: Sequence[np.ndarray | None] | None = None,
-        recorded: Sequence[np.ndarray | None] | None = None,
+        upcoming: Sequence[Given | None] | None = None,
+        recorded: Sequence[Given | None] | None = None,
         on_provisional: Callable[[Packet], None] | None = None,
     ) -> tuple[Packet, FrameReport]:
         """Fit the next frame and return its packet for the stream, and its report; see `step`.
@@ -357,25 +362,25 @@ class StreamLoop:
         observed = self._observed_ahead(images) or observe_frame(self.setup, frame, before, images)
         seen = observed.seen if recorded is None else see_frame(self.setup, frame, before, recorded)[0]
         if upcoming is not None:
-            copies = [None if image is None else np.array(image) for image in upcoming]
+            copies = [None if image is None else np.array(as_array(image)) for image in upcoming]
             self._ahead = frame + 1, in_background(partial(observe_frame, self.setup, frame + 1, seen, copies))
         state, packet, report = step(self.setup, self.state, observed, progress, on_provisional)
         self.state = replace(state, seen=seen)
         return packet, replace(report, seconds=time.perf_counter() - start)
 
-    def _observed_ahead(self, images: Sequence[np.ndarray | None]) -> FrameObservation | None:
+    def _observed_ahead(self, images: Sequence[Given | None]) -> FrameObservation | None:
         """Return the observation made ahead of time, if its images are the same."""
         ahead, self._ahead = self._ahead, None
         if ahead is None or ahead[0] != self.state.frame:
             return None
-        observed, given = ahead[1].result(), {v: image for v, image in enumerate(images) if image is not None}
+        observed, given = ahead[1].result(), {v: as_array(image) for v, image in enumerate(images) if image is not None}
         same = given.keys() == observed.recorded.keys()
         return observed if same and all(np.array_equal(given[v], observed.recorded[v]) for v in given) else None
 
     def resume(
         self,
         coded: CodedFrame,
-        frames: Iterable[Sequence[np.ndarray | None]],
+        frames: Iterable[Sequence[Given | None]],
         exposures: Sequence[Exposure] = (),
     ) -> None:
         """Continue after a frame of a stream, as if it had just been pushed.

@@ -70,7 +70,9 @@ class ColorCorrection:
     matrix: np.ndarray
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """Return the corrected image, uint8 [H, W, 3]."""
+        """Return the corrected image [H, W, 3], uint8, or float32 of linear light."""
+        if image.dtype != np.uint8:
+            return np.maximum(_corrected(image, self.matrix), 0)
         return _encode(_corrected(_LINEAR[image], self.matrix))
 
 

@@ -15,6 +15,8 @@ An image is either uint8 in sRGB, or of floats; those of recordings are linear l
 
 from __future__ import annotations
 
+import logging
+from functools import cache
 from typing import Any
 
 import drjit as dr
@@ -22,6 +24,8 @@ import mitsuba as mi
 import numpy as np
 
 __all__ = [
+    "BRIGHTEST",
+    "BRIGHTEST_LIGHT",
     "SH_C0",
     "TRANSFER",
     "decode_light",
@@ -30,13 +34,20 @@ __all__ = [
     "display_stops",
     "encode_light",
     "encode_traced",
+    "positive_light",
     "unit_values",
 ]
+
+_LOG = logging.getLogger(__name__)
 
 SH_C0 = 0.28209479177387814
 """The spherical harmonic of degree 0: a colour is 0.5 + SH_C0 * coefficient."""
 TRANSFER = "srgb-log"
 """Name of the curve in the header of a stream with colours above white."""
+BRIGHTEST_LIGHT = 1e30
+"""Linear light that no image exceeds: sums and squares of its encoded values stay far from the limits of float32."""
+BRIGHTEST = 32.0
+"""Encoded value that no image exceeds: that of `BRIGHTEST_LIGHT` is 31.4."""
 # Slope of sRGB at 1.
 _SLOPE = 1.055 / 2.4
 # Percentile of the brightest channels of a recording that a display shows as white: lamps and highlights are fewer.
@@ -70,6 +81,32 @@ def decode_traced(encoded: Any) -> Any:
 def unit_values(image: np.ndarray, dtype: type[np.floating[Any]] = np.float64) -> np.ndarray:
     """Return encoded values of an image as floats, white being 1: uint8 is divided by 255, floats are such values."""
     return image.astype(dtype) / 255 if image.dtype == np.uint8 else image.astype(dtype)
+
+
+def positive_light(light: np.ndarray, place: str) -> np.ndarray:
+    """Return a copy of linear light as float32 with 0 for negative values, which are warned of once.
+
+    Args:
+        light: of an image [H, W, 3].
+        place: where the error's sentence begins.
+
+    Raises:
+        ValueError: a value is not finite, or above `BRIGHTEST_LIGHT`.
+    """
+    least, most = float(light.min()), float(light.max())
+    if not -BRIGHTEST_LIGHT <= least <= most <= BRIGHTEST_LIGHT:
+        raise ValueError(
+            f"{place} must be finite and at most {BRIGHTEST_LIGHT:g}, got linear light from {least:g} to {most:g}; "
+            "replace such pixels."
+        )
+    if least < 0:
+        _warn_about_negative_light()
+    return np.maximum(light, 0, dtype=np.float32)
+
+
+@cache
+def _warn_about_negative_light() -> None:
+    _LOG.warning("Images in linear light have negative values, which are set to 0.")
 
 
 def display_image(image: np.ndarray, stops: float = 0.0) -> np.ndarray:

@@ -72,6 +72,7 @@ def draw_stream(
     if not frames:
         raise ValueError(f"{stream.path}: expected at least one frame, got a header alone; fit the capture again.")
     recording = open_stream_capture(stream, capture, frames, any_recording)
+    recording = recording.displayed()
     view = recording.reference_view
     camera = recording.with_delays(stream.cameras)[view]
     # Nothing moves up to the first frame.

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import correlate1d
 
-from morgs_mi.core.color_space import decode_light
+from morgs_mi.core.color_space import decode_light, unit_values
 from morgs_mi.core.threads import map_in_threads
 
 __all__ = ["delta_e_map", "endpoint_error", "iou", "mean_over", "psnr", "psnr_of", "ssim", "ssim_map", "unit_pair"]
@@ -174,5 +174,4 @@ def _check(name: str, image: np.ndarray, truth: np.ndarray, mask: np.ndarray | N
 
 
 def _unit(image: np.ndarray) -> np.ndarray:
-    image = np.asarray(image)
-    return image / 255.0 if image.dtype == np.uint8 else image.astype(np.float64)
+    return unit_values(np.asarray(image))

@@ -28,6 +28,7 @@ from morgs_mi.calibration.stereo import stereo_points
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.features import Features, Match, detect, match_views, reprojection_errors, triangulate
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.core.random_streams import Stream, rng_of
 
 __all__ = [
@@ -128,7 +129,7 @@ def match_capture(capture: Capture, progress: Callable[[int, int], None] | None 
         capture: a capture, downscaled or not.
         progress: called with (views done, views).
     """
-    capture = capture.at_recorded_size()
+    capture = capture.displayed().at_recorded_size()
     images, count = next(capture.partial_frames(0, 1)).images, len(capture.cameras)
     features = []
     for done, (image, mask) in enumerate(zip(images, capture.masks, strict=True)):
@@ -190,7 +191,7 @@ def dense_points(capture: Capture, shared: SharedFeatures, seed: int = 0) -> Cap
         seed: seed of the selection of stereo points.
     """
     sparse, recorded = triangulate_points(capture, shared), capture.at_recorded_size()
-    images = next(recorded.partial_frames(0, 1)).images
+    images = next(recorded.displayed().partial_frames(0, 1)).images
     views = [(v, image) for v in capture.train_views if (image := images[v]) is not None]
     points, colors = stereo_points(
         [recorded.cameras[v] for v, _ in views],
@@ -200,6 +201,8 @@ def dense_points(capture: Capture, shared: SharedFeatures, seed: int = 0) -> Cap
         rng_of(seed, Stream.POINTS),
     )
     points, colors = np.concatenate([sparse.points, points]), np.concatenate([sparse.point_colors, colors])
+    if capture.display_exposure:
+        colors = encode_light(decode_light(colors) / 2**capture.display_exposure)
     return replace(capture, points=points, point_colors=colors)
 
 

@@ -83,7 +83,7 @@ def read_signals(capture: Capture, max_frames: int, progress: Callable[[int, int
     thumbs = [np.full((count, *size[::-1]), np.nan, np.float32) for size in sizes]
     sharpness = np.full((count, len(sizes)), np.nan)
     inner = [None if m is None else cv2.erode(m.astype(np.uint8), np.ones((9, 9))) > 0 for m in capture.masks]
-    for t, frame in enumerate(capture.partial_frames(0, count)):
+    for t, frame in enumerate(capture.displayed().partial_frames(0, count)):
         for c, image in enumerate(frame.images):
             if image is None:
                 continue
