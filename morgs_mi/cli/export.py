@@ -13,7 +13,7 @@ from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.opening import DropInvalid, opened
-from morgs_mi.cli.settings import ChannelName, Flag, one_of, optional, place
+from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, one_of, optional, place
 from morgs_mi.core.documentation import page
 from morgs_mi.playback.export.formats import GLTF, PLY, TRACKS, USD, VIDEO, WEB, Format, destination
 
@@ -143,12 +143,14 @@ class Flight:
     """Width of the video; by default that of the first camera or the JSON file."""
     channels: tuple[ChannelName, ...] = ("color",)
     """Channels to render, side by side."""
+    display_exposure: DisplayExposure = None
 
     arguments: ClassVar[Mapping[str, str]] = {"least": "--least-seconds"}
 
     def run(self, stream: PlayableStream) -> None:
         from morgs_mi.playback.export.clips import flight, frame_numbers, named_path, num_images, repeated_frames
         from morgs_mi.playback.export.frames import write_images
+        from morgs_mi.playback.player import stream_exposure
 
         frames = frame_numbers(stream)
         if self.freeze is not None and self.freeze not in frames:
@@ -161,7 +163,8 @@ class Flight:
         with progress() as report:
             clip = repeated_frames(stream, self.freeze, self.back_and_forth)
             images = flight(stream, path, self.channels, clip)
-            write_images(images, stream.fps, output, lambda done: report("Rendering", done, count))
+            stops = stream_exposure(stream) if self.display_exposure is None else self.display_exposure
+            write_images(images, stream.fps, output, lambda done: report("Rendering", done, count), None, stops)
         print_result(f"{output}: {path.seconds:.1f} s, {path.keys[0].width}x{path.keys[0].height}.")
 
 

@@ -34,6 +34,7 @@ __all__ = [
     "display_stops",
     "encode_light",
     "encode_traced",
+    "exposed",
     "positive_light",
     "unit_values",
 ]
@@ -107,6 +108,11 @@ def positive_light(light: np.ndarray, place: str) -> np.ndarray:
 @cache
 def _warn_about_negative_light() -> None:
     _LOG.warning("Images in linear light have negative values, which are set to 0.")
+
+
+def exposed(encoded: np.ndarray, stops: float) -> np.ndarray:
+    """Return encoded values, brightened by stops of linear light; not clipped."""
+    return encode_light(np.float32(2**stops) * decode_light(encoded)) if stops else encoded
 
 
 def display_image(image: np.ndarray, stops: float = 0.0) -> np.ndarray:

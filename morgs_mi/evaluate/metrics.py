@@ -11,11 +11,24 @@ from scipy.ndimage import correlate1d
 from morgs_mi.core.color_space import decode_light, unit_values
 from morgs_mi.core.threads import map_in_threads
 
-__all__ = ["delta_e_map", "endpoint_error", "iou", "mean_over", "psnr", "psnr_of", "ssim", "ssim_map", "unit_pair"]
+__all__ = [
+    "delta_e_map",
+    "endpoint_error",
+    "iou",
+    "mean_over",
+    "psnr",
+    "psnr_mu",
+    "psnr_of",
+    "ssim",
+    "ssim_map",
+    "unit_pair",
+]
 
 # Wang, Bovik, Sheikh and Simoncelli, "Image quality assessment", TIP 2004.
 WINDOW, SIGMA = 11, 1.5
 C1, C2 = 0.01**2, 0.03**2
+# Of the mu-law, by which papers on HDR compare images.
+_MU = 5000
 # Rows of an image whose colours are compared at once; the temporaries of a whole image exceed the cache.
 _ROWS = 32
 
@@ -33,6 +46,24 @@ def psnr(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -
     """
     image, truth = unit_pair("psnr", image, truth, mask)
     return psnr_of(mean_over(np.square(image - truth), mask))
+
+
+def psnr_mu(light: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Return the PSNR of tonemapped linear light, log(1 + mu x) / log(1 + mu) with mu = 5000, in dB.
+
+    x is relative to the brightest true value and clipped to [0, 1] (Kalantari and Ramamoorthi, TOG 2017).
+
+    Args:
+        light: linear light [H, W, 3].
+        truth: likewise.
+        mask: [H, W] bool, the pixels that count; the result is NaN if there are none.
+
+    Raises:
+        ValueError: the sizes differ.
+    """
+    most = max(float(truth.max()), 1e-12)
+    mapped = (np.log1p(_MU * np.clip(x.astype(np.float64) / most, 0, 1)) / np.log1p(_MU) for x in (light, truth))
+    return psnr(*mapped, mask=mask)
 
 
 def psnr_of(error: float) -> float:

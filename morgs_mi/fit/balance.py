@@ -109,7 +109,7 @@ def balance_cameras(
         gaussians = fit(gaussians, exposures, -(-steps // 2) if k else steps)
         exposures = centred(
             {
-                v: fit_exposure(rendered(gaussians, view, render), unit_values(view.image), view.mask)
+                v: fit_exposure(rendered(gaussians, view.camera, render), unit_values(view.image), view.mask)
                 for v, view in enumerate(visible)
             }
         )

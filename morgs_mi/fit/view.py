@@ -93,14 +93,15 @@ def squared_errors(gaussians: Gaussians, views: Sequence[View], render: RenderCo
     """Return the mean square error of each view [V], of its valid pixels."""
     errors = []
     for view in views:
-        squares = ((rendered(gaussians, view, render) - unit_values(view.image)) ** 2).mean(axis=-1)
+        image = rendered(gaussians, view.camera, render, view.white)
+        squares = ((image - unit_values(view.image)) ** 2).mean(axis=-1)
         errors.append(squares[slice(None) if view.mask is None else view.mask].mean())
     return np.array(errors)
 
 
-def rendered(gaussians: Gaussians, view: View, render: RenderConfig) -> np.ndarray:
-    """Return the rendered image of a view [H, W, 3], encoded and clipped as the recorded one."""
-    return np.clip(np.asarray(rasterize(gaussians, view.camera, ("color",), config=render).color), 0, view.white)
+def rendered(gaussians: Gaussians, camera: Camera, render: RenderConfig, white: float = 1.0) -> np.ndarray:
+    """Return the encoded image of a camera [H, W, 3], clipped to [0, white]."""
+    return np.clip(np.asarray(rasterize(gaussians, camera, ("color",), config=render).color), 0, white)
 
 
 def decibels(squares: np.ndarray) -> np.ndarray:

@@ -9,12 +9,12 @@ import numpy as np
 
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.color_space import decode_light
+from morgs_mi.core.color_space import decode_light, exposed
 from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import PLAYABLE, write_video
 from morgs_mi.playback.export.formats import IMAGES, choose_format
-from morgs_mi.playback.player import channel_image, render_stream
+from morgs_mi.playback.player import channel_image, render_stream, stream_exposure
 from morgs_mi.playback.visualise import side_by_side, write_png
 
 __all__ = ["exr_channels", "pad_to_even", "write_frames", "write_images"]
@@ -49,7 +49,8 @@ def write_frames(
         raise ValueError(f"{stream.path}: at least one frame was expected, got none; the stream has only a header.")
     chosen = choose_format(IMAGES, output, format).name
     channels = channels or (None if chosen == "exr" else ("color",))
-    write_images(render_stream(stream, camera, channels), stream.fps, output, progress, chosen)
+    images = render_stream(stream, camera, channels)
+    write_images(images, stream.fps, output, progress, chosen, stream_exposure(stream))
 
 
 def write_images(
@@ -58,8 +59,11 @@ def write_images(
     output: str | Path,
     progress: Callable[[int], None] | None = None,
     format: str | None = None,
+    display_exposure: float = 0.0,
 ) -> None:
     """Write rendered frames, pairs of index and channels [H, W, C] by name, into files as `write_frames` does.
+
+    Videos and PNG files show colours that are brightened by the display exposure, in stops, and clipped at white.
 
     Raises:
         ValueError: another type of video.
@@ -69,7 +73,8 @@ def write_images(
 
     def frames() -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:
         for done, (frame, images) in enumerate(rendered, start=1):
-            yield frame, images
+            shows = display_exposure and chosen != "exr" and "color" in images
+            yield frame, {**images, "color": exposed(images["color"], display_exposure)} if shows else images
             if progress is not None:
                 progress(done)
 
