@@ -149,7 +149,8 @@ def record(options: Options) -> dict[str, Path]:
     points, colors = surface_points(cameras[1:])
     for folder in folders.values():
         write_colmap(folder / "sparse" / "0", cameras, points, colors)
-        write_json(folder / "capture.json", {"test_view": 0, "fps": FPS})
+        # Both are compared as a display shows them at the exposure of the recording of 8 bits.
+        write_json(folder / "capture.json", {"test_view": 0, "fps": FPS, "display_exposure": 0})
     return folders
 
 

@@ -80,7 +80,8 @@ def initial_points(views: Sequence[View], points: Points, count: int, rng: np.ra
     """Return the points that Gaussians start from, at most [count, 3], and their colours.
 
     Fewer than `MIN_POINTS` given ones are replaced by random points inside the views; where there are few, random ones
-    are added where the views show none. Points in the empty space before the cameras are left out.
+    are added where the views show none. Points in the empty space before the cameras are left out. Given points get the
+    colours of HDR views, because their own do not exceed white.
 
     Args:
         views: V views, at least one.
@@ -88,7 +89,7 @@ def initial_points(views: Sequence[View], points: Points, count: int, rng: np.ra
         count: number of points; those in the empty space are not replaced.
         rng: draws points.
     """
-    known = len(points[0])
+    points, known = _in_light(points, views), len(points[0])
     if known < MIN_POINTS:
         points = seed_points(views, count, rng)
     elif known < _MANY_POINTS:
@@ -102,6 +103,23 @@ def _outside_empty_space(cameras: Sequence[Camera], points: Points) -> Points:
     """Return the points that are not in the empty space before the cameras; all, if all are."""
     is_empty = in_empty_space(cameras, points[0])
     return points if is_empty.all() else (points[0][~is_empty], points[1][~is_empty])
+
+
+def _in_light(points: Points, views: Sequence[View]) -> Points:
+    """Return the points with their median colours in HDR views; their own where no such view shows them."""
+    positions, own = points
+    shown = [view for view in views if np.isinf(view.white)]
+    if not shown or not len(positions):
+        return points
+    colors = np.full((len(shown), *positions.shape), np.nan)
+    for k, (camera, image, mask) in enumerate(shown):
+        inside, pixels, _ = seen_points(camera, positions)
+        columns, rows = pixels.astype(int).T
+        recorded = np.ones(len(rows), bool) if mask is None else mask[rows, columns]
+        colors[k, inside] = np.where(recorded[:, None], image[rows, columns], np.nan)
+    unseen = np.isnan(colors).all(axis=(0, 2))
+    colors[:, unseen] = own[unseen]
+    return positions, np.nanmedian(colors, axis=0)
 
 
 def resample_points(points: Points, count: int, rng: np.random.Generator) -> Points:

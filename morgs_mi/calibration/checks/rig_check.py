@@ -28,7 +28,6 @@ from morgs_mi.calibration.stereo import stereo_points
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.features import Features, Match, detect, match_views, reprojection_errors, triangulate
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.core.random_streams import Stream, rng_of
 
 __all__ = [
@@ -201,8 +200,6 @@ def dense_points(capture: Capture, shared: SharedFeatures, seed: int = 0) -> Cap
         rng_of(seed, Stream.POINTS),
     )
     points, colors = np.concatenate([sparse.points, points]), np.concatenate([sparse.point_colors, colors])
-    if capture.display_exposure:
-        colors = encode_light(decode_light(colors) / 2**capture.display_exposure)
     return replace(capture, points=points, point_colors=colors)
 
 
