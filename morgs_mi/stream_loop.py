@@ -29,6 +29,7 @@ from morgs_mi.loop.correction import Correction
 from morgs_mi.loop.first_frame import fitted_first_frame, with_first_confidence
 from morgs_mi.loop.frame_report import FittedFrame, FrameReport
 from morgs_mi.loop.image_status import image_status
+from morgs_mi.loop.input_images import Given, as_array
 from morgs_mi.loop.observation import (
     FrameObservation,
     Images,
@@ -79,7 +80,7 @@ class StreamState:
 def step(
     setup: Setup,
     state: StreamState,
-    images: Sequence[np.ndarray | None] | FrameObservation,
+    images: Sequence[Given | None] | FrameObservation,
     progress: Report | None = None,
     on_provisional: Callable[[Packet], None] | None = None,
 ) -> tuple[StreamState, Packet, FrameReport]:
@@ -88,7 +89,8 @@ def step(
     Args:
         setup: data that all frames share, as from `prepare`.
         state: as returned for the last frame; `StreamState()` before the first.
-        images: per training view uint8 [H, W, 3], RGB, or None where the view has no image. They are copied.
+        images: per training view an image [H, W, 3], RGB, or None where the view has none: uint8 in sRGB, linear light
+            as a float array or a `mi.TensorXf`, or a `mi.Bitmap`, whose flag `srgb_gamma` counts. They are copied.
             Alternatively, the result of `observe_frame` for them.
         progress: called with (stage, done, total): the stages of the first frame, or the steps of a later one.
         on_provisional: called with provisional keyframes while the first frame is fitted.
@@ -143,7 +145,7 @@ def _fitted_later_frame(
         previous = with_first_confidence(setup, previous, state.seen.images, observed.flows, rng)  # (9-11)
     observations = observe(observed.key_views, motion, config.fit.objective)
     active = _active_set(setup, previous, images, observed.changes, observations)
-    corrected = state.correction.corrected({view: images[view] for view in active.views})
+    corrected = state.correction.corrected({view: observed.encoded[view] for view in active.views})
     targets = {view: Target(image, setup.masks[view]) for view, image in corrected.items()}
     initial = initial_motion(previous, active, observed.flows, targets, motion, rng)  # motion (5)
     problem = FrameProblem(previous, active, targets, observations, initial, setup.extent)
@@ -186,14 +188,16 @@ class StreamLoop:
         point_colors: [P, 3] in [0, 1].
         config: settings.
         masks: per view [H, W] bool of valid pixels, or None.
+        display_exposure: stops by which images in linear light are brightened where flow and changes are computed,
+            which see 8 bits; None: if any light of the first frame exceeds 1, the 99th percentile becomes 1.
 
     Example:
         >>> loop = morgs_mi.StreamLoop(cameras, points, point_colors)
-        >>> for images in frames:  # per frame one uint8 image [H, W, 3] per camera
+        >>> for images in frames:  # per frame one image [H, W, 3] per camera: uint8, or linear light in floats
         ...     packet, report = loop.push(images)
 
     Raises:
-        ValueError: no cameras, points that are not finite, colours outside [0, 1] or of another shape, or a mask of
+        ValueError: no cameras, points that are not finite, colours of another range or shape, or a mask of
             another shape than its view.
     """
 
@@ -204,8 +208,9 @@ class StreamLoop:
         point_colors: np.ndarray,
         config: StreamConfig | None = None,
         masks: Sequence[np.ndarray | None] | None = None,
+        display_exposure: float | None = None,
     ) -> None:
-        self.setup = prepare(cameras, points, point_colors, config, masks)
+        self.setup = prepare(cameras, points, point_colors, config, masks, display_exposure)
         self.state = StreamState()
         self._ahead: tuple[int, Future[FrameObservation]] | None = None  # of the next frame, with its index
 
@@ -220,7 +225,7 @@ class StreamLoop:
         views = capture.train_views
         cameras = [capture.cameras[v] for v in views]
         masks = [capture.masks[v] for v in views]
-        return cls(cameras, capture.points, capture.point_colors, config, masks)
+        return cls(cameras, capture.points, capture.point_colors, config, masks, capture.display_exposure)
 
     def __repr__(self) -> str:
         return f"StreamLoop({len(self.setup.cameras)} cameras, frame {self.state.frame} is next, {self.gaussians})"
@@ -233,10 +238,10 @@ class StreamLoop:
     @interrupts_raised()
     def push(
         self,
-        images: Sequence[np.ndarray | None],
+        images: Sequence[Given | None],
         progress: Report | None = None,
-        upcoming: Sequence[np.ndarray | None] | None = None,
-        recorded: Sequence[np.ndarray | None] | None = None,
+        upcoming: Sequence[Given | None] | None = None,
+        recorded: Sequence[Given | None] | None = None,
         on_provisional: Callable[[Packet], None] | None = None,
     ) -> tuple[Packet, FrameReport]:
         """Fit the next frame and return its packet for the stream, and its report; see `step`.
@@ -256,20 +261,20 @@ class StreamLoop:
         observed = self._observed_ahead(images) or observe_frame(self.setup, frame, past, images)
         seen = observed.seen if recorded is None else see_frame(self.setup, frame, past, recorded)[0]
         if upcoming is not None:
-            copies = [None if image is None else np.array(image) for image in upcoming]
+            copies = [None if image is None else np.array(as_array(image)) for image in upcoming]
             self._ahead = frame + 1, in_background(partial(observe_frame, self.setup, frame + 1, seen, copies))
         state, packet, report = step(self.setup, self.state, observed, progress, on_provisional)
         self.state = replace(state, seen=seen)
         return packet, replace(report, seconds=time.perf_counter() - start)
 
-    def _observed_ahead(self, images: Sequence[np.ndarray | None]) -> FrameObservation | None:
+    def _observed_ahead(self, images: Sequence[Given | None]) -> FrameObservation | None:
         """Return the observation made ahead of time, if its images are the same."""
         ahead = self._ahead
         self._ahead = None
         if ahead is None or ahead[0] != self.state.frame:
             return None
         observed = ahead[1].result()
-        present = {v: image for v, image in enumerate(images) if image is not None}
+        present = {v: as_array(image) for v, image in enumerate(images) if image is not None}
         same_views = present.keys() == observed.recorded.keys()
         same = same_views and all(np.array_equal(image, observed.recorded[v]) for v, image in present.items())
         return observed if same else None
@@ -277,7 +282,7 @@ class StreamLoop:
     def resume(
         self,
         coded: CodedFrame,
-        frames: Iterable[Sequence[np.ndarray | None]],
+        frames: Iterable[Sequence[Given | None]],
         exposures: Sequence[Exposure] = (),
     ) -> None:
         """Continue after a frame of a stream, as if it had just been pushed.

@@ -12,7 +12,7 @@ from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.opening import DropInvalid, opened
-from morgs_mi.cli.settings import ChannelName, Flag, one_of, optional, place
+from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, one_of, optional, place
 from morgs_mi.cli.suggestion import one_command
 from morgs_mi.core.documentation import page
 from morgs_mi.core.progress import Report
@@ -144,6 +144,7 @@ class Flight(_Kind):
     """Width of the video; by default that of the first camera or the JSON file."""
     channels: tuple[ChannelName, ...] = ("color",)
     """Channels to render, side by side."""
+    display_exposure: DisplayExposure = None
 
     formats = VIDEO
     drawn = True
@@ -151,6 +152,7 @@ class Flight(_Kind):
     def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
         from morgs_mi.playback.export.clips import flight, frame_numbers, named_path, num_images, repeated_frames
         from morgs_mi.playback.export.frames import write_images
+        from morgs_mi.playback.player import stream_exposure
 
         frames = frame_numbers(stream)
         if self.freeze is not None and self.freeze not in frames:
@@ -160,7 +162,8 @@ class Flight(_Kind):
         path = path if self.seconds is None else path.with_duration(self.seconds)
         count = num_images(stream, path)
         images = flight(stream, path, self.channels, repeated_frames(stream, self.freeze, self.back_and_forth))
-        write_images(images, stream.fps, output, lambda done: report("Rendering", done, count))
+        stops = stream_exposure(stream) if self.display_exposure is None else self.display_exposure
+        write_images(images, stream.fps, output, lambda done: report("Rendering", done, count), None, stops)
         return f"{path.seconds:.1f} s, {path.keys[0].width}x{path.keys[0].height}"
 
 

@@ -11,7 +11,7 @@ from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.opening import DropInvalid, opened
-from morgs_mi.cli.settings import ChannelName, Flag, one_of, optional
+from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, one_of, optional
 from morgs_mi.core.documentation import page
 from morgs_mi.playback.export.formats import IMAGES, destination
 
@@ -79,6 +79,7 @@ class Render:
     light: Literal["probe", "traced"] = "probe"
     """Light of an inserted scene: an environment map at its middle, or rays traced through the Gaussians, for their
     shadows and reflections."""
+    display_exposure: DisplayExposure = None
     drop_invalid: DropInvalid = False
     skip_damaged: Flag = False
     """Skip damaged frames of a stream, and those after them up to the next intact keyframe."""
@@ -86,7 +87,7 @@ class Render:
     def run(self) -> None:
         from morgs_mi.playback.export.clips import frame_numbers, named_path, num_images
         from morgs_mi.playback.export.frames import write_images
-        from morgs_mi.playback.player import find_camera
+        from morgs_mi.playback.player import find_camera, stream_exposure
 
         self._check()
         stream = opened(self.out, self.drop_invalid, skip_damaged=self.skip_damaged)
@@ -104,7 +105,8 @@ class Render:
         if single and count > 1:
             raise ValueError(f"{output}: expected one image for one file, got {count}; name a folder.")
         with progress() as report:
-            write_images(images, stream.fps, output, lambda done: report("Rendering", done, count), chosen.name)
+            stops = stream_exposure(stream) if self.display_exposure is None else self.display_exposure
+            write_images(images, stream.fps, output, lambda done: report("Rendering", done, count), chosen.name, stops)
         print_result(f"{output}: {count} {'image' if count == 1 else 'images'}.")
 
     def _check(self) -> None:

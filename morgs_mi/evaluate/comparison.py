@@ -14,6 +14,7 @@ from morgs_mi.capture.truth import GroundTruth
 from morgs_mi.codec.container import PacketKind, encode_packet
 from morgs_mi.codec.frame_source import FrameSource, FrameState
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.color_space import display_image, exposed
 from morgs_mi.evaluate.temporal import recorded_change
 from morgs_mi.playback.player import has_confidence, open_stream_capture, render, render_config, truth_for_camera
 from morgs_mi.playback.visualise import to_uint8
@@ -67,14 +68,15 @@ class ComparedClip:
 
     def frames(self) -> Iterator[ComparedFrame]:
         """Yield the decoded frames beside the recorded ones."""
-        last = None
+        last, stops = None, self.recording.display_exposure or 0.0
         # The file may have grown since it was read.
         decoded = islice(self.stream.states(), len(self.packets))
         recorded = self.recording.partial_frames(min(self.packets), max(self.packets) + 1)
         for state, frame in zip(decoded, recorded, strict=True):
             kind, num_bytes = self.packets[state.frame]
-            yield ComparedFrame(self, state, kind, num_bytes, frame.images, last)
-            last = frame.images
+            images = [None if image is None else display_image(image, stops) for image in frame.images]
+            yield ComparedFrame(self, state, kind, num_bytes, images, last, frame.images)
+            last = images
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,8 +88,9 @@ class ComparedFrame:
         state: its Gaussians.
         kind: kind of the frame's packet.
         num_bytes: its size.
-        images: recorded images of all views; None: missing.
+        images: recorded images of all views, as a display shows them; None: missing.
         last: likewise of the frame before; None in the first one.
+        recorded: the images as they were recorded.
     """
 
     clip: ComparedClip
@@ -96,6 +99,7 @@ class ComparedFrame:
     num_bytes: int
     images: Sequence[np.ndarray | None]
     last: Sequence[np.ndarray | None] | None
+    recorded: Sequence[np.ndarray | None]
 
     def views(self) -> Iterator[ComparedView]:
         """Render and yield the evaluated views, except those without an image."""
@@ -106,7 +110,8 @@ class ComparedFrame:
                 maps = render(self.state.gaussians, camera, clip.channels, clip.render)
                 truth = truth_for_camera(clip.recording, camera, self.state.frame)
                 moving = self._changed(index) if truth is None else truth.mask
-                yield ComparedView(self, index, maps, image, clip.recording.masks[index], moving, truth)
+                light = None if clip.recording.display_exposure is None else self.recorded[index]
+                yield ComparedView(self, index, maps, image, clip.recording.masks[index], moving, truth, light)
 
     def _changed(self, view: int) -> np.ndarray | None:
         """Return the mask of pixels that changed since the last image; None without one, and beside ground truth."""
@@ -124,10 +129,11 @@ class ComparedView:
         frame: its frame.
         index: of the view.
         maps: rendered channels by name.
-        recorded: image [H, W, 3].
+        recorded: image [H, W, 3], uint8; of an HDR recording as a display shows it.
         valid: valid pixels [H, W] bool; None: all.
         moving: moving pixels [H, W] bool; None: unknown.
         truth: ground truth; None: unknown.
+        light: image of an HDR recording [H, W, 3], linear; None of others.
     """
 
     frame: ComparedFrame
@@ -137,6 +143,7 @@ class ComparedView:
     valid: np.ndarray | None
     moving: np.ndarray | None
     truth: GroundTruth | None
+    light: np.ndarray | None = None
 
     @property
     def camera(self) -> Camera:
@@ -146,4 +153,4 @@ class ComparedView:
     @property
     def rendered(self) -> np.ndarray:
         """Rendered image [H, W, 3], uint8 as a decoder shows it."""
-        return to_uint8(self.maps["color"])
+        return to_uint8(exposed(self.maps["color"], self.frame.clip.recording.display_exposure or 0.0))

@@ -20,10 +20,21 @@ from morgs_mi.calibration.refine import register_camera
 from morgs_mi.capture.truth import GroundTruth, load_tracks, load_truth
 from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.frame_source import FrameState
+from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.core.rig import scene_extent
 from morgs_mi.evaluate.comparison import ComparedClip, ComparedFrame, ComparedView
 from morgs_mi.evaluate.lpips import Lpips
-from morgs_mi.evaluate.metrics import WINDOW, delta_e_map, endpoint_error, iou, mean_over, psnr_of, ssim_map, unit_pair
+from morgs_mi.evaluate.metrics import (
+    WINDOW,
+    delta_e_map,
+    endpoint_error,
+    iou,
+    mean_over,
+    psnr_mu,
+    psnr_of,
+    ssim_map,
+    unit_pair,
+)
 from morgs_mi.evaluate.motion3d import evaluate_motion
 from morgs_mi.evaluate.results import Motion3DScores, VariationScores, ViewScores
 from morgs_mi.evaluate.temporal import StillVariation, slope
@@ -151,7 +162,8 @@ class Registration(Measure):
         clip = view.frame.clip
         if self._begun or view.index not in clip.recording.test_views:
             return
-        given = View(clip.stream.cameras[view.index], view.recorded, view.valid)
+        image = view.recorded if view.light is None else encode_light(view.light)
+        given = View(clip.stream.cameras[view.index], image, view.valid)
         extent = scene_extent([clip.stream.cameras[v] for v in clip.recording.train_views])
         gaussians = view.frame.state.gaussians
         registered = given._replace(camera=register_camera(gaussians, given, extent, FitConfig(), clip.render))
@@ -187,6 +199,8 @@ def _image_scores(view: ComparedView, lpips: Lpips | None) -> dict[str, float]:
         maps["ssim"] = ssim_map(a, b)
     matched = follow_exposure(rendered, view.recorded, view.valid)(a).clip(0, 1)
     scores = {"psnr_matched": psnr_of(mean_over(np.square(matched - b), whole))}
+    if view.light is not None:
+        scores["psnr_mu"] = psnr_mu(decode_light(view.maps["color"]), view.light, view.valid)
     for name, values in maps.items():
         finish = psnr_of if name == "psnr" else float
         scores |= {name + r: finish(mean_over(values, mask)) for r, mask in zip(REGIONS, regions, strict=True)}

@@ -27,6 +27,7 @@ from morgs_mi.codec.container import Packet, PacketKind
 from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import check_number
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.types import Tensor
 from morgs_mi.io.bounded import read_json
@@ -55,6 +56,7 @@ __all__ = [
     "render",
     "render_config",
     "render_stream",
+    "stream_exposure",
     "stream_name",
     "truth_for_camera",
 ]
@@ -240,6 +242,18 @@ def render_config(stream: FrameSource) -> RenderConfig:
     return apply_values(RenderConfig(), values, _place(stream, "config.render"))
 
 
+def stream_exposure(stream: FrameSource) -> float:
+    """Return the stops by which a display brightens a stream, 0 for the stream of a recording of 8 bits.
+
+    Raises:
+        ValueError: the header has another value than a number from -100 to 100.
+    """
+    key = "transfer.display_exposure"
+    stops = metadata_entry(stream, key, 0.0, int, float)
+    check_number(_place(stream, key), "display_exposure", stops, "[-100, 100]")
+    return float(stops)
+
+
 def num_frames(stream: FrameSource) -> int:
     """Return the number of frames of the capture that was fitted, zero if the stream's header does not state it.
 
@@ -318,6 +332,8 @@ def open_stream_capture(
     if not any_recording:
         _check_recording(stream, recording)
     # Other refined cameras change no image, and ground truth refers to the recording's cameras.
+    if recording.display_exposure is not None:
+        recording = replace(recording, display_exposure=stream_exposure(stream))
     return as_fitted(recording, stream) if "distortions" in stream.metadata else recording
 
 

@@ -31,6 +31,7 @@ from morgs_mi.capture.outputs import check_output
 from morgs_mi.codec.container import Packet, PacketKind, StreamWriter, TruncatedStreamError, header_json
 from morgs_mi.codec.packets import CodedFrame, decode, reemitted_keyframe
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.color_space import TRANSFER
 from morgs_mi.core.files import atomic_path, is_same_file, write_json
 from morgs_mi.core.rig import choose_key_views
 from morgs_mi.io.bounded import read_json
@@ -334,6 +335,8 @@ def stream_metadata(capture: Capture, first: PartialFrame, config: StreamConfig)
         "versions": {"mitsuba": mi.__version__},
         "variant": mi.variant(),
     }
+    if capture.display_exposure is not None:
+        metadata["transfer"] = {"name": TRANSFER, "display_exposure": capture.display_exposure}
     return _without_folders(metadata)
 
 

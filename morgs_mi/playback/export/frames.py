@@ -9,13 +9,13 @@ import numpy as np
 
 from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.color_space import srgb_to_linear
+from morgs_mi.core.color_space import decode_light, exposed
 from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import PLAYABLE, write_video
 from morgs_mi.playback.export.clips import frame_numbers
 from morgs_mi.playback.export.formats import IMAGES, choose_format
-from morgs_mi.playback.player import channel_image, render_stream
+from morgs_mi.playback.player import channel_image, render_stream, stream_exposure
 from morgs_mi.playback.visualise import side_by_side, write_png
 
 __all__ = ["exr_channels", "pad_to_even", "write_frames", "write_images"]
@@ -49,7 +49,8 @@ def write_frames(
     frame_numbers(stream)  # refuses a stream without frames
     kind = choose_format(IMAGES, output, format).name
     channels = channels or (None if kind == "exr" else ("color",))
-    write_images(render_stream(stream, camera, channels), stream.fps, output, progress, kind)
+    images = render_stream(stream, camera, channels)
+    write_images(images, stream.fps, output, progress, kind, stream_exposure(stream))
 
 
 def write_images(
@@ -58,8 +59,11 @@ def write_images(
     output: str | Path,
     progress: Callable[[int], None] | None = None,
     format: str | None = None,
+    display_exposure: float = 0.0,
 ) -> None:
     """Write rendered frames, pairs of index and channels [H, W, C] by name, into files as `write_frames` does.
+
+    Videos and PNG files show colours that are brightened by the display exposure, in stops, and clipped at white.
 
     Raises:
         ValueError: another type of video.
@@ -69,7 +73,8 @@ def write_images(
 
     def frames() -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:
         for count, (frame, images) in enumerate(rendered, start=1):
-            yield frame, images
+            shows = display_exposure and kind != "exr" and "color" in images
+            yield frame, {**images, "color": exposed(images["color"], display_exposure)} if shows else images
             if progress is not None:
                 progress(count)
 
@@ -104,7 +109,7 @@ def exr_channels(images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     Colour is R, G, B in linear light, as EXR readers expect, and alpha is A. Other channels are called ``depth.Y`` if
     they have one component, ``motion.X``, ``motion.Y`` if they have several. Motion is in pixels, depth in world units.
     """
-    planes = {**images, **({"color": srgb_to_linear(images["color"])} if "color" in images else {})}
+    planes = {**images, **({"color": decode_light(images["color"])} if "color" in images else {})}
     return {
         name: plane[..., i] for key, plane in planes.items() for i, name in enumerate(_exr_names(key, plane.shape[2]))
     }

@@ -13,7 +13,7 @@ from __future__ import annotations
 import importlib.util
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 from xml.etree import ElementTree
@@ -25,13 +25,13 @@ import numpy as np
 from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import LARGEST, bounded, check_number
-from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
+from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.ranges import check_ranges
 from morgs_mi.gaussian_integrator import ellipsoids
 from morgs_mi.playback.export.clips import frame_numbers
 from morgs_mi.playback.player import available_channels
-from morgs_mi.plugins.light_probe import light_probe
+from morgs_mi.plugins.light_probe import CLIPPED, light_probe
 from morgs_mi.plugins.shadows import shadow_ratio, shadowed
 from morgs_mi.plugins.surface_view import lights, rays_for, traced
 from morgs_mi.render.channels import exr_names
@@ -69,6 +69,9 @@ class InsertConfig:
     light: Light = "probe"
     """``probe`` lights the surfaces by an environment map, see `captured_light`; ``traced`` traces rays through the
     Gaussians (`splat_path`), which also throw shadows on them."""
+    clipped: float | None = None
+    """Radiance of colours that the video clipped at 1, see `light_probe`; None: 4, or 1 for a stream of an HDR
+    recording, which is not clipped."""
 
     def __post_init__(self) -> None:
         check_number("render_inserted()", "samples", self.samples, "[1, inf)")
@@ -165,6 +168,8 @@ def render_inserted(
         ValueError: a broken packet, or a scene that Mitsuba or `gaussian_splat` refuses.
     """
     config = config or InsertConfig()
+    if config.clipped is None:
+        config = replace(config, clipped=1.0 if "transfer" in stream.metadata else CLIPPED)
     for frame, gaussians in play(stream):
         if frames is None or frame in frames:
             entries = build(frame, frame / stream.fps)
@@ -182,32 +187,35 @@ def _resized(name: str, image: np.ndarray, camera: Camera) -> np.ndarray:
     return resized.reshape(camera.height, camera.width, -1) * unit
 
 
-def captured_light(gaussians: Gaussians, camera: Camera, position: np.ndarray) -> dict[str, Any]:
+def captured_light(
+    gaussians: Gaussians, camera: Camera, position: np.ndarray, clipped: float = CLIPPED
+) -> dict[str, Any]:
     """Return the `light_probe` at a point, where directions without Gaussians have the mean colour of a view.
 
     A capture rarely shows what is behind the cameras; black there would take half of the light away.
     """
-    return light_probe(gaussians, position, background=_mean_color(gaussians, camera))
+    return light_probe(gaussians, position, background=_mean_color(gaussians, camera, clipped), clipped=clipped)
 
 
-def _mean_color(gaussians: Gaussians, camera: Camera) -> list[float]:
-    return np.clip(np.asarray(rasterize(gaussians, camera, ("color",)).color), 0, 1).mean((0, 1)).tolist()
+def _mean_color(gaussians: Gaussians, camera: Camera, clipped: float) -> list[float]:
+    white = np.inf if clipped == 1 else 1.0
+    return np.clip(np.asarray(rasterize(gaussians, camera, ("color",)).color), 0, white).mean((0, 1)).tolist()
 
 
-def _in_background_light(entries: dict[str, Any], gaussians: Gaussians, camera: Camera) -> Any:
+def _in_background_light(entries: dict[str, Any], gaussians: Gaussians, camera: Camera, clipped: float) -> Any:
     """Return the inserted scene with the light that comes from behind all Gaussians, as for `captured_light`."""
-    radiance = srgb_to_linear(np.array(_mean_color(gaussians, camera))).tolist()
+    radiance = decode_light(np.array(_mean_color(gaussians, camera, clipped))).tolist()
     lamp = {"type": "constant", "radiance": {"type": "rgb", "value": radiance}}
     return mi.load_dict({"type": "scene", **entries, "captured light": lamp})
 
 
-def _integrator(entry: Any, light: Light) -> Any:
+def _integrator(entry: Any, light: Light, clipped: float) -> Any:
     """Return the integrator of the surfaces: the one of the inserted scene, if it has one.
 
     Raises:
         ValueError: it does not light them as the option demands.
     """
-    entry = entry or {"type": "splat_path" if light == "traced" else "path"}
+    entry = entry or ({"type": "splat_path", "clipped": clipped} if light == "traced" else {"type": "path"})
     nested = mi.load_dict(entry) if isinstance(entry, dict) else entry
     if hasattr(nested, "splats") != (light == "traced"):
         name = type(nested).__name__ if hasattr(nested, "splats") else nested.class_name()
@@ -222,15 +230,16 @@ def _render(
     gaussians: Gaussians, camera: Camera, entries: dict[str, Any], channels: Sequence[str], config: InsertConfig
 ) -> dict[str, np.ndarray]:
     entries = {name: value for name, value in entries.items() if name not in ("type", "sensor")}
-    nested = _integrator(entries.pop("integrator", None), config.light)
+    clipped = CLIPPED if config.clipped is None else config.clipped
+    nested = _integrator(entries.pop("integrator", None), config.light, clipped)
     ratio = np.ones(len(gaussians), np.float32)
     try:
         inserted = _inserted_scene(entries)
         lit = inserted
         if not inserted.emitters():
-            lamp = captured_light(gaussians, camera, np.array(inserted.bbox().center()).ravel())
+            lamp = captured_light(gaussians, camera, np.array(inserted.bbox().center()).ravel(), clipped)
             lit = mi.load_dict({"type": "scene", **entries, "captured light": lamp})
-            inserted = lit if config.light == "probe" else _in_background_light(entries, gaussians, camera)
+            inserted = lit if config.light == "probe" else _in_background_light(entries, gaussians, camera, clipped)
         if config.shadows:
             ratio = shadow_ratio(gaussians, lit, camera.position)
         dark = shadowed(gaussians, ratio)
@@ -266,8 +275,8 @@ def _inserted_scene(entries: dict[str, Any]) -> Any:
 def _splat_layers(gaussians: Gaussians, shadowed_gaussians: Gaussians, camera: Camera) -> dict[str, np.ndarray]:
     """Return the layers `splats` [H, W, 4] and `shadow` [H, W, 3], in linear light."""
     image = rasterize(gaussians, camera)
-    bright = srgb_to_linear(np.asarray(image.color))
-    dark = srgb_to_linear(np.asarray(rasterize(shadowed_gaussians, camera).color))
+    bright = decode_light(np.asarray(image.color))
+    dark = decode_light(np.asarray(rasterize(shadowed_gaussians, camera).color))
     return {
         "splats": np.concatenate([bright, np.asarray(image.alpha)], axis=2),
         "shadow": np.where(bright > 0, dark / np.maximum(bright, 1e-6), 1),
@@ -289,7 +298,7 @@ def _plugin_images(
         }
     )
     image = np.asarray(scene.integrator().render(scene, spp=samples))
-    images = {"color": linear_to_srgb(image[..., :3]), "alpha": image[..., 3:4]}
+    images = {"color": encode_light(image[..., :3]), "alpha": image[..., 3:4]}
     first = 4
     for name in aovs:
         size = len(exr_names(name))

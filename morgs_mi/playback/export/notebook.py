@@ -6,9 +6,10 @@ import base64
 import html
 
 from morgs_mi.codec.frame_source import FrameSource, play
+from morgs_mi.core.color_space import exposed
 from morgs_mi.io.png import png_bytes
 from morgs_mi.playback.export.web import web_page
-from morgs_mi.playback.player import channel_image, render, render_config, stream_name
+from morgs_mi.playback.player import channel_image, render, render_config, stream_exposure, stream_name
 
 __all__ = ["stream_html"]
 
@@ -37,7 +38,8 @@ def stream_html(stream: FrameSource) -> str:
             page = web_page(stream).decode().replace("&", "&amp;").replace('"', "&quot;")
             return _PLAYER.format(title=title, style=style, page=page)
         gaussians = next(gaussians for _, gaussians in play(stream))
-        image = channel_image("color", render(gaussians, camera, ("color",), render_config(stream))["color"])
+        color = render(gaussians, camera, ("color",), render_config(stream))["color"]
+        image = channel_image("color", exposed(color, stream_exposure(stream)))
     except (OSError, ValueError, StopIteration) as error:
         return f"<div>{html.escape(str(error) or f'{stream.path}: expected at least one frame, got none.')}</div>"
     command = f"morgs-mi export web {stream.path} page.html"

@@ -9,9 +9,10 @@ from typing import Any
 
 from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.color_space import exposed
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.png import png_bytes
-from morgs_mi.playback.player import available_channels, channel_image, render, render_config
+from morgs_mi.playback.player import available_channels, channel_image, render, render_config, stream_exposure
 
 __all__ = ["ExactImages"]
 
@@ -56,6 +57,7 @@ class ExactImages:
         if channel not in available_channels(gaussians):
             raise ValueError(f"{stream.path}: expected a channel of the stream, got {channel!r}.")
         values = render(gaussians, camera, (channel,), render_config(stream))[channel]
+        values = exposed(values, stream_exposure(stream)) if channel == "color" else values
         return png_bytes(channel_image(channel, values, motion_scale))
 
     def _gaussians(self, stream: FrameSource, frame: int) -> Gaussians:

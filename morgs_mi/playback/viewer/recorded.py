@@ -50,7 +50,7 @@ class RecordedImages:
         with self._lock:
             if self._capture is None or frame >= self._capture.num_frames:  # the capture of a live fit grows
                 count = max(num_frames(stream), last + 1)
-                self._capture = open_stream_capture(stream, self._folder, list(range(count)))
+                self._capture = open_stream_capture(stream, self._folder, list(range(count))).displayed()
                 self._view = -1
             if view != self._view or not self._next <= frame < self._next + _NEAR:
                 self._images = self._capture.images(view, frame)
