@@ -23,6 +23,7 @@ lint: setup
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
+	$(BIN)/typos
 
 docs: setup
 	$(BIN)/sphinx-build -q -W --keep-going docs docs/_build/html

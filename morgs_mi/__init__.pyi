@@ -12,8 +12,12 @@ from .evaluate.evaluate import evaluate_stream
 from .evaluate.point_tracks import PointTracks, track_points
 from .fit.fit_config import FitConfig
 from .gaussian_integrator import ellipsoids
+from .io.ply import write_ply
+from .io.splats import read_splats
+from .loop.frame_report import FrameReport
 from .loop.stream_config import StreamConfig
 from .method.motion_config import MotionConfig
+from .method.objective import ObjectiveConfig, loss_term
 from .playback.export.tracks import extract_tracks
 from .playback.player import channel_image, render_stream
 from .playback.streams import open_stream
@@ -26,7 +30,7 @@ from .render.rasterize import Image, rasterize
 from .render.render_config import RenderConfig
 from .runs.live.live_frames import live_frames
 from .runs.recorder import stream_capture
-from .stream_loop import FrameReport, StreamLoop
+from .stream_loop import StreamLoop
 from .synth.synth_config import SynthConfig
 from .synth.synthesize import synthesize
 
@@ -40,6 +44,7 @@ __all__ = [
     "Gaussians",
     "Image",
     "MotionConfig",
+    "ObjectiveConfig",
     "PointTracks",
     "ProgressBar",
     "RenderConfig",
@@ -58,9 +63,11 @@ __all__ = [
     "load_capture",
     "load_tracks",
     "load_truth",
+    "loss_term",
     "motion_image",
     "open_stream",
     "rasterize",
+    "read_splats",
     "render_lock",
     "render_stream",
     "shadow_ratio",
@@ -69,4 +76,5 @@ __all__ = [
     "synthesize",
     "track_points",
     "with_near_planes",
+    "write_ply",
 ]

@@ -78,16 +78,34 @@ def ellipsoids(gaussians: ActivatedGaussians) -> dict[str, Any]:
 def integrator(plugin: str, props: Any) -> Any:
     """Return an integrator of the active variant; `plugin` is its type, `props` are its properties.
 
-    Raises:
-        ValueError: the variant has no derivatives.
+    In a variant without derivatives, such as `scalar_rgb`, it refuses to render.
     """
     if not dr.is_diff_v(mi.Float):
-        raise ValueError(
-            f"{plugin}: expected a variant such as 'llvm_ad_rgb' or 'cuda_ad_rgb', got {mi.variant()!r}; call "
-            "mi.set_variant() before the scene is loaded."
-        )
+        return _refusal(plugin, props)
     module, class_name = _PLUGINS[plugin]
     return getattr(import_module(module), class_name)(props)
+
+
+def _refusal(plugin: str, props: Any) -> Any:
+    """Return an integrator whose `render` raises a ValueError.
+
+    Mitsuba would report an error of a constructor as a traceback inside another one.
+    """
+
+    class Refusal(mi.CppADIntegrator):
+        def __init__(self, props: Any) -> None:
+            super().__init__(props)
+            for name in props.unqueried():  # Mitsuba refuses properties that nothing reads
+                props[name]
+
+        def render(self, *_: Any, **__: Any) -> Any:
+            raise ValueError(
+                f"{plugin}: expected a variant such as 'llvm_ad_rgb' or 'cuda_ad_rgb', got {variant!r}; call "
+                "mi.set_variant() before the scene is loaded."
+            )
+
+    variant = mi.variant()
+    return Refusal(props)
 
 
 def _register(*_arguments: Any) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 import morgs_mi
+from tests.scenes.cameras import QUAD, look_at_cameras
 
 ROOT = Path(__file__).parents[1]
 WITH_EXAMPLE = (
@@ -70,3 +71,22 @@ def test_front_door__has_what_readme_and_notebooks_import():
     imports = [node for node in ast.walk(ast.parse("\n".join(lines))) if isinstance(node, ast.ImportFrom)]
     inner = [node.module for node in imports if (node.module or "").startswith("morgs_mi.")]
     assert inner == []
+
+
+def test_front_door__reprs_are_short():
+    stream = morgs_mi.open_stream(ROOT / "tests/codec/streams/version2.morgs")
+    packet = next(iter(stream))
+    report = morgs_mi.FrameReport(3, 1.25, 400, {"recon": 0.1}, 20)
+    loop = morgs_mi.StreamLoop(look_at_cameras(QUAD), [], [])
+    assert repr(stream).startswith(f"PlayableStream('{stream.path}', ")
+    assert f"{len(stream.cameras)} cameras, {stream.fps:g} frames per second)" in repr(stream)
+    assert repr(packet) == f"Packet(KEYFRAME, frame 0, {len(packet.arrays)} arrays)"
+    assert repr(report) == "FrameReport(frame 3, 20 Gaussians, 400 bytes, 1.2 s, ok)"
+    assert repr(loop) == "StreamLoop(4 cameras, frame 0 is next, None)"
+
+
+@pytest.mark.parametrize("method", [{"flow_method": "files:none"}, {"mask_method": "sam2:a.onnx,b.onnx"}])
+def test_stream_loop__refuses_missing_files_before_the_first_frame(method):
+    config = morgs_mi.StreamConfig(motion=morgs_mi.MotionConfig(**method))
+    with pytest.raises(FileNotFoundError):
+        morgs_mi.StreamLoop(look_at_cameras(QUAD), [], [], config)

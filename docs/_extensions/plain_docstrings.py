@@ -25,6 +25,8 @@ def setup(app: Sphinx) -> dict[str, Any]:
 
 def convert(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
     """Replace the lines of a docstring by reStructuredText with the same content."""
+    if "Fields:" in lines:  # the fields of a config have entries of their own
+        del lines[lines.index("Fields:") :]
     result: list[str] = []
     for title, body in sections(lines):
         if title in FIELDS:

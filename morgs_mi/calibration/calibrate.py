@@ -27,6 +27,7 @@ from morgs_mi.capture.masks import opaque_pixels
 from morgs_mi.capture.timeline import nearest_frames
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_number
+from morgs_mi.core.color_space import display_image, display_stops
 from morgs_mi.core.files import atomic_path
 from morgs_mi.io.video import FrameReader, open_frames
 
@@ -213,7 +214,9 @@ def _frames(
     if short:
         raise ValueError(f"{path}: frame {config.frame} is not in the clips of {', '.join(short)}; choose another.")
     at = {name: int(nearest_frames(reader, np.array([config.frame]))[0]) for name, reader in readers.items()}
-    images = {name: next(reader.frames(at[name], at[name] + 1)) for name, reader in readers.items()}
+    recorded = {name: next(reader.frames(at[name], at[name] + 1)) for name, reader in readers.items()}
+    stops = display_stops(recorded.values())
+    images = {name: display_image(image, stops) for name, image in recorded.items()}
     masks = {name: opaque_pixels(reader, name)[0] for name, reader in readers.items()}
     return images, {name: mask for name, mask in masks.items() if mask is not None}
 

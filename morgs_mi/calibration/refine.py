@@ -159,7 +159,7 @@ class _Problem:
     @classmethod
     def of(cls, capture: Capture, config: FitConfig, render: RenderConfig, seed: int) -> _Problem:
         """Return the problem of the first frame of a capture; raises as `refine_cameras`."""
-        images = next(capture.partial_frames(0, 1)).images
+        images = next(capture.displayed().partial_frames(0, 1)).images
         given = {
             v: View(capture.cameras[v], image, capture.masks[v])
             for v in capture.train_views
@@ -274,7 +274,7 @@ def _matched(capture: Capture, train: Sequence[int], deviations: np.ndarray) -> 
 
     Without enough points, there are no changes, and the deviations equal the priors' deviations.
     """
-    recorded = capture.at_recorded_size()
+    recorded = capture.displayed().at_recorded_size()
     images, cameras = next(recorded.partial_frames(0, 1)).images, [recorded.cameras[v] for v in train]
     features = [detect(images[v], recorded.masks[v]) for v in train]
     tracks = join_matches(match_views(features, cameras), features)

@@ -188,7 +188,8 @@ class _Clips:
 
     @classmethod
     def of(cls, capture: Capture) -> _Clips:
-        clips = [[_checked(image) for image in capture.images(v, 0, _FRAMES)] for v in range(len(capture.cameras))]
+        shown = capture.displayed()
+        clips = [[_checked(image) for image in shown.images(v, 0, _FRAMES)] for v in range(len(capture.cameras))]
         views = zip(capture.cameras, (clip[0] for clip in clips), capture.masks, strict=True)
         small, _, masks = zip(*(View(*view).reduced(_WIDTH) for view in views), strict=True)
         # The images are whole frames: with the capture's delays they would be displaced twice.

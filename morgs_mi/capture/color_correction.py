@@ -17,7 +17,7 @@ import numpy as np
 
 from morgs_mi.capture.features import Features, Match, detect, match_views, reprojection_errors
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
+from morgs_mi.core.color_space import decode_light, encode_light
 
 __all__ = ["ColorCorrection", "ColorFit", "fit_colors", "matched_colors"]
 
@@ -30,8 +30,8 @@ _DARK, _BRIGHT = 12, 243
 _BLUR = 0.008  # standard deviation of the blur around a feature, as a fraction of the width
 
 # Tables: the light of each byte, and the byte of 65536 levels of light.
-_LINEAR = srgb_to_linear(np.arange(256, dtype=np.float32) / np.float32(255)).astype(np.float32)
-_ENCODED = np.rint(255 * linear_to_srgb(np.arange(65536) / 65535)).astype(np.uint8)
+_LINEAR = decode_light(np.arange(256, dtype=np.float32) / np.float32(255)).astype(np.float32)
+_ENCODED = np.rint(255 * encode_light(np.arange(65536) / 65535)).astype(np.uint8)
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,9 @@ class ColorCorrection:
     matrix: np.ndarray  #: Matrix on linear (R, G, B) [3, 3].
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """Return the corrected image, uint8 [H, W, 3]."""
+        """Return the corrected image [H, W, 3], uint8, or float32 of linear light."""
+        if image.dtype != np.uint8:
+            return np.maximum(_corrected(image, self.matrix), 0)
         return _encode(_corrected(_LINEAR[image], self.matrix))
 
 

@@ -30,7 +30,8 @@ from morgs_mi.io.video import FrameReader
 
 _LOG = logging.getLogger(__name__)
 _DEFAULT_FPS = 30.0
-_SETTINGS = {"fps", "test_view", "meters_per_unit", "readout"}
+_INTERVALS = {"fps": "[1e-6, 1e6]", "meters_per_unit": "[1e-12, 1e12]", "display_exposure": "[-100, 100]"}
+_SETTINGS = {*_INTERVALS, "test_view", "readout"}
 # Distance in frames up to which a frame shows an instant.
 _NEAR = 0.5
 
@@ -329,7 +330,7 @@ def read_settings(path: Path) -> dict[str, Any]:
 
     They are ``fps``, ``test_view``, ``meters_per_unit``, the length of a world unit in metres, and ``readout``, the
     frames from the exposure of an image's first row to the exposure of its last row: a number for all cameras, or an
-    object with the numbers that are not 0, by the cameras' names.
+    object with the numbers that are not 0, by the cameras' names; and ``display_exposure`` in stops, see `Capture`.
 
     Raises:
         ValueError: the file is not a JSON object, or a setting is not valid.
@@ -342,7 +343,7 @@ def read_settings(path: Path) -> dict[str, Any]:
     if "scene" not in settings:  # a synthetic capture describes itself
         warn_unread(path, settings.keys() - _SETTINGS)
     view = settings.get("test_view")
-    for name, interval in (("fps", "[1e-6, 1e6]"), ("meters_per_unit", "[1e-12, 1e12]")):
+    for name, interval in _INTERVALS.items():
         if (value := settings.get(name)) is not None:
             check_number(str(path), name, value, interval)
     readout = settings.get("readout", 0.0)

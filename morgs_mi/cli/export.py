@@ -12,14 +12,14 @@ from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.opening import DropInvalid, opened
-from morgs_mi.cli.settings import ChannelName, Flag, one_of, optional, place
+from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, one_of, optional, place
 from morgs_mi.cli.suggestion import one_command
 from morgs_mi.core.documentation import page
 from morgs_mi.core.progress import Report
 from morgs_mi.playback.export.formats import GLTF, PLY, TRACKS, USD, VIDEO, WEB, Format, destination
 
 if TYPE_CHECKING:
-    from morgs_mi.playback.streams import PlayableStream
+    from morgs_mi.codec.frame_source import FrameSource
 
 __all__ = ["EXPORTS", "Export"]
 
@@ -40,7 +40,7 @@ class _Kind:
     drawn: ClassVar[bool] = False
     arguments: ClassVar[Mapping[str, str]] = {"span": "--frames", "least": "--least-seconds"}
 
-    def run(self, stream: PlayableStream) -> None:
+    def run(self, stream: FrameSource) -> None:
         given: Mapping[str, Any] = vars(self)
         stem = Path(given.get("path", "")).stem
         output, chosen = destination(stream.path, given["output"], self.formats, given.get("format"), stem)
@@ -48,7 +48,7 @@ class _Kind:
             summary = self.write(stream, output, chosen, report)
         print_result(f"{output}: {summary}.")
 
-    def write(self, stream: PlayableStream, output: Path, chosen: Format, report: Report) -> str:
+    def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
         """Write a stream in a format, and return a summary."""
         raise NotImplementedError
 
@@ -65,8 +65,8 @@ class Ply(_Kind):
 
     formats = PLY
 
-    def write(self, stream: PlayableStream, output: Path, chosen: Format, report: Report) -> str:
-        from morgs_mi.codec.packets import play
+    def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
+        from morgs_mi.codec.frame_source import play
         from morgs_mi.io.compressed_ply import write_compressed_ply
         from morgs_mi.io.ply import write_ply
         from morgs_mi.playback.export.clips import select_frames, write_each
@@ -88,8 +88,8 @@ class Gltf(_Kind):
 
     formats = GLTF
 
-    def write(self, stream: PlayableStream, output: Path, chosen: Format, report: Report) -> str:
-        from morgs_mi.codec.packets import play
+    def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
+        from morgs_mi.codec.frame_source import play
         from morgs_mi.playback.export.axes import gltf_axes
         from morgs_mi.playback.export.clips import select_frames, write_each
         from morgs_mi.playback.export.gltf_export import write_gltf
@@ -114,7 +114,7 @@ class Usd(_Kind):
 
     formats = USD
 
-    def write(self, stream: PlayableStream, output: Path, chosen: Format, report: Report) -> str:
+    def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
         from morgs_mi.playback.export.clips import select_frames
         from morgs_mi.playback.export.usd import write_usd
 
@@ -144,13 +144,15 @@ class Flight(_Kind):
     """Width of the video; by default that of the first camera or the JSON file."""
     channels: tuple[ChannelName, ...] = ("color",)
     """Channels to render, side by side."""
+    display_exposure: DisplayExposure = None
 
     formats = VIDEO
     drawn = True
 
-    def write(self, stream: PlayableStream, output: Path, chosen: Format, report: Report) -> str:
+    def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
         from morgs_mi.playback.export.clips import flight, frame_numbers, named_path, num_images, repeated_frames
         from morgs_mi.playback.export.frames import write_images
+        from morgs_mi.playback.player import stream_exposure
 
         frames = frame_numbers(stream)
         if self.freeze is not None and self.freeze not in frames:
@@ -160,7 +162,8 @@ class Flight(_Kind):
         path = path if self.seconds is None else path.with_duration(self.seconds)
         count = num_images(stream, path)
         images = flight(stream, path, self.channels, repeated_frames(stream, self.freeze, self.back_and_forth))
-        write_images(images, stream.fps, output, lambda done: report("Rendering", done, count))
+        stops = stream_exposure(stream) if self.display_exposure is None else self.display_exposure
+        write_images(images, stream.fps, output, lambda done: report("Rendering", done, count), None, stops)
         return f"{path.seconds:.1f} s, {path.keys[0].width}x{path.keys[0].height}"
 
 
@@ -173,7 +176,7 @@ class Tracks(_Kind):
 
     formats = TRACKS
 
-    def write(self, stream: PlayableStream, output: Path, chosen: Format, report: Report) -> str:
+    def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
         from morgs_mi.playback.export.clips import frame_numbers
         from morgs_mi.playback.export.tracks import extract_tracks, write_tracks
 
@@ -199,7 +202,7 @@ class Web(_Kind):
     formats = WEB
     drawn = True
 
-    def write(self, stream: PlayableStream, output: Path, chosen: Format, report: Report) -> str:
+    def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
         from morgs_mi.playback.export.clips import frame_numbers
         from morgs_mi.playback.export.web import write_web_folder, write_web_page
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
+from morgs_mi.core.documentation import documented
 from morgs_mi.core.ranges import Above, AtLeast, AtMost, check_ranges
 
 
+@documented
 @dataclass(frozen=True)
 class CodecConfig:
     """Settings of the encoder; a decoder needs none of them.

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import drjit as dr
+import numpy as np
 
 from morgs_mi.core.types import Jit
 
@@ -26,17 +27,28 @@ class Activation:
 
     Attributes:
         function: of a Dr.Jit array or tensor.
+        inverse: of a NumPy array of activated values, float64; finite also where the exact one is infinite.
         largest_slope: bound of its derivative, which converts a tolerated error of the activated value into one of the
             optimised value; None where there is no bound.
     """
 
     function: Callable[[Jit], Jit]
+    inverse: Callable[[np.ndarray], np.ndarray]
     largest_slope: float | None
 
 
-IDENTITY = Activation(lambda x: x, 1.0)
-EXP = Activation(dr.exp, None)
-SIGMOID = Activation(sigmoid, 0.25)
+def _log(x: np.ndarray) -> np.ndarray:
+    return np.log(np.maximum(np.asarray(x, np.float64), 1e-30))
+
+
+def _logit(x: np.ndarray) -> np.ndarray:
+    x = np.clip(np.asarray(x, np.float64), 1e-6, 1 - 1e-6)
+    return np.log(x / (1 - x))
+
+
+IDENTITY = Activation(lambda x: x, lambda x: x, 1.0)
+EXP = Activation(dr.exp, _log, None)
+SIGMOID = Activation(sigmoid, _logit, 0.25)
 
 
 @dataclass(frozen=True)

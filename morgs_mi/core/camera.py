@@ -86,6 +86,11 @@ class Camera:
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "viewmat", viewmat)
 
+    def __repr__(self) -> str:
+        place = ", ".join(f"{x:.4g}" for x in self.position + 0.0)  # without -0
+        fov = np.rad2deg(2 * np.arctan(0.5 * self.width / self.K[0, 0]))
+        return f"Camera({self.name!r}, {self.width}x{self.height}, {fov:.3g} degrees across, at ({place}))"
+
     @classmethod
     def look_at(
         cls,

@@ -1,11 +1,20 @@
-"""Paths and addresses of the documentation's pages, for help and messages."""
+"""Help: docstrings of fields, and paths and addresses of the documentation's pages."""
 
 from __future__ import annotations
 
+import ast
+import inspect
 import re
+import textwrap
+from dataclasses import MISSING, Field, fields
+from functools import cache
+from itertools import pairwise
 from pathlib import Path
+from typing import Any, TypeVar
 
-__all__ = ["DOCUMENTATION", "page", "with_pages"]
+__all__ = ["DOCUMENTATION", "documented", "field_docs", "page", "with_pages"]
+
+Class = TypeVar("Class")
 
 DOCUMENTATION = "https://morgs-mi.readthedocs.io/"
 """Address of the documentation."""
@@ -22,3 +31,56 @@ def page(name: str) -> str:
 def with_pages(text: str) -> str:
     """Return a text with the result of `page` in place of every path of a page, such as docs/flow.md."""
     return re.sub(r"\bdocs/([\w/-]+)\.md\b", lambda match: page(match[1]), text)
+
+
+@cache
+def field_docs(config_type: type) -> dict[str, str]:
+    """Return the docstrings of a dataclass's fields by name; those without source code have none."""
+    docs: dict[str, str] = {}
+    for base in reversed(config_type.__mro__):
+        try:
+            (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        except (OSError, TypeError, SyntaxError):
+            continue
+        body = definition.body if isinstance(definition, ast.ClassDef) else []
+        for node, after in pairwise(body):
+            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and isinstance(after, ast.Expr):
+                text = after.value.value if isinstance(after.value, ast.Constant) else None
+                if isinstance(text, str):
+                    docs[node.target.id] = inspect.cleandoc(text)
+    return docs
+
+
+def documented(config_type: type[Class]) -> type[Class]:
+    """Return a dataclass whose docstring lists its fields with defaults and docstrings, for `help()` and notebooks."""
+    config_type.__doc__ = _ListedFields(inspect.cleandoc(config_type.__doc__ or ""))  # pyright: ignore
+    return config_type
+
+
+class _ListedFields:
+    """Docstring of a dataclass that reads the source of the class when it is first used.
+
+    Attributes:
+        text: the docstring without the list of fields.
+    """
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+
+    def __get__(self, instance: Any, config_type: Any) -> str:
+        return f"{self.text}\n\nFields:\n{_field_list(config_type)}"
+
+
+@cache
+def _field_list(config_type: Any) -> str:
+    docs = field_docs(config_type)
+    entries = (f"{f.name} = {_default(f)}: {' '.join(docs.get(f.name, '').split())}" for f in fields(config_type))
+    lines = (textwrap.wrap(with_pages(entry), 116, break_on_hyphens=False) for entry in entries)
+    return "\n".join(textwrap.indent("\n    ".join(line), "    ") for line in lines)
+
+
+def _default(field: Field) -> str:
+    """Return the default of a field; that of a nested config by its name."""
+    if field.default is not MISSING:
+        return repr(field.default)
+    return f"{type(field.default_factory()).__name__}(...)" if field.default_factory is not MISSING else "(required)"

@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from morgs_mi.core.attributes import ATTRIBUTES, BY_ACTIVATED_NAME, sigmoid
+from morgs_mi.core.attributes import ATTRIBUTES, BY_ACTIVATED_NAME, EXP, SIGMOID, sigmoid
 from morgs_mi.core.checks import numbers
 from morgs_mi.core.memory import float_tensor
 from morgs_mi.core.types import Float, Tensor, UInt32
@@ -170,6 +170,12 @@ class Gaussians:
     def __len__(self) -> int:
         return int(self.means.shape[0])
 
+    def __repr__(self) -> str:
+        means = np.asarray(dr.detach(self.means))
+        size = " x ".join(f"{side:.3g}" for side in np.ptp(means, axis=0)) if len(self) else "0"
+        more = [name for name in self.items() if name in ("motion", "logit_confidence", "offset")]
+        return f"Gaussians({', '.join([f'N={len(self)}', f'SH degree {self.sh_degree}', f'box of {size}', *more])})"
+
     @classmethod
     def from_activated(
         cls,
@@ -197,10 +203,7 @@ class Gaussians:
                     f"{place}: `{name}` must be {'at least 0' if high > 1 else 'in [0, 1]'}, got "
                     f"{values[tuple(bad[0])]} at {bad[0].tolist()}; pass activated values, not logarithms or logits."
                 )
-        opacities = np.clip(opacities.astype(np.float64), 1e-6, 1 - 1e-6)
-        log_scales = np.log(np.maximum(scales.astype(np.float64), 1e-30))
-        logits = np.log(opacities / (1 - opacities))
-        return cls(means, log_scales, quats, logits, sh_coeffs, **more)
+        return cls(means, EXP.inverse(scales), quats, SIGMOID.inverse(opacities), sh_coeffs, **more)
 
     @property
     def scales(self) -> Tensor:

@@ -48,6 +48,7 @@ class ViewScores(_Scores):
     psnr_still: float = _NAN
     #: PSNR after the gain and bias per channel that make the rendered image most like the recorded one, dB.
     psnr_matched: float = _NAN
+    psnr_mu: float = _NAN  #: PSNR of the linear light by the mu-law, dB, of HDR recordings alone.
     ssim: float = _NAN  #: SSIM, at most 1.
     ssim_moving: float = _NAN
     ssim_still: float = _NAN

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from morgs_mi.core.color_space import unit_values
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.progress import Progress
 from morgs_mi.core.random_streams import Stream, rng_of
@@ -101,8 +102,8 @@ def balance_cameras(
         gaussians = fit(gaussians, exposures, -(-steps // 2) if k else steps)
         exposures = centred(
             {
-                v: fit_exposure(rendered(gaussians, camera, render), image / 255, mask)
-                for v, (camera, image, mask) in enumerate(visible)
+                v: fit_exposure(rendered(gaussians, view.camera, render), unit_values(view.image), view.mask)
+                for v, view in enumerate(visible)
             }
         )
         largest = max(exposure.change for exposure in exposures.values())

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Annotated, Literal
 
 from morgs_mi.core.attributes import ATTRIBUTES
+from morgs_mi.core.documentation import documented
 from morgs_mi.core.ranges import Above, AtLeast, AtMost, Below, check_ranges
 from morgs_mi.method.objective import ObjectiveConfig
 
@@ -17,6 +18,7 @@ _USUAL_EPOCHS = 8
 _LEAST_STEPS, _GAUSSIANS_PER_STEP = 1200, 25
 
 
+@documented
 @dataclass(frozen=True)
 class LearningRates:
     """Adam's learning rate of every parameter, per step.
@@ -53,6 +55,7 @@ class LearningRates:
         return rates
 
 
+@documented
 @dataclass(frozen=True)
 class DensityConfig:
     """Settings of density control (see `density`), with thresholds from the literature."""
@@ -77,6 +80,7 @@ class DensityConfig:
         check_ranges(self)
 
 
+@documented
 @dataclass(frozen=True)
 class DetailConfig:
     """Settings of the number of Gaussians of the first frame where none is given (see `detail`)."""
@@ -97,6 +101,7 @@ class DetailConfig:
             )
 
 
+@documented
 @dataclass(frozen=True)
 class CameraPriors:
     """Standard deviations of the errors of a calibration, under which its cameras are refined."""
@@ -117,6 +122,7 @@ class CameraPriors:
         check_ranges(self)
 
 
+@documented
 @dataclass(frozen=True)
 class ShortFitConfig:
     """Settings of the short fits with which cameras are refined and balanced, and the results are compared."""
@@ -134,6 +140,7 @@ class ShortFitConfig:
         check_ranges(self)
 
 
+@documented
 @dataclass(frozen=True)
 class FitConfig:
     """Settings of the optimisation."""

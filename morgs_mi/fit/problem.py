@@ -61,7 +61,7 @@ class FirstFrameProblem:
 
     @property
     def images(self) -> list[np.ndarray]:
-        """Images of the views, [H, W, 3] uint8."""
+        """Images of the views, as in `View`."""
         return [view.image for view in self.views]
 
     def reduced(self, width: int) -> FirstFrameProblem:

@@ -24,6 +24,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from morgs_mi.core.color_space import unit_values
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.rig import angles_to, scene_depths
 from morgs_mi.fit.forecast import Forecast, forecast, quality_of
@@ -186,7 +187,7 @@ def _disagreement(gaussians: Gaussians, view: View, others: Sequence[View], rend
     camera = view.camera
     image = rasterize(gaussians, camera, ("color", "depth"), config=render)
     step = max(1, camera.width // _COLUMNS)
-    color = np.clip(np.asarray(image.color)[::step, ::step], 0, 1)
+    color = np.clip(np.asarray(image.color)[::step, ::step], 0, view.white)
     depth = np.asarray(image.depth)[::step, ::step, 0].astype(float)
     rows, columns = np.mgrid[: camera.height : step, : camera.width : step]
     points = camera.unproject(np.stack([columns, rows], axis=-1) + 0.5, depth)
@@ -206,4 +207,4 @@ def _squares(color: np.ndarray, points: np.ndarray, drawn: np.ndarray, view: Vie
         inside &= view.mask[rows, columns]
     x, y = (pixels - 0.5).astype(np.float32).transpose(2, 0, 1)
     recorded = cv2.remap(view.image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.where(inside, ((recorded / 255 - color) ** 2).mean(axis=-1), np.inf)
+    return np.where(inside, ((unit_values(recorded) - color) ** 2).mean(axis=-1), np.inf)

@@ -18,6 +18,7 @@ _WORDS = {
     "quats": "rotation",
     "logit_opacities": "opacity",
     "sh_coeffs": "colour",
+    "logit_confidence": "confidence",
 }
 _MOST_NAMED = 3
 
@@ -41,19 +42,18 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
         _log.warning(
             "%s: %d of %d Gaussians have a rotation of 0 and are not rotated: %s.", path, len(zero), N, _few(zero)
         )
-    limits = {name: np.log(LARGEST) if name == "log_scales" else LARGEST for name in _WORDS}
+    limits = {name: np.log(LARGEST) if name == "log_scales" else LARGEST for name in raw}
     # Small sizes have negative logarithms without a bound.
     valid = {
         name: ((values <= limits[name]) & (values >= -LARGEST)).all(axis=tuple(range(1, values.ndim)))
         for name, values in raw.items()
-        if name in _WORDS
     }
     every = np.all([*valid.values()], axis=0)
     count = int(N - every.sum())
     if not count:
         return gaussians
     named = "; ".join(
-        f"{_WORDS[name]} of {_few(np.flatnonzero(~rows))}" for name, rows in valid.items() if not rows.all()
+        f"{_WORDS.get(name, name)} of {_few(np.flatnonzero(~rows))}" for name, rows in valid.items() if not rows.all()
     )
     if count > most_invalid * N:
         raise ValueError(

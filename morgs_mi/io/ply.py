@@ -3,6 +3,8 @@
 One vertex per Gaussian with float properties: ``x y z``, ``nx ny nz`` (zeros), ``f_dc_0..2``, ``f_rest_0..3(K-1)-1``
 channel by channel (all of red, then green, then blue), ``opacity`` (logit), ``scale_0..2`` (natural logarithms of the
 standard deviations), ``rot_0..3`` (w, x, y, z). World axes stay as they are; the layout does not prescribe any.
+
+Mitsuba's shape `ellipsoids` reads this layout, and one with further attributes, see `mitsuba_ply`.
 """
 
 from __future__ import annotations
@@ -11,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Literal
 
 import numpy as np
 from plyfile import PlyData, PlyElement
@@ -19,6 +21,7 @@ from plyfile import PlyData, PlyElement
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.invalid import without_invalid
+from morgs_mi.io.mitsuba_ply import from_mitsuba, mitsuba_columns
 from morgs_mi.io.ply_kinds import as_3dgs
 
 _MEAN, _SCALE, _ROTATION = ("x", "y", "z"), ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2", "rot_3")
@@ -43,31 +46,44 @@ _BOUNDS = {"opacity": (-99, 99), **dict.fromkeys(_SCALE, (-69, None))}
 _NORMAL, _DC = ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
 
 
-def write_ply(path: str | Path, gaussians: Gaussians) -> None:
+def write_ply(path: str | Path, gaussians: Gaussians, layout: Literal["3dgs", "mitsuba"] = "3dgs") -> None:
     """Write Gaussians as a binary PLY file, atomically.
 
-    Quaternions are normalised. The layout has no motion and no confidence, so they are not written.
+    Quaternions are normalised.
+
+    Args:
+        path: the file.
+        gaussians: N Gaussians.
+        layout: ``3dgs``, the layout of 3D Gaussian Splatting, which has no motion and no confidence; or ``mitsuba``,
+            with all attributes for the shape `ellipsoids`, which tools other than Mitsuba and this package do not read.
 
     Raises:
+        ValueError: another layout.
         OSError: the file cannot be written.
     """
+    if layout not in ("3dgs", "mitsuba"):
+        raise ValueError(f"write_ply(): `layout` must be 3dgs or mitsuba, got {layout!r}.")
     raw = gaussians.numpy()
-    N, K = raw["sh_coeffs"].shape[:2]
     lengths = np.linalg.norm(raw["quats"], axis=1, keepdims=True)
-    columns = [
-        raw["means"],
-        np.zeros((N, 3)),
-        raw["sh_coeffs"][:, 0],
-        raw["sh_coeffs"][:, 1:].transpose(0, 2, 1).reshape(N, 3 * (K - 1)),
-        raw["logit_opacities"][:, None],
-        raw["log_scales"],
-        np.where(lengths > 0, raw["quats"] / np.maximum(lengths, 1e-30), (1, 0, 0, 0)),  # zero is no rotation
-    ]
-    names = (*_MEAN, *_NORMAL, *_DC, *_rest(K), "opacity", *_SCALE, *_ROTATION)
-    table = np.concatenate(columns, axis=1, dtype=np.float32, casting="same_kind")
+    columns = {
+        _MEAN: raw["means"],
+        _NORMAL: np.zeros_like(raw["means"]),
+        **(mitsuba_columns(gaussians) if layout == "mitsuba" else _columns(raw)),
+        _SCALE: raw["log_scales"],
+        _ROTATION: np.where(lengths > 0, raw["quats"] / np.maximum(lengths, 1e-30), (1, 0, 0, 0)),  # zero: no rotation
+    }
+    names = [name for names in columns for name in names]
+    table = np.concatenate([*columns.values()], axis=1, dtype=np.float32, casting="same_kind")
     vertices = table.astype("<f4").view([(name, "<f4") for name in names])[:, 0]
     with atomic_path(path, "write_ply()") as partial:
         PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(partial))
+
+
+def _columns(raw: dict[str, np.ndarray]) -> dict[tuple[str, ...], np.ndarray]:
+    """Return colours and opacities as columns [N, names] by their names, in the order of the layout."""
+    N, K = raw["sh_coeffs"].shape[:2]
+    rest = raw["sh_coeffs"][:, 1:].transpose(0, 2, 1).reshape(N, 3 * (K - 1))
+    return {_DC: raw["sh_coeffs"][:, 0], _rest(K): rest, ("opacity",): raw["logit_opacities"][:, None]}
 
 
 def read_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
@@ -75,7 +91,8 @@ def read_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
 
     Normals and other harmless properties are ignored; without ``f_rest_*`` the degree is 0. Infinite logits of the
     opacities 0 and 1 and infinite logarithms of sizes of 0 are replaced by finite ones, as in `from_activated`.
-    `ply_kinds` lists the kinds of Gaussians of other methods that are read.
+    `ply_kinds` lists the kinds of Gaussians of other methods that are read. All attributes of the layout ``mitsuba`` of
+    `write_ply` are read.
 
     Args:
         path: the file.
@@ -91,6 +108,7 @@ def read_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
         raise ValueError(
             f"{path}: expected an uncompressed PLY, got PlayCanvas' compressed one; read it with `read_splats`."
         )
+    vertices, more = from_mitsuba(vertices)
     vertices = as_3dgs(path, vertices)
     missing = [name for name in (*_MEAN, *_DC, "opacity", *_SCALE, *_ROTATION) if name not in vertices]
     if missing:
@@ -117,7 +135,9 @@ def read_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
     coeffs = np.empty((N, K, 3), np.float32)
     coeffs[:, 0] = columns(_DC)
     coeffs[:, 1:] = columns(_rest(K)).reshape(N, 3, K - 1).transpose(0, 2, 1)
-    gaussians = Gaussians(columns(_MEAN), columns(_SCALE), columns(_ROTATION), columns(("opacity",))[:, 0], coeffs)
+    gaussians = Gaussians(
+        columns(_MEAN), columns(_SCALE), columns(_ROTATION), columns(("opacity",))[:, 0], coeffs, **more
+    )
     return without_invalid(path, gaussians, most_invalid)
 
 

@@ -17,8 +17,6 @@ TOML has no null: the string ``"none"`` stands for None.
 
 from __future__ import annotations
 
-import ast
-import inspect
 import json
 import re
 import textwrap
@@ -26,15 +24,13 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, is_dataclass, replace
 from difflib import get_close_matches
-from functools import cache
-from itertools import pairwise
 from pathlib import Path
 from reprlib import repr as shortened
 from types import NoneType
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 from morgs_mi.codec.codec_config import CodecConfig
-from morgs_mi.core.documentation import with_pages
+from morgs_mi.core.documentation import documented, field_docs, with_pages
 from morgs_mi.core.ranges import AtLeast, arms_of, check_ranges, check_value, types_of
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.io.bounded import read_toml
@@ -48,7 +44,6 @@ __all__ = [
     "apply_preset",
     "apply_values",
     "config_toml",
-    "field_docs",
     "read_config",
     "relocated",
 ]
@@ -59,6 +54,7 @@ _NONE = "none"
 _COMMENT_WIDTH = 110
 
 
+@documented
 @dataclass(frozen=True)
 class StreamConfig:
     """Settings of the streaming loop.
@@ -168,24 +164,6 @@ def config_toml(config: Any) -> str:
         ValueError: an optional string is "none", which would be read as None.
     """
     return "\n".join((f'# The string "{_NONE}" stands for no value.', "", *_table(config, ""))) + "\n"
-
-
-@cache
-def field_docs(config_type: type) -> dict[str, str]:
-    """Return the docstrings of a dataclass's fields by name; those without source code have none."""
-    docs: dict[str, str] = {}
-    for base in reversed(config_type.__mro__):
-        try:
-            (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
-        except (OSError, TypeError, SyntaxError):
-            continue
-        body = definition.body if isinstance(definition, ast.ClassDef) else []
-        for node, after in pairwise(body):
-            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and isinstance(after, ast.Expr):
-                text = after.value.value if isinstance(after.value, ast.Constant) else None
-                if isinstance(text, str):
-                    docs[node.target.id] = inspect.cleandoc(text)
-    return docs
 
 
 def relocated(error: ValueError, source: str, prefix: str, names: list[str]) -> ValueError:

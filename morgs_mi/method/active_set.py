@@ -22,6 +22,7 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.documentation import documented
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.ranges import AtLeast, check_ranges
@@ -45,6 +46,7 @@ _CORE = 0.6
 _QUIET = 0.2
 
 
+@documented
 @dataclass(frozen=True)
 class ActiveSetConfig:
     """Settings of the selection, see the module."""
@@ -123,7 +125,8 @@ def find_active_set(
     if gaussians.logit_confidence is not None:
         active |= np.asarray(gaussians.logit_confidence) > 0
     for found in changed.values():
-        grid, boxes = found.view.grid, found.boxes
+        grid = found.view.grid
+        boxes = found.boxes
         unexplained = _unexplained(found.counts, boxes.union(active, grid), grid.block)
         if unexplained.any():
             table = from_numpy(mi.UInt32, summed_area(unexplained))

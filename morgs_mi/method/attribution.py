@@ -36,7 +36,8 @@ class Attribution:
     """
 
     def __init__(self, count: int) -> None:
-        self._count, self._probe = count, None
+        self._count = count
+        self._probe = None
         self._largest = dr.zeros(mi.Float, count)
 
     def features(self) -> Tensor:

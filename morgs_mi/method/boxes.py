@@ -44,12 +44,15 @@ class Boxes:
         rows, columns = grid.shape
 
         def before(x: UInt32, y: UInt32) -> Float:
-            across, down = mi.Float(x) * (1 / width), mi.Float(y) * (1 / height)
+            across = mi.Float(x) * (1 / width)
+            down = mi.Float(y) * (1 / height)
             i = dr.minimum(mi.UInt32(across), dr.opaque(mi.UInt32, columns - 1))
             j = dr.minimum(mi.UInt32(down), dr.opaque(mi.UInt32, rows - 1))
-            place, pitch = j * dr.opaque(mi.UInt32, columns + 1) + i, dr.opaque(mi.UInt32, columns + 1)
+            place = j * dr.opaque(mi.UInt32, columns + 1) + i
+            pitch = dr.opaque(mi.UInt32, columns + 1)
             a, b, c, d = (mi.Float(dr.gather(mi.UInt32, table, place + step)) for step in (0, 1, pitch, pitch + 1))
-            u, v = dr.minimum(across - mi.Float(i), 1), dr.minimum(down - mi.Float(j), 1)
+            u = dr.minimum(across - mi.Float(i), 1)
+            v = dr.minimum(down - mi.Float(j), 1)
             return dr.lerp(dr.lerp(a, b, u), dr.lerp(c, d, u), v)
 
         right = before(self.right, self.bottom) - before(self.right, self.top)
@@ -61,9 +64,12 @@ class Boxes:
         x0, y0, x1, y1 = (
             np.asarray(v)[chosen].astype(np.int64) for v in (self.left, self.top, self.right, self.bottom)
         )
-        some, (width, height) = (x1 > x0) & (y1 > y0), grid.block
-        x0, y0 = x0[some] // width, y0[some] // height
-        x1, y1 = -(-x1[some] // width), -(-y1[some] // height)
+        some = (x1 > x0) & (y1 > y0)
+        width, height = grid.block
+        x0 = x0[some] // width
+        y0 = y0[some] // height
+        x1 = -(-x1[some] // width)
+        y1 = -(-y1[some] // height)
         rows, columns = (size + 1 for size in grid.shape)
         corners = np.concatenate([y0 * columns + x0, y1 * columns + x1, y0 * columns + x1, y1 * columns + x0])
         signs = np.repeat([1.0, -1.0], 2 * len(x0))
@@ -84,7 +90,8 @@ def boxes_around(gaussians: Gaussians, camera: Camera, render: RenderConfig, cor
         splats = project(gaussians, camera, (), render)
         corners = []
         for axis, size in ((0, camera.width), (1, camera.height)):
-            center, half = splats.shape[axis], core * splats.extent[axis]
+            center = splats.shape[axis]
+            half = core * splats.extent[axis]
             low = dr.clip(dr.floor(center - half), 0, dr.opaque(mi.Float, size))
             high = dr.clip(dr.floor(center + half) + 1, 0, dr.opaque(mi.Float, size))
             corners.append((mi.UInt32(low), mi.UInt32(dr.select(splats.valid, high, low))))

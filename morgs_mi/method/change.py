@@ -23,6 +23,7 @@ from typing import Annotated
 import cv2
 import numpy as np
 
+from morgs_mi.core.documentation import documented
 from morgs_mi.core.ranges import AtLeast, check_ranges
 
 _GREY_LEVEL = 1 / 255
@@ -41,6 +42,7 @@ _SUM = np.ones((1, 3), np.float32)
 _COLORS = np.array([[0.5, -0.5, 0], [0.25, 0.25, -0.5]])
 
 
+@documented
 @dataclass(frozen=True)
 class ChangeConfig:
     """Settings of the change detection."""
@@ -71,9 +73,11 @@ def change_mask(
     config = config or ChangeConfig()
     H, W = before.shape[:2]
     if before.dtype == np.uint8 and after.dtype == np.uint8:
-        difference, unit = cv2.subtract(after, before, dtype=cv2.CV_16S), _GREY_LEVEL
+        difference = cv2.subtract(after, before, dtype=cv2.CV_16S)
+        unit = _GREY_LEVEL
     else:
-        difference, unit = np.subtract(after, before, dtype=np.float32), 1.0
+        difference = np.subtract(after, before, dtype=np.float32)
+        unit = 1.0
     # Integers as long as possible: these images are large.
     levels = _levels(cv2.transform(difference, _SUM) * np.float32(unit / 3), 1, config)
     half = cv2.resize(difference, (max(W // 2, 1), max(H // 2, 1)), interpolation=cv2.INTER_AREA).astype(np.float32)
@@ -162,7 +166,8 @@ def box_around(mask: np.ndarray) -> tuple[slice, slice] | None:
     spans = []
     for axis in (0, 1):
         (places,) = np.nonzero(mask.any(axis=1 - axis))
-        low, high = int(places[0]), int(places[-1]) + 1
+        low = int(places[0])
+        high = int(places[-1]) + 1
         margin = max(_MARGIN, (high - low) // 2)
         spans.append(slice(max(low - margin, 0), min(high + margin, mask.shape[axis])))
     return spans[0], spans[1]

@@ -54,7 +54,8 @@ def share_confidence(
     near = neighbours.nearest_of(chosen, _NEIGHBOURS)
     if not near.size:
         return logit
-    chroma, opacity = _chromaticity(gaussians), np.asarray(gaussians.opacities)
+    chroma = _chromaticity(gaussians)
+    opacity = np.asarray(gaussians.opacities)
     affinity = np.exp(-np.sum((chroma[chosen][:, None] - chroma[near]) ** 2, axis=2) / (2 * _CHROMA_SCALE**2))
     affinity = weight * (opacity[near] * affinity).astype(np.float32)
     starts = np.arange(0, near.size + 1, near.shape[1])

@@ -24,9 +24,11 @@ LEAST_CHANGE = 3e-3
 # a change there.
 _WEIGHTS = (1e-4, 0.02)
 # Values, of 1, that are neither nearly black nor nearly white.
-_DARK, _BRIGHT = 0.03, 0.97
+_DARK = 0.03
+_BRIGHT = 0.97
 # Most steps of the reweighted least squares, and the least scale of its errors, of 1.
-_STEPS, _LEAST_SCALE = 13, 1e-3
+_STEPS = 13
+_LEAST_SCALE = 1e-3
 # Change of gain and bias in a step at which it ends, of 1: a hundredth of a grey level.
 _CONVERGED = 4e-5
 _MIN_PIXELS = 30
@@ -54,9 +56,11 @@ class Exposure:
         return colors * np.array(self.gain) + np.array(self.bias)
 
     def corrected(self, image: np.ndarray) -> np.ndarray:
-        """Return the image, uint8 [H, W, 3], in the colours of the scene; clipped values stay lost."""
+        """Return the image [H, W, 3], uint8 or encoded floats, in the scene's colours; clipped values stay lost."""
         if self == Exposure():
             return image
+        if image.dtype != np.uint8:
+            return _bent(self.inverse(_straightened(image))).astype(np.float32)
         table = 255 * self.inverse(np.arange(256)[:, None] / 255)
         return cv2.LUT(image, np.clip(np.rint(table), 0, 255).astype(np.uint8)[None])
 
@@ -114,8 +118,10 @@ def fit_exposure(
 def _line(x: np.ndarray, y: np.ndarray, prior: Sequence[float], weights: tuple[float, float]) -> tuple[float, float]:
     """Return slope and intercept of y over x [P] by reweighted least squares (Geman and McClure 1987)."""
     # The change of the gain, and of the bias beyond the bias of a factor on the light.
-    rows, rest = np.stack([x + _TOE, np.ones_like(x)]), y - prior[0] * x - prior[1]
-    regular, counts = len(x) * np.diag(weights), np.ones_like(x)
+    rows = np.stack([x + _TOE, np.ones_like(x)])
+    rest = y - prior[0] * x - prior[1]
+    regular = len(x) * np.diag(weights)
+    counts = np.ones_like(x)
     change = np.zeros(2)
     for _ in range(_STEPS):
         last = change
@@ -175,6 +181,17 @@ def follow_exposure(
     )
     small = None if mask is None else cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
     return fit_exposure(before, now, small, last)
+
+
+def _straightened(encoded: np.ndarray) -> np.ndarray:
+    """Return encoded values, with sRGB's root of the light also above white, where the curve is logarithmic."""
+    return np.where(encoded > 1, (1 + _TOE) * np.exp((np.maximum(encoded, 1) - 1) / (1 + _TOE)) - _TOE, encoded)
+
+
+def _bent(root: np.ndarray) -> np.ndarray:
+    """Return the encoded values, not negative, of which `_straightened` makes these."""
+    above = 1 + (1 + _TOE) * np.log((np.maximum(root, 1) + _TOE) / (1 + _TOE))
+    return np.where(root > 1, above, np.maximum(root, 0))
 
 
 def _exposure(gain: np.ndarray, bias: np.ndarray) -> Exposure:

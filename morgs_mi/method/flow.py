@@ -65,7 +65,8 @@ def _checked_flow(
         # Flow bleeds over the edges of moving objects; unchanged pixels have not moved.
         backward, forward = (np.where(pair.region[..., None], f, 0) for f in (backward, forward))
         still = ~pair.region if pair.valid is None else ~pair.region & pair.valid
-        reliable, forward_reliable = reliable | still, forward_reliable | still
+        reliable = reliable | still
+        forward_reliable = forward_reliable | still
     return backward, forward, reliable, forward_reliable
 
 

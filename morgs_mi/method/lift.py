@@ -35,6 +35,7 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.documentation import documented
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.ranges import Above, AtLeast, check_ranges
@@ -60,6 +61,7 @@ _HALF_WEIGHT_PIXELS = 1.0
 _CONFIDENCE_SLOPE = 4.0
 
 
+@documented
 @dataclass(frozen=True)
 class LiftConfig:
     """Settings of the lifted flow."""
@@ -114,7 +116,8 @@ def lift_flow(
     """
     config = config or LiftConfig()
     means = gaussians.numpy()["means"].astype(np.float64)
-    top, chosen = config.max_logit, sorted(observations.keys() & views.keys())
+    top = config.max_logit
+    chosen = sorted(observations.keys() & views.keys())
     if not chosen:
         return MotionStart(np.zeros((len(means), 3), np.float32), np.full(len(means), -top, np.float32))
     group = ViewGroup([views[v] for v in chosen])
@@ -128,9 +131,12 @@ def lift_flow(
     d = _solve(seen, [np.ones(len(means))] * len(seen))
     for _ in range(_ROUNDS):
         d = _solve(seen, [np.exp(-view.cost(d, view.project(d))) for view in seen])
-    gain, total, moves = np.zeros(len(means)), np.full(len(means), 1e-6), np.zeros(len(means), bool)
+    gain = np.zeros(len(means))
+    total = np.full(len(means), 1e-6)
+    moves = np.zeros(len(means), bool)
     for view in seen:
-        motion, a = view.project(d), view.weight / (view.weight + _HALF_WEIGHT_PIXELS)
+        motion = view.project(d)
+        a = view.weight / (view.weight + _HALF_WEIGHT_PIXELS)
         gain += a * (view.cost(np.zeros_like(d), motion) - view.cost(d, motion))
         total += a
         moves |= np.linalg.norm(motion, axis=1) > view.floor
@@ -160,7 +166,8 @@ def _solve(views: list[_LiftView], trust: list[np.ndarray]) -> np.ndarray:
     right: np.ndarray | float = 0.0
     scale = []
     for view, k in zip(views, trust, strict=True):
-        J, weight = view.jacobian, k * view.weight
+        J = view.jacobian
+        weight = k * view.weight
         system = system + weight[:, None, None] * np.einsum("nij,nik->njk", J, J)
         right = right + np.einsum("nij,ni->nj", J, weight[:, None] * view.flow)
         scale.append(np.median(np.sum(J[:, 0] ** 2, axis=1)))

@@ -20,7 +20,8 @@ class Registry(Generic[Made, Config]):
     """
 
     def __init__(self, place: str, setting: str) -> None:
-        self._place, self._setting = place, setting
+        self._place = place
+        self._setting = setting
         self._factories: dict[str, Callable[[str, Config], Made]] = {}
         self._arguments: dict[str, str] = {}
 
@@ -80,5 +81,5 @@ class Registry(Generic[Made, Config]):
         name, colon, argument = text.partition(":")
         takes_argument = bool(self._arguments.get(name))
         if name not in self._factories or not (takes_argument == bool(colon) == bool(argument)):
-            usages = ", ".join(self.usages)
+            usages = ", ".join(self.usages) or "the registered names, of which there are none"
             raise ValueError(f"{place or self._place}: `{self._setting}` must be one of {usages}, got {text!r}.")

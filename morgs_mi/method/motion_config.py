@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
+from morgs_mi.core.documentation import documented
 from morgs_mi.core.ranges import AtLeast, AtMost, check_ranges
 from morgs_mi.method.active_set import ActiveSetConfig
 from morgs_mi.method.change import ChangeConfig
@@ -17,6 +18,7 @@ from morgs_mi.method.motion_model import MOTION_MODELS
 from morgs_mi.method.search import SearchConfig
 
 
+@documented
 @dataclass(frozen=True)
 class MotionConfig:
     """Settings of the motion modules; the first three are the rows of the paper's ablation.

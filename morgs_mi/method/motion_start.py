@@ -72,7 +72,8 @@ class MotionProblem:
         """
         some = self.gaussians.select(np.flatnonzero(chosen))
         places = [some, *(displaced(some, d[chosen]) for d in displacements if d.any())]
-        narrowed, everyone = {}, np.ones(len(some), bool)
+        narrowed = {}
+        everyone = np.ones(len(some), bool)
         for index, view in self.views.items():
             boxes = [boxes_around(place, view.camera, view.config, 1.0) for place in places]
             narrowed[index] = view.narrowed(np.any([box.union(everyone, view.grid) for box in boxes], axis=0))

@@ -4,37 +4,44 @@ A `Term` declares its weight, the channels that must be rendered for it, and the
 with. Which channels a view renders, which static splats it needs and which losses a report lists follow from `TERMS`.
 
 An observation is an array of one view at one frame, by name. `target` exists in all views, and so do `neighbours`, the
-Gaussians of the previous frame, where a term compares them. The observations of `OBSERVERS` exist in key views, where
-an observer returns them. A term acts in the views that have all its observations.
+Gaussians of the previous frame, where a term compares them. The others exist in key views, where the observer of a term
+returns them. A term acts in the views that have all its observations.
+
+`loss_term` registers further terms, which `ObjectiveConfig.terms` selects.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Annotated, Any
 
 import numpy as np
 
+from morgs_mi.core.checks import check_number
+from morgs_mi.core.documentation import documented
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.ranges import AtLeast, AtMost, check_ranges
 from morgs_mi.core.types import Tensor
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.flow_sources.flow_registry import FramePair
 from morgs_mi.method.losses import flow_loss, mask_loss, offset_loss, recon_loss
+from morgs_mi.method.method_registry import Registry
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.rigidity import isometry_loss, rigid_loss, rotation_loss
 from morgs_mi.render.rasterize import Image
 from morgs_mi.render.region import Region
 
 __all__ = [
-    "OBSERVERS",
+    "LOSS_TERMS",
     "TERMS",
     "KeyView",
     "ObjectiveConfig",
     "Prediction",
     "Term",
     "channels_of",
+    "loss_term",
     "losses_of",
     "observe",
     "weights_of",
@@ -43,9 +50,14 @@ __all__ = [
 Observations = Mapping[str, Any]
 
 
+@documented
 @dataclass(frozen=True)
 class ObjectiveConfig:
-    """Weights of the terms; 0 switches one off."""
+    """Weights of the terms; 0 switches one off.
+
+    Raises:
+        ValueError: a weight is out of range, or a further term is not registered or named twice.
+    """
 
     dssim_weight: Annotated[float, AtLeast(0), AtMost(1)] = 0.2
     """lambda of eq. 2."""
@@ -61,9 +73,17 @@ class ObjectiveConfig:
     """Weight of the similarity of rotations there."""
     isometry_weight: Annotated[float, AtLeast(0)] = 0.0
     """Weight of the isometry there, per scene extent."""
+    terms: tuple[str, ...] = ()
+    """Registered terms, NAME:WEIGHT each (see docs/extending.md)."""
 
     def __post_init__(self) -> None:
         check_ranges(self)
+        for text in self.terms:
+            LOSS_TERMS.check(text, "ObjectiveConfig()")
+            _weight(text.partition(":")[2])
+        names = [text.partition(":")[0] for text in self.terms]
+        if len(names) > len({*names}):
+            raise ValueError(f"ObjectiveConfig(): `terms` must name each term once, got {self.terms}.")
 
     @property
     def is_rigid(self) -> bool:
@@ -92,6 +112,10 @@ class Prediction:
     gaussians: Gaussians  #: The active ones, after the residual.
 
 
+Loss = Callable[[Prediction, Observations, ObjectiveConfig], Tensor]
+Observer = Callable[[KeyView, MotionConfig, ObjectiveConfig], Mapping[str, np.ndarray]]
+
+
 @dataclass(frozen=True)
 class Term:
     """One term of the objective.
@@ -103,14 +127,27 @@ class Term:
         channels: that must be rendered.
         observations: that must exist.
         parameters: of the residual that must exist.
+        observer: (key view, settings of the motion, settings) -> observations [H, W, ...] by name; None: they exist
+            without it.
     """
 
     name: str
     weight: Callable[[ObjectiveConfig], float]
-    loss: Callable[[Prediction, Observations, ObjectiveConfig], Tensor]
+    loss: Loss
     channels: tuple[str, ...] = ()
     observations: tuple[str, ...] = ()
     parameters: tuple[str, ...] = ()
+    observer: Observer | None = None
+
+
+def _observe_motion(view: KeyView, motion: MotionConfig, config: ObjectiveConfig) -> dict[str, np.ndarray]:
+    """Return the motion by optical flow [H, W, 2] in px, and where it is reliable [H, W]."""
+    return {"motion": view.flow.motion, "reliable": view.flow.reliable} if motion.learn_motion else {}
+
+
+def _observe_mask(view: KeyView, motion: MotionConfig, config: ObjectiveConfig) -> dict[str, np.ndarray]:
+    """Return the motion mask [H, W], in frames that have one."""
+    return {"mask": view.flow.mask} if motion.learn_confidence and view.flow.mask is not None else {}
 
 
 TERMS: tuple[Term, ...] = (
@@ -127,6 +164,7 @@ TERMS: tuple[Term, ...] = (
         lambda p, o, config: flow_loss(p.image["guided_motion"], o["motion"], o["reliable"], p.num_pixels),
         channels=("guided_motion",),
         observations=("motion", "reliable"),
+        observer=_observe_motion,
     ),
     Term(  # eq. 11
         "mask",
@@ -134,6 +172,7 @@ TERMS: tuple[Term, ...] = (
         lambda p, o, config: mask_loss(p.image.confidence, o["mask"], p.num_pixels),
         channels=("confidence",),
         observations=("mask",),
+        observer=_observe_mask,
     ),
     Term(  # L_off
         "offset",
@@ -153,21 +192,61 @@ TERMS: tuple[Term, ...] = (
 )
 
 
-def _observe_motion(view: KeyView, motion: MotionConfig, config: ObjectiveConfig) -> dict[str, np.ndarray]:
-    """Return the motion by optical flow [H, W, 2] in px, and where it is reliable [H, W]."""
-    return {"motion": view.flow.motion, "reliable": view.flow.reliable} if motion.learn_motion else {}
+LOSS_TERMS: Registry[Term, ObjectiveConfig] = Registry("ObjectiveConfig()", "terms")
 
 
-def _observe_mask(view: KeyView, motion: MotionConfig, config: ObjectiveConfig) -> dict[str, np.ndarray]:
-    """Return the motion mask [H, W], in frames that have one."""
-    return {"mask": view.flow.mask} if motion.learn_confidence and view.flow.mask is not None else {}
+def loss_term(
+    name: str,
+    channels: tuple[str, ...] = (),
+    observations: tuple[str, ...] = (),
+    parameters: tuple[str, ...] = (),
+    observer: Observer | None = None,
+) -> Callable[[Loss], Loss]:
+    """Return a decorator that registers a loss as a term of the objective of later frames.
+
+    Example:
+        >>> @morgs_mi.loss_term("speed", parameters=("motion",))
+        ... def speed_loss(prediction, observations, config):
+        ...     return dr.mean(dr.abs(prediction.parameters["motion"]), axis=None) / prediction.extent
+        >>> objective = morgs_mi.ObjectiveConfig(terms=("speed:0.1",))
+
+    Args:
+        name: selects the term, with its weight, in `ObjectiveConfig.terms`.
+        channels: as `Term` has them, like all that follow.
+        observations: that must exist.
+        parameters: of the residual that must exist.
+        observer: of the key views.
+
+    Raises:
+        ValueError: the name is taken, empty, or has a colon.
+    """
+    if name in (term.name for term in TERMS):
+        raise ValueError(f"loss_term(): `name` must be new, got {name!r}, which the objective has already; rename it.")
+
+    def add(loss: Loss) -> Loss:
+        def term(weight: str, config: ObjectiveConfig) -> Term:
+            return Term(name, lambda _: _weight(weight), loss, channels, observations, parameters, observer)
+
+        LOSS_TERMS.register(name, "WEIGHT")(term)
+        return loss
+
+    return add
 
 
-Observer = Callable[[KeyView, MotionConfig, ObjectiveConfig], Mapping[str, np.ndarray]]
-OBSERVERS: tuple[Observer, ...] = (
-    _observe_motion,
-    _observe_mask,
-)
+def _weight(text: str) -> float:
+    """Return the weight of a registered term."""
+    try:
+        weight: Any = float(text)
+    except ValueError:
+        weight = text
+    check_number("ObjectiveConfig()", "terms", weight, "[0, inf)")
+    return weight
+
+
+@cache
+def _terms_of(config: ObjectiveConfig) -> tuple[Term, ...]:
+    """Return all terms that the settings have a weight for."""
+    return (*TERMS, *(LOSS_TERMS.make(text, config) for text in config.terms))
 
 
 def observe(
@@ -176,8 +255,9 @@ def observe(
     """Return the observations of the key views, arrays [H, W, ...] by name, by view index."""
     observations: dict[int, dict[str, np.ndarray]] = {}
     for index, view in views.items():
-        found = (observer(view, motion, config) for observer in OBSERVERS)
-        observations[index] = {name: array for arrays in found for name, array in arrays.items()}
+        observers = (term.observer for term in _terms_of(config) if term.observer)
+        arrays = (observer(view, motion, config) for observer in observers)
+        observations[index] = {name: array for by_name in arrays for name, array in by_name.items()}
     return observations
 
 
@@ -188,7 +268,7 @@ def active_terms(observations: Observations, parameters: Mapping[str, Tensor], c
         given = all(name in observations for name in term.observations)
         return given and all(name in parameters for name in term.parameters)
 
-    return [term for term in TERMS if term.weight(config) and acts(term)]
+    return [term for term in _terms_of(config) if term.weight(config) and acts(term)]
 
 
 def channels_of(observations: Observations, config: ObjectiveConfig) -> tuple[str, ...]:
@@ -205,4 +285,4 @@ def losses_of(prediction: Prediction, observations: Observations, config: Object
 
 def weights_of(config: ObjectiveConfig) -> dict[str, float]:
     """Return the weights of the terms, by name."""
-    return {term.name: term.weight(config) for term in TERMS}
+    return {term.name: term.weight(config) for term in _terms_of(config)}

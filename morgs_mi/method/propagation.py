@@ -26,7 +26,8 @@ _ROUNDS = 2
 _NEIGHBOURS = 8
 # Ratio of the new error to the old one up to which a Gaussian accepts a proposal, if it moves otherwise and if not.
 # Others move at the same time: a smaller gain is chance.
-_ERROR_RATIO, _ERROR_RATIO_STATIC = 0.9, 0.8
+_ERROR_RATIO = 0.9
+_ERROR_RATIO_STATIC = 0.8
 # Logit of the confidence of a Gaussian that accepted a motion: 0.57, as some accept a wrong one by chance.
 _LOGIT = 0.3
 
@@ -51,7 +52,8 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
     def error_of(d: np.ndarray) -> np.ndarray:
         return relative_error(images.sums(displaced(problem.gaussians, d), ("error", "weight")))
 
-    error, continues = error_of(d), np.any(before, axis=1, keepdims=True)
+    error = error_of(d)
+    continues = np.any(before, axis=1, keepdims=True)
     for k in range(1 + rounds):
         proposal = d[_moving_neighbour(near, d, problem.rng)] if k else np.where(continues, before, d)
         differs = np.any(proposal != d, axis=1)
@@ -60,7 +62,8 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
         new_error = error_of(proposal)
         ratio = np.where(d.any(axis=1), _ERROR_RATIO, _ERROR_RATIO_STATIC)
         accepted = differs & (new_error < ratio * error)
-        d, error = np.where(accepted[:, None], proposal, d), np.where(accepted, new_error, error)
+        d = np.where(accepted[:, None], proposal, d)
+        error = np.where(accepted, new_error, error)
         moves = np.where(d.any(axis=1), np.maximum(logit, _LOGIT), np.minimum(logit, -_LOGIT))
         logit = np.where(accepted, moves, logit)
     return MotionStart(d, logit.astype(np.float32))

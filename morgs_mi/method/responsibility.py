@@ -62,10 +62,14 @@ def responsibility(
         min_weight: blend weight summed over all changed blocks, in px, below which a Gaussian counts as hidden.
         width: views are reduced by the largest whole factor that leaves this width, in px.
     """
-    near, area = dr.zeros(mi.Float, len(gaussians)), dr.zeros(mi.Float, len(gaussians))
-    drawn, shares, factors = list[ActiveView](), list[np.ndarray](), list[int]()
+    near = dr.zeros(mi.Float, len(gaussians))
+    area = dr.zeros(mi.Float, len(gaussians))
+    drawn = list[ActiveView]()
+    shares = list[np.ndarray]()
+    factors = list[int]()
     for changed_view in views:
-        view, boxes = changed_view.view, changed_view.boxes
+        view = changed_view.view
+        boxes = changed_view.boxes
         area += boxes.area
         if not changed_view.change.any():
             continue

@@ -60,7 +60,8 @@ def find_neighbours(
     if len(means) < 2:
         return None
     near = NeighbourIndex(means).nearest(count)
-    (N, k), pairs = near.shape, np.arange(near.size)
+    N, k = near.shape
+    pairs = np.arange(near.size)
     ones = np.ones(near.size, np.float32)
     first, second = (
         csr_array((ones, (pairs, of)), (near.size, N)) for of in (np.repeat(np.arange(N), k), near.ravel())
@@ -87,7 +88,8 @@ def rigid_loss(gaussians: Gaussians, neighbours: Neighbours) -> Tensor:
         neighbours: theirs in the previous frame.
     """
     r = _columns(sparse_product(neighbours.first, _turns(gaussians, neighbours)), 4)
-    e, u = neighbours.edges, mi.Vector3f(r.y, r.z, r.w)
+    e = neighbours.edges
+    u = mi.Vector3f(r.y, r.z, r.w)
     t = 2 * dr.cross(u, e)
     return _mean(_length(_edges(gaussians, neighbours) - (e + r.x * t + dr.cross(u, t))), neighbours)
 

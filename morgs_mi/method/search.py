@@ -26,6 +26,7 @@ from scipy.sparse.csgraph import connected_components
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import SH_C0
+from morgs_mi.core.documentation import documented
 from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.core.ranges import Above, AtLeast, AtMost, check_ranges
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
@@ -37,7 +38,8 @@ _GRID = 16  # steps of the grid from 0 to its end, in each direction of each axi
 # explained.
 _UNEXPLAINED = 3.0
 # Nearest Gaussians that it forms a part with if they are not explained either, and the fewest Gaussians of a part.
-_NEIGHBOURS, _MIN_SIZE = 8, 4
+_NEIGHBOURS = 8
+_MIN_SIZE = 4
 # Cost of a displacement, relative to no displacement, up to which it is tested.
 _COST_RATIO = 0.3
 # Error of the images around a part, relative to the error without the displacement, up to which it is accepted.
@@ -46,6 +48,7 @@ _ERROR_RATIO = 0.8
 _LOGIT = 0.3
 
 
+@documented
 @dataclass(frozen=True)
 class SearchConfig:
     """Settings of the coarse search."""
@@ -72,7 +75,8 @@ def search_motion(problem: MotionProblem, start: MotionStart, config: SearchConf
     config = config or SearchConfig()
     if not problem.views:
         return start
-    displacement, logit = start.displacement, start.logit_confidence
+    displacement = start.displacement
+    logit = start.logit_confidence
     parts = _unexplained_parts(problem, displacement, config.max_parts)
     for part, d in _find(problem, parts, config):
         proposal = np.where(part[:, None], d, displacement).astype(np.float32)
@@ -81,7 +85,8 @@ def search_motion(problem: MotionProblem, start: MotionStart, config: SearchConf
             continue
         before, after = (around.total_error(displaced(problem.gaussians, at)) for at in (displacement, proposal))
         if after < _ERROR_RATIO * before:
-            displacement, logit = proposal, np.where(part, np.maximum(logit, _LOGIT), logit)
+            displacement = proposal
+            logit = np.where(part, np.maximum(logit, _LOGIT), logit)
     if displacement is start.displacement:
         return start
     return replace(start, displacement=displacement, logit_confidence=logit.astype(np.float32))
@@ -90,8 +95,10 @@ def search_motion(problem: MotionProblem, start: MotionStart, config: SearchConf
 def _unexplained_parts(problem: MotionProblem, displacement: np.ndarray, count: int) -> list[np.ndarray]:
     """Return the `count` parts with the largest errors that are not explained, or fewer, each as a mask [N]."""
     sums = problem.sums_at(displacement)
-    attributed, weight = sums["error"].sum(0), sums["weight"].sum(0)
-    error, seen = attributed / (weight + 1), weight > 1
+    attributed = sums["error"].sum(0)
+    weight = sums["weight"].sum(0)
+    error = attributed / (weight + 1)
+    seen = weight > 1
     if not seen.any():
         return []
     unexplained = seen & (error > _UNEXPLAINED * max(float(np.median(error[seen])), 1 / 255))
@@ -102,7 +109,8 @@ def _unexplained_parts(problem: MotionProblem, displacement: np.ndarray, count: 
     rows = np.broadcast_to(np.arange(len(near))[:, None], near.shape)[ends]
     graph = coo_array((np.ones(len(rows), bool), (rows, near[ends])), (len(near), len(near)))
     label = connected_components(graph, directed=False)[1]
-    size, total = np.bincount(label, unexplained), np.bincount(label, np.where(unexplained, attributed, 0))
+    size = np.bincount(label, unexplained)
+    total = np.bincount(label, np.where(unexplained, attributed, 0))
     largest = np.argsort(-total, kind="stable")[:count]
     return [label == part for part in largest if size[part] >= _MIN_SIZE]
 
@@ -113,7 +121,8 @@ def _find(
     """Return the parts that are found elsewhere, each with its displacement [3]."""
     if not parts:
         return []
-    previous, found = problem.gaussians, []
+    previous = problem.gaussians
+    found = []
     for first in range(0, len(parts), 3):
         few = parts[first : first + 3]
         images = problem.images_around(np.any(few, axis=0), [])
@@ -202,12 +211,14 @@ class _MatchedView:
 
 def _reduction(group: ViewGroup, reach: float) -> int:
     """Return the factor by which the images of views are reduced: it leaves 2 px per step of the grid, if any does."""
-    widest, block = max(view.camera.width for view in group.views), gcd(*group.region.block)
+    widest = max(view.camera.width for view in group.views)
+    block = gcd(*group.region.block)
     return next(f for f in (4, 2, 1) if f == 1 or (2 * _GRID * f <= reach * widest and block % f == 0))
 
 
 def _reduced(image: np.ndarray, factor: int) -> np.ndarray:
     """Return the means of an image's squares of `factor` x `factor` pixels."""
-    height, width = image.shape[0] // factor, image.shape[1] // factor
+    height = image.shape[0] // factor
+    width = image.shape[1] // factor
     whole = image[: height * factor, : width * factor]
     return whole if factor == 1 else cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)

@@ -26,6 +26,7 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.checks import check_mask
+from morgs_mi.core.color_space import BRIGHTEST
 from morgs_mi.core.memory import from_numpy, owned_copy
 from morgs_mi.core.types import Bool, Float, Int32, Jit, Tensor, UInt32
 from morgs_mi.method.ssim_layout import (
@@ -47,7 +48,8 @@ _Read = Callable[[Float], list[Float]]  # plane -> its numbers around the lane's
 
 # Noise and rendered colours exceed [0, 1] by less, 8-bit values by more.
 _MARGIN = 1.0
-_C1, _C2 = 0.01**2, 0.03**2
+_C1 = 0.01**2
+_C2 = 0.03**2
 _TAPS = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / 1.5) ** 2)
 _TAPS = (_TAPS / _TAPS.sum()).astype(np.float32).tolist()
 
@@ -66,7 +68,7 @@ class Target:
     """A target image. Its terms of SSIM are computed once for each region on which it is compared.
 
     Args:
-        image: [H, W, 3], RGB, uint8 or float in [0, 1], display-referred.
+        image: [H, W, 3], RGB, encoded: uint8, or floats, of which 1 is white and HDR images have larger ones.
         mask: [H, W] bool; pixels that are False do not count. None: all pixels count.
 
     Raises:
@@ -101,7 +103,7 @@ class Target:
         return planes
 
     def image(self) -> np.ndarray:
-        """Return the target [H, W, 3], float32 in [0, 1]; black where masked. It is read-only."""
+        """Return the target [H, W, 3], float32 with white at 1; black where masked. It is read-only."""
         if self._image is None:
             self._image = np.asarray(self.planes.image(self.pixels)).reshape(self.shape)
             self._image.flags.writeable = False
@@ -165,10 +167,11 @@ def _check_image(image: np.ndarray) -> None:
     if image.dtype == np.uint8:
         return
     low, high = (image.min(), image.max()) if image.dtype.kind == "f" else (np.nan, np.nan)
-    if not (low >= -_MARGIN and high <= 1 + _MARGIN):
+    if not (low >= -_MARGIN and high <= BRIGHTEST):
         found = f"{image.dtype} from {low:g} to {high:g}" if image.dtype.kind == "f" else str(image.dtype)
         raise ValueError(
-            f"Target(): `image` must be uint8, or floats in [0, 1], got {found}; divide 8-bit values by 255."
+            f"Target(): `image` must be uint8, or floats from 0 to {BRIGHTEST:g} with white at 1, got {found}; divide "
+            "8-bit values by 255."
         )
 
 
@@ -203,7 +206,8 @@ class OnRegion(_Recon):
     def eval(self, x: Float, target: Target, weight: float, region: Region) -> Float:
         if target.surroundings is None:
             target.surroundings = target.pixels + 0
-        image, (places, inside) = target.surroundings, target.places_on(region)
+        image = target.surroundings
+        places, inside = target.places_on(region)
         dr.scatter(image, target.masked(x, places), places, active=inside, mode=dr.ReduceMode.NoConflicts)
         gradient, loss = _passes(image, target, weight, target.windows_on(region))
         return self.finish(target.masked(dr.gather(mi.Float, gradient, places, active=inside), places), loss)
@@ -211,7 +215,8 @@ class OnRegion(_Recon):
 
 def _passes(image: Float, target: Target, weight: float, on: _Windows) -> tuple[Float, Float]:
     """Return dL/dx in planes, defined on the runs of `on.pixels`, and L over the runs of `on`."""
-    planes, scale = target.planes, dr.opaque(mi.Float, 1 / int(np.prod(target.shape)))
+    planes = target.planes
+    scale = dr.opaque(mi.Float, 1 / int(np.prod(target.shape)))
     height = dr.opaque(mi.Int32, planes.height)
     dr.eval(image)
     arguments = (on.windows.lanes, height, image, target.pixels, on.mean, on.variance)
@@ -242,7 +247,8 @@ def _similarity_pass(
     """Return the planes of SSIM's derivatives by M x, M xx and M xy, and the sum of SSIM over each run."""
 
     def products(read: _Read) -> list[list[Float]]:
-        x, y = read(image), read(target)
+        x = read(image)
+        y = read(target)
         return [x, [v * v for v in x], [v * w for v, w in zip(x, y, strict=True)]]
 
     def similarity(read: _Read, blurred: list[list[Float]]) -> tuple[list[list[Float]], list[Float]]:
@@ -255,9 +261,12 @@ def _similarity_pass(
 
 def _similarity(mx: Float, xx: Float, xy: Float, my: Float, variance: Float) -> tuple[Float, Float, Float, Float]:
     """Return SSIM of a window and its derivatives by M x, M xx and M xy."""
-    a1, a2 = dr.fma(2 * mx, my, _C1), dr.fma(2.0, dr.fma(-mx, my, xy), _C2)
-    b1, b2 = dr.fma(mx, mx, dr.fma(my, my, _C1)), dr.fma(-mx, mx, xx) + (variance + _C2)
-    r1, r2 = dr.rcp(b1), dr.rcp(b2)
+    a1 = dr.fma(2 * mx, my, _C1)
+    a2 = dr.fma(2.0, dr.fma(-mx, my, xy), _C2)
+    b1 = dr.fma(mx, mx, dr.fma(my, my, _C1))
+    b2 = dr.fma(-mx, mx, xx) + (variance + _C2)
+    r1 = dr.rcp(b1)
+    r2 = dr.rcp(b2)
     r12 = r1 * r2
     ssim = a1 * a2 * r12
     d_x = 2 * dr.fma(my * r12, a2 - a1, mx * ssim * (r2 - r1))
@@ -280,9 +289,11 @@ def _gradient_pass(
         return [read(plane) for plane in derivatives]
 
     def gradient(read: _Read, blurred: list[list[Float]]) -> tuple[list[list[Float]], list[Float]]:
-        row, errors = [], []
+        row = []
+        errors = []
         for x, y, d_x, d_xx, d_xy in zip(read(image), read(target), *blurred, strict=True):
-            error, structure = x - y, dr.fma(y, d_xy, dr.fma(2 * x, d_xx, d_x))
+            error = x - y
+            structure = dr.fma(y, d_xy, dr.fma(2 * x, d_xx, d_x))
             sign = dr.select(error > 0, 1.0, dr.select(error < 0, -1.0, 0.0))
             row.append(scale * ((1 - weight) * sign - weight * structure))
             errors.append(dr.abs(error))
@@ -318,7 +329,8 @@ def _walk(
     targets = [dr.empty(mi.Float, size) for _ in range(outputs)]
 
     def blurred(row: Int32, height: Int32, places: tuple[UInt32, UInt32, UInt32]) -> Jit:
-        inside, down = (row >= 0) & (row < height), mi.UInt32(row) * COLUMN
+        inside = (row >= 0) & (row < height)
+        down = mi.UInt32(row) * COLUMN
 
         def wide(plane: Float) -> list[Float]:
             numbers = [v for place in places for v in read_packet(plane, place + down, inside)]
@@ -335,7 +347,9 @@ def _walk(
 
     def body(row, end, first, places, columns, height, windows, total, targets):
         # Two rows per turn: the windows are read and written half as often. Window k ends k rows further down.
-        a, b, w = blurred(row, height, places), blurred(row + 1, height, places), _TAPS
+        a = blurred(row, height, places)
+        b = blurred(row + 1, height, places)
+        w = _TAPS
         done = dr.fma(a, w[0], windows[0]), dr.fma(b, w[0], dr.fma(a, w[1], windows[1]))
         windows = [dr.fma(a, w[k], dr.fma(b, w[k - 1], windows[k])) for k in range(2, 2 * RADIUS)]
         windows += [dr.fma(a, w[-1], b * w[-2]), b * w[-1]]
@@ -343,7 +357,8 @@ def _walk(
         inside = [columns > k for k in range(STRIP)]
         for k in range(2):
             at = row + k - RADIUS
-            center, ready = places[1] + mi.UInt32(at) * COLUMN, (at >= first) & (at < end)
+            center = places[1] + mi.UInt32(at) * COLUMN
+            ready = (at >= first) & (at < end)
 
             def narrow(plane: Float, center: UInt32 = center, ready: Bool = ready) -> list[Float]:
                 return list(read_packet(plane, center, ready))

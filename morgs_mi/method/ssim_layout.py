@@ -49,7 +49,8 @@ class Planes:
     """The layout of an image [H, W, 3] in planes."""
 
     def __init__(self, height: int, width: int) -> None:
-        self.height, self.width = height, width
+        self.height = height
+        self.width = width
         self.num_strips = -(-width // STRIP)
         self.num_columns = -(-(self.num_strips + 2 * _SPARE) // COLUMN)
         self.size = 3 * self.num_columns * height * COLUMN * STRIP
@@ -59,14 +60,16 @@ class Planes:
         if self.width % STRIP == 0:
             target = dr.empty(mi.Float, self.size)
             strip, y, places = self._strips(self.num_columns * COLUMN)
-            strip, strips = strip - _SPARE, dr.opaque(mi.UInt32, self.num_strips)
+            strip = strip - _SPARE
+            strips = dr.opaque(mi.UInt32, self.num_strips)
             reads = [read_packet(image, 3 * (y * strips + strip) + k, strip < strips) for k in range(3)]
             values = [v for read in reads for v in read]
             for component, place in enumerate(places):
                 write_packet(target, values[component::3], place)
             return target
         lane = dr.arange(mi.UInt32, self.size)
-        line, x = lane // (COLUMN * STRIP), lane % (COLUMN * STRIP)
+        line = lane // (COLUMN * STRIP)
+        x = lane % (COLUMN * STRIP)
         column = quotient(line, self.height)
         y = line - column * dr.opaque(mi.UInt32, self.height)
         component = quotient(column, self.num_columns)
@@ -195,7 +198,8 @@ def _cell_runs(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     parts = -(-(end - first) // _LONGEST)
     index = np.repeat(np.arange(len(line)), parts)
     first = first[index] + _LONGEST * (np.arange(len(index)) - np.repeat(parts.cumsum() - parts, parts))
-    end, line = np.minimum(end[index], first + _LONGEST), line[index]
+    end = np.minimum(end[index], first + _LONGEST)
+    line = line[index]
     # The lanes of a packet are neighbours in one column.
     order = np.lexsort((line, first, (line + _SPARE - 1) // COLUMN))
     return line[order], first[order], end[order]

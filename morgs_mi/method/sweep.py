@@ -39,7 +39,8 @@ MAPS: dict[str, _Map] = {
 
 # Error, in pixels of full contrast, and covered pixels, that are added to every Gaussian's: one that is hardly visible
 # has little of either.
-_FLOOR_PX, _FLOOR_WEIGHT = 0.01, 1.0
+_FLOOR_PX = 0.01
+_FLOOR_WEIGHT = 1.0
 
 
 def relative_error(sums: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -56,7 +57,8 @@ class KeyImages:
     """
 
     def __init__(self, views: Mapping[int, ActiveView], targets: Mapping[int, Target]) -> None:
-        self.views, self._targets = views, [targets[v] for v in views]
+        self.views = views
+        self._targets = [targets[v] for v in views]
         self.group = ViewGroup([*views.values()])
 
     def sums(self, gaussians: Gaussians, names: Sequence[str]) -> dict[str, np.ndarray]:

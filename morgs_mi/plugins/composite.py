@@ -17,9 +17,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.color_space import decode_traced, encode_traced
 from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.memory import from_numpy
-from morgs_mi.core.types import Float, Tensor
+from morgs_mi.core.types import Float, Jit, Tensor
 from morgs_mi.plugins.surface_view import SurfaceView
 from morgs_mi.render.channels import NORMALISED
 from morgs_mi.render.rasterize import Image, rasterize
@@ -33,7 +34,7 @@ Columns = dict[str, list[Float]]
 def composite(
     gaussians: ActivatedGaussians,
     channels: Sequence[str],
-    background: Sequence[float] | None,
+    background: Sequence[float] | Jit | None,
     view: SurfaceView,
     config: RenderConfig | None = None,
 ) -> Columns:
@@ -49,12 +50,14 @@ def composite(
         view: the surfaces on P pixels of a camera's image.
         config: settings of the rasteriser.
     """
-    encode, decode = (mi.math.linear_to_srgb, mi.math.srgb_to_linear) if view.srgb else (_unchanged, _unchanged)
+    encode, decode = (encode_traced, decode_traced) if view.srgb else (_unchanged, _unchanged)
     channels = tuple(dict.fromkeys(("color", "alpha", *channels)))
-    image, crop = rasterize(gaussians, view.pixels.camera, channels, config=config), view.pixels.crop
+    image = rasterize(gaussians, view.pixels.camera, channels, config=config)
+    crop = view.pixels.crop
     whole = _blended(image, channels, lambda image: cropped(image, crop))
     front = _in_front(gaussians, channels, view, config) or whole
-    f, covered = view.coverage, view.coverage > 0
+    f = view.coverage
+    covered = view.coverage > 0
     t_front, t_whole = (1 - part["alpha"][0] for part in (front, whole))
 
     shown = view.behind is not None
@@ -62,7 +65,8 @@ def composite(
     ground = [0.0] * 3 if background is None or shown else background
     color = []
     for k in range(3):
-        L, E = view.image[:, :, k].array, behind[k]
+        L = view.image[:, :, k].array
+        E = behind[k]
         # Rays of its own find the coverage. Without splats, the two parts add up to L whatever it is.
         surface = dr.maximum(L - (1 - f) * E, 0) / dr.select(covered, f, 1)
         rest = dr.maximum(L - f * surface, 0) / dr.select(f < 1, 1 - f, 1)
@@ -74,7 +78,8 @@ def composite(
     splats = {name: [dr.lerp(b, a, f) for a, b in zip(front[name], whole[name], strict=True)] for name in channels}
     (alpha,) = splats["alpha"]
     if "depth" in channels:
-        (depth,), weight = splats["depth"], alpha + f * t_front
+        (depth,) = splats["depth"]
+        weight = alpha + f * t_front
         splats["depth"] = _ratio([depth + f * t_front * dr.select(covered, view.depth, 0)], weight)
     if "motion" in channels:
         splats["motion"] = _ratio(splats["motion"], alpha)
@@ -89,13 +94,15 @@ def _in_front(
 
     Only the blocks of pixels in which a surface is seen are drawn.
     """
-    camera, (x, y, width, height) = view.pixels.camera, view.pixels.crop
+    camera = view.pixels.camera
+    x, y, width, height = view.pixels.crop
     mask = np.zeros((camera.height, camera.width), bool)
     mask[y : y + height, x : x + width] = view.mask
     if not mask.any():
         return None
     pixel = dr.arange(mi.UInt32, width * height)
-    row, limit = pixel // dr.opaque(mi.UInt32, width), dr.full(mi.Float, dr.inf, mask.size)
+    row = pixel // dr.opaque(mi.UInt32, width)
+    limit = dr.full(mi.Float, dr.inf, mask.size)
     inside = dr.fma(row + y, dr.opaque(mi.UInt32, camera.width), pixel - row * dr.opaque(mi.UInt32, width) + x)
     dr.scatter(limit, view.depth, inside, mode=dr.ReduceMode.Permute)
     region = Region(mask)
@@ -108,7 +115,8 @@ def _in_front(
     drawn = view.coverage > 0
 
     def on_crop(image: Tensor) -> list[Float]:
-        size, mode = image.shape[-1], dr.ReduceMode.NoConflicts
+        size = image.shape[-1]
+        mode = dr.ReduceMode.NoConflicts
         return [dr.gather(mi.Float, image.array, index * size + k, active=drawn, mode=mode) for k in range(size)]
 
     return _blended(part, channels, on_crop)

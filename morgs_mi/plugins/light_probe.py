@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_number, numbers
+from morgs_mi.core.color_space import decode_traced
 from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.render.rasterize import rasterize
@@ -89,7 +90,8 @@ def _directions(height: int) -> np.ndarray:
     """Return the directions [H, 2 H, 3] of the texels of an `envmap`; its first and last rows are the poles."""
     theta = np.pi * np.arange(height)[:, None] / (height - 1)
     phi = 2 * np.pi * (np.arange(2 * height) + 0.5) / (2 * height)
-    x, z = np.sin(theta) * np.sin(phi), -np.sin(theta) * np.cos(phi)
+    x = np.sin(theta) * np.sin(phi)
+    z = -np.sin(theta) * np.cos(phi)
     return np.stack([x, np.broadcast_to(np.cos(theta), x.shape), z], axis=-1)
 
 
@@ -136,4 +138,4 @@ def radiance(color: Any, clipped: float, srgb: bool = True) -> Any:
     if not srgb:
         return color
     position = dr.clip((dr.max(color) - _KNEE) / (1 - _KNEE), 0, 1)
-    return mi.math.srgb_to_linear(color) * (1 + (clipped - 1) * dr.square(position) * (3 - 2 * position))
+    return decode_traced(color) * (1 + (clipped - 1) * dr.square(position) * (3 - 2 * position))

@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from morgs_mi.core.checks import check_number, check_type, numbers
-from morgs_mi.core.color_space import SH_C0, linear_to_srgb, srgb_to_linear
+from morgs_mi.core.color_space import SH_C0, decode_light, encode_light
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, UInt32
@@ -52,7 +52,8 @@ def shadow_ratio(gaussians: Gaussians, scene: Any, viewpoint: ArrayLike, samples
     eye = numbers(place, "viewpoint", viewpoint)
     if eye.shape != (3,) or not np.isfinite(eye).all():
         raise ValueError(f"{place}: `viewpoint` must be [3] and finite, got {eye.tolist()}; pass a camera's position.")
-    emitters, shapes = scene.emitters(), [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
+    emitters = scene.emitters()
+    shapes = [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
     if not emitters:
         raise ValueError(
             f"{place}: expected a scene with an emitter, got none; add one, such as an `envmap` of "
@@ -61,11 +62,13 @@ def shadow_ratio(gaussians: Gaussians, scene: Any, viewpoint: ArrayLike, samples
     if not len(gaussians) or not shapes:
         return np.ones(len(gaussians), np.float32)
     with dr.suspend_grad():
-        receivers, blockers = _Receivers(gaussians, eye), shared_scene(shapes, scene)
+        receivers = _Receivers(gaussians, eye)
+        blockers = shared_scene(shapes, scene)
         blocked, total = (mi.Float(0) for _ in range(2))
         for emitter in emitters:
             some, every = _irradiance(emitter, receivers, blockers, int(samples))
-            blocked, total = blocked + some, total + every
+            blocked = blocked + some
+            total = total + every
         return np.array(1 - dr.select(total > 0, blocked / total, 0))
 
 
@@ -84,7 +87,7 @@ def shadowed(gaussians: Gaussians, ratio: np.ndarray) -> Gaussians:
             f"{list(ratio.shape)}; pass the result of shadow_ratio()."
         )
     mean = np.maximum(0.5 + SH_C0 * np.array(dr.detach(gaussians.sh_coeffs))[:, :1], 1e-6)  # [N, 1, 3]
-    factor = linear_to_srgb(ratio[:, None, None] * srgb_to_linear(mean)) / mean
+    factor = encode_light(ratio[:, None, None] * decode_light(mean)) / mean
     shift = np.zeros((1, int(gaussians.sh_coeffs.shape[1]), 1))
     shift[:, 0] = 0.5 / SH_C0  # factor (0.5 + SH) = 0.5 + SH of the new coefficients
     scale = from_numpy(mi.TensorXf, np.broadcast_to(factor, gaussians.sh_coeffs.shape))
@@ -113,7 +116,8 @@ def _orientation(gaussians: Gaussians, means: np.ndarray) -> tuple[np.ndarray, n
 
     Single Gaussians of a fitted surface lie in it, but are not all flat.
     """
-    scales, quats = np.array(dr.detach(gaussians.scales)), np.array(dr.detach(gaussians.quats), np.float64)
+    scales = np.array(dr.detach(gaussians.scales))
+    quats = np.array(dr.detach(gaussians.quats), np.float64)
     quats = np.where(np.linalg.norm(quats, axis=1, keepdims=True) > 0, quats, [1, 0, 0, 0])
     axes = Rotation.from_quat(quats, scalar_first=True).as_matrix() * scales[:, None]
     _, near = KDTree(means).query(means, min(_NEIGHBOURS, len(means)), workers=-1)
@@ -136,7 +140,8 @@ def _irradiance(emitter: Any, receivers: _Receivers, blockers: Any, samples: int
     far = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
     it = dr.zeros(mi.Interaction3f, dr.width(receivers.centers))
     it.p = receivers.centers
-    count, step_size = dr.opaque(mi.UInt32, samples), dr.opaque(mi.Float, 1 / samples)
+    count = dr.opaque(mi.UInt32, samples)
+    step_size = dr.opaque(mi.Float, 1 / samples)
     no_scramble: Any = 0
 
     def step(k: UInt32, blocked: Float, total: Float) -> tuple[UInt32, Float, Float]:

@@ -192,7 +192,8 @@ class SplatPathIntegrator(RBIntegrator):
         assert self.splats
         ray = si.spawn_ray_to(ds.p)
         far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-        ray.d, ray.maxt = ds.d, dr.select(far, dr.largest(mi.Float), ds.dist)
+        ray.d = ds.d
+        ray.maxt = dr.select(far, dr.largest(mi.Float), ds.dist)
         return self.splats.transmittance(ray, active)
 
     def to_string(self) -> str:

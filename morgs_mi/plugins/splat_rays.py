@@ -58,7 +58,8 @@ class _Tree:
         """
         N = len(centers)
         depth = max(N - 1, 0).bit_length()
-        order, flips = np.arange(1 << depth), [0, 0, 0]
+        order = np.arange(1 << depth)
+        flips = [0, 0, 0]
         # Leaves without a box are at the end of every axis.
         placed = np.concatenate([centers, np.full((len(order) - N, 3), np.inf)])
         for level in range(depth):
@@ -167,7 +168,8 @@ class SplatRays:
         rows[:, 3, 0] = np.where(order < len(drawn), opacities.ravel()[index], 0)
         padded = np.zeros((*coeffs.shape[:2], 4))
         padded[..., :3] = coeffs
-        self._rows, self._coeffs = from_numpy(mi.Float, rows), from_numpy(mi.Float, padded[index])
+        self._rows = from_numpy(mi.Float, rows)
+        self._coeffs = from_numpy(mi.Float, padded[index])
         self._degree = round(sqrt(coeffs.shape[1])) - 1
 
     def transmittance(self, ray: Any, active: Bool = True) -> Float:
@@ -231,7 +233,8 @@ class SplatRays:
 
         def visit(state: tuple[Jit, ...], row: UInt32, active: Bool) -> tuple[Jit, ...]:
             depths, rows, count = state
-            depths, rows = list(depths), list(rows)
+            depths = list(depths)
+            rows = list(rows)
             depth, alpha = self._response(ray, row)
             found = (alpha > 0) & _before(*last, depth, row)
             depth = dr.select(found, depth, dr.inf)
@@ -255,7 +258,8 @@ class SplatRays:
         W = [mi.Vector3f(v.x, v.y, v.z) for v in (x, y, z)]
         o, d = (mi.Vector3f(*(dr.dot(w, v) for w in W)) for v in (mi.Vector3f(offset), ray.d))
         dd = dr.squared_norm(d)
-        depth, r_sigma = -dr.dot(o, d) / dd, dr.sqrt(dd)
+        depth = -dr.dot(o, d) / dd
+        r_sigma = dr.sqrt(dd)
         # The distance as a cross product: a difference of squares would cancel for thin Gaussians.
         alpha = more.x * dr.exp(-0.5 * dr.squared_norm(dr.cross(o, d)) / dd)
         alpha = dr.select(alpha >= self._config.alpha_min, dr.minimum(alpha, self._config.alpha_max), 0)

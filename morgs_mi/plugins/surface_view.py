@@ -27,7 +27,8 @@ _log = logging.getLogger(__name__)
 # Rays along each axis of a pixel that find its coverage and depth.
 _GRID = 3
 # Rays of the grid that are cast in every pixel, and the others, row by row.
-_FIRST, _OTHERS = (1, 5, 6), (0, 2, 3, 4, 7, 8)
+_FIRST = (1, 5, 6)
+_OTHERS = (0, 2, 3, 4, 7, 8)
 
 
 def rays_for(integrator: Any, gaussians: ActivatedGaussians, config: RenderConfig | None = None) -> SplatRays | None:
@@ -47,7 +48,8 @@ def traced(integrator: Any, splats: SplatRays | None, srgb: bool) -> Iterator[No
     if splats is None:
         yield
         return
-    integrator.splats, integrator.srgb = splats, srgb
+    integrator.splats = splats
+    integrator.srgb = srgb
     try:
         yield
     finally:
@@ -239,7 +241,8 @@ class SurfaceView:
 
     def _differentiates(self) -> bool:
         """Return whether any parameter of the surfaces is differentiated."""
-        params, attached = mi.traverse(self.scene), _attached(self.scene)
+        params = mi.traverse(self.scene)
+        attached = _attached(self.scene)
         moving = [key for key in attached if params.flags(key) & mi.ParamFlags.Discontinuous]
         if moving:
             _log.warning(
@@ -275,7 +278,8 @@ def coverage_and_depth(scene: Any, sensor: Any, camera: Camera, crop: tuple[int,
         crop: pixels of the camera's image, (x, y, width, height), P in all.
     """
     first, (across, down) = _rectangle(scene.bbox(), camera, crop)
-    coverage, depth = dr.zeros(mi.Float, crop[2] * crop[3]), dr.full(mi.Float, dr.inf, crop[2] * crop[3])
+    coverage = dr.zeros(mi.Float, crop[2] * crop[3])
+    depth = dr.full(mi.Float, dr.inf, crop[2] * crop[3])
     if not across * down:
         return coverage, depth
     lane: UInt32 = dr.arange(mi.UInt32, across * down)
@@ -287,7 +291,8 @@ def coverage_and_depth(scene: Any, sensor: Any, camera: Camera, crop: tuple[int,
 
     def cast(pixel: UInt32, grid: tuple[int, ...]) -> tuple[Float, Float]:
         """Return the number of hits of some rays of the grid in pixels, and the sum of their depths."""
-        cells, end = mi.UInt32(grid), dr.opaque(mi.UInt32, len(grid))
+        cells = mi.UInt32(grid)
+        end = dr.opaque(mi.UInt32, len(grid))
 
         def step(i: UInt32, count: Float, total: Float) -> tuple[UInt32, Float, Float]:
             k = dr.gather(mi.UInt32, cells, i)
@@ -312,7 +317,8 @@ def coverage_and_depth(scene: Any, sensor: Any, camera: Camera, crop: tuple[int,
     edge: Any = dr.compress(mixed)
     if dr.width(edge):
         more, deeper = cast(dr.gather(mi.UInt32, pixel, edge), _OTHERS)
-        more, deeper = more + dr.gather(mi.Float, count, edge), deeper + dr.gather(mi.Float, total, edge)
+        more = more + dr.gather(mi.Float, count, edge)
+        deeper = deeper + dr.gather(mi.Float, total, edge)
         for target, values in ((count, more), (total, deeper), (rays, mi.Float(_GRID**2))):
             dr.scatter(target, values, edge, mode=dr.ReduceMode.Permute)
     dr.scatter(coverage, count / rays, pixel, mode=dr.ReduceMode.Permute)
@@ -328,7 +334,8 @@ def _rectangle(box: Any, camera: Camera, crop: tuple[int, int, int, int]) -> tup
     ends = np.stack([np.ravel(box.min), np.ravel(box.max)])
     corners = np.array([[ends[i, 0], ends[j, 1], ends[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
     pixels, depth = camera.project(corners)
-    low, high = np.zeros(2), np.array(crop[2:])
+    low = np.zeros(2)
+    high = np.array(crop[2:])
     if (depth >= camera.near).all():
         low, high = (
             np.clip(end - np.array(crop[:2]), 0, high)
@@ -342,7 +349,8 @@ def _environment(scene: Any, sensor: Any) -> Any:
     pixel = dr.arange(mi.UInt32, int(dr.prod(sensor.film().crop_size())))
     rays = _rays(sensor, pixel, mi.Point2f(0.5))
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(pixel))
-    si.wi, si.wavelengths = -rays.d, rays.wavelengths
+    si.wi = -rays.d
+    si.wavelengths = rays.wavelengths
     return mi.Color3f(mi.unpolarized_spectrum(scene.environment().eval(si)))
 
 

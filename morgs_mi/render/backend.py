@@ -45,6 +45,7 @@ def on_aligned_stack(value: UInt32 | Int32) -> UInt32 | Int32:
     """
     if _backend() != dr.JitBackend.LLVM:
         return value
-    local, place = dr.alloc_local(type(value), 2), mi.UInt32(value) & 1
+    local = dr.alloc_local(type(value), 2)
+    place = mi.UInt32(value) & 1
     local[place] = value
     return local[place]

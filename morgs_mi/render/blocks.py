@@ -106,7 +106,8 @@ def pack_records(columns: list[Float], order: UInt32) -> Float:
 
     Records are read in packets of 4 floats, one cache line or less for each Gaussian.
     """
-    N, width = dr.width(order), -(-len(columns) // 4)
+    N = dr.width(order)
+    width = -(-len(columns) // 4)
     values = [dr.gather(mi.Float, column, order) for column in columns]
     values += [mi.Float(0)] * (4 * width - len(values))
     records = dr.empty(mi.Float, 4 * width * N)
@@ -150,15 +151,19 @@ def _cells_within(
     down = dr.gather(mi.UInt32, region.tile_grid, mi.UInt32(1)) * (DOWN // cell[1])
 
     def span(axis: int, cells: UInt32) -> tuple[UInt32, UInt32]:
-        center, half, top = dr.detach(splats.shape[axis]), splats.extent[axis], mi.Float(cells)
+        center = dr.detach(splats.shape[axis])
+        half = splats.extent[axis]
+        top = mi.Float(cells)
         bound = 1.0 / (cell[axis] * region.block[axis])
         low = dr.clip(dr.floor((center - half) * bound), 0, top)
         high = dr.clip(dr.floor((center + half) * bound) + 1, 0, top)
         return mi.UInt32(low), mi.UInt32(high)
 
-    (x0, x1), (y0, y1) = span(0, across), span(1, down)
+    x0, x1 = span(0, across)
+    y0, y1 = span(1, down)
     if splats.view is not None:
-        y0, y1 = y0 + splats.view * down, y1 + splats.view * down
+        y0 = y0 + splats.view * down
+        y1 = y1 + splats.view * down
     if region.whole:
         return (x0, y0, x1, y1), (x1 - x0) * (y1 - y0)
 
@@ -177,7 +182,8 @@ def _tile_rectangles(splats: Splats, region: Region) -> tuple[UInt32, UInt32, UI
 def _tile_lists(rectangles: list[UInt32], region: Region) -> _Tiles:
     """Enter every rank into the region's tiles within its rectangle, and sort by tile."""
     x0, y0, columns, counts = rectangles
-    N, slots = dr.width(counts), region.num_tiles
+    N = dr.width(counts)
+    slots = region.num_tiles
     if N * slots >= 2**32 and (entries := dr.sum(mi.Float64(counts))[0]) >= 2**32:
         raise ValueError(
             f"rasterize(): the lists must have fewer than 2^32 entries, got {entries:.3g} for {N} Gaussians in "
@@ -187,7 +193,8 @@ def _tile_lists(rectangles: list[UInt32], region: Region) -> _Tiles:
     total = int(end[-1])  # the one number that must reach the host: the size of the lists
     if total == 0:
         return _Tiles(*(dr.zeros(mi.UInt32, size) for size in (1, 1, slots, slots)))
-    slot_at, rank_at = dr.empty(mi.UInt32, total), dr.empty(mi.UInt32, total)
+    slot_at = dr.empty(mi.UInt32, total)
+    rank_at = dr.empty(mi.UInt32, total)
     across = dr.gather(mi.UInt32, region.tile_grid, mi.UInt32(0))
 
     def enter(place, end, column, tile, columns, rank, across, slot_of, slot_at, rank_at):
@@ -197,7 +204,8 @@ def _tile_lists(rectangles: list[UInt32], region: Region) -> _Tiles:
         dr.scatter(rank_at, rank, place, active=drawn, mode=dr.ReduceMode.NoConflicts)
         place = place + 1 if region.whole else dr.select(drawn, place + 1, place)
         wrap = column + 1 == columns
-        column, tile = dr.select(wrap, 0, column + 1), dr.select(wrap, tile + across + 1 - columns, tile + 1)
+        column = dr.select(wrap, 0, column + 1)
+        tile = dr.select(wrap, tile + across + 1 - columns, tile + 1)
         return place, end, column, tile, columns, rank, across, slot_of, slot_at, rank_at
 
     state = (
@@ -227,7 +235,8 @@ def sorted_buckets(keys: UInt32, buckets: int) -> tuple[UInt32, UInt32, UInt32, 
     perm = stable_order(keys, buckets)
     ordered = dr.gather(mi.UInt32, keys, perm)
     dr.eval(ordered)
-    first, end = dr.zeros(mi.UInt32, buckets), dr.zeros(mi.UInt32, buckets)
+    first = dr.zeros(mi.UInt32, buckets)
+    end = dr.zeros(mi.UInt32, buckets)
     j = dr.arange(mi.UInt32, total)
     is_last = j + 1 == dr.opaque(mi.UInt32, total)
     following = dr.gather(mi.UInt32, ordered, j + 1, active=~is_last)
@@ -246,7 +255,8 @@ def _block_bits(
     Bit k of word 32 w + b is set if block b of the tile is touched by entry 32 w + k, both counted from the tile's
     first.
     """
-    (bw, bh), num_tiles = region.block, region.num_tiles
+    bw, bh = region.block
+    num_tiles = region.num_tiles
     length = (tiles.end - tiles.first + 31) // 32
     end_word = dr.cumsum(length)
     first_word = end_word - length
@@ -257,30 +267,42 @@ def _block_bits(
     mx, my, a, b, c, log2_opacity, *profile = geometry
     # Slopes dx/dy and dy/dx along which p is largest for a given dy and for a given dx.
     tilt = b / dr.maximum(c, 1e-30)
-    slope_x, slope_y = -b / dr.maximum(a, 1e-30), -a / dr.maximum(c, 1e-30) * tilt / dr.fma(tilt, tilt, 1)
-    px, py = dr.gather(mi.Float, region.corner_x, slot) - mx, dr.gather(mi.Float, region.corner_y, slot) - my
+    slope_x = -b / dr.maximum(a, 1e-30)
+    slope_y = -a / dr.maximum(c, 1e-30) * tilt / dr.fma(tilt, tilt, 1)
+    px = dr.gather(mi.Float, region.corner_x, slot) - mx
+    py = dr.gather(mi.Float, region.corner_y, slot) - my
     reach = log2_opacity - log2(config.alpha_min) + _TEST_SLACK
     columns = []
     for i in range(ACROSS):
-        x0, x1 = px + (i * bw + 0.5), px + (i * bw + bw - 0.5)
+        x0 = px + (i * bw + 0.5)
+        x1 = px + (i * bw + bw - 0.5)
         x = _clipped(0, x0, x1)
         columns.append((x0, x1, a * x, slope_y * x))
-    left, right, top, bottom = columns[0][0], columns[-1][1], py + 0.5, py + (DOWN * bh - 0.5)
+    left = columns[0][0]
+    right = columns[-1][1]
+    top = py + 0.5
+    bottom = py + (DOWN * bh - 0.5)
     if farthest_limits is not None:
         z, gx, gy, r_sigma = profile
         nearest = [z + dr.minimum(gx * x0, gx * x1) for x0, x1, *_ in columns]
     mask = mi.UInt32(0)
     for j in range(DOWN):
-        y0, y1 = py + (j * bh + 0.5), py + (j * bh + bh - 0.5)
+        y0 = py + (j * bh + 0.5)
+        y1 = py + (j * bh + bh - 0.5)
         if farthest_limits is not None:
-            row, farthest = dr.minimum(gy * y0, gy * y1), dr.gather(mi.Vector4f, farthest_limits, slot * DOWN + j)
+            row = dr.minimum(gy * y0, gy * y1)
+            farthest = dr.gather(mi.Vector4f, farthest_limits, slot * DOWN + j)
             ahead = [(limit - z - row) * r_sigma > -FARTHEST_CUT for limit, z in zip(farthest, nearest, strict=True)]
         y = _clipped(0, y0, y1)
-        by, v, best_x = b * y, c * y, slope_x * y
+        by = b * y
+        v = c * y
+        best_x = slope_x * y
         for i, (x0, x1, ax, best_y) in enumerate(columns):
             # Over a box, u^2 + v^2 is least at the clamped centre or on the two nearest edges.
-            u1, y_edge = dr.fma(a, _clipped(best_x, x0, x1), by), _clipped(best_y, y0, y1)
-            u2, v2 = dr.fma(b, y_edge, ax), c * y_edge
+            u1 = dr.fma(a, _clipped(best_x, x0, x1), by)
+            y_edge = _clipped(best_y, y0, y1)
+            u2 = dr.fma(b, y_edge, ax)
+            v2 = c * y_edge
             touches = (dr.fma(u1, u1, v * v) <= reach) | (dr.fma(u2, u2, v2 * v2) <= reach)
             if farthest_limits is not None:
                 touches &= ahead[i]
@@ -294,7 +316,8 @@ def _block_bits(
     # Over the tile, u^2 + v^2 is largest at a corner: a lower bound of alpha, hence an upper bound of the transmittance
     # behind an entry. Entries below the stop in all blocks are not listed; they would not have been blended.
     def distance(x: Float, y: Float) -> Float:
-        u, v = dr.fma(a, x, b * y), c * y
+        u = dr.fma(a, x, b * y)
+        v = c * y
         return dr.fma(u, u, v * v)
 
     farthest = distance(left, top)
@@ -316,7 +339,8 @@ def _farthest_limits(limits: Float, region: Region) -> Float:
     row = quotient(lane, region.width)
     column = lane - row * dr.opaque(mi.UInt32, region.width)
     across = dr.gather(mi.UInt32, region.tile_grid, mi.UInt32(0))
-    x, y = column // region.block[0], row // region.block[1]
+    x = column // region.block[0]
+    y = row // region.block[1]
     tile = y // DOWN * across + x // ACROSS
     slot = tile if region.whole else dr.gather(mi.UInt32, region.slot_of, tile)
     farthest = dr.full(mi.Float, -dr.inf, region.num_tiles * ACROSS * DOWN)
@@ -352,7 +376,9 @@ def _clipped(value: Float | int, low: Float, high: Float) -> Float:
 
 def _transposed(rows: list[UInt32]) -> list[UInt32]:
     """Return 32 words of 32 bits transposed: swap off-diagonal squares of 16, 8, ... 1 bits (Hacker's Delight, 7-3)."""
-    rows, size, mask = list(rows), 16, 0x0000FFFF
+    rows = list(rows)
+    size = 16
+    mask = 0x0000FFFF
     while size:
         for k in range(32):
             if not k & size:

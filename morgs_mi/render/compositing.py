@@ -56,13 +56,16 @@ class _Blend(dr.CustomOp):
         self, values: list[Float], region: Region, lists: BlockLists, layout: Layout, limits: Float | None
     ) -> list[Float]:
         # The lists' records contain the values already: they are arguments only to be differentiated.
-        self.region, self.lists, self.layout = region, lists, layout
+        self.region = region
+        self.lists = lists
+        self.layout = layout
         self.blocks = Blocks.of(region, lists, None if limits is None else on_region(limits, region))
         self.images = _run(primal, layout, self.blocks, lists.records, self._allocated())
         return self._outputs(self.images)
 
     def backward(self) -> None:
-        layout, grads = self.layout, self._image_grads(cast(list[Float], self.grad_out()))
+        layout = self.layout
+        grads = self._image_grads(cast(list[Float], self.grad_out()))
         columns = _gradients(self.blocks, self.lists, layout, self.images, grads)
         missing = layout.geometry + layout.columns - len(columns)
         self.set_grad_in("values", [mi.Float(0)] * missing + columns)
@@ -115,17 +118,21 @@ def _gradients(
     blocks: Blocks, lists: BlockLists, layout: Layout, images: list[Float], grads: list[Float]
 ) -> list[Float]:
     """Return the gradients of the geometry (if the layout reaches it) and the columns, from the images' gradients."""
-    N, arrays, stride = dr.width(lists.by_rank), (blocks, lists.records, images, grads), 4 * record_packets(layout)
+    N = dr.width(lists.by_rank)
+    arrays = (blocks, lists.records, images, grads)
+    stride = 4 * record_packets(layout)
     if layout.config.reproducible:
         end = dr.cumsum(lists.count)
         first = end - lists.count
         dr.eval(first)
         pairs = dr.opaque(mi.Float, 0, max(int(end[-1]), 1) * 4 * pair_packets(layout))
         pairs = _run(adjoint_of_pairs, layout, *arrays, first, pairs)
-        sums, stride = _summed_by_rank(pairs, N, layout), 4 * pair_packets(layout)
+        sums = _summed_by_rank(pairs, N, layout)
+        stride = 4 * pair_packets(layout)
     else:
         sums = _run(adjoint, layout, _rounded_up(N), *arrays)
-    lane, skipped = lists.rank_of * stride, 0 if layout.reaches_weights else layout.geometry
+    lane = lists.rank_of * stride
+    skipped = 0 if layout.reaches_weights else layout.geometry
     return [dr.gather(mi.Float, sums, lane + k) for k in range(skipped, layout.geometry + layout.columns)]
 
 
@@ -153,13 +160,15 @@ def padded(image: Float, region: Region, size: int) -> Float:
         return image * dr.opaque(mi.Float, 1)
     lane = dr.arange(mi.UInt32, total)
     row = quotient(lane, region.row * size)
-    column, width = lane - row * dr.opaque(mi.UInt32, region.row * size), dr.opaque(mi.UInt32, region.width * size)
+    column = lane - row * dr.opaque(mi.UInt32, region.row * size)
+    width = dr.opaque(mi.UInt32, region.width * size)
     return dr.gather(mi.Float, image, row * width + column, active=column < width)
 
 
 def _summed_by_rank(pairs: Float, N: int, layout: Layout) -> Float:
     """Return the sums of the records of all pairs of each rank, one lane per rank, in the order of the blocks."""
-    packets, place = pair_packets(layout), layout.geometry + layout.columns
+    packets = pair_packets(layout)
+    place = layout.geometry + layout.columns
     lane = dr.arange(mi.UInt32, dr.width(pairs) // (4 * packets)) * (4 * packets)
     rank = dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, pairs, lane + place))
     perm, _, first, end = sorted_buckets(dr.opaque(rank), N)

@@ -51,8 +51,13 @@ class Cut:
 
     def __init__(self, profile: list[Float], dx: list[Float], dy: list[Float], limits: list[Float]) -> None:
         z, gx, gy, self.r_sigma = profile
-        self.gx, self.gy, self.dx, self.dy, self.limits = gx, gy, dx, dy, limits
-        self.columns, self.rows = [dr.fma(gx, x, z) for x in dx], [gy * y for y in dy]
+        self.gx = gx
+        self.gy = gy
+        self.dx = dx
+        self.dy = dy
+        self.limits = limits
+        self.columns = [dr.fma(gx, x, z) for x in dx]
+        self.rows = [gy * y for y in dy]
         self.sums = [mi.Float(0) for _ in range(4)]  # of dL/dq times 1, column, row, limit - depth
 
     def alpha(self, k: int, alpha: Float) -> CutAlpha:

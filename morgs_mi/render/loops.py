@@ -127,16 +127,20 @@ class _Block:
     """The lanes' blocks: their pixels, their section of the lists, and the shape in which they are unrolled."""
 
     def __init__(self, layout: Layout, blocks: Blocks) -> None:
-        config, order = layout.config, blocks.order
+        config = layout.config
+        order = blocks.order
         self.width, self.height = block_shape(config)
         self.area = self.width * self.height
-        self.log_min, self.alpha_max = log2(config.alpha_min), config.alpha_max
+        self.log_min = log2(config.alpha_min)
+        self.alpha_max = config.alpha_max
         self.stop = config.stop_transmittance
-        self.place, self.rows = dr.gather(mi.UInt32, blocks.place, order), dr.gather(mi.UInt32, blocks.rows, order)
+        self.place = dr.gather(mi.UInt32, blocks.place, order)
+        self.rows = dr.gather(mi.UInt32, blocks.rows, order)
         self.pitch = dr.gather(mi.UInt32, blocks.pitch, mi.UInt32(0))
         # Centre of the first pixel.
         self.x, self.y = (mi.Float(dr.gather(mi.UInt32, v, order)) + 0.5 for v in (blocks.x, blocks.y))
-        begin, first = dr.gather(mi.UInt32, blocks.begin, order), dr.gather(mi.UInt32, blocks.first, order)
+        begin = dr.gather(mi.UInt32, blocks.begin, order)
+        first = dr.gather(mi.UInt32, blocks.first, order)
         # One depth limit per pixel, row by row; none without depth limits.
         self.limits = [] if blocks.limits is None else [v for (v,) in _load_image(self, 1, blocks.limits)]
         self.end = on_aligned_stack(dr.gather(mi.UInt32, blocks.end, order))
@@ -158,15 +162,18 @@ class _Block:
 
     def offsets(self, x: Float, y: Float, geometry: list[Float]) -> tuple[list[Float], list[Float]]:
         """Return the offsets dx [width] and dy [height] of the block's columns and rows from the mean."""
-        dx, dy = x - geometry[0], y - geometry[1]
+        dx = x - geometry[0]
+        dy = y - geometry[1]
         return [dx + i for i in range(self.width)], [dy + j for j in range(self.height)]
 
     def powers(self, dx: list[Float], dy: list[Float], geometry: list[Float]) -> list[tuple[Float, Float]]:
         """Return (p, u) of every pixel, row by row."""
         _, _, a, b, c, log2_opacity = geometry[:_SHAPE]
-        ax, rows = [a * x for x in dx], []
+        ax = [a * x for x in dx]
+        rows = []
         for y in dy:
-            v, by = c * y, b * y
+            v = c * y
+            by = b * y
             top = dr.fma(-v, v, log2_opacity)
             for x in ax:
                 u = x + by
@@ -198,7 +205,8 @@ def _store(
     block: _Block, layout: Layout, sums: list[list[Float]], alpha: list[Float], images: list[Float]
 ) -> list[Float]:
     """Write every pixel's columns, and alpha if it is an output, to the channels' images."""
-    pixels, first = [[*row, a] for row, a in zip(sums, alpha, strict=True)], 0
+    pixels = [[*row, a] for row, a in zip(sums, alpha, strict=True)]
+    first = 0
     for image, size in zip(images, layout.sizes, strict=True):
         values = [value for pixel in pixels for value in pixel[first : first + size]]
         for k, (place, inside) in enumerate(block.packets(size)):
@@ -228,15 +236,19 @@ def _load_image(block: _Block, size: int, image: Float) -> list[list[Float]]:
 
 def primal(layout: Layout, blocks: Blocks, records: Float, images: list[Float]) -> list[Float]:
     """Blend the records' columns into the channels' images, which are overwritten."""
-    block, G, C = _Block(layout, blocks), layout.geometry, layout.columns
+    block = _Block(layout, blocks)
+    G = layout.geometry
+    C = layout.columns
 
     def body(walk, end, x, y, limits, T, sums, records, words, entries):
         rank, walk = _advance(walk, end, words, entries)
         record = fetch_record(records, rank, G + C)
-        geometry, values = record[:G], record[G:]
+        geometry = record[:G]
+        values = record[G:]
         dx, dy = block.offsets(x, y, geometry)
         cut = Cut(geometry[_SHAPE:], dx, dy, limits) if layout.cut else None
-        T_next, sums_next = [], []
+        T_next = []
+        sums_next = []
         for k, (p, _) in enumerate(block.powers(dx, dy, geometry)):
             alpha, _ = block.alpha(p)
             w = (cut.alpha(k, alpha).alpha if cut else alpha) * T[k]
@@ -244,7 +256,8 @@ def primal(layout: Layout, blocks: Blocks, records: Float, images: list[Float]) 
             sums_next.append([dr.fma(w, c, total) for c, total in zip(values, sums[k], strict=True)])
         return walk, end, x, y, limits, T_next, sums_next, records, words, entries
 
-    T, sums = _floats(block.area, 1.0), [_floats(C) for _ in range(block.area)]
+    T = _floats(block.area, 1.0)
+    sums = [_floats(C) for _ in range(block.area)]
     walk = (block.walk, block.end, block.x, block.y, block.limits)
     state = (*walk, T, sums, records, blocks.words, blocks.entries)
     *_, T, sums, _, _, _ = dr.while_loop(
@@ -327,8 +340,10 @@ def _adjoint(
     target: Float,
     add: Callable[[Float, list[Float], UInt32, UInt32], None],
 ) -> Float:
-    block, geometric = _Block(layout, blocks), layout.reaches_weights
-    G, C = layout.geometry, layout.columns
+    block = _Block(layout, blocks)
+    geometric = layout.reaches_weights
+    G = layout.geometry
+    C = layout.columns
     gradients = _load(block, layout, image_grads)
     suffix = [
         _inner(g, v, layout, v[C] if layout.alpha else None)
@@ -338,10 +353,13 @@ def _adjoint(
     def body(walk, pair, end, x, y, limits, T, S, g, records, words, entries, target):
         rank, walk = _advance(walk, end, words, entries)
         record = fetch_record(records, rank, G + C)
-        geometry, values = record[:G], record[G:]
+        geometry = record[:G]
+        values = record[G:]
         dx, dy = block.offsets(x, y, geometry)
         cut = Cut(geometry[_SHAPE:], dx, dy, limits) if layout.cut else None
-        T_next, S_next, value_grads = [], [], _floats(C)
+        T_next = []
+        S_next = []
+        value_grads = _floats(C)
         moments = _Moments(block)
         for k, (p, u) in enumerate(block.powers(dx, dy, geometry)):
             alpha, full = block.alpha(p)
@@ -368,7 +386,8 @@ def _adjoint(
         add(target, [*geometry_grads, *value_grads], rank, pair)
         return walk, pair + 1, end, x, y, limits, T_next, S_next, g, records, words, entries, target
 
-    T, suffix = _floats(block.area, 1.0), suffix if geometric else []
+    T = _floats(block.area, 1.0)
+    suffix = suffix if geometric else []
     walk = (block.walk, pair, block.end, block.x, block.y, block.limits)
     state = (*walk, T, suffix, gradients, records, blocks.words, blocks.entries, target)
     *_, target = dr.while_loop(
@@ -394,7 +413,8 @@ class _Moments:
     def __init__(self, block: _Block) -> None:
         self.width = block.width
         self.d, self.du, self.dui, self.duj, self.dj, self.djj = _floats(6)
-        self.row_d, self.row_du = mi.Float(0), mi.Float(0)
+        self.row_d = mi.Float(0)
+        self.row_du = mi.Float(0)
 
     def add(self, k: int, d: Float, u: Float) -> None:
         """Add pixel k (row by row) with its d and u."""
@@ -403,7 +423,8 @@ class _Moments:
         self.row_d, self.row_du = (self.row_d + d, self.row_du + du) if i else (d, du)
         self.dui = dr.fma(du, float(i), self.dui)
         if i == self.width - 1:
-            self.d, self.du = self.d + self.row_d, self.du + self.row_du
+            self.d = self.d + self.row_d
+            self.du = self.du + self.row_du
             self.dj, self.djj = (
                 dr.fma(self.row_d, float(j), self.dj),
                 dr.fma(self.row_d, float(j * j), self.djj),
@@ -413,7 +434,8 @@ class _Moments:
     def gradients(self, x0: Float, y0: Float, geometry: list[Float]) -> list[Float]:
         """Return the gradients of (mean_x, mean_y, a, b, c, log2_opacity); (x0, y0) is the first pixel's offset."""
         _, _, a, b, c, _ = geometry[:_SHAPE]
-        du_dx, du_dy = dr.fma(self.du, x0, self.dui), dr.fma(self.du, y0, self.duj)
+        du_dx = dr.fma(self.du, x0, self.dui)
+        du_dy = dr.fma(self.du, y0, self.duj)
         d_dy = dr.fma(self.d, y0, self.dj)
         d_dy2 = dr.fma(y0, self.dj + d_dy, self.djj)
         grads = (
@@ -434,27 +456,37 @@ class _Moments:
 
 def tangent(layout: Layout, blocks: Blocks, records: Float, tangents: Float, images: list[Float]) -> list[Float]:
     """Write the directional derivative along the records' tangents to `images`, which are overwritten."""
-    block, G, C = _Block(layout, blocks), layout.geometry, layout.columns
+    block = _Block(layout, blocks)
+    G = layout.geometry
+    C = layout.columns
 
     def body(walk, end, x, y, limits, T, dT, dsums, records, tangents, words, entries):
         rank, walk = _advance(walk, end, words, entries)
         record, tangent = (fetch_record(r, rank, G + C) for r in (records, tangents))
-        geometry, values = record[:G], record[G:]
-        (a, b, c), (tx, ty, ta, tb, tc, t_log2) = geometry[2:5], tangent[:_SHAPE]
+        geometry = record[:G]
+        values = record[G:]
+        a, b, c = geometry[2:5]
+        tx, ty, ta, tb, tc, t_log2 = tangent[:_SHAPE]
         dx, dy = block.offsets(x, y, geometry)
         cut = Cut(geometry[_SHAPE:], dx, dy, limits) if layout.cut else None
-        T_next, dT_next, dsums_next = [], [], []
+        T_next = []
+        dT_next = []
+        dsums_next = []
         for k, (p, u) in enumerate(block.powers(dx, dy, geometry)):
-            px, py = dx[k % block.width], dy[k // block.width]
+            px = dx[k % block.width]
+            py = dy[k // block.width]
             alpha, full = block.alpha(p)
-            tu, tv = ta * px + tb * py - a * tx - b * ty, tc * py - c * ty
+            tu = ta * px + tb * py - a * tx - b * ty
+            tv = tc * py - c * ty
             tp = t_log2 - 2 * (u * tu + c * py * tv)
             t_alpha = dr.select(full <= block.alpha_max, _LN2 * alpha * tp, 0)
             if cut:
                 part = cut.alpha(k, alpha)
                 along = cut.tangent(k, part, [tx, ty], tangent[_SHAPE:G])
-                alpha, t_alpha = part.alpha, dr.fma(part.by_alpha, t_alpha, along)
-            w, tw = alpha * T[k], dr.fma(t_alpha, T[k], alpha * dT[k])
+                alpha = part.alpha
+                t_alpha = dr.fma(part.by_alpha, t_alpha, along)
+            w = alpha * T[k]
+            tw = dr.fma(t_alpha, T[k], alpha * dT[k])
             T_next.append(T[k] - w)
             dT_next.append(dT[k] - tw)
             dsums_next.append(
@@ -466,7 +498,8 @@ def tangent(layout: Layout, blocks: Blocks, records: Float, tangents: Float, ima
         return walk, end, x, y, limits, T_next, dT_next, dsums_next, records, tangents, words, entries
 
     dsums = [_floats(C) for _ in range(block.area)]
-    T, dT = _floats(block.area, 1.0), _floats(block.area)
+    T = _floats(block.area, 1.0)
+    dT = _floats(block.area)
     walk = (block.walk, block.end, block.x, block.y, block.limits)
     state = (*walk, T, dT, dsums, records, tangents, blocks.words, blocks.entries)
     _, _, _, _, _, _, dT, dsums, *_ = dr.while_loop(

@@ -83,7 +83,8 @@ class Splats:
             return splats.shape, blended, *culled, splats.profile, () if splats.view is None else splats.view
 
         shape, blended, *culled, profile, view = concatenated(columns_of(self), columns_of(other))
-        channels, (depths, extent, valid, finite) = dict(zip(self.channels, blended, strict=True)), culled
+        channels = dict(zip(self.channels, blended, strict=True))
+        depths, extent, valid, finite = culled
         view = None if self.view is None else view
         return Splats(shape, channels, depths, extent, valid, finite, profile, view)
 
@@ -96,7 +97,7 @@ def _zeros(columns: tuple[Float, ...], count: int) -> tuple[Float, ...]:
 class AttachedCamera(Camera):
     """Camera with intrinsics that get gradients."""
 
-    intrinsics: tuple[Float, ...] = ()  #: Fx, fy, cx and cy in pixels, with the values of `K`.
+    intrinsics: tuple[Float, ...] = ()  #: fx, fy, cx and cy in pixels, with the values of `K`.
 
 
 @dataclass(frozen=True)
@@ -145,8 +146,10 @@ def project(
     """
     if rows is None:
         rows = dr.arange(mi.UInt32, int(dr.prod(gaussians.means.shape[:1])))
-    means, quats = gaussians.rows("means", rows), mi.Vector4f(*gaussians.rows("quats", rows))
-    scales, (opacities,) = mi.Vector3f(*gaussians.rows("scales", rows)), gaussians.rows("opacities", rows)
+    means = gaussians.rows("means", rows)
+    quats = mi.Vector4f(*gaussians.rows("quats", rows))
+    scales = mi.Vector3f(*gaussians.rows("scales", rows))
+    (opacities,) = gaussians.rows("opacities", rows)
     R, pose, eye = _pose(camera)
     fx, fy, cx, cy, near, *limits, delay, readout, height = _intrinsics(camera)
     cameras = camera.cameras if isinstance(camera, Views) else (camera,)
@@ -160,20 +163,30 @@ def project(
     x, y, z = _transformed(world, pose)
     probe = dr.detach(x + y + z)
     front = dr.detach((z >= near) & (dr.maximum(dr.maximum(dr.abs(x), dr.abs(y)), z) < FARTHEST))
-    x, y, z = dr.select(front, x, 0), dr.select(front, y, 0), dr.select(front, z, 1)
+    x = dr.select(front, x, 0)
+    y = dr.select(front, y, 0)
+    z = dr.select(front, z, 1)
     rz = dr.rcp(z)
-    mean_x, mean_y = dr.fma(fx, x * rz, cx), dr.fma(fy, y * rz, cy)
+    mean_x = dr.fma(fx, x * rz, cx)
+    mean_y = dr.fma(fy, y * rz, cy)
 
     u0, u1, w, r_focal, r_scale = _screen_axes(x * rz, y * rz, fx * rz, fy * rz, R, quats, scales, limits)
     r_size = r_focal * r_scale
     eps = dr.maximum(config.eps2d * dr.square(r_size), _THINNEST**2)
-    xx, yy, xy = dr.dot(u0, u0), dr.dot(u1, u1), dr.dot(u0, u1)
+    xx = dr.dot(u0, u0)
+    yy = dr.dot(u1, u1)
+    xy = dr.dot(u0, u1)
     # Lagrange's identity: det(U U' + eps I) without the cancellation that xx yy - xy^2 has for needles.
     det_exact = dr.squared_norm(dr.cross(u0, u1))
     det = det_exact + eps * (xx + yy) + eps * eps
-    xx, yy = xx + eps, yy + eps
-    r_det, r_yy, s = dr.rsqrt(det), dr.rsqrt(yy), sqrt(_HALF_LOG2E) * r_size
-    a, b, c = s * yy * r_yy * r_det, -s * xy * r_yy * r_det, s * r_yy
+    xx = xx + eps
+    yy = yy + eps
+    r_det = dr.rsqrt(det)
+    r_yy = dr.rsqrt(yy)
+    s = sqrt(_HALF_LOG2E) * r_size
+    a = s * yy * r_yy * r_det
+    b = -s * xy * r_yy * r_det
+    c = s * r_yy
     log2_opacity = dr.log2(dr.maximum(opacities, _FAINTEST))
     if config.antialiased:
         log2_opacity += 0.5 * dr.log2(dr.maximum(det_exact / det, _FAINTEST**2))
@@ -201,7 +214,8 @@ def project(
 
     # alpha >= alpha_min  <=>  u^2 + v^2 <= reach, an ellipse with these half axes along x and y
     reach = dr.maximum(dr.detach(log2_opacity) - log2(config.alpha_min), 0)
-    xx, yy = dr.detach(xx), dr.detach(yy)
+    xx = dr.detach(xx)
+    yy = dr.detach(yy)
     # Not finite where any of these values is not.
     probe += sum(dr.detach(v) for v in (*shape, *line, *(v for values in blended.values() for v in values)))
     largest = _largest(largest, [v for name, values in blended.items() if name != "depth" for v in values])
@@ -260,7 +274,8 @@ def _intrinsics(camera: Camera | Views) -> list[Float]:
     """
     if isinstance(camera, Views):
         values = [_numbers_of(c) for c in camera.cameras]
-        memory, first = from_numpy(mi.Float, values), camera.view * len(values[0])
+        memory = from_numpy(mi.Float, values)
+        first = camera.view * len(values[0])
         return [dr.gather(mi.Float, memory, first + i) for i in range(len(values[0]))]
     values = list(_numbers(mi.Float, tuple(_numbers_of(camera))))
     attached = camera.intrinsics if isinstance(camera, AttachedCamera) else ()
@@ -278,9 +293,11 @@ def _numbers(kind: type[Jit], values: tuple[float, ...]) -> tuple[Jit, ...]:
 
 def _numbers_of(camera: Camera) -> list[float]:
     """Return the numbers that `_intrinsics` describes."""
-    K, bounds = camera.K, []
+    K = camera.K
+    bounds = []
     for axis, size in enumerate((camera.width, camera.height)):
-        f, c = K[axis, axis], K[axis, 2]
+        f = K[axis, axis]
+        c = K[axis, 2]
         margin = 0.15 * size / f  # 30 % of the half view on every side
         bounds += [-c / f - margin, (size - c) / f + margin]
     return [K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.near, *bounds, camera.delay, camera.readout, camera.height]
@@ -310,10 +327,13 @@ def _screen_axes(
     """
     # Outside the view the linearisation diverges: its point is clamped to 1.3 times the half view, as in 3DGS.
     lo_x, hi_x, lo_y, hi_y = limits
-    tan_x, tan_y = dr.clip(tan_x, lo_x, hi_x), dr.clip(tan_y, lo_y, hi_y)
+    tan_x = dr.clip(tan_x, lo_x, hi_x)
+    tan_y = dr.clip(tan_y, lo_y, hi_y)
     r_focal = dr.rcp(dr.detach(dr.maximum(jx, jy)))
     r_scale = dr.rcp(dr.maximum(dr.max(dr.detach(scales)), r_focal))
-    jx, jy, scales = jx * r_focal, jy * r_focal, scales * r_scale
+    jx = jx * r_focal
+    jy = jy * r_focal
+    scales = scales * r_scale
     J0 = mi.Vector3f(*(jx * (R[0][k] - tan_x * R[2][k]) for k in range(3)))
     J1 = mi.Vector3f(*(jy * (R[1][k] - tan_y * R[2][k]) for k in range(3)))
     Q = _rotation(quats)
@@ -335,8 +355,10 @@ def _depth_profile(
 
     The response along the ray is largest at that depth, in the affine approximation (RaDe-GS, Zhang et al. 2024).
     """
-    (u0, u1, w), (xx, xy, yy) = rows, covariance
-    zx, zy = dr.dot(u0, w), dr.dot(u1, w)
+    u0, u1, w = rows
+    xx, xy, yy = covariance
+    zx = dr.dot(u0, w)
+    zy = dr.dot(u1, w)
     slope = r_focal / det
     # The determinant with the third row and column, as a sum of squares: differences would cancel for thin Gaussians.
     across = dr.cross(u0, u1)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
+from math import prod
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +16,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_type, numbers
 from morgs_mi.core.gaussians import ActivatedGaussians, repeat_each
 from morgs_mi.core.memory import check_memory, float_tensor, from_numpy, refuse_freezing
-from morgs_mi.core.types import Bool, Float, Tensor
+from morgs_mi.core.types import Bool, Float, Jit, Tensor
 from morgs_mi.io.png import png_bytes
 from morgs_mi.render.backend import block_shape
 from morgs_mi.render.blocks import build_lists, touches
@@ -37,7 +39,8 @@ _PIXEL_BYTES = 60
 class Image:
     """Tensors of one view, one per requested channel; H rows, W columns.
 
-    ``image["color"]`` is `image.color`, and so on for every channel.
+    ``image["color"]`` is `image.color`, and so on for every channel. For a sequence of V cameras, all tensors are
+    [V, H, W, C] instead of [H, W, C].
     On a region all tensors are [A, block_height, block_width, C] instead of [H, W, C], and 0 outside the view.
 
     Attributes:
@@ -89,9 +92,9 @@ class Image:
 @with_render_lock
 def rasterize(
     gaussians: ActivatedGaussians,
-    camera: Camera,
+    camera: Camera | Sequence[Camera],
     channels: Sequence[str] = ("color", "alpha"),
-    background: Sequence[float] | None = None,
+    background: Sequence[float] | Jit | None = None,
     detach_weights: Sequence[str] = (),
     region: Region | None = None,
     features: Tensor | np.ndarray | None = None,
@@ -106,11 +109,11 @@ def rasterize(
 
     Args:
         gaussians: N Gaussians, usually a `Gaussians`, or any object with its activated attributes.
-        camera: the view.
+        camera: the view; or V >= 1 views of the same size, which are drawn together.
         channels: out of ``color``, ``alpha``, ``depth``, ``motion``, ``guided_motion`` (motion without the learned
             offset), and the channels of the table of attributes (``confidence``). Colour and the channels of attributes
             are sums weighted by T alpha; depth and motion are divided by the sum of those weights.
-        background: display-referred colour [3] behind all Gaussians; None: black.
+        background: display-referred colour [3] behind all Gaussians; None: black. A Dr.Jit array gets gradients.
         detach_weights: channels with a gradient that reaches only the blended values, not opacity and geometry.
         region: the blocks of pixels to draw; None: the whole view. Gaussians that touch none of its blocks are only
             projected.
@@ -130,7 +133,8 @@ def rasterize(
         the full computation's.
 
     Raises:
-        ValueError: an image that does not fit in memory, an unknown channel, a channel with a missing attribute, NaN or
+        ValueError: an image that does not fit in memory, cameras of different sizes, or several with a region, static
+            splats or a depth limit, an unknown channel, a channel with a missing attribute, NaN or
             infinite attributes or poses, values above 1e18 to blend, a region of another view or block shape,
             `static_splats` together with a depth limit, a depth limit with gradients enabled, or a call inside a
             function under `dr.freeze`.
@@ -144,33 +148,41 @@ def rasterize(
     """
     refuse_freezing("rasterize()")
     config = RenderConfig() if config is None else config
-    _check_types(gaussians, camera, config, {"channels": channels, "detach_weights": detach_weights})
+    cameras = tuple(camera) if isinstance(camera, Sequence) else (camera,)
+    _check_types(gaussians, cameras, config, {"channels": channels, "detach_weights": detach_weights})
     for name, value, kind in (("region", region, Region), ("static_splats", static_splats, Splats)):
         if value is not None:
             check_type("rasterize()", name, value, kind)
-    channels, sizes = tuple(dict.fromkeys(channels)), {**channel_sizes(), "alpha": 1}
-    _check(gaussians, camera, channels, background, detach_weights)
+    channels = tuple(dict.fromkeys(channels))
+    sizes = {**channel_sizes(), "alpha": 1}
+    _check(gaussians, cameras, channels, background, detach_weights)
+    if isinstance(camera, Sequence):
+        _check_alone({"region": region, "static_splats": static_splats, "depth_limit": depth_limit})
+    view = cameras[0]
     if features is not None:
         features, sizes["features"] = _checked_features(features, gaussians)
         channels = (*channels, "features")
-    limits = None if depth_limit is None else _checked_limits(depth_limit, camera, static_splats)
-    region = region or full_view(camera.width, camera.height, config)
-    _check_region(region, camera, config)
+    limits = None if depth_limit is None else _checked_limits(depth_limit, view, static_splats)
+    if region is None:
+        region = full_view(view.width, view.height, config, len(cameras))
+    else:
+        _check_region(region, view, config)
+    stack = (len(cameras), view.height, view.width) if isinstance(camera, Sequence) else region.shape(0)[:-1]
     blended = tuple(c for c in channels if c != "alpha")
     if dr.prod(gaussians.means.shape[:1]) == 0:
-        return _empty(channels, sizes, background, region)
+        return _empty(channels, sizes, background, region, stack)
     cut = limits is not None
     projected = (*blended, "profile") if cut else blended
     if static_splats is not None:
-        splats = project(gaussians, camera, projected, config, features=features).concatenated_with(static_splats)
+        splats = project(gaussians, view, projected, config, features=features).concatenated_with(static_splats)
     elif region.whole:
-        splats = project(gaussians, camera, projected, config, features=features)
+        splats = _project_views(gaussians, cameras, projected, features, config)
     else:
-        splats = _project_region(gaussians, camera, projected, region, features, config)
+        splats = _project_region(gaussians, view, projected, region, features, config)
     if splats is None:
-        return _empty(channels, sizes, background, region)
+        return _empty(channels, sizes, background, region, stack)
     dr.schedule(splats.geometry, splats.channels, splats.depths, splats.extent, splats.valid)
-    _check_finite(splats.finite, gaussians, camera, features)
+    _check_finite(splats.finite, gaussians, cameras, features)
     values = [splats.channels[name] for name in blended]
     with dr.suspend_grad():
         lists = build_lists(splats, [column for columns in values for column in columns], region, config, limits)
@@ -183,7 +195,7 @@ def rasterize(
             weight = repeat_each(dr.detach(coverage) if name in detach_weights else coverage, sizes[name])
             finish = _normalised if name in NORMALISED else _over(background)
             images[name] = finish(images[name], weight)
-    return Image._of({name: _tensor(images[name], region, sizes[name]) for name in channels})
+    return Image._of({name: _tensor(images[name], region, (*stack, sizes[name])) for name in channels})
 
 
 def _normalised(values: Float, weight: Float) -> Float:
@@ -191,12 +203,41 @@ def _normalised(values: Float, weight: Float) -> Float:
     return dr.select(weight > 0, values / dr.maximum(weight, 1e-8), 0)
 
 
-def _over(background: Sequence[float] | None) -> Callable[[Float, Float], Float]:
+def _over(background: Sequence[float] | Jit) -> Callable[[Float, Float], Float]:
     """Return the function that composites a colour over the background."""
-    behind = from_numpy(mi.Float, np.asarray(background))
-    return lambda values, weight: dr.fma(
-        1 - weight, dr.gather(mi.Float, behind, dr.arange(mi.UInt32, dr.width(weight)) % 3), values
-    )
+    given: Any = background
+    if dr.is_array_v(given):
+        behind = given.array if dr.is_tensor_v(given) else dr.ravel(given)
+    else:
+        behind = from_numpy(mi.Float, np.asarray(given))
+    # Numbers of their own: the gradient of one array would be added by all pixels to three places.
+    red, green, blue = (dr.gather(mi.Float, behind, mi.UInt32(k)) for k in range(3))
+
+    def composited(values: Float, weight: Float) -> Float:
+        component = dr.arange(mi.UInt32, dr.width(weight)) % 3
+        return dr.fma(1 - weight, dr.select(component == 0, red, dr.select(component == 1, green, blue)), values)
+
+    return composited
+
+
+def _project_views(
+    gaussians: ActivatedGaussians,
+    cameras: Sequence[Camera],
+    channels: tuple[str, ...],
+    features: Tensor | None,
+    config: RenderConfig,
+) -> Splats:
+    """Project the Gaussians into every view; one after the other, so that the views share a kernel."""
+    parts = [project(gaussians, camera, channels, config, features=features) for camera in cameras]
+    if len(parts) == 1:
+        return parts[0]
+    for v, part in enumerate(parts):
+        parts[v] = replace(part, view=dr.full(mi.UInt32, v, len(part)))
+        dr.eval(part.geometry, part.channels, part.depths, part.extent, part.valid, part.finite, parts[v].view)
+    while len(parts) > 1:
+        pairs = zip(parts[::2], parts[1::2], strict=False)
+        parts = [a.concatenated_with(b) for a, b in pairs] + parts[len(parts) & ~1 :]
+    return parts[0]
 
 
 def _project_region(
@@ -212,7 +253,7 @@ def _project_region(
         bare = project(dr.detach(gaussians), camera, (), config)
         visible = touches(bare, region)
         dr.schedule(visible)
-        _check_finite(bare.finite, gaussians, camera, features)
+        _check_finite(bare.finite, gaussians, (camera,), features)
         rows = dr.compress(visible)
     return project(gaussians, camera, channels, config, rows, features) if dr.width(rows) else None
 
@@ -220,7 +261,7 @@ def _project_region(
 def _layout(
     channels: tuple[str, ...],
     sizes: Mapping[str, int],
-    background: Sequence[float] | None,
+    background: Sequence[float] | Jit | None,
     detach_weights: Sequence[str],
     config: RenderConfig,
     cut: bool,
@@ -236,21 +277,25 @@ def _layout(
     return Layout(blended, bool(read_alpha), any(name not in detach_weights for name in read_alpha), config, cut)
 
 
-def _tensor(values: Float, region: Region, size: int) -> Tensor:
+def _tensor(values: Float, region: Region, shape: tuple[int, ...]) -> Tensor:
     """Return a channel's image; pixels of a region that lie outside the view are 0."""
     if region.weights is not None:
-        values = values * repeat_each(region.weights, size)
-    return mi.TensorXf(values, region.shape(size))
+        values = values * repeat_each(region.weights, shape[-1])
+    return mi.TensorXf(values, shape)
 
 
 def _empty(
-    channels: tuple[str, ...], sizes: Mapping[str, int], background: Sequence[float] | None, region: Region
+    channels: tuple[str, ...],
+    sizes: Mapping[str, int],
+    background: Sequence[float] | Jit | None,
+    region: Region,
+    shape: tuple[int, ...],
 ) -> Image:
-    """Return the image of no Gaussians."""
-    images = {n: dr.zeros(mi.TensorXf, region.shape(sizes[n])) for n in channels}
+    """Return the image of no Gaussians; `shape` is that of a tensor without its channels."""
+    images = {name: dr.zeros(mi.TensorXf, (*shape, sizes[name])) for name in channels}
     if background is not None and "color" in images:
-        behind = np.broadcast_to(background, region.shape(3))
-        images["color"] = _tensor(from_numpy(mi.Float, behind), region, 3)
+        nothing = dr.zeros(mi.Float, prod((*shape, 3)))
+        images["color"] = _tensor(_over(background)(nothing, nothing), region, (*shape, 3))
     return Image._of(images)
 
 
@@ -265,15 +310,34 @@ def _check_region(region: Region, camera: Camera, config: RenderConfig) -> None:
         )
 
 
+def _check_alone(given: Mapping[str, object]) -> None:
+    """Raise an error if what belongs to one view is given with a sequence of cameras."""
+    for name, value in given.items():
+        if value is not None:
+            raise ValueError(
+                f"rasterize(): `{name}` must be None with a sequence of cameras, got a {type(value).__name__}; render "
+                "one camera at a time."
+            )
+
+
 def _check_types(
     gaussians: ActivatedGaussians,
-    camera: Camera,
+    cameras: Sequence[Camera],
     config: RenderConfig,
     names: Mapping[str, Sequence[str]],
 ) -> None:
     if not hasattr(gaussians, "means"):
         raise ValueError(f"rasterize(): `gaussians` must be Gaussians, got a {type(gaussians).__name__}; pass some.")
-    check_type("rasterize()", "camera", camera, Camera)
+    if not cameras:
+        raise ValueError("rasterize(): `camera` must be one or more cameras, got an empty sequence; pass one.")
+    for camera in cameras:
+        check_type("rasterize()", "camera", camera, Camera)
+    sizes = list(dict.fromkeys((camera.width, camera.height) for camera in cameras))
+    if len(sizes) > 1:
+        described = " and ".join(f"{width}x{height}" for width, height in sizes[:2])
+        raise ValueError(
+            f"rasterize(): `camera` must be cameras of the same size, got {described}; render one camera at a time."
+        )
     check_type("rasterize()", "config", config, RenderConfig)
     for name, given in names.items():
         if isinstance(given, str) or not isinstance(given, Sequence):
@@ -282,9 +346,9 @@ def _check_types(
 
 def _check(
     gaussians: ActivatedGaussians,
-    camera: Camera,
+    cameras: Sequence[Camera],
     channels: tuple[str, ...],
-    background: Sequence[float] | None,
+    background: Sequence[float] | Jit | None,
     detach_weights: Sequence[str],
 ) -> None:
     if mi.variant() is None or not dr.is_jit_v(mi.Float) or not dr.is_diff_v(mi.Float):
@@ -307,28 +371,33 @@ def _check(
                 f"rasterize(): channel {name!r} requires Gaussians with `{attribute.name}`, got none; set it or remove "
                 "the channel."
             )
-    if background is not None and not (
-        np.shape(background) == (3,) and (np.abs(numbers("rasterize()", "background", background)) <= FARTHEST).all()
+    behind = np.asarray(dr.detach(background)).ravel() if dr.is_array_v(background) else background
+    if behind is not None and not (
+        np.shape(behind) == (3,) and (np.abs(numbers("rasterize()", "background", behind)) <= FARTHEST).all()
     ):
         raise ValueError(
             f"rasterize(): `background` must be three finite numbers of at most 1e18, got {background!r}; "
             "pass a colour or None."
         )
-    if camera.width * camera.height > 2**28:
+    V = len(cameras)
+    W = cameras[0].width
+    H = cameras[0].height
+    pixels = V * W * H
+    if pixels > 2**28:
+        size = f"{W}x{H}" if V == 1 else f"{V} times {W}x{H}"
         raise ValueError(
-            f"rasterize(): the image must have at most 2^28 pixels, got {camera.width}x{camera.height}; "
-            "render it in tiles, one camera each."
+            f"rasterize(): the image must have at most 2^28 pixels, got {size}; render it in tiles, one camera each."
         )
-    pixels = camera.width * camera.height
     if pixels >= _LARGE:
-        size = f"an image of {camera.width}x{camera.height} pixels"
+        size = f"an image of {W}x{H} pixels" if V == 1 else f"{V} images of {W}x{H} pixels"
         check_memory("rasterize()", _PIXEL_BYTES * pixels, size, "render a smaller one, or tiles, one camera each")
 
 
 def _checked_features(features: Tensor | np.ndarray, gaussians: ActivatedGaussians) -> tuple[Tensor, int]:
     """Return the features as a tensor [N, F], and F."""
     features = float_tensor("rasterize()", "features", features)
-    shape, N = tuple(features.shape), int(gaussians.means.shape[0])
+    shape = tuple(features.shape)
+    N = int(gaussians.means.shape[0])
     if len(shape) != 2 or shape[0] != N or not 1 <= shape[1] <= _MOST_FEATURES:
         raise ValueError(
             f"rasterize(): `features` must be [N, F] with N={N} and F from 1 to {_MOST_FEATURES}, got {list(shape)}; "
@@ -360,7 +429,9 @@ def _checked_limits(depth_limit: Tensor | np.ndarray, camera: Camera, static_spl
     return dr.clip(limits.array, -FARTHEST, FARTHEST)
 
 
-def _check_finite(finite: Bool, gaussians: ActivatedGaussians, camera: Camera, features: Tensor | None) -> None:
+def _check_finite(
+    finite: Bool, gaussians: ActivatedGaussians, cameras: Sequence[Camera], features: Tensor | None
+) -> None:
     """Raise an error if a projected Gaussian is not finite because its attributes, or the pose, are not.
 
     Values that are blended must also be at most 1e18, beyond which their squares and gradients overflow.
@@ -369,8 +440,9 @@ def _check_finite(finite: Bool, gaussians: ActivatedGaussians, camera: Camera, f
         return
     blended = ["sh_coeffs", "motion", *(attribute.activated_name for attribute in attribute_channels().values())]
     names = ["means", "scales", "quats", "opacities", *blended]
-    values = {"camera.viewmat": camera.viewmat, **{name: getattr(gaussians, name, None) for name in names}}
-    for name, value in {**values, "features": features}.items():
+    poses = [("camera.viewmat", camera.viewmat) for camera in cameras]
+    attributes = [(name, getattr(gaussians, name, None)) for name in names]
+    for name, value in [*poses, *attributes, ("features", features)]:
         if value is None:
             continue
         array = np.asarray(dr.detach(value))

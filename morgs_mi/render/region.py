@@ -24,7 +24,8 @@ from morgs_mi.render.backend import block_shape
 from morgs_mi.render.render_config import RenderConfig
 
 # Blocks of a tile, across and down: one for each bit of a word.
-ACROSS, DOWN = 4, 8
+ACROSS = 4
+DOWN = 8
 # In `Region.slot_of`: no block of the tile is drawn.
 NO_SLOT = 0xFFFFFFFF
 
@@ -63,14 +64,16 @@ class BlockGrid:
 
     def counts(self, mask: np.ndarray) -> np.ndarray:
         """Return the number of pixels of a mask [H, W] in each block, int32 [rows, columns]."""
-        (rows, columns), (width, height) = self.shape, self.block
+        rows, columns = self.shape
+        width, height = self.block
         pixels = self._padded(mask).view(np.uint8)
         shares = cv2.resize(pixels.astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
         return np.rint(shares * (width * height)).astype(np.int32)
 
     def _padded(self, mask: np.ndarray) -> np.ndarray:
         """Return a mask [H, W] with rows and columns of False up to whole tiles."""
-        (rows, columns), (width, height) = self.shape, self.block
+        rows, columns = self.shape
+        width, height = self.block
         padded = np.zeros((rows * height, columns * width), bool)
         padded[: self.height, : self.width] = mask
         return padded
@@ -110,16 +113,17 @@ class Region:
         self._build(grid, grid.covering(mask))
 
     @classmethod
-    def of(cls, grid: BlockGrid, blocks: np.ndarray, whole: bool = False) -> Region:
+    def of(cls, grid: BlockGrid, blocks: np.ndarray, whole: bool = False, views: int = 1) -> Region:
         """Return the region of some blocks of a view, at least one.
 
         Args:
             grid: all blocks of the view.
             blocks: the requested ones, bool [rows, columns].
             whole: whether images are [H, W, C]; all blocks must be requested.
+            views: number of equal views, one below the other; several must be whole.
         """
         region = cls.__new__(cls)
-        region._build(grid, blocks, whole)
+        region._build(grid, blocks, whole, views)
         return region
 
     # Per block: slot of its tile, its bit there, its first pixel (x, y), that pixel's packet in memory, its rows.
@@ -140,33 +144,42 @@ class Region:
     weights: Float | None  # per pixel: 1 in the view, 0 outside; None: all pixels are in the view
     _blocks: tuple[np.ndarray, np.ndarray]  # per block: its row and column in the grid
 
-    def _build(self, grid: BlockGrid, blocks: np.ndarray, whole: bool = False) -> None:
-        self.grid, self.width, self.height, self.block, self.whole = grid, grid.width, grid.height, grid.block, whole
+    def _build(self, grid: BlockGrid, blocks: np.ndarray, whole: bool = False, views: int = 1) -> None:
+        self.grid = grid
+        self.width = grid.width
+        self.block = grid.block
+        self.whole = whole
+        self.height = views * grid.height
         self.across, self.down = grid.tiles
-        self._lay_out(blocks)
+        self._lay_out(np.tile(blocks, (views, 1)))
         inside = None if whole else self.inside()
         self.weights = None if inside is None or inside.all() else from_numpy(mi.Float, inside)
 
     def _lay_out(self, blocks: np.ndarray) -> None:
         """Number the blocks of a grid bool [rows, columns]; a second view begins after `down` rows of tiles."""
-        (bw, bh), H, W, whole = self.block, self.height, self.width, self.whole
+        bw, bh = self.block
+        W = self.width
+        whole = self.whole
         active = blocks.reshape(-1, DOWN, self.across, ACROSS).transpose(0, 2, 1, 3)
         active = active.reshape(-1, ACROSS * DOWN)  # [tiles, blocks of a tile]
         tiles = np.flatnonzero(active.any(1))
         tile, bit = np.nonzero(active[tiles])
-        column, row = (
-            tiles[tile] % self.across * ACROSS + bit % ACROSS,
-            tiles[tile] // self.across * DOWN + bit // ACROSS,
-        )
-        x, y = column * bw, row % (self.down * DOWN) * bh
-        self.drawn, self._blocks = blocks, (row, column)
+        column = tiles[tile] % self.across * ACROSS + bit % ACROSS
+        row = tiles[tile] // self.across * DOWN + bit // ACROSS
+        view, row_in_view = np.divmod(row, self.down * DOWN)
+        x = column * bw
+        y = row_in_view * bh
+        self.drawn = blocks
+        self._blocks = (row, column)
         slot_of = np.full(len(active), NO_SLOT, np.uint32)
         slot_of[tiles] = np.arange(len(tiles))
         pitch = -(-W // bw) * bw if whole else bw
-        place = y * pitch + x if whole else np.arange(len(x)) * (bw * bh)
+        H = self.grid.height if whole else 0
+        place = (view * H + y) * pitch + x if whole else np.arange(len(x)) * (bw * bh)
 
-        self.num_blocks, self.num_tiles = len(x), len(tiles)
-        self.row, self.num_pixels = pitch, pitch * H if whole else len(x) * bw * bh
+        self.num_blocks = len(x)
+        self.num_tiles = len(tiles)
+        self.row, self.num_pixels = pitch, pitch * self.height if whole else len(x) * bw * bh
         # Pixels are read and written in packets of 4 floats: places and pitch count packets.
         arrays = {
             "tile": tile,
@@ -216,9 +229,12 @@ class Region:
                 f"Region.crop(): `image` must be [{self.height}, {self.width}, ...], got {list(image.shape)}; resize "
                 "it to the view."
             )
-        (row, column), (width, height) = self._blocks, self.block
-        rows, columns = image.shape[0] // height, image.shape[1] // width
-        (down, across, *rest), shape = image.strides, (rows, height, columns, width, *image.shape[2:])
+        row, column = self._blocks
+        width, height = self.block
+        rows = image.shape[0] // height
+        columns = image.shape[1] // width
+        (down, across, *rest) = image.strides
+        shape = (rows, height, columns, width, *image.shape[2:])
         # A view of the blocks that lie in the image as a whole: a copy of large images would take most of the time.
         blocks = as_strided(image, shape, (height * down, down, width * across, across, *rest))
         inside = (row < rows) & (column < columns)
@@ -227,15 +243,18 @@ class Region:
         cropped = np.zeros((len(row), height, width, *image.shape[2:]), image.dtype)
         cropped[inside] = blocks[row[inside], :, column[inside]]
         for k in np.flatnonzero(~inside):
-            y, x = row[k] * height, column[k] * width
+            y = row[k] * height
+            x = column[k] * width
             part = image[y : y + height, x : x + width]
             cropped[k, : part.shape[0], : part.shape[1]] = part
         return cropped
 
     def uncropped(self, values: np.ndarray) -> np.ndarray:
         """Return an image in whole blocks from this region's values [A, height, width, ...], 0 in all other blocks."""
-        (row, column), (_, height, width, *rest) = self._blocks, values.shape
-        (rows, columns), dtype = self.drawn.shape, values.dtype
+        row, column = self._blocks
+        (_, height, width, *rest) = values.shape
+        rows, columns = self.drawn.shape
+        dtype = values.dtype
         blocks = np.zeros((rows, height, columns, width, *rest), dtype)
         blocks[row, :, column] = values
         return blocks.reshape(rows * height, columns * width, *rest)
@@ -245,12 +264,14 @@ class Region:
         row, column = self._blocks
         blocks = self._in_blocks(image).copy()
         blocks[row, :, column] = values
-        (rows, height, columns, width), rest = blocks.shape[:4], blocks.shape[4:]
+        rows, height, columns, width = blocks.shape[:4]
+        rest = blocks.shape[4:]
         return blocks.reshape(rows * height, columns * width, *rest)[: self.height, : self.width]
 
     def _in_blocks(self, image: np.ndarray) -> np.ndarray:
         """Return an image [H, W, ...] as [rows, block_height, columns, block_width, ...], padded by zeros."""
-        (rows, columns), (width, height) = self.drawn.shape, self.block
+        rows, columns = self.drawn.shape
+        width, height = self.block
         missing = [(0, rows * height - image.shape[0]), (0, columns * width - image.shape[1])]
         if any(after for _, after in missing):
             image = np.pad(image, missing + [(0, 0)] * (image.ndim - 2))
@@ -263,9 +284,13 @@ def joined(regions: Sequence[Region]) -> Region:
     Its images are the regions' images, one after the other. Blocks keep the pixel coordinates of their view.
     """
     region = Region.__new__(Region)
-    region.block, region.whole, grids = regions[0].block, False, [part.drawn for part in regions]
-    region.across, region.down = max(part.across for part in regions), max(part.down for part in regions)
-    rows, columns = region.down * DOWN, region.across * ACROSS
+    region.block = regions[0].block
+    region.whole = False
+    grids = [part.drawn for part in regions]
+    region.across = max(part.across for part in regions)
+    region.down = max(part.down for part in regions)
+    rows = region.down * DOWN
+    columns = region.across * ACROSS
     region.width, region.height = columns * region.block[0], len(regions) * rows * region.block[1]
     padded = [np.pad(grid, ((0, rows - len(grid)), (0, columns - grid.shape[1]))) for grid in grids]
     region._lay_out(np.concatenate(padded))
@@ -292,24 +317,26 @@ def on_region(values: Float, region: Region) -> Float:
     lane = dr.arange(mi.UInt32, region.num_pixels)
     if region.whole:
         row = quotient(lane, region.row)
-        x, y = lane - row * dr.opaque(mi.UInt32, region.row), row
+        x = lane - row * dr.opaque(mi.UInt32, region.row)
+        y = row
     else:
         block = lane // (region.block[0] * region.block[1])
         within = lane - block * (region.block[0] * region.block[1])
         x = dr.gather(mi.UInt32, region.x, block) + within % region.block[0]
         y = dr.gather(mi.UInt32, region.y, block) + within // region.block[0]
-    width, height = dr.opaque(mi.UInt32, region.width), dr.opaque(mi.UInt32, region.height)
+    width = dr.opaque(mi.UInt32, region.width)
+    height = dr.opaque(mi.UInt32, region.height)
     image = dr.gather(mi.Float, values, y * width + x, active=(x < width) & (y < height))
     dr.eval(image)
     return image
 
 
-def full_view(width: int, height: int, config: RenderConfig) -> Region:
-    """Return the region of all blocks of a view; its images are [H, W, C]."""
-    return _whole_view(width, height, block_shape(config), mi.variant())
+def full_view(width: int, height: int, config: RenderConfig, views: int = 1) -> Region:
+    """Return the region of all blocks of equal views, one below the other; its images are [views * H, W, C]."""
+    return _whole_view(width, height, block_shape(config), views, mi.variant())
 
 
 @lru_cache(maxsize=8)
-def _whole_view(width: int, height: int, block: tuple[int, int], variant: str) -> Region:
+def _whole_view(width: int, height: int, block: tuple[int, int], views: int, variant: str) -> Region:
     grid = BlockGrid(width, height, block)
-    return Region.of(grid, grid.covering(np.ones((height, width), bool)), whole=True)
+    return Region.of(grid, grid.covering(np.ones((height, width), bool)), whole=True, views=views)

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
+from morgs_mi.core.documentation import documented
 from morgs_mi.core.ranges import Above, AtLeast, AtMost, Below, MultipleOf, check_ranges
 
 
+@documented
 @dataclass(frozen=True)
 class RenderConfig:
     """Settings of the rasteriser. The defaults match 3DGS, because its models depend on them."""

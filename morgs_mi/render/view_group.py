@@ -68,7 +68,8 @@ class ViewGroup:
         Args:
             gaussians: N > 0 Gaussians.
         """
-        N, V = int(gaussians.means.shape[0]), len(self.views)
+        N = int(gaussians.means.shape[0])
+        V = len(self.views)
         cameras = [view.camera for view in self.views]
         with dr.suspend_grad():
             lane = dr.arange(mi.UInt32, N * V)
@@ -117,7 +118,8 @@ class Drawing:
         """Colour of the group's pixels, flat [A * block_height * block_width * 3]; 0 outside the views."""
         if self.drawn is None:
             return dr.zeros(mi.Float, 3 * self.group.region.num_pixels)
-        (splats, lists), layout = self.drawn, Layout((Channel(3, True),), False, False, self.group.config)
+        splats, lists = self.drawn
+        layout = Layout((Channel(3, True),), False, False, self.group.config)
         with dr.suspend_grad():
             (image,) = blend(splats.geometry, [splats.channels["color"]], self.group.region, lists, layout)
             if self.group.region.weights is not None:
@@ -132,7 +134,8 @@ class Drawing:
             image: flat image of the group [A * block_height * block_width * C].
             channels: C.
         """
-        sums, lanes = np.zeros((len(self.group.views) * self.count, channels), np.float32), np.asarray(self.lanes)
+        sums = np.zeros((len(self.group.views) * self.count, channels), np.float32)
+        lanes = np.asarray(self.lanes)
         if len(lanes):
             sums[lanes] = np.stack([np.asarray(own) for own in self._sums(image, channels)], axis=1)
         return sums.reshape(-1, self.count, channels)
@@ -181,7 +184,8 @@ def backproject(gaussians: ActivatedGaussians, view: ActiveView, image: np.ndarr
     Raises:
         ValueError: the size of the image does not match the view.
     """
-    group, C = ViewGroup([view]), (np.shape(image) or (0,))[-1]
+    group = ViewGroup([view])
+    C = (np.shape(image) or (0,))[-1]
     size = (view.camera.height, view.camera.width) if view.region is None else group.region.shape(0)[:-1]
     if not C or image.shape != (*size, C):
         raise ValueError(

@@ -31,13 +31,14 @@ from morgs_mi.capture.outputs import check_output
 from morgs_mi.codec.container import Packet, PacketKind, StreamWriter, TruncatedStreamError, header_json
 from morgs_mi.codec.packets import CodedFrame, decode, reemitted_keyframe
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.color_space import TRANSFER
 from morgs_mi.core.files import atomic_path, is_same_file, write_json
 from morgs_mi.core.rig import choose_key_views
 from morgs_mi.io.bounded import read_json
+from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.exposure import Exposure
 from morgs_mi.playback.player import PROVISIONAL
-from morgs_mi.stream_loop import FrameReport
 
 __all__ = [
     "FILES",
@@ -330,11 +331,18 @@ def stream_metadata(capture: Capture, first: PartialFrame, config: StreamConfig)
         "train_views": list(train),
         "num_frames": capture.num_frames,
         "key_views": [train[v] for v in key_views],
-        "config": asdict(config),
+        "config": asdict(config, dict_factory=_given),
         "versions": {"mitsuba": mi.__version__},
         "variant": mi.variant(),
     }
+    if capture.display_exposure is not None:
+        metadata["transfer"] = {"name": TRANSFER, "display_exposure": capture.display_exposure}
     return _without_folders(metadata)
+
+
+def _given(items: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a table of settings without empty lists, such as terms that no module registers."""
+    return {name: value for name, value in items if value != ()}
 
 
 def _without_folders(metadata: Mapping[str, Any]) -> dict[str, Any]:

@@ -77,7 +77,8 @@ def draw_disturbances(
         ValueError: a setting is out of range.
     """
     check_ranges(disturbances, "draw_disturbances()")
-    d, shape = disturbances, (num_cameras, num_frames)
+    d = disturbances
+    shape = (num_cameras, num_frames)
     offsets, gains, drifts, flicker, lenses = (np.random.default_rng([seed, 3, kind]) for kind in range(5))
     offset = d.time_offset * offsets.uniform(-1, 1, num_cameras)
     log_gain = (np.log1p(d.exposure_gain) * gains.uniform(-1, 1, num_cameras))[:, None] + np.zeros(num_frames)

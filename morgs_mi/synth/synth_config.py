@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 from morgs_mi.core.checks import check_number
+from morgs_mi.core.documentation import documented
 from morgs_mi.core.ranges import Above, AtLeast, Below, MultipleOf, check_ranges
 from morgs_mi.synth.disturbances import Disturbances
 
@@ -17,6 +18,7 @@ _FPS = "(0, 1000]"
 _SPP = "[1, 1e6]"
 
 
+@documented
 @dataclass(frozen=True)
 class SynthConfig:
     """Size, length and disturbances of a synthetic capture."""

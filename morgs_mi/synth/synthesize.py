@@ -140,7 +140,8 @@ def _write_clips(
     tracer: PathTracer, rig: _Rig, folder: Path, progress: Callable[[int, int], None] | None
 ) -> list[Path]:
     """Write the images of all cameras; return the clips that `load_capture` reads."""
-    config, count = rig.config, itertools.count(1)
+    config = rig.config
+    count = itertools.count(1)
 
     def render_view(index: int) -> Iterator[np.ndarray]:
         for image in _images(tracer, rig, index):
@@ -150,7 +151,8 @@ def _write_clips(
 
     clips = []
     for index, camera in enumerate(rig.cameras):
-        video, png = folder / f"{camera.name}.mp4", folder / "frames" / camera.name
+        video = folder / f"{camera.name}.mp4"
+        png = folder / "frames" / camera.name
         if config.lossless:
             write_video(png, render_view(index), config.fps)
         images = open_frames(png).frames() if config.lossless else render_view(index)
@@ -161,7 +163,8 @@ def _write_clips(
 
 def _images(tracer: PathTracer, rig: _Rig, index: int) -> Iterator[np.ndarray]:
     """Yield the images of a camera."""
-    config, own = rig.config, rig.disturbed[index]
+    config = rig.config
+    own = rig.disturbed[index]
     assert config.noise is not None
     for frame in range(config.frames):
         # The noise must differ between views and frames; otherwise it would look like a moving texture.
@@ -194,12 +197,14 @@ def _check_views(tracer: PathTracer, cameras: Sequence[Camera]) -> None:
 
 def _write_truth(tracer: PathTracer, rig: _Rig, folder: Path) -> None:
     """Write the ground truth of every camera, the tracks and the disturbances."""
-    fps, frames = rig.config.fps, np.arange(rig.config.frames)
+    fps = rig.config.fps
+    frames = np.arange(rig.config.frames)
     for camera, own in zip(rig.cameras, rig.disturbed, strict=True):
         times = (frames + own.time_offset) / fps
         for frame, time in enumerate(times):
             tracer.set_time(time)
-            surface, before = tracer.surface_points(camera), tracer.poses(times[frame - 1]) if frame else None
+            surface = tracer.surface_points(camera)
+            before = tracer.poses(times[frame - 1]) if frame else None
             truth = compute_ground_truth(camera, surface, tracer.poses(time), before, tracer.poses(time + 1 / fps))
             save_truth(folder, camera.name, frame, truth)
     rng = np.random.default_rng([rig.config.seed, 1])
@@ -218,7 +223,9 @@ def _sample_tracks(
     objects = tracer.scene.objects.values()
     can_move = np.array([item.pose is not None for item in objects])
     share = -(-_NUM_TRACKS // (2 * len(starts) * len(cameras)))
-    points, owners, poses = [], [], [tracer.poses(time) for time in times]
+    points = []
+    owners = []
+    poses = [tracer.poses(time) for time in times]
     for start in starts:
         tracer.set_time(times[start])
         for camera in cameras:
@@ -243,11 +250,16 @@ def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], fol
 
     The points have the colours of the `clips`, one per camera.
     """
-    cameras, disturbed, rng = rig.cameras, rig.disturbed, np.random.default_rng([rig.config.seed, 2])
-    points, colors, bounds = [], [], []
+    cameras = rig.cameras
+    disturbed = rig.disturbed
+    rng = np.random.default_rng([rig.config.seed, 2])
+    points = []
+    colors = []
+    bounds = []
     for index, (camera, own) in enumerate(zip(cameras, disturbed, strict=True)):
         tracer.set_time(own.time_offset / rig.config.fps)
-        visible, lens = tracer.surface_points(camera), undistortion(camera, own.lens)
+        visible = tracer.surface_points(camera)
+        lens = undistortion(camera, own.lens)
         pixels = np.flatnonzero((visible.ids >= 0) & (lens is None or lens.mask))
         depths = camera.project(visible.pick(pixels).positions)[1]
         # LLFF's percentiles, which readers of the file expect.

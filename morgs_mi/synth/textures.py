@@ -73,7 +73,8 @@ def room(seed: int, half_width: float = 2.4, height: float = 3.2, depth: float =
 
     T = mi.ScalarTransform4f
     front = 2.2
-    length, middle = 0.5 * (front + depth), 0.5 * (front - depth)
+    length = 0.5 * (front + depth)
+    middle = 0.5 * (front - depth)
     walls = {
         "floor": (
             T().translate([0, 0, middle]).rotate([1, 0, 0], -90).scale([half_width, length, 1]),

@@ -170,3 +170,8 @@ def test_look_at__has_a_near_plane_before_its_target(distance: float, near: floa
     camera = Camera.look_at((0, 0, -distance), (0, 0, 0), (0, -1, 0), 40, 32, 24)
     assert camera.near == pytest.approx(near)
     assert Camera.look_at((0, 0, -distance), (0, 0, 0), (0, -1, 0), 40, 32, 24, near=0.5).near == 0.5
+
+
+def test_repr__has_name_size_and_place():
+    camera = Camera.look_at((0, -4, 1.25), (0, 0, 0), (0, 0, 1), 40, 64, 48, "cam00")
+    assert repr(camera) == "Camera('cam00', 64x48, 40 degrees across, at (0, -4, 1.25))"

@@ -3,17 +3,77 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import re
+from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from morgs_mi.core import documentation
-from morgs_mi.core.documentation import page, with_pages
+from morgs_mi.core.documentation import documented, field_docs, page, with_pages
+from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig, config_toml
+from morgs_mi.method.motion_config import MotionConfig
 
 ROOT = Path(__file__).parents[2]
 SOURCES = sorted((ROOT / "morgs_mi").rglob("*.py"))
+
+
+@dataclass
+class Stem:
+    """Base."""
+
+    number: float = 1e-5
+    """Length
+    in px."""
+
+
+@documented
+@dataclass
+class Plant(Stem):
+    """A plant.
+
+    Raises:
+        ValueError: never.
+    """
+
+    name: str = "a"
+    """Name, see docs/flow.md."""
+    leaves: list = field(default_factory=list)
+    roots: int = field(kw_only=True)
+    """Number of roots."""
+
+
+def test_field_docs__returns_docstrings_by_field() -> None:
+    docs = {"number": "Length\nin px.", "name": "Name, see docs/flow.md.", "roots": "Number of roots."}
+    assert field_docs(Plant) == docs
+    assert field_docs(int) == {}
+    without_source: dict[str, Any] = {"__name__": "builtins"}
+    exec("from dataclasses import dataclass\n@dataclass\nclass A:\n    a: int = 1", without_source)
+    assert field_docs(without_source["A"]) == {}
+
+
+def test_documented__lists_fields_with_defaults() -> None:
+    expected = """A plant.
+
+Raises:
+    ValueError: never.
+
+Fields:
+    number = 1e-05: Length in px.
+    name = 'a': Name, see docs/flow.md.
+    leaves = list(...):
+    roots = (required): Number of roots."""
+    assert Plant.__doc__ == inspect.getdoc(Plant) == Plant(roots=1).__doc__ == expected
+
+
+@pytest.mark.parametrize("config_type", [StreamConfig, FitConfig, MotionConfig, type(FitConfig().density)])
+def test_documented__lists_every_setting(config_type: type) -> None:
+    text = inspect.getdoc(config_type) or ""
+    for setting in fields(config_type):
+        assert re.search(rf"^    {setting.name} = .+: .*\w", text, re.MULTILINE), setting.name
 
 
 def test_page__is_a_path_in_the_checkout() -> None:

@@ -84,3 +84,10 @@ def test_from_activated__refuses_values_that_are_not_activated(name, value):
     values[name][1] = value
     with pytest.raises(ValueError, match=rf"`{name}` must be .*, got {value}.* at \[1"):
         Gaussians.from_activated(**values)
+
+
+def test_repr__has_number_degree_and_size():
+    raw = {**make_scene(2, n=3), "means": np.array([[0, 0, 0], [2, 1, 0], [1, 0.5, -0.25]])}
+    gaussians = to_gaussians({name: value for name, value in raw.items() if name != "logit_confidence"})
+    assert repr(gaussians) == "Gaussians(N=3, SH degree 2, box of 2 x 1 x 0.25, motion)"
+    assert repr(gaussians.select(np.zeros(3, bool))) == "Gaussians(N=0, SH degree 2, box of 0, motion)"

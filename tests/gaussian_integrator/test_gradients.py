@@ -7,6 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from morgs_mi import RenderConfig, rasterize
+from morgs_mi.plugins import gaussian_splat
 from tests import reference
 from tests import tolerances as tol
 from tests.assertions import assert_close
@@ -167,3 +169,90 @@ def test_gaussian_splat__gradient_of_the_sensors_intrinsics(raw, name):
     dr.forward_to(image)
     slope = 2 * np.vdot(np.asarray(image, np.float64), np.asarray(dr.grad(image)))
     assert slope == pytest.approx(expected, rel=10 * tol.GRADIENT_REL)
+
+
+def test_gaussian_splat__has_the_gradients_of_rasterize_to_the_bit(raw):
+    """With the same settings, in a fixed order, and through a film that changes nothing."""
+    film = {"rfilter": {"type": "box"}}
+    scene = make_mitsuba_scene(to_gaussians(raw), film, srgb_primitives=False, reproducible=True)
+    params = mi.traverse(scene)
+    camera = make_sensor_camera()
+    weight = mi.TensorXf(np.float32(np.random.default_rng(8).normal(size=(camera.height, camera.width, 3))))
+    names = ("gaussians.data", "gaussians.opacities", "gaussians.sh_coeffs")
+
+    def gradients(image) -> list[np.ndarray]:
+        dr.backward(dr.sum(image * weight, axis=None))
+        grads = [np.array(dr.grad(params[name])) for name in names]
+        for name in names:
+            dr.set_grad(params[name], 0)
+        return grads
+
+    dr.enable_grad([params[name] for name in names])
+    shape = scene.shapes()[0]
+    splats = gaussian_splat._SceneGaussians(gaussian_splat._shape_gaussians(shape, ["opacities", "sh_coeffs"]))
+    camera = gaussian_splat._sensor_camera(scene.sensors()[0], border=0)
+    plugin = gradients(mi.render(scene, params))
+    direct = gradients(rasterize(splats, camera, ("color",), config=RenderConfig(reproducible=True)).color)
+    for name, by_plugin, by_rasterize in zip(names, plugin, direct, strict=True):
+        np.testing.assert_array_equal(by_plugin, by_rasterize, err_msg=name)
+
+
+def counting_renders(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Return a list that grows with every call of the rasteriser by the integrator."""
+    calls: list[int] = []
+    draw = gaussian_splat.rasterize
+    monkeypatch.setattr(gaussian_splat, "rasterize", lambda *args, **kwargs: calls.append(1) or draw(*args, **kwargs))
+    return calls
+
+
+def test_gaussian_splat__backward_uses_the_rendering_of_the_same_parameters(raw, monkeypatch):
+    scene = make_mitsuba_scene(to_gaussians(raw), reproducible=True)
+    params = mi.traverse(scene)
+    opacities = params["gaussians.opacities"]
+    dr.enable_grad(opacities)
+    calls = counting_renders(monkeypatch)
+    dr.backward(dr.sum(dr.square(mi.render(scene, params)), axis=None))
+    assert len(calls) == 1
+    kept = np.array(dr.grad(opacities))
+    assert np.abs(kept).max() > 0
+
+    # Only the last rendering is kept: the earlier one of two images is rendered again.
+    dr.set_grad(opacities, 0)
+    images = [mi.render(scene, params) for _ in range(2)]
+    dr.backward(dr.sum(dr.square(images[0]), axis=None) + dr.sum(dr.square(images[1]), axis=None))
+    assert len(calls) == 1 + 2 + 1
+    assert_close(np.array(dr.grad(opacities)), 2 * kept, rtol=1e-6)
+
+
+def test_gaussian_splat__backward_renders_what_has_changed_since(raw):
+    """A sensor that moved between the two passes is used as it is, like Mitsuba's own integrators use it."""
+
+    def gradient(zoom: str) -> np.ndarray:
+        scene = make_mitsuba_scene(to_gaussians(raw), reproducible=True)
+        params = mi.traverse(scene)
+        dr.enable_grad(params["gaussians.opacities"])
+        for moment in ("before", "after"):
+            if zoom == moment:
+                params["sensor.x_fov"] = mi.Float(60)
+                params.update()
+            if moment == "before":
+                loss = dr.sum(mi.render(scene, params), axis=None)
+        dr.backward(loss)
+        return np.array(dr.grad(params["gaussians.opacities"]))
+
+    np.testing.assert_array_equal(gradient("after"), gradient("before"))
+    assert np.abs(gradient("after") - gradient("never")).max() > 0.01
+
+
+def test_gaussian_splat__gradient_of_the_background(raw):
+    """Encoded, so that the image is linear in it."""
+    props = {"background": {"type": "rgb", "value": (0.2, 0.4, 0.6)}, "srgb_primitives": False}
+    scene = make_mitsuba_scene(to_gaussians(raw), {"pixel_format": "rgba"}, **props)
+    params = mi.traverse(scene)
+    background = params["integrator.background"]
+    dr.enable_grad(background)
+    image = mi.render(scene, params)
+    weight = np.float32(np.random.default_rng(7).normal(size=(*image.shape[:2], 3)))
+    dr.backward(dr.sum(image[:, :, :3] * mi.TensorXf(weight), axis=None))
+    transmitted = 1 - rasterize_view(raw, make_sensor_camera())["alpha"]
+    assert_close(np.array(dr.grad(background)).ravel(), (transmitted * weight).sum((0, 1)), rtol=tol.GRADIENT_REL)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from numpy.lib.recfunctions import repack_fields
 from plyfile import PlyData, PlyElement
 
+from morgs_mi import ellipsoids
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.ply import read_ply, write_ply
 from tests.assertions import assert_close
@@ -49,6 +52,48 @@ def test_read_ply__inverts_write_ply(tmp_path, degree):
     write_ply(tmp_path / "g.ply", gaussians)
     # Quaternions are normalised again: one rounding.
     assert_same(gaussians, read_ply(tmp_path / "g.ply"), rtol=3e-7)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_read_ply__inverts_write_ply_with_all_attributes(tmp_path, degree):
+    gaussians = replace(to_gaussians(make_unit_scene(degree)), offset=np.arange(30.0).reshape(10, 3))
+    write_ply(tmp_path / "g.ply", gaussians, layout="mitsuba")
+    copy = read_ply(tmp_path / "g.ply")
+    assert copy.items().keys() == gaussians.items().keys()
+    # Logits of float32 activations.
+    assert_same(gaussians, copy, rtol=1e-5, atol=1e-6)
+
+
+def test_write_ply__stores_the_attributes_of_mitsuba(tmp_path):
+    gaussians = to_gaussians(make_unit_scene(1, 2))
+    write_ply(tmp_path / "g.ply", gaussians, layout="mitsuba")
+    attributes = dict(mi.traverse(mi.load_dict({"type": "ellipsoids", "filename": str(tmp_path / "g.ply")})))
+    for name, value in ellipsoids(gaussians).items():
+        if name != "type":
+            assert_close(attributes[name], np.ravel(value), atol=2e-6)  # of the unit quaternions
+
+
+@pytest.mark.parametrize("columns", [10, 6])
+def test_read_ply__refuses_an_odd_number_of_coefficients_of_mitsuba(tmp_path, columns):
+    write_ply(tmp_path / "g.ply", to_gaussians(make_unit_scene(1)), layout="mitsuba")
+    records = PlyData.read(tmp_path / "g.ply")["vertex"].data
+    records = without(*(f"sh_coeffs_{i}" for i in range(columns, 12)))(records)
+    PlyData([PlyElement.describe(records, "vertex")]).write(str(tmp_path / "h.ply"))
+    with pytest.raises(ValueError, match="expected f_rest_0 to f_rest_8"):
+        read_ply(tmp_path / "h.ply")
+
+
+def test_read_ply__names_an_invalid_motion(tmp_path):
+    raw = make_unit_scene()
+    raw["motion"][3, 1] = np.nan
+    write_ply(tmp_path / "g.ply", to_gaussians(raw), layout="mitsuba")
+    with pytest.raises(ValueError, match=r"others in 1 of 10 Gaussians \(motion of 3\)"):
+        read_ply(tmp_path / "g.ply")
+
+
+def test_write_ply__refuses_an_unknown_layout(tmp_path):
+    with pytest.raises(ValueError, match="`layout` must be 3dgs or mitsuba, got 'sog'"):
+        write_ply(tmp_path / "g.ply", random_gaussians(), layout="sog")
 
 
 def test_write_ply__has_the_bytes_of_the_layout(tmp_path):

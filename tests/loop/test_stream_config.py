@@ -18,7 +18,6 @@ from morgs_mi.loop.stream_config import (
     apply_preset,
     apply_values,
     config_toml,
-    field_docs,
     read_config,
     relocated,
 )
@@ -293,18 +292,6 @@ def test_read_config__names_a_file_that_cannot_be_read(content, error, message, 
         path.write_bytes(content)
     with pytest.raises(error, match=f"a.toml: {message}"):
         read_config(path)
-
-
-def test_field_docs__returns_docstrings_by_field() -> None:
-    assert field_docs(Leaf) == {
-        "number": "Length in px.",
-        "name": "Name of\nthe leaf.",
-        "limit": "Limit; None: no limit.",
-    }
-    assert field_docs(int) == {}
-    without_source: dict[str, Any] = {"__name__": "builtins"}
-    exec("from dataclasses import dataclass\n@dataclass\nclass A:\n    a: int = 1", without_source)
-    assert field_docs(without_source["A"]) == {}
 
 
 def test_relocated__changes_only_errors_that_name_a_field() -> None:

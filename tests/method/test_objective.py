@@ -9,8 +9,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from morgs_mi.method import objective
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.flow_sources.flow_registry import FramePair
+from morgs_mi.method.method_registry import Registry
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.objective import (
     TERMS,
@@ -18,6 +20,7 @@ from morgs_mi.method.objective import (
     ObjectiveConfig,
     Prediction,
     channels_of,
+    loss_term,
     losses_of,
     observe,
     weights_of,
@@ -107,3 +110,62 @@ def test_weights_of__are_those_of_the_settings():
     }
     with pytest.raises(ValueError, match="`flow_weight` must be at least 0, got -1"):
         ObjectiveConfig(flow_weight=-1)
+
+
+@pytest.fixture
+def registry(monkeypatch):
+    """Return an empty registry of terms."""
+    monkeypatch.setattr(objective, "LOSS_TERMS", Registry("ObjectiveConfig()", "terms"))
+    return objective.LOSS_TERMS
+
+
+def test_loss_term__acts_where_its_observation_exists(registry):
+    observer = lambda view, motion, config: {"height": view.pair.image[..., 0] + 7.0}  # noqa: E731
+
+    @loss_term("height", channels=("depth",), observations=("height",), observer=observer)
+    def height_loss(prediction, observations, config):
+        return dr.sum(observations["height"] - prediction.image.depth[..., 0], axis=None)
+
+    config = ObjectiveConfig(terms=("height:2.5",))
+    (observations,) = observe({0: key_view(mask=False)}, MotionConfig(), config).values()
+    assert observations.keys() == {"motion", "reliable", "height"}
+    assert channels_of(observations, config) == ("color", "guided_motion", "depth")
+    assert channels_of(observations, ObjectiveConfig()) == ("color", "guided_motion")
+    assert channels_of({}, config) == ("color",)
+    assert weights_of(config)["height"] == 2.5
+
+    prediction = Prediction(Image(depth=mi.TensorXf(np.full((H, W, 1), 3.0))), {}, None, H * W, 1, 1.0, None)
+    losses = losses_of(prediction, {"height": mi.TensorXf(observations["height"])}, config)
+    assert losses.keys() == {"height"}
+    assert np.asarray(losses["height"]).item() == 4 * H * W
+
+
+@pytest.mark.parametrize(
+    ("terms", "message"),
+    [
+        (("sped:1",), r"ObjectiveConfig\(\): `terms` must be one of speed:WEIGHT, got 'sped:1'"),
+        (("speed",), "must be one of speed:WEIGHT, got 'speed'"),
+        (("speed:much",), r"`terms` must be a number in \[0, inf\), got 'much'"),
+        (("speed:-1",), r"`terms` must be a number in \[0, inf\), got -1.0"),
+        (("speed:1", "speed:2"), "must name each term once"),
+        ("speed:1", "`terms` must be a list"),
+    ],
+)
+def test_objective_config__refuses_terms(registry, terms, message):
+    loss_term("speed")(lambda p, o, config: 0)
+    with pytest.raises(ValueError, match=message):
+        ObjectiveConfig(terms=terms)
+
+
+def test_objective_config__refuses_terms_where_none_is_registered(registry):
+    with pytest.raises(ValueError, match="`terms` must be one of the registered names, of which there are none"):
+        ObjectiveConfig(terms=("speed:1",))
+
+
+@pytest.mark.parametrize(
+    ("name", "message"), [("flow", "which the objective has already"), ("speed", "registered"), ("a:b", "colon")]
+)
+def test_loss_term__refuses_names(registry, name, message):
+    loss_term("speed")(lambda p, o, config: 0)
+    with pytest.raises(ValueError, match=message):
+        loss_term(name)(lambda p, o, config: 0)

@@ -144,7 +144,7 @@ def check_exposures(capture: Capture, shared: SharedFeatures) -> list[Finding]:
 
 def _gains(capture: Capture, shared: SharedFeatures) -> np.ndarray:
     """Return the log gains of all cameras [C, 3] that explain the colours of points in two views."""
-    images = next(capture.partial_frames(0, 1)).images
+    images = next(capture.displayed().partial_frames(0, 1)).images
     pairs, colors = matched_colors(capture.cameras, images, shared.features, shared.matches)
     pairs = [pair for pair in pairs if len(pair.features) >= _MIN_SAMPLES]
     light = [[colors[view][pair.features[:, k]] for k, view in enumerate(pair.views)] for pair in pairs]

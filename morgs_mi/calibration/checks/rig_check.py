@@ -97,7 +97,7 @@ def match_capture(capture: Capture, progress: Callable[[int, int], None] | None 
         capture: a capture, downscaled or not.
         progress: called with (views done, views).
     """
-    capture = capture.at_recorded_size()
+    capture = capture.displayed().at_recorded_size()
     images, count = next(capture.partial_frames(0, 1)).images, len(capture.cameras)
     features = []
     for done, (image, mask) in enumerate(zip(images, capture.masks, strict=True)):
@@ -159,7 +159,7 @@ def dense_points(capture: Capture, shared: SharedFeatures, seed: int = 0) -> Cap
         seed: seed of the selection of stereo points.
     """
     sparse, recorded = triangulate_points(capture, shared), capture.at_recorded_size()
-    images = next(recorded.partial_frames(0, 1)).images
+    images = next(recorded.displayed().partial_frames(0, 1)).images
     views = [(v, image) for v in capture.train_views if (image := images[v]) is not None]
     points, colors = stereo_points(
         [recorded.cameras[v] for v, _ in views],

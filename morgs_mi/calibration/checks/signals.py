@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
-from morgs_mi.core.color_space import srgb_to_linear
+from morgs_mi.core.color_space import decode_light
 
 __all__ = [
     "Lamp",
@@ -72,7 +72,7 @@ def read_signals(capture: Capture, max_frames: int, progress: Callable[[int, int
     thumbs = [np.full((count, *size[::-1]), np.nan, np.float32) for size in sizes]
     sharpness = np.full((count, len(sizes)), np.nan)
     inner = [None if m is None else cv2.erode(m.astype(np.uint8), np.ones((9, 9))) > 0 for m in capture.masks]
-    for t, frame in enumerate(capture.partial_frames(0, count)):
+    for t, frame in enumerate(capture.displayed().partial_frames(0, count)):
         for c, image in enumerate(frame.images):
             if image is None:
                 continue
@@ -171,7 +171,7 @@ def _brightness(thumbs: np.ndarray) -> np.ndarray:
     reference = known_median(thumbs, axis=0)
     good = (thumbs > _DARK) & (thumbs < _BRIGHT) & (reference > _DARK) & (reference < _BRIGHT)
     with np.errstate(invalid="ignore", divide="ignore"):
-        ratios = np.log(srgb_to_linear(thumbs / 255) / srgb_to_linear(reference / 255))
+        ratios = np.log(decode_light(thumbs / 255) / decode_light(reference / 255))
     ratios = np.where(good, ratios, np.nan)
     bands = [band.reshape(len(thumbs), -1) for band in np.array_split(ratios, _BANDS, axis=1)]
     columns = [np.where(np.isfinite(x).sum(axis=1) < _MIN_PIXELS, np.nan, known_median(x, axis=1)) for x in bands]

@@ -1,6 +1,7 @@
 """The supported capture layouts.
 
-To add a layout, write a module in this package that exposes a `LAYOUT`, and add its name to `_READERS`.
+A layout of this package is a module that exposes a `LAYOUT`, whose name is in `_READERS`. Another module appends its
+layout to `LAYOUTS`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ _READERS = (
     "anipose",
     "poses_bounds",
 )
-LAYOUTS: tuple[Layout, ...] = tuple(import_module(f"{__package__}.{name}").LAYOUT for name in _READERS)
+LAYOUTS: list[Layout] = [import_module(f"{__package__}.{name}").LAYOUT for name in _READERS]
 """The layouts in order of precedence, for folders with several calibrations. COLMAP's is the most complete one: it has
 lenses, principal points and points."""
 

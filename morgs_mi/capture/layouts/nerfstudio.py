@@ -30,7 +30,7 @@ from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.core.checks import LARGEST, bounded
 from morgs_mi.io.bounded import read_json
-from morgs_mi.io.listing import IMAGE_SUFFIXES, VIDEO_SUFFIXES
+from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from morgs_mi.io.ply import read_vertices
 from morgs_mi.io.unread import warn_unread
 from morgs_mi.io.video import Clip
@@ -263,7 +263,7 @@ def _images_named(source: Path, split: str, given: Sequence[str], names: Sequenc
 def _parts(name: str) -> tuple[str, ...]:
     """Return the parts of an image's path without the suffix of its format."""
     place = PurePosixPath(name.replace("\\", "/"))
-    has_suffix = place.suffix.lower() in (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES)
+    has_suffix = place.suffix.lower() in (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES, EXR_SUFFIX)
     return (place.with_suffix("") if has_suffix else place).parts
 
 

@@ -22,9 +22,11 @@ def consistency_mask(flow: np.ndarray, back: np.ndarray, config: FlowConfig | No
     config = config or FlowConfig()
     height, width = flow.shape[:2]
     y, x = np.mgrid[:height, :width].astype(np.float32)
-    x, y = x + flow[..., 0], y + flow[..., 1]
+    x = x + flow[..., 0]
+    y = y + flow[..., 1]
     back = cv2.remap(back, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    mismatch, length = _squared(flow + back), _squared(flow) + _squared(back)
+    mismatch = _squared(flow + back)
+    length = _squared(flow) + _squared(back)
     agrees = mismatch < config.consistency_relative * length + config.consistency_absolute
     # The image ends half a pixel beyond the outermost centres, so the flow's own error does not reject the border.
     return agrees & (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)

@@ -66,14 +66,16 @@ class FlowFolder:
             FileNotFoundError: a file or its folder is missing.
             ValueError: a frame has two files, a flow has another size, or as `read_flow`.
         """
-        back, forward_flow = self._read(camera, "backward", frame, size), self._read(camera, "forward", frame - 1, size)
+        back = self._read(camera, "backward", frame, size)
+        forward_flow = self._read(camera, "forward", frame - 1, size)
         return back, forward_flow
 
     def _read(self, camera: str, direction: str, frame: int, size: tuple[int, int]) -> np.ndarray:
         path = self._find(self.folder / camera / direction, frame)
         flow = read_flow(path)
         if flow.shape[:2] != size:
-            (height, width), (rows, columns) = size, flow.shape[:2]
+            height, width = size
+            rows, columns = flow.shape[:2]
             raise ValueError(
                 f"{path}: expected {width}x{height} pixels as the images of {camera} have, got {columns}x{rows}; "
                 "compute the flow on undistorted and downscaled images."
@@ -137,7 +139,8 @@ def write_flow(path: str | Path, flow: np.ndarray) -> None:
         ValueError: the suffix is neither `.flo` nor `.exr`, or the flow has another shape.
         OSError: the file cannot be written.
     """
-    path, flow = Path(path), np.asarray(flow)
+    path = Path(path)
+    flow = np.asarray(flow)
     suffix = _suffix("write_flow()", path)
     if flow.ndim != 3 or flow.shape[2] != 2 or not flow.size:
         raise ValueError(f"write_flow(): `flow` must be [H, W, 2], got {flow.shape}.")
@@ -155,7 +158,8 @@ def _read_flo(path: Path) -> np.ndarray:
     header = np.frombuffer(data[: _HEADER.itemsize].ljust(_HEADER.itemsize, b"\0"), _HEADER)[0]
     if header["magic"] != np.float32(_MAGIC):
         raise ValueError(f"{path}: expected a .flo file, which begins with the float {_MAGIC}, got {data[:4]!r}.")
-    width, height = int(header["width"]), int(header["height"])
+    width = int(header["width"])
+    height = int(header["height"])
     length = _HEADER.itemsize + 8 * width * height
     if min(width, height) < 1 or len(data) != length:
         raise ValueError(

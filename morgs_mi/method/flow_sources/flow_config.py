@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
+from morgs_mi.core.documentation import documented
 from morgs_mi.core.ranges import AtLeast, check_ranges
 
 
+@documented
 @dataclass(frozen=True)
 class FlowConfig:
     """Settings of OpenCV's methods and of the forward-backward check.

@@ -17,6 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from morgs_mi.core.color_space import unit_values
 from morgs_mi.io.onnx_file import OnnxNetwork, written_shapes
 from morgs_mi.method.flow_sources.flow_config import FlowConfig
 from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FlowSource, both_directions
@@ -42,7 +43,9 @@ class FlowNetwork:
     """
 
     def __init__(self, path: str | Path, low: float = 0.0, high: float = 255.0) -> None:
-        self.path, self.low, self.high = Path(path), low, high
+        self.path = Path(path)
+        self.low = low
+        self.high = high
         self._net = OnnxNetwork(path, " or use its flow from files")
         shapes = list(self._net.inputs.values())
         images = all(len(s) == 4 and s[0] in (1, None) and s[1] in (3, None) for s in shapes)
@@ -81,8 +84,10 @@ class FlowNetwork:
 
     def _padded(self, image: np.ndarray, other: np.ndarray) -> np.ndarray:
         height, width = image.shape[:2]
-        down, right = -height % _MULTIPLE, -width % _MULTIPLE
-        top, left = down // 2, right // 2
+        down = -height % _MULTIPLE
+        right = -width % _MULTIPLE
+        top = down // 2
+        left = right // 2
         padded = (
             cv2.copyMakeBorder(each, top, down - top, left, right - left, cv2.BORDER_REPLICATE)
             for each in (image, other)
@@ -102,7 +107,7 @@ class FlowNetwork:
 
     def _blob(self, image: np.ndarray) -> np.ndarray:
         """Return an image as the network's input, [1, 3, H, W] float32."""
-        unit = image.astype(np.float32) / (255 if image.dtype == np.uint8 else 1)
+        unit = unit_values(image, np.float32)
         return np.ascontiguousarray(np.moveaxis(self.low + (self.high - self.low) * unit, 2, 0)[None], np.float32)
 
 

@@ -46,7 +46,8 @@ def _dis(preset: int, finest: Callable[[int, FlowConfig], int] | None = None) ->
         if finest is not None:
             method.setFinestScale(finest(a.shape[1], config))
         # DIS chooses its coarsest level by the width alone and crashes where the height is less than a patch.
-        rows, missing = a.shape[0], max(0, a.shape[1] // 2 - a.shape[0])
+        rows = a.shape[0]
+        missing = max(0, a.shape[1] // 2 - a.shape[0])
         a, b = (cv2.copyMakeBorder(image, 0, missing, 0, 0, cv2.BORDER_REPLICATE) for image in (a, b))
         return method.calc(a, b, _ALLOCATE)[:rows]
 
@@ -99,7 +100,8 @@ def optical_flow(
     if method not in FLOW_METHODS:
         raise ValueError(f"optical_flow(): `method` must be one of {', '.join(FLOW_METHODS)}, got {method!r}.")
     config = config or FlowConfig()
-    image, previous = np.asarray(image), np.asarray(previous)
+    image = np.asarray(image)
+    previous = np.asarray(previous)
     check_images("optical_flow()", image, previous)
     if min(image.shape[:2]) < _MIN_SIDE:
         return np.zeros((*image.shape[:2], 2), np.float32)

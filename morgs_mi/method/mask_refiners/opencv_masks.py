@@ -19,7 +19,9 @@ _REACH = 0.05
 # Share of the image above which GrabCut is skipped: the rest has too few colours to learn from.
 _COVERAGE = 0.9
 # Side of a superpixel in pixels of the reduced image, iterations of SLIC, and its weight of distance against colour.
-_SIDE, _SLIC_ITERATIONS, _COMPACTNESS = 8, 5, 10.0
+_SIDE = 8
+_SLIC_ITERATIONS = 5
+_COMPACTNESS = 10.0
 
 
 def refine_mask(image: np.ndarray, mask: np.ndarray, config: MaskConfig | None = None) -> np.ndarray:
@@ -48,7 +50,8 @@ def refine_mask(image: np.ndarray, mask: np.ndarray, config: MaskConfig | None =
         return clean
     labels = np.where(near > 0, np.where(seed > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD), cv2.GC_BGD).astype(np.uint8)
     cv2.setRNGSeed(0)  # GrabCut's k-means starts at random
-    back, front = np.zeros((1, 65)), np.zeros((1, 65))
+    back = np.zeros((1, 65))
+    front = np.zeros((1, 65))
     labels, _, _ = cv2.grabCut(small, labels, (0, 0, 0, 0), back, front, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
     return clean_mask(_enlarged(np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)), mask.shape))
 

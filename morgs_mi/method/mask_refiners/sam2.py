@@ -32,7 +32,9 @@ _SIZE = 1024
 _MASK_SHRINK = 4
 _PROMPTS = ("point_coords", "point_labels", "mask_input", "has_mask_input")
 _RESULTS = ("masks", "iou_predictions")
-_ON_OBJECT, _UPPER_LEFT, _LOWER_RIGHT = 1, 2, 3
+_ON_OBJECT = 1
+_UPPER_LEFT = 2
+_LOWER_RIGHT = 3
 
 
 class SegmentNetwork:
@@ -51,7 +53,8 @@ class SegmentNetwork:
 
     def __init__(self, encoder: str | Path, decoder: str | Path, count: int = MaskConfig.prompts) -> None:
         self._count = count
-        self._encoder, self._decoder = OnnxNetwork(encoder), OnnxNetwork(decoder)
+        self._encoder = OnnxNetwork(encoder)
+        self._decoder = OnnxNetwork(decoder)
         shapes = list(self._encoder.inputs.values())
         if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] != 3:
             raise ValueError(
@@ -90,7 +93,8 @@ class SegmentNetwork:
 
     def _segment(self, features: Mapping[str, np.ndarray], component: np.ndarray) -> np.ndarray:
         """Return the object [H, W] under one component: the decoder's mask with the highest predicted IoU."""
-        (height, width), (across, down) = component.shape, self._size
+        height, width = component.shape
+        across, down = self._size
         points, labels = prompts(component)
         # The decoder adds half a pixel: its pixel centres have whole coordinates.
         scaled = points * np.array((across / width, down / height), np.float32) - np.float32(0.5)
@@ -129,8 +133,10 @@ def prompts(component: np.ndarray, count: int = 3, spacing: float = 0.25) -> tup
         Coordinates [P, 2] in pixels of the image, float32, pixel centres at +0.5, and labels [P], float32; first the
         box's corners, then the points.
     """
-    rows, columns = np.flatnonzero(component.any(1)), np.flatnonzero(component.any(0))
-    upper_left, lower_right = (columns[0], rows[0]), (columns[-1] + 1, rows[-1] + 1)
+    rows = np.flatnonzero(component.any(1))
+    columns = np.flatnonzero(component.any(0))
+    upper_left = (columns[0], rows[0])
+    lower_right = (columns[-1] + 1, rows[-1] + 1)
     depth = cv2.distanceTransform(np.pad(component, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
     apart = max(np.subtract(lower_right, upper_left)) * spacing
     y, x = np.mgrid[: component.shape[0], : component.shape[1]]

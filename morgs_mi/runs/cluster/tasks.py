@@ -20,13 +20,14 @@ from morgs_mi.codec.container import Packet, decode_packet
 from morgs_mi.codec.packets import CodedFrame, decode, reemitted_keyframe
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.remote import url_of
+from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.exposure import Exposure
 from morgs_mi.runs.cluster.seams import SegmentConfig, fit_seam_frame
 from morgs_mi.runs.cluster.workers import prepared, worker_name
 from morgs_mi.runs.recorder import push_frame, with_next
 from morgs_mi.runs.recording import due_keyframe, restart_of
-from morgs_mi.stream_loop import FrameReport, StreamLoop
+from morgs_mi.stream_loop import StreamLoop
 
 __all__ = ["Fit", "Part", "Segment", "Source", "fit_frames"]
 

@@ -21,6 +21,7 @@ from morgs_mi.core.files import locked_folder
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.threads import in_background, map_in_threads
+from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.live.feed import Bundle, Feed
 from morgs_mi.runs.live.live_capture import begin_capture, read_calibration, write_images
@@ -28,7 +29,7 @@ from morgs_mi.runs.live.live_config import LIVE_STREAM, LiveConfig
 from morgs_mi.runs.live.sources import Source, open_feed
 from morgs_mi.runs.recorder import Prepared, push_frame
 from morgs_mi.runs.recording import FitFiles, Recording, check_outputs, stream_metadata
-from morgs_mi.stream_loop import FrameReport, StreamLoop
+from morgs_mi.stream_loop import StreamLoop
 
 __all__ = ["LiveFrame", "fit_live"]
 

@@ -1,0 +1,87 @@
+"""Several cameras in one call of `rasterize`, against one call for each."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
+from morgs_mi.render.region import Region
+from tests.assertions import assert_close
+from tests.scenes.cameras import make_camera
+from tests.scenes.gaussians import make_scene, to_gaussians
+
+CHANNELS = ("color", "alpha", "depth", "motion", "confidence")
+EXACT = RenderConfig(reproducible=True)
+
+
+def cameras(count: int) -> list[Camera]:
+    """Return cameras beside each other, with sizes that are no multiples of a block."""
+    camera = replace(make_camera(), width=45, height=37)
+    viewmats = [np.array(camera.viewmat, np.float64) for _ in range(count)]
+    for v, viewmat in enumerate(viewmats):
+        viewmat[0, 3] += 0.1 * v
+    return [replace(camera, viewmat=viewmat) for viewmat in viewmats]
+
+
+@pytest.fixture(scope="module")
+def gaussians() -> Gaussians:
+    return to_gaussians(make_scene())
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+def test_rasterize__draws_cameras_together_as_one_by_one(gaussians, count):
+    views = cameras(count)
+    together = rasterize(gaussians, views, CHANNELS, background=(0.2, 0.4, 0.6))
+    for v, camera in enumerate(views):
+        alone = rasterize(gaussians, camera, CHANNELS, background=(0.2, 0.4, 0.6))
+        for name in CHANNELS:
+            assert together[name].shape == (count, *alone[name].shape)
+            np.testing.assert_array_equal(np.array(together[name])[v], np.array(alone[name]), err_msg=name)
+
+
+def test_rasterize__sums_the_gradients_of_cameras():
+    views = cameras(3)
+    weights = np.random.default_rng(0).normal(size=(3, 37, 45, 3)).astype(np.float32)
+
+    def gradients(draw) -> dict[str, np.ndarray]:
+        trained = to_gaussians(make_scene(), grad=True)
+        poses = [mi.TensorXf(np.array(camera.viewmat)) for camera in views]
+        dr.enable_grad(poses)
+        posed = [replace(camera, viewmat=pose) for camera, pose in zip(views, poses, strict=True)]
+        dr.backward(draw(trained, posed))
+        grads = {name: np.array(dr.grad(getattr(trained, name))) for name in ("means", "log_scales", "sh_coeffs")}
+        return grads | {f"pose {v}": np.array(dr.grad(pose)) for v, pose in enumerate(poses)}
+
+    together = gradients(
+        lambda trained, posed: dr.sum(rasterize(trained, posed, config=EXACT).color * mi.TensorXf(weights), axis=None)
+    )
+    alone = gradients(
+        lambda trained, posed: sum(
+            dr.sum(rasterize(trained, camera, config=EXACT).color * mi.TensorXf(weights[v]), axis=None)
+            for v, camera in enumerate(posed)
+        )
+    )
+    for name, grads in together.items():
+        assert np.abs(grads).max() > 0
+        assert_close(grads, alone[name], rtol=1e-5, atol=1e-5)
+
+
+def test_rasterize__refuses_cameras_that_do_not_fit(gaussians):
+    first, second = cameras(2)
+    with pytest.raises(ValueError, match="same size, got 45x37 and 90x37"):
+        rasterize(gaussians, [first, replace(second, width=90)])
+    with pytest.raises(ValueError, match="got an empty sequence"):
+        rasterize(gaussians, [])
+    with pytest.raises(ValueError, match="`region` must be None with a sequence of cameras"):
+        rasterize(gaussians, [first], region=Region(np.ones((37, 45), bool)))
+
+
+def test_rasterize__draws_no_gaussians_in_several_cameras(gaussians):
+    image = rasterize(gaussians.select(slice(0)), cameras(2), background=(0.1, 0.2, 0.3))
+    assert image.color.shape == (2, 37, 45, 3)
+    assert_close(np.array(image.color)[1, 0, 0], (0.1, 0.2, 0.3), atol=1e-7)
