@@ -47,8 +47,6 @@ from morgs_mi.method.motion import initial_motion
 from morgs_mi.method.objective import Observations, channels_of, observe
 from morgs_mi.method.ssim import Target
 
-__all__ = ["StreamLoop", "StreamState", "step"]
-
 _LOG = logging.getLogger(__name__)
 
 

@@ -18,28 +18,20 @@ from morgs_mi.io.video import FrameReader, ImageOrError
 
 @dataclass(frozen=True)
 class CameraSource:
-    """One camera's clip and the processing of its images.
+    """One camera's clip and the processing of its images."""
 
-    Attributes:
-        reader: reader of the clip.
-        lens: the lens that the clip was recorded through.
-        undistortion: the pixel maps that remove the lens distortion, or None.
-        frame_indices: the clip's frames that show the instants 0, 1, ... of the recording, -1 for none, int [T].
-        shares: the share of the time to the clip's next frame that has passed at each instant [T]; None: none has.
-        color_correction: the colour correction, or None.
-        used: the mask of the recorded pixels that are neither transparent nor masked out [H, W], or None if all are.
-        delay: time from an instant to the frame that shows it, in frames of the clip.
-        display_exposure: stops by which linear light is brightened and shown in 8 bits; None: it is not shown.
-    """
-
-    reader: FrameReader
-    lens: Lens
-    undistortion: Undistortion | None
+    reader: FrameReader  #: Reader of the clip.
+    lens: Lens  #: The lens that the clip was recorded through.
+    undistortion: Undistortion | None  #: The pixel maps that remove the lens distortion, or None.
+    #: The clip's frames that show the instants 0, 1, ... of the recording, -1 for none, int [T].
     frame_indices: np.ndarray
+    #: The share of the time to the clip's next frame that has passed at each instant [T]; None: none has.
     shares: np.ndarray | None = None
-    color_correction: ColorCorrection | None = None
+    color_correction: ColorCorrection | None = None  #: The colour correction, or None.
+    #: The mask of the recorded pixels that are neither transparent nor masked out [H, W], or None if all are.
     used: np.ndarray | None = None
-    delay: float = 0.0
+    delay: float = 0.0  #: Time from an instant to the frame that shows it, in frames of the clip.
+    #: Stops by which linear light is brightened and shown in 8 bits; None: it is not shown.
     display_exposure: float | None = None
 
     def at_instants(self) -> CameraSource:

@@ -37,15 +37,10 @@ _MIN_SIDE = 32
 
 @dataclass(frozen=True)
 class Frame:
-    """One instant in all views.
+    """One instant in all views."""
 
-    Attributes:
-        index: position in the recording, from 0.
-        images: per camera [H, W, 3], RGB: uint8 in sRGB, or of EXR files float32 in linear light.
-    """
-
-    index: int
-    images: tuple[np.ndarray, ...]
+    index: int  #: Position in the recording, from 0.
+    images: tuple[np.ndarray, ...]  #: Per camera [H, W, 3], RGB: uint8 in sRGB, or of EXR files float32 in linear light
 
 
 @dataclass(frozen=True)

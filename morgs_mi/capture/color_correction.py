@@ -19,8 +19,6 @@ from morgs_mi.capture.features import Features, Match, detect, match_views, repr
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import decode_light, encode_light
 
-__all__ = ["ColorCorrection", "ColorFit", "fit_colors", "matched_colors"]
-
 _LOG = logging.getLogger(__name__)
 
 # A matrix has nine numbers; features are noisy.

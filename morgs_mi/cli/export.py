@@ -21,8 +21,6 @@ from morgs_mi.playback.export.formats import GLTF, PLY, TRACKS, USD, VIDEO, WEB,
 if TYPE_CHECKING:
     from morgs_mi.codec.frame_source import FrameSource
 
-__all__ = ["EXPORTS", "Export"]
-
 _PATH = (
     f"Camera path: between (through the rig's cameras), orbit (around the scene), or a JSON file ({page('exports')})."
 )

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from morgs_mi.capture.capture import Capture
     from morgs_mi.loop.frame_report import FrameReport
 
-__all__ = ["Fit"]
-
 _SCHEDULER = f"Dask scheduler whose workers fit them, such as tcp://host:8786 ({page('cluster')})."
 
 

@@ -12,8 +12,6 @@ from morgs_mi.cli.console import print_warning
 if TYPE_CHECKING:
     from morgs_mi.codec.frame_source import FrameSource
 
-__all__ = ["DropInvalid", "opened"]
-
 _DROP = "Leave out the Gaussians of a file whose numbers are not finite or absurdly large, however many they are."
 DropInvalid = Annotated[bool, FlagCreatePairsOff, arg(help=_DROP, help_behavior_hint="")]
 """Option of the commands that read files of Gaussians."""

@@ -30,25 +30,6 @@ import numpy as np
 from morgs_mi.codec.header import header_json, load_json
 from morgs_mi.core.camera import Camera
 
-__all__ = [
-    "ENTRY",
-    "HEAD",
-    "INDEX_MAGIC",
-    "MAGIC",
-    "PAYLOAD",
-    "PREAMBLE",
-    "TRAILER",
-    "VERSION",
-    "Packet",
-    "PacketKind",
-    "StreamWriter",
-    "TruncatedStreamError",
-    "decode_packet",
-    "encode_packet",
-    "header_json",
-    "open_packet",
-]
-
 MAGIC = b"MORGS-MI"
 INDEX_MAGIC = b"MORGSIDX"
 VERSION = 2

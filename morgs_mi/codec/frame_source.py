@@ -13,24 +13,17 @@ from morgs_mi.codec.container import Packet
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 
-__all__ = ["FrameSource", "FrameState", "play"]
-
 
 @dataclass(frozen=True, eq=False)
 class FrameState:
-    """Gaussians of one frame.
+    """Gaussians of one frame."""
 
-    Attributes:
-        frame: index of the video frame.
-        ids: uint32 [N], ascending: the number of each Gaussian from its birth to its death.
-        gaussians: the N Gaussians; `motion` is the displacement since the frame before, zero where there is none,
-            `offset` its learned part, None if the packet does not contain it.
-        first_id: number of ids in earlier sets since decoding began; a keyframe of a new frame begins a set.
-    """
-
-    frame: int
-    ids: np.ndarray
+    frame: int  #: Index of the video frame.
+    ids: np.ndarray  #: uint32 [N], ascending: the number of each Gaussian from its birth to its death.
+    #: The N Gaussians; `motion` is the displacement since the frame before, zero where there is none, `offset` its
+    #: learned part, None if the packet does not contain it.
     gaussians: Gaussians
+    #: Number of ids in earlier sets since decoding began; a keyframe of a new frame begins a set.
     first_id: int = field(default=0, kw_only=True)
 
     def __len__(self) -> int:

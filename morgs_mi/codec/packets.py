@@ -42,15 +42,6 @@ from morgs_mi.codec.residuals import Coder, offset_steps, take_change
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 
-__all__ = [
-    "CodedFrame",
-    "coded_frames",
-    "decode",
-    "keyframe_packet",
-    "reemitted_keyframe",
-    "residual_packet",
-]
-
 # An entropy code stores a column of one value in almost no bytes. A small packet must not request much memory: it
 # has a word for each 16 Gaussians that it adds, or for each 16 of their integers if the state has more than 2^22. The
 # integers of a fit take about four bits each, twice as much.
@@ -62,15 +53,10 @@ _COARSEST = 80  # quarter octaves: a million times the step
 
 @dataclass(frozen=True, eq=False)
 class CodedFrame(FrameState):
-    """State of a stream after a packet, the same in encoder and decoder to the bit.
+    """State of a stream after a packet, the same in encoder and decoder to the bit."""
 
-    Attributes:
-        grid: its N Gaussians as integers, for which `gaussians` stand.
-        next_id: number of the next birth.
-    """
-
-    grid: Grid
-    next_id: int
+    grid: Grid  #: Its N Gaussians as integers, for which `gaussians` stand.
+    next_id: int  #: Number of the next birth.
 
     @cached_property
     def digest(self) -> np.ndarray:

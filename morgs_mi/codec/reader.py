@@ -28,8 +28,6 @@ from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.codec.header import header_fields
 from morgs_mi.codec.packets import CodedFrame, coded_frames
 
-__all__ = ["StreamReader"]
-
 _CHUNK = 2**20
 
 _Entry = tuple[int, int, int]

@@ -15,8 +15,6 @@ import numpy as np
 from morgs_mi.codec.entropy import LIMIT, ColumnReader
 from morgs_mi.codec.quantisation import GROUPS, Grid, bounded, step_sizes
 
-__all__ = ["Coder", "offset_steps", "take_change"]
-
 _GEOMETRY = GROUPS[:3]
 _APPEARANCE = GROUPS[3:]
 _DEAD = 8  # flags of the geometry of a Gaussian that dies; the three groups are its lower bits

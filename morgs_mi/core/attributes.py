@@ -23,17 +23,13 @@ def sigmoid(x: Jit) -> Jit:
 
 @dataclass(frozen=True)
 class Activation:
-    """Function from an optimised value to the value that is rendered.
+    """Function from an optimised value to the value that is rendered."""
 
-    Attributes:
-        function: of a Dr.Jit array or tensor.
-        inverse: of a NumPy array of activated values, float64; finite also where the exact one is infinite.
-        largest_slope: bound of its derivative, which converts a tolerated error of the activated value into one of the
-            optimised value; None where there is no bound.
-    """
-
-    function: Callable[[Jit], Jit]
+    function: Callable[[Jit], Jit]  #: Of a Dr.Jit array or tensor.
+    #: Of a NumPy array of activated values, float64; finite also where the exact one is infinite.
     inverse: Callable[[np.ndarray], np.ndarray]
+    #: Bound of its derivative, which converts a tolerated error of the activated value into one of the optimised value;
+    #: None where there is no bound.
     largest_slope: float | None
 
 

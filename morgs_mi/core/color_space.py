@@ -23,22 +23,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-__all__ = [
-    "BRIGHTEST",
-    "BRIGHTEST_LIGHT",
-    "SH_C0",
-    "TRANSFER",
-    "decode_light",
-    "decode_traced",
-    "display_image",
-    "display_stops",
-    "encode_light",
-    "encode_traced",
-    "exposed",
-    "positive_light",
-    "unit_values",
-]
-
 _LOG = logging.getLogger(__name__)
 
 SH_C0 = 0.28209479177387814

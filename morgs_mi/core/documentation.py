@@ -12,8 +12,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
-__all__ = ["DOCUMENTATION", "documented", "field_docs", "page", "with_pages"]
-
 Class = TypeVar("Class")
 
 DOCUMENTATION = "https://morgs-mi.readthedocs.io/"

@@ -23,25 +23,15 @@ from morgs_mi.render.render_config import RenderConfig
 
 @dataclass(frozen=True, eq=False)
 class ComparedClip:
-    """A stream and its recording.
+    """A stream and its recording."""
 
-    Attributes:
-        stream: the stream.
-        recording: its capture.
-        packets: kind and size of each frame's packet.
-        views: the evaluated views: the held-out ones, or otherwise all training views.
-        cameras: of all views, with the delays of the recording.
-        channels: rendered channels.
-        render: settings of the renderer, as in the fit.
-    """
-
-    stream: FrameSource
-    recording: Capture
-    packets: Mapping[int, tuple[PacketKind, int]]
-    views: Sequence[int]
-    cameras: Sequence[Camera]
-    channels: Sequence[str]
-    render: RenderConfig
+    stream: FrameSource  #: The stream.
+    recording: Capture  #: Its capture.
+    packets: Mapping[int, tuple[PacketKind, int]]  #: Kind and size of each frame's packet.
+    views: Sequence[int]  #: The evaluated views: the held-out ones, or otherwise all training views.
+    cameras: Sequence[Camera]  #: Of all views, with the delays of the recording.
+    channels: Sequence[str]  #: Rendered channels.
+    render: RenderConfig  #: Settings of the renderer, as in the fit.
 
     @classmethod
     def of(cls, stream: FrameSource, capture: str | Path | None, any_recording: bool = False) -> ComparedClip:
@@ -79,25 +69,15 @@ class ComparedClip:
 
 @dataclass(frozen=True, eq=False)
 class ComparedFrame:
-    """A decoded frame and the recorded one.
+    """A decoded frame and the recorded one."""
 
-    Attributes:
-        clip: their clip.
-        state: its Gaussians.
-        kind: kind of the frame's packet.
-        num_bytes: its size.
-        images: recorded images of all views, as a display shows them; None: missing.
-        last: likewise of the frame before; None in the first one.
-        recorded: the images as they were recorded.
-    """
-
-    clip: ComparedClip
-    state: FrameState
-    kind: PacketKind
-    num_bytes: int
-    images: Sequence[np.ndarray | None]
-    last: Sequence[np.ndarray | None] | None
-    recorded: Sequence[np.ndarray | None]
+    clip: ComparedClip  #: Their clip.
+    state: FrameState  #: Its Gaussians.
+    kind: PacketKind  #: Kind of the frame's packet.
+    num_bytes: int  #: Its size.
+    images: Sequence[np.ndarray | None]  #: Recorded images of all views, as a display shows them; None: missing.
+    last: Sequence[np.ndarray | None] | None  #: Likewise of the frame before; None in the first one.
+    recorded: Sequence[np.ndarray | None]  #: The images as they were recorded.
 
     def views(self) -> Iterator[ComparedView]:
         """Render and yield the evaluated views, except those without an image."""
@@ -121,27 +101,16 @@ class ComparedFrame:
 
 @dataclass(frozen=True, eq=False)
 class ComparedView:
-    """One view of a frame, rendered and recorded.
+    """One view of a frame, rendered and recorded."""
 
-    Attributes:
-        frame: its frame.
-        index: of the view.
-        maps: rendered channels by name.
-        recorded: image [H, W, 3], uint8; of an HDR recording as a display shows it.
-        valid: valid pixels [H, W] bool; None: all.
-        moving: moving pixels [H, W] bool; None: unknown.
-        truth: ground truth; None: unknown.
-        light: image of an HDR recording [H, W, 3], linear; None of others.
-    """
-
-    frame: ComparedFrame
-    index: int
-    maps: Mapping[str, np.ndarray]
-    recorded: np.ndarray
-    valid: np.ndarray | None
-    moving: np.ndarray | None
-    truth: GroundTruth | None
-    light: np.ndarray | None = None
+    frame: ComparedFrame  #: Its frame.
+    index: int  #: Of the view.
+    maps: Mapping[str, np.ndarray]  #: Rendered channels by name.
+    recorded: np.ndarray  #: image [H, W, 3], uint8; of an HDR recording as a display shows it.
+    valid: np.ndarray | None  #: Valid pixels [H, W] bool; None: all.
+    moving: np.ndarray | None  #: Moving pixels [H, W] bool; None: unknown.
+    truth: GroundTruth | None  #: Ground truth; None: unknown.
+    light: np.ndarray | None = None  #: Image of an HDR recording [H, W, 3], linear; None of others.
 
     @property
     def camera(self) -> Camera:

@@ -11,19 +11,6 @@ from scipy.ndimage import correlate1d
 from morgs_mi.core.color_space import decode_light, unit_values
 from morgs_mi.core.threads import map_in_threads
 
-__all__ = [
-    "delta_e_map",
-    "endpoint_error",
-    "iou",
-    "mean_over",
-    "psnr",
-    "psnr_mu",
-    "psnr_of",
-    "ssim",
-    "ssim_map",
-    "unit_pair",
-]
-
 # Wang, Bovik, Sheikh and Simoncelli, "Image quality assessment", TIP 2004.
 WINDOW, SIGMA = 11, 1.5
 C1, C2 = 0.01**2, 0.03**2

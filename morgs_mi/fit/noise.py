@@ -18,8 +18,6 @@ import numpy as np
 
 from morgs_mi.core.color_space import unit_values
 
-__all__ = ["is_noisy", "noise_of", "white_noise_of"]
-
 _FILTER = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
 # Of normal noise, median absolute value relative to the standard deviation.
 _MEDIAN = 0.6745

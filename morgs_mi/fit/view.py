@@ -26,17 +26,11 @@ _BLOCK, _SHARE = 12, 8
 
 
 class View(NamedTuple):
-    """A camera and its image.
+    """A camera and its image."""
 
-    Attributes:
-        camera: the camera.
-        image: [H, W, 3], encoded: uint8, or float32 with values above 1 of an HDR recording.
-        mask: valid pixels [H, W] bool, or None if all are.
-    """
-
-    camera: Camera
-    image: np.ndarray
-    mask: np.ndarray | None = None
+    camera: Camera  #: The camera.
+    image: np.ndarray  #: [H, W, 3], encoded: uint8, or float32 with values above 1 of an HDR recording.
+    mask: np.ndarray | None = None  #: Valid pixels [H, W] bool, or None if all are.
 
     @property
     def white(self) -> float:

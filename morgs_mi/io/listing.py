@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-__all__ = ["EXR_SUFFIX", "IMAGE_SUFFIXES", "VIDEO_SUFFIXES", "images_in", "is_added", "is_listed", "listed"]
-
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".mov", ".webm")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 EXR_SUFFIX = ".exr"

@@ -12,8 +12,6 @@ import numpy as np
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME, SIGMOID
 from morgs_mi.core.gaussians import Gaussians
 
-__all__ = ["from_mitsuba", "mitsuba_columns"]
-
 # Properties of the layout that hold no attribute of this form.
 _GEOMETRY = ("means", "scales", "quats")
 

@@ -11,8 +11,6 @@ import numpy as np
 
 from morgs_mi.core.color_space import unit_values
 
-__all__ = ["OnnxNetwork", "imagenet_blob", "written_shapes"]
-
 # Mean and standard deviation of ImageNet's colours, by which most networks for images normalise their input.
 _MEAN = np.array([0.485, 0.456, 0.406], np.float32)
 _DEVIATION = np.array([0.229, 0.224, 0.225], np.float32)

@@ -25,8 +25,6 @@ from morgs_mi.core.files import write_json
 from morgs_mi.core.llvm import cache_folder
 from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_listed
 
-__all__ = ["fetched", "is_url", "mirrored", "url_of"]
-
 # Entries of fsspec's listings that change with a file, by file system. A size alone does not prove that it is the same.
 _VERSION = (
     *("mtime", "created", "LastModified", "ETag", "etag", "last_modified", "md5Hash", "generation"),  # disks and clouds

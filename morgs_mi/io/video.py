@@ -55,26 +55,18 @@ class VideoReader:
     """Reader of a video file.
 
     Each call of `frames` or `pick` decodes from the start, or far from there from the last keyframe before, see `pick`.
-
-    Attributes:
-        path: the file.
-        num_frames: number of frames according to the file's header.
-        fps: frames per second, None if unknown.
-        width: in pixels.
-        height: in pixels.
-        num_held: number of frames in the file; less than `num_frames` if it was truncated.
-        positions: times of the frames in the file, in frames of a regular clock of rate `fps`, which shows position k
-            at the time of frame k of a clip of constant rate [num_held]; None at a constant rate.
-        times: times of the frames in the file, ascending, s [num_held]; None if it does not store them.
     """
 
-    path: Path
-    num_frames: int
-    fps: float | None
-    width: int
-    height: int
-    num_held: int
+    path: Path  #: The file.
+    num_frames: int  #: Number of frames according to the file's header.
+    fps: float | None  #: Frames per second, None if unknown.
+    width: int  #: In pixels.
+    height: int  #: In pixels.
+    num_held: int  #: Number of frames in the file; less than `num_frames` if it was truncated.
+    #: Times of the frames in the file, in frames of a regular clock of rate `fps`, which shows position k at the time
+    #: of frame k of a clip of constant rate [num_held]; None at a constant rate.
     positions: np.ndarray | None = field(default=None, compare=False)
+    #: Times of the frames in the file, ascending, s [num_held]; None if it does not store them.
     times: np.ndarray | None = field(default=None, compare=False, repr=False)
     has_light: ClassVar[bool] = False
 

@@ -25,8 +25,6 @@ from morgs_mi.loop.observation import FrameObservation, Images, Setup, views_of
 from morgs_mi.method.confidence import motion_mask
 from morgs_mi.method.flow import FlowObservation
 
-__all__ = ["fitted_first_frame", "with_first_confidence"]
-
 _LOG = logging.getLogger(__name__)
 
 

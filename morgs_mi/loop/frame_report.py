@@ -9,8 +9,6 @@ from morgs_mi.codec.container import Packet
 from morgs_mi.loop.correction import Correction
 from morgs_mi.method.exposure import Exposure
 
-__all__ = ["FittedFrame", "FrameReport"]
-
 
 @dataclass(frozen=True)
 class FrameReport:

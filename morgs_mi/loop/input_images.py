@@ -12,8 +12,6 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import positive_light
 
-__all__ = ["Given", "as_array", "copied_images"]
-
 Given: TypeAlias = Any
 """An image [H, W, 3]: a uint8 array in sRGB; linear light as a float array or a `mi.TensorXf`; or a `mi.Bitmap`, whose
 flag `srgb_gamma` counts."""

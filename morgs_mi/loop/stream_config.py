@@ -37,17 +37,6 @@ from morgs_mi.io.bounded import read_toml
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = [
-    "PRESETS",
-    "PresetName",
-    "StreamConfig",
-    "apply_preset",
-    "apply_values",
-    "config_toml",
-    "read_config",
-    "relocated",
-]
-
 PresetName = Literal["l", "s", "baseline", "ml", "ml-mo", "ml-mo-mc", "paper", "rigidity"]
 Config = TypeVar("Config")
 _NONE = "none"

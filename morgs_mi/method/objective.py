@@ -33,20 +33,6 @@ from morgs_mi.method.rigidity import isometry_loss, rigid_loss, rotation_loss
 from morgs_mi.render.rasterize import Image
 from morgs_mi.render.region import Region
 
-__all__ = [
-    "LOSS_TERMS",
-    "TERMS",
-    "KeyView",
-    "ObjectiveConfig",
-    "Prediction",
-    "Term",
-    "channels_of",
-    "loss_term",
-    "losses_of",
-    "observe",
-    "weights_of",
-]
-
 Observations = Mapping[str, Any]
 
 
@@ -118,25 +104,15 @@ Observer = Callable[[KeyView, MotionConfig, ObjectiveConfig], Mapping[str, np.nd
 
 @dataclass(frozen=True)
 class Term:
-    """One term of the objective.
+    """One term of the objective."""
 
-    Attributes:
-        name: in reports.
-        weight: lambda, by the settings.
-        loss: (prediction, observations, settings) -> scalar.
-        channels: that must be rendered.
-        observations: that must exist.
-        parameters: of the residual that must exist.
-        observer: (key view, settings of the motion, settings) -> observations [H, W, ...] by name; None: they exist
-            without it.
-    """
-
-    name: str
-    weight: Callable[[ObjectiveConfig], float]
-    loss: Loss
-    channels: tuple[str, ...] = ()
-    observations: tuple[str, ...] = ()
-    parameters: tuple[str, ...] = ()
+    name: str  #: In reports.
+    weight: Callable[[ObjectiveConfig], float]  #: Lambda, by the settings.
+    loss: Loss  #: (prediction, observations, settings) -> scalar.
+    channels: tuple[str, ...] = ()  #: That must be rendered.
+    observations: tuple[str, ...] = ()  #: That must exist.
+    parameters: tuple[str, ...] = ()  #: Of the residual that must exist.
+    #: (key view, settings of the motion, settings) -> observations [H, W, ...] by name; None: they exist without it.
     observer: Observer | None = None
 
 

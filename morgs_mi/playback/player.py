@@ -37,30 +37,6 @@ from morgs_mi.playback.visualise import confidence_image, depth_image, grey_imag
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = [
-    "CHANNELS",
-    "MOTION_SCALE",
-    "OFFSET_SCALE",
-    "PROVISIONAL",
-    "STREAM",
-    "available_channels",
-    "channel_image",
-    "find_camera",
-    "fitted_capture",
-    "has_confidence",
-    "has_offset",
-    "metadata_entry",
-    "num_frames",
-    "open_stream_capture",
-    "playback_speed",
-    "render",
-    "render_config",
-    "render_stream",
-    "stream_exposure",
-    "stream_name",
-    "truth_for_camera",
-]
-
 _ATTRIBUTE_CHANNELS = {row.channel: row.name for row in ATTRIBUTES if row.channel is not None}
 
 CHANNELS = ("color", "motion", *_ATTRIBUTE_CHANNELS, "offset", "depth", "alpha")

@@ -9,8 +9,6 @@ import numpy as np
 from morgs_mi.capture.capture import Capture
 from morgs_mi.codec.frame_source import FrameSource
 
-__all__ = ["about_lenses", "as_fitted"]
-
 
 def as_fitted(capture: Capture, stream: FrameSource) -> Capture:
     """Return a capture with the cameras of a stream, which its fit may have refined.

@@ -32,8 +32,6 @@ from morgs_mi.runs.recording import (
 )
 from morgs_mi.stream_loop import StreamLoop
 
-__all__ = ["Prepared", "push_frame", "stream_capture", "with_next", "with_points"]
-
 # Fewer points are replaced by triangulated ones, if there are more of those.
 _FEW_POINTS = 100
 

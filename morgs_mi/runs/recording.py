@@ -40,22 +40,6 @@ from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.exposure import Exposure
 from morgs_mi.playback.player import PROVISIONAL
 
-__all__ = [
-    "FILES",
-    "Entry",
-    "FitFiles",
-    "Interrupted",
-    "Recording",
-    "check_outputs",
-    "check_same_fit",
-    "described_capture",
-    "due_keyframe",
-    "interrupted_fit",
-    "read_reports",
-    "restart_of",
-    "stream_metadata",
-]
-
 _LOG = logging.getLogger(__name__)
 
 FILES = ("stream.morgs", "capture.json", "report.json")

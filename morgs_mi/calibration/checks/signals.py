@@ -16,17 +16,6 @@ import numpy as np
 from morgs_mi.capture.capture import Capture
 from morgs_mi.core.color_space import decode_light
 
-__all__ = [
-    "Lamp",
-    "Signals",
-    "brightness",
-    "known_median",
-    "lamp_flicker",
-    "others_median",
-    "read_signals",
-    "repeated_frames",
-]
-
 _WIDTH = 128  # of a thumbnail, px
 # Range of thumbnail values that determine a gain; darker ones are noise, brighter ones are clipped.
 _DARK, _BRIGHT, _MIN_PIXELS = 20, 240, 30

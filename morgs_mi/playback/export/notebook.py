@@ -11,8 +11,6 @@ from morgs_mi.io.png import png_bytes
 from morgs_mi.playback.export.web import web_page
 from morgs_mi.playback.player import channel_image, render, render_config, stream_exposure, stream_name
 
-__all__ = ["stream_html"]
-
 # Largest stream that is stored in a notebook, in bytes; the player adds a bit more than a megabyte.
 _LARGEST = 4_000_000
 # Width and height of the player in pixels, unless the output of the cell is narrower.

@@ -37,16 +37,12 @@ _OTHER_FILES = {
 class CameraPath:
     """A camera that moves through key views.
 
-    Attributes:
-        times: seconds [K], increasing from 0.
-        keys: the K views, all of the same image size.
-
     Raises:
         ValueError: fewer than two keys, times that do not increase from 0, or different image sizes.
     """
 
-    times: np.ndarray
-    keys: tuple[Camera, ...]
+    times: np.ndarray  #: Seconds [K], increasing from 0.
+    keys: tuple[Camera, ...]  #: The K views, all of the same image size.
 
     def __post_init__(self) -> None:
         times = np.asarray(self.times, np.float64)

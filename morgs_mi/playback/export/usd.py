@@ -45,8 +45,6 @@ from morgs_mi.core.geometry import covariances, rotated, unit_quats
 from morgs_mi.playback.export.axes import gltf_axes
 from morgs_mi.playback.export.formats import USD, choose_format
 
-__all__ = ["write_usd"]
-
 _COEFFICIENTS = "radiance:sphericalHarmonicsCoefficients"
 _DEGREE = "radiance:sphericalHarmonicsDegree"
 # Types of the arrays in pxr.Vt, as float and as half. Half positions would have steps of a thousandth of the scene.

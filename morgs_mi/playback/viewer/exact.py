@@ -14,8 +14,6 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.png import png_bytes
 from morgs_mi.playback.player import available_channels, channel_image, render, render_config, stream_exposure
 
-__all__ = ["ExactImages"]
-
 _MOST_PIXELS = 2**24  # a page of 4K has half as many
 
 

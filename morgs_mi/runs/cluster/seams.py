@@ -21,8 +21,6 @@ from morgs_mi.loop.observation import Setup
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.stream_loop import StreamState, step
 
-__all__ = ["COMMON_FRAMES", "SegmentConfig", "fit_seam_frame"]
-
 COMMON_FRAMES = 2
 """Frames of the common model: the second one determines the confidence."""
 

@@ -29,19 +29,12 @@ from morgs_mi.runs.recorder import push_frame, with_next
 from morgs_mi.runs.recording import due_keyframe, restart_of
 from morgs_mi.stream_loop import StreamLoop
 
-__all__ = ["Fit", "Part", "Segment", "Source", "fit_frames"]
-
 
 @dataclass(frozen=True)
 class Source:
-    """A capture as every worker opens it.
+    """A capture as every worker opens it; the other fields are as `load_capture` takes them."""
 
-    Attributes:
-        path: its folder, absolute, or its URL.
-        downscale, test_views, num_frames, reading: as `load_capture` takes them.
-    """
-
-    path: str
+    path: str  #: Its folder, absolute, or its URL.
     downscale: float
     test_views: tuple[int, ...]
     num_frames: int
@@ -86,18 +79,13 @@ class Fit:
 
 @dataclass(frozen=True)
 class Segment:
-    """A stretch of a recording, and how far it is fitted.
-
-    Attributes:
-        start, stop: its frames.
-        frame: the next one to fit.
-        restart: encoded packets that lead a decoder to the state before that frame, a keyframe and perhaps a residual.
-            Before a segment begins, they lead to the common model; before the recording begins, there are none.
-    """
+    """A stretch of a recording, from frame `start` up to `stop`, and how far it is fitted."""
 
     start: int
     stop: int
-    frame: int
+    frame: int  #: The next one to fit.
+    #: Encoded packets that lead a decoder to the state before that frame, a keyframe and perhaps a residual. Before a
+    #: segment begins, they lead to the common model; before the recording begins, there are none.
     restart: tuple[bytes, ...] = ()
 
     @property

@@ -31,8 +31,6 @@ from morgs_mi.runs.recorder import Prepared, push_frame
 from morgs_mi.runs.recording import FitFiles, Recording, check_outputs, stream_metadata
 from morgs_mi.stream_loop import StreamLoop
 
-__all__ = ["LiveFrame", "fit_live"]
-
 _LOG = logging.getLogger(__name__)
 
 
