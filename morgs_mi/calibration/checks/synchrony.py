@@ -5,6 +5,10 @@ is the change per epipolar plane and frame. The profiles of both views are simil
 difference of the cameras' time offsets (after Pundik and Moses, Video Synchronization Using Temporal Signals from
 Epipolar Lines, ECCV 2010).
 
+The offsets of `calibration.timing` are more exact. On 12 frames of `spheres` by 7 cameras of 128x96 pixels, which are
+up to 1.1 frames apart, their largest error is 0.05 frames, here 0.30. But its fits take minutes instead of half a
+second, and it finds no offsets beyond 3 frames.
+
 Notation: frame k of camera i shows the time k + o_i, with o_i its time offset in frames.
 """
 
