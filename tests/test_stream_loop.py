@@ -447,7 +447,7 @@ def test_resume__copies_its_images_and_refuses_those_of_another_size(clip, full)
     loop.resume(coded, [buffers])
     for buffer in buffers:
         buffer[:] = 0
-    assert all(np.array_equal(loop.state.seen.images[view], clip[0][view]) for view in range(4))
+    assert all(np.array_equal(loop.state.history.images[view], clip[0][view]) for view in range(4))
     with pytest.raises(ValueError, match=r"must be uint8 \[72, 96, 3\]"):
         loop.resume(coded, [[image[:50] for image in buffers]])
 

@@ -45,8 +45,8 @@ def fitted_first_frame(
         on_provisional: called with provisional keyframes during the fit; None: there are none.
     """
     config = setup.config
-    correction, correction_entry = estimate_correction(setup, observed.seen.images, progress)
-    views = views_of(setup, correction.corrected(observed.seen.images))
+    correction, correction_entry = estimate_correction(setup, observed.history.images, progress)
+    views = views_of(setup, correction.corrected(observed.history.images))
     rng = rng_of(config.seed, Stream.FIRST_FRAME)
     plan = plan_first_frame(views, setup.points, config.fit)
     problem = FirstFrameProblem.of(views, setup.cloud, plan.config, config.render, rng)
