@@ -452,7 +452,7 @@ def test_resume__copies_its_images_and_refuses_those_of_another_size(clip, full)
     loop.resume(coded, [buffers])
     for buffer in buffers:
         buffer[:] = 0
-    assert all(np.array_equal(loop.state.seen.images[view], clip[0][view]) for view in range(4))
+    assert all(np.array_equal(loop.state.history.images[view], clip[0][view]) for view in range(4))
     with pytest.raises(ValueError, match=r"must be uint8 \[72, 96, 3\]"):
         loop.resume(coded, [[image[:50] for image in buffers]])
 
@@ -646,7 +646,7 @@ def test_push__light_above_white_is_fitted_and_followed():
     for frame in range(2):
         _, report = loop.push([*map(mi.TensorXf, recorded(frame)[:4])])
         assert report.status == "ok"
-    assert loop.state.seen.display_exposure < -1
+    assert loop.state.history.display_exposure < -1
     rendered = np.asarray(held_out(loop.gaussians, ("color",)).color)
     truth = encode_light(recorded(1)[4])
     above = truth > 1.2
