@@ -1,6 +1,6 @@
 """Command line, the package's only argument parser.
 
-`morgs-mi synth`, `info`, `calibrate`, `fit`, `live`, `render`, `export`, `import`, `view`, `eval` and `demo`.
+`morgs-mi synth`, `info`, `calibrate`, `fit`, `live`, `render`, `export`, `import`, `view`, `eval`, `sweep` and `demo`.
 
 Results go to standard output; progress, warnings and errors to standard error. An error that the user can correct is
 one sentence and exit status 1, an interruption by Ctrl-C or SIGTERM is status 130; `--debug` adds the traceback.
@@ -35,6 +35,7 @@ from morgs_mi.cli.live import Live
 from morgs_mi.cli.render import Render
 from morgs_mi.cli.settings import Flag, Settings
 from morgs_mi.cli.suggestion import suggesting_command
+from morgs_mi.cli.sweep import Sweep
 from morgs_mi.cli.synth import Synth
 from morgs_mi.cli.view import View
 from morgs_mi.core.interrupts import INTERRUPTED, interruptible, is_interruption
@@ -52,6 +53,7 @@ Command = (
     | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
+    | Annotated[Sweep, tyro.conf.subcommand("sweep")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
 )
 
