@@ -14,6 +14,7 @@ from .fit.fit_config import FitConfig
 from .gaussian_integrator import ellipsoids
 from .io.ply import write_ply
 from .io.splats import read_splats
+from .loop.frame_report import FrameReport
 from .loop.stream_config import StreamConfig
 from .method.motion_config import MotionConfig
 from .method.objective import ObjectiveConfig, loss_term
@@ -29,7 +30,7 @@ from .render.rasterize import Image, rasterize
 from .render.render_config import RenderConfig
 from .runs.live.live_frames import live_frames
 from .runs.recorder import stream_capture
-from .stream_loop import FrameReport, StreamLoop
+from .stream_loop import StreamLoop
 from .synth.synth_config import SynthConfig
 from .synth.synthesize import synthesize
 

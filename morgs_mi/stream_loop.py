@@ -13,28 +13,23 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from morgs_mi.codec.container import Packet
-from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, residual_packet
+from morgs_mi.codec.packets import CodedFrame, decode, residual_packet
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.threads import in_background
-from morgs_mi.fit.budget import plan_first_frame
-from morgs_mi.fit.dropping import adapted_to_images
-from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
-from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.fit.initialise import MIN_POINTS
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
-from morgs_mi.fit.problem import FirstFrameProblem
-from morgs_mi.fit.unseen_views import unseen_views
-from morgs_mi.loop.correction import Correction, estimate_correction
+from morgs_mi.loop.correction import Correction
+from morgs_mi.loop.first_frame import fitted_first_frame, with_first_confidence
+from morgs_mi.loop.frame_report import FittedFrame, FrameReport
 from morgs_mi.loop.image_status import image_status
+from morgs_mi.loop.input_images import Given, as_array
 from morgs_mi.loop.observation import (
     FrameObservation,
     Images,
@@ -44,56 +39,17 @@ from morgs_mi.loop.observation import (
     observe_frame,
     prepare,
     see_frame,
-    views_of,
 )
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.active_set import ActiveSet, find_active_set, full_active_set
-from morgs_mi.method.confidence import motion_mask
 from morgs_mi.method.exposure import Exposure
-from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.motion import initial_motion
 from morgs_mi.method.objective import Observations, channels_of, observe
 from morgs_mi.method.ssim import Target
 
-__all__ = ["FrameReport", "StreamLoop", "StreamState", "step"]
+__all__ = ["StreamLoop", "StreamState", "step"]
 
 _LOG = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class FrameReport:
-    """Report of one frame.
-
-    Attributes:
-        frame: its index.
-        seconds: wall time from the images to the packet, optical flow and optimisation included.
-        num_bytes: size of the packet in the stream.
-        losses: means over the last steps, by the names of the terms.
-        num_gaussians: number of Gaussians of the frame.
-        status: "ok", or a sentence about a problem and how it was handled.
-        missing_views: names of the views without an image.
-        active: fractions that took part, by name: gaussians, views, pixels, epochs.
-        validation: of the first frame, a `sentence` on views between the cameras, with the fields of `UnseenViews`
-            (see `fit.unseen_views`); empty with a single view.
-        steps: number of optimisation steps.
-        exposures: gain and bias of each view; empty if they are not estimated.
-    """
-
-    frame: int
-    seconds: float
-    num_bytes: int
-    losses: dict[str, float]
-    num_gaussians: int
-    status: str = "ok"
-    missing_views: tuple[str, ...] = ()
-    active: dict[str, float] = field(default_factory=dict)
-    validation: dict[str, Any] = field(default_factory=dict)
-    steps: int = 0
-    exposures: tuple[Exposure, ...] = ()
-
-    def __repr__(self) -> str:
-        size = f"{self.num_gaussians} Gaussians, {self.num_bytes} bytes, {self.seconds:.1f} s"
-        return f"FrameReport(frame {self.frame}, {size}, {self.status})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,24 +76,11 @@ class StreamState:
         return self.coded.gaussians if self.coded else None
 
 
-@dataclass(frozen=True)
-class _Fitted:
-    """Result of the fit of a frame: its packet, entries of its `FrameReport`, and the correction of its images."""
-
-    packet: Packet
-    correction: Correction
-    losses: dict[str, float]
-    steps: int
-    status: str
-    active: dict[str, float] = field(default_factory=dict)
-    validation: dict[str, Any] = field(default_factory=dict)
-
-
 @interrupts_raised()
 def step(
     setup: Setup,
     state: StreamState,
-    images: Sequence[np.ndarray | None] | FrameObservation,
+    images: Sequence[Given | None] | FrameObservation,
     progress: Report | None = None,
     on_provisional: Callable[[Packet], None] | None = None,
 ) -> tuple[StreamState, Packet, FrameReport]:
@@ -146,7 +89,8 @@ def step(
     Args:
         setup: data that all frames share, as from `prepare`.
         state: as returned for the last frame; `StreamState()` before the first.
-        images: per training view uint8 [H, W, 3], RGB, or None where the view has no image. They are copied.
+        images: per training view an image [H, W, 3], RGB, or None where the view has none: uint8 in sRGB, linear light
+            as a float array or a `mi.TensorXf`, or a `mi.Bitmap`, whose flag `srgb_gamma` counts. They are copied.
             Alternatively, the result of `observe_frame` for them.
         progress: called with (stage, done, total): the stages of the first frame, or the steps of a later one.
         on_provisional: called with provisional keyframes while the first frame is fitted.
@@ -158,9 +102,9 @@ def step(
     frame_progress = Progress(progress, f"Frame {state.frame}")
     observed = images if isinstance(images, FrameObservation) else observe_frame(setup, state.frame, state.seen, images)
     if state.coded is None:
-        fitted = _fit_first_frame(setup, observed, frame_progress, on_provisional)
+        fitted = fitted_first_frame(setup, observed, frame_progress, on_provisional)
     else:
-        fitted = _fit_later_frame(setup, state, observed, frame_progress)
+        fitted = _fitted_later_frame(setup, state, observed, frame_progress)
     coded = decode(state.coded, fitted.packet)
     seen = observed.seen
     report = FrameReport(
@@ -187,21 +131,27 @@ def _status(setup: Setup, state: StreamState, images: Images, status: str) -> st
     return "; ".join([*([] if status == "ok" else [status]), *problems]) or "ok"
 
 
-def _fit_later_frame(setup: Setup, state: StreamState, observed: FrameObservation, progress: Progress) -> _Fitted:
-    """Return the fit of a later frame; numbers refer to the paper's equations."""
+def _fitted_later_frame(
+    setup: Setup, state: StreamState, observed: FrameObservation, progress: Progress
+) -> FittedFrame:
+    """Return the fit of a later frame; numbers in brackets are the paper's equations."""
     assert state.coded is not None
-    config, motion, images, flows = setup.config, setup.config.motion, observed.seen.images, observed.flows
+    config = setup.config
+    motion = config.motion
+    images = observed.seen.images
     rng = rng_of(config.seed, Stream.LATER_FRAMES, state.frame)  # of its own for each frame: it is no state
-    previous = _first_confidence(setup, state, flows, rng)  # frame 0's confidence (11)
+    previous = state.coded.gaussians
+    if state.frame == 1:  # the masks of frame 0 need the flow to this frame
+        previous = with_first_confidence(setup, previous, state.seen.images, observed.flows, rng)  # (9-11)
     observations = observe(observed.key_views, motion, config.fit.objective)
     active = _active_set(setup, previous, images, observed.changes, observations)
-    corrected = state.correction.corrected({view: images[view] for view in active.views})
+    corrected = state.correction.corrected({view: observed.encoded[view] for view in active.views})
     targets = {view: Target(image, setup.masks[view]) for view, image in corrected.items()}
-    initial = initial_motion(previous, active, flows, targets, motion, rng)  # motion (5)
+    initial = initial_motion(previous, active, observed.flows, targets, motion, rng)  # motion (5)
     problem = FrameProblem(previous, active, targets, observations, initial, setup.extent)
     fitted = fit_later_frame(problem, config.fit, motion, rng, progress)  # residual (6-8, 12), objective (13)
     packet = residual_packet(state.coded, fitted.gaussians, fitted.source, setup.cameras, config.codec)  # (3)
-    return _Fitted(
+    return FittedFrame(
         packet=packet,
         correction=state.correction,
         losses=fitted.losses,
@@ -209,65 +159,6 @@ def _fit_later_frame(setup: Setup, state: StreamState, observed: FrameObservatio
         status="ok" if images else "no view has an image",
         active={**active.fractions, "epochs": fitted.epochs / config.fit.epochs},
     )
-
-
-def _fit_first_frame(
-    setup: Setup,
-    observed: FrameObservation,
-    progress: Progress,
-    on_provisional: Callable[[Packet], None] | None,
-) -> _Fitted:
-    """Return the fit of the first frame."""
-    config = setup.config
-    correction, correction_entry = estimate_correction(setup, observed.seen.images, progress)
-    views = views_of(setup, correction.corrected(observed.seen.images))
-    rng = rng_of(config.seed, Stream.FIRST_FRAME)
-    plan = plan_first_frame(views, setup.points, config.fit)
-    problem = FirstFrameProblem.of(views, setup.cloud, plan.config, config.render, rng)
-    fit_config = adapted_to_images(plan.config, problem)
-
-    def packed(gaussians: Gaussians) -> Packet:
-        return keyframe_packet(gaussians, 0, setup.cameras, config.codec)
-
-    on_round = None if on_provisional is None else lambda gaussians: on_provisional(packed(gaussians))
-    fitted = fit_first_frame(problem, fit_config, rng, progress.of(plan.stage), on_round)
-    forecast = unseen_views(problem, fitted.gaussians).entries if len(views) > 1 else {}
-    return _Fitted(
-        packet=packed(fitted.gaussians),
-        correction=correction,
-        losses=fitted.losses,
-        steps=fitted.steps,
-        status=_start_status(setup, plan.config),
-        validation=forecast | correction_entry,
-    )
-
-
-def _start_status(setup: Setup, config: FitConfig) -> str:
-    """Return a status about the points that the first frame starts from."""
-    if (count := len(setup.points)) >= MIN_POINTS:
-        return "ok"
-    status = f"the capture has {count} points, too few: seeded {config.first_count} random ones inside the views"
-    _LOG.warning("frame 0: %s", status)
-    return status
-
-
-def _first_confidence(
-    setup: Setup, state: StreamState, flows: Mapping[int, FlowObservation], rng: np.random.Generator
-) -> Gaussians:
-    """Return the previous Gaussians; in frame 1 with a confidence learned from the masks of frame 0 (eq. 11).
-
-    The masks of the first frame need the flow to the second one.
-    """
-    previous, config = state.gaussians, setup.config
-    assert previous is not None
-    if state.frame != 1 or not flows or not config.motion.learn_confidence:
-        return previous
-    motion, images = config.motion, state.seen.images
-    masks = {
-        v: motion_mask(images[v], flow.forward_flow, flow.forward_reliable, motion.mask_method, motion.masks)
-        for v, flow in flows.items()
-    }
-    return fit_confidence(previous, dict(enumerate(setup.cameras)), masks, config.fit, config.render, rng)[0]
 
 
 def _active_set(
@@ -297,14 +188,16 @@ class StreamLoop:
         point_colors: [P, 3] in [0, 1].
         config: settings.
         masks: per view [H, W] bool of valid pixels, or None.
+        display_exposure: stops by which images in linear light are brightened where flow and changes are computed,
+            which see 8 bits; None: if any light of the first frame exceeds 1, the 99th percentile becomes 1.
 
     Example:
         >>> loop = morgs_mi.StreamLoop(cameras, points, point_colors)
-        >>> for images in frames:  # per frame one uint8 image [H, W, 3] per camera
+        >>> for images in frames:  # per frame one image [H, W, 3] per camera: uint8, or linear light in floats
         ...     packet, report = loop.push(images)
 
     Raises:
-        ValueError: no cameras, points that are not finite, colours outside [0, 1] or of another shape, or a mask of
+        ValueError: no cameras, points that are not finite, colours of another range or shape, or a mask of
             another shape than its view.
     """
 
@@ -315,8 +208,9 @@ class StreamLoop:
         point_colors: np.ndarray,
         config: StreamConfig | None = None,
         masks: Sequence[np.ndarray | None] | None = None,
+        display_exposure: float | None = None,
     ) -> None:
-        self.setup = prepare(cameras, points, point_colors, config, masks)
+        self.setup = prepare(cameras, points, point_colors, config, masks, display_exposure)
         self.state = StreamState()
         self._ahead: tuple[int, Future[FrameObservation]] | None = None  # of the next frame, with its index
 
@@ -329,8 +223,9 @@ class StreamLoop:
             config: settings.
         """
         views = capture.train_views
-        cameras, masks = [capture.cameras[v] for v in views], [capture.masks[v] for v in views]
-        return cls(cameras, capture.points, capture.point_colors, config, masks)
+        cameras = [capture.cameras[v] for v in views]
+        masks = [capture.masks[v] for v in views]
+        return cls(cameras, capture.points, capture.point_colors, config, masks, capture.display_exposure)
 
     def __repr__(self) -> str:
         return f"StreamLoop({len(self.setup.cameras)} cameras, frame {self.state.frame} is next, {self.gaussians})"
@@ -343,10 +238,10 @@ class StreamLoop:
     @interrupts_raised()
     def push(
         self,
-        images: Sequence[np.ndarray | None],
+        images: Sequence[Given | None],
         progress: Report | None = None,
-        upcoming: Sequence[np.ndarray | None] | None = None,
-        recorded: Sequence[np.ndarray | None] | None = None,
+        upcoming: Sequence[Given | None] | None = None,
+        recorded: Sequence[Given | None] | None = None,
         on_provisional: Callable[[Packet], None] | None = None,
     ) -> tuple[Packet, FrameReport]:
         """Fit the next frame and return its packet for the stream, and its report; see `step`.
@@ -360,29 +255,34 @@ class StreamLoop:
                 frame, where `images` are interpolated because cameras have delays.
             on_provisional: as for `step`.
         """
-        start, frame, before = time.perf_counter(), self.state.frame, self.state.seen
-        observed = self._observed_ahead(images) or observe_frame(self.setup, frame, before, images)
-        seen = observed.seen if recorded is None else see_frame(self.setup, frame, before, recorded)[0]
+        start = time.perf_counter()
+        frame = self.state.frame
+        past = self.state.seen
+        observed = self._observed_ahead(images) or observe_frame(self.setup, frame, past, images)
+        seen = observed.seen if recorded is None else see_frame(self.setup, frame, past, recorded)[0]
         if upcoming is not None:
-            copies = [None if image is None else np.array(image) for image in upcoming]
+            copies = [None if image is None else np.array(as_array(image)) for image in upcoming]
             self._ahead = frame + 1, in_background(partial(observe_frame, self.setup, frame + 1, seen, copies))
         state, packet, report = step(self.setup, self.state, observed, progress, on_provisional)
         self.state = replace(state, seen=seen)
         return packet, replace(report, seconds=time.perf_counter() - start)
 
-    def _observed_ahead(self, images: Sequence[np.ndarray | None]) -> FrameObservation | None:
+    def _observed_ahead(self, images: Sequence[Given | None]) -> FrameObservation | None:
         """Return the observation made ahead of time, if its images are the same."""
-        ahead, self._ahead = self._ahead, None
+        ahead = self._ahead
+        self._ahead = None
         if ahead is None or ahead[0] != self.state.frame:
             return None
-        observed, given = ahead[1].result(), {v: image for v, image in enumerate(images) if image is not None}
-        same = given.keys() == observed.recorded.keys()
-        return observed if same and all(np.array_equal(given[v], observed.recorded[v]) for v in given) else None
+        observed = ahead[1].result()
+        present = {v: as_array(image) for v, image in enumerate(images) if image is not None}
+        same_views = present.keys() == observed.recorded.keys()
+        same = same_views and all(np.array_equal(image, observed.recorded[v]) for v, image in present.items())
+        return observed if same else None
 
     def resume(
         self,
         coded: CodedFrame,
-        frames: Iterable[Sequence[np.ndarray | None]],
+        frames: Iterable[Sequence[Given | None]],
         exposures: Sequence[Exposure] = (),
     ) -> None:
         """Continue after a frame of a stream, as if it had just been pushed.

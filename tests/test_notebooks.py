@@ -33,7 +33,7 @@ import mitsuba as mi
 mi.set_variant("llvm_ad_rgb")
 import morgs_mi
 from morgs_mi import ProgressBar as Bar
-from morgs_mi.codec.packets import play
+from morgs_mi.codec.frame_source import play
 from morgs_mi.playback.export.clips import write_each
 from morgs_mi.playback.export.web import write_web_page
 from morgs_mi.runs.import_frames import import_frames

@@ -9,15 +9,16 @@ import json
 import threading
 from itertools import pairwise
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize, stream_loop
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.codec.container import PacketKind, encode_packet
-from morgs_mi.codec.packets import coded_frames, decode, play
+from morgs_mi.codec.packets import coded_frames, decode
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.color_space import SH_C0
+from morgs_mi.core.color_space import SH_C0, decode_light, encode_light
 from morgs_mi.evaluate.metrics import endpoint_error, psnr
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig, LearningRates, ShortFitConfig
 from morgs_mi.loop import observation
@@ -140,10 +141,10 @@ def test_push__confidence_is_high_where_things_move(full):
 
 def test_push__decoder_has_the_encoders_state_to_the_bit(full):
     loop, packets, _ = full
-    *_, (frame, decoded) = play(packets)
-    assert frame == 2
+    *_, decoded = coded_frames(packets)
+    assert decoded.frame == 2
     state = loop.gaussians.numpy()
-    for name, value in decoded.numpy().items():
+    for name, value in decoded.gaussians.numpy().items():
         assert np.array_equal(value, state[name]), name
 
 
@@ -326,7 +327,7 @@ def test_stream_capture__writes_a_file(clip, tmp_path):
     reader = StreamReader(path)
     assert [c.name for c in reader.cameras] == [c.name for c in cameras()]
     assert (reader.metadata["train_views"], reader.metadata["downscale"]) == ([0, 1, 2, 3], 2)
-    assert [frame for frame, _ in play(reader)] == [0, 1]
+    assert [state.frame for state in reader.states()] == [0, 1]
     assert sum(r.num_bytes for r in reports) < path.stat().st_size
     assert ticks[-1] == ("Later frames", 1, 1)
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["capture.json", "report.json", "stream.morgs"]
@@ -345,7 +346,11 @@ def masked(masks):
         (lambda clip: new_loop().push(clip[0][:3]), "one image or None for each of 4 views, got 3"),
         (lambda clip: new_loop().push([None] * 4), "frame 0 must have an image of at least one view, got none"),
         (lambda clip: new_loop().push([i[:50] for i in clip[0][:4]]), r"view 'cam00' must be uint8 \[72, 96, 3\]"),
-        (lambda clip: new_loop().push([i / 255 for i in clip[0][:4]]), "got float64"),
+        (lambda clip: new_loop().push([i.astype(int) for i in clip[0][:4]]), "got int64"),
+        (
+            lambda clip: new_loop().push([np.full(i.shape, np.nan) for i in clip[0][:4]]),
+            "must be finite and at most 1e",
+        ),
         (
             lambda clip: StreamLoop(cameras(), np.full((200, 3), np.nan), np.zeros((200, 3))),
             r"`points` must be finite and at most 1e\+12, got .* at 0",
@@ -357,7 +362,7 @@ def masked(masks):
         (lambda clip: StreamLoop(cameras(), np.zeros((3, 4)), np.zeros((4, 3))), r"`points` must be \[P, 3\]"),
         (
             lambda clip: StreamLoop(cameras(), np.zeros((200, 3)), np.full((200, 3), 128)),
-            r"`point_colors` must be in \[0, 1\], got \[128, 128, 128\] at 0; divide colours of 8 bits by 255",
+            r"`point_colors` must be from 0 to 32 with white at 1, got .* at 0; divide colours of 8 bits by 255",
         ),
         (lambda clip: masked([None]), "one mask or None for each of 4 views, got 1"),
         (lambda clip: masked([None, np.ones((50, 96), bool), None, None]), r"view 'cam01': the mask must be bool \[72"),
@@ -619,3 +624,32 @@ def test_push__reports_a_black_first_frame_and_a_cut(clip):
         "ok",
         "the images show another scene than in the frame before",
     ]
+
+
+def test_push__light_above_white_is_fitted_and_followed():
+    """The wall of the scene shines with 1 to 20 times white; images, points and packets have encoded colours."""
+
+    def shining(frame):
+        gaussians, moves = scene(frame)
+        sh = gaussians.numpy()["sh_coeffs"] + np.where(moves, 0, 1.5 / SH_C0)[:, None, None].astype(np.float32)
+        return dataclasses.replace(gaussians, sh_coeffs=sh)
+
+    def recorded(frame):
+        views = cameras()
+        return [decode_light(np.asarray(rasterize(shining(frame), c, ("color",)).color)) for c in views]
+
+    start = shining(0).numpy()
+    colors = np.maximum(start["sh_coeffs"][:, 0] * SH_C0 + 0.5, 0)
+    loop = StreamLoop(cameras()[:4], start["means"], colors, SHORT)
+    images = recorded(0)
+    assert max(image.max() for image in images) > 10
+    for frame in range(2):
+        _, report = loop.push([*map(mi.TensorXf, recorded(frame)[:4])])
+        assert report.status == "ok"
+    assert loop.state.seen.display_exposure < -1
+    rendered = np.asarray(held_out(loop.gaussians, ("color",)).color)
+    truth = encode_light(recorded(1)[4])
+    above = truth > 1.2
+    # Without the range above white the error would be at least 0.2.
+    assert above.mean() > 0.2
+    assert np.abs(rendered - truth)[above].mean() < 0.1

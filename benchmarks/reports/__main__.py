@@ -11,28 +11,25 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any, ClassVar
 
 import tyro
-from tyro.conf import arg
 
 from benchmarks.reports import codec, method, renderer
 from morgs_mi.cli import Common, run
+from morgs_mi.cli.suggestion import one_command
 
-Subject = (
-    Annotated[renderer.Options, tyro.conf.subcommand("renderer")]
-    | Annotated[codec.Options, tyro.conf.subcommand("codec")]
-    | Annotated[method.Options, tyro.conf.subcommand("method")]
-)
+SUBJECTS = {"renderer": renderer.Options, "codec": codec.Options, "method": method.Options}
 
 
 @dataclass(frozen=True)
 class Options(Common):
     """Measure error and run time of a part of the package."""
 
-    command: Annotated[Subject, arg(name="")] = tyro.MISSING
+    commands: ClassVar[Mapping[str, type]] = SUBJECTS
+    command: Annotated[Any, one_command(SUBJECTS)] = tyro.MISSING
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -25,9 +25,9 @@ from benchmarks.reports.plots import Column, blank_figure, means_over, save_figu
 from benchmarks.speed.output import Output
 from morgs_mi.core.files import json_finite
 from morgs_mi.evaluate.results import Evaluation, known_mean
+from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig, apply_preset, apply_values
 from morgs_mi.runs.cluster.tasks import Source
-from morgs_mi.stream_loop import FrameReport
 
 __all__ = ["METHODS", "Options", "field_table", "main", "plot_field"]
 

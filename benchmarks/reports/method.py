@@ -37,11 +37,11 @@ from morgs_mi.core.files import json_finite
 from morgs_mi.core.rig import choose_key_views
 from morgs_mi.evaluate.results import Evaluation, known_mean
 from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import PRESETS, StreamConfig, apply_preset
 from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FramePair
 from morgs_mi.runs.cluster.tasks import Source
-from morgs_mi.stream_loop import FrameReport
 
 if TYPE_CHECKING:
     from distributed import Client

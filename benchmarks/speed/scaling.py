@@ -25,11 +25,11 @@ from benchmarks.speed.output import Output
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.cluster.seams import COMMON_FRAMES, SegmentConfig
 from morgs_mi.runs.cluster.segments import SegmentedRun
 from morgs_mi.runs.cluster.workers import open_client
-from morgs_mi.stream_loop import FrameReport
 from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 

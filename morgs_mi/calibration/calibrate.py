@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -27,6 +27,7 @@ from morgs_mi.capture.masks import opaque_pixels
 from morgs_mi.capture.timeline import nearest_frames
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_number
+from morgs_mi.core.color_space import display_image, display_stops
 from morgs_mi.core.files import atomic_path
 from morgs_mi.io.video import FrameReader, open_frames
 
@@ -70,44 +71,27 @@ class CalibrateConfig:
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """Result of `calibrate`.
+    """Result of `calibrate`."""
 
-    Attributes:
-        model: folder of the COLMAP model.
-        cameras: names of the calibrated cameras.
-        left_out: names of the cameras that could not be calibrated.
-        points: number of points.
-        error: mean reprojection error of the points, px.
-        checks: result of every camera, including the ones left out; `matches` is the number of its points.
-        mapper: COLMAP's mapper of the model, ``"incremental"`` or ``"global"``.
-        principal_points: whether each image has a principal point of its own.
-    """
-
-    model: Path
-    cameras: tuple[str, ...]
-    left_out: tuple[str, ...]
-    points: int
-    error: float
+    model: Path  #: Folder of the COLMAP model.
+    cameras: tuple[str, ...]  #: Names of the calibrated cameras.
+    left_out: tuple[str, ...]  #: Names of the cameras that could not be calibrated.
+    points: int  #: Number of points.
+    error: float  #: Mean reprojection error of the points, px.
+    #: Result of every camera, including the ones left out; `matches` is the number of its points.
     checks: tuple[CameraCheck, ...]
-    mapper: Mapper
-    principal_points: bool
+    mapper: Mapper  #: COLMAP's mapper of the model, ``"incremental"`` or ``"global"``.
+    principal_points: bool  #: Whether each image has a principal point of its own.
 
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A model of COLMAP.
+    """A model of COLMAP."""
 
-    Attributes:
-        mapper: the mapper that made it.
-        model: pycolmap's reconstruction.
-        checks: result of every camera, including the ones without a pose.
-        principal_points: whether each image has a principal point of its own.
-    """
-
-    mapper: Mapper
-    model: Any
-    checks: tuple[CameraCheck, ...]
-    principal_points: bool = False
+    mapper: Mapper  # the mapper that made it
+    model: Any  # pycolmap's reconstruction
+    checks: tuple[CameraCheck, ...]  # result of every camera, including the ones without a pose
+    principal_points: bool = False  # whether each image has a principal point of its own
 
     @property
     def error(self) -> float:
@@ -232,7 +216,9 @@ def _frames(
     if short:
         raise ValueError(f"{path}: frame {config.frame} is not in the clips of {', '.join(short)}; choose another.")
     at = {name: int(nearest_frames(reader, np.array([config.frame]))[0]) for name, reader in readers.items()}
-    images = {name: next(reader.frames(at[name], at[name] + 1)) for name, reader in readers.items()}
+    recorded = {name: next(reader.frames(at[name], at[name] + 1)) for name, reader in readers.items()}
+    stops = display_stops(recorded.values())
+    images = {name: display_image(image, stops) for name, image in recorded.items()}
     masks = {name: opaque_pixels(reader, name)[0] for name, reader in readers.items()}
     return images, {name: mask for name, mask in masks.items() if mask is not None}
 
@@ -371,7 +357,9 @@ def _median_error(model: Any) -> float:
 
 
 def _check_features(path: Path, database: Path) -> None:
-    with _opened(database) as db:
+    import pycolmap
+
+    with closing(pycolmap.Database.open(database)) as db:
         counts = {Path(i.name).stem: db.num_keypoints_for_image(i.image_id) for i in db.read_all_images()}
     if poor := {name: count for name, count in counts.items() if count < _MIN_FEATURES}:
         table = ", ".join(f"{count} in {name}" for name, count in poor.items())
@@ -382,7 +370,9 @@ def _check_features(path: Path, database: Path) -> None:
 
 
 def _check_pairs(path: Path, database: Path) -> None:
-    with _opened(database) as db:
+    import pycolmap
+
+    with closing(pycolmap.Database.open(database)) as db:
         count = len(db.read_all_images())
         _, geometries = db.read_two_view_geometries()
     if not any(len(geometry.inlier_matches) for geometry in geometries):
@@ -390,17 +380,6 @@ def _check_pairs(path: Path, database: Path) -> None:
             f"{path}: no two of the {count} views match: they may show different objects, be too far apart (more than "
             f"about 30 degrees), or not be simultaneous; move the cameras closer, or {_MORE_TEXTURE}."
         )
-
-
-@contextmanager
-def _opened(database: Path) -> Iterator[Any]:
-    import pycolmap
-
-    db = pycolmap.Database.open(database)
-    try:
-        yield db
-    finally:
-        db.close()
 
 
 @contextmanager

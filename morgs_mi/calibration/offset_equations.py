@@ -51,21 +51,13 @@ _GROUP = 32
 
 @dataclass(frozen=True, eq=False)
 class OffsetEquations:
-    """S o = r of V views; sums of the equations of several instants are equations again.
+    """S o = r of V views; sums of the equations of several instants are equations again."""
 
-    Attributes:
-        matrix: S [V, V]; the columns of held-out views are zero off the diagonal.
-        right: r [V].
-        scatter: sum over groups of neighbouring Gaussians of the products of their parts of r [V, V].
-        own: sum of d^T c [V], the diagonal of S if the Gaussians were in their true positions.
-        train: mask of the training views, bool [V].
-    """
-
-    matrix: np.ndarray
-    right: np.ndarray
-    scatter: np.ndarray
-    own: np.ndarray
-    train: np.ndarray
+    matrix: np.ndarray  #: S [V, V]; the columns of held-out views are zero off the diagonal.
+    right: np.ndarray  #: r [V].
+    scatter: np.ndarray  #: Sum over groups of neighbouring Gaussians of the products of their parts of r [V, V].
+    own: np.ndarray  #: Sum of d^T c [V], the diagonal of S if the Gaussians were in their true positions.
+    train: np.ndarray  #: Mask of the training views, bool [V].
 
     def __add__(self, other: OffsetEquations) -> OffsetEquations:
         return OffsetEquations(

@@ -80,27 +80,17 @@ _LATER_RATES = {"means": 0.25, "scales": 0.5, "quats": 0.5, "opacities": 0.25}
 
 @dataclass(frozen=True)
 class Refinement:
-    """Result of refining cameras.
+    """Result of refining cameras."""
 
-    Attributes:
-        taken: whether the refined cameras are used.
-        calibrated_psnr: PSNR of withheld pixels in a fit with the calibrated cameras, dB; NaN without a comparison.
-        refined_psnr: PSNR of the same pixels in a fit with the refined cameras, dB.
-        tracks: number of points in the bundle adjustment; 0 if there were too few.
-        rotation: largest change of a rotation, degrees.
-        position: largest change of a position, world units.
-        focal: largest relative change of a focal length.
-        distortion: largest shift of a pixel by the remaining distortion, in image widths.
-    """
-
-    taken: bool
+    taken: bool  #: Whether the refined cameras are used.
+    #: PSNR of withheld pixels in a fit with the calibrated cameras, dB; NaN without a comparison.
     calibrated_psnr: float
-    refined_psnr: float
-    tracks: int
-    rotation: float
-    position: float
-    focal: float
-    distortion: float = 0.0
+    refined_psnr: float  #: PSNR of the same pixels in a fit with the refined cameras, dB.
+    tracks: int  #: Number of points in the bundle adjustment; 0 if there were too few.
+    rotation: float  #: Largest change of a rotation, degrees.
+    position: float  #: Largest change of a position, world units.
+    focal: float  #: Largest relative change of a focal length.
+    distortion: float = 0.0  #: Largest shift of a pixel by the remaining distortion, in image widths.
 
     @property
     def sentence(self) -> str:
@@ -157,32 +147,21 @@ def refine_cameras(
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Cameras to refine, and the images that evaluate them.
+    """Cameras to refine, and the images that evaluate them."""
 
-    Attributes:
-        capture: capture with the calibrated cameras.
-        indices: indices of the V training views with an image.
-        views: these views, reduced, without the withheld blocks.
-        unseen: their withheld blocks.
-        extent: scene extent, world units.
-        config: settings of the fit.
-        render: cut-offs.
-        seed: seed of all random choices.
-    """
-
-    capture: Capture
-    indices: tuple[int, ...]
-    views: tuple[View, ...]
-    unseen: tuple[View, ...]
-    extent: float
-    config: FitConfig
-    render: RenderConfig
-    seed: int
+    capture: Capture  # capture with the calibrated cameras
+    indices: tuple[int, ...]  # indices of the V training views with an image
+    views: tuple[View, ...]  # these views, reduced, without the withheld blocks
+    unseen: tuple[View, ...]  # their withheld blocks
+    extent: float  # scene extent, world units
+    config: FitConfig  # settings of the fit
+    render: RenderConfig  # cut-offs
+    seed: int  # seed of all random choices
 
     @classmethod
     def of(cls, capture: Capture, config: FitConfig, render: RenderConfig, seed: int) -> _Problem:
         """Return the problem of the first frame of a capture; raises as `refine_cameras`."""
-        images = next(capture.partial_frames(0, 1)).images
+        images = next(capture.displayed().partial_frames(0, 1)).images
         given = {
             v: View(capture.cameras[v], image, capture.masks[v])
             for v in capture.train_views
@@ -297,7 +276,7 @@ def _matched(capture: Capture, train: Sequence[int], deviations: np.ndarray) -> 
 
     Without enough points, there are no changes, and the deviations equal the priors' deviations.
     """
-    recorded = capture.at_recorded_size()
+    recorded = capture.displayed().at_recorded_size()
     images, cameras = next(recorded.partial_frames(0, 1)).images, [recorded.cameras[v] for v in train]
     features = [detect(images[v], recorded.masks[v]) for v in train]
     tracks = join_matches(match_views(features, cameras), features)

@@ -62,19 +62,12 @@ def stereo_points(
 
 @dataclass(frozen=True)
 class _View:
-    """A view, reduced.
+    """A view, reduced."""
 
-    Attributes:
-        camera: camera of the image's size.
-        image: uint8 [H, W, 3].
-        blurred: the image, averaged over 3 x 3 pixels.
-        valid: uint8 [H, W], 255 where the pixel is valid.
-    """
-
-    camera: Camera
-    image: np.ndarray
-    blurred: np.ndarray
-    valid: np.ndarray
+    camera: Camera  # camera of the image's size
+    image: np.ndarray  # uint8 [H, W, 3]
+    blurred: np.ndarray  # the image, averaged over 3 x 3 pixels
+    valid: np.ndarray  # uint8 [H, W], 255 where the pixel is valid
 
     @classmethod
     def of(cls, camera: Camera, image: np.ndarray, mask: np.ndarray | None) -> _View:
@@ -110,23 +103,16 @@ def _depth_range(cameras: Sequence[Camera], view: int, known: np.ndarray) -> tup
 
 @dataclass(frozen=True)
 class _Rectified:
-    """Two views on one plane along the line between their cameras.
+    """Two views on one plane along the line between their cameras."""
 
-    Attributes:
-        axes: axes of the plane, rows right, down and forward in the world [3, 3].
-        focal: focal length, px.
-        baseline: distance of the cameras, world units.
-        homographies: mappings from the pixels of each view to the pixels of its rectified image.
-        corners: position of each image's first column relative to the optical axis, px, and of their first row.
-        size: width and height of both images.
-    """
-
-    axes: np.ndarray
-    focal: float
-    baseline: float
+    axes: np.ndarray  # axes of the plane, rows right, down and forward in the world [3, 3]
+    focal: float  # focal length, px
+    baseline: float  # distance of the cameras, world units
+    # mappings from the pixels of each view to the pixels of its rectified image
     homographies: tuple[np.ndarray, np.ndarray]
+    # position of each image's first column relative to the optical axis, px, and of their first row
     corners: tuple[float, float, float]
-    size: tuple[int, int]
+    size: tuple[int, int]  # width and height of both images
 
     @classmethod
     def of(cls, a: Camera, b: Camera) -> _Rectified | None:

@@ -71,22 +71,16 @@ _MOVED, _LEAST_FOUND = 0.5, 0.05
 
 @dataclass(frozen=True)
 class TimeOffsets:
-    """Time offsets of the cameras.
+    """Time offsets of the cameras."""
 
-    Attributes:
-        offsets: by name, the frame of each camera's clip that is simultaneous with frame 0 of the reference's, as in
-            `ReadConfig.offset`; negative for a camera that began later.
-        errors: by name, standard errors of the offsets, frames: large where the images hardly depend on the offset.
-        reference: name of the held-out camera, or of the first one; its offset does not change.
-        change: largest change in the last round, frames.
-        converged: whether `change` is within the tolerance; the accuracy of the offsets is in `errors`.
-    """
-
+    #: By name, the frame of each camera's clip that is simultaneous with frame 0 of the reference's, as in
+    #: `ReadConfig.offset`; negative for a camera that began later.
     offsets: dict[str, float]
+    #: By name, standard errors of the offsets, frames: large where the images hardly depend on the offset.
     errors: dict[str, float]
-    reference: str
-    change: float
-    converged: bool
+    reference: str  #: Name of the held-out camera, or of the first one; its offset does not change.
+    change: float  #: Largest change in the last round, frames.
+    converged: bool  #: Whether `change` is within the tolerance; the accuracy of the offsets is in `errors`.
 
 
 def estimate_time_offsets(
@@ -157,21 +151,13 @@ def _found_back(rounds: _Rounds, offsets: np.ndarray, equations: OffsetEquations
 
 @dataclass(eq=False)
 class _Rounds:
-    """Fits of successive rounds.
+    """Fits of successive rounds."""
 
-    Attributes:
-        clips: images to fit.
-        instants: frames at which Gaussians are fitted.
-        seed: seed of all fits.
-        progress: called with (fits done, fits at most), or None.
-        done: number of completed fits.
-    """
-
-    clips: _Clips
-    instants: np.ndarray
-    seed: int
-    progress: Callable[[int, int], None] | None
-    done: int = 0
+    clips: _Clips  # images to fit
+    instants: np.ndarray  # frames at which Gaussians are fitted
+    seed: int  # seed of all fits
+    progress: Callable[[int, int], None] | None  # called with (fits done, fits at most), or None
+    done: int = 0  # number of completed fits
 
     def equations(self, offsets: np.ndarray, blur: float) -> OffsetEquations:
         """Return the sum of the equations of all instants, with images interpolated by offsets [V] and blurred."""
@@ -192,34 +178,28 @@ class _Rounds:
 
 @dataclass(frozen=True, eq=False)
 class _Clips:
-    """The first frames of a capture, reduced.
+    """The first frames of a capture, reduced."""
 
-    Attributes:
-        path: folder of the capture.
-        cameras: V views.
-        masks: valid pixels of each [H, W], or None.
-        images: per view and frame uint8 [H, W, 3].
-        train: indices of the training views.
-        points: [P, 3], world units.
-        point_colors: [P, 3] in [0, 1].
-    """
-
-    path: Path
-    cameras: tuple[Camera, ...]
-    masks: tuple[np.ndarray | None, ...]
-    images: tuple[tuple[np.ndarray, ...], ...]
-    train: list[int]
-    points: np.ndarray
-    point_colors: np.ndarray
+    path: Path  # folder of the capture
+    cameras: tuple[Camera, ...]  # V views
+    masks: tuple[np.ndarray | None, ...]  # valid pixels of each [H, W], or None
+    images: tuple[tuple[np.ndarray, ...], ...]  # per view and frame uint8 [H, W, 3]
+    train: list[int]  # indices of the training views
+    points: np.ndarray  # [P, 3], world units
+    point_colors: np.ndarray  # [P, 3] in [0, 1]
 
     @classmethod
     def of(cls, capture: Capture) -> _Clips:
-        clips = [[_checked(image) for image in capture.images(v, 0, _FRAMES)] for v in range(len(capture.cameras))]
+        shown = capture.displayed()
+        clips = [[_checked(image) for image in shown.images(v, 0, _FRAMES)] for v in range(len(capture.cameras))]
         views = zip(capture.cameras, (clip[0] for clip in clips), capture.masks, strict=True)
         small, _, masks = zip(*(View(*view).reduced(_WIDTH) for view in views), strict=True)
         # The images are whole frames: with the capture's delays they would be displaced twice.
         cameras = tuple(camera.without_delays() for camera in small)
-        images = tuple(tuple(_resized(i, c) for i in clip) for clip, c in zip(clips, cameras, strict=True))
+        images = tuple(
+            tuple(np.asarray(cv2.resize(image, (c.width, c.height), interpolation=cv2.INTER_AREA)) for image in clip)
+            for clip, c in zip(clips, cameras, strict=True)
+        )
         return cls(
             capture.path, cameras, masks, images, list(capture.train_views), capture.points, capture.point_colors
         )
@@ -241,10 +221,6 @@ def _checked(image: ImageOrError) -> np.ndarray:
     if isinstance(image, Exception):
         raise image
     return image
-
-
-def _resized(image: np.ndarray, camera: Camera) -> np.ndarray:
-    return np.asarray(cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA))
 
 
 def _equations_at(clips: _Clips, times: np.ndarray, blur: float, seed: int) -> OffsetEquations:

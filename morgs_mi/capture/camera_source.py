@@ -12,6 +12,7 @@ from morgs_mi.capture.color_correction import ColorCorrection
 from morgs_mi.capture.interpolation import image_between
 from morgs_mi.capture.lens import Lens, Undistortion
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.color_space import decode_light, display_image, encode_light
 from morgs_mi.io.video import FrameReader, ImageOrError
 
 __all__ = ["CameraSource", "at_clip_size"]
@@ -30,6 +31,7 @@ class CameraSource:
         color_correction: the colour correction, or None.
         used: the mask of the recorded pixels that are neither transparent nor masked out [H, W], or None if all are.
         delay: time from an instant to the frame that shows it, in frames of the clip.
+        display_exposure: stops by which linear light is brightened and shown in 8 bits; None: it is not shown.
     """
 
     reader: FrameReader
@@ -40,6 +42,7 @@ class CameraSource:
     color_correction: ColorCorrection | None = None
     used: np.ndarray | None = None
     delay: float = 0.0
+    display_exposure: float | None = None
 
     def at_instants(self) -> CameraSource:
         """Return the source without a delay: its images are interpolated instead."""
@@ -73,8 +76,14 @@ class CameraSource:
 
     def process(self, image: np.ndarray, camera: Camera) -> np.ndarray:
         """Return a recorded image undistorted, downscaled to the size of `camera` and colour-corrected."""
-        image = _downscaled(self.undistortion(image) if self.undistortion else image, camera)
-        return self.color_correction(image) if self.color_correction else image
+        if self.undistortion:
+            # The cubic filter rings less in encoded values, in which lamps are less far from their surroundings.
+            has_light = image.dtype != np.uint8
+            image = self.undistortion(encode_light(image) if has_light else image)
+            image = np.maximum(decode_light(image), 0) if has_light else image
+        image = _downscaled(image, camera)
+        image = self.color_correction(image) if self.color_correction else image
+        return image if self.display_exposure is None else display_image(image, self.display_exposure)
 
     def mask(self, camera: Camera) -> np.ndarray | None:
         """Return the mask of the valid pixels of `camera` [H, W] bool, or None if all are valid."""

@@ -24,6 +24,7 @@ from morgs_mi.capture.masks import used_in_clip
 from morgs_mi.capture.timeline import ReadConfig, read_settings, timeline
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_points
+from morgs_mi.core.color_space import display_stops
 from morgs_mi.core.rig import with_near_planes
 from morgs_mi.io.prefetch import prefetched
 from morgs_mi.io.remote import is_url, mirrored
@@ -43,7 +44,7 @@ class Frame:
 
     Attributes:
         index: position in the recording, from 0.
-        images: per camera uint8 [H, W, 3], RGB, display-referred.
+        images: per camera [H, W, 3], RGB: uint8 in sRGB, or of EXR files float32 in linear light.
     """
 
     index: int
@@ -52,18 +53,12 @@ class Frame:
 
 @dataclass(frozen=True)
 class PartialFrame:
-    """One instant in the views that have an image of it.
+    """One instant in the views that have an image of it."""
 
-    Attributes:
-        index: position in the recording, from 0.
-        images: as in `Frame`, None for a missing image.
-        problems: one sentence per missing image.
-        recorded: reference images for the next frame's images; None if these are `images`.
-    """
-
-    index: int
-    images: tuple[np.ndarray | None, ...]
-    problems: tuple[str, ...] = ()
+    index: int  #: Position in the recording, from 0.
+    images: tuple[np.ndarray | None, ...]  #: As in `Frame`, None for a missing image.
+    problems: tuple[str, ...] = ()  #: One sentence per missing image.
+    #: Reference images for the next frame's images; None if these are `images`.
     recorded: tuple[np.ndarray | None, ...] | None = None
 
     def comparable(self, views: Sequence[int]) -> list[np.ndarray | None]:
@@ -93,6 +88,7 @@ class Capture:
         notes: a sentence for each unexpected property of the clips, e.g. a variable frame rate.
         distortions: per camera the radial terms k1, k2 of the distortion left in the images, which is removed as well;
             empty if there is none.
+        display_exposure: of EXR files, stops by which a display brightens them; None: the images have 8 bits.
     """
 
     path: Path
@@ -111,6 +107,7 @@ class Capture:
     colors: ColorFit | None = None
     notes: tuple[str, ...] = ()
     distortions: tuple[tuple[float, float], ...] = ()
+    display_exposure: float | None = None
 
     def __post_init__(self) -> None:
         check_points(str(self.path), self.points, self.point_colors)
@@ -147,6 +144,13 @@ class Capture:
         cameras = tuple(c.resized(*size) for c, size in zip(self.cameras, self.recorded_sizes, strict=True))
         masks = tuple(source.mask(camera) for source, camera in zip(self._sources, cameras, strict=True))
         return replace(self, cameras=cameras, masks=masks, downscale=1)
+
+    def displayed(self) -> Capture:
+        """Return the capture with images of 8 bits: linear light as a display shows it."""
+        if self.display_exposure is None:
+            return self
+        sources = tuple(replace(source, display_exposure=self.display_exposure) for source in self._sources)
+        return replace(self, _sources=sources, display_exposure=None)
 
     def with_cameras(self, cameras: Sequence[Camera], distortions: Sequence[Sequence[float]] = ()) -> Capture:
         """Return the capture, as calibrated, with refined cameras.
@@ -358,6 +362,10 @@ def load_capture(
         reading=reading,
         notes=(*common.notes, *(note for _, notes in used for note in notes), *_photos(calibration.clips)),
     )
+    if any(reader.has_light for reader in readers):
+        stops = settings.get("display_exposure")
+        stops = display_stops(next(capture.partial_frames(0, 1)).images) if stops is None else stops
+        capture = replace(capture, display_exposure=stops)
     return capture if reading.color == "none" else _color_corrected(capture, reading.color)
 
 
@@ -402,7 +410,7 @@ def _color_corrected(capture: Capture, color: str) -> Capture:
             f"{capture.path}: `color` must be none, linear, or linear with a camera of {', '.join(capture.names)}, "
             f"such as linear:{capture.names[0]}, got {color!r}."
         )
-    images = next(capture.partial_frames(0, 1)).images
+    images = next(capture.displayed().partial_frames(0, 1)).images
     reference = capture.names.index(name) if name else None
     fit = fit_colors(capture.cameras, images, capture.masks, reference)
     sources = tuple(replace(s, color_correction=fit.correction(view)) for view, s in enumerate(capture._sources))

@@ -17,7 +17,7 @@ import numpy as np
 
 from morgs_mi.capture.features import Features, Match, detect, match_views, reprojection_errors
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
+from morgs_mi.core.color_space import decode_light, encode_light
 
 __all__ = ["ColorCorrection", "ColorFit", "fit_colors", "matched_colors"]
 
@@ -30,28 +30,21 @@ _DARK, _BRIGHT = 12, 243
 _BLUR = 0.008  # standard deviation of the blur around a feature, as a fraction of the width
 
 # Tables: the light of each byte, and the byte of 65536 levels of light.
-_LINEAR = srgb_to_linear(np.arange(256, dtype=np.float32) / np.float32(255)).astype(np.float32)
-_ENCODED = np.rint(255 * linear_to_srgb(np.arange(65536) / 65535)).astype(np.uint8)
+_LINEAR = decode_light(np.arange(256, dtype=np.float32) / np.float32(255)).astype(np.float32)
+_ENCODED = np.rint(255 * encode_light(np.arange(65536) / 65535)).astype(np.uint8)
 
 
 @dataclass(frozen=True)
 class ColorFit:
-    """Colour correction of all cameras towards a reference camera.
+    """Colour correction of all cameras towards a reference camera."""
 
-    Attributes:
-        reference: index of the reference camera, which is not changed.
-        matrices: per camera [3, 3]; None for the reference, and for a camera that shares too few points with the
-            others.
-        samples: per camera, number of points shared with others.
-        before: per camera, mean dE2000 of its points against the other views' colours; NaN without points.
-        after: the same after the correction.
-    """
-
-    reference: int
+    reference: int  #: Index of the reference camera, which is not changed.
+    #: Per camera [3, 3]; None for the reference, and for a camera that shares too few points with the others.
     matrices: tuple[np.ndarray | None, ...]
-    samples: tuple[int, ...]
+    samples: tuple[int, ...]  #: Per camera, number of points shared with others.
+    #: Per camera, mean dE2000 of its points against the other views' colours; NaN without points.
     before: tuple[float, ...]
-    after: tuple[float, ...]
+    after: tuple[float, ...]  #: The same after the correction.
 
     def correction(self, view: int) -> ColorCorrection | None:
         """Return the correction of a view, None if it is not changed."""
@@ -61,16 +54,14 @@ class ColorFit:
 
 @dataclass(frozen=True)
 class ColorCorrection:
-    """Colour correction of one camera's images, towards the other cameras.
+    """Colour correction of one camera's images, towards the other cameras."""
 
-    Attributes:
-        matrix: matrix on linear (R, G, B) [3, 3].
-    """
-
-    matrix: np.ndarray
+    matrix: np.ndarray  #: Matrix on linear (R, G, B) [3, 3].
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """Return the corrected image, uint8 [H, W, 3]."""
+        """Return the corrected image [H, W, 3], uint8, or float32 of linear light."""
+        if image.dtype != np.uint8:
+            return np.maximum(_corrected(image, self.matrix), 0)
         return _encode(_corrected(_LINEAR[image], self.matrix))
 
 

@@ -38,32 +38,21 @@ _MIN_MATCHES = 16
 
 @dataclass(frozen=True)
 class Features:
-    """SIFT features of one image.
+    """SIFT features of one image."""
 
-    Attributes:
-        points: [K, 2] float64, pixels.
-        descriptors: [K, 128] float32 of length 1.
-        colors: [K, 3] float32 in [0, 1], colour of the pixel.
-        axes: [K, 2] float64, pixels, from the centre of the described patch along its orientation to its edge.
-    """
-
-    points: np.ndarray
-    descriptors: np.ndarray
-    colors: np.ndarray
+    points: np.ndarray  #: [K, 2] float64, pixels.
+    descriptors: np.ndarray  #: [K, 128] float32 of length 1.
+    colors: np.ndarray  #: [K, 3] float32 in [0, 1], colour of the pixel.
+    #: [K, 2] float64, pixels, from the centre of the described patch along its orientation to its edge.
     axes: np.ndarray
 
 
 @dataclass(frozen=True)
 class Match:
-    """Matched features of two views.
+    """Matched features of two views."""
 
-    Attributes:
-        views: indices of the two views.
-        features: [M, 2] int, index of the feature in each view.
-    """
-
-    views: tuple[int, int]
-    features: np.ndarray
+    views: tuple[int, int]  #: Indices of the two views.
+    features: np.ndarray  #: [M, 2] int, index of the feature in each view.
 
 
 @dataclass(frozen=True)

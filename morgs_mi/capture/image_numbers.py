@@ -23,19 +23,12 @@ _Numbers = Mapping[int, range]
 
 @dataclass(frozen=True)
 class ImageNumbers:
-    """Alignment of clips by the numbers of their images: the image o + r t of a clip shows instant t.
+    """Alignment of clips by the numbers of their images: the image o + r t of a clip shows instant t."""
 
-    Attributes:
-        offsets: o of each clip [C].
-        rates: r of each clip [C].
-        interval: time between two instants, in frames of the clip with the most frames per time.
-        notes: a sentence for each assumption.
-    """
-
-    offsets: np.ndarray
-    rates: np.ndarray
-    interval: float = 1.0
-    notes: tuple[str, ...] = ()
+    offsets: np.ndarray  #: o of each clip [C].
+    rates: np.ndarray  #: r of each clip [C].
+    interval: float = 1.0  #: Time between two instants, in frames of the clip with the most frames per time.
+    notes: tuple[str, ...] = ()  #: A sentence for each assumption.
 
 
 def align_numbers(

@@ -11,6 +11,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.method.flow_sources.consistency import consistency_mask
 from morgs_mi.method.flow_sources.flow_registry import FramePair, flow_source
 
@@ -23,17 +24,21 @@ _LEAST_WEIGHT = 1e-3
 
 
 def image_between(first: np.ndarray, second: np.ndarray, share: float) -> np.ndarray:
-    """Return the image at a share of the time from one frame of a clip to the next, uint8 [H, W, 3].
+    """Return the image at a share of the time from one frame of a clip to the next [H, W, 3].
 
     Args:
-        first: uint8 [H, W, 3], RGB.
-        second: uint8 [H, W, 3], RGB.
+        first: [H, W, 3], RGB: uint8, or float32 of linear light.
+        second: likewise, of the same type.
         share: in [0, 1]; 0 for the first frame, 1 for the second.
 
     Raises:
         ValueError: the images are not RGB or differ in size.
     """
-    backward, forward = flow_source("dis")(FramePair(second, first))
+    has_light = first.dtype != np.uint8
+    if has_light:
+        first, second = (encode_light(image) for image in (first, second))
+    pair = [np.clip(image, 0, 1) if has_light else image for image in (second, first)]
+    backward, forward = flow_source("dis")(FramePair(pair[0], pair[1]))
     both = (first, forward, backward, share), (second, backward, forward, 1 - share)
     total, weights = np.zeros(first.shape, np.float32), np.zeros((*first.shape[:2], 1), np.float32)
     for image, flow, back, passed in both:
@@ -42,6 +47,8 @@ def image_between(first: np.ndarray, second: np.ndarray, share: float) -> np.nda
         weight = np.float32(1 - passed) * (reliable + np.float32(_LEAST_WEIGHT))
         total += weight * _sampled(image.astype(np.float32), places, cv2.INTER_CUBIC)
         weights += weight
+    if has_light:
+        return np.maximum(decode_light(total / weights), 0)
     return np.clip(np.rint(total / weights), 0, 255).astype(np.uint8)
 
 

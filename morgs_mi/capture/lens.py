@@ -31,15 +31,10 @@ MODELS = {
 
 @dataclass(frozen=True)
 class Lens:
-    """Lens distortion of a COLMAP camera.
+    """Lens distortion of a COLMAP camera."""
 
-    Attributes:
-        model: COLMAP's name of the model, e.g. ``OPENCV``.
-        distortion: distortion coefficients in COLMAP's order; empty for a pinhole.
-    """
-
-    model: str = "PINHOLE"
-    distortion: tuple[float, ...] = ()
+    model: str = "PINHOLE"  #: COLMAP's name of the model, e.g. ``OPENCV``.
+    distortion: tuple[float, ...] = ()  #: Distortion coefficients in COLMAP's order; empty for a pinhole.
 
     @property
     def opencv_coefficients(self) -> np.ndarray:
@@ -80,14 +75,10 @@ def opencv_lens(coefficients: Sequence[float]) -> Lens:
 
 @dataclass(frozen=True)
 class Undistortion:
-    """Pixel maps that remove the distortion of one lens.
+    """Pixel maps that remove the distortion of one lens."""
 
-    Attributes:
-        maps: OpenCV's fixed-point maps for `cv2.remap`.
-        mask: [H, W] bool, true where the undistorted pixel lies inside the recorded image and the lens model is valid.
-    """
-
-    maps: tuple[np.ndarray, np.ndarray]
+    maps: tuple[np.ndarray, np.ndarray]  #: OpenCV's fixed-point maps for `cv2.remap`.
+    #: [H, W] bool, true where the undistorted pixel lies inside the recorded image and the lens model is valid.
     mask: np.ndarray
 
     def __call__(self, image: np.ndarray) -> np.ndarray:

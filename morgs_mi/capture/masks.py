@@ -104,7 +104,8 @@ def _may_be_transparent(header: bytes) -> bool:
     """Return whether an image may have an alpha channel, from the first 26 bytes of its file."""
     if header.startswith(b"\x89PNG"):
         return header[25:] in (b"\3", b"\4", b"\6")  # with a palette, grey and alpha, or RGB and alpha
-    return not header.startswith((b"\xff\xd8", b"BM"))  # JPEG has none, and BMP's has no meaning
+    # JPEG has none, and the alpha channel of BMP and EXR files is not a mask.
+    return not header.startswith((b"\xff\xd8", b"BM", b"\x76\x2f\x31\x01"))
 
 
 def _decoded(file: Path) -> np.ndarray:

@@ -32,7 +32,8 @@ __all__ = ["ReadConfig", "Timeline", "nearest_frames", "read_settings", "timelin
 
 _LOG = logging.getLogger(__name__)
 _DEFAULT_FPS = 30.0
-_SETTINGS = {"fps", "test_view", "meters_per_unit", "readout"}
+_INTERVALS = {"fps": "[1e-6, 1e6]", "meters_per_unit": "[1e-12, 1e12]", "display_exposure": "[-100, 100]"}
+_SETTINGS = {*_INTERVALS, "test_view", "readout"}
 # Distance in frames up to which a frame shows an instant.
 _NEAR = 0.5
 
@@ -74,26 +75,17 @@ class ReadConfig:
 
 @dataclass(frozen=True)
 class Timeline:
-    """Frames of each clip that show the instants of the recording.
+    """Frames of each clip that show the instants of the recording."""
 
-    Attributes:
-        frame_indices: per camera the clip's frames in ascending order, -1 for none, int [T].
-        shares: per camera the share of the time to the next frame that has passed at each instant [T]; None: no image
-            is interpolated.
-        delays: per camera the time from an instant to the frame that shows it, in frames of its clip.
-        rates: per camera the frames of its clip per instant.
-        fps: instants per second.
-        unchanged: whether instant t is frame t of every clip.
-        notes: a sentence for each clip of variable frame rate, and on the numbers of images.
-    """
-
-    frame_indices: tuple[np.ndarray, ...]
+    frame_indices: tuple[np.ndarray, ...]  #: Per camera the clip's frames in ascending order, -1 for none, int [T].
+    #: Per camera the share of the time to the next frame that has passed at each instant [T]; None: no image is
+    #: interpolated.
     shares: tuple[np.ndarray | None, ...]
-    delays: tuple[float, ...]
-    rates: tuple[float, ...]
-    fps: float
-    unchanged: bool
-    notes: tuple[str, ...] = ()
+    delays: tuple[float, ...]  #: Per camera the time from an instant to the frame that shows it, in frames of its clip.
+    rates: tuple[float, ...]  #: Per camera the frames of its clip per instant.
+    fps: float  #: Instants per second.
+    unchanged: bool  #: Whether instant t is frame t of every clip.
+    notes: tuple[str, ...] = ()  #: A sentence for each clip of variable frame rate, and on the numbers of images.
 
 
 def timeline(
@@ -340,7 +332,7 @@ def read_settings(path: Path) -> dict[str, Any]:
 
     They are ``fps``, ``test_view``, ``meters_per_unit``, the length of a world unit in metres, and ``readout``, the
     frames from the exposure of an image's first row to the exposure of its last row: a number for all cameras, or an
-    object with the numbers that are not 0, by the cameras' names.
+    object with the numbers that are not 0, by the cameras' names; and ``display_exposure`` in stops, see `Capture`.
 
     Raises:
         ValueError: the file is not a JSON object, or a setting is not valid.
@@ -353,7 +345,7 @@ def read_settings(path: Path) -> dict[str, Any]:
     if "scene" not in settings:  # a synthetic capture describes itself
         warn_unread(path, settings.keys() - _SETTINGS)
     view = settings.get("test_view")
-    for name, interval in (("fps", "[1e-6, 1e6]"), ("meters_per_unit", "[1e-12, 1e12]")):
+    for name, interval in _INTERVALS.items():
         if (value := settings.get(name)) is not None:
             check_number(str(path), name, value, interval)
     readout = settings.get("readout", 0.0)

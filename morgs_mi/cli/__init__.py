@@ -13,49 +13,40 @@ import logging
 import os
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
 from importlib.metadata import version
 from io import TextIOWrapper
-from typing import Annotated, Any, Literal
+from pkgutil import resolve_name
+from typing import Annotated, Any, ClassVar, Literal
 
 import tyro
 from tyro.conf import arg
 
-from morgs_mi.cli.calibrate import Calibrate
 from morgs_mi.cli.console import ERR, LogHandler, naming_output, print_result, print_warning, sentence_of
-from morgs_mi.cli.demo import Demo
-from morgs_mi.cli.evaluate import Eval
-from morgs_mi.cli.export import Export
-from morgs_mi.cli.fit import Fit
-from morgs_mi.cli.import_frames import Import
-from morgs_mi.cli.info import Info
-from morgs_mi.cli.live import Live
-from morgs_mi.cli.render import Render
 from morgs_mi.cli.settings import Flag, Settings
-from morgs_mi.cli.suggestion import suggesting_command
-from morgs_mi.cli.sweep import Sweep
-from morgs_mi.cli.synth import Synth
-from morgs_mi.cli.view import View
+from morgs_mi.cli.suggestion import one_command, suggesting_command
 from morgs_mi.core.interrupts import INTERRUPTED, interruptible, is_interruption
 
-__all__ = ["Common", "main", "run"]
+__all__ = ["COMMANDS", "Common", "main", "run"]
 
-Command = (
-    Annotated[Synth, tyro.conf.subcommand("synth")]
-    | Annotated[Info, tyro.conf.subcommand("info")]
-    | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
-    | Annotated[Fit, tyro.conf.subcommand("fit")]
-    | Annotated[Live, tyro.conf.subcommand("live")]
-    | Annotated[Render, tyro.conf.subcommand("render")]
-    | Annotated[Export, tyro.conf.subcommand("export")]
-    | Annotated[Import, tyro.conf.subcommand("import")]
-    | Annotated[View, tyro.conf.subcommand("view")]
-    | Annotated[Eval, tyro.conf.subcommand("eval")]
-    | Annotated[Sweep, tyro.conf.subcommand("sweep")]
-    | Annotated[Demo, tyro.conf.subcommand("demo")]
-)
+_PLACES = {
+    "synth": "synth:Synth",
+    "info": "info:Info",
+    "calibrate": "calibrate:Calibrate",
+    "fit": "fit:Fit",
+    "live": "live:Live",
+    "render": "render:Render",
+    "export": "export:Export",
+    "import": "import_frames:Import",
+    "view": "view:View",
+    "eval": "evaluate:Eval",
+    "sweep": "sweep:Sweep",
+    "demo": "demo:Demo",
+}
+# The class of each command: a dataclass of its options, with `run`.
+COMMANDS: Mapping[str, type] = {name: resolve_name(f"{__name__}.{place}") for name, place in _PLACES.items()}
 
 
 @dataclass(frozen=True)
@@ -75,7 +66,8 @@ class Options(Common):
     Alone, --version prints the version, and --tyro-write-completion bash FILE writes the completion of a shell.
     """
 
-    command: Annotated[Command, arg(name="")] = tyro.MISSING
+    commands: ClassVar[Mapping[str, type]] = COMMANDS
+    command: Annotated[Any, one_command(COMMANDS)] = tyro.MISSING
 
 
 def main(args: Sequence[str] | None = None) -> int:

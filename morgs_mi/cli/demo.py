@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -63,7 +62,8 @@ class Demo:
         with progress() as report:
             result = run_demo(self.out, replace(_DEFAULT, scene=self.scene, clip=clip, stream=stream), report)
         full = result.full
-        table = Table(title=f"held-out view, frames {_span(result.compared_frames)}")
+        frames = result.compared_frames
+        table = Table(title=f"held-out view, frames {f'{frames[0]} to {frames[-1]}' if frames else 'none'}")
         for column in ("", "PSNR, dB", "SSIM", "flow error, px", "moving, px", "still, px"):
             table.add_column(column, justify="right" if column else "left")
         for name, title in (("full", "with motion"), ("plain", "without")):
@@ -80,7 +80,3 @@ class Demo:
         )
         print_result(f"Video and contact sheet: {self.out / 'side_by_side.mp4'}, {self.out / 'contact_sheet.png'}")
         print_result(f"All results: {self.out / 'report.json'}")
-
-
-def _span(frames: Sequence[int]) -> str:
-    return f"{frames[0]} to {frames[-1]}" if frames else "none"

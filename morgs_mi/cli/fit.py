@@ -19,7 +19,7 @@ from morgs_mi.loop.stream_config import StreamConfig, config_toml
 
 if TYPE_CHECKING:
     from morgs_mi.capture.capture import Capture
-    from morgs_mi.stream_loop import FrameReport
+    from morgs_mi.loop.frame_report import FrameReport
 
 __all__ = ["Fit"]
 

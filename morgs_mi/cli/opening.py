@@ -10,7 +10,7 @@ from tyro.conf import FlagCreatePairsOff, arg
 from morgs_mi.cli.console import print_warning
 
 if TYPE_CHECKING:
-    from morgs_mi.playback.streams import PlayableStream
+    from morgs_mi.codec.frame_source import FrameSource
 
 __all__ = ["DropInvalid", "opened"]
 
@@ -19,7 +19,7 @@ DropInvalid = Annotated[bool, FlagCreatePairsOff, arg(help=_DROP, help_behavior_
 """Option of the commands that read files of Gaussians."""
 
 
-def opened(out: Path, drop_invalid: bool, drawn: bool = True, skip_damaged: bool = False) -> PlayableStream:
+def opened(out: Path, drop_invalid: bool, drawn: bool = True, skip_damaged: bool = False) -> FrameSource:
     """Return the stream that a command reads, and print which cameras a file of Gaussians has.
 
     Args:

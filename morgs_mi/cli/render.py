@@ -11,12 +11,12 @@ from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.opening import DropInvalid, opened
-from morgs_mi.cli.settings import ChannelName, Flag, one_of, optional
+from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, one_of, optional
 from morgs_mi.core.documentation import page
 from morgs_mi.playback.export.formats import IMAGES, destination
 
 if TYPE_CHECKING:
-    from morgs_mi.codec.reader import StreamReader
+    from morgs_mi.codec.frame_source import FrameSource
     from morgs_mi.core.camera import Camera
     from morgs_mi.playback.export.paths import CameraPath
 
@@ -79,6 +79,7 @@ class Render:
     light: Literal["probe", "traced"] = "probe"
     """Light of an inserted scene: an environment map at its middle, or rays traced through the Gaussians, for their
     shadows and reflections."""
+    display_exposure: DisplayExposure = None
     drop_invalid: DropInvalid = False
     skip_damaged: Flag = False
     """Skip damaged frames of a stream, and those after them up to the next intact keyframe."""
@@ -86,7 +87,7 @@ class Render:
     def run(self) -> None:
         from morgs_mi.playback.export.clips import frame_numbers, named_path, num_images
         from morgs_mi.playback.export.frames import write_images
-        from morgs_mi.playback.player import find_camera
+        from morgs_mi.playback.player import find_camera, stream_exposure
 
         self._check()
         stream = opened(self.out, self.drop_invalid, skip_damaged=self.skip_damaged)
@@ -104,7 +105,8 @@ class Render:
         if single and count > 1:
             raise ValueError(f"{output}: expected one image for one file, got {count}; name a folder.")
         with progress() as report:
-            write_images(images, stream.fps, output, lambda done: report("Rendering", done, count), chosen.name)
+            stops = stream_exposure(stream) if self.display_exposure is None else self.display_exposure
+            write_images(images, stream.fps, output, lambda done: report("Rendering", done, count), chosen.name, stops)
         print_result(f"{output}: {count} {'image' if count == 1 else 'images'}.")
 
     def _check(self) -> None:
@@ -122,7 +124,7 @@ class Render:
             raise ValueError("--projection equirectangular renders the colour of a stream alone; leave out the others.")
 
     def _seen(
-        self, stream: StreamReader, view: Camera | CameraPath, format: str
+        self, stream: FrameSource, view: Camera | CameraPath, format: str
     ) -> Iterator[tuple[int, dict[str, Any]]]:
         """Return the rendered images of a camera or along a path."""
         from morgs_mi.core.camera import Camera
@@ -139,7 +141,7 @@ class Render:
         return flight(stream, view, channels)
 
     def _inserted(
-        self, stream: StreamReader, view: Camera, format: str
+        self, stream: FrameSource, view: Camera, format: str
     ) -> tuple[Iterator[tuple[int, dict[str, Any]]], int]:
         """Return the rendered frames with the inserted scene, and their number."""
         from morgs_mi.playback.export.clips import frame_numbers

@@ -86,6 +86,18 @@ def optional(metavar: str, hint: str = "", text: str | None = None) -> Any:
     return arg(metavar=metavar, help_behavior_hint=hint, help=text)
 
 
+DisplayExposure = Annotated[
+    float | None,
+    DisallowNone,
+    optional(
+        "STOPS",
+        text="Stops by which PNG files and videos are brightened before they are clipped at white; by default those of "
+        "the stream, 0 for a recording of 8 bits.",
+    ),
+]
+"""Option of the commands that render a stream."""
+
+
 def place(metavar: str) -> Any:
     """Return the help of a positional argument for an output that has a default place."""
     return arg(metavar=f"[{metavar}]", help_behavior_hint="")

@@ -1,21 +1,26 @@
-"""Suggestion of the command that a mistyped one resembles."""
+"""Choice of a command by its name, and suggestion of the one that a mistyped name resembles."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import is_dataclass
 from difflib import get_close_matches
+from functools import reduce
 from itertools import takewhile
-from typing import Any, get_args, get_type_hints
+from operator import or_
+from typing import Annotated, Any
 
-from tyro.conf import subcommand
+from tyro.conf import arg, subcommand
 
 from morgs_mi.cli.console import print_warning
 
-__all__ = ["near_command", "suggesting_command"]
+__all__ = ["near_command", "one_command", "suggesting_command"]
 
-_SUBCOMMAND: Any = type(subcommand())
+
+def one_command(commands: Mapping[str, type]) -> Any:
+    """Return the annotation of an argument that is one of several commands, by their names."""
+    union: Any = reduce(or_, (Annotated[command, subcommand(name)] for name, command in commands.items()))
+    return arg(name="", constructor=union)
 
 
 @contextmanager
@@ -34,24 +39,13 @@ def near_command(owner: Any, words: Sequence[str]) -> list[str]:
     """Return the words of the command that `words` resemble; empty if none does, or if they are a command.
 
     Args:
-        owner: dataclass with the commands.
+        owner: class with the mapping `commands`, or a command without one.
         words: the arguments before the first option.
     """
-    commands = _commands(owner)
+    commands: Mapping[str, type] = getattr(owner, "commands", {})
     if not commands or not words:
         return []
     if words[0] not in commands:
         return get_close_matches(words[0], commands, 1)
     rest = near_command(commands[words[0]], words[1:])
     return [words[0], *rest] if rest else []
-
-
-def _commands(owner: Any) -> dict[str, Any]:
-    """Return the commands of a dataclass by their names: the types in the union of one of its fields."""
-    try:
-        hints = get_type_hints(owner, include_extras=True) if is_dataclass(owner) else {}
-    except NameError:  # a type of a command's option that is known to type checkers alone
-        return {}
-    members = (member for hint in hints.values() for union in get_args(hint) for member in get_args(union))
-    pairs = ((get_args(member)[0], extra) for member in members for extra in get_args(member)[1:])
-    return {extra.name: command for command, extra in pairs if isinstance(extra, _SUBCOMMAND)}

@@ -49,7 +49,8 @@ __all__ = [
     "open_packet",
 ]
 
-MAGIC, INDEX_MAGIC = b"MORGS-MI", b"MORGSIDX"
+MAGIC = b"MORGS-MI"
+INDEX_MAGIC = b"MORGSIDX"
 VERSION = 2
 PREAMBLE = struct.Struct("<8sI")
 HEAD = struct.Struct("<IIQ")  # kind, frame, payload length; the CRC covers these and the payload
@@ -77,19 +78,13 @@ class TruncatedStreamError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Packet:
-    """Data of one frame.
+    """Data of one frame."""
 
-    Attributes:
-        kind: `KEYFRAME` (self-contained) or `RESIDUAL` (changes since the frame before).
-        frame: index of the video frame.
-        arrays: float32, uint32 or uint8 arrays of any shape, by name; read-only copies of those that are passed.
-        place: description of where the packet was read, for messages; empty for a new one.
-    """
-
-    kind: PacketKind
-    frame: int
+    kind: PacketKind  #: `KEYFRAME` (self-contained) or `RESIDUAL` (changes since the frame before).
+    frame: int  #: Index of the video frame.
+    #: float32, uint32 or uint8 arrays of any shape, by name; read-only copies of those that are passed.
     arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
-    place: str = ""
+    place: str = ""  #: Description of where the packet was read, for messages; empty for a new one.
 
     def __post_init__(self) -> None:
         arrays = {name: np.array(array) for name, array in self.arrays.items()}
@@ -179,9 +174,13 @@ class StreamWriter:
         self._file: BinaryIO
         if isinstance(sink, str | Path):
             # Unbuffered: a buffer would write its rest again after a failed packet has been removed.
-            self.path, self._owned, self._file = Path(sink), True, open(sink, "wb", buffering=0)  # noqa: SIM115
+            self.path = Path(sink)
+            self._owns_file = True
+            self._file = open(sink, "wb", buffering=0)  # noqa: SIM115
         else:
-            self.path, self._owned, self._file = Path(str(getattr(sink, "name", "stream"))), False, sink
+            self.path = Path(str(getattr(sink, "name", "stream")))
+            self._owns_file = False
+            self._file = sink
         try:
             self._append(PREAMBLE.pack(MAGIC, VERSION) + _sealed(PacketKind.HEADER, 0, payload))
         except OSError:
@@ -202,7 +201,10 @@ class StreamWriter:
             OSError: the file cannot be opened or truncated.
         """
         writer = cls.__new__(cls)
-        writer._owned, writer.path, writer.num_bytes, writer._index = True, Path(path), end, list(index)
+        writer._owns_file = True
+        writer.path = Path(path)
+        writer.num_bytes = end
+        writer._index = list(index)
         writer._file = open(path, "r+b", buffering=0)  # noqa: SIM115
         writer._file.truncate(end)
         writer._file.seek(end)
@@ -217,7 +219,8 @@ class StreamWriter:
         """
         if self._index is None:
             raise ValueError(f"{self.path}: expected a stream that is still open, got one that was closed.")
-        at, size = self.num_bytes, self._append(packet.encoded)
+        at = self.num_bytes
+        size = self._append(packet.encoded)
         self._index.append((packet.kind, packet.frame, at))
         return size
 
@@ -229,7 +232,7 @@ class StreamWriter:
             self._index = None
             with contextlib.suppress(OSError):  # a full disk or a closed pipe; readers do not need the index
                 self._append(_sealed(PacketKind.INDEX, 0, payload))
-        if self._owned:
+        if self._owns_file:
             self._file.close()
 
     def __enter__(self) -> StreamWriter:
@@ -247,7 +250,7 @@ class StreamWriter:
                 rest = rest[self._file.write(rest) :]
             self._file.flush()
         except BaseException as error:  # Ctrl-C must leave complete packets too
-            if self._owned:
+            if self._owns_file:
                 with contextlib.suppress(OSError):  # a device cannot be truncated
                     self._file.truncate(self.num_bytes)
                     self._file.seek(self.num_bytes)
@@ -275,13 +278,14 @@ def open_packet(data: bytes) -> tuple[int, int, memoryview]:
     """
     if len(data) < PAYLOAD:
         raise ValueError(f"a packet has at least {PAYLOAD} bytes, got {len(data)}")
-    head, payload = data[: HEAD.size], memoryview(data)[PAYLOAD:]
+    head = data[: HEAD.size]
+    payload = memoryview(data)[PAYLOAD:]
     kind, frame, length = HEAD.unpack(head)
     if length != len(payload):
         raise ValueError(f"its payload should have {length} bytes, got {len(payload)}")
-    (expected,) = _U32.unpack_from(data, HEAD.size)
-    if (crc := zlib.crc32(payload, zlib.crc32(head))) != expected:
-        raise ValueError(f"its CRC should be {expected:08x}, got {crc:08x}: the bytes are damaged")
+    (stated_crc,) = _U32.unpack_from(data, HEAD.size)
+    if (crc := zlib.crc32(payload, zlib.crc32(head))) != stated_crc:
+        raise ValueError(f"its CRC should be {stated_crc:08x}, got {crc:08x}: the bytes are damaged")
     return kind, frame, payload
 
 
@@ -290,11 +294,11 @@ def _arrays(payload: memoryview) -> dict[str, np.ndarray]:
     at = _U32.size + length
     arrays: dict[str, np.ndarray] = {}
     for name, dtype, shape in _table(load_json(payload[_U32.size : at], _MAX_TABLE)):
-        stored = np.dtype(dtype).newbyteorder("<")
-        end = at + math.prod(shape) * stored.itemsize
+        file_dtype = np.dtype(dtype).newbyteorder("<")
+        end = at + math.prod(shape) * file_dtype.itemsize
         if end > len(payload):
             raise ValueError(f"`{name}` {shape} would end at byte {end} of {len(payload)}")
-        arrays[name] = np.frombuffer(payload[at:end], stored).reshape(shape).astype(dtype)
+        arrays[name] = np.frombuffer(payload[at:end], file_dtype).reshape(shape).astype(dtype)
         at = end
     if at != len(payload):
         raise ValueError(f"it describes {at} bytes of {len(payload)}")

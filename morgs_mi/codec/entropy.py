@@ -24,10 +24,11 @@ LIMIT = 2**30
 """Integers must lie between -LIMIT and LIMIT."""
 
 _stream = cast(Any, constriction).stream  # a compiled submodule, which type checkers cannot see
-_QUEUE, _MODEL = _stream.queue, _stream.model
+_QUEUE = _stream.queue
+_MODEL = _stream.model
 _DIRECT = 16
 _TOKENS = 2 * 42 + 1
-_BLOCK = 16
+_BLOCK = 16  # integers of the first block; each further one ends at twice the place
 _LOW = 16  # bits of one uniform model, which must have fewer than 24
 _WEIGHT = 32  # of an observed token, relative to the prior below
 _PRIOR = np.maximum(1, 256 // (1 + np.arange(_TOKENS)) ** 2)
@@ -72,7 +73,8 @@ class ColumnReader:
         Raises:
             ValueError: the words do not encode such a column.
         """
-        tokens, counts = np.zeros(count, np.int64), _PRIOR.copy()
+        tokens = np.zeros(count, np.int64)
+        counts = _PRIOR.copy()
         try:
             for block in _blocks(count):
                 tokens[block] = self._decoder.decode(
@@ -117,10 +119,12 @@ def _tokens(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _blocks(count: int) -> Iterator[slice]:
-    start, stop = 0, _BLOCK
+    start = 0
+    stop = _BLOCK
     while start < count:
         yield slice(start, min(stop, count))
-        start, stop = stop, 2 * stop
+        start = stop
+        stop = 2 * stop
 
 
 def _halves(bits: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:

@@ -141,7 +141,8 @@ def camera_of_fields(fields: Any, where: str) -> Camera:
 
 
 def _matrix(fields: dict[str, Any], key: str, size: int, where: str) -> np.ndarray:
-    rows, what = _entry(fields, key, list, where), f"{where}.{key}"
+    rows = _entry(fields, key, list, where)
+    what = f"{where}.{key}"
     if len(rows) != size or any(not isinstance(row, list) or len(row) != size for row in rows):
         raise ValueError(f"`{what}` must be a matrix [{size}][{size}]")
     return np.array([[_within(_typed(x, float, what), -LARGEST, LARGEST, what) for x in row] for row in rows])

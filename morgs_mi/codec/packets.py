@@ -23,6 +23,7 @@ import numpy as np
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import Packet, PacketKind
 from morgs_mi.codec.entropy import LIMIT, ColumnReader, ColumnWriter, column_bits
+from morgs_mi.codec.frame_source import FrameState
 from morgs_mi.codec.quantisation import (
     KNOWN_OPTIONAL,
     Grid,
@@ -37,24 +38,17 @@ from morgs_mi.codec.quantisation import (
     split_groups,
     stored_fields,
 )
-from morgs_mi.codec.reader import StreamReader
 from morgs_mi.codec.residuals import Coder, offset_steps, take_change
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 
 __all__ = [
     "CodedFrame",
-    "WholeFrame",
     "coded_frames",
     "decode",
-    "frames_near",
-    "frames_with_first_id",
-    "frames_with_lasting_ids",
     "keyframe_packet",
-    "play",
     "reemitted_keyframe",
     "residual_packet",
-    "seek",
 ]
 
 # An entropy code stores a column of one value in almost no bytes. A small packet must not request much memory: it
@@ -67,31 +61,22 @@ _COARSEST = 80  # quarter octaves: a million times the step
 
 
 @dataclass(frozen=True, eq=False)
-class CodedFrame:
+class CodedFrame(FrameState):
     """State of a stream after a packet, the same in encoder and decoder to the bit.
 
     Attributes:
-        frame: index of the video frame.
-        grid: its N Gaussians as integers.
-        ids: uint32 [N], ascending: the number of each Gaussian from its birth to its death.
+        grid: its N Gaussians as integers, for which `gaussians` stand.
         next_id: number of the next birth.
-        gaussians: the Gaussians that the integers stand for; `motion` is the displacement since the frame before, zero
-            where there is none, `offset` its learned part, None if the packet does not contain it.
     """
 
-    frame: int
     grid: Grid
-    ids: np.ndarray
     next_id: int
-    gaussians: Gaussians
-
-    def __len__(self) -> int:
-        return len(self.ids)
 
     @cached_property
     def digest(self) -> np.ndarray:
         """BLAKE2b of all integers, uint8 [8], by which a residual names its parent."""
-        grid, hashed = self.grid, blake2b(digest_size=8)
+        grid = self.grid
+        hashed = blake2b(digest_size=8)
         for array, dtype in (
             (self.ids, "<u4"),
             (grid.largest_components, "u1"),
@@ -103,40 +88,6 @@ class CodedFrame:
         mask = [grid.optional] if grid.optional > 1 else []
         hashed.update(np.array([self.next_id, grid.degree, *mask], "<u4").data)
         return np.frombuffer(hashed.digest(), np.uint8)
-
-
-class WholeFrame(Packet):
-    """Keyframe of Gaussians in memory: it decodes without loss, and is coded where its integers or bytes are needed.
-
-    Args:
-        gaussians: N Gaussians; a missing `motion` is zero.
-        cameras: cameras in which the error of its integers is measured.
-    """
-
-    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
-        for name, value in (("kind", PacketKind.KEYFRAME), ("frame", 0), ("place", "")):
-            object.__setattr__(self, name, value)
-        self.coded = _WholeState(gaussians, cameras)
-
-    @cached_property
-    def arrays(self) -> Mapping[str, np.ndarray]:
-        return reemitted_keyframe(self.coded).arrays
-
-
-class _WholeState(CodedFrame):
-    """State after a `WholeFrame`: its Gaussians are not rounded, and its integers follow when they are needed."""
-
-    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
-        N = len(gaussians)
-        motion = np.zeros((N, 3), np.float32) if gaussians.motion is None else gaussians.motion
-        fields = {"frame": 0, "ids": np.arange(N, dtype=np.uint32), "next_id": N}
-        for name, value in (*fields.items(), ("gaussians", replace(gaussians, motion=motion))):
-            object.__setattr__(self, name, value)
-        self.cameras = cameras
-
-    @cached_property
-    def grid(self) -> Grid:
-        return new_grid(split_groups(finite_fields(self.gaussians)), self.cameras, CodecConfig())
 
 
 def keyframe_packet(
@@ -154,12 +105,13 @@ def keyframe_packet(
         ValueError: an attribute is not finite.
     """
     grid = new_grid(split_groups(finite_fields(gaussians)), cameras, config or CodecConfig())
-    return reemitted_keyframe(CodedFrame(frame, grid, np.arange(len(grid), dtype=np.uint32), len(grid), gaussians))
+    return reemitted_keyframe(CodedFrame(frame, np.arange(len(grid), dtype=np.uint32), gaussians, grid, len(grid)))
 
 
 def reemitted_keyframe(coded: CodedFrame) -> Packet:
     """Return the keyframe that decodes to exactly `coded`: an entry point for readers, without any loss."""
-    grid, writer = coded.grid, ColumnWriter()
+    grid = coded.grid
+    writer = ColumnWriter()
     writer.put(np.diff(coded.ids.astype(np.int64), prepend=-1) - 1)
     _put_grid(writer, grid)
     head = np.array([len(grid), grid.degree, grid.optional, coded.next_id], np.uint32)
@@ -190,22 +142,25 @@ def residual_packet(
     Raises:
         ValueError: `source` or the attributes do not fit, or an attribute is not finite.
     """
-    config, grid = config or CodecConfig(), previous.grid
+    config = config or CodecConfig()
+    grid = previous.grid
     _check_attributes(previous, gaussians.sh_degree, optional_mask(gaussians.items()))
     source = _checked(np.arange(len(grid)) if source is None else source, len(grid), len(gaussians))
-    stored, survivors = finite_fields(gaussians), source[source >= 0]
+    fields = finite_fields(gaussians)
+    survivors = source[source >= 0]
     offset = np.zeros((len(gaussians), 3)) if gaussians.offset is None else np.asarray(gaussians.offset)
-    coder = _coder(previous, stored, survivors, offset if config.offset else None)
-    births, born = len(gaussians) - len(survivors), None
+    coder = _coder(previous, fields, survivors, offset if config.offset else None)
+    births = len(gaussians) - len(survivors)
+    birth_grid = None
     if births:
-        born = new_grid({n: v[len(survivors) :] for n, v in split_groups(stored).items()}, cameras, config)
+        birth_grid = new_grid({n: v[len(survivors) :] for n, v in split_groups(fields).items()}, cameras, config)
     coarseness = round(4 * np.log2(config.birth_precision))
     if config.target_size:
         coarseness = _fitting(coder, coarseness, config.target_size)
-    codes = _codes(coder, coarseness, born)
+    codes = _codes(coder, coarseness, birth_grid)
     while config.target_size and coarseness < _COARSEST and sum(c.nbytes for c in codes.values()) > config.target_size:
         coarseness += 1
-        codes = _codes(coder, coarseness, born)
+        codes = _codes(coder, coarseness, birth_grid)
     arrays = {"parent": previous.digest, "head": np.array([births, coarseness], np.uint32), **codes}
     return Packet(PacketKind.RESIDUAL, previous.frame + 1, arrays)
 
@@ -221,8 +176,6 @@ def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
         ValueError: a residual without the state that it continues, a packet that contradicts itself, or a packet
             of a frame that is not after the frame of `previous`.
     """
-    if isinstance(packet, WholeFrame):
-        return packet.coded
     where = packet.place or f"packet of frame {packet.frame}"
     names = {"head", "code"} | ({"parent"} if packet.kind == PacketKind.RESIDUAL else set())
     optional = {"offset"} if packet.kind == PacketKind.RESIDUAL else set()
@@ -235,7 +188,7 @@ def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
         if previous is not None and packet.frame <= previous.frame:
             raise ValueError(f"its frame must be above {previous.frame}, that of the state before, got {packet.frame}")
         if packet.kind == PacketKind.KEYFRAME:
-            return _decoded_keyframe(packet)
+            return _decoded_keyframe(packet, 0 if previous is None else previous.first_id + max(previous.next_id, 1))
         if previous is None:
             raise ValueError("a residual needs the frame before it, got none; start from a keyframe")
         if not np.array_equal(packet.arrays["parent"], previous.digest):
@@ -254,67 +207,7 @@ def coded_frames(packets: Iterable[Packet]) -> Iterator[CodedFrame]:
             yield coded  # a re-emitted keyframe is for readers that start there
 
 
-def frames_with_first_id(packets: Iterable[Packet]) -> Iterator[tuple[int, CodedFrame]]:
-    """Decode packets in order and yield (first_id, state) after each frame; `first_id` is added to the state's ids.
-
-    It changes where a keyframe starts a new set of Gaussians with ids from 0; no two Gaussians have one id.
-    """
-    first_id, coded = 0, None
-    for packet in packets:
-        if coded is not None and packet.kind == PacketKind.KEYFRAME:
-            if packet.frame == coded.frame:
-                continue  # a re-emitted keyframe is for readers that start there
-            first_id += max(coded.next_id, 1)  # also after a set without Gaussians
-        coded = decode(coded, packet)
-        yield first_id, coded
-
-
-def frames_with_lasting_ids(packets: Iterable[Packet]) -> Iterator[tuple[np.ndarray, CodedFrame]]:
-    """Decode packets in order and yield (ids, state) after each frame; ids int64 [N] are unique in the whole stream."""
-    return ((coded.ids.astype(np.int64) + first_id, coded) for first_id, coded in frames_with_first_id(packets))
-
-
-def play(packets: Iterable[Packet]) -> Iterator[tuple[int, Gaussians]]:
-    """Decode packets in order and yield (frame, Gaussians), once for each frame."""
-    return ((coded.frame, coded.gaussians) for coded in coded_frames(packets))
-
-
-def seek(stream: StreamReader, frame: int) -> CodedFrame:
-    """Return the state at a frame; decoding starts as in `frames_near`.
-
-    Raises:
-        ValueError: the stream has no such frame, is not a file, or a packet is broken.
-    """
-    last = next((coded for coded in frames_near(stream, frame) if coded.frame >= frame), None)
-    if last is None or last.frame != frame:
-        raise ValueError(f"{stream.path}: expected a frame of the stream, got {frame}; choose one that it contains.")
-    return last
-
-
-def frames_near(stream: StreamReader, frame: int) -> Iterator[CodedFrame]:
-    """Yield the states from the last keyframe before a frame on.
-
-    Where the frame cannot be reached from there, because that keyframe or the index is forged, those from the start of
-    the stream follow.
-
-    Raises:
-        ValueError: the stream is not a file, or a packet is broken.
-    """
-    near, reached = stream.near(frame), False
-    try:
-        for coded in coded_frames(near):
-            if coded.frame > frame and not reached:
-                break
-            reached = reached or coded.frame == frame
-            yield coded
-    except ValueError:
-        if reached:
-            raise
-    if not reached:
-        yield from coded_frames(stream)
-
-
-def _decoded_keyframe(packet: Packet) -> CodedFrame:
+def _decoded_keyframe(packet: Packet, first_id: int) -> CodedFrame:
     code = packet.arrays["code"]
     N, degree, optional, next_id = _head(packet, 4)
     if unknown := optional & ~KNOWN_OPTIONAL:
@@ -330,12 +223,13 @@ def _decoded_keyframe(packet: Packet) -> CodedFrame:
     grid = _taken_grid(reader, N, degree, optional)
     if np.any(np.diff(ids, prepend=-1) < 1) or (N and ids[-1] >= next_id):
         raise ValueError("its ids do not ascend")
-    return CodedFrame(packet.frame, grid, ids.astype(np.uint32), next_id, grid.gaussians())
+    return CodedFrame(packet.frame, ids.astype(np.uint32), grid.gaussians(), grid, next_id, first_id=first_id)
 
 
 def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
     births, coarseness = _head(packet, 2)
-    code, grid = packet.arrays["code"], previous.grid
+    code = packet.arrays["code"]
+    grid = previous.grid
     _check_most(coarseness, _COARSEST, "its coarseness")
     _check_most(previous.next_id + births, LIMIT - 1, "its next id")
     reader = ColumnReader(code)
@@ -344,19 +238,32 @@ def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
     _check_words(code, births, len(survivors) + births, grid.degree, grid.optional)
     new = replace(grid, values=values).select(survivors)
     motion = np.zeros((len(survivors) + births, 3), np.float32)
-    before = np.asarray(previous.gaussians.means)[survivors]
-    motion[: len(survivors)] = new.real("means").astype(np.float32) - before
+    starts = np.asarray(previous.gaussians.means)[survivors]
+    motion[: len(survivors)] = new.real("means").astype(np.float32) - starts
     offset = None
     if "offset" in packet.arrays:
-        offset, at, words = np.zeros_like(motion), grid.columns["means"], ColumnReader(packet.arrays["offset"])
-        moved = np.flatnonzero(np.any(new.values[:, at] != grid.values[survivors, at], axis=1))
-        r = np.stack([words.take(len(moved)) for _ in range(3)], axis=1)
-        offset[moved] = r * offset_steps(new.select(moved), coarseness)
+        offset = np.zeros_like(motion)
+        at = grid.columns["means"]
+        rows = np.flatnonzero(np.any(new.values[:, at] != grid.values[survivors, at], axis=1))
+        offset[rows] = _taken_offsets(packet.arrays["offset"], new.select(rows), coarseness)
     if births:
         new = new.concatenate(_taken_grid(reader, births, grid.degree, grid.optional))
     ids = np.concatenate([previous.ids[survivors], previous.next_id + np.arange(births, dtype=np.uint32)])
-    gaussians = new.gaussians(motion, offset)
-    return CodedFrame(packet.frame, new, ids.astype(np.uint32), previous.next_id + births, gaussians)
+    return replace(
+        previous,
+        frame=packet.frame,
+        ids=ids.astype(np.uint32),
+        gaussians=new.gaussians(motion, offset),
+        grid=new,
+        next_id=previous.next_id + births,
+    )
+
+
+def _taken_offsets(code: np.ndarray, grid: Grid, coarseness: int) -> np.ndarray:
+    """Return the offsets [M, 3] of the Gaussians whose means change, which `Coder.offsets` yields."""
+    reader = ColumnReader(code)
+    r = np.stack([reader.take(len(grid)) for _ in range(3)], axis=1)
+    return r * offset_steps(grid, coarseness)
 
 
 def _words(columns: Iterable[np.ndarray]) -> np.ndarray:
@@ -381,7 +288,8 @@ def _taken_grid(reader: ColumnReader, N: int, degree: int, optional: int) -> Gri
     largest = reader.take(N) + middle[0]
     if np.any((largest < 0) | (largest > 3)):
         raise ValueError("the largest component of a quaternion must be 0 to 3")
-    exponents, values = np.empty((N, first - 1), np.int8), np.empty((N, len(middle) - first), np.int32)
+    exponents = np.empty((N, first - 1), np.int8)
+    values = np.empty((N, len(middle) - first), np.int32)
     for column, shift in zip(exponents.T, middle[1:first], strict=True):
         column[:] = bounded(reader.take(N) + shift, 128, "exponent")
     for column, shift in zip(values.T, middle[first:], strict=True):
@@ -390,27 +298,31 @@ def _taken_grid(reader: ColumnReader, N: int, degree: int, optional: int) -> Gri
 
 
 def _coder(
-    previous: CodedFrame, now: Mapping[str, np.ndarray], survivors: np.ndarray, offset: np.ndarray | None
+    previous: CodedFrame, fields: Mapping[str, np.ndarray], survivors: np.ndarray, offset: np.ndarray | None
 ) -> Coder:
-    """Return the coder of the changes to the stored fields `now`; survivors without any difference are skipped."""
-    grid, before, differs = previous.grid, stored_fields(previous.gaussians), np.zeros(len(survivors), bool)
-    for name, value in now.items():
-        different = value[: len(survivors)] != before[name][survivors]
-        differs |= different.reshape(len(survivors), prod(value.shape[1:])).any(1)
-    touched = np.flatnonzero(differs)
-    rows = survivors[touched]
-    change = real_values({name: value[touched] for name, value in split_groups(now).items()}, grid.select(rows))
+    """Return the coder of the changes to the next stored `fields`; survivors without any difference are skipped."""
+    grid = previous.grid
+    previous_fields = stored_fields(previous.gaussians)
+    differs = np.zeros(len(survivors), bool)
+    for name, value in fields.items():
+        differences = value[: len(survivors)] != previous_fields[name][survivors]
+        differs |= differences.reshape(len(survivors), prod(value.shape[1:])).any(1)
+    indices = np.flatnonzero(differs)
+    rows = survivors[indices]
+    change = real_values({name: value[indices] for name, value in split_groups(fields).items()}, grid.select(rows))
     change -= grid.values[rows].T
     return Coder(grid, survivors, rows, change, offset)
 
 
-def _codes(coder: Coder, coarseness: int, born: Grid | None) -> dict[str, np.ndarray]:
+def _codes(coder: Coder, coarseness: int, birth_grid: Grid | None) -> dict[str, np.ndarray]:
     """Return the words of the changes in steps of a coarseness, and of the births."""
-    r, writer, births = coder.rounded(coarseness), ColumnWriter(), 0 if born is None else len(born)
+    r = coder.rounded(coarseness)
+    writer = ColumnWriter()
+    births = 0 if birth_grid is None else len(birth_grid)
     for column in coder.columns(r):
         writer.put(column)
-    if born is not None:
-        _put_grid(writer, born)
+    if birth_grid is not None:
+        _put_grid(writer, birth_grid)
     codes = {"code": _padded(writer.words(), births, len(coder.survivors) + births, coder.grid)}
     if coder.offset is not None:
         codes["offset"] = _words(coder.offsets(r, coarseness))
@@ -434,21 +346,22 @@ def _fitting(coder: Coder, low: int, target: int) -> int:
 def _check_attributes(previous: CodedFrame, degree: int, optional: int) -> None:
     grid = previous.grid
     if (degree, optional) != (grid.degree, grid.optional):
-        expected, got = (list(optional_names(mask)) for mask in (grid.optional, optional))
+        names, new_names = (list(optional_names(mask)) for mask in (grid.optional, optional))
         raise ValueError(
             f"residual_packet(): frame {previous.frame + 1} must have SH of degree {grid.degree} and the optional "
-            f"attributes {expected} as the frame before, got degree {degree} and {got}; write a keyframe instead."
+            f"attributes {names} as the frame before, got degree {degree} and {new_names}; write a keyframe instead."
         )
 
 
-def _checked(source: np.ndarray, before: int, now: int) -> np.ndarray:
+def _checked(source: np.ndarray, N: int, next_N: int) -> np.ndarray:
+    """Return the sources of the next Gaussians, if they are in order and refer to N Gaussians."""
     source = np.asarray(source)
-    born = source < 0
-    survivors = source[~born]
-    sound = source.shape == (now,) and np.all(np.diff(survivors) > 0) and np.all(np.diff(born.astype(int)) >= 0)
-    if not sound or np.any(survivors >= before):
+    births = source < 0
+    survivors = source[~births]
+    is_ordered = np.all(np.diff(survivors) > 0) and np.all(np.diff(births.astype(int)) >= 0)
+    if source.shape != (next_N,) or not is_ordered or np.any(survivors >= N):
         raise ValueError(
-            f"residual_packet(): `source` must be [{now}] with survivors of 0..{before - 1} in ascending order, then "
+            f"residual_packet(): `source` must be [{next_N}] with survivors of 0..{N - 1} in ascending order, then "
             f"-1 for each birth, got {source.shape}; sort the Gaussians in this order."
         )
     return source

@@ -64,7 +64,9 @@ KNOWN_OPTIONAL = (1 << len(_OPTIONAL)) - 1
 _QUARTERS = np.array([1.0, 1.189207115002721, 1.4142135623730951, 1.681792830507429])  # 2^(k/4)
 _STEPS = np.ldexp(_QUARTERS[np.arange(256) & 3], np.arange(256).astype(np.int8) >> 2)  # by e mod 256
 # Values beyond these bounds make no visible difference, and one outlier must not cost the others their steps.
-_MAX_RATIO, _MAX_LOGIT, _MAX_OPTIONAL = 4096.0, 16.0, 6.0
+_MAX_RATIO = 4096.0
+_MAX_LOGIT = 16.0
+_MAX_OPTIONAL = 6.0
 _MIN_SIZE_PX = 0.5  # smaller splats are blurred to about this size when they are drawn
 _MAX_BITS = 24  # of an integer of a new Gaussian
 _MAX_VALUE = LIMIT - 2**20  # stays within the limit when it is rounded to the coarsest change (see `packets`)
@@ -72,21 +74,13 @@ _MAX_VALUE = LIMIT - 2**20  # stays within the limit when it is rounded to the c
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """N Gaussians as integers.
+    """N Gaussians as integers."""
 
-    Attributes:
-        values: int32 [N, C].
-        exponents: int8 [N, E].
-        largest_components: uint8 [N], the component of each quaternion that is not stored.
-        degree: of the spherical harmonics, 0 to 3.
-        optional: bit mask of the optional attributes, see `optional_mask`.
-    """
-
-    values: np.ndarray
-    exponents: np.ndarray
-    largest_components: np.ndarray
-    degree: int
-    optional: int
+    values: np.ndarray  #: int32 [N, C].
+    exponents: np.ndarray  #: int8 [N, E].
+    largest_components: np.ndarray  #: uint8 [N], the component of each quaternion that is not stored.
+    degree: int  #: Of the spherical harmonics, 0 to 3.
+    optional: int  #: Bit mask of the optional attributes, see `optional_mask`.
 
     def __len__(self) -> int:
         return len(self.values)
@@ -213,10 +207,10 @@ def stored_fields(gaussians: Gaussians) -> dict[str, np.ndarray]:
     return {name: value for name, value in gaussians.numpy().items() if name == "sh_coeffs" or name in GROUPS}
 
 
-def split_groups(stored: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def split_groups(fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Return `stored_fields` by group: the spherical harmonics in two parts."""
-    sh = stored["sh_coeffs"]
-    return {name: value for name, value in stored.items() if name in GROUPS} | {
+    sh = fields["sh_coeffs"]
+    return {name: value for name, value in fields.items() if name in GROUPS} | {
         "sh_dc": sh[:, :1],
         "sh_rest": sh[:, 1:],
     }
@@ -228,14 +222,14 @@ def finite_fields(gaussians: Gaussians) -> dict[str, np.ndarray]:
     Raises:
         ValueError: one is not finite.
     """
-    stored = stored_fields(gaussians)
-    for name, value in stored.items():
+    fields = stored_fields(gaussians)
+    for name, value in fields.items():
         if not np.isfinite(value).all():
             row = np.argwhere(~np.isfinite(value))[0][0]
             raise ValueError(
                 f"the stream: `{name}` must be finite, that of Gaussian {row} is not; lower the learning rates."
             )
-    return stored
+    return fields
 
 
 def new_grid(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: CodecConfig) -> Grid:
@@ -256,7 +250,8 @@ def _bounded_optional(name: str, values: np.ndarray) -> np.ndarray:
 
 def real_values(raw: Mapping[str, np.ndarray], grid: Grid) -> np.ndarray:
     """Return unrounded `Grid.values` of other raw attributes by group, float64 [C, N], with the steps of `grid`."""
-    largest_components, rows = grid.largest_components, np.arange(len(grid.largest_components))
+    largest_components = grid.largest_components
+    rows = np.arange(len(grid.largest_components))
     quats = np.asarray(raw["quats"], np.float64)
     others = np.stack([quats[rows, k + (k >= largest_components)] for k in range(3)], axis=1)
     largest = quats[rows, largest_components][:, None]
@@ -274,37 +269,51 @@ def real_values(raw: Mapping[str, np.ndarray], grid: Grid) -> np.ndarray:
 
 def _exponents(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: CodecConfig) -> np.ndarray:
     """Return quarter octaves int8 [N, E] of steps, which are twice the error that `config` tolerates."""
+    ones = np.ones(len(raw["means"]))
+    steps = _steps_of_groups(raw, cameras, config)
+    magnitudes = _magnitudes(raw)
+    columns = []
+    for name in (*_ALWAYS, *optional_names(optional_mask(raw))):
+        group = steps.get(name) or [(_generic_step(name, config), ones)]
+        for (step, factor), magnitude in zip(group, magnitudes.get(name) or [ones], strict=True):
+            # The factor of a Gaussian in whole octaves, which take fewer bits than they save.
+            e = np.floor(4 * np.log2(step)) + 4 * np.floor(np.log2(factor))
+            finest = np.ceil(4 * (np.log2(np.maximum(magnitude, 1e-38)) - _MAX_BITS))
+            columns.append(np.maximum(e, finest))
+    return np.clip(np.stack(columns, axis=1), -128, 127).astype(np.int8)
+
+
+def _steps_of_groups(
+    raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: CodecConfig
+) -> dict[str, list[tuple[float, np.ndarray]]]:
+    """Return (step of all Gaussians, factor of each one [N]) for each exponent of a group, by group."""
     precision = config.quality * config.birth_precision
     error, color = (2 * _tolerated(name) / precision for name in ("means", "sh_dc"))
-    pixel, N = _world_per_pixel(raw["means"], cameras), len(raw["means"])
+    pixel = _world_per_pixel(raw["means"], cameras)
+    ones = np.ones(len(pixel))
     sizes = np.maximum(np.exp(np.minimum(raw["log_scales"], 80.0)) / pixel[:, None], _MIN_SIZE_PX)  # px
     elongation = np.maximum(np.sqrt(sizes.max(1) ** 2 - sizes.min(1) ** 2), _MIN_SIZE_PX)  # a ball tolerates any turn
-    one = np.ones(N)
-    # (tolerance of every Gaussian, tolerance of this one in these units) for each exponent of a group.
-    steps = {
+    return {
         "means": [(error, pixel)],
         "log_scales": [(error, 1 / size) for size in sizes.T],
         "quats": [(error / 2, 1 / elongation)],  # a turn by a changes tan(a / 2)
-        "logit_opacities": [(_generic_step("logit_opacities", config), one)],
-        "sh_dc": [(color / SH_C0, one)],
-        "sh_rest": [(color, one)],
+        "logit_opacities": [(_generic_step("logit_opacities", config), ones)],
+        "sh_dc": [(color / SH_C0, ones)],
+        "sh_rest": [(color, ones)],
     }
-    # Close to a lens, and for huge splats, such steps would be finer than float32, and the integers without bound.
-    largest = {
+
+
+def _magnitudes(raw: Mapping[str, np.ndarray]) -> dict[str, list[np.ndarray]]:
+    """Return the largest absolute values [N] for each exponent of a group, by group.
+
+    Close to a lens, and for huge splats, steps would be finer than float32, and the integers without bound.
+    """
+    return {
         "means": [np.abs(raw["means"]).max(1)],
         "log_scales": list(np.abs(raw["log_scales"]).T),
         "sh_dc": [np.abs(raw["sh_dc"]).max((1, 2))],
         "sh_rest": [np.abs(raw["sh_rest"]).max((1, 2), initial=0)],
     }
-    columns = []
-    for name in (*_ALWAYS, *optional_names(optional_mask(raw))):
-        group = steps.get(name) or [(_generic_step(name, config), one)]
-        for (shared, own), most in zip(group, largest.get(name) or [one], strict=True):
-            # The factor of this Gaussian in whole octaves, which take fewer bits than they save.
-            e = np.floor(4 * np.log2(shared)) + 4 * np.floor(np.log2(own))
-            finest = np.ceil(4 * (np.log2(np.maximum(most, 1e-38)) - _MAX_BITS))
-            columns.append(np.maximum(e, finest))
-    return np.clip(np.stack(columns, axis=1), -128, 127).astype(np.int8)
 
 
 def _generic_step(name: str, config: CodecConfig) -> float:
@@ -331,6 +340,6 @@ def _world_per_pixel(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray
         depth = means @ view[2, :3] + view[2, 3]
         focal = max(camera.K[0, 0], camera.K[1, 1])
         pixel = np.minimum(pixel, np.where(depth > camera.near, depth, np.inf) / focal)
-    seen = pixel[np.isfinite(pixel)]
+    sizes = pixel[np.isfinite(pixel)]
     # A Gaussian behind every camera is invisible but may come into view.
-    return np.where(np.isfinite(pixel), pixel, np.median(seen) if len(seen) else 1e-3)
+    return np.where(np.isfinite(pixel), pixel, np.median(sizes) if len(sizes) else 1e-3)

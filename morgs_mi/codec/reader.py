@@ -24,7 +24,9 @@ from morgs_mi.codec.container import (
     decode_packet,
     open_packet,
 )
+from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.codec.header import header_fields
+from morgs_mi.codec.packets import CodedFrame, coded_frames
 
 __all__ = ["StreamReader"]
 
@@ -33,7 +35,7 @@ _CHUNK = 2**20
 _Entry = tuple[int, int, int]
 
 
-class StreamReader:
+class StreamReader(FrameSource):
     """Reader of a stream.
 
     Iterating yields its packets from the first. A file may be read again, e.g. when it has grown; a pipe yields each
@@ -82,10 +84,10 @@ class StreamReader:
                     raise ValueError(f"the first packet must be the header, got kind {kind}")
                 self.cameras, self.fps, self.metadata = header_fields(payload)
         self._first = PREAMBLE.size + len(data)
-        self._kept: list[_Entry] | None = None
+        self._playable_entries: list[_Entry] | None = None
         self.skipped: list[int] = []
         if skip_damaged:
-            self._kept, self.skipped = self._playable()
+            self._playable_entries, self.skipped = self._playable()
 
     def __repr__(self) -> str:
         frames = f"{self.metadata['num_frames']} frames, " if "num_frames" in self.metadata else ""
@@ -95,6 +97,30 @@ class StreamReader:
 
     def __iter__(self) -> Iterator[Packet]:
         return self._packets(1, self._first)
+
+    def frame_numbers(self) -> list[int]:
+        return list(dict.fromkeys(frame for _, frame, _ in self.index()))
+
+    def states(self, near: int | None = None) -> Iterator[CodedFrame]:
+        """Decode the packets and yield the state after each frame; see `FrameSource.states`.
+
+        Near a frame, decoding starts at the last keyframe before it. Where the frame cannot be reached from there,
+        because that keyframe or the index is forged, the states from the start of the stream follow.
+        """
+        has_frame = False
+        if near is not None:
+            packets = self.near(near)
+            try:
+                for coded in coded_frames(packets):
+                    if coded.frame > near and not has_frame:
+                        break
+                    has_frame = has_frame or coded.frame == near
+                    yield coded
+            except ValueError:
+                if has_frame:
+                    raise
+        if not has_frame:
+            yield from coded_frames(self)
 
     def near(self, frame: int) -> Iterator[Packet]:
         """Yield the packets from the last keyframe before `frame` on, or from the first.
@@ -107,10 +133,12 @@ class StreamReader:
         """
         if self._pipe is not None:
             raise ValueError(f"{self.path}: expected a file to seek in, got a pipe; save it first.")
-        number, at = 1, self._first
-        for k, (kind, known, offset) in enumerate(self.index()):
-            if kind == PacketKind.KEYFRAME and known < frame:
-                number, at = k + 1, offset
+        number = 1
+        at = self._first
+        for k, (kind, packet_frame, offset) in enumerate(self.index(), start=1):
+            if kind == PacketKind.KEYFRAME and packet_frame < frame:
+                number = k
+                at = offset
         return self._packets(number, at)
 
     def closed(self) -> bool:
@@ -130,12 +158,14 @@ class StreamReader:
         Raises:
             TruncatedStreamError: the file is now shorter than the header that was read from it.
         """
-        if self._kept is not None:
-            return list(self._kept)
+        if self._playable_entries is not None:
+            return list(self._playable_entries)
         with open(self.path, "rb") as file:
             if (entries := self._last_index(file)) is not None:
                 return entries
-            entries, at, size = [], self._first, file.seek(0, 2)
+            entries = []
+            size = file.seek(0, 2)
+            at = self._first
             while at + PAYLOAD <= size:
                 file.seek(at)
                 kind, frame, length = HEAD.unpack(file.read(HEAD.size))
@@ -148,7 +178,7 @@ class StreamReader:
         """Return the entries of the packets that play without the damaged ones, and the frames that do not play."""
         if self._pipe is not None:
             raise ValueError(f"{self.path}: expected a file to skip damage in, got a pipe; save it first.")
-        kept = list[_Entry]()
+        entries = list[_Entry]()
         frames = [-1]
         plays = False
         with open(self.path, "rb") as file:
@@ -157,12 +187,12 @@ class StreamReader:
                     frames.append(frame)
                     plays = plays or kind == PacketKind.KEYFRAME
                     if plays:
-                        kept.append((kind, frame, offset))
+                        entries.append((kind, frame, offset))
                 else:
                     # A damaged head may name any frame. A keyframe that repeats the state of a frame is not needed.
                     frames.append(frame if frame == frames[-1] else frames[-1] + 1)
-                    plays = plays and kept[-1][1] == frames[-1]
-        return kept, sorted({*frames[1:]} - {frame for _, frame, _ in kept})
+                    plays = plays and entries[-1][1] == frames[-1]
+        return entries, sorted({*frames[1:]} - {frame for _, frame, _ in entries})
 
     def _is_intact(self, file: BinaryIO, number: int, at: int) -> bool:
         file.seek(at)
@@ -205,7 +235,8 @@ class StreamReader:
         """
         if self._pipe is not None:
             raise ValueError(f"{self.path}: expected a file that is read twice, got a pipe; save it first.")
-        entries, end = [], self._first
+        entries = []
+        end = self._first
         with contextlib.suppress(TruncatedStreamError):
             for at, data in self._checked(1, self._first):
                 kind, frame, _ = HEAD.unpack_from(data)
@@ -216,7 +247,8 @@ class StreamReader:
 
     def _packets(self, number: int, at: int) -> Iterator[Packet]:
         last = None
-        for offset, data in self._checked(number, at) if self._kept is None else self._undamaged(number, at):
+        read = self._checked if self._playable_entries is None else self._undamaged
+        for offset, data in read(number, at):
             if HEAD.unpack_from(data)[0] != PacketKind.INDEX:
                 with self._located(number, offset, last):
                     packet = decode_packet(data, self._place(number, offset))

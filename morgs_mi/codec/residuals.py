@@ -17,33 +17,30 @@ from morgs_mi.codec.quantisation import GROUPS, Grid, bounded, step_sizes
 
 __all__ = ["Coder", "offset_steps", "take_change"]
 
-_GEOMETRY, _APPEARANCE, _DEAD = GROUPS[:3], GROUPS[3:], 8
+_GEOMETRY = GROUPS[:3]
+_APPEARANCE = GROUPS[3:]
+_DEAD = 8  # flags of the geometry of a Gaussian that dies; the three groups are its lower bits
 # Changes below a step are jitter of the fit, but in the base colour every bit is visible. Slightly less than a step,
 # because a decoded state is rounded to float32 and must give the packet that it was decoded from.
-_THRESHOLD, _THRESHOLD_DC = 0.99, 0.5
+_THRESHOLD = 0.99
+_THRESHOLD_DC = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Coder:
-    """Coder of the changes from a state to the next Gaussians, in steps of any coarseness.
+    """Coder of the changes from a state to the next Gaussians, in steps of any coarseness."""
 
-    Attributes:
-        grid: the N Gaussians of the state.
-        survivors: their indices in the state [S], ascending; the others die.
-        rows: indices of the M survivors that differ.
-        change: their differences by integer, in multiples of the grid's steps [C, M].
-        offset: offsets of the next Gaussians, survivors first [N', 3], world units; None: they are not stored.
-    """
-
-    grid: Grid
-    survivors: np.ndarray
-    rows: np.ndarray
-    change: np.ndarray
+    grid: Grid  #: The N Gaussians of the state.
+    survivors: np.ndarray  #: Their indices in the state [S], ascending; the others die.
+    rows: np.ndarray  #: Indices of the M survivors that differ.
+    change: np.ndarray  #: Their differences by integer, in multiples of the grid's steps [C, M].
+    #: Offsets of the next Gaussians, survivors first [N', 3], world units; None: they are not stored.
     offset: np.ndarray | None
 
     def rounded(self, coarseness: int) -> np.ndarray:
         """Return the changes in whole steps, int32 [C, N]."""
-        r, scaled = np.zeros((len(self.change), len(self.grid)), np.int32), self.change / _step(coarseness)
+        r = np.zeros((len(self.change), len(self.grid)), np.int32)
+        scaled = self.change / _step(coarseness)
         for name, at in self.grid.columns.items():
             largest = np.max(np.abs(scaled[at]), axis=0)
             scaled[at][:, largest < (_THRESHOLD_DC if name == "sh_dc" else _THRESHOLD)] = 0
@@ -58,7 +55,8 @@ class Coder:
         geometry = np.where(dead, _DEAD, _flags(changed, _GEOMETRY, len(self.grid)))
         appearance = _flags(changed, _APPEARANCE, len(self.grid))
         for rows in _classes(self.grid):
-            shape, shading = geometry[rows], appearance[rows]
+            shape = geometry[rows]
+            shading = appearance[rows]
             yield shape
             yield shading[shape == 0]
             yield shading[(shape > 0) & (shape < _DEAD)]
@@ -68,8 +66,8 @@ class Coder:
     def offsets(self, r: np.ndarray, coarseness: int) -> Iterator[np.ndarray]:
         """Yield the columns of the offsets of the survivors with changed means; none if they are not stored."""
         if self.offset is not None:
-            moved = np.flatnonzero(np.any(r[self.grid.columns["means"]], axis=0)[self.survivors])
-            real = self.offset[moved] / offset_steps(self.grid.select(self.survivors[moved]), coarseness)
+            rows = np.flatnonzero(np.any(r[self.grid.columns["means"]], axis=0)[self.survivors])
+            real = self.offset[rows] / offset_steps(self.grid.select(self.survivors[rows]), coarseness)
             yield from np.clip(np.rint(real), 1 - LIMIT, LIMIT - 1).astype(np.int32).T
 
 
@@ -84,13 +82,16 @@ def take_change(reader: ColumnReader, grid: Grid, coarseness: int) -> tuple[np.n
     Raises:
         ValueError: the columns do not describe changes, or a value leaves its range.
     """
-    values, dead, step = grid.values.copy(), np.zeros(len(grid), bool), float(_step(coarseness))
+    values = grid.values.copy()
+    dead = np.zeros(len(grid), bool)
+    step = float(_step(coarseness))
     for rows in _classes(grid):
-        geometry, appearance = reader.take(len(rows)), np.zeros(len(rows), np.int64)
+        geometry = reader.take(len(rows))
+        appearance = np.zeros(len(rows), np.int64)
         for some in (geometry == 0, (geometry > 0) & (geometry < _DEAD)):
             appearance[some] = reader.take(int(some.sum()))
-        known = sum(1 << bit for bit, name in enumerate(_APPEARANCE) if name in grid.columns)
-        if np.any((geometry < 0) | (geometry > _DEAD) | (appearance & ~known != 0)):
+        bits = sum(1 << bit for bit, name in enumerate(_APPEARANCE) if name in grid.columns)
+        if np.any((geometry < 0) | (geometry > _DEAD) | (appearance & ~bits != 0)):
             raise ValueError("its flags name groups that do not exist")
         dead[rows] = geometry == _DEAD
         flags = {name: (geometry >> bit & 1) & (geometry < _DEAD) for bit, name in enumerate(_GEOMETRY)}

@@ -65,38 +65,27 @@ SIGMOID = Activation(sigmoid, _logit, 0.25)
 
 @dataclass(frozen=True)
 class Attribute:
-    """One row of the table.
+    """One row of the table."""
 
-    Attributes:
-        name: of the optimised tensor in `Gaussians`; the two rows of the spherical harmonics share `sh_coeffs`.
-        shape: of one Gaussian's value; -1 where it depends on the degree of the spherical harmonics.
-        activated_name: of the rendered value.
-        activation: between the two.
-        required: whether every `Gaussians` has it.
-        rate: field of `LearningRates`, or a learning rate; None where it is not optimised.
-        rate_in_extents: whether that rate counts in scene extents.
-        gate: of its residual with two gates: the confidence for ``motion``, none for ``appearance``;
-            None where it has no residual (eq. 12).
-        first_frame: whether the first frame fits it.
-        error: of the activated value that the stream tolerates with `quality` 1; on screen in px for means, scales and
-            rotations. None where the stream does not store it.
-        channel: of the renderer that blends it like a colour; None where there is none, or where the channel is not
-            plain blending (`color`, `motion`).
-        initial: value of the optimised tensor before the first frame; None where `fit.initialise` computes it, or where
-            the attribute is absent then.
-    """
-
-    name: str
-    shape: tuple[int, ...]
-    activated_name: str
-    activation: Activation = IDENTITY
-    required: bool = False
-    rate: str | float | None = None
-    rate_in_extents: bool = False
+    name: str  #: Of the optimised tensor in `Gaussians`; the two rows of the spherical harmonics share `sh_coeffs`.
+    shape: tuple[int, ...]  #: Of one Gaussian's value; -1 where it depends on the degree of the spherical harmonics.
+    activated_name: str  #: Of the rendered value.
+    activation: Activation = IDENTITY  #: Between the two.
+    required: bool = False  #: Whether every `Gaussians` has it.
+    rate: str | float | None = None  #: Field of `LearningRates`, or a learning rate; None where it is not optimised.
+    rate_in_extents: bool = False  #: Whether that rate counts in scene extents.
+    #: Of its residual with two gates: the confidence for ``motion``, none for ``appearance``; None where it has no
+    #: residual (eq. 12).
     gate: Literal["motion", "appearance"] | None = None
-    first_frame: bool = False
+    first_frame: bool = False  #: Whether the first frame fits it.
+    #: Of the activated value that the stream tolerates with `quality` 1; on screen in px for means, scales and
+    #: rotations. None where the stream does not store it.
     error: float | None = None
+    #: Of the renderer that blends it like a colour; None where there is none, or where the channel is not plain
+    #: blending (`color`, `motion`).
     channel: str | None = None
+    #: Value of the optimised tensor before the first frame; None where `fit.initialise` computes it, or where the
+    #: attribute is absent then.
     initial: float | None = None
 
     @property

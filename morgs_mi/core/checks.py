@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from morgs_mi.core.color_space import BRIGHTEST
+
 __all__ = ["LARGEST", "bounded", "check_mask", "check_number", "check_points", "check_size", "check_type", "numbers"]
 
 
@@ -96,7 +98,7 @@ def numbers(place: str, name: str, values: ArrayLike) -> np.ndarray:
 
 
 def check_points(place: str, points: ArrayLike, colors: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Return points and colours as arrays [P, 3], P >= 0, if they are finite and the colours lie in [0, 1].
+    """Return points and colours as arrays [P, 3], P >= 0, if they are finite, and the colours encoded (1 is white).
 
     Raises:
         ValueError: they are not.
@@ -113,7 +115,13 @@ def check_points(place: str, points: ArrayLike, colors: ArrayLike) -> tuple[np.n
         )
     for name, values, good, expected, remedy in (
         ("points", points, np.abs(points) <= LARGEST, f"finite and at most {LARGEST:g}", "remove this point"),
-        ("point_colors", colors, (colors >= 0) & (colors <= 1), "in [0, 1]", "divide colours of 8 bits by 255"),
+        (
+            "point_colors",
+            colors,
+            (colors >= 0) & (colors <= BRIGHTEST),
+            f"from 0 to {BRIGHTEST:g} with white at 1",
+            "divide colours of 8 bits by 255",
+        ),
     ):
         if not good.all():
             row = np.flatnonzero(~good.all(axis=1))[0]

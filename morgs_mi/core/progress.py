@@ -22,15 +22,10 @@ _HTML = '<div>{title} <progress value="{done}" max="{total}" style="width:20em">
 
 @dataclass(frozen=True)
 class Progress:
-    """Progress of a stage of a long call; to be called with (done, total).
+    """Progress of a stage of a long call; to be called with (done, total)."""
 
-    Attributes:
-        report: function that is called with (stage, done, total); None: nothing is reported.
-        stage: name of the stage.
-    """
-
-    report: Report | None = None
-    stage: str = ""
+    report: Report | None = None  #: Function that is called with (stage, done, total); None: nothing is reported.
+    stage: str = ""  #: Name of the stage.
 
     def __call__(self, done: float, total: float) -> None:
         """Report that `done` of `total` is done."""

@@ -22,6 +22,7 @@ __all__ = [
     "scene_extent",
     "seen_points",
     "surface_of",
+    "up_direction",
     "with_near_planes",
 ]
 
@@ -45,6 +46,14 @@ def scene_extent(cameras: Sequence[Camera]) -> float:
     positions = np.array([camera.position for camera in cameras])
     radius = np.linalg.norm(positions - positions.mean(0), axis=1).max()
     return float(1.1 * radius) if radius > 0 else 1.0
+
+
+def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the mean up direction of the cameras [3], of unit length; the first camera's where they cancel out."""
+    ups = np.stack([-np.asarray(camera.viewmat, np.float64)[1, :3] for camera in cameras])
+    mean = ups.mean(axis=0)
+    up = mean if np.linalg.norm(mean) > 0.1 else ups[0]
+    return up / np.linalg.norm(up)
 
 
 def focus_point(cameras: Sequence[Camera]) -> np.ndarray:

@@ -12,9 +12,9 @@ import numpy as np
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.truth import GroundTruth
 from morgs_mi.codec.container import PacketKind, encode_packet
-from morgs_mi.codec.packets import CodedFrame, coded_frames
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.frame_source import FrameSource, FrameState
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.color_space import display_image, exposed
 from morgs_mi.evaluate.temporal import recorded_change
 from morgs_mi.playback.player import has_confidence, open_stream_capture, render, render_config, truth_for_camera
 from morgs_mi.playback.visualise import to_uint8
@@ -31,24 +31,22 @@ class ComparedClip:
         stream: the stream.
         recording: its capture.
         packets: kind and size of each frame's packet.
-        num_packets: number of packets, re-emitted keyframes included.
         views: the evaluated views: the held-out ones, or otherwise all training views.
         cameras: of all views, with the delays of the recording.
         channels: rendered channels.
         render: settings of the renderer, as in the fit.
     """
 
-    stream: StreamReader
+    stream: FrameSource
     recording: Capture
     packets: Mapping[int, tuple[PacketKind, int]]
-    num_packets: int
     views: Sequence[int]
     cameras: Sequence[Camera]
     channels: Sequence[str]
     render: RenderConfig
 
     @classmethod
-    def of(cls, stream: StreamReader, capture: str | Path | None, any_recording: bool = False) -> ComparedClip:
+    def of(cls, stream: FrameSource, capture: str | Path | None, any_recording: bool = False) -> ComparedClip:
         """Return a stream beside `capture`; None: the capture that it was fitted to.
 
         The sizes are read from the file and not from the fit's report, because a receiver has only the file. The
@@ -58,29 +56,27 @@ class ComparedClip:
             FileNotFoundError: the capture is missing.
             ValueError: the stream is truncated, broken or empty, or was fitted to another capture.
         """
-        packets, count = dict[int, tuple[PacketKind, int]](), 0
+        packets = dict[int, tuple[PacketKind, int]]()
         for packet in stream:
             # Later packets of a frame are re-emitted keyframes.
             packets.setdefault(packet.frame, (packet.kind, len(encode_packet(packet))))
-            count += 1
-        if not packets:
-            raise ValueError(f"{stream.path}: expected at least one frame, got a header alone; fit the capture again.")
         recording = open_stream_capture(stream, capture, list(packets), any_recording)
         views = recording.test_views or recording.train_views
         channels = ("color", "motion", *(("confidence",) if has_confidence(stream) else ()))
         cameras = recording.with_delays(stream.cameras)
-        return cls(stream, recording, packets, count, views, cameras, channels, render_config(stream))
+        return cls(stream, recording, packets, views, cameras, channels, render_config(stream))
 
     def frames(self) -> Iterator[ComparedFrame]:
         """Yield the decoded frames beside the recorded ones."""
-        last = None
+        last, stops = None, self.recording.display_exposure or 0.0
         # The file may have grown since it was read.
-        decoded = coded_frames(islice(self.stream, self.num_packets))
+        decoded = islice(self.stream.states(), len(self.packets))
         recorded = self.recording.partial_frames(min(self.packets), max(self.packets) + 1)
-        for coded, frame in zip(decoded, recorded, strict=True):
-            kind, num_bytes = self.packets[coded.frame]
-            yield ComparedFrame(self, coded, kind, num_bytes, frame.images, last)
-            last = frame.images
+        for state, frame in zip(decoded, recorded, strict=True):
+            kind, num_bytes = self.packets[state.frame]
+            images = [None if image is None else display_image(image, stops) for image in frame.images]
+            yield ComparedFrame(self, state, kind, num_bytes, images, last, frame.images)
+            last = images
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,19 +85,21 @@ class ComparedFrame:
 
     Attributes:
         clip: their clip.
-        coded: state of the decoder.
+        state: its Gaussians.
         kind: kind of the frame's packet.
         num_bytes: its size.
-        images: recorded images of all views; None: missing.
+        images: recorded images of all views, as a display shows them; None: missing.
         last: likewise of the frame before; None in the first one.
+        recorded: the images as they were recorded.
     """
 
     clip: ComparedClip
-    coded: CodedFrame
+    state: FrameState
     kind: PacketKind
     num_bytes: int
     images: Sequence[np.ndarray | None]
     last: Sequence[np.ndarray | None] | None
+    recorded: Sequence[np.ndarray | None]
 
     def views(self) -> Iterator[ComparedView]:
         """Render and yield the evaluated views, except those without an image."""
@@ -109,10 +107,11 @@ class ComparedFrame:
         for index in clip.views:
             camera, image = clip.cameras[index], self.images[index]
             if image is not None:
-                maps = render(self.coded.gaussians, camera, clip.channels, clip.render)
-                truth = truth_for_camera(clip.recording, camera, self.coded.frame)
+                maps = render(self.state.gaussians, camera, clip.channels, clip.render)
+                truth = truth_for_camera(clip.recording, camera, self.state.frame)
                 moving = self._changed(index) if truth is None else truth.mask
-                yield ComparedView(self, index, maps, image, clip.recording.masks[index], moving, truth)
+                light = None if clip.recording.display_exposure is None else self.recorded[index]
+                yield ComparedView(self, index, maps, image, clip.recording.masks[index], moving, truth, light)
 
     def _changed(self, view: int) -> np.ndarray | None:
         """Return the mask of pixels that changed since the last image; None without one, and beside ground truth."""
@@ -130,10 +129,11 @@ class ComparedView:
         frame: its frame.
         index: of the view.
         maps: rendered channels by name.
-        recorded: image [H, W, 3].
+        recorded: image [H, W, 3], uint8; of an HDR recording as a display shows it.
         valid: valid pixels [H, W] bool; None: all.
         moving: moving pixels [H, W] bool; None: unknown.
         truth: ground truth; None: unknown.
+        light: image of an HDR recording [H, W, 3], linear; None of others.
     """
 
     frame: ComparedFrame
@@ -143,6 +143,7 @@ class ComparedView:
     valid: np.ndarray | None
     moving: np.ndarray | None
     truth: GroundTruth | None
+    light: np.ndarray | None = None
 
     @property
     def camera(self) -> Camera:
@@ -152,4 +153,4 @@ class ComparedView:
     @property
     def rendered(self) -> np.ndarray:
         """Rendered image [H, W, 3], uint8 as a decoder shows it."""
-        return to_uint8(self.maps["color"])
+        return to_uint8(exposed(self.maps["color"], self.frame.clip.recording.display_exposure or 0.0))

@@ -55,7 +55,7 @@ def evaluate_stream(
         for view in frame.views():
             for measure in measures:
                 measure.add_view(view)
-        index, scores = frame.coded.frame, _merged(measure.add_frame(frame) for measure in measures)
+        index, scores = frame.state.frame, _merged(measure.add_frame(frame) for measure in measures)
         rows.append(FrameScores(index, frame.kind.name.lower(), frame.num_bytes, seconds.get(index), **scores))
         if progress is not None:
             progress(len(rows), len(clip.packets))

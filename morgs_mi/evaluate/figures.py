@@ -10,6 +10,7 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.color_space import exposed
 from morgs_mi.playback.player import (
     OFFSET_SCALE,
     channel_image,
@@ -17,6 +18,7 @@ from morgs_mi.playback.player import (
     has_offset,
     open_stream_capture,
     render_stream,
+    stream_exposure,
     truth_for_camera,
 )
 from morgs_mi.playback.streams import open_stream
@@ -68,10 +70,9 @@ def draw_stream(
         ValueError: as `open_stream_capture`, or the stream is broken or has no frame.
     """
     stream = open_stream(out)
-    frames = [packet.frame for packet in stream]
-    if not frames:
-        raise ValueError(f"{stream.path}: expected at least one frame, got a header alone; fit the capture again.")
+    frames = stream.frame_numbers()
     recording = open_stream_capture(stream, capture, frames, any_recording)
+    recording, stops = recording.displayed(), stream_exposure(stream)
     view = recording.reference_view
     camera = recording.with_delays(stream.cameras)[view]
     # Nothing moves up to the first frame.
@@ -85,7 +86,7 @@ def draw_stream(
     played = render_stream(stream, camera, ("color", "motion", *maps))
     for (index, images), frame in zip(played, recording.partial_frames(frames[0], frames[-1] + 1), strict=False):
         # Copies: views would keep all images of a long clip in memory.
-        shown.append(to_uint8(images["color"])[:, column].copy())
+        shown.append(to_uint8(exposed(images["color"], stops))[:, column].copy())
         seen = frame.images[view]
         recorded.append(np.zeros_like(shown[-1]) if seen is None else seen[:, column].copy())
         if index in chosen:

@@ -19,11 +19,22 @@ import numpy as np
 from morgs_mi.calibration.refine import register_camera
 from morgs_mi.capture.truth import GroundTruth, load_tracks, load_truth
 from morgs_mi.codec.container import PacketKind
-from morgs_mi.codec.packets import CodedFrame
+from morgs_mi.codec.frame_source import FrameState
+from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.core.rig import scene_extent
 from morgs_mi.evaluate.comparison import ComparedClip, ComparedFrame, ComparedView
 from morgs_mi.evaluate.lpips import Lpips
-from morgs_mi.evaluate.metrics import WINDOW, delta_e_map, endpoint_error, iou, mean_over, psnr_of, ssim_map, unit_pair
+from morgs_mi.evaluate.metrics import (
+    WINDOW,
+    delta_e_map,
+    endpoint_error,
+    iou,
+    mean_over,
+    psnr_mu,
+    psnr_of,
+    ssim_map,
+    unit_pair,
+)
 from morgs_mi.evaluate.motion3d import evaluate_motion
 from morgs_mi.evaluate.results import Motion3DScores, VariationScores, ViewScores
 from morgs_mi.evaluate.temporal import StillVariation, slope
@@ -116,15 +127,15 @@ class Motion3D(Measure):
         self._cameras, self._truth = clip.recording.cameras, clip.recording.truth
         folder = self._truth
         self._tracks = load_tracks(folder) if folder is not None and (folder / "tracks.npz").is_file() else None
-        self._before: CodedFrame | None = None
+        self._before: FrameState | None = None
 
     def add_frame(self, frame: ComparedFrame) -> dict[str, Any]:
-        before, self._before = self._before, frame.coded
+        before, self._before = self._before, frame.state
         if frame.kind != PacketKind.RESIDUAL or before is None:
             return {"motion_3d": None}
-        return {"motion_3d": self._motion(before, frame.coded)}
+        return {"motion_3d": self._motion(before, frame.state)}
 
-    def _motion(self, before: CodedFrame, now: CodedFrame) -> Motion3DScores | None:
+    def _motion(self, before: FrameState, now: FrameState) -> Motion3DScores | None:
         """Return the errors between two frames; None without truth."""
         frame, tracks = now.frame, self._tracks
         if tracks is None or self._truth is None or frame >= tracks.points.shape[1]:
@@ -151,9 +162,10 @@ class Registration(Measure):
         clip = view.frame.clip
         if self._begun or view.index not in clip.recording.test_views:
             return
-        given = View(clip.stream.cameras[view.index], view.recorded, view.valid)
+        image = view.recorded if view.light is None else encode_light(view.light)
+        given = View(clip.stream.cameras[view.index], image, view.valid)
         extent = scene_extent([clip.stream.cameras[v] for v in clip.recording.train_views])
-        gaussians = view.frame.coded.gaussians
+        gaussians = view.frame.state.gaussians
         registered = given._replace(camera=register_camera(gaussians, given, extent, FitConfig(), clip.render))
         self._psnr[view.camera.name] = mean_psnr(gaussians, [registered], clip.render)
 
@@ -187,6 +199,8 @@ def _image_scores(view: ComparedView, lpips: Lpips | None) -> dict[str, float]:
         maps["ssim"] = ssim_map(a, b)
     matched = follow_exposure(rendered, view.recorded, view.valid)(a).clip(0, 1)
     scores = {"psnr_matched": psnr_of(mean_over(np.square(matched - b), whole))}
+    if view.light is not None:
+        scores["psnr_mu"] = psnr_mu(decode_light(view.maps["color"]), view.light, view.valid)
     for name, values in maps.items():
         finish = psnr_of if name == "psnr" else float
         scores |= {name + r: finish(mean_over(values, mask)) for r, mask in zip(REGIONS, regions, strict=True)}

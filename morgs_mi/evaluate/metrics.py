@@ -8,14 +8,27 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import correlate1d
 
-from morgs_mi.core.color_space import srgb_to_linear
+from morgs_mi.core.color_space import decode_light, unit_values
 from morgs_mi.core.threads import map_in_threads
 
-__all__ = ["delta_e_map", "endpoint_error", "iou", "mean_over", "psnr", "psnr_of", "ssim", "ssim_map", "unit_pair"]
+__all__ = [
+    "delta_e_map",
+    "endpoint_error",
+    "iou",
+    "mean_over",
+    "psnr",
+    "psnr_mu",
+    "psnr_of",
+    "ssim",
+    "ssim_map",
+    "unit_pair",
+]
 
 # Wang, Bovik, Sheikh and Simoncelli, "Image quality assessment", TIP 2004.
 WINDOW, SIGMA = 11, 1.5
 C1, C2 = 0.01**2, 0.03**2
+# Of the mu-law, by which papers on HDR compare images.
+_MU = 5000
 # Rows of an image whose colours are compared at once; the temporaries of a whole image exceed the cache.
 _ROWS = 32
 
@@ -33,6 +46,24 @@ def psnr(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -
     """
     image, truth = unit_pair("psnr", image, truth, mask)
     return psnr_of(mean_over(np.square(image - truth), mask))
+
+
+def psnr_mu(light: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Return the PSNR of tonemapped linear light, log(1 + mu x) / log(1 + mu) with mu = 5000, in dB.
+
+    x is relative to the brightest true value and clipped to [0, 1] (Kalantari and Ramamoorthi, TOG 2017).
+
+    Args:
+        light: linear light [H, W, 3].
+        truth: likewise.
+        mask: [H, W] bool, the pixels that count; the result is NaN if there are none.
+
+    Raises:
+        ValueError: the sizes differ.
+    """
+    most = max(float(truth.max()), 1e-12)
+    mapped = (np.log1p(_MU * np.clip(x.astype(np.float64) / most, 0, 1)) / np.log1p(_MU) for x in (light, truth))
+    return psnr(*mapped, mask=mask)
 
 
 def psnr_of(error: float) -> float:
@@ -97,7 +128,7 @@ def delta_e_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     a, b = (np.clip(each, 0, 1) for each in unit_pair("delta_e_map", image, truth))
 
     def lab(colours: np.ndarray) -> np.ndarray:
-        xyz = srgb_to_linear(colours) @ RGB_COLOURSPACE_sRGB.matrix_RGB_to_XYZ.T
+        xyz = decode_light(colours) @ RGB_COLOURSPACE_sRGB.matrix_RGB_to_XYZ.T
         return XYZ_to_Lab(xyz, RGB_COLOURSPACE_sRGB.whitepoint)
 
     def rows(start: int) -> np.ndarray:
@@ -174,5 +205,4 @@ def _check(name: str, image: np.ndarray, truth: np.ndarray, mask: np.ndarray | N
 
 
 def _unit(image: np.ndarray) -> np.ndarray:
-    image = np.asarray(image)
-    return image / 255.0 if image.dtype == np.uint8 else image.astype(np.float64)
+    return unit_values(np.asarray(image))

@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from morgs_mi.codec.packets import frames_with_lasting_ids
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import numbers
 from morgs_mi.core.gaussians import Gaussians
@@ -57,7 +56,7 @@ class PointTracks:
 
 
 def track_points(
-    stream: StreamReader,
+    stream: FrameSource,
     points: ArrayLike,
     frame: int | ArrayLike,
     num_gaussians: int = 8,
@@ -179,22 +178,23 @@ def seen_in_depth(depth: np.ndarray, alpha: np.ndarray, camera: Camera, points: 
 
 
 def _bindings(
-    stream: StreamReader, points: np.ndarray, queries: np.ndarray, num_gaussians: int
+    stream: FrameSource, points: np.ndarray, queries: np.ndarray, num_gaussians: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return ids and weights [P, K] of the points' Gaussians, and the points in their axes [P, K, 3]."""
     shape = len(points), num_gaussians
     ids, weights, local = np.full(shape, -1), np.zeros(shape), np.zeros((*shape, 3))
     last, left = int(queries.max(initial=-1)), set(queries.tolist())
-    for present, coded in frames_with_lasting_ids(stream):
-        left.discard(coded.frame)
-        own = np.flatnonzero(queries == coded.frame)
+    for state in stream.states():
+        left.discard(state.frame)
+        own = np.flatnonzero(queries == state.frame)
         if len(own):
-            rows, weight = bind(coded.gaussians, points[own], num_gaussians)
-            means, axes = _means_and_axes(coded.gaussians, rows)
+            rows, weight = bind(state.gaussians, points[own], num_gaussians)
+            means, axes = _means_and_axes(state.gaussians, rows)
             columns = slice(rows.shape[1])
-            ids[own, columns], weights[own, columns] = present[rows], weight
+            ids[own, columns] = state.lasting_ids[rows]
+            weights[own, columns] = weight
             local[own, columns] = np.einsum("pkji,pkj->pki", axes, points[own][:, None] - means)
-        if coded.frame >= last:
+        if state.frame >= last:
             break
     if left:
         raise ValueError(
@@ -203,15 +203,16 @@ def _bindings(
     return ids, weights, local
 
 
-def _bound(stream: StreamReader, ids: np.ndarray) -> Iterator[tuple[int, np.ndarray, tuple[np.ndarray, np.ndarray]]]:
+def _bound(stream: FrameSource, ids: np.ndarray) -> Iterator[tuple[int, np.ndarray, tuple[np.ndarray, np.ndarray]]]:
     """Yield (frame, mask of the living [P, K], their means [P, K, 3] and axes [P, K, 3, 3]) of the bound Gaussians."""
-    for present, coded in frames_with_lasting_ids(stream):
+    for state in stream.states():
+        present = state.lasting_ids
         rows = np.searchsorted(present, ids)
         found = rows < len(present)
         found[found] = present[rows[found]] == ids[found]
         means, axes = np.zeros((*ids.shape, 3)), np.zeros((*ids.shape, 3, 3))
-        means[found], axes[found] = _means_and_axes(coded.gaussians, rows[found])
-        yield coded.frame, found, (means, axes)
+        means[found], axes[found] = _means_and_axes(state.gaussians, rows[found])
+        yield state.frame, found, (means, axes)
 
 
 def _means_and_axes(gaussians: Gaussians, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

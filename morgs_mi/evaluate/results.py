@@ -57,118 +57,87 @@ class _Scores:
 class ViewScores(_Scores):
     """Scores of one view of one frame, or means of several."""
 
-    psnr: float = _NAN
-    """PSNR, dB."""
+    psnr: float = _NAN  #: PSNR, dB.
     psnr_moving: float = _NAN
     psnr_still: float = _NAN
+    #: PSNR after the gain and bias per channel that make the rendered image most like the recorded one, dB.
     psnr_matched: float = _NAN
-    """PSNR after the gain and bias per channel that make the rendered image most like the recorded one, dB."""
-    ssim: float = _NAN
-    """SSIM, at most 1."""
+    psnr_mu: float = _NAN  #: PSNR of the linear light by the mu-law, dB, of HDR recordings alone.
+    ssim: float = _NAN  #: SSIM, at most 1.
     ssim_moving: float = _NAN
     ssim_still: float = _NAN
-    delta_e: float = _NAN
-    """Colour difference CIE dE2000."""
+    delta_e: float = _NAN  #: Colour difference CIE dE2000.
     delta_e_moving: float = _NAN
     delta_e_still: float = _NAN
-    lpips: float = _NAN
-    """LPIPS, if a network is given."""
+    lpips: float = _NAN  #: LPIPS, if a network is given.
     lpips_moving: float = _NAN
     lpips_still: float = _NAN
-    motion_error: float = _NAN
-    """Endpoint error of the rendered motion, px."""
+    motion_error: float = _NAN  #: Endpoint error of the rendered motion, px.
     motion_error_moving: float = _NAN
     motion_error_still: float = _NAN
-    true_motion_moving: float = _NAN
-    """Mean length of the true motion where the surface moves, px."""
-    confidence_iou: float = _NAN
-    """IoU of the rendered confidence above 0.5 and the true mask."""
+    true_motion_moving: float = _NAN  #: Mean length of the true motion where the surface moves, px.
+    confidence_iou: float = _NAN  #: IoU of the rendered confidence above 0.5 and the true mask.
 
 
 @dataclass(frozen=True)
 class Motion3DScores(_Scores):
     """Error of the 3D displacements of Gaussians on moving objects (see `motion3d`)."""
 
-    num_gaussians: float = 0
-    """Number of Gaussians that are compared."""
-    error: float = _NAN
-    """Mean of |d - d*|, world units."""
-    true_length: float = _NAN
-    """Mean of |d*|, world units."""
-    relative_error: float = _NAN
-    """`error` divided by `true_length`."""
-    length_ratio: float = _NAN
-    """Mean of |d| divided by `true_length`."""
-    angle: float = _NAN
-    """Mean angle between d and d*, degrees; 90 for a Gaussian that does not move."""
+    num_gaussians: float = 0  #: Number of Gaussians that are compared.
+    error: float = _NAN  #: Mean of |d - d*|, world units.
+    true_length: float = _NAN  #: Mean of |d*|, world units.
+    relative_error: float = _NAN  #: `error` divided by `true_length`.
+    length_ratio: float = _NAN  #: Mean of |d| divided by `true_length`.
+    angle: float = _NAN  #: Mean angle between d and d*, degrees; 90 for a Gaussian that does not move.
 
 
 @dataclass(frozen=True)
 class TrackScores:
     """Scores of 3D point tracks by one protocol (see `track_scores`); NaN where the protocol does not define one."""
 
-    num_tracks: int = 0
-    """Number of tracks that are compared."""
+    num_tracks: int = 0  #: Number of tracks that are compared.
+    #: AJ: Jaccard index of positions and visibility, mean over the thresholds, in [0, 1].
     average_jaccard: float = _NAN
-    """AJ: Jaccard index of positions and visibility, mean over the thresholds, in [0, 1]."""
+    #: Share of the visible points that are within a threshold, mean over the thresholds, in [0, 1].
     delta_avg: float = _NAN
-    """Share of the visible points that are within a threshold, mean over the thresholds, in [0, 1]."""
-    occlusion_accuracy: float = _NAN
-    """OA: share of the points with the right visibility, in [0, 1]."""
+    occlusion_accuracy: float = _NAN  #: OA: share of the points with the right visibility, in [0, 1].
+    #: MTE: median over the visible points of a track of the distance, mean over the tracks, world units.
     median_error: float = _NAN
-    """MTE: median over the visible points of a track of the distance, mean over the tracks, world units."""
-    median_error_percent: float = _NAN
-    """The same in percent of the scene extent."""
-    survival: float = _NAN
-    """Share of a track before its first failure, mean over the tracks, in [0, 1]."""
-    bound: float = _NAN
-    """Share of the points and frames for which a Gaussian of the point is alive, in [0, 1]."""
+    median_error_percent: float = _NAN  #: The same in percent of the scene extent.
+    survival: float = _NAN  #: Share of a track before its first failure, mean over the tracks, in [0, 1].
+    bound: float = _NAN  #: Share of the points and frames for which a Gaussian of the point is alive, in [0, 1].
 
 
 @dataclass(frozen=True)
 class TrackingScores:
     """Scores of 3D point tracks by one protocol."""
 
-    protocol: str
-    """Name of the protocol."""
-    thresholds: str
-    """Its thresholds with their units."""
-    all: TrackScores
-    """Scores of all tracks."""
-    moving: TrackScores
-    """Scores of the tracks with true paths longer than 10 cm."""
+    protocol: str  #: Name of the protocol.
+    thresholds: str  #: Its thresholds with their units.
+    all: TrackScores  #: Scores of all tracks.
+    moving: TrackScores  #: Scores of the tracks with true paths longer than 10 cm.
 
 
 @dataclass(frozen=True)
 class VariationScores(_Scores):
     """Masked total variation (mTV, x100) of the static pixels of a view (see `StillVariation`)."""
 
-    render: float = _NAN
-    """mTV of the rendered view."""
-    input: float = _NAN
-    """mTV of the recording."""
-    still_share: float = _NAN
-    """Share of the view's pixels that count as static."""
+    render: float = _NAN  #: mTV of the rendered view.
+    input: float = _NAN  #: mTV of the recording.
+    still_share: float = _NAN  #: Share of the view's pixels that count as static.
 
 
 @dataclass(frozen=True)
 class FrameScores:
     """Scores of one frame."""
 
-    frame: int
-    """Index of the frame."""
-    kind: str
-    """Kind of its packet, ``keyframe`` or ``residual``."""
-    num_bytes: int
-    """Size of its packet."""
-    seconds: float | None
-    """Wall time of its fit; None without a report of the fit."""
-    scores: ViewScores
-    """Means over the views."""
-    motion_3d: Motion3DScores | None
-    """Errors in 3D; None without tracks or a previous frame."""
-    views: Mapping[str, ViewScores]
-    """Scores by camera name."""
+    frame: int  #: Index of the frame.
+    kind: str  #: Kind of its packet, ``keyframe`` or ``residual``.
+    num_bytes: int  #: Size of its packet.
+    seconds: float | None  #: Wall time of its fit; None without a report of the fit.
+    scores: ViewScores  #: Means over the views.
+    motion_3d: Motion3DScores | None  #: Errors in 3D; None without tracks or a previous frame.
+    views: Mapping[str, ViewScores]  #: Scores by camera name.
 
     def as_dict(self) -> dict[str, Any]:
         """Return the frame's row of the JSON."""
@@ -181,71 +150,53 @@ class FrameScores:
 class Timings:
     """Wall times of a fit, from the images in memory to the packet."""
 
-    first: float | None
-    """Seconds of the first frame; None without a report of the fit."""
-    per_later_frame: float
-    """Mean seconds of a later frame."""
+    first: float | None  #: Seconds of the first frame; None without a report of the fit.
+    per_later_frame: float  #: Mean seconds of a later frame.
 
 
 @dataclass(frozen=True)
 class Sizes:
     """Sizes of a stream, bytes."""
 
-    file: int
-    """Size of the file."""
-    overhead: int
-    """Header, index and re-emitted keyframes."""
-    per_frame: float
-    """`file` divided by the number of frames."""
-    per_keyframe: float
-    """Mean size of a keyframe's packet."""
-    per_residual: float
-    """Mean size of a residual's packet."""
+    file: int  #: Size of the file.
+    overhead: int  #: Header, index and re-emitted keyframes.
+    per_frame: float  #: `file` divided by the number of frames.
+    per_keyframe: float  #: Mean size of a keyframe's packet.
+    per_residual: float  #: Mean size of a residual's packet.
 
 
 @dataclass(frozen=True)
 class PlaybackTimes:
     """Speed of decoding and rendering a stream on this machine (see `playback_speed`)."""
 
-    fps: float
-    """Frames per second."""
-    decode_ms: float
-    """Median time to decode a frame, ms."""
-    render_ms: float
-    """Median time to render a frame, ms."""
+    fps: float  #: Frames per second.
+    decode_ms: float  #: Median time to decode a frame, ms.
+    render_ms: float  #: Median time to render a frame, ms.
 
 
 @dataclass(frozen=True)
 class Evaluation:
     """Scores of a stream."""
 
-    stream: str
-    """Path of the stream file."""
-    capture: str
-    """Path of the capture."""
-    held_out: bool
-    """Whether held-out views are scored; otherwise all training views."""
-    complete: bool
-    """Whether the stream holds all frames that were to be fitted."""
-    regions: str
-    """Source of the regions, ``true masks`` or ``recorded change``."""
+    stream: str  #: Path of the stream file.
+    capture: str  #: Path of the capture.
+    held_out: bool  #: Whether held-out views are scored; otherwise all training views.
+    complete: bool  #: Whether the stream holds all frames that were to be fitted.
+    regions: str  #: Source of the regions, ``true masks`` or ``recorded change``.
     sizes: Sizes
-    variation: VariationScores
-    """Mean over the views."""
+    variation: VariationScores  #: Mean over the views.
     playback: PlaybackTimes
-    psnr_slope: float
-    """Slope of the PSNR, dB per frame."""
+    psnr_slope: float  #: Slope of the PSNR, dB per frame.
     frames: tuple[FrameScores, ...]
+    #: 3D point tracks against the true ones, a row per protocol; empty without true tracks.
     tracking: tuple[TrackingScores, ...] = ()
-    """3D point tracks against the true ones, a row per protocol; empty without true tracks."""
+    #: PSNR of each held-out view in the first frame, seen from the camera that fits its image best, dB, by camera name.
+    #: The scores of the frames are those as calibrated.
     registered: Mapping[str, float] = field(default_factory=dict)
-    """PSNR of each held-out view in the first frame, seen from the camera that fits its image best, dB, by camera name.
-    The scores of the frames are those as calibrated."""
+    #: Expected quality of views between the cameras, a sentence from the report of the fit; without one, a forecast
+    #: from the rig; empty with a single training view.
     expected: str = ""
-    """Expected quality of views between the cameras, a sentence from the report of the fit; without one, a forecast
-    from the rig; empty with a single training view."""
-    expected_psnr: float = _NAN
-    """Their PSNR as the fit forecasts it, dB; NaN where it does not."""
+    expected_psnr: float = _NAN  #: Their PSNR as the fit forecasts it, dB; NaN where it does not.
 
     @property
     def num_frames(self) -> int:

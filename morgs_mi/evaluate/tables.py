@@ -48,6 +48,8 @@ def evaluation_tables(result: Evaluation) -> Iterator[Table]:
             regions.add_row(title, *(figure(value, digits) for value in values))
         if name == "psnr" and mean.psnr_matched == mean.psnr_matched:
             regions.add_row("PSNR, colours matched", figure(mean.psnr_matched, digits), "", "")
+    if mean.psnr_mu == mean.psnr_mu:
+        regions.add_row("PSNR of the light, mu-law", figure(mean.psnr_mu, 2), "", "")
     if result.variation.render == result.variation.render:
         regions.add_row("mTV x100", "", "", figure(result.variation.render, 3))
         regions.add_row("mTV x100 of the recording", "", "", figure(result.variation.input, 3))

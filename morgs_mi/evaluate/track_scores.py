@@ -43,19 +43,13 @@ _MOVING = 0.1
 
 @dataclass(frozen=True)
 class Protocol:
-    """A published way to score 3D point tracks.
+    """A published way to score 3D point tracks."""
 
-    Attributes:
-        name: name in tables.
-        thresholds: of the distance: pixels if `per_view`, otherwise centimetres.
-        survival: distance at which a track fails, cm; None if the protocol defines neither survival nor MTE.
-        per_view: whether each view is a video of its own, with its points counted together in all frames.
-    """
-
-    name: str
-    thresholds: tuple[float, ...]
+    name: str  #: Name in tables.
+    thresholds: tuple[float, ...]  #: Of the distance: pixels if `per_view`, otherwise centimetres.
+    #: Distance at which a track fails, cm; None if the protocol defines neither survival nor MTE.
     survival: float | None
-    per_view: bool = False
+    per_view: bool = False  #: Whether each view is a video of its own, with its points counted together in all frames.
 
     @property
     def description(self) -> str:
@@ -71,38 +65,27 @@ MVTRACKER = Protocol("MVTracker", (5, 10, 20, 40), 100)
 
 @dataclass(frozen=True)
 class Comparison:
-    """Tracks of P points through T frames beside the true ones, in one video: one view, or several that see as one.
+    """Tracks of P points through T frames beside the true ones, in one video: one view, or several that see as one."""
 
-    Attributes:
-        truth: true positions [P, T, 3], world units.
-        found: tracked positions [P, T, 3].
-        visible: bool [P, T], whether the true point is visible; None if unknown, which counts as visible.
-        found_visible: bool [P, T], whether the tracked point is predicted to be visible.
-        alive: bool [P, T], whether the tracked point is bound to a living Gaussian.
-        queries: int [P], the index of each track's query frame.
-        pixel: [P, T], width of a pixel at the true point in world units, for an image with a shorter side of 256;
-            None for several views.
-    """
-
-    truth: np.ndarray
-    found: np.ndarray
+    truth: np.ndarray  #: True positions [P, T, 3], world units.
+    found: np.ndarray  #: Tracked positions [P, T, 3].
+    #: bool [P, T], whether the true point is visible; None if unknown, which counts as visible.
     visible: np.ndarray | None
-    found_visible: np.ndarray
-    alive: np.ndarray
-    queries: np.ndarray
+    found_visible: np.ndarray  #: bool [P, T], whether the tracked point is predicted to be visible.
+    alive: np.ndarray  #: bool [P, T], whether the tracked point is bound to a living Gaussian.
+    queries: np.ndarray  #: int [P], the index of each track's query frame.
+    #: [P, T], width of a pixel at the true point in world units, for an image with a shorter side of 256; None for
+    #: several views.
     pixel: np.ndarray | None = None
 
     def select(self, rows: np.ndarray) -> Comparison:
         """Return some of the tracks, by a mask [P]."""
-        return Comparison(
-            self.truth[rows],
-            self.found[rows],
-            None if self.visible is None else self.visible[rows],
-            self.found_visible[rows],
-            self.alive[rows],
-            self.queries[rows],
-            None if self.pixel is None else self.pixel[rows],
-        )
+        return replace(self, **{name: values[rows] for name, values in vars(self).items() if values is not None})
+
+    @property
+    def counts(self) -> np.ndarray:
+        """Mask [P, T] of the visible points from the query on."""
+        return _visibility(self)[0] & (np.arange(self.truth.shape[1]) >= self.queries[:, None])
 
 
 def score_tracks(
@@ -124,7 +107,7 @@ def score_tracks(
 def score(protocol: Protocol, videos: Sequence[Comparison], meters_per_unit: float, extent: float) -> TrackScores:
     """Return the scores of the tracks of some videos; see `score_tracks`."""
     if not protocol.per_view:
-        videos = [_countable(video) for video in videos]
+        videos = [video.select(video.counts.sum(1) >= 2) for video in videos]
     num_tracks = sum(len(video.truth) for video in videos)
     if not num_tracks:
         return TrackScores()
@@ -185,20 +168,12 @@ def _shares(counts: np.ndarray) -> np.ndarray:
 
 def _median_error_and_survival(video: Comparison, failure: float) -> np.ndarray:
     """Return the median error in world units and the survival of each track [P, 2]."""
-    frames, queries = np.arange(video.truth.shape[1]), video.queries
-    visible, _ = _visibility(video)
-    counts = visible & (frames >= queries[:, None])
+    num_frames, queries = video.truth.shape[1], video.queries
     error = np.linalg.norm(video.found - video.truth, axis=-1)
-    failed = counts & (error > failure)
-    first = np.where(failed.any(1), failed.argmax(1), len(frames))
-    median = [np.median(row[mask]) for row, mask in zip(error, counts, strict=True)]
-    return np.stack([np.array(median), (first - queries) / (len(frames) - queries)], axis=1).reshape(-1, 2)
-
-
-def _countable(video: Comparison) -> Comparison:
-    """Return the tracks with at least two visible frames from the query on."""
-    visible, _ = _visibility(video)
-    return video.select((visible & (np.arange(video.truth.shape[1]) >= video.queries[:, None])).sum(1) >= 2)
+    failed = video.counts & (error > failure)
+    first = np.where(failed.any(1), failed.argmax(1), num_frames)
+    median = [np.median(row[mask]) for row, mask in zip(error, video.counts, strict=True)]
+    return np.stack([np.array(median), (first - queries) / (num_frames - queries)], axis=1).reshape(-1, 2)
 
 
 def _visibility(video: Comparison) -> tuple[np.ndarray, np.ndarray]:
@@ -211,7 +186,5 @@ def _visibility(video: Comparison) -> tuple[np.ndarray, np.ndarray]:
 
 def _path_length(video: Comparison) -> np.ndarray:
     """Return the length of each true path over its visible frames from the query on, world units [P]."""
-    visible, _ = _visibility(video)
-    counts = visible & (np.arange(video.truth.shape[1]) >= video.queries[:, None])
-    steps = (np.diff(points[mask], axis=0) for points, mask in zip(video.truth, counts, strict=True))
+    steps = (np.diff(points[mask], axis=0) for points, mask in zip(video.truth, video.counts, strict=True))
     return np.array([np.linalg.norm(step, axis=-1).sum() for step in steps])

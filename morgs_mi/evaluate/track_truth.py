@@ -27,19 +27,12 @@ _SHORT_SIDE = 256
 
 @dataclass(frozen=True)
 class TrackTruth:
-    """True tracks of P points through T frames, in one video: one view, or several that see as one.
+    """True tracks of P points through T frames, in one video: one view, or several that see as one."""
 
-    Attributes:
-        cameras: the views.
-        points: [P, T, 3], world units.
-        visible: bool [P, T], whether any of the views sees the point; None if unknown.
-        queries: int [P], the frame at which each track starts.
-    """
-
-    cameras: tuple[Camera, ...]
-    points: np.ndarray
-    visible: np.ndarray | None
-    queries: np.ndarray
+    cameras: tuple[Camera, ...]  #: The views.
+    points: np.ndarray  #: [P, T, 3], world units.
+    visible: np.ndarray | None  #: bool [P, T], whether any of the views sees the point; None if unknown.
+    queries: np.ndarray  #: int [P], the frame at which each track starts.
 
     @property
     def pixel(self) -> np.ndarray | None:

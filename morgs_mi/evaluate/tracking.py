@@ -8,8 +8,7 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.timeline import read_settings
-from morgs_mi.codec.packets import play
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.rig import scene_extent
 from morgs_mi.evaluate.point_tracks import seen_in_depth, track_points
 from morgs_mi.evaluate.results import TrackingScores
@@ -20,7 +19,7 @@ from morgs_mi.playback.player import render, render_config
 __all__ = ["evaluate_tracks"]
 
 
-def evaluate_tracks(stream: StreamReader, recording: Capture, views: Sequence[int]) -> tuple[TrackingScores, ...]:
+def evaluate_tracks(stream: FrameSource, recording: Capture, views: Sequence[int]) -> tuple[TrackingScores, ...]:
     """Return the scores of a stream's point tracks by each protocol; empty without true tracks or a second frame.
 
     Queries are the true points at the frames where their tracks start. In a synthetic capture, each of `views` is a
@@ -40,7 +39,7 @@ def evaluate_tracks(stream: StreamReader, recording: Capture, views: Sequence[in
     single = single or tapvid3d_tracks(recording)
     if not single:
         return ()
-    frames = sorted({packet.frame for packet in stream})
+    frames = stream.frame_numbers()
     videos = [_during(video, frames) for video in (*single, *joint)]
     if len(frames) < 2 or not any(len(video.points) for video in videos):
         return ()
@@ -60,7 +59,7 @@ def _during(video: TrackTruth, frames: Sequence[int]) -> TrackTruth:
     return TrackTruth(video.cameras, video.points[kept, start:stop], visible, video.queries[kept] - start)
 
 
-def _compared(stream: StreamReader, videos: Sequence[TrackTruth], start: int) -> list[Comparison]:
+def _compared(stream: FrameSource, videos: Sequence[TrackTruth], start: int) -> list[Comparison]:
     """Return the tracks of the stream beside the true ones of each video, which begins with the frame `start`."""
     points = [video.points[np.arange(len(video.queries)), video.queries] for video in videos]
     queries = np.concatenate([video.queries for video in videos]) + start
@@ -76,7 +75,7 @@ def _compared(stream: StreamReader, videos: Sequence[TrackTruth], start: int) ->
     ]
 
 
-def _seen(stream: StreamReader, videos: Sequence[TrackTruth], found: Sequence[np.ndarray]) -> list[np.ndarray]:
+def _seen(stream: FrameSource, videos: Sequence[TrackTruth], found: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Return the masks of the tracked points [P, T, 3] that a view of their video sees, [P, T]."""
     seen = [np.zeros(positions.shape[:2], bool) for positions in found]
     config = render_config(stream)

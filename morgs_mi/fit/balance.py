@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from morgs_mi.core.color_space import unit_values
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.progress import Progress
 from morgs_mi.core.random_streams import Stream, rng_of
@@ -36,18 +37,13 @@ _LEAST_SHARE = 4
 
 @dataclass(frozen=True)
 class Balance:
-    """Result of balancing cameras.
+    """Result of balancing cameras."""
 
-    Attributes:
-        exposures: estimated exposure of each camera, used or not.
-        taken: whether they are used.
-        recorded_psnr: of withheld pixels in a fit to the images as recorded, dB; NaN where they were not compared.
-        balanced_psnr: of the same pixels in a fit to the balanced images, dB; NaN where they were not compared.
-    """
-
-    exposures: tuple[Exposure, ...]
-    taken: bool
+    exposures: tuple[Exposure, ...]  #: Estimated exposure of each camera, used or not.
+    taken: bool  #: Whether they are used.
+    #: Of withheld pixels in a fit to the images as recorded, dB; NaN where they were not compared.
     recorded_psnr: float = float("nan")
+    #: Of the same pixels in a fit to the balanced images, dB; NaN where they were not compared.
     balanced_psnr: float = float("nan")
 
     @property
@@ -108,8 +104,8 @@ def balance_cameras(
         gaussians = fit(gaussians, exposures, -(-steps // 2) if k else steps)
         exposures = centred(
             {
-                v: fit_exposure(rendered(gaussians, camera, render), image / 255, mask)
-                for v, (camera, image, mask) in enumerate(visible)
+                v: fit_exposure(rendered(gaussians, view.camera, render), unit_values(view.image), view.mask)
+                for v, view in enumerate(visible)
             }
         )
         largest = max(exposure.change for exposure in exposures.values())

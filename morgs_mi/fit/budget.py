@@ -41,15 +41,10 @@ _GROWING = 0.75
 
 @dataclass(frozen=True)
 class Plan:
-    """Gaussians and steps of a first frame.
+    """Gaussians and steps of a first frame."""
 
-    Attributes:
-        config: settings with both numbers.
-        seconds: time of the first frame on the reference machine; None if both numbers were given.
-    """
-
-    config: FitConfig
-    seconds: float | None = None
+    config: FitConfig  #: Settings with both numbers.
+    seconds: float | None = None  #: Time of the first frame on the reference machine; None if both numbers were given.
 
     @property
     def stage(self) -> str:

@@ -52,27 +52,17 @@ _SPLIT_OPACITY = 0.6
 
 @dataclass(frozen=True)
 class DensityPlan:
-    """One round of density control; see the module for the order of the M Gaussians.
+    """One round of density control; see the module for the order of the M Gaussians."""
 
-    Attributes:
-        parent: int [M], index among the N Gaussians before.
-        source: int [M], the same for survivors, -1 for births.
-        edits: changes added to raw attributes, by name, [M, ...]; other attributes stay unchanged.
-    """
-
-    parent: np.ndarray
-    source: np.ndarray
+    parent: np.ndarray  #: int [M], index among the N Gaussians before.
+    source: np.ndarray  #: int [M], the same for survivors, -1 for births.
+    #: Changes added to raw attributes, by name, [M, ...]; other attributes stay unchanged.
     edits: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def num_births(self) -> int:
         """Number of births."""
         return int((self.source < 0).sum())
-
-    @property
-    def num_survivors(self) -> int:
-        """Number of survivors."""
-        return len(self.source) - self.num_births
 
 
 class Room(NamedTuple):

@@ -14,6 +14,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
+from morgs_mi.core.color_space import unit_values
 from morgs_mi.core.rig import mean_views
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.noise import noise_of
@@ -48,10 +49,10 @@ def count_details(image: np.ndarray, mask: np.ndarray | None) -> float:
     """Return the number of details of an image.
 
     Args:
-        image: [H, W, 3], uint8.
+        image: [H, W, 3], uint8 or encoded floats.
         mask: valid pixels [H, W], or None; a block with others has no detail.
     """
-    values = image.astype(np.float32) / 255
+    values = unit_values(image, np.float32)
     valid = np.ones(image.shape[:2], np.float32) if mask is None else mask.astype(np.float32)
     noise, count = _NOISE * noise_of(image), 0
     while min(values.shape[:2]) > 1:

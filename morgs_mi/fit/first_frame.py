@@ -46,17 +46,11 @@ _FINAL_RATE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class FirstFrame:
-    """Result of fitting the first frame.
+    """Result of fitting the first frame."""
 
-    Attributes:
-        gaussians: the fitted Gaussians.
-        losses: by name, means over the last steps.
-        steps: number of steps.
-    """
-
-    gaussians: Gaussians
-    losses: dict[str, float]
-    steps: int
+    gaussians: Gaussians  #: The fitted Gaussians.
+    losses: dict[str, float]  #: By name, means over the last steps.
+    steps: int  #: Number of steps.
 
 
 def fit_first_frame(

@@ -28,18 +28,12 @@ _UNSEEN = 90.0
 
 @dataclass(frozen=True)
 class Forecast:
-    """Expected quality of views between the cameras of a rig.
+    """Expected quality of views between the cameras of a rig."""
 
-    Attributes:
-        cameras: number of cameras.
-        spacing: mean angle from a camera to its nearest one, seen from the scene, degrees.
-        overlap: mean share of a camera's image that its nearest one sees as well.
-        reach: mean angle from a camera to the nearest one that sees the same point, degrees, 90 where there is none.
-    """
-
-    cameras: int
-    spacing: float
-    overlap: float
+    cameras: int  #: Number of cameras.
+    spacing: float  #: Mean angle from a camera to its nearest one, seen from the scene, degrees.
+    overlap: float  #: Mean share of a camera's image that its nearest one sees as well.
+    #: Mean angle from a camera to the nearest one that sees the same point, degrees, 90 where there is none.
     reach: float
 
     @property

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_points
-from morgs_mi.core.color_space import SH_C0
+from morgs_mi.core.color_space import SH_C0, unit_values
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.rig import focus_depths, scene_extent, seen_points
 from morgs_mi.fit.empty_space import in_empty_space
@@ -27,7 +27,7 @@ __all__ = [
 ]
 
 Points = tuple[np.ndarray, np.ndarray]
-"""Points [P, 3] in world units, and their colours [P, 3] in [0, 1], display-referred."""
+"""Points [P, 3] in world units, and their encoded colours [P, 3], of which 1 is white."""
 MIN_POINTS = 20
 """Number of points below which Gaussians start from random ones."""
 # Number of points below which random ones are added where views show none.
@@ -45,12 +45,12 @@ def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int, opacity:
 
     Args:
         points: [P, 3], world units.
-        colors: [P, 3] in [0, 1], display-referred.
+        colors: [P, 3], encoded: 1 is white.
         sh_degree: 0 to 3; all but the constant coefficient start at 0.
         opacity: of every Gaussian.
 
     Raises:
-        ValueError: no points, points that are not finite, or colours of another shape or outside [0, 1].
+        ValueError: no points, points that are not finite, or colours of another shape or range.
     """
     points, colors = (v.astype(np.float64) for v in check_points("from_points()", points, colors))
     n = len(points)
@@ -77,10 +77,11 @@ def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int, opacity:
 
 
 def initial_points(views: Sequence[View], points: Points, count: int, rng: np.random.Generator) -> Points:
-    """Return the points that Gaussians start from, at most [count, 3], and their colours in [0, 1].
+    """Return the points that Gaussians start from, at most [count, 3], and their colours.
 
     Fewer than `MIN_POINTS` given ones are replaced by random points inside the views; where there are few, random ones
-    are added where the views show none. Points in the empty space before the cameras are left out.
+    are added where the views show none. Points in the empty space before the cameras are left out. Given points get the
+    colours of HDR views, because their own do not exceed white.
 
     Args:
         views: V views, at least one.
@@ -88,7 +89,7 @@ def initial_points(views: Sequence[View], points: Points, count: int, rng: np.ra
         count: number of points; those in the empty space are not replaced.
         rng: draws points.
     """
-    known = len(points[0])
+    points, known = _in_light(points, views), len(points[0])
     if known < MIN_POINTS:
         points = seed_points(views, count, rng)
     elif known < _MANY_POINTS:
@@ -102,6 +103,23 @@ def _outside_empty_space(cameras: Sequence[Camera], points: Points) -> Points:
     """Return the points that are not in the empty space before the cameras; all, if all are."""
     is_empty = in_empty_space(cameras, points[0])
     return points if is_empty.all() else (points[0][~is_empty], points[1][~is_empty])
+
+
+def _in_light(points: Points, views: Sequence[View]) -> Points:
+    """Return the points with their median colours in HDR views; their own where no such view shows them."""
+    positions, own = points
+    shown = [view for view in views if np.isinf(view.white)]
+    if not shown or not len(positions):
+        return points
+    colors = np.full((len(shown), *positions.shape), np.nan)
+    for k, (camera, image, mask) in enumerate(shown):
+        inside, pixels, _ = seen_points(camera, positions)
+        columns, rows = pixels.astype(int).T
+        recorded = np.ones(len(rows), bool) if mask is None else mask[rows, columns]
+        colors[k, inside] = np.where(recorded[:, None], image[rows, columns], np.nan)
+    unseen = np.isnan(colors).all(axis=(0, 2))
+    colors[:, unseen] = own[unseen]
+    return positions, np.nanmedian(colors, axis=0)
 
 
 def resample_points(points: Points, count: int, rng: np.random.Generator) -> Points:
@@ -121,7 +139,7 @@ def resample_points(points: Points, count: int, rng: np.random.Generator) -> Poi
 
 
 def seed_points(views: Sequence[View], count: int, rng: np.random.Generator) -> Points:
-    """Return random points [count, 3] inside the views, and their colours [count, 3] in [0, 1].
+    """Return random points [count, 3] inside the views, and their colours [count, 3].
 
     Each view with valid pixels gets the same number of points: random ones of these pixels at random depths, uniform in
     1 / depth between a third and three times the distance of the `focus_point`, in their colours. Where the
@@ -145,7 +163,7 @@ def seed_points(views: Sequence[View], count: int, rng: np.random.Generator) -> 
         rows, columns = rows[pixels], columns[pixels]
         within = np.stack([columns, rows], axis=1) + rng.uniform(0, 1, (n, 2))
         points.append(camera.unproject(within, distance / rng.uniform(1 / 3, 3, n)))
-        colors.append(image[rows, columns] / 255.0)
+        colors.append(unit_values(image[rows, columns]))
     return np.concatenate(points), np.concatenate(colors)
 
 
@@ -174,7 +192,7 @@ def fill_points(points: Points, views: Sequence[View], count: int, rng: np.rando
         weights = 1 / (distance + 1e-3)
         depth = weights.sum(axis=1) / (weights / depths[near]).sum(axis=1)
         added.append(camera.unproject(pixels[free], depth * rng.uniform(1 - _SPREAD, 1 + _SPREAD, len(depth))))
-        added_colors.append(image[rows[free], columns[free]] / 255.0)
+        added_colors.append(unit_values(image[rows[free], columns[free]]))
     kept, colors = resample_points(points, count - sum(map(len, added)), rng)
     return np.concatenate([kept, *added]), np.concatenate([colors, *added_colors])
 

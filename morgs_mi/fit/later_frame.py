@@ -38,40 +38,26 @@ _DENSITY_ROUND = 0.625
 
 @dataclass(frozen=True, eq=False)
 class FrameProblem:
-    """Data to which one later frame is fitted.
+    """Data to which one later frame is fitted."""
 
-    Attributes:
-        previous: N Gaussians of the previous frame, detached.
-        active: the active Gaussians and views.
-        targets: images of the active views, by view index.
-        observations: of the key views, arrays [H, W, ...] by name, by view index.
-        start: start of motion and confidence of the M active Gaussians; None: no motion, confidence as before.
-        extent: of the scene in world units.
-    """
-
-    previous: Gaussians
-    active: ActiveSet
-    targets: Mapping[int, Target]
-    observations: Mapping[int, Mapping[str, np.ndarray]]
+    previous: Gaussians  #: N Gaussians of the previous frame, detached.
+    active: ActiveSet  #: The active Gaussians and views.
+    targets: Mapping[int, Target]  #: Images of the active views, by view index.
+    observations: Mapping[int, Mapping[str, np.ndarray]]  #: Of the key views, arrays [H, W, ...] by name, by view index
+    #: Start of motion and confidence of the M active Gaussians; None: no motion, confidence as before.
     start: MotionStart | None
-    extent: float
+    extent: float  #: Of the scene in world units.
 
 
 @dataclass(frozen=True, eq=False)
 class LaterFrame:
-    """Result of fitting one later frame.
+    """Result of fitting one later frame."""
 
-    Attributes:
-        gaussians: M Gaussians, with the `motion` that moved them and the learned `offset` that is part of it.
-        source: int [M], index of each Gaussian in the previous frame, ascending; -1 for births, which come last.
-        losses: means over the last epoch, by the names of the terms.
-        epochs: number of epochs that were run.
-    """
-
-    gaussians: Gaussians
+    gaussians: Gaussians  #: M Gaussians, with the `motion` that moved them and the learned `offset` that is part of it.
+    #: int [M], index of each Gaussian in the previous frame, ascending; -1 for births, which come last.
     source: np.ndarray
-    losses: dict[str, float]
-    epochs: int
+    losses: dict[str, float]  #: Means over the last epoch, by the names of the terms.
+    epochs: int  #: Number of epochs that were run.
 
 
 def fit_later_frame(

@@ -16,6 +16,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from morgs_mi.core.color_space import unit_values
+
 __all__ = ["is_noisy", "noise_of", "white_noise_of"]
 
 _FILTER = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
@@ -26,7 +28,7 @@ _NOISY = 0.015
 
 
 def is_noisy(images: Sequence[np.ndarray]) -> bool:
-    """Return whether images [H, W, 3], uint8, have much white noise in the mean."""
+    """Return whether images [H, W, 3], uint8 or encoded floats, have much white noise in the mean."""
     return bool(np.mean([white_noise_of(image) for image in images]) >= _NOISY)
 
 
@@ -34,17 +36,18 @@ def noise_of(image: np.ndarray) -> float:
     """Return the standard deviation of noise and fine texture in most of an image [H, W, 3], relative to white.
 
     Args:
-        image: uint8, or float in [0, 255].
+        image: uint8 or encoded floats.
     """
-    filtered = cv2.filter2D(image.astype(np.float32) / 255, -1, _FILTER)
+    filtered = cv2.filter2D(unit_values(image, np.float32), -1, _FILTER)
     return float(np.median(np.abs(filtered))) / _MEDIAN
 
 
 def white_noise_of(image: np.ndarray) -> float:
-    """Return the standard deviation of the white noise of an image [H, W, 3], uint8, relative to white."""
+    """Return the standard deviation of the white noise of an image [H, W, 3], uint8 or floats, relative to white."""
     height, width = (size // 2 for size in image.shape[:2])
     if not (height and width):
         return 0.0
     values = image[: 2 * height, : 2 * width].astype(np.float32)
     half = cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA)
+    half = half / 255 if image.dtype == np.uint8 else half
     return float(np.sqrt(max(4 / 3 * (noise_of(image) ** 2 - noise_of(half) ** 2), 0)))

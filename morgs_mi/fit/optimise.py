@@ -56,21 +56,13 @@ def replace_parameter(optimizer: Adam, name: str, value: np.ndarray, carry: Call
 
 @dataclass(frozen=True)
 class Steps:
-    """Steps of an optimisation, one view each.
+    """Steps of an optimisation, one view each."""
 
-    Attributes:
-        views: the view of every step.
-        first: number of steps before these.
-        decay: step -> factor on all learning rates; None: 1.
-        on_step: called with the number of steps done.
-        last: number of steps over which the losses are averaged.
-    """
-
-    views: Iterable[int]
-    first: int = 0
-    decay: Callable[[int], float] | None = None
-    on_step: Callable[[int], None] | None = None
-    last: int = 8
+    views: Iterable[int]  #: The view of every step.
+    first: int = 0  #: Number of steps before these.
+    decay: Callable[[int], float] | None = None  #: Step -> factor on all learning rates; None: 1.
+    on_step: Callable[[int], None] | None = None  #: Called with the number of steps done.
+    last: int = 8  #: Number of steps over which the losses are averaged.
 
 
 def optimise(

@@ -25,21 +25,13 @@ _OPACITY = 0.3
 
 @dataclass(frozen=True, eq=False)
 class FirstFrameProblem:
-    """Data to which the first frame is fitted.
+    """Data to which the first frame is fitted."""
 
-    Attributes:
-        start: initial Gaussians.
-        views: V views of one instant.
-        points: [P, 3] of the scene, world units, or none.
-        extent: of the scene in world units, at least a sixth of its depth: cameras close together see far.
-        render: cut-offs.
-    """
-
-    start: Gaussians
-    views: tuple[View, ...]
-    points: np.ndarray
-    extent: float
-    render: RenderConfig
+    start: Gaussians  #: Initial Gaussians.
+    views: tuple[View, ...]  #: V views of one instant.
+    points: np.ndarray  #: [P, 3] of the scene, world units, or none.
+    extent: float  #: Of the scene in world units, at least a sixth of its depth: cameras close together see far.
+    render: RenderConfig  #: Cut-offs.
 
     @classmethod
     def of(
@@ -71,7 +63,7 @@ class FirstFrameProblem:
 
     @property
     def images(self) -> list[np.ndarray]:
-        """Images of the views, [H, W, 3] uint8."""
+        """Images of the views, as in `View`."""
         return [view.image for view in self.views]
 
     def reduced(self, width: int) -> FirstFrameProblem:

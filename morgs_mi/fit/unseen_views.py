@@ -24,6 +24,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from morgs_mi.core.color_space import unit_values
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.rig import angles_to, scene_depths
 from morgs_mi.fit.forecast import Forecast, forecast, quality_of
@@ -51,21 +52,13 @@ _OUTSIDE = 2.0
 
 @dataclass(frozen=True)
 class Regression:
-    """Loss of views between the cameras, from the features of a fit: disagreement and training PSNR, both in dB.
+    """Loss of views between the cameras, from the features of a fit: disagreement and training PSNR, both in dB."""
 
-    Attributes:
-        intercept: loss where both features are 0, dB.
-        slopes: dB per dB of each feature.
-        lowest: least value of each feature in the data.
-        highest: largest value of each feature in the data.
-        spread: half of the interval, relative to 1 dB plus the loss.
-    """
-
-    intercept: float
-    slopes: tuple[float, float]
-    lowest: tuple[float, float]
-    highest: tuple[float, float]
-    spread: float
+    intercept: float  #: Loss where both features are 0, dB.
+    slopes: tuple[float, float]  #: dB per dB of each feature.
+    lowest: tuple[float, float]  #: Least value of each feature in the data.
+    highest: tuple[float, float]  #: Largest value of each feature in the data.
+    spread: float  #: Half of the interval, relative to 1 dB plus the loss.
 
     def loss(self, features: Sequence[float]) -> float:
         """Return the loss of views between the cameras, dB, at least 0."""
@@ -97,20 +90,13 @@ REGRESSION = Regression(
 
 @dataclass(frozen=True)
 class UnseenViews:
-    """Expected quality of views between the cameras of a fitted first frame.
+    """Expected quality of views between the cameras of a fitted first frame."""
 
-    Attributes:
-        rig: angles and overlap of the cameras.
-        training_psnr: mean PSNR of the training views, dB.
-        loss: expected difference of the views between the cameras, dB.
-        margin: nine times in ten, the mean loss differs from the expected one by less, dB.
-        is_outside: whether few captures of the regression are like this one, and the margin is wider for that.
-    """
-
-    rig: Forecast
-    training_psnr: float
-    loss: float
-    margin: float
+    rig: Forecast  #: Angles and overlap of the cameras.
+    training_psnr: float  #: Mean PSNR of the training views, dB.
+    loss: float  #: Expected difference of the views between the cameras, dB.
+    margin: float  #: Nine times in ten, the mean loss differs from the expected one by less, dB.
+    #: Whether few captures of the regression are like this one, and the margin is wider for that.
     is_outside: bool = False
 
     @property
@@ -203,7 +189,7 @@ def _disagreement(gaussians: Gaussians, view: View, others: Sequence[View], rend
     camera = view.camera
     image = rasterize(gaussians, camera, ("color", "depth"), config=render)
     step = max(1, camera.width // _COLUMNS)
-    color = np.clip(np.asarray(image.color)[::step, ::step], 0, 1)
+    color = np.clip(np.asarray(image.color)[::step, ::step], 0, view.white)
     depth = np.asarray(image.depth)[::step, ::step, 0].astype(float)
     rows, columns = np.mgrid[: camera.height : step, : camera.width : step]
     points = camera.unproject(np.stack([columns, rows], axis=-1) + 0.5, depth)
@@ -223,4 +209,4 @@ def _squares(color: np.ndarray, points: np.ndarray, drawn: np.ndarray, view: Vie
         inside &= view.mask[rows, columns]
     x, y = (pixels - 0.5).astype(np.float32).transpose(2, 0, 1)
     recorded = cv2.remap(view.image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.where(inside, ((recorded / 255 - color) ** 2).mean(axis=-1), np.inf)
+    return np.where(inside, ((unit_values(recorded) - color) ** 2).mean(axis=-1), np.inf)

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.color_space import unit_values
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.rasterize import rasterize
@@ -31,13 +32,18 @@ class View(NamedTuple):
 
     Attributes:
         camera: the camera.
-        image: [H, W, 3], uint8.
+        image: [H, W, 3], encoded: uint8, or float32 with values above 1 of an HDR recording.
         mask: valid pixels [H, W] bool, or None if all are.
     """
 
     camera: Camera
     image: np.ndarray
     mask: np.ndarray | None = None
+
+    @property
+    def white(self) -> float:
+        """Value at which the recording was clipped: 1, or infinity for an HDR recording."""
+        return 1.0 if self.image.dtype == np.uint8 else np.inf
 
     @property
     def target(self) -> Target:
@@ -86,15 +92,16 @@ def withheld_blocks(views: Sequence[View], width: int, rng: np.random.Generator)
 def squared_errors(gaussians: Gaussians, views: Sequence[View], render: RenderConfig) -> np.ndarray:
     """Return the mean square error of each view [V], of its valid pixels."""
     errors = []
-    for camera, image, mask in views:
-        squares = ((rendered(gaussians, camera, render) - image / 255.0) ** 2).mean(axis=-1)
-        errors.append(squares[slice(None) if mask is None else mask].mean())
+    for view in views:
+        image = rendered(gaussians, view.camera, render, view.white)
+        squares = ((image - unit_values(view.image)) ** 2).mean(axis=-1)
+        errors.append(squares[slice(None) if view.mask is None else view.mask].mean())
     return np.array(errors)
 
 
-def rendered(gaussians: Gaussians, camera: Camera, render: RenderConfig) -> np.ndarray:
-    """Return the image of a view [H, W, 3] in [0, 1]."""
-    return np.clip(np.asarray(rasterize(gaussians, camera, ("color",), config=render).color), 0, 1)
+def rendered(gaussians: Gaussians, camera: Camera, render: RenderConfig, white: float = 1.0) -> np.ndarray:
+    """Return the encoded image of a camera [H, W, 3], clipped to [0, white]."""
+    return np.clip(np.asarray(rasterize(gaussians, camera, ("color",), config=render).color), 0, white)
 
 
 def decibels(squares: np.ndarray) -> np.ndarray:

@@ -1,21 +1,26 @@
-"""Multi-channel float32 EXR files with the channel names of the renderer's AOVs (`motion.X`, ...)."""
+"""EXR files: float32 channels with the names of the renderer's AOVs (`motion.X`, ...), and images in linear light."""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 import OpenEXR
 
+from morgs_mi.core.color_space import positive_light
 from morgs_mi.core.files import atomic_path
 from morgs_mi.io.bounded import check_claim
 
-__all__ = ["read_exr", "write_exr"]
+__all__ = ["read_exr", "read_light", "write_exr"]
 
 _MAGIC, _MULTIPART = 20000630, 1 << 12
+# Of Rec. 709, which files without the attribute have: x and y of red, green, blue and white.
+_REC_709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
+# Difference up to which others are the same.
+_SAME = 1e-3
 
 
 def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
@@ -44,12 +49,48 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
         FileNotFoundError: there is no such file.
         OSError: it is not a readable EXR file, or claims more pixels than fit its size.
     """
+    return _read(path)[0]
+
+
+def read_light(path: str | Path) -> np.ndarray:
+    """Return the image of an EXR file [H, W, 3], float32 in linear light with Rec. 709 primaries, not negative.
+
+    Its channels are R, G, B, or Y alone. Other primaries, which the attribute `chromaticities` names, are converted by
+    colour-science, with Bradford's adaptation to another white.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        OSError: as for `read_exr`.
+        ValueError: it has other channels, or values that are not finite.
+    """
+    channels, primaries = _read(path)
+    names = "RGB" if {"R", "G", "B"} <= channels.keys() else "YYY"
+    if not set(names) <= channels.keys():
+        raise ValueError(f"{path}: expected the channels R, G, B, or Y, got {', '.join(channels)}; rename them.")
+    light = np.stack([channels[name] for name in names], axis=-1)
+    if np.abs(np.subtract(primaries, _REC_709)).max() > _SAME:
+        light = light @ _to_rec_709(primaries).T
+    return positive_light(light, f"{path}: its image")
+
+
+def _to_rec_709(primaries: Sequence[float]) -> np.ndarray:
+    """Return the matrix [3, 3] from linear colours of some primaries, see `_REC_709`, to those of Rec. 709."""
+    # The import takes a second, for which other images should not wait.
+    from colour import RGB_Colourspace, matrix_RGB_to_RGB
+
+    spaces = (RGB_Colourspace("", np.reshape(xy[:6], (3, 2)), np.array(xy[6:])) for xy in (primaries, _REC_709))
+    return matrix_RGB_to_RGB(*spaces, chromatic_adaptation_transform="Bradford").astype(np.float32)
+
+
+def _read(path: str | Path) -> tuple[dict[str, np.ndarray], Sequence[float]]:
+    """Return the channels of an EXR file by name, and the primaries and the white, see `_REC_709`."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"read_exr(): there is no file {path}; check the path.")
     try:
         _check_size(path)
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            return {name: np.asarray(channel.pixels, np.float32) for name, channel in file.channels().items()}
+            channels = {name: np.asarray(channel.pixels, np.float32) for name, channel in file.channels().items()}
+            return channels, file.header().get("chromaticities", _REC_709)
     except (RuntimeError, ValueError, KeyError, struct.error) as error:
         raise OSError(f"read_exr(): cannot read {path}: {error}; the file may be truncated.") from error
 

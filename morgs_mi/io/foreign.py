@@ -18,17 +18,11 @@ _HEAD = 4096
 
 @dataclass(frozen=True)
 class _Format:
-    """A format that is not read.
+    """A format that is not read."""
 
-    Attributes:
-        name: in words.
-        endings: of the names of its files.
-        remedy: how to get a file that is read.
-    """
-
-    name: str
-    endings: tuple[str, ...]
-    remedy: str = _CONVERTERS
+    name: str  # in words
+    endings: tuple[str, ...]  # of the names of its files
+    remedy: str = _CONVERTERS  # how to get a file that is read
 
 
 _SPZ = _Format("SPZ (Niantic's compressed format)", (".spz",))

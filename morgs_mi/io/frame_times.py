@@ -31,23 +31,15 @@ _LAST = 32
 
 @dataclass(frozen=True)
 class VideoHeader:
-    """Header of a video file.
+    """Header of a video file."""
 
-    Attributes:
-        width: of the first frame, in pixels.
-        height: of the first frame, in pixels.
-        num_frames: number of frames that the file shows if it is complete, 0 if it does not state it.
-        num_held: number of these frames in the file.
-        fps: frames per second, 0 if it does not state them.
-        times: times of the frames in the file on the clock of OpenCV's decoder, ascending, s [num_held]; None if it
-            does not store them.
-    """
-
-    width: int
-    height: int
-    num_frames: int
-    num_held: int
-    fps: float
+    width: int  #: Of the first frame, in pixels.
+    height: int  #: Of the first frame, in pixels.
+    num_frames: int  #: Number of frames that the file shows if it is complete, 0 if it does not state it.
+    num_held: int  #: Number of these frames in the file.
+    fps: float  #: Frames per second, 0 if it does not state them.
+    #: Times of the frames in the file on the clock of OpenCV's decoder, ascending, s [num_held]; None if it does not
+    #: store them.
     times: np.ndarray | None
 
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-__all__ = ["IMAGE_SUFFIXES", "VIDEO_SUFFIXES", "is_added", "is_listed", "listed"]
+__all__ = ["EXR_SUFFIX", "IMAGE_SUFFIXES", "VIDEO_SUFFIXES", "images_in", "is_added", "is_listed", "listed"]
 
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".mov", ".webm")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
+EXR_SUFFIX = ".exr"
 
 # In lower case: of macOS and its archives, Windows (thumbnails, settings, bins), Synology, and ext4.
 _ADDED = {
@@ -34,3 +35,16 @@ def listed(folder: str | Path) -> list[Path]:
         OSError: there is no such folder, or it cannot be read.
     """
     return sorted(file for file in Path(folder).iterdir() if is_listed(file.name))
+
+
+def images_in(folder: str | Path) -> list[Path]:
+    """Return the images in a folder by name: those of 8 bits, or EXR files where there is no other image.
+
+    Renderers write depth and normals as EXR files beside their images.
+
+    Raises:
+        OSError: there is no such folder, or it cannot be read.
+    """
+    files = listed(folder)
+    images = [file for file in files if file.suffix.lower() in IMAGE_SUFFIXES]
+    return images or [file for file in files if file.suffix.lower() == EXR_SUFFIX]

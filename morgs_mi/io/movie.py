@@ -22,15 +22,10 @@ _MAX_EDITS = 1_000_000
 
 @dataclass(frozen=True)
 class Movie:
-    """An MP4 or QuickTime file.
+    """An MP4 or QuickTime file."""
 
-    Attributes:
-        complete: whether the file is as long as its boxes state.
-        parts: lengths of the parts of the video that are shown in succession, s; 0: up to its end.
-    """
-
-    complete: bool
-    parts: tuple[float, ...]
+    complete: bool  #: Whether the file is as long as its boxes state.
+    parts: tuple[float, ...]  #: Lengths of the parts of the video that are shown in succession, s; 0: up to its end.
 
 
 @dataclass(frozen=True)

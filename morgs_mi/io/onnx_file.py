@@ -9,6 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from morgs_mi.core.color_space import unit_values
+
 __all__ = ["OnnxNetwork", "imagenet_blob", "written_shapes"]
 
 # Mean and standard deviation of ImageNet's colours, by which most networks for images normalise their input.
@@ -104,7 +106,7 @@ def imagenet_blob(image: np.ndarray, width: int, height: int) -> np.ndarray:
         width: of the input.
         height: of the input.
     """
-    unit = image.astype(np.float32) / (255 if image.dtype == np.uint8 else 1)
+    unit = unit_values(image, np.float32)
     shrinks = image.shape[1] > width
     unit = cv2.resize(unit, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
     return np.ascontiguousarray(np.moveaxis((unit - _MEAN) / _DEVIATION, 2, 0)[None])

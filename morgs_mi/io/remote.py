@@ -23,7 +23,7 @@ from typing import Any
 
 from morgs_mi.core.files import write_json
 from morgs_mi.core.llvm import cache_folder
-from morgs_mi.io.listing import IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_listed
+from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_listed
 
 __all__ = ["fetched", "is_url", "mirrored", "url_of"]
 
@@ -73,7 +73,7 @@ def mirrored(url: str) -> Path:
     for name, size in sizes.items():
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)
-        if file.suffix.lower() in (*VIDEO_SUFFIXES, *IMAGE_SUFFIXES):
+        if file.suffix.lower() in (*VIDEO_SUFFIXES, *IMAGE_SUFFIXES, EXR_SUFFIX):
             file.touch()
         elif not file.exists():
             _fetch(system, url, f"{base}/{name}", file, size)

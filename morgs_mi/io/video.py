@@ -1,6 +1,7 @@
 """Readers of video files and of folders of images.
 
-A frame is an RGB uint8 array [H, W, 3]. `VideoReader` and `FolderReader` have the same members.
+A frame is an RGB array [H, W, 3]: uint8 in sRGB, or of an EXR file float32 in linear light. `VideoReader` and
+`FolderReader` have the same members.
 
 Many cameras, above all in phones, record at a variable frame rate: they delay or leave out frames. The container
 stores the time of each frame, so the reader knows where on a regular clock the frames lie.
@@ -12,14 +13,16 @@ import re
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import ClassVar
 
 import cv2
 import numpy as np
 
 from morgs_mi.io.bounded import check_claim
+from morgs_mi.io.exr import read_light
 from morgs_mi.io.frame_times import SAME_TIME, clock, read_header, seconds, true_rate
 from morgs_mi.io.image_size import image_size
-from morgs_mi.io.listing import IMAGE_SUFFIXES, listed
+from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, images_in
 from morgs_mi.io.numbering import counting_together
 from morgs_mi.io.remote import fetched
 
@@ -87,6 +90,7 @@ class VideoReader:
     num_held: int
     positions: np.ndarray | None = field(default=None, compare=False)
     times: np.ndarray | None = field(default=None, compare=False, repr=False)
+    has_light: ClassVar[bool] = False
 
     @classmethod
     def open(cls, path: str | Path) -> VideoReader:
@@ -183,9 +187,6 @@ class FolderReader:
     `positions` being None.
 
     The images may also be a list of files in any folders; `path` is then the folder of the first.
-
-    Attributes:
-        numbers: numbers of the images, None of a list of files and of a single image without a number.
     """
 
     path: Path
@@ -194,6 +195,7 @@ class FolderReader:
     height: int
     fps: float | None = None
     positions: np.ndarray | None = None
+    #: Numbers of the images, None of a list of files and of a single image without a number.
     numbers: range | None = None
 
     @classmethod
@@ -234,6 +236,11 @@ class FolderReader:
         return len(self.files)
 
     num_held = num_frames
+
+    @property
+    def has_light(self) -> bool:
+        """Whether the images are EXR files, which have linear light."""
+        return self.files[0].suffix.lower() == EXR_SUFFIX
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
         """Yield frames start..stop-1.
@@ -326,11 +333,10 @@ def _images(path: Path) -> list[Path]:
     """Return a folder's images in the order of their numbers."""
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: expected a folder of images, found none; check the path.")
-    found = (f for f in listed(path) if f.suffix.lower() in IMAGE_SUFFIXES)
-    files = sorted(found, key=lambda f: natural_key(f.stem))
+    files = sorted(images_in(path), key=lambda f: natural_key(f.stem))
     if not files:
         raise FileNotFoundError(
-            f"{path}: expected images ({', '.join(IMAGE_SUFFIXES)}), found none; extract the frames."
+            f"{path}: expected images ({', '.join((*IMAGE_SUFFIXES, EXR_SUFFIX))}), found none; extract the frames."
         )
     return files
 
@@ -378,6 +384,11 @@ def _image_or_error(file: Path) -> ImageOrError:
 def _read_image(file: Path) -> np.ndarray:
     if not file.is_file():
         raise _no_image(file)
+    if file.suffix.lower() == EXR_SUFFIX:
+        try:
+            return read_light(fetched(file))
+        except OSError as error:
+            raise ValueError(f"{file}: expected an image in linear light, got a broken file ({error}).") from None
     # The stored pixels, without EXIF's rotation: calibrations refer to them.
     image = decode_image(file, np.fromfile(fetched(file), np.uint8), cv2.IMREAD_COLOR)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)

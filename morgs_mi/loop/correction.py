@@ -20,13 +20,9 @@ __all__ = ["Correction", "estimate_correction"]
 
 @dataclass(frozen=True)
 class Correction:
-    """Exposures of the first frame, relative to the scene; the identity by default.
+    """Exposures of the first frame, relative to the scene; the identity by default."""
 
-    Attributes:
-        exposures: of each view; empty if they are not estimated.
-    """
-
-    exposures: tuple[Exposure, ...] = ()
+    exposures: tuple[Exposure, ...] = ()  #: Of each view; empty if they are not estimated.
 
     def corrected(self, images: Images) -> dict[int, np.ndarray]:
         """Return images, by view index, in the colours of the scene."""

@@ -13,12 +13,14 @@ from typing import Protocol
 import numpy as np
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import check_mask, check_points, check_type
+from morgs_mi.core.checks import check_mask, check_number, check_points, check_type
+from morgs_mi.core.color_space import display_image, display_stops, encode_light
 from morgs_mi.core.rig import check_near_planes, choose_key_views, scene_extent
 from morgs_mi.core.threads import map_in_threads
 from morgs_mi.fit.capacity import check_capacity
 from morgs_mi.fit.initialise import Points
 from morgs_mi.fit.view import View
+from morgs_mi.loop.input_images import Given, copied_images
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.change import box_around, change_mask, moving_region, update_reference
 from morgs_mi.method.exposure import LEAST_CHANGE, Exposure, common_change, follow_exposure
@@ -68,6 +70,11 @@ class Recorded(Protocol):
         ...
 
     @property
+    def display_exposure(self) -> float | None:
+        """Display exposure of images in linear light, stops; None: by the first frame."""
+        ...
+
+    @property
     def point_colors(self) -> np.ndarray:
         """Their colours [P, 3] in [0, 1]."""
         ...
@@ -78,14 +85,16 @@ class Seen:
     """Images up to a frame, with the exposure of each view's first image if exposures are estimated.
 
     Attributes:
-        images: of that frame, by view index, of the views that have one.
+        images: of that frame as a display shows them, uint8, by view index, of the views that have one.
         references: images that the next frame is compared with to detect changes, by view index.
         exposures: of that frame relative to the view's first image, by view index; empty if they are not estimated.
+        display_exposure: stops by which linear light is brightened for them; None before the first frame.
     """
 
     images: Images = field(default_factory=dict)
     references: Images = field(default_factory=dict)
     exposures: Mapping[int, Exposure] = field(default_factory=dict)
+    display_exposure: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +106,8 @@ class FrameObservation:
         changes: masks of changed pixels [H, W], by view index; None: all pixels may have changed.
         flows: optical flow of the key views that changed, by view index.
         key_views: these views for the terms of the objective, by view index.
+        encoded: images that the fit compares, encoded, by view index: `seen.images` where uint8 was given, otherwise
+            float32 with values above 1.
         recorded: the images as they were given, by view index.
     """
 
@@ -104,6 +115,7 @@ class FrameObservation:
     changes: Mapping[int, np.ndarray] | None
     flows: Mapping[int, FlowObservation]
     key_views: Mapping[int, KeyView]
+    encoded: Images
     recorded: Images
 
 
@@ -119,6 +131,8 @@ class Setup:
         key_views: indices of the views with optical flow and masks.
         extent: of the scene, world units.
         config: settings.
+        display_exposure: stops by which linear light is brightened where flow and changes are computed; None: the first
+            frame determines it, see `display_stops`.
     """
 
     cameras: tuple[Camera, ...]
@@ -128,6 +142,7 @@ class Setup:
     key_views: tuple[int, ...]
     extent: float
     config: StreamConfig
+    display_exposure: float | None = None
 
     @property
     def cloud(self) -> Points:
@@ -141,6 +156,7 @@ def prepare(
     point_colors: np.ndarray,
     config: StreamConfig | None = None,
     masks: Sequence[np.ndarray | None] | None = None,
+    display_exposure: float | None = None,
 ) -> Setup:
     """Return the data that all frames share; arguments and errors as for `StreamLoop`."""
     config = StreamConfig() if config is None else config
@@ -169,7 +185,10 @@ def prepare(
     copies = tuple(None if mask is None else mask.copy() for mask in masks)
     key_views = choose_key_views(cameras, config.motion.key_views)
     extent = scene_extent(cameras)
-    return Setup(tuple(cameras), copies, points.copy(), point_colors.copy(), key_views, extent, config)
+    if display_exposure is not None:
+        check_number("StreamLoop()", "display_exposure", display_exposure, "(-inf, inf)")
+    cloud = points.copy(), point_colors.copy()
+    return Setup(tuple(cameras), copies, *cloud, key_views, extent, config, display_exposure)
 
 
 def views_of(setup: Setup, images: Images) -> list[View]:
@@ -177,43 +196,58 @@ def views_of(setup: Setup, images: Images) -> list[View]:
     return [View(setup.cameras[v], image, setup.masks[v]) for v, image in images.items()]
 
 
-def observe_frame(setup: Setup, frame: int, before: Seen, images: Sequence[np.ndarray | None]) -> FrameObservation:
+def observe_frame(setup: Setup, frame: int, before: Seen, images: Sequence[Given | None]) -> FrameObservation:
     """Return the observations of a frame: changes, flow (eq. 4) and masks (eqs. 9, 10).
 
     Args:
         setup: data that all frames share.
         frame: its index.
         before: images up to the frame before; `Seen()` for the first.
-        images: per training view uint8 [H, W, 3], RGB, or None where the view has no image. They are copied.
+        images: per training view uint8 [H, W, 3], RGB, or linear light (see `Given`), or None where the view has no
+            image. They are copied.
 
     Raises:
         ValueError: an image has another size or type than its camera, or the first frame has no image at all.
     """
-    recorded = _copies(setup.cameras, images, frame)
+    recorded = copied_images(setup.cameras, images, frame)
     seen, changes = _seen(setup, before, recorded)
-    return FrameObservation(seen, changes, *_flows(setup, frame, before.images, seen.images, changes), recorded)
+    flows, key_views = _flows(setup, frame, before.images, seen.images, changes)
+    return FrameObservation(seen, changes, flows, key_views, _encoded(recorded, seen), recorded)
 
 
 def see_frame(
-    setup: Setup, frame: int, before: Seen, images: Sequence[np.ndarray | None]
+    setup: Setup, frame: int, before: Seen, images: Sequence[Given | None]
 ) -> tuple[Seen, dict[int, np.ndarray] | None]:
     """Return the images up to a frame and the masks of its changes, without flow; see `observe_frame`."""
-    return _seen(setup, before, _copies(setup.cameras, images, frame))
+    return _seen(setup, before, copied_images(setup.cameras, images, frame))
 
 
 def _seen(setup: Setup, before: Seen, recorded: Images) -> tuple[Seen, dict[int, np.ndarray] | None]:
     """Return the images up to a frame with these, and the masks of its changes; None: all may have changed."""
     skip, follow = setup.config.fit.skip_static, setup.config.fit.exposure != "off"
+    stops = before.display_exposure if setup.display_exposure is None else setup.display_exposure
+    stops = display_stops(recorded.values()) if stops is None else stops
+    shown = {v: display_image(image, stops) for v, image in recorded.items()}
     if not (skip or follow):
-        return Seen(recorded), None
-    exposures = _exposures(setup, before, recorded) if follow else {}
-    now = {v: exposures[v].corrected(image) if v in exposures else image for v, image in recorded.items()}
+        return Seen(shown, display_exposure=stops), None
+    exposures = _exposures(setup, before, shown) if follow else {}
+    now = {v: exposures[v].corrected(image) if v in exposures else image for v, image in shown.items()}
     changes = {v: np.zeros(image.shape[:2], bool) for v, image in now.items()}  # where it is the view's first image
     known, config = sorted(now.keys() & before.references.keys()), setup.config.motion.change
     masks = map_in_threads(lambda v: change_mask(before.references[v], now[v], setup.masks[v], config), known)
     changes |= dict(zip(known, masks, strict=True))
     references = {v: update_reference(before.references[v], now[v], changes[v]) for v in known}
-    return Seen(now, {**before.references, **now, **references}, exposures), changes if skip else None
+    return Seen(now, {**before.references, **now, **references}, exposures, stops), changes if skip else None
+
+
+def _encoded(recorded: Images, seen: Seen) -> dict[int, np.ndarray]:
+    """Return the images that the fit compares, see `FrameObservation`."""
+    return {
+        v: seen.images[v]
+        if image.dtype == np.uint8
+        else seen.exposures.get(v, Exposure()).corrected(encode_light(image))
+        for v, image in recorded.items()
+    }
 
 
 def _exposures(setup: Setup, before: Seen, recorded: Images) -> dict[int, Exposure]:
@@ -258,27 +292,3 @@ def _frame_key_views(setup: Setup, before: Images, images: Images) -> tuple[int,
     if len(key_views) == len(setup.key_views) or not both:
         return key_views
     return tuple(both[k] for k in choose_key_views([setup.cameras[v] for v in both], len(setup.key_views)))
-
-
-def _copies(cameras: Sequence[Camera], images: Sequence[np.ndarray | None], frame: int) -> dict[int, np.ndarray]:
-    """Return copies of the images of those views that have one, by view index, if all have their camera's size."""
-    _check_images(cameras, images, frame)
-    return {view: image.copy() for view, image in enumerate(images) if image is not None}
-
-
-def _check_images(cameras: Sequence[Camera], images: Sequence[np.ndarray | None], frame: int) -> None:
-    count = len(images) if isinstance(images, (Sequence, np.ndarray)) else f"a {type(images).__name__}"
-    if count != len(cameras):
-        raise ValueError(
-            f"step(): frame {frame} must have one image or None for each of {len(cameras)} views, got {count}."
-        )
-    if not frame and all(image is None for image in images):
-        raise ValueError("step(): frame 0 must have an image of at least one view, got none; begin with one that has.")
-    for view, (camera, image) in enumerate(zip(cameras, images, strict=True)):
-        shape = camera.height, camera.width, 3
-        if image is not None and (not isinstance(image, np.ndarray) or (image.shape, image.dtype) != (shape, np.uint8)):
-            found = f"{image.dtype} {list(image.shape)}" if isinstance(image, np.ndarray) else type(image).__name__
-            raise ValueError(
-                f"step(): frame {frame} of view {camera.name or view!r} must be uint8 {list(shape)}, got {found}; "
-                "convert it."
-            )

@@ -69,19 +69,12 @@ class ActiveSetConfig:
 
 @dataclass(frozen=True, eq=False)
 class ActiveSet:
-    """The Gaussians and pixels that take part in a frame.
+    """The Gaussians and pixels that take part in a frame."""
 
-    Attributes:
-        indices: int [M], ascending: the active Gaussians among N.
-        num_gaussians: N.
-        views: active views in which they are visible, by view index.
-        num_views: V, the views that have an image.
-    """
-
-    indices: np.ndarray
-    num_gaussians: int
-    views: Mapping[int, ActiveView]
-    num_views: int
+    indices: np.ndarray  #: int [M], ascending: the active Gaussians among N.
+    num_gaussians: int  #: N.
+    views: Mapping[int, ActiveView]  #: Active views in which they are visible, by view index.
+    num_views: int  #: V, the views that have an image.
 
     def select(self, gaussians: Gaussians) -> Gaussians:
         """Return the active ones among N Gaussians."""

@@ -20,19 +20,12 @@ __all__ = ["Boxes", "boxes_around"]
 
 @dataclass(frozen=True, eq=False)
 class Boxes:
-    """Boxes of N Gaussians in one view, in px; empty where a Gaussian is culled.
+    """Boxes of N Gaussians in one view, in px; empty where a Gaussian is culled."""
 
-    Attributes:
-        left: first column [N].
-        top: first row [N].
-        right: column after the last one [N].
-        bottom: row after the last one [N].
-    """
-
-    left: UInt32
-    top: UInt32
-    right: UInt32
-    bottom: UInt32
+    left: UInt32  #: First column [N].
+    top: UInt32  #: First row [N].
+    right: UInt32  #: Column after the last one [N].
+    bottom: UInt32  #: Row after the last one [N].
 
     @property
     def area(self) -> Float:

@@ -48,24 +48,21 @@ _MIDDLE_TONES = np.repeat([[0.2], [0.6]], 3, axis=1)
 
 @dataclass(frozen=True)
 class Exposure:
-    """Exposure and white balance of an image: recorded = gain * scene + bias, display-referred in [0, 1].
+    """Exposure and white balance of an image: recorded = gain * scene + bias, display-referred in [0, 1]."""
 
-    Attributes:
-        gain: of R, G and B.
-        bias: of R, G and B.
-    """
-
-    gain: tuple[float, ...] = (1.0, 1.0, 1.0)
-    bias: tuple[float, ...] = (0.0, 0.0, 0.0)
+    gain: tuple[float, ...] = (1.0, 1.0, 1.0)  #: Of R, G and B.
+    bias: tuple[float, ...] = (0.0, 0.0, 0.0)  #: Of R, G and B.
 
     def __call__(self, colors: np.ndarray) -> np.ndarray:
         """Return how the camera shows colours [..., 3] of the scene; not clipped."""
         return colors * np.array(self.gain) + np.array(self.bias)
 
     def corrected(self, image: np.ndarray) -> np.ndarray:
-        """Return the image, uint8 [H, W, 3], in the colours of the scene; clipped values stay lost."""
+        """Return the image [H, W, 3], uint8 or encoded floats, in the scene's colours; clipped values stay lost."""
         if self == Exposure():
             return image
+        if image.dtype != np.uint8:
+            return _bent(self.inverse(_straightened(image))).astype(np.float32)
         table = 255 * self.inverse(np.arange(256)[:, None] / 255)
         return cv2.LUT(image, np.clip(np.rint(table), 0, 255).astype(np.uint8)[None])
 
@@ -186,6 +183,17 @@ def follow_exposure(
     )
     small = None if mask is None else cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
     return fit_exposure(before, now, small, last)
+
+
+def _straightened(encoded: np.ndarray) -> np.ndarray:
+    """Return encoded values, with sRGB's root of the light also above white, where the curve is logarithmic."""
+    return np.where(encoded > 1, (1 + _TOE) * np.exp((np.maximum(encoded, 1) - 1) / (1 + _TOE)) - _TOE, encoded)
+
+
+def _bent(root: np.ndarray) -> np.ndarray:
+    """Return the encoded values, not negative, of which `_straightened` makes these."""
+    above = 1 + (1 + _TOE) * np.log((np.maximum(root, 1) + _TOE) / (1 + _TOE))
+    return np.where(root > 1, above, np.maximum(root, 0))
 
 
 def _exposure(gain: np.ndarray, bias: np.ndarray) -> Exposure:

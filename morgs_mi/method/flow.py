@@ -14,49 +14,18 @@ from morgs_mi.method.flow_sources.flow_config import FlowConfig
 from morgs_mi.method.flow_sources.flow_registry import FlowSource, FramePair, flow_source
 from morgs_mi.method.mask_refiners.mask_config import MaskConfig
 
-__all__ = ["FlowObservation", "observe_flow", "observe_key_views"]
+__all__ = ["FlowObservation", "observe_key_views"]
 
 
 @dataclass(frozen=True, eq=False)
 class FlowObservation:
-    """Optical flow of one key view at one frame.
+    """Optical flow of one key view at one frame."""
 
-    Attributes:
-        motion: x_t - x_{t-1} [H, W, 2] in px on frame t's grid: the negative of the flow to frame t - 1.
-        reliable: [H, W] bool, where forward and backward flow agree.
-        forward_flow: x_t - x_{t-1} [H, W, 2] in px on frame t - 1's grid: the flow to frame t.
-        forward_reliable: [H, W] bool, likewise.
-        mask: motion mask [H, W] bool (eq. 10), or None if it was not requested.
-    """
-
-    motion: np.ndarray
-    reliable: np.ndarray
-    forward_flow: np.ndarray
-    forward_reliable: np.ndarray
-    mask: np.ndarray | None = None
-
-
-def observe_flow(
-    image: np.ndarray,
-    previous: np.ndarray,
-    method: str = "dis",
-    mask_method: str | None = None,
-    valid: np.ndarray | None = None,
-) -> FlowObservation:
-    """Return the flow observation of two images of one camera.
-
-    Args:
-        image: I_t [H, W, 3], RGB, uint8 or float in [0, 1].
-        previous: I_{t-1}, likewise.
-        method: source of the flow, see `flow_source`.
-        mask_method: refinement of the mask, see `mask_refiner`; None: no mask.
-        valid: [H, W] bool, False where undistortion left no data; None: valid everywhere.
-
-    Raises:
-        ValueError: as `flow_source`, `optical_flow` and `mask_refiner`.
-    """
-    pair = FramePair(np.asarray(image), np.asarray(previous), valid=valid)
-    return observe_key_views({0: pair}, method, mask_method)[0]
+    motion: np.ndarray  #: x_t - x_{t-1} [H, W, 2] in px on frame t's grid: the negative of the flow to frame t - 1.
+    reliable: np.ndarray  #: [H, W] bool, where forward and backward flow agree.
+    forward_flow: np.ndarray  #: x_t - x_{t-1} [H, W, 2] in px on frame t - 1's grid: the flow to frame t.
+    forward_reliable: np.ndarray  #: [H, W] bool, likewise.
+    mask: np.ndarray | None = None  #: Motion mask [H, W] bool (eq. 10), or None if it was not requested.
 
 
 def observe_key_views(

@@ -81,23 +81,14 @@ class LiftConfig:
 
 @dataclass(frozen=True, eq=False)
 class _LiftView:
-    """Flow of one key view at every Gaussian.
+    """Flow of one key view at every Gaussian."""
 
-    Attributes:
-        weight: W [N].
-        flow: u [N, 2], px.
-        variance: of the flow over the pixels of the Gaussian [N], px^2.
-        jacobian: J [N, 2, 3], px per world unit.
-        floor: of the motion, px.
-        noise_px: scale s of the cost without motion, px.
-    """
-
-    weight: np.ndarray
-    flow: np.ndarray
-    variance: np.ndarray
-    jacobian: np.ndarray
-    floor: float
-    noise_px: float
+    weight: np.ndarray  # W [N]
+    flow: np.ndarray  # u [N, 2], px
+    variance: np.ndarray  # of the flow over the pixels of the Gaussian [N], px^2
+    jacobian: np.ndarray  # J [N, 2, 3], px per world unit
+    floor: float  # of the motion, px
+    noise_px: float  # scale s of the cost without motion, px
 
     def project(self, d: np.ndarray) -> np.ndarray:
         """Return J d [N, 2] in px."""

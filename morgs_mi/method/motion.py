@@ -28,15 +28,10 @@ __all__ = ["STAGES", "Stage", "initial_motion"]
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage of the start of the motion.
+    """One stage of the start of the motion."""
 
-    Attributes:
-        acts: whether it is on, by the settings.
-        run: (problem, start, settings) -> start.
-    """
-
-    acts: Callable[[MotionConfig], bool]
-    run: Callable[[MotionProblem, MotionStart, MotionConfig], MotionStart]
+    acts: Callable[[MotionConfig], bool]  #: Whether it is on, by the settings.
+    run: Callable[[MotionProblem, MotionStart, MotionConfig], MotionStart]  #: (problem, start, settings) -> start.
 
 
 STAGES: tuple[Stage, ...] = (

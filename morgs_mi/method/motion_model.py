@@ -44,18 +44,13 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class MotionModel:
-    """A motion that N Gaussians share.
+    """A motion that N Gaussians share."""
 
-    Attributes:
-        parameters: tensors at their start, by name, for which nothing moves.
-        rates: Adam's learning rate of each, by name.
-        motion: parameters -> (displacements [N, 3] in world units, rotations [N, 4] minus the identity, wxyz).
-        losses: parameters -> weighted losses in addition to L_recon, by name.
-    """
-
-    parameters: Mapping[str, Tensor]
-    rates: Mapping[str, float]
+    parameters: Mapping[str, Tensor]  #: Tensors at their start, by name, for which nothing moves.
+    rates: Mapping[str, float]  #: Adam's learning rate of each, by name.
+    #: Parameters -> (displacements [N, 3] in world units, rotations [N, 4] minus the identity, wxyz).
     motion: Callable[[Mapping[str, Tensor]], tuple[Tensor, Tensor]]
+    #: Parameters -> weighted losses in addition to L_recon, by name.
     losses: Callable[[Mapping[str, Tensor]], dict[str, Tensor]] = lambda parameters: {}
 
 

@@ -22,19 +22,12 @@ __all__ = ["MotionProblem", "MotionStart"]
 
 @dataclass(frozen=True, eq=False)
 class MotionStart:
-    """Start of the motion, of the confidence, of the colour and of the rotation of N Gaussians.
+    """Start of the motion, of the confidence, of the colour and of the rotation of N Gaussians."""
 
-    Attributes:
-        displacement: d [N, 3] since the previous frame, world units; 0 for a Gaussian that does not move.
-        logit_confidence: logit of the confidence that it moves [N].
-        color_change: change of the constant SH coefficients [N, 3]; None: none.
-        rotation: change of the quaternions [N, 4]; None: none.
-    """
-
-    displacement: np.ndarray
-    logit_confidence: np.ndarray
-    color_change: np.ndarray | None = None
-    rotation: np.ndarray | None = None
+    displacement: np.ndarray  #: d [N, 3] since the previous frame, world units; 0 for a Gaussian that does not move.
+    logit_confidence: np.ndarray  #: Logit of the confidence that it moves [N].
+    color_change: np.ndarray | None = None  #: Change of the constant SH coefficients [N, 3]; None: none.
+    rotation: np.ndarray | None = None  #: Change of the quaternions [N, 4]; None: none.
 
     @classmethod
     def without_motion(cls, gaussians: Gaussians) -> MotionStart:
@@ -46,21 +39,13 @@ class MotionStart:
 
 @dataclass(frozen=True, eq=False)
 class MotionProblem:
-    """N Gaussians of the previous frame, and images of this one that show their motion.
+    """N Gaussians of the previous frame, and images of this one that show their motion."""
 
-    Attributes:
-        gaussians: N Gaussians of the previous frame, detached; `motion` is their displacement into that frame.
-        views: active views, by view index.
-        targets: images of these views, by view index.
-        rng: draws the neighbours that proposals come from.
-        flows: optical flow of the views, by view index.
-    """
-
-    gaussians: Gaussians
-    views: Mapping[int, ActiveView]
-    targets: Mapping[int, Target]
-    rng: np.random.Generator
-    flows: Mapping[int, FlowObservation] = field(default_factory=dict)
+    gaussians: Gaussians  #: N Gaussians of the previous frame, detached; `motion` is their displacement into that frame
+    views: Mapping[int, ActiveView]  #: Active views, by view index.
+    targets: Mapping[int, Target]  #: Images of these views, by view index.
+    rng: np.random.Generator  #: Draws the neighbours that proposals come from.
+    flows: Mapping[int, FlowObservation] = field(default_factory=dict)  #: Optical flow of the views, by view index.
     _last: dict[str, Any] = field(default_factory=dict)
 
     @cached_property

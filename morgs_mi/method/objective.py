@@ -93,38 +93,23 @@ class ObjectiveConfig:
 
 @dataclass(frozen=True, eq=False)
 class KeyView:
-    """Input of the observers: one key view at one frame.
+    """Input of the observers: one key view at one frame."""
 
-    Attributes:
-        pair: its images at frames t and t - 1.
-        flow: its optical flow.
-    """
-
-    pair: FramePair
-    flow: FlowObservation
+    pair: FramePair  #: Its images at frames t and t - 1.
+    flow: FlowObservation  #: Its optical flow.
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Rendering of one view at one step, which terms compare with the observations.
+    """Rendering of one view at one step, which terms compare with the observations."""
 
-    Attributes:
-        image: the rendered channels.
-        parameters: of the residual, by name.
-        region: the rendered blocks; None: the whole view.
-        num_pixels: of the whole view.
-        num_gaussians: of the whole scene.
-        extent: of the scene, world units.
-        gaussians: the active ones, after the residual.
-    """
-
-    image: Image
-    parameters: Mapping[str, Tensor]
-    region: Region | None
-    num_pixels: int
-    num_gaussians: int
-    extent: float
-    gaussians: Gaussians
+    image: Image  #: The rendered channels.
+    parameters: Mapping[str, Tensor]  #: Of the residual, by name.
+    region: Region | None  #: The rendered blocks; None: the whole view.
+    num_pixels: int  #: Of the whole view.
+    num_gaussians: int  #: Of the whole scene.
+    extent: float  #: Of the scene, world units.
+    gaussians: Gaussians  #: The active ones, after the residual.
 
 
 Loss = Callable[[Prediction, Observations, ObjectiveConfig], Tensor]

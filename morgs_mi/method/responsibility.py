@@ -41,17 +41,11 @@ __all__ = ["ChangedView", "overlap", "responsibility"]
 
 @dataclass(frozen=True, eq=False)
 class ChangedView:
-    """A view, its changed pixels and the Gaussians in it.
+    """A view, its changed pixels and the Gaussians in it."""
 
-    Attributes:
-        view: the whole view.
-        change: mask of the changed pixels, bool [H, W].
-        boxes: boxes of the N Gaussians.
-    """
-
-    view: ActiveView
-    change: np.ndarray
-    boxes: Boxes
+    view: ActiveView  #: The whole view.
+    change: np.ndarray  #: Mask of the changed pixels, bool [H, W].
+    boxes: Boxes  #: Boxes of the N Gaussians.
 
     @cached_property
     def counts(self) -> np.ndarray:

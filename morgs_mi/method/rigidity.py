@@ -37,23 +37,14 @@ _REACH = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Neighbours:
-    """E pairs (i, j) of N Gaussians as they were in the previous frame.
+    """E pairs (i, j) of N Gaussians as they were in the previous frame."""
 
-    Attributes:
-        first: matrix [E, N] that selects i.
-        difference: matrix [E, N] that subtracts the value of i from the value of j.
-        weights: w [E], divided by E.
-        edges: e [3, E], scene extents.
-        inverse: inverse rotations, unit quaternions wxyz [4, N].
-        extent: of the scene, world units.
-    """
-
-    first: csr_array
-    difference: csr_array
-    weights: Float
-    edges: Jit
-    inverse: Jit
-    extent: float
+    first: csr_array  #: matrix [E, N] that selects i.
+    difference: csr_array  #: matrix [E, N] that subtracts the value of i from the value of j.
+    weights: Float  #: w [E], divided by E.
+    edges: Jit  #: e [3, E], scene extents.
+    inverse: Jit  #: Inverse rotations, unit quaternions wxyz [4, N].
+    extent: float  #: Of the scene, world units.
 
 
 def find_neighbours(

@@ -177,17 +177,11 @@ def _best_displacement(center: np.ndarray, surfaces: Sequence[_CostSurface], rea
 
 @dataclass(frozen=True, eq=False)
 class _CostSurface:
-    """The inner sums of C(d) in one view, for all shifts up to its margin.
+    """The inner sums of C(d) in one view, for all shifts up to its margin."""
 
-    Attributes:
-        cost: [2 M + 1, 2 M + 1], by shift along y and x, in reduced pixels.
-        camera: the view.
-        scale: reduced pixels per pixel.
-    """
-
-    cost: np.ndarray
-    camera: Camera
-    scale: float
+    cost: np.ndarray  # [2 M + 1, 2 M + 1], by shift along y and x, in reduced pixels
+    camera: Camera  # the view
+    scale: float  # reduced pixels per pixel
 
     def at(self, center: np.ndarray, d: np.ndarray) -> np.ndarray:
         """Return the costs [K] of displacements d [K, 3] of a part around `center` [3]."""
@@ -198,19 +192,12 @@ class _CostSurface:
 
 @dataclass(frozen=True, eq=False)
 class _MatchedView:
-    """A view in which parts are looked for, with images reduced to 2 px or more per step of the grid.
+    """A view in which parts are looked for, with images reduced to 2 px or more per step of the grid."""
 
-    Attributes:
-        camera: the view.
-        before: rendering of the previous Gaussians around the parts, reduced [h, w, 3].
-        after: the target, reduced [h, w, 3].
-        scale: reduced pixels per pixel.
-    """
-
-    camera: Camera
-    before: np.ndarray
-    after: np.ndarray
-    scale: float
+    camera: Camera  # the view
+    before: np.ndarray  # rendering of the previous Gaussians around the parts, reduced [h, w, 3]
+    after: np.ndarray  # the target, reduced [h, w, 3]
+    scale: float  # reduced pixels per pixel
 
     def cost_surface(self, weight: np.ndarray) -> _CostSurface:
         """Match the pixels of a part with the weight m [h, w], not all 0."""

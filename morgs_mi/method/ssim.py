@@ -26,6 +26,7 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.checks import check_mask
+from morgs_mi.core.color_space import BRIGHTEST
 from morgs_mi.core.memory import from_numpy, owned_copy
 from morgs_mi.core.types import Bool, Float, Int32, Jit, Tensor, UInt32
 from morgs_mi.method.ssim_layout import (
@@ -57,26 +58,19 @@ _TAPS = (_TAPS / _TAPS.sum()).astype(np.float32).tolist()
 
 @dataclass(frozen=True, eq=False)
 class _Windows:
-    """The windows that pixels of a region lie in, and the target's statistics there.
+    """The windows that pixels of a region lie in, and the target's statistics there."""
 
-    Attributes:
-        windows: runs of the centres of the windows.
-        pixels: runs of the pixels.
-        mean: planes of M y, defined on `windows`.
-        variance: planes of M yy - (M y)^2, likewise.
-    """
-
-    windows: Runs
-    pixels: Runs
-    mean: Float
-    variance: Float
+    windows: Runs  # runs of the centres of the windows
+    pixels: Runs  # runs of the pixels
+    mean: Float  # planes of M y, defined on `windows`
+    variance: Float  # planes of M yy - (M y)^2, likewise
 
 
 class Target:
     """A target image. Its terms of SSIM are computed once for each region on which it is compared.
 
     Args:
-        image: [H, W, 3], RGB, uint8 or float in [0, 1], display-referred.
+        image: [H, W, 3], RGB, encoded: uint8, or floats, of which 1 is white and HDR images have larger ones.
         mask: [H, W] bool; pixels that are False do not count. None: all pixels count.
 
     Raises:
@@ -111,7 +105,7 @@ class Target:
         return planes
 
     def image(self) -> np.ndarray:
-        """Return the target [H, W, 3], float32 in [0, 1]; black where masked. It is read-only."""
+        """Return the target [H, W, 3], float32 with white at 1; black where masked. It is read-only."""
         if self._image is None:
             self._image = np.asarray(self.planes.image(self.pixels)).reshape(self.shape)
             self._image.flags.writeable = False
@@ -175,10 +169,11 @@ def _check_image(image: np.ndarray) -> None:
     if image.dtype == np.uint8:
         return
     low, high = (image.min(), image.max()) if image.dtype.kind == "f" else (np.nan, np.nan)
-    if not (low >= -_MARGIN and high <= 1 + _MARGIN):
+    if not (low >= -_MARGIN and high <= BRIGHTEST):
         found = f"{image.dtype} from {low:g} to {high:g}" if image.dtype.kind == "f" else str(image.dtype)
         raise ValueError(
-            f"Target(): `image` must be uint8, or floats in [0, 1], got {found}; divide 8-bit values by 255."
+            f"Target(): `image` must be uint8, or floats from 0 to {BRIGHTEST:g} with white at 1, got {found}; divide "
+            "8-bit values by 255."
         )
 
 

@@ -30,19 +30,13 @@ _LONGEST = 64
 
 @dataclass(frozen=True)
 class Lanes:
-    """Runs of rows of strips, in all three planes, one for each SIMD lane.
+    """Runs of rows of strips, in all three planes, one for each SIMD lane."""
 
-    Attributes:
-        places: places of row 0 of the strip to the left, of the strip, and of the one to the right, in strips.
-        first: first row.
-        end: row past the last.
-        columns: number of the strip's columns that lie in the image, 0 to 8.
-    """
-
+    #: Places of row 0 of the strip to the left, of the strip, and of the one to the right, in strips.
     places: tuple[UInt32, UInt32, UInt32]
-    first: Int32
-    end: Int32
-    columns: UInt32
+    first: Int32  #: First row.
+    end: Int32  #: Row past the last.
+    columns: UInt32  #: Number of the strip's columns that lie in the image, 0 to 8.
 
 
 @dataclass(frozen=True)

@@ -33,8 +33,11 @@ _DIRECTIONS: dict[Axes, tuple[np.ndarray, np.ndarray]] = {
 }
 # Every 45 degrees: orbits treat cameras without a gap of 90 degrees as a full circle.
 _NAMES = ("front", "front-right", "right", "back-right", "back", "back-left", "left", "front-left")
-_WIDTH, _HEIGHT, _FOV_X = 1280, 720, 50.0
-_THUMBNAIL, _MOST = 240, 30_000  # width of the images that are compared, and Gaussians in them
+_WIDTH = 1280
+_HEIGHT = 720
+_FOV_X = 50.0  # degrees
+_THUMBNAIL = 240  # width of the images that are compared
+_MOST = 30_000  # Gaussians in them
 _PERCENT_OUTSIDE = 5.0  # of the weight, on each side
 _MARGIN = 1.1
 _LEAST_EXTENT = 1e-6  # of the distance from the origin
@@ -57,7 +60,8 @@ def default_rig(frames: Sequence[Gaussians], axes: Axes = "y-down") -> tuple[Cam
     least = _LEAST_EXTENT * (1 + np.abs((low, high)).max())
     half = np.maximum(_MARGIN * 0.5 * (high - low) + 3 * size, least)
     tall = np.abs(up) @ half
-    wide, deep = np.abs(np.cross(forward, up)) @ half, np.abs(forward) @ half
+    wide = np.abs(np.cross(forward, up)) @ half
+    deep = np.abs(forward) @ half
     tangent = np.tan(np.deg2rad(_FOV_X / 2))
     # The first camera sees the box; the others keep its distance from the middle.
     distance = deep + max(wide, tall * _WIDTH / _HEIGHT) / tangent
@@ -93,7 +97,8 @@ def _extent(frames: Sequence[Gaussians]) -> tuple[np.ndarray, np.ndarray, float]
     opacities = 0.5 + 0.5 * np.tanh(0.5 * np.concatenate([values["logit_opacities"] for values in raw], dtype=float))
     if not len(means):
         raise ValueError("expected at least one Gaussian, got none; leave out files that are empty.")
-    percents, weights = (_PERCENT_OUTSIDE, 100 - _PERCENT_OUTSIDE), opacities + 1e-9
+    percents = (_PERCENT_OUTSIDE, 100 - _PERCENT_OUTSIDE)
+    weights = opacities + 1e-9
     corners = [np.percentile(axis, percents, weights=weights, method="inverted_cdf") for axis in means.T]
     low, high = np.array(corners).T
     return low, high, float(np.exp(np.median(sizes)))

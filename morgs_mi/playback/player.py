@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
@@ -23,11 +23,11 @@ from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.fingerprint import fingerprint
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.capture.truth import GroundTruth, load_truth
-from morgs_mi.codec.container import PacketKind
-from morgs_mi.codec.packets import play
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.container import Packet, PacketKind
+from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import check_number
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.types import Tensor
 from morgs_mi.io.bounded import read_json
@@ -56,6 +56,7 @@ __all__ = [
     "render",
     "render_config",
     "render_stream",
+    "stream_exposure",
     "stream_name",
     "truth_for_camera",
 ]
@@ -84,7 +85,7 @@ _JSON_TYPES = {
 }
 
 
-def stream_name(stream: StreamReader) -> str:
+def stream_name(stream: FrameSource) -> str:
     """Return the name of a stream: the name of its folder or file, without `.morgs`.
 
     Bytes of the name that are not UTF-8 are replaced, because pages and messages to a browser cannot contain them.
@@ -94,7 +95,7 @@ def stream_name(stream: StreamReader) -> str:
     return os.fsencode(name).decode(errors="replace")
 
 
-def find_camera(stream: StreamReader, camera: int | str) -> Camera:
+def find_camera(stream: FrameSource, camera: int | str) -> Camera:
     """Return a camera of the stream's rig by name or index.
 
     Raises:
@@ -111,7 +112,7 @@ def find_camera(stream: StreamReader, camera: int | str) -> Camera:
 
 
 def render_stream(
-    stream: StreamReader, camera: Camera, channels: Sequence[str] | None = None
+    stream: FrameSource, camera: Camera, channels: Sequence[str] | None = None
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     """Render every frame of a stream for one camera, with the cut-offs of the fit.
 
@@ -132,7 +133,7 @@ def render_stream(
         yield frame, render(gaussians, camera, channels or available_channels(gaussians), config)
 
 
-def has_confidence(stream: StreamReader) -> bool:
+def has_confidence(stream: FrameSource) -> bool:
     """Return whether a stream stores a confidence, and the fit has learned it.
 
     Raises:
@@ -142,9 +143,9 @@ def has_confidence(stream: StreamReader) -> bool:
     return learned and any(gaussians.logit_confidence is not None for _, gaussians in islice(play(stream), 1))
 
 
-def has_offset(stream: StreamReader) -> bool:
-    """Return whether a stream's residuals store the learned offset, which is off by default."""
-    residuals = (packet for packet in stream if packet.kind == PacketKind.RESIDUAL)
+def has_offset(packets: Iterable[Packet]) -> bool:
+    """Return whether the residuals of a stream store the learned offset, which is off by default."""
+    residuals = (packet for packet in packets if packet.kind == PacketKind.RESIDUAL)
     return any("offset" in packet.arrays for packet in islice(residuals, 1))
 
 
@@ -164,7 +165,7 @@ def channel_image(name: str, image: np.ndarray, motion_scale: float | None = Non
     return draw.get(name, grey_image)(image)
 
 
-def playback_speed(stream: StreamReader, camera: Camera) -> dict[str, float]:
+def playback_speed(stream: FrameSource, camera: Camera) -> dict[str, float]:
     """Return the speed at which this machine plays a stream: decode a frame, render its colour, copy it to the host.
 
     At most the first 30 frames are measured. The first one compiles kernels and is excluded if there are others.
@@ -176,7 +177,8 @@ def playback_speed(stream: StreamReader, camera: Camera) -> dict[str, float]:
     Raises:
         ValueError: a broken packet.
     """
-    config, times = render_config(stream), []
+    config = render_config(stream)
+    times = []
     frames = islice(play(stream), _MOST_TIMED_FRAMES)
     while True:
         start = time.perf_counter()
@@ -230,7 +232,7 @@ def render(
     return {name: np.array(images[name]) for name in channels}
 
 
-def render_config(stream: StreamReader) -> RenderConfig:
+def render_config(stream: FrameSource) -> RenderConfig:
     """Return the renderer settings of the fit.
 
     Raises:
@@ -240,7 +242,19 @@ def render_config(stream: StreamReader) -> RenderConfig:
     return apply_values(RenderConfig(), values, _place(stream, "config.render"))
 
 
-def num_frames(stream: StreamReader) -> int:
+def stream_exposure(stream: FrameSource) -> float:
+    """Return the stops by which a display brightens a stream, 0 for the stream of a recording of 8 bits.
+
+    Raises:
+        ValueError: the header has another value than a number from -100 to 100.
+    """
+    key = "transfer.display_exposure"
+    stops = metadata_entry(stream, key, 0.0, int, float)
+    check_number(_place(stream, key), "display_exposure", stops, "[-100, 100]")
+    return float(stops)
+
+
+def num_frames(stream: FrameSource) -> int:
     """Return the number of frames of the capture that was fitted, zero if the stream's header does not state it.
 
     Raises:
@@ -249,7 +263,7 @@ def num_frames(stream: StreamReader) -> int:
     return metadata_entry(stream, "num_frames", 0, int)
 
 
-def metadata_entry(stream: StreamReader, key: str, default: Any, *kinds: type) -> Any:
+def metadata_entry(stream: FrameSource, key: str, default: Any, *kinds: type) -> Any:
     """Return an entry of a stream's metadata, `default` where there is none.
 
     A stream may come from anybody, and its metadata may be any JSON object.
@@ -269,17 +283,17 @@ def metadata_entry(stream: StreamReader, key: str, default: Any, *kinds: type) -
             return default
         value = value[name] if isinstance(value, dict) else None
     if type(value) not in kinds:
-        expected = " or ".join(_JSON_TYPES[kind] for kind in kinds)
-        raise ValueError(f"{_place(stream, key)} must be {expected}, got {shortened(value)}; fit the capture again.")
+        names = " or ".join(_JSON_TYPES[kind] for kind in kinds)
+        raise ValueError(f"{_place(stream, key)} must be {names}, got {shortened(value)}; fit the capture again.")
     return value
 
 
-def _place(stream: StreamReader, key: str) -> str:
+def _place(stream: FrameSource, key: str) -> str:
     return f"{stream.path}: packet 0: `{key}` of the header's metadata"
 
 
 def open_stream_capture(
-    stream: StreamReader, capture: str | Path | None, frames: Sequence[int], any_recording: bool = False
+    stream: FrameSource, capture: str | Path | None, frames: Sequence[int], any_recording: bool = False
 ) -> Capture:
     """Open the capture to which a stream was fitted, with the settings of the fit.
 
@@ -301,10 +315,11 @@ def open_stream_capture(
     if not frames:
         raise ValueError(f"{stream.path}: expected at least one frame, got a header alone; fit the capture again.")
     recording = load_capture(path, downscale, "auto" if test_view == "auto" else None, frames[-1] + 1, reading)
-    expected, found = _sizes(stream.cameras), _sizes(recording.cameras)
-    if found != expected:
+    sizes = _sizes(stream.cameras)
+    recorded_sizes = _sizes(recording.cameras)
+    if recorded_sizes != sizes:
         raise ValueError(
-            f"{path}: expected the cameras that {stream.path} was fitted to, {expected}, got {found}; "
+            f"{path}: expected the cameras that {stream.path} was fitted to, {sizes}, got {recorded_sizes}; "
             "pass that capture (--capture)."
         )
     if test_view != "auto":
@@ -317,40 +332,43 @@ def open_stream_capture(
     if not any_recording:
         _check_recording(stream, recording)
     # Other refined cameras change no image, and ground truth refers to the recording's cameras.
+    if recording.display_exposure is not None:
+        recording = replace(recording, display_exposure=stream_exposure(stream))
     return as_fitted(recording, stream) if "distortions" in stream.metadata else recording
 
 
-def _check_recording(stream: StreamReader, recording: Capture) -> None:
+def _check_recording(stream: FrameSource, recording: Capture) -> None:
     """Raise `ValueError` if a recording has not the fingerprint in a stream's header; imported streams have none."""
-    expected = metadata_entry(stream, "fingerprint", None, str, NoneType)
-    if expected is None:
+    stream_fingerprint = metadata_entry(stream, "fingerprint", None, str, NoneType)
+    if stream_fingerprint is None:
         return
     refines = metadata_entry(stream, "config.fit.refine_cameras", "off", str) != "off"
-    if fingerprint(recording, next(recording.partial_frames(0, 1)).images, refines) != expected:
+    if fingerprint(recording, next(recording.partial_frames(0, 1)).images, refines) != stream_fingerprint:
         raise ValueError(
             f"{recording.path}: expected the recording that {stream.path} was fitted to, got other images in its first "
             "frame, or other points; pass that capture (--capture), or compare with any recording (--any-recording)."
         )
 
 
-def fitted_capture(stream: StreamReader) -> str:
+def fitted_capture(stream: FrameSource) -> str:
     """Return the path of a stream's capture, which is in the `capture.json` beside it; in the header of older streams.
 
     Raises:
         FileNotFoundError: it is not there any more.
         ValueError: no path is stored.
     """
-    beside = None
+    capture_file = None
     with suppress(OSError, ValueError):
-        beside = read_json(stream.path.with_name("capture.json"))
-    stored = [about.get("capture") for about in (stream.metadata, beside) if isinstance(about, dict)]
-    paths, remedy = [path for path in stored if isinstance(path, str)], "name its folder with --capture"
+        capture_file = read_json(stream.path.with_name("capture.json"))
+    entries = [fields.get("capture") for fields in (stream.metadata, capture_file) if isinstance(fields, dict)]
+    paths = [path for path in entries if isinstance(path, str)]
+    remedy = "name its folder with --capture"
     if not paths:
         raise ValueError(
             f"{stream.path}: expected the path of its capture in the capture.json beside it, found none; {remedy}."
         )
-    if found := next((path for path in paths if Path(path).is_dir()), None):
-        return found
+    if folder := next((path for path in paths if Path(path).is_dir()), None):
+        return folder
     raise FileNotFoundError(
         f"{paths[0]}: expected the capture of {stream.path}, found none; if it has moved, {remedy}."
     )

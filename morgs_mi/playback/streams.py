@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
 
-from morgs_mi.codec.container import MAGIC, Packet, PacketKind
-from morgs_mi.codec.packets import WholeFrame
+import numpy as np
+
+from morgs_mi.codec.container import MAGIC, Packet
+from morgs_mi.codec.frame_source import FrameSource, FrameState
+from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.listing import listed
@@ -33,8 +37,8 @@ class PlayableStream(StreamReader):
         return stream_html(self)
 
 
-class SplatFile(PlayableStream):
-    """File with the Gaussians of one frame, of any tool, as a stream.
+class SplatFile(FrameSource):
+    """File with the Gaussians of one frame, of any tool; they are rounded only where it is coded into a packet.
 
     Its cameras are the training cameras, if it has any (see `trained_cameras`), or a `default_rig`.
 
@@ -53,29 +57,27 @@ class SplatFile(PlayableStream):
     def __init__(self, path: Path, most_invalid: float = DRAWN) -> None:
         gaussians = read_splats(path, most_invalid)
         self.cameras_file, trained = trained_cameras(path, gaussians)
-        self.path, self.fps, self.metadata = path, 30.0, {"num_frames": 1, DEFAULT_RIG: not trained}
+        self.path = path
+        self.fps = 30.0
+        self.metadata = {"num_frames": 1, DEFAULT_RIG: not trained}
         try:
             self.cameras = trained or default_rig([gaussians])
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
-        self._frame = WholeFrame(gaussians, self.cameras)
+        still = replace(gaussians, motion=np.zeros((len(gaussians), 3), np.float32))
+        self._state = FrameState(0, np.arange(len(gaussians), dtype=np.uint32), still)
+
+    def frame_numbers(self) -> list[int]:
+        return [0]
+
+    def states(self, near: int | None = None) -> Iterator[FrameState]:
+        yield self._state
 
     def __iter__(self) -> Iterator[Packet]:
-        return iter((self._frame,))
+        yield keyframe_packet(self._state.gaussians, 0, self.cameras)
 
-    def near(self, frame: int) -> Iterator[Packet]:
-        return iter(self)
-
-    def closed(self) -> bool:
-        return True
-
-    def index(self) -> list[tuple[int, int, int]]:
-        return [(PacketKind.KEYFRAME, 0, 0)]
-
-    def check(self) -> tuple[list[tuple[int, int, int]], int]:
-        raise ValueError(
-            f"{self.path}: expected a stream file, got a file of Gaussians; `morgs-mi import` converts it."
-        )
+    def _repr_html_(self) -> str:
+        return stream_html(self)
 
 
 def stream_path(out: str | Path) -> Path:
@@ -104,7 +106,7 @@ def stream_path(out: str | Path) -> Path:
     return path
 
 
-def open_stream(out: str | Path, most_invalid: float = DRAWN, skip_damaged: bool = False) -> PlayableStream:
+def open_stream(out: str | Path, most_invalid: float = DRAWN, skip_damaged: bool = False) -> PlayableStream | SplatFile:
     """Open a stream file, the ``stream.morgs`` in the folder of a fit, or a file with Gaussians as one frame.
 
     Files with Gaussians are ``.ply`` files in the layout of 3D Gaussian Splatting, ``.compressed.ply`` and ``.splat``.

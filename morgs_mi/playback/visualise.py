@@ -24,7 +24,6 @@ __all__ = [
     "label",
     "motion_image",
     "motion_legend",
-    "motion_wheel",
     "side_by_side",
     "time_slice",
     "to_uint8",
@@ -81,27 +80,22 @@ def motion_image(motion: np.ndarray, scale_px: float) -> np.ndarray:
         raise ValueError(f"motion_image(): `motion` must be [H, W, 2], got {motion.shape}.")
     if not scale_px > 0:
         raise ValueError(f"motion_image(): `scale_px` must be positive, got {scale_px}.")
-    known = np.asarray(np.isfinite(motion).all(-1))
-    x, y = np.moveaxis(np.where(known[..., None], motion, 0), -1, 0)
+    valid = np.asarray(np.isfinite(motion).all(-1))
+    x, y = np.moveaxis(np.where(valid[..., None], motion, 0), -1, 0)
     hue = np.rad2deg(np.arctan2(y, x)) % 360
     saturation = np.minimum(np.hypot(x, y) / scale_px, 1)
     hsv = np.stack([hue, saturation, np.ones_like(hue)], -1).astype(np.float32)
     image = to_uint8(cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB))
-    image[~known] = UNDEFINED
+    image[~valid] = UNDEFINED
     return image
 
 
-def motion_wheel(scale_px: float, size: int = 96) -> np.ndarray:
-    """Return the colours of `motion_image` as a disc [size, size, 3] with `scale_px` at its rim."""
+def motion_legend(scale_px: float, size: int = 96) -> np.ndarray:
+    """Return the legend [size, size, 3] of `motion_image`: a disc of its colours with the speed at the rim."""
     axis = np.linspace(-scale_px, scale_px, size, dtype=np.float32)
     motion = np.stack(np.meshgrid(axis, axis), -1)
     motion[np.hypot(*np.moveaxis(motion, -1, 0)) > scale_px] = 0
-    return motion_image(motion, scale_px)
-
-
-def motion_legend(scale_px: float, size: int = 96) -> np.ndarray:
-    """Return the legend [size, size, 3] of `motion_image`: `motion_wheel`, labelled with the speed at its rim."""
-    return label(motion_wheel(scale_px, size), f"{scale_px:.3g} px")
+    return label(motion_image(motion, scale_px), f"{scale_px:.3g} px")
 
 
 def confidence_image(confidence: np.ndarray) -> np.ndarray:
@@ -143,22 +137,23 @@ def depth_image(depth: np.ndarray, near: float | None = None, far: float | None 
         far: depth of the blue end; default: from `depth_range`.
     """
     depth = np.asarray(depth, np.float64).reshape(np.shape(depth)[:2])
-    known = np.isfinite(depth) & (depth > 0)
-    if not known.any():
+    valid = np.isfinite(depth) & (depth > 0)
+    if not valid.any():
         return np.full((*depth.shape, 3), UNDEFINED, np.uint8)
     low, high = depth_range(depth)
-    near, far = near or low, far or high
-    inverse = 1 / np.where(known, depth, far)
+    near = near or low
+    far = far or high
+    inverse = 1 / np.where(valid, depth, far)
     span = max(1 / near - 1 / far, 1e-12)
     image = _apply_colour_map((inverse - 1 / far) / span, cv2.COLORMAP_TURBO)
-    image[~known] = UNDEFINED
+    image[~valid] = UNDEFINED
     return image
 
 
 def depth_range(depth: np.ndarray) -> tuple[float, float]:
     """Return the 1st and the 99th percentile of the depths that are positive and finite; (1, 1) if there is none."""
-    known = depth[np.isfinite(depth) & (depth > 0)]
-    low, high = np.percentile(known, (1, 99)) if known.size else (1.0, 1.0)
+    values = depth[np.isfinite(depth) & (depth > 0)]
+    low, high = np.percentile(values, (1, 99)) if values.size else (1.0, 1.0)
     return float(low), float(high)
 
 
@@ -166,7 +161,8 @@ def label(image: np.ndarray, text: str) -> np.ndarray:
     """Return the image with `text` (ASCII) in its top left corner, white on a dark strip."""
     image = to_uint8(image)
     scale = np.clip(image.shape[1] / 640, 0.35, 1.0)
-    font, thickness = cv2.FONT_HERSHEY_SIMPLEX, 2 if scale > 0.8 else 1
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    thickness = 2 if scale > 0.8 else 1
     (width, height), base = cv2.getTextSize(text, font, scale, thickness)
     strip = image[: height + base + 4, : width + 8]
     strip[:] = strip // 4

@@ -17,6 +17,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.color_space import decode_traced, encode_traced
 from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, Jit, Tensor
@@ -51,7 +52,7 @@ def composite(
         view: the surfaces on P pixels of a camera's image.
         config: settings of the rasteriser.
     """
-    encode, decode = (mi.math.linear_to_srgb, mi.math.srgb_to_linear) if view.srgb else (_unchanged, _unchanged)
+    encode, decode = (encode_traced, decode_traced) if view.srgb else (_unchanged, _unchanged)
     channels = tuple(dict.fromkeys(("color", "alpha", *channels)))
     image = rasterize(gaussians, view.pixels.camera, channels, config=config)
     crop = view.pixels.crop

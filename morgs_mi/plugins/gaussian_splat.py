@@ -14,6 +14,7 @@ import numpy as np
 
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.color_space import decode_traced
 from morgs_mi.core.gaussians import tensor_rows
 from morgs_mi.core.memory import refuse_freezing
 from morgs_mi.core.types import Float, Tensor, UInt32
@@ -380,7 +381,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
             images = {name: dr.concat([stack[v] for v in count], axis=1) for name, stack in images.items()}
         columns = {name: cropped(value, crop) for name, value in images.items()}
         if self.srgb_primitives:
-            columns["color"] = [mi.math.srgb_to_linear(value) for value in columns["color"]]
+            columns["color"] = [decode_traced(value) for value in columns["color"]]
         return columns
 
     def _warn(self, scene: Any, gaussians: _SceneGaussians) -> None:

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_number, numbers
+from morgs_mi.core.color_space import decode_traced
 from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.render.rasterize import rasterize
@@ -139,4 +140,4 @@ def radiance(color: Any, clipped: float, srgb: bool = True) -> Any:
     if not srgb:
         return color
     position = dr.clip((dr.max(color) - _KNEE) / (1 - _KNEE), 0, 1)
-    return mi.math.srgb_to_linear(color) * (1 + (clipped - 1) * dr.square(position) * (3 - 2 * position))
+    return decode_traced(color) * (1 + (clipped - 1) * dr.square(position) * (3 - 2 * position))

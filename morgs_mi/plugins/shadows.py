@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from morgs_mi.core.checks import check_number, check_type, numbers
-from morgs_mi.core.color_space import SH_C0, linear_to_srgb, srgb_to_linear
+from morgs_mi.core.color_space import SH_C0, decode_light, encode_light
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, UInt32
@@ -89,7 +89,7 @@ def shadowed(gaussians: Gaussians, ratio: np.ndarray) -> Gaussians:
             f"{list(ratio.shape)}; pass the result of shadow_ratio()."
         )
     mean = np.maximum(0.5 + SH_C0 * np.array(dr.detach(gaussians.sh_coeffs))[:, :1], 1e-6)  # [N, 1, 3]
-    factor = linear_to_srgb(ratio[:, None, None] * srgb_to_linear(mean)) / mean
+    factor = encode_light(ratio[:, None, None] * decode_light(mean)) / mean
     shift = np.zeros((1, int(gaussians.sh_coeffs.shape[1]), 1))
     shift[:, 0] = 0.5 / SH_C0  # factor (0.5 + SH) = 0.5 + SH of the new coefficients
     scale = from_numpy(mi.TensorXf, np.broadcast_to(factor, gaussians.sh_coeffs.shape))

@@ -44,17 +44,11 @@ _THINNEST = 1e-4
 
 @dataclass(frozen=True)
 class _Tree:
-    """Boxes of a complete binary tree with 2^depth leaves.
+    """Boxes of a complete binary tree with 2^depth leaves."""
 
-    Attributes:
-        depth: depth of the leaves; the root has depth 0.
-        flips: for each axis, the bits of a leaf's number that choose a side along it.
-        boxes: lower and upper corner of every node, from 1, in rows of eight floats.
-    """
-
-    depth: UInt32
-    flips: tuple[UInt32, UInt32, UInt32]
-    boxes: Float
+    depth: UInt32  # depth of the leaves; the root has depth 0
+    flips: tuple[UInt32, UInt32, UInt32]  # for each axis, the bits of a leaf's number that choose a side along it
+    boxes: Float  # lower and upper corner of every node, from 1, in rows of eight floats
 
     @staticmethod
     def of(centers: np.ndarray, halves: np.ndarray) -> tuple[_Tree, np.ndarray]:

@@ -144,21 +144,13 @@ def _detached(shapes: list[Any]) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class SampledPixels:
-    """Pixels of a view, and the samples of an integrator in them.
+    """Pixels of a view, and the samples of an integrator in them."""
 
-    Attributes:
-        camera: the view.
-        crop: its pixels, (x, y, width, height), P in all.
-        template: sensor with the sampler and the far plane.
-        seed: seed of the samples.
-        spp: samples per pixel; 0: the sampler's number.
-    """
-
-    camera: Camera
-    crop: tuple[int, int, int, int]
-    template: Any
-    seed: int = 0
-    spp: int = 0
+    camera: Camera  #: The view.
+    crop: tuple[int, int, int, int]  #: Its pixels, (x, y, width, height), P in all.
+    template: Any  #: Sensor with the sampler and the far plane.
+    seed: int = 0  #: Seed of the samples.
+    spp: int = 0  #: Samples per pixel; 0: the sampler's number.
 
     def sensor(self) -> Any:
         """Return a sensor with a film of the pixels."""
@@ -178,34 +170,23 @@ class SampledPixels:
 
 @dataclass(frozen=True)
 class SurfaceView:
-    """Surfaces as seen by one camera, P pixels row by row.
+    """Surfaces as seen by one camera, P pixels row by row."""
 
-    Attributes:
-        scene: the surfaces, see `surface_scene`.
-        gaussians: the other shapes.
-        integrator: renders them.
-        pixels: the pixels and their samples.
-        sensor: the camera, with a film of those pixels.
-        image: radiance and alpha of the nested integrator [h, w, 4], in linear light, a leaf of the gradient graph.
-        coverage: fraction of each pixel in which a surface is seen [P], in [0, 1].
-        depth: mean camera-space z of what is seen there [P], world units; inf where there is no surface.
-        behind: radiance of the environment at the pixels' centres, `mi.Color3f` [P], a leaf of the gradient graph; None
-            if there is none, or the integrator hides it.
-        splats: the Gaussians, for an integrator that traces rays through them; None for other integrators.
-        srgb: whether their colours are sRGB-encoded.
-    """
-
-    scene: Any
-    gaussians: list[Any]
-    integrator: Any
-    pixels: SampledPixels
-    sensor: Any
+    scene: Any  #: The surfaces, see `surface_scene`.
+    gaussians: list[Any]  #: The other shapes.
+    integrator: Any  #: Renders them.
+    pixels: SampledPixels  #: The pixels and their samples.
+    sensor: Any  #: The camera, with a film of those pixels.
+    #: Radiance and alpha of the nested integrator [h, w, 4], in linear light, a leaf of the gradient graph.
     image: Tensor
-    coverage: Float
-    depth: Float
+    coverage: Float  #: Fraction of each pixel in which a surface is seen [P], in [0, 1].
+    depth: Float  #: Mean camera-space z of what is seen there [P], world units; inf where there is no surface.
+    #: Radiance of the environment at the pixels' centres, `mi.Color3f` [P], a leaf of the gradient graph; None if there
+    #: is none, or the integrator hides it.
     behind: Any
+    #: The Gaussians, for an integrator that traces rays through them; None for other integrators.
     splats: SplatRays | None
-    srgb: bool
+    srgb: bool  #: Whether their colours are sRGB-encoded.
 
     @staticmethod
     def of(

@@ -22,19 +22,12 @@ __all__ = ["ActiveView", "make_active_view"]
 
 @dataclass(frozen=True, eq=False)
 class ActiveView:
-    """A view, or its active region, through which Gaussians are rendered.
+    """A view, or its active region, through which Gaussians are rendered."""
 
-    Attributes:
-        camera: the view.
-        config: cut-offs and block shape.
-        region: the blocks of pixels that are drawn; None: the whole view.
-        static_splats: further splats that are drawn there and get no gradients; None: none.
-    """
-
-    camera: Camera
-    config: RenderConfig = field(default_factory=RenderConfig)
-    region: Region | None = None
-    static_splats: Splats | None = None
+    camera: Camera  #: The view.
+    config: RenderConfig = field(default_factory=RenderConfig)  #: Cut-offs and block shape.
+    region: Region | None = None  #: The blocks of pixels that are drawn; None: the whole view.
+    static_splats: Splats | None = None  #: Further splats that are drawn there and get no gradients; None: none.
 
     def render(
         self,

@@ -32,31 +32,18 @@ _TEST_SLACK = 1e-3
 
 @dataclass(frozen=True)
 class BlockLists:
-    """Depth-ordered lists, one per block of pixels, as bits over the entries of its tile.
+    """Depth-ordered lists, one per block of pixels, as bits over the entries of its tile."""
 
-    Attributes:
-        records: (geometry, blended columns) of each rank, see `Splats.geometry` and `pack_records`.
-        words: bit k of a block's i-th word is set if the block draws entry `first` + 32 i + k.
-        entries: ranks, tile by tile.
-        begin: place of each block's first word [A]; the next ones follow at steps of 32.
-        end: place past its last word [A].
-        first: first entry of its tile [A].
-        count: number of set bits of each block [A].
-        order: blocks by falling count, roughly [A]: the lanes of a packet finish together.
-        rank_of: rank of each splat [N].
-        by_rank: splat of each rank [N].
-    """
-
-    records: Float
-    words: UInt32
-    entries: UInt32
-    begin: UInt32
-    end: UInt32
-    first: UInt32
-    count: UInt32
-    order: UInt32
-    rank_of: UInt32
-    by_rank: UInt32
+    records: Float  #: (geometry, blended columns) of each rank, see `Splats.geometry` and `pack_records`.
+    words: UInt32  #: Bit k of a block's i-th word is set if the block draws entry `first` + 32 i + k.
+    entries: UInt32  #: Ranks, tile by tile.
+    begin: UInt32  #: Place of each block's first word [A]; the next ones follow at steps of 32.
+    end: UInt32  #: Place past its last word [A].
+    first: UInt32  #: First entry of its tile [A].
+    count: UInt32  #: Number of set bits of each block [A].
+    order: UInt32  #: Blocks by falling count, roughly [A]: the lanes of a packet finish together.
+    rank_of: UInt32  #: Rank of each splat [N].
+    by_rank: UInt32  #: Splat of each rank [N].
 
 
 def build_lists(

@@ -64,21 +64,13 @@ class Channel:
 
 @dataclass(frozen=True)
 class Layout:
-    """Static description of a blend: the loops are traced once for each.
+    """Static description of a blend: the loops are traced once for each."""
 
-    Attributes:
-        channels: the blended channels, in the order of the records' columns.
-        alpha: whether alpha is an output.
-        alpha_attached: whether the gradient of alpha is wanted.
-        config: cut-offs.
-        cut: whether every pixel has a depth limit.
-    """
-
-    channels: tuple[Channel, ...]
-    alpha: bool
-    alpha_attached: bool
-    config: RenderConfig
-    cut: bool = False
+    channels: tuple[Channel, ...]  #: The blended channels, in the order of the records' columns.
+    alpha: bool  #: Whether alpha is an output.
+    alpha_attached: bool  #: Whether the gradient of alpha is wanted.
+    config: RenderConfig  #: Cut-offs.
+    cut: bool = False  #: Whether every pixel has a depth limit.
 
     @property
     def geometry(self) -> int:

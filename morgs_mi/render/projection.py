@@ -51,27 +51,21 @@ _THINNEST = 1e-6
 
 @dataclass(frozen=True)
 class Splats:
-    """Projected Gaussians, one Dr.Jit float [N] per number.
+    """Projected Gaussians, one Dr.Jit float [N] per number."""
 
-    Attributes:
-        shape: (mean_x, mean_y, a, b, c, log2_opacity), the differentiable geometry (see module docstring).
-        channels: blended values, by channel name.
-        depths: camera-space z in world units, detached.
-        extent: (half width, half height) in px of the region where alpha >= alpha_min, detached; 0 if culled.
-        valid: False where culled: behind the near plane, too faint, or not finite.
-        finite: False where an attribute, or a value computed from it, is not finite, or a blended one is above 1e18.
-        profile: (z, gx, gy, 1 / sigma), the Gaussian in depth along the ray of a pixel (see module docstring), world
-            units, differentiable; empty if no depth limit cuts the splats.
-        view: index of the view that each splat belongs to, in a region of several views; None: there is one view.
-    """
-
+    #: (mean_x, mean_y, a, b, c, log2_opacity), the differentiable geometry (see module docstring).
     shape: tuple[Float, ...]
-    channels: dict[str, tuple[Float, ...]]
-    depths: Float
+    channels: dict[str, tuple[Float, ...]]  #: Blended values, by channel name.
+    depths: Float  #: Camera-space z in world units, detached.
+    #: (half width, half height) in px of the region where alpha >= alpha_min, detached; 0 if culled.
     extent: tuple[Float, Float]
-    valid: Bool
+    valid: Bool  #: False where culled: behind the near plane, too faint, or not finite.
+    #: False where an attribute, or a value computed from it, is not finite, or a blended one is above 1e18.
     finite: Bool
+    #: (z, gx, gy, 1 / sigma), the Gaussian in depth along the ray of a pixel (see module docstring), world units,
+    #: differentiable; empty if no depth limit cuts the splats.
     profile: tuple[Float, ...] = ()
+    #: Index of the view that each splat belongs to, in a region of several views; None: there is one view.
     view: UInt32 | None = None
 
     def __len__(self) -> int:
@@ -103,26 +97,17 @@ def _zeros(columns: tuple[Float, ...], count: int) -> tuple[Float, ...]:
 
 @dataclass(frozen=True)
 class AttachedCamera(Camera):
-    """Camera with intrinsics that get gradients.
+    """Camera with intrinsics that get gradients."""
 
-    Attributes:
-        intrinsics: fx, fy, cx and cy in pixels, with the values of `K`.
-    """
-
-    intrinsics: tuple[Float, ...] = ()
+    intrinsics: tuple[Float, ...] = ()  #: fx, fy, cx and cy in pixels, with the values of `K`.
 
 
 @dataclass(frozen=True)
 class Views:
-    """Several cameras, and the one that each lane projects to.
+    """Several cameras, and the one that each lane projects to."""
 
-    Attributes:
-        cameras: the cameras.
-        view: index of the camera of each lane.
-    """
-
-    cameras: Sequence[Camera]
-    view: UInt32
+    cameras: Sequence[Camera]  #: The cameras.
+    view: UInt32  #: Index of the camera of each lane.
 
 
 def concatenated(a: Jit, b: Jit) -> Jit:

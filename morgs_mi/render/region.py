@@ -45,17 +45,11 @@ NO_SLOT = 0xFFFFFFFF
 
 @dataclass(frozen=True)
 class BlockGrid:
-    """All blocks of a view, in rows and columns that are padded to whole tiles.
+    """All blocks of a view, in rows and columns that are padded to whole tiles."""
 
-    Attributes:
-        width: width of the view in pixels.
-        height: height of the view in pixels.
-        block: (width, height) of a block in pixels.
-    """
-
-    width: int
-    height: int
-    block: tuple[int, int]
+    width: int  #: Width of the view in pixels.
+    height: int  #: Height of the view in pixels.
+    block: tuple[int, int]  #: (width, height) of a block in pixels.
 
     @classmethod
     def of(cls, width: int, height: int, config: RenderConfig) -> BlockGrid:

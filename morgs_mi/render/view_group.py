@@ -105,20 +105,14 @@ class ViewGroup:
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """Gaussians in the views of a group.
+    """Gaussians in the views of a group."""
 
-    Attributes:
-        group: the views.
-        drawn: the projected Gaussians that touch the group's blocks, with the static splats after them, and the lists
-            of the blocks; None if there are no splats.
-        lanes: (view * N + Gaussian) of the splats that are not static, ascending.
-        count: N.
-    """
-
-    group: ViewGroup
+    group: ViewGroup  #: The views.
+    #: The projected Gaussians that touch the group's blocks, with the static splats after them, and the lists of the
+    #: blocks; None if there are no splats.
     drawn: tuple[Splats, BlockLists] | None
-    lanes: UInt32
-    count: int
+    lanes: UInt32  #: (view * N + Gaussian) of the splats that are not static, ascending.
+    count: int  #: N.
 
     @cached_property
     def color(self) -> Float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -59,27 +59,17 @@ class DemoConfig:
 
 @dataclass(frozen=True)
 class DemoReport:
-    """Results of the demonstration.
+    """Results of the demonstration."""
 
-    Attributes:
-        config: the settings.
-        full: evaluation of the fit with motion, offset and confidence.
-        plain: evaluation of the fit without.
-        compared_frames: indices of the frames that both fits have, without the first.
-        comparison: mean scores over these frames, by fit (``full``, ``plain``) and by name.
-        seconds: wall time by step, and ``total``.
-        machine: the machine, see `core.environment`.
-        versions: of the libraries, likewise.
-    """
-
-    config: DemoConfig
-    full: Evaluation
-    plain: Evaluation
-    compared_frames: list[int]
+    config: DemoConfig  #: The settings.
+    full: Evaluation  #: Evaluation of the fit with motion, offset and confidence.
+    plain: Evaluation  #: Evaluation of the fit without.
+    compared_frames: list[int]  #: Indices of the frames that both fits have, without the first.
+    #: Mean scores over these frames, by fit (``full``, ``plain``) and by name.
     comparison: dict[str, dict[str, float | None]]
-    seconds: dict[str, float]
-    machine: dict[str, Any]
-    versions: dict[str, str]
+    seconds: dict[str, float]  #: Wall time by step, and ``total``.
+    machine: dict[str, Any]  #: The machine, see `core.environment`.
+    versions: dict[str, str]  #: Of the libraries, likewise.
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content of ``report.json``."""
@@ -233,11 +223,7 @@ def _panels(capture: Capture, stream: Path, scale: float, note: str = "") -> lis
         panels = {"truth": recorded.images[view], "render": rendered, "error": channel_image("color", error)}
         if truth is not None:
             panels["true motion"] = channel_image("motion", truth.motion, scale)
-        panels |= {name: channel_image(name, images[name], scale) for name in _motion_channels(images)}
+        panels |= {n: channel_image(n, images[n], scale) for n in ("motion", "confidence") if n in images}
         labels = {"truth": f"truth, frame {index}", "error": f"error x{_ERROR_GAIN}", "true motion": "true motion"}
         frames.append({name: label(panel, labels.get(name, name + note)) for name, panel in panels.items()})
     return frames
-
-
-def _motion_channels(images: Mapping[str, np.ndarray]) -> Sequence[str]:
-    return [name for name in ("motion", "confidence") if name in images]

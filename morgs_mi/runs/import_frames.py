@@ -12,7 +12,6 @@ begin. An imported stream has a ring of them, which sees the Gaussians of severa
 
 from __future__ import annotations
 
-import re
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -23,14 +22,16 @@ from scipy.spatial import KDTree
 
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import PacketKind, StreamWriter
-from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, reemitted_keyframe, residual_packet
+from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
 from morgs_mi.core.checks import check_number
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.listing import listed
 from morgs_mi.io.splats import SUFFIXES, read_splats, suffix_of
+from morgs_mi.io.video import natural_key
 from morgs_mi.playback.default_rig import DEFAULT_RIG, Axes, default_rig
+from morgs_mi.runs.recording import due_keyframe
 
 __all__ = ["Imported", "find_frames", "import_frames", "matched_rows", "same_gaussians"]
 
@@ -43,19 +44,12 @@ _LEAST_SURVIVORS = 0.8
 
 @dataclass(frozen=True)
 class Imported:
-    """Result of an import.
+    """Result of an import."""
 
-    Attributes:
-        path: the stream.
-        num_frames: number of its frames.
-        num_keyframes: number of the frames that start a new set of Gaussians.
-        num_bytes: size of the stream.
-    """
-
-    path: Path
-    num_frames: int
-    num_keyframes: int
-    num_bytes: int
+    path: Path  #: The stream.
+    num_frames: int  #: Number of its frames.
+    num_keyframes: int  #: Number of the frames that start a new set of Gaussians.
+    num_bytes: int  #: Size of the stream.
 
 
 def import_frames(
@@ -114,10 +108,10 @@ def import_frames(
                 order = np.argsort(np.where(rows < 0, len(coded), rows), kind="stable")
                 packet = residual_packet(coded, gaussians.select(order), rows[order], cameras, config)
             coded = decode(coded, packet)
-            writer.write(packet)
-            keyframes += packet.kind == PacketKind.KEYFRAME
-            if packet.kind == PacketKind.RESIDUAL and _is_due(coded, config.keyframe_interval):
-                writer.write(reemitted_keyframe(coded))
+            is_keyframe = packet.kind == PacketKind.KEYFRAME
+            keyframes += is_keyframe
+            for each in (packet, *([] if is_keyframe else due_keyframe(coded, config.keyframe_interval))):
+                writer.write(each)
             if progress is not None:
                 progress(frame + 1, len(paths))
     return Imported(path, len(paths), keyframes, path.stat().st_size)
@@ -140,7 +134,8 @@ def find_frames(sources: Sequence[str | Path]) -> list[Path]:
             raise FileNotFoundError(f"{path}: expected frames ({', '.join(SUFFIXES)}), found none; check the path.")
     if len(paths) == 1 and paths[0].is_dir():
         folder = paths[0]
-        paths = sorted((path for path in listed(folder) if path.is_file() and suffix_of(path)), key=_by_numbers)
+        files = (path for path in listed(folder) if path.is_file() and suffix_of(path))
+        paths = sorted(files, key=lambda path: natural_key(path.name))
         if not paths:
             for file in listed(folder):
                 refuse_foreign(file)
@@ -240,14 +235,3 @@ def _features(gaussians: Gaussians) -> np.ndarray:
     return np.concatenate(
         [raw["means"], raw["log_scales"], opacities, raw["sh_coeffs"][:, 0]], axis=1, dtype=np.float64
     )
-
-
-def _is_due(coded: CodedFrame, interval: int) -> bool:
-    """Return whether the state after a frame is re-emitted as a keyframe."""
-    return bool(interval) and coded.frame % interval == 0
-
-
-def _by_numbers(path: Path) -> list[tuple[int, str]]:
-    """Return a key that sorts names as a reader expects: `frame9` before `frame10`."""
-    parts = re.split(r"(\d+)", path.name)
-    return [(int(part), part) if k % 2 else (0, part) for k, part in enumerate(parts)]

@@ -19,6 +19,7 @@ from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.rig import scene_extent
 from morgs_mi.fit.capacity import check_capacity
 from morgs_mi.fit.view import View, mean_psnr
+from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.source import about_lenses, as_fitted
 from morgs_mi.runs.recording import (
@@ -29,7 +30,7 @@ from morgs_mi.runs.recording import (
     interrupted_fit,
     stream_metadata,
 )
-from morgs_mi.stream_loop import FrameReport, StreamLoop
+from morgs_mi.stream_loop import StreamLoop
 
 __all__ = ["Prepared", "push_frame", "stream_capture", "with_next", "with_points"]
 
@@ -112,15 +113,10 @@ def _resumed(loop: StreamLoop, capture: Capture, earlier: Interrupted, progress:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A capture that is ready to be fitted.
+    """A capture that is ready to be fitted."""
 
-    Attributes:
-        capture: with enough points, and with refined cameras where the settings ask for them.
-        refinement: of the cameras; None if they are the calibration's.
-    """
-
-    capture: Capture
-    refinement: Refinement | None = None
+    capture: Capture  #: With enough points, and with refined cameras where the settings ask for them.
+    refinement: Refinement | None = None  #: Of the cameras; None if they are the calibration's.
 
     @classmethod
     def of(cls, capture: Capture, config: StreamConfig, progress: Progress) -> Prepared:

@@ -31,13 +31,14 @@ from morgs_mi.capture.outputs import check_output
 from morgs_mi.codec.container import Packet, PacketKind, StreamWriter, TruncatedStreamError, header_json
 from morgs_mi.codec.packets import CodedFrame, decode, reemitted_keyframe
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.color_space import TRANSFER
 from morgs_mi.core.files import atomic_path, is_same_file, write_json
 from morgs_mi.core.rig import choose_key_views
 from morgs_mi.io.bounded import read_json
+from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.exposure import Exposure
 from morgs_mi.playback.player import PROVISIONAL
-from morgs_mi.stream_loop import FrameReport
 
 __all__ = [
     "FILES",
@@ -235,25 +236,15 @@ class Recording:
 
 @dataclass(frozen=True, eq=False)
 class Interrupted:
-    """An interrupted fit, up to its last complete packet.
+    """An interrupted fit, up to its last complete packet."""
 
-    Attributes:
-        stream: its stream.
-        index: the complete packets.
-        end: offset of the end of the last one.
-        coded: state after it.
-        before: state before the last frame; None if there is none.
-        last: first packet of the last frame.
-        reports: of the frames.
-    """
-
-    stream: StreamReader
-    index: Sequence[Entry]
-    end: int
-    coded: CodedFrame
-    before: CodedFrame | None
-    last: Packet
-    reports: list[FrameReport]
+    stream: StreamReader  #: Its stream.
+    index: Sequence[Entry]  #: The complete packets.
+    end: int  #: Offset of the end of the last one.
+    coded: CodedFrame  #: State after it.
+    before: CodedFrame | None  #: State before the last frame; None if there is none.
+    last: Packet  #: First packet of the last frame.
+    reports: list[FrameReport]  #: Of the frames.
 
 
 def interrupted_fit(
@@ -344,6 +335,8 @@ def stream_metadata(capture: Capture, first: PartialFrame, config: StreamConfig)
         "versions": {"mitsuba": mi.__version__},
         "variant": mi.variant(),
     }
+    if capture.display_exposure is not None:
+        metadata["transfer"] = {"name": TRANSFER, "display_exposure": capture.display_exposure}
     return _without_folders(metadata)
 
 

@@ -59,21 +59,13 @@ class Disturbances:
 
 @dataclass(frozen=True)
 class CameraDisturbance:
-    """The disturbance of one camera.
+    """The disturbance of one camera."""
 
-    Attributes:
-        time_offset: frame k shows the time of frame k + time_offset of the reference, at its middle row.
-        rolling_shutter: time from the first row to the last, frames.
-        gains: factor on the linear light of each frame [T].
-        distortion: k of COLMAP's SIMPLE_RADIAL lens.
-        jpeg_quality: quality of the compression; 0 for none.
-    """
-
-    time_offset: float
-    rolling_shutter: float
-    gains: tuple[float, ...]
-    distortion: float
-    jpeg_quality: int
+    time_offset: float  #: Frame k shows the time of frame k + time_offset of the reference, at its middle row.
+    rolling_shutter: float  #: Time from the first row to the last, frames.
+    gains: tuple[float, ...]  #: Factor on the linear light of each frame [T].
+    distortion: float  #: k of COLMAP's SIMPLE_RADIAL lens.
+    jpeg_quality: int  #: Quality of the compression; 0 for none.
 
     @property
     def lens(self) -> Lens:

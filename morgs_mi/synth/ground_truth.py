@@ -25,15 +25,10 @@ __all__ = [
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """Points on the objects of a scene at one time.
+    """Points on the objects of a scene at one time."""
 
-    Attributes:
-        positions: [..., 3], world units; undefined where the id is negative.
-        ids: object id [...]; -1 where there is no surface, or a lamp.
-    """
-
-    positions: np.ndarray
-    ids: np.ndarray
+    positions: np.ndarray  #: [..., 3], world units; undefined where the id is negative.
+    ids: np.ndarray  #: Object id [...]; -1 where there is no surface, or a lamp.
 
     def reshaped(self, *shape: int) -> SurfacePoints:
         """Return the points in another shape."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.color_space import linear_to_srgb
+from morgs_mi.core.color_space import encode_light
 from morgs_mi.synth.disturbances import undistorted
 from morgs_mi.synth.ground_truth import SurfacePoints
 from morgs_mi.synth.scene import Scene
@@ -27,7 +27,7 @@ def srgb_bytes(linear: np.ndarray, noise: np.ndarray | float = 0.0) -> np.ndarra
 
     Mitsuba's bitmap conversion is not used because it dithers, and dither looks like noise in a static scene.
     """
-    encoded = linear_to_srgb(np.clip(linear, 0, 1))
+    encoded = encode_light(np.clip(linear, 0, 1))
     return np.rint(255 * np.clip(encoded + noise, 0, 1)).astype(np.uint8)
 
 

@@ -41,47 +41,30 @@ Pose = Callable[[float], np.ndarray]
 
 @dataclass(frozen=True)
 class Object:
-    """A rigid object.
+    """A rigid object."""
 
-    Attributes:
-        shapes: Mitsuba shape dictionaries by name, in object space.
-        pose: seconds -> rigid object-to-world matrix [4, 4]; None for a static object, in world space.
-    """
-
-    shapes: Mapping[str, dict[str, Any]]
+    shapes: Mapping[str, dict[str, Any]]  #: Mitsuba shape dictionaries by name, in object space.
+    #: Seconds -> rigid object-to-world matrix [4, 4]; None for a static object, in world space.
     pose: Pose | None = None
 
 
 @dataclass(frozen=True)
 class Light:
-    """A lamp. It has no id in the ground truth, so it must not be visible.
+    """A lamp. It has no id in the ground truth, so it must not be visible."""
 
-    Attributes:
-        shape: Mitsuba dictionary of an emitter, or of a shape with one, in the lamp's space.
-        pose: seconds -> rigid lamp-to-world matrix [4, 4]; None for a static lamp, in world space.
-    """
-
-    shape: dict[str, Any]
-    pose: Pose | None = None
+    shape: dict[str, Any]  #: Mitsuba dictionary of an emitter, or of a shape with one, in the lamp's space.
+    pose: Pose | None = None  #: Seconds -> rigid lamp-to-world matrix [4, 4]; None for a static lamp, in world space.
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Fixed cameras on a spherical cap in front of the scene, all looking at its centre.
+    """Fixed cameras on a spherical cap in front of the scene, all looking at its centre."""
 
-    Attributes:
-        center: point that the cameras look at [3].
-        distance: distance of the cameras from the centre, world units.
-        fov: horizontal field of view, degrees.
-        elevation: elevation of the cap's centre above the horizon, degrees.
-        spread: half-width and half-height of the cap, degrees.
-    """
-
-    center: tuple[float, float, float] = (0.0, 0.8, 0.0)
-    distance: float = 4.2
-    fov: float = 42.0
-    elevation: float = 16.0
-    spread: tuple[float, float] = (26.0, 10.0)
+    center: tuple[float, float, float] = (0.0, 0.8, 0.0)  #: Point that the cameras look at [3].
+    distance: float = 4.2  #: Distance of the cameras from the centre, world units.
+    fov: float = 42.0  #: Horizontal field of view, degrees.
+    elevation: float = 16.0  #: Elevation of the cap's centre above the horizon, degrees.
+    spread: tuple[float, float] = (26.0, 10.0)  #: Half-width and half-height of the cap, degrees.
 
     def cameras(self, count: int, width: int, height: int) -> list[Camera]:
         """Return `count` cameras: ``cam00`` at the centre of the cap, the others evenly distributed around it."""
@@ -100,38 +83,23 @@ class Rig:
 
 @dataclass(frozen=True)
 class RecordingDefaults:
-    """Default settings of a scene's recording, for `synthesize`.
+    """Default settings of a scene's recording, for `synthesize`."""
 
-    Attributes:
-        num_cameras: number of cameras, including the held-out view.
-        spp: samples per pixel.
-        noise: standard deviation of the sensor noise, relative to white.
-    """
-
-    num_cameras: int = 10
-    spp: int = 16
-    noise: float = 0.0
+    num_cameras: int = 10  #: Number of cameras, including the held-out view.
+    spp: int = 16  #: Samples per pixel.
+    noise: float = 0.0  #: Standard deviation of the sensor noise, relative to white.
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A moving scene.
+    """A moving scene."""
 
-    Attributes:
-        name: the scene's name in the capture.
-        objects: objects by name; the index in this mapping is the id in the ground truth.
-        lights: lamps by name.
-        rig: positions of the cameras.
-        exposure: seconds -> exposure factor of all cameras; None for 1.
-        recording: number of cameras and noise.
-    """
-
-    name: str
-    objects: Mapping[str, Object]
-    lights: Mapping[str, Light]
-    rig: Rig = field(default_factory=Rig)
-    exposure: Callable[[float], float] | None = None
-    recording: RecordingDefaults = field(default_factory=RecordingDefaults)
+    name: str  #: The scene's name in the capture.
+    objects: Mapping[str, Object]  #: Objects by name; the index in this mapping is the id in the ground truth.
+    lights: Mapping[str, Light]  #: Lamps by name.
+    rig: Rig = field(default_factory=Rig)  #: Positions of the cameras.
+    exposure: Callable[[float], float] | None = None  #: Seconds -> exposure factor of all cameras; None for 1.
+    recording: RecordingDefaults = field(default_factory=RecordingDefaults)  #: Number of cameras and noise.
 
 
 def load_scene(scene: str | Path, seed: int = 0) -> Scene:

@@ -119,17 +119,11 @@ def synthesize(
 
 @dataclass(frozen=True)
 class _Rig:
-    """Cameras that record a scene.
+    """Cameras that record a scene."""
 
-    Attributes:
-        cameras: cameras without distortion.
-        disturbed: disturbance of each camera.
-        config: complete settings.
-    """
-
-    cameras: Sequence[Camera]
-    disturbed: Sequence[CameraDisturbance]
-    config: SynthConfig
+    cameras: Sequence[Camera]  # cameras without distortion
+    disturbed: Sequence[CameraDisturbance]  # disturbance of each camera
+    config: SynthConfig  # complete settings
 
     @classmethod
     def of(cls, scene: Scene, config: SynthConfig) -> _Rig:

@@ -15,6 +15,7 @@ from morgs_mi.synth.scene import Light, Object
 __all__ = ["lights", "pattern", "room", "textured"]
 
 RGB = tuple[float, float, float]
+_SIZE = 512  # texels across
 
 
 def fractal(rng: np.random.Generator, size: int, finest: float) -> np.ndarray:
@@ -25,8 +26,8 @@ def fractal(rng: np.random.Generator, size: int, finest: float) -> np.ndarray:
     return noise / noise.std()
 
 
-def pattern(seed: int, first: RGB, second: RGB, cells: int, finest: float, size: int = 512) -> np.ndarray:
-    """Return a reflectance texture [size, size, 3], linear: a checker of two colours under coloured noise.
+def pattern(seed: int, first: RGB, second: RGB, cells: int, finest: float) -> np.ndarray:
+    """Return a reflectance texture [512, 512, 3], linear: a checker of two colours under coloured noise.
 
     Args:
         seed: seed of the noise.
@@ -34,13 +35,12 @@ def pattern(seed: int, first: RGB, second: RGB, cells: int, finest: float, size:
         second: the other.
         cells: squares across; an even number gives a periodic texture.
         finest: highest frequency of the noise in cycles across.
-        size: texels across.
     """
     rng = np.random.default_rng(seed)
-    x = np.arange(size) * cells // size
+    x = np.arange(_SIZE) * cells // _SIZE
     checker = ((x[:, None] + x) % 2)[..., None]
-    shade = fractal(rng, size, finest)[..., None]
-    tint = np.stack([fractal(rng, size, finest) for _ in range(3)], axis=-1)
+    shade = fractal(rng, _SIZE, finest)[..., None]
+    tint = np.stack([fractal(rng, _SIZE, finest) for _ in range(3)], axis=-1)
     texture = np.where(checker == 1, first, second) * np.exp(0.35 * shade + 0.10 * tint)
     return np.clip(texture, 0.03, 0.85).astype(np.float32)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import shutil
+from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -21,7 +22,6 @@ from morgs_mi.calibration.calibrate import (
     _frames,
     _map,
     _match,
-    _opened,
     calibrate,
 )
 from morgs_mi.calibration.checks.rig_check import CameraCheck, check_rig, match_capture
@@ -77,7 +77,7 @@ def test_calibrate__finds_the_same_poses_on_every_run(tmp_path: Path) -> None:
     images, _ = _frames(tmp_path, config, ())
     (scratch := tmp_path / "scratch").mkdir()
     _match(tmp_path, images, {}, scratch, config, lambda *_: None)
-    with _opened(scratch / _DATABASE) as db:
+    with closing(pycolmap.Database.open(scratch / _DATABASE)) as db:
         numbered = sorted((image.image_id, Path(image.name).stem) for image in db.read_all_images())
     assert [name for _, name in numbered] == list(images), "other numbers change the world's axes by 0.1"
     found = []

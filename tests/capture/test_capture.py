@@ -64,13 +64,6 @@ def test_frames__releases_the_images_of_past_frames(tmp_path: Path) -> None:
     assert len(references) == 40
 
 
-def test_load_capture__orders_cameras_by_number(tmp_path: Path) -> None:
-    names = ("cam_0", "cam_2", "cam_10")
-    capture = load_capture(n3dv(tmp_path, names))
-    assert capture.names == names
-    assert [image[0, 0, 0] for image in next(capture.frames()).images] == [0, 1, 2]
-
-
 def test_load_capture__prefers_the_colmap_model_and_orders_it_by_number(tmp_path: Path) -> None:
     points = np.arange(6.0).reshape(2, 3)
     names = ("cam10", "cam2", "cam1")  # a model lists its images in any order
@@ -216,38 +209,12 @@ def no_videos(path: Path) -> None:
     [video.unlink() for video in path.glob("*.mp4")]
 
 
-def no_calibration(path: Path) -> None:
-    shutil.rmtree(path / "sparse")
-
-
-def other_names(path: Path) -> None:
-    for i in (1, 2):
-        (path / f"cam0{i}.mp4").rename(path / f"left{i}.mp4")
-
-
 def other_size(path: Path) -> None:
     write_video(path / "cam02.mp4", frames(1, width=WIDTH - 2), FPS)
 
 
-def other_length(path: Path) -> None:
-    write_video(path / "cam02.mp4", frames(1, count=COUNT + 2), FPS)
-
-
-def other_rate(path: Path) -> None:
-    write_video(path / "cam02.mp4", frames(1), 60)
-
-
-def empty_clip(path: Path) -> None:
-    (path / "cam02.mp4").write_bytes(b"")
-
-
 def two_images_of_a_camera(path: Path) -> None:
     write_colmap(path / "sparse/0", [make_camera(0, "cam01"), make_camera(1, "cam01/0001.png")])
-
-
-def missing_video_of_a_row(path: Path) -> None:
-    no_calibration(path)
-    write_poses_bounds(path / "poses_bounds.npy", [make_camera(i, "") for i in range(3)], [[1, 9]] * 3)
 
 
 def bad_settings(path: Path) -> None:
@@ -294,25 +261,15 @@ def square(camera: Camera) -> Camera:
         (no_folder, FileNotFoundError, "expected a capture folder, found none"),
         (no_videos, FileNotFoundError, r"expected videos \(.mp4"),
         (
-            no_calibration,
-            FileNotFoundError,
-            r"expected a calibration .*; run `morgs-mi calibrate`",
-        ),
-        (other_names, FileNotFoundError, "named after its cameras cam01.png, cam02.png, found left1, left2; name"),
-        (
             other_size,
             ValueError,
             "cam02.mp4: expected 62x46, the calibrated size of cam02, or a scaled version of it, got 60x46",
         ),
-        (other_length, ValueError, "got cam01.mp4 4, cam02.mp4 6; .*max_frames=4"),
-        (other_rate, ValueError, "the same frame rate, got cam01.mp4 25, cam02.mp4 60; .*--trim"),
-        (empty_clip, ValueError, "cam02.mp4: expected a video, got an empty file"),
         (
             two_images_of_a_camera,
             ValueError,
             "cameras must not move, but 'cam01.png' and 'cam01/0001.png', both of cam01, have",
         ),
-        (missing_video_of_a_row, ValueError, r"got 3 rows for 2 videos \(cam01, cam02\)"),
         (
             bad_settings,
             ValueError,
@@ -364,7 +321,7 @@ def test_load_capture__refuses_point_colours_out_of_range(tmp_path: Path, colors
     (row,) = (line for line in (path / "sparse/0/points3D.txt").read_text().splitlines() if line[0] != "#")
     fields = [*row.split()[:4], *map(str, colors[0]), "0.5"]
     (path / "sparse/0/points3D.txt").write_text(" ".join(fields) + "\n")
-    with pytest.raises(ValueError, match=r"`point_colors` must be in \[0, 1\], got .*; divide"):
+    with pytest.raises(ValueError, match=r"`point_colors` must be from 0 to 32 with white at 1, got .*; divide"):
         load_capture(path)
 
 

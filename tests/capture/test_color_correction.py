@@ -12,7 +12,7 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.color_correction import ColorFit, delta_e, fit_colors
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.timeline import ReadConfig
-from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
+from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.io.video_writer import write_video
 from tests.assertions import assert_close
 from tests.scenes import textured
@@ -29,11 +29,11 @@ SENSORS = np.array(
 
 
 def linear(image: np.ndarray) -> np.ndarray:
-    return srgb_to_linear(image / 255)
+    return decode_light(image / 255)
 
 
 def encoded(light: np.ndarray) -> np.ndarray:
-    return np.rint(255 * linear_to_srgb(np.clip(light, 0, 1))).astype(np.uint8)
+    return np.rint(255 * encode_light(np.clip(light, 0, 1))).astype(np.uint8)
 
 
 def through(sensor: np.ndarray, image: np.ndarray, gain: float = 1.0) -> np.ndarray:

@@ -96,7 +96,7 @@ def test_info__checks_a_whole_recording(textured_capture: Capture, tmp_path: Pat
     assert status == 0
     assert "Check of 1 frames: no findings." in out
     assert "Not measured, without enough common motion or matches: time offsets of all cameras." in out
-    assert cv2.imread(str(plot)).shape == (760 + 700, 1440, 3)
+    assert cv2.imread(str(plot)).shape == (760 + 560, 1440, 3)
     content = json.loads(measured.read_text())
     assert content["offsets"] == [None] * 6
     np.testing.assert_allclose(content["gains"], np.zeros((6, 3)), atol=0.02)

@@ -24,7 +24,7 @@ import mitsuba as mi
 import numpy as np
 
 import morgs_mi  # noqa: F401  (finds a usable LLVM before the variant is set)
-from morgs_mi.codec.packets import CodedFrame, coded_frames, frames_near, seek
+from morgs_mi.codec.packets import CodedFrame, coded_frames
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.playback.player import has_confidence, has_offset, num_frames, open_stream_capture, render_config
 from tests.codec.forge import Forgery, damaged, with_forged_bytes, with_forged_header, with_forged_packets
@@ -93,7 +93,7 @@ def check_intact_frames(clip: Clip, data: bytes, path: Path) -> None:
         for piece in clip.pieces[first + 1 : -1]:
             behind = [p for p in clip.pieces[first:] if p.start >= piece.start and p.frame <= piece.frame + 1]
             if piece.kind == 1 and piece.frame + 1 < FRAMES and all(intact[clip.pieces.index(p)] for p in behind):
-                assert not differs(seek(StreamReader(path), piece.frame + 1), clip)
+                assert not differs(StreamReader(path).seek(piece.frame + 1), clip)
 
 
 def playable(clip: Clip, intact: list[bool]) -> list[int]:
@@ -163,7 +163,7 @@ def check_seek(stream: StreamReader, played: list[CodedFrame]) -> None:
     """
     digests = {state.frame: state.digest for state in played}
     for state in (*played[len(played) // 2 : -1][:1], *played[-1:]):
-        start, found = next(frames_near(stream, state.frame)), seek(stream, state.frame)
+        start, found = next(stream.states(state.frame)), stream.seek(state.frame)
         assert found.frame == state.frame
         if np.array_equal(start.digest, digests.get(start.frame)):
             assert np.array_equal(found.digest, state.digest), state.frame

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.codec.container import Packet, PacketKind
-from morgs_mi.codec.packets import CodedFrame, coded_frames, decode, reemitted_keyframe, seek
+from morgs_mi.codec.packets import CodedFrame, coded_frames, decode, reemitted_keyframe
 from morgs_mi.codec.quantisation import Grid
 from morgs_mi.codec.reader import StreamReader
 from tests.codec.forge import forged_streams
@@ -97,7 +97,7 @@ def test_stream_reader__continues_at_the_next_intact_keyframe(
     assert {frame for _, frame, _ in stream.index()} == {state.frame for state in states}
     for state in states:
         assert not differs(state, clip)
-        assert not differs(seek(stream, state.frame), clip)
+        assert not differs(stream.seek(state.frame), clip)
 
 
 def test_stream_reader__skips_the_rest_behind_a_damaged_length_without_an_index(clip: Clip, tmp_path: Path) -> None:
@@ -130,14 +130,14 @@ def test_seek__plays_from_the_start_where_a_keyframe_or_the_index_is_forged(clip
         (tmp_path / "s").write_bytes(data)
         stream = StreamReader(tmp_path / "s")
         for state in coded_frames(stream):
-            assert not differs(seek(stream, state.frame), clip)
+            assert not differs(stream.seek(state.frame), clip)
 
 
 def constant(N: int, degree: int) -> CodedFrame:
     """Return N equal Gaussians, which an entropy code stores in almost no bytes."""
     C = 10 + 3 * (degree + 1) ** 2
     grid = Grid(np.zeros((N, C), np.int32), np.zeros((N, 8), np.int8), np.zeros(N, np.uint8), degree, 0)
-    return CodedFrame(0, grid, np.arange(N, dtype=np.uint32), N, cloud(1))
+    return CodedFrame(0, np.arange(N, dtype=np.uint32), cloud(1), grid, N)
 
 
 def test_reemitted_keyframe__is_padded_to_the_words_that_its_integers_need() -> None:

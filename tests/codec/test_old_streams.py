@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.codec.container import VERSION
-from morgs_mi.codec.packets import coded_frames, seek
+from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
 
 STREAMS = Path(__file__).parent / "streams"
@@ -43,7 +43,7 @@ def summary(path: Path) -> list[dict[str, Any]]:
 def test_old_streams__decode_to_the_same_numbers(path):
     expected = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
     assert summary(path) == expected
-    assert seek(StreamReader(path), expected[-1]["frame"]).digest.tobytes().hex() == expected[-1]["integers"]
+    assert StreamReader(path).seek(expected[-1]["frame"]).digest.tobytes().hex() == expected[-1]["integers"]
 
 
 def test_old_streams__are_those_that_the_page_of_promises_lists():

@@ -12,8 +12,8 @@ import pytest
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import Packet, PacketKind, encode_packet
 from morgs_mi.codec.packets import (
+    coded_frames,
     decode,
-    frames_with_lasting_ids,
     keyframe_packet,
     reemitted_keyframe,
     residual_packet,
@@ -191,10 +191,10 @@ def test_packets__refuse_bad_input(call, message: str) -> None:
         call(state)
 
 
-def test_frames_with_lasting_ids__shifts_the_ids_of_a_new_set_of_gaussians() -> None:
+def test_lasting_ids__continue_after_those_of_the_set_before() -> None:
     """A re-emitted keyframe repeats a set; a keyframe of the next frame starts another one with ids from 0."""
     first = keyframe_packet(cloud(3), 0)
     state = decode(None, first)
     packets = [first, reemitted_keyframe(state), residual_packet(state, cloud(3)), keyframe_packet(cloud(2), 2)]
-    found = [(coded.frame, ids.tolist()) for ids, coded in frames_with_lasting_ids(packets)]
+    found = [(coded.frame, coded.lasting_ids.tolist()) for coded in coded_frames(packets)]
     assert found == [(0, [0, 1, 2]), (1, [0, 1, 2]), (2, [3, 4])]

@@ -17,7 +17,6 @@ from morgs_mi.codec.container import StreamWriter, TruncatedStreamError, encode_
 from morgs_mi.codec.packets import (
     CodedFrame,
     coded_frames,
-    seek,
 )
 from morgs_mi.codec.reader import StreamReader
 from tests.scenes.coded_clip import CAMERAS, assert_same, encoded_clip, history, write
@@ -33,10 +32,10 @@ def test_seek__equals_playing_with_and_without_an_index(tmp_path: Path) -> None:
         reader = StreamReader(path)
         assert len(reader.index()) == 14 + 3
         for state in states:
-            assert_same(seek(reader, state.frame), state)
+            assert_same(reader.seek(state.frame), state)
         assert len(list(reader.near(9))) == 14 + 3 - 10  # starting at the keyframe of frame 8
     with pytest.raises(ValueError, match="expected a frame of the stream, got 14"):
-        seek(StreamReader(path), 14)
+        StreamReader(path).seek(14)
 
 
 def pipe() -> tuple[BinaryIO, BinaryIO]:
@@ -127,7 +126,7 @@ print(history(coded_frames(StreamReader({str(tmp_path / "s")!r}))))
     expected = history(states)
     assert result.stdout.strip() == expected
     assert history(coded_frames(StreamReader(tmp_path / "s"))) == expected
-    assert_same(seek(StreamReader(tmp_path / "s"), frames - 1), states[-1])
+    assert_same(StreamReader(tmp_path / "s").seek(frames - 1), states[-1])
 
 
 def test_coded_frames__name_file_packet_and_byte(tmp_path: Path) -> None:

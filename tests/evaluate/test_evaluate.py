@@ -15,13 +15,15 @@ from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, reemitted_keyframe, residual_packet
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.color_space import SH_C0
+from morgs_mi.core.color_space import SH_C0, TRANSFER, decode_light, display_image
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.lpips import Lpips
 from morgs_mi.evaluate.measures import IMAGE_SCORES, REGIONS
+from morgs_mi.evaluate.metrics import psnr, psnr_mu
 from morgs_mi.evaluate.results import known_mean
 from morgs_mi.evaluate.tables import evaluation_summary
 from morgs_mi.fit.forecast import forecast
+from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.render.rasterize import rasterize
 from tests.evaluate.tiny_onnx import squared_difference
@@ -256,3 +258,22 @@ def test_evaluate_stream__refuses_a_stream_of_another_capture(fitted_clip: Path,
         writer.write(keyframe_packet(moved(0), FRAMES))
     with pytest.raises(ValueError, match="expected consecutive frames out of the 3 of"):
         evaluate_stream(tmp_path / "late.morgs", fitted_clip / "capture")
+
+
+def test_evaluate_stream__compares_the_light_of_an_hdr_recording(tmp_path: Path) -> None:
+    write_colmap(tmp_path / "capture" / "sparse", CAMERAS)
+    for camera in CAMERAS:
+        (tmp_path / "capture" / camera.name).mkdir()
+        for t in range(FRAMES):
+            light = 2 * decode_light(np.array(rasterize(moved(t), camera).color))
+            planes = {name: light[..., k] for k, name in enumerate("RGB")}
+            write_exr(tmp_path / "capture" / camera.name / f"{t:04d}.exr", planes)
+    about = {"capture": str(tmp_path / "capture"), "test_view": 0}
+    write_stream(tmp_path / "s.morgs", about | {"transfer": {"name": TRANSFER, "display_exposure": -1}})
+    scores = evaluate_stream(tmp_path / "s.morgs").scores
+    color = np.array(rasterize(moved(0), CAMERAS[0]).color)
+    light, truth = (gain * decode_light(color) for gain in (1, 2))
+    assert truth.max() > 1
+    assert scores.psnr_mu == pytest.approx(psnr_mu(light, truth), abs=0.5)
+    shown = psnr(display_image(light, -1), display_image(truth, -1))
+    assert scores.psnr == pytest.approx(shown, abs=0.5)

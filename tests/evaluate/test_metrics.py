@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morgs_mi.evaluate.metrics import delta_e_map, endpoint_error, iou, mean_over, psnr, ssim, ssim_map
+from morgs_mi.evaluate.metrics import delta_e_map, endpoint_error, iou, mean_over, psnr, psnr_mu, ssim, ssim_map
 
 rng = np.random.default_rng(0)
 TRUTH = rng.random((24, 31, 3))
@@ -131,3 +131,14 @@ def test_mean_over__centres_a_smaller_map_in_the_mask():
 def test_metrics__refuse_bad_input(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_psnr_mu__is_the_psnr_of_the_mu_law_relative_to_the_brightest_true_value():
+    truth = np.full((4, 4, 3), 20.0)
+    truth[0] = 0
+    assert psnr_mu(truth, truth) == np.inf
+    light = np.where(truth > 0, 10.0, 0.0)
+    error = 1 - np.log1p(2500) / np.log1p(5000)
+    assert psnr_mu(light, truth) == pytest.approx(-10 * np.log10(0.75 * error**2))
+    assert psnr_mu(1000 * light, truth) == np.inf, "values above the brightest true one are clipped"
+    assert psnr_mu(light, truth, np.arange(16).reshape(4, 4) < 4) == np.inf

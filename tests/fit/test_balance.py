@@ -9,7 +9,7 @@ import pytest
 
 from morgs_mi import Gaussians, RenderConfig, rasterize
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
+from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.rig import scene_extent
 from morgs_mi.fit.balance import Balance, balance_cameras, balance_config
@@ -37,7 +37,7 @@ def scene() -> Gaussians:
 
 
 def exposed(colors: np.ndarray, gain: float) -> np.ndarray:
-    return linear_to_srgb(np.clip(gain * srgb_to_linear(colors), 0, 1))
+    return encode_light(np.clip(gain * decode_light(colors), 0, 1))
 
 
 def images(cameras: list[Camera], gains: np.ndarray) -> list[np.ndarray]:

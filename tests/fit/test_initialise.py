@@ -10,7 +10,7 @@ import pytest
 from morgs_mi import Camera
 from morgs_mi.core.rig import focus_point, scene_extent, seen_points
 from morgs_mi.fit.empty_space import in_empty_space
-from morgs_mi.fit.initialise import MIN_POINTS, fill_points, initial_points, seed_points
+from morgs_mi.fit.initialise import MIN_POINTS, _in_light, fill_points, initial_points, seed_points
 from morgs_mi.fit.view import View
 from tests.scenes.cameras import arc, look_at_cameras
 
@@ -130,3 +130,16 @@ def test_seen_points__leaves_out_points_behind_and_beside_the_camera():
     assert inside.tolist() == [True, False, False]
     np.testing.assert_allclose(pixels, [(camera.width / 2, camera.height / 2)])
     np.testing.assert_allclose(depths, [3])
+
+
+def test_in_light__points_get_the_median_colours_of_hdr_views():
+    """The points of a recording have colours of 8 bits; a view in which something hides a point does not matter."""
+    cameras = look_at_cameras([(x, 0, -4) for x in (-0.5, 0, 0.5)], 60, 40, 30)
+    images = [np.full((30, 40, 3), light, np.float32) for light in (2.5, 2.6, 0.1)]
+    masks = [None, np.ones((30, 40), bool), None]
+    views = [View(*view) for view in zip(cameras, images, masks, strict=True)]
+    inside, outside = np.random.default_rng(0).uniform(-0.5, 0.5, (30, 3)), np.array([[90, 0, 0]])
+    points = np.concatenate([inside, outside]), np.full((31, 3), 0.75)
+    expected = np.repeat([2.5, 0.75], (30, 1))[:, None] * np.ones(3)
+    np.testing.assert_allclose(_in_light(points, views)[1], expected)
+    assert _in_light(points, [View(camera, np.zeros((30, 40, 3), np.uint8)) for camera in cameras]) is points

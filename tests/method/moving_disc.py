@@ -5,6 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from morgs_mi.method.flow import FlowObservation, observe_key_views
+from morgs_mi.method.flow_sources.flow_registry import FramePair
+
 
 def texture(height: int, width: int, seed: int) -> np.ndarray:
     """Return a random texture [H, W, 3] in [0, 1] with detail of 2 to 8 pixels."""
@@ -29,3 +32,8 @@ def moving_disc(
         frame = np.where(mask[..., None], np.roll(disc, (dy, dx), (0, 1)), background)
         frames.append(np.clip(frame + rng.normal(0, noise, frame.shape), 0, 1))
     return frames[0], frames[1], mask
+
+
+def observed(image: np.ndarray, previous: np.ndarray, mask_method: str | None = None) -> FlowObservation:
+    """Return the flow observation of two images of one camera."""
+    return observe_key_views({0: FramePair(image, previous)}, "dis", mask_method)[0]

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from morgs_mi.method.confidence import flow_mask, flow_threshold, motion_floor, motion_mask
-from morgs_mi.method.flow import observe_flow, observe_key_views
+from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FramePair
 from morgs_mi.method.mask_refiners.mask_config import MaskConfig
 from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, mask_refiner
-from tests.method.moving_disc import moving_disc
+from tests.method.moving_disc import moving_disc, observed
 
 CAMERA_NOISE = 2 / 255  # standard deviation of a video camera in room light
 
@@ -23,14 +23,14 @@ def overlap(a: np.ndarray, b: np.ndarray) -> float:
 @pytest.mark.parametrize("method", MASK_REFINERS.names)
 def test_motion_mask__is_empty_for_a_static_pair_under_camera_noise(method, size):
     previous, image, _ = moving_disc(*size, shift=(0, 0), noise=CAMERA_NOISE)
-    assert not observe_flow(image, previous, mask_method=method).mask.any()
+    assert not observed(image, previous, method).mask.any()
 
 
 @pytest.mark.parametrize("shift", [(6, -4), (1, 0)])
 @pytest.mark.parametrize("method", MASK_REFINERS.names)
 def test_motion_mask__finds_a_moving_disc(method, shift):
     previous, image, disc = moving_disc(240, 320, shift, CAMERA_NOISE)
-    mask = observe_flow(image, previous, mask_method=method).mask
+    mask = observed(image, previous, method).mask
     # DIS spreads motion by up to half a patch, 4 px: the bound is a disc of 48 px radius grown by that much.
     assert overlap(mask, disc) > (48 / 52) ** 2 - 0.1
     assert mask[disc].mean() > 0.95
@@ -38,19 +38,13 @@ def test_motion_mask__finds_a_moving_disc(method, shift):
 
 def test_motion_mask__with_grabcut_contains_the_flow_mask():
     previous, image, _ = moving_disc(120, 160, (3, 2))
-    observation = observe_flow(image, previous, mask_method="grabcut")
+    observation = observed(image, previous, "grabcut")
     assert not (flow_mask(observation.motion, observation.reliable) & ~observation.mask).any()
-
-
-def test_motion_mask__without_refinement_is_the_flow_mask():
-    previous, image, _ = moving_disc(120, 160, (3, 2))
-    observation = observe_flow(image, previous, mask_method="none")
-    np.testing.assert_array_equal(observation.mask, flow_mask(observation.motion, observation.reliable))
 
 
 def test_motion_mask__passes_its_config_to_threshold_and_refiner():
     previous, image, _ = moving_disc(120, 160, (3, 2), CAMERA_NOISE)
-    motion = observe_flow(image, previous).motion
+    motion = observed(image, previous).motion
     for config in (MaskConfig(floor=20), MaskConfig(superpixel_share=0.2)):
         expected = mask_refiner("superpixels+grabcut", config)(image, flow_mask(motion, config=config))
         np.testing.assert_array_equal(motion_mask(image, motion, method="superpixels+grabcut", config=config), expected)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
+from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.method.exposure import (
     LEAST_CHANGE,
     Exposure,
@@ -42,7 +42,7 @@ def test_fit_exposure__is_not_drawn_by_a_third_of_moved_pixels():
 
 def test_fit_exposure__explains_a_factor_on_the_light_within_a_grey_level():
     colors = scene()
-    brighter = linear_to_srgb(1.2 * srgb_to_linear(colors))
+    brighter = encode_light(1.2 * decode_light(colors))
     found = fit_exposure(colors, brighter)
     assert np.abs(found(colors) - brighter).max() < 1 / 255
 
@@ -56,9 +56,9 @@ def test_fit_exposure__is_the_prior_of_images_that_do_not_show_the_same():
 
 
 def test_fit_exposure__explains_a_change_by_a_factor_on_the_light_where_images_have_no_contrast():
-    dull = linear_to_srgb(np.random.default_rng(0).uniform(0.2, 0.21, (40, 40, 3)))
-    found = fit_exposure(dull, linear_to_srgb(1.1 * srgb_to_linear(dull)))
-    np.testing.assert_allclose(found(scene()), linear_to_srgb(1.1 * srgb_to_linear(scene())), atol=0.003)
+    dull = encode_light(np.random.default_rng(0).uniform(0.2, 0.21, (40, 40, 3)))
+    found = fit_exposure(dull, encode_light(1.1 * decode_light(dull)))
+    np.testing.assert_allclose(found(scene()), encode_light(1.1 * decode_light(scene())), atol=0.003)
 
 
 def test_fit_exposure__ignores_masked_pixels():

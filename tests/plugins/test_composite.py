@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from morgs_mi import Gaussians, rasterize
-from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
+from morgs_mi.core.color_space import decode_light, encode_light
 from tests import tolerances as tol
 from tests.assertions import assert_close
 from tests.scenes.gaussians import isotropic
@@ -38,7 +38,7 @@ def splats(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
 def over(gaussians: Gaussians, linear: Any) -> np.ndarray:
     """Return Gaussians over linear light, blended display-referred, as linear light."""
     color, transmittance = splats(gaussians)
-    return srgb_to_linear(color + transmittance * linear_to_srgb(np.asarray(linear)))
+    return decode_light(color + transmittance * encode_light(np.asarray(linear)))
 
 
 def test_surfaces__in_front_equal_themselves_alone():
@@ -74,7 +74,7 @@ def test_surfaces__behind_show_through_the_splats():
     assert_close(render(scene(gaussians, wall=wall(1, **glowing()))), over(gaussians, COLOR), atol=tol.IMAGE_ABS)
     black = {"bsdf": {"type": "diffuse", "reflectance": 0.0}}
     found = render(scene(gaussians, wall=wall(1, **black), lamp=LAMP))
-    assert_close(found, srgb_to_linear(splats(gaussians)[0]), atol=tol.IMAGE_ABS)
+    assert_close(found, decode_light(splats(gaussians)[0]), atol=tol.IMAGE_ABS)
 
 
 def test_surfaces__around_the_camera_are_behind_all_splats():
@@ -111,7 +111,7 @@ def test_surfaces__cover_a_pixel_by_the_fraction_that_they_fill():
     splat = Gaussians.from_activated([(0, 0, 1)], [(50, 50, 0.01)], [(1, 0, 0, 0)], [0.999], np.full((1, 1, 3), 0.2))
     half = 0.61
     image = render(scene(splat, card=wall(0, half, **glowing((0.9, 0.9, 0.9)))), spp=1024)
-    color = srgb_to_linear(splats(splat)[0])
+    color = decode_light(splats(splat)[0])
     f = camera().K[0, 0]
     edge = 16 + f * half / 4  # in px
     column = int(edge)
@@ -123,7 +123,7 @@ def test_surfaces__cover_a_pixel_by_the_fraction_that_they_fill():
 def test_surfaces__background_is_behind_all():
     gaussians, background = cloud(0.0), (0.1, 0.4, 0.8)
     found = render(scene(gaussians, card=wall(1, 0.5, **glowing()), props={"background": list(background)}))
-    expected = over(gaussians, srgb_to_linear(np.array(background)))
+    expected = over(gaussians, decode_light(np.array(background)))
     outside = np.hypot(*np.meshgrid(np.arange(32) - 15.5, np.arange(24) - 11.5)) > 10
     assert_close(found, expected, atol=tol.IMAGE_ABS, where=outside[..., None])
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, Gaussians, light_probe, rasterize
-from morgs_mi.core.color_space import SH_C0, srgb_to_linear
+from morgs_mi.core.color_space import SH_C0, decode_light
 from tests.assertions import assert_close
 from tests.scenes.gaussians import isotropic
 from tests.scenes.surfaces import render, scene
@@ -38,13 +38,13 @@ def test_light_probe__shows_every_direction_where_it_is():
     colors = rng.uniform(0.1, 0.9, (len(axes), 3))
     lamps = isotropic(CENTER + 5 * axes, 0.6, 0.99, ((colors - 0.5) / SH_C0)[:, None])
     probe = light_probe(lamps, CENTER)
-    assert_close(radiance(probe, axes), srgb_to_linear(0.99 * colors), atol=0.02)
+    assert_close(radiance(probe, axes), decode_light(0.99 * colors), atol=0.02)
 
 
 def test_light_probe__of_a_uniform_shell_is_uniform():
     rng = np.random.default_rng(2)
     found = radiance(light_probe(shell(), CENTER, height=32), rng.normal(size=(100, 3)))
-    assert_close(found, srgb_to_linear(np.array(0.5)), atol=2e-3)
+    assert_close(found, decode_light(np.array(0.5)), atol=2e-3)
 
 
 def test_light_probe__assigns_a_radiance_to_what_is_clipped():
@@ -57,7 +57,7 @@ def test_light_probe__assigns_a_radiance_to_what_is_clipped():
 def test_light_probe__leaves_out_what_is_near_and_shows_the_background():
     near = isotropic([CENTER + np.array([0, 0, 0.2])], 0.05, 0.9)
     probe = light_probe(near, CENTER, height=16, background=(0.5, 0.5, 0.5), near=0.5)
-    assert_close(np.array(probe["bitmap"]), srgb_to_linear(np.array(0.5)), atol=1e-5)
+    assert_close(np.array(probe["bitmap"]), decode_light(np.array(0.5)), atol=1e-5)
 
 
 def test_light_probe__in_a_plane_mirror_is_the_view_of_the_mirrored_camera():
@@ -75,7 +75,7 @@ def test_light_probe__in_a_plane_mirror_is_the_view_of_the_mirrored_camera():
     # The mirror hides what is behind it from the camera; the Gaussians are behind the camera.
     light = light_probe(gaussians, mirrored.position, height=512, clipped=1.0)
     image = render(scene(gaussians, view=view, mirror=mirror, light=light), spp=16)
-    expected = srgb_to_linear(np.asarray(rasterize(gaussians, mirrored).color, np.float64))[:, ::-1]
+    expected = decode_light(np.asarray(rasterize(gaussians, mirrored).color, np.float64))[:, ::-1]
     assert np.abs(image - expected).mean() < 0.004
     assert np.corrcoef(image.ravel(), expected.ravel())[0, 1] > 0.998
 

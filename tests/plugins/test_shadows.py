@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, Gaussians, rasterize, shadow_ratio, shadowed
-from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
+from morgs_mi.core.color_space import decode_light, encode_light
 from tests.assertions import assert_close
 from tests.scenes.gaussians import isotropic
 
@@ -99,7 +99,7 @@ def test_shadowed__scales_the_linear_light_of_an_image():
         np.asarray(rasterize(gaussians, camera, ("color", "alpha")).color, np.float64)
         for gaussians in (wall, shadowed(wall, np.array([0.3])))
     )
-    assert_close(after / 0.98, linear_to_srgb(0.3 * srgb_to_linear(before / 0.98)), atol=1e-4)
+    assert_close(after / 0.98, encode_light(0.3 * decode_light(before / 0.98)), atol=1e-4)
 
 
 def test_shadowed__scales_all_directions_alike_and_one_changes_nothing():

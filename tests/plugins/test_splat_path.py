@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
-from morgs_mi.core.color_space import SH_C0, srgb_to_linear
+from morgs_mi.core.color_space import SH_C0, decode_light
 from morgs_mi.evaluate.metrics import psnr
 from tests.assertions import assert_close
 from tests.scenes.gaussians import isotropic
@@ -128,7 +128,7 @@ def test_splat_path__mirror_shows_the_view_of_the_mirrored_camera(srgb):
     # A pixel averages over a square of variance 1 / 12 px^2 in each direction.
     expected = rasterize(gaussians, mirrored, ("color", "alpha"), config=RenderConfig(eps2d=1 / 12))
     color, alpha = (np.asarray(value, np.float64)[:, ::-1] for value in (expected.color, expected.alpha))
-    layer = alpha * srgb_to_linear(color / np.maximum(alpha, 1e-6)) if srgb else color
+    layer = alpha * decode_light(color / np.maximum(alpha, 1e-6)) if srgb else color
     assert psnr(image, layer) > 36
 
 
@@ -139,7 +139,7 @@ def test_splat_path__glass_without_refraction_shows_what_is_behind_it():
     image = render(scene(behind, {**TRACED, "max_depth": 4}, pane=pane, dark=dark), spp=256)
     expected = rasterize(behind, camera(), ("color", "alpha"), config=RenderConfig(eps2d=1 / 12))
     color, alpha = (np.asarray(value, np.float64) for value in (expected.color, expected.alpha))
-    assert psnr(image, alpha * srgb_to_linear(color / np.maximum(alpha, 1e-6))) > 35
+    assert psnr(image, alpha * decode_light(color / np.maximum(alpha, 1e-6))) > 35
 
 
 def test_splat_path__camera_sees_the_splats_in_front_of_surfaces_as_before():

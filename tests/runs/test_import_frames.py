@@ -11,7 +11,8 @@ import pytest
 from morgs_mi import cli
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import PacketKind
-from morgs_mi.codec.packets import coded_frames, play, seek
+from morgs_mi.codec.frame_source import play
+from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.ply import write_ply
@@ -62,7 +63,7 @@ def test_import_frames__keeps_the_ids_of_the_same_gaussians(clip, tmp_path):
         assert_close(raw["means"], expected["means"], atol=0.2 * pixel)
         moved = np.abs(raw["motion"] - 0.1 * (coded.frame > 0) * (np.arange(N) < N // 2)[:, None] * [1, 0, 0])
         assert moved.max() < 0.4 * pixel
-    np.testing.assert_array_equal(seek(stream, 3).gaussians.means, coded_frame(stream, 3).means)
+    np.testing.assert_array_equal(stream.seek(3).gaussians.means, coded_frame(stream, 3).means)
 
 
 def coded_frame(stream: StreamReader, frame: int) -> Gaussians:

@@ -24,7 +24,8 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import PAYLOAD, TRAILER, Packet, StreamWriter
-from morgs_mi.codec.packets import CodedFrame, coded_frames, play, reemitted_keyframe, seek
+from morgs_mi.codec.frame_source import play
+from morgs_mi.codec.packets import CodedFrame, coded_frames, reemitted_keyframe
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.fit.fit_config import DensityConfig, ShortFitConfig
 from morgs_mi.playback.player import PROVISIONAL, open_stream_capture
@@ -259,7 +260,7 @@ def test_stream_capture__300_frames_play_as_they_were_fitted(tmp_path: Path) -> 
     reader = StreamReader(tmp_path / "s")
     assert history(coded_frames(reader)) == history(states)
     for frame in range(0, 300, 23):
-        assert history([seek(reader, frame)]) == history([states[frame]])
+        assert history([reader.seek(frame)]) == history([states[frame]])
 
 
 def cuts(whole: Path) -> list[int]:
@@ -478,7 +479,7 @@ def test_stream_capture__resumes_hostile_streams_or_refuses_them_in_one_sentence
             stream_capture(recording(), out, CONFIG, resume=True)
         except ValueError as error:
             refusal = str(error)
-        assert refusal.startswith(f"{out}/") or seek(StreamReader(out / "stream.morgs"), FRAMES - 1)
+        assert refusal.startswith(f"{out}/") or StreamReader(out / "stream.morgs").seek(FRAMES - 1)
 
 
 @pytest.mark.parametrize("link", ["", "folder", "file"])

@@ -12,7 +12,7 @@ import pytest
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.lens import Lens
 from morgs_mi.capture.truth import load_tracks, load_truth
-from morgs_mi.core.color_space import srgb_to_linear
+from morgs_mi.core.color_space import decode_light
 from morgs_mi.io.video import open_frames
 from morgs_mi.synth.disturbances import (
     CameraDisturbance,
@@ -198,7 +198,7 @@ def test_synthesize__exposes_frames_with_the_gains_of_the_truth(clean: Path, tmp
     gains = load_disturbances(dimmed / "truth")
     for camera in ("cam00", "cam01"):
         for frame in (0, 1):
-            before, after = (srgb_to_linear(frame_of(c, camera, frame) / 255.0) for c in (clean, dimmed))
+            before, after = (decode_light(frame_of(c, camera, frame) / 255.0) for c in (clean, dimmed))
             usable = (before > 0.1) & (after > 0.1) & (before < 0.8) & (after < 0.95)
             assert_close(np.median(after[usable] / before[usable]), gains[camera].gains[frame], rtol=0.01)
     assert gains["cam00"].gains == (1.0, 1.0)

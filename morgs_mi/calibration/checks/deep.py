@@ -51,54 +51,31 @@ _CORRECTION = "; fit corrects it (not with --exposure off)"
 
 @dataclass(frozen=True)
 class Finding:
-    """A fault of a recording.
+    """A fault of a recording."""
 
-    Attributes:
-        question: name of the check: error, time, exposure, variation, flicker, blur, repeats or overlap.
-        cameras: names of the cameras that it concerns.
-        sentence: numbers and advice.
-    """
-
-    question: str
-    cameras: tuple[str, ...]
-    sentence: str
+    question: str  #: Name of the check: error, time, exposure, variation, flicker, blur, repeats or overlap.
+    cameras: tuple[str, ...]  #: Names of the cameras that it concerns.
+    sentence: str  #: Numbers and advice.
 
 
 @dataclass(frozen=True)
 class DeepCheck:
-    """Result of checking a recording; missing measurements are NaN.
+    """Result of checking a recording; missing measurements are NaN."""
 
-    Attributes:
-        names: names of the C cameras.
-        frames: number T of frames that were read.
-        fps: frames per second.
-        given: time offset with which each camera was read, frames.
-        errors: median reprojection error of each camera [C], px.
-        offsets: time offset of each camera from the median [C], frames.
-        halves: the same in the first and the last half of the frames [2, C].
-        gains: log gain of each camera's channels in linear light, relative to the median [C, 3].
-        brightness: log brightness of each camera over time, relative to its median [T, C].
-        sharpness: per image [T, C], octaves.
-        repeated: per camera the frames that repeat the previous one.
-        lamps: per camera the flicker of lamps, or None.
-        overlaps: share of each camera's image that each other camera sees [C, C].
-        findings: faults.
-    """
-
-    names: tuple[str, ...]
-    frames: int
-    fps: float
-    given: tuple[float, ...]
-    errors: np.ndarray
-    offsets: np.ndarray
-    halves: np.ndarray
-    gains: np.ndarray
-    brightness: np.ndarray
-    sharpness: np.ndarray
-    repeated: tuple[tuple[int, ...], ...]
-    lamps: tuple[Lamp | None, ...]
-    overlaps: np.ndarray
-    findings: tuple[Finding, ...] = ()
+    names: tuple[str, ...]  #: Names of the C cameras.
+    frames: int  #: Number T of frames that were read.
+    fps: float  #: Frames per second.
+    given: tuple[float, ...]  #: Time offset with which each camera was read, frames.
+    errors: np.ndarray  #: Median reprojection error of each camera [C], px.
+    offsets: np.ndarray  #: Time offset of each camera from the median [C], frames.
+    halves: np.ndarray  #: The same in the first and the last half of the frames [2, C].
+    gains: np.ndarray  #: Log gain of each camera's channels in linear light, relative to the median [C, 3].
+    brightness: np.ndarray  #: Log brightness of each camera over time, relative to its median [T, C].
+    sharpness: np.ndarray  #: Per image [T, C], octaves.
+    repeated: tuple[tuple[int, ...], ...]  #: Per camera the frames that repeat the previous one.
+    lamps: tuple[Lamp | None, ...]  #: Per camera the flicker of lamps, or None.
+    overlaps: np.ndarray  #: Share of each camera's image that each other camera sees [C, C].
+    findings: tuple[Finding, ...] = ()  #: Faults.
 
     @property
     def largest_overlaps(self) -> np.ndarray:
@@ -169,21 +146,16 @@ def check_exposures(capture: Capture, shared: SharedFeatures) -> list[Finding]:
 
 def _gains(capture: Capture, shared: SharedFeatures) -> np.ndarray:
     """Return the log gains of all cameras [C, 3] that explain the colours of points in two views."""
-    images = next(capture.partial_frames(0, 1)).images
+    images = next(capture.displayed().partial_frames(0, 1)).images
     pairs, colors = matched_colors(capture.cameras, images, shared.features, shared.matches)
-    views = []
-    middles = []
-    weights = []
-    for pair in pairs:
-        if len(pair.features) >= _MIN_SAMPLES:
-            a, b = (colors[view][pair.features[:, k]] for k, view in enumerate(pair.views))
-            ratio = np.log(b / a)
-            middle = np.median(ratio, axis=0)
-            views.append(pair.views)
-            middles.append(middle)
-            weights.append(1 / (np.abs(ratio - middle).mean() ** 2 / len(ratio) + _LOG_ERROR**2))
-    channels = np.reshape(middles, (-1, 3)).T
-    return np.stack([consensus(len(colors), views, x, np.array(weights)) for x in channels], axis=1)
+    pairs = [pair for pair in pairs if len(pair.features) >= _MIN_SAMPLES]
+    light = [[colors[view][pair.features[:, k]] for k, view in enumerate(pair.views)] for pair in pairs]
+    ratios = [np.log(b / a) for a, b in light]
+    middles = np.reshape([np.median(ratio, axis=0) for ratio in ratios], (-1, 3))
+    spreads = [np.abs(ratio - middle).mean() for ratio, middle in zip(ratios, middles, strict=True)]
+    weights = np.array([1 / (s**2 / len(r) + _LOG_ERROR**2) for s, r in zip(spreads, ratios, strict=True)])
+    views = [pair.views for pair in pairs]
+    return np.stack([consensus(len(colors), views, channel, weights) for channel in middles.T], axis=1)
 
 
 # Values of each camera [C] by name: `value` is compared with the limit, the others stand in the sentence.
@@ -192,21 +164,13 @@ _Values = Mapping[str, Sequence[Any] | np.ndarray]
 
 @dataclass(frozen=True)
 class _Question:
-    """Row of the table of questions.
+    """Row of the table of questions."""
 
-    Attributes:
-        name: as in `Finding.question`.
-        measure: returns the values of each camera.
-        limit: a camera with a larger `value` has a fault.
-        sentence: follows the name of the camera, with values in braces.
-        common: whether cameras with the same sentence share a finding.
-    """
-
-    name: str
-    measure: Callable[[Any], _Values]
-    limit: float
-    sentence: str
-    common: bool = False
+    name: str  # as in `Finding.question`
+    measure: Callable[[Any], _Values]  # returns the values of each camera
+    limit: float  # a camera with a larger `value` has a fault
+    sentence: str  # follows the name of the camera, with values in braces
+    common: bool = False  # whether cameras with the same sentence share a finding
 
     def findings(self, names: Sequence[str], measured: Any) -> list[Finding]:
         """Return the faults of the cameras `names` in what the question measures."""
@@ -261,10 +225,6 @@ def _flickers(check: DeepCheck) -> _Values:
     }
 
 
-def _lights(check: DeepCheck) -> _Values:
-    return {"value": _changes(check, np.broadcast_to(_common_brightness(check), check.brightness.shape))}
-
-
 def _variations(check: DeepCheck) -> _Values:
     values = check.brightness - _common_brightness(check)
     jump = np.fmax.reduce(np.abs(np.diff(values, axis=0)), axis=0, initial=np.nan)
@@ -311,10 +271,6 @@ def _listed(frames: Sequence[Sequence[int] | np.ndarray]) -> _Values:
     texts = [", ".join(map(str, camera[:_MAX_LISTED])) for camera in frames]
     ends = [", ..." if count > _MAX_LISTED else "" for count in counts]
     return {"value": counts, "frames": [text + end for text, end in zip(texts, ends, strict=True)]}
-
-
-def _overlaps(check: DeepCheck) -> _Values:
-    return {"value": 1 - check.largest_overlaps, "share": check.largest_overlaps}
 
 
 # These two rows measure the gains [C, 3], which `check_exposures` has without the rest of a check.
@@ -365,7 +321,7 @@ _QUESTIONS = (
     ),
     _Question(
         "variation",
-        _lights,
+        lambda check: {"value": _changes(check, _common_brightness(check) + 0 * check.brightness)},
         0.08,  # people who walk through a room change it by 5 %
         "change their brightness alike, by {value:.0%} over time: the light of the scene changes; use constant light",
         common=True,
@@ -399,7 +355,7 @@ _QUESTIONS = (
     ),
     _Question(
         "overlap",
-        _overlaps,
+        lambda check: {"value": 1 - check.largest_overlaps, "share": check.largest_overlaps},
         0.7,  # px
         "shares at most {share:.0%} of its image with another camera: turn it towards what the others see, or add a "
         "camera in between",

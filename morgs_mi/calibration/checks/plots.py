@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Collection, Sequence
 from io import BytesIO
 from pathlib import Path
-from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from morgs_mi.calibration.checks.deep import DeepCheck
 from morgs_mi.capture.capture import Capture
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_path
+from morgs_mi.core.rig import up_direction
 
 __all__ = ["check_plot", "draw_deep", "draw_rig", "write_rig"]
 
@@ -22,7 +22,7 @@ _SUFFIXES = (".png", ".jpg", ".jpeg", ".svg", ".pdf")
 # Inches.
 _WIDTH = 14.4
 _RIG_HEIGHT = 7.6
-_DEEP_HEIGHT = 7.0
+_DEEP_HEIGHT = 5.6
 # Dots per inch.
 _DPI = 100
 # Colour of a camera, and of one with a finding.
@@ -35,10 +35,6 @@ _MAX_POINTS = 20_000
 _EDGES = [0, 1, 2, 3, 4, 1, 0, 2, 0, 3, 0, 4]
 # Width of a group of bars, as a share of its slot.
 _BAR = 0.7
-# Number of lines of the findings.
-_MAX_LINES = 16
-# Characters of a line.
-_LINE_LENGTH = 140
 
 
 def check_plot(path: Path) -> None:
@@ -138,17 +134,12 @@ def draw_rig(
 def _directions(cameras: Sequence[Camera]) -> np.ndarray:
     """Return the rig's right, forward and up [3, 3], orthonormal."""
     rotations = np.array([np.asarray(camera.viewmat, np.float64)[:3, :3] for camera in cameras])
-    up = _first_direction([-rotations[:, 1].mean(0), -rotations[0, 1]])
+    up = up_direction(cameras)
     # Cameras all around a scene have no common forward direction: use the first camera's direction.
     candidates = np.array([rotations[:, 2].mean(0), rotations[0, 2], np.cross(up, rotations[0, 0])])
-    forward = _first_direction(candidates - np.outer(candidates @ up, up))
+    level = candidates - np.outer(candidates @ up, up)
+    forward = next(vector / length for vector in level if (length := np.linalg.norm(vector)) > 1e-3)
     return np.stack([np.cross(forward, up), forward, up])
-
-
-def _first_direction(vectors: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
-    """Return the first of the vectors [3] that is not almost zero, at length 1."""
-    vector = next(vector for vector in vectors if np.linalg.norm(vector) > 1e-3)
-    return vector / np.linalg.norm(vector)
 
 
 def _frustum(camera: Camera, depth: float) -> np.ndarray:
@@ -158,7 +149,7 @@ def _frustum(camera: Camera, depth: float) -> np.ndarray:
 
 
 def draw_deep(figure: Any, check: DeepCheck) -> None:
-    """Plot a check: a panel per question, and the findings.
+    """Plot a check: a panel per question.
 
     The panels show reprojection error, time offset, exposure per channel, brightness and sharpness over time, repeated
     frames and overlap. Cameras with a finding are red; a question mark stands for a missing measurement.
@@ -167,38 +158,26 @@ def draw_deep(figure: Any, check: DeepCheck) -> None:
         figure: an empty figure or subfigure of matplotlib.
         check: result of `check_deep`.
     """
-    rows = [
-        ["error", "time", "exposure", "overlap"],
-        ["brightness", "sharpness", "repeats", "repeats"],
-        ["findings"] * 4,
-    ]
-    panels = figure.subplot_mosaic(rows)
-    _bars(panels["error"], check, "error", check.errors[:, None])
-    _bars(panels["time"], check, "time", check.offsets[:, None])
-    _bars(panels["exposure"], check, "exposure", 100 * np.expm1(check.gains))
-    _bars(panels["overlap"], check, "overlap", 100 * check.largest_overlaps[:, None])
-    _curves(panels["brightness"], check, ("variation", "flicker"), 100 * np.expm1(check.brightness))
-    _curves(panels["sharpness"], check, ("blur",), check.sharpness)
+    panels = figure.subplot_mosaic([["error", "time", "exposure", "overlap"], ["variation", "blur", *2 * ["repeats"]]])
+    for question, values, title, least in (
+        ("error", check.errors[:, None], "Reprojection error, px", (0, 1)),
+        ("time", check.offsets[:, None], "Time offset, frames", (-1, 1)),
+        ("exposure", 100 * np.expm1(check.gains), "Exposure of R, G, B, %", (-10, 10)),
+        ("overlap", 100 * check.largest_overlaps[:, None], "Largest overlap, %", (0, 100)),
+    ):
+        _bars(panels[question], values, check.names, _colors(check, question))
+        _label(panels[question], title, least=least)
+    brightness = 100 * np.expm1(check.brightness)
+    _curves(panels["variation"], brightness, check.names, _colors(check, "variation", "flicker"))
+    _label(panels["variation"], "Brightness over time, %", "frame", least=(-5, 5))
+    _curves(panels["blur"], check.sharpness, check.names, _colors(check, "blur"))
+    _label(panels["blur"], "Sharpness over time, octaves", "frame", least=(-1, 1))
     _events(panels["repeats"], check)
-    # The least range of the vertical axis: negligible differences look small.
-    _label(panels["error"], "Reprojection error, px", least=(0, 1))
-    _label(panels["time"], "Time offset, frames", least=(-1, 1))
-    _label(panels["exposure"], "Exposure of R, G, B, %", least=(-10, 10))
-    _label(panels["overlap"], "Largest overlap, %", least=(0, 100))
-    _label(panels["brightness"], "Brightness over time, %", "frame", least=(-5, 5))
-    _label(panels["sharpness"], "Sharpness over time, octaves", "frame", least=(-1, 1))
     _label(panels["repeats"], "Repeated frames (red) and missing ones (grey)", "frame")
-    _label(panels["findings"], f"Findings: {len(check.findings)}")
-    sentences = [*(finding.sentence for finding in check.findings), check.unmeasured]
-    lines = "\n".join(fill(sentence, _LINE_LENGTH, subsequent_indent="  ") for sentence in sentences).splitlines()
-    lines = lines if len(lines) <= _MAX_LINES else [*lines[: _MAX_LINES - 1], "..."]
-    panels["findings"].set_axis_off()
-    text = panels["findings"].text(0, 1, "\n".join(lines), va="top", fontsize=8, transform=panels["findings"].transAxes)
-    text.set_in_layout(False)  # it would shrink the other panels
 
 
 def _label(axes: Any, title: str, xlabel: str = "", ylabel: str = "", least: tuple[float, float] | None = None) -> None:
-    """Set the title and the labels of a panel, and the least range of its vertical axis."""
+    """Set the title and the labels of a panel, and the least range of its vertical axis, where values look small."""
     axes.set_title(title, fontsize=11, loc="left")
     axes.set(xlabel=xlabel, ylabel=ylabel)
     if least is not None:
@@ -206,9 +185,8 @@ def _label(axes: Any, title: str, xlabel: str = "", ylabel: str = "", least: tup
         axes.set_ylim(min(low, least[0]), max(high, least[1]))
 
 
-def _bars(axes: Any, check: DeepCheck, question: str, values: np.ndarray) -> None:
+def _bars(axes: Any, values: np.ndarray, names: Sequence[str], colors: Sequence[str]) -> None:
     """Draw a group of bars per camera, for values [C, K]."""
-    colors = _colors(check, question)
     count = values.shape[1]
     for k, column in enumerate(values.T):
         places = np.arange(len(values)) + _BAR * ((k + 0.5) / count - 0.5)
@@ -216,40 +194,33 @@ def _bars(axes: Any, check: DeepCheck, question: str, values: np.ndarray) -> Non
         for place in places[~np.isfinite(column)]:
             axes.annotate("?", (place, 0), ha="center", va="bottom", color="0.5")
     axes.axhline(0, color="black", linewidth=0.8)
-    _name_cameras(axes.xaxis, check, colors, rotation=90 if len(values) > 6 else 0)
+    _name_cameras(axes.xaxis, names, colors, rotation=90 if len(values) > 6 else 0)
 
 
-def _curves(axes: Any, check: DeepCheck, questions: Sequence[str], values: np.ndarray) -> None:
-    """Draw a curve per camera, for values [T, C]; cameras with a finding are drawn last, with their names."""
-    for name, color, curve in zip(check.names, _colors(check, *questions), values.T, strict=True):
-        axes.plot(curve, color=color, linewidth=1, zorder=3 if color == _MARKED else 2)
-        frames = np.flatnonzero(np.isfinite(curve))
-        if color == _MARKED and len(frames):
-            axes.annotate(name, (frames[-1], curve[frames[-1]]), ha="right", va="bottom", color=_MARKED)
-    if not np.isfinite(values).any():
-        axes.annotate("not measured", (0.5, 0.5), xycoords="axes fraction", ha="center", color="0.5")
-    _show_frames(axes, check)
+def _curves(axes: Any, values: np.ndarray, names: Sequence[str], colors: Sequence[str]) -> None:
+    """Draw a curve per camera, for values [T, C]; cameras with a finding are drawn last and named in a legend."""
+    for name, color, curve in zip(names, colors, values.T, strict=True):
+        marked = color == _MARKED
+        axes.plot(curve, color=color, linewidth=1, zorder=3 if marked else 2, label=name if marked else "_")
+    if _MARKED in colors:
+        axes.legend(fontsize=8)
+    axes.set_xlim(-0.5, len(values) - 0.5)
+    axes.xaxis.get_major_locator().set_params(integer=True)
 
 
 def _events(axes: Any, check: DeepCheck) -> None:
     """Draw a row per camera with the frames that repeat another or are missing."""
-    for view, repeated in enumerate(check.repeated):
-        missing = np.flatnonzero(np.isnan(check.sharpness[:, view]))
-        for frames, color in ((missing, "0.75"), (repeated, _MARKED)):
-            axes.broken_barh([(frame - 0.5, 1) for frame in frames], (view - 0.45, 0.9), color=color)
-    axes.set_ylim(len(check.names) - 0.5, -0.5)
-    _show_frames(axes, check)
-    _name_cameras(axes.yaxis, check, _colors(check, "repeats"))
+    states = np.isnan(check.sharpness.T).astype(int)
+    for row, repeated in zip(states, check.repeated, strict=True):
+        row[list(repeated)] = 2
+    colors = np.array([(255, 255, 255), (190, 190, 190), (214, 39, 40)], np.uint8)
+    axes.imshow(colors[states], aspect="auto", interpolation="none")
+    _name_cameras(axes.yaxis, check.names, _colors(check, "repeats"))
 
 
-def _show_frames(axes: Any, check: DeepCheck) -> None:
-    axes.set_xlim(-0.5, check.frames - 0.5)
-    axes.xaxis.get_major_locator().set_params(integer=True)
-
-
-def _name_cameras(axis: Any, check: DeepCheck, colors: Sequence[str], rotation: float = 0) -> None:
+def _name_cameras(axis: Any, names: Sequence[str], colors: Sequence[str], rotation: float = 0) -> None:
     """Label the positions along an axis with the cameras' names, red with a finding."""
-    axis.set_ticks(np.arange(len(check.names)), check.names, fontsize=8, rotation=rotation)
+    axis.set_ticks(np.arange(len(names)), names, fontsize=8, rotation=rotation)
     for color, label in zip(colors, axis.get_ticklabels(), strict=True):
         label.set_color(_MARKED if color == _MARKED else "black")
 

@@ -62,22 +62,15 @@ _NO_OVERLAP = (
 
 @dataclass(frozen=True)
 class CameraCheck:
-    """Result of checking the pose of one camera.
+    """Result of checking the pose of one camera."""
 
-    Attributes:
-        name: name of the camera.
-        matches: number of its matches with other cameras.
-        error: median reprojection error of its matches with the cameras that fit, or of all its matches if there are
-            none, px. NaN without matches, infinite if most of the points lie behind a camera.
-        fits: whether the pose fits the images; None if that could not be checked.
-        advice: the reason and a remedy; empty if the pose fits.
-    """
-
-    name: str
-    matches: int
+    name: str  #: Name of the camera.
+    matches: int  #: Number of its matches with other cameras.
+    #: Median reprojection error of its matches with the cameras that fit, or of all its matches if there are none, px.
+    #: NaN without matches, infinite if most of the points lie behind a camera.
     error: float
-    fits: bool | None
-    advice: str = ""
+    fits: bool | None  #: Whether the pose fits the images; None if that could not be checked.
+    advice: str = ""  #: The reason and a remedy; empty if the pose fits.
 
     @property
     def verdict(self) -> str:
@@ -87,36 +80,23 @@ class CameraCheck:
 
 @dataclass(frozen=True)
 class RigCheck:
-    """Result of checking the poses on the first frame.
+    """Result of checking the poses on the first frame."""
 
-    Attributes:
-        matches: number of matches, over all pairs of views.
-        pairs: number of pairs of views with matches.
-        error: median reprojection error, px; NaN without matches.
-        cameras: result of each camera.
-        fits: whether all poses fit the images; None if no pose is known to be wrong but some could not be checked.
-        advice: one sentence with the result, and the remedy if it is the same for all cameras.
-    """
-
-    matches: int
-    pairs: int
-    error: float
-    cameras: tuple[CameraCheck, ...]
+    matches: int  #: Number of matches, over all pairs of views.
+    pairs: int  #: Number of pairs of views with matches.
+    error: float  #: Median reprojection error, px; NaN without matches.
+    cameras: tuple[CameraCheck, ...]  #: Result of each camera.
+    #: Whether all poses fit the images; None if no pose is known to be wrong but some could not be checked.
     fits: bool | None
-    advice: str
+    advice: str  #: One sentence with the result, and the remedy if it is the same for all cameras.
 
 
 @dataclass(frozen=True)
 class SharedFeatures:
-    """Features of a capture's first frame and their matches between views.
+    """Features of a capture's first frame and their matches between views."""
 
-    Attributes:
-        features: per camera, in pixels of the recorded size.
-        matches: per pair of cameras with matches.
-    """
-
-    features: tuple[Features, ...]
-    matches: tuple[Match, ...]
+    features: tuple[Features, ...]  #: Per camera, in pixels of the recorded size.
+    matches: tuple[Match, ...]  #: Per pair of cameras with matches.
 
 
 def match_capture(capture: Capture, progress: Callable[[int, int], None] | None = None) -> SharedFeatures:
@@ -128,7 +108,7 @@ def match_capture(capture: Capture, progress: Callable[[int, int], None] | None 
         capture: a capture, downscaled or not.
         progress: called with (views done, views).
     """
-    capture = capture.at_recorded_size()
+    capture = capture.displayed().at_recorded_size()
     images, count = next(capture.partial_frames(0, 1)).images, len(capture.cameras)
     features = []
     for done, (image, mask) in enumerate(zip(images, capture.masks, strict=True)):
@@ -190,7 +170,7 @@ def dense_points(capture: Capture, shared: SharedFeatures, seed: int = 0) -> Cap
         seed: seed of the selection of stereo points.
     """
     sparse, recorded = triangulate_points(capture, shared), capture.at_recorded_size()
-    images = next(recorded.partial_frames(0, 1)).images
+    images = next(recorded.displayed().partial_frames(0, 1)).images
     views = [(v, image) for v in capture.train_views if (image := images[v]) is not None]
     points, colors = stereo_points(
         [recorded.cameras[v] for v, _ in views],
@@ -213,17 +193,11 @@ def _unmatched(views: Sequence[int], matches: Sequence[Match]) -> list[tuple[int
 
 @dataclass(frozen=True)
 class _Pairs:
-    """Reprojection errors of all pairs of views with matches.
+    """Reprojection errors of all pairs of views with matches."""
 
-    Attributes:
-        shared: the matches.
-        cameras: the poses.
-        errors: per match of a pair [M], px.
-    """
-
-    shared: SharedFeatures
-    cameras: tuple[Camera, ...]
-    errors: tuple[np.ndarray, ...]
+    shared: SharedFeatures  # the matches
+    cameras: tuple[Camera, ...]  # the poses
+    errors: tuple[np.ndarray, ...]  # per match of a pair [M], px
 
     @classmethod
     def of(cls, shared: SharedFeatures, cameras: Sequence[Camera]) -> _Pairs:
@@ -248,10 +222,6 @@ class _Pairs:
         few = (replace(m, features=m.features[:: -(-len(m.features) // _SAMPLE)]) for m in largest)
         return self.of(replace(self.shared, matches=tuple(few)), self.cameras)
 
-    def with_cameras(self, cameras: Sequence[Camera]) -> _Pairs:
-        """Return the errors with other poses."""
-        return self.of(self.shared, cameras)
-
     def worst(self) -> float:
         """Return the largest median error of a view, px; NaN without matches."""
         medians = [_median(errors) for view in range(len(self.cameras)) if len(errors := self.of_view(view))]
@@ -265,9 +235,10 @@ class _Pairs:
         """
         group = {view for match in self.shared.matches for view in match.views}
         while group:
-            bad = {view: _share_of_large(self.of_view(view, group)) for view in sorted(group)}
-            worst = max(bad, key=lambda view: bad[view])
-            if bad[worst] <= 0.5:
+            errors = {view: self.of_view(view, group) for view in sorted(group)}
+            shares = {view: np.mean(own > MAX_ERROR) if len(own) else 1.0 for view, own in errors.items()}
+            worst = max(shares, key=lambda view: shares[view])
+            if shares[worst] <= 0.5:
                 break
             group = group - {worst}
         return group
@@ -276,10 +247,6 @@ class _Pairs:
 def _is_shared(match: Match, view: int, partners: Collection[int] | None) -> bool:
     """Return whether a match is between a view and one of its `partners`, which are all views if None."""
     return view in match.views and (partners is None or (set(match.views) - {view}) <= set(partners))
-
-
-def _share_of_large(errors: np.ndarray) -> float:
-    return float((errors > MAX_ERROR).mean()) if len(errors) else 1.0
 
 
 def _median(errors: np.ndarray) -> float:
@@ -308,34 +275,32 @@ def _correct_rig(capture: Capture, pairs: _Pairs, checks: Sequence[CameraCheck])
     candidates = focal_candidates(
         "the focal lengths of all cameras seem",
         lambda factor: [with_focal_factor(camera, factor) for camera in capture.cameras],
-        lambda cameras: _median(np.concatenate(largest.with_cameras(cameras).errors)),
+        lambda cameras: _median(np.concatenate(_Pairs.of(largest.shared, cameras).errors)),
     )
     if error > _GOOD_ERROR:
         candidates = [*rig_candidates(capture, wrong), *candidates]
-    errors = [pairs.with_cameras(cameras).worst() for cameras, _ in candidates]
+    errors = [_Pairs.of(pairs.shared, cameras).worst() for cameras, _ in candidates]
     index = int(np.argmin([*errors, np.inf]))
     return candidates[index] if min(errors, default=np.inf) <= min(error / _GAIN, MAX_ERROR) else None
 
 
 def _copies(shared: SharedFeatures, checks: Sequence[CameraCheck], cameras: Sequence[Camera]) -> dict[int, str]:
     """Return the reason for each camera with the pose or the clip of another one."""
-    found: dict[int, str] = {}
+    reasons: dict[int, str] = {}
     for pair in same_poses(cameras):
         # If one of the two fits, the pose is its own.
-        wrong = [view for view in pair if not checks[view].fits] or pair
-        for view in wrong:
-            other = checks[pair[0] + pair[1] - view].name
-            found.setdefault(
-                view, f"it has the same pose as {other}: give each camera its own, or leave the copy out (--without)"
-            )
+        for view in [view for view in pair if not checks[view].fits] or pair:
+            other = checks[sum(pair) - view].name
+            remedy = "give each camera its own, or leave the copy out (--without)"
+            reasons.setdefault(view, f"it has the same pose as {other}: {remedy}")
     for match in shared.matches:
         a, b = (shared.features[view].points[match.features[:, k]] for k, view in enumerate(match.views))
         if np.median(np.linalg.norm(a - b, axis=1)) < _SAME_IMAGE:
             for view in match.views:
-                if view in found or not checks[view].fits:
+                if view in reasons or not checks[view].fits:
                     other = checks[sum(match.views) - view].name
-                    found[view] = f"its images are those of {other}: one clip is a copy of the other; replace it"
-    return found
+                    reasons[view] = f"its images are those of {other}: one clip is a copy of the other; replace it"
+    return reasons
 
 
 def _explain_camera(view: int, check: CameraCheck, pairs: _Pairs, group: set[int]) -> str:

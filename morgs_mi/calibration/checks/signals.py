@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
-from morgs_mi.core.color_space import srgb_to_linear
+from morgs_mi.core.color_space import decode_light
 
 __all__ = [
     "Lamp",
@@ -44,30 +44,19 @@ _MIN_FLICKER_FRAMES, _MIN_PERIODS = 20, 2
 
 @dataclass(frozen=True)
 class Signals:
-    """Measurements taken while the frames of a capture are read.
+    """Measurements taken while the frames of a capture are read."""
 
-    Attributes:
-        thumbs: per camera float32 [T, h, w], NaN where no pixel was recorded.
-        sharpness: per image [T, C], octaves: log2 of the detail at the finest scale relative to the next one.
-    """
-
-    thumbs: tuple[np.ndarray, ...]
-    sharpness: np.ndarray
+    thumbs: tuple[np.ndarray, ...]  #: Per camera float32 [T, h, w], NaN where no pixel was recorded.
+    sharpness: np.ndarray  #: Per image [T, C], octaves: log2 of the detail at the finest scale relative to the next one
 
 
 @dataclass(frozen=True)
 class Lamp:
-    """Flicker of lamps in a camera's images.
+    """Flicker of lamps in a camera's images."""
 
-    Attributes:
-        mains: frequencies of the mains that explain the flicker, Hz.
-        alias: the frequency at which the images become brighter and darker, Hz.
-        amplitude: amplitude of the brightness, as a share.
-    """
-
-    mains: tuple[int, ...]
-    alias: float
-    amplitude: float
+    mains: tuple[int, ...]  #: Frequencies of the mains that explain the flicker, Hz.
+    alias: float  #: The frequency at which the images become brighter and darker, Hz.
+    amplitude: float  #: Amplitude of the brightness, as a share.
 
 
 def read_signals(capture: Capture, max_frames: int, progress: Callable[[int, int], None] | None = None) -> Signals:
@@ -83,7 +72,7 @@ def read_signals(capture: Capture, max_frames: int, progress: Callable[[int, int
     thumbs = [np.full((count, *size[::-1]), np.nan, np.float32) for size in sizes]
     sharpness = np.full((count, len(sizes)), np.nan)
     inner = [None if m is None else cv2.erode(m.astype(np.uint8), np.ones((9, 9))) > 0 for m in capture.masks]
-    for t, frame in enumerate(capture.partial_frames(0, count)):
+    for t, frame in enumerate(capture.displayed().partial_frames(0, count)):
         for c, image in enumerate(frame.images):
             if image is None:
                 continue
@@ -182,7 +171,7 @@ def _brightness(thumbs: np.ndarray) -> np.ndarray:
     reference = known_median(thumbs, axis=0)
     good = (thumbs > _DARK) & (thumbs < _BRIGHT) & (reference > _DARK) & (reference < _BRIGHT)
     with np.errstate(invalid="ignore", divide="ignore"):
-        ratios = np.log(srgb_to_linear(thumbs / 255) / srgb_to_linear(reference / 255))
+        ratios = np.log(decode_light(thumbs / 255) / decode_light(reference / 255))
     ratios = np.where(good, ratios, np.nan)
     bands = [band.reshape(len(thumbs), -1) for band in np.array_split(ratios, _BANDS, axis=1)]
     columns = [np.where(np.isfinite(x).sum(axis=1) < _MIN_PIXELS, np.nan, known_median(x, axis=1)) for x in bands]

@@ -146,11 +146,6 @@ def _best_shift(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
     return float(peak), float(top - beside)
 
 
-def _correlation(a: np.ndarray, b: np.ndarray) -> float:
-    a, b = _centred(a), _centred(b)
+def _correlation(*profiles: np.ndarray) -> float:
+    a, b = (p - p.mean(axis=0) - p.mean(axis=1, keepdims=True) + p.mean() for p in profiles)
     return float((a * b).sum() / max(np.sqrt((a * a).sum() * (b * b).sum()), 1e-9))
-
-
-def _centred(profile: np.ndarray) -> np.ndarray:
-    centred = profile - profile.mean(axis=0)
-    return centred - centred.mean(axis=1, keepdims=True)

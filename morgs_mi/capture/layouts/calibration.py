@@ -51,25 +51,18 @@ NO_POINTS = np.zeros((0, 3), np.float32)
 
 @dataclass(frozen=True)
 class Calibration:
-    """Cameras, clips and points of a capture folder, at the calibrated size.
+    """Cameras, clips and points of a capture folder, at the calibrated size."""
 
-    Attributes:
-        cameras: in numerical order of their names.
-        lenses: one per camera.
-        clips: one per camera: its video, folder of images or list of images.
-        points: [P, 3] float32, world units; P = 0 if the layout has none.
-        point_colors: [P, 3] float32 in [0, 1].
-        test_views: indices of the cameras that the layout holds out, in ascending order; None if it specifies none.
-        masks: per camera images of its clip's size or scaled versions, whose black pixels are not used; no images: all
-            pixels are used.
-    """
-
-    cameras: tuple[Camera, ...]
-    lenses: tuple[Lens, ...]
-    clips: tuple[Clip, ...]
+    cameras: tuple[Camera, ...]  #: In numerical order of their names.
+    lenses: tuple[Lens, ...]  #: One per camera.
+    clips: tuple[Clip, ...]  #: One per camera: its video, folder of images or list of images.
+    #: [P, 3] float32, world units; P = 0 if the layout has none.
     points: np.ndarray = field(default_factory=lambda: NO_POINTS)
-    point_colors: np.ndarray = field(default_factory=lambda: NO_POINTS)
+    point_colors: np.ndarray = field(default_factory=lambda: NO_POINTS)  #: [P, 3] float32 in [0, 1].
+    #: Indices of the cameras that the layout holds out, in ascending order; None if it specifies none.
     test_views: tuple[int, ...] | None = None
+    #: Per camera images of its clip's size or scaled versions, whose black pixels are not used; no images: all pixels
+    #: are used.
     masks: tuple[tuple[Path, ...], ...] = ()
 
     @property
@@ -97,35 +90,26 @@ class Calibration:
 
 @dataclass(frozen=True)
 class PoseConvention:
-    """Meaning of the 4x4 pose matrices in a calibration file.
+    """Meaning of the 4x4 pose matrices in a calibration file."""
 
-    Attributes:
-        direction: source and target frame of the matrices.
-        axes: OpenCV's (x right, y down, z forward) or OpenGL's (x right, y up, z backward).
-    """
-
+    #: Source and target frame of the matrices.
     direction: Literal["world to camera", "camera to world"] = "world to camera"
+    #: OpenCV's (x right, y down, z forward) or OpenGL's (x right, y up, z backward).
     axes: Literal["OpenCV", "OpenGL"] = "OpenCV"
 
 
 @dataclass(frozen=True)
 class Layout:
-    """One way to store a calibration in a capture folder.
+    """One way to store a calibration in a capture folder."""
 
-    Attributes:
-        name: name of the layout in reports, e.g. ``COLMAP``.
-        files: names of the files or folders that hold the calibration, for error messages.
-        find: returns whether a capture folder holds such a calibration.
-        read: returns the calibration of a capture folder. Raises FileNotFoundError if a file or clip is missing and
-            ValueError if a file is broken or does not match the clips.
-        poses: convention of the pose matrices, which the rig check compares with other ones; None if poses are not
-            stored as 4x4 matrices.
-    """
-
-    name: str
-    files: tuple[str, ...]
-    find: Callable[[Path], bool]
+    name: str  #: Name of the layout in reports, e.g. ``COLMAP``.
+    files: tuple[str, ...]  #: Names of the files or folders that hold the calibration, for error messages.
+    find: Callable[[Path], bool]  #: Returns whether a capture folder holds such a calibration.
+    #: Returns the calibration of a capture folder. Raises FileNotFoundError if a file or clip is missing and ValueError
+    #: if a file is broken or does not match the clips.
     read: Callable[[Path], Calibration]
+    #: Convention of the pose matrices, which the rig check compares with other ones; None if poses are not stored as
+    #: 4x4 matrices.
     poses: PoseConvention | None = PoseConvention()
 
 
@@ -163,15 +147,10 @@ def required_clips(path: Path) -> Mapping[str, Clip]:
 
 @dataclass(frozen=True)
 class Match:
-    """Fixed cameras and their clips.
+    """Fixed cameras and their clips."""
 
-    Attributes:
-        calibration: one camera, lens and clip per fixed camera.
-        images: per camera the indices of its images in the file of the calibration.
-    """
-
-    calibration: Calibration
-    images: tuple[tuple[int, ...], ...]
+    calibration: Calibration  #: One camera, lens and clip per fixed camera.
+    images: tuple[tuple[int, ...], ...]  #: Per camera the indices of its images in the file of the calibration.
 
 
 def match_clips(
@@ -213,17 +192,11 @@ def match_clips(
 
 @dataclass(frozen=True)
 class _NamedMatch:
-    """Clips and the cameras that they belong to.
+    """Clips and the cameras that they belong to."""
 
-    Attributes:
-        clips: clips by name.
-        images: indices of the cameras of each clip that has some, by the clip's name.
-        without: names of the cameras that have no clip.
-    """
-
-    clips: Mapping[str, Clip]
-    images: dict[str, list[int]]
-    without: list[str]
+    clips: Mapping[str, Clip]  # clips by name
+    images: dict[str, list[int]]  # indices of the cameras of each clip that has some, by the clip's name
+    without: list[str]  # names of the cameras that have no clip
 
 
 def _best_match(

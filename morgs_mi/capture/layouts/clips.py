@@ -9,6 +9,8 @@ camera or per frame; cameras are ordered numerically, cam_2 before cam_10:
   those in the folder ``images`` or ``videos`` over those in others. Files that differ in their suffixes are refused;
 - per frame: ``0000/cam01.png`` or ``0000/images/cam01.png``, with the same cameras in every folder;
 - photos: ``cam01.png`` or ``images/cam01.png``, one image per camera.
+
+Images are files of 8 bits, or EXR files, which have linear light, where a folder has no others.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 
 from morgs_mi.io.image_size import image_size
-from morgs_mi.io.listing import IMAGE_SUFFIXES, VIDEO_SUFFIXES, listed
+from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, VIDEO_SUFFIXES, images_in, listed
 from morgs_mi.io.remote import fetched
 from morgs_mi.io.video import Clip, natural_key, numbering_gap, open_frames
 
@@ -74,7 +76,7 @@ def photos(path: Path) -> dict[str, tuple[Path]]:
         ValueError: two images differ only in their suffixes.
     """
     folder = _image_folder(path)
-    images = _by_stem(filter(_is_image, listed(folder))) if folder else {}
+    images = _by_stem(images_in(folder)) if folder else {}
     return {name: (images[name],) for name in sorted(images, key=natural_key)}
 
 
@@ -86,7 +88,7 @@ def clips_by_frame(path: Path) -> dict[str, tuple[Path, ...]]:
     frames = sorted(_folders(path).values(), key=lambda f: natural_key(str(f)))
     if not frames:
         return {}
-    images = _by_stem(filter(_is_image, listed(frames[0])))
+    images = _by_stem(images_in(frames[0]))
     return {name: tuple(f / images[name].name for f in frames) for name in sorted(images, key=natural_key)}
 
 
@@ -172,7 +174,7 @@ class ImageSizes:
             return image
         folder = image.parent
         if folder not in self._files:
-            images = filter(_is_image, listed(folder)) if folder.is_dir() else ()
+            images = images_in(folder) if folder.is_dir() else ()
             self._files[folder] = {file.stem: file for file in images}
         return self._files[folder].get(image.name)
 
@@ -233,13 +235,13 @@ def _merged(path: Path, places: Iterable[Mapping[str, Path]]) -> dict[str, Path]
 def _image_folder(folder: Path) -> Path | None:
     """Return the folder that holds a camera's or a frame's images: its own or the `images` folder in it, or None."""
     for place in (folder, folder / "images"):
-        if place.is_dir() and any(map(_is_image, listed(place))):
+        if place.is_dir() and images_in(place):
             return place
     return None
 
 
 def _is_image(file: Path) -> bool:
-    return file.suffix.lower() in IMAGE_SUFFIXES
+    return file.suffix.lower() in (*IMAGE_SUFFIXES, EXR_SUFFIX)
 
 
 def _is_video(file: Path) -> bool:

@@ -52,19 +52,12 @@ _CAMERA_BYTES = 500
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """A COLMAP model, before undistortion.
+    """A COLMAP model, before undistortion."""
 
-    Attributes:
-        cameras: one camera per image in the order of the file; `name` is the name of the image.
-        lenses: one lens per camera.
-        points: [P, 3] float32, world units.
-        point_colors: [P, 3] float32 in [0, 1], display-referred.
-    """
-
-    cameras: tuple[Camera, ...]
-    lenses: tuple[Lens, ...]
-    points: np.ndarray
-    point_colors: np.ndarray
+    cameras: tuple[Camera, ...]  #: One camera per image in the order of the file; `name` is the name of the image.
+    lenses: tuple[Lens, ...]  #: One lens per camera.
+    points: np.ndarray  #: [P, 3] float32, world units.
+    point_colors: np.ndarray  #: [P, 3] float32 in [0, 1], display-referred.
 
 
 def find_colmap(folder: Path) -> Path | None:

@@ -30,7 +30,7 @@ from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.core.checks import LARGEST, bounded
 from morgs_mi.io.bounded import read_json
-from morgs_mi.io.listing import IMAGE_SUFFIXES, VIDEO_SUFFIXES
+from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from morgs_mi.io.ply import read_vertices
 from morgs_mi.io.unread import warn_unread
 from morgs_mi.io.video import Clip
@@ -63,21 +63,13 @@ _HARMLESS = {
 
 @dataclass(frozen=True)
 class Transforms:
-    """Content of a `transforms.json`.
+    """Content of a `transforms.json`."""
 
-    Attributes:
-        cameras: one per frame, named by its `file_path`.
-        lenses: one per frame.
-        masks: per frame the image whose black pixels are not used, or None.
-        points: the points' PLY file, or None.
-        splits: names of images by split; empty if the file does not split them.
-    """
-
-    cameras: list[Camera]
-    lenses: list[Lens]
-    masks: list[Path | None]
-    points: Path | None
-    splits: Mapping[str, list[str]]
+    cameras: list[Camera]  #: One per frame, named by its `file_path`.
+    lenses: list[Lens]  #: One per frame.
+    masks: list[Path | None]  #: Per frame the image whose black pixels are not used, or None.
+    points: Path | None  #: The points' PLY file, or None.
+    splits: Mapping[str, list[str]]  #: Names of images by split; empty if the file does not split them.
 
 
 def read_transforms(path: Path, clips: Mapping[str, Clip] | None = None) -> Transforms:
@@ -273,7 +265,7 @@ def _images_named(source: Path, split: str, given: Sequence[str], names: Sequenc
 def _parts(name: str) -> tuple[str, ...]:
     """Return the parts of an image's path without the suffix of its format."""
     place = PurePosixPath(name.replace("\\", "/"))
-    has_suffix = place.suffix.lower() in (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES)
+    has_suffix = place.suffix.lower() in (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES, EXR_SUFFIX)
     return (place.with_suffix("") if has_suffix else place).parts
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from morgs_mi.core.color_space import unit_values
 from morgs_mi.io.onnx_file import OnnxNetwork, written_shapes
 from morgs_mi.method.flow_sources.flow_config import FlowConfig
 from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FlowSource, both_directions
@@ -108,7 +109,7 @@ class FlowNetwork:
 
     def _blob(self, image: np.ndarray) -> np.ndarray:
         """Return an image as the network's input, [1, 3, H, W] float32."""
-        unit = image.astype(np.float32) / (255 if image.dtype == np.uint8 else 1)
+        unit = unit_values(image, np.float32)
         return np.ascontiguousarray(np.moveaxis(self.low + (self.high - self.low) * unit, 2, 0)[None], np.float32)
 
 

@@ -23,24 +23,16 @@ __all__ = ["FLOW_SOURCES", "FlowSource", "FramePair", "both_directions", "check_
 
 @dataclass(frozen=True, eq=False)
 class FramePair:
-    """Two successive images of one camera.
+    """Two successive images of one camera."""
 
-    Attributes:
-        image: I_t [H, W, 3], RGB, uint8 or float in [0, 1].
-        previous: I_{t-1}, likewise.
-        camera: the camera's name; flow from files needs it.
-        frame: t; flow from files needs it.
-        valid: [H, W] bool, False where undistortion left nothing; None: valid everywhere.
-        box: rows and columns outside which nothing has changed; None: any pixel may have changed.
-        region: [H, W] bool, pixels outside which nothing has moved, all of them in the box; None: any may have.
-    """
-
-    image: np.ndarray
-    previous: np.ndarray
-    camera: str = ""
-    frame: int = 1
-    valid: np.ndarray | None = None
+    image: np.ndarray  #: I_t [H, W, 3], RGB, uint8 or float in [0, 1].
+    previous: np.ndarray  #: I_{t-1}, likewise.
+    camera: str = ""  #: The camera's name; flow from files needs it.
+    frame: int = 1  #: t; flow from files needs it.
+    valid: np.ndarray | None = None  #: [H, W] bool, False where undistortion left nothing; None: valid everywhere.
+    #: Rows and columns outside which nothing has changed; None: any pixel may have changed.
     box: tuple[slice, slice] | None = None
+    #: [H, W] bool, pixels outside which nothing has moved, all of them in the box; None: any may have.
     region: np.ndarray | None = None
 
 

@@ -7,16 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.rig import up_direction
 
-__all__ = ["gltf_axes", "up_direction"]
-
-
-def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the mean up direction of the cameras [3], of unit length; the first camera's where they cancel out."""
-    ups = np.stack([-np.asarray(camera.viewmat, np.float64)[1, :3] for camera in cameras])
-    mean = ups.mean(axis=0)
-    up = mean if np.linalg.norm(mean) > 0.1 else ups[0]
-    return up / np.linalg.norm(up)
+__all__ = ["gltf_axes"]
 
 
 def gltf_axes(cameras: Sequence[Camera]) -> np.ndarray:

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.codec.packets import CodedFrame, frames_near, play, seek
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.frame_source import FrameSource, FrameState, play
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.core.gaussians import Gaussians
@@ -34,19 +33,19 @@ Progress = Callable[[int, int], None] | None
 _SWING = 60.0
 
 
-def frame_numbers(stream: StreamReader) -> list[int]:
+def frame_numbers(stream: FrameSource) -> list[int]:
     """Return the indices of a stream's frames, without decoding them.
 
     Raises:
         ValueError: the stream has no frame.
     """
-    numbers = list(dict.fromkeys(frame for _, frame, _ in stream.index()))
+    numbers = stream.frame_numbers()
     if not numbers:
         raise ValueError(f"{stream.path}: at least one frame was expected, got none; the stream has only a header.")
     return numbers
 
 
-def select_frames(stream: StreamReader, span: str | None) -> list[int]:
+def select_frames(stream: FrameSource, span: str | None) -> list[int]:
     """Return the frames of a stream that `span` selects: ``12``, ``10:20`` (without 20), ``::5``; None selects all.
 
     Raises:
@@ -62,10 +61,11 @@ def select_frames(stream: StreamReader, span: str | None) -> list[int]:
     except ValueError:
         raise ValueError(f"select_frames(): `span` must be like 12, 10:20 or 0:100:5, got {span!r}.") from None
     if ":" not in span:
-        start, stop = start, None if start is None else start + 1
-    low, high = numbers[0] if start is None else start, numbers[-1] + 1 if stop is None else stop
-    wanted = set(range(low, high, step or 1))
-    if not (selected := [number for number in numbers if number in wanted]):
+        stop = None if start is None else start + 1
+    low = numbers[0] if start is None else start
+    high = numbers[-1] + 1 if stop is None else stop
+    indices = range(low, high, step or 1)
+    if not (selected := [number for number in numbers if number in indices]):
         raise ValueError(
             f"select_frames(): `span` must select frames of {stream.path}, {numbers[0]} to {numbers[-1]}, got {span!r}."
         )
@@ -94,25 +94,26 @@ def write_each(
         ValueError: a broken packet, or several frames for one file.
         OSError: the folder exists, or a file cannot be written.
     """
-    wanted, done = set(frames), 0
-    single = Path(output).name.lower().endswith(suffix)
-    if single and len(wanted) > 1:
+    selection = set(frames)
+    count = 0
+    is_file = Path(output).name.lower().endswith(suffix)
+    if is_file and len(selection) > 1:
         raise ValueError(
-            f"{output}: expected one frame for one file, got {len(wanted)}; select one (--frames), or name a folder."
+            f"{output}: expected one frame for one file, got {len(selection)}; select one (--frames), or name a folder."
         )
-    with (atomic_path if single else atomic_folder)(output, "write_each()") as partial:
+    with (atomic_path if is_file else atomic_folder)(output, "write_each()") as partial:
         for frame, gaussians in clip:
-            if frame in wanted:
-                write(partial if single else partial / f"{frame:04d}{suffix}", gaussians)
-                done += 1
+            if frame in selection:
+                write(partial if is_file else partial / f"{frame:04d}{suffix}", gaussians)
+                count += 1
                 if progress is not None:
-                    progress(done, len(wanted))
-            if done == len(wanted):
+                    progress(count, len(selection))
+            if count == len(selection):
                 break
 
 
 def flight(
-    stream: StreamReader,
+    stream: FrameSource,
     path: CameraPath,
     channels: Sequence[str] | None = ("color",),
     clip: Iterator[Gaussians] | None = None,
@@ -137,7 +138,7 @@ def flight(
 
 
 def flight_views(
-    stream: StreamReader, path: CameraPath, clip: Iterator[Gaussians] | None = None
+    stream: FrameSource, path: CameraPath, clip: Iterator[Gaussians] | None = None
 ) -> Iterator[tuple[int, Gaussians, Camera]]:
     """Yield the number, the Gaussians and the camera of each image of `flight`.
 
@@ -149,13 +150,13 @@ def flight_views(
     return ((i, gaussians, path.at(i / stream.fps)) for i, gaussians in frames)
 
 
-def num_images(stream: StreamReader, path: CameraPath) -> int:
+def num_images(stream: FrameSource, path: CameraPath) -> int:
     """Return the number of images of `flight`."""
     return max(1, round(path.seconds * stream.fps))
 
 
 def named_path(
-    stream: StreamReader, name: str = "orbit", degrees: float | None = None, least_seconds: float = 5.0
+    stream: FrameSource, name: str = "orbit", degrees: float | None = None, least_seconds: float = 5.0
 ) -> CameraPath:
     """Return the camera path `between` or `orbit`, as long as the clip, or the path in a JSON file.
 
@@ -191,7 +192,7 @@ def repeated_seconds(clip: float, least: float) -> float:
 
 
 def repeated_frames(
-    stream: StreamReader, freeze: int | None = None, back_and_forth: bool = False
+    stream: FrameSource, freeze: int | None = None, back_and_forth: bool = False
 ) -> Iterator[Gaussians]:
     """Yield the frames of a stream without end.
 
@@ -204,22 +205,22 @@ def repeated_frames(
     Raises:
         ValueError: the stream has no such frame, or a packet is broken.
     """
-    frozen = None if freeze is None else seek(stream, freeze).gaussians
+    frozen = None if freeze is None else stream.seek(freeze).gaussians
     while True:
         yield from (frozen,) if frozen is not None else (gaussians for _, gaussians in play(stream))
         if frozen is None and back_and_forth:
             yield from _frames_backwards(stream)
 
 
-def _frames_backwards(stream: StreamReader) -> Iterator[Gaussians]:
+def _frames_backwards(stream: FrameSource) -> Iterator[Gaussians]:
     """Yield the frames between the first and the last one backwards, decoded from one keyframe to the next."""
     between = frame_numbers(stream)[1:-1]
     while between:
-        block: list[CodedFrame] = []
-        for coded in frames_near(stream, between[-1]):
-            block = [*(before for before in block if before.frame < coded.frame), coded]
-            if coded.frame == between[-1]:
+        block: list[FrameState] = []
+        for state in stream.states(between[-1]):
+            block = [*(earlier for earlier in block if earlier.frame < state.frame), state]
+            if state.frame == between[-1]:
                 break
         # A keyframe has no motion of its own: it follows from the residual, in the block before.
-        yield from (coded.gaussians for coded in block[:0:-1])
+        yield from (state.gaussians for state in block[:0:-1])
         between = [frame for frame in between if frame <= block[0].frame]

@@ -14,19 +14,13 @@ __all__ = ["GLTF", "IMAGES", "PLY", "TRACKS", "USD", "VIDEO", "WEB", "Format", "
 
 @dataclass(frozen=True)
 class Format:
-    """A format of an export.
+    """A format of an export."""
 
-    Attributes:
-        name: of the format.
-        ending: end of the names of its outputs; empty: of names without a suffix.
-        default: name of the output beside a stream; ``{}`` stands for the name of a camera or a path.
-        folder: whether it is a folder with a file per frame, or for a web server. With an `ending`, the file of a
-            single frame is one, too.
-    """
-
-    name: str
-    ending: str
-    default: str
+    name: str  #: Of the format.
+    ending: str  #: End of the names of its outputs; empty: of names without a suffix.
+    default: str  #: Name of the output beside a stream; ``{}`` stands for the name of a camera or a path.
+    #: Whether it is a folder with a file per frame, or for a web server. With an `ending`, the file of a single frame
+    #: is one, too.
     folder: bool = False
 
     @property
@@ -36,8 +30,8 @@ class Format:
             return (f"FILE{self.ending}",)
         if not self.ending:
             return ("a folder",)
-        named = "" if self.ending.startswith(".") else f" ending in {self.ending}"
-        return (f"a folder{named}", f"FILE{self._suffix} for one frame")
+        ending = "" if self.ending.startswith(".") else f" ending in {self.ending}"
+        return (f"a folder{ending}", f"FILE{self._suffix} for one frame")
 
     @property
     def _suffix(self) -> str:
@@ -65,19 +59,19 @@ def choose_format(formats: Sequence[Format], output: str | Path | None = None, n
     Raises:
         ValueError: no format is called `name`, or the output has another ending.
     """
-    named = [chosen for chosen in formats if name in (None, chosen.name)]
-    if not named:
+    choices = [choice for choice in formats if name in (None, choice.name)]
+    if not choices:
         raise ValueError(f"choose_format(): `format` must be {_listed([f.name for f in formats])}, got {name!r}.")
-    if output is None or (name is not None and named[0].folder):
-        return named[0]
-    given = Path(output).name.lower()
-    if found := [chosen for chosen in named if chosen.ending and given.endswith(chosen.ending)]:
-        return max(found, key=lambda chosen: len(chosen.ending))
-    suffix = re.search(r"\.[a-z]\w*$", given)
-    if suffix is None and (folders := [chosen for chosen in named if chosen.folder]):
+    if output is None or (name is not None and choices[0].folder):
+        return choices[0]
+    file_name = Path(output).name.lower()
+    if matches := [choice for choice in choices if choice.ending and file_name.endswith(choice.ending)]:
+        return max(matches, key=lambda choice: len(choice.ending))
+    suffix = re.search(r"\.[a-z]\w*$", file_name)
+    if suffix is None and (folders := [choice for choice in choices if choice.folder]):
         return folders[0]
-    expected = _listed(list(dict.fromkeys(text for chosen in named for text in chosen.outputs)))
-    raise ValueError(f"{output}: the output must be {expected}, got {suffix[0] if suffix else given!r}.")
+    outputs = _listed(list(dict.fromkeys(text for choice in choices for text in choice.outputs)))
+    raise ValueError(f"{output}: the output must be {outputs}, got {suffix[0] if suffix else file_name!r}.")
 
 
 def destination(
@@ -96,13 +90,13 @@ def destination(
         ValueError: as `choose_format` and `check_output`, a folder stands where a file is to be written, or the output
             is the stream itself, by any of its names.
     """
-    chosen = choose_format(formats, output, name)
-    path = check_output(output or stream.with_name(chosen.default.format(stem)))
-    if chosen.is_file(path) and path.is_dir():
+    choice = choose_format(formats, output, name)
+    path = check_output(output or stream.with_name(choice.default.format(stem)))
+    if choice.is_file(path) and path.is_dir():
         raise ValueError(f"{path}: expected a file to write, got a folder; choose another name.")
     if path.exists() and stream.exists() and path.samefile(stream):
         raise ValueError(f"{path}: expected an output beside its source, got the source itself; choose another name.")
-    return path, chosen
+    return path, choice
 
 
 def _listed(names: Sequence[str]) -> str:

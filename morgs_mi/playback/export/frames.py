@@ -7,21 +7,22 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.color_space import srgb_to_linear
+from morgs_mi.core.color_space import decode_light, exposed
 from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import PLAYABLE, write_video
+from morgs_mi.playback.export.clips import frame_numbers
 from morgs_mi.playback.export.formats import IMAGES, choose_format
-from morgs_mi.playback.player import channel_image, render_stream
+from morgs_mi.playback.player import channel_image, render_stream, stream_exposure
 from morgs_mi.playback.visualise import side_by_side, write_png
 
 __all__ = ["exr_channels", "pad_to_even", "write_frames", "write_images"]
 
 
 def write_frames(
-    stream: StreamReader,
+    stream: FrameSource,
     camera: Camera,
     output: str | Path,
     channels: Sequence[str] | None = None,
@@ -45,11 +46,11 @@ def write_frames(
             that is truncated, broken or has no frame.
         OSError: the folder exists, or a file cannot be written.
     """
-    if not stream.index():
-        raise ValueError(f"{stream.path}: at least one frame was expected, got none; the stream has only a header.")
-    chosen = choose_format(IMAGES, output, format).name
-    channels = channels or (None if chosen == "exr" else ("color",))
-    write_images(render_stream(stream, camera, channels), stream.fps, output, progress, chosen)
+    frame_numbers(stream)  # refuses a stream without frames
+    kind = choose_format(IMAGES, output, format).name
+    channels = channels or (None if kind == "exr" else ("color",))
+    images = render_stream(stream, camera, channels)
+    write_images(images, stream.fps, output, progress, kind, stream_exposure(stream))
 
 
 def write_images(
@@ -58,27 +59,31 @@ def write_images(
     output: str | Path,
     progress: Callable[[int], None] | None = None,
     format: str | None = None,
+    display_exposure: float = 0.0,
 ) -> None:
     """Write rendered frames, pairs of index and channels [H, W, C] by name, into files as `write_frames` does.
+
+    Videos and PNG files show colours that are brightened by the display exposure, in stops, and clipped at white.
 
     Raises:
         ValueError: another type of video.
         OSError: the folder exists, or a file cannot be written.
     """
-    chosen = choose_format(IMAGES, output, format).name
+    kind = choose_format(IMAGES, output, format).name
 
     def frames() -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:
-        for done, (frame, images) in enumerate(rendered, start=1):
-            yield frame, images
+        for count, (frame, images) in enumerate(rendered, start=1):
+            shows = display_exposure and kind != "exr" and "color" in images
+            yield frame, {**images, "color": exposed(images["color"], display_exposure)} if shows else images
             if progress is not None:
-                progress(done)
+                progress(count)
 
-    if chosen == "mp4":
+    if kind == "mp4":
         padded = (pad_to_even(_combined_image(images)) for _, images in frames())
         write_video(output, padded, fps, PLAYABLE)
         return
-    write = _write_png if chosen == "png" else _write_exr
-    if Path(output).name.lower().endswith(f".{chosen}"):
+    write = _write_png if kind == "png" else _write_exr
+    if Path(output).name.lower().endswith(f".{kind}"):
         with atomic_path(output, "write_frames()") as partial:
             for count, (_, images) in enumerate(frames()):
                 if count:
@@ -87,7 +92,7 @@ def write_images(
         return
     with atomic_folder(output, "write_frames()") as folder:
         for frame, images in frames():
-            write(folder / f"{frame:04d}.{chosen}", images)
+            write(folder / f"{frame:04d}.{kind}", images)
 
 
 def _write_png(path: Path, images: Mapping[str, np.ndarray]) -> None:
@@ -104,7 +109,7 @@ def exr_channels(images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     Colour is R, G, B in linear light, as EXR readers expect, and alpha is A. Other channels are called ``depth.Y`` if
     they have one component, ``motion.X``, ``motion.Y`` if they have several. Motion is in pixels, depth in world units.
     """
-    planes = {**images, **({"color": srgb_to_linear(images["color"])} if "color" in images else {})}
+    planes = {**images, **({"color": decode_light(images["color"])} if "color" in images else {})}
     return {
         name: plane[..., i] for key, plane in planes.items() for i, name in enumerate(_exr_names(key, plane.shape[2]))
     }

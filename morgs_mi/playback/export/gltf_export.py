@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from morgs_mi.core.color_space import SH_C0, srgb_to_linear
+from morgs_mi.core.color_space import SH_C0, decode_light
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import rotated, unit_quats
@@ -31,7 +31,9 @@ from morgs_mi.core.geometry import rotated, unit_quats
 __all__ = ["glb", "write_gltf"]
 
 _NAME = "KHR_gaussian_splatting"
-_FLOAT, _ARRAY_BUFFER, _POINTS = 5126, 34962, 0
+_FLOAT = 5126
+_ARRAY_BUFFER = 34962
+_POINTS = 0
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 
 
@@ -79,7 +81,7 @@ def glb(gaussians: Gaussians, axes: np.ndarray | None = None) -> bytes:
 def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
     raw = gaussians.numpy()
     opacities = np.asarray(gaussians.opacities, np.float32)
-    diffuse = srgb_to_linear(np.clip(0.5 + SH_C0 * raw["sh_coeffs"][:, 0], 0, 1))
+    diffuse = decode_light(np.clip(0.5 + SH_C0 * raw["sh_coeffs"][:, 0], 0, 1))
     columns = {
         "POSITION": raw["means"],
         f"{_NAME}:ROTATION": np.roll(unit_quats(gaussians), -1, axis=1),

@@ -13,7 +13,7 @@ from __future__ import annotations
 import importlib.util
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 from xml.etree import ElementTree
@@ -22,17 +22,16 @@ import cv2
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.codec.packets import play
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import LARGEST, bounded, check_number
-from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
+from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.ranges import check_ranges
 from morgs_mi.gaussian_integrator import ellipsoids
 from morgs_mi.playback.export.clips import frame_numbers
 from morgs_mi.playback.player import available_channels
-from morgs_mi.plugins.light_probe import light_probe
+from morgs_mi.plugins.light_probe import CLIPPED, light_probe
 from morgs_mi.plugins.shadows import shadow_ratio, shadowed
 from morgs_mi.plugins.surface_view import lights, rays_for, traced
 from morgs_mi.render.channels import exr_names
@@ -70,6 +69,9 @@ class InsertConfig:
     light: Light = "probe"
     """``probe`` lights the surfaces by an environment map, see `captured_light`; ``traced`` traces rays through the
     Gaussians (`splat_path`), which also throw shadows on them."""
+    clipped: float | None = None
+    """Radiance of colours that the video clipped at 1, see `light_probe`; None: 4, or 1 for a stream of an HDR
+    recording, which is not clipped."""
 
     def __post_init__(self) -> None:
         check_number("render_inserted()", "samples", self.samples, "[1, inf)")
@@ -85,8 +87,8 @@ def load_insert(path: str | Path) -> Build:
     """
     path = Path(path)
     if path.suffix not in (".xml", ".py") or not path.is_file():
-        found = f"{path.suffix!r}" if path.is_file() else "none"
-        raise ValueError(f"{path}: expected a scene to insert, FILE.xml or FILE.py, got {found}; check the path.")
+        kind = f"{path.suffix!r}" if path.is_file() else "none"
+        raise ValueError(f"{path}: expected a scene to insert, FILE.xml or FILE.py, got {kind}; check the path.")
     if path.suffix == ".xml":
         entries = _xml_entries(path)
         return lambda frame, time: entries
@@ -113,7 +115,7 @@ def load_insert(path: str | Path) -> Build:
     return checked
 
 
-def inserted_channels(stream: StreamReader) -> tuple[str, ...]:
+def inserted_channels(stream: FrameSource) -> tuple[str, ...]:
     """Return all channels of a stream with an inserted scene, for EXR files.
 
     Raises:
@@ -124,7 +126,7 @@ def inserted_channels(stream: StreamReader) -> tuple[str, ...]:
     return ("color", "alpha", *(name for name in available_channels(gaussians) if name != "color"), *LAYERS)
 
 
-def selected(stream: StreamReader, frames: Sequence[int]) -> list[int]:
+def selected(stream: FrameSource, frames: Sequence[int]) -> list[int]:
     """Return `frames` in ascending order, each once.
 
     Raises:
@@ -140,7 +142,7 @@ def selected(stream: StreamReader, frames: Sequence[int]) -> list[int]:
 
 
 def render_inserted(
-    stream: StreamReader,
+    stream: FrameSource,
     camera: Camera,
     build: Build,
     frames: Sequence[int] | None = None,
@@ -166,6 +168,8 @@ def render_inserted(
         ValueError: a broken packet, or a scene that Mitsuba or `gaussian_splat` refuses.
     """
     config = config or InsertConfig()
+    if config.clipped is None:
+        config = replace(config, clipped=1.0 if "transfer" in stream.metadata else CLIPPED)
     for frame, gaussians in play(stream):
         if frames is None or frame in frames:
             entries = build(frame, frame / stream.fps)
@@ -183,38 +187,41 @@ def _resized(name: str, image: np.ndarray, camera: Camera) -> np.ndarray:
     return resized.reshape(camera.height, camera.width, -1) * unit
 
 
-def captured_light(gaussians: Gaussians, camera: Camera, position: np.ndarray) -> dict[str, Any]:
+def captured_light(
+    gaussians: Gaussians, camera: Camera, position: np.ndarray, clipped: float = CLIPPED
+) -> dict[str, Any]:
     """Return the `light_probe` at a point, where directions without Gaussians have the mean colour of a view.
 
     A capture rarely shows what is behind the cameras; black there would take half of the light away.
     """
-    return light_probe(gaussians, position, background=_mean_color(gaussians, camera))
+    return light_probe(gaussians, position, background=_mean_color(gaussians, camera, clipped), clipped=clipped)
 
 
-def _mean_color(gaussians: Gaussians, camera: Camera) -> list[float]:
-    return np.clip(np.asarray(rasterize(gaussians, camera, ("color",)).color), 0, 1).mean((0, 1)).tolist()
+def _mean_color(gaussians: Gaussians, camera: Camera, clipped: float) -> list[float]:
+    white = np.inf if clipped == 1 else 1.0
+    return np.clip(np.asarray(rasterize(gaussians, camera, ("color",)).color), 0, white).mean((0, 1)).tolist()
 
 
-def _in_background_light(entries: dict[str, Any], gaussians: Gaussians, camera: Camera) -> Any:
+def _in_background_light(entries: dict[str, Any], gaussians: Gaussians, camera: Camera, clipped: float) -> Any:
     """Return the inserted scene with the light that comes from behind all Gaussians, as for `captured_light`."""
-    radiance = srgb_to_linear(np.array(_mean_color(gaussians, camera))).tolist()
+    radiance = decode_light(np.array(_mean_color(gaussians, camera, clipped))).tolist()
     lamp = {"type": "constant", "radiance": {"type": "rgb", "value": radiance}}
     return mi.load_dict({"type": "scene", **entries, "captured light": lamp})
 
 
-def _integrator(chosen: Any, light: Light) -> Any:
-    """Return the integrator of the surfaces: the inserted scene's own, if it has one.
+def _integrator(entry: Any, light: Light, clipped: float) -> Any:
+    """Return the integrator of the surfaces: the one of the inserted scene, if it has one.
 
     Raises:
         ValueError: it does not light them as the option demands.
     """
-    chosen = chosen or {"type": "splat_path" if light == "traced" else "path"}
-    nested = mi.load_dict(chosen) if isinstance(chosen, dict) else chosen
+    entry = entry or ({"type": "splat_path", "clipped": clipped} if light == "traced" else {"type": "path"})
+    nested = mi.load_dict(entry) if isinstance(entry, dict) else entry
     if hasattr(nested, "splats") != (light == "traced"):
-        found = type(nested).__name__ if hasattr(nested, "splats") else nested.class_name()
+        name = type(nested).__name__ if hasattr(nested, "splats") else nested.class_name()
         raise ValueError(
             f"The inserted scene: with light {light!r}, expected {'an' if light == 'traced' else 'no'} integrator "
-            f"`splat_path`, got {found}; remove `integrator` from the scene, or choose the other light."
+            f"`splat_path`, got {name}; remove `integrator` from the scene, or choose the other light."
         )
     return nested
 
@@ -223,22 +230,16 @@ def _render(
     gaussians: Gaussians, camera: Camera, entries: dict[str, Any], channels: Sequence[str], config: InsertConfig
 ) -> dict[str, np.ndarray]:
     entries = {name: value for name, value in entries.items() if name not in ("type", "sensor")}
-    nested = _integrator(entries.pop("integrator", None), config.light)
+    clipped = CLIPPED if config.clipped is None else config.clipped
+    nested = _integrator(entries.pop("integrator", None), config.light, clipped)
     ratio = np.ones(len(gaussians), np.float32)
     try:
-        inserted: Any = mi.load_dict({"type": "scene", **entries})
-        if not (inserted.shapes() or inserted.emitters()):
-            raise ValueError("The inserted scene: expected at least one shape, got none; add one.")
-        if inserted.shapes() and not bounded(np.array([inserted.bbox().min, inserted.bbox().max])):
-            raise ValueError(
-                f"The inserted scene: expected shapes within {LARGEST:g} world units, got {inserted.bbox().min} to "
-                f"{inserted.bbox().max}; correct their places and sizes."
-            )
+        inserted = _inserted_scene(entries)
         lit = inserted
         if not inserted.emitters():
-            lamp = captured_light(gaussians, camera, np.array(inserted.bbox().center()).ravel())
+            lamp = captured_light(gaussians, camera, np.array(inserted.bbox().center()).ravel(), clipped)
             lit = mi.load_dict({"type": "scene", **entries, "captured light": lamp})
-            inserted = lit if config.light == "probe" else _in_background_light(entries, gaussians, camera)
+            inserted = lit if config.light == "probe" else _in_background_light(entries, gaussians, camera, clipped)
         if config.shadows:
             ratio = shadow_ratio(gaussians, lit, camera.position)
         dark = shadowed(gaussians, ratio)
@@ -249,11 +250,37 @@ def _render(
     except RuntimeError as error:
         raise ValueError(f"The inserted scene: {_reason(error)}; correct it.") from error
     if {"splats", "shadow"} & set(channels):
-        alone, less = (rasterize(part, camera) for part in (gaussians, dark))
-        bright, less = (srgb_to_linear(np.asarray(image.color)) for image in (alone, less))
-        images["splats"] = np.concatenate([bright, np.asarray(alone.alpha)], axis=2)
-        images["shadow"] = np.where(bright > 0, less / np.maximum(bright, 1e-6), 1)
+        images |= _splat_layers(gaussians, dark, camera)
     return {name: images[name].astype(np.float32) for name in channels}
+
+
+def _inserted_scene(entries: dict[str, Any]) -> Any:
+    """Return the scene of the entries, with the light that it has itself.
+
+    Raises:
+        ValueError: it has no shapes, or they are not finite.
+    """
+    scene: Any = mi.load_dict({"type": "scene", **entries})
+    if not (scene.shapes() or scene.emitters()):
+        raise ValueError("The inserted scene: expected at least one shape, got none; add one.")
+    box = scene.bbox()
+    if scene.shapes() and not bounded(np.array([box.min, box.max])):
+        raise ValueError(
+            f"The inserted scene: expected shapes within {LARGEST:g} world units, got {box.min} to {box.max}; correct "
+            "their places and sizes."
+        )
+    return scene
+
+
+def _splat_layers(gaussians: Gaussians, shadowed_gaussians: Gaussians, camera: Camera) -> dict[str, np.ndarray]:
+    """Return the layers `splats` [H, W, 4] and `shadow` [H, W, 3], in linear light."""
+    image = rasterize(gaussians, camera)
+    bright = decode_light(np.asarray(image.color))
+    dark = decode_light(np.asarray(rasterize(shadowed_gaussians, camera).color))
+    return {
+        "splats": np.concatenate([bright, np.asarray(image.alpha)], axis=2),
+        "shadow": np.where(bright > 0, dark / np.maximum(bright, 1e-6), 1),
+    }
 
 
 def _plugin_images(
@@ -271,7 +298,8 @@ def _plugin_images(
         }
     )
     image = np.asarray(scene.integrator().render(scene, spp=samples))
-    images, first = {"color": linear_to_srgb(image[..., :3]), "alpha": image[..., 3:4]}, 4
+    images = {"color": encode_light(image[..., :3]), "alpha": image[..., 3:4]}
+    first = 4
     for name in aovs:
         size = len(exr_names(name))
         images[name] = image[..., first : first + size]
@@ -291,8 +319,8 @@ def _xml_entries(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path}: {_reason(error)}; correct the scene file.") from error
     parts = {part.id() or f"part{i}": part for i, part in enumerate(_parts(scene))}
     # Mitsuba adds an integrator to files without one.
-    chosen = ElementTree.parse(path).find("integrator") is not None
-    return {**parts, "integrator": scene.integrator()} if chosen else parts
+    has_integrator = ElementTree.parse(path).find("integrator") is not None
+    return {**parts, "integrator": scene.integrator()} if has_integrator else parts
 
 
 def _reason(error: RuntimeError) -> str:

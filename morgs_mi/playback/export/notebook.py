@@ -5,30 +5,32 @@ from __future__ import annotations
 import base64
 import html
 
-from morgs_mi.codec.packets import play
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.frame_source import FrameSource, play
+from morgs_mi.core.color_space import exposed
 from morgs_mi.io.png import png_bytes
 from morgs_mi.playback.export.web import web_page
-from morgs_mi.playback.player import channel_image, render, render_config, stream_name
+from morgs_mi.playback.player import channel_image, render, render_config, stream_exposure, stream_name
 
 __all__ = ["stream_html"]
 
 # Largest stream that is stored in a notebook, in bytes; the player adds a bit more than a megabyte.
 _LARGEST = 4_000_000
 # Width and height of the player in pixels, unless the output of the cell is narrower.
-_WIDTH, _HEIGHT = 800, 600
+_WIDTH = 800
+_HEIGHT = 600
 _STYLE = "width:100%;max-width:{width:.0f}px;aspect-ratio:{aspect:.4f};border:0;border-radius:8px"
 _PLAYER = '<iframe sandbox="allow-scripts" allow="fullscreen" title="{title}" style="{style}" srcdoc="{page}"></iframe>'
 _POSTER = '<img alt="{title}" style="{style}" src="data:image/png;base64,{image}"><div>{text}</div>'
 
 
-def stream_html(stream: StreamReader) -> str:
+def stream_html(stream: FrameSource) -> str:
     """Return a stream as HTML: the player of `morgs-mi export web`, or the first frame where it would be too large.
 
     A stream that cannot be read becomes the sentence that describes why.
     """
     try:
-        camera, size = stream.cameras[0], stream.path.stat().st_size
+        camera = stream.cameras[0]
+        size = stream.path.stat().st_size
         aspect = camera.width / camera.height
         style = _STYLE.format(width=min(_WIDTH, _HEIGHT * aspect), aspect=aspect)
         title = html.escape(stream_name(stream))
@@ -36,7 +38,8 @@ def stream_html(stream: StreamReader) -> str:
             page = web_page(stream).decode().replace("&", "&amp;").replace('"', "&quot;")
             return _PLAYER.format(title=title, style=style, page=page)
         gaussians = next(gaussians for _, gaussians in play(stream))
-        image = channel_image("color", render(gaussians, camera, ("color",), render_config(stream))["color"])
+        color = render(gaussians, camera, ("color",), render_config(stream))["color"]
+        image = channel_image("color", exposed(color, stream_exposure(stream)))
     except (OSError, ValueError, StopIteration) as error:
         return f"<div>{html.escape(str(error) or f'{stream.path}: expected at least one frame, got none.')}</div>"
     command = f"morgs-mi export web {stream.path} page.html"

@@ -20,13 +20,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.codec.packets import play
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_number
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import check_memory
-from morgs_mi.playback.export.axes import up_direction
+from morgs_mi.core.rig import up_direction
 from morgs_mi.playback.export.clips import flight_views
 from morgs_mi.playback.export.paths import CameraPath
 from morgs_mi.playback.player import render_config
@@ -66,7 +65,8 @@ def panorama(
     check_number("panorama()", "stereo", stereo, "[0, inf)")
     if width < 2 or width % 2:
         raise ValueError(f"panorama(): `width` must be even and at least 2, got {width}; it is twice the height.")
-    height, eyes = width // 2, (-0.5, 0.5) if stereo else (0.0,)
+    height = width // 2
+    eyes = (-0.5, 0.5) if stereo else (0.0,)
     strip = max(_MOST_RAYS, width * samples**2)
     check_memory(
         "panorama()",
@@ -76,7 +76,8 @@ def panorama(
     )
     if not len(gaussians):
         return np.zeros((len(eyes) * height, width, 3), np.float32)
-    rays, to_world = SplatRays(gaussians, config), np.linalg.inv(np.asarray(camera.viewmat, np.float64))[:3]
+    rays = SplatRays(gaussians, config)
+    to_world = np.linalg.inv(np.asarray(camera.viewmat, np.float64))[:3]
     rows = max(1, _MOST_RAYS // (width * samples**2))
     parts = [
         _strip(rays, to_world, eye * stereo, (width, height, samples), np.arange(start, min(start + rows, height)))
@@ -106,7 +107,7 @@ def _strip(
 
 
 def panoramas(
-    stream: StreamReader, view: Camera | CameraPath, width: int = 2048, stereo: float = 0.0
+    stream: FrameSource, view: Camera | CameraPath, width: int = 2048, stereo: float = 0.0
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     """Render the panoramas of a stream at a camera, or of the images of `flight` along a path, with a level horizon.
 
@@ -122,7 +123,8 @@ def panoramas(
     Raises:
         ValueError: as `panorama`, or a packet is broken.
     """
-    up, config = up_direction(stream.cameras), render_config(stream)
+    up = up_direction(stream.cameras)
+    config = render_config(stream)
     if isinstance(view, CameraPath):
         views = flight_views(stream, view)
     else:
@@ -137,7 +139,9 @@ def levelled(camera: Camera, up: np.ndarray) -> Camera:
     The side of a camera that looks straight down is where the top of its image is.
     """
     _, down, forward = np.asarray(camera.viewmat, np.float64)[:3, :3]
-    ahead = np.cross(np.cross(up, forward), up)
-    if np.linalg.norm(ahead) < 1e-3:
-        ahead = down if forward @ up > 0 else -down
-    return Camera.look_at(camera.position, camera.position + ahead, up, 90, camera.width, camera.height, camera.name)
+    direction = np.cross(np.cross(up, forward), up)
+    if np.linalg.norm(direction) < 1e-3:
+        direction = down if forward @ up > 0 else -down
+    return Camera.look_at(
+        camera.position, camera.position + direction, up, 90, camera.width, camera.height, camera.name
+    )

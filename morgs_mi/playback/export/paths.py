@@ -16,8 +16,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from morgs_mi.core.camera import Camera, rigid
+from morgs_mi.core.rig import up_direction
 from morgs_mi.io.bounded import read_json
-from morgs_mi.playback.export.axes import up_direction
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
@@ -83,7 +83,8 @@ class CameraPath:
         positions, rotations, intrinsics = self._splines
         R = rotations(time).as_matrix().T
         viewmat = np.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = R, -R @ positions(time)
+        viewmat[:3, :3] = R
+        viewmat[:3, 3] = -R @ positions(time)
         log_fx, log_fy, cx, cy = intrinsics(time)
         K = np.array([[np.exp(log_fx), 0, cx], [0, np.exp(log_fy), cy], [0, 0, 1]])
         return replace(self.keys[0], K=K, viewmat=viewmat, name="path")
@@ -120,11 +121,13 @@ def focus(cameras: Sequence[Camera], means: np.ndarray) -> np.ndarray:
     The median of the Gaussians' centres [N, 3] has a small weight; it determines the distance of parallel axes.
     """
     weight = _MEDIAN_WEIGHT * len(cameras)
-    A, b = weight * np.eye(3), weight * np.median(means, axis=0)
+    A = weight * np.eye(3)
+    b = weight * np.median(means, axis=0)
     for camera in cameras:
         axis = np.asarray(camera.viewmat, np.float64)[2, :3]
         across = np.eye(3) - np.outer(axis, axis)
-        A, b = A + across, b + across @ camera.position
+        A = A + across
+        b = b + across @ camera.position
     return np.linalg.solve(A, b)
 
 
@@ -139,7 +142,8 @@ def orbit(
     Raises:
         ValueError: the camera is at the centre or directly above it, or `degrees` is not in 1..360.
     """
-    first, up = cameras[0], up_direction(cameras)
+    first = cameras[0]
+    up = up_direction(cameras)
     arm = first.position - center
     if np.linalg.norm(np.cross(arm, up)) < 1e-3 * np.linalg.norm(arm) or not arm.any():
         raise ValueError(
@@ -200,7 +204,8 @@ def load_path(file: str | Path, cameras: Sequence[Camera]) -> CameraPath:
             "views of the camera path as `keys`."
         )
     common = {name: value for name, value in document.items() if name != "keys"}
-    views, times = [], []
+    views = []
+    times = []
     for i, key in enumerate(keys):
         try:
             times.append(float(key["time"]))
@@ -229,10 +234,10 @@ def _key_view(key: Mapping[str, Any], cameras: Sequence[Camera]) -> Camera:
     first = cameras[0]
     like = first.resized(int(key.get("width", first.width)), int(key.get("height", first.height)))
     if "camera" in key:
-        named = {camera.name: camera for camera in cameras}
-        if key["camera"] not in named:
-            raise ValueError(f"`camera` must be one of {', '.join(named)}, got {key['camera']!r}.")
-        return named[key["camera"]].resized(like.width, like.height)
+        by_name = {camera.name: camera for camera in cameras}
+        if key["camera"] not in by_name:
+            raise ValueError(f"`camera` must be one of {', '.join(by_name)}, got {key['camera']!r}.")
+        return by_name[key["camera"]].resized(like.width, like.height)
     if "fov_x" in key:
         f = 0.5 * like.width / np.tan(np.deg2rad(0.5 * float(key["fov_x"])))
         like = replace(like, K=np.array([[f, 0, 0.5 * like.width], [0, f, 0.5 * like.height], [0, 0, 1]]))

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.codec.packets import frames_with_lasting_ids
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.files import atomic_path
 from morgs_mi.playback.export.formats import TRACKS, choose_format
 
@@ -33,7 +32,7 @@ class Tracks:
     confidence: np.ndarray
 
 
-def extract_tracks(stream: StreamReader, progress: Callable[[int], None] | None = None) -> Tracks:
+def extract_tracks(stream: FrameSource, progress: Callable[[int], None] | None = None) -> Tracks:
     """Return the tracks of all Gaussians of a stream; they take 16 bytes of memory per Gaussian and frame.
 
     Where a keyframe starts a new set of Gaussians with ids from 0, these ids continue after the earlier ones.
@@ -45,13 +44,15 @@ def extract_tracks(stream: StreamReader, progress: Callable[[int], None] | None 
     Raises:
         ValueError: a broken packet, or a stream without a frame.
     """
-    ids_of_frames, rows, frames = [], [], []
-    for ids, coded in frames_with_lasting_ids(stream):
-        gaussians = coded.gaussians
+    ids_of_frames = []
+    rows = []
+    frames = []
+    for state in stream.states():
+        gaussians = state.gaussians
         has_confidence = gaussians.confidence is not None
-        confidence = np.asarray(gaussians.confidence) if has_confidence else np.full(len(coded), np.nan, np.float32)
-        frames.append(coded.frame)
-        ids_of_frames.append(ids)
+        confidence = np.asarray(gaussians.confidence) if has_confidence else np.full(len(state), np.nan, np.float32)
+        frames.append(state.frame)
+        ids_of_frames.append(state.lasting_ids)
         rows.append((gaussians.numpy()["means"], confidence))
         if progress is not None:
             progress(len(frames))
@@ -62,7 +63,8 @@ def extract_tracks(stream: StreamReader, progress: Callable[[int], None] | None 
     confidences = np.full((len(frames), len(ids)), np.nan, np.float32)
     for t, (present, (means, confidence)) in enumerate(zip(ids_of_frames, rows, strict=True)):
         columns = np.searchsorted(ids, present)
-        positions[t, columns], confidences[t, columns] = means, confidence
+        positions[t, columns] = means
+        confidences[t, columns] = confidence
     return Tracks(ids.astype(np.uint32), np.asarray(frames), positions, confidences)
 
 

@@ -38,8 +38,7 @@ from typing import Any
 import numpy as np
 from scipy.special import expit
 
-from morgs_mi.codec.packets import CodedFrame, frames_with_first_id
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.frame_source import FrameSource, FrameState
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import covariances, rotated, unit_quats
@@ -48,7 +47,8 @@ from morgs_mi.playback.export.formats import USD, choose_format
 
 __all__ = ["write_usd"]
 
-_COEFFICIENTS, _DEGREE = "radiance:sphericalHarmonicsCoefficients", "radiance:sphericalHarmonicsDegree"
+_COEFFICIENTS = "radiance:sphericalHarmonicsCoefficients"
+_DEGREE = "radiance:sphericalHarmonicsDegree"
 # Types of the arrays in pxr.Vt, as float and as half. Half positions would have steps of a thousandth of the scene.
 _TYPES = {
     "positions": ("Vec3fArray", None),
@@ -63,7 +63,7 @@ _UNSAVED_BYTES = 2**28  # of samples in memory
 
 
 def write_usd(
-    stream: StreamReader,
+    stream: FrameSource,
     path: str | Path,
     frames: Sequence[int],
     half: bool = False,
@@ -99,68 +99,63 @@ def write_usd(
 
 def _write_stage(
     pxr: Any,
-    stream: StreamReader,
+    stream: FrameSource,
     path: Path,
     frames: Sequence[int],
     half: bool,
     progress: Callable[[int, int], None] | None,
 ) -> None:
     """Write a file that is not a package; the arguments are the same as for `write_usd`."""
-    axes, wanted, unsaved = gltf_axes(stream.cameras), set(frames), 0
+    axes = gltf_axes(stream.cameras)
+    selection = set(frames)
+    unsaved = 0
 
-    def selected() -> Iterator[tuple[int, CodedFrame]]:
-        return ((first_id, coded) for first_id, coded in frames_with_first_id(stream) if coded.frame in wanted)
+    def selected() -> Iterator[FrameState]:
+        return (state for state in stream.states() if state.frame in selection)
 
     sets = _sets(selected(), axes)
     stage = pxr.Usd.Stage.CreateNew(str(path))
     _describe(pxr, stage, stream, frames, axes)
     fields = _fields(pxr, stage, sets, frames, half)
-    for done, (first_id, coded) in enumerate(selected(), start=1):
-        unsaved += fields[first_id].put(coded, axes)
+    for count, state in enumerate(selected(), start=1):
+        unsaved += fields[state.first_id].put(state, axes)
         # A binary file is appended to, which bounds the memory; a text would be written again.
         if unsaved > _UNSAVED_BYTES and path.suffix.lower() != ".usda":
             stage.Save()
             unsaved = 0
         if progress is not None:
-            progress(done, len(frames))
+            progress(count, len(frames))
     stage.Save()
 
 
 @dataclass
 class _Set:
-    """The Gaussians that begin with one keyframe.
+    """The Gaussians that begin with one keyframe."""
 
-    Attributes:
-        start: the first frame.
-        degree: of the spherical harmonics.
-        ids: uint32 [M], ascending.
-        births: attributes [M, ...] at birth, by the names of the schema.
-    """
-
-    start: int
-    degree: int
-    ids: np.ndarray
-    births: dict[str, np.ndarray]
+    start: int  # the first frame
+    degree: int  # of the spherical harmonics
+    ids: np.ndarray  # uint32 [M], ascending
+    births: dict[str, np.ndarray]  # attributes [M, ...] at birth, by the names of the schema
 
 
-def _sets(clip: Iterator[tuple[int, CodedFrame]], axes: np.ndarray) -> dict[int, _Set]:
+def _sets(states: Iterator[FrameState], axes: np.ndarray) -> dict[int, _Set]:
     """Return the sets of Gaussians by the number that is added to their ids."""
-    found: dict[int, list[tuple[np.ndarray, dict[str, np.ndarray]]]] = {}
+    parts_of: dict[int, list[tuple[np.ndarray, dict[str, np.ndarray]]]] = {}
     starts: dict[int, tuple[int, int]] = {}
-    for first_id, coded in clip:
-        parts = found.setdefault(first_id, [])
-        starts.setdefault(first_id, (coded.frame, coded.gaussians.sh_degree))
-        known = parts[-1][0][-1] if parts else -1
-        born = coded.ids.astype(np.int64) > known
-        if born.any():
-            parts.append((coded.ids[born], _values(rotated(coded.gaussians.select(born), axes))))
+    for state in states:
+        parts = parts_of.setdefault(state.first_id, [])
+        starts.setdefault(state.first_id, (state.frame, state.gaussians.sh_degree))
+        last_id = parts[-1][0][-1] if parts else -1
+        births = state.ids.astype(np.int64) > last_id
+        if births.any():
+            parts.append((state.ids[births], _values(rotated(state.gaussians.select(births), axes))))
     return {
         first_id: _Set(
             *starts[first_id],
             np.concatenate([np.zeros(0, np.uint32), *(ids for ids, _ in parts)]),
             {name: np.concatenate([values[name] for _, values in parts]) for name in _TYPES} if parts else {},
         )
-        for first_id, parts in found.items()
+        for first_id, parts in parts_of.items()
     }
 
 
@@ -181,24 +176,26 @@ class _Field:
     """Writer of the time samples of one prim."""
 
     def __init__(self, pxr: Any, prim: Any, gaussians: _Set, half: bool) -> None:
-        self._ids, self._state = gaussians.ids, {name: value.copy() for name, value in gaussians.births.items()}
+        self._ids = gaussians.ids
+        self._state = {name: value.copy() for name, value in gaussians.births.items()}
         self._samples = {"extent": _Samples(prim.GetAttribute("extent"), pxr.Vt.Vec3fArray, np.float32)}
-        for name, (single, small) in _TYPES.items():
+        for name, (full, small) in _TYPES.items():
             as_half = half and small is not None
             attribute = prim.GetAttribute(name + ("h" if as_half else ""))
-            array = getattr(pxr.Vt, small if as_half and small else single)
+            array = getattr(pxr.Vt, small if as_half and small else full)
             self._samples[name] = _Samples(attribute, array, np.float16 if as_half else np.float32)
 
-    def put(self, coded: CodedFrame, axes: np.ndarray) -> int:
+    def put(self, state: FrameState, axes: np.ndarray) -> int:
         """Write a frame and return the number of bytes of its samples."""
         if not len(self._ids):
             return 0
-        gaussians, rows = rotated(coded.gaussians, axes), np.searchsorted(self._ids, coded.ids)
+        gaussians = rotated(state.gaussians, axes)
+        rows = np.searchsorted(self._ids, state.ids)
         self._state["opacities"][:] = 0
         for name, value in _values(gaussians).items():
             self._state[name][rows] = value
         values = {**self._state, "extent": _extent(gaussians)}
-        return sum(self._samples[name].put(coded.frame, value) for name, value in values.items())
+        return sum(self._samples[name].put(state.frame, value) for name, value in values.items())
 
 
 @dataclass
@@ -212,15 +209,16 @@ class _Samples:
     array: Any
     dtype: type
     last: np.ndarray = field(default_factory=lambda: np.empty(0))
-    held: int | None = None
+    last_time: int | None = None
 
     def put(self, time: int, values: np.ndarray) -> int:
         if np.array_equal(values, self.last):
-            self.held = time
+            self.last_time = time
             return 0
-        if self.held is not None:
-            self._set(self.held, self.last)
-        self.last, self.held = values.copy(), None
+        if self.last_time is not None:
+            self._set(self.last_time, self.last)
+        self.last = values.copy()
+        self.last_time = None
         self._set(time, values)
         return values.nbytes
 
@@ -240,7 +238,7 @@ def _extent(gaussians: Gaussians) -> np.ndarray:
     return np.stack([(means - reach).min(axis=0), (means + reach).max(axis=0)]).astype(np.float32)
 
 
-def _describe(pxr: Any, stage: Any, stream: StreamReader, frames: Sequence[int], axes: np.ndarray) -> None:
+def _describe(pxr: Any, stage: Any, stream: FrameSource, frames: Sequence[int], axes: np.ndarray) -> None:
     """Write the metadata of the stage and its root prim."""
     pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.y)
     pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -257,7 +255,8 @@ def _describe(pxr: Any, stage: Any, stream: StreamReader, frames: Sequence[int],
 
 def _fields(pxr: Any, stage: Any, sets: dict[int, _Set], frames: Sequence[int], half: bool) -> dict[int, _Field]:
     """Define a prim for each set, with what does not change, and return their writers."""
-    fields, ends = {}, [*(gaussians.start for gaussians in sets.values()), None][1:]
+    fields = {}
+    ends = [*(gaussians.start for gaussians in sets.values()), None][1:]
     for number, ((first_id, gaussians), end) in enumerate(zip(sets.items(), ends, strict=True)):
         splats = pxr.UsdVol.ParticleField3DGaussianSplat.Define(stage, f"/Stream/Gaussians{number or ''}")
         prim = splats.GetPrim()

@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.codec.container import StreamWriter
+from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.codec.packets import coded_frames
-from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.core.gaussians import Gaussians
@@ -43,7 +43,7 @@ _LEAST_SCALE = 0.001
 
 
 def write_web_page(
-    stream: StreamReader, path: str | Path, title: str | None = None, progress: Progress | None = None
+    stream: FrameSource, path: str | Path, title: str | None = None, progress: Progress | None = None
 ) -> int:
     """Write a self-contained page that plays a stream, and return its number of bytes.
 
@@ -66,14 +66,14 @@ def write_web_page(
     return len(page)
 
 
-def web_page(stream: StreamReader, title: str | None = None, progress: Progress | None = None) -> bytes:
+def web_page(stream: FrameSource, title: str | None = None, progress: Progress | None = None) -> bytes:
     """Return the page that `write_web_page` writes; arguments and errors are the same."""
     data = _script("stream", published_bytes(stream, progress))
     return _page(title or stream_name(stream), data, "data: blob:")
 
 
 def write_web_folder(
-    stream: StreamReader, path: str | Path, title: str | None = None, progress: Progress | None = None
+    stream: FrameSource, path: str | Path, title: str | None = None, progress: Progress | None = None
 ) -> int:
     """Write a folder for a web server and return its number of bytes.
 
@@ -125,17 +125,19 @@ def text_of_bytes(data: bytes) -> str:
     return (codes + np.uint8(128) * np.isin(codes, _UNSAFE)).tobytes().decode("latin-1")
 
 
-def published_bytes(stream: StreamReader, progress: Progress | None = None) -> bytes:
+def published_bytes(stream: FrameSource, progress: Progress | None = None) -> bytes:
     """Return the stream with the metadata that the page reads, after decoding it once; errors as `write_web_page`."""
     render = metadata_entry(stream, "config.render", {}, dict)
-    packets, speeds = list(stream), []
+    packets = list(stream)
+    speeds = []
     for coded in coded_frames(packets):
         speeds.append(_speeds(coded.gaussians, stream.cameras))
         if progress is not None:
             progress(len(speeds))
     if not speeds:
         raise ValueError(f"{stream.path}: expected at least one frame to show, got none.")
-    sink, metadata = io.BytesIO(), {"config": {"render": render}, "motion_scale": _motion_scale(*np.hstack(speeds))}
+    sink = io.BytesIO()
+    metadata = {"config": {"render": render}, "motion_scale": _motion_scale(*np.hstack(speeds))}
     if stream.metadata.get(DEFAULT_RIG) is True:
         metadata[DEFAULT_RIG] = True
     with StreamWriter(sink, stream.cameras, stream.fps, metadata) as writer:
@@ -164,17 +166,20 @@ def _speeds(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarray:
     motion = np.asarray(gaussians.motion)
     rows = np.flatnonzero(motion.any(axis=1))
     rows = rows[:: len(rows) // _SAMPLES + 1]
-    motion, raw = motion[rows], gaussians.numpy()
-    means, log_sizes = raw["means"][rows], raw["log_scales"][rows].mean(axis=1)
+    motion = motion[rows]
+    raw = gaussians.numpy()
+    means = raw["means"][rows]
+    log_sizes = raw["log_scales"][rows].mean(axis=1)
     # A stream may contain any scale; the bound keeps the weights finite.
-    weights, found = np.asarray(gaussians.opacities)[rows] * np.exp(2 * np.minimum(log_sizes, 20)), []
+    weights = np.asarray(gaussians.opacities)[rows] * np.exp(2 * np.minimum(log_sizes, 20))
+    columns = []
     for camera in cameras:
         pixels, depths = camera.project(means)
-        seen = (depths > camera.near) & ((pixels > 0) & (pixels < (camera.width, camera.height))).all(axis=1)
-        motions = np.einsum("nij,nj->ni", camera.projection_jacobian(means[seen]), motion[seen])
+        visible = (depths > camera.near) & ((pixels > 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+        motions = np.einsum("nij,nj->ni", camera.projection_jacobian(means[visible]), motion[visible])
         speeds = np.linalg.norm(motions, axis=1) / camera.width
-        found.append([speeds, weights[seen] / depths[seen] ** 2])
-    return np.hstack(found)
+        columns.append([speeds, weights[visible] / depths[visible] ** 2])
+    return np.hstack(columns)
 
 
 def _player() -> Traversable:

@@ -7,12 +7,12 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from morgs_mi.codec.packets import seek
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.color_space import exposed
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.png import png_bytes
-from morgs_mi.playback.player import available_channels, channel_image, render, render_config
+from morgs_mi.playback.player import available_channels, channel_image, render, render_config, stream_exposure
 
 __all__ = ["ExactImages"]
 
@@ -25,7 +25,7 @@ class ExactImages:
     Of the requests that wait for it, the newest wins.
     """
 
-    def __init__(self, opened: Callable[[], StreamReader]) -> None:
+    def __init__(self, opened: Callable[[], FrameSource]) -> None:
         self._opened = opened
         self._newest = 0
         self._lock = asyncio.Lock()
@@ -57,12 +57,13 @@ class ExactImages:
         if channel not in available_channels(gaussians):
             raise ValueError(f"{stream.path}: expected a channel of the stream, got {channel!r}.")
         values = render(gaussians, camera, (channel,), render_config(stream))[channel]
+        values = exposed(values, stream_exposure(stream)) if channel == "color" else values
         return png_bytes(channel_image(channel, values, motion_scale))
 
-    def _gaussians(self, stream: StreamReader, frame: int) -> Gaussians:
+    def _gaussians(self, stream: FrameSource, frame: int) -> Gaussians:
         """Return the Gaussians of a frame; the last ones stay decoded as long as the file is the same."""
         status = stream.path.stat()
         key = (frame, stream.path, status.st_ino, status.st_mtime_ns)
         if self._decoded is None or self._decoded[0] != key:
-            self._decoded = (key, seek(stream, frame).gaussians)
+            self._decoded = (key, stream.seek(frame).gaussians)
         return self._decoded[1]

@@ -10,7 +10,7 @@ from threading import Lock
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
-from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.playback.player import fitted_capture, num_frames, open_stream_capture
 
 __all__ = ["RecordedImages"]
@@ -30,27 +30,27 @@ class RecordedImages:
         self._images: Iterator[np.ndarray | Exception] = iter(())
         self._lock = Lock()
 
-    def are_present(self, stream: StreamReader) -> bool:
+    def are_present(self, stream: FrameSource) -> bool:
         """Return whether the folder of the capture is there."""
         try:
             return Path(self._folder or fitted_capture(stream)).is_dir()
         except (OSError, ValueError):
             return False
 
-    def at(self, stream: StreamReader, view: int, frame: int) -> np.ndarray:
+    def at(self, stream: FrameSource, view: int, frame: int) -> np.ndarray:
         """Return the image [H, W, 3] of a camera at a frame, undistorted as for the fit.
 
         Raises:
             OSError, ValueError: the capture is missing, broken, or not the one of the stream; or the image was not
                 recorded.
         """
-        last = max((frame for _, frame, _ in stream.index()), default=-1)
+        last = max(stream.frame_numbers(), default=-1)
         if view >= len(stream.cameras) or frame > last:
             raise ValueError(f"{stream.path}: expected a camera and a frame of the stream, got {view} and {frame}.")
         with self._lock:
             if self._capture is None or frame >= self._capture.num_frames:  # the capture of a live fit grows
                 count = max(num_frames(stream), last + 1)
-                self._capture = open_stream_capture(stream, self._folder, list(range(count)))
+                self._capture = open_stream_capture(stream, self._folder, list(range(count))).displayed()
                 self._view = -1
             if view != self._view or not self._next <= frame < self._next + _NEAR:
                 self._images = self._capture.images(view, frame)

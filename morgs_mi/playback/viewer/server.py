@@ -22,6 +22,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, PlainTextResponse, Response
 from starlette.routing import Route
 
+from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.codec.header import camera_of_fields, load_json
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.playback.export.web import published_bytes, served_page
@@ -56,7 +57,7 @@ class Viewer:
     """
 
     def __init__(
-        self, stream: StreamReader, host: str = "127.0.0.1", port: int = 0, capture: Path | None = None
+        self, stream: FrameSource, host: str = "127.0.0.1", port: int = 0, capture: Path | None = None
     ) -> None:
         self._stream = stream
         self._path = stream.path
@@ -103,7 +104,7 @@ class Viewer:
         provisional = self._path.with_name(PROVISIONAL)
         return provisional if provisional.is_file() and not StreamReader(self._path).index() else self._path
 
-    def _opened(self) -> StreamReader:
+    def _opened(self) -> FrameSource:
         """Return the stream as it is now; a file of Gaussians stays as it was opened."""
         return self._stream if isinstance(self._stream, SplatFile) else StreamReader(self._newest())
 

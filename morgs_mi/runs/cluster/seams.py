@@ -16,9 +16,10 @@ import numpy as np
 
 from morgs_mi.codec.packets import CodedFrame
 from morgs_mi.core.ranges import AtLeast, check_ranges
+from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.observation import Setup
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.stream_loop import FrameReport, StreamState, step
+from morgs_mi.stream_loop import StreamState, step
 
 __all__ = ["COMMON_FRAMES", "SegmentConfig", "fit_seam_frame"]
 

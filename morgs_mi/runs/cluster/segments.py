@@ -20,11 +20,12 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture
 from morgs_mi.codec.container import StreamWriter, TruncatedStreamError, decode_packet
-from morgs_mi.codec.packets import decode, reemitted_keyframe, seek
+from morgs_mi.codec.packets import decode, reemitted_keyframe
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.files import locked_folder, write_json
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
+from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.source import about_lenses, as_fitted
 from morgs_mi.runs.cluster.seams import COMMON_FRAMES, SegmentConfig
@@ -44,7 +45,6 @@ from morgs_mi.runs.recording import (
     restart_of,
     stream_metadata,
 )
-from morgs_mi.stream_loop import FrameReport
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -66,7 +66,7 @@ def noting_segments(out: Path) -> Iterator[None]:
     except (KeyboardInterrupt, OSError, MemoryError) as error:
         streams = sorted((out / FOLDER).glob("[0-9]*.morgs"))
         with suppress(OSError, ValueError):
-            count = sum(len({frame for _, frame, _ in StreamReader(path).index()}) for path in streams)
+            count = sum(len(StreamReader(path).frame_numbers()) for path in streams)
             if count:
                 error.add_note(f"{out / FOLDER} holds {count} frames; continue with `--resume`.")
         raise
@@ -178,7 +178,8 @@ class SegmentedRun:
             self._add(part if prepared is None else self._completed(part, prepared))
             first = replace(part.segment, stop=first.stop)
         self.task = replace(self.task, points=None, balance=self.recordings[0].reports[0].exposures)
-        common = reemitted_keyframe(seek(StreamReader(self._files(0).stream), stop - 1)).encoded
+        states = StreamReader(self._files(0).stream).states(stop - 1)
+        common = reemitted_keyframe(next(state for state in states if state.frame == stop - 1)).encoded
         return [first, *(s if s.restart else replace(s, restart=(common,)) for s in segments[1:])]
 
     def _fit_side_by_side(self, segments: Iterable[Segment]) -> None:

@@ -20,13 +20,14 @@ from morgs_mi.codec.container import Packet, decode_packet
 from morgs_mi.codec.packets import CodedFrame, decode, reemitted_keyframe
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.remote import url_of
+from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.exposure import Exposure
 from morgs_mi.runs.cluster.seams import SegmentConfig, fit_seam_frame
 from morgs_mi.runs.cluster.workers import prepared, worker_name
 from morgs_mi.runs.recorder import push_frame, with_next
 from morgs_mi.runs.recording import due_keyframe, restart_of
-from morgs_mi.stream_loop import FrameReport, StreamLoop
+from morgs_mi.stream_loop import StreamLoop
 
 __all__ = ["Fit", "Part", "Segment", "Source", "fit_frames"]
 
@@ -59,26 +60,18 @@ class Source:
 
 @dataclass(frozen=True)
 class Fit:
-    """Data that all tasks of a fit share.
+    """Data that all tasks of a fit share."""
 
-    Attributes:
-        source: the recording.
-        config: settings.
-        segments: the segments, and the settings of their seams.
-        variant: Mitsuba variant.
-        versions: as `installed` returns them to the client.
-        rig: refined cameras and distortions, as `Capture.with_cameras` takes them; None: the recording's.
-        points: points and their colours in place of the capture's, where those have been triangulated.
-        balance: exposures in the first frame of the recording, by view; empty before it is fitted.
-    """
-
-    source: Source
-    config: StreamConfig
-    segments: SegmentConfig
-    variant: str
-    versions: tuple[tuple[str, str], ...]
+    source: Source  #: The recording.
+    config: StreamConfig  #: Settings.
+    segments: SegmentConfig  #: The segments, and the settings of their seams.
+    variant: str  #: Mitsuba variant.
+    versions: tuple[tuple[str, str], ...]  #: As `installed` returns them to the client.
+    #: Refined cameras and distortions, as `Capture.with_cameras` takes them; None: the recording's.
     rig: tuple[tuple[Camera, ...], tuple[tuple[float, float], ...]] | None = None
+    #: Points and their colours in place of the capture's, where those have been triangulated.
     points: tuple[np.ndarray, np.ndarray] | None = None
+    #: Exposures in the first frame of the recording, by view; empty before it is fitted.
     balance: tuple[Exposure, ...] = ()
 
     def open(self) -> Capture:
@@ -118,23 +111,14 @@ class Segment:
 
 @dataclass(frozen=True)
 class Part:
-    """Result of a task.
+    """Result of a task."""
 
-    Attributes:
-        segment: the segment after its frames.
-        packets: encoded packets of the frames, re-emitted keyframes included.
-        reports: of the frames.
-        worker: address of the worker.
-        peak_bytes: peak memory of the worker so far.
-        messages: warnings.
-    """
-
-    segment: Segment
-    packets: tuple[bytes, ...]
-    reports: tuple[FrameReport, ...]
-    worker: str
-    peak_bytes: int
-    messages: tuple[str, ...]
+    segment: Segment  #: The segment after its frames.
+    packets: tuple[bytes, ...]  #: Encoded packets of the frames, re-emitted keyframes included.
+    reports: tuple[FrameReport, ...]  #: Of the frames.
+    worker: str  #: Address of the worker.
+    peak_bytes: int  #: Peak memory of the worker so far.
+    messages: tuple[str, ...]  #: Warnings.
 
 
 # The loop of the last task by what continues it, with the capture and its next frames.

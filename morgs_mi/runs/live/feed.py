@@ -13,36 +13,22 @@ __all__ = ["Bundle", "Feed", "Shot", "bundled"]
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One image of one camera.
+    """One image of one camera."""
 
-    Attributes:
-        image: uint8 [H, W, 3], RGB.
-        time: at which it arrived, s of `time.monotonic`.
-        number: its number among the camera's images, without gaps.
-    """
-
-    image: np.ndarray
-    time: float
-    number: int
+    image: np.ndarray  #: uint8 [H, W, 3], RGB.
+    time: float  #: At which it arrived, s of `time.monotonic`.
+    number: int  #: Its number among the camera's images, without gaps.
 
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Images of the cameras at about one time.
+    """Images of the cameras at about one time."""
 
-    Attributes:
-        images: per camera uint8 [H, W, 3], RGB, None where it has none.
-        numbers: per camera the number of its image, or of its newest one before where it has none.
-        time: at which the last of the images arrived, s of `time.monotonic`.
-        skew: largest difference in time between two of the images, s.
-        dropped: number of images that each camera delivered after the bundle before and that are in none.
-    """
-
-    images: tuple[np.ndarray | None, ...]
-    numbers: tuple[int, ...]
-    time: float
-    skew: float
-    dropped: int
+    images: tuple[np.ndarray | None, ...]  #: Per camera uint8 [H, W, 3], RGB, None where it has none.
+    numbers: tuple[int, ...]  #: Per camera the number of its image, or of its newest one before where it has none.
+    time: float  #: At which the last of the images arrived, s of `time.monotonic`.
+    skew: float  #: Largest difference in time between two of the images, s.
+    dropped: int  #: Number of images that each camera delivered after the bundle before and that are in none.
 
 
 class Feed(Protocol):

@@ -21,6 +21,7 @@ from morgs_mi.core.files import locked_folder
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.threads import in_background, map_in_threads
+from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.live.feed import Bundle, Feed
 from morgs_mi.runs.live.live_capture import begin_capture, read_calibration, write_images
@@ -28,7 +29,7 @@ from morgs_mi.runs.live.live_config import LIVE_STREAM, LiveConfig
 from morgs_mi.runs.live.sources import Source, open_feed
 from morgs_mi.runs.recorder import Prepared, push_frame
 from morgs_mi.runs.recording import FitFiles, Recording, check_outputs, stream_metadata
-from morgs_mi.stream_loop import FrameReport, StreamLoop
+from morgs_mi.stream_loop import StreamLoop
 
 __all__ = ["LiveFrame", "fit_live"]
 
@@ -37,23 +38,14 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class LiveFrame:
-    """Report of one frame of a live fit.
+    """Report of one frame of a live fit."""
 
-    Attributes:
-        frame: its index in the stream.
-        time: between the first images and its images, s.
-        latency: between its images and the end of its fit, s.
-        skew: largest difference in time between two of its images, s.
-        dropped: number of images of each camera that were dropped after the frame before.
-        problems: one sentence per missing image.
-    """
-
-    frame: int
-    time: float
-    latency: float
-    skew: float
-    dropped: int
-    problems: tuple[str, ...] = ()
+    frame: int  #: Its index in the stream.
+    time: float  #: Between the first images and its images, s.
+    latency: float  #: Between its images and the end of its fit, s.
+    skew: float  #: Largest difference in time between two of its images, s.
+    dropped: int  #: Number of images of each camera that were dropped after the frame before.
+    problems: tuple[str, ...] = ()  #: One sentence per missing image.
 
 
 @interrupts_raised()

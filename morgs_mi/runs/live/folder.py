@@ -34,15 +34,11 @@ _ENDS, _TAIL = (b"IEND\xaeB`\x82", b"\xff\xd9"), 64
 
 @dataclass(frozen=True)
 class _Images:
-    """Images of a camera.
+    """Images of a camera."""
 
-    Attributes:
-        files: by number.
-        ahead: time by which `time.monotonic` is ahead of the times of the files, s: the program that writes them may
-            run on a machine with another clock.
-    """
-
-    files: Mapping[int, Path]
+    files: Mapping[int, Path]  # by number
+    # time by which `time.monotonic` is ahead of the times of the files, s: the program that writes them may run on a
+    # machine with another clock
     ahead: float = 0.0
 
     def arrival(self, number: int) -> float:

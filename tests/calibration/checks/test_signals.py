@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from morgs_mi.calibration.checks.signals import brightness, known_median, lamp_flicker, read_signals, repeated_frames
-from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
+from morgs_mi.core.color_space import decode_light, encode_light
 from tests.assertions import assert_close
 from tests.scenes.filmed import Clips, filmed
 
 
 def brighter(image: np.ndarray, gain: float) -> np.ndarray:
     """Return an image at `gain` times the linear light."""
-    return np.rint(255 * np.clip(linear_to_srgb(gain * srgb_to_linear(image / 255)), 0, 1)).astype(np.uint8)
+    return np.rint(255 * np.clip(encode_light(gain * decode_light(image / 255)), 0, 1)).astype(np.uint8)
 
 
 def flickering(mains: float, fps: float, amplitude: float = 0.03, count: int = 60) -> np.ndarray:

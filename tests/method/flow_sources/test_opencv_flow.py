@@ -6,11 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.method.flow import observe_flow
 from morgs_mi.method.flow_sources.flow_config import FlowConfig
 from morgs_mi.method.flow_sources.flow_registry import FramePair, flow_source
 from morgs_mi.method.flow_sources.opencv_flow import FLOW_METHODS, optical_flow
-from tests.method.moving_disc import moving_disc, texture
+from tests.method.moving_disc import moving_disc, observed, texture
 
 
 @pytest.mark.parametrize("method", FLOW_METHODS)
@@ -23,9 +22,9 @@ def test_optical_flow__recovers_a_translation_with_its_sign(method):
         assert np.median(error) < 0.5, (dx, dy)  # `dis-ultrafast` stops at a quarter of the resolution
 
 
-def test_observe_flow__motion_is_the_shift_on_frame_ts_grid():
+def test_observe_key_views__motion_is_the_shift_on_frame_ts_grid():
     previous, image, disc = moving_disc(240, 320, shift=(6, -4))
-    observation = observe_flow(image, previous)
+    observation = observed(image, previous)
     motion, reliable = observation.motion, observation.reliable
     # 0.25 px: DIS smooths over 8x8 patches.
     assert np.abs(motion[disc & reliable] - (6, -4)).mean() < 0.25
@@ -33,9 +32,9 @@ def test_observe_flow__motion_is_the_shift_on_frame_ts_grid():
     assert reliable[disc].mean() > 0.8
 
 
-def test_observe_flow__uncovered_pixels_are_unreliable():
+def test_observe_key_views__uncovered_pixels_are_unreliable():
     previous, image, disc = moving_disc(240, 320, shift=(10, 0))
-    reliable = observe_flow(image, previous).reliable
+    reliable = observed(image, previous).reliable
     uncovered = np.roll(disc, (0, -10), (0, 1)) & ~disc
     assert reliable[uncovered].mean() < 0.5 < 0.95 < reliable.mean()
 

@@ -11,7 +11,7 @@ import pytest
 
 from morgs_mi import cli
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.color_space import srgb_to_linear
+from morgs_mi.core.color_space import decode_light
 from morgs_mi.io.ply import read_ply
 from morgs_mi.io.splats import read_splats
 from morgs_mi.playback.export.clips import _frames_backwards, repeated_seconds, select_frames
@@ -227,7 +227,7 @@ def test_exr_channels__are_read_by_mitsuba(stream, tmp_path):
     assert_close(planes["motion.X"], np.array(rendered.motion)[..., 0], atol=1e-5)
     assert_close(planes["confidence.Y"], np.array(rendered.confidence)[..., 0], atol=1e-6)
     assert_close(planes["depth.Y"], np.array(rendered.depth)[..., 0], atol=1e-5)
-    linear = srgb_to_linear(np.array(rendered.color))
+    linear = decode_light(np.array(rendered.color))
     assert_close(np.stack([planes[c] for c in "RGB"], -1), linear, atol=1e-6)
 
 

@@ -10,7 +10,7 @@ import pytest
 from morgs_mi import open_stream
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
-from morgs_mi.core.color_space import srgb_to_linear
+from morgs_mi.core.color_space import decode_light
 from morgs_mi.io.exr import read_exr
 from morgs_mi.playback.export.frames import write_images
 from morgs_mi.playback.export.insert import InsertConfig, inserted_channels, load_insert, render_inserted, selected
@@ -115,7 +115,7 @@ def test_render_inserted__layers_compose_to_the_image_where_surfaces_cover_nothi
     outside = images["surfaces"][..., 3] == 0
     assert images["shadow"].min() < 0.7 < images["shadow"].max() == pytest.approx(1)
     shadowed = images["splats"][..., :3] * images["shadow"]
-    np.testing.assert_allclose(srgb_to_linear(images["color"])[outside], shadowed[outside], atol=1e-4)
+    np.testing.assert_allclose(decode_light(images["color"])[outside], shadowed[outside], atol=1e-4)
     write_images([(0, images)], 10, tmp_path / "exr")
     names = read_exr(tmp_path / "exr" / "0000.exr").keys()
     assert {"R", "A", "depth.Y", "splats.R", "surfaces.A", "shadow.R", "motion.X"} <= names

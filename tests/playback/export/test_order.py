@@ -1,11 +1,12 @@
-"""Ids for life, and an order by place that stays the same."""
+"""An order of the Gaussians by place that stays the same."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from morgs_mi.codec.container import StreamWriter
-from morgs_mi.codec.packets import frames_with_first_id, keyframe_packet, play
+from morgs_mi.codec.frame_source import play
+from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.playback.export.order import by_place
 from tests.scenes.changing_splats import rig, splats, write_stream
@@ -44,10 +45,3 @@ def test_by_place__yields_frames_without_gaussians(tmp_path):
         for t, count in enumerate((0, 5, 0)):
             writer.write(keyframe_packet(splats(count), t, rig()))
     assert [len(gaussians) for _, gaussians in by_place(StreamReader(tmp_path / "s.morgs"))] == [0, 5, 0]
-
-
-def test_frames_with_first_id__gives_new_sets_new_ids(tmp_path):
-    with StreamWriter(tmp_path / "s.morgs", rig(), 10) as writer:
-        for t in range(2):
-            writer.write(keyframe_packet(splats(3), t, rig()))
-    assert [first for first, _ in frames_with_first_id(StreamReader(tmp_path / "s.morgs"))] == [0, 3]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.playback.export.axes import up_direction
+from morgs_mi.core.rig import up_direction
 from morgs_mi.playback.export.paths import CameraPath, focus, load_path, orbit, through_cameras
 from tests.assertions import assert_close
 from tests.scenes.cameras import circle, look_at_cameras

@@ -20,16 +20,16 @@ from distributed import Client
 from morgs_mi import cli
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.codec.container import PacketKind
-from morgs_mi.codec.packets import coded_frames, frames_with_lasting_ids, seek
+from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.fit.fit_config import ShortFitConfig
+from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.cluster.seams import SegmentConfig
 from morgs_mi.runs.cluster.segments import SegmentedRun
 from morgs_mi.runs.cluster.workers import open_client
 from morgs_mi.runs.recorder import stream_capture
 from morgs_mi.runs.recording import FILES
-from morgs_mi.stream_loop import FrameReport
 from tests.scenes.coded_clip import history
 from tests.scenes.recording import CONFIG, write_recording
 
@@ -96,10 +96,10 @@ def test_SegmentedRun__joins_them_to_an_ordinary_stream(whole: Path) -> None:
     states = list(coded_frames(reader))
     assert [coded.frame for coded in states] == list(range(FRAMES))
     for state in states:
-        assert history([seek(reader, state.frame)]) == history([state])
+        assert history([reader.seek(state.frame)]) == history([state])
     sets = [set[int]() for _ in STARTS]
-    for ids, coded in frames_with_lasting_ids(reader):
-        sets[np.searchsorted(STARTS, coded.frame, "right") - 1] |= set(ids.tolist())
+    for state in states:
+        sets[np.searchsorted(STARTS, state.frame, "right") - 1] |= set(state.lasting_ids.tolist())
     assert len(set().union(*sets)) == sum(map(len, sets)), "no id is in two segments"
 
 

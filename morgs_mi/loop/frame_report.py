@@ -1,0 +1,61 @@
+"""Report of a frame, and the result of its fit, from which the loop makes the report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from morgs_mi.codec.container import Packet
+from morgs_mi.loop.correction import Correction
+from morgs_mi.method.exposure import Exposure
+
+__all__ = ["FittedFrame", "FrameReport"]
+
+
+@dataclass(frozen=True)
+class FrameReport:
+    """Report of one frame.
+
+    Attributes:
+        frame: its index.
+        seconds: wall time from the images to the packet, optical flow and optimisation included.
+        num_bytes: size of the packet in the stream.
+        losses: means over the last steps, by the names of the terms.
+        num_gaussians: number of Gaussians of the frame.
+        status: "ok", or a sentence about a problem and how it was handled.
+        missing_views: names of the views without an image.
+        active: fractions that took part, by name: gaussians, views, pixels, epochs.
+        validation: of the first frame, a `sentence` on views between the cameras, with the fields of `UnseenViews`
+            (see `fit.unseen_views`); empty with a single view.
+        steps: number of optimisation steps.
+        exposures: gain and bias of each view; empty if they are not estimated.
+    """
+
+    frame: int
+    seconds: float
+    num_bytes: int
+    losses: dict[str, float]
+    num_gaussians: int
+    status: str = "ok"
+    missing_views: tuple[str, ...] = ()
+    active: dict[str, float] = field(default_factory=dict)
+    validation: dict[str, Any] = field(default_factory=dict)
+    steps: int = 0
+    exposures: tuple[Exposure, ...] = ()
+
+    def __repr__(self) -> str:
+        size = f"{self.num_gaussians} Gaussians, {self.num_bytes} bytes, {self.seconds:.1f} s"
+        return f"FrameReport(frame {self.frame}, {size}, {self.status})"
+
+
+@dataclass(frozen=True)
+class FittedFrame:
+    """Result of the fit of a frame: its packet, entries of its `FrameReport`, and the correction of its images."""
+
+    packet: Packet
+    correction: Correction
+    losses: dict[str, float]
+    steps: int
+    status: str
+    active: dict[str, float] = field(default_factory=dict)
+    validation: dict[str, Any] = field(default_factory=dict)

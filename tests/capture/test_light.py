@@ -1,0 +1,90 @@
+"""Captures of EXR files, which have linear light."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.color_correction import ColorCorrection
+from morgs_mi.capture.interpolation import image_between
+from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.capture.lens import Lens
+from morgs_mi.core.color_space import display_image
+from morgs_mi.io.exr import write_exr
+from morgs_mi.playback.visualise import write_png
+from tests.scenes.captures import HEIGHT, WIDTH, rig
+
+NAMES = ("cam01", "cam02")
+
+
+def light(camera: int, frame: int) -> np.ndarray:
+    image = np.random.default_rng([camera, frame]).uniform(0, 0.5, (HEIGHT, WIDTH, 3)).astype(np.float32)
+    image[: HEIGHT // 4] *= 16
+    return image
+
+
+def recorded(path: Path, **kwargs) -> Path:
+    write_colmap(path / "sparse" / "0", rig(NAMES, shift=3.0), **kwargs)
+    for camera, name in enumerate(NAMES):
+        (path / name).mkdir(parents=True)
+        for frame in range(2):
+            image = light(camera, frame)
+            write_exr(path / name / f"{frame:04d}.exr", {c: image[..., k] for k, c in enumerate("RGB")})
+    return path
+
+
+def test_load_capture__reads_sequences_of_exr_files(tmp_path: Path) -> None:
+    capture = load_capture(recorded(tmp_path))
+    for t, frame in enumerate(capture.frames()):
+        for camera, image in enumerate(frame.images):
+            np.testing.assert_array_equal(image, light(camera, t))
+    white = np.percentile([light(camera, 0).max(axis=-1) for camera in range(2)], 99)
+    assert capture.display_exposure == pytest.approx(-np.log2(white))
+    shown = next(capture.displayed().frames()).images[0]
+    np.testing.assert_array_equal(shown, display_image(light(0, 0), capture.display_exposure))
+
+
+def test_load_capture__takes_the_display_exposure_of_its_settings(tmp_path: Path) -> None:
+    recorded(tmp_path)
+    (tmp_path / "capture.json").write_text(json.dumps({"display_exposure": -2}))
+    assert load_capture(tmp_path).display_exposure == -2
+
+
+def test_load_capture__prefers_images_of_8_bits_to_exr_files_beside_them(tmp_path: Path) -> None:
+    recorded(tmp_path)
+    for name in NAMES:
+        for frame in range(2):
+            write_png(tmp_path / name / f"{frame:04d}.png", np.full((HEIGHT, WIDTH, 3), 9, np.uint8))
+    capture = load_capture(tmp_path)
+    assert capture.display_exposure is None
+    assert next(capture.frames()).images[0].dtype == np.uint8
+
+
+def test_process__averages_light_when_it_downscales(tmp_path: Path) -> None:
+    capture = load_capture(recorded(tmp_path))
+    smaller = replace(capture, cameras=tuple(c.resized(WIDTH // 2, HEIGHT // 2) for c in capture.cameras))
+    blocks = light(0, 0).reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean((1, 3))
+    np.testing.assert_allclose(next(smaller.frames()).images[0], blocks, rtol=1e-5)
+
+
+def test_process__keeps_light_positive_through_undistortion(tmp_path: Path) -> None:
+    lens = Lens("SIMPLE_RADIAL", (0.05,))
+    image = next(load_capture(recorded(tmp_path, lenses=[lens] * 2)).frames()).images[0]
+    assert image.min() >= 0
+    assert image.max() > 4
+
+
+def test_color_correction__multiplies_light() -> None:
+    image = light(0, 0)
+    corrected = ColorCorrection(np.diag([2.0, 1, 0.5]))(image)
+    np.testing.assert_allclose(corrected, image * np.float32([2, 1, 0.5]), rtol=1e-6)
+
+
+def test_image_between__of_equal_images_is_the_image() -> None:
+    image = light(0, 0)
+    np.testing.assert_allclose(image_between(image, image, 0.5), image, rtol=1e-4, atol=1e-6)

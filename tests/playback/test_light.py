@@ -1,0 +1,88 @@
+"""Streams of HDR recordings: files of linear light, displays after an exposure, and the light of inserted scenes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from morgs_mi import open_stream
+from morgs_mi.codec.container import StreamWriter
+from morgs_mi.codec.packets import keyframe_packet
+from morgs_mi.core.color_space import SH_C0, TRANSFER, decode_light, display_image
+from morgs_mi.io.exr import read_light
+from morgs_mi.playback.export.frames import write_frames, write_images
+from morgs_mi.playback.export.insert import InsertConfig, render_inserted
+from morgs_mi.playback.player import render_stream, stream_exposure
+from tests.scenes.surfaces import camera, cloud
+
+STOPS = -2.5
+
+
+def bright_cloud():
+    gaussians = cloud(0.5)
+    return replace(gaussians, sh_coeffs=gaussians.sh_coeffs + 1.2 / SH_C0)
+
+
+def written(path: Path, metadata: dict) -> Path:
+    with StreamWriter(path, [camera()], 10, metadata) as writer:
+        writer.write(keyframe_packet(bright_cloud(), 0))
+    return path
+
+
+@pytest.fixture
+def stream(tmp_path: Path):
+    return open_stream(written(tmp_path / "s.morgs", {"transfer": {"name": TRANSFER, "display_exposure": STOPS}}))
+
+
+def rendered(stream):
+    return dict(render_stream(stream, camera(), ("color",)))[0]["color"]
+
+
+def test_write_frames__exr_files_have_the_light_of_the_curve(stream, tmp_path):
+    write_frames(stream, camera(), tmp_path / "a.exr")
+    light = read_light(tmp_path / "a.exr")
+    np.testing.assert_allclose(light, decode_light(rendered(stream)), rtol=1e-5)
+    assert light.max() > 4
+
+
+def test_write_frames__png_files_show_the_streams_exposure(stream, tmp_path):
+    write_frames(stream, camera(), tmp_path / "a.png")
+    shown = cv2.imread(str(tmp_path / "a.png"))[..., ::-1]
+    expected = display_image(decode_light(rendered(stream)), STOPS)
+    assert np.abs(shown.astype(int) - expected).max() <= 1
+    write_images(render_stream(stream, camera(), ("color",)), 10, tmp_path / "b.png", display_exposure=-20)
+    assert cv2.imread(str(tmp_path / "b.png")).max() == 0
+
+
+def test_write_frames__streams_of_8_bits_are_clipped_as_they_are(tmp_path):
+    stream = open_stream(written(tmp_path / "s.morgs", {}))
+    assert stream_exposure(stream) == 0
+    write_frames(stream, camera(), tmp_path / "a.png")
+    expected = (np.clip(rendered(stream), 0, 1) * 255 + 0.5).astype(np.uint8)
+    np.testing.assert_array_equal(cv2.imread(str(tmp_path / "a.png"))[..., ::-1], expected)
+
+
+@pytest.mark.parametrize("stops", ["bright", 1e9, None])
+def test_stream_exposure__refuses_other_values(tmp_path, stops):
+    stream = open_stream(written(tmp_path / "s.morgs", {"transfer": {"display_exposure": stops}}))
+    with pytest.raises(ValueError, match=r"s\.morgs: packet 0: `transfer.display_exposure` of the header's metadata"):
+        stream_exposure(stream)
+
+
+def test_render_inserted__guesses_clipped_light_of_recordings_of_8_bits_alone(stream, tmp_path):
+    ball = {"type": "sphere", "center": [0, 0, -1], "radius": 0.2}
+    plain = open_stream(written(tmp_path / "plain.morgs", {}))
+
+    def inserted(stream, clipped):
+        config = InsertConfig(4, shadows=False, clipped=clipped)
+        (frame,) = render_inserted(stream, camera(), lambda frame, time: {"ball": ball}, [0], config=config)
+        return frame[1]["color"]
+
+    recorded, guessed = inserted(stream, 1.0), inserted(plain, 4.0)
+    np.testing.assert_array_equal(inserted(stream, None), recorded)
+    np.testing.assert_array_equal(inserted(plain, None), guessed)
+    assert np.abs(recorded - guessed).max() > 0.1
