@@ -292,7 +292,7 @@ class StreamLoop:
     Args:
         cameras: the training views.
         points: SfM points [P, 3], world units; fewer than 20 are replaced by random ones inside the views.
-        point_colors: [P, 3] in [0, 1].
+        point_colors: [P, 3], encoded: 1 is white.
         config: settings.
         masks: per view [H, W] bool of valid pixels, or None.
         display_exposure: stops by which images in linear light are brightened where flow and changes are computed,
