@@ -388,7 +388,7 @@ class StreamLoop:
         Args:
             coded: state of the stream after that frame.
             frames: images of all frames up to it, as for `push`; the last frame suffices without `skip_static` and
-                `exposure`.
+                `exposure`, if they have 8 bits or the display exposure is given.
             exposures: in the report of the first frame.
         """
         seen = Seen()

@@ -180,7 +180,7 @@ def prepare(
     key_views = choose_key_views(cameras, config.motion.key_views)
     extent = scene_extent(cameras)
     if display_exposure is not None:
-        check_number("StreamLoop()", "display_exposure", display_exposure, "(-inf, inf)")
+        check_number("StreamLoop()", "display_exposure", display_exposure, "[-100, 100]")
     cloud = points.copy(), point_colors.copy()
     return Setup(tuple(cameras), copies, *cloud, key_views, extent, config, display_exposure)
 
