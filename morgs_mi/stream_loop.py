@@ -188,7 +188,7 @@ class StreamLoop:
     Args:
         cameras: the training views.
         points: SfM points [P, 3], world units; fewer than 20 are replaced by random ones inside the views.
-        point_colors: [P, 3] in [0, 1].
+        point_colors: [P, 3], encoded: 1 is white.
         config: settings.
         masks: per view [H, W] bool of valid pixels, or None.
         display_exposure: stops by which images in linear light are brightened where flow and changes are computed,
@@ -294,7 +294,7 @@ class StreamLoop:
         Args:
             coded: state of the stream after that frame.
             frames: images of all frames up to it, as for `push`; the last frame suffices without `skip_static` and
-                `exposure`.
+                `exposure`, if they have 8 bits or the display exposure is given.
             exposures: in the report of the first frame.
         """
         history = ImageHistory()

@@ -362,7 +362,7 @@ def masked(masks):
         (lambda clip: StreamLoop(cameras(), np.zeros((3, 4)), np.zeros((4, 3))), r"`points` must be \[P, 3\]"),
         (
             lambda clip: StreamLoop(cameras(), np.zeros((200, 3)), np.full((200, 3), 128)),
-            r"`point_colors` must be from 0 to 32 with white at 1, got .* at 0; divide colours of 8 bits by 255",
+            r"`point_colors` must be in \[0, 32\], got .* at 0; divide colours of 8 bits by 255",
         ),
         (lambda clip: masked([None]), "one mask or None for each of 4 views, got 1"),
         (lambda clip: masked([None, np.ones((50, 96), bool), None, None]), r"view 'cam01': the mask must be bool \[72"),

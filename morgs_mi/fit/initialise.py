@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_points
-from morgs_mi.core.color_space import SH_C0, unit_values
+from morgs_mi.core.color_space import BRIGHTEST, SH_C0, unit_values
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.rig import focus_depths, scene_extent, seen_points
 from morgs_mi.fit.empty_space import in_empty_space
@@ -44,7 +44,7 @@ def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int, opacity:
     Raises:
         ValueError: no points, points that are not finite, or colours of another shape or range.
     """
-    points, colors = (v.astype(np.float64) for v in check_points("from_points()", points, colors))
+    points, colors = (v.astype(np.float64) for v in check_points("from_points()", points, colors, BRIGHTEST))
     n = len(points)
     if not n:
         raise ValueError(

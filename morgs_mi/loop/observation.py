@@ -14,7 +14,7 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_mask, check_number, check_points, check_type
-from morgs_mi.core.color_space import display_image, display_stops, encode_light
+from morgs_mi.core.color_space import BRIGHTEST, display_image, display_stops, encode_light
 from morgs_mi.core.rig import check_near_planes, choose_key_views, scene_extent
 from morgs_mi.core.threads import map_in_threads
 from morgs_mi.fit.capacity import check_capacity
@@ -127,7 +127,7 @@ class Setup:
         cameras: the V training views.
         masks: per view [H, W] bool of valid pixels, or None.
         points: SfM points [P, 3], world units.
-        point_colors: [P, 3] in [0, 1].
+        point_colors: [P, 3], encoded: 1 is white.
         key_views: indices of the views with optical flow and masks.
         extent: of the scene, world units.
         config: settings.
@@ -166,7 +166,7 @@ def prepare(
         raise ValueError(f"StreamLoop(): `cameras` must be a sequence of at least one view, got {kind}; pass a list.")
     for camera in cameras:
         check_type("StreamLoop()", "cameras", camera, Camera)
-    points, point_colors = check_points("StreamLoop()", points, point_colors)
+    points, point_colors = check_points("StreamLoop()", points, point_colors, BRIGHTEST)
     masks = (None,) * len(cameras) if masks is None else masks
     if len(masks) != len(cameras):
         raise ValueError(
@@ -186,7 +186,7 @@ def prepare(
     key_views = choose_key_views(cameras, config.motion.key_views)
     extent = scene_extent(cameras)
     if display_exposure is not None:
-        check_number("StreamLoop()", "display_exposure", display_exposure, "(-inf, inf)")
+        check_number("StreamLoop()", "display_exposure", display_exposure, "[-100, 100]")
     cloud = points.copy(), point_colors.copy()
     return Setup(tuple(cameras), copies, *cloud, key_views, extent, config, display_exposure)
 
