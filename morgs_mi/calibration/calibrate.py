@@ -29,6 +29,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_number
 from morgs_mi.core.color_space import display_image, display_stops
 from morgs_mi.core.files import atomic_path
+from morgs_mi.core.ranges import check_ranges
 from morgs_mi.io.video import FrameReader, open_frames
 
 Mapper = Literal["incremental", "global"]
@@ -133,6 +134,7 @@ def calibrate(
     """
     path, config = Path(path), config or CalibrateConfig()
     check_number("calibrate()", "seed", config.seed, _SEEDS)
+    check_ranges(config, "calibrate()")
     report = progress or (lambda stage, done, total: None)
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: expected a folder of clips, found none; check the path.")

@@ -1,6 +1,6 @@
 """Command line, the package's only argument parser.
 
-`morgs-mi synth`, `info`, `calibrate`, `fit`, `live`, `render`, `export`, `import`, `view`, `eval` and `demo`.
+`morgs-mi synth`, `info`, `calibrate`, `fit`, `live`, `render`, `export`, `import`, `view`, `eval`, `sweep` and `demo`.
 
 Results go to standard output; progress, warnings and errors to standard error. An error that the user can correct is
 one sentence and exit status 1, an interruption by Ctrl-C or SIGTERM is status 130; `--debug` adds the traceback.
@@ -40,6 +40,7 @@ _PLACES = {
     "import": "import_frames:Import",
     "view": "view:View",
     "eval": "evaluate:Eval",
+    "sweep": "sweep:Sweep",
     "demo": "demo:Demo",
 }
 # The class of each command: a dataclass of its options, with `run`.

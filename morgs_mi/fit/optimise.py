@@ -88,7 +88,8 @@ def optimise(
     scale = {name: float(rates[name]) for name in optimizer}
     # As Python numbers: Dr.Jit 1.5 multiplies a rate that is an array in place, once per step.
     optimizer.set_learning_rate(scale)
-    history, weights = dict[str, list[Tensor]](), weights or {}
+    history = dict[str, list[Tensor]]()
+    weights = weights or {}
     for step, view in enumerate(steps.views, steps.first):
         if steps.decay is not None:
             factor = steps.decay(step)

@@ -211,6 +211,11 @@ def test_calibrate__of_a_full_disk_leaves_no_model(tmp_path: Path, monkeypatch: 
     assert not (clips / "sparse").exists()
 
 
+def test_calibrate__refuses_an_unknown_camera_model(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"calibrate\(\): `camera_model` must be SIMPLE_PINHOLE, PINHOLE, .*'PIN'"):
+        calibrate(tmp_path, CalibrateConfig(camera_model="PIN"))
+
+
 @pytest.mark.parametrize("seed", [-1, 10**23])
 def test_calibrate__refuses_a_seed_that_colmap_does_not_take(tmp_path: Path, seed: int) -> None:
     with pytest.raises(ValueError, match=rf"`seed` must be a number in \[0, 2147483647\], got {seed}"):

@@ -307,11 +307,11 @@ def test_gaussian_splat__renders_the_same_channels_from_a_file_as_from_a_diction
     assert_close(image, expected, atol=tol.IMAGE_ABS)
 
 
-def test_gaussian_splat__renders_a_scene_file_as_the_limits_describe(tmp_path, raw):
-    """The command `mitsuba` does not find the plugin; the Python command in docs/limits.md renders the same file."""
+def test_gaussian_splat__renders_a_scene_file_as_the_page_describes(tmp_path, raw):
+    """The command `mitsuba` does not find the plugin; the Python command in docs/mitsuba.md renders the same file."""
     write_ply(tmp_path / "gaussians.ply", to_gaussians(raw))
     (tmp_path / "scene.xml").write_text(SCENE_FILE)
-    page = (Path(__file__).parents[2] / "docs/limits.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs/mitsuba.md").read_text(encoding="utf-8")
     command = textwrap.dedent(re.findall(r"```bash\n(.*?)```", page, re.DOTALL)[0])
     program = re.search(r'python -c "\n(.*?)"', command, re.DOTALL)[1]
     subprocess.run([sys.executable, "-c", program], check=True, cwd=tmp_path, timeout=120)

@@ -143,7 +143,7 @@ def test_loss_term__acts_where_its_observation_exists(registry):
 @pytest.mark.parametrize(
     ("terms", "message"),
     [
-        (("sped:1",), r"ObjectiveConfig\(\): `terms` must be one of speed:WEIGHT, got 'sped:1'"),
+        (("fast:1",), r"ObjectiveConfig\(\): `terms` must be one of speed:WEIGHT, got 'fast:1'"),
         (("speed",), "must be one of speed:WEIGHT, got 'speed'"),
         (("speed:much",), r"`terms` must be a number in \[0, inf\), got 'much'"),
         (("speed:-1",), r"`terms` must be a number in \[0, inf\), got -1.0"),

@@ -122,10 +122,11 @@ def selected(stream: FrameSource, frames: Sequence[int]) -> list[int]:
         ValueError: the stream does not have one of them.
     """
     numbers = frame_numbers(stream)
-    missing = sorted(set(frames) - set(numbers))
-    if missing:
+    missing_frames = sorted(set(frames) - set(numbers))
+    if missing_frames:
         raise ValueError(
-            f"{stream.path}: the frames must be out of {numbers[0]} to {numbers[-1]}, got {missing[0]}; choose others."
+            f"{stream.path}: the frames must be out of {numbers[0]} to {numbers[-1]}, got {missing_frames[0]}; choose "
+            "others."
         )
     return sorted(set(frames))
 

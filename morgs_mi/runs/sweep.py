@@ -1,0 +1,128 @@
+"""Error against run time of a capture: fits with several numbers of epochs and several seeds, and their scores."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import islice, product
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+
+from morgs_mi.calibration.checks.plots import check_plot
+from morgs_mi.capture.capture import Capture
+from morgs_mi.core.environment import machine, versions
+from morgs_mi.core.files import atomic_path, write_json
+from morgs_mi.core.progress import Progress, Report
+from morgs_mi.core.ranges import AtLeast, check_value
+from morgs_mi.evaluate.evaluate import evaluate_stream
+from morgs_mi.evaluate.results import Evaluation, known_mean
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.runs.recorder import stream_capture
+from morgs_mi.stream_loop import StreamLoop
+
+__all__ = ["mean_scores", "sweep", "write_sweep_plot"]
+
+Scores = Mapping[str, float]
+
+# The first and two later frames compile the kernels of a fit.
+_WARM_FRAMES = 3
+_WARM_STEPS = 60
+# By the title of a panel of the plot, its scores and their names.
+_PANELS = {
+    "PSNR, dB": {"psnr": "whole image", "psnr_moving": "moving"},
+    "motion error, px": {"motion_error_moving": "moving"},
+    "IoU of the confidence": {"confidence_iou": "whole image"},
+    "bytes per frame": {"bytes_per_frame": "stream"},
+}
+
+
+def sweep(
+    capture: Capture,
+    out: str | Path,
+    epochs: Sequence[int],
+    seeds: int = 1,
+    config: StreamConfig | None = None,
+    progress: Report | None = None,
+) -> list[Scores]:
+    """Fit and evaluate a capture with each number of epochs and each of the seeds 0, 1, ....
+
+    Kernels are compiled before the first fit. OUT/epochs4-seed0 etc. have the streams, OUT/sweep.json the scores.
+
+    Returns:
+        The number of epochs, seed, seconds, bytes and mean scores of each fit, by name; NaN where they are unknown.
+
+    Raises:
+        ValueError: a number is below 1, or as `stream_capture`.
+        OSError: as `stream_capture`.
+    """
+    for name, value in (("seeds", seeds), *(("epochs", value) for value in epochs)):
+        check_value("sweep()", name, value, Annotated[int, AtLeast(1)])
+    config = config or StreamConfig()
+    _compile_kernels(capture, config)
+    rows: list[Scores] = []
+    ladder = list(product(dict.fromkeys(epochs), range(seeds)))
+    stage = Progress(progress, "Fitting and evaluating")
+    for count, seed in ladder:
+        stage(len(rows), len(ladder))
+        folder = Path(out) / f"epochs{count}-seed{seed}"
+        stream_capture(capture, folder, replace(config, fit=replace(config.fit, epochs=count), seed=seed))
+        rows.append({"epochs": count, "seed": seed, **_scores(evaluate_stream(folder, capture.path))})
+        write_json(Path(out) / "sweep.json", {"rows": rows, "machine": machine(), "versions": versions()})
+    stage(len(rows), len(ladder))
+    return rows
+
+
+def _compile_kernels(capture: Capture, config: StreamConfig) -> None:
+    """Fit the first frames in few steps and discard the result."""
+    fit = replace(config.fit, first_frame_steps=_WARM_STEPS, epochs=1)
+    loop = StreamLoop.of(capture, replace(config, fit=fit))
+    for frame in islice(capture.partial_frames(), _WARM_FRAMES):
+        loop.push([frame.images[view] for view in capture.train_views])
+
+
+def _scores(result: Evaluation) -> Scores:
+    seconds = result.seconds
+    names = ("psnr", "psnr_moving", "motion_error_moving", "confidence_iou")
+    return {
+        "first_seconds": float("nan") if seconds.first is None else seconds.first,
+        "later_seconds": seconds.per_later_frame,
+        "bytes_per_frame": result.sizes.per_frame,
+        **{name: getattr(result.scores, name) for name in names},
+    }
+
+
+def mean_scores(rows: Sequence[Scores]) -> list[Scores]:
+    """Return the means over the seeds, for each number of epochs."""
+    same = {epochs: [row for row in rows if row["epochs"] == epochs] for epochs in {row["epochs"]: 0 for row in rows}}
+    return [{name: known_mean([row[name] for row in group]) for name in group[0]} for group in same.values()]
+
+
+def write_sweep_plot(path: Path, rows: Sequence[Scores]) -> None:
+    """Plot scores and sizes over the seconds of a later frame: a dot for each fit, a line through the means.
+
+    Raises:
+        ValueError: as `check_plot`.
+        OSError: the file cannot be written.
+    """
+    check_plot(path)
+    from matplotlib.figure import Figure
+
+    panels = {title: lines for title, lines in _PANELS.items() if any(np.isfinite(rows[0][name]) for name in lines)}
+    figure = Figure(figsize=(4.2 * len(panels), 3.6), layout="constrained")
+    means = sorted(mean_scores(rows), key=lambda row: row["later_seconds"])
+    for axes, (title, lines) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
+        for name, label in lines.items():
+            (line,) = axes.plot([row["later_seconds"] for row in means], [row[name] for row in means], label=label)
+            dots = [(row["later_seconds"], row[name]) for row in rows]
+            axes.plot(*zip(*dots, strict=True), "o", markersize=4, color=line.get_color())
+        for row in means:
+            place = (row["later_seconds"], row[next(iter(lines))])
+            axes.annotate(f"{row['epochs']:.0f}", place, xytext=(4, 4), textcoords="offset points")
+        axes.set(xlabel="seconds of a later frame (numbers: epochs)", ylabel=title)
+        axes.grid(color="0.9")
+        axes.legend()
+    with atomic_path(path, "write_sweep_plot()") as partial:
+        partial.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(partial, format=path.suffix[1:].lower())

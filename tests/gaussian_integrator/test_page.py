@@ -1,0 +1,63 @@
+"""The blocks of docs/mitsuba.md run, and its tables name the properties and channels that exist."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from morgs_mi.core.attributes import BY_ACTIVATED_NAME
+from morgs_mi.plugins import gaussian_splat
+from morgs_mi.render.channels import aov_attributes, exr_names
+
+TEXT = (Path(__file__).parents[2] / "docs/mitsuba.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
+FILES = dict(re.findall(r"<!-- file ([^ ]+) -->\n```\w+\n(.*?)```", TEXT, re.DOTALL))
+
+
+def rows(title: str) -> set[str]:
+    """Return the names in the first column of the table whose header begins with a column `title`."""
+    (table,) = re.findall(rf"^\| {title} \|.*\n((?:\|.*\n)+)", TEXT, re.MULTILINE)
+    return set(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE))
+
+
+def test_mitsuba_page__blocks_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, text in FILES.items():
+        (tmp_path / name).write_text(text)
+    space = {}
+    for block in BLOCKS:
+        exec(compile(block, "docs/mitsuba.md", "exec"), space)
+        if "image = mi.render" in block:
+            assert np.array(space["image"]).shape == (32, 48, 7)
+            assert np.ptp(np.array(space["image"]), axis=(0, 1)).min() > 0.01, "every channel shows something"
+    assert space["both"].shape == (32, 96, 7)
+    space["test_gradient_of_data"]()
+    assert not dr.grad_enabled(mi.Float(0))
+
+
+def test_mitsuba_page__lists_all_properties():
+    docstring = gaussian_splat.GaussianSplatIntegrator.__doc__
+    properties = {
+        name for names in re.findall(r"^ +\* - ([\w, ]+)$", docstring, re.MULTILINE) for name in names.split(", ")
+    }
+    assert rows(r"parameter \| type") == properties
+
+
+def test_mitsuba_page__lists_all_channels():
+    assert rows(r"`aovs` \| channels") == {*aov_attributes()}
+    for channel in aov_attributes():
+        assert all(f"`{name}`" in TEXT for name in exr_names(channel))
+    assert all(f"`SHAPE.{name}`" in TEXT for name in aov_attributes().values() if name in BY_ACTIVATED_NAME)
+
+
+@pytest.mark.parametrize("name", ["eps2d", "alpha_min", "stop_transmittance"])
+def test_mitsuba_page__states_the_defaults_of_the_cut_offs(name):
+    (stated,) = re.findall(rf"^\| `{name}` .*\(Default: (\S+)\)", TEXT, re.MULTILINE)
+    default = getattr(gaussian_splat.RenderConfig(), name)
+    numerator, _, denominator = stated.partition("/")
+    assert float(numerator) / float(denominator or 1) == pytest.approx(default)
