@@ -55,18 +55,12 @@ class StreamState:
     """State that one frame hands to the next.
 
     It follows from the stream and the recording. An interrupted fit can therefore be resumed exactly (see `recording`).
-
-    Attributes:
-        frame: index of the next frame.
-        coded: state of a decoder after the last frame; None before the first.
-        history: images up to the last frame.
-        correction: of the images to the colours of the scene.
     """
 
-    frame: int = 0
-    coded: CodedFrame | None = None
-    history: ImageHistory = field(default_factory=ImageHistory)
-    correction: Correction = field(default_factory=Correction)
+    frame: int = 0  #: Index of the next frame.
+    coded: CodedFrame | None = None  #: State of a decoder after the last frame; None before the first.
+    history: ImageHistory = field(default_factory=ImageHistory)  #: Images up to the last frame.
+    correction: Correction = field(default_factory=Correction)  #: Of the images to the colours of the scene.
 
     @property
     def gaussians(self) -> Gaussians | None:

@@ -11,8 +11,6 @@ from tyro.conf import DisallowNone, Positional
 from morgs_mi.cli.console import print_result, print_table, progress
 from morgs_mi.cli.settings import HeldOut, Settings, held_out, optional
 
-__all__ = ["Sweep"]
-
 
 @dataclass(frozen=True)
 class Sweep:

@@ -9,8 +9,6 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.memory import check_memory
 from morgs_mi.fit.fit_config import FitConfig
 
-__all__ = ["check_capacity"]
-
 # Arrays of each parameter: value, gradient and Adam's two moments.
 _ARRAYS = 4
 # Floats of a projected Gaussian.

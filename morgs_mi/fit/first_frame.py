@@ -31,8 +31,6 @@ from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["LAST_ROUND", "FirstFrame", "fit_confidence", "fit_first_frame"]
-
 # Passes over all views of which the loss is averaged.
 _PASSES = 4
 # Least number of steps of which it is averaged.

@@ -30,18 +30,6 @@ from morgs_mi.method.mask_refiners.mask_registry import mask_refiner
 from morgs_mi.method.motion_model import motion_model
 from morgs_mi.method.objective import KeyView
 
-__all__ = [
-    "FrameObservation",
-    "ImageHistory",
-    "Images",
-    "Recorded",
-    "Setup",
-    "extended_history",
-    "observe_frame",
-    "prepare",
-    "views_of",
-]
-
 # By view index: the images of those views that have one.
 Images = Mapping[int, np.ndarray]
 

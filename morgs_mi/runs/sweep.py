@@ -22,8 +22,6 @@ from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.recorder import stream_capture
 from morgs_mi.stream_loop import StreamLoop
 
-__all__ = ["mean_scores", "sweep", "write_sweep_plot"]
-
 Scores = Mapping[str, float]
 
 # The first and two later frames compile the kernels of a fit.
