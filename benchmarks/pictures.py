@@ -66,11 +66,11 @@ def main(options: Options) -> None:
 def draw(loop: StreamLoop, images: Sequence[np.ndarray | None]) -> dict[str, np.ndarray]:
     """Push the next frame and return the image [H, W, 3] of each stage in the key view that changes most, by name."""
     setup, state = loop.setup, loop.state
-    observed = observe_frame(setup, state.frame, state.seen, images)
+    observed = observe_frame(setup, state.frame, state.history, images)
     changes = observed.changes or {}
     view = max(observed.flows, key=lambda v: changes[v].sum())
     camera, flow, before = setup.cameras[view], observed.flows[view], loop.gaussians
-    image = observed.seen.images[view]
+    image = observed.history.images[view]
     assert before is not None
     assert state.coded is not None
     assert flow.mask is not None, "motion masks are computed at multiples of `mask_interval`"

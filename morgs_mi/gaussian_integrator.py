@@ -39,8 +39,6 @@ from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.render.channels import attribute_widths
 
-__all__ = ["ellipsoids", "integrator"]
-
 # By the name of a plugin, its module and class. The base classes exist once per variant.
 _PLUGINS = {
     "gaussian_splat": ("morgs_mi.plugins.gaussian_splat", "GaussianSplatIntegrator"),

@@ -32,13 +32,13 @@ from morgs_mi.loop.image_status import image_status
 from morgs_mi.loop.input_images import Given, as_array
 from morgs_mi.loop.observation import (
     FrameObservation,
+    ImageHistory,
     Images,
     Recorded,
-    Seen,
     Setup,
+    extended_history,
     observe_frame,
     prepare,
-    see_frame,
 )
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.active_set import ActiveSet, find_active_set, full_active_set
@@ -61,13 +61,13 @@ class StreamState:
     Attributes:
         frame: index of the next frame.
         coded: state of a decoder after the last frame; None before the first.
-        seen: images up to the last frame.
+        history: images up to the last frame.
         correction: of the images to the colours of the scene.
     """
 
     frame: int = 0
     coded: CodedFrame | None = None
-    seen: Seen = field(default_factory=Seen)
+    history: ImageHistory = field(default_factory=ImageHistory)
     correction: Correction = field(default_factory=Correction)
 
     @property
@@ -100,32 +100,35 @@ def step(
     """
     start = time.perf_counter()
     frame_progress = Progress(progress, f"Frame {state.frame}")
-    observed = images if isinstance(images, FrameObservation) else observe_frame(setup, state.frame, state.seen, images)
+    if isinstance(images, FrameObservation):
+        observed = images
+    else:
+        observed = observe_frame(setup, state.frame, state.history, images)
     if state.coded is None:
         fitted = fitted_first_frame(setup, observed, frame_progress, on_provisional)
     else:
         fitted = _fitted_later_frame(setup, state, observed, frame_progress)
     coded = decode(state.coded, fitted.packet)
-    seen = observed.seen
+    history = observed.history
     report = FrameReport(
         frame=state.frame,
         seconds=time.perf_counter() - start,
         num_bytes=fitted.packet.num_bytes,
         losses=fitted.losses,
         num_gaussians=len(coded),
-        status=_status(setup, state, seen.images, fitted.status),
-        missing_views=tuple(camera.name for v, camera in enumerate(setup.cameras) if v not in seen.images),
+        status=_status(setup, state, history.images, fitted.status),
+        missing_views=tuple(camera.name for v, camera in enumerate(setup.cameras) if v not in history.images),
         active=fitted.active,
         validation=fitted.validation,
         steps=fitted.steps,
-        exposures=fitted.correction.followed_by(seen.exposures),
+        exposures=fitted.correction.followed_by(history.exposures),
     )
-    return StreamState(state.frame + 1, coded, seen, fitted.correction), fitted.packet, report
+    return StreamState(state.frame + 1, coded, history, fitted.correction), fitted.packet, report
 
 
 def _status(setup: Setup, state: StreamState, images: Images, status: str) -> str:
     """Return the status of a frame with the problems of its images, which are logged in the first frame."""
-    problems = image_status([camera.name for camera in setup.cameras], state.seen.images, images)
+    problems = image_status([camera.name for camera in setup.cameras], state.history.images, images)
     for problem in problems if state.coded is None else ():
         _LOG.warning("frame 0: %s", problem)
     return "; ".join([*([] if status == "ok" else [status]), *problems]) or "ok"
@@ -138,11 +141,11 @@ def _fitted_later_frame(
     assert state.coded is not None
     config = setup.config
     motion = config.motion
-    images = observed.seen.images
+    images = observed.history.images
     rng = rng_of(config.seed, Stream.LATER_FRAMES, state.frame)  # of its own for each frame: it is no state
     previous = state.coded.gaussians
     if state.frame == 1:  # the masks of frame 0 need the flow to this frame
-        previous = with_first_confidence(setup, previous, state.seen.images, observed.flows, rng)  # (9-11)
+        previous = with_first_confidence(setup, previous, state.history.images, observed.flows, rng)  # (9-11)
     observations = observe(observed.key_views, motion, config.fit.objective)
     active = _active_set(setup, previous, images, observed.changes, observations)
     corrected = state.correction.corrected({view: observed.encoded[view] for view in active.views})
@@ -185,7 +188,7 @@ class StreamLoop:
     Args:
         cameras: the training views.
         points: SfM points [P, 3], world units; fewer than 20 are replaced by random ones inside the views.
-        point_colors: [P, 3] in [0, 1].
+        point_colors: [P, 3], encoded: 1 is white.
         config: settings.
         masks: per view [H, W] bool of valid pixels, or None.
         display_exposure: stops by which images in linear light are brightened where flow and changes are computed,
@@ -212,7 +215,7 @@ class StreamLoop:
     ) -> None:
         self.setup = prepare(cameras, points, point_colors, config, masks, display_exposure)
         self.state = StreamState()
-        self._ahead: tuple[int, Future[FrameObservation]] | None = None  # of the next frame, with its index
+        self._next_observation: tuple[int, Future[FrameObservation]] | None = None  # of the next frame, with its index
 
     @classmethod
     def of(cls, capture: Recorded, config: StreamConfig | None = None) -> StreamLoop:
@@ -257,23 +260,24 @@ class StreamLoop:
         """
         start = time.perf_counter()
         frame = self.state.frame
-        past = self.state.seen
-        observed = self._observed_ahead(images) or observe_frame(self.setup, frame, past, images)
-        seen = observed.seen if recorded is None else see_frame(self.setup, frame, past, recorded)[0]
+        previous = self.state.history
+        observed = self._observed_ahead(images) or observe_frame(self.setup, frame, previous, images)
+        history = observed.history if recorded is None else extended_history(self.setup, frame, previous, recorded)
         if upcoming is not None:
             copies = [None if image is None else np.array(as_array(image)) for image in upcoming]
-            self._ahead = frame + 1, in_background(partial(observe_frame, self.setup, frame + 1, seen, copies))
+            observation = in_background(partial(observe_frame, self.setup, frame + 1, history, copies))
+            self._next_observation = frame + 1, observation
         state, packet, report = step(self.setup, self.state, observed, progress, on_provisional)
-        self.state = replace(state, seen=seen)
+        self.state = replace(state, history=history)
         return packet, replace(report, seconds=time.perf_counter() - start)
 
     def _observed_ahead(self, images: Sequence[Given | None]) -> FrameObservation | None:
         """Return the observation made ahead of time, if its images are the same."""
-        ahead = self._ahead
-        self._ahead = None
-        if ahead is None or ahead[0] != self.state.frame:
+        task = self._next_observation
+        self._next_observation = None
+        if task is None or task[0] != self.state.frame:
             return None
-        observed = ahead[1].result()
+        observed = task[1].result()
         present = {v: as_array(image) for v, image in enumerate(images) if image is not None}
         same_views = present.keys() == observed.recorded.keys()
         same = same_views and all(np.array_equal(image, observed.recorded[v]) for v, image in present.items())
@@ -290,11 +294,11 @@ class StreamLoop:
         Args:
             coded: state of the stream after that frame.
             frames: images of all frames up to it, as for `push`; the last frame suffices without `skip_static` and
-                `exposure`.
+                `exposure`, if they have 8 bits or the display exposure is given.
             exposures: in the report of the first frame.
         """
-        seen = Seen()
+        history = ImageHistory()
         for images in frames:
-            seen, _ = see_frame(self.setup, coded.frame, seen, images)
-        self.state = StreamState(coded.frame + 1, coded, seen, Correction(tuple(exposures)))
-        self._ahead = None
+            history = extended_history(self.setup, coded.frame, history, images)
+        self.state = StreamState(coded.frame + 1, coded, history, Correction(tuple(exposures)))
+        self._next_observation = None

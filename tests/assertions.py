@@ -7,8 +7,6 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-__all__ = ["assert_close"]
-
 
 def assert_close(
     found: Any, expected: Any, *, atol: float = 0.0, rtol: float = 0.0, where: Any = True, name: str = ""

@@ -362,7 +362,7 @@ def masked(masks):
         (lambda clip: StreamLoop(cameras(), np.zeros((3, 4)), np.zeros((4, 3))), r"`points` must be \[P, 3\]"),
         (
             lambda clip: StreamLoop(cameras(), np.zeros((200, 3)), np.full((200, 3), 128)),
-            r"`point_colors` must be from 0 to 32 with white at 1, got .* at 0; divide colours of 8 bits by 255",
+            r"`point_colors` must be in \[0, 32\], got .* at 0; divide colours of 8 bits by 255",
         ),
         (lambda clip: masked([None]), "one mask or None for each of 4 views, got 1"),
         (lambda clip: masked([None, np.ones((50, 96), bool), None, None]), r"view 'cam01': the mask must be bool \[72"),
@@ -452,7 +452,7 @@ def test_resume__copies_its_images_and_refuses_those_of_another_size(clip, full)
     loop.resume(coded, [buffers])
     for buffer in buffers:
         buffer[:] = 0
-    assert all(np.array_equal(loop.state.seen.images[view], clip[0][view]) for view in range(4))
+    assert all(np.array_equal(loop.state.history.images[view], clip[0][view]) for view in range(4))
     with pytest.raises(ValueError, match=r"must be uint8 \[72, 96, 3\]"):
         loop.resume(coded, [[image[:50] for image in buffers]])
 
@@ -646,7 +646,7 @@ def test_push__light_above_white_is_fitted_and_followed():
     for frame in range(2):
         _, report = loop.push([*map(mi.TensorXf, recorded(frame)[:4])])
         assert report.status == "ok"
-    assert loop.state.seen.display_exposure < -1
+    assert loop.state.history.display_exposure < -1
     rendered = np.asarray(held_out(loop.gaussians, ("color",)).color)
     truth = encode_light(recorded(1)[4])
     above = truth > 1.2

@@ -27,8 +27,6 @@ from morgs_mi.core.z_order import equal_cells, z_order
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, MotionModelFactory, sparse_product
 
-__all__ = ["AnchorConfig", "anchor_matrix", "anchored_motion"]
-
 
 @dataclass(frozen=True)
 class AnchorConfig:

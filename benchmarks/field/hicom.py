@@ -22,8 +22,6 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, MotionModelFactory, sparse_product
 
-__all__ = ["HicomConfig", "cell_matrix", "coherent_motion"]
-
 
 @dataclass(frozen=True)
 class HicomConfig:

@@ -28,8 +28,6 @@ from morgs_mi.core.types import Float, Tensor
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, MotionModelFactory, sparse_product
 
-__all__ = ["GridConfig", "bits", "corner_matrix", "motion_grid"]
-
 # Least probability of a value, which bounds its bits.
 _LEAST = 1e-6
 

@@ -7,8 +7,6 @@ import numpy as np
 
 from morgs_mi.core.types import Tensor
 
-__all__ = ["corners", "quantised"]
-
 
 def corners(points: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the corners of the cubic cells around points, and their weights in trilinear interpolation.

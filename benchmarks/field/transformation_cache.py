@@ -25,8 +25,6 @@ from morgs_mi.core.memory import from_numpy
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, MotionModelFactory, sparse_product
 
-__all__ = ["CacheConfig", "hash_matrix", "transformation_cache"]
-
 # Of the hash by Mueller et al.
 _PRIMES = np.array([1, 2_654_435_761, 805_459_861], np.uint64)
 

@@ -15,8 +15,6 @@ from benchmarks.pages.plots import PLOTS
 from benchmarks.pages.tables import TABLES
 from benchmarks.reports.plots import save_figure
 
-__all__ = ["PAGES", "with_tables"]
-
 PAGES = Path(__file__).parents[2] / "docs/experiments"
 
 

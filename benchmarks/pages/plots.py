@@ -13,8 +13,6 @@ from benchmarks.reports.plots import blank_figure, grouped
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["PLOTS"]
-
 
 def drift() -> Figure:
     """Return the PSNR where things move over the frames of five clips, means of their fits."""

@@ -15,8 +15,6 @@ from benchmarks.reports.plots import grouped, markdown
 from benchmarks.reports.unseen import out_of_capture
 from morgs_mi.fit.unseen_views import WIDEST
 
-__all__ = ["TABLES"]
-
 
 def study_table(report: Any, *names: str) -> str:
     """Return the table of a study over the committed fits of some results."""
@@ -31,6 +29,17 @@ def demo() -> str:
         for title, row in (("default", comparison["full"]), ("residuals alone", comparison["plain"]))
     )
     return markdown(("", "PSNR", "motion error, moving", "still"), rows)
+
+
+def hdr() -> str:
+    """Return the error of the light that an inserted sphere receives, of fits of an HDR recording and one of 8 bits."""
+    titles = {"hdr": "HDR", "8-bit": "8 bits, as recorded", "8-bit, guessed": "8 bits, clipped light taken as 4"}
+    light = committed("hdr")["light"]
+    rows = (
+        (title, f"{100 * light[name]['error']:.1f} %", f"{100 * light[name]['mean']:.1f} %")
+        for name, title in titles.items()
+    )
+    return markdown(("recording", "error of the light", "mean light"), rows)
 
 
 def gains() -> str:
@@ -157,6 +166,7 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "frame_times": frame_times,
     "fuzz": fuzz,
     "gains": gains,
+    "hdr": hdr,
     "held_out_views": lambda: held_out.first_frames(committed("held_out")["fits"]),
     "held_out_views_over_time": lambda: held_out.later_frames(committed("held_out")["fits"]),
     "parts": parts,

@@ -16,8 +16,6 @@ from morgs_mi.runs.cluster.workers import installed, open_client, prepared
 if TYPE_CHECKING:
     from distributed import Client
 
-__all__ = ["OnWorkers", "run_cells"]
-
 Name = TypeVar("Name")
 Result = TypeVar("Result")
 _LOG = logging.getLogger("morgs_mi")

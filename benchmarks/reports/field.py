@@ -29,8 +29,6 @@ from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig, apply_preset, apply_values
 from morgs_mi.runs.cluster.tasks import Source
 
-__all__ = ["METHODS", "Options", "field_table", "main", "plot_field"]
-
 _FAST = {"fit": {"rates": {"means": 2e-3}}}
 _RIGID = {"rigid_weight": 0.4, "rotation_weight": 0.4, "isometry_weight": 0.2}
 # Presets and further settings by name, in the order of the tables; DEFAULT is no preset. The motion models register

@@ -25,18 +25,6 @@ from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
-__all__ = [
-    "DEFAULT",
-    "Clip",
-    "ClipOptions",
-    "Continuation",
-    "new_loop",
-    "random_capture",
-    "spread_views",
-    "synthetic",
-]
-
-
 DEFAULT = "default"  # name of the settings without a preset
 
 

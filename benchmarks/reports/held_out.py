@@ -21,8 +21,6 @@ from benchmarks.speed.output import Output
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.io.bounded import read_json
 
-__all__ = ["first_frames", "later_frames"]
-
 # Frames of a table over time, at most.
 _ROWS = 7
 

@@ -13,17 +13,6 @@ from benchmarks.reports.plots import blank_figure, label_points, markdown, save_
 from benchmarks.reports.study import Row
 from morgs_mi.evaluate.tables import figure
 
-__all__ = [
-    "ablation_table",
-    "best_rows",
-    "epochs_table",
-    "gains_table",
-    "key_views_rows",
-    "key_views_table",
-    "method_page",
-    "plot_method",
-]
-
 _COLUMNS = (
     ("PSNR, dB", "psnr", 2, 1),
     ("moving", "psnr_moving", 2, 1),

@@ -14,19 +14,6 @@ from morgs_mi.evaluate.tables import figure
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = [
-    "Column",
-    "blank_figure",
-    "grouped",
-    "label_points",
-    "markdown",
-    "means_over",
-    "plus_minus",
-    "save_figure",
-    "scores_table",
-    "span",
-]
-
 
 class Column(NamedTuple):
     """Column of a table of scores.

@@ -24,8 +24,6 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["ATTRIBUTES", "Reference64"]
-
 ATTRIBUTES = ("means", "log_scales", "quats", "logit_opacities", "sh_coeffs")
 _GEOMETRY = ATTRIBUTES[:4]
 _STEP = 1e-30

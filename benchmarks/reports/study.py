@@ -33,8 +33,6 @@ from morgs_mi.loop.stream_config import StreamConfig
 if TYPE_CHECKING:
     from distributed import Client
 
-__all__ = ["Row", "Scene", "Study", "StudyOptions", "Variant", "method_version", "rounded"]
-
 Row = Mapping[str, Any]
 _SHOWN = 300  # characters of a cell's scores that are printed
 # Options for the paths of files and for the processes that fit.

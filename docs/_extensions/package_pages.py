@@ -7,6 +7,7 @@ import re
 import sys
 from importlib import import_module
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 from docutils.nodes import Element
@@ -72,9 +73,9 @@ def description(name: str) -> tuple[str, str]:
     target = getattr(morgs_mi, name)
     if hasattr(target, "__qualname__"):
         return f"{target.__module__}.{target.__qualname__}", target.__doc__ or ""
-    # A constant does not name its module: it is the one that exports it.
+    # A constant does not name its module: it is the one that describes it.
     packages = (module for module in sorted(sys.modules) if module.startswith("morgs_mi."))
-    module = next(m for m in packages if name in getattr(sys.modules[m], "__all__", ()))
+    module = next(m for m in packages if ("", name) in ModuleAnalyzer.for_module(m).find_attr_docs())
     return f"{module}.{name}", "\n".join(ModuleAnalyzer.for_module(module).find_attr_docs()["", name])
 
 
@@ -91,8 +92,9 @@ def link_notebooks(app: Sphinx, name: str, source: list[str]) -> None:
 
 
 def leave_internal_names(app: Sphinx, env: BuildEnvironment, node: Element, content: Element) -> Element | None:
-    """Leave a type in a signature without a link if no module exports it: it has no description."""
-    target = node.get("reftarget", "")
-    module, _, name = target.rpartition(".")
-    exported = name in getattr(sys.modules.get(module), "__all__", ())
-    return content if target.startswith("morgs_mi.") and not exported else None
+    """Leave a type in a signature without a link if it has no description: it is private, or a variable."""
+    module, _, name = node.get("reftarget", "").rpartition(".")
+    target = getattr(sys.modules.get(module), name, None)
+    is_described = isinstance(target, type | FunctionType) and target.__module__ == module and target.__doc__
+    is_internal = module.startswith("morgs_mi") and (name.startswith("_") or not is_described)
+    return content if is_internal else None

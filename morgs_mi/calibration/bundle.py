@@ -30,18 +30,6 @@ from morgs_mi.capture.features import Tracks, intersect
 from morgs_mi.core.camera import Camera
 from morgs_mi.fit.fit_config import CameraPriors
 
-__all__ = [
-    "CHANGES",
-    "NormalEquations",
-    "bundle_adjust",
-    "camera_jacobian",
-    "changed_camera",
-    "distorted",
-    "likely_deviations",
-    "prior_deviations",
-    "undistorted",
-]
-
 # Number of parameters of a camera's change.
 CHANGES = 11
 # Steps, and the relative decrease of the loss below which they end.

@@ -32,8 +32,6 @@ from morgs_mi.core.files import atomic_path
 from morgs_mi.core.ranges import check_ranges
 from morgs_mi.io.video import FrameReader, open_frames
 
-__all__ = ["CalibrateConfig", "CalibrationResult", "Mapper", "calibrate"]
-
 Mapper = Literal["incremental", "global"]
 
 # With fewer features in a view COLMAP cannot register it.

@@ -15,8 +15,6 @@ import numpy as np
 from morgs_mi.capture.features import Features, Match, descriptor_distances, intersect, mutual_neighbours
 from morgs_mi.core.camera import Camera
 
-__all__ = ["match_guided"]
-
 # Largest distance from an epipolar line, px, and between two descriptors of length 1.
 _BAND, _MAX_DISTANCE = 1.0, 0.9
 # Largest difference of the patches in size, octaves, and in orientation, degrees.

@@ -37,8 +37,6 @@ from morgs_mi.method.image_gradient import blurred, gradient_products, image_gra
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 
-__all__ = ["UNKNOWN", "OffsetEquations", "offset_equations"]
-
 # lambda, as a fraction of a Gaussian's mean curvature along an axis.
 _PRIOR = 1e-4
 # Added to the eigenvalues of S for a step and for its error, as fractions of its mean diagonal without elimination.

@@ -55,8 +55,6 @@ from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["Refinement", "refine_cameras", "register_camera"]
-
 # A camera with features in fewer tracks is not determined by them.
 _MIN_TRACKS = 40
 # Number of pixels with similar errors, because the fit lacks a detail there. They count as one pixel: otherwise priors

@@ -15,8 +15,6 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.rig import angles_to, scene_depths, seen_points
 
-__all__ = ["stereo_points"]
-
 # Images are reduced to this number of pixels: the points only initialise a fit, which is more exact.
 _PIXELS = 2e5
 # Number of nearest cameras that each is matched with, and their least and largest angle, degrees.

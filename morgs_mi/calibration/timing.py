@@ -45,8 +45,6 @@ from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["TimeOffsets", "estimate_time_offsets"]
-
 # px, least width of the images: small images are fitted fast, and an offset displaces them by few pixels.
 _WIDTH = 160
 # Number of frames used from the start of the recording, and of instants among them at which Gaussians are fitted.

@@ -15,8 +15,6 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import decode_light, display_image, encode_light
 from morgs_mi.io.video import FrameReader, ImageOrError
 
-__all__ = ["CameraSource", "at_clip_size"]
-
 
 @dataclass(frozen=True)
 class CameraSource:

@@ -30,9 +30,6 @@ from morgs_mi.io.prefetch import prefetched
 from morgs_mi.io.remote import is_url, mirrored
 from morgs_mi.io.video import Clip, ImageOrError, open_clips
 
-__all__ = ["Capture", "Frame", "PartialFrame", "load_capture"]
-
-
 _LOG = logging.getLogger(__name__)
 # Pixels of the shorter side that a downscaled image needs.
 _MIN_SIDE = 32

@@ -14,20 +14,6 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 
-__all__ = [
-    "Features",
-    "Match",
-    "Tracks",
-    "descriptor_distances",
-    "detect",
-    "intersect",
-    "join_matches",
-    "match_views",
-    "mutual_neighbours",
-    "reprojection_errors",
-    "triangulate",
-]
-
 # Larger images add no corners that other views also see, and SIFT is slow.
 _DETECTION_PIXELS = 1.3e6
 _MAX_FEATURES = 2500

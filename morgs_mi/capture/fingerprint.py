@@ -9,8 +9,6 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture
 
-__all__ = ["fingerprint"]
-
 
 def fingerprint(capture: Capture, images: Sequence[np.ndarray | None], with_cameras: bool = False) -> str:
     """Return the digest of a recording as 16 hexadecimal digits.

@@ -8,8 +8,6 @@ from typing import Any
 
 from morgs_mi.capture.layouts.calibration import Calibration
 
-__all__ = ["TestViews", "held_out_by", "held_out_views"]
-
 TestViews = int | str | Sequence[int | str] | None
 """Held-out cameras: an index, a name, several of these, None for none, or "auto"."""
 # Number of cameras from which one is held out by default, as in N3DV.

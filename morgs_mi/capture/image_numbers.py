@@ -16,8 +16,6 @@ import numpy as np
 from morgs_mi.io.numbering import counting_together
 from morgs_mi.io.video import FolderReader, FrameReader
 
-__all__ = ["ImageNumbers", "align_numbers"]
-
 _Numbers = Mapping[int, range]
 
 

@@ -15,8 +15,6 @@ from morgs_mi.core.color_space import decode_light, encode_light
 from morgs_mi.method.flow_sources.consistency import consistency_mask
 from morgs_mi.method.flow_sources.flow_registry import FramePair, flow_source
 
-__all__ = ["image_between"]
-
 # Rounds of the fixed-point iteration: flow is smooth, so each round gains about a digit.
 _ROUNDS = 5
 # Weight of an unreliable point: it matters only where neither frame has a reliable one.

@@ -15,8 +15,6 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import LARGEST, bounded
 
-__all__ = ["Lens", "Undistortion", "lens_and_intrinsics", "opencv_lens", "undistortion"]
-
 # Per COLMAP model, in the order of its binary ids: the number of focal lengths and of coefficients.
 MODELS = {
     "SIMPLE_PINHOLE": (1, 0),

@@ -11,8 +11,6 @@ import numpy as np
 from morgs_mi.io.remote import fetched
 from morgs_mi.io.video import FolderReader, FrameReader, decode_image
 
-__all__ = ["opaque_pixels", "used_in_clip", "used_pixels"]
-
 
 def used_in_clip(reader: FrameReader, masks: Sequence[Path], name: str) -> tuple[np.ndarray | None, list[str]]:
     """Return the mask of the pixels of a clip that are opaque and in no mask black, None if all are, and notes.

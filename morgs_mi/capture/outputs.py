@@ -7,8 +7,6 @@ from typing import TypeVar
 
 from morgs_mi.capture.layouts.layout_registry import LAYOUTS
 
-__all__ = ["check_output"]
-
 PathLike = TypeVar("PathLike", str, Path)
 
 

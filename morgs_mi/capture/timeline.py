@@ -28,8 +28,6 @@ from morgs_mi.io.bounded import read_json
 from morgs_mi.io.unread import warn_unread
 from morgs_mi.io.video import FrameReader
 
-__all__ = ["ReadConfig", "Timeline", "nearest_frames", "read_settings", "timeline"]
-
 _LOG = logging.getLogger(__name__)
 _DEFAULT_FPS = 30.0
 _INTERVALS = {"fps": "[1e-6, 1e6]", "meters_per_unit": "[1e-12, 1e12]", "display_exposure": "[-100, 100]"}

@@ -15,8 +15,6 @@ import numpy as np
 from morgs_mi.io.bounded import array_names, read_array
 from morgs_mi.io.exr import read_exr, write_exr
 
-__all__ = ["GroundTruth", "Tracks", "load_tracks", "load_truth", "save_tracks", "save_truth"]
-
 
 @dataclass(frozen=True)
 class GroundTruth:

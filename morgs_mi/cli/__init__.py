@@ -29,8 +29,6 @@ from morgs_mi.cli.settings import Flag, Settings
 from morgs_mi.cli.suggestion import one_command, suggesting_command
 from morgs_mi.core.interrupts import INTERRUPTED, interruptible, is_interruption
 
-__all__ = ["COMMANDS", "Common", "main", "run"]
-
 _PLACES = {
     "synth": "synth:Synth",
     "info": "info:Info",

@@ -15,8 +15,6 @@ from morgs_mi.cli.console import print_result, print_table, print_warning, progr
 from morgs_mi.cli.info import advice_lines, check_cells
 from morgs_mi.cli.settings import Flag, Without
 
-__all__ = ["Calibrate"]
-
 
 @dataclass(frozen=True)
 class Calibrate:

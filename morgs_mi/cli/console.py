@@ -18,20 +18,6 @@ from rich.text import Text
 
 from morgs_mi.core.progress import Report
 
-__all__ = [
-    "ERR",
-    "OUT",
-    "LogHandler",
-    "naming_output",
-    "print_result",
-    "print_table",
-    "print_warning",
-    "printable",
-    "progress",
-    "sentence_of",
-    "with_option_names",
-]
-
 
 def printable(text: str) -> str:
     r"""Return a text with its control characters as ``\u001b``: names in a file may hold escape sequences."""

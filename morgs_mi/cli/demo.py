@@ -14,8 +14,6 @@ from morgs_mi.cli.settings import Settings, optional, setting
 from morgs_mi.evaluate.tables import figure
 from morgs_mi.runs.demo import DemoConfig
 
-__all__ = ["Demo"]
-
 _DEFAULT = DemoConfig()
 
 

@@ -17,8 +17,6 @@ from morgs_mi.evaluate.results import Evaluation
 from morgs_mi.evaluate.tables import evaluation_summary, evaluation_tables
 from morgs_mi.runs.recording import FILES
 
-__all__ = ["Eval"]
-
 
 @dataclass(frozen=True)
 class Eval:

@@ -15,8 +15,6 @@ from morgs_mi.cli.settings import setting
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.playback.default_rig import Axes
 
-__all__ = ["Import"]
-
 _PATHS = (
     "Frames: a folder with a .ply, .compressed.ply or .splat file for each, or the files in the order of the frames. "
     "Last, OUT: a folder for stream.morgs, or a new file whose name ends in .morgs."

@@ -30,8 +30,6 @@ from morgs_mi.cli.settings import Flag, GivenReading, Reading, optional
 from morgs_mi.core.files import write_json
 from morgs_mi.fit.forecast import forecast
 
-__all__ = ["Info"]
-
 # Standard errors in frames above which a time offset is uncertain, and from which it counts as not found.
 _UNCERTAIN, _NOT_FOUND = 0.1, 0.5
 _UNCERTAIN_WHY = (

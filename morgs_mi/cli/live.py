@@ -22,8 +22,6 @@ from morgs_mi.runs.live.live_config import LIVE_STREAM, LiveConfig
 if TYPE_CHECKING:
     from morgs_mi.runs.live.fit_live import LiveFrame
 
-__all__ = ["Live", "LiveSettings"]
-
 _PERIOD = 1.0  # least time between two lines about frames, s
 
 

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from morgs_mi.core.camera import Camera
     from morgs_mi.playback.export.paths import CameraPath
 
-__all__ = ["Render"]
-
 _CHANNELS = (
     "Channels to render, side by side: color, motion, confidence, depth, alpha. By default color, and for EXR files "
     "all that the stream stores."

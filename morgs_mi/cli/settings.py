@@ -16,23 +16,6 @@ from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.documentation import page
 from morgs_mi.loop.stream_config import PresetName, StreamConfig, apply_preset, apply_values, read_config, relocated
 
-__all__ = [
-    "SETTINGS",
-    "ChannelName",
-    "Flag",
-    "GivenReading",
-    "GivenSettings",
-    "HeldOut",
-    "Reading",
-    "Settings",
-    "Without",
-    "held_out",
-    "one_of",
-    "optional",
-    "place",
-    "setting",
-]
-
 # The setting of every option. All others are set in a file.
 SETTINGS = {
     "seed": "seed",
@@ -86,15 +69,8 @@ def optional(metavar: str, hint: str = "", text: str | None = None) -> Any:
     return arg(metavar=metavar, help_behavior_hint=hint, help=text)
 
 
-DisplayExposure = Annotated[
-    float | None,
-    DisallowNone,
-    optional(
-        "STOPS",
-        text="Stops by which PNG files and videos are brightened before they are clipped at white; by default those of "
-        "the stream, 0 for a recording of 8 bits.",
-    ),
-]
+_EXPOSURE = "Stops by which PNG files and videos are brightened; by default the stream's, 0 for a recording of 8 bits."
+DisplayExposure = Annotated[float | None, DisallowNone, optional("STOPS", text=_EXPOSURE)]
 """Option of the commands that render a stream."""
 
 

@@ -14,8 +14,6 @@ from tyro.conf import arg, subcommand
 
 from morgs_mi.cli.console import print_warning
 
-__all__ = ["near_command", "one_command", "suggesting_command"]
-
 
 def one_command(commands: Mapping[str, type]) -> Any:
     """Return the annotation of an argument that is one of several commands, by their names."""

@@ -12,8 +12,6 @@ from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.settings import Flag
 from morgs_mi.synth.synth_config import SynthConfig
 
-__all__ = ["Synth"]
-
 
 @dataclass(frozen=True)
 class Synth:

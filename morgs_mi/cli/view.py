@@ -11,8 +11,6 @@ from tyro.conf import Positional
 from morgs_mi.cli.console import print_result
 from morgs_mi.cli.opening import DropInvalid, opened
 
-__all__ = ["View"]
-
 
 @dataclass(frozen=True)
 class View:

@@ -8,8 +8,6 @@ from typing import Annotated
 from morgs_mi.core.documentation import documented
 from morgs_mi.core.ranges import Above, AtLeast, AtMost, check_ranges
 
-__all__ = ["CodecConfig"]
-
 
 @documented
 @dataclass(frozen=True)

@@ -18,8 +18,6 @@ from typing import Any, cast
 import constriction
 import numpy as np
 
-__all__ = ["LIMIT", "ColumnReader", "ColumnWriter", "column_bits"]
-
 LIMIT = 2**30
 """Integers must lie between -LIMIT and LIMIT."""
 

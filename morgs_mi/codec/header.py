@@ -16,8 +16,6 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import LARGEST
 
-__all__ = ["camera_of_fields", "header_fields", "header_json", "load_json"]
-
 _MAX_BYTES = 2**22
 _MAX_LEVELS = 32  # of JSON; recursive programs must be able to visit it
 _MAX_PIXELS = 2**26  # of a camera

@@ -76,18 +76,18 @@ class CodedFrame(FrameState):
     def digest(self) -> np.ndarray:
         """BLAKE2b of all integers, uint8 [8], by which a residual names its parent."""
         grid = self.grid
-        hashed = blake2b(digest_size=8)
+        hasher = blake2b(digest_size=8)
         for array, dtype in (
             (self.ids, "<u4"),
             (grid.largest_components, "u1"),
             (grid.exponents, "i1"),
             (grid.values, "<i4"),
         ):
-            hashed.update(np.ascontiguousarray(array, dtype).data)
+            hasher.update(np.ascontiguousarray(array, dtype).data)
         # A mask of the confidence alone follows from the number of exponents.
         mask = [grid.optional] if grid.optional > 1 else []
-        hashed.update(np.array([self.next_id, grid.degree, *mask], "<u4").data)
-        return np.frombuffer(hashed.digest(), np.uint8)
+        hasher.update(np.array([self.next_id, grid.degree, *mask], "<u4").data)
+        return np.frombuffer(hasher.digest(), np.uint8)
 
 
 def keyframe_packet(
@@ -210,10 +210,10 @@ def coded_frames(packets: Iterable[Packet]) -> Iterator[CodedFrame]:
 def _decoded_keyframe(packet: Packet, first_id: int) -> CodedFrame:
     code = packet.arrays["code"]
     N, degree, optional, next_id = _head(packet, 4)
-    if unknown := optional & ~KNOWN_OPTIONAL:
+    if unknown_bits := optional & ~KNOWN_OPTIONAL:
         raise ValueError(
             f"its mask of optional attributes must have no bits beyond {KNOWN_OPTIONAL:#b}, got {optional:#b} with the "
-            f"unknown {unknown:#b}; read it with the release that wrote it"
+            f"unknown {unknown_bits:#b}; read it with the release that wrote it"
         )
     _check_most(degree, 3, "its degree")
     _check_most(next_id, LIMIT - 1, "its next id")
@@ -379,17 +379,17 @@ def _check_most(number: int, most: int, what: str) -> None:
         raise ValueError(f"{what} must be at most {most}, got {number}")
 
 
-def _padded(words: np.ndarray, added: int, total: int, grid: Grid) -> np.ndarray:
-    return np.pad(words, (0, max(0, _least_words(added, total, grid.degree, grid.optional) - len(words))))
+def _padded(words: np.ndarray, births: int, total: int, grid: Grid) -> np.ndarray:
+    return np.pad(words, (0, max(0, _least_words(births, total, grid.degree, grid.optional) - len(words))))
 
 
-def _check_words(code: np.ndarray, added: int, total: int, degree: int, optional: int) -> None:
-    least = _least_words(added, total, degree, optional)
+def _check_words(code: np.ndarray, births: int, total: int, degree: int, optional: int) -> None:
+    least = _least_words(births, total, degree, optional)
     if len(code) < least:
-        raise ValueError(f"{added} new of {total} Gaussians take at least {least} words of code, got {len(code)}")
+        raise ValueError(f"{births} new of {total} Gaussians take at least {least} words of code, got {len(code)}")
 
 
-def _least_words(added: int, total: int, degree: int, optional: int) -> int:
+def _least_words(births: int, total: int, degree: int, optional: int) -> int:
     """Return the number of words that a packet has at least if it adds some Gaussians to a state with a new total."""
     integers = num_integers(degree, optional)
-    return -(-added * (integers if total * integers > _FREE_INTEGERS else 1) // _PER_WORD)
+    return -(-births * (integers if total * integers > _FREE_INTEGERS else 1) // _PER_WORD)

@@ -34,24 +34,6 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
 
-__all__ = [
-    "GROUPS",
-    "KNOWN_OPTIONAL",
-    "Grid",
-    "bounded",
-    "columns_of",
-    "finite_fields",
-    "new_grid",
-    "num_exponents",
-    "num_integers",
-    "optional_mask",
-    "optional_names",
-    "real_values",
-    "split_groups",
-    "step_sizes",
-    "stored_fields",
-]
-
 _STORED: dict[str, Attribute] = {row.name: row for row in ATTRIBUTES if row.error is not None}
 # Every stream has these groups, and `_exponents` has a rule for each; all others are optional.
 _ALWAYS = ("means", "log_scales", "quats", "logit_opacities", "sh_dc", "sh_rest")

@@ -40,11 +40,11 @@ class Coder:
     def rounded(self, coarseness: int) -> np.ndarray:
         """Return the changes in whole steps, int32 [C, N]."""
         r = np.zeros((len(self.change), len(self.grid)), np.int32)
-        scaled = self.change / _step(coarseness)
+        steps = self.change / _step(coarseness)
         for name, at in self.grid.columns.items():
-            largest = np.max(np.abs(scaled[at]), axis=0)
-            scaled[at][:, largest < (_THRESHOLD_DC if name == "sh_dc" else _THRESHOLD)] = 0
-        r[:, self.rows] = np.clip(np.rint(scaled, out=scaled), 1 - LIMIT, LIMIT - 1, out=scaled)
+            largest = np.max(np.abs(steps[at]), axis=0)
+            steps[at][:, largest < (_THRESHOLD_DC if name == "sh_dc" else _THRESHOLD)] = 0
+        r[:, self.rows] = np.clip(np.rint(steps, out=steps), 1 - LIMIT, LIMIT - 1, out=steps)
         return r
 
     def columns(self, r: np.ndarray) -> Iterator[np.ndarray]:

@@ -15,18 +15,6 @@ import numpy as np
 
 from morgs_mi.core.types import Jit
 
-__all__ = [
-    "ATTRIBUTES",
-    "BY_ACTIVATED_NAME",
-    "BY_NAME",
-    "EXP",
-    "IDENTITY",
-    "SIGMOID",
-    "Activation",
-    "Attribute",
-    "sigmoid",
-]
-
 
 def sigmoid(x: Jit) -> Jit:
     """Return 1 / (1 + exp(-x)); finite with a finite gradient for every finite x."""

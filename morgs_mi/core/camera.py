@@ -16,8 +16,6 @@ from numpy.typing import ArrayLike
 from morgs_mi.core.checks import LARGEST, bounded, check_number, check_size, numbers
 from morgs_mi.core.types import Tensor
 
-__all__ = ["Camera", "rigid"]
-
 # Mitsuba's camera looks along +z with x to the left and y up; OpenCV's has x right and y down.
 _OPENCV_FROM_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])
 

@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from morgs_mi.core.color_space import BRIGHTEST
-
 __all__ = ["LARGEST", "bounded", "check_mask", "check_number", "check_points", "check_size", "check_type", "numbers"]
 
 
@@ -97,8 +95,8 @@ def numbers(place: str, name: str, values: ArrayLike) -> np.ndarray:
     return array
 
 
-def check_points(place: str, points: ArrayLike, colors: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Return points and colours as arrays [P, 3], P >= 0, if they are finite, and the colours encoded (1 is white).
+def check_points(place: str, points: ArrayLike, colors: ArrayLike, most: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Return points and colours as arrays [P, 3], P >= 0, if they are finite and the colours lie in [0, most].
 
     Raises:
         ValueError: they are not.
@@ -118,8 +116,8 @@ def check_points(place: str, points: ArrayLike, colors: ArrayLike) -> tuple[np.n
         (
             "point_colors",
             colors,
-            (colors >= 0) & (colors <= BRIGHTEST),
-            f"from 0 to {BRIGHTEST:g} with white at 1",
+            (colors >= 0) & (colors <= most),
+            f"in [0, {most:g}]",
             "divide colours of 8 bits by 255",
         ),
     ):

@@ -16,6 +16,7 @@ An image is either uint8 in sRGB, or of floats; those of recordings are linear l
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable
 from functools import cache
 from typing import Any
 
@@ -85,14 +86,10 @@ def unit_values(image: np.ndarray, dtype: type[np.floating[Any]] = np.float64) -
 
 
 def positive_light(light: np.ndarray, place: str) -> np.ndarray:
-    """Return a copy of linear light as float32 with 0 for negative values, which are warned of once.
-
-    Args:
-        light: of an image [H, W, 3].
-        place: where the error's sentence begins.
+    """Return a copy of linear light [H, W, 3] as float32 with 0 for negative values, which are warned of once.
 
     Raises:
-        ValueError: a value is not finite, or above `BRIGHTEST_LIGHT`.
+        ValueError: a value is not finite, or above `BRIGHTEST_LIGHT`; `place` is where the sentence begins.
     """
     least, most = float(light.min()), float(light.max())
     if not -BRIGHTEST_LIGHT <= least <= most <= BRIGHTEST_LIGHT:
@@ -116,23 +113,16 @@ def exposed(encoded: np.ndarray, stops: float) -> np.ndarray:
 
 
 def display_image(image: np.ndarray, stops: float = 0.0) -> np.ndarray:
-    """Return an image as a display shows it, uint8 [H, W, 3].
-
-    Args:
-        image: linear light [H, W, 3], brightened by 2^stops and clipped at white; uint8 is returned as it is.
-        stops: display exposure.
-    """
+    """Return linear light [H, W, 3], brightened by stops and clipped at white, as uint8, and uint8 as it is."""
     if image.dtype == np.uint8:
         return image
     return np.rint(255 * encode_light(np.clip(image * np.float32(2**stops), 0, 1))).astype(np.uint8)
 
 
-def display_stops(images: Any) -> float:
-    """Return the display exposure of a recording in stops, which shows nearly all of its first images up to white.
+def display_stops(images: Iterable[np.ndarray | None]) -> float:
+    """Return the display exposure in stops by which the 99th percentile of images [H, W, 3] or None becomes white.
 
-    Args:
-        images: of the first frame, an iterable of [H, W, 3]; None is skipped. With no linear light above 1, the
-            exposure is 0.
+    It is 0 without linear light above 1.
     """
     brightest = [image.max(axis=-1).ravel() for image in images if image is not None and image.dtype != np.uint8]
     if not brightest or max(each.max() for each in brightest) <= 1:

@@ -10,8 +10,6 @@ from typing import Any
 
 import mitsuba as mi
 
-__all__ = ["machine", "versions"]
-
 
 def machine() -> dict[str, Any]:
     """Return the processor, its number of threads, the system and the Mitsuba variant."""

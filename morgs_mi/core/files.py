@@ -17,8 +17,6 @@ try:
 except ImportError:  # Windows, where folders are not locked
     fcntl = None
 
-__all__ = ["atomic_folder", "atomic_path", "is_same_file", "json_finite", "locked_folder", "write_error", "write_json"]
-
 _LOCK = ".morgs-lock"
 
 

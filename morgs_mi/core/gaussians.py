@@ -21,8 +21,6 @@ from morgs_mi.core.checks import numbers
 from morgs_mi.core.memory import float_tensor
 from morgs_mi.core.types import Float, Tensor, UInt32
 
-__all__ = ["ActivatedGaussians", "Gaussians", "displaced", "join_sh", "repeat_each", "split_sh", "tensor_rows"]
-
 
 class ActivatedGaussians(Protocol):
     """Activated attributes as Dr.Jit tensors, which the renderer reads."""

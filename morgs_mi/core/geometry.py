@@ -14,8 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from morgs_mi.core.gaussians import Gaussians
 
-__all__ = ["covariances", "rotated", "sh_basis", "unit_quats"]
-
 
 def unit_quats(gaussians: Gaussians) -> np.ndarray:
     """Return the rotations as unit quaternions wxyz, float64 [N, 4]; a quaternion of length 0 becomes the identity."""

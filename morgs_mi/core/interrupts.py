@@ -22,8 +22,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-__all__ = ["INTERRUPTED", "begin_command", "interruptible", "interrupts_raised", "is_interruption"]
-
 INTERRUPTED = 130
 """Exit status after an interruption."""
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)

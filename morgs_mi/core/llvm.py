@@ -19,8 +19,6 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
-__all__ = ["cache_folder", "choose_llvm", "ensure_llvm", "find_llvm", "llvm_major", "usable"]
-
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 SAFE_MAJOR = 17
 DOUBTFUL_MAJOR = 15

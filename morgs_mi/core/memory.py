@@ -16,8 +16,6 @@ from numpy.typing import ArrayLike
 from morgs_mi.core.checks import numbers
 from morgs_mi.core.types import Jit, Tensor
 
-__all__ = ["check_memory", "float_tensor", "free_memory", "from_numpy", "owned_copy", "refuse_freezing"]
-
 # Bytes: Dr.Jit aligns its own memory to as many.
 _ALIGNMENT = 64
 

@@ -10,8 +10,6 @@ from dataclasses import dataclass, replace
 from datetime import timedelta
 from typing import Any
 
-__all__ = ["Progress", "ProgressBar", "Report"]
-
 Report = Callable[[str, float, float], None]
 """Function that is called with (stage, done, total)."""
 

@@ -6,8 +6,6 @@ from enum import IntEnum, auto
 
 import numpy as np
 
-__all__ = ["Stream", "rng_of"]
-
 
 class Stream(IntEnum):
     """Purposes of random numbers."""

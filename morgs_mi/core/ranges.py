@@ -16,8 +16,6 @@ from reprlib import repr as shortened
 from types import NoneType, UnionType
 from typing import Annotated, Any, ClassVar, Literal, Union, get_args, get_origin, get_type_hints
 
-__all__ = ["Above", "AtLeast", "AtMost", "Below", "MultipleOf", "arms_of", "check_ranges", "check_value", "types_of"]
-
 _WORDS = {bool: "true or false", str: "a string", NoneType: "none", dict: "a table"}
 _WORDS |= {int: "a whole number below 2^64", float: "a finite number"}
 

@@ -9,23 +9,6 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 
-__all__ = [
-    "angles_between",
-    "angles_to",
-    "check_near_planes",
-    "choose_key_views",
-    "focus_depths",
-    "focus_point",
-    "mean_views",
-    "overlaps",
-    "scene_depths",
-    "scene_extent",
-    "seen_points",
-    "surface_of",
-    "up_direction",
-    "with_near_planes",
-]
-
 # Rows and columns of the points of each view.
 _GRID = 16
 # Depth of a near plane relative to what a camera sees. A subject may come this much closer than the scene's points, and

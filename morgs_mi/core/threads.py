@@ -7,8 +7,6 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
-__all__ = ["in_background", "map_in_threads"]
-
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from typing import Any, TypeAlias
 
-__all__ = ["Bool", "Float", "Int32", "Jit", "Tensor", "UInt32"]
-
 Float: TypeAlias = Any
 """`mi.Float`, a differentiable float32 array [N]."""
 Int32: TypeAlias = Any

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["equal_cells", "z_order"]
-
 _CELL_BITS = 10
 
 

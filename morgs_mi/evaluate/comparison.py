@@ -20,8 +20,6 @@ from morgs_mi.playback.player import has_confidence, open_stream_capture, render
 from morgs_mi.playback.visualise import to_uint8
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["ComparedClip", "ComparedFrame", "ComparedView"]
-
 
 @dataclass(frozen=True, eq=False)
 class ComparedClip:

@@ -17,8 +17,6 @@ from morgs_mi.io.bounded import read_json
 from morgs_mi.playback.player import playback_speed
 from morgs_mi.playback.streams import open_stream
 
-__all__ = ["evaluate_stream"]
-
 
 @interrupts_raised()
 def evaluate_stream(

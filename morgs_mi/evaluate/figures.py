@@ -35,8 +35,6 @@ from morgs_mi.playback.visualise import (
     write_png,
 )
 
-__all__ = ["draw_stream", "motion_scale"]
-
 _ROWS = 4
 _MARK = (255, 0, 0)
 

@@ -19,8 +19,6 @@ import numpy as np
 from morgs_mi.evaluate.metrics import unit_pair
 from morgs_mi.io.onnx_file import OnnxNetwork
 
-__all__ = ["Lpips"]
-
 _INPUTS = ("in0", "in1")
 _ADVICE = "export the network as the documentation of morgs_mi.evaluate.lpips shows"
 

@@ -43,17 +43,6 @@ from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.view import View, mean_psnr
 from morgs_mi.method.exposure import follow_exposure
 
-__all__ = [
-    "IMAGE_SCORES",
-    "REGIONS",
-    "Measure",
-    "Motion3D",
-    "Quality",
-    "Registration",
-    "Tracking",
-    "Variation",
-]
-
 REGIONS = ("", "_moving", "_still")
 IMAGE_SCORES = ("psnr", "ssim", "delta_e", "lpips")
 # Compression flickers: after a hundred frames half the pixels of a real recording have changed once.

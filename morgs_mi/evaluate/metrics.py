@@ -51,15 +51,8 @@ def psnr(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -
 def psnr_mu(light: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Return the PSNR of tonemapped linear light, log(1 + mu x) / log(1 + mu) with mu = 5000, in dB.
 
-    x is relative to the brightest true value and clipped to [0, 1] (Kalantari and Ramamoorthi, TOG 2017).
-
-    Args:
-        light: linear light [H, W, 3].
-        truth: likewise.
-        mask: [H, W] bool, the pixels that count; the result is NaN if there are none.
-
-    Raises:
-        ValueError: the sizes differ.
+    x is relative to the brightest true value and clipped to [0, 1] (Kalantari and Ramamoorthi, TOG 2017). Arguments,
+    apart from their encoding, and errors are as for `psnr`.
     """
     most = max(float(truth.max()), 1e-12)
     mapped = (np.log1p(_MU * np.clip(x.astype(np.float64) / most, 0, 1)) / np.log1p(_MU) for x in (light, truth))

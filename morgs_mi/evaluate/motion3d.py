@@ -25,8 +25,6 @@ from morgs_mi.capture.truth import GroundTruth
 from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.results import Motion3DScores
 
-__all__ = ["compare_motion", "evaluate_motion", "local_motion", "rigid_motions", "surface_ids"]
-
 _DEPTH_TOLERANCE = 0.01
 _LEAST_OPACITY = 0.1
 _LEAST_SHARE = 0.1

@@ -26,8 +26,6 @@ from morgs_mi.core.checks import numbers
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import unit_quats
 
-__all__ = ["PointTracks", "bind", "seen_in_depth", "track_points"]
-
 _MOST_ENTRIES = 2**24
 # Floor of the scales, as a share of the distance of the farthest point or mean, so that a flat Gaussian has an inverse
 # covariance that float64 can represent.

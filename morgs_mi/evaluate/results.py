@@ -11,20 +11,6 @@ from typing import Any, Self
 
 import numpy as np
 
-__all__ = [
-    "Evaluation",
-    "FrameScores",
-    "Motion3DScores",
-    "PlaybackTimes",
-    "Sizes",
-    "Timings",
-    "TrackScores",
-    "TrackingScores",
-    "VariationScores",
-    "ViewScores",
-    "known_mean",
-]
-
 _NAN = float("nan")
 _SECONDS = (
     "wall time of a frame from the images in memory to its packet: flow, masks, optimisation, residual and its "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 
 from rich.box import SIMPLE_HEAD
@@ -11,14 +11,15 @@ from rich.table import Table
 from morgs_mi.evaluate.measures import REGIONS
 from morgs_mi.evaluate.results import Evaluation
 
-__all__ = ["evaluation_summary", "evaluation_tables", "figure"]
-
 _METRICS = (("PSNR, dB", "psnr", 2), ("SSIM", "ssim", 4), ("dE2000", "delta_e", 2))
 _METRICS += (("LPIPS", "lpips", 4), ("flow error, px", "motion_error", 2))
 _FRAME = (("PSNR, dB", "psnr", 2), ("moving", "psnr_moving", 2), ("SSIM", "ssim", 4))
 _FRAME += (("flow error", "motion_error", 2), ("moving", "motion_error_moving", 2))
 _VIEW = (("PSNR, dB", "psnr", 2), ("colours matched", "psnr_matched", 2), ("SSIM", "ssim", 4))
 _VIEW += (("flow error", "motion_error", 2), ("registered", "registered", 2))
+_SWEEP = (("first, s", "first_seconds", 1), ("later, s", "later_seconds", 2), ("bytes", "bytes_per_frame", 0))
+_SWEEP += (("PSNR, dB", "psnr", 2), ("moving", "psnr_moving", 2))
+_SWEEP += (("flow error, moving", "motion_error_moving", 2), ("IoU", "confidence_iou", 2))
 
 
 def figure(value: float | None, digits: int) -> str:
@@ -53,6 +54,15 @@ def evaluation_tables(result: Evaluation) -> Iterator[Table]:
     yield regions
     if result.tracking:
         yield _tracking_table(result)
+
+
+def sweep_table(rows: Sequence[Mapping[str, float]]) -> Table:
+    """Return the scores of fits with several numbers of epochs, without columns that are unknown."""
+    columns = [column for column in _SWEEP if any(figure(row[column[1]], 0) != "-" for row in rows)]
+    table = _table("seconds and bytes of a frame, scores of all", "epochs", *(title for title, *_ in columns))
+    for row in rows:
+        table.add_row(figure(row["epochs"], 0), *(figure(row[name], digits) for _, name, digits in columns))
+    return table
 
 
 def _view_table(result: Evaluation) -> Table:

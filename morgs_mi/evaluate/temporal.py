@@ -13,8 +13,6 @@ import numpy as np
 from morgs_mi.evaluate.metrics import mean_over, unit_pair
 from morgs_mi.evaluate.results import VariationScores
 
-__all__ = ["StillVariation", "recorded_change", "slope"]
-
 _WINDOW = 5
 _SIGMAS = 4
 _GREY_LEVEL = 1 / 255

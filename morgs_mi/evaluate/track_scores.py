@@ -34,8 +34,6 @@ import numpy as np
 
 from morgs_mi.evaluate.results import TrackingScores, TrackScores, known_mean
 
-__all__ = ["DYNAMIC_3D_GAUSSIANS", "MVTRACKER", "TAPVID3D", "Comparison", "Protocol", "score", "score_tracks"]
-
 _CENTIMETRE = 0.01
 # MVTracker's definition of a moving point: the length of its path in metres, over the frames in which it is visible.
 _MOVING = 0.1

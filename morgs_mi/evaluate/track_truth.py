@@ -20,8 +20,6 @@ from morgs_mi.capture.truth import load_tracks
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.bounded import read_array
 
-__all__ = ["TrackTruth", "read_annotation", "synthetic_tracks", "tapvid3d_tracks"]
-
 _SHORT_SIDE = 256
 
 

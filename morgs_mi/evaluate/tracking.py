@@ -16,8 +16,6 @@ from morgs_mi.evaluate.track_scores import DYNAMIC_3D_GAUSSIANS, MVTRACKER, TAPV
 from morgs_mi.evaluate.track_truth import TrackTruth, synthetic_tracks, tapvid3d_tracks
 from morgs_mi.playback.player import render, render_config
 
-__all__ = ["evaluate_tracks"]
-
 
 def evaluate_tracks(stream: FrameSource, recording: Capture, views: Sequence[int]) -> tuple[TrackingScores, ...]:
     """Return the scores of a stream's point tracks by each protocol; empty without true tracks or a second frame.

@@ -8,7 +8,6 @@ every view that no fit has seen.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -23,8 +22,6 @@ from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.view import LEAST_GAIN, View, mean_psnr, rendered, withheld_blocks
 from morgs_mi.method.exposure import Exposure, centred, fit_exposure
-
-__all__ = ["Balance", "balance_cameras", "balance_config"]
 
 # Fits that are compared: to the images as recorded and to the balanced ones.
 _COMPARED = 2
@@ -82,45 +79,66 @@ def balance_cameras(
         seed: of all random choices.
         progress: of the fits, in one stage.
     """
-    rounds = config.short_fits.rounds
-    short = balance_config(config)
-    steps = short.planned_steps
-    progress = (progress or Progress()).of("Balancing cameras")
-    render = problem.render
-    visible, withheld = withheld_blocks(problem.views, config.short_fits.width, rng_of(seed, Stream.WITHHELD_BLOCKS))
-    as_recorded = {v: Exposure() for v in range(len(visible))}
-    fits = itertools.count(1)
-
-    def fit(start: Gaussians, exposures: Mapping[int, Exposure], steps: int) -> Gaussians:
-        corrected = [view._replace(image=exposures[v].corrected(view.image)) for v, view in enumerate(visible)]
-        posed = replace(problem, start=start, views=tuple(corrected))
-        fitted = fit_first_frame(posed, replace(short, first_frame_steps=steps), rng_of(seed, Stream.BALANCE))
-        progress(next(fits), rounds + _COMPARED)
-        return fitted.gaussians
-
+    fits = _ShortFits(problem, config, seed, (progress or Progress()).of("Balancing cameras"))
+    as_recorded = {v: Exposure() for v in range(len(problem.views))}
     exposures = as_recorded
     gaussians = problem.start
-    for k in range(rounds):
-        gaussians = fit(gaussians, exposures, -(-steps // 2) if k else steps)
-        exposures = centred(
-            {
-                v: fit_exposure(rendered(gaussians, view.camera, render), unit_values(view.image), view.mask)
-                for v, view in enumerate(visible)
-            }
-        )
+    for k in range(config.short_fits.rounds):
+        gaussians = fits.fit(gaussians, exposures, -(-fits.steps // 2) if k else fits.steps)
+        exposures = fits.exposures_of(gaussians)
         largest = max(exposure.change for exposure in exposures.values())
         if config.exposure == "auto" and largest < _LEAST_DIFFERENCE:
             return Balance(tuple(exposures.values()), False)
     if config.exposure == "on":
         return Balance(tuple(exposures.values()), True)
-    scores = []
-    for candidate in (as_recorded, exposures):
-        fitted = fit(problem.start, candidate, steps)
-        compared = [
-            View(camera, candidate[v].corrected(image), mask)
-            for v, (camera, image, mask) in enumerate(withheld)
+    recorded_psnr, balanced_psnr = (fits.withheld_psnr(candidate) for candidate in (as_recorded, exposures))
+    is_gain = balanced_psnr >= recorded_psnr + LEAST_GAIN
+    return Balance(tuple(exposures.values()), is_gain, recorded_psnr, balanced_psnr)
+
+
+class _ShortFits:
+    """Short fits to images in the colours that exposures give them, without withheld pixels.
+
+    Attributes:
+        steps: number of steps of a fit from the start.
+    """
+
+    def __init__(self, problem: FirstFrameProblem, config: FitConfig, seed: int, progress: Progress) -> None:
+        rng = rng_of(seed, Stream.WITHHELD_BLOCKS)
+        self._visible, self._withheld = withheld_blocks(problem.views, config.short_fits.width, rng)
+        self._problem = problem
+        self._config = balance_config(config)
+        self._seed = seed
+        self._progress = progress
+        self._count = 0
+        self._total = config.short_fits.rounds + _COMPARED
+        self.steps = self._config.planned_steps
+
+    def fit(self, start: Gaussians, exposures: Mapping[int, Exposure], steps: int) -> Gaussians:
+        """Return Gaussians after some steps, from a start."""
+        corrected = [view._replace(image=exposures[v].corrected(view.image)) for v, view in enumerate(self._visible)]
+        problem = replace(self._problem, start=start, views=tuple(corrected))
+        config = replace(self._config, first_frame_steps=steps)
+        gaussians = fit_first_frame(problem, config, rng_of(self._seed, Stream.BALANCE)).gaussians
+        self._count += 1
+        self._progress(self._count, self._total)
+        return gaussians
+
+    def exposures_of(self, gaussians: Gaussians) -> dict[int, Exposure]:
+        """Return the exposure of each camera relative to the Gaussians, without what most have in common."""
+        return centred(
+            {
+                v: fit_exposure(rendered(gaussians, camera, self._problem.render), unit_values(image), mask)
+                for v, (camera, image, mask) in enumerate(self._visible)
+            }
+        )
+
+    def withheld_psnr(self, exposures: Mapping[int, Exposure]) -> float:
+        """Return the PSNR of the withheld pixels of a fit from the start, dB."""
+        gaussians = self.fit(self._problem.start, exposures, self.steps)
+        views = [
+            View(camera, exposures[v].corrected(image), mask)
+            for v, (camera, image, mask) in enumerate(self._withheld)
             if mask is not None and mask.any()
         ]
-        scores.append(mean_psnr(fitted, compared, render))
-    taken = scores[1] >= scores[0] + LEAST_GAIN
-    return Balance(tuple(exposures.values()), taken, scores[0], scores[1])
+        return mean_psnr(gaussians, views, self._problem.render)

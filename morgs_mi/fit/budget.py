@@ -26,8 +26,6 @@ from morgs_mi.fit.first_frame import LAST_ROUND
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.view import View, half_sized
 
-__all__ = ["Plan", "plan_first_frame"]
-
 # Seconds of a step per Gaussian, and per pixel of its view.
 _GAUSSIAN_SECONDS = 2.2e-7
 _PIXEL_SECONDS = 0.5e-7
@@ -63,29 +61,29 @@ def plan_first_frame(views: Sequence[View], points: np.ndarray, config: FitConfi
     if None not in (config.num_gaussians, config.first_frame_steps):
         return Plan(config)
     limit = config.first_frame_seconds
-    wanted = with_num_gaussians(config, views, points)
-    plan = wanted
+    full_plan = with_num_gaussians(config, views, points)
+    plan = full_plan
     pixels = _pixels(views)
     half_pixels = _pixels(half_sized(views))
 
     def seconds(plan: FitConfig) -> float:
         """Return the time of a plan. A round of density control is a step in every view, at half the size."""
-        late = _step_seconds(plan.planned_gaussians, pixels)
+        late_seconds = _step_seconds(plan.planned_gaussians, pixels)
         if not plan.density.rounds:
-            return plan.planned_steps * late
-        early = _step_seconds(_GROWING * plan.planned_gaussians, half_pixels)
-        mean = LAST_ROUND * early + (1 - LAST_ROUND) * late
-        return plan.planned_steps * mean + plan.density.rounds * len(views) * early
+            return plan.planned_steps * late_seconds
+        early_seconds = _step_seconds(_GROWING * plan.planned_gaussians, half_pixels)
+        mean = LAST_ROUND * early_seconds + (1 - LAST_ROUND) * late_seconds
+        return plan.planned_steps * mean + plan.density.rounds * len(views) * early_seconds
 
     if config.num_gaussians is None:
-        most = wanted.planned_gaussians
+        most = full_plan.planned_gaussians
         least = min(max(config.detail.least_gaussians, most // _LEAST_SHARE), most)
         counts = range(least + 1, most + 1)
-        too_many = bisect_left(counts, True, key=lambda count: seconds(replace(wanted, num_gaussians=count)) > limit)
-        plan = replace(wanted, num_gaussians=least + too_many)
+        too_many = bisect_left(counts, True, key=lambda count: seconds(replace(full_plan, num_gaussians=count)) > limit)
+        plan = replace(full_plan, num_gaussians=least + too_many)
     if config.first_frame_steps is None:
-        allowed = int(plan.planned_steps * limit / seconds(plan))
-        plan = replace(plan, first_frame_steps=max(_LEAST_STEPS, min(plan.planned_steps, allowed)))
+        affordable = int(plan.planned_steps * limit / seconds(plan))
+        plan = replace(plan, first_frame_steps=max(_LEAST_STEPS, min(plan.planned_steps, affordable)))
     return Plan(plan, seconds(plan))
 
 

@@ -11,8 +11,12 @@ from morgs_mi.fit.fit_config import FitConfig
 
 __all__ = ["check_capacity"]
 
-# Arrays of each parameter: value, gradient and Adam's two moments; floats of a projected Gaussian; bytes of a float.
-_ARRAYS, _PROJECTED, _FLOAT = 4, 40, 4
+# Arrays of each parameter: value, gradient and Adam's two moments.
+_ARRAYS = 4
+# Floats of a projected Gaussian.
+_PROJECTED = 40
+# Bytes of a float.
+_FLOAT = 4
 # Bytes of a pixel of a view: its image as bytes and as floats, and its reference.
 _PIXEL = 30
 # Bytes of a step in the order of the views.
@@ -32,11 +36,11 @@ def check_capacity(place: str, cameras: Sequence[Camera], config: FitConfig) -> 
     """
     K = (config.sh_degree + 1) ** 2
     floats = sum(3 * (K - 1) if attribute.width < 0 else attribute.width for attribute in ATTRIBUTES)
-    given = {
+    sizes = {
         "num_gaussians": _FLOAT * (_ARRAYS * floats + _PROJECTED),
         "first_frame_steps": _STEP,
     }
-    for name, size in given.items():
+    for name, size in sizes.items():
         count = getattr(config, name) or 0
         check_memory(place, size * count, f"`{name}={count}`", "set a smaller number")
     pixels = sum(camera.width * camera.height for camera in cameras)

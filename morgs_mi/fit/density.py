@@ -29,8 +29,6 @@ from morgs_mi.fit.empty_space import in_empty_space
 from morgs_mi.fit.fit_config import DensityConfig
 from morgs_mi.fit.optimise import replace_parameter
 
-__all__ = ["DensityPlan", "Room", "apply_plan", "plan_additions", "plan_growth", "resize_optimizer"]
-
 # float32 has no opacity closer to 1.
 _MAX_OPACITY = 1 - 1e-6
 # Opacity of a birth in a later frame: low, because unnecessary births are then pruned soon.
@@ -98,23 +96,36 @@ def plan_growth(
     visible = (np.asarray(gaussians.opacities) >= config.min_opacity) & ~in_empty_space(cameras, means)
     survivors, parents = _select(visible, scores, room, 0)
     parent = np.concatenate([survivors, parents])
-    touched = np.isin(parent, parents)
-    quats, scales = (np.asarray(values)[parent] for values in (gaussians.quats, gaussians.scales))
-    large = touched & (scales.max(axis=1) > config.split_scale * extent)
+    is_parent = np.isin(parent, parents)
+    scales = np.asarray(gaussians.scales)[parent]
+    is_large = is_parent & (scales.max(axis=1) > config.split_scale * extent)
     _, second, longest = np.sort(scales, axis=1).T
-    halved = large & (longest > _LONG * second)
-    shrunk = large & ~halved
+    is_halved = is_large & (longest > _LONG * second)
+    is_shrunk = is_large & ~is_halved
     opacity = np.minimum(np.asarray(gaussians.opacities)[parent], _MAX_OPACITY)
-    changed = np.where(halved, _SPLIT_OPACITY * opacity, 1 - np.sqrt(1 - opacity))
-    logits = np.where(touched & ~shrunk, _logit(changed) - np.asarray(gaussians.logit_opacities)[parent], 0)
-    plan = _plan(gaussians, survivors, parents, np.where(shrunk, _LOG_SHRINK, 0), logits, rng)
-    is_longest = np.eye(3, dtype=bool)[scales.argmax(axis=1)]
-    side = np.where(plan.source < 0, _SPLIT_SHIFT, -_SPLIT_SHIFT)[:, None]
-    plan.edits["means"][halved] = _rotated(quats, side * is_longest * scales)[halved]
-    plan.edits["log_scales"][halved] = np.log(np.where(is_longest, _SPLIT_LONGEST, _SPLIT_OTHERS))[halved]
+    new_opacity = np.where(is_halved, _SPLIT_OPACITY * opacity, 1 - np.sqrt(1 - opacity))
+    logit_change = _logit(new_opacity) - np.asarray(gaussians.logit_opacities)[parent]
+    logits = np.where(is_parent & ~is_shrunk, logit_change, 0)
+    plan = _plan(gaussians, survivors, parents, np.where(is_shrunk, _LOG_SHRINK, 0), logits, rng)
+    _halve(plan, is_halved, np.asarray(gaussians.quats)[parent], scales)
     shift = plan.edits["means"]
     shift[in_empty_space(cameras, means[parent] + shift)] = 0
     return plan
+
+
+def _halve(plan: DensityPlan, is_halved: np.ndarray, quats: np.ndarray, scales: np.ndarray) -> None:
+    """Edit a plan to place both parts of the split Gaussians along the longest axis.
+
+    Args:
+        plan: of M Gaussians.
+        is_halved: mask of both parts [M].
+        quats: of the parents [M, 4].
+        scales: of the parents [M, 3].
+    """
+    is_longest = np.eye(3, dtype=bool)[scales.argmax(axis=1)]
+    side = np.where(plan.source < 0, _SPLIT_SHIFT, -_SPLIT_SHIFT)[:, None]
+    plan.edits["means"][is_halved] = _rotated(quats, side * is_longest * scales)[is_halved]
+    plan.edits["log_scales"][is_halved] = np.log(np.where(is_longest, _SPLIT_LONGEST, _SPLIT_OTHERS))[is_halved]
 
 
 def plan_additions(
@@ -137,10 +148,10 @@ def plan_additions(
     room = Room(births, max(config.max_gaussians - num_static, 0))
     visible = np.asarray(gaussians.opacities) >= config.min_opacity
     survivors, parents = _select(visible, scores, room, config.min_error)
-    born = np.arange(len(survivors) + len(parents)) >= len(survivors)
+    is_birth = np.arange(len(survivors) + len(parents)) >= len(survivors)
     logits = np.asarray(gaussians.logit_opacities)[np.concatenate([survivors, parents])]
-    fainter = np.where(born, _logit(_BIRTH_OPACITY) - logits, 0)
-    return _plan(gaussians, survivors, parents, np.where(born, _LOG_SHRINK, 0), fainter, rng)
+    fainter = np.where(is_birth, _logit(_BIRTH_OPACITY) - logits, 0)
+    return _plan(gaussians, survivors, parents, np.where(is_birth, _LOG_SHRINK, 0), fainter, rng)
 
 
 def _select(visible: np.ndarray, scores: np.ndarray, room: Room, min_error: float) -> tuple[np.ndarray, np.ndarray]:
@@ -165,7 +176,8 @@ def _plan(
     rng: np.random.Generator,
 ) -> DensityPlan:
     """Return the plan that adds `log_scale` and `logit_opacity` [M] and draws the means of the births."""
-    parent, source = np.concatenate([survivors, parents]), np.concatenate([survivors, np.full(len(parents), -1)])
+    parent = np.concatenate([survivors, parents])
+    source = np.concatenate([survivors, np.full(len(parents), -1)])
     shift = np.zeros((len(parent), 3))
     shift[len(survivors) :] = _draw(np.asarray(gaussians.quats)[parents], np.asarray(gaussians.scales)[parents], rng)
     edits = {"means": shift, "log_scales": np.repeat(log_scale[:, None], 3, axis=1), "logit_opacities": logit_opacity}
@@ -179,7 +191,8 @@ def _draw(quats: np.ndarray, scales: np.ndarray, rng: np.random.Generator) -> np
 
 def _rotated(quats: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """Return the vectors [M, 3], rotated by quaternions [M, 4] of any length (Rodrigues)."""
-    w, v = quats[:, :1], quats[:, 1:]
+    w = quats[:, :1]
+    v = quats[:, 1:]
     t = 2 * np.cross(v, vectors)
     square = np.maximum((quats**2).sum(axis=1, keepdims=True), 1e-30)
     return vectors + (w * t + np.cross(v, t)) / square
@@ -204,11 +217,11 @@ def resize_optimizer(optimizer: Adam, plan: DensityPlan, edits: Mapping[str, np.
         plan: one round of density control.
         edits: changes added to the parameters, by name.
     """
-    born = plan.source < 0
+    is_birth = plan.source < 0
 
     def carry(moment: np.ndarray) -> np.ndarray:
         rows = moment[plan.parent]
-        rows[born] = 0
+        rows[is_birth] = 0
         return rows
 
     for name in list(optimizer):

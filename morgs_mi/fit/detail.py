@@ -20,13 +20,12 @@ from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.noise import noise_of
 from morgs_mi.fit.view import View
 
-__all__ = ["count_details", "with_num_gaussians"]
-
 # A value of a block follows from its mean and the other three.
 _INDEPENDENT = 3 / 4
-# Difference from the mean of a block, relative to white, from which a value is a detail, and the same in standard
-# deviations of the noise.
-_THRESHOLD, _NOISE = 0.02, 3.5
+# Difference from the mean of a block, relative to white, from which a value is a detail.
+_THRESHOLD = 0.02
+# The same in standard deviations of the noise.
+_NOISE = 3.5
 
 
 def with_num_gaussians(config: FitConfig, views: Sequence[View], points: np.ndarray) -> FitConfig:
@@ -41,8 +40,8 @@ def with_num_gaussians(config: FitConfig, views: Sequence[View], points: np.ndar
         return config
     how = config.detail
     details = sum(count_details(view.image, view.mask) for view in views)
-    wanted = how.per_detail * details / mean_views([view.camera for view in views], points)
-    return replace(config, num_gaussians=int(np.clip(round(wanted), how.least_gaussians, how.most_gaussians)))
+    count = how.per_detail * details / mean_views([view.camera for view in views], points)
+    return replace(config, num_gaussians=int(np.clip(round(count), how.least_gaussians, how.most_gaussians)))
 
 
 def count_details(image: np.ndarray, mask: np.ndarray | None) -> float:
@@ -54,13 +53,17 @@ def count_details(image: np.ndarray, mask: np.ndarray | None) -> float:
     """
     values = unit_values(image, np.float32)
     valid = np.ones(image.shape[:2], np.float32) if mask is None else mask.astype(np.float32)
-    noise, count = _NOISE * noise_of(image), 0
+    noise = _NOISE * noise_of(image)
+    count = 0
     while min(values.shape[:2]) > 1:
         height, width = (size // 2 for size in values.shape[:2])
-        values, valid = values[: 2 * height, : 2 * width], valid[: 2 * height, : 2 * width]
+        values = values[: 2 * height, : 2 * width]
+        valid = valid[: 2 * height, : 2 * width]
         means, fractions = (cv2.resize(v, (width, height), interpolation=cv2.INTER_AREA) for v in (values, valid))
         differences = np.abs(values - means.repeat(2, axis=0).repeat(2, axis=1)).max(axis=-1)
-        whole = (fractions == 1).repeat(2, axis=0).repeat(2, axis=1)
-        count += np.count_nonzero((differences > max(_THRESHOLD, noise)) & whole)
-        values, valid, noise = means, fractions, noise / 2
+        is_complete = (fractions == 1).repeat(2, axis=0).repeat(2, axis=1)
+        count += np.count_nonzero((differences > max(_THRESHOLD, noise)) & is_complete)
+        values = means
+        valid = fractions
+        noise = noise / 2
     return _INDEPENDENT * count

@@ -21,15 +21,16 @@ from morgs_mi.fit.forecast import forecast
 from morgs_mi.fit.noise import is_noisy
 from morgs_mi.fit.problem import FirstFrameProblem
 
-__all__ = ["adapted_to_images", "default_dropping", "dropped"]
-
 # Number of views that are fitted without dropping.
 _MANY_VIEWS = 6
-# Logit of an opacity that no cut-off of the renderer lets pass, and the largest opacity.
-_INVISIBLE, _MOST = -30.0, 0.999
-# Probability with which few views are fitted that are noisy or far apart, and the least `Forecast.reach` of the latter,
-# degrees.
-_DROPPING, _FAR = 0.2, 24.0
+# Logit of an opacity that no cut-off of the renderer lets pass.
+_INVISIBLE = -30.0
+# Largest opacity, which has a finite logit.
+_MOST = 0.999
+# Probability with which few views are fitted that are noisy or far apart.
+_DROPPING = 0.2
+# Least `Forecast.reach` of views that are far apart, degrees.
+_FAR = 24.0
 
 
 def dropped(gaussians: Gaussians, probability: float, rng: np.random.Generator) -> Gaussians:
@@ -42,9 +43,9 @@ def dropped(gaussians: Gaussians, probability: float, rng: np.random.Generator) 
     """
     if not probability:
         return gaussians
-    kept = from_numpy(mi.UInt32, rng.random(len(gaussians), np.float32) >= probability) != 0
+    is_kept = from_numpy(mi.UInt32, rng.random(len(gaussians), np.float32) >= probability) != 0
     opacity = dr.minimum(sigmoid(gaussians.logit_opacities.array) * dr.opaque(mi.Float, 1 / (1 - probability)), _MOST)
-    logits = dr.select(kept, dr.log(opacity) - dr.log(1 - opacity), _INVISIBLE)
+    logits = dr.select(is_kept, dr.log(opacity) - dr.log(1 - opacity), _INVISIBLE)
     return replace(gaussians, logit_opacities=mi.TensorXf(logits))
 
 

@@ -8,8 +8,6 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 
-__all__ = ["in_empty_space"]
-
 
 def in_empty_space(cameras: Sequence[Camera], means: np.ndarray) -> np.ndarray:
     """Return the mask of means [N] that lie in the view of a camera, nearer than its near plane.

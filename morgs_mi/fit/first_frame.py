@@ -33,8 +33,10 @@ from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["LAST_ROUND", "FirstFrame", "fit_confidence", "fit_first_frame"]
 
-# Passes over all views of which the loss is averaged, and the least number of steps.
-_PASSES, _LEAST = 4, 8
+# Passes over all views of which the loss is averaged.
+_PASSES = 4
+# Least number of steps of which it is averaged.
+_LEAST = 8
 # Fraction of the steps after which another SH band is added, as in 3DGS.
 _BAND = 1 / 30
 _FIRST_ROUND = 0.1
@@ -73,7 +75,9 @@ def fit_first_frame(
         progress: of the steps.
         on_round: called with the Gaussians before each round of density control.
     """
-    fit, steps, losses = _Fit(problem, config, rng, progress), config.planned_steps, {}
+    fit = _Fit(problem, config, rng, progress)
+    steps = config.planned_steps
+    losses = {}
     order = iter(view_order(len(problem.views), steps, rng))
     for start, stop in fit.stretches(steps):
         if on_round is not None and fit.has_round(start):
@@ -89,8 +93,12 @@ class _Fit:
     def __init__(
         self, problem: FirstFrameProblem, config: FitConfig, rng: np.random.Generator, progress: Progress | None
     ) -> None:
-        self._problem, self._config, self._rng, self._progress = problem, config, rng, progress
-        self._base, self._optimizer = problem.start, adam(_start(problem.start))
+        self._problem = problem
+        self._config = config
+        self._rng = rng
+        self._progress = progress
+        self._base = problem.start
+        self._optimizer = adam(_start(problem.start))
         self._rates = config.first_frame_rates.by_parameter(problem.extent)
         self._bands = [
             int(band * config.planned_steps * _BAND + 1e-9) for band in range(1, problem.start.sh_degree + 1)
@@ -127,7 +135,7 @@ class _Fit:
             views,
             first,
             decay=lambda step: _FINAL_RATE ** (step / steps),
-            on_step=None if progress is None else lambda done: progress(done, steps),
+            on_step=None if progress is None else lambda count: progress(count, steps),
             last=max(_LEAST, _PASSES * len(self._views)),
         )
         return optimise(self._optimizer, self._rates, self._losses_at, stretch)
@@ -138,17 +146,18 @@ class _Fit:
         self._targets = [view.target for view in problem.views]
 
     def _losses_at(self, values: Mapping[str, Tensor], view: int) -> dict[str, Tensor]:
-        drawn = dropped(self._base.with_parameters(values), self._config.dropping or 0.0, self._rng)
-        image = self._views[view].render(drawn, ("color",))
+        gaussians = dropped(self._base.with_parameters(values), self._config.dropping or 0.0, self._rng)
+        image = self._views[view].render(gaussians, ("color",))
         return {"recon": recon_loss(image.color, self._targets[view], self._config.objective.dssim_weight)}
 
     def _grow(self, rounds: int) -> None:
         """Add and prune Gaussians by density control; `rounds` are left, with this one."""
-        now, config = self.gaussians, self._config
-        room = Room(-(-max(config.planned_gaussians - len(now), 0) // rounds), config.planned_gaussians)
-        scores = densification_scores(now, self._views, self._targets)
+        gaussians = self.gaussians
+        config = self._config
+        room = Room(-(-max(config.planned_gaussians - len(gaussians), 0) // rounds), config.planned_gaussians)
+        scores = densification_scores(gaussians, self._views, self._targets)
         problem = self._problem
-        plan = plan_growth(now, scores, room, problem.extent, config.density, self._rng, problem.cameras)
+        plan = plan_growth(gaussians, scores, room, problem.extent, config.density, self._rng, problem.cameras)
         resize_optimizer(self._optimizer, plan, plan.edits)
         self._base = self._base.select(plan.parent)
 
@@ -161,8 +170,9 @@ def density_rounds(config: FitConfig) -> list[int]:
 
 def _start(gaussians: Gaussians) -> dict[str, Tensor]:
     """Return the parameters at the start: those that the first frame fits, without the higher SH bands."""
-    known = gaussians.parameters()
-    return {a.name: known[a.name] for a in ATTRIBUTES if a.first_frame and a.name in known and a.name != "sh_rest"}
+    parameters = gaussians.parameters()
+    names = [a.name for a in ATTRIBUTES if a.first_frame and a.name in parameters and a.name != "sh_rest"]
+    return {name: parameters[name] for name in names}
 
 
 def _add_band(optimizer: Adam, base: Gaussians) -> None:
@@ -171,11 +181,11 @@ def _add_band(optimizer: Adam, base: Gaussians) -> None:
     if "sh_rest" not in optimizer:
         optimizer["sh_rest"] = from_numpy(mi.TensorXf, rest[:, :3])
         return
-    known = np.asarray(dr.detach(optimizer["sh_rest"]))
-    width = (round((known.shape[1] + 1) ** 0.5) + 1) ** 2 - 1
-    value = np.concatenate([known, rest[:, known.shape[1] : width]], axis=1)
+    coefficients = np.asarray(dr.detach(optimizer["sh_rest"]))
+    width = (round((coefficients.shape[1] + 1) ** 0.5) + 1) ** 2 - 1
+    value = np.concatenate([coefficients, rest[:, coefficients.shape[1] : width]], axis=1)
     replace_parameter(
-        optimizer, "sh_rest", value, lambda moment: np.pad(moment, [(0, 0), (0, width - known.shape[1]), (0, 0)])
+        optimizer, "sh_rest", value, lambda moment: np.pad(moment, [(0, 0), (0, width - coefficients.shape[1]), (0, 0)])
     )
 
 
@@ -204,8 +214,8 @@ def fit_confidence(
     targets = {view: from_numpy(mi.TensorXf, masks[view]) for view in views}
 
     def losses_at(values: Mapping[str, Tensor], k: int) -> dict[str, Tensor]:
-        posed = replace(gaussians, logit_confidence=values["logit_confidence"])
-        image = rasterize(posed, cameras[views[k]], ("confidence",), detach_weights=("confidence",), config=render)
+        trial = replace(gaussians, logit_confidence=values["logit_confidence"])
+        image = rasterize(trial, cameras[views[k]], ("confidence",), detach_weights=("confidence",), config=render)
         return {"mask": mask_loss(image.confidence, targets[views[k]])}
 
     rates = {"logit_confidence": config.first_frame_rates.confidence}

@@ -10,21 +10,14 @@ from morgs_mi.core.documentation import documented
 from morgs_mi.core.ranges import Above, AtLeast, AtMost, Below, check_ranges
 from morgs_mi.method.objective import ObjectiveConfig
 
-__all__ = [
-    "CameraPriors",
-    "DensityConfig",
-    "DetailConfig",
-    "FitConfig",
-    "LearningRates",
-    "ShortFitConfig",
-]
-
 # Epochs of a later frame before the learning rate of the means begins to decay.
 _CONSTANT_EPOCHS = 2
 # Epochs of a later frame that its learning rates were chosen for: they are larger in fewer epochs.
 _USUAL_EPOCHS = 8
-# Least number of steps of a first frame, and Gaussians per step: many see each pixel less often.
-_LEAST_STEPS, _GAUSSIANS_PER_STEP = 1200, 25
+# Least number of steps of a first frame.
+_LEAST_STEPS = 1200
+# Gaussians of a first frame per step: many see each pixel less often.
+_GAUSSIANS_PER_STEP = 25
 
 
 @documented

@@ -16,12 +16,14 @@ from morgs_mi.core.rig import (
     surface_of,
 )
 
-__all__ = ["Forecast", "forecast", "quality_of"]
-
 _WORDS = ("good", "fair", "poor")
-# Limits of good and of fair views between the cameras: loss against the training views in dB, PSNR in dB, and the angle
-# in degrees, of `Forecast.reach`, at which the loss is about as large (`docs/experiments/first-frame.md`).
-_LOSSES, _LEAST_PSNR, _ANGLES = (4.0, 8.0), (22.0, 16.0), (9.5, 18.0)
+# Limits of good and of fair views between the cameras (`docs/experiments/first-frame.md`). Loss against the training
+# views, dB.
+_LOSSES = (4.0, 8.0)
+# PSNR, dB.
+_LEAST_PSNR = (22.0, 16.0)
+# `Forecast.reach` at which the loss is about as large, degrees.
+_ANGLES = (9.5, 18.0)
 # Angle that stands for a point that no other camera sees, degrees.
 _UNSEEN = 90.0
 
@@ -75,10 +77,11 @@ def forecast(cameras: Sequence[Camera], points: np.ndarray) -> Forecast:
     measures = []
     for view, (camera, depth) in enumerate(zip(cameras, scene_depths(cameras, points), strict=True)):
         others = [*cameras[:view], *cameras[view + 1 :]]
-        angles, surface = angles_to(camera, depth, others), surface_of(camera, depth)
-        seen = np.array([seen_points(other, surface)[0] for other in others])
+        angles = angles_to(camera, depth, others)
+        surface = surface_of(camera, depth)
+        visible = np.array([seen_points(other, surface)[0] for other in others])
         to_each = np.array([angles_between(surface, camera, other) for other in others])
-        nearest = np.where(seen, to_each, _UNSEEN).min(axis=0)
-        measures.append((angles.min(), seen[angles.argmin()].mean(), nearest.mean()))
+        nearest = np.where(visible, to_each, _UNSEEN).min(axis=0)
+        measures.append((angles.min(), visible[angles.argmin()].mean(), nearest.mean()))
     spacing, overlap, reach = np.mean(measures, axis=0)
     return Forecast(len(cameras), float(spacing), float(overlap), float(reach))

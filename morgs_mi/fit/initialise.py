@@ -10,21 +10,11 @@ from scipy.spatial import KDTree
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_points
-from morgs_mi.core.color_space import SH_C0, unit_values
+from morgs_mi.core.color_space import BRIGHTEST, SH_C0, unit_values
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.rig import focus_depths, scene_extent, seen_points
 from morgs_mi.fit.empty_space import in_empty_space
 from morgs_mi.fit.view import View
-
-__all__ = [
-    "MIN_POINTS",
-    "Points",
-    "fill_points",
-    "from_points",
-    "initial_points",
-    "resample_points",
-    "seed_points",
-]
 
 Points = tuple[np.ndarray, np.ndarray]
 """Points [P, 3] in world units, and their encoded colours [P, 3], of which 1 is white."""
@@ -36,8 +26,10 @@ _MANY_POINTS = 1000
 _CELLS = 8
 # Distance of random points from cameras with parallel axes, scene extents.
 _PARALLEL = 10.0
-# Points in a view that a random one gets its depth from, and how far it may be off, as a fraction.
-_NEIGHBOURS, _SPREAD = 3, 0.1
+# Points in a view that a random one gets its depth from.
+_NEIGHBOURS = 3
+# Largest deviation of the depth of a random point, as a fraction.
+_SPREAD = 0.1
 
 
 def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int, opacity: float = 0.3) -> Gaussians:
@@ -52,7 +44,7 @@ def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int, opacity:
     Raises:
         ValueError: no points, points that are not finite, or colours of another shape or range.
     """
-    points, colors = (v.astype(np.float64) for v in check_points("from_points()", points, colors))
+    points, colors = (v.astype(np.float64) for v in check_points("from_points()", points, colors, BRIGHTEST))
     n = len(points)
     if not n:
         raise ValueError(
@@ -89,10 +81,11 @@ def initial_points(views: Sequence[View], points: Points, count: int, rng: np.ra
         count: number of points; those in the empty space are not replaced.
         rng: draws points.
     """
-    points, known = _in_light(points, views), len(points[0])
-    if known < MIN_POINTS:
+    points = _in_light(points, views)
+    num_points = len(points[0])
+    if num_points < MIN_POINTS:
         points = seed_points(views, count, rng)
-    elif known < _MANY_POINTS:
+    elif num_points < _MANY_POINTS:
         points = fill_points(points, views, count, rng)
     cameras = [view.camera for view in views]
     points = resample_points(_outside_empty_space(cameras, points), count, rng)
@@ -126,16 +119,16 @@ def resample_points(points: Points, count: int, rng: np.random.Generator) -> Poi
     """Return `count` points [count, 3] and colours: a random subset, or with points added between near neighbours."""
     positions, colors = points
     if len(positions) >= count:
-        chosen = np.sort(rng.choice(len(positions), count, replace=False))
-        return positions[chosen], colors[chosen]
+        rows = np.sort(rng.choice(len(positions), count, replace=False))
+        return positions[rows], colors[rows]
     if len(positions) < 2:
         return points
     parent = rng.integers(0, len(positions), count - len(positions))
     neighbours = np.asarray(KDTree(positions).query(positions[parent], k=min(4, len(positions)))[1])
     partner = neighbours[np.arange(len(parent)), rng.integers(1, neighbours.shape[1], len(parent))]
     blend = rng.uniform(0.2, 0.8, (len(parent), 1))
-    added = [(1 - blend) * values[parent] + blend * values[partner] for values in points]
-    return np.concatenate([positions, added[0]]), np.concatenate([colors, added[1]])
+    blends = [(1 - blend) * values[parent] + blend * values[partner] for values in points]
+    return np.concatenate([positions, blends[0]]), np.concatenate([colors, blends[1]])
 
 
 def seed_points(views: Sequence[View], count: int, rng: np.random.Generator) -> Points:
@@ -153,14 +146,16 @@ def seed_points(views: Sequence[View], count: int, rng: np.random.Generator) -> 
     cameras = [view.camera for view in views]
     depths = focus_depths(cameras)
     depths[np.isinf(depths)] = _PARALLEL * scene_extent(cameras)
-    shown = [pair for pair in zip(views, depths, strict=True) if pair[0].mask is None or pair[0].mask.any()]
-    points, colors = [np.zeros((0, 3))], [np.zeros((0, 3))]
-    for index, ((camera, image, mask), depth) in enumerate(shown):
-        n = _share(count, index, len(shown))
+    pairs = [pair for pair in zip(views, depths, strict=True) if pair[0].mask is None or pair[0].mask.any()]
+    points = [np.zeros((0, 3))]
+    colors = [np.zeros((0, 3))]
+    for index, ((camera, image, mask), depth) in enumerate(pairs):
+        n = _share(count, index, len(pairs))
         distance = max(depth, 10 * camera.near)
         rows, columns = np.nonzero(np.ones(image.shape[:2], bool) if mask is None else mask)
         pixels = rng.integers(0, len(rows), n)
-        rows, columns = rows[pixels], columns[pixels]
+        rows = rows[pixels]
+        columns = columns[pixels]
         within = np.stack([columns, rows], axis=1) + rng.uniform(0, 1, (n, 2))
         points.append(camera.unproject(within, distance / rng.uniform(1 / 3, 3, n)))
         colors.append(unit_values(image[rows, columns]))
@@ -179,22 +174,26 @@ def fill_points(points: Points, views: Sequence[View], count: int, rng: np.rando
         count: number of points.
         rng: draws pixels and depths.
     """
-    added, added_colors = [], []
+    new_points = []
+    new_colors = []
     for index, (camera, image, mask) in enumerate(views):
-        _, seen, depths = seen_points(camera, points[0])
-        if not len(seen):
+        _, point_pixels, depths = seen_points(camera, points[0])
+        if not len(point_pixels):
             continue
         pixels = rng.uniform(0, (camera.width, camera.height), (_share(count, index, len(views)), 2))
         columns, rows = pixels.astype(int).T
-        free = ~_shown_cells(camera, seen)[_cells_of(camera, pixels)] & (True if mask is None else mask[rows, columns])
-        k = min(_NEIGHBOURS, len(seen))
-        distance, near = (np.reshape(found, (-1, k)) for found in KDTree(seen).query(pixels[free], k=k))
+        is_free = ~_shown_cells(camera, point_pixels)[_cells_of(camera, pixels)]
+        if mask is not None:
+            is_free &= mask[rows, columns]
+        k = min(_NEIGHBOURS, len(point_pixels))
+        nearest = KDTree(point_pixels).query(pixels[is_free], k=k)
+        distance, near = (np.reshape(values, (-1, k)) for values in nearest)
         weights = 1 / (distance + 1e-3)
         depth = weights.sum(axis=1) / (weights / depths[near]).sum(axis=1)
-        added.append(camera.unproject(pixels[free], depth * rng.uniform(1 - _SPREAD, 1 + _SPREAD, len(depth))))
-        added_colors.append(unit_values(image[rows[free], columns[free]]))
-    kept, colors = resample_points(points, count - sum(map(len, added)), rng)
-    return np.concatenate([kept, *added]), np.concatenate([colors, *added_colors])
+        new_points.append(camera.unproject(pixels[is_free], depth * rng.uniform(1 - _SPREAD, 1 + _SPREAD, len(depth))))
+        new_colors.append(unit_values(image[rows[is_free], columns[is_free]]))
+    positions, colors = resample_points(points, count - sum(map(len, new_points)), rng)
+    return np.concatenate([positions, *new_points]), np.concatenate([colors, *new_colors])
 
 
 def _share(count: int, index: int, views: int) -> int:
@@ -210,6 +209,6 @@ def _cells_of(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def _shown_cells(camera: Camera, pixels: np.ndarray) -> np.ndarray:
     """Return the cells of a view that have a pixel position, [_CELLS, _CELLS] bool."""
-    shown = np.zeros((_CELLS, _CELLS), bool)
-    shown[_cells_of(camera, pixels)] = True
-    return shown
+    is_covered = np.zeros((_CELLS, _CELLS), bool)
+    is_covered[_cells_of(camera, pixels)] = True
+    return is_covered

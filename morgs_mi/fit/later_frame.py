@@ -28,8 +28,6 @@ from morgs_mi.method.rigidity import find_neighbours
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 
-__all__ = ["FrameProblem", "LaterFrame", "fit_later_frame"]
-
 _SCORES = "scores"  # name of the loss of the densification scores, which is 0
 # The round of density control is due when the loss hardly falls, and at this fraction of the epochs at the latest: the
 # residual has shown by then where Gaussians are missing, and enough steps are left to fit the births.
@@ -76,7 +74,8 @@ def fit_later_frame(
         rng: draws the order of the views and the positions of births.
         progress: of the steps.
     """
-    previous, active = problem.previous, problem.active
+    previous = problem.previous
+    active = problem.active
     if not active.views or not len(active.indices):
         return LaterFrame(with_zero_motion(previous), np.arange(len(previous)), {}, 0)
     fit = _Fit(problem, config, motion, rng, progress)
@@ -108,15 +107,23 @@ class _Fit:
         rng: np.random.Generator,
         progress: Progress | None,
     ) -> None:
-        self._problem, self._config, self._motion, self._rng, self._progress = problem, config, motion, rng, progress
+        self._problem = problem
+        self._config = config
+        self._motion = motion
+        self._rng = rng
+        self._progress = progress
         self._views = sorted(problem.active.views)
         count = len(self._views)
         self._order = [self._views[k] for k in view_order(count, config.epochs * count, rng)]
         self._observations = _on_active_views(problem)
-        self._base, self.source = problem.active.select(problem.previous), np.arange(len(problem.active.indices))
-        self._neighbours = self._found_neighbours()
-        self._densifies, self._attribution = config.density.later_frames, None
-        self._objectives, self.losses, self.steps = list[float](), dict[str, float](), 0
+        self._base = problem.active.select(problem.previous)
+        self.source = np.arange(len(problem.active.indices))
+        self._neighbours = self._neighbour_observation()
+        self._densifies = config.density.later_frames
+        self._attribution = None
+        self._objectives = list[float]()
+        self.losses = dict[str, float]()
+        self.steps = 0
 
     @property
     def gaussians(self) -> Gaussians:
@@ -127,12 +134,16 @@ class _Fit:
     @property
     def has_converged(self) -> bool:
         """Whether the objective (eq. 13) hardly decreased over the last two epochs: a single one may overshoot."""
-        tolerance, values = self._config.early_stopping_tolerance, self._objectives
+        tolerance = self._config.early_stopping_tolerance
+        values = self._objectives
         return tolerance > 0 and len(values) > 2 and values[-1] > (1 - tolerance) * values[-3]
 
     def start(self) -> int:
         """Fit the motion model, if there is one, start the residual, and return the number of epochs that this took."""
-        problem, motion, start, epochs = self._problem, self._motion, self._problem.start, 0
+        problem = self._problem
+        motion = self._motion
+        start = self._problem.start
+        epochs = 0
         if (factory := motion_model(motion)) is not None:
             epochs = max(1, round(motion.model_share * self._config.epochs))
             model = factory(self._base, problem.extent, self._rng)
@@ -158,56 +169,65 @@ class _Fit:
     def densify(self) -> None:
         """Add and prune active Gaussians by density control, once."""
         assert self._attribution is not None
-        problem, density, scores = self._problem, self._config.density, self._attribution.scores()
+        problem = self._problem
+        density = self._config.density
+        scores = self._attribution.scores()
         num_static = len(problem.previous) - len(problem.active.indices)
         plan = plan_additions(self.gaussians, scores, density, self._rng, num_static)
         # A birth has the motion of its parent: it starts from the parent's past and shares the residual.
-        self._base, self.source = apply_plan(self._base, plan), plan.source
-        self._neighbours = self._found_neighbours()
+        self._base = apply_plan(self._base, plan)
+        self.source = plan.source
+        self._neighbours = self._neighbour_observation()
         resize_optimizer(self._optimizer, plan)
-        self._densifies, self._attribution = False, None
+        self._densifies = False
+        self._attribution = None
 
     def _next_steps(self, epochs: int) -> Steps:
         """Return the steps of the next epochs."""
-        first, progress, total = self.steps, self._progress, len(self._order)
+        first = self.steps
+        progress = self._progress
+        total = len(self._order)
         self.steps += epochs * len(self._views)
         # The first steps of an epoch still correct what the last ones show.
         half = self.steps - (len(self._views) + 3) // 4
         self._attribution = Attribution(len(self.source)) if self._densifies and half == first else None
 
-        def on_step(done: int) -> None:
+        def on_step(step: int) -> None:
             if self._attribution is not None:
                 self._attribution.collect()
-            if self._densifies and done == half:
+            if self._densifies and step == half:
                 self._attribution = Attribution(len(self.source))
             if progress is not None:
-                progress(done, total)
+                progress(step, total)
 
         return Steps(self._order[first : self.steps], first, on_step=on_step, last=len(self._views))
 
     def _losses_at(self, parameters: Mapping[str, Tensor], index: int) -> dict[str, Tensor]:
         """Render one view and return its losses by name."""
-        problem, objective = self._problem, self._config.objective
-        view, observed = problem.active.views[index], {**self._observations[index], **self._neighbours}
-        channels = channels_of(observed, objective)
+        problem = self._problem
+        objective = self._config.objective
+        view = problem.active.views[index]
+        observations = {**self._observations[index], **self._neighbours}
+        channels = channels_of(observations, objective)
         # The other terms are about motion and confidence, and must not move opacity and geometry.
         detached = [name for name in channels if name != "color"]
-        now = apply_residual(self._base, parameters, self._motion)
+        gaussians = apply_residual(self._base, parameters, self._motion)
         scores = self._attribution
         features = None if scores is None else scores.features()
-        image = view.render(now, channels, [*detached, "features"] if scores else detached, features)
-        num_pixels, num_gaussians = view.camera.width * view.camera.height, problem.active.num_gaussians
-        prediction = Prediction(image, parameters, view.region, num_pixels, num_gaussians, problem.extent, now)
-        losses = losses_of(prediction, observed, objective)
+        image = view.render(gaussians, channels, [*detached, "features"] if scores else detached, features)
+        num_pixels = view.camera.width * view.camera.height
+        num_gaussians = problem.active.num_gaussians
+        prediction = Prediction(image, parameters, view.region, num_pixels, num_gaussians, problem.extent, gaussians)
+        losses = losses_of(prediction, observations, objective)
         return losses if scores is None else losses | {_SCORES: scores.loss(image, problem.targets[index], view.region)}
 
-    def _found_neighbours(self) -> Observations:
+    def _neighbour_observation(self) -> Observations:
         """Return the observation of all views that compares neighbours, if a term does."""
         objective = self._config.objective
         if not objective.is_rigid:
             return {}
-        found = find_neighbours(self._base, self._problem.extent)
-        return {} if found is None else {"neighbours": found}
+        neighbours = find_neighbours(self._base, self._problem.extent)
+        return {} if neighbours is None else {"neighbours": neighbours}
 
 
 def _on_active_views(problem: FrameProblem) -> dict[int, Observations]:
@@ -223,15 +243,15 @@ def _tensor(array: np.ndarray, view: ActiveView) -> Tensor:
 
 
 def _merge(
-    previous: Gaussians, active: ActiveSet, changed: Gaussians, source: np.ndarray
+    previous: Gaussians, active: ActiveSet, gaussians: Gaussians, source: np.ndarray
 ) -> tuple[Gaussians, np.ndarray]:
-    """Return the changed Gaussians among the static ones, in the order of the previous frame, and their `source`."""
+    """Return the fitted Gaussians among the static ones, in the order of the previous frame, and their `source`."""
     if len(active.indices) == len(previous):
-        return changed, source
+        return gaussians, source
     is_static = np.ones(len(previous), bool)
     is_static[active.indices] = False
     static = np.flatnonzero(is_static)
-    known = np.concatenate([static, np.where(source < 0, len(previous), active.indices[source])])
-    order = np.argsort(known, kind="stable")  # births come last
-    everything = Gaussians.concatenate([with_zero_motion(previous.select(static)), changed])
-    return everything.select(order), np.where(known < len(previous), known, -1)[order]
+    previous_index = np.concatenate([static, np.where(source < 0, len(previous), active.indices[source])])
+    order = np.argsort(previous_index, kind="stable")  # births come last
+    all_gaussians = Gaussians.concatenate([with_zero_motion(previous.select(static)), gaussians])
+    return all_gaussians.select(order), np.where(previous_index < len(previous), previous_index, -1)[order]

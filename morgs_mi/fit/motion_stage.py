@@ -15,8 +15,6 @@ from morgs_mi.method.losses import recon_loss
 from morgs_mi.method.motion_model import MotionModel, moved
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 
-__all__ = ["fit_motion"]
-
 # Learning rates at the end, as a fraction of those at the start.
 _FINAL_RATE = 0.1
 
@@ -37,21 +35,23 @@ def fit_motion(
         The start of the residual, with the confidence of `start` or of the previous frame, and the losses by name,
         means over the last round of views.
     """
-    gaussians, start = problem.gaussians, start or MotionStart.without_motion(problem.gaussians)
-    begun = displaced(gaussians, start.displacement)
+    gaussians = problem.gaussians
+    start = start or MotionStart.without_motion(problem.gaussians)
+    start_gaussians = displaced(gaussians, start.displacement)
 
     def losses_at(parameters: Mapping[str, Tensor], index: int) -> dict[str, Tensor]:
         view = problem.views[index]
-        image = view.render(moved(begun, *model.motion(parameters)), ("color",))
+        image = view.render(moved(start_gaussians, *model.motion(parameters)), ("color",))
         return {
             "recon": recon_loss(image.color, problem.targets[index], dssim_weight, view.region),
             **model.losses(parameters),
         }
 
-    optimizer, total = adam(model.parameters), len([*steps.views])
+    optimizer = adam(model.parameters)
+    total = len([*steps.views])
     # Adam's steps are as long as the rate; long ones find the motion, short ones settle it.
-    falling = replace(steps, decay=lambda step: _FINAL_RATE ** (step / total))
-    losses = optimise(optimizer, model.rates, losses_at, falling)
+    decaying_steps = replace(steps, decay=lambda step: _FINAL_RATE ** (step / total))
+    losses = optimise(optimizer, model.rates, losses_at, decaying_steps)
     with dr.suspend_grad():
         displacement, rotation = model.motion(values_of(optimizer))
         change = moved(gaussians, displacement, rotation).quats - gaussians.quats

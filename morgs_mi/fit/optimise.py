@@ -15,8 +15,6 @@ from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Tensor
 from morgs_mi.render.kernel_recording import render_lock
 
-__all__ = ["Losses", "Steps", "adam", "optimise", "replace_parameter", "values_of", "view_order"]
-
 Losses = dict[str, Tensor]
 
 
@@ -90,7 +88,8 @@ def optimise(
     scale = {name: float(rates[name]) for name in optimizer}
     # As Python numbers: Dr.Jit 1.5 multiplies a rate that is an array in place, once per step.
     optimizer.set_learning_rate(scale)
-    history, weights = dict[str, list[Tensor]](), weights or {}
+    history = dict[str, list[Tensor]]()
+    weights = weights or {}
     for step, view in enumerate(steps.views, steps.first):
         if steps.decay is not None:
             factor = steps.decay(step)

@@ -15,8 +15,6 @@ from morgs_mi.fit.initialise import Points, from_points, initial_points
 from morgs_mi.fit.view import View, half_sized, mean_psnr
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["FirstFrameProblem"]
-
 # Least scene extent, relative to the median depth: of means that move by fractions of the extent.
 _DEPTH = 1 / 6
 # Opacity of the Gaussians at the start: most can become opaque or vanish within the steps of a first frame.
@@ -51,9 +49,10 @@ class FirstFrameProblem:
             render: cut-offs.
             rng: draws points.
         """
-        chosen = initial_points(views, points, config.first_count, rng)
-        start, cameras = from_points(*chosen, config.sh_degree, _OPACITY), [view.camera for view in views]
-        extent = max(scene_extent(cameras), _DEPTH * float(np.median(scene_depths(cameras, chosen[0]))))
+        start_points = initial_points(views, points, config.first_count, rng)
+        start = from_points(*start_points, config.sh_degree, _OPACITY)
+        cameras = [view.camera for view in views]
+        extent = max(scene_extent(cameras), _DEPTH * float(np.median(scene_depths(cameras, start_points[0]))))
         return cls(start, tuple(views), points[0], extent, render)
 
     @property

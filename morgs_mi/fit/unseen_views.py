@@ -33,8 +33,6 @@ from morgs_mi.fit.view import View, mean_psnr
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["REGRESSION", "WIDEST", "WIDEST_REACH", "Regression", "UnseenViews", "features_of", "unseen_views"]
-
 WIDEST = 6.0
 """Width of an interval in dB beyond which only the word is certain."""
 WIDEST_REACH = 20.0
@@ -197,12 +195,12 @@ def _disagreement(gaussians: Gaussians, view: View, others: Sequence[View], rend
     return float(least[np.isfinite(least)].mean()) if np.isfinite(least).any() else 1.0
 
 
-def _squares(color: np.ndarray, points: np.ndarray, drawn: np.ndarray, view: View) -> np.ndarray:
+def _squares(color: np.ndarray, points: np.ndarray, is_drawn: np.ndarray, view: View) -> np.ndarray:
     """Return the square differences [H, W] of colours from a view of their points [H, W, 3]; infinite outside it."""
     camera = view.camera
     with np.errstate(divide="ignore", invalid="ignore"):  # points beside the camera
         pixels, depths = camera.project(points)
-    inside = drawn & (depths > camera.near) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=-1)
+    inside = is_drawn & (depths > camera.near) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=-1)
     pixels = np.where(inside[..., None], pixels, 0)
     if view.mask is not None:
         columns, rows = pixels.astype(int).transpose(2, 0, 1)

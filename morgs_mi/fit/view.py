@@ -15,16 +15,16 @@ from morgs_mi.method.ssim import Target
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["LEAST_GAIN", "View", "decibels", "half_sized", "mean_psnr", "rendered", "squared_errors", "withheld_blocks"]
-
 LEAST_GAIN = 0.1
 """Increase of the PSNR of withheld pixels from which a change of the cameras is taken, dB: less is chance."""
 
 _MIN_SIDE = 32  # px, of a reduced image
 # Least width of views of half the size, px.
 _COARSE_WIDTH = 160
-# Withheld blocks: side in px, and one of how many.
-_BLOCK, _SHARE = 12, 8
+# Side of the withheld blocks, px.
+_BLOCK = 12
+# One of so many blocks is withheld.
+_SHARE = 8
 
 
 class View(NamedTuple):
@@ -79,14 +79,15 @@ def withheld_blocks(views: Sequence[View], width: int, rng: np.random.Generator)
         width: least width of the reduced images, px.
         rng: draws the blocks.
     """
-    kept, unseen = [], []
+    visible = []
+    withheld = []
     for camera, image, mask in (view.reduced(width) for view in views):
         rows, columns = (np.arange(size) // _BLOCK for size in image.shape[:2])
-        withheld = (rng.random((rows[-1] + 1, columns[-1] + 1)) < 1 / _SHARE)[rows][:, columns]
-        valid = np.ones_like(withheld) if mask is None else mask
-        kept.append(View(camera, image, valid & ~withheld))
-        unseen.append(View(camera, image, valid & withheld))
-    return kept, unseen
+        is_withheld = (rng.random((rows[-1] + 1, columns[-1] + 1)) < 1 / _SHARE)[rows][:, columns]
+        valid = np.ones_like(is_withheld) if mask is None else mask
+        visible.append(View(camera, image, valid & ~is_withheld))
+        withheld.append(View(camera, image, valid & is_withheld))
+    return visible, withheld
 
 
 def squared_errors(gaussians: Gaussians, views: Sequence[View], render: RenderConfig) -> np.ndarray:

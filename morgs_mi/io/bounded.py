@@ -23,19 +23,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = [
-    "MAX_TOML",
-    "array_names",
-    "check_claim",
-    "encoding_of",
-    "read_array",
-    "read_bytes",
-    "read_json",
-    "read_text",
-    "read_toml",
-    "regular",
-]
-
 _FACTOR, _ALLOWANCE = 10, 200_000_000
 # Errors of NumPy and zipfile for broken files. NumPy parses headers as Python.
 _BROKEN = (

@@ -29,8 +29,6 @@ from morgs_mi.core.geometry import unit_quats
 from morgs_mi.io.invalid import without_invalid
 from morgs_mi.io.ply import read_elements
 
-__all__ = ["read_compressed_ply", "write_compressed_ply"]
-
 _CHUNK = 256
 _BOUNDS = {
     "position": (("min_x", "min_y", "min_z"), ("max_x", "max_y", "max_z")),

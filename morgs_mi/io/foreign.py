@@ -9,8 +9,6 @@ import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["refuse_foreign"]
-
 _CONVERTERS = "convert it to .ply with SuperSplat (superspl.at/editor) or splat-transform (@playcanvas/splat-transform)"
 _EXPORT = "export it as .ply in the layout of 3D Gaussian Splatting from the program that wrote it"
 _HEAD = 4096

@@ -14,8 +14,6 @@ import numpy as np
 from morgs_mi.io.movie import Movie, read_movie
 from morgs_mi.io.remote import fetched
 
-__all__ = ["SAME_TIME", "VideoHeader", "clock", "read_header", "seconds", "true_rate"]
-
 SAME_TIME = 1e-6
 """Difference in s up to which two times are the same."""
 

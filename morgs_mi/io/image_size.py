@@ -6,8 +6,6 @@ import struct
 
 import numpy as np
 
-__all__ = ["image_size"]
-
 # Bytes of a JPEG file in which its size is searched.
 _MAX_HEADER = 1_000_000
 

@@ -10,8 +10,6 @@ import numpy as np
 from morgs_mi.core.checks import LARGEST
 from morgs_mi.core.gaussians import Gaussians
 
-__all__ = ["without_invalid"]
-
 _log = logging.getLogger(__name__)
 
 _WORDS = {

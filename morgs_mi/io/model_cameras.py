@@ -16,8 +16,6 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.io.bounded import read_json
 from morgs_mi.io.unread import warn_unread
 
-__all__ = ["model_cameras"]
-
 _FILE = "cameras.json"
 _KEYS = {"width", "height", "position", "rotation", "fx", "fy"}
 _HARMLESS = {"id", "img_name", "image_name", "name", "near", "far"}

@@ -12,8 +12,6 @@ from typing import BinaryIO
 
 from morgs_mi.io.remote import fetched
 
-__all__ = ["Movie", "read_movie"]
-
 # The boxes with which a file of this kind begins.
 _FIRST = {b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip"}
 # Bytes of an edit list that are read; it has a few entries.

@@ -24,8 +24,6 @@ from morgs_mi.io.invalid import without_invalid
 from morgs_mi.io.mitsuba_ply import from_mitsuba, mitsuba_columns
 from morgs_mi.io.ply_kinds import as_3dgs
 
-__all__ = ["read_elements", "read_ply", "read_vertices", "write_ply"]
-
 _MEAN, _SCALE, _ROTATION = ("x", "y", "z"), ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2", "rot_3")
 # Type names of the format and of its older writers.
 _TYPES = {

@@ -19,8 +19,6 @@ from pathlib import Path
 
 import numpy as np
 
-__all__ = ["as_3dgs"]
-
 _log = logging.getLogger(__name__)
 
 Vertices = dict[str, np.ndarray]

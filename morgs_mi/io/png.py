@@ -5,8 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-__all__ = ["png_bytes"]
-
 
 def png_bytes(image: np.ndarray) -> bytes:
     """Return an image, uint8 RGB [H, W, 3], as a PNG file."""

@@ -9,8 +9,6 @@ from queue import Empty, Full, Queue
 from threading import Event, Thread
 from typing import TypeVar
 
-__all__ = ["prefetched"]
-
 T = TypeVar("T")
 _POLL_SECONDS = 0.1  # interval at which the thread checks whether the consumer has closed
 _CLOSING_SECONDS = 12.0  # longest wait for the thread; a connection may take 10 s to break

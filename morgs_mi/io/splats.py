@@ -17,8 +17,6 @@ from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.invalid import without_invalid
 from morgs_mi.io.ply import read_ply
 
-__all__ = ["SUFFIXES", "read_splats", "suffix_of"]
-
 SUFFIXES = (".compressed.ply", ".ply", ".splat")
 """Ends of the names of files that `read_splats` reads."""
 

@@ -6,8 +6,6 @@ import logging
 from collections.abc import Iterable
 from pathlib import Path
 
-__all__ = ["warn_unread"]
-
 _LOG = logging.getLogger(__name__)
 # Names in a message.
 _MAX_LISTED = 10

@@ -26,20 +26,6 @@ from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, images_in
 from morgs_mi.io.numbering import counting_together
 from morgs_mi.io.remote import fetched
 
-__all__ = [
-    "Clip",
-    "FolderReader",
-    "FrameReader",
-    "ImageOrError",
-    "VideoReader",
-    "decode_image",
-    "image_number",
-    "natural_key",
-    "numbering_gap",
-    "open_clips",
-    "open_frames",
-]
-
 # Bytes of memory that a pixel takes, in BGR and RGB.
 _BYTES_PER_PIXEL = 6
 # First frame that is worth a search, and the frames before it at which the search aims: those shown right after a

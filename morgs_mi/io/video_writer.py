@@ -10,8 +10,6 @@ import numpy as np
 
 from morgs_mi.core.files import atomic_folder, atomic_path
 
-__all__ = ["PLAYABLE", "write_video"]
-
 PLAYABLE = "vp09"
 """Codec of videos in .mp4 that browsers and players open: VP9, which OpenCV's wheels have."""
 

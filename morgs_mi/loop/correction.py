@@ -15,8 +15,6 @@ from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.loop.observation import Images, Setup, views_of
 from morgs_mi.method.exposure import Exposure
 
-__all__ = ["Correction", "estimate_correction"]
-
 
 @dataclass(frozen=True)
 class Correction:
@@ -28,9 +26,9 @@ class Correction:
         """Return images, by view index, in the colours of the scene."""
         return {v: self.exposures[v].corrected(image) if self.exposures else image for v, image in images.items()}
 
-    def followed_by(self, later: Mapping[int, Exposure]) -> tuple[Exposure, ...]:
+    def followed_by(self, relative: Mapping[int, Exposure]) -> tuple[Exposure, ...]:
         """Return the exposures of a frame, with those relative to the view's first image by view index."""
-        return tuple(later.get(v, Exposure()).after(first) for v, first in enumerate(self.exposures))
+        return tuple(relative.get(v, Exposure()).after(first) for v, first in enumerate(self.exposures))
 
 
 def estimate_correction(setup: Setup, images: Images, progress: Progress) -> tuple[Correction, dict[str, Any]]:

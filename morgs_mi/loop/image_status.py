@@ -7,8 +7,6 @@ from collections.abc import Mapping, Sequence
 import cv2
 import numpy as np
 
-__all__ = ["image_status"]
-
 # px: thumbnails of this width keep the layout of a scene, without noise and the motion between two frames.
 _WIDTH = 16
 # Standard deviation of the thumbnail of an image of one colour, in grey levels.
@@ -24,19 +22,20 @@ _CHANGE = 8.0
 
 
 def image_status(
-    names: Sequence[str], before: Mapping[int, np.ndarray], images: Mapping[int, np.ndarray]
+    names: Sequence[str], previous: Mapping[int, np.ndarray], images: Mapping[int, np.ndarray]
 ) -> tuple[str, ...]:
     """Return a sentence with advice for each problem of a frame's images.
 
     Args:
         names: of the views.
-        before: images of the frame before, uint8 [H, W, 3], by view index; empty for the first frame.
+        previous: images of the frame before, uint8 [H, W, 3], by view index; empty for the first frame.
         images: of this frame, likewise.
     """
-    now = {v: _thumbnail(image) for v, image in images.items()}
-    plain = [v for v, image in now.items() if image.std((0, 1)).max() < _PLAIN]
-    others = [v for v in now.keys() & before.keys() if v not in plain and _is_cut(_thumbnail(before[v]), now[v])]
-    return (*_plain_status(names, now, plain), *_cut_status(names, len(now), others))
+    thumbnails = {v: _thumbnail(image) for v, image in images.items()}
+    plain = [v for v, image in thumbnails.items() if image.std((0, 1)).max() < _PLAIN]
+    pairs = {v: (_thumbnail(previous[v]), thumbnails[v]) for v in thumbnails.keys() & previous.keys()}
+    cuts = [v for v, pair in pairs.items() if v not in plain and _is_cut(*pair)]
+    return (*_plain_status(names, thumbnails, plain), *_cut_status(names, len(thumbnails), cuts))
 
 
 def _plain_status(names: Sequence[str], images: Mapping[int, np.ndarray], plain: Sequence[int]) -> tuple[str, ...]:

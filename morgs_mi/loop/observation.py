@@ -14,7 +14,7 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_mask, check_number, check_points, check_type
-from morgs_mi.core.color_space import display_image, display_stops, encode_light
+from morgs_mi.core.color_space import BRIGHTEST, display_image, display_stops, encode_light
 from morgs_mi.core.rig import check_near_planes, choose_key_views, scene_extent
 from morgs_mi.core.threads import map_in_threads
 from morgs_mi.fit.capacity import check_capacity
@@ -32,13 +32,13 @@ from morgs_mi.method.objective import KeyView
 
 __all__ = [
     "FrameObservation",
+    "ImageHistory",
     "Images",
     "Recorded",
-    "Seen",
     "Setup",
+    "extended_history",
     "observe_frame",
     "prepare",
-    "see_frame",
     "views_of",
 ]
 
@@ -81,7 +81,7 @@ class Recorded(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class ImageHistory:
     """Images up to a frame, with the exposure of each view's first image if exposures are estimated.
 
     Attributes:
@@ -102,16 +102,16 @@ class FrameObservation:
     """Observations of a frame that follow from its images alone.
 
     Attributes:
-        seen: the images.
+        history: the images, with those before.
         changes: masks of changed pixels [H, W], by view index; None: all pixels may have changed.
         flows: optical flow of the key views that changed, by view index.
         key_views: these views for the terms of the objective, by view index.
-        encoded: images that the fit compares, encoded, by view index: `seen.images` where uint8 was given, otherwise
+        encoded: images that the fit compares, encoded, by view index: `history.images` where uint8 was given, otherwise
             float32 with values above 1.
         recorded: the images as they were given, by view index.
     """
 
-    seen: Seen
+    history: ImageHistory
     changes: Mapping[int, np.ndarray] | None
     flows: Mapping[int, FlowObservation]
     key_views: Mapping[int, KeyView]
@@ -127,7 +127,7 @@ class Setup:
         cameras: the V training views.
         masks: per view [H, W] bool of valid pixels, or None.
         points: SfM points [P, 3], world units.
-        point_colors: [P, 3] in [0, 1].
+        point_colors: [P, 3], encoded: 1 is white.
         key_views: indices of the views with optical flow and masks.
         extent: of the scene, world units.
         config: settings.
@@ -162,11 +162,11 @@ def prepare(
     config = StreamConfig() if config is None else config
     check_type("StreamLoop()", "config", config, StreamConfig)
     if not isinstance(cameras, Sequence) or not cameras:
-        found = f"a {type(cameras).__name__}" if cameras else "none"
-        raise ValueError(f"StreamLoop(): `cameras` must be a sequence of at least one view, got {found}; pass a list.")
+        kind = f"a {type(cameras).__name__}" if cameras else "none"
+        raise ValueError(f"StreamLoop(): `cameras` must be a sequence of at least one view, got {kind}; pass a list.")
     for camera in cameras:
         check_type("StreamLoop()", "cameras", camera, Camera)
-    points, point_colors = check_points("StreamLoop()", points, point_colors)
+    points, point_colors = check_points("StreamLoop()", points, point_colors, BRIGHTEST)
     masks = (None,) * len(cameras) if masks is None else masks
     if len(masks) != len(cameras):
         raise ValueError(
@@ -186,7 +186,7 @@ def prepare(
     key_views = choose_key_views(cameras, config.motion.key_views)
     extent = scene_extent(cameras)
     if display_exposure is not None:
-        check_number("StreamLoop()", "display_exposure", display_exposure, "(-inf, inf)")
+        check_number("StreamLoop()", "display_exposure", display_exposure, "[-100, 100]")
     cloud = points.copy(), point_colors.copy()
     return Setup(tuple(cameras), copies, *cloud, key_views, extent, config, display_exposure)
 
@@ -196,13 +196,13 @@ def views_of(setup: Setup, images: Images) -> list[View]:
     return [View(setup.cameras[v], image, setup.masks[v]) for v, image in images.items()]
 
 
-def observe_frame(setup: Setup, frame: int, before: Seen, images: Sequence[Given | None]) -> FrameObservation:
+def observe_frame(setup: Setup, frame: int, history: ImageHistory, images: Sequence[Given | None]) -> FrameObservation:
     """Return the observations of a frame: changes, flow (eq. 4) and masks (eqs. 9, 10).
 
     Args:
         setup: data that all frames share.
         frame: its index.
-        before: images up to the frame before; `Seen()` for the first.
+        history: images up to the frame before; `ImageHistory()` for the first.
         images: per training view uint8 [H, W, 3], RGB, or linear light (see `Given`), or None where the view has no
             image. They are copied.
 
@@ -210,61 +210,65 @@ def observe_frame(setup: Setup, frame: int, before: Seen, images: Sequence[Given
         ValueError: an image has another size or type than its camera, or the first frame has no image at all.
     """
     recorded = copied_images(setup.cameras, images, frame)
-    seen, changes = _seen(setup, before, recorded)
-    flows, key_views = _flows(setup, frame, before.images, seen.images, changes)
-    return FrameObservation(seen, changes, flows, key_views, _encoded(recorded, seen), recorded)
+    new_history, changes = _extended(setup, history, recorded)
+    flows, key_views = _flows(setup, frame, history.images, new_history.images, changes)
+    return FrameObservation(new_history, changes, flows, key_views, _encoded(recorded, new_history), recorded)
 
 
-def see_frame(
-    setup: Setup, frame: int, before: Seen, images: Sequence[Given | None]
-) -> tuple[Seen, dict[int, np.ndarray] | None]:
-    """Return the images up to a frame and the masks of its changes, without flow; see `observe_frame`."""
-    return _seen(setup, before, copied_images(setup.cameras, images, frame))
+def extended_history(setup: Setup, frame: int, history: ImageHistory, images: Sequence[Given | None]) -> ImageHistory:
+    """Return the images up to a frame, without flow; arguments and errors as for `observe_frame`."""
+    return _extended(setup, history, copied_images(setup.cameras, images, frame))[0]
 
 
-def _seen(setup: Setup, before: Seen, recorded: Images) -> tuple[Seen, dict[int, np.ndarray] | None]:
+def _extended(
+    setup: Setup, history: ImageHistory, recorded: Images
+) -> tuple[ImageHistory, dict[int, np.ndarray] | None]:
     """Return the images up to a frame with these, and the masks of its changes; None: all may have changed."""
-    skip, follow = setup.config.fit.skip_static, setup.config.fit.exposure != "off"
-    stops = before.display_exposure if setup.display_exposure is None else setup.display_exposure
+    skip = setup.config.fit.skip_static
+    follow = setup.config.fit.exposure != "off"
+    stops = history.display_exposure if setup.display_exposure is None else setup.display_exposure
     stops = display_stops(recorded.values()) if stops is None else stops
     shown = {v: display_image(image, stops) for v, image in recorded.items()}
     if not (skip or follow):
-        return Seen(shown, display_exposure=stops), None
-    exposures = _exposures(setup, before, shown) if follow else {}
-    now = {v: exposures[v].corrected(image) if v in exposures else image for v, image in shown.items()}
-    changes = {v: np.zeros(image.shape[:2], bool) for v, image in now.items()}  # where it is the view's first image
-    known, config = sorted(now.keys() & before.references.keys()), setup.config.motion.change
-    masks = map_in_threads(lambda v: change_mask(before.references[v], now[v], setup.masks[v], config), known)
-    changes |= dict(zip(known, masks, strict=True))
-    references = {v: update_reference(before.references[v], now[v], changes[v]) for v in known}
-    return Seen(now, {**before.references, **now, **references}, exposures, stops), changes if skip else None
+        return ImageHistory(shown, display_exposure=stops), None
+    references = history.references
+    exposures = _exposures(setup, history, shown) if follow else {}
+    images = {v: exposures[v].corrected(image) if v in exposures else image for v, image in shown.items()}
+    changes = {v: np.zeros(image.shape[:2], bool) for v, image in images.items()}  # where it is the view's first image
+    views = sorted(images.keys() & references.keys())
+    config = setup.config.motion.change
+    masks = map_in_threads(lambda v: change_mask(references[v], images[v], setup.masks[v], config), views)
+    changes |= dict(zip(views, masks, strict=True))
+    new_references = {v: update_reference(references[v], images[v], changes[v]) for v in views}
+    new_history = ImageHistory(images, {**references, **images, **new_references}, exposures, stops)
+    return new_history, changes if skip else None
 
 
-def _encoded(recorded: Images, seen: Seen) -> dict[int, np.ndarray]:
+def _encoded(recorded: Images, history: ImageHistory) -> dict[int, np.ndarray]:
     """Return the images that the fit compares, see `FrameObservation`."""
     return {
-        v: seen.images[v]
+        v: history.images[v]
         if image.dtype == np.uint8
-        else seen.exposures.get(v, Exposure()).corrected(encode_light(image))
+        else history.exposures.get(v, Exposure()).corrected(encode_light(image))
         for v, image in recorded.items()
     }
 
 
-def _exposures(setup: Setup, before: Seen, recorded: Images) -> dict[int, Exposure]:
+def _exposures(setup: Setup, history: ImageHistory, recorded: Images) -> dict[int, Exposure]:
     """Return the exposures relative to the views' first images, without the change of light that all views show."""
-    known = sorted(recorded.keys() & before.references.keys())
-    found = map_in_threads(
-        lambda v: follow_exposure(before.references[v], recorded[v], setup.masks[v], before.exposures.get(v)),
-        known,
+    views = sorted(recorded.keys() & history.references.keys())
+    view_exposures = map_in_threads(
+        lambda v: follow_exposure(history.references[v], recorded[v], setup.masks[v], history.exposures.get(v)),
+        views,
     )
-    light = common_change(found)
-    own = {v: exposure.without(light) for v, exposure in zip(known, found, strict=True)}
-    kept = {v: exposure if exposure.change > LEAST_CHANGE else Exposure() for v, exposure in own.items()}
-    return {**before.exposures, **kept}
+    light = common_change(view_exposures)
+    exposures = {v: exposure.without(light) for v, exposure in zip(views, view_exposures, strict=True)}
+    exposures = {v: exposure if exposure.change > LEAST_CHANGE else Exposure() for v, exposure in exposures.items()}
+    return {**history.exposures, **exposures}
 
 
 def _flows(
-    setup: Setup, frame: int, before: Images, images: Images, changes: Mapping[int, np.ndarray] | None
+    setup: Setup, frame: int, previous: Images, images: Images, changes: Mapping[int, np.ndarray] | None
 ) -> tuple[dict[int, FlowObservation], dict[int, KeyView]]:
     """Return the optical flow of the key views that changed, with masks in every n-th frame, where a term uses it."""
     motion = setup.config.motion
@@ -272,12 +276,13 @@ def _flows(
     if not (motion.learn_motion or with_masks or (motion.learn_confidence and frame == 1)):
         return {}, {}
     pairs = {}
-    for v in _frame_key_views(setup, before, images):
+    for v in _frame_key_views(setup, previous, images):
         box = None if changes is None else box_around(changes[v])
         if changes is None or box is not None:
             region = None if changes is None else moving_region(changes[v])
-            name, valid = setup.cameras[v].name, setup.masks[v]
-            pairs[v] = FramePair(images[v], before[v], name, frame, valid, box, region)
+            name = setup.cameras[v].name
+            valid = setup.masks[v]
+            pairs[v] = FramePair(images[v], previous[v], name, frame, valid, box, region)
     if not pairs:
         return {}, {}
     masks = motion.mask_method if with_masks else None
@@ -285,10 +290,12 @@ def _flows(
     return flows, {v: KeyView(pairs[v], flow) for v, flow in flows.items()}
 
 
-def _frame_key_views(setup: Setup, before: Images, images: Images) -> tuple[int, ...]:
+def _frame_key_views(setup: Setup, previous: Images, images: Images) -> tuple[int, ...]:
     """Return the key views of a frame: the key views of the setup, or others if some of them lack an image."""
-    both = sorted(before.keys() & images.keys())
-    key_views = tuple(v for v in setup.key_views if v in both)
-    if len(key_views) == len(setup.key_views) or not both:
+    common_views = sorted(previous.keys() & images.keys())
+    key_views = tuple(v for v in setup.key_views if v in common_views)
+    if len(key_views) == len(setup.key_views) or not common_views:
         return key_views
-    return tuple(both[k] for k in choose_key_views([setup.cameras[v] for v in both], len(setup.key_views)))
+    return tuple(
+        common_views[k] for k in choose_key_views([setup.cameras[v] for v in common_views], len(setup.key_views))
+    )

@@ -173,8 +173,8 @@ def relocated(error: ValueError, source: str, prefix: str, names: list[str]) -> 
     the fields is returned as it is.
     """
     text = re.sub(r"^[\w.]+\(\): ", "", str(error))
-    keyed = re.sub(r"`(\w+)`", lambda m: f"`{prefix}{m[1]}`" if m[1] in names else m[0], text)
-    return ValueError(f"{source}: {keyed}") if any(f"`{name}`" in text for name in names) else error
+    keyed_text = re.sub(r"`(\w+)`", lambda m: f"`{prefix}{m[1]}`" if m[1] in names else m[0], text)
+    return ValueError(f"{source}: {keyed_text}") if any(f"`{name}`" in text for name in names) else error
 
 
 def _replaced(config: Any, values: Mapping[str, Any], source: str, prefix: str) -> Any:
@@ -188,8 +188,8 @@ def _replaced(config: Any, values: Mapping[str, Any], source: str, prefix: str) 
             raise ValueError(f"{source}: `{key}` is unknown, expected {near}.")
         nested = next((arm for arm in arms_of(kinds[name]) if is_dataclass(arm) and isinstance(arm, type)), None)
         if nested and isinstance(value, Mapping):
-            before = getattr(config, name)
-            changes[name] = _replaced(nested() if before is None else before, value, source, f"{key}.")
+            current = getattr(config, name)
+            changes[name] = _replaced(nested() if current is None else current, value, source, f"{key}.")
         else:
             changes[name] = _converted(value, kinds[name])
             check_value(source, key, changes[name], kinds[name])
@@ -220,7 +220,8 @@ def _converted(value: Any, kind: Any) -> Any:
 
 def _table(config: Any, key: str) -> Iterator[str]:
     """Yield the lines of a table: its own settings, then the tables inside it."""
-    docs, kinds = field_docs(type(config)), types_of(type(config))
+    docs = field_docs(type(config))
+    kinds = types_of(type(config))
     values = {name: getattr(config, name) for name in kinds}
     nested = {name: value for name, value in values.items() if is_dataclass(value)}
     for name, value in values.items():

@@ -33,8 +33,6 @@ from morgs_mi.render.active_view import ActiveView, make_active_view
 from morgs_mi.render.region import Region, summed_area
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["ActiveSet", "ActiveSetConfig", "find_active_set", "full_active_set", "with_zero_motion"]
-
 # Fraction of a connected change that active Gaussians must cover to explain it.
 _EXPLAINED = 0.5
 # Fraction of a block's pixels above which it belongs to a connected change: fewer are noise, or the rim of one.

@@ -23,8 +23,6 @@ from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.rasterize import Image
 from morgs_mi.render.region import Region
 
-__all__ = ["Attribution", "densification_scores"]
-
 # Error that counts as noise, in typical errors of the image: normal noise, independent in three colours, exceeds 3 at
 # 3 of 10,000 pixels.
 _NOISE = 3.0

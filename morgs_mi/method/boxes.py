@@ -15,8 +15,6 @@ from morgs_mi.render.projection import project
 from morgs_mi.render.region import BlockGrid
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["Boxes", "boxes_around"]
-
 
 @dataclass(frozen=True, eq=False)
 class Boxes:

@@ -26,8 +26,6 @@ import numpy as np
 from morgs_mi.core.documentation import documented
 from morgs_mi.core.ranges import AtLeast, check_ranges
 
-__all__ = ["ChangeConfig", "box_around", "change_mask", "moving_region", "update_reference"]
-
 _GREY_LEVEL = 1 / 255
 # Standard deviations of normal noise in a median absolute deviation.
 _NORMAL = 1.4826

@@ -22,8 +22,6 @@ from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.method.neighbours import NeighbourIndex
 
-__all__ = ["share_confidence"]
-
 # Of 1: the chromaticity of darker colours is noise.
 _LEAST_COLOR = 0.02
 # Number of nearest Gaussians: more of them would pull along thin objects of few Gaussians.

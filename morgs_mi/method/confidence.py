@@ -10,8 +10,6 @@ import numpy as np
 from morgs_mi.method.mask_refiners.mask_config import MaskConfig
 from morgs_mi.method.mask_refiners.mask_registry import mask_refiner
 
-__all__ = ["flow_mask", "flow_threshold", "motion_floor", "motion_mask"]
-
 # px, the width of an image that `MaskConfig.floor` refers to.
 _FLOOR_WIDTH = 1352
 # Least threshold in px at any width: the noise of the flow itself.

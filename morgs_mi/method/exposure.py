@@ -16,8 +16,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-__all__ = ["LEAST_CHANGE", "Exposure", "centred", "common_change", "fit_exposure", "follow_exposure"]
-
 LEAST_CHANGE = 3e-3
 """Change of tones over time, of 1, below which an image is not corrected: it is an error of the measurement."""
 

@@ -14,8 +14,6 @@ from morgs_mi.method.flow_sources.flow_config import FlowConfig
 from morgs_mi.method.flow_sources.flow_registry import FlowSource, FramePair, flow_source
 from morgs_mi.method.mask_refiners.mask_config import MaskConfig
 
-__all__ = ["FlowObservation", "observe_key_views"]
-
 
 @dataclass(frozen=True, eq=False)
 class FlowObservation:

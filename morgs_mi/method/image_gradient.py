@@ -9,8 +9,6 @@ from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.view_group import backproject
 
-__all__ = ["blurred", "gradient_products", "image_gradient"]
-
 
 def blurred(image: np.ndarray, blur: float) -> np.ndarray:
     """Return an image [H, W, C] after a Gaussian filter of standard deviation `blur` in pixels; 0: as it is."""

@@ -46,8 +46,6 @@ from morgs_mi.method.motion_start import MotionStart
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.view_group import ViewGroup
 
-__all__ = ["LiftConfig", "lift_flow"]
-
 # Numbers of a pixel that are summed per Gaussian.
 _FLOW_MAPS = 4
 # Weight of the prior that nothing moves, in fully covered pixels without motion: a Gaussian that is hardly visible

@@ -15,8 +15,6 @@ from morgs_mi.core.types import Float, Tensor
 from morgs_mi.method.ssim import OnRegion, Target, WholeView
 from morgs_mi.render.region import Region
 
-__all__ = ["flow_loss", "mask_loss", "offset_loss", "recon_loss"]
-
 
 def recon_loss(image: Tensor, target: Target, dssim_weight: float = 0.2, region: Region | None = None) -> Tensor:
     """Return (1 - lambda) mean |I - I*| + lambda (1 - SSIM) (eq. 2), differentiable in `image`.

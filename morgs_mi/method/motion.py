@@ -23,8 +23,6 @@ from morgs_mi.method.propagation import propagate_motion
 from morgs_mi.method.search import search_motion
 from morgs_mi.method.ssim import Target
 
-__all__ = ["STAGES", "Stage", "initial_motion"]
-
 
 @dataclass(frozen=True)
 class Stage:

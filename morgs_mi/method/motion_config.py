@@ -17,8 +17,6 @@ from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS
 from morgs_mi.method.motion_model import MOTION_MODELS
 from morgs_mi.method.search import SearchConfig
 
-__all__ = ["MotionConfig"]
-
 
 @documented
 @dataclass(frozen=True)

@@ -31,16 +31,6 @@ from morgs_mi.method.method_registry import Registry
 if TYPE_CHECKING:
     from morgs_mi.method.motion_config import MotionConfig
 
-__all__ = [
-    "MOTION_MODELS",
-    "MotionModel",
-    "MotionModelFactory",
-    "motion_model",
-    "moved",
-    "quaternion_product",
-    "sparse_product",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class MotionModel:

@@ -17,8 +17,6 @@ from morgs_mi.method.ssim import Target
 from morgs_mi.method.sweep import MAPS, KeyImages
 from morgs_mi.render.active_view import ActiveView
 
-__all__ = ["MotionProblem", "MotionStart"]
-
 
 @dataclass(frozen=True, eq=False)
 class MotionStart:

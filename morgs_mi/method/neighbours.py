@@ -7,8 +7,6 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import KDTree
 
-__all__ = ["NeighbourIndex"]
-
 
 class NeighbourIndex:
     """Nearest neighbours among N points; the tree is built at the first query.

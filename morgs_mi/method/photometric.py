@@ -28,8 +28,6 @@ from morgs_mi.core.gaussians import displaced
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.sweep import relative_error
 
-__all__ = ["refine_start"]
-
 # Nearest Gaussians. Their pixels count, too, if they move: a small Gaussian alone may cover one straight edge.
 _NEIGHBOURS = 8
 # Weight of the prior that a step is 0, in pixels on which the contrast is 1 per px.

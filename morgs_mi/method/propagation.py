@@ -20,8 +20,6 @@ from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.sweep import relative_error
 
-__all__ = ["propagate_motion"]
-
 # Rounds of proposals from neighbours, after the one from the previous frame.
 _ROUNDS = 2
 # Nearest Gaussians that a proposal is drawn from.

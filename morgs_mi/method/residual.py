@@ -25,8 +25,6 @@ from morgs_mi.core.types import Tensor
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_start import MotionStart
 
-__all__ = ["apply_residual", "residual_parameters"]
-
 # Gate below which a lifted motion is no longer scaled up to pass the gate at full length.
 _MIN_GATE = 0.1
 _RESIDUALS = tuple(a.name for a in ATTRIBUTES if a.gate is not None)

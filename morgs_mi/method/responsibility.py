@@ -36,8 +36,6 @@ from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.region import Region, summed_area
 from morgs_mi.render.view_group import ViewGroup
 
-__all__ = ["ChangedView", "overlap", "responsibility"]
-
 
 @dataclass(frozen=True, eq=False)
 class ChangedView:

@@ -25,8 +25,6 @@ from morgs_mi.core.types import Float, Jit, Tensor
 from morgs_mi.method.motion_model import quaternion_product, sparse_product
 from morgs_mi.method.neighbours import NeighbourIndex
 
-__all__ = ["Neighbours", "find_neighbours", "isometry_loss", "rigid_loss", "rotation_loss"]
-
 # Scene extents below which a length counts as 0: the derivative of a norm is infinite there.
 _SHORT = 1e-6
 # Neighbours k of each Gaussian, as in the publication.

@@ -33,8 +33,6 @@ from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.neighbours import NeighbourIndex
 from morgs_mi.render.view_group import ViewGroup
 
-__all__ = ["SearchConfig", "search_motion"]
-
 _GRID = 16  # steps of the grid from 0 to its end, in each direction of each axis
 # Error of a Gaussian, in medians of all active ones, or in grey levels if the median is less, above which it is not
 # explained.

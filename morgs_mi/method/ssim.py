@@ -44,8 +44,6 @@ from morgs_mi.render.backend import on_aligned_stack
 from morgs_mi.render.kernel_recording import recorded
 from morgs_mi.render.region import Region
 
-__all__ = ["OnRegion", "Target", "WholeView"]
-
 _Read = Callable[[Float], list[Float]]  # plane -> its numbers around the lane's row
 
 # Noise and rendered colours exceed [0, 1] by less, 8-bit values by more.

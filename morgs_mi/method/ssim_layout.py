@@ -18,8 +18,6 @@ from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Bool, Float, Int32, Jit, UInt32
 from morgs_mi.render.region import Region, quotient
 
-__all__ = ["COLUMN", "RADIUS", "STRIP", "Lanes", "Planes", "Runs", "packet_type", "read_packet", "write_packet"]
-
 RADIUS = 5
 STRIP = 8  # pixels wide: a window extends at most into the next strip
 COLUMN = 16  # strips

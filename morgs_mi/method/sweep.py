@@ -24,8 +24,6 @@ from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.projection import concatenated
 from morgs_mi.render.view_group import Drawing, ViewGroup
 
-__all__ = ["MAPS", "KeyImages", "relative_error"]
-
 _Map = Callable[[list[Float], list[Float], list[Float]], list[Float]]
 
 MAPS: dict[str, _Map] = {

@@ -18,8 +18,6 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.render.rasterize import rasterize
 
-__all__ = ["DEFAULT_RIG", "Axes", "default_rig", "thinned"]
-
 Axes = Literal["y-down", "y-up", "z-up"]
 """Direction that is up, by axis. Files in the layout of 3D Gaussian Splatting mostly have COLMAP's axes, y down."""
 DEFAULT_RIG = "default_rig"

@@ -139,8 +139,9 @@ def has_confidence(stream: FrameSource) -> bool:
     Raises:
         ValueError: the header's metadata or the first packet is broken.
     """
-    learned = metadata_entry(stream, "config.motion.learn_confidence", True, bool)
-    return learned and any(gaussians.logit_confidence is not None for _, gaussians in islice(play(stream), 1))
+    learns_confidence = metadata_entry(stream, "config.motion.learn_confidence", True, bool)
+    first_frames = islice(play(stream), 1)
+    return learns_confidence and any(gaussians.logit_confidence is not None for _, gaussians in first_frames)
 
 
 def has_offset(packets: Iterable[Packet]) -> bool:
@@ -185,12 +186,12 @@ def playback_speed(stream: FrameSource, camera: Camera) -> dict[str, float]:
         _, gaussians = next(frames, (0, None))
         if gaussians is None:
             break
-        decoded = time.perf_counter()
+        end_of_decoding = time.perf_counter()
         if not times:
             render(gaussians, camera, ("color",), config)
         start_of_render = time.perf_counter()
         to_uint8(render(gaussians, camera, ("color",), config)["color"])
-        times.append((decoded - start, time.perf_counter() - start_of_render))
+        times.append((end_of_decoding - start, time.perf_counter() - start_of_render))
     decode, draw = np.median(times[1:] or times or [(np.nan, np.nan)], axis=0)
     return {"fps": float(1 / (decode + draw)), "decode_ms": float(1e3 * decode), "render_ms": float(1e3 * draw)}
 

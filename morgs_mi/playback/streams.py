@@ -22,8 +22,6 @@ from morgs_mi.playback.export.notebook import stream_html
 from morgs_mi.playback.player import PROVISIONAL, STREAM
 from morgs_mi.playback.trained_cameras import trained_cameras
 
-__all__ = ["DRAWN", "PlayableStream", "SplatFile", "open_stream", "stream_path"]
-
 DRAWN = 0.5
 """Share of invalid Gaussians up to which a file is drawn without them: beyond, the file as a whole is broken."""
 

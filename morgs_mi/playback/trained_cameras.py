@@ -17,8 +17,6 @@ from morgs_mi.core.rig import with_near_planes
 from morgs_mi.io.model_cameras import model_cameras
 from morgs_mi.playback.default_rig import thinned
 
-__all__ = ["trained_cameras"]
-
 _log = logging.getLogger(__name__)
 
 # Share of the Gaussians, weighted by opacity, that all cameras together see at least.

@@ -14,22 +14,6 @@ import numpy as np
 from morgs_mi.core.files import atomic_path
 from morgs_mi.io.png import png_bytes
 
-__all__ = [
-    "confidence_image",
-    "confidence_legend",
-    "contact_sheet",
-    "depth_image",
-    "depth_range",
-    "grey_image",
-    "label",
-    "motion_image",
-    "motion_legend",
-    "side_by_side",
-    "time_slice",
-    "to_uint8",
-    "write_png",
-]
-
 GAP = 4
 """Space between the images of a row or sheet, in pixels."""
 BACKGROUND = 255

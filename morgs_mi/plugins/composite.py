@@ -27,8 +27,6 @@ from morgs_mi.render.rasterize import Image, rasterize
 from morgs_mi.render.region import Region
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["composite", "cropped"]
-
 Crop = tuple[int, int, int, int]
 Columns = dict[str, list[Float]]
 

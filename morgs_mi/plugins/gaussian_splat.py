@@ -26,8 +26,6 @@ from morgs_mi.render.projection import AttachedCamera
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["GaussianSplatIntegrator"]
-
 _log = logging.getLogger(__name__)
 
 # Settings of the rasteriser that are properties of the plugin.

@@ -22,8 +22,6 @@ from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.render.rasterize import rasterize
 
-__all__ = ["CLIPPED", "light_probe", "radiance"]
-
 CLIPPED = 4.0
 """Radiance of colours that the video clipped at 1: a guess of two stops above white."""
 

@@ -25,8 +25,6 @@ from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, UInt32
 from morgs_mi.plugins.surface_view import shared_scene
 
-__all__ = ["shadow_ratio", "shadowed"]
-
 # Gaussians around one that determine the surface it lies on.
 _NEIGHBOURS = 16
 

@@ -28,8 +28,6 @@ from morgs_mi.core.types import Bool, Float, Jit
 from morgs_mi.plugins.light_probe import CLIPPED, radiance
 from morgs_mi.plugins.splat_rays import SplatRays
 
-__all__ = ["SplatPathIntegrator"]
-
 
 class SplatPathIntegrator(RBIntegrator):
     r"""Path tracer for surfaces among Gaussians (:monosp:`splat_path`), the `surfaces` of a `gaussian_splat`.

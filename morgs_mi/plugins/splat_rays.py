@@ -34,8 +34,6 @@ from morgs_mi.core.types import Bool, Float, Jit, UInt32
 from morgs_mi.render.projection import FARTHEST
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["SplatRays"]
-
 # Gaussians that one walk through the tree sorts.
 _SORTED = 16
 # Smallest aspect of a Gaussian: float32 has no digits for thinner ones.

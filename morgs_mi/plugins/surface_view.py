@@ -22,17 +22,6 @@ from morgs_mi.core.types import Bool, Float, Tensor, UInt32
 from morgs_mi.plugins.splat_rays import SplatRays
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = [
-    "SampledPixels",
-    "SurfaceView",
-    "coverage_and_depth",
-    "lights",
-    "rays_for",
-    "shared_scene",
-    "surface_scene",
-    "traced",
-]
-
 _log = logging.getLogger(__name__)
 
 # Rays along each axis of a pixel that find its coverage and depth.

@@ -17,8 +17,6 @@ from morgs_mi.render.rasterize import Image, rasterize
 from morgs_mi.render.region import BlockGrid, Region
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["ActiveView", "make_active_view"]
-
 
 @dataclass(frozen=True, eq=False)
 class ActiveView:

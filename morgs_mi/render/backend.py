@@ -8,8 +8,6 @@ import mitsuba as mi
 from morgs_mi.core.types import Int32, UInt32
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["add_mode", "block_shape", "on_aligned_stack", "stable_order"]
-
 
 def _backend() -> dr.JitBackend:
     return dr.backend_v(mi.Float)

@@ -24,8 +24,6 @@ from morgs_mi.render.projection import Splats
 from morgs_mi.render.region import ACROSS, DOWN, NO_SLOT, Region, quotient
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["BlockLists", "build_lists", "fetch_record", "next_entry", "pack_records", "sorted_buckets", "touches"]
-
 # A thousandth of an octave: the block test may accept too many entries, never too few.
 _TEST_SLACK = 1e-3
 

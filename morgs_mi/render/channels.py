@@ -9,15 +9,6 @@ from __future__ import annotations
 
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME, Attribute
 
-__all__ = [
-    "NORMALISED",
-    "aov_attributes",
-    "attribute_channels",
-    "attribute_widths",
-    "channel_sizes",
-    "exr_names",
-]
-
 _OWN_RULE = {"color": 3, "depth": 1, "motion": 2, "guided_motion": 2}
 
 NORMALISED = ("depth", "motion", "guided_motion")

@@ -13,7 +13,6 @@ from morgs_mi.render.blocks import BlockLists, pack_records, sorted_buckets
 from morgs_mi.render.kernel_recording import recorded
 from morgs_mi.render.loops import (
     Blocks,
-    Channel,
     Layout,
     adjoint,
     adjoint_of_pairs,
@@ -23,8 +22,6 @@ from morgs_mi.render.loops import (
     tangent,
 )
 from morgs_mi.render.region import Region, on_region, quotient
-
-__all__ = ["Channel", "Layout", "blend", "padded", "weighted_sums"]
 
 
 def blend(

@@ -20,8 +20,6 @@ import mitsuba as mi
 from morgs_mi.core.types import Float
 from morgs_mi.render.exp2 import exp2
 
-__all__ = ["FARTHEST_CUT", "PROFILE", "Cut", "CutAlpha"]
-
 PROFILE = 4  # z, gx, gy, 1 / sigma
 
 _LN2 = log(2.0)

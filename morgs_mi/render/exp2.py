@@ -7,8 +7,6 @@ import mitsuba as mi
 
 from morgs_mi.core.types import Float
 
-__all__ = ["exp2"]
-
 # Minimax over [-1/2, 1/2], highest power first: relative error 2.7e-6 in float32, like Taylor's fifth degree.
 _EXP2 = (0.009570102207362652, 0.05591786280274391, 0.240247443318367, 0.6931217908859253, 0.9999992847442627)
 

@@ -21,8 +21,6 @@ import mitsuba as mi
 
 from morgs_mi.core.types import Jit
 
-__all__ = ["recorded", "render_lock", "with_render_lock"]
-
 P = ParamSpec("P")
 R = TypeVar("R")
 

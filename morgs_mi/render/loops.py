@@ -38,18 +38,6 @@ from morgs_mi.render.exp2 import exp2
 from morgs_mi.render.region import Region
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = [
-    "Blocks",
-    "Channel",
-    "Layout",
-    "adjoint",
-    "adjoint_of_pairs",
-    "pair_packets",
-    "primal",
-    "record_packets",
-    "tangent",
-]
-
 _LN2 = log(2.0)
 _SHAPE = 6  # mean_x, mean_y, a, b, c, log2_opacity
 

@@ -37,8 +37,6 @@ from morgs_mi.core.types import Bool, Float, Jit, Tensor, UInt32
 from morgs_mi.render.channels import attribute_channels
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["FARTHEST", "AttachedCamera", "Splats", "Views", "concatenated", "project"]
-
 _HALF_LOG2E = 0.5 * log2(2.718281828459045)
 
 # World units, or units of a channel; squares of what is farther or larger overflow.

@@ -21,13 +21,12 @@ from morgs_mi.io.png import png_bytes
 from morgs_mi.render.backend import block_shape
 from morgs_mi.render.blocks import build_lists, touches
 from morgs_mi.render.channels import NORMALISED, attribute_channels, channel_sizes
-from morgs_mi.render.compositing import Channel, Layout, blend
+from morgs_mi.render.compositing import Layout, blend
 from morgs_mi.render.kernel_recording import with_render_lock
+from morgs_mi.render.loops import Channel
 from morgs_mi.render.projection import FARTHEST, Splats, project
 from morgs_mi.render.region import Region, full_view
 from morgs_mi.render.render_config import RenderConfig
-
-__all__ = ["Image", "rasterize"]
 
 # Beside the channels color, depth, motion and confidence, a record then takes seven packets of 4 floats.
 _MOST_FEATURES = 12

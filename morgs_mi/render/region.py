@@ -23,19 +23,6 @@ from morgs_mi.core.types import Float, UInt32
 from morgs_mi.render.backend import block_shape
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = [
-    "ACROSS",
-    "DOWN",
-    "NO_SLOT",
-    "BlockGrid",
-    "Region",
-    "full_view",
-    "joined",
-    "on_region",
-    "quotient",
-    "summed_area",
-]
-
 # Blocks of a tile, across and down: one for each bit of a word.
 ACROSS = 4
 DOWN = 8

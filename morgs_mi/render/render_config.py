@@ -8,8 +8,6 @@ from typing import Annotated
 from morgs_mi.core.documentation import documented
 from morgs_mi.core.ranges import Above, AtLeast, AtMost, Below, MultipleOf, check_ranges
 
-__all__ = ["RenderConfig"]
-
 
 @documented
 @dataclass(frozen=True)

@@ -20,13 +20,12 @@ from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, UInt32
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.blocks import BlockLists, build_lists, pack_records, touches
-from morgs_mi.render.compositing import Channel, Layout, blend, weighted_sums
+from morgs_mi.render.compositing import Layout, blend, weighted_sums
 from morgs_mi.render.kernel_recording import with_render_lock
+from morgs_mi.render.loops import Channel
 from morgs_mi.render.projection import Splats, Views, project
 from morgs_mi.render.region import Region, joined, quotient
 from morgs_mi.render.render_config import RenderConfig
-
-__all__ = ["Drawing", "ViewGroup", "backproject"]
 
 
 class ViewGroup:

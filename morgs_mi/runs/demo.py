@@ -32,8 +32,6 @@ from morgs_mi.runs.recording import FitFiles, Recording, read_reports, stream_me
 from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
-__all__ = ["DemoConfig", "DemoReport", "run_demo"]
-
 _COMPARED = ("psnr", "ssim", "motion_error", "motion_error_moving", "motion_error_still", "true_motion_moving")
 # Factor on the error images: errors of a tenth are visible, typical ones are smaller.
 _ERROR_GAIN = 4

@@ -33,8 +33,6 @@ from morgs_mi.io.video import natural_key
 from morgs_mi.playback.default_rig import DEFAULT_RIG, Axes, default_rig
 from morgs_mi.runs.recording import due_keyframe
 
-__all__ = ["Imported", "find_frames", "import_frames", "matched_rows", "same_gaussians"]
-
 _FRAMES_IN_VIEW = 3  # first, middle and last
 # With rows of other Gaussians the share is about a half; with the same ones, only near-duplicates reduce it.
 _LEAST_SHARE = 0.95

@@ -23,16 +23,6 @@ from morgs_mi.core.files import write_json
 from morgs_mi.core.ranges import AtLeast, AtMost, check_ranges
 from morgs_mi.io.bounded import read_json
 
-__all__ = [
-    "CameraDisturbance",
-    "Disturbances",
-    "compressed",
-    "draw_disturbances",
-    "load_disturbances",
-    "save_disturbances",
-    "undistorted",
-]
-
 
 @dataclass(frozen=True)
 class Disturbances:

@@ -16,12 +16,6 @@ import numpy as np
 from morgs_mi.capture.truth import GroundTruth
 from morgs_mi.core.camera import Camera
 
-__all__ = [
-    "SurfacePoints",
-    "compute_ground_truth",
-    "move_with_objects",
-]
-
 
 @dataclass(frozen=True)
 class SurfacePoints:

@@ -16,8 +16,6 @@ from morgs_mi.synth.disturbances import undistorted
 from morgs_mi.synth.ground_truth import SurfacePoints
 from morgs_mi.synth.scene import Scene
 
-__all__ = ["PathTracer", "developed", "srgb_bytes"]
-
 # A hit within this share of a point's distance is its own surface: intersections are single-precision.
 _OWN_SURFACE = 1e-4
 

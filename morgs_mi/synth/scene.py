@@ -23,19 +23,6 @@ from scipy.spatial.transform import Rotation
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.core.documentation import page
 
-__all__ = [
-    "Light",
-    "Object",
-    "RecordingDefaults",
-    "Rig",
-    "Scene",
-    "check_scene",
-    "failures_in",
-    "load_scene",
-    "rotate",
-    "translate",
-]
-
 Pose = Callable[[float], np.ndarray]
 
 

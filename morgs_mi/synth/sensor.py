@@ -11,8 +11,6 @@ from morgs_mi.synth.disturbances import CameraDisturbance
 from morgs_mi.synth.path_tracer import PathTracer
 from morgs_mi.synth.synth_config import SynthConfig
 
-__all__ = ["check_lenses", "record_light"]
-
 # Rows that a rolling shutter reads at one time; at 10 pixels per frame, objects move by 0.2 pixels in this time.
 _BAND = 4
 

@@ -9,8 +9,6 @@ import numpy as np
 
 from morgs_mi.synth.scene import rotate, translate
 
-__all__ = ["ball", "box", "disk", "rod"]
-
 Material = dict[str, Any]
 
 

@@ -13,7 +13,6 @@ from morgs_mi.synth.disturbances import Disturbances
 if TYPE_CHECKING:
     from morgs_mi.synth.scene import RecordingDefaults
 
-__all__ = ["SynthConfig"]
 # Frame rates that the encoders of videos take, and numbers of samples that a sampler of Mitsuba takes.
 _FPS = "(0, 1000]"
 _SPP = "[1, 1e6]"

@@ -40,8 +40,6 @@ from morgs_mi.synth.scene import Scene, check_scene, load_scene
 from morgs_mi.synth.sensor import check_lenses, record_light
 from morgs_mi.synth.synth_config import SynthConfig
 
-__all__ = ["synthesize"]
-
 _LOG = logging.getLogger(__name__)
 # Bytes of a pixel of an image with its ground truth.
 _PIXEL_BYTES = 100

@@ -12,8 +12,6 @@ import numpy as np
 
 from morgs_mi.synth.scene import Light, Object
 
-__all__ = ["lights", "pattern", "room", "textured"]
-
 RGB = tuple[float, float, float]
 _SIZE = 512  # texels across
 

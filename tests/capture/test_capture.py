@@ -321,7 +321,7 @@ def test_load_capture__refuses_point_colours_out_of_range(tmp_path: Path, colors
     (row,) = (line for line in (path / "sparse/0/points3D.txt").read_text().splitlines() if line[0] != "#")
     fields = [*row.split()[:4], *map(str, colors[0]), "0.5"]
     (path / "sparse/0/points3D.txt").write_text(" ".join(fields) + "\n")
-    with pytest.raises(ValueError, match=r"`point_colors` must be from 0 to 32 with white at 1, got .*; divide"):
+    with pytest.raises(ValueError, match=r"`point_colors` must be in \[0, 1\], got .*; divide"):
         load_capture(path)
 
 

@@ -13,7 +13,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import display_image, encode_light
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.input_images import copied_images
-from morgs_mi.loop.observation import Seen, observe_frame, prepare
+from morgs_mi.loop.observation import ImageHistory, observe_frame, prepare
 from morgs_mi.loop.stream_config import StreamConfig
 
 CAMERA = Camera.look_at((0, 0, -3), (0, 0, 0), (0, -1, 0), 50, 6, 5, "cam")
@@ -78,25 +78,25 @@ def test_copied_images__refuses_others(image, message):
 def observed(images, before=None, **kwargs):
     config = StreamConfig(fit=FitConfig(num_gaussians=100))
     setup = prepare([CAMERA], np.zeros((0, 3)), np.zeros((0, 3)), config, **kwargs)
-    return observe_frame(setup, 0, before or Seen(), images)
+    return observe_frame(setup, 0, before or ImageHistory(), images)
 
 
 def test_observe_frame__keeps_light_for_the_fit_and_shows_8_bits():
     result = observed([LIGHT], display_exposure=-1.0)
     np.testing.assert_array_equal(result.encoded[0], encode_light(LIGHT))
     assert result.encoded[0].dtype == np.float32
-    np.testing.assert_array_equal(result.seen.images[0], display_image(LIGHT, -1))
+    np.testing.assert_array_equal(result.history.images[0], display_image(LIGHT, -1))
 
 
 def test_observe_frame__first_frame_determines_the_display_exposure():
     first = observed([LIGHT])
     white = np.percentile(LIGHT.max(axis=-1), 99)
-    assert first.seen.display_exposure == pytest.approx(-np.log2(white))
-    later = observed([100 * LIGHT], first.seen)
-    assert later.seen.display_exposure == first.seen.display_exposure
+    assert first.history.display_exposure == pytest.approx(-np.log2(white))
+    later = observed([100 * LIGHT], first.history)
+    assert later.history.display_exposure == first.history.display_exposure
 
 
 def test_observe_frame__bytes_are_compared_and_shown_alike():
     result = observed([GREY])
-    assert result.encoded[0] is result.seen.images[0]
+    assert result.encoded[0] is result.history.images[0]
     np.testing.assert_array_equal(result.encoded[0], GREY)

@@ -123,3 +123,12 @@ def test_follow_exposure__finds_a_change_of_two_percent():
     image = as_bytes(scene(size=(120, 160)))
     change = Exposure((1.02, 0.98, 1.0), (0.0011, -0.0011, 0))
     assert_close(follow_exposure(image, as_bytes(change(image / 255))), change, 2e-3)
+
+
+def test_corrected__factor_on_the_light_is_removed_also_above_white():
+    light = np.geomspace(0.01, 100, 30, dtype=np.float32).reshape(2, 5, 3)
+    gain = 1.3 ** (1 / 2.4)
+    exposure = Exposure((gain,) * 3, (0.055 * (gain - 1),) * 3)
+    corrected = exposure.corrected(encode_light(1.3 * light).astype(np.float32))
+    assert corrected.dtype == np.float32
+    np.testing.assert_allclose(corrected, encode_light(light), rtol=1e-5)

@@ -6,8 +6,6 @@ import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-__all__ = ["files_end_at"]
-
 
 @contextmanager
 def files_end_at(size: int) -> Iterator[None]:

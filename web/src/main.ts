@@ -86,6 +86,7 @@ interface Metadata {
   config?: { render?: object };
   motion_scale?: number;
   default_rig?: boolean;
+  transfer?: { display_exposure?: number };
 }
 
 class Player {
@@ -218,6 +219,7 @@ class Player {
     const metadata = stream.metadata as Metadata;
     this.motionScale = metadata.motion_scale ?? 0.03;
     this.splats = new Splats(canvas, stream.metadata, unit);
+    this.splats.expose(metadata.transfer?.display_exposure ?? 0);
     this.view = new View(this.cameras, unit, canvas, () => this.followView());
     if (metadata.default_rig === true) this.bound(); // no recorded views to stay near
     cameraList.replaceChildren(...this.cameras.map(({ name }, i) => new Option(name, String(i))));
@@ -427,6 +429,8 @@ class Player {
       r: () => this.selectCamera(camera),
       "<": () => this.selectSpeed(speedList.selectedIndex - 1),
       ">": () => this.selectSpeed(speedList.selectedIndex + 1),
+      "[": () => this.splats.expose(-0.5),
+      "]": () => this.splats.expose(0.5),
       l: () => this.repeat(),
       b: () => this.bound(),
       v: () => this.wipe(),

@@ -27,12 +27,23 @@ const POST = /* glsl */ `
 uniform sampler2D image;
 uniform sampler2D colors;
 uniform int mode;
+uniform float stops;
 varying vec2 at;
+
+// The transfer curve of morgs_mi/core/color_space.py.
+vec3 decoded(vec3 y) {
+  vec3 srgb = mix(y / 12.92, pow((max(y, 0.0) + 0.055) / 1.055, vec3(2.4)), step(0.04045, y));
+  return mix(srgb, exp((max(y, 1.0) - 1.0) * 2.4 / 1.055), step(1.0, y));
+}
+
+vec3 encoded(vec3 x) {
+  return mix(12.92 * x, 1.055 * pow(max(x, 0.0), vec3(1.0 / 2.4)) - 0.055, step(0.0031308, x));
+}
 
 void main() {
   vec4 blended = texture2D(image, at);
   if (mode == 0) {
-    gl_FragColor = vec4(blended.rgb, 1.0);
+    gl_FragColor = vec4(encoded(min(exp2(stops) * decoded(blended.rgb), 1.0)), 1.0);
   } else if (mode == 1) {
     vec2 m = blended.b > 0.0 ? blended.rg / blended.b - ${SHIFT}.0 : vec2(0.0);
     float sixth = fract(atan(m.y, m.x) / 6.283185307179586) * 6.0;
@@ -66,6 +77,8 @@ export class Splats {
   private readonly target = new THREE.WebGLRenderTarget(1, 1, { type: THREE.HalfFloatType, depthBuffer: false });
   private readonly post: FullScreenQuad;
   private changed = true;
+  /** Stops by which the colours are brightened before they are clipped at white. */
+  private stops = 0;
 
   constructor(canvas: HTMLCanvasElement, metadata: Record<string, unknown>, unit: number) {
     // Colours are display-referred, and blended as they are.
@@ -86,7 +99,7 @@ export class Splats {
     const colors = new THREE.DataTexture(CONFIDENCE_COLORS, CONFIDENCE_COLORS.length / 4, 1);
     colors.minFilter = colors.magFilter = THREE.LinearFilter;
     colors.needsUpdate = true;
-    const values = { image: { value: this.target.texture }, colors: { value: colors }, mode: { value: 0 } };
+    const values = { image: { value: this.target.texture }, colors: { value: colors }, mode: { value: 0 }, stops: { value: 0 } };
     this.post = new FullScreenQuad(
       new THREE.ShaderMaterial({ uniforms: values, vertexShader: POST_VERTEX, fragmentShader: POST }),
     );
@@ -111,6 +124,13 @@ export class Splats {
     this.changed = true;
   }
 
+  /** Show the colours brighter by some stops. */
+  expose(stops: number): void {
+    this.stops += stops;
+    (this.post.material as THREE.ShaderMaterial).uniforms.stops.value = this.stops;
+    this.changed = true;
+  }
+
   /** Follow the camera; `saturation` is the tangent of the motion that is fully saturated. */
   setView(camera: THREE.PerspectiveCamera, saturation: number): void {
     camera.updateMatrixWorld();
@@ -124,7 +144,7 @@ export class Splats {
   draw(camera: THREE.PerspectiveCamera): void {
     if (!this.changed) return;
     this.changed = false;
-    const direct = this.mode === "color" && this.displayedMode() === "color";
+    const direct = this.stops === 0 && this.mode === "color" && this.displayedMode() === "color";
     this.renderer.setRenderTarget(direct ? null : this.target);
     this.renderer.render(this.scene, camera);
     this.renderer.setRenderTarget(null);

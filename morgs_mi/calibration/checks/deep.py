@@ -28,8 +28,6 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.color_correction import matched_colors
 from morgs_mi.core.rig import overlaps
 
-__all__ = ["MAX_FRAMES", "DeepCheck", "Finding", "check_deep", "check_exposures"]
-
 # Largest number of frames that are read: the start of a longer recording shows its faults.
 MAX_FRAMES = 120
 # Multiple of the other cameras' reprojection error from which an error is a finding.

@@ -19,14 +19,6 @@ from morgs_mi.capture.layouts.calibration import PoseConvention
 from morgs_mi.capture.layouts.layout_registry import layout_called
 from morgs_mi.core.camera import Camera
 
-__all__ = [
-    "camera_candidates",
-    "focal_candidates",
-    "rig_candidates",
-    "same_poses",
-    "with_focal_factor",
-]
-
 # A camera or the cameras of a rig.
 T = TypeVar("T")
 

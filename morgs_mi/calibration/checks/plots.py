@@ -16,8 +16,6 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.rig import up_direction
 
-__all__ = ["check_plot", "draw_deep", "draw_rig", "write_rig"]
-
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".svg", ".pdf")
 # Inches.
 _WIDTH = 14.4

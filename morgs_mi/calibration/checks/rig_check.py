@@ -30,17 +30,6 @@ from morgs_mi.capture.features import Features, Match, detect, match_views, repr
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.random_streams import Stream, rng_of
 
-__all__ = [
-    "MAX_ERROR",
-    "CameraCheck",
-    "RigCheck",
-    "SharedFeatures",
-    "check_rig",
-    "dense_points",
-    "match_capture",
-    "triangulate_points",
-]
-
 # px. Distortion that a layout cannot represent causes errors of about a pixel, a wrong pose tens of pixels.
 MAX_ERROR = 2.0
 # With a wrong pose a few matches may fit by chance, but not this many.

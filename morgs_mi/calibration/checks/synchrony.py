@@ -19,8 +19,6 @@ from numpy.typing import ArrayLike
 from morgs_mi.calibration.checks.signals import known_median
 from morgs_mi.core.camera import Camera
 
-__all__ = ["consensus", "time_offsets"]
-
 _PLANES = 48
 # Grey levels, and multiples of a frame's median change, below which a change is noise or compression.
 _NOISE, _MEDIANS = 6.0, 5.0

@@ -34,8 +34,6 @@ from morgs_mi.core.checks import LARGEST, bounded
 from morgs_mi.io.bounded import MAX_TOML, read_text, read_toml
 from morgs_mi.io.unread import warn_unread
 
-__all__ = ["LAYOUT", "read_anipose"]
-
 _KEYS = ("matrix", "distortions", "rotation", "translation")
 _CAMERA = {*_KEYS, "name", "size", "fisheye"}
 # Entries of caliscope, FreeMoCap and Pose2Sim that say nothing about the lenses and poses.

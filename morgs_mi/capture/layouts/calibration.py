@@ -29,18 +29,6 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.io.listing import VIDEO_SUFFIXES, listed
 from morgs_mi.io.video import Clip, natural_key
 
-__all__ = [
-    "NO_POINTS",
-    "Calibration",
-    "Layout",
-    "Match",
-    "PoseConvention",
-    "calibration_files",
-    "match_clips",
-    "only_calibration",
-    "required_clips",
-]
-
 _LOG = logging.getLogger(__name__)
 
 # Names in a message: a model may have hundreds of images.

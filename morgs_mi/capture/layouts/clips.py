@@ -27,18 +27,6 @@ from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, VIDEO_SUFFIXES, imag
 from morgs_mi.io.remote import fetched
 from morgs_mi.io.video import Clip, natural_key, numbering_gap, open_frames
 
-__all__ = [
-    "EXAMPLE",
-    "ImageSizes",
-    "check_frames",
-    "clip_of_camera",
-    "clips_by_camera",
-    "clips_by_frame",
-    "names_without",
-    "photos",
-    "view_of_image",
-]
-
 _LOG = logging.getLogger(__name__)
 
 EXAMPLE = "one folder per camera: cam01/0000.png, cam01/0001.png, ..., cam02/0000.png, cam02/0001.png, ..."

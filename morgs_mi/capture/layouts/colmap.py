@@ -41,8 +41,6 @@ from morgs_mi.io.video import natural_key
 if TYPE_CHECKING:
     import pycolmap
 
-__all__ = ["LAYOUT", "ColmapModel", "find_colmap", "read_colmap", "write_colmap", "write_reconstruction"]
-
 _LOG = logging.getLogger(__name__)
 
 _FILES = ("cameras", "images", "points3D")

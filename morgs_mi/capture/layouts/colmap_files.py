@@ -17,16 +17,6 @@ import numpy as np
 from morgs_mi.capture.lens import MODELS
 from morgs_mi.io.bounded import encoding_of, read_bytes, regular
 
-__all__ = [
-    "binary_cameras",
-    "binary_images",
-    "binary_points",
-    "count_images",
-    "text_cameras",
-    "text_images",
-    "text_points",
-]
-
 # The least bytes of an image in a binary model.
 _IMAGE_BYTES = 73
 # What precedes the name of an image in a line of text: nine words, and one space. The name may begin with spaces.

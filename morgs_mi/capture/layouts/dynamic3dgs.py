@@ -24,8 +24,6 @@ from morgs_mi.io.bounded import read_array, read_json
 from morgs_mi.io.unread import warn_unread
 from morgs_mi.io.video import natural_key
 
-__all__ = ["LAYOUT", "MetaCamera", "read_meta", "read_point_cloud"]
-
 _LOG = logging.getLogger(__name__)
 
 _KEYS = ("w", "h", "k", "w2c", "fn", "cam_id")

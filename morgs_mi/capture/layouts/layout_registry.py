@@ -13,8 +13,6 @@ from morgs_mi.capture.layouts.calibration import Layout, required_clips
 from morgs_mi.capture.layouts.clips import EXAMPLE
 from morgs_mi.io.bounded import read_json
 
-__all__ = ["LAYOUTS", "find_layout", "layout_called"]
-
 _READERS = (
     "colmap",
     "nerfstudio",

@@ -35,8 +35,6 @@ from morgs_mi.io.ply import read_vertices
 from morgs_mi.io.unread import warn_unread
 from morgs_mi.io.video import Clip
 
-__all__ = ["LAYOUT", "Transforms", "read_points_ply", "read_transforms"]
-
 _LOG = logging.getLogger(__name__)
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])

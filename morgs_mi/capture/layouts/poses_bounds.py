@@ -21,8 +21,6 @@ from morgs_mi.core.files import atomic_path
 from morgs_mi.io.bounded import read_array
 from morgs_mi.io.video import Clip
 
-__all__ = ["LAYOUT", "count_rows", "read_poses_bounds", "write_poses_bounds"]
-
 
 def read_poses_bounds(path: str | Path, names: Sequence[str]) -> tuple[tuple[Camera, ...], np.ndarray]:
     """Return one camera per name, and their depth bounds [C, 2] in world units.

@@ -37,8 +37,6 @@ from morgs_mi.core.checks import LARGEST, bounded
 from morgs_mi.io.bounded import check_claim, encoding_of, read_bytes
 from morgs_mi.io.unread import warn_unread
 
-__all__ = ["LAYOUT", "read_qualisys"]
-
 _LOG = logging.getLogger(__name__)
 
 _PATTERN = "*.qca.txt"

@@ -7,8 +7,6 @@ import numpy as np
 
 from morgs_mi.method.flow_sources.flow_config import FlowConfig
 
-__all__ = ["consistency_mask"]
-
 
 def consistency_mask(flow: np.ndarray, back: np.ndarray, config: FlowConfig | None = None) -> np.ndarray:
     """Return the mask of reliable flow [H, W], bool: pixels that the flow back returns to where they started.

@@ -29,8 +29,6 @@ from morgs_mi.io.listing import listed
 from morgs_mi.method.flow_sources.flow_config import FlowConfig
 from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FlowSource, FramePair
 
-__all__ = ["SUFFIXES", "FlowFolder", "read_flow", "write_flow"]
-
 SUFFIXES = (".flo", ".exr")
 
 _MAGIC = 202021.25

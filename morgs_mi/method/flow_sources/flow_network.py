@@ -22,8 +22,6 @@ from morgs_mi.io.onnx_file import OnnxNetwork, written_shapes
 from morgs_mi.method.flow_sources.flow_config import FlowConfig
 from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FlowSource, both_directions
 
-__all__ = ["VALUE_RANGES", "FlowNetwork"]
-
 # Values of black and white. RAFT's and SEA-RAFT's own code takes bytes and normalises inside; torchvision's RAFT takes
 # -1 to 1.
 VALUE_RANGES = {"onnx": (0.0, 255.0), "onnx-unit": (0.0, 1.0), "onnx-signed": (-1.0, 1.0)}

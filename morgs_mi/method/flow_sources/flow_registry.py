@@ -18,8 +18,6 @@ import numpy as np
 from morgs_mi.method.flow_sources.flow_config import FlowConfig
 from morgs_mi.method.method_registry import Registry
 
-__all__ = ["FLOW_SOURCES", "FlowSource", "FramePair", "both_directions", "check_images", "flow_source"]
-
 
 @dataclass(frozen=True, eq=False)
 class FramePair:

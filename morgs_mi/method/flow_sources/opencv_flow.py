@@ -17,8 +17,6 @@ import numpy as np
 from morgs_mi.method.flow_sources.flow_config import FlowConfig
 from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FlowSource, both_directions, check_images
 
-__all__ = ["FLOW_METHODS", "optical_flow"]
-
 # Side of an image in pixels below which the methods have too little to match: DIS needs patches of 8 pixels on its
 # coarsest level.
 _MIN_SIDE = 16

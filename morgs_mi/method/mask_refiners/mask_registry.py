@@ -17,8 +17,6 @@ import numpy as np
 from morgs_mi.method.mask_refiners.mask_config import MaskConfig
 from morgs_mi.method.method_registry import Registry
 
-__all__ = ["MASK_REFINERS", "MaskRefiner", "mask_refiner"]
-
 MaskRefiner = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 MASK_REFINERS: Registry[MaskRefiner, MaskConfig] = Registry("mask_refiner()", "mask_method")

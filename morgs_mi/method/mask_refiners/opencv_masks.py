@@ -8,8 +8,6 @@ import numpy as np
 from morgs_mi.method.mask_refiners.mask_config import MaskConfig
 from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskRefiner
 
-__all__ = ["clean_mask", "refine_mask", "vote_superpixels"]
-
 # Radius in pixels of the opening that removes specks.
 _OPENING = 1
 # Radius of the closing that fills holes, in widths of the mask; at least a pixel.

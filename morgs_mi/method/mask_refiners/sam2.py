@@ -26,8 +26,6 @@ from morgs_mi.method.mask_refiners.mask_config import MaskConfig
 from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskRefiner
 from morgs_mi.method.mask_refiners.opencv_masks import clean_mask
 
-__all__ = ["SegmentNetwork", "prompts"]
-
 # SAM2's own size, for an encoder that leaves it open.
 _SIZE = 1024
 # The decoder's optional mask input, which is left empty here, has a quarter of the image's side.

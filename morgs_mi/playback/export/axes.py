@@ -9,8 +9,6 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.rig import up_direction
 
-__all__ = ["gltf_axes"]
-
 
 def gltf_axes(cameras: Sequence[Camera]) -> np.ndarray:
     """Return the rotation [3, 3] from world to glTF axes: y is the cameras' mean up, x nearly the first one's right."""

@@ -16,18 +16,6 @@ from morgs_mi.playback.default_rig import DEFAULT_RIG
 from morgs_mi.playback.export.paths import CameraPath, focus, load_path, orbit, through_cameras
 from morgs_mi.playback.player import available_channels, render, render_config
 
-__all__ = [
-    "flight",
-    "flight_views",
-    "frame_numbers",
-    "named_path",
-    "num_images",
-    "repeated_frames",
-    "repeated_seconds",
-    "select_frames",
-    "write_each",
-]
-
 Progress = Callable[[int, int], None] | None
 # Angle of an orbit around Gaussians without a recording. Scenes fall apart from behind, and may be tilted.
 _SWING = 60.0
@@ -214,13 +202,13 @@ def repeated_frames(
 
 def _frames_backwards(stream: FrameSource) -> Iterator[Gaussians]:
     """Yield the frames between the first and the last one backwards, decoded from one keyframe to the next."""
-    between = frame_numbers(stream)[1:-1]
-    while between:
+    inner_frames = frame_numbers(stream)[1:-1]
+    while inner_frames:
         block: list[FrameState] = []
-        for state in stream.states(between[-1]):
+        for state in stream.states(inner_frames[-1]):
             block = [*(earlier for earlier in block if earlier.frame < state.frame), state]
-            if state.frame == between[-1]:
+            if state.frame == inner_frames[-1]:
                 break
         # A keyframe has no motion of its own: it follows from the residual, in the block before.
         yield from (state.gaussians for state in block[:0:-1])
-        between = [frame for frame in between if frame <= block[0].frame]
+        inner_frames = [frame for frame in inner_frames if frame <= block[0].frame]

@@ -9,8 +9,6 @@ from pathlib import Path
 
 from morgs_mi.capture.outputs import check_output
 
-__all__ = ["GLTF", "IMAGES", "PLY", "TRACKS", "USD", "VIDEO", "WEB", "Format", "choose_format", "destination"]
-
 
 @dataclass(frozen=True)
 class Format:

@@ -18,8 +18,6 @@ from morgs_mi.playback.export.formats import IMAGES, choose_format
 from morgs_mi.playback.player import channel_image, render_stream, stream_exposure
 from morgs_mi.playback.visualise import side_by_side, write_png
 
-__all__ = ["exr_channels", "pad_to_even", "write_frames", "write_images"]
-
 
 def write_frames(
     stream: FrameSource,

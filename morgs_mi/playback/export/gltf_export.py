@@ -28,8 +28,6 @@ from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import rotated, unit_quats
 
-__all__ = ["glb", "write_gltf"]
-
 _NAME = "KHR_gaussian_splatting"
 _FLOAT = 5126
 _ARRAY_BUFFER = 34962

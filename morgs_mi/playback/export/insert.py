@@ -38,17 +38,6 @@ from morgs_mi.render.channels import exr_names
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.synth.scene import failures_in
 
-__all__ = [
-    "LAYERS",
-    "InsertConfig",
-    "Light",
-    "captured_light",
-    "inserted_channels",
-    "load_insert",
-    "render_inserted",
-    "selected",
-]
-
 LAYERS = ("splats", "surfaces", "shadow")
 """Further channels, for compositing: the splats alone and the surfaces alone, in linear light with alpha, and the
 shadow of the surfaces on the splats, a factor of their linear light."""
@@ -133,10 +122,11 @@ def selected(stream: FrameSource, frames: Sequence[int]) -> list[int]:
         ValueError: the stream does not have one of them.
     """
     numbers = frame_numbers(stream)
-    missing = sorted(set(frames) - set(numbers))
-    if missing:
+    missing_frames = sorted(set(frames) - set(numbers))
+    if missing_frames:
         raise ValueError(
-            f"{stream.path}: the frames must be out of {numbers[0]} to {numbers[-1]}, got {missing[0]}; choose others."
+            f"{stream.path}: the frames must be out of {numbers[0]} to {numbers[-1]}, got {missing_frames[0]}; choose "
+            "others."
         )
     return sorted(set(frames))
 

@@ -10,8 +10,6 @@ from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.z_order import equal_cells, z_order
 
-__all__ = ["by_place"]
-
 
 def by_place(stream: FrameSource) -> Iterator[tuple[int, Gaussians]]:
     """Yield (frame, Gaussians) like `play`, with the Gaussians along a Z-order curve of the places of their births.

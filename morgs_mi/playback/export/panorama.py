@@ -32,8 +32,6 @@ from morgs_mi.playback.player import render_config
 from morgs_mi.plugins.splat_rays import SplatRays
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["levelled", "panorama", "panoramas"]
-
 # Rays that are traced at a time.
 _MOST_RAYS = 2**20
 # Bytes of a pixel of the result with a copy, and of a ray.

@@ -22,8 +22,6 @@ from morgs_mi.io.bounded import read_json
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
-__all__ = ["CameraPath", "focus", "load_path", "orbit", "through_cameras"]
-
 # Weight of the Gaussians' median relative to an optical axis; it matters only where the axes do not meet.
 _MEDIAN_WEIGHT = 0.01
 # Keys of other files of cameras, and what these are.

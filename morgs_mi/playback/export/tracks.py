@@ -12,8 +12,6 @@ from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.files import atomic_path
 from morgs_mi.playback.export.formats import TRACKS, choose_format
 
-__all__ = ["Tracks", "extract_tracks", "write_tracks"]
-
 
 @dataclass(frozen=True)
 class Tracks:

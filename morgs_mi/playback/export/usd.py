@@ -108,7 +108,7 @@ def _write_stage(
     """Write a file that is not a package; the arguments are the same as for `write_usd`."""
     axes = gltf_axes(stream.cameras)
     selection = set(frames)
-    unsaved = 0
+    unsaved_bytes = 0
 
     def selected() -> Iterator[FrameState]:
         return (state for state in stream.states() if state.frame in selection)
@@ -118,11 +118,11 @@ def _write_stage(
     _describe(pxr, stage, stream, frames, axes)
     fields = _fields(pxr, stage, sets, frames, half)
     for count, state in enumerate(selected(), start=1):
-        unsaved += fields[state.first_id].put(state, axes)
+        unsaved_bytes += fields[state.first_id].put(state, axes)
         # A binary file is appended to, which bounds the memory; a text would be written again.
-        if unsaved > _UNSAVED_BYTES and path.suffix.lower() != ".usda":
+        if unsaved_bytes > _UNSAVED_BYTES and path.suffix.lower() != ".usda":
             stage.Save()
-            unsaved = 0
+            unsaved_bytes = 0
         if progress is not None:
             progress(count, len(frames))
     stage.Save()

@@ -23,12 +23,11 @@ from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.color_space import TRANSFER
 from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.playback.default_rig import DEFAULT_RIG
-from morgs_mi.playback.player import MOTION_SCALE, metadata_entry, stream_name
-
-__all__ = ["published_bytes", "served_page", "text_of_bytes", "web_page", "write_web_folder", "write_web_page"]
+from morgs_mi.playback.player import MOTION_SCALE, metadata_entry, stream_exposure, stream_name
 
 Progress = Callable[[int], None]
 
@@ -140,6 +139,8 @@ def published_bytes(stream: FrameSource, progress: Progress | None = None) -> by
     metadata = {"config": {"render": render}, "motion_scale": _motion_scale(*np.hstack(speeds))}
     if stream.metadata.get(DEFAULT_RIG) is True:
         metadata[DEFAULT_RIG] = True
+    if stops := stream_exposure(stream):
+        metadata["transfer"] = {"name": TRANSFER, "display_exposure": stops}
     with StreamWriter(sink, stream.cameras, stream.fps, metadata) as writer:
         for packet in packets:
             writer.write(packet)

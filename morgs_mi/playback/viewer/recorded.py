@@ -13,8 +13,6 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.playback.player import fitted_capture, num_frames, open_stream_capture
 
-__all__ = ["RecordedImages"]
-
 # Frames that are decoded and dropped rather than seeking, which decodes from a keyframe of the video.
 _NEAR = 8
 

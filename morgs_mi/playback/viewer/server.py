@@ -33,8 +33,6 @@ from morgs_mi.playback.viewer.exact import ExactImages
 from morgs_mi.playback.viewer.recorded import RecordedImages
 from morgs_mi.playback.viewer.stream_bytes import stream_response
 
-__all__ = ["Viewer"]
-
 _GRACE = 1  # seconds for answers that are under way at the end
 _MOST_CAMERA_BYTES = 4096
 

@@ -13,8 +13,6 @@ from starlette.responses import PlainTextResponse, Response, StreamingResponse
 
 from morgs_mi.codec.container import HEAD, PAYLOAD, PREAMBLE
 
-__all__ = ["stream_response"]
-
 _CHUNK = 2**20
 # One range of bytes; others are ignored, as HTTP allows. 15 digits: more than any file has bytes.
 _RANGE = re.compile(r"bytes=(\d{1,15})-(\d{0,15})", re.ASCII)

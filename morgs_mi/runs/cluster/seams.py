@@ -79,14 +79,14 @@ def fit_seam_frame(
     setup = replace(setup, cameras=tuple(camera.without_delays() for camera in setup.cameras))
     coded = common.coded
     assert coded is not None
-    history = common.seen
+    history = common.history
     seconds = 0.0
     for number in range(config.passes):
         repeated = replace(setup, config=config.fit_config(setup.config, number))
-        state = replace(common, frame=frame, coded=replace(coded, frame=frame - 1), seen=history)
+        state = replace(common, frame=frame, coded=replace(coded, frame=frame - 1), history=history)
         state, _, report = step(repeated, state, images)
         coded = state.coded
         assert coded is not None
-        history = replace(common.seen, images=state.seen.images)  # changes are relative to the common model again
+        history = replace(common.history, images=state.history.images)  # changes are relative to the common model again
         seconds += report.seconds
     return coded, replace(report, seconds=seconds)

@@ -49,8 +49,6 @@ from morgs_mi.runs.recording import (
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-__all__ = ["SegmentedRun", "noting_segments"]
-
 FOLDER = "segments"
 # Frames of a task, two at least: they are lost if a worker dies, and the progress is known that finely.
 TASK_FRAMES = 10

@@ -24,8 +24,6 @@ from morgs_mi.core.environment import versions
 if TYPE_CHECKING:
     from distributed import Client
 
-__all__ = ["cores", "installed", "num_workers", "open_client", "prepared", "worker_name"]
-
 # Seconds after which a scheduler that does not answer counts as lost.
 _TIMEOUT = 10
 _SETTINGS = {

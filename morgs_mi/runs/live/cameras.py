@@ -12,8 +12,6 @@ import numpy as np
 
 from morgs_mi.runs.live.feed import Bundle, Shot, bundled
 
-__all__ = ["CameraFeed"]
-
 # Images of a camera from which the one that agrees best with the others is chosen: networks deliver them in bursts.
 _KEPT = 4
 # Largest skew of a bundle, s: the skew of unsynchronised cameras with one image per second.

@@ -8,8 +8,6 @@ from typing import Protocol
 
 import numpy as np
 
-__all__ = ["Bundle", "Feed", "Shot", "bundled"]
-
 
 @dataclass(frozen=True, eq=False)
 class Shot:

@@ -18,8 +18,6 @@ from morgs_mi.io.listing import is_listed, listed
 from morgs_mi.io.video import decode_image, image_number, natural_key
 from morgs_mi.runs.live.feed import Bundle, Shot, bundled
 
-__all__ = ["FolderFeed"]
-
 _LOG = logging.getLogger(__name__)
 _POLL = 0.05  # s
 # Pause after which the numbers may begin again, s: images of several cameras are written in any order until then.

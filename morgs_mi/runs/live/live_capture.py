@@ -24,8 +24,6 @@ from morgs_mi.core.threads import map_in_threads
 from morgs_mi.io.png import png_bytes
 from morgs_mi.runs.live.live_config import LiveConfig
 
-__all__ = ["begin_capture", "read_calibration", "write_images"]
-
 _LOG = logging.getLogger(__name__)
 
 

@@ -11,8 +11,6 @@ from morgs_mi.core.ranges import Above, AtLeast, check_ranges
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
 
-__all__ = ["LIVE_STREAM", "LiveConfig"]
-
 # Default settings of the loop. Dropped frames cost more than the last epochs of a frame gain, and nothing should move
 # during the first frame.
 LIVE_STREAM = StreamConfig(fit=FitConfig(epochs=2, first_frame_seconds=30.0))

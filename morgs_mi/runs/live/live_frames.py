@@ -24,8 +24,6 @@ from morgs_mi.io.prefetch import prefetched
 from morgs_mi.runs.live.playing import ClipClock, is_video, play
 from morgs_mi.runs.live.reading import raw_images, read_camera
 
-__all__ = ["Source", "live_frames"]
-
 Source = int | str | Path | BinaryIO | Iterable[np.ndarray | None]
 
 

@@ -14,8 +14,6 @@ import numpy as np
 
 from morgs_mi.runs.live.reading import open_stream
 
-__all__ = ["ClipClock", "is_video", "play"]
-
 _POLL = 0.1  # interval at which a clip that waits for others looks whether it is to end, s
 _RATE = 30.0  # frames per second of a clip that does not state it
 _DESCRIPTIONS = (".sdp", ".m3u8")  # files that name streams

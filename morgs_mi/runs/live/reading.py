@@ -15,8 +15,6 @@ from typing import BinaryIO
 import cv2
 import numpy as np
 
-__all__ = ["open_stream", "raw_images", "read_camera"]
-
 # Reads that may fail in succession before a source counts as ended, and the pause after each, s.
 _FAILURES, _PAUSE = 10, 0.02
 _RETRY = 1.0  # pause before a connection is opened again, s

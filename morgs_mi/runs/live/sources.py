@@ -15,8 +15,6 @@ from morgs_mi.runs.live.live_config import LiveConfig
 from morgs_mi.runs.live.playing import ClipClock, is_video, play
 from morgs_mi.runs.live.reading import read_camera
 
-__all__ = ["Source", "open_feed"]
-
 Source = int | str | Path
 """A camera of this machine, by OpenCV's index; a path or URL that FFmpeg opens; or a folder with images of all."""
 

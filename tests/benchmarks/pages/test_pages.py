@@ -43,7 +43,7 @@ def test_plots__are_drawn_and_shown(tmp_path: Path):
 
 
 def test_claims__have_a_table_or_figure_a_command_and_committed_results():
-    assert len(CLAIMS) == 12
+    assert len(CLAIMS) == 13
     result = r"\]\(\.\./\.\./benchmarks/results/\w+\.json\)"
     parts = r"<!-- table: |!\[", r"`(?:make demo|python\s+-m\s+(?:benchmarks|tests)\.[^`]+)`", SETUP, result
     assert [(claim.partition("\n")[0], part) for claim in CLAIMS for part in parts if not re.search(part, claim)] == []

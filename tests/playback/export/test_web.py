@@ -14,8 +14,16 @@ import pytest
 
 from morgs_mi.cli import main
 from morgs_mi.codec.container import StreamWriter
-from morgs_mi.codec.packets import CodedFrame, coded_frames, reemitted_keyframe, residual_packet
+from morgs_mi.codec.packets import (
+    CodedFrame,
+    coded_frames,
+    keyframe_packet,
+    play,
+    reemitted_keyframe,
+    residual_packet,
+)
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.color_space import TRANSFER, exposed
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.io.ply import write_ply
@@ -424,6 +432,24 @@ def test_page__shows_a_file_of_gaussians_and_orbits_freely(browser, tmp_path):
         shown = [opened.page.locator(f"#{name}").is_visible() for name in ("slider", "speed", "loop", "camera", "full")]
         assert shown == [False, False, False, True, True]
         assert opened.errors == []
+
+
+def test_page__shows_an_hdr_stream_at_its_exposure(browser, clip, tmp_path):
+    gaussians = clip[1][0].gaussians
+    bright = replace(gaussians, sh_coeffs=gaussians.sh_coeffs + 1.2)
+    metadata = {"transfer": {"name": TRANSFER, "display_exposure": -2}}
+    with StreamWriter(tmp_path / "stream.morgs", rig(WIDTH, HEIGHT), 10, metadata) as writer:
+        writer.write(keyframe_packet(bright, 0))
+    stream = open_stream(tmp_path)
+    write_web_page(stream, tmp_path / "page.html")
+    color = render(next(play(stream))[1], stream.cameras[0], ("color",), render_config(stream))["color"]
+    assert color.max() > 1.2
+    with Player(browser, (tmp_path / "page.html").as_uri() + "#pause") as page:
+        for stops, key in ((-2, "]"), (-1.5, "[")):
+            page.wait("player.settled")
+            assert psnr(page.image() / 255, channel_image("color", exposed(color, stops)) / 255) > 35
+            page.page.keyboard.press(key)
+        assert page.errors == []
 
 
 def test_page__is_operated_by_keyboard(page):
