@@ -17,7 +17,7 @@ import numpy as np
 import tyro
 
 import morgs_mi
-from morgs_mi.core.color_space import linear_to_srgb
+from morgs_mi.core.color_space import encode_light
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.playback.visualise import to_uint8
 
@@ -75,7 +75,7 @@ def rendered(gaussians: morgs_mi.Gaussians, camera: morgs_mi.Camera, spp: int) -
     images = {}
     for name in ("gaussian_splat", "volprim_rf_basic"):
         image = np.array(mi.render(scene, integrator=mi.load_dict({"type": name}), spp=spp))[..., :3]
-        images[name] = np.clip(linear_to_srgb(image), 0, 1)
+        images[name] = np.clip(encode_light(image), 0, 1)
     return images
 
 
