@@ -7,15 +7,15 @@ import numpy as np
 
 mi.set_variant("llvm_ad_rgb")
 import morgs_mi
+from morgs_mi.core.color_space import encode_light
 
 (output,) = sys.argv[1:]
 # A room: Gaussians on a sphere of radius 3 around a glossy and a diffuse ball, with a bright window.
-rng = np.random.default_rng(0)
-directions = rng.normal(size=(20_000, 3))
+count = 20_000
+directions = np.random.default_rng(0).normal(size=(count, 3))
 directions /= np.linalg.norm(directions, axis=1, keepdims=True)
 colors = 0.5 + 0.2 * np.sin(4 * directions)
-colors[directions @ (0.5, 0.8, -0.33) > 0.9] = 1
-count = len(directions)
+colors[directions @ (0.5, 0.8, -0.33) > 0.9] = encode_light(np.array(5.0))  # five times white
 gaussians = morgs_mi.Gaussians.from_activated(
     3 * directions,
     np.full((count, 3), 0.07),
@@ -31,7 +31,7 @@ scene = mi.load_dict(
         "gaussians": morgs_mi.ellipsoids(gaussians),
         "glossy": {"type": "sphere", "center": [-0.5, 0, 0], "radius": 0.4, "bsdf": gold},
         "diffuse": {"type": "sphere", "center": [0.5, 0, 0], "radius": 0.4},
-        "light": morgs_mi.light_probe(gaussians, position=(0, 0, 0), clipped=8.0),
+        "light": morgs_mi.light_probe(gaussians, position=(0, 0, 0), clipped=1),
         "sensor": camera.sensor(),
         "integrator": {"type": "gaussian_splat", "surfaces": {"type": "path", "max_depth": 4}},
     }

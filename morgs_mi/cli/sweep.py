@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
 from tyro.conf import DisallowNone, Positional
 
 from morgs_mi.cli.console import print_result, print_table, progress
@@ -38,8 +40,8 @@ class Sweep:
     def run(self) -> None:
         from morgs_mi.calibration.checks.plots import check_plot
         from morgs_mi.capture.capture import load_capture
-        from morgs_mi.evaluate.tables import sweep_table
-        from morgs_mi.runs.sweep import mean_scores, sweep, write_sweep_plot
+        from morgs_mi.evaluate.tables import figure
+        from morgs_mi.runs.sweep import SCORES, mean_scores, sweep, write_sweep_plot
 
         if self.plot is not None:
             check_plot(self.plot)
@@ -47,7 +49,10 @@ class Sweep:
         capture = load_capture(self.capture, self.downscale, held_out(self.test_view), self.frames)
         with progress() as report:
             rows = sweep(capture, self.out, self.epochs, self.seeds, config, report)
-        print_table(sweep_table(mean_scores(rows)))
+        table = Table("epochs", *(title for title, _ in SCORES.values()), box=SIMPLE_HEAD, title="means over the seeds")
+        for row in mean_scores(rows):
+            table.add_row(figure(row["epochs"], 0), *(figure(row[name], SCORES[name][1]) for name in SCORES))
+        print_table(table)
         print_result(f"All fits: {self.out / 'sweep.json'}")
         if self.plot is not None:
             write_sweep_plot(self.plot, rows)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import islice, product
 from pathlib import Path
 from typing import Annotated
@@ -27,13 +27,16 @@ Scores = Mapping[str, float]
 # The first and two later frames compile the kernels of a fit.
 _WARM_FRAMES = 3
 _WARM_STEPS = 60
-# By the title of a panel of the plot, its scores and their names.
-_PANELS = {
-    "PSNR, dB": {"psnr": "whole image", "psnr_moving": "moving"},
-    "motion error, px": {"motion_error_moving": "moving"},
-    "IoU of the confidence": {"confidence_iou": "whole image"},
-    "bytes per frame": {"bytes_per_frame": "stream"},
+SCORES = {
+    "first_seconds": ("first, s", 1),
+    "later_seconds": ("later, s", 2),
+    "bytes_per_frame": ("bytes", 0),
+    "psnr": ("PSNR, dB", 2),
+    "psnr_moving": ("moving, dB", 2),
+    "motion_error_moving": ("motion error, px", 2),
+    "confidence_iou": ("IoU", 2),
 }
+"""Titles and digits of the scores of a fit, by name; seconds and bytes are of a frame."""
 
 
 def sweep(
@@ -82,13 +85,9 @@ def _compile_kernels(capture: Capture, config: StreamConfig) -> None:
 
 def _scores(result: Evaluation) -> Scores:
     seconds = result.seconds
-    names = ("psnr", "psnr_moving", "motion_error_moving", "confidence_iou")
-    return {
-        "first_seconds": float("nan") if seconds.first is None else seconds.first,
-        "later_seconds": seconds.per_later_frame,
-        "bytes_per_frame": result.sizes.per_frame,
-        **{name: getattr(result.scores, name) for name in names},
-    }
+    times = {"first_seconds": seconds.first, "later_seconds": seconds.per_later_frame}
+    values = {**asdict(result.scores), **times, "bytes_per_frame": result.sizes.per_frame}
+    return {name: values[name] for name in SCORES}
 
 
 def mean_scores(rows: Sequence[Scores]) -> list[Scores]:
@@ -107,20 +106,17 @@ def write_sweep_plot(path: Path, rows: Sequence[Scores]) -> None:
     check_plot(path)
     from matplotlib.figure import Figure
 
-    panels = {title: lines for title, lines in _PANELS.items() if any(np.isfinite(rows[0][name]) for name in lines)}
-    figure = Figure(figsize=(4.2 * len(panels), 3.6), layout="constrained")
     means = sorted(mean_scores(rows), key=lambda row: row["later_seconds"])
-    for axes, (title, lines) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
-        for name, label in lines.items():
-            (line,) = axes.plot([row["later_seconds"] for row in means], [row[name] for row in means], label=label)
-            dots = [(row["later_seconds"], row[name]) for row in rows]
-            axes.plot(*zip(*dots, strict=True), "o", markersize=4, color=line.get_color())
+    panels = [name for name in [*SCORES][2:] if np.isfinite(means[0][name])]
+    figure = Figure(figsize=(3.6 * len(panels), 3.2), layout="constrained")
+    for axes, name in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+        axes.plot([row["later_seconds"] for row in means], [row[name] for row in means])
+        axes.plot([row["later_seconds"] for row in rows], [row[name] for row in rows], "o", markersize=4)
         for row in means:
-            place = (row["later_seconds"], row[next(iter(lines))])
+            place = (row["later_seconds"], row[name])
             axes.annotate(f"{row['epochs']:.0f}", place, xytext=(4, 4), textcoords="offset points")
-        axes.set(xlabel="seconds of a later frame (numbers: epochs)", ylabel=title)
+        axes.set(xlabel="seconds of a later frame", ylabel=SCORES[name][0])
         axes.grid(color="0.9")
-        axes.legend()
     with atomic_path(path, "write_sweep_plot()") as partial:
         partial.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(partial, format=path.suffix[1:].lower())
