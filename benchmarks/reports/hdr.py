@@ -256,7 +256,9 @@ def draw(streams: Mapping[str, Any], options: Options) -> np.ndarray:
     rows = {"truth": (traced(room(0), camera, 256, 7), traced(room(0, ball=ball), camera, 256, 8))}
     for name, stream in streams.items():
         plain = np.asarray(morgs_mi.rasterize(first_gaussians(stream), camera).color)
-        entries = {"ball": ball, "light": lamps[name]}
+        # The map itself would shine through walls that are not quite opaque.
+        hidden = {"type": "path", "hide_emitters": True}
+        entries = {"ball": ball, "light": lamps[name], "integrator": hidden}
         (_, images), *_ = render_inserted(
             stream, camera, partial(as_given, entries), [0], ("color",), InsertConfig(128, shadows=False)
         )
