@@ -1,6 +1,6 @@
 """Light that an inserted sphere receives from the fit of an HDR recording, and from the fit of one of 8 bits.
 
-    python -m benchmarks.reports.hdr --json benchmarks/results/hdr.json --picture docs/experiments/hdr.png
+    python -m benchmarks.reports.hdr --json benchmarks/results/hdr.json --picture docs/experiments/hdr.jpg
 
 A room without a ceiling, with a lamp and a metal sphere that moves, is path-traced in linear light. It is recorded
 twice: as EXR files, and as PNG files, which clip the lamp and its reflections at white. Both recordings are fitted with
@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import mitsuba as mi
 import numpy as np
 import tyro
@@ -47,6 +48,7 @@ _NORMALS, _SAMPLES = 400, 1024
 _POINTS = 1500
 # Rows of the light probe: a texel is smaller than the lamp.
 _HEIGHT = 128
+_JPEG_QUALITY = 90
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class Options(Output):
     out: Path = Path("out/hdr")
     """Folder of the recordings and the fits; those that are there are used."""
     picture: Path | None = None
-    """PNG file for the picture."""
+    """JPEG file for the picture."""
     width: int = 200
     """Width of the images; 3/4 of it is their height."""
     spp: int = 512
@@ -229,7 +231,8 @@ def main(options: Options) -> None:
     settings = {key: value for key, value in asdict(options).items() if key not in ("json", "out", "picture")}
     options.write({"light": rows, "options": settings})
     if options.picture is not None:
-        write_png(options.picture, draw(streams, options))
+        picture = cv2.cvtColor(draw(streams, options), cv2.COLOR_RGB2BGR)
+        cv2.imwrite(str(options.picture), picture, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
 
 
 def probe(stream: Any, clipped: float) -> dict[str, Any]:
@@ -256,7 +259,9 @@ def draw(streams: Mapping[str, Any], options: Options) -> np.ndarray:
     rows = {"truth": (traced(room(0), camera, 256, 7), traced(room(0, ball=ball), camera, 256, 8))}
     for name, stream in streams.items():
         plain = np.asarray(morgs_mi.rasterize(first_gaussians(stream), camera).color)
-        entries = {"ball": ball, "light": lamps[name]}
+        # The map itself would shine through walls that are not quite opaque.
+        hidden = {"type": "path", "hide_emitters": True}
+        entries = {"ball": ball, "light": lamps[name], "integrator": hidden}
         (_, images), *_ = render_inserted(
             stream, camera, partial(as_given, entries), [0], ("color",), InsertConfig(128, shadows=False)
         )

@@ -366,7 +366,7 @@ def _read_image(file: Path) -> np.ndarray:
         try:
             return read_light(fetched(file))
         except OSError as error:
-            raise ValueError(f"{file}: expected an image in linear light, got a broken file ({error}).") from None
+            raise ValueError(str(error)) from None
     # The stored pixels, without EXIF's rotation: calibrations refer to them.
     image = decode_image(file, np.fromfile(fetched(file), np.uint8), cv2.IMREAD_COLOR)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)

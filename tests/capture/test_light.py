@@ -14,9 +14,11 @@ from morgs_mi.capture.color_correction import ColorCorrection
 from morgs_mi.capture.interpolation import image_between
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.lens import Lens
-from morgs_mi.core.color_space import display_image
+from morgs_mi.core.color_space import TRANSFER, display_image
 from morgs_mi.io.exr import write_exr
+from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.visualise import write_png
+from morgs_mi.runs.recording import stream_metadata
 from tests.scenes.captures import HEIGHT, WIDTH, rig
 
 NAMES = ("cam01", "cam02")
@@ -88,3 +90,21 @@ def test_color_correction__multiplies_light() -> None:
 def test_image_between__of_equal_images_is_the_image() -> None:
     image = light(0, 0)
     np.testing.assert_allclose(image_between(image, image, 0.5), image, rtol=1e-4, atol=1e-6)
+
+
+def test_partial_frames__leave_out_a_broken_file(tmp_path: Path) -> None:
+    broken = recorded(tmp_path) / "cam02" / "0001.exr"
+    broken.write_bytes(broken.read_bytes()[:900])
+    _, frame = load_capture(tmp_path).partial_frames()
+    assert frame.images[1] is None
+    assert "cam02/0001.exr" in frame.problems[0]
+    assert "the file may be truncated" in frame.problems[0]
+
+
+def test_stream_metadata__names_the_transfer_of_light_alone(tmp_path: Path) -> None:
+    capture = load_capture(recorded(tmp_path))
+    first = next(capture.partial_frames())
+    transfer = stream_metadata(capture, first, StreamConfig())["transfer"]
+    assert transfer == {"name": TRANSFER, "display_exposure": capture.display_exposure}
+    shown = capture.displayed()
+    assert "transfer" not in stream_metadata(shown, next(shown.partial_frames()), StreamConfig())
