@@ -91,31 +91,28 @@ def step(
         ValueError: an image has another size or type than its camera, or the first frame has no image at all.
     """
     start = time.perf_counter()
-    frame_progress = Progress(progress, f"Frame {state.frame}")
-    if isinstance(images, FrameObservation):
-        observed = images
-    else:
-        observed = observe_frame(setup, state.frame, state.history, images)
+    frame = state.frame
+    frame_progress = Progress(progress, f"Frame {frame}")
+    observed = images if isinstance(images, FrameObservation) else observe_frame(setup, frame, state.history, images)
     if state.coded is None:
         fitted = fitted_first_frame(setup, observed, frame_progress, on_provisional)
     else:
-        fitted = _fitted_later_frame(setup, state, observed, frame_progress)
+        fitted = _fit_later_frame(setup, state, observed, frame_progress)
     coded = decode(state.coded, fitted.packet)
-    history = observed.history
     report = FrameReport(
-        frame=state.frame,
+        frame=frame,
         seconds=time.perf_counter() - start,
         num_bytes=fitted.packet.num_bytes,
         losses=fitted.losses,
         num_gaussians=len(coded),
-        status=_status(setup, state, history.images, fitted.status),
-        missing_views=tuple(camera.name for v, camera in enumerate(setup.cameras) if v not in history.images),
+        status=_status(setup, state, observed.history.images, fitted.status),
+        missing_views=tuple(camera.name for v, camera in enumerate(setup.cameras) if v not in observed.history.images),
         active=fitted.active,
         validation=fitted.validation,
         steps=fitted.steps,
-        exposures=fitted.correction.followed_by(history.exposures),
+        exposures=fitted.correction.followed_by(observed.history.exposures),
     )
-    return StreamState(state.frame + 1, coded, history, fitted.correction), fitted.packet, report
+    return StreamState(frame + 1, coded, observed.history, fitted.correction), fitted.packet, report
 
 
 def _status(setup: Setup, state: StreamState, images: Images, status: str) -> str:
@@ -126,9 +123,7 @@ def _status(setup: Setup, state: StreamState, images: Images, status: str) -> st
     return "; ".join([*([] if status == "ok" else [status]), *problems]) or "ok"
 
 
-def _fitted_later_frame(
-    setup: Setup, state: StreamState, observed: FrameObservation, progress: Progress
-) -> FittedFrame:
+def _fit_later_frame(setup: Setup, state: StreamState, observed: FrameObservation, progress: Progress) -> FittedFrame:
     """Return the fit of a later frame; numbers in brackets are the paper's equations."""
     assert state.coded is not None
     config = setup.config

@@ -24,7 +24,7 @@ import tyro
 import morgs_mi
 from benchmarks.speed.output import Output
 from morgs_mi.capture.layouts.colmap import write_colmap
-from morgs_mi.codec.packets import play
+from morgs_mi.codec.frame_source import play
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import decode_light, display_image, unit_values
 from morgs_mi.core.files import write_json

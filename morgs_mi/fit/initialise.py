@@ -100,18 +100,18 @@ def _outside_empty_space(cameras: Sequence[Camera], points: Points) -> Points:
 
 def _in_light(points: Points, views: Sequence[View]) -> Points:
     """Return the points with their median colours in HDR views; their own where no such view shows them."""
-    positions, own = points
-    shown = [view for view in views if np.isinf(view.white)]
-    if not shown or not len(positions):
+    positions, own_colors = points
+    hdr_views = [view for view in views if np.isinf(view.white)]
+    if not hdr_views or not len(positions):
         return points
-    colors = np.full((len(shown), *positions.shape), np.nan)
-    for k, (camera, image, mask) in enumerate(shown):
+    colors = np.full((len(hdr_views), *positions.shape), np.nan)
+    for k, (camera, image, mask) in enumerate(hdr_views):
         inside, pixels, _ = seen_points(camera, positions)
         columns, rows = pixels.astype(int).T
         recorded = np.ones(len(rows), bool) if mask is None else mask[rows, columns]
         colors[k, inside] = np.where(recorded[:, None], image[rows, columns], np.nan)
     unseen = np.isnan(colors).all(axis=(0, 2))
-    colors[:, unseen] = own[unseen]
+    colors[:, unseen] = own_colors[unseen]
     return positions, np.nanmedian(colors, axis=0)
 
 

@@ -52,11 +52,12 @@ def copied_images(cameras: Sequence[Camera], images: Sequence[Given | None], fra
 
 
 def _copy(image: Given, camera: Camera, place: str) -> np.ndarray:
-    array, shape = as_array(image), (camera.height, camera.width, 3)
+    array = as_array(image)
+    shape = (camera.height, camera.width, 3)
     is_image = isinstance(array, np.ndarray) and array.shape == shape
     if is_image and array.dtype == np.uint8:
         return array.copy()
     if is_image and array.dtype.kind == "f":
         return positive_light(array, place)
-    found = f"{array.dtype} {list(array.shape)}" if isinstance(array, np.ndarray) else type(array).__name__
-    raise ValueError(f"{place} must be uint8 {list(shape)}, or linear light in floats, got {found}; convert it.")
+    kind = f"{array.dtype} {list(array.shape)}" if isinstance(array, np.ndarray) else type(array).__name__
+    raise ValueError(f"{place} must be uint8 {list(shape)}, or linear light in floats, got {kind}; convert it.")

@@ -216,12 +216,12 @@ def _extended(
     follow = setup.config.fit.exposure != "off"
     stops = history.display_exposure if setup.display_exposure is None else setup.display_exposure
     stops = display_stops(recorded.values()) if stops is None else stops
-    shown = {v: display_image(image, stops) for v, image in recorded.items()}
+    display_images = {v: display_image(image, stops) for v, image in recorded.items()}
     if not (skip or follow):
-        return ImageHistory(shown, display_exposure=stops), None
+        return ImageHistory(display_images, display_exposure=stops), None
     references = history.references
-    exposures = _exposures(setup, history, shown) if follow else {}
-    images = {v: exposures[v].corrected(image) if v in exposures else image for v, image in shown.items()}
+    exposures = _exposures(setup, history, display_images) if follow else {}
+    images = {v: exposures[v].corrected(image) if v in exposures else image for v, image in display_images.items()}
     changes = {v: np.zeros(image.shape[:2], bool) for v, image in images.items()}  # where it is the view's first image
     views = sorted(images.keys() & references.keys())
     config = setup.config.motion.change
