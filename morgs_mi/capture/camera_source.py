@@ -58,7 +58,8 @@ class CameraSource:
     ) -> Generator[ImageOrError, None, None]:
         frames = self.reader.pick(np.stack([indices, indices + 1], axis=1).ravel().tolist())
         for share in shares:
-            first, second = next(frames), next(frames)
+            first = next(frames)
+            second = next(frames)
             if isinstance(first, np.ndarray) and isinstance(second, np.ndarray):
                 yield image_between(self.process(first, camera), self.process(second, camera), share)
             else:

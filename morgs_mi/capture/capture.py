@@ -155,7 +155,8 @@ class Capture:
         rig = replace(self, cameras=tuple(cameras))
         if not np.any(distortions):
             return rig
-        sources, left = list(self._sources), tuple((float(k1), float(k2)) for k1, k2 in distortions)
+        sources = list(self._sources)
+        left = tuple((float(k1), float(k2)) for k1, k2 in distortions)
         views = zip(self.at_recorded_size().cameras, rig.at_recorded_size().cameras, left, strict=True)
         for v, (given, refined, terms) in enumerate(views):
             both = undistortion(given, sources[v].lens, (refined, Lens("RADIAL", terms)))
@@ -303,7 +304,8 @@ def load_capture(
         raise ValueError(f"load_capture(): `downscale` must be at least 1, got {downscale}.")
     if max_frames is not None and max_frames < 1:
         raise ValueError(f"load_capture(): `max_frames` must be at least 1, got {max_frames}.")
-    reading, settings = reading or ReadConfig(), read_settings(path / "capture.json")
+    reading = reading or ReadConfig()
+    settings = read_settings(path / "capture.json")
     layout = find_layout(path)
     every = layout.read(path)
     calibration = every.without(path, reading.without)

@@ -22,9 +22,11 @@ from morgs_mi.core.color_space import decode_light, encode_light
 _LOG = logging.getLogger(__name__)
 
 # A matrix has nine numbers; features are noisy.
-_MIN_SAMPLES, _MAX_ERROR = 30, 2.0
+_MIN_SAMPLES = 30
+_MAX_ERROR = 2.0
 # Well-exposed pixel values, of 0..255; those nearly black or white do not determine a gain.
-_DARK, _BRIGHT = 12, 243
+_DARK = 12
+_BRIGHT = 243
 _BLUR = 0.008  # standard deviation of the blur around a feature, as a fraction of the width
 
 # Tables: the light of each byte, and the byte of 65536 levels of light.
@@ -150,7 +152,8 @@ def _shared_colors(
     view: int, pairs: Sequence[Match], colors: Sequence[np.ndarray], corrected: dict[int, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the colours [M, 3] of the same points in a view and in the views already corrected."""
-    mine, theirs = [], []
+    mine = []
+    theirs = []
     for pair in pairs:
         if view in pair.views and (other := sum(pair.views) - view) in corrected:
             k = pair.views.index(view)

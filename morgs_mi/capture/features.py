@@ -18,7 +18,9 @@ from morgs_mi.core.camera import Camera
 _DETECTION_PIXELS = 1.3e6
 _MAX_FEATURES = 2500
 # Lowe's ratio; with more cameras than this, each is matched with its nearest neighbours only.
-_RATIO, _ALL_PAIRS, _NEIGHBOURS = 0.8, 24, 8
+_RATIO = 0.8
+_ALL_PAIRS = 24
+_NEIGHBOURS = 8
 _MIN_MATCHES = 16
 
 
@@ -86,7 +88,8 @@ def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features
         return none
     enlarged = width / size[0], height / size[1]
     points = (np.array([k.pt for k in found]) + 0.5) * enlarged
-    angles, sizes = np.deg2rad([k.angle for k in found]), np.array([k.size for k in found])
+    angles = np.deg2rad([k.angle for k in found])
+    sizes = np.array([k.size for k in found])
     axes = 0.5 * sizes[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1) * enlarged
     # RootSIFT: square roots of the normalised descriptors are easier to distinguish (Arandjelovic 2012).
     descriptors = np.sqrt(descriptors / descriptors.sum(1, keepdims=True))
@@ -143,7 +146,8 @@ def descriptor_distances(a: Features, b: Features) -> np.ndarray:
 
 def mutual_neighbours(distances: np.ndarray) -> np.ndarray:
     """Return the pairs [M, 2] that are mutual nearest neighbours and pass Lowe's ratio test, from distances [K, L]."""
-    forth, back = distances.argmin(1), distances.argmin(0)
+    forth = distances.argmin(1)
+    back = distances.argmin(0)
     rows = np.arange(len(forth))
     first, second = np.partition(distances, 1, axis=1)[:, :2].T
     good = (back[forth] == rows) & (first < _RATIO * second)
@@ -186,7 +190,10 @@ def triangulate(
         for match in matches
     ]
     tracks = join_matches(close, features)
-    track, views, pixels, count = tracks.ids, tracks.views, tracks.pixels, tracks.count
+    track = tracks.ids
+    views = tracks.views
+    pixels = tracks.pixels
+    count = tracks.count
     if not count:
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
     points = intersect(track, views, pixels, cameras, count)
@@ -225,12 +232,14 @@ def intersect(
     V = np.array([np.asarray(camera.viewmat, np.float64)[:3] for camera in cameras])
     # Positions relative to the rig's centre and size make the system well conditioned.
     positions = np.array([camera.position for camera in cameras])
-    middle, scale = positions.mean(0), np.linalg.norm(positions - positions.mean(0), axis=1).max() or 1.0
+    middle = positions.mean(0)
+    scale = np.linalg.norm(positions - positions.mean(0), axis=1).max() or 1.0
     V = np.concatenate([V[:, :, :3], ((V[:, :, :3] @ middle + V[:, :, 3]) / scale)[..., None]], axis=2)[views]
     # Image coordinates at depth 1, in each camera's own frame.
     x = np.empty_like(pixels)
     for view in np.unique(views):
-        of_view, local = views == view, replace(cameras[view], viewmat=np.eye(4))
+        of_view = views == view
+        local = replace(cameras[view], viewmat=np.eye(4))
         x[of_view] = local.unproject(pixels[of_view], np.ones(np.count_nonzero(of_view)))[:, :2]
     rows = x[:, :, None] * V[:, 2:3] - V[:, :2]
     system = np.zeros((count, 4, 4))
@@ -242,7 +251,8 @@ def intersect(
 
 def _distances(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     """Return the distance of each point's projection [n] from its pixel, px, infinite behind the camera."""
-    projected, depths = np.empty_like(pixels), np.empty(len(points))
+    projected = np.empty_like(pixels)
+    depths = np.empty(len(points))
     with np.errstate(divide="ignore", invalid="ignore"):
         for view in np.unique(views):
             of_view = views == view

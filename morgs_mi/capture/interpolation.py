@@ -38,7 +38,8 @@ def image_between(first: np.ndarray, second: np.ndarray, share: float) -> np.nda
     pair = [np.clip(image, 0, 1) if has_light else image for image in (second, first)]
     backward, forward = flow_source("dis")(FramePair(pair[0], pair[1]))
     both = (first, forward, backward, share), (second, backward, forward, 1 - share)
-    total, weights = np.zeros(first.shape, np.float32), np.zeros((*first.shape[:2], 1), np.float32)
+    total = np.zeros(first.shape, np.float32)
+    weights = np.zeros((*first.shape[:2], 1), np.float32)
     for image, flow, back, passed in both:
         places = _origins(flow, passed)
         reliable = _sampled(consistency_mask(flow, back).astype(np.float32), places, cv2.INTER_LINEAR)[..., None]
@@ -61,5 +62,6 @@ def _origins(flow: np.ndarray, share: float) -> np.ndarray:
 
 def _sampled(image: np.ndarray, places: np.ndarray, how: int) -> np.ndarray:
     """Return the values of an image [H, W, ...] at positions [H, W, 2] in pixels."""
-    x, y = np.ascontiguousarray(places[..., 0]), np.ascontiguousarray(places[..., 1])
+    x = np.ascontiguousarray(places[..., 0])
+    y = np.ascontiguousarray(places[..., 1])
     return cv2.remap(image, x, y, how, borderMode=cv2.BORDER_REPLICATE)

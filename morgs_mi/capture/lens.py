@@ -60,14 +60,17 @@ def lens_and_intrinsics(model: str, params: Sequence[float]) -> tuple[Lens, np.n
         )
     if not bounded(params):
         raise ValueError(f"its parameters must be finite and at most {LARGEST:g}, got {[*params]}; calibrate again.")
-    fx, fy, (cx, cy) = params[0], params[focals - 1], params[focals : focals + 2]
+    fx = params[0]
+    fy = params[focals - 1]
+    cx, cy = params[focals : focals + 2]
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
     return Lens(model, tuple(map(float, params[focals + 2 :]))), K
 
 
 def opencv_lens(coefficients: Sequence[float]) -> Lens:
     """Return the lens with OpenCV's coefficients k1 k2 p1 p2, or k1 k2 p1 p2 k3, or k1 k2 p1 p2 k3 k4 k5 k6."""
-    first, more = tuple(map(float, coefficients[:4])), tuple(map(float, coefficients[4:]))
+    first = tuple(map(float, coefficients[:4]))
+    more = tuple(map(float, coefficients[4:]))
     return Lens("FULL_OPENCV", (*first, *more, *(0.0,) * (4 - len(more)))) if any(more) else Lens("OPENCV", first)
 
 
@@ -135,7 +138,8 @@ def _folded(x: np.ndarray, y: np.ndarray, camera: Camera) -> np.ndarray:
     (x_down, x_right), (y_down, y_right) = (np.gradient(values) for values in coarse)
     # Image coordinates at depth 1: x depends on the column only, y on the row only.
     local = replace(camera, viewmat=np.eye(4))
-    columns, rows = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
+    columns = np.arange(camera.width) + 0.5
+    rows = np.arange(camera.height) + 0.5
     across = local.unproject(np.stack([columns, columns], axis=1), np.ones_like(columns))[:, 0]
     down = local.unproject(np.stack([rows, rows], axis=1), np.ones_like(rows))[:, 1]
     radius = np.hypot(across, down[:, None])

@@ -206,9 +206,11 @@ def _common_instants(
     clocks: _Clocks,
 ) -> np.ndarray:
     """Return the instants that all clips cover [T]."""
-    offsets, rates = clocks.offsets, clocks.rates
+    offsets = clocks.offsets
+    rates = clocks.rates
     lengths = np.array([_usable_periods(reader, config) for reader in readers])
-    first, last = np.ceil(np.max(-offsets / rates)), np.floor(np.min((lengths - 1 - offsets) / rates))
+    first = np.ceil(np.max(-offsets / rates))
+    last = np.floor(np.min((lengths - 1 - offsets) / rates))
     if last >= first:
         return np.arange(first, last + 1)
     per_second = rates * clocks.fps
@@ -243,7 +245,8 @@ def _note(reader: FrameReader, indices: np.ndarray) -> str:
     assert reader.positions is not None
     assert reader.fps
     late = np.abs(reader.positions - np.rint(reader.positions)).max() / reader.fps
-    missing, shown = int(np.sum(indices < 0)), indices[indices >= 0]
+    missing = int(np.sum(indices < 0))
+    shown = indices[indices >= 0]
     repeated = len(shown) - len(np.unique(shown))
     return (
         f"{reader.path.name}: variable frame rate, {len(reader.positions)} frames in {_periods(reader)} periods "

@@ -99,7 +99,8 @@ def load_tracks(folder: str | Path) -> Tracks:
         raise FileNotFoundError(
             f"load_tracks(): there is no file {path}; pass the truth folder of a synthetic capture."
         )
-    points, ids = read_array(path, "points"), read_array(path, "ids")
+    points = read_array(path, "points")
+    ids = read_array(path, "ids")
     prefix = "visible_"
     names = [name.removeprefix(prefix) for name in array_names(path) if name.startswith(prefix)]
     return Tracks(points, ids, {name: read_array(path, prefix + name) for name in names})

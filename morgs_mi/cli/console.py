@@ -174,7 +174,8 @@ def _line_report() -> Report:
         if now - last < _PERIOD:
             return
         start, before = begin[stage]
-        last, seconds = now, now - start
+        last = now
+        seconds = now - start
         left = f", about {_clock(seconds * (total - done) / (done - before))} left" if done > before else ""
         print_warning(f"{stage}: {int(done)}/{total:.0f}, {_clock(seconds)} elapsed{left}.")
 

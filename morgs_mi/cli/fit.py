@@ -99,7 +99,8 @@ class Fit:
 
 def _print_summary(stream: Path, reports: Sequence[FrameReport]) -> None:
     """Print the size of a stream and the time that its frames took."""
-    first, seconds = reports[0], [row.seconds for row in reports[1:]]
+    first = reports[0]
+    seconds = [row.seconds for row in reports[1:]]
     later = f", {sum(seconds) / len(seconds):.1f} s for each later one" if seconds else ""
     print_result(
         f"{stream}: {len(reports)} frames, {stream.stat().st_size / 1e6:.1f} MB, "

@@ -31,7 +31,8 @@ from morgs_mi.core.files import write_json
 from morgs_mi.fit.forecast import forecast
 
 # Standard errors in frames above which a time offset is uncertain, and from which it counts as not found.
-_UNCERTAIN, _NOT_FOUND = 0.1, 0.5
+_UNCERTAIN = 0.1
+_NOT_FOUND = 0.5
 _UNCERTAIN_WHY = (
     "Their images hardly depend on the clocks: little moves, or in a direction in which an offset looks like a change "
     "of depth, or the cameras are far apart."
@@ -70,7 +71,9 @@ class Info:
                 check_output(output)
         if self.plot is not None:
             check_plot(self.plot)
-        capture, found, deep = load_capture(self.capture, reading=self.reading.read_config()), None, None
+        capture = load_capture(self.capture, reading=self.reading.read_config())
+        found = None
+        deep = None
         exposures: Sequence[Finding] = ()
         origin = "" if len(capture.points) else "without points"
         if self.check:

@@ -62,7 +62,8 @@ class Live:
         self.settings.check_methods(config)
         sources = [int(source) if source.isdecimal() else source for source in self.camera]
         with ExitStack() as viewer, progress() as report:
-            lines, is_shown = _Lines(), not self.view
+            lines = _Lines()
+            is_shown = not self.view
 
             def show() -> None:
                 nonlocal is_shown
@@ -87,7 +88,8 @@ class _Lines:
     """Lines about frames on standard error, at most one per second; each counts what was dropped since the last."""
 
     def __init__(self) -> None:
-        self._last, self._dropped = float("-inf"), 0
+        self._last = float("-inf")
+        self._dropped = 0
 
     def add(self, row: LiveFrame) -> None:
         self._dropped += row.dropped
@@ -97,12 +99,14 @@ class _Lines:
             f"Frame {row.frame}: {row.time:.1f} s after the first, latency {row.latency:.2f} s, {self._dropped} frames "
             f"dropped, skew {1e3 * row.skew:.0f} ms."
         )
-        self._last, self._dropped = now, 0
+        self._last = now
+        self._dropped = 0
 
 
 def _summary(out: Path, rows: Sequence[LiveFrame]) -> str:
     """Return a summary of a live fit in one sentence."""
-    stream, later = out / "stream.morgs", rows[1:]
+    stream = out / "stream.morgs"
+    later = rows[1:]
     dropped = sum(row.dropped for row in rows)
     text = (
         f"{stream}: fitted {len(rows)} of {len(rows) + dropped} frames ({dropped} dropped) in {rows[-1].time:.1f} s, "
@@ -110,7 +114,8 @@ def _summary(out: Path, rows: Sequence[LiveFrame]) -> str:
     text += f"{stream.stat().st_size / 1e6:.1f} MB, {rows[0].latency:.1f} s for the first one"
     if not later:
         return f"{text}."
-    latency, skew = np.mean([row.latency for row in later]), max(row.skew for row in rows)
+    latency = np.mean([row.latency for row in later])
+    skew = max(row.skew for row in rows)
     return f"{text}, mean latency of the others {latency:.2f} s, largest skew {1e3 * skew:.0f} ms."
 
 

@@ -96,10 +96,12 @@ class Render:
         if self.insert is not None:
             images, count = self._inserted(stream, view, chosen.name)
         elif self.camera is not None or (self.path is None and single):
-            images, count = self._seen(stream, view, chosen.name), len(frame_numbers(stream))
+            images = self._seen(stream, view, chosen.name)
+            count = len(frame_numbers(stream))
         else:
             path = named_path(stream, self.path or "orbit", self.degrees)
-            images, count = self._seen(stream, path, chosen.name), num_images(stream, path)
+            images = self._seen(stream, path, chosen.name)
+            count = num_images(stream, path)
         if single and count > 1:
             raise ValueError(f"{output}: expected one image for one file, got {count}; name a folder.")
         with progress() as report:

@@ -94,7 +94,8 @@ def _offsets(words: list[str]) -> dict[str, float]:
     Raises:
         ValueError: a word is missing, is no number, or names a camera a second time.
     """
-    names, numbers = words[::2], words[1::2]
+    names = words[::2]
+    numbers = words[1::2]
     if not words or len(names) > len(numbers):
         last = f"{words[-1]!r} without one" if words else "nothing"
         raise ValueError(f"expected pairs of a camera and a number, such as cam01 -0.5, got {last}.")

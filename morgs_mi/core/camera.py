@@ -182,8 +182,10 @@ class Camera:
 
     def unproject(self, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
         """Return the world points [..., 3] at pixel positions [..., 2] and depths z [...]: the inverse of `project`."""
-        V, K = np.asarray(self.viewmat, dtype=np.float64), self.K
-        x, y = (pixels[..., 0] - K[0, 2]) / K[0, 0], (pixels[..., 1] - K[1, 2]) / K[1, 1]
+        V = np.asarray(self.viewmat, dtype=np.float64)
+        K = self.K
+        x = (pixels[..., 0] - K[0, 2]) / K[0, 0]
+        y = (pixels[..., 1] - K[1, 2]) / K[1, 1]
         local = np.stack([x, y, np.ones_like(x)], axis=-1) * np.asarray(depths)[..., None]
         return (local - V[:3, 3]) @ V[:3, :3]
 
@@ -197,7 +199,9 @@ class Camera:
         V = np.asarray(self.viewmat, dtype=np.float64)
         x, y, z = (points @ V[:3, :3].T + V[:3, 3]).T
         inverse = np.where(z > self.near, 1 / np.maximum(z, self.near), 0)
-        fx, fy, zero = self.K[0, 0] * inverse, self.K[1, 1] * inverse, np.zeros_like(z)
+        fx = self.K[0, 0] * inverse
+        fy = self.K[1, 1] * inverse
+        zero = np.zeros_like(z)
         J = np.stack([fx, zero, -fx * x * inverse, zero, fy, -fy * y * inverse], axis=1).reshape(-1, 2, 3)
         return J @ V[:3, :3]
 
@@ -234,7 +238,10 @@ class Camera:
         """
         import mitsuba as mi
 
-        f, fy, cx, cy = self.K[0, 0], self.K[1, 1], self.K[0, 2], self.K[1, 2]
+        f = self.K[0, 0]
+        fy = self.K[1, 1]
+        cx = self.K[0, 2]
+        cy = self.K[1, 2]
         if abs(f / fy - 1) * self.height > 1:
             raise ValueError(
                 f"Camera.sensor(): `K` must have equal focal lengths, because Mitsuba's sensor has one, got {f:g} and "

@@ -101,7 +101,8 @@ def check_points(place: str, points: ArrayLike, colors: ArrayLike, most: float =
     Raises:
         ValueError: they are not.
     """
-    points, colors = numbers(place, "points", points), numbers(place, "point_colors", colors)
+    points = numbers(place, "points", points)
+    colors = numbers(place, "point_colors", colors)
     if not points.size and not colors.size:
         return np.zeros((0, 3)), np.zeros((0, 3))
     if points.ndim != 2 or points.shape[1] != 3:

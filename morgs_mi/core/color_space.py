@@ -75,7 +75,8 @@ def positive_light(light: np.ndarray, place: str) -> np.ndarray:
     Raises:
         ValueError: a value is not finite, or above `BRIGHTEST_LIGHT`; `place` is where the sentence begins.
     """
-    least, most = float(light.min()), float(light.max())
+    least = float(light.min())
+    most = float(light.max())
     if not -BRIGHTEST_LIGHT <= least <= most <= BRIGHTEST_LIGHT:
         raise ValueError(
             f"{place} must be finite and at most {BRIGHTEST_LIGHT:g}, got linear light from {least:g} to {most:g}; "

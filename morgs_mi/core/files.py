@@ -79,7 +79,8 @@ def locked_folder(path: str | os.PathLike[str], place: str) -> Generator[None, N
         BlockingIOError: another writer has locked the folder.
         OSError: the folder cannot be created or written; the sentence begins with `place`.
     """
-    folder, file = Path(path), Path(path) / _LOCK
+    folder = Path(path)
+    file = Path(path) / _LOCK
     created = [parent for parent in (folder, *folder.parents) if not os.path.lexists(parent)]
     with ExitStack() as undo:
         undo.callback(_remove_empty, created)
@@ -166,7 +167,8 @@ def _remove_empty(folders: Iterable[Path]) -> None:
 
 def _left_behind(final: Path) -> list[Path]:
     """Return the partial files of `final` of killed processes, one of which may have had this process's number."""
-    own, named = str(os.getpid()), re.compile(rf"\.partial-(\d+)-{re.escape(final.name)}")
+    own = str(os.getpid())
+    named = re.compile(rf"\.partial-(\d+)-{re.escape(final.name)}")
     found = ((path, named.fullmatch(path.name)) for path in final.parent.glob(".partial-*"))
     return [path for path, match in found if match and (match[1] == own or not _alive(int(match[1])))]
 

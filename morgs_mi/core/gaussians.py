@@ -77,7 +77,8 @@ def tensor_rows(tensor: Tensor, index: UInt32) -> list[Float]:
         tensor: D numbers in each of N rows.
         index: UInt32 [M], none of them twice: every element is read once, and the adjoint needs no atomics.
     """
-    size, mode = int(dr.prod(tensor.shape[1:])), dr.ReduceMode.NoConflicts
+    size = int(dr.prod(tensor.shape[1:]))
+    mode = dr.ReduceMode.NoConflicts
     if size in (3, 4):  # four at a time are read as one packet
         return list(dr.gather(mi.Vector3f if size == 3 else mi.Vector4f, tensor.array, index, mode=mode))
     return [dr.gather(mi.Float, tensor.array, index * size + k, mode=mode) for k in range(size)]
@@ -153,7 +154,8 @@ class Gaussians:
         for attribute in ATTRIBUTES:
             if attribute.activated_name == "sh_coeffs":  # two rows in one tensor, checked below
                 continue
-            value, tail = getattr(self, attribute.name), attribute.shape
+            value = getattr(self, attribute.name)
+            tail = attribute.shape
             if value is not None and tuple(value.shape) != (N, *tail):
                 expected = ", ".join(["N", *map(str, tail)])
                 raise ValueError(
@@ -195,7 +197,8 @@ class Gaussians:
             ValueError: a scale or an opacity out of these ranges, and as for `Gaussians`.
         """
         place = "Gaussians.from_activated()"
-        opacities, scales = numbers(place, "opacities", opacities), numbers(place, "scales", scales)
+        opacities = numbers(place, "opacities", opacities)
+        scales = numbers(place, "scales", scales)
         for name, values, high in (("scales", scales, np.inf), ("opacities", opacities, 1)):
             bad = np.argwhere((values < 0) | (values > high))
             if len(bad):
@@ -302,11 +305,14 @@ def join_sh(sh_dc: Tensor, sh_rest: Tensor | None) -> Tensor:
     """Return the coefficients [N, K, 3] of the two results of `split_sh`."""
     if sh_rest is None:
         return sh_dc
-    N, K = int(sh_dc.shape[0]), int(sh_rest.shape[1]) + 1
+    N = int(sh_dc.shape[0])
+    K = int(sh_rest.shape[1]) + 1
     # One gather per part: every element is read once, and the adjoint needs no atomics.
     lane = dr.arange(mi.UInt32, N * K * 3)
-    row, column = lane // (3 * K), lane % (3 * K)
-    is_dc, mode = column < 3, dr.ReduceMode.NoConflicts
+    row = lane // (3 * K)
+    column = lane % (3 * K)
+    is_dc = column < 3
+    mode = dr.ReduceMode.NoConflicts
     concatenated = dr.gather(mi.Float, sh_dc.array, row * 3 + column, active=is_dc, mode=mode)
     concatenated += dr.gather(mi.Float, sh_rest.array, row * (3 * K - 3) + column - 3, active=~is_dc, mode=mode)
     return mi.TensorXf(concatenated, (N, K, 3))

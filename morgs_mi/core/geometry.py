@@ -47,7 +47,8 @@ def rotated(gaussians: Gaussians, R: np.ndarray) -> Gaussians:
     raw = gaussians.numpy()
     vectors = {name: raw[name] @ R.T for name in ("means", "motion", "offset") if name in raw}
     # Golden spiral: evenly spread directions, twice as many as the 16 functions of degree 3.
-    z, angle = 1 - (2 * np.arange(32) + 1) / 32, np.pi * (1 + 5**0.5) * np.arange(32)
+    z = 1 - (2 * np.arange(32) + 1) / 32
+    angle = np.pi * (1 + 5**0.5) * np.arange(32)
     directions = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
     degree = gaussians.sh_degree
     change = np.linalg.pinv(sh_basis(directions, degree)) @ sh_basis(directions @ R, degree)

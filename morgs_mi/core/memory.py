@@ -34,7 +34,8 @@ def from_numpy(kind: type[Jit], values: ArrayLike) -> Jit:
         ValueError: it is called inside a function under `dr.freeze`.
     """
     refuse_freezing("from_numpy()")
-    source, dtype = np.asarray(values), np.dtype(dr.type_v(kind).name.lower())
+    source = np.asarray(values)
+    dtype = np.dtype(dr.type_v(kind).name.lower())
     memory = np.empty(source.size * dtype.itemsize + _ALIGNMENT, np.uint8)
     first = -memory.ctypes.data % _ALIGNMENT
     copy = memory[first : first + source.size * dtype.itemsize].view(dtype).reshape(source.shape)

@@ -54,14 +54,18 @@ class ProgressBar:
     """
 
     def __init__(self, title: str, total: float | None = None) -> None:
-        self._title, self._total, self._stage = title, total, ""
-        self._begin, self._shown = time.monotonic(), -_PERIOD
+        self._title = title
+        self._total = total
+        self._stage = ""
+        self._begin = time.monotonic()
+        self._shown = -_PERIOD
         self._output: Any = None
         self._is_notebook = _is_notebook()
 
     def __call__(self, done: float, total: float | None = None) -> None:
         """Show that `done` steps of `total` are done."""
-        total, now = total or self._total, time.monotonic() - self._begin
+        total = total or self._total
+        now = time.monotonic() - self._begin
         if now - self._shown < _PERIOD and done != total:
             return
         self._shown = now
@@ -77,7 +81,9 @@ class ProgressBar:
     def report(self, stage: str, done: float, total: float) -> None:
         """Show that `done` of `total` is done in a stage; for calls that report stages."""
         if stage != self._stage:
-            self._begin, self._shown, self._stage = time.monotonic(), -_PERIOD, stage
+            self._begin = time.monotonic()
+            self._shown = -_PERIOD
+            self._stage = stage
         self(done, total)
 
     @property

@@ -33,31 +33,36 @@ class _Bound:
 class AtLeast(_Bound):
     """Closed lower bound of a number."""
 
-    words, holds = "at least", operator.ge
+    words = "at least"
+    holds = operator.ge
 
 
 class Above(_Bound):
     """Open lower bound of a number."""
 
-    words, holds = "above", operator.gt
+    words = "above"
+    holds = operator.gt
 
 
 class AtMost(_Bound):
     """Closed upper bound of a number."""
 
-    words, holds = "at most", operator.le
+    words = "at most"
+    holds = operator.le
 
 
 class Below(_Bound):
     """Open upper bound of a number."""
 
-    words, holds = "below", operator.lt
+    words = "below"
+    holds = operator.lt
 
 
 class MultipleOf(_Bound):
     """Divisor of an integer."""
 
-    words, holds = "a multiple of", staticmethod(lambda value, divisor: value % divisor == 0)
+    words = "a multiple of"
+    holds = staticmethod(lambda value, divisor: value % divisor == 0)
 
 
 def check_ranges(config: Any, place: str = "") -> None:
@@ -103,7 +108,8 @@ def arms_of(kind: Any) -> tuple[Any, ...]:
 
 
 def _fits(value: Any, kind: Any) -> bool:
-    origin, args = get_origin(kind), get_args(kind)
+    origin = get_origin(kind)
+    args = get_args(kind)
     if origin in (Union, UnionType):
         return any(_fits(value, arm) for arm in args)
     if origin is Annotated:
@@ -134,7 +140,8 @@ def _in_words(kind: Any) -> str:
     """Return a type in words, such as "a finite number, at least 0 and below 1"."""
     if len(arms := arms_of(kind)) > 1:
         return " or ".join(map(_in_words, arms))
-    origin, args = get_origin(kind), get_args(kind)
+    origin = get_origin(kind)
+    args = get_args(kind)
     if origin is Annotated:
         return ", ".join(filter(None, (_in_words(args[0]), _bounds(args[1:]))))
     if origin is Literal:

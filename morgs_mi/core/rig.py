@@ -45,17 +45,20 @@ def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
     Along a direction that all axes share, it lies at the mean camera position.
     """
     middle = np.mean([camera.position for camera in cameras], axis=0)
-    system, right = 1e-9 * np.eye(3), np.zeros(3)
+    system = 1e-9 * np.eye(3)
+    right = np.zeros(3)
     for camera in cameras:
         axis = np.asarray(camera.viewmat, float)[2, :3]
         across = np.eye(3) - np.outer(axis, axis)
-        system, right = system + across, right + across @ (camera.position - middle)
+        system = system + across
+        right = right + across @ (camera.position - middle)
     return middle + np.linalg.solve(system, right)
 
 
 def focus_depths(cameras: Sequence[Camera]) -> np.ndarray:
     """Return the depth of the `focus_point` in each view [V], world units; infinite where it is not in front."""
-    focus, least = np.append(focus_point(cameras), 1), 1e-3 * scene_extent(cameras)
+    focus = np.append(focus_point(cameras), 1)
+    least = 1e-3 * scene_extent(cameras)
     depths = np.array([np.asarray(camera.viewmat, float)[2] @ focus for camera in cameras])
     return np.where(depths > least, depths, np.inf)
 
@@ -168,7 +171,8 @@ def scene_depths(cameras: Sequence[Camera], points: np.ndarray) -> list[float]:
 
     Without points in a view, it is the depth of the `focus_point`, or 1e6 scene extents if that is not in front.
     """
-    far, depths = 1e6 * scene_extent(cameras), []
+    far = 1e6 * scene_extent(cameras)
+    depths = []
     for camera, focus in zip(cameras, focus_depths(cameras), strict=True):
         _, _, seen = seen_points(camera, points)
         middle = float(np.median(seen)) if len(seen) else min(float(focus), far)

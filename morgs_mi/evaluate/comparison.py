@@ -56,7 +56,8 @@ class ComparedClip:
 
     def frames(self) -> Iterator[ComparedFrame]:
         """Yield the decoded frames beside the recorded ones."""
-        last, stops = None, self.recording.display_exposure or 0.0
+        last = None
+        stops = self.recording.display_exposure or 0.0
         # The file may have grown since it was read.
         decoded = islice(self.stream.states(), len(self.packets))
         recorded = self.recording.partial_frames(min(self.packets), max(self.packets) + 1)
@@ -83,7 +84,8 @@ class ComparedFrame:
         """Render and yield the evaluated views, except those without an image."""
         clip = self.clip
         for index in clip.views:
-            camera, image = clip.cameras[index], self.images[index]
+            camera = clip.cameras[index]
+            image = self.images[index]
             if image is not None:
                 maps = render(self.state.gaussians, camera, clip.channels, clip.render)
                 truth = truth_for_camera(clip.recording, camera, self.state.frame)
@@ -93,7 +95,8 @@ class ComparedFrame:
 
     def _changed(self, view: int) -> np.ndarray | None:
         """Return the mask of pixels that changed since the last image; None without one, and beside ground truth."""
-        before, now = None if self.last is None else self.last[view], self.images[view]
+        before = None if self.last is None else self.last[view]
+        now = self.images[view]
         if before is None or now is None or self.clip.recording.truth is not None:
             return None
         return recorded_change(before, now)

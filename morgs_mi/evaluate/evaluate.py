@@ -46,14 +46,16 @@ def evaluate_stream(
     """
     stream = open_stream(out)
     clip = ComparedClip.of(stream, capture, any_recording)
-    recording, (seconds, of_fit) = clip.recording, _of_fit(stream.path)
+    recording = clip.recording
+    seconds, of_fit = _of_fit(stream.path)
     measures = (Quality(lpips), Variation(clip), Motion3D(clip), Registration(), Tracking(clip))
     rows: list[FrameScores] = []
     for frame in clip.frames():
         for view in frame.views():
             for measure in measures:
                 measure.add_view(view)
-        index, scores = frame.state.frame, _merged(measure.add_frame(frame) for measure in measures)
+        index = frame.state.frame
+        scores = _merged(measure.add_frame(frame) for measure in measures)
         rows.append(FrameScores(index, frame.kind.name.lower(), frame.num_bytes, seconds.get(index), **scores))
         if progress is not None:
             progress(len(rows), len(clip.packets))

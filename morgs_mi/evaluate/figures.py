@@ -70,7 +70,8 @@ def draw_stream(
     stream = open_stream(out)
     frames = stream.frame_numbers()
     recording = open_stream_capture(stream, capture, frames, any_recording)
-    recording, stops = recording.displayed(), stream_exposure(stream)
+    recording = recording.displayed()
+    stops = stream_exposure(stream)
     view = recording.reference_view
     camera = recording.with_delays(stream.cameras)[view]
     # Nothing moves up to the first frame.
@@ -78,8 +79,13 @@ def draw_stream(
     chosen = {later[i] for i in np.linspace(0, len(later) - 1, min(_ROWS, len(later))).astype(int)}
     scale = motion_scale(recording, camera)
     column, still = _busiest_column(recording, view, frames)
-    shown, recorded, motions, confidences, offsets = [], [], [], [], []
-    with_confidence, with_offset = has_confidence(stream), has_offset(stream)
+    shown = []
+    recorded = []
+    motions = []
+    confidences = []
+    offsets = []
+    with_confidence = has_confidence(stream)
+    with_offset = has_offset(stream)
     maps = (*(("confidence",) if with_confidence else ()), *(("offset",) if with_offset else ()))
     played = render_stream(stream, camera, ("color", "motion", *maps))
     for (index, images), frame in zip(played, recording.partial_frames(frames[0], frames[-1] + 1), strict=False):
@@ -123,7 +129,8 @@ def motion_scale(capture: Capture, camera: Camera) -> float:
 
 def _busiest_column(recording: Capture, view: int, frames: Sequence[int]) -> tuple[int, np.ndarray]:
     """Return the column of a view in which the recording changes most, and its last image."""
-    change, last = np.zeros(recording.cameras[view].width), None
+    change = np.zeros(recording.cameras[view].width)
+    last = None
     for frame in recording.partial_frames(frames[0], frames[-1] + 1):
         if (seen := frame.images[view]) is None:
             continue

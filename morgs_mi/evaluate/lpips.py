@@ -38,7 +38,8 @@ class Lpips:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path, self._network = Path(path), OnnxNetwork(path)
+        self.path = Path(path)
+        self._network = OnnxNetwork(path)
         if {*self._network.inputs} != {*_INPUTS}:
             raise ValueError(
                 f"{path}: expected a network with inputs {' and '.join(_INPUTS)}, got "

@@ -113,20 +113,23 @@ class Motion3D(Measure):
     """Errors in 3D of the Gaussians that exist in a frame and in the frame before, see `evaluate_motion`."""
 
     def __init__(self, clip: ComparedClip) -> None:
-        self._cameras, self._truth = clip.recording.cameras, clip.recording.truth
+        self._cameras = clip.recording.cameras
+        self._truth = clip.recording.truth
         folder = self._truth
         self._tracks = load_tracks(folder) if folder is not None and (folder / "tracks.npz").is_file() else None
         self._before: FrameState | None = None
 
     def add_frame(self, frame: ComparedFrame) -> dict[str, Any]:
-        before, self._before = self._before, frame.state
+        before = self._before
+        self._before = frame.state
         if frame.kind != PacketKind.RESIDUAL or before is None:
             return {"motion_3d": None}
         return {"motion_3d": self._motion(before, frame.state)}
 
     def _motion(self, before: FrameState, now: FrameState) -> Motion3DScores | None:
         """Return the errors between two frames; None without truth."""
-        frame, tracks = now.frame, self._tracks
+        frame = now.frame
+        tracks = self._tracks
         if tracks is None or self._truth is None or frame >= tracks.points.shape[1]:
             return None
         views = []
@@ -178,7 +181,8 @@ class Tracking(Measure):
 
 def _image_scores(view: ComparedView, lpips: Lpips | None) -> dict[str, float]:
     """Return the scores of a rendered image by metric and region."""
-    rendered, moving = view.rendered, view.moving
+    rendered = view.rendered
+    moving = view.moving
     whole = np.ones(rendered.shape[:2], bool) if view.valid is None else view.valid
     nothing = np.zeros_like(whole)
     regions = (whole, *((nothing, nothing) if moving is None else (whole & moving, whole & ~moving)))
@@ -204,7 +208,9 @@ def _image_scores(view: ComparedView, lpips: Lpips | None) -> dict[str, float]:
 
 def _motion_scores(maps: Mapping[str, np.ndarray], truth: GroundTruth) -> dict[str, float]:
     """Return the errors of the rendered motion and confidence."""
-    motion, true, moving = maps["motion"], truth.motion, truth.mask
+    motion = maps["motion"]
+    true = truth.motion
+    moving = truth.mask
     scores = {
         "motion_error": endpoint_error(motion, true),
         "motion_error_moving": endpoint_error(motion, true, moving),

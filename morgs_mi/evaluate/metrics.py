@@ -12,8 +12,10 @@ from morgs_mi.core.color_space import decode_light, unit_values
 from morgs_mi.core.threads import map_in_threads
 
 # Wang, Bovik, Sheikh and Simoncelli, "Image quality assessment", TIP 2004.
-WINDOW, SIGMA = 11, 1.5
-C1, C2 = 0.01**2, 0.03**2
+WINDOW = 11
+SIGMA = 1.5
+C1 = 0.01**2
+C2 = 0.03**2
 # Of the mu-law, by which papers on HDR compare images.
 _MU = 5000
 # Rows of an image whose colours are compared at once; the temporaries of a whole image exceed the cache.
@@ -78,8 +80,10 @@ def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     image, truth = unit_pair("ssim", image, truth)
     if min(image.shape[:2]) < WINDOW:
         raise ValueError(f"ssim(): images must be at least {WINDOW}x{WINDOW} pixels, got {image.shape[:2]}.")
-    x, y = _blur(image), _blur(truth)
-    var_x, var_y = _blur(image**2) - x**2, _blur(truth**2) - y**2
+    x = _blur(image)
+    y = _blur(truth)
+    var_x = _blur(image**2) - x**2
+    var_y = _blur(truth**2) - y**2
     covariance = _blur(image * truth) - x * y
     similarity = (2 * x * y + C1) * (2 * covariance + C2) / ((x**2 + y**2 + C1) * (var_x + var_y + C2))
     return similarity.reshape(*similarity.shape[:2], -1).mean(-1)

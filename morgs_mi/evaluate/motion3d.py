@@ -29,9 +29,11 @@ _DEPTH_TOLERANCE = 0.01
 _LEAST_OPACITY = 0.1
 _LEAST_SHARE = 0.1
 # Tolerances relative to an object's size: distance of tracked points from a rigid motion, and from one line.
-_RIGID, _FLAT = 1e-4, 1e-3
+_RIGID = 1e-4
+_FLAT = 1e-3
 # Tracked points around a Gaussian on a deforming object, and how much of the displacement they may leave.
-_NEIGHBOURS, _LEAST_AGREEMENT = 8, 0.1
+_NEIGHBOURS = 8
+_LEAST_AGREEMENT = 0.1
 
 
 def evaluate_motion(
@@ -50,8 +52,10 @@ def evaluate_motion(
         tracks: the tracked points at t-1 and at t [P, 3], and their objects' ids [P].
         views: cameras with their ground truth at t-1.
     """
-    ids, rigid = surface_ids(means, views), rigid_motions(*tracks)
-    true, evaluated = np.zeros_like(means, float), np.zeros(len(means), bool)
+    ids = surface_ids(means, views)
+    rigid = rigid_motions(*tracks)
+    true = np.zeros_like(means, float)
+    evaluated = np.zeros(len(means), bool)
     for index in np.unique(tracks[2]):
         before, after = (points[tracks[2] == index] for points in tracks[:2])
         longest = np.linalg.norm(after - before, axis=-1).max()
@@ -78,8 +82,10 @@ def local_motion(points: np.ndarray, before: np.ndarray, after: np.ndarray) -> n
     if len(before) < _NEIGHBOURS:
         return np.full_like(points, np.nan)
     _, nearest = KDTree(before).query(points, k=_NEIGHBOURS)
-    p, q = before[nearest], after[nearest]
-    center, target = p.mean(axis=1, keepdims=True), q.mean(axis=1, keepdims=True)
+    p = before[nearest]
+    q = after[nearest]
+    center = p.mean(axis=1, keepdims=True)
+    target = q.mean(axis=1, keepdims=True)
     turn = _rotation(p - center, q - target)
     left = np.linalg.norm((p - center) @ turn.swapaxes(-1, -2) + target - q, axis=-1).max(axis=-1)
     moved = np.einsum("mij,mj->mi", turn, points - center[:, 0]) + target[:, 0] - points
@@ -91,7 +97,8 @@ def compare_motion(motion: np.ndarray, truth: np.ndarray) -> Motion3DScores:
     """Return the errors of displacements [M, 3] for true ones [M, 3], none of which is 0; NaN if M is 0."""
     if not len(truth):
         return Motion3DScores()
-    length, true_length = np.linalg.norm(motion, axis=-1), np.linalg.norm(truth, axis=-1)
+    length = np.linalg.norm(motion, axis=-1)
+    true_length = np.linalg.norm(truth, axis=-1)
     error = np.linalg.norm(motion - truth, axis=-1)
     cosine = (motion * truth).sum(-1) / np.where(length > 0, length * true_length, 1)
     return Motion3DScores(
@@ -113,10 +120,12 @@ def surface_ids(points: np.ndarray, views: Sequence[tuple[Camera, GroundTruth]])
         front = np.flatnonzero(depth > camera.near)
         pixels = np.floor(camera.project(points[front])[0])
         inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(-1)
-        front, (column, row) = front[inside], pixels[inside].astype(int).T
+        front = front[inside]
+        column, row = pixels[inside].astype(int).T
         seen = truth.ids[row, column]
         on = (seen >= 0) & (np.abs(truth.depth[row, column] - depth[front]) <= _DEPTH_TOLERANCE * depth[front])
-        front, seen = front[on], seen[on]
+        front = front[on]
+        seen = seen[on]
         several[front] |= (ids[front] >= 0) & (ids[front] != seen)
         ids[front] = seen
     ids[several] = -1
@@ -138,10 +147,12 @@ def rigid_motions(
     """
     found = {}
     for index in np.unique(ids):
-        p, q = before[ids == index], after[ids == index]
+        p = before[ids == index]
+        q = after[ids == index]
         if np.array_equal(p, q) or len(p) < 3:
             continue
-        center, target = p.mean(0), q.mean(0)
+        center = p.mean(0)
+        target = q.mean(0)
         size = np.linalg.norm(p - center, axis=-1).max()
         spread = np.linalg.svd((q - target).T @ (p - center) / len(p), compute_uv=False)
         rotation = _rotation(p - center, q - target)

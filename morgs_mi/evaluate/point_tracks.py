@@ -91,7 +91,9 @@ def track_points(
         raise ValueError(f"track_points(): `num_gaussians` must be at least 1, got {num_gaussians}.")
     queries = np.broadcast_to(queries, len(points))
     ids, weights, local = _bindings(stream, points, queries, num_gaussians)
-    frames, positions, alive = [], [], []
+    frames = []
+    positions = []
+    alive = []
     for t, found, (means, axes) in _bound(stream, ids):
         carried = means + np.einsum("pkij,pkj->pki", axes, local)
         weight = weights * found
@@ -102,7 +104,8 @@ def track_points(
         if progress is not None:
             progress(len(frames))
     order = np.asarray(frames)
-    tracks, living = np.stack(positions, 1), np.stack(alive, 1)
+    tracks = np.stack(positions, 1)
+    living = np.stack(alive, 1)
     at_query = order == queries[:, None]
     tracks[at_query] = points
     return PointTracks(order, _held(tracks, living | at_query, order >= queries[:, None]), living, ids, weights)
@@ -117,12 +120,14 @@ def bind(gaussians: Gaussians, points: np.ndarray, num_gaussians: int) -> tuple[
         num_gaussians: K is this number, but at most N.
     """
     count = min(num_gaussians, len(gaussians))
-    rows, weights = np.zeros((len(points), count), np.int64), np.zeros((len(points), count))
+    rows = np.zeros((len(points), count), np.int64)
+    weights = np.zeros((len(points), count))
     if not count or not len(points):
         return rows, weights
     raw = gaussians.numpy()
     center = raw["means"].mean(0, dtype=np.float64)
-    means, points = raw["means"] - center, points - center
+    means = raw["means"] - center
+    points = points - center
     size = max(np.abs(means).max(), np.abs(points).max(), 1e-30)
     scales = np.maximum(np.exp(raw["log_scales"].astype(np.float64)), _FLATTEST * size)
     axes = Rotation.from_quat(unit_quats(gaussians), scalar_first=True).as_matrix() / scales[:, None]
@@ -167,7 +172,8 @@ def seen_in_depth(depth: np.ndarray, alpha: np.ndarray, camera: Camera, points: 
     front = np.flatnonzero(z > camera.near)
     pixels = np.floor(camera.project(points[front])[0])
     inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(-1)
-    front, (column, row) = front[inside], pixels[inside].astype(int).T
+    front = front[inside]
+    column, row = pixels[inside].astype(int).T
     surface = np.pad(np.where(alpha < 0.5, np.inf, depth), 1, mode="edge")
     farthest = np.max([surface[row + dy, column + dx] for dy in range(3) for dx in range(3)], axis=0, initial=0)
     seen = np.zeros(len(points), bool)
@@ -180,8 +186,11 @@ def _bindings(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return ids and weights [P, K] of the points' Gaussians, and the points in their axes [P, K, 3]."""
     shape = len(points), num_gaussians
-    ids, weights, local = np.full(shape, -1), np.zeros(shape), np.zeros((*shape, 3))
-    last, left = int(queries.max(initial=-1)), set(queries.tolist())
+    ids = np.full(shape, -1)
+    weights = np.zeros(shape)
+    local = np.zeros((*shape, 3))
+    last = int(queries.max(initial=-1))
+    left = set(queries.tolist())
     for state in stream.states():
         left.discard(state.frame)
         own = np.flatnonzero(queries == state.frame)
@@ -208,7 +217,8 @@ def _bound(stream: FrameSource, ids: np.ndarray) -> Iterator[tuple[int, np.ndarr
         rows = np.searchsorted(present, ids)
         found = rows < len(present)
         found[found] = present[rows[found]] == ids[found]
-        means, axes = np.zeros((*ids.shape, 3)), np.zeros((*ids.shape, 3, 3))
+        means = np.zeros((*ids.shape, 3))
+        axes = np.zeros((*ids.shape, 3, 3))
         means[found], axes[found] = _means_and_axes(state.gaussians, rows[found])
         yield state.frame, found, (means, axes)
 

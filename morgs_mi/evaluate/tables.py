@@ -94,7 +94,10 @@ def _tracking_table(result: Evaluation) -> Table:
 
 def evaluation_summary(result: Evaluation) -> Iterator[str]:
     """Yield sentences on other views, time, size, drift and 3D motion."""
-    sizes, seconds, play, mean = result.sizes, result.seconds, result.playback, result.scores
+    sizes = result.sizes
+    seconds = result.seconds
+    play = result.playback
+    mean = result.scores
     first, last = (result.frames[k].scores.psnr for k in (0, -1))
     yield (
         f"Drift: PSNR {figure(first, 2)} dB in the first frame, {figure(last, 2)} dB in the last, "

@@ -32,7 +32,9 @@ class StillVariation:
     """
 
     def __init__(self, valid: np.ndarray | None = None, false_alarms: float = 0) -> None:
-        self._valid, self._false_alarms, self._frames = valid, false_alarms, 0
+        self._valid = valid
+        self._false_alarms = false_alarms
+        self._frames = 0
         self._last: tuple[np.ndarray, np.ndarray] | None = None
         self._sums: list[np.ndarray] = []
         self._moved = np.zeros((1, 1), int)

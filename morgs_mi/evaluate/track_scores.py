@@ -166,7 +166,8 @@ def _shares(counts: np.ndarray) -> np.ndarray:
 
 def _median_error_and_survival(video: Comparison, failure: float) -> np.ndarray:
     """Return the median error in world units and the survival of each track [P, 2]."""
-    num_frames, queries = video.truth.shape[1], video.queries
+    num_frames = video.truth.shape[1]
+    queries = video.queries
     error = np.linalg.norm(video.found - video.truth, axis=-1)
     failed = video.counts & (error > failure)
     first = np.where(failed.any(1), failed.argmax(1), num_frames)

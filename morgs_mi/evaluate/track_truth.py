@@ -88,8 +88,10 @@ def read_annotation(path: Path, camera: Camera) -> TrackTruth:
     Raises:
         ValueError: the file is broken, its arrays do not have the shapes above, or its intrinsics are not the camera's.
     """
-    tracks, visible = read_array(path, "tracks_XYZ"), read_array(path, "visibility")
-    queries, intrinsics = read_array(path, "queries_xyt"), read_array(path, "fx_fy_cx_cy")
+    tracks = read_array(path, "tracks_XYZ")
+    visible = read_array(path, "visibility")
+    queries = read_array(path, "queries_xyt")
+    intrinsics = read_array(path, "fx_fy_cx_cy")
     T, P = tracks.shape[:2] if tracks.ndim == 3 else (0, 0)
     shapes = {"tracks_XYZ": (T, P, 3), "visibility": (T, P), "queries_xyt": (P, 3), "fx_fy_cx_cy": (4,)}
     for (name, shape), found in zip(shapes.items(), (tracks, visible, queries, intrinsics), strict=True):

@@ -42,7 +42,8 @@ def evaluate_tracks(stream: FrameSource, recording: Capture, views: Sequence[int
     if len(frames) < 2 or not any(len(video.points) for video in videos):
         return ()
     compared = _compared(stream, videos, frames[0])
-    per_view, together = compared[: len(single)], compared[len(single) :] or compared
+    per_view = compared[: len(single)]
+    together = compared[len(single) :] or compared
     scale = read_settings(recording.path / "capture.json").get("meters_per_unit") or 1
     extent = scene_extent([recording.cameras[view] for view in recording.train_views])
     protocols = ((TAPVID3D, per_view), (DYNAMIC_3D_GAUSSIANS, together), (MVTRACKER, together))
@@ -51,7 +52,8 @@ def evaluate_tracks(stream: FrameSource, recording: Capture, views: Sequence[int
 
 def _during(video: TrackTruth, frames: Sequence[int]) -> TrackTruth:
     """Return the part of true tracks in the consecutive frames of a stream, without tracks that start in others."""
-    start, stop = frames[0], min(frames[-1] + 1, video.points.shape[1])
+    start = frames[0]
+    stop = min(frames[-1] + 1, video.points.shape[1])
     kept = (video.queries >= start) & (video.queries < stop)
     visible = None if video.visible is None else video.visible[kept, start:stop]
     return TrackTruth(video.cameras, video.points[kept, start:stop], visible, video.queries[kept] - start)
@@ -63,7 +65,8 @@ def _compared(stream: FrameSource, videos: Sequence[TrackTruth], start: int) -> 
     queries = np.concatenate([video.queries for video in videos]) + start
     tracks = track_points(stream, np.concatenate(points), queries)
     ends = np.cumsum([len(video.queries) for video in videos])
-    points, alive = np.split(tracks.points, ends[:-1]), np.split(tracks.alive, ends[:-1])
+    points = np.split(tracks.points, ends[:-1])
+    alive = np.split(tracks.alive, ends[:-1])
     lengths = [video.points.shape[1] for video in videos]
     found = [(p[:, :length], a[:, :length]) for p, a, length in zip(points, alive, lengths, strict=True)]
     seen = _seen(stream, videos, [positions for positions, _ in found])

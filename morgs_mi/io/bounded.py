@@ -23,19 +23,24 @@ from typing import Any
 
 import numpy as np
 
-_FACTOR, _ALLOWANCE = 10, 200_000_000
+_FACTOR = 10
+_ALLOWANCE = 200_000_000
 # Errors of NumPy and zipfile for broken files. NumPy parses headers as Python.
 _BROKEN = (
     *(ValueError, TypeError, EOFError, KeyError, MemoryError, RuntimeError, OverflowError, zipfile.BadZipFile),
     *(zlib.error, SyntaxError, tokenize.TokenError),
 )
 # At most, in bytes: an empty dict or list as the value of a list, and a number or a short key with its reference.
-_DICT_BYTES, _LIST_BYTES, _VALUE_BYTES = 240, 64, 40
+_DICT_BYTES = 240
+_LIST_BYTES = 64
+_VALUE_BYTES = 40
 # A text in JSON, which may lack its end.
 _TEXT = re.compile(r'"(?:[^"\\]|\\.)*+"?', re.DOTALL)
 # Size of a TOML file, bytes that its parser takes for a table, and parts of a key: memory and time grow with the square
 # of their number.
-MAX_TOML, _TABLE_BYTES, _MAX_PARTS = 1_000_000, 1000, 32
+MAX_TOML = 1_000_000
+_TABLE_BYTES = 1000
+_MAX_PARTS = 32
 # A comment or a string of a TOML file, which may lack its end. Every branch consumes what it has searched.
 _COMMENT = r"#[^\n]*+"
 _STRING = (
@@ -173,7 +178,8 @@ def read_array(path: str | Path, name: str | None = None) -> np.ndarray:
         # NumPy would execute what such a file contains.
         if dtype.hasobject:
             raise ValueError("it holds Python objects, not numbers")
-        count, held = math.prod(shape), len(data) - stream.tell()
+        count = math.prod(shape)
+        held = len(data) - stream.tell()
         if min(shape, default=0) < 0 or count * dtype.itemsize != held:
             raise ValueError(f"its header claims {dtype} {shape}, but {held} bytes follow")
         flat = np.frombuffer(data, dtype, count, stream.tell())

@@ -36,7 +36,9 @@ _BOUNDS = {
     "color": (("min_r", "min_g", "min_b"), ("max_r", "max_g", "max_b")),
 }
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-_XYZ_BITS, _ROTATION_BITS, _COLOR_BITS = (11, 10, 11), (10, 10, 10), (8, 8, 8, 8)
+_XYZ_BITS = (11, 10, 11)
+_ROTATION_BITS = (10, 10, 10)
+_COLOR_BITS = (8, 8, 8, 8)
 _MOST_LOG_SCALE = 20.0
 _SH_RANGE = 4.0
 # The components of a quaternion that are not the largest one, by its index.
@@ -97,9 +99,12 @@ def read_compressed_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussian
         ValueError: it is not a PLY file, is truncated, lacks a property, or has more invalid Gaussians.
     """
     elements = read_elements(path, ("chunk", "vertex"), ("sh",))
-    chunks, vertices, rest = elements["chunk"], elements["vertex"], elements.get("sh", {})
+    chunks = elements["chunk"]
+    vertices = elements["vertex"]
+    rest = elements.get("sh", {})
     _check_columns(path, "vertex", vertices, _PACKED, "<u4")
-    N, num_chunks = len(vertices["packed_position"]), len(next(iter(chunks.values()), ()))
+    N = len(vertices["packed_position"])
+    num_chunks = len(next(iter(chunks.values()), ()))
     if num_chunks != -(-N // _CHUNK):
         raise ValueError(
             f"{path}: expected {-(-N // _CHUNK)} chunks of {_CHUNK} for {N} Gaussians, got {num_chunks}; the file is "
@@ -173,7 +178,8 @@ def _packed(fractions: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
 
 def _unpacked(packed: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
     """Return the fractions [N, k] of the lowest bits, the inverse of `_packed`."""
-    columns, rest = [], packed.astype(np.uint32)
+    columns = []
+    rest = packed.astype(np.uint32)
     for count in reversed(bits):
         most = 2**count - 1
         columns.append((rest & np.uint32(most)) / most)

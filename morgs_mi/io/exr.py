@@ -14,7 +14,8 @@ from morgs_mi.core.color_space import positive_light
 from morgs_mi.core.files import atomic_path
 from morgs_mi.io.bounded import check_claim
 
-_MAGIC, _MULTIPART = 20000630, 1 << 12
+_MAGIC = 20000630
+_MULTIPART = 1 << 12
 # Of Rec. 709, which files without the attribute have: x and y of red, green, blue and white.
 _REC_709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
 # Difference up to which others are the same.

@@ -36,7 +36,8 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
     Raises:
         ValueError: more of them are invalid.
     """
-    raw, N = gaussians.numpy(), len(gaussians)
+    raw = gaussians.numpy()
+    N = len(gaussians)
     zero = np.flatnonzero(~raw["quats"].any(axis=1))
     if len(zero):
         _log.warning(

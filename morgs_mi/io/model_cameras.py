@@ -44,7 +44,8 @@ def model_cameras(path: Path) -> tuple[Path | None, tuple[Camera, ...]]:
 
 def _camera(file: Path, index: int, row: dict[str, Any]) -> Camera:
     try:
-        R, position = np.asarray(row["rotation"], np.float64), np.asarray(row["position"], np.float64)
+        R = np.asarray(row["rotation"], np.float64)
+        position = np.asarray(row["position"], np.float64)
         viewmat = np.eye(4)
         viewmat[:3, :3], viewmat[:3, 3] = R.T, -R.T @ position
         width, height, fx, fy = (float(row[key]) for key in ("width", "height", "fx", "fy"))

@@ -40,7 +40,8 @@ class OnnxNetwork:
     """
 
     def __init__(self, path: str | Path, instead: str = "") -> None:
-        self.path, self._instead = Path(path), instead
+        self.path = Path(path)
+        self._instead = instead
         if not self.path.is_file():
             raise FileNotFoundError(f"{path}: expected an ONNX file, found none; check the path.")
         try:

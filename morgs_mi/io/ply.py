@@ -24,7 +24,9 @@ from morgs_mi.io.invalid import without_invalid
 from morgs_mi.io.mitsuba_ply import from_mitsuba, mitsuba_columns
 from morgs_mi.io.ply_kinds import as_3dgs
 
-_MEAN, _SCALE, _ROTATION = ("x", "y", "z"), ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2", "rot_3")
+_MEAN = ("x", "y", "z")
+_SCALE = ("scale_0", "scale_1", "scale_2")
+_ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 # Type names of the format and of its older writers.
 _TYPES = {
     name: dtype
@@ -43,7 +45,8 @@ _TYPES = {
 _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 # Beyond these, an opacity is 0 or 1 and a size is 0, which other tools store as infinite numbers.
 _BOUNDS = {"opacity": (-99, 99), **dict.fromkeys(_SCALE, (-69, None))}
-_NORMAL, _DC = ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
+_NORMAL = ("nx", "ny", "nz")
+_DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 
 
 def write_ply(path: str | Path, gaussians: Gaussians, layout: Literal["3dgs", "mitsuba"] = "3dgs") -> None:
@@ -123,7 +126,8 @@ def read_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
             f"{path}: expected f_rest_0 to f_rest_8, 23 or 44 (SH of degree 1 to 3) or none, got {count} of them; "
             "export the Gaussians with SH of degree 3 or less."
         )
-    N, K = len(vertices["x"]), (degree + 1) ** 2
+    N = len(vertices["x"])
+    K = (degree + 1) ** 2
 
     def columns(names: tuple[str, ...]) -> np.ndarray:
         values = np.empty((N, len(names)), np.float32)
@@ -217,7 +221,8 @@ def _read_header(file: BinaryIO) -> tuple[str, list[_Element]]:
     """Return the byte order, empty for text, and the elements."""
     if file.readline(8).strip() != b"ply":
         raise ValueError("it does not begin with `ply`")
-    order, elements = None, []
+    order = None
+    elements = []
     # Beyond any header: a file without line ends would be read as one line.
     while line := file.readline(4096):
         words = line.decode("ascii", errors="replace").split()

@@ -35,7 +35,8 @@ _PAGE = (b"<!doctype html", b"<html")
 _IGNORED = "truth"
 _INDEX = ".remote.json"  # file in a mirrored folder: its URL, and the sizes of the files
 # Seconds to wait for a connection and for each further piece of a file, and requests at a time.
-_PATIENCE, _REQUESTS = 60, 16
+_PATIENCE = 60
+_REQUESTS = 16
 
 
 def is_url(path: str | Path) -> bool:
@@ -86,7 +87,8 @@ def fetched(file: Path) -> Path:
         OSError, ValueError: as for `mirrored`.
     """
     if file.is_file() and not file.stat().st_size and (folder := _mirror_of(file)) is not None:
-        index, name = _index(folder), file.relative_to(folder).as_posix()
+        index = _index(folder)
+        name = file.relative_to(folder).as_posix()
         system, root = _file_system(index["url"])
         _fetch(system, index["url"], f"{root.rstrip('/')}/{name}", file, index["sizes"].get(name))
     return file
@@ -103,7 +105,8 @@ def _cache() -> Path:
 
 def _listing(system: Any, base: str) -> dict[str, Mapping[str, Any]]:
     """Return the files below a folder by path; fsspec's `find` would leave out folders that it cannot list."""
-    found, folders = {}, [base]
+    found = {}
+    folders = [base]
     for folder in folders:  # which grows
         for about in system.ls(folder, detail=True):
             path = about["name"].rstrip("/")

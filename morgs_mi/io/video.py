@@ -30,7 +30,8 @@ from morgs_mi.io.remote import fetched
 _BYTES_PER_PIXEL = 6
 # First frame that is worth a search, and the frames before it at which the search aims: those shown right after a
 # keyframe may refer to frames before it, and a file may be indexed by the times of decoding.
-_FAR, _BEFORE = 100, 32
+_FAR = 100
+_BEFORE = 32
 # Frames that a clip may pause; the instants of the pause are listed.
 _MAX_PAUSE = 1_000_000
 

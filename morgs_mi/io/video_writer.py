@@ -46,7 +46,8 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float, code
 
 
 def _write_file(partial: Path, path: Path, frames: Iterable[np.ndarray], fps: float, codec: str) -> None:
-    count, encoder = 0, None
+    count = 0
+    encoder = None
     try:
         for frame in _checked(path, frames):
             if encoder is None:

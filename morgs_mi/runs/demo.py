@@ -139,7 +139,8 @@ def _run(root: Path, config: DemoConfig, shown: Report | None) -> DemoReport:
     run_step("Drawing", lambda report: _draw(root, load_capture(root / "capture"), report))
     frames, comparison = _compare(results)
     seconds["total"] = sum(seconds.values())
-    full, plain_result = results["full"], results["plain"]
+    full = results["full"]
+    plain_result = results["plain"]
     report = DemoReport(config, full, plain_result, frames, comparison, seconds, machine(), versions())
     write_json(root / "report.json", report.as_dict())
     return report
@@ -212,11 +213,13 @@ def _draw(out: Path, capture: Capture, report: Callable[[float, float], None]) -
 
 def _panels(capture: Capture, stream: Path, scale: float, note: str = "") -> list[dict[str, np.ndarray]]:
     """Return the labelled images of every frame of the held-out view by name; `note` is appended to the labels."""
-    reader, view = open_stream(stream), capture.reference_view
+    reader = open_stream(stream)
+    view = capture.reference_view
     camera = reader.cameras[view]
     frames = []
     for recorded, (index, images) in zip(capture.frames(), render_stream(reader, camera), strict=False):
-        truth, rendered = truth_for_camera(capture, camera, index), channel_image("color", images["color"])
+        truth = truth_for_camera(capture, camera, index)
+        rendered = channel_image("color", images["color"])
         error = np.abs(rendered.astype(float) - recorded.images[view]) * _ERROR_GAIN / 255
         panels = {"truth": recorded.images[view], "render": rendered, "error": channel_image("color", error)}
         if truth is not None:

@@ -80,7 +80,8 @@ def import_frames(
         OSError: the stream cannot be written.
     """
     check_number("import_frames()", "fps", fps, "[1e-6, 1e6]")
-    config, paths = config or CodecConfig(), find_frames(sources)
+    config = config or CodecConfig()
+    paths = find_frames(sources)
     path = Path(out) if Path(out).suffix.lower() == ".morgs" else Path(out) / "stream.morgs"
     if path.exists():
         raise FileExistsError(f"{path}: expected a new stream, got a file that exists; remove it, or name another.")
@@ -92,7 +93,9 @@ def import_frames(
             raise
         raise ValueError(f"{paths[0].parent}: {error}") from None
     path.parent.mkdir(parents=True, exist_ok=True)
-    coded, order, keyframes = None, np.zeros(0, np.int64), 0
+    coded = None
+    order = np.zeros(0, np.int64)
+    keyframes = 0
     metadata = {"num_frames": len(paths), DEFAULT_RIG: True, "config": {"codec": asdict(config)}}
     with atomic_path(path, "import_frames()") as partial, StreamWriter(partial, cameras, fps, metadata) as writer:
         for frame, source in enumerate(paths):
@@ -204,7 +207,8 @@ def matched_rows(before: Gaussians, now: Gaussians) -> np.ndarray | None:
 
 def _scaled_features(before: Gaussians, now: Gaussians) -> tuple[np.ndarray, np.ndarray]:
     """Return the features of two frames in units of their spread in the first, without those that are equal there."""
-    old, new = _features(before), _features(now)
+    old = _features(before)
+    new = _features(now)
     spread = old.std(axis=0)
     return old[:, spread > 0] / spread[spread > 0], new[:, spread > 0] / spread[spread > 0]
 

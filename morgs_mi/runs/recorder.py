@@ -89,7 +89,8 @@ def _stream(capture: Capture, out: Path, config: StreamConfig, resume: bool, pro
         prepared = Prepared(as_fitted(capture, earlier.stream))
         loop = StreamLoop.of(prepared.capture, config)
         frames = _resumed(loop, prepared.capture, earlier, progress)
-    last, train = capture.num_frames - 1, capture.train_views
+    last = capture.num_frames - 1
+    train = capture.train_views
     with Recording(files, prepared.capture, metadata | prepared.metadata, earlier) as recording:
         for frame, upcoming in with_next(frames):
             stage = progress.of("Later frames").part(frame.index - 1, last) if frame.index else progress
@@ -100,10 +101,13 @@ def _stream(capture: Capture, out: Path, config: StreamConfig, resume: bool, pro
 
 def _resumed(loop: StreamLoop, capture: Capture, earlier: Interrupted, progress: Progress) -> Iterator[PartialFrame]:
     """Let a loop continue after an interrupted fit, and return the frames that follow."""
-    fit, now, train = loop.setup.config.fit, earlier.coded.frame, capture.train_views
+    fit = loop.setup.config.fit
+    now = earlier.coded.frame
+    train = capture.train_views
     # Changes and exposures are relative to references that depend on all images so far.
     start = 0 if fit.skip_static or fit.exposure != "off" else now
-    frames, count = capture.partial_frames(start), now + 1 - start
+    frames = capture.partial_frames(start)
+    count = now + 1 - start
     past = _counted(islice(frames, count), progress.of("Reading the fitted frames"), count)
     loop.resume(earlier.coded, (frame.comparable(train) for frame in past), earlier.reports[0].exposures)
     return frames
@@ -194,7 +198,8 @@ def with_next(frames: Iterable[PartialFrame]) -> Iterator[tuple[PartialFrame, Pa
     frames = iter(frames)
     frame = next(frames, None)
     while frame is not None:
-        upcoming, problem = None, None
+        upcoming = None
+        problem = None
         try:
             upcoming = next(frames, None)
         except Exception as error:

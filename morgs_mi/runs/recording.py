@@ -125,7 +125,9 @@ class Recording:
     def __init__(
         self, files: FitFiles, capture: Capture, metadata: Mapping[str, Any], earlier: Interrupted | None = None
     ) -> None:
-        self._files, self._metadata, self._capture = files, metadata, capture
+        self._files = files
+        self._metadata = metadata
+        self._capture = capture
         self._interval: int = metadata["config"]["codec"]["keyframe_interval"]
         self._shows_provisional = True
         self.reports: list[FrameReport] = []
@@ -259,11 +261,16 @@ def interrupted_fit(
     index, end = finished(*stream.check())
     if not index:
         return None
-    frame, coded, before, last = index[-1][1], None, None, None
+    frame = index[-1][1]
+    coded = None
+    before = None
+    last = None
     with suppress(TruncatedStreamError):
         for packet in takewhile(lambda packet: packet.frame <= frame, stream.near(frame)):
             if coded is None or packet.frame > coded.frame:
-                before, coded, last = coded, decode(coded, packet), packet
+                before = coded
+                coded = decode(coded, packet)
+                last = packet
     assert coded is not None
     assert last is not None
     return Interrupted(stream, index, end, coded, before, last, read_reports(files.report, range(first, frame + 1)))

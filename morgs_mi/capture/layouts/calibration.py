@@ -163,7 +163,8 @@ def match_clips(
     match = _best_match(path, source, clips, cameras, lenses)
     clips = match.clips
     if match.without:
-        names, count = ", ".join(match.without[:_MAX_LISTED]), len(match.without) - _MAX_LISTED
+        names = ", ".join(match.without[:_MAX_LISTED])
+        count = len(match.without) - _MAX_LISTED
         rest = f" and {count} others" if count > 0 else ""
         _LOG.warning("%s: no clip is named after %s%s: left out.", source, names, rest)
     if unused := [name for name in clips if name not in match.images]:
@@ -191,7 +192,8 @@ def _best_match(
     path: Path, source: Path, clips: Mapping[str, Clip], cameras: Sequence[Camera], lenses: Sequence[Lens]
 ) -> _NamedMatch:
     """Return the match of `clips`, photos or frame folders with the most cameras; see `match_clips`."""
-    matches, errors = [], []
+    matches = []
+    errors = []
     attempts: Sequence[tuple[Callable[[Path], Mapping[str, Clip]], bool]] = (
         (lambda _: clips, True),
         (lambda _: {} if _in_folders(clips, cameras) else clips, False),

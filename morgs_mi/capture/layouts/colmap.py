@@ -116,7 +116,8 @@ def read_colmap(folder: str | Path) -> ColmapModel:
         except ValueError as error:
             raise ValueError(f"{cameras_path}: camera {camera_id}: {error}") from None
         check_claim(cameras_path, _CAMERA_BYTES * len(intrinsics), f"{len(intrinsics)} cameras")
-    cameras, lenses = [], []
+    cameras = []
+    lenses = []
     for name, camera_id, pose in (text_images if text else binary_images)(images_path):
         if camera_id not in intrinsics:
             raise ValueError(
@@ -170,7 +171,8 @@ def write_colmap(
     model = pycolmap.Reconstruction()
     lenses = [Lens()] * len(cameras) if lenses is None else lenses
     for i, (camera, lens) in enumerate(zip(cameras, lenses, strict=True), start=1):
-        K, one_focal = camera.K, lens.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+        K = camera.K
+        one_focal = lens.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
         focals = [K[0, 0]] if one_focal else [K[0, 0], K[1, 1]]
         model.add_camera_with_trivial_rig(
             pycolmap.Camera(
@@ -199,7 +201,8 @@ def write_reconstruction(model: pycolmap.Reconstruction, folder: str | Path) -> 
         OSError: a file could not be written.
     """
     folder = Path(folder)
-    images, frames = model.num_reg_images(), model.num_reg_frames()
+    images = model.num_reg_images()
+    frames = model.num_reg_frames()
     lines = {"rigs": model.num_rigs(), "frames": frames, "images": 2 * images, "points3D": model.num_points3D()}
     lines["cameras"] = model.num_cameras()  # the last one that is renamed, because readers look for it
     try:
@@ -229,7 +232,8 @@ def _check_written(file: Path, expected: int) -> None:
 
 def _viewmat(pose: Sequence[float]) -> np.ndarray:
     """Return the world-to-camera matrix [4, 4] of a wxyz quaternion and a translation."""
-    quat, t = np.array(pose[:4]), np.array(pose[4:])
+    quat = np.array(pose[:4])
+    t = np.array(pose[4:])
     if not np.isfinite(pose).all():
         raise ValueError(f"the pose must be finite, got {[*pose]}; export the model again.")
     # COLMAP writes unit quaternions.

@@ -57,7 +57,9 @@ def text_cameras(path: Path) -> Iterator[tuple[int, str, int, int, list[float]]]
     for number, line in _lines(path):
         if fields := line.split(maxsplit=_MAX_CAMERA_FIELDS):
             try:
-                camera_id, width, height = int(fields[0]), int(fields[2]), int(fields[3])
+                camera_id = int(fields[0])
+                width = int(fields[2])
+                height = int(fields[3])
                 yield camera_id, fields[1], width, height, [float(f) for f in fields[4:]]
             except (ValueError, IndexError):
                 raise _broken(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", line) from None
@@ -70,7 +72,8 @@ def text_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
             continue
         fields = line.split(maxsplit=9)
         try:
-            camera_id, pose = int(fields[8]), [float(f) for f in fields[1:8]]
+            camera_id = int(fields[8])
+            pose = [float(f) for f in fields[1:8]]
             name = _BEFORE_NAME.sub("", line, count=1).rstrip() if fields[9] else ""
         except (ValueError, IndexError):
             raise _broken(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line) from None
@@ -104,7 +107,9 @@ class _Bytes:
     """A binary file that is read sequentially; reads past its end raise ValueError."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.data, self.at = path, read_bytes(path), 0
+        self.path = path
+        self.data = read_bytes(path)
+        self.at = 0
 
     def take(self, layout: str) -> tuple:
         """Return the fields of one little-endian record."""
@@ -129,13 +134,15 @@ class _Bytes:
             )
 
     def string(self) -> str:
-        start, end = self.at, self.data.find(b"\0", self.at)
+        start = self.at
+        end = self.data.find(b"\0", self.at)
         self.skip((end if end >= 0 else len(self.data)) + 1 - start)
         return self.data[start:end].decode("utf-8", errors="replace")
 
 
 def binary_cameras(path: Path) -> Iterator[tuple[int, str, int, int, tuple[float, ...]]]:
-    file, names = _Bytes(path), list(MODELS)
+    file = _Bytes(path)
+    names = list(MODELS)
     (count,) = file.take("Q")
     for _ in range(count):
         camera_id, model, width, height = file.take("IiQQ")

@@ -87,7 +87,9 @@ def read_transforms(path: Path, clips: Mapping[str, Clip] | None = None) -> Tran
         raise ValueError(f"{path}: expected an object with a list of `frames`, got none; export it again.")
     unread = {key for values in (meta, *frames) for key in values} - _KEYS - _HARMLESS
     sizes = ImageSizes(path.parent, clips or {})
-    cameras, lenses, masks = [], [], []
+    cameras = []
+    lenses = []
+    masks = []
     for index, frame in enumerate(frames):
         where = f"{path}, frame {index}"
         name = frame.get("file_path")
@@ -147,7 +149,8 @@ def _camera(where: str, values: Mapping[str, Any], name: str) -> Camera:
 
 def _focal_length(where: str, values: Mapping[str, Any], axis: str, size: float, default: float | None = None) -> float:
     """Return the focal length from `fl_x` or `camera_angle_x`, px, of an axis along which the image has `size` px."""
-    key, angle = f"fl_{axis}", f"camera_angle_{axis}"
+    key = f"fl_{axis}"
+    angle = f"camera_angle_{axis}"
     if key not in values and angle in values:
         return float(0.5 * size / np.tan(0.5 * _number(where, values, angle)))
     return _number(where, values, key, default)
@@ -209,7 +212,8 @@ def read_points_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read_calibration(path: Path) -> Calibration:
-    clips, source = required_clips(path), path / "transforms.json"
+    clips = required_clips(path)
+    source = path / "transforms.json"
     content = read_transforms(source, clips)
     points, colors = read_points_ply(content.points) if content.points else (NO_POINTS, NO_POINTS)
     match = match_clips(path, source, clips, content.cameras, content.lenses)

@@ -84,7 +84,8 @@ def write_poses_bounds(path: str | Path, cameras: Sequence[Camera], bounds: np.n
         raise ValueError(f"write_poses_bounds(): `bounds` must be [C, 2] with C={len(cameras)}, got {bounds.shape}.")
     rows = []
     for camera, near_far in zip(cameras, bounds, strict=True):
-        K, size = camera.K, np.array([camera.width, camera.height])
+        K = camera.K
+        size = np.array([camera.width, camera.height])
         if not np.allclose(K[0, 0], K[1, 1], rtol=1e-6) or not np.allclose(K[:2, 2], size / 2, atol=1e-3):
             raise ValueError(
                 f"write_poses_bounds(): camera {camera.name!r} must have one focal length and a centred "

@@ -42,7 +42,10 @@ class CameraFeed:
         closed: Event | None = None,
         ended: str = "it has ended",
     ) -> None:
-        self.names, self._timeout, self._warm_up, self._changed = tuple(cameras), timeout, warm_up, Condition()
+        self.names = tuple(cameras)
+        self._timeout = timeout
+        self._warm_up = warm_up
+        self._changed = Condition()
         self._closed = closed or Event()
         self._cameras = [_Camera(images, self._changed, self._closed, ended) for images in cameras.values()]
         # A thread that executes library code when the interpreter ends aborts the process.
@@ -140,7 +143,10 @@ class _Camera(Thread):
         self.shots: deque[Shot] = deque(maxlen=_KEPT)
         self.ended: str | None = None  # why there are no images any more
         self.error: Exception | None = None
-        self._images, self._changed, self._closed, self._ended = images, changed, closed, ended
+        self._images = images
+        self._changed = changed
+        self._closed = closed
+        self._ended = ended
 
     def run(self) -> None:
         """Read until the source ends or the feed is closed."""

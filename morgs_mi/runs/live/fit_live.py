@@ -77,7 +77,8 @@ def fit_live(
         ValueError: a setting is out of range, a camera has no first image, or the cameras cannot be calibrated or do
             not have the calibrated sizes.
     """
-    out, live = Path(out), live or LiveConfig()
+    out = Path(out)
+    live = live or LiveConfig()
     live.check("fit_live()")
     check_outputs(out)
     if (out / "capture").exists():
@@ -123,15 +124,21 @@ class _LiveFrames:
     """
 
     def __init__(self, feed: Feed, capture: Capture, first: Bundle, config: LiveConfig) -> None:
-        self.capture, self.config, self._feed, self._first = capture, config, feed, first
+        self.capture = capture
+        self.config = config
+        self._feed = feed
+        self._first = first
         self._missing: set[str] = set()
 
     def __iter__(self) -> Iterator[tuple[Bundle, PartialFrame]]:
         """Yield whenever the next frame is asked for the newest images, as recorded and as processed."""
-        bundle, frame, begin = self._first, 0, float("inf")
+        bundle = self._first
+        frame = 0
+        begin = float("inf")
         while bundle is not None and bundle.time - begin <= (self.config.seconds or float("inf")):
             yield bundle, self._processed(bundle, frame)
-            frame, begin = frame + 1, min(begin, time.monotonic())
+            frame = frame + 1
+            begin = min(begin, time.monotonic())
             if frame == self.config.frames:
                 return
             if (bundle := self._feed.newest(bundle)) is None:
@@ -139,7 +146,8 @@ class _LiveFrames:
 
     def report(self, bundle: Bundle, frame: PartialFrame) -> LiveFrame:
         """Return the report of a fitted frame."""
-        since, latency = bundle.time - self._first.time, time.monotonic() - bundle.time
+        since = bundle.time - self._first.time
+        latency = time.monotonic() - bundle.time
         return LiveFrame(frame.index, since, latency, bundle.skew, bundle.dropped, frame.problems)
 
     def _processed(self, bundle: Bundle, frame: int) -> PartialFrame:
@@ -162,7 +170,8 @@ class _LiveFrames:
         """Return why a camera has no image, or none of its size; empty if it has one."""
         if image is None:
             return self._feed.problem(view)
-        size, recorded = image.shape[1::-1], self.capture.recorded_sizes[view]
+        size = image.shape[1::-1]
+        recorded = self.capture.recorded_sizes[view]
         return "" if size == recorded else "expected an image of {}x{}, got {}x{}".format(*recorded, *size)
 
 
@@ -174,7 +183,8 @@ def _fit(
     on_stage: Report,
 ) -> list[LiveFrame]:
     """Fit live frames into a locked folder."""
-    capture, train = frames.capture, frames.capture.train_views
+    capture = frames.capture
+    train = frames.capture.train_views
     metadata = stream_metadata(capture, next(capture.partial_frames()), config)
     del metadata["num_frames"]  # not known yet
     prepared = Prepared.of(capture, config, Progress(on_stage))

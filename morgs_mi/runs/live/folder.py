@@ -27,7 +27,8 @@ _MAX_RATE = 1000
 # Suffixes of the images, whose last bytes show that the file is complete; what these bytes contain, and how many they
 # are: cameras may add a few bytes behind an image.
 _SUFFIXES = (".png", ".jpg", ".jpeg")
-_ENDS, _TAIL = (b"IEND\xaeB`\x82", b"\xff\xd9"), 64
+_ENDS = (b"IEND\xaeB`\x82", b"\xff\xd9")
+_TAIL = 64
 
 
 @dataclass(frozen=True)

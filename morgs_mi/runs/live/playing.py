@@ -38,7 +38,9 @@ class ClipClock:
 
     def __init__(self, clips: int = 1) -> None:
         self.length = inf
-        self._times, self._start, self._changed = [-inf] * clips, -inf, Condition()
+        self._times = [-inf] * clips
+        self._start = -inf
+        self._changed = Condition()
 
     def wait(self, clip: int, due: float, interval: float, closed: Event) -> None:
         """Wait until it is time for an image of a clip, or `closed` is set.
@@ -105,7 +107,8 @@ def _timed(path: str | Path) -> Iterator[tuple[np.ndarray, float, float]]:
     """Yield the images of a video, BGR, with their times from its beginning and the time between two of them, s."""
     stream = open_stream(str(path), path)
     try:
-        interval, last = 1 / (stream.get(cv2.CAP_PROP_FPS) or _RATE), -inf
+        interval = 1 / (stream.get(cv2.CAP_PROP_FPS) or _RATE)
+        last = -inf
         while (read := stream.read())[0]:
             at = stream.get(cv2.CAP_PROP_POS_MSEC) / 1000
             last = at if at > last else last + interval  # not all containers have times

@@ -16,12 +16,14 @@ import cv2
 import numpy as np
 
 # Reads that may fail in succession before a source counts as ended, and the pause after each, s.
-_FAILURES, _PAUSE = 10, 0.02
+_FAILURES = 10
+_PAUSE = 0.02
 _RETRY = 1.0  # pause before a connection is opened again, s
 # Longest wait of FFmpeg for a connection or its next bytes, s; some streams come in parts of a few seconds.
 _SILENCE = 10.0
 # Silence after which the reader of a pipe looks whether it is to end, s, and how many bytes it copies at most.
-_POLL, _CHUNK = 0.3, 1 << 20
+_POLL = 0.3
+_CHUNK = 1 << 20
 
 
 def read_camera(

@@ -51,7 +51,8 @@ def open_feed(sources: Sequence[Source], config: LiveConfig, names: Sequence[str
             f"open_feed(): `camera` must have a source for each of the {len(names)} calibrated cameras "
             f"({', '.join(names)}), got {_listed(sources)}; name them in that order."
         )
-    closed, videos = Event(), [source for source in sources if is_video(source)]
+    closed = Event()
+    videos = [source for source in sources if is_video(source)]
     if config.loop and not videos:
         raise ValueError(f"open_feed(): `loop` repeats videos, got none in {_listed(sources)}; leave it out.")
     clock = ClipClock(len(videos))
