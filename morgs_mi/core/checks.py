@@ -8,9 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["LARGEST", "bounded", "check_mask", "check_number", "check_points", "check_size", "check_type", "numbers"]
-
-
 LARGEST = 1e12
 """Largest coordinate or coefficient that is read, in its own unit: its cube is still a float32."""
 

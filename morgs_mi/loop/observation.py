@@ -70,66 +70,46 @@ class Recorded(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ImageHistory:
-    """Images up to a frame, with the exposure of each view's first image if exposures are estimated.
+    """Images up to a frame, with the exposure of each view's first image if exposures are estimated."""
 
-    Attributes:
-        images: of that frame as a display shows them, uint8, by view index, of the views that have one.
-        references: images that the next frame is compared with to detect changes, by view index.
-        exposures: of that frame relative to the view's first image, by view index; empty if they are not estimated.
-        display_exposure: stops by which linear light is brightened for them; None before the first frame.
-    """
-
+    #: Of that frame as a display shows them, uint8, by view index, of the views that have one.
     images: Images = field(default_factory=dict)
+    #: Images that the next frame is compared with to detect changes, by view index.
     references: Images = field(default_factory=dict)
+    #: Of that frame relative to the view's first image, by view index; empty if they are not estimated.
     exposures: Mapping[int, Exposure] = field(default_factory=dict)
+    #: Stops by which linear light is brightened for them; None before the first frame.
     display_exposure: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class FrameObservation:
-    """Observations of a frame that follow from its images alone.
+    """Observations of a frame that follow from its images alone."""
 
-    Attributes:
-        history: the images, with those before.
-        changes: masks of changed pixels [H, W], by view index; None: all pixels may have changed.
-        flows: optical flow of the key views that changed, by view index.
-        key_views: these views for the terms of the objective, by view index.
-        encoded: images that the fit compares, encoded, by view index: `history.images` where uint8 was given, otherwise
-            float32 with values above 1.
-        recorded: the images as they were given, by view index.
-    """
-
-    history: ImageHistory
+    history: ImageHistory  #: The images, with those before.
+    #: Masks of changed pixels [H, W], by view index; None: all pixels may have changed.
     changes: Mapping[int, np.ndarray] | None
-    flows: Mapping[int, FlowObservation]
-    key_views: Mapping[int, KeyView]
+    flows: Mapping[int, FlowObservation]  #: Optical flow of the key views that changed, by view index.
+    key_views: Mapping[int, KeyView]  #: These views for the terms of the objective, by view index.
+    #: Images that the fit compares, encoded, by view index: `history.images` where uint8 was given, otherwise float32
+    #: with values above 1.
     encoded: Images
-    recorded: Images
+    recorded: Images  #: The images as they were given, by view index.
 
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """Data that all frames share; made by `prepare`.
+    """Data that all frames share; made by `prepare`."""
 
-    Attributes:
-        cameras: the V training views.
-        masks: per view [H, W] bool of valid pixels, or None.
-        points: SfM points [P, 3], world units.
-        point_colors: [P, 3], encoded: 1 is white.
-        key_views: indices of the views with optical flow and masks.
-        extent: of the scene, world units.
-        config: settings.
-        display_exposure: stops by which linear light is brightened where flow and changes are computed; None: the first
-            frame determines it, see `display_stops`.
-    """
-
-    cameras: tuple[Camera, ...]
-    masks: tuple[np.ndarray | None, ...]
-    points: np.ndarray
-    point_colors: np.ndarray
-    key_views: tuple[int, ...]
-    extent: float
-    config: StreamConfig
+    cameras: tuple[Camera, ...]  #: The V training views.
+    masks: tuple[np.ndarray | None, ...]  #: Per view [H, W] bool of valid pixels, or None.
+    points: np.ndarray  #: SfM points [P, 3], world units.
+    point_colors: np.ndarray  #: [P, 3], encoded: 1 is white.
+    key_views: tuple[int, ...]  #: Indices of the views with optical flow and masks.
+    extent: float  #: Of the scene, world units.
+    config: StreamConfig  #: Settings.
+    #: Stops by which linear light is brightened where flow and changes are computed; None: the first frame determines
+    #: it, see `display_stops`.
     display_exposure: float | None = None
 
     @property
