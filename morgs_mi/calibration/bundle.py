@@ -33,13 +33,16 @@ from morgs_mi.fit.fit_config import CameraPriors
 # Number of parameters of a camera's change.
 CHANGES = 11
 # Steps, and the relative decrease of the loss below which they end.
-_STEPS, _LEAST_DECREASE = 60, 1e-6
+_STEPS = 60
+_LEAST_DECREASE = 1e-6
 # Initial and largest damping of Levenberg and Marquardt.
-_DAMPING, _MOST_DAMPING = 1e-3, 1e6
+_DAMPING = 1e-3
+_MOST_DAMPING = 1e6
 # px, least scale of the reprojection errors of cameras with errors as large as the priors.
 _LARGE_ERROR = 1.7
 # px, the least scale of the reprojection errors. Cauchy's loss halves the weight of an error of 2.4 deviations.
-_LEAST_SCALE, _CAUCHY = 0.05, 2.4
+_LEAST_SCALE = 0.05
+_CAUCHY = 2.4
 
 
 def bundle_adjust(cameras: Sequence[Camera], tracks: Tracks, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -50,7 +53,8 @@ def bundle_adjust(cameras: Sequence[Camera], tracks: Tracks, deviations: np.ndar
         tracks: features of P > 0 points, each with at most one in a view.
         deviations: standard deviations of the priors of a camera's changes [11], as from `likely_deviations`.
     """
-    damping, changes = _DAMPING, np.zeros((len(cameras), CHANGES))
+    damping = _DAMPING
+    changes = np.zeros((len(cameras), CHANGES))
     points = intersect(tracks.ids, tracks.views, tracks.pixels, cameras, tracks.count)
     errors = _errors(cameras, changes, points, tracks)
     scale = _scale(errors)
@@ -68,7 +72,9 @@ def bundle_adjust(cameras: Sequence[Camera], tracks: Tracks, deviations: np.ndar
                 break
             continue
         converged = loss - new < _LEAST_DECREASE * loss
-        (changes, points), errors, damping = tried, found, damping / 10
+        changes, points = tried
+        errors = found
+        damping = damping / 10
         if converged:
             break
         scale = min(scale, _scale(errors))
@@ -93,7 +99,8 @@ def likely_deviations(cameras: Sequence[Camera], tracks: Tracks, deviations: np.
 
 def changed_camera(camera: Camera, changes: np.ndarray) -> Camera:
     """Return a camera with the changes [11] of the module docstring, without the distortion."""
-    K, V = camera.K.copy(), np.eye(4)
+    K = camera.K.copy()
+    V = np.eye(4)
     K[[0, 1], [0, 1]] *= 1 + changes[6]
     K[:2, 2] += changes[7:9] * camera.width
     V[:3, :3] = cv2.Rodrigues(np.asarray(changes[:3], np.float64))[0] @ np.asarray(camera.viewmat)[:3, :3]
@@ -110,7 +117,8 @@ def prior_deviations(extent: float, priors: CameraPriors) -> np.ndarray:
 
 def distorted(camera: Camera, pixels: np.ndarray, distortion: np.ndarray) -> np.ndarray:
     """Return the positions [n, 2] at which radial distortion k [2] shows the pixels [n, 2] of a pinhole camera."""
-    focal, centre = camera.K[[0, 1], [0, 1]], camera.K[:2, 2]
+    focal = camera.K[[0, 1], [0, 1]]
+    centre = camera.K[:2, 2]
     square = np.sum(((pixels - centre) / focal) ** 2, axis=-1, keepdims=True)
     return pixels + (pixels - centre) * (distortion[0] + distortion[1] * square) * square
 
@@ -149,7 +157,8 @@ def camera_jacobian(
     J[front, :, 9], J[front, :, 10] = from_centre * square, from_centre * square**2
     if distortion is not None and distortion.any():
         k1, k2 = distortion
-        scale, slope = 1 + (k1 + k2 * square) * square, 2 * k1 + 4 * k2 * square
+        scale = 1 + (k1 + k2 * square) * square
+        slope = 2 * k1 + 4 * k2 * square
         by_pixel = scale[..., None] * np.eye(2) + slope[..., None] * np.einsum(
             "ni,nj,j->nij", from_centre, ray, 1 / camera.K[[0, 1], [0, 1]]
         )
@@ -166,8 +175,10 @@ class NormalEquations:
     """
 
     def __init__(self, views: int, points: int) -> None:
-        self._cameras, self._right = np.zeros((views, CHANGES, CHANGES)), np.zeros((views, CHANGES))
-        self._points, self._right_points = np.zeros((points, 3, 3)), np.zeros((points, 3))
+        self._cameras = np.zeros((views, CHANGES, CHANGES))
+        self._right = np.zeros((views, CHANGES))
+        self._points = np.zeros((points, 3, 3))
+        self._right_points = np.zeros((points, 3))
         self._across = np.zeros((points, views, CHANGES, 3))
 
     def add(
@@ -183,7 +194,8 @@ class NormalEquations:
             b: [n, 2].
         """
         of_camera, of_point = jacobians
-        left, right = of_camera.transpose(0, 2, 1) @ G, of_point.transpose(0, 2, 1) @ G
+        left = of_camera.transpose(0, 2, 1) @ G
+        right = of_point.transpose(0, 2, 1) @ G
         self.add_camera(view, of_camera, G, b)
         self._points[ids] += right @ of_point
         self._right_points[ids] += np.einsum("nij,ni->nj", of_point, b)
@@ -240,7 +252,8 @@ def _solved(A: np.ndarray, b: np.ndarray, rows: np.ndarray, value: np.ndarray) -
     """Return the x that minimises x' A x / 2 - b' x with `rows` x = `value`; rows of zeros are ignored."""
     scale = np.diag(A).mean()
     lengths = np.maximum(np.linalg.norm(rows, axis=1), 1e-30) / scale
-    rows, value = rows / lengths[:, None], value / lengths
+    rows = rows / lengths[:, None]
+    value = value / lengths
     system = np.block([[A, rows.T], [rows, -1e-9 * scale * np.eye(len(rows))]])
     return np.linalg.solve(system, np.concatenate([b, value]))[: len(b)]
 
@@ -272,7 +285,8 @@ def _equations(
     weights = 1 / (scale**2 + (errors**2).sum(axis=1, keepdims=True) / _CAUCHY**2)
     for view, (camera, change) in enumerate(zip(cameras, changes, strict=True)):
         here = tracks.views == view
-        now, seen = changed_camera(camera, change), points[tracks.ids[here]]
+        now = changed_camera(camera, change)
+        seen = points[tracks.ids[here]]
         jacobians = camera_jacobian(now, 1 + change[6], seen, change[9:])
         w = weights[here]
         equations.add(view, tracks.ids[here], jacobians, w[..., None] * np.eye(2), w * errors[here])
@@ -281,7 +295,8 @@ def _equations(
 
 def _errors(cameras: Sequence[Camera], changes: np.ndarray, points: np.ndarray, tracks: Tracks) -> np.ndarray:
     """Return the projections minus the features [n, 2], px; large behind a camera."""
-    errors, depths = np.empty_like(tracks.pixels), np.empty(len(tracks.ids))
+    errors = np.empty_like(tracks.pixels)
+    depths = np.empty(len(tracks.ids))
     with np.errstate(divide="ignore", invalid="ignore"):
         for view, (camera, change) in enumerate(zip(cameras, changes, strict=True)):
             here = tracks.views == view

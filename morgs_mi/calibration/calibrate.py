@@ -44,7 +44,8 @@ _MIN_POINTS = 50
 # phones it is 0.26 and 0.28, on others at most 0.11.
 _LEAST_DECREASE = 0.15
 # Files in the folder that COLMAP works in.
-_IMAGES, _DATABASE = "images", "database.db"
+_IMAGES = "images"
+_DATABASE = "database.db"
 _MORE_TEXTURE = "light the scene evenly, add textured objects, or record a frame with such objects before the take"
 # Seeds that COLMAP takes.
 _SEEDS = "[0, 2147483647]"
@@ -132,7 +133,8 @@ def calibrate(
             message names them and suggests a remedy.
         OSError: the model cannot be written.
     """
-    path, config = Path(path), config or CalibrateConfig()
+    path = Path(path)
+    config = config or CalibrateConfig()
     check_number("calibrate()", "seed", config.seed, _SEEDS)
     check_ranges(config, "calibrate()")
     report = progress or (lambda stage, done, total: None)
@@ -192,7 +194,8 @@ def _check(name: str, image: Any | None, model: Any) -> CameraCheck:
     seen = [p for p in image.points2D if p.has_point3D()]
     projected = (image.project_point(model.point3D(p.point3D_id).xyz) for p in seen)
     errors = [np.inf if q is None else float(np.linalg.norm(q - p.xy)) for p, q in zip(seen, projected, strict=True)]
-    error, advice = float(np.median(errors)) if errors else float("nan"), ""
+    error = float(np.median(errors)) if errors else float("nan")
+    advice = ""
     if len(seen) < _MIN_POINTS:
         advice = f"only {len(seen)} points, {_MIN_POINTS} are needed for a reliable pose: {_MORE_TEXTURE}"
     elif error > MAX_ERROR:
@@ -239,7 +242,9 @@ def _match(
     """Write images, features and the matches of all pairs of views into a folder, for `_map`."""
     import pycolmap
 
-    folder, masked, database = scratch / _IMAGES, scratch / "masks", scratch / _DATABASE
+    folder = scratch / _IMAGES
+    masked = scratch / "masks"
+    database = scratch / _DATABASE
     folder.mkdir()
     masked.mkdir()
     by_size: dict[tuple[int, ...], list[str]] = {}
@@ -317,7 +322,8 @@ def _with_principal_points(found: _Candidate, names: Sequence[str]) -> _Candidat
     """Return the model with a camera and a principal point for each image, or as it is if that fits no better."""
     import pycolmap
 
-    moved, config = _with_own_cameras(found.model), pycolmap.BundleAdjustmentConfig()
+    moved = _with_own_cameras(found.model)
+    config = pycolmap.BundleAdjustmentConfig()
     for image in moved.reg_image_ids():
         config.add_image(image)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
@@ -338,7 +344,8 @@ def _with_own_cameras(model: Any) -> Any:
 
     copy = pycolmap.Reconstruction()
     for i in model.reg_image_ids():
-        image, camera = model.image(i), pycolmap.Camera(model.camera(model.image(i).camera_id).todict())
+        image = model.image(i)
+        camera = pycolmap.Camera(model.camera(model.image(i).camera_id).todict())
         camera.camera_id = i
         copy.add_camera_with_trivial_rig(camera)
         keypoints = np.array([point.xy for point in image.points2D]).reshape(-1, 2)

@@ -16,9 +16,11 @@ from morgs_mi.capture.features import Features, Match, descriptor_distances, int
 from morgs_mi.core.camera import Camera
 
 # Largest distance from an epipolar line, px, and between two descriptors of length 1.
-_BAND, _MAX_DISTANCE = 1.0, 0.9
+_BAND = 1.0
+_MAX_DISTANCE = 0.9
 # Largest difference of the patches in size, octaves, and in orientation, degrees.
-_MAX_OCTAVES, _MAX_TURN = 0.7, 30.0
+_MAX_OCTAVES = 0.7
+_MAX_TURN = 30.0
 # Distance of two cameras that rounding can cause, relative to their distance from the origin.
 _ROUNDING = 1e-9
 
@@ -29,7 +31,8 @@ def match_guided(
     """Return the matches of pairs of views, found with the poses of their cameras."""
     matches = []
     for i, j in pairs:
-        a, b = features[i], features[j]
+        a = features[i]
+        b = features[j]
         if min(len(a.points), len(b.points)) < 2:
             continue
         distances = descriptor_distances(a, b)
@@ -47,11 +50,13 @@ def _line_distances(x: np.ndarray, y: np.ndarray, a: Camera, b: Camera) -> np.nd
     if np.linalg.norm(centres[1] - centres[0]) <= _ROUNDING * np.linalg.norm(centres):
         return np.full((len(x), len(y)), np.inf)  # two cameras at one position have no lines
     relative = np.asarray(b.viewmat, np.float64) @ np.linalg.inv(np.asarray(a.viewmat, np.float64))
-    (tx, ty, tz), R = relative[:3, 3], relative[:3, :3]
+    tx, ty, tz = relative[:3, 3]
+    R = relative[:3, :3]
     essential = np.array([[0, -tz, ty], [tz, 0, -tx], [-ty, tx, 0]]) @ R
     fundamental = np.linalg.inv(b.K).T @ essential @ np.linalg.inv(a.K)
     x, y = (np.column_stack([v, np.ones(len(v))]) for v in (x, y))
-    of_x, of_y = x @ fundamental.T, y @ fundamental
+    of_x = x @ fundamental.T
+    of_y = y @ fundamental
     slopes = np.minimum(np.hypot(*of_x[:, :2].T)[:, None], np.hypot(*of_y[:, :2].T))
     with np.errstate(divide="ignore", invalid="ignore"):  # the epipoles have no lines
         return np.abs(of_x @ y.T) / slopes
@@ -61,10 +66,12 @@ def _patches_agree(a: Features, b: Features, pairs: np.ndarray, first: Camera, s
     """Return whether the patches of each pair [M, 2] agree in size and orientation, [M]."""
     count = len(pairs)
     pixels = np.concatenate([a.points[pairs[:, 0]], b.points[pairs[:, 1]]])
-    tracks, views = np.tile(np.arange(count), 2), np.repeat([0, 1], count)
+    tracks = np.tile(np.arange(count), 2)
+    views = np.repeat([0, 1], count)
     points = intersect(tracks, views, pixels, (first, second), count)
     with np.errstate(divide="ignore", invalid="ignore"):
-        expected, found = _carried(points, a.axes[pairs[:, 0]], first, second), b.axes[pairs[:, 1]]
+        expected = _carried(points, a.axes[pairs[:, 0]], first, second)
+        found = b.axes[pairs[:, 1]]
         octaves = np.log2(np.linalg.norm(expected, axis=1) / np.linalg.norm(found, axis=1))
         cosines = (expected * found).sum(axis=1) / np.linalg.norm(expected, axis=1) / np.linalg.norm(found, axis=1)
     return (np.abs(octaves) <= _MAX_OCTAVES) & (cosines >= np.cos(np.deg2rad(_MAX_TURN)))

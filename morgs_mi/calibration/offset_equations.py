@@ -40,7 +40,8 @@ from morgs_mi.render.active_view import ActiveView
 # lambda, as a fraction of a Gaussian's mean curvature along an axis.
 _PRIOR = 1e-4
 # Added to the eigenvalues of S for a step and for its error, as fractions of its mean diagonal without elimination.
-_DAMPING, _FLOOR = 0.03, 1e-3
+_DAMPING = 0.03
+_FLOOR = 1e-3
 # Standard deviation in frames of an unknown offset.
 UNKNOWN = 1.0
 # Mean number of Gaussians of a group, which counts as one error: neighbours share pixels and have similar errors.
@@ -82,12 +83,15 @@ class OffsetEquations:
         """
         found = self._inverse(_FLOOR)
         unseen = np.eye(len(found)) - found @ self.matrix
-        noise, missed = found - found[reference], unseen - unseen[reference]
+        noise = found - found[reference]
+        missed = unseen - unseen[reference]
         return np.sqrt(np.einsum("vi,ij,vj->v", noise, self.scatter, noise) + UNKNOWN**2 * (missed**2).sum(axis=1))
 
     def _inverse(self, damping: float, share: float = 1.0) -> np.ndarray:
         """Return the matrix [V, V] that turns r into o."""
-        train, scale, count = self.train, self.own.mean() or 1.0, int(self.train.sum())
+        train = self.train
+        scale = self.own.mean() or 1.0
+        count = int(self.train.sum())
         centred = np.eye(count) - 1 / count
         values, vectors = np.linalg.eigh(centred @ self.matrix[np.ix_(train, train)] @ centred)
         inverse = (vectors / (np.maximum(values, 0) + damping * scale)) @ vectors.T
@@ -114,7 +118,8 @@ def offset_equations(
     """
     motion = np.asarray(gaussians.motion, np.float64)
     moving = (motion != 0).any(axis=1)
-    d, means = motion[moving], np.asarray(gaussians.means, np.float64)[moving]
+    d = motion[moving]
+    means = np.asarray(gaussians.means, np.float64)[moving]
     J = np.stack([view.camera.projection_jacobian(means) for view in views])
     sums = [_products(gaussians, *each, blur) for each in zip(views, targets, strict=True)]
     A, b = (np.stack([each[moving] for each in kind]) for kind in zip(*sums, strict=True))

@@ -61,7 +61,9 @@ _MIN_TRACKS = 40
 # would have no influence, and cameras would follow the errors of a short fit.
 _ALIKE = 10.0
 # Gauss-Newton steps of a round, their damping, and the longest step of a mean in scene extents.
-_STEPS, _DAMPING, _LONGEST = 3, 1e-3, 0.02
+_STEPS = 3
+_DAMPING = 1e-3
+_LONGEST = 0.02
 # px, standard deviations of the blur of images and gradients in the first rounds, for errors of several pixels.
 _BLURS = (2.0, 1.0)
 # Error at which a pixel has half its weight, relative to white: larger errors are details that the fit lacks.
@@ -69,9 +71,11 @@ _HALF_WEIGHT = 0.1
 # Least mean square error: a rendering compared with itself has an error of 0.
 _LEAST_ERROR = 1e-10
 # Deviation of a fixed distortion; least valid share of a resampled pixel.
-_NO_DISTORTION, _VALID = 1e-4, 0.999
+_NO_DISTORTION = 1e-4
+_VALID = 0.999
 # Steps of the registration of a camera, which end when they change its pixels by less than this, px.
-_REGISTRATION_STEPS, _LEAST_SHIFT = 30, 1e-3
+_REGISTRATION_STEPS = 30
+_LEAST_SHIFT = 1e-3
 # Factors on the learning rates in the rounds after the first.
 _LATER_RATES = {"means": 0.25, "scales": 0.5, "quats": 0.5, "opacities": 0.25}
 
@@ -122,7 +126,8 @@ def refine_cameras(
     Raises:
         ValueError: fewer than two training views have an image of the first frame.
     """
-    rounds, report = config.short_fits.rounds, progress or (lambda done, count: None)
+    rounds = config.short_fits.rounds
+    report = progress or (lambda done, count: None)
     problem = _Problem.of(capture, config, render or RenderConfig(), seed)
     matched, tracks, deviations = _matched(capture, problem.indices, problem.deviations)
     # Cameras of the calibration, of the bundle adjustment, and of the images; a single set is not compared.
@@ -217,7 +222,8 @@ class _Problem:
 
     def changed_capture(self, changes: np.ndarray) -> Capture:
         """Return the capture with changed cameras and moved points."""
-        capture, pairs = self.capture, zip(self.cameras, changes, strict=True)
+        capture = self.capture
+        pairs = zip(self.cameras, changes, strict=True)
         refined = dict(zip(self.indices, (changed_camera(*pair) for pair in pairs), strict=True))
         left = dict(zip(self.indices, changes[:, 9:].tolist(), strict=True))
         every = [refined.get(v, camera) for v, camera in enumerate(capture.cameras)]
@@ -229,7 +235,8 @@ class _Problem:
 
     def _begun(self, changes: np.ndarray) -> FirstFrameProblem:
         """Return the problem of a short fit with changed cameras."""
-        points, rng = (self._points(changes), self.capture.point_colors), rng_of(self.seed, Stream.REFINED_POINTS)
+        points = (self._points(changes), self.capture.point_colors)
+        rng = rng_of(self.seed, Stream.REFINED_POINTS)
         return FirstFrameProblem.of(_changed(self.views, changes), points, _short(self.config), self.render, rng)
 
     def _fitted(self, problem: FirstFrameProblem, later: bool = False) -> Gaussians:
@@ -248,19 +255,25 @@ def register_camera(
         config: settings with the priors of the changes.
         render: cut-offs.
     """
-    render, camera, target = render or RenderConfig(), view.camera, view.target
+    render = render or RenderConfig()
+    camera = view.camera
+    target = view.target
     priors = replace(config.camera_priors, distortion=_NO_DISTORTION)  # the image is not changed
-    deviations, best = prior_deviations(extent, priors), np.zeros((1, CHANGES))
+    deviations = prior_deviations(extent, priors)
+    best = np.zeros((1, CHANGES))
     means = np.asarray(gaussians.means, np.float64)
     for blur in (*_BLURS, 0.0):
-        changes, error = best, np.inf
+        changes = best
+        error = np.inf
         for _ in range(_REGISTRATION_STEPS):
             now = changed_camera(camera, changes[0])
             G, b, found = _shifts(gaussians, now, target, blur, render)
             if not found < error:
                 break
-            best, error = changes, found
-            equations, (of_camera, _) = NormalEquations(1, 0), camera_jacobian(now, 1 + changes[0, 6], means)
+            best = changes
+            error = found
+            equations = NormalEquations(1, 0)
+            of_camera, _ = camera_jacobian(now, 1 + changes[0, 6], means)
             equations.add_camera(0, of_camera, G / found / _ALIKE, b / found / _ALIKE)
             step, _ = equations.step(changes, deviations, 0.0)
             changes = changes + step
@@ -275,7 +288,8 @@ def _matched(capture: Capture, train: Sequence[int], deviations: np.ndarray) -> 
     Without enough points, there are no changes, and the deviations equal the priors' deviations.
     """
     recorded = capture.displayed().at_recorded_size()
-    images, cameras = next(recorded.partial_frames(0, 1)).images, [recorded.cameras[v] for v in train]
+    images = next(recorded.partial_frames(0, 1)).images
+    cameras = [recorded.cameras[v] for v in train]
     features = [detect(images[v], recorded.masks[v]) for v in train]
     tracks = join_matches(match_views(features, cameras), features)
     if np.bincount(tracks.views, minlength=len(train)).min() < _MIN_TRACKS:
@@ -326,7 +340,8 @@ def _short(config: FitConfig, later: bool = False) -> FitConfig:
 
     It has no view-dependent colours, which would hide wrong poses.
     """
-    how, rates = config.short_fits, config.first_frame_rates
+    how = config.short_fits
+    rates = config.first_frame_rates
     if later:
         rates = replace(rates, **{name: factor * getattr(rates, name) for name, factor in _LATER_RATES.items()})
     return replace(
@@ -349,9 +364,11 @@ def _joint_step(
     render: RenderConfig,
 ) -> tuple[Gaussians, np.ndarray]:
     """Return the Gaussians and the changes of the cameras [V, 11] after one Gauss-Newton step of both."""
-    means, changed = np.asarray(gaussians.means, np.float64), _changed(views, changes)
+    means = np.asarray(gaussians.means, np.float64)
+    changed = _changed(views, changes)
     shifts = [_shifts(gaussians, view.camera, view.target, blur, render) for view in changed]
-    variance, equations = _ALIKE * np.mean([error for *_, error in shifts]), NormalEquations(len(views), len(means))
+    variance = _ALIKE * np.mean([error for *_, error in shifts])
+    equations = NormalEquations(len(views), len(means))
     for v, (view, (G, b, _)) in enumerate(zip(changed, shifts, strict=True)):
         jacobian = camera_jacobian(view.camera, 1 + changes[v, 6], means)
         equations.add(v, slice(None), jacobian, G / variance, b / variance)

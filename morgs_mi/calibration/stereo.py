@@ -18,15 +18,20 @@ from morgs_mi.core.rig import angles_to, scene_depths, seen_points
 # Images are reduced to this number of pixels: the points only initialise a fit, which is more exact.
 _PIXELS = 2e5
 # Number of nearest cameras that each is matched with, and their least and largest angle, degrees.
-_NEIGHBOURS, _MIN_ANGLE, _MAX_ANGLE = 2, 0.5, 25.0
+_NEIGHBOURS = 2
+_MIN_ANGLE = 0.5
+_MAX_ANGLE = 25.0
 # Points per pair.
 _POINTS = 4000
 # Range of searched depths, as fractions of the near and far end of the known points. With fewer than this many points,
 # the search is around the depth that the cameras look at.
-_NEAR, _FAR, _KNOWN = 0.6, 1.6, 10
+_NEAR = 0.6
+_FAR = 1.6
+_KNOWN = 10
 _BLIND = 3.0
 # px, largest difference between the disparities of both directions; largest difference of a colour.
-_MAX_DIFFERENCE, _MAX_COLOR = 1.0, 0.08
+_MAX_DIFFERENCE = 1.0
+_MAX_COLOR = 0.08
 _BLOCK = 5
 # Least depth of a view's corners in the rectified view, for depth 1 in the camera: less is too oblique.
 _LEAST_DEPTH = 0.2
@@ -117,11 +122,14 @@ class _Rectified:
         """Return the rectification of two views, None if no plane shows both, e.g. with one camera behind the other."""
         right = b.position - a.position
         baseline = float(np.linalg.norm(right))
-        right, forward = right / baseline, a.viewmat[2, :3] + b.viewmat[2, :3]
+        right = right / baseline
+        forward = a.viewmat[2, :3] + b.viewmat[2, :3]
         forward = forward - forward @ right * right
         forward /= max(float(np.linalg.norm(forward)), 1e-12)
-        axes, focal = np.stack([right, np.cross(forward, right), forward]), float(a.K[0, 0] + b.K[0, 0]) / 2
-        homographies, boxes = [], []
+        axes = np.stack([right, np.cross(forward, right), forward])
+        focal = float(a.K[0, 0] + b.K[0, 0]) / 2
+        homographies = []
+        boxes = []
         for camera in (a, b):
             H = np.diag([focal, focal, 1]) @ axes @ camera.viewmat[:3, :3].T @ np.linalg.inv(camera.K)
             sides = np.array([[x, y, 1] for x in (0, camera.width) for y in (0, camera.height)]) @ H.T
@@ -130,7 +138,8 @@ class _Rectified:
             homographies.append(H)
             boxes.append([(sides[:, :2] / sides[:, 2:]).min(axis=0), (sides[:, :2] / sides[:, 2:]).max(axis=0)])
         (a0, a1), (b0, b1) = boxes
-        top, bottom = max(a0[1], b0[1]), min(a1[1], b1[1])
+        top = max(a0[1], b0[1])
+        bottom = min(a1[1], b1[1])
         size = int(np.ceil(max(a1[0] - a0[0], b1[0] - b0[0]))), int(np.ceil(bottom - top))
         shifted = [_shift(-box[0][0], -top) @ H for box, H in zip(boxes, homographies, strict=True)]
         return cls(axes, focal, baseline, (shifted[0], shifted[1]), (a0[0], b0[0], top), size)
@@ -147,7 +156,8 @@ def _matched(a: _View, b: _View, depths: tuple[float, float]) -> np.ndarray:
     if rig is None:
         return np.zeros((0, 6))
     width, height = rig.size
-    product, shift = rig.focal * rig.baseline, rig.corners[1] - rig.corners[0]
+    product = rig.focal * rig.baseline
+    shift = rig.corners[1] - rig.corners[0]
     lowest = int(np.floor(product / depths[1] + shift))
     count = 16 * max(1, int(np.ceil((product / depths[0] + shift - lowest + 1) / 16)))
     # Strongly converging cameras have no useful plane in common.
@@ -158,7 +168,8 @@ def _matched(a: _View, b: _View, depths: tuple[float, float]) -> np.ndarray:
         for pair, flag in (((a.image, b.image), cv2.INTER_LINEAR), ((a.valid, b.valid), cv2.INTER_NEAREST))
     )
     left, right = images
-    forth, back = _disparity(left, right, lowest, count), _disparity(right, left, 1 - lowest - count, count)
+    forth = _disparity(left, right, lowest, count)
+    back = _disparity(right, left, 1 - lowest - count, count)
     rows, columns = np.mgrid[:height, :width]
     partner = np.round(columns - forth).astype(int)
     inside = (partner >= 0) & (partner < width)
@@ -166,7 +177,8 @@ def _matched(a: _View, b: _View, depths: tuple[float, float]) -> np.ndarray:
     agree = np.abs(forth + back[rows, partner]) <= _MAX_DIFFERENCE
     kept = agree & inside & (forth >= lowest) & (forth - shift > 0) & (valid[0] > 0) & (valid[1][rows, partner] > 0)
     depth = product / (forth[kept] - shift)
-    x, y = columns[kept] + 0.5 + rig.corners[0], rows[kept] + 0.5 + rig.corners[2]
+    x = columns[kept] + 0.5 + rig.corners[0]
+    y = rows[kept] + 0.5 + rig.corners[2]
     points = np.stack([x * depth / rig.focal, y * depth / rig.focal, depth], axis=1) @ rig.axes + a.camera.position
     return np.concatenate([points, left[kept] / 255.0], axis=1)
 

@@ -48,9 +48,11 @@ from morgs_mi.render.render_config import RenderConfig
 # px, least width of the images: small images are fitted fast, and an offset displaces them by few pixels.
 _WIDTH = 160
 # Number of frames used from the start of the recording, and of instants among them at which Gaussians are fitted.
-_FRAMES, _INSTANTS = 12, 2
+_FRAMES = 12
+_INSTANTS = 2
 # Gaussians and steps of the fit at an instant; half as many of both for blurred images.
-_GAUSSIANS, _STEPS = 8000, 600
+_GAUSSIANS = 8000
+_STEPS = 600
 # Standard deviations in pixels of the filters of the first rounds, one round each.
 _BLURS = (6.0, 3.0, 1.5)
 # Largest number of rounds after these, with unblurred images.
@@ -62,9 +64,11 @@ _LARGEST = 3
 _BLUR_OF_ROUND = (*_BLURS, *[0.0] * _ROUNDS)
 
 # Bounds of kappa, and of a step in frames.
-_SHARES, _LONGEST_STEP = (0.2, 1.2), 1.0
+_SHARES = (0.2, 1.2)
+_LONGEST_STEP = 1.0
 # Frames by which the last round moves the clocks, and the least part of it that counts as recovered.
-_MOVED, _LEAST_FOUND = 0.5, 0.05
+_MOVED = 0.5
+_LEAST_FOUND = 0.05
 
 
 @dataclass(frozen=True)
@@ -121,10 +125,13 @@ def estimate_time_offsets(
 def _aligned(rounds: _Rounds, largest: int) -> tuple[np.ndarray, np.ndarray, OffsetEquations]:
     """Return offsets [V] of at most `largest`, the last step [V], and the equations of that step."""
     clips = rounds.clips
-    offsets, step, left = np.zeros(len(clips.cameras)), np.zeros(len(clips.cameras)), None
+    offsets = np.zeros(len(clips.cameras))
+    step = np.zeros(len(clips.cameras))
+    left = None
     for index, blur in enumerate(_BLUR_OF_ROUND):
         equations = rounds.equations(offsets, blur)
-        before, left = left if blur in _BLUR_OF_ROUND[:index] else None, equations.solution()
+        before = left if blur in _BLUR_OF_ROUND[:index] else None
+        left = equations.solution()
         share = 1.0 if before is None else _share(step[clips.train], (left - before)[clips.train])
         moved = np.clip(offsets + np.clip(equations.solution(share), -_LONGEST_STEP, _LONGEST_STEP), -largest, largest)
         offsets, step = moved, moved - offsets
@@ -223,7 +230,8 @@ def _checked(image: ImageOrError) -> np.ndarray:
 
 def _equations_at(clips: _Clips, times: np.ndarray, blur: float, seed: int) -> OffsetEquations:
     """Return the equations of an instant, which each view shows at its own time [V]."""
-    images, after = clips.at(times), clips.at(times + 1)
+    images = clips.at(times)
+    after = clips.at(times + 1)
     targets = [Target(image, mask) for image, mask in zip(images, clips.masks, strict=True)]
     gaussians = _fitted(clips, images, 2 if blur else 1, seed)
     pairs = {v: FramePair(after[v], images[v], valid=clips.masks[v]) for v in clips.train}
@@ -250,7 +258,8 @@ def _fitted(clips: _Clips, images: Sequence[np.ndarray], divisor: int, seed: int
         density=DensityConfig(rounds=0),
     )
     views = [View(clips.cameras[v], images[v], clips.masks[v]) for v in clips.train]
-    rng, points = rng_of(seed, Stream.TIMING), (clips.points, clips.point_colors)
+    rng = rng_of(seed, Stream.TIMING)
+    points = (clips.points, clips.point_colors)
     problem = FirstFrameProblem.of(views, points, fit, RenderConfig(), rng)
     return fit_first_frame(problem, fit, rng).gaussians
 

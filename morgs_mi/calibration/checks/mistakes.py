@@ -41,9 +41,11 @@ _CAMERA_MISTAKES = (
     (_FLIP, "its pose is in other axes, unlike the other cameras: negate its y and z axes"),
 )
 # Every exchange of poses is compared with all matches, so their number is limited.
-_MAX_EXCHANGED, _MAX_PERMUTED = 12, 4
+_MAX_EXCHANGED = 12
+_MAX_PERMUTED = 4
 # Factors of the focal length that are tried, and their step: at a wrong focal length the error has several minima.
-_FACTOR_OCTAVES, _FACTOR_STEP = 2.0, 0.25
+_FACTOR_OCTAVES = 2.0
+_FACTOR_STEP = 0.25
 # Factors nearer to 1 than this are no mistake in the calibration's image size or field of view.
 _LEAST_FACTOR = 0.1
 
@@ -73,7 +75,8 @@ def rig_candidates(capture: Capture, wrong: Sequence[int]) -> Iterator[tuple[Seq
         layout = layout_called(capture.layout)
         poses = layout.poses if layout else PoseConvention()
         yield from _other_conventions(capture.cameras, poses) if poses else ()
-    cameras, every = capture.cameras, range(len(capture.cameras))
+    cameras = capture.cameras
+    every = range(len(capture.cameras))
     if len(cameras) <= _MAX_EXCHANGED:
         for i, j in combinations(every, 2):
             order = [{i: j, j: i}.get(view, view) for view in every]
@@ -140,7 +143,8 @@ def with_focal_factor(camera: Camera, factor: float) -> Camera:
 
 def _other_rows(capture: Capture) -> list[tuple[Sequence[Camera], str]]:
     """Return the alternatives for poses in the rows of `poses_bounds.npy`."""
-    cameras, alphabetical = capture.cameras, sorted(capture.names)
+    cameras = capture.cameras
+    alphabetical = sorted(capture.names)
     rows = [cameras[alphabetical.index(name)] for name in capture.names]
     turned = [replace(c, viewmat=_UPRIGHT @ c.viewmat) for c in cameras]
     order = ", ".join(alphabetical[:4])

@@ -38,9 +38,11 @@ _MIN_MATCHES = 50
 _SAME_IMAGE = 0.5
 # A correction must lower the error by this factor, and to less than twice the error of the poses that fit or to this
 # many pixels: among many candidates, a wrong one may be slightly better than the given poses.
-_GAIN, _GOOD_ERROR = 3.0, 0.5
+_GAIN = 3.0
+_GOOD_ERROR = 0.5
 # Number of matches of a pair, and of pairs, to compare candidates with: more are slower, but not more accurate.
-_SAMPLE, _FACTOR_PAIRS = 40, 8
+_SAMPLE = 40
+_FACTOR_PAIRS = 8
 # A view that matches fewer others without its pose is also matched with it, which takes longer.
 _MIN_PARTNERS = 3
 _NO_OVERLAP = (
@@ -98,7 +100,8 @@ def match_capture(capture: Capture, progress: Callable[[int, int], None] | None 
         progress: called with (views done, views).
     """
     capture = capture.displayed().at_recorded_size()
-    images, count = next(capture.partial_frames(0, 1)).images, len(capture.cameras)
+    images = next(capture.partial_frames(0, 1)).images
+    count = len(capture.cameras)
     features = []
     for done, (image, mask) in enumerate(zip(images, capture.masks, strict=True)):
         if progress is not None:
@@ -113,7 +116,8 @@ def match_capture(capture: Capture, progress: Callable[[int, int], None] | None 
 def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
     """Return the result of checking the capture's cameras against the matches between its views."""
     capture = capture.at_recorded_size()
-    pairs, views = _Pairs.of(shared, capture.cameras), range(len(capture.cameras))
+    pairs = _Pairs.of(shared, capture.cameras)
+    views = range(len(capture.cameras))
     group = pairs.agreeing()
     checks = [_check(view, pairs, group) for view in views]
     errors = np.concatenate([np.zeros(0), *pairs.errors])
@@ -158,7 +162,8 @@ def dense_points(capture: Capture, shared: SharedFeatures, seed: int = 0) -> Cap
         shared: features of its first frame.
         seed: seed of the selection of stereo points.
     """
-    sparse, recorded = triangulate_points(capture, shared), capture.at_recorded_size()
+    sparse = triangulate_points(capture, shared)
+    recorded = capture.at_recorded_size()
     images = next(recorded.displayed().partial_frames(0, 1)).images
     views = [(v, image) for v in capture.train_views if (image := images[v]) is not None]
     points, colors = stereo_points(
@@ -168,7 +173,8 @@ def dense_points(capture: Capture, shared: SharedFeatures, seed: int = 0) -> Cap
         sparse.points,
         rng_of(seed, Stream.POINTS),
     )
-    points, colors = np.concatenate([sparse.points, points]), np.concatenate([sparse.point_colors, colors])
+    points = np.concatenate([sparse.points, points])
+    colors = np.concatenate([sparse.point_colors, colors])
     return replace(capture, points=points, point_colors=colors)
 
 
@@ -244,15 +250,21 @@ def _median(errors: np.ndarray) -> float:
 
 def _check(view: int, pairs: _Pairs, group: set[int]) -> CameraCheck:
     """Return the result of a view; its advice is empty if the pose does not fit."""
-    name, every, agreed = pairs.cameras[view].name, pairs.of_view(view), pairs.of_view(view, group)
+    name = pairs.cameras[view].name
+    every = pairs.of_view(view)
+    agreed = pairs.of_view(view, group)
     used = agreed if len(agreed) else every
-    fits, advice = bool(_median(used) <= MAX_ERROR), ""
+    fits = bool(_median(used) <= MAX_ERROR)
+    advice = ""
     if not len(every):
-        fits, advice = None, f"no matches with any other camera: {_NO_OVERLAP}"
+        fits = None
+        advice = f"no matches with any other camera: {_NO_OVERLAP}"
     elif group and not len(agreed):
-        fits, advice = None, "matches only with cameras that do not fit: correct those first"
+        fits = None
+        advice = "matches only with cameras that do not fit: correct those first"
     elif len(used) < _MIN_MATCHES:
-        fits, advice = None, f"only {len(used)} matches, {_MIN_MATCHES} are needed: {_NO_OVERLAP}"
+        fits = None
+        advice = f"only {len(used)} matches, {_MIN_MATCHES} are needed: {_NO_OVERLAP}"
     return CameraCheck(name, len(every), _median(used), fits, advice)
 
 

@@ -18,17 +18,22 @@ from morgs_mi.core.color_space import decode_light
 
 _WIDTH = 128  # of a thumbnail, px
 # Range of thumbnail values that determine a gain; darker ones are noise, brighter ones are clipped.
-_DARK, _BRIGHT, _MIN_PIXELS = 20, 240, 30
+_DARK = 20
+_BRIGHT = 240
+_MIN_PIXELS = 30
 # Bands of rows: a rolling shutter reads each at another phase of a lamp.
 _BANDS = 6
 # A repeated frame changes by less than this share of its camera's usual change, while the other cameras change by more
 # than half of their usual change.
-_REPEATED, _CHANGING = 0.1, 0.5
+_REPEATED = 0.1
+_CHANGING = 0.5
 # Lamps flicker at twice the frequency of the mains, Hz.
 _MAINS = (50, 60)
 # Least amplitude of a flicker that is reported, and its power relative to the median over all frequencies.
-_MIN_AMPLITUDE, _MIN_POWER = 0.004, 12.0
-_MIN_FLICKER_FRAMES, _MIN_PERIODS = 20, 2
+_MIN_AMPLITUDE = 0.004
+_MIN_POWER = 12.0
+_MIN_FLICKER_FRAMES = 20
+_MIN_PERIODS = 2
 
 
 @dataclass(frozen=True)
@@ -118,7 +123,8 @@ def lamp_flicker(bands: np.ndarray, fps: float) -> Lamp | None:
     window = np.hanning(count + 2)[1:-1, None]
     window = 2 * window / window.sum()
     amplitude = _rms(np.fft.rfft(bands * window, axis=0))
-    peak, step = int(amplitude.argmax()), fps / count
+    peak = int(amplitude.argmax())
+    step = fps / count
     if amplitude[peak] < _MIN_AMPLITUDE or amplitude[peak] ** 2 < _MIN_POWER * np.median(amplitude**2):
         return None
     aliases = {mains: abs(2 * mains - fps * round(2 * mains / fps)) for mains in _MAINS}

@@ -25,15 +25,19 @@ from morgs_mi.core.camera import Camera
 
 _PLANES = 48
 # Grey levels, and multiples of a frame's median change, below which a change is noise or compression.
-_NOISE, _MEDIANS = 6.0, 5.0
+_NOISE = 6.0
+_MEDIANS = 5.0
 # Largest shift, in frames and as a share of the clip: fewer overlapping frames correlate by chance.
-_MAX_SHIFT, _MAX_SHARE = 15, 0.25
+_MAX_SHIFT = 15
+_MAX_SHARE = 0.25
 # A pair's peak counts if it is this high, and higher by this much than three frames beside it.
-_MIN_CORRELATION, _MIN_PROMINENCE = 0.3, 0.05
+_MIN_CORRELATION = 0.3
+_MIN_PROMINENCE = 0.05
 _BESIDE = 3
 # Difference in frames up to which a pair agrees with the offsets of its cameras, and the share of a camera's pairs that
 # must agree.
-_AGREEING, _MIN_AGREEMENT = 0.5, 0.75
+_AGREEING = 0.5
+_MIN_AGREEMENT = 0.75
 _ITERATIONS = 30
 
 
