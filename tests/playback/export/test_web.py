@@ -14,14 +14,8 @@ import pytest
 
 from morgs_mi.cli import main
 from morgs_mi.codec.container import StreamWriter
-from morgs_mi.codec.packets import (
-    CodedFrame,
-    coded_frames,
-    keyframe_packet,
-    play,
-    reemitted_keyframe,
-    residual_packet,
-)
+from morgs_mi.codec.frame_source import play
+from morgs_mi.codec.packets import CodedFrame, coded_frames, keyframe_packet, reemitted_keyframe, residual_packet
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import TRANSFER, exposed
 from morgs_mi.core.gaussians import Gaussians
