@@ -115,6 +115,18 @@ def splat_files() -> str:
     return markdown(titles, rows, left=0)
 
 
+def plugin_step() -> str:
+    """Return the times of a step through `mi.render`, and of several cameras, by number of Gaussians."""
+    rows = []
+    for row in committed("plugin_step")["rows"]:
+        times = (f"{row[name]:.0f} ms" for name in ("rasterize", "plugin", "update"))
+        ratios = (row["plugin"] / row["rasterize"], row["cameras_together"] / row["cameras_one_by_one"])
+        size = f"{row['width']}x{row['height']}"
+        rows.append((f"{row['gaussians']:,}", size, *times, *(f"{ratio:.2f}" for ratio in ratios)))
+    titles = "Gaussians", "film", "`rasterize`", "`mi.render`", "`params.update()`", "ratio", "four cameras together"
+    return markdown(titles, rows, left=0)
+
+
 def fuzz() -> str:
     """Return the number of damaged streams and of refusals by fuzzer."""
     changes = {
@@ -172,6 +184,7 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "parts": parts,
     "principal_points": partial(study_table, real, "real"),
     "splat_files": splat_files,
+    "plugin_step": plugin_step,
     "steps": steps,
     "unseen": partial(study_table, random_scenes, "random_scenes"),
     "unseen_groups": unseen_groups,

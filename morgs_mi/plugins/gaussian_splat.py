@@ -134,22 +134,22 @@ def _sensor_camera(sensor: Any, border: int) -> Camera:
             f"gaussian_splat: expected a `perspective` sensor or a `batch` of them, got {sensor.class_name()}; splats "
             "are drawn only by pinhole cameras without lens distortion."
         )
+    view = Camera.from_sensor(sensor)
     params: Any = mi.traverse(sensor)
-    W, H = (int(size) for size in sensor.film().size())
-    names = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")
-    fov, offset_x, offset_y = (params[name] for name in names)
-    f = 0.5 * W / dr.tan(dr.deg2rad(0.5 * fov))
+    W = view.width
+    H = view.height
+    # Numbers of the view, which take no kernel of their own; Dr.Jit arrays only for their gradients.
+    K = view.K.copy()
+    K[:2, 2] += border
+    f = 0.5 * W / dr.tan(dr.deg2rad(0.5 * params["x_fov"]))
     # Mitsuba adds its offset to the pixel's position: the principal point moves the other way.
-    cx = W * (0.5 - offset_x) + border
-    cy = H * (0.5 - offset_y) + border
-    K = np.diag([float(f[0]), float(f[0]), 1.0])
-    K[:2, 2] = cx[0], cy[0]
+    cx = W * (0.5 - params["principal_point_offset_x"]) + border
+    cy = H * (0.5 - params["principal_point_offset_y"]) + border
     world_to_sensor = mi.TensorXf(dr.rcp(params["to_world"].matrix))[..., 0]
     # Mitsuba's camera has x to the left and y up.
     viewmat = world_to_sensor * mi.TensorXf([-1, -1, 1, 1], (4, 1))
     size = (W + 2 * border, H + 2 * border)
-    near = float(params["near_clip"])
-    return AttachedCamera(K, viewmat, *size, sensor.id(), near, intrinsics=(f, f, cx, cy))
+    return AttachedCamera(K, viewmat, *size, view.name, view.near, intrinsics=(f, f, cx, cy))
 
 
 def _render_config(props: Any) -> RenderConfig:
