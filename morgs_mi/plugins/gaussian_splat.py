@@ -266,6 +266,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
     def render(
         self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
     ) -> Any:
+        refuse_freezing("gaussian_splat")  # before any memory is released, which would end the process
         self.kept = None
         with dr.resume_grad():
             inputs = self._inputs(scene, sensor)
@@ -320,7 +321,6 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
 
     def _expose(self, scene: Any, sensor: Any, seed: Any, spp: int) -> tuple[Any, SurfaceView | None]:
         """Render the scene to the sensor's film and return the film, and the surfaces if there are any."""
-        refuse_freezing("gaussian_splat")
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         film = sensor.film()
         if mi.has_flag(film.flags(), mi.FilmFlags.Special):
