@@ -258,6 +258,7 @@ def test_main__prints_a_traceback_with_debug(tmp_path: Path, run) -> None:
     assert "load_capture" in error
 
 
+@pytest.mark.slow
 def test_main__goes_from_a_scene_to_an_evaluation(tmp_path: Path, run) -> None:
     clip, out = tmp_path / "clip", tmp_path / "out"
     size = ("--width", 64, "--height", 48, "--spp", 4)

@@ -73,6 +73,7 @@ def test_balance_cameras__leaves_equal_cameras_alone_after_one_fit():
     assert "stay as recorded" in found.sentence
 
 
+@pytest.mark.slow
 def test_balance_cameras__judges_by_withheld_pixels(monkeypatch: pytest.MonkeyPatch):
     scores = iter((25.0, 25.05))
     monkeypatch.setattr("morgs_mi.fit.balance.mean_psnr", lambda *_: next(scores))

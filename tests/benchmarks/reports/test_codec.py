@@ -64,6 +64,7 @@ def test_options__reuse_complete_streams_and_write_tables_json_and_plot(
     assert plot.stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_measure__of_workers_is_that_of_one_process(fitted_clip: Path, tmp_path: Path) -> None:
     stream = replace(QUICK.stream, render=RenderConfig(reproducible=True))
     capture = load_capture(fitted_clip / "capture", max_frames=2)

@@ -166,6 +166,7 @@ def test_later_frames__has_the_scores_of_a_fit(clip, tmp_path):
     assert mean.keys() | {"by_frame"} == made_up(None, None, options.base).keys()
 
 
+@pytest.mark.slow
 def test_measure__of_workers_is_that_of_one_process(clip, tmp_path, monkeypatch):
     """Also if a worker dies, and the report is started again."""
     monkeypatch.setattr(method, "later_frames", made_up)

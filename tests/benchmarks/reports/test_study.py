@@ -39,7 +39,7 @@ STUDIES = {
     drift: ({**SMALL, "scenes": ("spheres",)}, 2),
     timing: ({**SMALL, "seeds": (3,), "frames": 6, "fitted": 2, "time_offset": 0.4}, 2),
 }
-FAST = (random_scenes, unseen)
+FAST = (random_scenes,)
 
 
 def tiny_loop(cameras, points, colors, config, image_masks):
