@@ -65,18 +65,22 @@ def main(options: Options) -> None:
 
 def draw(loop: StreamLoop, images: Sequence[np.ndarray | None]) -> dict[str, np.ndarray]:
     """Push the next frame and return the image [H, W, 3] of each stage in the key view that changes most, by name."""
-    setup, state = loop.setup, loop.state
+    setup = loop.setup
+    state = loop.state
     observed = observe_frame(setup, state.frame, state.history, images)
     changes = observed.changes or {}
     view = max(observed.flows, key=lambda v: changes[v].sum())
-    camera, flow, before = setup.cameras[view], observed.flows[view], loop.gaussians
+    camera = setup.cameras[view]
+    flow = observed.flows[view]
+    before = loop.gaussians
     image = observed.history.images[view]
     assert before is not None
     assert state.coded is not None
     assert flow.mask is not None, "motion masks are computed at multiples of `mask_interval`"
     lifted = _lifted(before, loop, observed)
     loop.push(images)
-    after, coded = loop.gaussians, loop.state.coded
+    after = loop.gaussians
+    coded = loop.state.coded
     assert after is not None
     assert coded is not None
     rendered = _channel(after, camera, "color")

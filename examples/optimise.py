@@ -9,12 +9,12 @@ import numpy as np
 mi.set_variant("llvm_ad_rgb")
 import morgs_mi
 
-rng, N = np.random.default_rng(0), 300
+rng = np.random.default_rng(0)
+N = 300
 camera = morgs_mi.Camera.look_at((0, 0, -3), (0, 0, 0), (0, -1, 0), 40, 96, 96)
 y, x = np.mgrid[-1:1:96j, -1:1:96j]
 disc = (x**2 + y**2 < 0.6)[..., None] * np.stack([0.5 + 0.5 * x, 0.5 + 0.5 * y, 0 * x + 0.3], axis=2)
 target = mi.TensorXf(disc.astype(np.float32))  # linear RGB [96, 96, 3]
-
 gaussians = morgs_mi.Gaussians.from_activated(
     means=rng.uniform(-0.8, 0.8, (N, 3)) * (1, 1, 0.1),
     scales=np.full((N, 3), 0.06),
@@ -28,12 +28,11 @@ params = mi.traverse(scene)
 params.keep(["gaussians.data", "gaussians.opacities", "gaussians.sh_coeffs"])
 optimiser = mi.ad.Adam(lr=5e-3, params=params)
 images = [mi.render(scene)]
-for step in range(150):
+for _ in range(150):
     params.update(optimiser)
     image = mi.render(scene, params)
-    loss = dr.mean(dr.square(image - target), axis=None)
-    dr.backward(loss)
+    dr.backward(dr.mean(dr.square(image - target), axis=None))
     optimiser.step()
-    print(step, loss)
+    optimiser["gaussians.opacities"] = dr.clip(optimiser["gaussians.opacities"], 0.01, 0.99)
 row = np.concatenate([np.array(picture) for picture in (*images, image, target)], axis=1)
 mi.util.write_bitmap(sys.argv[1], row)  # before, after, target

@@ -78,7 +78,8 @@ def anchor_matrix(points: np.ndarray, counts: Sequence[int]) -> tuple[csr_array,
         counts: points per anchor of each level.
     """
     order = np.argsort(z_order(points, equal_cells(points)), kind="stable")
-    levels, size = [], 0
+    levels = []
+    size = 0
     for count in counts:
         anchors = points[order[min(count, len(points)) // 2 :: count]]
         _, nearest = KDTree(anchors).query(points, workers=-1)

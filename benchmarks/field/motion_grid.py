@@ -61,7 +61,9 @@ _SLOW = GridConfig(translation_rate=5e-4, rotation_rate=2e-3)
 def motion_grid(gaussians: Gaussians, extent: float, config: GridConfig) -> MotionModel:
     """Return the model of N Gaussians of the previous frame; `extent` of the scene in world units."""
     matrix, level = corner_matrix(np.asarray(gaussians.means), [side * extent for side in config.cells])
-    C, N, L = len(level), len(gaussians), len(config.cells)
+    C = len(level)
+    N = len(gaussians)
+    L = len(config.cells)
     of_level = csr_array((np.ones(C, np.float32), level, np.arange(C + 1)), (C, L))
     steps = {"translation": config.translation_step * extent, "rotation": config.rotation_step}
 

@@ -19,7 +19,8 @@ def corners(points: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray]:
         Integer coordinates [N, 8, 3], and weights float32 [N, 8], which sum to 1.
     """
     lowest = np.floor(points / side)
-    offsets, fraction = np.indices((2, 2, 2)).reshape(3, 8).T, points / side - lowest
+    offsets = np.indices((2, 2, 2)).reshape(3, 8).T
+    fraction = points / side - lowest
     weights = np.prod(np.where(offsets, fraction[:, None], 1 - fraction[:, None]), axis=-1)
     return lowest.astype(np.int64)[:, None] + offsets, weights.astype(np.float32)
 

@@ -64,7 +64,10 @@ def transformation_cache(
         rng: draws the weights and the tables.
         config: settings.
     """
-    N, L, F, H = len(gaussians), config.levels, config.features, config.hidden
+    N = len(gaussians)
+    L = config.levels
+    F = config.features
+    H = config.hidden
     sides = [config.coarsest * extent / 2**level for level in range(L)]
     matrix = hash_matrix(np.asarray(gaussians.means), sides, config.table)
 
@@ -100,7 +103,8 @@ def hash_matrix(points: np.ndarray, sides: list[float], table: int) -> csr_array
         sides: of the cells of each of L levels, world units.
         table: number T of entries of each table.
     """
-    indices, weights = [], []
+    indices = []
+    weights = []
     for level, side in enumerate(sides):
         corner, weight = corners(points, side)  # [N, 8, 3], [N, 8]
         hashed = np.bitwise_xor.reduce(corner.astype(np.uint64) * _PRIMES, axis=-1)

@@ -102,7 +102,9 @@ class Options(StudyOptions):
 
 def disturbed(cameras: Sequence[Camera], degrees: float, seed: int) -> tuple[Camera, ...]:
     """Return cameras with wrong poses and focal lengths."""
-    rng, extent, found = np.random.default_rng([seed, 7]), scene_extent(cameras), []
+    rng = np.random.default_rng([seed, 7])
+    extent = scene_extent(cameras)
+    found = []
     focal = _FOCAL_ERROR if degrees else 0.0
     for camera in cameras:
         axis, direction = rng.normal(size=(2, 3))
@@ -115,7 +117,8 @@ def disturbed(cameras: Sequence[Camera], degrees: float, seed: int) -> tuple[Cam
 def pose_errors(cameras: Sequence[Camera], true: Sequence[Camera]) -> dict[str, float]:
     """Return the errors of cameras after the best common rotation, displacement and scale: degrees, extents, ratio."""
     centres, goals = (np.array([camera.position for camera in rig]) for rig in (cameras, true))
-    centres, goals = centres - centres.mean(axis=0), goals - goals.mean(axis=0)
+    centres = centres - centres.mean(axis=0)
+    goals = goals - goals.mean(axis=0)
     pairs = list(zip(cameras, true, strict=True))
     U, _, Vt = np.linalg.svd(sum(a.viewmat[:3, :3].T @ b.viewmat[:3, :3] for a, b in pairs))
     centres = centres @ (U @ Vt)
@@ -132,7 +135,9 @@ def pose_errors(cameras: Sequence[Camera], true: Sequence[Camera]) -> dict[str, 
 
 def scores(capture: Capture, config: StreamConfig) -> dict[str, float]:
     """Fit the first frame; return the PSNR of the training views, and of the held-out one in both ways."""
-    loop, images, train = new_loop(capture, config), next(capture.frames(0, 1)).images, capture.train_views
+    loop = new_loop(capture, config)
+    images = next(capture.frames(0, 1)).images
+    train = capture.train_views
     loop.push([images[v] for v in train])
     gaussians = loop.gaussians
     test = capture.reference_view
@@ -159,7 +164,8 @@ def measure(
         disturbance: seed of the disturbance.
         config: settings.
     """
-    capture, wrong = source.open(), calibrated.open()
+    capture = source.open()
+    wrong = calibrated.open()
     if degrees:
         wrong = replace(wrong, cameras=disturbed(wrong.cameras, degrees, disturbance))
     better, found = refine_cameras(wrong, config.fit, config.render, config.seed)
@@ -173,8 +179,10 @@ def measure(
 
 def camera_errors(given: Capture, capture: Capture) -> dict[str, float]:
     """Return the errors of the training cameras, and by how much their lenses shift a corner of the image, px."""
-    truth, none = load_disturbances(capture.path / "truth"), [(0.0, 0.0)] * len(capture.cameras)
-    terms, train = given.distortions or none, capture.train_views
+    truth = load_disturbances(capture.path / "truth")
+    none = [(0.0, 0.0)] * len(capture.cameras)
+    terms = given.distortions or none
+    train = capture.train_views
     corners = [
         _at_corner(given.cameras[v], terms[v]) - _at_corner(capture.cameras[v], (truth[capture.names[v]].distortion, 0))
         for v in train
@@ -186,7 +194,8 @@ def camera_errors(given: Capture, capture: Capture) -> dict[str, float]:
 def lens_clips(options: Options, seed: int) -> tuple[Path, Path]:
     """Return a clip through lenses with distortion, and a copy with a calibration without it for the training views."""
     true = options.clips / f"random-{seed}-lens-{options.lens:g}"
-    denied, own = true.with_name(f"{true.name}-denied"), Disturbances(distortion=options.lens)
+    denied = true.with_name(f"{true.name}-denied")
+    own = Disturbances(distortion=options.lens)
     capture = synthetic("random", true, SynthConfig(frames=1, seed=seed, disturbances=own))
     if not denied.exists():
         truth = load_disturbances(true / "truth")

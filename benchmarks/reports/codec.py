@@ -95,7 +95,8 @@ def measure(capture: Capture, options: Options, client: Client | None) -> dict[s
     name = capture.path.resolve().name
     if capture.num_frames < 2:
         raise ValueError(f"{capture.path}: expected a capture of two frames or more, got {capture.num_frames}.")
-    qualities, codec = (*options.qualities, options.reference), options.stream.codec
+    qualities = (*options.qualities, options.reference)
+    codec = options.stream.codec
     settings = {quality: replace(options.stream, codec=replace(codec, quality=quality)) for quality in qualities}
     folders = {quality: options.out / name / f"{quality:g}" for quality in qualities}
     source = Source.of(capture)
@@ -164,7 +165,9 @@ def _evaluated(folder: Path, capture: Capture) -> dict[str, Any]:
 def _measured(folder: Path, settings: StreamConfig) -> dict[str, Any]:
     """Return times and bytes of encoding the later frames again, with the codec and with lzma."""
     stream = open_stream(folder)
-    cameras, rows, before = stream.cameras, [], None
+    cameras = stream.cameras
+    rows = []
+    before = None
     for state in coded_frames(stream):
         if before is not None:
             rows.append(_frame(before, state, cameras, settings))
@@ -185,7 +188,8 @@ def _frame(before: CodedFrame, now: CodedFrame, cameras: Sequence[Any], settings
     decode(before, packet)
     decoded = time.perf_counter()
     survivors = source[~born]
-    old, new = before.gaussians.numpy(), now.gaussians.numpy()
+    old = before.gaussians.numpy()
+    new = now.gaussians.numpy()
     raw = b"".join(
         np.concatenate([new[name][~born] - old[name][survivors], new[name][born]]).tobytes()
         for name in new

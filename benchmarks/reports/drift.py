@@ -70,7 +70,8 @@ class Options(ClipOptions):
 def measure(source: Source, num_frames: int, config: StreamConfig) -> dict[str, Any]:
     """Fit a clip and return its scores per later frame, and the slope of PSNR where things move, in dB a frame."""
     capture = source.open()
-    loop, frames = new_loop(capture, config), capture.partial_frames(0, num_frames)
+    loop = new_loop(capture, config)
+    frames = capture.partial_frames(0, num_frames)
     images = next(frames).images
     loop.push([images[v] for v in capture.train_views])
     rows = list(fitted_frames(loop, capture, frames))

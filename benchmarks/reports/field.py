@@ -163,7 +163,8 @@ def plot_field(cells: Cells, path: Path) -> None:
         ValueError: matplotlib is not installed.
     """
     names = list(next(iter(cells.values())))
-    methods, most = list(dict.fromkeys(n.split("/")[0] for n in names)), max(int(n.split("/")[1]) for n in names)
+    methods = list(dict.fromkeys(n.split("/")[0] for n in names))
+    most = max(int(n.split("/")[1]) for n in names)
     figure = blank_figure(11, 7)
     axes = figure.subplots(2, 2)
     for k, method in enumerate(methods):

@@ -87,7 +87,8 @@ def spread_views(cameras: Sequence[Camera], count: int, among: Sequence[int]) ->
 def new_loop(capture: Capture, config: StreamConfig, train: Sequence[int] | None = None) -> StreamLoop:
     """Return a loop over the views `train` of a capture, its training views if they are None."""
     train = capture.train_views if train is None else train
-    cameras, masks = [capture.cameras[v] for v in train], [capture.masks[v] for v in train]
+    cameras = [capture.cameras[v] for v in train]
+    masks = [capture.masks[v] for v in train]
     return StreamLoop(cameras, capture.points, capture.point_colors, config, masks)
 
 

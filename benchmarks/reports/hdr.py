@@ -4,8 +4,8 @@
 
 A room without a ceiling, with a lamp and a metal sphere that moves, is path-traced in linear light. It is recorded
 twice: as EXR files, and as PNG files, which clip the lamp and its reflections at white. Both recordings are fitted with
-the same settings. A diffuse white sphere in the room then receives the light of a `light_probe`, and in truth that of
-the room, traced with the sphere in it.
+the same settings. A diffuse white sphere is lit by the `light_probe` of each fit. The truth is a path-traced image of
+the room with the sphere in it.
 """
 
 from __future__ import annotations
@@ -39,12 +39,15 @@ from morgs_mi.runs.recorder import stream_capture
 from morgs_mi.synth.scene import Rig
 
 RIG = Rig(center=(0, 0.75, 0), distance=4.0, fov=44.0)
-FRAMES, FPS = 3, 30
+FRAMES = 3
+FPS = 30
 # Place and radius of the inserted sphere, where the room is empty.
-PLACE, RADIUS = (0.1, 0.7, 0.35), 0.25
+PLACE = (0.1, 0.7, 0.35)
+RADIUS = 0.25
 # Radius of the sphere on which the light is measured: it hardly changes the light of the room.
 _SMALL = 0.01
-_NORMALS, _SAMPLES = 400, 1024
+_NORMALS = 400
+_SAMPLES = 1024
 _POINTS = 1500
 # Rows of the light probe: a texel is smaller than the lamp.
 _HEIGHT = 128
@@ -158,8 +161,10 @@ def record(options: Options) -> dict[str, Path]:
 
 def surface_points(cameras: list[Camera]) -> tuple[np.ndarray, np.ndarray]:
     """Return points on the surfaces that the cameras see in the first frame, and their colours in [0, 1]."""
-    rng, scene = np.random.default_rng(0), room(0)
-    points, colors = [], []
+    rng = np.random.default_rng(0)
+    scene = room(0)
+    points = []
+    colors = []
     for camera in cameras:
         pixels = rng.uniform(0, (camera.width, camera.height), (_POINTS // len(cameras), 2))
         position, directions = camera.rays(pixels)
@@ -176,7 +181,8 @@ def surface_points(cameras: list[Camera]) -> tuple[np.ndarray, np.ndarray]:
 def normals() -> np.ndarray:
     """Return directions [K, 3], evenly distributed on the sphere."""
     k = np.arange(_NORMALS) + 0.5
-    y, angle = 1 - 2 * k / _NORMALS, np.pi * (1 + np.sqrt(5)) * k
+    y = 1 - 2 * k / _NORMALS
+    angle = np.pi * (1 + np.sqrt(5)) * k
     return np.stack([np.sqrt(1 - y * y) * np.cos(angle), y, np.sqrt(1 - y * y) * np.sin(angle)], axis=1)
 
 

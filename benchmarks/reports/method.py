@@ -47,7 +47,8 @@ if TYPE_CHECKING:
     from distributed import Client
 
 # Rows of the paper's table of key views.
-_WITHOUT_OFFSET, _WITH_OFFSET = "ml", "ml-mo"
+_WITHOUT_OFFSET = "ml"
+_WITH_OFFSET = "ml-mo"
 _PAPER_EPOCHS = 8
 _WORK = "captures", "out", "workers", "scheduler"  # options on which no figure depends
 _SETTING = "preset", "epochs", "key_views", "rates"
@@ -122,7 +123,8 @@ class Options(OnWorkers):
             raise ValueError(
                 f"method: `captures` must be one folder or more with distinct names, got {', '.join(names)}."
             )
-        clips, settings = [], {n: v for n, v in asdict(self).items() if n not in _WORK}
+        clips = []
+        settings = {n: v for n, v in asdict(self).items() if n not in _WORK}
         about = {"table_epochs": self.table_epochs, "version": self.version or method_version()}
         with self.opened() as client:
             for path in self.captures:
@@ -196,7 +198,8 @@ def fitted(
     client: Client | None,
 ) -> list[Row]:
     """Return the rows of all variants with the first seed, and of the others at the best rates and all key views."""
-    source, rows = Source.of(capture), list[Row]()
+    source = Source.of(capture)
+    rows = list[Row]()
     start = Study(first_frame, [Scene({"frame": 0}, (replace(source, num_frames=1),))], [Variant({}, options.base)])
     start = replace(start, seeds=range(options.seeds), version=options.version)
     firsts = {row["fit_seed"]: row["packet"] for row in start.run(client, options.out)}

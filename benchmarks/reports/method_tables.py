@@ -177,7 +177,8 @@ def _edges(clip: Row) -> str:
 
 
 def _spread(row: Row, name: str, digits: int, unit: float) -> str:
-    mean, std = row["mean"][name], row["std"][name]
+    mean = row["mean"][name]
+    std = row["std"][name]
     if not _known(mean):
         return "-"
     return figure(unit * mean, digits) + (f" ± {figure(unit * std, digits)}" if _known(std) else "")

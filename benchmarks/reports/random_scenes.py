@@ -76,7 +76,8 @@ def fitted_frames(loop: StreamLoop, capture: Capture, frames: Iterable[PartialFr
     for frame in frames:
         start = time.process_time()
         _, report = loop.push([frame.images[v] for v in capture.train_views])
-        seconds, recorded = time.process_time() - start, frame.images[test]
+        seconds = time.process_time() - start
+        recorded = frame.images[test]
         if recorded is not None and loop.gaussians is not None:
             scores = scores_of(loop.gaussians, capture, test, frame.index, recorded)
             sizes = {"bytes": report.num_bytes, "num_gaussians": report.num_gaussians}
@@ -89,8 +90,10 @@ def scores_of(gaussians: Gaussians, capture: Capture, view: int, frame: int, rec
     camera = capture.cameras[view]
     truth = load_truth(capture.truth, camera.name, frame)
     image = rasterize(gaussians, camera, ("color", "motion", "confidence"))
-    color, confidence = np.clip(np.asarray(image.color), 0, 1), np.asarray(image.confidence).reshape(truth.mask.shape)
-    target, error = recorded / 255.0, np.linalg.norm(np.asarray(image.motion) - truth.motion, axis=-1)
+    color = np.clip(np.asarray(image.color), 0, 1)
+    confidence = np.asarray(image.confidence).reshape(truth.mask.shape)
+    target = recorded / 255.0
+    error = np.linalg.norm(np.asarray(image.motion) - truth.motion, axis=-1)
     return {
         "psnr": psnr(color, target),
         "psnr_moving": psnr(color[truth.mask], target[truth.mask]) if truth.mask.any() else np.nan,

@@ -42,7 +42,9 @@ COLUMNS = (
     Column("registered", "registered"),
     Column("difference", lambda fit: fit["registered"] - fit["held_out"], spread=False),
 )
-_FIRST, _EVERY, _FEW = 4, 8, 6
+_FIRST = 4
+_EVERY = 8
+_FEW = 6
 
 
 @dataclass(frozen=True)

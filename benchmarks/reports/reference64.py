@@ -54,14 +54,16 @@ class Reference64:
         """Return dL/d(attribute) by name, given dL/d(colour, alpha) [P, 4] at the pixels [P, 2]."""
         splats, values, order = self._splats()
         N = len(values)
-        to_splats, to_values = np.zeros((N, 6)), np.zeros((N, 4))
+        to_splats = np.zeros((N, 6))
+        to_values = np.zeros((N, 4))
         for chunk, distance, weights, light, alpha, free in self._blended(splats, order, pixels):
             g = gradient[chunk]
             product = g @ values[order].T  # <g, c_i>
             inner = weights * product
             behind = inner[:, ::-1].cumsum(axis=1)[:, ::-1] - inner
             to_full = np.where(free, light * product - behind / (1 - alpha), 0) * alpha  # dL/dA A
-            (dx, dy), (_, _, a, b, c, opacity) = distance, splats[order].T
+            dx, dy = distance
+            _, _, a, b, c, opacity = splats[order].T
             moments = (
                 a * (to_full * dx).sum(0) + b * (to_full * dy).sum(0),
                 b * (to_full * dx).sum(0) + c * (to_full * dy).sum(0),
@@ -88,16 +90,19 @@ class Reference64:
         rows = max(1, _PAIRS // max(len(order), 1))
         for first in range(0, len(pixels), rows):
             chunk = slice(first, first + rows)
-            dx, dy = pixels[chunk, :1] + 0.5 - mean_x, pixels[chunk, 1:] + 0.5 - mean_y
+            dx = pixels[chunk, :1] + 0.5 - mean_x
+            dy = pixels[chunk, 1:] + 0.5 - mean_y
             full = opacity * np.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
-            drawn, free = full >= self.config.alpha_min, full <= self.config.alpha_max
+            drawn = full >= self.config.alpha_min
+            free = full <= self.config.alpha_max
             alpha = np.where(drawn, np.minimum(full, self.config.alpha_max), 0)
             light = np.cumprod(np.column_stack([np.ones(len(alpha)), 1 - alpha]), axis=1)[:, :-1]
             yield chunk, (dx, dy), light * alpha, light, alpha, drawn & free
 
     def _to_attributes(self, incoming: np.ndarray) -> dict[str, np.ndarray]:
         """Return the gradients of the attributes, given the gradients of splats and colours [N, 9]."""
-        raw, grads = self._float64(), {}
+        raw = self._float64()
+        grads = {}
         for name in _GEOMETRY:
             columns = raw[name].reshape(len(incoming), -1)
             grad = np.zeros(columns.shape)
@@ -122,20 +127,26 @@ def _pose(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 def _project(raw: Mapping[str, np.ndarray], camera: Camera, eps2d: float) -> tuple[np.ndarray, np.ndarray]:
     """Return (mean, conic, opacity, colour) [N, 9] of every Gaussian, real or complex, and depths [N]."""
-    (R, t), K = _pose(camera), np.asarray(np.float32(camera.K), np.float64)
+    R, t = _pose(camera)
+    K = np.asarray(np.float32(camera.K), np.float64)
     x, y, z = (raw["means"] @ R.T + t).T
     depths = z.real
     z = np.where(depths >= camera.near, z, 1)  # Gaussians behind the camera only need finite values
-    means2d, jacobian = [], np.zeros((len(z), 2, 3), z.dtype)
+    means2d = []
+    jacobian = np.zeros((len(z), 2, 3), z.dtype)
     for axis, (slope, size) in enumerate(((x / z, camera.width), (y / z, camera.height))):
-        f, c = K[axis, axis], K[axis, 2]
-        low, high = -c / f - 0.15 * size / f, (size - c) / f + 0.15 * size / f
+        f = K[axis, axis]
+        c = K[axis, 2]
+        low = -c / f - 0.15 * size / f
+        high = (size - c) / f + 0.15 * size / f
         clamped = np.where(slope.real < low, low, np.where(slope.real > high, high, slope))
         jacobian[:, axis, axis], jacobian[:, axis, 2] = f / z, -f * clamped / z
         means2d.append(f * slope + c)
     axes = jacobian @ R @ _rotation(raw["quats"]) * np.exp(raw["log_scales"])[:, None, :]
     covariance = axes @ axes.transpose(0, 2, 1)
-    xx, xy, yy = covariance[:, 0, 0] + eps2d, covariance[:, 0, 1], covariance[:, 1, 1] + eps2d
+    xx = covariance[:, 0, 0] + eps2d
+    xy = covariance[:, 0, 1]
+    yy = covariance[:, 1, 1] + eps2d
     det = xx * yy - xy * xy
     opacity = 1 / (1 + np.exp(-raw["logit_opacities"]))
     basis = _sh_basis(_directions(raw["means"], camera), raw["sh_coeffs"].shape[1])
@@ -165,7 +176,9 @@ def _rotation(quats: np.ndarray) -> np.ndarray:
 def _sh_basis(directions: np.ndarray, K: int) -> np.ndarray:
     """Return the real spherical harmonics [N, K] of unit directions [N, 3] with 3DGS's signs."""
     x, y, z = directions.T
-    xx, yy, zz = x * x, y * y, z * z
+    xx = x * x
+    yy = y * y
+    zz = z * z
     basis = [SH_C0 + 0 * x]
     basis += [0.4886025119029199 * v for v in (-y, z, -x)]
     basis += [1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (2 * zz - xx - yy)]

@@ -90,7 +90,8 @@ class Setting:
 
 def ladder() -> list[Setting]:
     """Return the settings, one option changed at a time; each option's values include the default."""
-    default, settings = RenderConfig(), []
+    default = RenderConfig()
+    settings = []
     for factor, name in ((1 / 64, "1/16320"), (1 / 8, "1/2040"), (1, "1/255"), (4, "4/255")):
         settings.append(Setting("alpha_min", name, replace(default, alpha_min=default.alpha_min * factor)))
     for stop in (0.0, 1e-5, 1e-4, 1e-3, 1e-2):
@@ -109,7 +110,8 @@ def measure(options: Options) -> list[dict[str, Any]]:
     """Return one row for every setting of the ladder."""
     shape = options.width, options.height
     gaussians, camera = ball(options.seed, options.gaussians, *shape, options.median_scale, options.sh_degree)
-    settings, rng = ladder(), np.random.default_rng(options.seed)
+    settings = ladder()
+    rng = np.random.default_rng(options.seed)
     count = options.width * options.height
     chosen = rng.choice(count, min(options.pixels, count), replace=False)
     pixels = np.stack([chosen % options.width, chosen // options.width], axis=1)
@@ -205,7 +207,8 @@ def _errors(found: Values, expected: Values) -> dict[str, Any]:
     psnr = -20 * float(np.log10(rms)) if rms > 0 else float("inf")
     gradients = {}
     for name in ATTRIBUTES:
-        a, b = found[1][name].ravel(), expected[1][name].ravel()
+        a = found[1][name].ravel()
+        b = expected[1][name].ravel()
         length = np.linalg.norm(b)
         cosine = float(a @ b / (np.linalg.norm(a) * length))
         gradients[name] = {"relative_l2": float(np.linalg.norm(a - b) / length), "cosine": cosine}

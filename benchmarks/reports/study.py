@@ -97,7 +97,8 @@ class Study:
         Raises:
             OSError: a worker died several times, the scheduler was lost, or a score cannot be stored.
         """
-        cells, keys = {}, {}
+        cells = {}
+        keys = {}
         for scene, variant, seed in product(self.scenes, self.variants, self.seeds):
             about = {**scene.keys, **variant.keys, self.seed_key: seed}
             name = ", ".join(f"{key} {value}" for key, value in about.items())

@@ -84,7 +84,8 @@ def measure(
     fits = {"synchronised": (synchronised, first), "recorded": (recorded, first), "aligned": (aligned, 0)}
     rows = []
     for seed in seeds:
-        row, own = {"fit_seed": seed, **errors}, replace(config, seed=seed)
+        row = {"fit_seed": seed, **errors}
+        own = replace(config, seed=seed)
         for name, (capture, begin) in fits.items():
             found = scores(capture, range(begin, begin + num_frames), first, own)
             row |= {f"{name}_{score}": value for score, value in found.items()}
@@ -96,7 +97,8 @@ def offset_errors(recorded: Capture) -> tuple[dict[str, float], dict[str, float]
     """Return the errors of a clip's offsets, the offsets by camera, and the reference."""
     start = time.perf_counter()
     found = estimate_time_offsets(recorded)
-    seconds, truth = time.perf_counter() - start, load_disturbances(recorded.path / "truth")
+    seconds = time.perf_counter() - start
+    truth = load_disturbances(recorded.path / "truth")
     others = [name for name in found.offsets if name != found.reference]
     errors = np.abs([found.offsets[name] + truth[name].time_offset for name in others])
     figures = {
@@ -121,7 +123,8 @@ def scores(capture: Capture, frames: range, first: int, config: StreamConfig) ->
         image = frame.images[test]
         assert loop.gaussians is not None
         assert image is not None
-        color, target = np.asarray(rasterize(loop.gaussians, camera, ("color",)).color), image / 255.0
+        color = np.asarray(rasterize(loop.gaussians, camera, ("color",)).color)
+        target = image / 255.0
         moving = load_truth(capture.path / "truth", camera.name, first + k).mask
         if k and moving.any():
             color = np.clip(color, 0, 1)

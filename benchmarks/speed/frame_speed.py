@@ -75,15 +75,18 @@ class Scene:
 
     def __init__(self, size: Size, seed: int) -> None:
         rng = np.random.default_rng(seed)
-        self.size, count = size, size.gaussians
-        flat, each = count // 3, (count - 2 * (count // 3)) // 40
+        self.size = size
+        count = size.gaussians
+        flat = count // 3
+        each = (count - 2 * (count // 3)) // 40
         wall = np.stack([rng.uniform(-3, 3, flat), rng.uniform(-2, 1, flat), np.full(flat, 1.5)], 1)
         floor = np.stack([rng.uniform(-3, 3, flat), np.full(flat, 1.0), rng.uniform(-1.5, 1.5, flat)], 1)
         centers = np.stack([rng.uniform(-1.8, 1.8, 40), rng.uniform(-1.2, 0.6, 40), rng.uniform(-0.8, 1.0, 40)], 1)
         self.owner = np.concatenate([np.full(2 * flat, -1), np.repeat(np.arange(40), each)])
         self.local = rng.normal(size=(40 * each, 3))
         self.local *= 0.22 / np.linalg.norm(self.local, axis=1, keepdims=True)
-        self.centers, self.ground = centers, np.concatenate([wall, floor])
+        self.centers = centers
+        self.ground = np.concatenate([wall, floor])
         rest = np.concatenate([self.ground, centers.repeat(each, 0) + self.local])
         waves = np.sin(rest @ rng.normal(0, 6, (3, 3)) + rng.uniform(0, 6, 3)) * np.sin(
             rest @ rng.normal(0, 15, (3, 3))
@@ -106,9 +109,11 @@ class Scene:
 
     def gaussians(self, means: np.ndarray, noise: float = 0.0, seed: int = 0) -> Gaussians:
         """Return Gaussians at the given means [N, 3], with noise of a standard deviation `noise` on the SH."""
-        rng, count = np.random.default_rng(seed), len(means)
+        rng = np.random.default_rng(seed)
+        count = len(means)
         sh = self.sh + noise * rng.normal(size=self.sh.shape)
-        quats, opacities = np.tile([1.0, 0, 0, 0], (count, 1)), np.full(count, 0.9)
+        quats = np.tile([1.0, 0, 0, 0], (count, 1))
+        opacities = np.full(count, 0.9)
         return Gaussians.from_activated(means, self.scales, quats, opacities, sh, logit_confidence=np.zeros(count))
 
     def cameras(self) -> list[Camera]:
@@ -180,7 +185,8 @@ def main(options: Options) -> None:
     mi.set_variant("llvm_ad_rgb")
     result: dict[str, Any] = {"seed": options.seed, "noise": NOISE}
     for name in options.sizes:
-        scene, rows = Scene(SIZES[name], options.seed), {}
+        scene = Scene(SIZES[name], options.seed)
+        rows = {}
         recorded = scene.recorded(options.frames + 2, options.seed)
         for label, config in settings(options, name).items():
             for live in (False, True) if label.startswith("default") else (True,):

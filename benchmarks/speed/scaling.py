@@ -108,7 +108,8 @@ def _limited_to(count: int) -> Iterator[None]:
 
 
 def _config(options: Options) -> StreamConfig:
-    steps, count = options.first_frame_steps, options.gaussians
+    steps = options.first_frame_steps
+    count = options.gaussians
     fit = FitConfig(num_gaussians=count, first_frame_steps=steps, epochs=options.epochs, dropping=0.0)
     return StreamConfig(fit=fit)
 

@@ -30,7 +30,8 @@ from morgs_mi.render.region import Region, full_view
 # Pairs of pixel and Gaussian that are computed in float64.
 _REFERENCE_PAIRS = 20_000_000
 # Mitsuba's integrator traces rays through a hierarchy: beyond this a step takes many seconds.
-VOLPRIM_GAUSSIANS, VOLPRIM_PIXELS = 20_000, 512 * 384
+VOLPRIM_GAUSSIANS = 20_000
+VOLPRIM_PIXELS = 512 * 384
 
 
 def timed(work: Callable[[], Any], repeats: int, patience: float = float("inf")) -> float:
@@ -63,7 +64,8 @@ def stages(gaussians: Gaussians, camera: Camera, seed: int = 1) -> dict[str, Cal
     """
     config = RenderConfig()
     target = np.broadcast_to(np.array(TARGET, np.float32), (camera.height, camera.width, 3)).copy()
-    attributes, full = list(gaussians.items().values()), mi.TensorXf(target)
+    attributes = list(gaussians.items().values())
+    full = mi.TensorXf(target)
     dr.enable_grad(attributes)
 
     def lists() -> Any:
