@@ -286,8 +286,7 @@ def _equations(
     for view, (camera, change) in enumerate(zip(cameras, changes, strict=True)):
         here = tracks.views == view
         now = changed_camera(camera, change)
-        seen = points[tracks.ids[here]]
-        jacobians = camera_jacobian(now, 1 + change[6], seen, change[9:])
+        jacobians = camera_jacobian(now, 1 + change[6], points[tracks.ids[here]], change[9:])
         w = weights[here]
         equations.add(view, tracks.ids[here], jacobians, w[..., None] * np.eye(2), w * errors[here])
     return equations

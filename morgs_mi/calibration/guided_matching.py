@@ -71,9 +71,10 @@ def _patches_agree(a: Features, b: Features, pairs: np.ndarray, first: Camera, s
     points = intersect(tracks, views, pixels, (first, second), count)
     with np.errstate(divide="ignore", invalid="ignore"):
         expected = _carried(points, a.axes[pairs[:, 0]], first, second)
-        found = b.axes[pairs[:, 1]]
-        octaves = np.log2(np.linalg.norm(expected, axis=1) / np.linalg.norm(found, axis=1))
-        cosines = (expected * found).sum(axis=1) / np.linalg.norm(expected, axis=1) / np.linalg.norm(found, axis=1)
+        axes = b.axes[pairs[:, 1]]
+        expected_length, length = (np.linalg.norm(vectors, axis=1) for vectors in (expected, axes))
+        octaves = np.log2(expected_length / length)
+        cosines = (expected * axes).sum(axis=1) / expected_length / length
     return (np.abs(octaves) <= _MAX_OCTAVES) & (cosines >= np.cos(np.deg2rad(_MAX_TURN)))
 
 

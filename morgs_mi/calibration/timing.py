@@ -127,14 +127,15 @@ def _aligned(rounds: _Rounds, largest: int) -> tuple[np.ndarray, np.ndarray, Off
     clips = rounds.clips
     offsets = np.zeros(len(clips.cameras))
     step = np.zeros(len(clips.cameras))
-    left = None
+    solution = None
     for index, blur in enumerate(_BLUR_OF_ROUND):
         equations = rounds.equations(offsets, blur)
-        before = left if blur in _BLUR_OF_ROUND[:index] else None
-        left = equations.solution()
-        share = 1.0 if before is None else _share(step[clips.train], (left - before)[clips.train])
+        previous = solution if blur in _BLUR_OF_ROUND[:index] else None
+        solution = equations.solution()
+        share = 1.0 if previous is None else _share(step[clips.train], (solution - previous)[clips.train])
         moved = np.clip(offsets + np.clip(equations.solution(share), -_LONGEST_STEP, _LONGEST_STEP), -largest, largest)
-        offsets, step = moved, moved - offsets
+        step = moved - offsets
+        offsets = moved
         if not blur and np.abs(step).max() < _TOLERANCE:
             break
     return offsets, step, equations

@@ -72,26 +72,26 @@ class Info:
         if self.plot is not None:
             check_plot(self.plot)
         capture = load_capture(self.capture, reading=self.reading.read_config())
-        found = None
+        rig_check = None
         deep = None
         exposures: Sequence[Finding] = ()
         origin = "" if len(capture.points) else "without points"
         if self.check:
             with progress() as report:
                 common = match_capture(capture, lambda done, total: report("Matching views", done, total))
-            found = check_rig(capture, common)
+            rig_check = check_rig(capture, common)
             if origin:
                 capture = triangulate_points(capture, common)
                 origin += f" ({len(capture.points)} can be triangulated)"
             if self.deep:
-                deep = _deep_check(capture, common, found)
+                deep = _deep_check(capture, common, rig_check)
             else:
                 exposures = check_exposures(capture, common)
-        print_table(_camera_table(capture, found))
+        print_table(_camera_table(capture, rig_check))
         points = origin or f"{len(capture.points)} points"
         truth = "with ground truth" if capture.truth else "without ground truth"
         print_result(f"{capture.num_frames} frames at {capture.fps:g} fps, {points}, {truth}.")
-        for line in (*capture.notes, *_check_lines(found), *_color_lines(capture), *_forecast_lines(capture)):
+        for line in (*capture.notes, *_check_lines(rig_check), *_color_lines(capture), *_forecast_lines(capture)):
             print_result(line)
         if self.time:
             with progress() as report:

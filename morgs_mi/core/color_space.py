@@ -10,7 +10,7 @@ brightness is seen, with the slope that sRGB has at 1:
 
 so 100 times white is 3.02. Below 0, the curve continues its linear part; NaN remains NaN.
 
-An image is either uint8 in sRGB, or of floats; those of recordings are linear light, those of a fit are encoded.
+An image has uint8 values in sRGB, or floats. Floats of a recording are linear light; floats of a fit are encoded.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ TRANSFER = "srgb-log"
 BRIGHTEST_LIGHT = 1e30
 """Linear light that no image exceeds: sums and squares of its encoded values stay far from the limits of float32."""
 BRIGHTEST = 32.0
-"""Encoded value that no image exceeds: that of `BRIGHTEST_LIGHT` is 31.4."""
+"""Encoded value that no image exceeds; `BRIGHTEST_LIGHT` is encoded as 31.4."""
 # Slope of sRGB at 1.
 _SLOPE = 1.055 / 2.4
 # Percentile of the brightest channels of a recording that a display shows as white: lamps and highlights are fewer.

@@ -78,7 +78,7 @@ def _field_list(config_type: Any) -> str:
 
 
 def _default(field: Field) -> str:
-    """Return the default of a field; that of a nested config by its name."""
+    """Return the default of a field as text; the name of the class for a nested config."""
     if field.default is not MISSING:
         return repr(field.default)
     return f"{type(field.default_factory()).__name__}(...)" if field.default_factory is not MISSING else "(required)"

@@ -16,9 +16,9 @@ from morgs_mi.io.bounded import check_claim
 
 _MAGIC = 20000630
 _MULTIPART = 1 << 12
-# Of Rec. 709, which files without the attribute have: x and y of red, green, blue and white.
+# Chromaticities of Rec. 709, the default of EXR files: x and y of red, green, blue and white.
 _REC_709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
-# Difference up to which others are the same.
+# Largest difference of chromaticities that counts as equal.
 _SAME = 1e-3
 
 
@@ -73,7 +73,7 @@ def read_light(path: str | Path) -> np.ndarray:
 
 
 def _to_rec_709(primaries: Sequence[float]) -> np.ndarray:
-    """Return the matrix [3, 3] from linear colours of some primaries, see `_REC_709`, to those of Rec. 709."""
+    """Return the matrix [3, 3] that converts linear RGB from primaries in the form of `_REC_709` to Rec. 709."""
     # The import takes a second, for which other images should not wait.
     from colour import RGB_Colourspace, matrix_RGB_to_RGB
 

@@ -285,6 +285,8 @@ _BALANCE = _Question(
     "has another white balance than the other cameras (R {R:+.0%}, G {G:+.0%}, B {B:+.0%}): set a fixed one"
     + _CORRECTION,
 )
+# Change of the brightness over time; a person walking through a room causes 0.05.
+_VARIATION = 0.08
 # Where the limit is 0, the measure has its own.
 _QUESTIONS = (
     _Question(
@@ -320,14 +322,14 @@ _QUESTIONS = (
     _Question(
         "variation",
         lambda check: {"value": _changes(check, _common_brightness(check) + 0 * check.brightness)},
-        0.08,  # people who walk through a room change it by 5 %
+        _VARIATION,
         "change their brightness alike, by {value:.0%} over time: the light of the scene changes; use constant light",
         common=True,
     ),
     _Question(
         "variation",
         _variations,
-        0.08,  # people who walk through a room change it by 5 %
+        _VARIATION,
         "changes its brightness by {value:.0%} over time, up to {jump:.0%} from frame to frame: fix the exposure"
         + _CORRECTION,
     ),

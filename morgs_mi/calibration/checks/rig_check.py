@@ -300,7 +300,7 @@ def _copies(shared: SharedFeatures, checks: Sequence[CameraCheck], cameras: Sequ
             for view in match.views:
                 if view in reasons or not checks[view].fits:
                     other = checks[sum(match.views) - view].name
-                    reasons[view] = f"its images are those of {other}: one clip is a copy of the other; replace it"
+                    reasons[view] = f"its clip is a copy of the clip of {other}; replace one of them"
     return reasons
 
 

@@ -152,7 +152,7 @@ def test_check_rig__names_swapped_images_in_a_small_rig(capture: Capture, shared
 def test_check_rig__names_a_copied_clip(capture: Capture, shared: SharedFeatures) -> None:
     check = check_rig(capture, with_images(shared, capture, (0, 1, 2, 3, 3, 5)))
     assert [camera.fits for camera in check.cameras] == [True, True, True, True, False, True]
-    assert "its images are those of cam3" in check.cameras[4].advice
+    assert "its clip is a copy of the clip of cam3" in check.cameras[4].advice
 
 
 def test_check_rig__names_rows_in_alphabetical_order(tmp_path: Path) -> None:
