@@ -24,9 +24,9 @@ from morgs_mi.loop.observation import FrameObservation, observe_frame
 from morgs_mi.method.active_set import full_active_set
 from morgs_mi.method.lift import lift_flow
 from morgs_mi.playback.visualise import confidence_image, grey_image, motion_image, to_uint8
-from morgs_mi.runs.demo import DemoConfig
 from morgs_mi.stream_loop import StreamLoop
-from morgs_mi.synth.synthesize import synthesize
+from morgs_mi.studio.demo import DemoConfig
+from morgs_mi.studio.synth.synthesize import synthesize
 
 _ERROR_GAIN = 10
 _JPEG_QUALITY = 90

@@ -9,7 +9,6 @@ from .core.gaussians import Gaussians
 from .core.progress import ProgressBar
 from .core.rig import with_near_planes
 from .evaluate.evaluate import evaluate_stream
-from .evaluate.point_tracks import PointTracks, track_points
 from .fit.fit_config import FitConfig
 from .gaussian_integrator import ellipsoids
 from .io.ply import write_ply
@@ -18,21 +17,22 @@ from .loop.frame_report import FrameReport
 from .loop.stream_config import StreamConfig
 from .method.motion_config import MotionConfig
 from .method.objective import ObjectiveConfig, loss_term
-from .playback.export.tracks import extract_tracks
 from .playback.player import channel_image, render_stream
 from .playback.streams import open_stream
 from .playback.visualise import confidence_image, depth_image, motion_image
-from .plugins.light_probe import light_probe
-from .plugins.shadows import shadow_ratio, shadowed
-from .plugins.splat_rays import SplatRays
 from .render.kernel_recording import render_lock
 from .render.rasterize import Image, rasterize
 from .render.render_config import RenderConfig
-from .runs.live.live_frames import live_frames
-from .runs.recorder import stream_capture
+from .runs.fit_capture import stream_capture
 from .stream_loop import StreamLoop
-from .synth.synth_config import SynthConfig
-from .synth.synthesize import synthesize
+from .studio.exports.tracks import extract_tracks
+from .studio.light.light_probe import light_probe
+from .studio.light.shadows import shadow_ratio, shadowed
+from .studio.live.live_frames import live_frames
+from .studio.measures.point_tracks import PointTracks, track_points
+from .studio.synth.synth_config import SynthConfig
+from .studio.synth.synthesize import synthesize
+from .surfaces.splat_rays import SplatRays
 
 __all__ = [
     "SH_C0",

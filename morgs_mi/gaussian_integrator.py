@@ -28,21 +28,22 @@ from __future__ import annotations
 
 import sys
 from functools import partial
-from importlib import import_module
+from pkgutil import resolve_name
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.entries import place_of
 from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.render.channels import attribute_widths
 
-# By the name of a plugin, its module and class. The base classes exist once per variant.
+# The class of each plugin, MODULE:NAME. The base classes exist once per variant.
 _PLUGINS = {
-    "gaussian_splat": ("morgs_mi.plugins.gaussian_splat", "GaussianSplatIntegrator"),
-    "splat_path": ("morgs_mi.plugins.splat_path", "SplatPathIntegrator"),
+    "gaussian_splat": "morgs_mi.surfaces.gaussian_splat:GaussianSplatIntegrator",
+    "splat_path": place_of("integrators", "splat_path"),
 }
 
 
@@ -82,8 +83,7 @@ def integrator(plugin: str, props: Any) -> Any:
     """
     if not dr.is_diff_v(mi.Float):
         return _refusal(plugin, props)
-    module, class_name = _PLUGINS[plugin]
-    return getattr(import_module(module), class_name)(props)
+    return resolve_name(_PLUGINS[plugin])(props)
 
 
 def _refusal(plugin: str, props: Any) -> Any:
@@ -110,8 +110,8 @@ def _refusal(plugin: str, props: Any) -> Any:
 
 def _register(*_arguments: Any) -> None:
     """Register the plugins with the active variant."""
-    for plugin, (module, _) in _PLUGINS.items():
-        sys.modules.pop(module, None)
+    for plugin, place in _PLUGINS.items():
+        sys.modules.pop(place.partition(":")[0], None)
         mi.register_integrator(plugin, partial(integrator, plugin))
 
 

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from morgs_mi.synth.scene import Object, Rig, Scene, rotate, translate
-from morgs_mi.synth.shapes import ball, box, disk, rod
-from morgs_mi.synth.textures import lights, pattern, room, textured
+from morgs_mi.studio.synth.scene import Object, Rig, Scene, rotate, translate
+from morgs_mi.studio.synth.shapes import ball, box, disk, rod
+from morgs_mi.studio.synth.textures import lights, pattern, room, textured
 
 UPPER, FORE = 0.70, 0.60
 

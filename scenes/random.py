@@ -17,9 +17,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.synth.scene import Light, Object, RecordingDefaults, Rig, Scene, rotate, translate
-from morgs_mi.synth.shapes import ball, box, disk, rod
-from morgs_mi.synth.textures import lights, pattern, room, textured
+from morgs_mi.studio.synth.scene import Light, Object, RecordingDefaults, Rig, Scene, rotate, translate
+from morgs_mi.studio.synth.shapes import ball, box, disk, rod
+from morgs_mi.studio.synth.textures import lights, pattern, room, textured
 
 WIDTH, HEIGHT, FPS = 320, 240, 30.0
 MOTIONS = ("slide", "spin", "swing", "bounce")

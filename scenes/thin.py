@@ -11,9 +11,9 @@ from functools import partial
 
 import numpy as np
 
-from morgs_mi.synth.scene import Object, Scene, rotate, translate
-from morgs_mi.synth.shapes import ball, box, rod
-from morgs_mi.synth.textures import RGB, lights, pattern, room, textured
+from morgs_mi.studio.synth.scene import Object, Scene, rotate, translate
+from morgs_mi.studio.synth.shapes import ball, box, rod
+from morgs_mi.studio.synth.textures import RGB, lights, pattern, room, textured
 
 BLADES, BLADE = 3, 0.62
 LINKS, LINK = 7, 0.19

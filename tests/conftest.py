@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import morgs_mi  # noqa: F401  (finds a usable LLVM before the variant is set)
-from morgs_mi.calibration.checks.rig_check import SharedFeatures, match_capture
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.capture.points import SharedFeatures, match_capture
 from morgs_mi.capture.truth import GroundTruth, save_truth
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME
 from morgs_mi.io.video_writer import write_video

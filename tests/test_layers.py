@@ -1,18 +1,24 @@
-"""The layers of the package: a module imports only from its own subpackage and from those before it."""
+"""The layers of the package: a module imports only from its own subpackage and from those before it.
+
+`studio` is the last one, so nothing outside of it imports it. It enters registries by the table in `core.entries`.
+"""
 
 from __future__ import annotations
 
 import ast
 from pathlib import Path
 
+import pytest
+
 import morgs_mi
+from morgs_mi.core.entries import STUDIO, studio_entry
 
 ROOT = Path(morgs_mi.__file__).parent
 SUBPACKAGES = (
     "core",
     "io",
     "render",
-    "plugins",
+    "surfaces",
     "gaussian_integrator",
     "method",
     "fit",
@@ -20,12 +26,11 @@ SUBPACKAGES = (
     "loop",
     "stream_loop",
     "capture",
-    "calibration",
-    "synth",
     "playback",
     "evaluate",
     "runs",
     "cli",
+    "studio",
 )
 # `import morgs_mi` collects names of all subpackages, and `python -m morgs_mi` runs the command line.
 ENTRY_POINTS = {ROOT / "__init__.py", ROOT / "__main__.py"}
@@ -66,3 +71,15 @@ def mistakes(path: Path) -> list[str]:
 
 def test_layers__imports_go_down():
     assert [mistake for path in MODULES for mistake in mistakes(path)] == []
+
+
+def test_layers__only_the_table_of_entries_names_the_studio():
+    places = [path.relative_to(ROOT) for path in MODULES if "morgs_mi.studio" in path.read_text(encoding="utf-8")]
+    assert [place for place in places if place.parts[0] != "studio"] == [Path("core/entries.py")]
+
+
+@pytest.mark.parametrize(
+    ("registry", "name"), [(registry, name) for registry, entries in STUDIO.items() for name in entries]
+)
+def test_layers__entries_of_the_studio_exist(registry, name):
+    assert studio_entry(registry, name) is not None

@@ -57,9 +57,9 @@ ELSEWHERE: dict[str, str] = {
     "render.reproducible": "changes the order of sums only: tests/render",
     "fit.detail": "the number of Gaussians is given here: tests/fit/test_detail.py",
     "fit.first_frame_seconds": "Gaussians and steps are given here: tests/fit/test_budget.py",
-    "fit.camera_priors": "cameras are refined by the recorder: tests/calibration/test_bundle.py",
-    "fit.short_fits": "no cameras are refined here: tests/calibration/test_refine.py, tests/fit/test_balance.py",
-    "fit.refine_cameras": "cameras are refined by the recorder: tests/calibration/test_refine.py",
+    "fit.camera_priors": "cameras are refined by the recorder: tests/studio/calibration/test_bundle.py",
+    "fit.short_fits": "no cameras are refined here: tests/studio/calibration/test_refine.py, tests/fit/test_balance.py",
+    "fit.refine_cameras": "cameras are refined by the recorder: tests/studio/calibration/test_refine.py",
     "fit.exposure": "the tests of the loop have cameras that differ: tests/test_stream_loop.py",
     "fit.noise_aware": "images without noise here: tests/fit/test_dropping.py",
     "motion.masks": "tests/method/test_confidence.py and tests/method/mask_refiners",
@@ -67,7 +67,7 @@ ELSEWHERE: dict[str, str] = {
     "motion.search_motion": "flow explains all parts here: tests/method/test_search.py",
     "motion.constant_velocity": "flow is lifted here: tests/fit/test_later_frame.py",
     "motion.model": "the package has no motion model: tests/fit/test_motion_stage.py",
-    "codec.keyframe_interval": "keyframes are written by the recorder: tests/runs/test_recorder.py",
+    "codec.keyframe_interval": "keyframes are written by the recorder: tests/runs/test_fit_capture.py",
 }
 
 

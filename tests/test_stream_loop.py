@@ -24,7 +24,7 @@ from morgs_mi.fit.fit_config import DensityConfig, FitConfig, LearningRates, Sho
 from morgs_mi.loop import observation
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.motion_config import MotionConfig
-from morgs_mi.runs.recorder import stream_capture
+from morgs_mi.runs.fit_capture import stream_capture
 from morgs_mi.stream_loop import StreamLoop
 from tests.scenes.cameras import QUAD, look_at_cameras
 from tests.scenes.gaussians import isotropic

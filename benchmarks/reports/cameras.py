@@ -28,8 +28,6 @@ import tyro
 from benchmarks.reports.fits import new_loop, random_capture, synthetic
 from benchmarks.reports.plots import grouped, markdown, span
 from benchmarks.reports.study import Row, Scene, Study, StudyOptions, Variant
-from morgs_mi.calibration.bundle import changed_camera, distorted
-from morgs_mi.calibration.refine import refine_cameras, register_camera
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.lens import Lens
@@ -39,8 +37,10 @@ from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.view import View, mean_psnr
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.cluster.tasks import Source
-from morgs_mi.synth.disturbances import Disturbances, load_disturbances
-from morgs_mi.synth.synth_config import SynthConfig
+from morgs_mi.studio.calibration.bundle import changed_camera, distorted
+from morgs_mi.studio.calibration.refine import refine_cameras, register_camera
+from morgs_mi.studio.synth.disturbances import Disturbances, load_disturbances
+from morgs_mi.studio.synth.synth_config import SynthConfig
 
 _FOCAL_ERROR = 0.01
 _RIGS = "true", "disturbed", "refined"

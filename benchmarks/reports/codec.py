@@ -34,7 +34,7 @@ from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.runs.cluster.tasks import Source
-from morgs_mi.runs.recorder import stream_capture
+from morgs_mi.runs.fit_capture import stream_capture
 
 if TYPE_CHECKING:
     from distributed import Client

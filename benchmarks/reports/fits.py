@@ -22,8 +22,8 @@ from morgs_mi.evaluate.results import Evaluation
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.synth.synth_config import SynthConfig
-from morgs_mi.synth.synthesize import synthesize
+from morgs_mi.studio.synth.synth_config import SynthConfig
+from morgs_mi.studio.synth.synthesize import synthesize
 
 DEFAULT = "default"  # name of the settings without a preset
 

@@ -32,11 +32,11 @@ from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.io.exr import write_exr
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.playback.export.insert import InsertConfig, render_inserted
 from morgs_mi.playback.visualise import contact_sheet, label, write_png
-from morgs_mi.plugins.light_probe import CLIPPED, light_probe
-from morgs_mi.runs.recorder import stream_capture
-from morgs_mi.synth.scene import Rig
+from morgs_mi.runs.fit_capture import stream_capture
+from morgs_mi.studio.light.insert import InsertConfig, render_inserted
+from morgs_mi.studio.light.light_probe import CLIPPED, light_probe
+from morgs_mi.studio.synth.scene import Rig
 
 RIG = Rig(center=(0, 0.75, 0), distance=4.0, fov=44.0)
 FRAMES = 3

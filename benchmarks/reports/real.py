@@ -25,7 +25,6 @@ from benchmarks.reports.fits import new_loop
 from benchmarks.reports.plots import Column, markdown, scores_table
 from benchmarks.reports.study import Row, Scene, Study, StudyOptions, Variant
 from morgs_mi import Gaussians, rasterize
-from morgs_mi.calibration.refine import register_camera
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.progress import Progress
@@ -34,7 +33,8 @@ from morgs_mi.fit.view import View, mean_psnr
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.visualise import label, side_by_side
 from morgs_mi.runs.cluster.tasks import Source
-from morgs_mi.runs.recorder import with_points
+from morgs_mi.runs.fit_capture import with_points
+from morgs_mi.studio.calibration.refine import register_camera
 
 COLUMNS = (
     Column("training views, dB", "training"),

@@ -21,14 +21,14 @@ from benchmarks.reports.fits import ClipOptions, new_loop
 from benchmarks.reports.plots import Column, scores_table
 from benchmarks.reports.study import Row, Scene, Study, Variant
 from morgs_mi import rasterize
-from morgs_mi.calibration.timing import estimate_time_offsets
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.truth import load_truth
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.cluster.tasks import Source
-from morgs_mi.runs.recorder import push_frame
-from morgs_mi.synth.disturbances import Disturbances, load_disturbances
+from morgs_mi.runs.fit_capture import push_frame
+from morgs_mi.studio.calibration.timing import estimate_time_offsets
+from morgs_mi.studio.synth.disturbances import Disturbances, load_disturbances
 
 COLUMNS = (
     Column("views", "views", 0, spread=False),

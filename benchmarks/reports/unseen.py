@@ -34,7 +34,7 @@ from morgs_mi.loop.observation import Setup
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.exposure import Exposure, fit_exposure
 from morgs_mi.runs.cluster.tasks import Source
-from morgs_mi.runs.recorder import with_points
+from morgs_mi.runs.fit_capture import with_points
 
 # Penalty of the standardised slopes, in captures.
 _RIDGE = 1.0

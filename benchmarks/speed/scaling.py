@@ -30,8 +30,8 @@ from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.cluster.seams import COMMON_FRAMES, SegmentConfig
 from morgs_mi.runs.cluster.segments import SegmentedRun
 from morgs_mi.runs.cluster.workers import open_client
-from morgs_mi.synth.synth_config import SynthConfig
-from morgs_mi.synth.synthesize import synthesize
+from morgs_mi.studio.synth.synth_config import SynthConfig
+from morgs_mi.studio.synth.synthesize import synthesize
 
 
 @dataclass(frozen=True)

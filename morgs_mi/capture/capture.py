@@ -25,6 +25,7 @@ from morgs_mi.capture.timeline import ReadConfig, read_settings, timeline
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_points
 from morgs_mi.core.color_space import display_stops
+from morgs_mi.core.fit_names import CAPTURE
 from morgs_mi.core.rig import with_near_planes
 from morgs_mi.io.prefetch import prefetched
 from morgs_mi.io.remote import is_url, mirrored
@@ -305,7 +306,7 @@ def load_capture(
     if max_frames is not None and max_frames < 1:
         raise ValueError(f"load_capture(): `max_frames` must be at least 1, got {max_frames}.")
     reading = reading or ReadConfig()
-    settings = read_settings(path / "capture.json")
+    settings = read_settings(path / CAPTURE)
     layout = find_layout(path)
     every = layout.read(path)
     calibration = every.without(path, reading.without)
@@ -373,7 +374,7 @@ def _readouts(path: Path, every: Sequence[str], names: Sequence[str], settings: 
     if not isinstance(readout, dict):
         return [readout] * len(names)
     if unknown := [name for name in readout if name not in every]:
-        where = path / "capture.json"
+        where = path / CAPTURE
         raise ValueError(f"{where}: `readout` must name cameras of {', '.join(every)}, got {', '.join(unknown)}.")
     return [readout.get(name, 0.0) for name in names]
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from morgs_mi.capture.layouts.calibration import Calibration
+from morgs_mi.core.fit_names import CAPTURE
 
 TestViews = int | str | Sequence[int | str] | None
 """Held-out cameras: an index, a name, several of these, None for none, or "auto"."""
@@ -32,7 +33,7 @@ def held_out_by(
     if requested != "auto":
         return held_out_views(path, requested, used.names)
     if "test_view" in settings:
-        views = _indices(path / "capture.json", settings["test_view"], every.names)
+        views = _indices(path / CAPTURE, settings["test_view"], every.names)
         if not views:
             return ()
     else:

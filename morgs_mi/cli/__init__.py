@@ -27,24 +27,20 @@ from tyro.conf import arg
 from morgs_mi.cli.console import ERR, LogHandler, naming_output, print_result, print_warning, sentence_of
 from morgs_mi.cli.settings import Flag, Settings
 from morgs_mi.cli.suggestion import one_command, suggesting_command
+from morgs_mi.core.entries import STUDIO, place_of
 from morgs_mi.core.interrupts import INTERRUPTED, interruptible, is_interruption
 
 _PLACES = {
-    "synth": "synth:Synth",
-    "info": "info:Info",
-    "calibrate": "calibrate:Calibrate",
-    "fit": "fit:Fit",
-    "live": "live:Live",
-    "render": "render:Render",
-    "export": "export:Export",
-    "import": "import_frames:Import",
-    "view": "view:View",
-    "eval": "evaluate:Eval",
-    "sweep": "sweep:Sweep",
-    "demo": "demo:Demo",
+    "fit": f"{__name__}.fit:Fit",
+    "render": f"{__name__}.render:Render",
+    "export": f"{__name__}.export:Export",
+    "view": f"{__name__}.view:View",
+    "eval": f"{__name__}.evaluate:Eval",
+    **{name: place_of("commands", name) for name in STUDIO["commands"]},
 }
+_ORDER = ("synth", "info", "calibrate", "fit", "live", "render", "export", "import", "view", "eval", "sweep", "demo")
 # The class of each command: a dataclass of its options, with `run`.
-COMMANDS: Mapping[str, type] = {name: resolve_name(f"{__name__}.{place}") for name, place in _PLACES.items()}
+COMMANDS: Mapping[str, type] = {name: resolve_name(_PLACES[name]) for name in _ORDER}
 
 
 @dataclass(frozen=True)

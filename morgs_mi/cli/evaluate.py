@@ -15,7 +15,7 @@ from morgs_mi.cli.console import print_result, print_table, print_warning, progr
 from morgs_mi.cli.settings import Flag, optional
 from morgs_mi.evaluate.results import Evaluation
 from morgs_mi.evaluate.tables import evaluation_summary, evaluation_tables
-from morgs_mi.runs.recording import FILES
+from morgs_mi.runs.fit_files import FILES
 
 
 @dataclass(frozen=True)
@@ -36,16 +36,16 @@ class Eval:
     """LPIPS network as ONNX with inputs in0 and in1, RGB [1, 3, H, W] from -1 to 1; the package includes none."""
 
     def run(self) -> None:
+        from morgs_mi.core.entries import studio_entry
         from morgs_mi.core.environment import machine, versions
         from morgs_mi.core.files import json_finite, write_json
         from morgs_mi.evaluate.evaluate import evaluate_stream
         from morgs_mi.evaluate.figures import draw_stream
-        from morgs_mi.evaluate.lpips import Lpips
 
         for output in (self.figures, self.json):
             if output not in (None, Path("-")):
                 _check_not_of_fit(self.out, check_output(output))
-        network = None if self.lpips is None else Lpips(self.lpips)
+        network = None if self.lpips is None else studio_entry("image distances", "lpips")(self.lpips)
         with progress() as report:
             frames = partial(report, "Evaluating frames")
             result = evaluate_stream(self.out, self.capture, frames, network, self.any_recording)

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tyro.conf import DisallowNone, Positional, arg
 
-from morgs_mi.cli.console import print_result, progress
+from morgs_mi.cli.export_kind import FRAMES, ExportKind
 from morgs_mi.cli.opening import DropInvalid, opened
 from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, one_of, optional, place
 from morgs_mi.cli.suggestion import one_command
 from morgs_mi.core.documentation import page
+from morgs_mi.core.entries import studio_entry
 from morgs_mi.core.progress import Report
-from morgs_mi.playback.export.formats import GLTF, PLY, TRACKS, USD, VIDEO, WEB, Format, destination
+from morgs_mi.playback.export.formats import PLY, VIDEO, WEB, Format
 
 if TYPE_CHECKING:
     from morgs_mi.codec.frame_source import FrameSource
@@ -24,42 +25,17 @@ if TYPE_CHECKING:
 _PATH = (
     f"Camera path: between (through the rig's cameras), orbit (around the scene), or a JSON file ({page('exports')})."
 )
-_FRAMES = optional("FRAMES", text="Frames to write: 12, 10:20 (20 excluded) or 0:100:5; all by default.")
 
 
 @dataclass(frozen=True)
-class _Kind:
-    """A kind of export: options, with `formats` and the method `write` of their writer."""
-
-    out: Positional[Path]
-    """Folder of a fit, a stream file, or a file of Gaussians."""
-
-    formats: ClassVar[tuple[Format, ...]]
-    drawn: ClassVar[bool] = False
-    arguments: ClassVar[Mapping[str, str]] = {"span": "--frames", "least": "--least-seconds"}
-
-    def run(self, stream: FrameSource) -> None:
-        given: Mapping[str, Any] = vars(self)
-        stem = Path(given.get("path", "")).stem
-        output, chosen = destination(stream.path, given["output"], self.formats, given.get("format"), stem)
-        with progress() as report:
-            summary = self.write(stream, output, chosen, report)
-        print_result(f"{output}: {summary}.")
-
-    def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
-        """Write a stream in a format, and return a summary."""
-        raise NotImplementedError
-
-
-@dataclass(frozen=True)
-class Ply(_Kind):
+class Ply(ExportKind):
     """Write a PLY file per frame, in the layout of 3D Gaussian Splatting or compressed, in the capture's axes."""
 
     output: Annotated[Positional[Path | None], DisallowNone, place("FOLDER")] = None
     """New folder for 0000.ply, ..., or FILE.ply for one frame; by default OUT/ply or OUT/compressed-ply."""
     format: Annotated[str | None, DisallowNone, optional("NAME"), one_of(tuple(f.name for f in PLY))] = None
     """Format: ply, or compressed.ply, PlayCanvas' layout, whose sequence SuperSplat plays. By default by the name."""
-    frames: Annotated[str | None, DisallowNone, _FRAMES] = None
+    frames: Annotated[str | None, DisallowNone, FRAMES] = None
 
     formats = PLY
 
@@ -77,52 +53,7 @@ class Ply(_Kind):
 
 
 @dataclass(frozen=True)
-class Gltf(_Kind):
-    """Write a .glb file per frame: glTF 2.0 with KHR_gaussian_splatting, rotated to y up."""
-
-    output: Annotated[Positional[Path | None], DisallowNone, place("FOLDER")] = None
-    """New folder for 0000.glb, ..., or FILE.glb for one frame; by default OUT/gltf."""
-    frames: Annotated[str | None, DisallowNone, _FRAMES] = None
-
-    formats = GLTF
-
-    def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
-        from morgs_mi.codec.frame_source import play
-        from morgs_mi.playback.export.axes import gltf_axes
-        from morgs_mi.playback.export.clips import select_frames, write_each
-        from morgs_mi.playback.export.gltf_export import write_gltf
-
-        frames = select_frames(stream, self.frames)
-        write = partial(write_gltf, axes=gltf_axes(stream.cameras))
-        write_each(play(stream), output, chosen.ending, write, frames, partial(report, "Writing"))
-        return f"{len(frames)} glTF {'file' if len(frames) == 1 else 'files'}"
-
-
-@dataclass(frozen=True)
-class Usd(_Kind):
-    """Write an OpenUSD stage with a time sample per frame: ParticleField3DGaussianSplat, rotated to y up."""
-
-    output: Annotated[Positional[Path | None], DisallowNone, place("FILE")] = None
-    """FILE.usd, .usdc (binary), .usda (text) or .usdz (package); by default OUT/stream.usdc."""
-    format: Annotated[str | None, DisallowNone, optional("NAME"), one_of(tuple(f.name for f in USD))] = None
-    """Format: usdc, usd, usda or usdz; by default by the name."""
-    frames: Annotated[str | None, DisallowNone, _FRAMES] = None
-    half: Flag = False
-    """Half precision of all attributes but the positions."""
-
-    formats = USD
-
-    def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
-        from morgs_mi.playback.export.clips import select_frames
-        from morgs_mi.playback.export.usd import write_usd
-
-        frames = select_frames(stream, self.frames)
-        write_usd(stream, output, frames, self.half, partial(report, "Writing"))
-        return f"{len(frames)} frames, {output.stat().st_size / 1e6:.2f} MB"
-
-
-@dataclass(frozen=True)
-class Flight(_Kind):
+class Flight(ExportKind):
     """Render a stream along a moving camera into an mp4."""
 
     output: Annotated[Positional[Path | None], DisallowNone, place("FILE.mp4")] = None
@@ -150,7 +81,7 @@ class Flight(_Kind):
     def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
         from morgs_mi.playback.export.clips import flight, frame_numbers, named_path, num_images, repeated_frames
         from morgs_mi.playback.export.frames import write_images
-        from morgs_mi.playback.player import stream_exposure
+        from morgs_mi.playback.stream_header import stream_exposure
 
         frames = frame_numbers(stream)
         if self.freeze is not None and self.freeze not in frames:
@@ -166,27 +97,7 @@ class Flight(_Kind):
 
 
 @dataclass(frozen=True)
-class Tracks(_Kind):
-    """Write the track of every Gaussian as NumPy arrays: ids, frames, positions, confidence."""
-
-    output: Annotated[Positional[Path | None], DisallowNone, place("FILE.npz")] = None
-    """File for the tracks; by default OUT/tracks.npz."""
-
-    formats = TRACKS
-
-    def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
-        from morgs_mi.playback.export.clips import frame_numbers
-        from morgs_mi.playback.export.tracks import extract_tracks, write_tracks
-
-        total = len(frame_numbers(stream))
-        tracks = extract_tracks(stream, lambda done: report("Following", done, total))
-        write_tracks(output, tracks)
-        T, N = tracks.positions.shape[:2]
-        return f"{N} Gaussians through {T} frames"
-
-
-@dataclass(frozen=True)
-class Web(_Kind):
+class Web(ExportKind):
     """Write a web page that plays the stream without a server, or a folder for a server."""
 
     output: Annotated[Positional[Path | None], DisallowNone, place("FILE.html")] = None
@@ -210,12 +121,13 @@ class Web(_Kind):
         return f"{total} {'frame' if total == 1 else 'frames'}, {size / 1e6:.2f} MB"
 
 
-EXPORTS: Mapping[str, type[_Kind]] = {
+# The class of each kind, in the order of the help.
+EXPORTS: Mapping[str, type[ExportKind]] = {
     "ply": Ply,
-    "gltf": Gltf,
-    "usd": Usd,
+    "gltf": studio_entry("exports", "gltf"),
+    "usd": studio_entry("exports", "usd"),
     "video": Flight,
-    "tracks": Tracks,
+    "tracks": studio_entry("exports", "tracks"),
     "web": Web,
 }
 

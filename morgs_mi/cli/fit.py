@@ -14,6 +14,7 @@ from tyro.conf import DisallowNone, Positional, arg
 from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.settings import Flag, GivenReading, GivenSettings, HeldOut, Reading, Settings, held_out, optional
 from morgs_mi.core.documentation import page
+from morgs_mi.core.fit_names import STREAM
 from morgs_mi.core.ranges import AtLeast, check_value
 from morgs_mi.loop.stream_config import StreamConfig, config_toml
 
@@ -59,7 +60,7 @@ class Fit:
 
     def run(self) -> None:
         from morgs_mi.capture.capture import load_capture
-        from morgs_mi.runs.recorder import stream_capture
+        from morgs_mi.runs.fit_capture import stream_capture
 
         config = self.settings.stream_config()
         if self.print_config:
@@ -76,7 +77,7 @@ class Fit:
         capture = load_capture(
             self.capture, self.downscale, held_out(self.test_view), self.frames, self.reading.read_config()
         )
-        stream = self.out / "stream.morgs"
+        stream = self.out / STREAM
         if self.segments is not None or self.scheduler is not None:
             reports = self._fit_in_segments(capture, config)
         else:

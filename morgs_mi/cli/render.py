@@ -13,6 +13,7 @@ from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.opening import DropInvalid, opened
 from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, one_of, optional
 from morgs_mi.core.documentation import page
+from morgs_mi.core.entries import studio_entry
 from morgs_mi.playback.export.formats import IMAGES, destination
 
 if TYPE_CHECKING:
@@ -85,7 +86,7 @@ class Render:
     def run(self) -> None:
         from morgs_mi.playback.export.clips import frame_numbers, named_path, num_images
         from morgs_mi.playback.export.frames import write_images
-        from morgs_mi.playback.player import find_camera, stream_exposure
+        from morgs_mi.playback.stream_header import find_camera, stream_exposure
 
         self._check()
         stream = opened(self.out, self.drop_invalid, skip_damaged=self.skip_damaged)
@@ -129,11 +130,12 @@ class Render:
         """Return the rendered images of a camera or along a path."""
         from morgs_mi.core.camera import Camera
         from morgs_mi.playback.export.clips import flight
-        from morgs_mi.playback.export.panorama import panoramas
         from morgs_mi.playback.player import render_stream
 
         if self.projection == "equirectangular":
-            return panoramas(stream, view, 2048 if self.width is None else self.width, self.stereo)
+            return studio_entry("renderings", "panorama").panoramas(
+                stream, view, 2048 if self.width is None else self.width, self.stereo
+            )
         view = view if self.width is None else view.with_width(self.width)
         channels = self.channels or (None if format == "exr" else ("color",))
         if isinstance(view, Camera):
@@ -145,17 +147,13 @@ class Render:
     ) -> tuple[Iterator[tuple[int, dict[str, Any]]], int]:
         """Return the rendered frames with the inserted scene, and their number."""
         from morgs_mi.playback.export.clips import frame_numbers
-        from morgs_mi.playback.export.insert import (
-            InsertConfig,
-            inserted_channels,
-            load_insert,
-            render_inserted,
-            selected,
-        )
 
         assert self.insert is not None
+        insert = studio_entry("renderings", "insert")
         view = view if self.width is None else view.with_width(self.width)
-        frames = frame_numbers(stream) if self.at is None else selected(stream, self.at)
-        channels = self.channels or (inserted_channels(stream) if format == "exr" else ("color",))
-        config = InsertConfig(self.samples, self.shadows, self.light)
-        return render_inserted(stream, view, load_insert(self.insert), frames, channels, config), len(frames)
+        frames = frame_numbers(stream) if self.at is None else insert.selected(stream, self.at)
+        channels = self.channels or (insert.inserted_channels(stream) if format == "exr" else ("color",))
+        config = insert.InsertConfig(self.samples, self.shadows, self.light)
+        return insert.render_inserted(stream, view, insert.load_insert(self.insert), frames, channels, config), len(
+            frames
+        )

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from morgs_mi.capture.capture import Capture
+from morgs_mi.core.entries import STUDIO, studio_entry
+from morgs_mi.core.fit_names import REPORT
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.evaluate.comparison import ComparedClip
-from morgs_mi.evaluate.lpips import Lpips
-from morgs_mi.evaluate.measures import Motion3D, Quality, Registration, Tracking, Variation
+from morgs_mi.evaluate.measures import ImageDistance, Measure, Motion3D, Quality, Variation
 from morgs_mi.evaluate.results import Evaluation, FrameScores, PlaybackTimes, Sizes, known_mean
 from morgs_mi.fit.forecast import forecast
 from morgs_mi.io.bounded import read_json
@@ -23,7 +24,7 @@ def evaluate_stream(
     out: str | Path,
     capture: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
-    lpips: Lpips | None = None,
+    lpips: ImageDistance | None = None,
     any_recording: bool = False,
 ) -> Evaluation:
     """Decode a stream and compare it with its recording: in the held-out view, or otherwise in all training views.
@@ -48,7 +49,8 @@ def evaluate_stream(
     clip = ComparedClip.of(stream, capture, any_recording)
     recording = clip.recording
     seconds, of_fit = _of_fit(stream.path)
-    measures = (Quality(lpips), Variation(clip), Motion3D(clip), Registration(), Tracking(clip))
+    measures: list[Measure] = [Quality(lpips), Variation(clip), Motion3D(clip)]
+    measures += [studio_entry("measures", name)(clip) for name in STUDIO["measures"]]
     rows: list[FrameScores] = []
     for frame in clip.frames():
         for view in frame.views():
@@ -93,7 +95,7 @@ def _of_fit(stream: Path) -> tuple[dict[int, float], dict[str, Any]]:
 
     They come from the report beside the stream. Without one they are empty.
     """
-    path = stream.with_name("report.json")
+    path = stream.with_name(REPORT)
     if not path.is_file():
         return {}, {}
     report = read_json(path)

@@ -11,16 +11,8 @@ import numpy as np
 from morgs_mi.capture.capture import Capture
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import exposed
-from morgs_mi.playback.player import (
-    OFFSET_SCALE,
-    channel_image,
-    has_confidence,
-    has_offset,
-    open_stream_capture,
-    render_stream,
-    stream_exposure,
-    truth_for_camera,
-)
+from morgs_mi.playback.player import OFFSET_SCALE, channel_image, has_confidence, has_offset, render_stream
+from morgs_mi.playback.stream_header import open_stream_capture, stream_exposure, truth_for_camera
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.playback.visualise import (
     confidence_image,

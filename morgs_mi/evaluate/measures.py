@@ -12,18 +12,15 @@ recording changed by more than its noise.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from morgs_mi.calibration.refine import register_camera
 from morgs_mi.capture.truth import GroundTruth, load_tracks, load_truth
 from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.frame_source import FrameState
-from morgs_mi.core.color_space import decode_light, encode_light
-from morgs_mi.core.rig import scene_extent
+from morgs_mi.core.color_space import decode_light
 from morgs_mi.evaluate.comparison import ComparedClip, ComparedFrame, ComparedView
-from morgs_mi.evaluate.lpips import Lpips
 from morgs_mi.evaluate.metrics import (
     WINDOW,
     delta_e_map,
@@ -38,9 +35,6 @@ from morgs_mi.evaluate.metrics import (
 from morgs_mi.evaluate.motion3d import evaluate_motion
 from morgs_mi.evaluate.results import Motion3DScores, VariationScores, ViewScores
 from morgs_mi.evaluate.temporal import StillVariation, slope
-from morgs_mi.evaluate.tracking import evaluate_tracks
-from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.fit.view import View, mean_psnr
 from morgs_mi.method.exposure import follow_exposure
 
 REGIONS = ("", "_moving", "_still")
@@ -64,6 +58,14 @@ class Measure:
         return {}
 
 
+class ImageDistance(Protocol):
+    """Perceptual distance between images, such as LPIPS."""
+
+    def distance_map(self, image: np.ndarray, other: np.ndarray) -> np.ndarray:
+        """Return the distance of two images [H, W, 3] in [0, 1], pixel by pixel [H, W] or as one number."""
+        ...
+
+
 class Quality(Measure):
     """Scores of the rendered images, motion and confidence, view by view.
 
@@ -71,7 +73,7 @@ class Quality(Measure):
         lpips: network for LPIPS; without one there is no LPIPS.
     """
 
-    def __init__(self, lpips: Lpips | None) -> None:
+    def __init__(self, lpips: ImageDistance | None) -> None:
         self._lpips = lpips
         self._views: dict[str, ViewScores] = {}
         self._psnr: list[float] = []
@@ -143,43 +145,7 @@ class Motion3D(Measure):
         return evaluate_motion(old, new - old, np.asarray(before.gaussians.opacities)[then], points, views)
 
 
-class Registration(Measure):
-    """PSNR of the held-out views in the first frame, from the cameras that fit their images best."""
-
-    def __init__(self) -> None:
-        self._psnr: dict[str, float] = {}
-        self._begun = False
-
-    def add_view(self, view: ComparedView) -> None:
-        clip = view.frame.clip
-        if self._begun or view.index not in clip.recording.test_views:
-            return
-        image = view.recorded if view.light is None else encode_light(view.light)
-        given = View(clip.stream.cameras[view.index], image, view.valid)
-        extent = scene_extent([clip.stream.cameras[v] for v in clip.recording.train_views])
-        gaussians = view.frame.state.gaussians
-        registered = given._replace(camera=register_camera(gaussians, given, extent, FitConfig(), clip.render))
-        self._psnr[view.camera.name] = mean_psnr(gaussians, [registered], clip.render)
-
-    def add_frame(self, frame: ComparedFrame) -> dict[str, Any]:
-        self._begun = True
-        return {}
-
-    def result(self) -> dict[str, Any]:
-        return {"registered": self._psnr}
-
-
-class Tracking(Measure):
-    """3D point tracks, see `evaluate_tracks`."""
-
-    def __init__(self, clip: ComparedClip) -> None:
-        self._clip = clip
-
-    def result(self) -> dict[str, Any]:
-        return {"tracking": evaluate_tracks(self._clip.stream, self._clip.recording, self._clip.views)}
-
-
-def _image_scores(view: ComparedView, lpips: Lpips | None) -> dict[str, float]:
+def _image_scores(view: ComparedView, lpips: ImageDistance | None) -> dict[str, float]:
     """Return the scores of a rendered image by metric and region."""
     rendered = view.rendered
     moving = view.moving

@@ -48,6 +48,16 @@ class Registry(Generic[Made, Config]):
 
         return add
 
+    def register_entry(self, name: str, argument: str, entry: Callable[[], Callable[[str, Config], Made]]) -> None:
+        """Register a factory that is imported when it is used.
+
+        Args:
+            name: as for `register`.
+            argument: as for `register`.
+            entry: returns the factory.
+        """
+        self.register(name, argument)(lambda text, config: entry()(text, config))
+
     @property
     def names(self) -> tuple[str, ...]:
         """The names that take no argument, in the order of their registration."""

@@ -1,4 +1,4 @@
-"""Playback of a stream file: rendered frames, the capture and its ground truth, and the playback speed.
+"""Playback of a stream: rendered frames, the images of their channels, and the playback speed.
 
 The Gaussians of frame t store their displacement since frame t-1. The motion map rendered from them lies on frame t's
 pixel grid and holds x_t - x_{t-1}, like the ground truth. Keyframes store no displacement.
@@ -6,33 +6,20 @@ pixel grid and holds x_t - x_{t-1}, like the ground truth. Keyframes store no di
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
-from pathlib import Path
-from reprlib import repr as shortened
-from types import NoneType
-from typing import Any
 
 import numpy as np
 
-from morgs_mi.capture.capture import Capture, load_capture
-from morgs_mi.capture.fingerprint import fingerprint
-from morgs_mi.capture.timeline import ReadConfig
-from morgs_mi.capture.truth import GroundTruth, load_truth
 from morgs_mi.codec.container import Packet, PacketKind
 from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import check_number
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.types import Tensor
-from morgs_mi.io.bounded import read_json
-from morgs_mi.loop.stream_config import apply_values
-from morgs_mi.playback.source import as_fitted
+from morgs_mi.playback.stream_header import metadata_entry, render_config
 from morgs_mi.playback.visualise import confidence_image, depth_image, grey_image, motion_image, to_uint8
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
@@ -45,46 +32,7 @@ MOTION_SCALE = 0.03
 """Speed at which the colour of motion is fully saturated, as a fraction of the image width per frame."""
 OFFSET_SCALE = 0.1
 """The same for the learned offset, as a fraction of that speed: the offset is the smaller part of the motion."""
-STREAM = "stream.morgs"
-"""Name of the stream in the folder of a fit."""
-PROVISIONAL = "provisional.morgs"
-"""Name of the stream beside it that has a provisional first frame, until the fit has the first frame."""
 _MOST_TIMED_FRAMES = 30
-_JSON_TYPES = {
-    dict: "an object",
-    list: "a list",
-    bool: "true or false",
-    int: "an integer",
-    float: "a number",
-    str: "a string",
-    NoneType: "null",
-}
-
-
-def stream_name(stream: FrameSource) -> str:
-    """Return the name of a stream: the name of its folder or file, without `.morgs`.
-
-    Bytes of the name that are not UTF-8 are replaced, because pages and messages to a browser cannot contain them.
-    """
-    path = stream.path.resolve()
-    name = path.parent.name if path.name == STREAM else path.stem
-    return os.fsencode(name).decode(errors="replace")
-
-
-def find_camera(stream: FrameSource, camera: int | str) -> Camera:
-    """Return a camera of the stream's rig by name or index.
-
-    Raises:
-        ValueError: the rig has no such camera.
-    """
-    names = [view.name for view in stream.cameras]
-    index = names.index(camera) if camera in names else camera
-    if str(index).isdecimal() and int(index) < len(names):
-        return stream.cameras[int(index)]
-    raise ValueError(
-        f"{stream.path}: the camera must be an index in 0..{len(names) - 1} or one of {', '.join(names)}, "
-        f"got {camera!r}."
-    )
 
 
 def render_stream(
@@ -172,22 +120,6 @@ def playback_speed(stream: FrameSource, camera: Camera) -> dict[str, float]:
     return {"fps": float(1 / (decode + draw)), "decode_ms": float(1e3 * decode), "render_ms": float(1e3 * draw)}
 
 
-def truth_for_camera(capture: Capture, camera: Camera, frame: int) -> GroundTruth | None:
-    """Return the ground truth of a frame on the pixel grid of `camera`, or None if the capture has none.
-
-    It is resampled by the nearest neighbour: averages across an outline would be motions of no surface. Motion is in
-    pixels of `camera`.
-    """
-    if capture.truth is None or not (capture.truth / camera.name / f"{frame:04d}.exr").is_file():
-        return None
-    truth = load_truth(capture.truth, camera.name, frame)
-    H, W = truth.mask.shape
-    rows = ((np.arange(camera.height) + 0.5) * H / camera.height).astype(int)[:, None]
-    columns = ((np.arange(camera.width) + 0.5) * W / camera.width).astype(int)
-    motion = truth.motion[rows, columns] * np.array([camera.width / W, camera.height / H], np.float32)
-    return GroundTruth(motion, truth.depth[rows, columns], truth.ids[rows, columns], truth.mask[rows, columns])
-
-
 def available_channels(gaussians: Gaussians) -> tuple[str, ...]:
     """Return the channels of a stream's Gaussians: color, motion, depth, and channels of their attributes."""
     attributes = (name for name, attribute in _ATTRIBUTE_CHANNELS.items() if getattr(gaussians, attribute) is not None)
@@ -207,149 +139,3 @@ def render(
         offset = np.zeros((len(gaussians), 3)) if gaussians.offset is None else gaussians.offset
         images["offset"] = rasterize(replace(gaussians, motion=offset), camera, ("motion",), config=config).motion
     return {name: np.array(images[name]) for name in channels}
-
-
-def render_config(stream: FrameSource) -> RenderConfig:
-    """Return the renderer settings of the fit.
-
-    Raises:
-        ValueError: the stream's header has settings of other names, types or ranges.
-    """
-    values = metadata_entry(stream, "config.render", {}, dict)
-    return apply_values(RenderConfig(), values, _place(stream, "config.render"))
-
-
-def stream_exposure(stream: FrameSource) -> float:
-    """Return the stops by which a display brightens a stream, 0 for the stream of a recording of 8 bits.
-
-    Raises:
-        ValueError: the header has another value than a number from -100 to 100.
-    """
-    key = "transfer.display_exposure"
-    stops = metadata_entry(stream, key, 0.0, int, float)
-    check_number(_place(stream, key), "display_exposure", stops, "[-100, 100]")
-    return float(stops)
-
-
-def num_frames(stream: FrameSource) -> int:
-    """Return the number of frames of the capture that was fitted, zero if the stream's header does not state it.
-
-    Raises:
-        ValueError: the header states something else.
-    """
-    return metadata_entry(stream, "num_frames", 0, int)
-
-
-def metadata_entry(stream: FrameSource, key: str, default: Any, *kinds: type) -> Any:
-    """Return an entry of a stream's metadata, `default` where there is none.
-
-    A stream may come from anybody, and its metadata may be any JSON object.
-
-    Args:
-        stream: the file.
-        key: names of the nested objects and of the entry, with dots between them.
-        default: value of a missing entry.
-        kinds: types that the entry may have.
-
-    Raises:
-        ValueError: it has another type.
-    """
-    value: Any = stream.metadata
-    for name in key.split("."):
-        if isinstance(value, dict) and name not in value:
-            return default
-        value = value[name] if isinstance(value, dict) else None
-    if type(value) not in kinds:
-        names = " or ".join(_JSON_TYPES[kind] for kind in kinds)
-        raise ValueError(f"{_place(stream, key)} must be {names}, got {shortened(value)}; fit the capture again.")
-    return value
-
-
-def _place(stream: FrameSource, key: str) -> str:
-    return f"{stream.path}: packet 0: `{key}` of the header's metadata"
-
-
-def open_stream_capture(
-    stream: FrameSource, capture: str | Path | None, frames: Sequence[int], any_recording: bool = False
-) -> Capture:
-    """Open the capture to which a stream was fitted, with the settings of the fit.
-
-    Args:
-        stream: the file.
-        capture: folder of the capture; default: the fit's, which the ``capture.json`` beside the stream names.
-        frames: indices of the stream's frames.
-        any_recording: whether the capture may be another recording by the same cameras.
-
-    Raises:
-        FileNotFoundError: the capture is missing.
-        ValueError: no capture is named, the header's metadata do not state how it was read, the capture is not the one
-            that was fitted, or there are no frames.
-    """
-    path = capture or fitted_capture(stream)
-    reading = apply_values(ReadConfig(), metadata_entry(stream, "reading", {}, dict), _place(stream, "reading"))
-    downscale = metadata_entry(stream, "downscale", 1, int, float)
-    test_view = metadata_entry(stream, "test_view", "auto", list, int, str, NoneType)
-    if not frames:
-        raise ValueError(f"{stream.path}: expected at least one frame, got a header alone; fit the capture again.")
-    recording = load_capture(path, downscale, "auto" if test_view == "auto" else None, frames[-1] + 1, reading)
-    sizes = _sizes(stream.cameras)
-    recorded_sizes = _sizes(recording.cameras)
-    if recorded_sizes != sizes:
-        raise ValueError(
-            f"{path}: expected the cameras that {stream.path} was fitted to, {sizes}, got {recorded_sizes}; "
-            "pass that capture (--capture)."
-        )
-    if test_view != "auto":
-        recording = recording.holding_out(test_view)
-    if frames != list(range(frames[0], frames[-1] + 1)) or recording.num_frames <= frames[-1]:
-        raise ValueError(
-            f"{stream.path}: expected consecutive frames out of the {recording.num_frames} of {path}, got {frames}; "
-            "pass the capture that was fitted (--capture)."
-        )
-    if not any_recording:
-        _check_recording(stream, recording)
-    # Other refined cameras change no image, and ground truth refers to the recording's cameras.
-    if recording.display_exposure is not None:
-        recording = replace(recording, display_exposure=stream_exposure(stream))
-    return as_fitted(recording, stream) if "distortions" in stream.metadata else recording
-
-
-def _check_recording(stream: FrameSource, recording: Capture) -> None:
-    """Raise `ValueError` if a recording has not the fingerprint in a stream's header; imported streams have none."""
-    stream_fingerprint = metadata_entry(stream, "fingerprint", None, str, NoneType)
-    if stream_fingerprint is None:
-        return
-    refines = metadata_entry(stream, "config.fit.refine_cameras", "off", str) != "off"
-    if fingerprint(recording, next(recording.partial_frames(0, 1)).images, refines) != stream_fingerprint:
-        raise ValueError(
-            f"{recording.path}: expected the recording that {stream.path} was fitted to, got other images in its first "
-            "frame, or other points; pass that capture (--capture), or compare with any recording (--any-recording)."
-        )
-
-
-def fitted_capture(stream: FrameSource) -> str:
-    """Return the path of a stream's capture, which is in the `capture.json` beside it; in the header of older streams.
-
-    Raises:
-        FileNotFoundError: it is not there any more.
-        ValueError: no path is stored.
-    """
-    capture_file = None
-    with suppress(OSError, ValueError):
-        capture_file = read_json(stream.path.with_name("capture.json"))
-    entries = [fields.get("capture") for fields in (stream.metadata, capture_file) if isinstance(fields, dict)]
-    paths = [path for path in entries if isinstance(path, str)]
-    remedy = "name its folder with --capture"
-    if not paths:
-        raise ValueError(
-            f"{stream.path}: expected the path of its capture in the capture.json beside it, found none; {remedy}."
-        )
-    if folder := next((path for path in paths if Path(path).is_dir()), None):
-        return folder
-    raise FileNotFoundError(
-        f"{paths[0]}: expected the capture of {stream.path}, found none; if it has moved, {remedy}."
-    )
-
-
-def _sizes(cameras: Sequence[Camera]) -> dict[str, tuple[int, int]]:
-    return {camera.name: (camera.width, camera.height) for camera in cameras}

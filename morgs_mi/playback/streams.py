@@ -14,12 +14,12 @@ from morgs_mi.codec.container import MAGIC, Packet
 from morgs_mi.codec.frame_source import FrameSource, FrameState
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.fit_names import PROVISIONAL, STREAM
 from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.listing import listed
 from morgs_mi.io.splats import read_splats, suffix_of
 from morgs_mi.playback.default_rig import DEFAULT_RIG, default_rig
 from morgs_mi.playback.export.notebook import stream_html
-from morgs_mi.playback.player import PROVISIONAL, STREAM
 from morgs_mi.playback.trained_cameras import trained_cameras
 
 DRAWN = 0.5

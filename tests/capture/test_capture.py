@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.calibration.calibrate import calibrate
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
@@ -21,6 +20,7 @@ from morgs_mi.capture.lens import Lens
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.video_writer import write_video
+from morgs_mi.studio.calibration.calibrate import calibrate
 from tests.assertions import assert_close
 from tests.scenes import captures as layouts
 from tests.scenes.captures import COUNT, FPS, HEIGHT, WIDTH, frames, make_camera, rig, videos

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from morgs_mi.calibration.checks.rig_check import SharedFeatures
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.features import Features, detect, match_views, reprojection_errors, triangulate
+from morgs_mi.capture.points import SharedFeatures
 from morgs_mi.core.camera import Camera
 from tests.assertions import assert_close
 from tests.scenes import textured

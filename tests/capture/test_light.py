@@ -18,7 +18,7 @@ from morgs_mi.core.color_space import TRANSFER, display_image
 from morgs_mi.io.exr import write_exr
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.visualise import write_png
-from morgs_mi.runs.recording import stream_metadata
+from morgs_mi.runs.fit_files import stream_metadata
 from tests.scenes.captures import HEIGHT, WIDTH, rig
 
 NAMES = ("cam01", "cam02")

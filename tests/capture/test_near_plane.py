@@ -21,7 +21,7 @@ from morgs_mi.playback.streams import open_stream
 from morgs_mi.playback.visualise import to_uint8, write_png
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
-from morgs_mi.runs.recorder import stream_capture
+from morgs_mi.runs.fit_capture import stream_capture
 from tests.scenes.cameras import circle, look_at_cameras
 
 RADIUS = 0.08  # of the dark ball around camera 0

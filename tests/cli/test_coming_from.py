@@ -19,8 +19,8 @@ from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.ply import write_ply
 from morgs_mi.playback.visualise import write_png
-from morgs_mi.synth.synth_config import SynthConfig
-from morgs_mi.synth.synthesize import synthesize
+from morgs_mi.studio.synth.synth_config import SynthConfig
+from morgs_mi.studio.synth.synthesize import synthesize
 from tests.scenes.changing_splats import splats
 
 PAGE = (Path(__file__).parents[2] / "docs/coming-from.md").read_text(encoding="utf-8")

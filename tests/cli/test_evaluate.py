@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import pytest
 
-from morgs_mi.playback.player import PROVISIONAL
+from morgs_mi.core.fit_names import PROVISIONAL
 from morgs_mi.playback.visualise import write_png
 from tests.cli.commands import QUICK, assert_refused
 from tests.scenes.recording import write_recording

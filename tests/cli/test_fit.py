@@ -25,12 +25,12 @@ from morgs_mi.runs.cluster.seams import SegmentConfig
 from morgs_mi.runs.cluster.segments import SegmentedRun
 from morgs_mi.runs.cluster.tasks import Part
 from morgs_mi.stream_loop import StreamLoop
-from tests.calibration.checks.test_signals import brighter
 from tests.cli.commands import QUICK, assert_one_sentence, assert_refused, interrupt
 from tests.scenes import textured
 from tests.scenes.captures import colmap
 from tests.scenes.noise_capture import FRAMES, lengthen_clip, rig, truncate_clip
 from tests.scenes.recording import write_recording
+from tests.studio.calibration.checks.test_signals import brighter
 
 
 def test_fit__continues_without_a_camera_whose_clip_is_cut_off_meanwhile(
@@ -208,7 +208,7 @@ def fitted_capture(monkeypatch: pytest.MonkeyPatch, run, capture: Path, out: Pat
         passed.append(capture)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("morgs_mi.runs.recorder.stream_capture", stop)
+    monkeypatch.setattr("morgs_mi.runs.fit_capture.stream_capture", stop)
     assert run("fit", capture, out, *args)[0] == 130
     return passed[0]
 
@@ -264,7 +264,7 @@ def test_fit__does_not_offer_to_resume_a_stream_of_an_earlier_fit(
 ) -> None:
     (tmp_path / "out").mkdir()
     stream.rename(tmp_path / "out" / "stream.morgs")
-    monkeypatch.setattr("morgs_mi.runs.recorder.StreamLoop.of", interrupt)
+    monkeypatch.setattr("morgs_mi.runs.fit_capture.StreamLoop.of", interrupt)
     status, _, error = run("fit", capture, tmp_path / "out", *QUICK)
     assert status == 130
     assert error.splitlines()[-1] == "Interrupted."
@@ -275,7 +275,7 @@ def test_fit__reports_progress_before_the_first_frame(capture: Path, tmp_path: P
     write_colmap(capture / "sparse" / "0", rig(), np.zeros((0, 3)), np.zeros((0, 3)))
     now = iter(range(0, 10**9, 40))
     monkeypatch.setattr("morgs_mi.cli.console.time.monotonic", lambda: float(next(now)))
-    monkeypatch.setattr("morgs_mi.runs.recorder.StreamLoop.of", interrupt)
+    monkeypatch.setattr("morgs_mi.runs.fit_capture.StreamLoop.of", interrupt)
     status, _, error = run("fit", capture, tmp_path / "out", *QUICK)
     assert status == 130
     assert error.startswith("Matching views: 0/3, 0:00:00 elapsed.\nMatching views: 1/3, ")

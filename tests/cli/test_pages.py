@@ -12,8 +12,8 @@ import pytest
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.io.ply import write_ply
 from morgs_mi.playback.visualise import write_png
-from morgs_mi.synth.synth_config import SynthConfig
-from morgs_mi.synth.synthesize import synthesize
+from morgs_mi.studio.synth.synth_config import SynthConfig
+from morgs_mi.studio.synth.synthesize import synthesize
 from tests.scenes.changing_splats import splats
 
 ROOT = Path(__file__).parents[2]

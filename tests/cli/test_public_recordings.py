@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from morgs_mi.synth.synth_config import SynthConfig
-from morgs_mi.synth.synthesize import synthesize
+from morgs_mi.studio.synth.synth_config import SynthConfig
+from morgs_mi.studio.synth.synthesize import synthesize
 
 PAGE = Path(__file__).parents[2] / "docs/experiments/index.md"
 FRAMES = 3

@@ -15,7 +15,7 @@ from morgs_mi import cli
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.cli.settings import SETTINGS, Reading
 from morgs_mi.loop.stream_config import StreamConfig, apply_values, config_toml
-from morgs_mi.runs.live.live_config import LIVE_STREAM
+from morgs_mi.studio.live.live_config import LIVE_STREAM
 
 
 def printed_config(run, *args: object) -> StreamConfig:

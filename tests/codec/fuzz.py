@@ -26,7 +26,8 @@ import numpy as np
 import morgs_mi  # noqa: F401  (finds a usable LLVM before the variant is set)
 from morgs_mi.codec.packets import CodedFrame, coded_frames
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.playback.player import has_confidence, has_offset, num_frames, open_stream_capture, render_config
+from morgs_mi.playback.player import has_confidence, has_offset
+from morgs_mi.playback.stream_header import num_frames, open_stream_capture, render_config
 from tests.codec.forge import Forgery, damaged, with_forged_bytes, with_forged_header, with_forged_packets
 from tests.scenes.short_clip import FRAMES, Clip, short_clip
 

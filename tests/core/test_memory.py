@@ -12,7 +12,7 @@ import pytest
 
 from morgs_mi import Camera, FitConfig, StreamConfig, StreamLoop, cli, rasterize
 from morgs_mi.core.memory import check_memory, from_numpy, owned_copy
-from morgs_mi.playback.export.panorama import panorama
+from morgs_mi.studio.exports.panorama import panorama
 from tests.scenes.changing_splats import splats
 
 

@@ -17,7 +17,6 @@ from morgs_mi.codec.packets import decode, keyframe_packet, reemitted_keyframe, 
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.color_space import SH_C0, TRANSFER, decode_light, display_image
 from morgs_mi.evaluate.evaluate import evaluate_stream
-from morgs_mi.evaluate.lpips import Lpips
 from morgs_mi.evaluate.measures import IMAGE_SCORES, REGIONS
 from morgs_mi.evaluate.metrics import psnr, psnr_mu
 from morgs_mi.evaluate.results import known_mean
@@ -26,6 +25,7 @@ from morgs_mi.fit.forecast import forecast
 from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.render.rasterize import rasterize
+from morgs_mi.studio.measures.lpips import Lpips
 from tests.evaluate.tiny_onnx import squared_difference
 from tests.scenes.moving_splats import CAMERAS, EXACT, FRAMES, HEIGHT, PIXELS, STEP, WIDTH, moved, write_stream
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from morgs_mi import RenderConfig, rasterize
-from morgs_mi.plugins import gaussian_splat
+from morgs_mi.surfaces import gaussian_splat
 from tests import reference
 from tests import tolerances as tol
 from tests.assertions import assert_close

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME
-from morgs_mi.plugins import gaussian_splat
 from morgs_mi.render.channels import aov_attributes, exr_names
+from morgs_mi.surfaces import gaussian_splat
 
 TEXT = (Path(__file__).parents[2] / "docs/mitsuba.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)

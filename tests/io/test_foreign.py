@@ -11,7 +11,7 @@ import pytest
 from morgs_mi import cli
 from morgs_mi.io.splats import read_splats
 from morgs_mi.playback.streams import open_stream
-from morgs_mi.runs.import_frames import import_frames
+from morgs_mi.studio.import_frames import import_frames
 
 SPZ = gzip.compress(b"NGSP" + bytes(100))
 

@@ -22,14 +22,16 @@ from morgs_mi.playback.player import (
     CHANNELS,
     available_channels,
     channel_image,
-    find_camera,
     has_confidence,
     has_offset,
+    playback_speed,
+    render_stream,
+)
+from morgs_mi.playback.stream_header import (
+    find_camera,
     num_frames,
     open_stream_capture,
-    playback_speed,
     render_config,
-    render_stream,
     truth_for_camera,
 )
 from morgs_mi.playback.streams import open_stream

@@ -22,7 +22,7 @@ from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.playback.visualise import write_png
-from morgs_mi.runs.recorder import stream_capture
+from morgs_mi.runs.fit_capture import stream_capture
 from tests.scenes.cameras import look_at_cameras
 
 FRAMES = 6

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from morgs_mi.capture.layouts.calibration import Layout, required_clips
 from morgs_mi.capture.layouts.clips import EXAMPLE
+from morgs_mi.core.fit_names import CAPTURE, STREAM
 from morgs_mi.io.bounded import read_json
 
 _READERS = (
@@ -34,7 +35,7 @@ def find_layout(path: Path) -> Layout:
     """
     if layout := next((layout for layout in LAYOUTS if layout.find(path)), None):
         return layout
-    if (path / "stream.morgs").is_file():
+    if (path / STREAM).is_file():
         raise FileNotFoundError(
             f"{path}: expected a capture, found a fit; `morgs-mi eval {path}` scores it, `morgs-mi view {path}` shows "
             f"it{_fitted_capture(path)}."
@@ -52,7 +53,7 @@ def find_layout(path: Path) -> Layout:
 def _fitted_capture(path: Path) -> str:
     """Return advice on the capture of a fit in the folder `path`; empty if the folder names none."""
     try:
-        about = read_json(path / "capture.json")
+        about = read_json(path / CAPTURE)
     except (OSError, ValueError):
         about = {}
     capture = about.get("capture") if isinstance(about, dict) else None

@@ -3,8 +3,14 @@
 Every module of this package is imported here. A new one only has to register itself (see `flow_registry`).
 """
 
+from functools import partial
 from importlib import import_module
 from pkgutil import iter_modules
 
+from morgs_mi.core.entries import STUDIO, studio_entry
+from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES
+
 for _module in iter_modules(__path__):
     import_module(f"{__name__}.{_module.name}")
+for _name in STUDIO["flow sources"]:
+    FLOW_SOURCES.register_entry(_name, "FILE", partial(studio_entry, "flow sources", _name))

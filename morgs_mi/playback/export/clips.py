@@ -14,7 +14,8 @@ from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.playback.default_rig import DEFAULT_RIG
 from morgs_mi.playback.export.paths import CameraPath, focus, load_path, orbit, through_cameras
-from morgs_mi.playback.player import available_channels, render, render_config
+from morgs_mi.playback.player import available_channels, render
+from morgs_mi.playback.stream_header import render_config
 
 Progress = Callable[[int, int], None] | None
 # Angle of an orbit around Gaussians without a recording. Scenes fall apart from behind, and may be tilted.

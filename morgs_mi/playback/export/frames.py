@@ -15,7 +15,8 @@ from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import PLAYABLE, write_video
 from morgs_mi.playback.export.clips import frame_numbers
 from morgs_mi.playback.export.formats import IMAGES, choose_format
-from morgs_mi.playback.player import channel_image, render_stream, stream_exposure
+from morgs_mi.playback.player import channel_image, render_stream
+from morgs_mi.playback.stream_header import stream_exposure
 from morgs_mi.playback.visualise import side_by_side, write_png
 
 

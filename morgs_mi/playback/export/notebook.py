@@ -9,7 +9,8 @@ from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.color_space import exposed
 from morgs_mi.io.png import png_bytes
 from morgs_mi.playback.export.web import web_page
-from morgs_mi.playback.player import channel_image, render, render_config, stream_exposure, stream_name
+from morgs_mi.playback.player import channel_image, render
+from morgs_mi.playback.stream_header import render_config, stream_exposure, stream_name
 
 # Largest stream that is stored in a notebook, in bytes; the player adds a bit more than a megabyte.
 _LARGEST = 4_000_000

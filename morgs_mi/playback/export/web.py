@@ -25,15 +25,16 @@ from morgs_mi.codec.packets import coded_frames
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import TRANSFER
 from morgs_mi.core.files import atomic_folder, atomic_path
+from morgs_mi.core.fit_names import STREAM
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.playback.default_rig import DEFAULT_RIG
-from morgs_mi.playback.player import MOTION_SCALE, metadata_entry, stream_exposure, stream_name
+from morgs_mi.playback.player import MOTION_SCALE
+from morgs_mi.playback.stream_header import metadata_entry, stream_exposure, stream_name
 
 Progress = Callable[[int], None]
 
 # What an HTML parser replaces (NUL, carriage return) or could take for the end of a script (<).
 _UNSAFE = (0x00, 0x0D, 0x3C)
-_STREAM = "stream.morgs"
 _MODULE = "morgs-spark.js"
 # Gaussians per frame and camera from which the scale of the motion is estimated.
 _SAMPLES = 500
@@ -90,9 +91,9 @@ def write_web_folder(
         OSError: the folder cannot be written.
     """
     data = published_bytes(stream, progress)
-    place = f'<i id="stream" data-address="{_STREAM}" hidden></i>'
+    place = f'<i id="stream" data-address="{STREAM}" hidden></i>'
     page = _page(title or stream_name(stream), place, "'self' data: blob:")
-    contents = {"index.html": page, _STREAM: data, _MODULE: (_player() / _MODULE).read_bytes()}
+    contents = {"index.html": page, STREAM: data, _MODULE: (_player() / _MODULE).read_bytes()}
     with atomic_folder(path, "write_web_folder()") as partial:
         for name, content in contents.items():
             (partial / name).write_bytes(content)
@@ -107,7 +108,7 @@ def served_page(title: str, has_recording: bool) -> bytes:
         has_recording: whether the server has recorded images.
     """
     server = "recorded" if has_recording else ""
-    place = f'<i id="stream" data-address="{_STREAM}" data-server="{server}" hidden></i>'
+    place = f'<i id="stream" data-address="{STREAM}" data-server="{server}" hidden></i>'
     return _page(title, place, "'self' data: blob:")
 
 

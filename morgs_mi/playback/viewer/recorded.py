@@ -11,7 +11,7 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture
 from morgs_mi.codec.frame_source import FrameSource
-from morgs_mi.playback.player import fitted_capture, num_frames, open_stream_capture
+from morgs_mi.playback.stream_header import fitted_capture, num_frames, open_stream_capture
 
 # Frames that are decoded and dropped rather than seeking, which decodes from a keyframe of the video.
 _NEAR = 8

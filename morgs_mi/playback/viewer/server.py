@@ -25,8 +25,9 @@ from starlette.routing import Route
 from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.codec.header import camera_of_fields, load_json
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.fit_names import PROVISIONAL, STREAM
 from morgs_mi.playback.export.web import published_bytes, served_page
-from morgs_mi.playback.player import PROVISIONAL, STREAM, stream_name
+from morgs_mi.playback.stream_header import stream_name
 from morgs_mi.playback.streams import SplatFile
 from morgs_mi.playback.viewer.access import Access
 from morgs_mi.playback.viewer.exact import ExactImages

@@ -23,6 +23,7 @@ from morgs_mi.codec.container import StreamWriter, TruncatedStreamError, decode_
 from morgs_mi.codec.packets import decode, reemitted_keyframe
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.files import locked_folder, write_json
+from morgs_mi.core.fit_names import REPORT, STREAM
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.loop.frame_report import FrameReport
@@ -31,8 +32,8 @@ from morgs_mi.playback.source import about_lenses, as_fitted
 from morgs_mi.runs.cluster.seams import COMMON_FRAMES, SegmentConfig
 from morgs_mi.runs.cluster.tasks import Fit, Part, Segment, Source, fit_frames
 from morgs_mi.runs.cluster.workers import installed, num_workers
-from morgs_mi.runs.recorder import Prepared
-from morgs_mi.runs.recording import (
+from morgs_mi.runs.fit_capture import Prepared
+from morgs_mi.runs.fit_files import (
     Entry,
     FitFiles,
     Interrupted,
@@ -257,14 +258,14 @@ class SegmentedRun:
     def _complete(self) -> list[FrameReport] | None:
         """Return the reports of an earlier fit that was finished, None if there is none."""
         try:
-            stream = StreamReader(self.out / "stream.morgs")
+            stream = StreamReader(self.out / STREAM)
         except (FileNotFoundError, TruncatedStreamError):
             return None
         check_same_fit(stream, self.capture, self.metadata)
         frames = self.capture.num_frames
         if not stream.closed() or stream.index()[-1][1] != frames - 1:
             return None
-        return read_reports(self.out / "report.json", range(frames))
+        return read_reports(self.out / REPORT, range(frames))
 
     def _joined(self, files: FitFiles) -> list[FrameReport]:
         """Join the segments into one stream with its report."""

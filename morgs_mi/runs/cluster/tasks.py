@@ -25,8 +25,8 @@ from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.exposure import Exposure
 from morgs_mi.runs.cluster.seams import SegmentConfig, fit_seam_frame
 from morgs_mi.runs.cluster.workers import prepared, worker_name
-from morgs_mi.runs.recorder import push_frame, with_next
-from morgs_mi.runs.recording import due_keyframe, restart_of
+from morgs_mi.runs.fit_capture import push_frame, with_next
+from morgs_mi.runs.fit_files import due_keyframe, restart_of
 from morgs_mi.stream_loop import StreamLoop
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from morgs_mi.synth.synth_config import SynthConfig
-from morgs_mi.synth.synthesize import synthesize
+from morgs_mi.studio.synth.synth_config import SynthConfig
+from morgs_mi.studio.synth.synthesize import synthesize
 
 
 @pytest.fixture(scope="session")

@@ -9,8 +9,8 @@ import pytest
 
 from benchmarks.reports import field
 from benchmarks.reports.field import METHODS, Options, field_table
-from morgs_mi.synth.synth_config import SynthConfig
-from morgs_mi.synth.synthesize import synthesize
+from morgs_mi.studio.synth.synth_config import SynthConfig
+from morgs_mi.studio.synth.synthesize import synthesize
 
 
 def test_settings__differ_between_methods_alone() -> None:

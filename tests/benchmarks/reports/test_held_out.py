@@ -8,7 +8,7 @@ from benchmarks.reports.held_out import first_frames, later_frames, scores_of
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.core.files import write_json
 from morgs_mi.evaluate.evaluate import evaluate_stream
-from morgs_mi.runs.recorder import stream_capture
+from morgs_mi.runs.fit_capture import stream_capture
 from tests.scenes.recording import CONFIG
 
 

@@ -19,7 +19,7 @@ from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.render.render_config import RenderConfig
 from morgs_mi.runs.cluster.tasks import Source
 from morgs_mi.runs.cluster.workers import open_client
-from morgs_mi.synth.disturbances import load_disturbances
+from morgs_mi.studio.synth.disturbances import load_disturbances
 from tests.benchmarks.reports.here import client_here
 
 TINY = StreamConfig(

@@ -12,7 +12,8 @@ import pytest
 
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.playback.export.web import write_web_folder
-from morgs_mi.playback.player import render, render_config
+from morgs_mi.playback.player import render
+from morgs_mi.playback.stream_header import render_config
 from morgs_mi.playback.streams import open_stream
 from tests.playback.export.pages import Page, served
 from tests.scenes.cameras import shift_principal_point

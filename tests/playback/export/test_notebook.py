@@ -14,7 +14,8 @@ from morgs_mi.codec.container import StreamWriter
 from morgs_mi.playback.export import notebook
 from morgs_mi.playback.export.notebook import stream_html
 from morgs_mi.playback.export.web import web_page
-from morgs_mi.playback.player import channel_image, render, render_config
+from morgs_mi.playback.player import channel_image, render
+from morgs_mi.playback.stream_header import render_config
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.render.rasterize import rasterize
 from tests.scenes.changing_splats import rig, splats, write_stream

@@ -23,7 +23,8 @@ from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.io.ply import write_ply
 from morgs_mi.playback.export.notebook import stream_html
 from morgs_mi.playback.export.web import text_of_bytes, write_web_folder, write_web_page
-from morgs_mi.playback.player import channel_image, render, render_config
+from morgs_mi.playback.player import channel_image, render
+from morgs_mi.playback.stream_header import render_config
 from morgs_mi.playback.streams import open_stream
 from tests.playback.export.pages import HEIGHT, WIDTH, Page, served
 from tests.scenes.cameras import look_at_cameras

@@ -22,8 +22,9 @@ from morgs_mi import cli
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
+from morgs_mi.core.fit_names import PROVISIONAL
 from morgs_mi.io.ply import write_ply
-from morgs_mi.playback.player import PROVISIONAL, channel_image
+from morgs_mi.playback.player import channel_image
 from morgs_mi.playback.player import render as render_channels
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.playback.viewer import exact as exact_images
@@ -31,7 +32,7 @@ from morgs_mi.playback.viewer.access import refusal
 from morgs_mi.playback.viewer.recorded import RecordedImages
 from morgs_mi.playback.viewer.server import Viewer
 from morgs_mi.render.rasterize import rasterize
-from morgs_mi.runs.live.live_capture import write_images
+from morgs_mi.studio.live.live_capture import write_images
 from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, with_forged_packets
 from tests.playback.viewer.serving import exact, get, raw, viewing
 from tests.scenes import noise_capture

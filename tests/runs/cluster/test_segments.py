@@ -28,8 +28,8 @@ from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.cluster.seams import SegmentConfig
 from morgs_mi.runs.cluster.segments import SegmentedRun
 from morgs_mi.runs.cluster.workers import open_client
-from morgs_mi.runs.recorder import stream_capture
-from morgs_mi.runs.recording import FILES
+from morgs_mi.runs.fit_capture import stream_capture
+from morgs_mi.runs.fit_files import FILES
 from tests.scenes.coded_clip import history
 from tests.scenes.recording import CONFIG, write_recording
 
@@ -243,7 +243,7 @@ def test_SegmentedRun__triangulates_points_where_there_are_few(
     capture: Capture, client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     few = replace(capture, points=capture.points[:3], point_colors=capture.point_colors[:3])
-    monkeypatch.setattr("morgs_mi.runs.recorder.with_points", lambda *_: capture)
+    monkeypatch.setattr("morgs_mi.runs.fit_capture.with_points", lambda *_: capture)
     fit(few, tmp_path / "few", client, segments=SegmentConfig(1), config=StreamConfig(SETTINGS.fit, SETTINGS.motion))
     assert len(next(coded_frames(StreamReader(tmp_path / "few" / "stream.morgs")))) == SETTINGS.fit.num_gaussians
 

@@ -1,0 +1,101 @@
+"""Points of a capture from its first frame: matched features, triangulated, and stereo points where cameras are close.
+
+Features are found at the recorded size, and pixels refer to that size, even if the capture is downscaled. Smaller
+images have fewer and less exact features.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from morgs_mi.capture.capture import Capture
+from morgs_mi.capture.features import Features, Match, detect, match_views, triangulate
+from morgs_mi.capture.guided_matching import match_guided
+from morgs_mi.capture.stereo import stereo_points
+from morgs_mi.core.random_streams import Stream, rng_of
+
+# px. Distortion that a layout cannot represent causes errors of about a pixel, a wrong pose tens of pixels.
+MAX_ERROR = 2.0
+# A view that matches fewer others without its pose is also matched with it, which takes longer.
+_MIN_PARTNERS = 3
+
+
+@dataclass(frozen=True)
+class SharedFeatures:
+    """Features of a capture's first frame and their matches between views."""
+
+    features: tuple[Features, ...]  #: Per camera, in pixels of the recorded size.
+    matches: tuple[Match, ...]  #: Per pair of cameras with matches.
+
+
+def match_capture(capture: Capture, progress: Callable[[int, int], None] | None = None) -> SharedFeatures:
+    """Return the features and matches of the first frame; takes about 0.6 s per view and 0.03 s per pair.
+
+    A view without an image has no features.
+
+    Args:
+        capture: a capture, downscaled or not.
+        progress: called with (views done, views).
+    """
+    capture = capture.displayed().at_recorded_size()
+    images = next(capture.partial_frames(0, 1)).images
+    count = len(capture.cameras)
+    features = []
+    for done, (image, mask) in enumerate(zip(images, capture.masks, strict=True)):
+        if progress is not None:
+            progress(done, count)
+        features.append(detect(image, mask))
+    matches = match_views(features, capture.cameras)
+    if progress is not None:
+        progress(count, count)
+    return SharedFeatures(tuple(features), tuple(matches))
+
+
+def triangulate_points(capture: Capture, shared: SharedFeatures) -> Capture:
+    """Return the capture with points triangulated from its training views instead of its own.
+
+    Views with few matches are also matched by their poses. Views that share few features give few points or none, which
+    the fit reports. Held-out views are not used.
+    """
+    cameras = capture.at_recorded_size().cameras
+    matches = [match for match in shared.matches if not set(capture.test_views) & set(match.views)]
+    matches += match_guided(shared.features, cameras, _unmatched(capture.train_views, matches))
+    points, colors = triangulate(matches, shared.features, cameras, MAX_ERROR)
+    return replace(capture, points=points, point_colors=colors)
+
+
+def dense_points(capture: Capture, shared: SharedFeatures, seed: int = 0) -> Capture:
+    """Return the capture with triangulated points instead of its own, and with stereo points where cameras are close.
+
+    Args:
+        capture: a capture; its held-out view is not used.
+        shared: features of its first frame.
+        seed: seed of the selection of stereo points.
+    """
+    sparse = triangulate_points(capture, shared)
+    recorded = capture.at_recorded_size()
+    images = next(recorded.displayed().partial_frames(0, 1)).images
+    views = [(v, image) for v in capture.train_views if (image := images[v]) is not None]
+    points, colors = stereo_points(
+        [recorded.cameras[v] for v, _ in views],
+        [image for _, image in views],
+        [recorded.masks[v] for v, _ in views],
+        sparse.points,
+        rng_of(seed, Stream.POINTS),
+    )
+    points = np.concatenate([sparse.points, points])
+    colors = np.concatenate([sparse.point_colors, colors])
+    return replace(capture, points=points, point_colors=colors)
+
+
+def _unmatched(views: Sequence[int], matches: Sequence[Match]) -> list[tuple[int, int]]:
+    """Return the unmatched pairs of views that match few others."""
+    matched = {match.views for match in matches}
+    partners = Counter(view for pair in matched for view in pair)
+    few = {view for view in views if partners[view] < _MIN_PARTNERS}
+    return [pair for pair in combinations(views, 2) if pair not in matched and few & set(pair)]

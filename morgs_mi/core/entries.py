@@ -1,0 +1,50 @@
+"""What `morgs_mi.studio` adds to the registries of the package: the only place outside of it that names the studio.
+
+A registry is a table in the module that uses it, such as the commands of `morgs_mi.cli`. An entry is imported when it
+is used. An extension from outside this package does not need this table: it registers itself where it is imported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pkgutil import resolve_name
+from typing import Any
+
+STUDIO: Mapping[str, Mapping[str, str]] = {
+    "commands": {
+        "calibrate": "commands.calibrate:Calibrate",
+        "demo": "commands.demo:Demo",
+        "import": "commands.import_frames:Import",
+        "info": "commands.info:Info",
+        "live": "commands.live:Live",
+        "sweep": "commands.sweep:Sweep",
+        "synth": "commands.synth:Synth",
+    },
+    "exports": {
+        "gltf": "commands.exports:Gltf",
+        "usd": "commands.exports:Usd",
+        "tracks": "commands.exports:Tracks",
+    },
+    "integrators": {"splat_path": "light.splat_path:SplatPathIntegrator"},
+    "renderings": {"insert": "light.insert", "panorama": "exports.panorama"},
+    "camera refinement": {"first frame": "calibration.refine:refine_cameras"},
+    "flow sources": {
+        "onnx": "networks.flow_network:onnx",
+        "onnx-unit": "networks.flow_network:onnx_unit",
+        "onnx-signed": "networks.flow_network:onnx_signed",
+    },
+    "mask refiners": {"sam2": "networks.sam2:sam2"},
+    "measures": {"registration": "measures.registration:Registration", "tracking": "measures.tracking:Tracking"},
+    "image distances": {"lpips": "measures.lpips:Lpips"},
+}
+"""Entries by registry and name, as MODULE or MODULE:NAME inside `morgs_mi.studio`."""
+
+
+def place_of(registry: str, name: str) -> str:
+    """Return the full place of an entry, MODULE or MODULE:NAME."""
+    return f"morgs_mi.studio.{STUDIO[registry][name]}"
+
+
+def studio_entry(registry: str, name: str) -> Any:
+    """Return the class, function or module that the studio adds to a registry under a name."""
+    return resolve_name(place_of(registry, name))

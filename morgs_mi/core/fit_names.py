@@ -1,0 +1,10 @@
+"""Names of the files in the folder of a fit, and of a capture's settings."""
+
+STREAM = "stream.morgs"
+"""The stream."""
+PROVISIONAL = "provisional.morgs"
+"""The stream beside it that has a provisional first frame, until the fit has the first frame."""
+REPORT = "report.json"
+"""The report of every frame."""
+CAPTURE = "capture.json"
+"""The path of the capture and how it was read; in a capture, its settings."""

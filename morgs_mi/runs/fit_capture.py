@@ -1,0 +1,210 @@
+"""Fitting a whole capture into a stream file, packet by packet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain, islice
+from pathlib import Path
+from typing import Any, Protocol
+
+from morgs_mi.capture.capture import Capture, PartialFrame
+from morgs_mi.capture.points import dense_points, match_capture
+from morgs_mi.codec.container import Packet
+from morgs_mi.core.entries import studio_entry
+from morgs_mi.core.files import locked_folder
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.interrupts import interrupts_raised
+from morgs_mi.core.progress import Progress, Report
+from morgs_mi.fit.capacity import check_capacity
+from morgs_mi.loop.frame_report import FrameReport
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.playback.source import about_lenses, as_fitted
+from morgs_mi.runs.fit_files import (
+    FitFiles,
+    Interrupted,
+    Recording,
+    check_outputs,
+    interrupted_fit,
+    stream_metadata,
+)
+from morgs_mi.stream_loop import StreamLoop
+
+# Fewer points are replaced by triangulated ones, if there are more of those.
+_FEW_POINTS = 100
+
+
+@interrupts_raised()
+def stream_capture(
+    capture: Capture,
+    out: str | Path,
+    config: StreamConfig | None = None,
+    resume: bool = False,
+    progress: Report | None = None,
+) -> list[FrameReport]:
+    """Fit a whole capture and write OUT/stream.morgs packet by packet, and OUT/report.json with every frame.
+
+    OUT/capture.json has the capture's path and describes how it was read. Points are triangulated where a capture has
+    too few. OUT is locked meanwhile.
+
+    Args:
+        capture: cameras and frames; the test view is not trained on, but is part of the stream's header.
+        out: folder, made if missing. The files of an earlier fit stay there until the first frame replaces them.
+        config: settings.
+        resume: continue after the last complete packet of the stream in `out`, if there is one. With
+            `RenderConfig(reproducible=True)` the stream has the same bytes as without an interruption.
+        progress: called with (stage, done, total): matching views, the first frame, later frames.
+
+    Returns:
+        The reports of all frames, including those before an interruption.
+
+    Raises:
+        OSError: the disk is full or not writable, another fit writes into OUT, or the stream was removed, moved or
+        replaced meanwhile; the stream is complete up to the last frame.
+        ValueError: as `StreamLoop`; OUT lies in a capture; or the stream to resume is damaged, or belongs to another
+        capture or other settings; or images, Gaussians or steps that do not fit in memory.
+    """
+    out = Path(out)
+    config = config or StreamConfig()
+    check_outputs(out)
+    check_capacity("stream_capture()", [capture.cameras[view] for view in capture.train_views], config.fit)
+    with locked_folder(out, "stream_capture()"):
+        return _stream(capture, out, config, resume, Progress(progress))
+
+
+def _stream(capture: Capture, out: Path, config: StreamConfig, resume: bool, progress: Progress) -> list[FrameReport]:
+    """Fit a capture into a locked folder."""
+    frames = capture.partial_frames()
+    files = FitFiles.of(out)
+    first = next(frames)
+    metadata = stream_metadata(capture, first, config)
+    earlier = interrupted_fit(files, capture, metadata) if resume else None
+    if earlier is None:
+        prepared = Prepared.of(capture, config, progress)
+        loop = StreamLoop.of(prepared.capture, config)
+        frames = chain((first,), frames) if prepared.refinement is None else prepared.capture.partial_frames()
+    else:
+        prepared = Prepared(as_fitted(capture, earlier.stream))
+        loop = StreamLoop.of(prepared.capture, config)
+        frames = _resumed(loop, prepared.capture, earlier, progress)
+    last = capture.num_frames - 1
+    train = capture.train_views
+    with Recording(files, prepared.capture, metadata | prepared.metadata, earlier) as recording:
+        for frame, upcoming in with_next(frames):
+            stage = progress.of("Later frames").part(frame.index - 1, last) if frame.index else progress
+            packet, report = push_frame(loop, frame, train, stage.report, upcoming, recording.show)
+            recording.push(packet, prepared.completed(report, loop.gaussians, frame, config), loop.state.coded)
+    return recording.reports
+
+
+def _resumed(loop: StreamLoop, capture: Capture, earlier: Interrupted, progress: Progress) -> Iterator[PartialFrame]:
+    """Let a loop continue after an interrupted fit, and return the frames that follow."""
+    fit = loop.setup.config.fit
+    now = earlier.coded.frame
+    train = capture.train_views
+    # Changes and exposures are relative to references that depend on all images so far.
+    start = 0 if fit.skip_static or fit.exposure != "off" else now
+    frames = capture.partial_frames(start)
+    count = now + 1 - start
+    past = _counted(islice(frames, count), progress.of("Reading the fitted frames"), count)
+    loop.resume(earlier.coded, (frame.comparable(train) for frame in past), earlier.reports[0].exposures)
+    return frames
+
+
+class Refinement(Protocol):
+    """Result of refining the cameras of a capture."""
+
+    def validation(
+        self, capture: Capture, gaussians: Gaussians, frame: PartialFrame, config: StreamConfig
+    ) -> dict[str, Any]:
+        """Return the changes of the cameras and what they gain, for the report of the first frame."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A capture that is ready to be fitted."""
+
+    capture: Capture  #: With enough points, and with refined cameras where the settings ask for them.
+    refinement: Refinement | None = None  #: Of the cameras; None if they are the calibration's.
+
+    @classmethod
+    def of(cls, capture: Capture, config: StreamConfig, progress: Progress) -> Prepared:
+        """Return a capture with triangulated points where it has few, and with refined cameras where asked for."""
+        capture = with_points(capture, config.seed, progress)
+        if config.fit.refine_cameras == "off":
+            return cls(capture)
+        stage = progress.of("Refining cameras")
+        refine_cameras = studio_entry("camera refinement", "first frame")
+        return cls(*refine_cameras(capture, config.fit, config.render, config.seed, stage))
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """Entries of the stream's header about the cameras."""
+        return about_lenses(self.capture)
+
+    def completed(
+        self, report: FrameReport, gaussians: Gaussians | None, frame: PartialFrame, config: StreamConfig
+    ) -> FrameReport:
+        """Return the report of a frame; the first one includes the findings about the cameras.
+
+        Args:
+            report: of the frame.
+            gaussians: of the frame.
+            frame: its images.
+            config: settings of the fit.
+        """
+        if self.refinement is None or frame.index or gaussians is None:
+            return report
+        result = self.refinement.validation(self.capture, gaussians, frame, config)
+        return replace(report, validation=report.validation | {"refinement": result})
+
+
+def with_points(capture: Capture, seed: int, progress: Progress) -> Capture:
+    """Return a capture with the points of `dense_points` if it has few and they are more; see `stream_capture`."""
+    if len(capture.points) >= _FEW_POINTS:
+        return capture
+    shared = match_capture(capture, progress.of("Matching views"))
+    progress.of("Triangulating points")(0, 1)
+    return max(capture, dense_points(capture, shared, seed), key=lambda c: len(c.points))
+
+
+def push_frame(
+    loop: StreamLoop,
+    frame: PartialFrame,
+    train: Sequence[int],
+    progress: Report | None = None,
+    upcoming: PartialFrame | None = None,
+    on_provisional: Callable[[Packet], None] | None = None,
+) -> tuple[Packet, FrameReport]:
+    """Fit the next frame of a loop on the views `train`; the report's status names the images that are missing."""
+    images, ahead = (None if f is None else [f.images[v] for v in train] for f in (frame, upcoming))
+    assert images is not None
+    recorded = None if frame.recorded is None else frame.comparable(train)
+    packet, report = loop.push(images, progress, ahead, recorded, on_provisional)
+    status = "; ".join([*([report.status] if report.status != "ok" else []), *frame.problems]) or "ok"
+    return packet, replace(report, status=status)
+
+
+def with_next(frames: Iterable[PartialFrame]) -> Iterator[tuple[PartialFrame, PartialFrame | None]]:
+    """Yield each frame with the one after it, which is None for the last; raise what reading that one raised after."""
+    frames = iter(frames)
+    frame = next(frames, None)
+    while frame is not None:
+        upcoming = None
+        problem = None
+        try:
+            upcoming = next(frames, None)
+        except Exception as error:
+            problem = error
+        yield frame, upcoming
+        if problem is not None:
+            raise problem
+        frame = upcoming
+
+
+def _counted(frames: Iterable[PartialFrame], progress: Progress, count: int) -> Iterator[PartialFrame]:
+    """Yield frames and report how many were there before."""
+    for done, frame in enumerate(frames):
+        progress(done, count)
+        yield frame

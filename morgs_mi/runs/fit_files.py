@@ -1,0 +1,394 @@
+"""The files of a fit: its stream, its report, and what an interrupted fit continues from.
+
+A fit may be killed at any instruction. The stream then holds complete packets and perhaps a part of the next one. A
+frame's row is written to the report before its packets are written to the stream, so every packet has a row. Nothing
+else is stored, because the state of the loop follows from the stream and the recording (see `StreamState`).
+
+A fit into a folder that has a stream writes hidden files beside it until its first frame is there. They then replace
+the earlier stream, its description and its report together.
+
+A stream is made to be shared, so its header has no paths. The path of the capture is in the `capture.json` beside it.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from itertools import takewhile
+from pathlib import Path
+from reprlib import repr as shortened
+from typing import Any, NamedTuple
+
+import mitsuba as mi
+
+from morgs_mi.capture.capture import Capture, PartialFrame
+from morgs_mi.capture.fingerprint import fingerprint
+from morgs_mi.capture.outputs import check_output
+from morgs_mi.codec.container import Packet, PacketKind, StreamWriter, TruncatedStreamError, header_json
+from morgs_mi.codec.packets import CodedFrame, decode, reemitted_keyframe
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.color_space import TRANSFER
+from morgs_mi.core.files import atomic_path, is_same_file, write_json
+from morgs_mi.core.fit_names import CAPTURE, PROVISIONAL, REPORT, STREAM
+from morgs_mi.core.rig import choose_key_views
+from morgs_mi.io.bounded import read_json
+from morgs_mi.loop.frame_report import FrameReport
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.method.exposure import Exposure
+
+_LOG = logging.getLogger(__name__)
+
+FILES = (STREAM, CAPTURE, REPORT)
+"""Names of the files that a fit writes into its folder."""
+
+Entry = tuple[int, int, int]
+"""(kind, frame, offset) of a packet."""
+Finished = Callable[[Sequence[Entry], int], tuple[Sequence[Entry], int]]
+
+
+class FitFiles(NamedTuple):
+    """Stream and report of a fit, and the description of its capture; None: there is none, as in a segment."""
+
+    stream: Path
+    report: Path
+    description: Path | None = None
+
+    @property
+    def provisional(self) -> Path:
+        """Stream of a provisional first frame."""
+        return self.stream.with_name(PROVISIONAL)
+
+    @property
+    def next(self) -> FitFiles:
+        """Hidden files that are to replace these."""
+        return FitFiles(*(path.with_name(f".next-{path.name}") for path in self if path is not None))
+
+    @classmethod
+    def of(cls, out: Path) -> FitFiles:
+        """Return the files of a fit in the folder `out`."""
+        return cls(*(out / name for name in (STREAM, REPORT, CAPTURE)))
+
+    def replace_by_next(self) -> None:
+        """Replace these files by the `next` ones; `settle` finishes what a kill leaves undone.
+
+        Raises:
+            OSError: a file cannot be renamed.
+        """
+        self.next.stream.replace(self.stream)
+        self.settle()
+
+    def settle(self) -> None:
+        """Finish a replacement that was cut off, or remove the `next` files of one that had not begun.
+
+        The stream is replaced first and removed last, which distinguishes the two.
+
+        Raises:
+            OSError: a file cannot be renamed.
+        """
+        has_begun = not self.next.stream.exists()
+        for path, successor in reversed([*zip(self, self.next, strict=True)]):
+            if path is None or successor is None:
+                continue
+            if has_begun and successor.exists():
+                successor.replace(path)
+            successor.unlink(missing_ok=True)
+
+
+def check_outputs(out: Path) -> None:
+    """Check that a fit may write its files into a folder; see `check_output`."""
+    for name in FILES:
+        check_output(out / name)
+
+
+class Recording:
+    """Stream and report of a fit, to which frames are added; a context manager.
+
+    The files of an earlier fit stay until the first frame replaces them.
+
+    Args:
+        files: the stream, the report and the description of the capture.
+        capture: cameras and frame rate of the stream's header.
+        metadata: other entries of the header, from `stream_metadata`.
+        earlier: an interrupted fit to continue; None to begin.
+
+    Attributes:
+        reports: of the frames.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+
+    def __init__(
+        self, files: FitFiles, capture: Capture, metadata: Mapping[str, Any], earlier: Interrupted | None = None
+    ) -> None:
+        self._files = files
+        self._metadata = metadata
+        self._capture = capture
+        self._interval: int = metadata["config"]["codec"]["keyframe_interval"]
+        self._shows_provisional = True
+        self.reports: list[FrameReport] = []
+        files.provisional.unlink(missing_ok=True)
+        files.settle()
+        has_predecessor = earlier is None and files.stream.exists()
+        self._written_files = files.next if has_predecessor else files
+        if earlier is None:
+            self._writer = StreamWriter(self._written_files.stream, capture.cameras, capture.fps, metadata)
+        else:
+            self.reports += earlier.reports
+            self._writer = StreamWriter.continued(files.stream, earlier.index, earlier.end)
+            if earlier.index[-1][0] == PacketKind.RESIDUAL:
+                for packet in due_keyframe(earlier.coded, self._interval):
+                    self._writer.write(packet)
+        self._written = os.stat(self._written_files.stream)
+        if self._written_files.description is not None:
+            description = described_capture(capture, files.description if earlier else None)
+            write_json(self._written_files.description, description)
+
+    def __enter__(self) -> Recording:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._writer.close()
+        self._files.provisional.unlink(missing_ok=True)
+        self._files.settle()
+        if kind is None:
+            self._check_in_place()
+
+    def show(self, keyframe: Packet) -> None:
+        """Write a provisional first frame beside the stream, which viewers show until the stream has its first frame.
+
+        If it cannot be written, e.g. because the disk has room for the result alone, a warning is logged, and it and
+        later ones are skipped.
+        """
+        if not self._shows_provisional:
+            return
+        try:
+            with (
+                atomic_path(self._files.provisional, "Recording.show()") as partial,
+                StreamWriter(partial, self._capture.cameras, self._capture.fps, self._metadata) as writer,
+            ):
+                writer.write(keyframe)
+        except OSError:
+            self._shows_provisional = False
+            _LOG.warning(
+                "%s: a provisional first frame cannot be written, perhaps for lack of room; the fit goes on without it",
+                self._files.provisional,
+            )
+
+    def push(self, packet: Packet, report: FrameReport, coded: CodedFrame | None, **entries: Any) -> None:
+        """Add a frame, and the keyframe that is due after it.
+
+        Args:
+            packet: of the frame.
+            report: of the frame.
+            coded: state of a decoder after it.
+            entries: further entries of the report.
+
+        Raises:
+            OSError: the disk is full or not writable, or the stream was removed, moved or replaced; the stream is
+                complete up to the last frame.
+        """
+        self.extend([packet, *due_keyframe(coded, self._interval)], [report], **entries)
+
+    def extend(self, packets: Iterable[Packet], reports: Iterable[FrameReport], **entries: Any) -> None:
+        """Add frames with all their packets; see `push`."""
+        self._check_in_place()
+        reports = [*self.reports, *reports]
+        rows = [asdict(report) for report in reports]
+        # The disk may have room for only one of the two first frames.
+        self._files.provisional.unlink(missing_ok=True)
+        write_json(self._written_files.report, {**self._metadata, "frames": rows, **entries})
+        for packet in packets:
+            self._writer.write(packet)
+        self.reports = reports
+        if self._written_files is not self._files:
+            self._files.replace_by_next()
+            self._written_files = self._files
+
+    def _check_in_place(self) -> None:
+        """Raise `FileNotFoundError` if the stream has been removed, moved or replaced."""
+        path = self._written_files.stream
+        if not is_same_file(path, self._written):
+            found = "another file" if path.exists() else "none"
+            raise FileNotFoundError(
+                f"{path}: expected the stream that is being written, found {found}: it was removed, moved or replaced; "
+                "start again, or resume it where it is now."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Interrupted:
+    """An interrupted fit, up to its last complete packet."""
+
+    stream: StreamReader  #: Its stream.
+    index: Sequence[Entry]  #: The complete packets.
+    end: int  #: Offset of the end of the last one.
+    coded: CodedFrame  #: State after it.
+    before: CodedFrame | None  #: State before the last frame; None if there is none.
+    last: Packet  #: First packet of the last frame.
+    reports: list[FrameReport]  #: Of the frames.
+
+
+def interrupted_fit(
+    files: FitFiles,
+    capture: Capture,
+    metadata: Mapping[str, Any],
+    finished: Finished = lambda index, end: (index, end),
+    first: int = 0,
+) -> Interrupted | None:
+    """Return an interrupted fit, None if it has no complete packet yet.
+
+    Args:
+        files: its stream and its report.
+        capture: what is fitted.
+        metadata: header that the fit would write.
+        finished: returns the packets, and the end of the last one, from which the fit can continue.
+        first: frame of the first row of the report.
+
+    Raises:
+        ValueError: the stream or the report is damaged, or belongs to another capture or other settings.
+    """
+    files.settle()
+    try:
+        stream = StreamReader(files.stream)
+    except (FileNotFoundError, TruncatedStreamError):
+        return None
+    check_same_fit(stream, capture, metadata)
+    index, end = finished(*stream.check())
+    if not index:
+        return None
+    frame = index[-1][1]
+    coded = None
+    before = None
+    last = None
+    with suppress(TruncatedStreamError):
+        for packet in takewhile(lambda packet: packet.frame <= frame, stream.near(frame)):
+            if coded is None or packet.frame > coded.frame:
+                before = coded
+                coded = decode(coded, packet)
+                last = packet
+    assert coded is not None
+    assert last is not None
+    return Interrupted(stream, index, end, coded, before, last, read_reports(files.report, range(first, frame + 1)))
+
+
+def restart_of(before: CodedFrame | None, last: Packet) -> tuple[bytes, ...]:
+    """Return encoded packets that lead a decoder to the state after a frame.
+
+    Args:
+        before: state before the frame; None if its packet is a keyframe.
+        last: packet of the frame.
+    """
+    return (last.encoded,) if before is None else (reemitted_keyframe(before).encoded, last.encoded)
+
+
+def check_same_fit(stream: StreamReader, capture: Capture, metadata: Mapping[str, Any]) -> None:
+    """Check that a stream to resume has the header that a fit would write.
+
+    Raises:
+        ValueError: it belongs to another capture or other settings.
+    """
+    # Streams of earlier versions have paths in their headers.
+    found = ("capture", "distortions")
+    recorded = _without_folders({name: value for name, value in stream.metadata.items() if name not in found})
+    # Refined cameras differ from the calibrated ones, which are part of the fingerprint then.
+    refined = metadata["config"]["fit"]["refine_cameras"] != "off"
+    cameras = stream.cameras if refined else capture.cameras
+    old, new = (
+        json.loads(header_json(*parts))
+        for parts in ((stream.cameras, stream.fps, recorded), (cameras, capture.fps, metadata))
+    )
+    if difference := _difference(old, new):
+        name, before, now = difference
+        raise ValueError(
+            f"{stream.path}: expected to resume a fit with {name} = {shortened(before)}, got {shortened(now)}; give "
+            "the same capture and settings, or start again without --resume."
+        )
+
+
+def stream_metadata(capture: Capture, first: PartialFrame, config: StreamConfig) -> dict[str, Any]:
+    """Return the entries of the stream's header about the fit; they must agree for a fit to be resumed."""
+    train = capture.train_views
+    key_views = choose_key_views([capture.cameras[v] for v in train], config.motion.key_views)
+    metadata = {
+        "fingerprint": fingerprint(capture, first.images, config.fit.refine_cameras != "off"),
+        "downscale": capture.downscale,
+        "test_view": list(capture.test_views),
+        "reading": asdict(capture.reading),
+        "train_views": list(train),
+        "num_frames": capture.num_frames,
+        "key_views": [train[v] for v in key_views],
+        "config": asdict(config, dict_factory=_given),
+        "versions": {"mitsuba": mi.__version__},
+        "variant": mi.variant(),
+    }
+    if capture.display_exposure is not None:
+        metadata["transfer"] = {"name": TRANSFER, "display_exposure": capture.display_exposure}
+    return _without_folders(metadata)
+
+
+def _given(items: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a table of settings without empty lists, such as terms that no module registers."""
+    return {name: value for name, value in items if value != ()}
+
+
+def _without_folders(metadata: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a header's metadata with methods such as ``onnx:FILE`` that have the names of their files alone."""
+    match metadata:
+        case {"config": {"motion": {"flow_method": str(flow), "mask_method": str(masks)} as motion} as config}:
+            motion = {**motion, "flow_method": _without_folder(flow), "mask_method": _without_folder(masks)}
+            return {**metadata, "config": {**config, "motion": motion}}
+    return dict(metadata)
+
+
+def _without_folder(method: str) -> str:
+    kind, colon, files = method.partition(":")
+    return kind + colon + ",".join(Path(file).name for file in files.split(","))
+
+
+def described_capture(capture: Capture, earlier: Path | None) -> dict[str, Any]:
+    """Return the content of `capture.json`: an earlier fit's if there is one, with the capture's present path."""
+    about = None
+    if earlier is not None:
+        with suppress(OSError, ValueError):
+            about = read_json(earlier)
+    return {**(about if isinstance(about, dict) else capture.metadata()), "capture": str(Path(capture.path).resolve())}
+
+
+def _difference(old: Any, new: Any, name: str = "") -> tuple[str, Any, Any] | None:
+    """Return (name, old, new) of the first entry in which two JSON values differ, None if they are equal."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        pairs = (_difference(old.get(key), new.get(key), f"{name}.{key}".lstrip(".")) for key in {**old, **new})
+        return next(filter(None, pairs), None)
+    return None if old == new else (name, old, new)
+
+
+def read_reports(path: Path, frames: range) -> list[FrameReport]:
+    """Return the reports of the first frames of a file, which are `frames`."""
+    remedy = "start again without --resume"
+    document = read_json(path) if path.exists() else {}
+    try:
+        reports = [_report(row) for row in document["frames"][: len(frames)]]
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        found = f"a broken one ({error})" if path.exists() else "none"
+        raise ValueError(f"{path}: expected the report of the fit, got {found}; {remedy}.") from None
+    if [report.frame for report in reports] != list(frames):
+        raise ValueError(f"{path}: expected the rows of {len(frames)} frames, got {len(reports)}; {remedy}.")
+    return reports
+
+
+def _report(row: Mapping[str, Any]) -> FrameReport:
+    exposures = tuple(Exposure(tuple(e["gain"]), tuple(e["bias"])) for e in row.get("exposures", ()))
+    known = {"seconds": float(row["seconds"]), "missing_views": tuple(row["missing_views"]), "exposures": exposures}
+    return FrameReport(**{**row, **known})
+
+
+def due_keyframe(coded: CodedFrame | None, interval: int) -> list[Packet]:
+    """Return the state as a keyframe where one is due."""
+    if coded is None or not interval or not coded.frame or coded.frame % interval:
+        return []
+    return [reemitted_keyframe(coded)]

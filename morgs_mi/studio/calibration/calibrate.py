@@ -1,0 +1,407 @@
+"""Calibration from clips alone: features, matches and mapping of one frame by pycolmap, stored as a COLMAP model.
+
+COLMAP keeps principal points in the middle of the images. Optical stabilisation moves the lens of a phone from photo to
+photo, by up to 2 % of the image's width. A last bundle adjustment therefore moves the principal points, one for each
+image, and is used if it fits clearly better.
+
+The scale and the up direction of the model's world are arbitrary: images do not determine them.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+
+from morgs_mi.capture.layouts.clips import EXAMPLE, clips_by_camera, names_without, photos
+from morgs_mi.capture.layouts.colmap import write_reconstruction
+from morgs_mi.capture.masks import opaque_pixels
+from morgs_mi.capture.points import MAX_ERROR
+from morgs_mi.capture.timeline import nearest_frames
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import check_number
+from morgs_mi.core.color_space import display_image, display_stops
+from morgs_mi.core.files import atomic_path
+from morgs_mi.core.ranges import check_ranges
+from morgs_mi.io.video import FrameReader, open_frames
+from morgs_mi.studio.calibration.checks.mistakes import same_poses
+from morgs_mi.studio.calibration.checks.rig_check import CameraCheck
+
+Mapper = Literal["incremental", "global"]
+
+# With fewer features in a view COLMAP cannot register it.
+_MIN_FEATURES = 100
+# Contrast of the weakest features. At COLMAP's 0.0067, views at the edge of a rig have too few matches for a pose.
+_PEAK = 0.002
+# COLMAP registers a camera with fewer points, but its pose then depends on a few of them.
+_MIN_POINTS = 50
+# Relative decrease of the median error from which images get principal points of their own. On photos by stabilised
+# phones it is 0.26 and 0.28, on others at most 0.11.
+_LEAST_DECREASE = 0.15
+# Files in the folder that COLMAP works in.
+_IMAGES = "images"
+_DATABASE = "database.db"
+_MORE_TEXTURE = "light the scene evenly, add textured objects, or record a frame with such objects before the take"
+# Seeds that COLMAP takes.
+_SEEDS = "[0, 2147483647]"
+
+
+@dataclass(frozen=True)
+class CalibrateConfig:
+    """Settings of the calibration."""
+
+    camera_model: Literal[
+        "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"
+    ] = "SIMPLE_RADIAL"
+    """COLMAP camera model; one with more parameters needs more views, or shared intrinsics."""
+    shared_intrinsics: bool = False
+    """One set of intrinsics for all cameras of an image size, which needs fewer views; for equal make and zoom."""
+    frame: int = 0
+    """Frame to calibrate on; in clips of variable frame rate, the one nearest in time."""
+    partial: bool = False
+    """Accept a model that lacks some of the cameras."""
+    seed: int = 0
+    """Seed of COLMAP's random samples."""
+
+
+@dataclass(frozen=True)
+class CalibrationResult:
+    """Result of `calibrate`."""
+
+    model: Path  #: Folder of the COLMAP model.
+    cameras: tuple[str, ...]  #: Names of the calibrated cameras.
+    left_out: tuple[str, ...]  #: Names of the cameras that could not be calibrated.
+    points: int  #: Number of points.
+    error: float  #: Mean reprojection error of the points, px.
+    #: Result of every camera, including the ones left out; `matches` is the number of its points.
+    checks: tuple[CameraCheck, ...]
+    mapper: Mapper  #: COLMAP's mapper of the model, ``"incremental"`` or ``"global"``.
+    principal_points: bool  #: Whether each image has a principal point of its own.
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A model of COLMAP."""
+
+    mapper: Mapper  # the mapper that made it
+    model: Any  # pycolmap's reconstruction
+    checks: tuple[CameraCheck, ...]  # result of every camera, including the ones without a pose
+    principal_points: bool = False  # whether each image has a principal point of its own
+
+    @property
+    def error(self) -> float:
+        """Mean reprojection error of the points, px."""
+        return float(self.model.compute_mean_reprojection_error())
+
+    @property
+    def complete(self) -> bool:
+        """Whether every camera has a pose."""
+        return all(check.fits is not None for check in self.checks)
+
+    @property
+    def rank(self) -> tuple[int, int, float]:
+        """Number of cameras that fit, number of cameras with a pose, and the negative error; larger is better."""
+        fits = [check.fits for check in self.checks]
+        return fits.count(True), len(fits) - fits.count(None), -self.error
+
+
+def calibrate(
+    path: str | Path,
+    config: CalibrateConfig | None = None,
+    overwrite: bool = False,
+    progress: Callable[[str, int, int], None] | None = None,
+    without: Sequence[str] = (),
+) -> CalibrationResult:
+    """Calibrate a folder of clips, one per camera, and write ``sparse/0`` there; nothing is written on failure.
+
+    Args:
+        path: the folder: videos, a folder of images per camera, or one photo per camera.
+        config: settings.
+        overwrite: whether to replace an existing model.
+        progress: called with (stage, done, total).
+        without: names of the cameras to leave out.
+
+    Raises:
+        FileNotFoundError: there is no such folder.
+        FileExistsError: there is a `sparse` folder and `overwrite` is not set.
+        ValueError: fewer than two clips, clips that cannot be read, or views that do not determine the cameras; the
+            message names them and suggests a remedy.
+        OSError: the model cannot be written.
+    """
+    path = Path(path)
+    config = config or CalibrateConfig()
+    check_number("calibrate()", "seed", config.seed, _SEEDS)
+    check_ranges(config, "calibrate()")
+    report = progress or (lambda stage, done, total: None)
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path}: expected a folder of clips, found none; check the path.")
+    if (path / "sparse").exists() and not overwrite:
+        raise FileExistsError(
+            f"{path / 'sparse'}: expected no model, got one; remove it, or overwrite it (--overwrite)."
+        )
+    report("Reading frames", 0, 1)
+    images, masks = _frames(path, config, without)
+    report("Reading frames", 1, 1)
+    with tempfile.TemporaryDirectory() as scratch, _quiet():
+        _match(path, images, masks, Path(scratch), config, report)
+        report("Mapping", 0, 1)
+        best = _map(path, tuple(images), Path(scratch), config.seed)
+        report("Mapping", 1, 1)
+        names = tuple(check.name for check in best.checks if check.fits is not None)
+        left_out = tuple(name for name in images if name not in names)
+        if left_out and not config.partial:
+            raise ValueError(
+                f"{path}: expected to register all {len(images)} cameras, got {len(names)}, without "
+                f"{', '.join(left_out)}: move these so that neighbours see the same objects, {_MORE_TEXTURE}, "
+                "calibrate on another frame (--frame), or accept the partial model (--partial)."
+            )
+        _name_photos(best.model, path)
+        with atomic_path(path / "sparse", "calibrate()") as folder:
+            write_reconstruction(best.model, folder / "0")
+    found = best.model.num_points3D(), best.error, best.checks, best.mapper, best.principal_points
+    return CalibrationResult(path / "sparse" / "0", names, left_out, *found)
+
+
+def _checks(model: Any, names: Sequence[str]) -> tuple[CameraCheck, ...]:
+    """Return the result of each camera from its points in COLMAP's model."""
+    images = {Path(model.image(i).name).stem: model.image(i) for i in model.reg_image_ids()}
+    checks = {name: _check(name, images.get(name), model) for name in names}
+    poses = {name: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for name, image in images.items()}
+    cameras = [Camera(np.eye(3), pose, 1, 1, name) for name, pose in poses.items()]
+    for i, j in same_poses(cameras):
+        for own, other in ((cameras[i].name, cameras[j].name), (cameras[j].name, cameras[i].name)):
+            advice = f"it has the same pose as {other}: one clip seems to be a copy of the other; replace it"
+            checks[own] = replace(checks[own], fits=False, advice=advice)
+    return tuple(checks.values())
+
+
+def _name_photos(model: Any, path: Path) -> None:
+    """Name the images of a folder of photos after their files, which other programs open by these names."""
+    files = {} if clips_by_camera(path) else photos(path)
+    for image in map(model.image, model.reg_image_ids()):
+        if (name := Path(image.name).stem) in files:
+            image.name = files[name][0].name
+
+
+def _check(name: str, image: Any | None, model: Any) -> CameraCheck:
+    if image is None:
+        return CameraCheck(name, 0, float("nan"), None, f"it could not be registered and has no pose: {_MORE_TEXTURE}")
+    seen = [p for p in image.points2D if p.has_point3D()]
+    projected = (image.project_point(model.point3D(p.point3D_id).xyz) for p in seen)
+    errors = [np.inf if q is None else float(np.linalg.norm(q - p.xy)) for p, q in zip(seen, projected, strict=True)]
+    error = float(np.median(errors)) if errors else float("nan")
+    advice = ""
+    if len(seen) < _MIN_POINTS:
+        advice = f"only {len(seen)} points, {_MIN_POINTS} are needed for a reliable pose: {_MORE_TEXTURE}"
+    elif error > MAX_ERROR:
+        advice = "its points do not fit: try a camera model with more parameters (--camera-model)"
+    return CameraCheck(name, len(seen), error, not advice, advice)
+
+
+def _frames(
+    path: Path, config: CalibrateConfig, without: Sequence[str]
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Return one image per camera by its name, and the masks of opaque pixels of images with transparent ones."""
+    clips = clips_by_camera(path) or photos(path)
+    clips = {name: clips[name] for name in names_without(path, clips, without)}
+    if len(clips) < 2:
+        found = ", ".join(clips) or "none"
+        raise ValueError(
+            f"{path}: expected the clips of at least two cameras, found {found}; check the path, or make {EXAMPLE}"
+        )
+    readers = {name: open_frames(clip) for name, clip in clips.items()}
+    short = [name for name, reader in readers.items() if not 0 <= config.frame <= _last_position(reader)]
+    if short:
+        raise ValueError(f"{path}: frame {config.frame} is not in the clips of {', '.join(short)}; choose another.")
+    at = {name: int(nearest_frames(reader, np.array([config.frame]))[0]) for name, reader in readers.items()}
+    recorded = {name: next(reader.frames(at[name], at[name] + 1)) for name, reader in readers.items()}
+    stops = display_stops(recorded.values())
+    images = {name: display_image(image, stops) for name, image in recorded.items()}
+    masks = {name: opaque_pixels(reader, name)[0] for name, reader in readers.items()}
+    return images, {name: mask for name, mask in masks.items() if mask is not None}
+
+
+def _last_position(reader: FrameReader) -> int:
+    """Return the last instant of a clip, in frames of a constant rate."""
+    return reader.num_held - 1 if reader.positions is None else round(reader.positions[-1])
+
+
+def _match(
+    path: Path,
+    images: dict[str, np.ndarray],
+    masks: dict[str, np.ndarray],
+    scratch: Path,
+    config: CalibrateConfig,
+    report: Callable[[str, int, int], None],
+) -> None:
+    """Write images, features and the matches of all pairs of views into a folder, for `_map`."""
+    import pycolmap
+
+    folder = scratch / _IMAGES
+    masked = scratch / "masks"
+    database = scratch / _DATABASE
+    folder.mkdir()
+    masked.mkdir()
+    by_size: dict[tuple[int, ...], list[str]] = {}
+    for name, image in images.items():
+        by_size.setdefault(image.shape[:2], []).append(f"{name}.png")
+        _write_png(folder / f"{name}.png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+        if masks:  # COLMAP needs a mask for every image, or none
+            opaque = masks.get(name, np.ones(image.shape[:2], bool))
+            _write_png(masked / f"{name}.png.png", 255 * opaque.astype(np.uint8))
+    pycolmap.set_random_seed(config.seed)
+    mode = pycolmap.CameraMode.SINGLE if config.shared_intrinsics else pycolmap.CameraMode.PER_IMAGE
+    reader = pycolmap.ImageReaderOptions(camera_model=config.camera_model)
+    if masks:
+        reader.mask_path = masked
+    pycolmap.Database.open(database).close()
+    for done, (size, names) in enumerate(by_size.items()):  # each call makes a camera of its own
+        report("Finding features", done, len(by_size))
+        extraction = pycolmap.FeatureExtractionOptions(max_image_size=max(size))
+        extraction.sift.peak_threshold = _PEAK
+        pycolmap.import_images(database, folder, mode, names, reader)  # else threads number them in any order
+        pycolmap.extract_features(database, folder, names, mode, reader, extraction, pycolmap.Device.cpu)
+    report("Finding features", len(by_size), len(by_size))
+    _check_features(path, database)
+    report("Matching views", 0, 1)
+    # Without a seed of its own, the verification keeps other matches on each run, and may lose a view with few of them.
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = config.seed
+    # Guided matching takes several times as long, and its poses are no better by matches of other features.
+    pycolmap.match_exhaustive(database, verification_options=verification, device=pycolmap.Device.cpu)
+    report("Matching views", 1, 1)
+    _check_pairs(path, database)
+
+
+def _map(path: Path, names: Sequence[str], scratch: Path, seed: int) -> _Candidate:
+    """Return the best model of incremental and of global mapping of the matches in a folder.
+
+    If none is complete, both map the matches that agree with focal lengths found from pairs of views, too.
+    """
+    import pycolmap
+
+    candidates = _mapped(names, scratch, seed)
+    if not any(candidate.complete for candidate in candidates):
+        pycolmap.calibrate_view_graph(scratch / _DATABASE, pycolmap.ViewGraphCalibrationOptions(random_seed=seed))
+        candidates += _mapped(names, scratch, seed)
+    if not candidates:
+        raise ValueError(
+            f"{path}: the views match, but neither incremental nor global mapping by COLMAP found poses: their "
+            "baselines may be too short or too wide, or all shared points may lie in one plane; try shared intrinsics "
+            f"(--shared-intrinsics), another frame (--frame), or {_MORE_TEXTURE}."
+        )
+    return _with_principal_points(max(candidates, key=lambda candidate: candidate.rank), names)
+
+
+def _mapped(names: Sequence[str], scratch: Path, seed: int) -> list[_Candidate]:
+    """Return the models of both mappers.
+
+    Threads of a mapper share its random samples, which makes other models on some runs; one thread takes as long.
+    """
+    import pycolmap
+
+    inputs = scratch / _DATABASE, scratch / _IMAGES, scratch
+    incremental = pycolmap.IncrementalPipelineOptions(min_model_size=2, random_seed=seed, num_threads=1)
+    found: dict[Mapper, dict[int, Any]] = {
+        "incremental": pycolmap.incremental_mapping(*inputs, incremental),
+        "global": pycolmap.global_mapping(*inputs, pycolmap.GlobalPipelineOptions(random_seed=seed, num_threads=1)),
+    }
+    return [
+        _Candidate(mapper, model, _checks(model, names))
+        for mapper, models in found.items()
+        for model in models.values()
+    ]
+
+
+def _with_principal_points(found: _Candidate, names: Sequence[str]) -> _Candidate:
+    """Return the model with a camera and a principal point for each image, or as it is if that fits no better."""
+    import pycolmap
+
+    moved = _with_own_cameras(found.model)
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in moved.reg_image_ids():
+        config.add_image(image)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    options = pycolmap.BundleAdjustmentOptions(
+        refine_focal_length=False, refine_extra_params=False, refine_principal_point=True, print_summary=False
+    )
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    pycolmap.create_default_bundle_adjuster(options, config, moved).solve()
+    before, after = (_median_error(model) for model in (found.model, moved))
+    if not after < (1 - _LEAST_DECREASE) * before:
+        return found
+    return _Candidate(found.mapper, moved, _checks(moved, names), principal_points=True)
+
+
+def _with_own_cameras(model: Any) -> Any:
+    """Return a copy of a model in which no two images share a camera."""
+    import pycolmap
+
+    copy = pycolmap.Reconstruction()
+    for i in model.reg_image_ids():
+        image = model.image(i)
+        camera = pycolmap.Camera(model.camera(model.image(i).camera_id).todict())
+        camera.camera_id = i
+        copy.add_camera_with_trivial_rig(camera)
+        keypoints = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
+        own = pycolmap.Image(image_id=i, camera_id=i, name=image.name, keypoints=keypoints)
+        copy.add_image_with_trivial_frame(own, image.cam_from_world())
+    for point in model.points3D.values():
+        copy.add_point3D(point.xyz, point.track, point.color)
+    return copy
+
+
+def _median_error(model: Any) -> float:
+    """Return the median reprojection error of a model's points, px; 0 without points."""
+    model.update_point_3d_errors()
+    errors = [point.error for point in model.points3D.values()]
+    return float(np.median(errors)) if errors else 0.0
+
+
+def _check_features(path: Path, database: Path) -> None:
+    import pycolmap
+
+    with closing(pycolmap.Database.open(database)) as db:
+        counts = {Path(i.name).stem: db.num_keypoints_for_image(i.image_id) for i in db.read_all_images()}
+    if poor := {name: count for name, count in counts.items() if count < _MIN_FEATURES}:
+        table = ", ".join(f"{count} in {name}" for name, count in poor.items())
+        raise ValueError(
+            f"{path}: expected at least {_MIN_FEATURES} features in every view, got {table}: too dark, blurred or "
+            f"uniform; {_MORE_TEXTURE}, or calibrate on another frame (--frame)."
+        )
+
+
+def _check_pairs(path: Path, database: Path) -> None:
+    import pycolmap
+
+    with closing(pycolmap.Database.open(database)) as db:
+        count = len(db.read_all_images())
+        _, geometries = db.read_two_view_geometries()
+    if not any(len(geometry.inlier_matches) for geometry in geometries):
+        raise ValueError(
+            f"{path}: no two of the {count} views match: they may show different objects, be too far apart (more than "
+            f"about 30 degrees), or not be simultaneous; move the cameras closer, or {_MORE_TEXTURE}."
+        )
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence COLMAP's log on standard error; this module reports failures itself."""
+    import pycolmap
+
+    before = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = before
+
+
+def _write_png(file: Path, image: np.ndarray) -> None:
+    file.write_bytes(cv2.imencode(".png", image)[1].tobytes())

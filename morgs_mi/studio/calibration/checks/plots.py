@@ -1,0 +1,229 @@
+"""Plots of a capture: its rig seen from above and from the side, and the check of a recording."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Collection, Sequence
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from morgs_mi.capture.capture import Capture
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.files import atomic_path
+from morgs_mi.core.rig import up_direction
+from morgs_mi.studio.calibration.checks.deep import DeepCheck
+
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".svg", ".pdf")
+# Inches.
+_WIDTH = 14.4
+_RIG_HEIGHT = 7.6
+_DEEP_HEIGHT = 5.6
+# Dots per inch.
+_DPI = 100
+# Colour of a camera, and of one with a finding.
+_USUAL = "tab:blue"
+_MARKED = "tab:red"
+# Colours of the channels of an image, and of the axes of the world.
+_THREE_COLORS = ("indianred", "seagreen", "royalblue")
+_MAX_POINTS = 20_000
+# The edges of a frustum as one line through its centre 0 and its corners 1 to 4.
+_EDGES = [0, 1, 2, 3, 4, 1, 0, 2, 0, 3, 0, 4]
+# Width of a group of bars, as a share of its slot.
+_BAR = 0.7
+
+
+def check_plot(path: Path) -> None:
+    """Check that a plot can be written.
+
+    Raises:
+        ValueError: the name has another suffix, or matplotlib is not installed.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in _SUFFIXES:
+        raise ValueError(f"{path}: the suffix of a plot must be .png, .jpg, .svg or .pdf, got {suffix!r}; rename it.")
+    try:
+        import matplotlib.figure  # noqa: F401
+    except ImportError:
+        raise ValueError(f"{path}: a plot needs the package matplotlib; pip install 'morgs-mi[plots]'.") from None
+
+
+def write_rig(path: Path, capture: Capture, deep: DeepCheck | None = None) -> None:
+    """Write the plot of a capture's rig, and below it the plot of a check; the file is written atomically.
+
+    Args:
+        path: .png, .jpg, .svg or .pdf.
+        capture: the capture.
+        deep: check of its frames.
+
+    Raises:
+        ValueError: as `check_plot`.
+        OSError: the file cannot be written.
+    """
+    check_plot(path)
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    heights = [_RIG_HEIGHT, _DEEP_HEIGHT] if deep else [_RIG_HEIGHT]
+    data = BytesIO()
+    # Names may contain dollars, and letters that the font lacks and draws as boxes.
+    with rc_context({"text.parse_math": False}), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")
+        figure = Figure(figsize=(_WIDTH, sum(heights)), layout="constrained")
+        rows = figure.subfigures(len(heights), height_ratios=heights, squeeze=False)[:, 0]
+        draw_rig(rows[0], capture.cameras, (capture.points, capture.point_colors), capture.test_views)
+        if deep:
+            draw_deep(rows[1], deep)
+        figure.savefig(data, format=path.suffix[1:].lower(), dpi=_DPI)
+    with atomic_path(path, "write_rig()") as partial:
+        partial.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_bytes(data.getbuffer())
+
+
+def draw_rig(
+    figure: Any, cameras: Sequence[Camera], points: tuple[np.ndarray, np.ndarray], test_views: Collection[int] = ()
+) -> None:
+    """Plot the cameras' frusta and names, the points and the world axes, in world units.
+
+    Up is the mean of the cameras' up directions, forward the mean of their viewing directions. The left half is seen
+    from above with forward to the top, the right half from the right with forward to the right.
+
+    Args:
+        figure: an empty figure or subfigure of matplotlib.
+        cameras: the rig.
+        points: positions [P, 3] in world units and colours [P, 3] in [0, 1]; distant ones are cut off.
+        test_views: indices of the held-out cameras, drawn in red.
+    """
+    right, forward, up = _directions(cameras)
+    positions = np.array([camera.position for camera in cameras])
+    middle = positions.mean(0)
+    radius = np.linalg.norm(positions - middle, axis=1).max() or 1.0
+    places, colors = (values[:: max(1, len(values) // _MAX_POINTS)] for values in points)
+    near = np.linalg.norm(places - middle, axis=1) < 8 * radius
+    places = places[near] - middle
+    frusta = np.array([_frustum(camera, 0.25 * radius) for camera in cameras]) - middle
+    core = np.percentile(places, [1, 99], axis=0) if len(places) else np.zeros((0, 3))
+    box = np.concatenate([frusta.reshape(-1, 3), core])
+    above, side = figure.subplots(1, 2)
+    _label(above, "From above", "right, world units", ylabel="forward, world units")
+    _label(side, "From the right", "forward, world units", ylabel="up, world units")
+    for axes, plane in ((above, np.stack([right, forward])), (side, np.stack([forward, up]))):
+        axes.scatter(*(plane @ places.T), s=1, c=np.clip(colors[near], 0, 1), rasterized=True)
+        for index, (camera, frustum) in enumerate(zip(cameras, frusta @ plane.T, strict=True)):
+            color = _MARKED if index in test_views else _USUAL
+            axes.plot(*frustum[_EDGES].T, color=color, linewidth=1)
+            axes.plot(*frustum[0], "o", color=color, markersize=4)
+            name = camera.name or str(index)
+            axes.annotate(name, frustum[0], xytext=(4, 4), textcoords="offset points", fontsize=8)
+        corners = box @ plane.T
+        half = 0.6 * max(np.ptp(corners, axis=0).max(), 1e-12)
+        limits = (corners.min(0) + corners.max(0))[:, None] / 2 + (-half, half)
+        axes.set(xlim=limits[0], ylim=limits[1], aspect="equal", axisbelow=True)
+        axes.grid(color="0.9")
+        for name, color, direction in zip("xyz", _THREE_COLORS, plane.T, strict=True):
+            arrow = {"arrowstyle": "<-", "color": color}
+            places_of_arrow = {"xycoords": "axes fraction", "xytext": 36 * direction, "textcoords": "offset points"}
+            if np.linalg.norm(direction) > 0.4:
+                axes.annotate(name, (0.12, 0.12), **places_of_arrow, color=color, arrowprops=arrow)
+
+
+def _directions(cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the rig's right, forward and up [3, 3], orthonormal."""
+    rotations = np.array([np.asarray(camera.viewmat, np.float64)[:3, :3] for camera in cameras])
+    up = up_direction(cameras)
+    # Cameras all around a scene have no common forward direction: use the first camera's direction.
+    candidates = np.array([rotations[:, 2].mean(0), rotations[0, 2], np.cross(up, rotations[0, 0])])
+    level = candidates - np.outer(candidates @ up, up)
+    forward = next(vector / length for vector in level if (length := np.linalg.norm(vector)) > 1e-3)
+    return np.stack([np.cross(forward, up), forward, up])
+
+
+def _frustum(camera: Camera, depth: float) -> np.ndarray:
+    """Return the camera's centre and the four corners of its image at `depth` [5, 3], world units."""
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (camera.width, camera.height)
+    return np.vstack([camera.position, camera.unproject(corners, np.full(4, depth))])
+
+
+def draw_deep(figure: Any, check: DeepCheck) -> None:
+    """Plot a check: a panel per question.
+
+    The panels show reprojection error, time offset, exposure per channel, brightness and sharpness over time, repeated
+    frames and overlap. Cameras with a finding are red; a question mark stands for a missing measurement.
+
+    Args:
+        figure: an empty figure or subfigure of matplotlib.
+        check: result of `check_deep`.
+    """
+    panels = figure.subplot_mosaic([["error", "time", "exposure", "overlap"], ["variation", "blur", *2 * ["repeats"]]])
+    for question, values, title, least in (
+        ("error", check.errors[:, None], "Reprojection error, px", (0, 1)),
+        ("time", check.offsets[:, None], "Time offset, frames", (-1, 1)),
+        ("exposure", 100 * np.expm1(check.gains), "Exposure of R, G, B, %", (-10, 10)),
+        ("overlap", 100 * check.largest_overlaps[:, None], "Largest overlap, %", (0, 100)),
+    ):
+        _bars(panels[question], values, check.names, _colors(check, question))
+        _label(panels[question], title, least=least)
+    brightness = 100 * np.expm1(check.brightness)
+    _curves(panels["variation"], brightness, check.names, _colors(check, "variation", "flicker"))
+    _label(panels["variation"], "Brightness over time, %", "frame", least=(-5, 5))
+    _curves(panels["blur"], check.sharpness, check.names, _colors(check, "blur"))
+    _label(panels["blur"], "Sharpness over time, octaves", "frame", least=(-1, 1))
+    _events(panels["repeats"], check)
+    _label(panels["repeats"], "Repeated frames (red) and missing ones (grey)", "frame")
+
+
+def _label(axes: Any, title: str, xlabel: str = "", ylabel: str = "", least: tuple[float, float] | None = None) -> None:
+    """Set the title and the labels of a panel, and the least range of its vertical axis, where values look small."""
+    axes.set_title(title, fontsize=11, loc="left")
+    axes.set(xlabel=xlabel, ylabel=ylabel)
+    if least is not None:
+        low, high = axes.get_ylim()
+        axes.set_ylim(min(low, least[0]), max(high, least[1]))
+
+
+def _bars(axes: Any, values: np.ndarray, names: Sequence[str], colors: Sequence[str]) -> None:
+    """Draw a group of bars per camera, for values [C, K]."""
+    count = values.shape[1]
+    for k, column in enumerate(values.T):
+        places = np.arange(len(values)) + _BAR * ((k + 0.5) / count - 0.5)
+        axes.bar(places, np.nan_to_num(column), _BAR / count, color=_THREE_COLORS[k] if count > 1 else colors)
+        for place in places[~np.isfinite(column)]:
+            axes.annotate("?", (place, 0), ha="center", va="bottom", color="0.5")
+    axes.axhline(0, color="black", linewidth=0.8)
+    _name_cameras(axes.xaxis, names, colors, rotation=90 if len(values) > 6 else 0)
+
+
+def _curves(axes: Any, values: np.ndarray, names: Sequence[str], colors: Sequence[str]) -> None:
+    """Draw a curve per camera, for values [T, C]; cameras with a finding are drawn last and named in a legend."""
+    for name, color, curve in zip(names, colors, values.T, strict=True):
+        marked = color == _MARKED
+        axes.plot(curve, color=color, linewidth=1, zorder=3 if marked else 2, label=name if marked else "_")
+    if _MARKED in colors:
+        axes.legend(fontsize=8)
+    axes.set_xlim(-0.5, len(values) - 0.5)
+    axes.xaxis.get_major_locator().set_params(integer=True)
+
+
+def _events(axes: Any, check: DeepCheck) -> None:
+    """Draw a row per camera with the frames that repeat another or are missing."""
+    states = np.isnan(check.sharpness.T).astype(int)
+    for row, repeated in zip(states, check.repeated, strict=True):
+        row[list(repeated)] = 2
+    colors = np.array([(255, 255, 255), (190, 190, 190), (214, 39, 40)], np.uint8)
+    axes.imshow(colors[states], aspect="auto", interpolation="none")
+    _name_cameras(axes.yaxis, check.names, _colors(check, "repeats"))
+
+
+def _name_cameras(axis: Any, names: Sequence[str], colors: Sequence[str], rotation: float = 0) -> None:
+    """Label the positions along an axis with the cameras' names, red with a finding."""
+    axis.set_ticks(np.arange(len(names)), names, fontsize=8, rotation=rotation)
+    for color, label in zip(colors, axis.get_ticklabels(), strict=True):
+        label.set_color(_MARKED if color == _MARKED else "black")
+
+
+def _colors(check: DeepCheck, *questions: str) -> list[str]:
+    """Return the colour of each camera, red with a finding about one of the questions."""
+    marked = {name for finding in check.findings if finding.question in questions for name in finding.cameras}
+    return [_MARKED if name in marked else _USUAL for name in check.names]

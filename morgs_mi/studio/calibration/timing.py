@@ -1,0 +1,276 @@
+"""Time offsets of the cameras of a rig with unsynchronised clocks, from the motion in their images.
+
+At an instant, Gaussians are fitted to the images of all training views, and the flow of the views is lifted to their
+displacement in one frame (see `method.lift`). `offset_equations` gives the offsets that explain the remaining error of
+the images. The images are interpolated at the times that these offsets give, and the Gaussians are fitted again. These
+are Gauss-Newton steps. The first ones use blurred images, because the equations hold only for small displacements.
+
+A fit compensates part of the offsets with shapes and colours. The visible part kappa follows from the last two rounds
+of one blur (the secant method),
+
+    kappa = - sum_v s_v (o'_v - o_v) / sum_v s_v^2 ,
+
+with s the step between them and o, o' the solutions of the equations before and after it, for the training views. If
+cameras are far apart, a fit can hide the whole offset, because it explains each image by separate Gaussians; then any
+offset fits. A last round therefore moves the clocks by half a frame. The errors of the offsets are divided by the part
+of this move that the equations recover.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from morgs_mi.capture.capture import Capture
+from morgs_mi.capture.interpolation import image_between
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.random_streams import Stream, rng_of
+from morgs_mi.fit.first_frame import fit_first_frame
+from morgs_mi.fit.fit_config import DensityConfig, FitConfig
+from morgs_mi.fit.problem import FirstFrameProblem
+from morgs_mi.fit.view import View
+from morgs_mi.io.video import ImageOrError
+from morgs_mi.method.flow import observe_key_views
+from morgs_mi.method.flow_sources.flow_registry import FramePair
+from morgs_mi.method.lift import lift_flow
+from morgs_mi.method.ssim import Target
+from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.render_config import RenderConfig
+from morgs_mi.studio.calibration.offset_equations import UNKNOWN, OffsetEquations, offset_equations
+
+# px, least width of the images: small images are fitted fast, and an offset displaces them by few pixels.
+_WIDTH = 160
+# Number of frames used from the start of the recording, and of instants among them at which Gaussians are fitted.
+_FRAMES = 12
+_INSTANTS = 2
+# Gaussians and steps of the fit at an instant; half as many of both for blurred images.
+_GAUSSIANS = 8000
+_STEPS = 600
+# Standard deviations in pixels of the filters of the first rounds, one round each.
+_BLURS = (6.0, 3.0, 1.5)
+# Largest number of rounds after these, with unblurred images.
+_ROUNDS = 6
+# Largest step in frames of the last round: an offset is accurate to about half of it.
+_TOLERANCE = 0.02
+# Largest offset from the mean of the training views, frames.
+_LARGEST = 3
+_BLUR_OF_ROUND = (*_BLURS, *[0.0] * _ROUNDS)
+
+# Bounds of kappa, and of a step in frames.
+_SHARES = (0.2, 1.2)
+_LONGEST_STEP = 1.0
+# Frames by which the last round moves the clocks, and the least part of it that counts as recovered.
+_MOVED = 0.5
+_LEAST_FOUND = 0.05
+
+
+@dataclass(frozen=True)
+class TimeOffsets:
+    """Time offsets of the cameras."""
+
+    #: By name, the frame of each camera's clip that is simultaneous with frame 0 of the reference's, as in
+    #: `ReadConfig.offset`; negative for a camera that began later.
+    offsets: dict[str, float]
+    #: By name, standard errors of the offsets, frames: large where the images hardly depend on the offset.
+    errors: dict[str, float]
+    reference: str  #: Name of the held-out camera, or of the first one; its offset does not change.
+    change: float  #: Largest change in the last round, frames.
+    converged: bool  #: Whether `change` is within the tolerance; the accuracy of the offsets is in `errors`.
+
+
+def estimate_time_offsets(
+    capture: Capture,
+    progress: Callable[[int, int], None] | None = None,
+    seed: int = 0,
+) -> TimeOffsets:
+    """Return the time offsets of a capture's cameras in frames, see `TimeOffsets`.
+
+    They include the offsets that the capture was read with: its `reading` with the result as `offset` aligns the clips.
+    Two runs differ by up to 0.02 frames, because the order of summed gradients varies.
+
+    No Gaussian is fitted to the held-out view. Its offset follows from its own error and from the others' offsets.
+
+    Args:
+        capture: a capture with clips of one frame rate.
+        progress: called with (fits done, fits at most).
+        seed: seed of the fits.
+
+    Raises:
+        ValueError: the recording has one camera or fewer than four frames, an image is missing, or nothing moves.
+    """
+    if len(capture.cameras) < 2:
+        raise ValueError(f"{capture.path}: expected at least 2 cameras to compare clocks, got 1.")
+    clips = _Clips.of(capture)
+    largest = min(_LARGEST, (clips.num_frames - 2) // 2)
+    if largest < 1:
+        raise ValueError(
+            f"{capture.path}: expected at least 4 frames to compare clocks, got {clips.num_frames}; record longer."
+        )
+    instants = np.linspace(largest, clips.num_frames - 2 - largest, _INSTANTS).round().astype(int)
+    rounds = _Rounds(clips, instants, seed, progress)
+    offsets, step, equations = _aligned(rounds, largest)
+    reference = capture.reference_view
+    part = _found_back(rounds, offsets - step, equations, reference)
+    errors = np.minimum(equations.errors(reference) / part, UNKNOWN)
+    return _relative(capture, offsets, errors, float(np.abs(step).max()))
+
+
+def _aligned(rounds: _Rounds, largest: int) -> tuple[np.ndarray, np.ndarray, OffsetEquations]:
+    """Return offsets [V] of at most `largest`, the last step [V], and the equations of that step."""
+    clips = rounds.clips
+    offsets = np.zeros(len(clips.cameras))
+    step = np.zeros(len(clips.cameras))
+    solution = None
+    for index, blur in enumerate(_BLUR_OF_ROUND):
+        equations = rounds.equations(offsets, blur)
+        previous = solution if blur in _BLUR_OF_ROUND[:index] else None
+        solution = equations.solution()
+        share = 1.0 if previous is None else _share(step[clips.train], (solution - previous)[clips.train])
+        moved = np.clip(offsets + np.clip(equations.solution(share), -_LONGEST_STEP, _LONGEST_STEP), -largest, largest)
+        step = moved - offsets
+        offsets = moved
+        if not blur and np.abs(step).max() < _TOLERANCE:
+            break
+    return offsets, step, equations
+
+
+def _share(step: np.ndarray, change: np.ndarray) -> float:
+    """Return kappa (see the module), within its bounds, from a step and the change of the solution after it."""
+    return float(np.clip(-np.sum(step * change) / np.sum(step**2), *_SHARES)) if step.any() else 1.0
+
+
+def _found_back(rounds: _Rounds, offsets: np.ndarray, equations: OffsetEquations, reference: int) -> np.ndarray:
+    """Return the part [V] that the equations recover of a move of the clocks relative to the clock of `reference`."""
+    moved = np.where(np.arange(len(offsets)) % 2, _MOVED, -_MOVED)
+    moved[reference] = 0
+    change = rounds.equations(offsets + moved, 0.0).solution() - equations.solution()
+    part = (change[reference] - change) / np.where(moved != 0, moved, 1)
+    return np.clip(part, _LEAST_FOUND, 1)
+
+
+@dataclass(eq=False)
+class _Rounds:
+    """Fits of successive rounds."""
+
+    clips: _Clips  # images to fit
+    instants: np.ndarray  # frames at which Gaussians are fitted
+    seed: int  # seed of all fits
+    progress: Callable[[int, int], None] | None  # called with (fits done, fits at most), or None
+    done: int = 0  # number of completed fits
+
+    def equations(self, offsets: np.ndarray, blur: float) -> OffsetEquations:
+        """Return the sum of the equations of all instants, with images interpolated by offsets [V] and blurred."""
+        found = []
+        for instant in self.instants:
+            found.append(_equations_at(self.clips, instant - offsets, blur, self.seed))
+            self.done += 1
+            if self.progress is not None:
+                self.progress(self.done, (len(_BLUR_OF_ROUND) + 1) * len(self.instants))
+        equations = reduce(add, found)
+        if not equations.own.any():
+            raise ValueError(
+                f"{self.clips.path}: expected motion in the first {self.clips.num_frames} frames, found none; record "
+                "something that moves."
+            )
+        return equations
+
+
+@dataclass(frozen=True, eq=False)
+class _Clips:
+    """The first frames of a capture, reduced."""
+
+    path: Path  # folder of the capture
+    cameras: tuple[Camera, ...]  # V views
+    masks: tuple[np.ndarray | None, ...]  # valid pixels of each [H, W], or None
+    images: tuple[tuple[np.ndarray, ...], ...]  # per view and frame uint8 [H, W, 3]
+    train: list[int]  # indices of the training views
+    points: np.ndarray  # [P, 3], world units
+    point_colors: np.ndarray  # [P, 3] in [0, 1]
+
+    @classmethod
+    def of(cls, capture: Capture) -> _Clips:
+        shown = capture.displayed()
+        clips = [[_checked(image) for image in shown.images(v, 0, _FRAMES)] for v in range(len(capture.cameras))]
+        views = zip(capture.cameras, (clip[0] for clip in clips), capture.masks, strict=True)
+        small, _, masks = zip(*(View(*view).reduced(_WIDTH) for view in views), strict=True)
+        # The images are whole frames: with the capture's delays they would be displaced twice.
+        cameras = tuple(camera.without_delays() for camera in small)
+        images = tuple(
+            tuple(np.asarray(cv2.resize(image, (c.width, c.height), interpolation=cv2.INTER_AREA)) for image in clip)
+            for clip, c in zip(clips, cameras, strict=True)
+        )
+        return cls(
+            capture.path, cameras, masks, images, list(capture.train_views), capture.points, capture.point_colors
+        )
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames."""
+        return len(self.images[0])
+
+    def at(self, times: np.ndarray) -> list[np.ndarray]:
+        """Return the image of each view at its own time [V], in frames."""
+        times = np.clip(times, 0, self.num_frames - 1)
+        first = np.minimum(np.floor(times).astype(int), self.num_frames - 2)
+        views = zip(self.images, first, times - first, strict=True)
+        return [clip[k + round(s)] if s in (0, 1) else image_between(clip[k], clip[k + 1], s) for clip, k, s in views]
+
+
+def _checked(image: ImageOrError) -> np.ndarray:
+    if isinstance(image, Exception):
+        raise image
+    return image
+
+
+def _equations_at(clips: _Clips, times: np.ndarray, blur: float, seed: int) -> OffsetEquations:
+    """Return the equations of an instant, which each view shows at its own time [V]."""
+    images = clips.at(times)
+    after = clips.at(times + 1)
+    targets = [Target(image, mask) for image, mask in zip(images, clips.masks, strict=True)]
+    gaussians = _fitted(clips, images, 2 if blur else 1, seed)
+    pairs = {v: FramePair(after[v], images[v], valid=clips.masks[v]) for v in clips.train}
+    views = [ActiveView(camera) for camera in clips.cameras]
+    lifted = lift_flow(gaussians, {v: views[v] for v in clips.train}, observe_key_views(pairs))
+    train = np.isin(np.arange(len(views)), clips.train)
+    return offset_equations(replace(gaussians, motion=lifted.displacement), views, targets, train, blur)
+
+
+def _fitted(clips: _Clips, images: Sequence[np.ndarray], divisor: int, seed: int) -> Gaussians:
+    """Return Gaussians fitted to the images of the training views at one instant.
+
+    Args:
+        clips: cameras and points of the fit.
+        images: images of all views.
+        divisor: divisor of the numbers of Gaussians and steps.
+        seed: seed of the fit.
+    """
+    fit = FitConfig(
+        sh_degree=0,
+        num_gaussians=_GAUSSIANS // divisor,
+        first_frame_steps=_STEPS // divisor,
+        dropping=0.0,
+        density=DensityConfig(rounds=0),
+    )
+    views = [View(clips.cameras[v], images[v], clips.masks[v]) for v in clips.train]
+    rng = rng_of(seed, Stream.TIMING)
+    points = (clips.points, clips.point_colors)
+    problem = FirstFrameProblem.of(views, points, fit, RenderConfig(), rng)
+    return fit_first_frame(problem, fit, rng).gaussians
+
+
+def _relative(capture: Capture, offsets: np.ndarray, errors: np.ndarray, change: float) -> TimeOffsets:
+    """Return the result with the offsets relative to the reference, in addition to the capture's offsets."""
+    reference = capture.reference_view
+    known = capture.reading.offset
+    apart = offsets - [camera.delay for camera in capture.cameras]
+    own = {n: known.get(n, 0.0) - (o - apart[reference]) for n, o in zip(capture.names, apart, strict=True)}
+    rounded = {name: round(float(offset), 3) + 0.0 for name, offset in own.items()}
+    uncertain = dict(zip(capture.names, np.round(errors, 3).tolist(), strict=True))
+    return TimeOffsets(rounded, uncertain, capture.names[reference], change, change < _TOLERANCE)

@@ -1,0 +1,48 @@
+"""`morgs-mi calibrate`: camera poses from images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+from tyro.conf import FlagCreatePairsOff, Positional, arg
+
+from morgs_mi.cli.console import print_result, print_table, print_warning, progress
+from morgs_mi.cli.settings import Flag, Without
+from morgs_mi.studio.calibration.calibrate import CalibrateConfig
+from morgs_mi.studio.commands.info import advice_lines, check_cells
+
+
+@dataclass(frozen=True)
+class Calibrate:
+    """Calibrate the cameras of a folder of clips with COLMAP, and write FOLDER/sparse/0."""
+
+    folder: Positional[Path]
+    """Folder of videos, or of one folder of images per camera."""
+    config: Annotated[CalibrateConfig, arg(name=""), FlagCreatePairsOff] = field(default_factory=CalibrateConfig)
+    without: Without = ()
+    """Cameras that are left out, by name."""
+    overwrite: Flag = False
+    """Replace an earlier model in FOLDER/sparse."""
+
+    def run(self) -> None:
+        from morgs_mi.studio.calibration.calibrate import calibrate
+
+        with progress() as report:
+            found = calibrate(self.folder, self.config, self.overwrite, lambda *stage: report(*stage), self.without)
+        table = Table(title=str(found.model), box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        for column in ("camera", "points", "error, px", "pose"):
+            table.add_column(column, no_wrap=True)
+        for check in found.checks:
+            table.add_row(check.name, *check_cells(check))
+        print_table(table)
+        for line in advice_lines(found.checks):
+            print_warning(line)
+        how = f"{found.mapper} mapping" + (", with a principal point for each" if found.principal_points else "")
+        print_result(
+            f"{found.model}: {len(found.cameras)} cameras, {found.points} points, mean reprojection error "
+            f"{found.error:.2f} px, by {how}; scale and up direction of its world are arbitrary."
+        )

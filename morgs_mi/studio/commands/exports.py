@@ -1,0 +1,83 @@
+"""`morgs-mi export gltf`, `usd` and `tracks`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import DisallowNone, Positional
+
+from morgs_mi.cli.export_kind import FRAMES, ExportKind
+from morgs_mi.cli.settings import Flag, one_of, optional, place
+from morgs_mi.core.progress import Report
+from morgs_mi.playback.export.formats import GLTF, TRACKS, USD, Format
+
+if TYPE_CHECKING:
+    from morgs_mi.codec.frame_source import FrameSource
+
+
+@dataclass(frozen=True)
+class Gltf(ExportKind):
+    """Write a .glb file per frame: glTF 2.0 with KHR_gaussian_splatting, rotated to y up."""
+
+    output: Annotated[Positional[Path | None], DisallowNone, place("FOLDER")] = None
+    """New folder for 0000.glb, ..., or FILE.glb for one frame; by default OUT/gltf."""
+    frames: Annotated[str | None, DisallowNone, FRAMES] = None
+
+    formats = GLTF
+
+    def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
+        from morgs_mi.codec.frame_source import play
+        from morgs_mi.playback.export.clips import select_frames, write_each
+        from morgs_mi.studio.exports.axes import gltf_axes
+        from morgs_mi.studio.exports.gltf_export import write_gltf
+
+        frames = select_frames(stream, self.frames)
+        write = partial(write_gltf, axes=gltf_axes(stream.cameras))
+        write_each(play(stream), output, chosen.ending, write, frames, partial(report, "Writing"))
+        return f"{len(frames)} glTF {'file' if len(frames) == 1 else 'files'}"
+
+
+@dataclass(frozen=True)
+class Usd(ExportKind):
+    """Write an OpenUSD stage with a time sample per frame: ParticleField3DGaussianSplat, rotated to y up."""
+
+    output: Annotated[Positional[Path | None], DisallowNone, place("FILE")] = None
+    """FILE.usd, .usdc (binary), .usda (text) or .usdz (package); by default OUT/stream.usdc."""
+    format: Annotated[str | None, DisallowNone, optional("NAME"), one_of(tuple(f.name for f in USD))] = None
+    """Format: usdc, usd, usda or usdz; by default by the name."""
+    frames: Annotated[str | None, DisallowNone, FRAMES] = None
+    half: Flag = False
+    """Half precision of all attributes but the positions."""
+
+    formats = USD
+
+    def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
+        from morgs_mi.playback.export.clips import select_frames
+        from morgs_mi.studio.exports.usd import write_usd
+
+        frames = select_frames(stream, self.frames)
+        write_usd(stream, output, frames, self.half, partial(report, "Writing"))
+        return f"{len(frames)} frames, {output.stat().st_size / 1e6:.2f} MB"
+
+
+@dataclass(frozen=True)
+class Tracks(ExportKind):
+    """Write the track of every Gaussian as NumPy arrays: ids, frames, positions, confidence."""
+
+    output: Annotated[Positional[Path | None], DisallowNone, place("FILE.npz")] = None
+    """File for the tracks; by default OUT/tracks.npz."""
+
+    formats = TRACKS
+
+    def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
+        from morgs_mi.playback.export.clips import frame_numbers
+        from morgs_mi.studio.exports.tracks import extract_tracks, write_tracks
+
+        total = len(frame_numbers(stream))
+        tracks = extract_tracks(stream, lambda done: report("Following", done, total))
+        write_tracks(output, tracks)
+        T, N = tracks.positions.shape[:2]
+        return f"{N} Gaussians through {T} frames"

@@ -1,0 +1,203 @@
+"""`morgs-mi info`: the contents of a capture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Annotated, ClassVar
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+from tyro.conf import DisallowNone, Positional, arg
+
+from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.outputs import check_output
+from morgs_mi.capture.points import SharedFeatures, match_capture, triangulate_points
+from morgs_mi.cli.console import print_result, print_table, progress
+from morgs_mi.cli.settings import Flag, GivenReading, Reading, optional
+from morgs_mi.core.files import write_json
+from morgs_mi.fit.forecast import forecast
+from morgs_mi.studio.calibration.checks.deep import MAX_FRAMES, DeepCheck, Finding, check_deep, check_exposures
+from morgs_mi.studio.calibration.checks.rig_check import CameraCheck, RigCheck, check_rig
+from morgs_mi.studio.calibration.checks.signals import read_signals
+from morgs_mi.studio.calibration.timing import TimeOffsets, estimate_time_offsets
+
+# Standard errors in frames above which a time offset is uncertain, and from which it counts as not found.
+_UNCERTAIN = 0.1
+_NOT_FOUND = 0.5
+_UNCERTAIN_WHY = (
+    "Their images hardly depend on the clocks: little moves, or in a direction in which an offset looks like a change "
+    "of depth, or the cameras are far apart."
+)
+
+
+@dataclass(frozen=True)
+class Info:
+    """List the contents of a capture: layout, cameras, sizes, frames, points; check its poses against the images."""
+
+    capture: Positional[Path]
+    """Folder of the capture."""
+    plot: Annotated[Path | None, DisallowNone, optional("FILE")] = None
+    """File for a plot of the rig, .png, .jpg, .svg or .pdf."""
+    check: Annotated[bool, arg(help_behavior_hint="(default: --check)")] = True
+    """Check the poses against feature matches between the views of the first frame."""
+    time: Flag = False
+    """Estimate the time offsets of the cameras from what moves in the first frames."""
+    deep: Flag = False
+    """Also check synchronisation, exposure, sharpness, lost frames, flicker and overlap, which reads many frames."""
+    json: Annotated[Path | None, DisallowNone, optional("FILE.json")] = None
+    """File for all measurements of --deep."""
+    reading: GivenReading = field(default_factory=Reading)
+
+    arguments: ClassVar[Mapping[str, str]] = {"max_frames": "morgs-mi fit --frames"}
+
+    def run(self) -> None:
+        from morgs_mi.studio.calibration.checks.plots import check_plot, write_rig
+
+        if self.deep and not self.check:
+            raise ValueError("--deep: expected the check of the poses, on which it builds; leave out --no-check.")
+        if self.json is not None and not self.deep:
+            raise ValueError("--json: expected --deep, whose measurements it holds; add --deep.")
+        for output in (self.plot, self.json):
+            if output is not None:
+                check_output(output)
+        if self.plot is not None:
+            check_plot(self.plot)
+        capture = load_capture(self.capture, reading=self.reading.read_config())
+        rig_check = None
+        deep = None
+        exposures: Sequence[Finding] = ()
+        origin = "" if len(capture.points) else "without points"
+        if self.check:
+            with progress() as report:
+                common = match_capture(capture, lambda done, total: report("Matching views", done, total))
+            rig_check = check_rig(capture, common)
+            if origin:
+                capture = triangulate_points(capture, common)
+                origin += f" ({len(capture.points)} can be triangulated)"
+            if self.deep:
+                deep = _deep_check(capture, common, rig_check)
+            else:
+                exposures = check_exposures(capture, common)
+        print_table(_camera_table(capture, rig_check))
+        points = origin or f"{len(capture.points)} points"
+        truth = "with ground truth" if capture.truth else "without ground truth"
+        print_result(f"{capture.num_frames} frames at {capture.fps:g} fps, {points}, {truth}.")
+        for line in (*capture.notes, *_check_lines(rig_check), *_color_lines(capture), *_forecast_lines(capture)):
+            print_result(line)
+        if self.time:
+            with progress() as report:
+                offsets = estimate_time_offsets(capture, lambda done, total: report("Comparing clocks", done, total))
+            for line in _time_lines(offsets):
+                print_result(line)
+        for line in (*(finding.sentence for finding in exposures), *_deep_lines(deep)):
+            print_result(line)
+        if self.json is not None and deep:
+            write_json(self.json, deep.as_dict())
+            print_result(f"All measurements: {self.json}")
+        if self.plot is not None:
+            write_rig(self.plot, capture, deep)
+            print_result(f"Plot of the rig: {self.plot}")
+
+
+def _deep_check(capture: Capture, shared: SharedFeatures, found: RigCheck) -> DeepCheck:
+    """Return the check of the first frames."""
+    with progress() as report:
+        signals = read_signals(capture, MAX_FRAMES, partial(report, "Reading frames"))
+    return check_deep(capture, shared, found, signals)
+
+
+def _deep_lines(deep: DeepCheck | None) -> list[str]:
+    """Return the findings of the check of many frames, and what it could not measure."""
+    if deep is None:
+        return []
+    count = len(deep.findings)
+    result = "no findings" if not count else "1 finding" if count == 1 else f"{count} findings"
+    sentences = [finding.sentence for finding in deep.findings]
+    return [f"Check of {deep.frames} frames: {result}.", *sentences, *filter(None, [deep.unmeasured])]
+
+
+def _camera_table(capture: Capture, found: RigCheck | None) -> Table:
+    """Return a row per camera: size, intrinsics, use, and how well its pose fits the matches."""
+    table = Table(title=f"{capture.path}: {capture.layout}", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for column in ("", "camera", "size", "focal, px", "centre, px", "seen", "use", "matches", "error, px", "pose"):
+        table.add_column(column, no_wrap=True)
+    for index, (camera, mask) in enumerate(zip(capture.cameras, capture.masks, strict=True)):
+        K = camera.K
+        table.add_row(
+            str(index),
+            camera.name,
+            f"{camera.width}x{camera.height}",
+            f"{K[0, 0]:.1f}" if f"{K[0, 0]:.1f}" == f"{K[1, 1]:.1f}" else f"{K[0, 0]:.1f} {K[1, 1]:.1f}",
+            f"{K[0, 2]:.1f} {K[1, 2]:.1f}",
+            "100 %" if mask is None else f"{100 * mask.mean():.0f} %",
+            "test" if index in capture.test_views else "train",
+            *check_cells(found.cameras[index] if found else None),
+        )
+    return table
+
+
+def _check_lines(found: RigCheck | None) -> list[str]:
+    """Return the result of the reprojection check and its advice."""
+    if found is None:
+        return []
+    error = f"median {found.error:.2f} px over " if found.matches else ""
+    result = f"Reprojection check: {error}{found.matches} matches in {found.pairs} pairs; {found.advice}"
+    return [result, *advice_lines(found.cameras)]
+
+
+def _time_lines(found: TimeOffsets) -> list[str]:
+    """Return the time offsets as the options that align the clips, and how certain they are."""
+    errors = {name: error for name, error in found.errors.items() if name != found.reference}
+    known = {name: error for name, error in errors.items() if error < _NOT_FOUND}
+    lines = []
+    if known:
+        listed = " ".join(f"{name} {found.offsets[name]:.2f}" for name in known)
+        worst = max(known, key=lambda name: known[name])
+        lines += [
+            f"Clocks: pass --offset {listed} for the time of {found.reference}.",
+            f"Standard errors of these offsets: up to {known[worst]:.2f} frames ({worst}).",
+        ]
+    doubts = [f"{name} ({error:.2f})" for name, error in known.items() if error > _UNCERTAIN]
+    if doubts:
+        lines.append(f"Uncertain: {', '.join(doubts)}. {_UNCERTAIN_WHY}")
+    if len(known) < len(errors):
+        missing = ", ".join(name for name in errors if name not in known)
+        lines.append(f"Clocks not found: {missing}; keep what is known of them. {_UNCERTAIN_WHY}")
+    if not found.converged:
+        lines.append(f"The offsets still change by {found.change:.2f} frames: the clips may not show enough.")
+    return lines
+
+
+def _forecast_lines(capture: Capture) -> list[str]:
+    """Return the expected quality of views between the training cameras, if there are several."""
+    cameras = [capture.cameras[v] for v in capture.train_views]
+    return [forecast(cameras, capture.points).sentence] if len(cameras) > 1 else []
+
+
+def _color_lines(capture: Capture) -> list[str]:
+    """Return the colour differences before and after the colour correction, if there is one."""
+    fit = capture.colors
+    if fit is None:
+        return []
+    changes = zip(capture.names, fit.before, fit.after, fit.samples, strict=True)
+    errors = ", ".join(f"{name} {a:.1f} -> {b:.1f} ({n} points)" if n else f"{name} -" for name, a, b, n in changes)
+    return [f"Colours towards {capture.names[fit.reference]}, dE2000 before -> after: {errors}."]
+
+
+def check_cells(check: CameraCheck | None) -> tuple[str, str, str]:
+    """Return the number of matches, the error and the verdict of a camera as text."""
+    if check is None:
+        return "-", "-", "not checked"
+    return str(check.matches), f"{check.error:.2f}" if check.matches else "-", check.verdict
+
+
+def advice_lines(checks: Sequence[CameraCheck]) -> list[str]:
+    """Return a sentence per advice, with the names of the cameras that it concerns."""
+    names: dict[str, list[str]] = {}
+    for check in checks:
+        if check.advice:
+            names.setdefault(f"{check.verdict}: {check.advice}.", []).append(check.name)
+    return [f"{', '.join(cameras)} {text}" for text, cameras in names.items()]

@@ -1,0 +1,232 @@
+"""The demonstration: synthesise a clip, fit it with and without learned motion, evaluate both fits and draw images."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.outputs import check_output
+from morgs_mi.core.environment import machine, versions
+from morgs_mi.core.files import locked_folder, write_json
+from morgs_mi.core.fit_names import CAPTURE, REPORT
+from morgs_mi.core.progress import Progress, Report
+from morgs_mi.evaluate.evaluate import evaluate_stream
+from morgs_mi.evaluate.figures import motion_scale
+from morgs_mi.evaluate.results import Evaluation
+from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.io.bounded import read_json
+from morgs_mi.io.video_writer import PLAYABLE, write_video
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.playback.export.frames import pad_to_even
+from morgs_mi.playback.player import channel_image, render_stream
+from morgs_mi.playback.source import about_lenses, as_fitted
+from morgs_mi.playback.stream_header import truth_for_camera
+from morgs_mi.playback.streams import open_stream
+from morgs_mi.playback.visualise import contact_sheet, label, motion_legend, side_by_side, write_png
+from morgs_mi.runs.fit_capture import stream_capture
+from morgs_mi.runs.fit_files import FitFiles, Recording, read_reports, stream_metadata
+from morgs_mi.studio.synth.synth_config import SynthConfig
+from morgs_mi.studio.synth.synthesize import synthesize
+
+_COMPARED = ("psnr", "ssim", "motion_error", "motion_error_moving", "motion_error_still", "true_motion_moving")
+# Factor on the error images: errors of a tenth are visible, typical ones are smaller.
+_ERROR_GAIN = 4
+# Shortest duration of the video in seconds; a short clip is played more slowly.
+_LEAST_SECONDS = 3
+
+
+@dataclass(frozen=True)
+class DemoConfig:
+    """Settings of the demonstration."""
+
+    scene: str = "spheres"
+    """Name or file of the scene."""
+    clip: SynthConfig = field(default_factory=lambda: SynthConfig(cameras=10, frames=10, spp=16))
+    """The path-traced clip, with the seed of the fit."""
+    plain_frames: int = 5
+    """Number of frames of the second fit, without learned motion, offset and confidence, for comparison."""
+    stream: StreamConfig = field(
+        default_factory=lambda: StreamConfig(fit=FitConfig(num_gaussians=20_000, first_frame_steps=750))
+    )
+    """The fit, with a shortened, smaller first frame; its seed is also the clip's."""
+
+
+@dataclass(frozen=True)
+class DemoReport:
+    """Results of the demonstration."""
+
+    config: DemoConfig  #: The settings.
+    full: Evaluation  #: Evaluation of the fit with motion, offset and confidence.
+    plain: Evaluation  #: Evaluation of the fit without.
+    compared_frames: list[int]  #: Indices of the frames that both fits have, without the first.
+    #: Mean scores over these frames, by fit (``full``, ``plain``) and by name.
+    comparison: dict[str, dict[str, float | None]]
+    seconds: dict[str, float]  #: Wall time by step, and ``total``.
+    machine: dict[str, Any]  #: The machine, see `core.environment`.
+    versions: dict[str, str]  #: Of the libraries, likewise.
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the content of ``report.json``."""
+        return {
+            "config": asdict(self.config),
+            "seed": self.config.stream.seed,
+            "comparison": {"frames": self.compared_frames, **self.comparison},
+            "seconds": self.seconds,
+            "machine": self.machine,
+            "versions": self.versions,
+            "full": self.full.as_dict(),
+            "plain": self.plain.as_dict(),
+        }
+
+
+def run_demo(out: str | Path, config: DemoConfig | None = None, progress: Report | None = None) -> DemoReport:
+    """Synthesise a clip, fit it, and write images and results of its held-out view into `out`.
+
+    The folder contains ``capture/`` (reused if it has the same settings), ``stream/``, ``stream_plain/``,
+    ``side_by_side.mp4`` (truth, render, motion, confidence), ``contact_sheet.png`` and ``report.json``.
+
+    Args:
+        out: the folder.
+        config: the settings.
+        progress: called with (step, done, total).
+
+    Raises:
+        ValueError: a setting is out of range, or `out` lies in a capture.
+        OSError: a file cannot be written, another process writes into the folder, or ``capture`` exists and is not a
+            synthetic capture.
+    """
+    root = check_output(Path(out))
+    with locked_folder(root, "run_demo()"):
+        return _run(root, config or DemoConfig(), progress)
+
+
+def _run(root: Path, config: DemoConfig, shown: Report | None) -> DemoReport:
+    """Run the demonstration in a locked folder."""
+    seconds: dict[str, float] = {}
+
+    def run_step(name: str, work: Callable[[Progress], Any]) -> Any:
+        start = time.perf_counter()
+        result = work(Progress(shown, name))
+        seconds[name] = time.perf_counter() - start
+        return result
+
+    def fit(capture: Capture, folder: str, settings: StreamConfig, progress: Progress, resume: bool = False) -> None:
+        def report(stage: str, done: float, total: float) -> None:
+            progress.of(f"{progress.stage}: {stage.lower()}")(done, total)
+
+        stream_capture(capture, root / folder, settings, resume, report)
+
+    def fit_plain(progress: Progress) -> None:
+        capture = load_capture(root / "capture", max_frames=min(config.plain_frames, config.clip.frames))
+        _begin_with_first_frame(root / "stream_plain", root / "stream", capture, plain)
+        fit(capture, "stream_plain", plain, progress, resume=True)
+
+    run_step("Path-tracing the clip", lambda report: _synthesize_clip(root / "capture", config, report))
+    off = {"learn_motion": False, "learn_offset": False, "learn_confidence": False}
+    plain = replace(config.stream, motion=replace(config.stream.motion, **off))
+    run_step("Fitting", lambda report: fit(load_capture(root / "capture"), "stream", config.stream, report))
+    run_step("Fitting without ML, MO, MC", fit_plain)
+    results = {
+        name: run_step(
+            f"Evaluating {folder}", lambda report, folder=folder: evaluate_stream(root / folder, progress=report)
+        )
+        for name, folder in (("full", "stream"), ("plain", "stream_plain"))
+    }
+    run_step("Drawing", lambda report: _draw(root, load_capture(root / "capture"), report))
+    frames, comparison = _compare(results)
+    seconds["total"] = sum(seconds.values())
+    full = results["full"]
+    plain_result = results["plain"]
+    report = DemoReport(config, full, plain_result, frames, comparison, seconds, machine(), versions())
+    write_json(root / REPORT, report.as_dict())
+    return report
+
+
+def _synthesize_clip(folder: Path, config: DemoConfig, report: Callable[[float, float], None]) -> None:
+    """Path-trace the clip unless `folder` has it already; captures are written atomically, so it is complete."""
+    clip = replace(config.clip, seed=config.stream.seed)
+    wanted = {"scene": config.scene, **clip.as_dict()}
+    given = {name: value for name, value in wanted.items() if value is not None}
+    try:
+        about = read_json(folder / CAPTURE)
+    except (OSError, ValueError):
+        about = None
+    if isinstance(about, dict) and all(about.get(name) == value for name, value in given.items()):
+        report(1, 1)
+        return
+    synthesize(config.scene, folder, clip, overwrite=True, progress=report)
+
+
+def _begin_with_first_frame(out: Path, source: Path, capture: Capture, config: StreamConfig) -> None:
+    """Begin a fit with the first frame of another fit: it has no motion, so the settings of the motion change nothing.
+
+    Args:
+        out: folder of the fit, which `stream_capture` resumes.
+        source: folder of the other fit.
+        capture: what is fitted.
+        config: settings of the fit.
+    """
+    stream = open_stream(source)
+    metadata = stream_metadata(capture, next(capture.partial_frames()), config)
+    capture = as_fitted(capture, stream)
+    metadata |= about_lenses(capture)
+    out.mkdir(exist_ok=True)
+    with Recording(FitFiles.of(out), capture, metadata) as recording:
+        recording.extend([next(iter(stream))], read_reports(FitFiles.of(source).report, range(1)))
+
+
+def _compare(results: Mapping[str, Evaluation]) -> tuple[list[int], dict[str, dict[str, float | None]]]:
+    """Return the frames that both fits have, without the first, which has no motion, and mean scores over them."""
+    count = min(result.num_frames for result in results.values())
+    rows = {name: result.frames[1:count] for name, result in results.items()}
+
+    def mean(name: str, score: str) -> float | None:
+        return float(np.mean([getattr(row.scores, score) for row in rows[name]])) if rows[name] else None
+
+    means = {name: {score: mean(name, score) for score in _COMPARED} for name in rows}
+    return [row.frame for row in rows["full"]], means
+
+
+def _draw(out: Path, capture: Capture, report: Callable[[float, float], None]) -> None:
+    """Write the video and the contact sheet."""
+    scale = motion_scale(capture, capture.cameras[capture.reference_view])
+    full = _panels(capture, out / "stream", scale)
+    plain = _panels(capture, out / "stream_plain", scale, ", no ML, MO, MC")
+    shown = ("truth", "render", "motion", "confidence")
+    rows = [side_by_side([panels[name] for name in shown if name in panels]) for panels in full]
+    fps = min(capture.fps, len(rows) / _LEAST_SECONDS)
+    write_video(out / "side_by_side.mp4", map(pad_to_even, rows), fps, PLAYABLE)
+    report(1, 2)
+    last = len(plain) - 1
+    frames = sorted({min(1, len(full) - 1), last, len(full) - 1})
+    sheet = [list(full[frame].values()) for frame in frames]
+    # The plain fit does not learn the confidence.
+    without = [panel for name, panel in plain[last].items() if name != "confidence"]
+    sheet.append([*without, motion_legend(scale)])
+    write_png(out / "contact_sheet.png", contact_sheet(sheet))
+    report(2, 2)
+
+
+def _panels(capture: Capture, stream: Path, scale: float, note: str = "") -> list[dict[str, np.ndarray]]:
+    """Return the labelled images of every frame of the held-out view by name; `note` is appended to the labels."""
+    reader = open_stream(stream)
+    view = capture.reference_view
+    camera = reader.cameras[view]
+    frames = []
+    for recorded, (index, images) in zip(capture.frames(), render_stream(reader, camera), strict=False):
+        truth = truth_for_camera(capture, camera, index)
+        rendered = channel_image("color", images["color"])
+        error = np.abs(rendered.astype(float) - recorded.images[view]) * _ERROR_GAIN / 255
+        panels = {"truth": recorded.images[view], "render": rendered, "error": channel_image("color", error)}
+        if truth is not None:
+            panels["true motion"] = channel_image("motion", truth.motion, scale)
+        panels |= {n: channel_image(n, images[n], scale) for n in ("motion", "confidence") if n in images}
+        labels = {"truth": f"truth, frame {index}", "error": f"error x{_ERROR_GAIN}", "true motion": "true motion"}
+        frames.append({name: label(panel, labels.get(name, name + note)) for name, panel in panels.items()})
+    return frames

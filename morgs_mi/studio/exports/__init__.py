@@ -1,0 +1,1 @@
+"""Exports to OpenUSD and glTF, tracks and panoramas."""

@@ -1,0 +1,1 @@
+"""Light between Gaussians and the objects of a scene."""

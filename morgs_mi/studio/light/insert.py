@@ -1,0 +1,323 @@
+"""A Mitsuba scene inserted into a stream: its objects stand among the Gaussians of every frame.
+
+A scene is an XML file, which is the same in all frames, or a Python file with a function
+
+    build(frame: int, time: float) -> dict
+
+that returns the entries of a Mitsuba scene: shapes, emitters, and optionally an `integrator` for them. The time is in
+seconds. World space and its units are the stream's.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+from xml.etree import ElementTree
+
+import cv2
+import mitsuba as mi
+import numpy as np
+
+from morgs_mi.codec.frame_source import FrameSource, play
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import LARGEST, bounded, check_number
+from morgs_mi.core.color_space import decode_light, encode_light
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.ranges import check_ranges
+from morgs_mi.gaussian_integrator import ellipsoids
+from morgs_mi.playback.export.clips import frame_numbers
+from morgs_mi.playback.player import available_channels
+from morgs_mi.render.channels import exr_names
+from morgs_mi.render.rasterize import rasterize
+from morgs_mi.studio.light.light_probe import CLIPPED, light_probe
+from morgs_mi.studio.light.shadows import shadow_ratio, shadowed
+from morgs_mi.studio.synth.scene import failures_in
+from morgs_mi.surfaces.surface_view import lights, rays_for, traced
+
+LAYERS = ("splats", "surfaces", "shadow")
+"""Further channels, for compositing: the splats alone and the surfaces alone, in linear light with alpha, and the
+shadow of the surfaces on the splats, a factor of their linear light."""
+
+Light = Literal["probe", "traced"]
+
+Build = Callable[[int, float], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class InsertConfig:
+    """Rendering of an inserted scene."""
+
+    samples: int = 16
+    """Samples per pixel of its surfaces."""
+    shadows: bool = True
+    """Whether its surfaces throw shadows on the Gaussians, see `shadow_ratio`."""
+    light: Light = "probe"
+    """``probe`` lights the surfaces by an environment map, see `captured_light`; ``traced`` traces rays through the
+    Gaussians (`splat_path`), which also throw shadows on them."""
+    clipped: float | None = None
+    """Radiance of colours that the video clipped at 1, see `light_probe`; None: 4, or 1 for a stream of an HDR
+    recording, which is not clipped."""
+
+    def __post_init__(self) -> None:
+        check_number("render_inserted()", "samples", self.samples, "[1, inf)")
+        check_ranges(self, "render_inserted()")
+
+
+def load_insert(path: str | Path) -> Build:
+    """Return the function (frame, seconds) -> entries of a Mitsuba scene of an XML or Python file.
+
+    Raises:
+        ValueError: there is no such file, it is of another type, or it fails; the sentence names the file, and the line
+            of a Python file.
+    """
+    path = Path(path)
+    if path.suffix not in (".xml", ".py") or not path.is_file():
+        kind = f"{path.suffix!r}" if path.is_file() else "none"
+        raise ValueError(f"{path}: expected a scene to insert, FILE.xml or FILE.py, got {kind}; check the path.")
+    if path.suffix == ".xml":
+        entries = _xml_entries(path)
+        return lambda frame, time: entries
+    spec = importlib.util.spec_from_file_location(f"morgs_mi_insert_{path.stem}", path)
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    with failures_in(path):
+        spec.loader.exec_module(module)
+    build = getattr(module, "build", None)
+    if not callable(build):
+        raise ValueError(
+            f"{path}: expected a function `build(frame, time)` that returns the entries of a Mitsuba scene, found "
+            "none; add it."
+        )
+
+    def checked(frame: int, time: float) -> dict[str, Any]:
+        with failures_in(path):
+            entries = build(frame, time)
+            if not isinstance(entries, dict):
+                raise TypeError(f"`build` must return a dict, got a {type(entries).__name__}")
+            return entries
+
+    return checked
+
+
+def inserted_channels(stream: FrameSource) -> tuple[str, ...]:
+    """Return all channels of a stream with an inserted scene, for EXR files.
+
+    Raises:
+        ValueError: a broken packet, or no frame.
+    """
+    frame_numbers(stream)
+    _, gaussians = next(iter(play(stream)))
+    return ("color", "alpha", *(name for name in available_channels(gaussians) if name != "color"), *LAYERS)
+
+
+def selected(stream: FrameSource, frames: Sequence[int]) -> list[int]:
+    """Return `frames` in ascending order, each once.
+
+    Raises:
+        ValueError: the stream does not have one of them.
+    """
+    numbers = frame_numbers(stream)
+    missing_frames = sorted(set(frames) - set(numbers))
+    if missing_frames:
+        raise ValueError(
+            f"{stream.path}: the frames must be out of {numbers[0]} to {numbers[-1]}, got {missing_frames[0]}; choose "
+            "others."
+        )
+    return sorted(set(frames))
+
+
+def render_inserted(
+    stream: FrameSource,
+    camera: Camera,
+    build: Build,
+    frames: Sequence[int] | None = None,
+    channels: Sequence[str] = ("color",),
+    config: InsertConfig | None = None,
+) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+    """Render frames of a stream for one camera with a Mitsuba scene inserted.
+
+    An inserted scene without emitters is lit by the Gaussians, see `captured_light`.
+
+    Args:
+        stream: the file.
+        camera: any view.
+        build: see `load_insert`.
+        frames: indices of the frames to render; None: all.
+        channels: out of ``color``, ``alpha``, the AOVs of `gaussian_splat`, and `LAYERS`.
+        config: settings.
+
+    Yields:
+        (frame, images) as `render_stream` does.
+
+    Raises:
+        ValueError: a broken packet, or a scene that Mitsuba or `gaussian_splat` refuses.
+    """
+    config = config or InsertConfig()
+    if config.clipped is None:
+        config = replace(config, clipped=1.0 if "transfer" in stream.metadata else CLIPPED)
+    for frame, gaussians in play(stream):
+        if frames is None or frame in frames:
+            entries = build(frame, frame / stream.fps)
+            images = _render(gaussians, camera.square(), entries, channels, config)
+            yield frame, {name: _resized(name, image, camera) for name, image in images.items()}
+
+
+def _resized(name: str, image: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return an image [H', W, C] of a camera's `square` view with the camera's height H."""
+    scale = camera.height / image.shape[0]
+    if scale == 1:
+        return image
+    resized = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
+    unit = np.array([1, scale] if name == "motion" else 1, np.float32)  # motion is in pixels
+    return resized.reshape(camera.height, camera.width, -1) * unit
+
+
+def captured_light(
+    gaussians: Gaussians, camera: Camera, position: np.ndarray, clipped: float = CLIPPED
+) -> dict[str, Any]:
+    """Return the `light_probe` at a point, where directions without Gaussians have the mean colour of a view.
+
+    A capture rarely shows what is behind the cameras; black there would take half of the light away.
+    """
+    return light_probe(gaussians, position, background=_mean_color(gaussians, camera, clipped), clipped=clipped)
+
+
+def _mean_color(gaussians: Gaussians, camera: Camera, clipped: float) -> list[float]:
+    white = np.inf if clipped == 1 else 1.0
+    return np.clip(np.asarray(rasterize(gaussians, camera, ("color",)).color), 0, white).mean((0, 1)).tolist()
+
+
+def _in_background_light(entries: dict[str, Any], gaussians: Gaussians, camera: Camera, clipped: float) -> Any:
+    """Return the inserted scene with the light that comes from behind all Gaussians, as for `captured_light`."""
+    radiance = decode_light(np.array(_mean_color(gaussians, camera, clipped))).tolist()
+    lamp = {"type": "constant", "radiance": {"type": "rgb", "value": radiance}}
+    return mi.load_dict({"type": "scene", **entries, "captured light": lamp})
+
+
+def _integrator(entry: Any, light: Light, clipped: float) -> Any:
+    """Return the integrator of the surfaces: the one of the inserted scene, if it has one.
+
+    Raises:
+        ValueError: it does not light them as the option demands.
+    """
+    entry = entry or ({"type": "splat_path", "clipped": clipped} if light == "traced" else {"type": "path"})
+    nested = mi.load_dict(entry) if isinstance(entry, dict) else entry
+    if hasattr(nested, "splats") != (light == "traced"):
+        name = type(nested).__name__ if hasattr(nested, "splats") else nested.class_name()
+        raise ValueError(
+            f"The inserted scene: with light {light!r}, expected {'an' if light == 'traced' else 'no'} integrator "
+            f"`splat_path`, got {name}; remove `integrator` from the scene, or choose the other light."
+        )
+    return nested
+
+
+def _render(
+    gaussians: Gaussians, camera: Camera, entries: dict[str, Any], channels: Sequence[str], config: InsertConfig
+) -> dict[str, np.ndarray]:
+    entries = {name: value for name, value in entries.items() if name not in ("type", "sensor")}
+    clipped = CLIPPED if config.clipped is None else config.clipped
+    nested = _integrator(entries.pop("integrator", None), config.light, clipped)
+    ratio = np.ones(len(gaussians), np.float32)
+    try:
+        inserted = _inserted_scene(entries)
+        lit = inserted
+        if not inserted.emitters():
+            lamp = captured_light(gaussians, camera, np.array(inserted.bbox().center()).ravel(), clipped)
+            lit = mi.load_dict({"type": "scene", **entries, "captured light": lamp})
+            inserted = lit if config.light == "probe" else _in_background_light(entries, gaussians, camera, clipped)
+        if config.shadows:
+            ratio = shadow_ratio(gaussians, lit, camera.position)
+        dark = shadowed(gaussians, ratio)
+        images = _plugin_images(dark, camera, inserted, nested, channels, config.samples)
+        if "surfaces" in channels:
+            with traced(nested, rays_for(nested, dark), srgb=True):
+                images["surfaces"] = np.asarray(nested.render(inserted, _sensor(camera), spp=config.samples))
+    except RuntimeError as error:
+        raise ValueError(f"The inserted scene: {_reason(error)}; correct it.") from error
+    if {"splats", "shadow"} & set(channels):
+        images |= _splat_layers(gaussians, dark, camera)
+    return {name: images[name].astype(np.float32) for name in channels}
+
+
+def _inserted_scene(entries: dict[str, Any]) -> Any:
+    """Return the scene of the entries, with the light that it has itself.
+
+    Raises:
+        ValueError: it has no shapes, or they are not finite.
+    """
+    scene: Any = mi.load_dict({"type": "scene", **entries})
+    if not (scene.shapes() or scene.emitters()):
+        raise ValueError("The inserted scene: expected at least one shape, got none; add one.")
+    box = scene.bbox()
+    if scene.shapes() and not bounded(np.array([box.min, box.max])):
+        raise ValueError(
+            f"The inserted scene: expected shapes within {LARGEST:g} world units, got {box.min} to {box.max}; correct "
+            "their places and sizes."
+        )
+    return scene
+
+
+def _splat_layers(gaussians: Gaussians, shadowed_gaussians: Gaussians, camera: Camera) -> dict[str, np.ndarray]:
+    """Return the layers `splats` [H, W, 4] and `shadow` [H, W, 3], in linear light."""
+    image = rasterize(gaussians, camera)
+    bright = decode_light(np.asarray(image.color))
+    dark = decode_light(np.asarray(rasterize(shadowed_gaussians, camera).color))
+    return {
+        "splats": np.concatenate([bright, np.asarray(image.alpha)], axis=2),
+        "shadow": np.where(bright > 0, dark / np.maximum(bright, 1e-6), 1),
+    }
+
+
+def _plugin_images(
+    gaussians: Gaussians, camera: Camera, inserted: Any, nested: Any, channels: Sequence[str], samples: int
+) -> dict[str, np.ndarray]:
+    """Return the colour, alpha and AOVs of `gaussian_splat` with an inserted scene."""
+    aovs = [name for name in channels if name not in ("color", "alpha", *LAYERS)]
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "gaussians": ellipsoids(gaussians),
+            "sensor": _sensor(camera),
+            "integrator": {"type": "gaussian_splat", "surfaces": nested, "aovs": ",".join(aovs)},
+            **{f"part{i}": part for i, part in enumerate(_parts(inserted))},
+        }
+    )
+    image = np.asarray(scene.integrator().render(scene, spp=samples))
+    images = {"color": encode_light(image[..., :3]), "alpha": image[..., 3:4]}
+    first = 4
+    for name in aovs:
+        size = len(exr_names(name))
+        images[name] = image[..., first : first + size]
+        first += size
+    return images
+
+
+def _sensor(camera: Camera) -> Any:
+    return mi.load_dict(camera.sensor(pixel_format="rgba"))
+
+
+def _xml_entries(path: Path) -> dict[str, Any]:
+    """Return the shapes, lights and integrator of a scene file."""
+    try:
+        scene: Any = mi.load_file(str(path))
+    except RuntimeError as error:
+        raise ValueError(f"{path}: {_reason(error)}; correct the scene file.") from error
+    parts = {part.id() or f"part{i}": part for i, part in enumerate(_parts(scene))}
+    # Mitsuba adds an integrator to files without one.
+    has_integrator = ElementTree.parse(path).find("integrator") is not None
+    return {**parts, "integrator": scene.integrator()} if has_integrator else parts
+
+
+def _reason(error: RuntimeError) -> str:
+    """Return Mitsuba's reason in one line, without the places in its own source."""
+    return re.sub(r"\[\w+\.\w+:\d+\] ", "", " ".join(str(error).split())).rstrip(".")
+
+
+def _parts(scene: Any) -> list[Any]:
+    """Return the shapes of a scene, and its emitters that are not on one."""
+    return [*scene.shapes(), *lights(scene)]

@@ -1,0 +1,200 @@
+"""The Mitsuba integrator `splat_path`: paths among surfaces, along which the Gaussians emit and absorb light.
+
+    "integrator": {"type": "gaussian_splat", "surfaces": {"type": "splat_path"}}
+
+The Gaussians on a segment of a path act as one layer. C and T are their blended colour and transmittance, and L is the
+radiance that arrives from behind:
+
+    (1 - T) dec(C / (1 - T)) + T L
+
+`dec` decodes colours to linear light. The layer is linear in L: estimates of L may be noisy, and lights shine
+through it by the factor T, from whichever side they are found. It is left out between the camera and the first surface:
+there, `gaussian_splat` blends the splats.
+
+Derivatives are computed by path replay (Vicini et al. 2021), with the layers as constants.
+
+Mitsuba has a base class for every variant, so this module is imported again after mi.set_variant().
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+from mitsuba.ad.integrators.common import RBIntegrator, mis_weight  # pyright: ignore
+
+from morgs_mi.core.types import Bool, Float, Jit
+from morgs_mi.studio.light.light_probe import CLIPPED, radiance
+from morgs_mi.surfaces.splat_rays import SplatRays
+
+
+class SplatPathIntegrator(RBIntegrator):
+    r"""Path tracer for surfaces among Gaussians (:monosp:`splat_path`), the `surfaces` of a `gaussian_splat`.
+
+    .. pluginparameters::
+
+     * - max_depth
+       - |int|
+       - Longest path, in segments; -1: any length. (Default: 6)
+
+     * - rr_depth
+       - |int|
+       - Segments after which Russian roulette may end a path. (Default: 5)
+
+     * - clipped
+       - |float|
+       - Radiance of colours that the video clipped at 1, as for `light_probe`. (Default: 4)
+
+     * - hide_emitters
+       - |bool|
+       - Whether the camera does not see the environment. (Default: False)
+
+    Differentiable in materials and lights. Positions of surfaces, and the Gaussians along paths, get no gradient.
+    """
+
+    def __init__(self, props: Any) -> None:
+        super().__init__(props)
+        if not mi.is_rgb:
+            raise ValueError(
+                f"splat_path: expected a variant such as 'llvm_ad_rgb', got {mi.variant()!r}; call mi.set_variant() "
+                "before the scene is loaded, because Gaussians have RGB colours."
+            )
+        self.clipped = float(props.get("clipped", CLIPPED))
+        if not 1 <= self.clipped < float("inf"):
+            raise ValueError(f"splat_path: `clipped` must be a number in [1, inf), got {self.clipped}; set another.")
+        self.splats: SplatRays | None = None
+        self.srgb = True
+
+    def sample(
+        self,
+        mode: Any,
+        scene: Any,
+        sampler: Any,
+        ray: Any,
+        δL: Any = None,
+        state_in: Any = None,
+        active: Bool = True,
+        **_: Any,
+    ) -> tuple[Any, Bool, list[Float], Any]:
+        """Return radiance or its derivative, as `ADIntegrator.sample` does."""
+        if self.splats is None:
+            raise ValueError(
+                "splat_path: expected Gaussians, got none; set it as the `surfaces` of a `gaussian_splat`, which "
+                "passes its own."
+            )
+        primal = mode == dr.ADMode.Primal
+        ctx = mi.BSDFContext()
+        sign = 1 if primal else -1
+
+        def bounce(
+            active: Bool,
+            sampler: Any,
+            ray: Any,
+            depth: Any,
+            L: Any,
+            δL: Any,
+            β: Any,
+            η: Float,
+            last_si: Any,
+            last_pdf: Float,
+            last_delta: Bool,
+        ) -> tuple[Jit, ...]:
+            si = scene.ray_intersect(ray, mi.RayFlags.All, False, active)
+            bsdf = si.bsdf(ray)
+
+            # --------------------- Gaussians on the segment ---------------------
+
+            ray.maxt = dr.select(si.is_valid(), si.t, dr.largest(mi.Float))
+            emitted, passed = self._layer(ray, active & (depth > 0))
+            L += sign * β * emitted
+            β *= passed
+
+            # ------------------------- Direct emission --------------------------
+
+            seen = active & ~((depth == 0) & ~si.is_valid()) if self.hide_emitters else active
+            ds = mi.DirectionSample3f(scene, si, last_si)
+            mis = mis_weight(last_pdf, scene.pdf_emitter_direction(last_si, ds, ~last_delta))
+            with dr.resume_grad(when=not primal):
+                Le = β * mis * ds.emitter.eval(si, seen)
+
+            # ------------------------- Emitter sampling -------------------------
+
+            proceed = active & (depth + 1 < self.max_depth) & si.is_valid()
+            lit = proceed & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(lit), True, lit)
+            lit &= ds.pdf != 0
+            weight *= self._to_light(si, ds, lit & (dr.max(mi.unpolarized_spectrum(weight)) > 0))
+            wo = si.to_local(ds.d)
+            with dr.resume_grad(when=not primal):
+                if not primal:
+                    attached = scene.eval_emitter_direction(si, ds, lit)
+                    weight = weight * dr.relative_grad(attached)
+                value, pdf = bsdf.eval_pdf(ctx, si, wo, lit)
+                Ld = β * dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf)) * value * weight
+
+            # -------------------------- BSDF sampling ---------------------------
+
+            chosen, scale = bsdf.sample(ctx, si, sampler.next_1d(proceed), sampler.next_2d(proceed), proceed)
+            L += sign * dr.detach(Le + Ld)
+            with dr.resume_grad(when=not primal):
+                if not primal:
+                    onward = L * dr.relative_grad(bsdf.eval(ctx, si, chosen.wo, proceed))
+                    Lo = Le + Ld + onward
+                    # Not attached where positions alone are differentiated.
+                    if dr.grad_enabled(Lo):
+                        if mode == dr.ADMode.Backward:
+                            dr.backward_from(δL * Lo)
+                        else:
+                            δL = δL + dr.forward_to(Lo)
+            β = β * scale
+            η = η * chosen.eta
+            onwards = si.spawn_ray(si.to_world(chosen.wo))
+
+            # ------------------------ Stopping criterion ------------------------
+
+            largest = dr.max(mi.unpolarized_spectrum(β))
+            survival = dr.minimum(largest * dr.square(η), 0.95)
+            roulette = depth >= self.rr_depth
+            proceed &= (largest > 0) & (~roulette | (sampler.next_1d(proceed) < survival))
+            β = dr.select(roulette, β * dr.rcp(survival), β)
+            delta = mi.has_flag(chosen.sampled_type, mi.BSDFFlags.Delta)
+            depth = dr.select(si.is_valid(), depth + 1, depth)
+            return proceed, sampler, onwards, depth, L, δL, β, η, dr.detach(si), chosen.pdf, delta
+
+        state = (
+            mi.Bool(active),
+            sampler,
+            mi.Ray3f(dr.detach(ray)),
+            mi.UInt32(0),
+            mi.Spectrum(0 if primal else state_in),
+            mi.Spectrum(0 if δL is None else δL),
+            mi.Spectrum(1),
+            mi.Float(1),
+            dr.zeros(mi.SurfaceInteraction3f),
+            mi.Float(1),
+            mi.Bool(True),
+        )
+        end = dr.while_loop(state, lambda active, *_: active, bounce, label=f"splat_path ({mode.name})")
+        depth, L, δL = end[3:6]
+        return L if primal else δL, depth != 0, [], L
+
+    def _layer(self, ray: Any, active: Bool) -> tuple[Any, Float]:
+        """Return the radiance that the Gaussians on a segment emit, and their transmittance."""
+        assert self.splats
+        color, passed = self.splats.trace(ray, active)
+        covered = 1 - passed
+        mean = color * dr.select(covered > 0, dr.rcp(covered), 0)
+        return covered * radiance(mean, self.clipped, self.srgb), passed
+
+    def _to_light(self, si: Any, ds: Any, active: Bool) -> Float:
+        """Return the transmittance between a surface and a sampled light."""
+        assert self.splats
+        ray = si.spawn_ray_to(ds.p)
+        far = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        ray.d = ds.d
+        ray.maxt = dr.select(far, dr.largest(mi.Float), ds.dist)
+        return self.splats.transmittance(ray, active)
+
+    def to_string(self) -> str:
+        return f"SplatPathIntegrator[max_depth = {self.max_depth}, clipped = {self.clipped}]"

@@ -1,0 +1,221 @@
+"""The loop on live cameras: whenever it is ready, it fits the newest images; those between are dropped.
+
+The frames of the stream are numbered in succession, since the loop and its stream know no others; the report has the
+time of each.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from morgs_mi.capture.capture import Capture, PartialFrame
+from morgs_mi.core.files import locked_folder
+from morgs_mi.core.interrupts import interrupts_raised
+from morgs_mi.core.progress import Progress, Report
+from morgs_mi.core.threads import in_background, map_in_threads
+from morgs_mi.loop.frame_report import FrameReport
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.runs.fit_capture import Prepared, push_frame
+from morgs_mi.runs.fit_files import FitFiles, Recording, check_outputs, stream_metadata
+from morgs_mi.stream_loop import StreamLoop
+from morgs_mi.studio.live.feed import Bundle, Feed
+from morgs_mi.studio.live.live_capture import begin_capture, read_calibration, write_images
+from morgs_mi.studio.live.live_config import LIVE_STREAM, LiveConfig
+from morgs_mi.studio.live.sources import Source, open_feed
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class LiveFrame:
+    """Report of one frame of a live fit."""
+
+    frame: int  #: Its index in the stream.
+    time: float  #: Between the first images and its images, s.
+    latency: float  #: Between its images and the end of its fit, s.
+    skew: float  #: Largest difference in time between two of its images, s.
+    dropped: int  #: Number of images of each camera that were dropped after the frame before.
+    problems: tuple[str, ...] = ()  #: One sentence per missing image.
+
+
+@interrupts_raised()
+def fit_live(
+    sources: Sequence[Source],
+    out: str | Path,
+    live: LiveConfig | None = None,
+    config: StreamConfig | None = None,
+    on_frame: Callable[[LiveFrame, FrameReport], None] | None = None,
+    on_stage: Report | None = None,
+) -> list[LiveFrame]:
+    """Fit live cameras into OUT/stream.morgs until they end, or until Ctrl-C after the first frame.
+
+    OUT/capture has the calibration and the images that were fitted, OUT/report.json the frames with their times.
+
+    Args:
+        sources: the cameras, see `open_feed`.
+        out: folder, made if missing.
+        live: settings of the cameras.
+        config: settings of the loop; None: `LIVE_STREAM`.
+        on_frame: called when a frame is in the stream.
+        on_stage: called with (name, done, total) of the work up to the first frame.
+
+    Returns:
+        The reports of all frames in the stream.
+
+    Raises:
+        FileExistsError: OUT has the capture of an earlier fit.
+        OSError: a source cannot be opened, the folder of the images is removed, or the output cannot be written; the
+            stream ends with a complete frame.
+        ValueError: a setting is out of range, a camera has no first image, or the cameras cannot be calibrated or do
+            not have the calibrated sizes.
+    """
+    out = Path(out)
+    live = live or LiveConfig()
+    live.check("fit_live()")
+    check_outputs(out)
+    if (out / "capture").exists():
+        raise FileExistsError(
+            f"{out / 'capture'}: expected no capture, got that of an earlier fit; choose another folder for this one."
+        )
+    _check_outside(out, sources)
+    calibration = live.calibration and read_calibration(live.calibration).without(live.calibration, live.without)
+    names = calibration and [camera.name for camera in calibration.cameras]
+    report = on_stage or (lambda *_: None)
+    with locked_folder(out, "fit_live()"), closing(open_feed(sources, live, names)) as feed:
+        report("Waiting for the cameras", 0, 1)
+        first = feed.newest()
+        if first is None:
+            raise ValueError("fit_live(): expected images of the cameras, got none.")
+        report("Waiting for the cameras", 1, 1)
+        capture = begin_capture(out / "capture", feed.names, first.images, live, calibration, on_stage)
+        return _fit(_LiveFrames(feed, capture, first, live), out, config or LIVE_STREAM, on_frame, report)
+
+
+def _check_outside(out: Path, sources: Sequence[Source]) -> None:
+    """Check that an output is in no folder of images: its folders would count as cameras.
+
+    Raises:
+        ValueError: it is.
+    """
+    for folder in (Path(source) for source in sources if isinstance(source, str | Path)):
+        if folder.is_dir() and out.resolve().is_relative_to(folder.resolve()):
+            raise ValueError(
+                f"{out}: expected a folder outside of {folder}, into which another program writes images; choose a "
+                "different one."
+            )
+
+
+class _LiveFrames:
+    """Frames of a live capture, processed like the frames of any capture.
+
+    Args:
+        feed: the cameras.
+        capture: of their first images.
+        first: these images.
+        config: settings.
+    """
+
+    def __init__(self, feed: Feed, capture: Capture, first: Bundle, config: LiveConfig) -> None:
+        self.capture = capture
+        self.config = config
+        self._feed = feed
+        self._first = first
+        self._missing: set[str] = set()
+
+    def __iter__(self) -> Iterator[tuple[Bundle, PartialFrame]]:
+        """Yield whenever the next frame is asked for the newest images, as recorded and as processed."""
+        bundle = self._first
+        frame = 0
+        begin = float("inf")
+        while bundle is not None and bundle.time - begin <= (self.config.seconds or float("inf")):
+            yield bundle, self._processed(bundle, frame)
+            frame = frame + 1
+            begin = min(begin, time.monotonic())
+            if frame == self.config.frames:
+                return
+            if (bundle := self._feed.newest(bundle)) is None:
+                _LOG.warning("the fit ends after frame %d: %s", frame - 1, self._feed.ended())
+
+    def report(self, bundle: Bundle, frame: PartialFrame) -> LiveFrame:
+        """Return the report of a fitted frame."""
+        since = bundle.time - self._first.time
+        latency = time.monotonic() - bundle.time
+        return LiveFrame(frame.index, since, latency, bundle.skew, bundle.dropped, frame.problems)
+
+    def _processed(self, bundle: Bundle, frame: int) -> PartialFrame:
+        """Return the processed images of a bundle; a camera that has none is logged once."""
+        problems = {k: self._problem(k, image) for k, image in enumerate(bundle.images)}
+        problems = {k: problem for k, problem in problems.items() if problem}
+        names = {self.capture.names[k]: problem for k, problem in problems.items()}
+        for name in names.keys() - self._missing:
+            _LOG.warning("frame %d: %s is left out: %s", frame, name, names[name].rstrip("."))
+        self._missing = set(names)
+
+        def process(view: int) -> np.ndarray | None:
+            image = bundle.images[view]
+            return None if image is None or view in problems else self.capture.process(view, image)
+
+        images = map_in_threads(process, range(len(bundle.images)))
+        return PartialFrame(frame, tuple(images), tuple(f"{name}: {problem}" for name, problem in names.items()))
+
+    def _problem(self, view: int, image: np.ndarray | None) -> str:
+        """Return why a camera has no image, or none of its size; empty if it has one."""
+        if image is None:
+            return self._feed.problem(view)
+        size = image.shape[1::-1]
+        recorded = self.capture.recorded_sizes[view]
+        return "" if size == recorded else "expected an image of {}x{}, got {}x{}".format(*recorded, *size)
+
+
+def _fit(
+    frames: _LiveFrames,
+    out: Path,
+    config: StreamConfig,
+    on_frame: Callable[[LiveFrame, FrameReport], None] | None,
+    on_stage: Report,
+) -> list[LiveFrame]:
+    """Fit live frames into a locked folder."""
+    capture = frames.capture
+    train = frames.capture.train_views
+    metadata = stream_metadata(capture, next(capture.partial_frames()), config)
+    del metadata["num_frames"]  # not known yet
+    prepared = Prepared.of(capture, config, Progress(on_stage))
+    frames.capture = prepared.capture
+    loop = StreamLoop.of(prepared.capture, config)
+    rows: list[LiveFrame] = []
+    with Recording(FitFiles.of(out), prepared.capture, metadata | prepared.metadata) as recording:
+        try:
+            for bundle, frame in frames:
+                recorded = in_background(partial(_record, frames, out, bundle, frame))
+                packet, report = push_frame(loop, frame, train, None if rows else on_stage, None, recording.show)
+                report = prepared.completed(report, loop.gaussians, frame, config)
+                recorded.result()
+                row = frames.report(bundle, frame)
+                live = [asdict(r) for r in (*rows, row)]
+                recording.push(packet, report, loop.state.coded, live=live)
+                rows.append(row)
+                if on_frame is not None:
+                    on_frame(row, report)
+        except KeyboardInterrupt:
+            if not rows:
+                raise
+        except OSError as error:
+            if rows:
+                error.add_note(f"{out / 'stream.morgs'} ends with frame {rows[-1].frame}.")
+            raise
+    return rows
+
+
+def _record(frames: _LiveFrames, out: Path, bundle: Bundle, frame: PartialFrame) -> None:
+    """Write the recorded images of a frame into the capture; the first frame's are there already."""
+    if frames.config.record and frame.index:
+        kept = [None if done is None else image for image, done in zip(bundle.images, frame.images, strict=True)]
+        write_images(out / "capture", frames.capture.names, kept, frame.index)

@@ -1,0 +1,291 @@
+"""Live images in a folder that another program fills, ``CAM/0000.png`` or ``CAM/0000.jpg``."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from math import inf
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from morgs_mi.io.listing import is_listed, listed
+from morgs_mi.io.video import decode_image, image_number, natural_key
+from morgs_mi.studio.live.feed import Bundle, Shot, bundled
+
+_LOG = logging.getLogger(__name__)
+_POLL = 0.05  # s
+# Pause after which the numbers may begin again, s: images of several cameras are written in any order until then.
+_PAUSE = 1.0
+# Numbers per second that grow faster than this do not count images; they are times, or one is far ahead.
+_MAX_RATE = 1000
+# Suffixes of the images, whose last bytes show that the file is complete; what these bytes contain, and how many they
+# are: cameras may add a few bytes behind an image.
+_SUFFIXES = (".png", ".jpg", ".jpeg")
+_ENDS = (b"IEND\xaeB`\x82", b"\xff\xd9")
+_TAIL = 64
+
+
+@dataclass(frozen=True)
+class _Images:
+    """Images of a camera."""
+
+    files: Mapping[int, Path]  # by number
+    # time by which `time.monotonic` is ahead of the times of the files, s: the program that writes them may run on a
+    # machine with another clock
+    ahead: float = 0.0
+
+    def arrival(self, number: int) -> float:
+        """Return when an image was written, s of `time.monotonic`."""
+        return _written(self.files[number]) + self.ahead
+
+    def since(self, begin: float) -> _Images:
+        """Return the images that did not arrive before `begin`, s of `time.monotonic`."""
+        return replace(self, files={n: file for n, file in self.files.items() if self.arrival(n) >= begin})
+
+
+_Found = Mapping[str, _Images]
+_NONE = _Images({})
+
+
+class FolderFeed:
+    """Live images in a folder that another program fills; it has the methods of `Feed`.
+
+    Images with one number are of one time, and an image that is not complete yet is not read. Newer images have larger
+    numbers. If none come, images that were written `_PAUSE` after the last bundle are newer, too: the program may count
+    from 0 again, or one number was far ahead.
+
+    Args:
+        folder: with one folder of images per camera.
+        timeout: seconds to wait for a camera before it is left out.
+        names: names of the cameras; by default the names of the folders that have images when the second number begins.
+
+    Raises:
+        FileNotFoundError: there is no such folder.
+    """
+
+    def __init__(self, folder: Path, timeout: float, names: Sequence[str] | None = None) -> None:
+        if not folder.is_dir():
+            raise FileNotFoundError(f"{folder}: expected a folder with the images of the cameras, found none.")
+        self.names = tuple(names or ())
+        self._folder = folder
+        self._timeout = timeout
+        # By camera, see `_Images.ahead`.
+        self._ahead: dict[str, float] = {}
+        # When the last bundle was returned, s of `time.monotonic`.
+        self._returned = time.monotonic()
+        # By camera, when the images of the last bundle were written, and those before the ones that are counted
+        # together with it, s of their files.
+        self._written: dict[str, float] = {}
+        self._before: dict[str, float] = {}
+
+    def newest(self, after: Bundle | None = None) -> Bundle | None:
+        """Wait for the newest bundle and return it; None if no camera delivers images any more."""
+        start = time.monotonic()
+        pause_end = start + _PAUSE
+        searched = self._returned
+        while True:
+            now = time.monotonic()
+            late = now - start >= self._timeout
+            paused = now >= pause_end or late
+            for found in self._newer(after, paused):
+                bundle = self._first(found, late) if after is None else self._next(found, after, late)
+                if bundle is not None:
+                    self._take(found, max(bundle.numbers), after)
+                    # Images that are not waited for may have been there for longer.
+                    return self._arrived(bundle, self._returned if paused else searched)
+            if late:
+                return self._end(after)
+            pause_end = now + _PAUSE if paused else pause_end
+            searched = now
+            time.sleep(_POLL)
+
+    def problem(self, camera: int) -> str:
+        """Return why a camera has no image in the last bundle."""
+        return f"no complete image in {self._folder / self.names[camera]} for {self._timeout:g} s"
+
+    def ended(self) -> str:
+        """Return why no camera delivers images any more."""
+        return f"no complete new images in {self._folder} for {self._timeout:g} s"
+
+    def close(self) -> None:
+        """Do nothing: no file is open."""
+
+    def _newer(self, after: Bundle | None, paused: bool) -> Iterator[_Found]:
+        """Yield the images with larger numbers than a bundle; after a pause also all that were written since."""
+        yield self._found(-1 if after is None else max(after.numbers), self._before)
+        if paused and after is not None:
+            yield self._found(-1, self._written)
+
+    def _first(self, found: _Found, late: bool) -> Bundle | None:
+        """Return the newest bundle of all cameras."""
+        names = self.names or tuple(found)
+        common = _common(found, names)
+        if not self.names and not late:
+            # Which cameras there are is known when the next number begins.
+            common -= {max(number for images in found.values() for number in images.files)} if found else set()
+        bundle = _bundle([found.get(name, _NONE) for name in names], common)
+        if bundle is not None:
+            if not self.names and not late and set(self._found(-1, self._before)) - set(names):
+                # The first image of a camera came while the folders were read.
+                return None
+            if silent := [name for name in self._cameras() if name not in names and not self.names]:
+                _LOG.warning("%s is left out: no image in %s", ", ".join(silent), self._folder)
+            self.names = names
+        return bundle
+
+    def _next(self, found: _Found, after: Bundle, late: bool) -> Bundle | None:
+        """Return the newest bundle of the cameras that are expected; if it is late, of those that have an image."""
+        cameras = [found.get(name, _NONE) for name in self.names]
+        pairs = zip(cameras, after.images, strict=True)
+        numbers = [set(camera.files) for camera, image in pairs if camera.files or image is not None]
+        if late:
+            return _bundle(cameras, set.union(*numbers), after, partial=True)
+        bundle = _bundle(cameras, set.intersection(*numbers), after)
+        # A camera that has stopped during a fit has images that the others had, too, but long ago.
+        newest = max((camera.arrival(max(camera.files)) for camera in cameras if camera.files), default=0.0)
+        return bundle if bundle is not None and newest - bundle.time <= self._timeout else None
+
+    def _take(self, found: _Found, number: int, after: Bundle | None) -> None:
+        """Store when the images of a number were written, and whether the count has begun again."""
+        if after is not None and number <= (last := max(after.numbers)):
+            if not self._before:
+                _LOG.warning("%s: the numbers go on with %d after %d", self._folder, number, last)
+            self._before = self._written
+        images = {name: images.files[number] for name, images in found.items() if number in images.files}
+        self._written = {name: _written(file) for name, file in images.items()}
+
+    def _arrived(self, bundle: Bundle, begin: float) -> Bundle:
+        """Return a bundle that was not there at the time `begin`, whatever the clock of its files."""
+        self._returned = time.monotonic()
+        return replace(bundle, time=min(max(bundle.time, begin), self._returned))
+
+    def _end(self, after: Bundle | None) -> None:
+        """End the images.
+
+        Raises:
+            FileNotFoundError: the folder was removed.
+            ValueError: there was no bundle.
+        """
+        if not self._folder.is_dir():
+            raise FileNotFoundError(f"{self._folder}: expected the images of the cameras, but the folder was removed.")
+        if after is None:
+            raise ValueError(
+                f"{self._folder}: expected images of {', '.join(self.names) or 'the cameras'} that have the same "
+                f"number, such as CAM/0000.png, found folders called {', '.join(self._cameras()) or 'nothing'}"
+                f"{self._lack()}; check the path and the names, or wait longer than {self._timeout:g} s (--timeout)."
+            )
+
+    def _lack(self) -> str:
+        """Return a description of the images that are missing for a first bundle."""
+        found = self._found(-1, {})
+        names = self.names or tuple(found)
+        if silent := [name for name in names if name not in found]:
+            return f", but no image of {', '.join(silent)}"
+        if common := _common(found, names):
+            broken = [name for name in names if _shot(found[name], max(common)) is None]
+            return f", but no complete image {max(common)} of {', '.join(broken)}"
+        numbers = ", ".join(f"{min(own.files)} to {max(own.files)} of {name}" for name, own in found.items())
+        return f", with {numbers}" if numbers else ""
+
+    def _found(self, after: int, before: Mapping[str, float]) -> dict[str, _Images]:
+        """Return the images of each camera with numbers larger than `after`, without images of the time of `before`.
+
+        Args:
+            after: number.
+            before: by camera, when its image was written, s of the file; images written up to `_PAUSE` later are of
+                the same time. Empty: no image is left out.
+        """
+        found = {}
+        for name in self.names or self._cameras():
+            if files := _files(self._folder / name, after):
+                self._compare_clocks(name, files[max(files)])
+                found[name] = _Images(files, self._ahead.get(name, 0.0))
+        if not before:
+            return found
+        begin = _PAUSE + max(written + self._ahead.get(name, 0.0) for name, written in before.items())
+        found = {name: images.since(begin) for name, images in found.items()}
+        return {name: images for name, images in found.items() if images.files}
+
+    def _compare_clocks(self, name: str, file: Path) -> None:
+        """Compare the clock of a camera's files with this machine's by one of its images.
+
+        An image is found after it was written, so the smallest difference is the most accurate one.
+        """
+        with suppress(FileNotFoundError):
+            ahead = time.monotonic() - file.stat().st_mtime
+            self._ahead[name] = min(ahead, self._ahead.get(name, inf))
+
+    def _cameras(self) -> list[str]:
+        """Return the names of the folders, in numerical order."""
+        with suppress(FileNotFoundError):
+            names = [file.name for file in listed(self._folder) if file.is_dir()]
+            return sorted(names, key=natural_key)
+        return []
+
+
+def _common(found: _Found, names: Sequence[str]) -> set[int]:
+    """Return the numbers that all cameras have."""
+    return set.intersection(*(set(found.get(name, _NONE).files) for name in names)) if names else set()
+
+
+def _bundle(
+    cameras: Sequence[_Images], numbers: Collection[int], after: Bundle | None = None, partial: bool = False
+) -> Bundle | None:
+    """Return the bundle of the largest of `numbers` of which every file is complete; `partial`: or at least one."""
+    for number in sorted(numbers, reverse=True):
+        shots = [_shot(images, number) for images in cameras]
+        complete = all(shot or number not in images.files for shot, images in zip(shots, cameras, strict=True))
+        if complete or (partial and any(shots)):
+            bundle = bundled(shots, [number] * len(shots), 0.0)
+            return bundle if after is None else replace(bundle, dropped=_dropped(cameras, bundle, after))
+    return None
+
+
+def _dropped(cameras: Sequence[_Images], bundle: Bundle, after: Bundle) -> int:
+    """Return the number of images that each camera delivered between two bundles."""
+    number = max(bundle.numbers)
+    between = number - max(after.numbers) - 1
+    if 0 <= between <= _MAX_RATE * (1 + bundle.time - after.time):
+        return between
+    pairs = zip(cameras, bundle.images, strict=True)
+    return min(sum(n < number for n in images.files) for images, image in pairs if image is not None)
+
+
+def _files(folder: Path, after: int) -> dict[int, Path]:
+    """Return the images in a folder, by their numbers, that are larger than `after`."""
+    files = {}
+    with suppress(FileNotFoundError, NotADirectoryError):
+        for name in os.listdir(folder):
+            if name.lower().endswith(_SUFFIXES) and is_listed(name):
+                with suppress(ValueError):
+                    files[image_number(Path(name))] = folder / name
+    return {number: file for number, file in files.items() if number > after}
+
+
+def _shot(images: _Images, number: int) -> Shot | None:
+    """Return an image, None if it is not complete yet or not there any more."""
+    if number not in images.files:
+        return None
+    file = images.files[number]
+    try:
+        data = np.fromfile(file, np.uint8)
+        arrival = images.arrival(number)
+        if not any(end in data[-_TAIL:].tobytes() for end in _ENDS):
+            return None
+        image = decode_image(file, data, cv2.IMREAD_COLOR)
+    except (ValueError, FileNotFoundError):
+        return None
+    return Shot(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), arrival, number)
+
+
+def _written(file: Path) -> float:
+    """Return when a file was written, s since the epoch; now if it is not there any more."""
+    with suppress(FileNotFoundError):
+        return file.stat().st_mtime
+    return time.time()

@@ -1,0 +1,117 @@
+"""Videos that are played side by side, as if they were recorded now."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from math import inf
+from pathlib import Path
+from threading import Condition, Event
+from typing import TypeGuard
+
+import cv2
+import numpy as np
+
+from morgs_mi.studio.live.reading import open_stream
+
+_POLL = 0.1  # interval at which a clip that waits for others looks whether it is to end, s
+_RATE = 30.0  # frames per second of a clip that does not state it
+_DESCRIPTIONS = (".sdp", ".m3u8")  # files that name streams
+
+
+def is_video(source: object) -> TypeGuard[str | Path]:
+    """Return whether a source is a video file."""
+    return isinstance(source, str | Path) and Path(source).is_file() and Path(source).suffix not in _DESCRIPTIONS
+
+
+class ClipClock:
+    """Common clock of clips that are played at their own speed, or slower if they cannot be decoded in time.
+
+    A clip waits until the others have reached its time, as otherwise the ones that are decoded faster would run ahead.
+
+    Args:
+        clips: their number.
+
+    Attributes:
+        length: time after which the clips are repeated, s: the length of the shortest one, once it has ended.
+    """
+
+    def __init__(self, clips: int = 1) -> None:
+        self.length = inf
+        self._times = [-inf] * clips
+        self._start = -inf
+        self._changed = Condition()
+
+    def wait(self, clip: int, due: float, interval: float, closed: Event) -> None:
+        """Wait until it is time for an image of a clip, or `closed` is set.
+
+        Args:
+            clip: index of the clip.
+            due: time of the image, s.
+            interval: time between two images of the clip, s.
+            closed: is set by another thread to end the clips.
+        """
+        with self._changed:
+            self._times[clip] = due
+            self._changed.notify_all()
+            while min(self._times) < due - interval / 2 and not closed.is_set():
+                self._changed.wait(_POLL)
+            self._start = max(self._start, time.monotonic() - due)  # a late clip does not hurry afterwards
+            left = self._start + due - time.monotonic()
+        closed.wait(max(0.0, left))
+
+    def leave(self, clip: int) -> None:
+        """Let the others go on without a clip."""
+        with self._changed:
+            self._times[clip] = inf
+            self._changed.notify_all()
+
+
+def play(path: str | Path, clock: ClipClock, closed: Event, clip: int = 0, loop: bool = False) -> Iterator[np.ndarray]:
+    """Yield the images of a video, RGB uint8 [H, W, 3], at their times.
+
+    Args:
+        path: the file.
+        clock: of all clips that are played side by side, each in a thread of its own.
+        closed: is set by another thread to end the images.
+        clip: index of the video among the clips.
+        loop: whether to begin again, together with the others, when the shortest clip has ended.
+
+    Raises:
+        OSError: the video cannot be opened, or has no image.
+    """
+    begin = 0.0
+    try:
+        while True:
+            end = 0.0
+            for image, at, interval in _timed(path):
+                clock.wait(clip, begin + at, interval, closed)
+                if closed.is_set():
+                    return
+                if at > clock.length - interval / 2:
+                    break
+                yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+                end = at + interval
+            else:  # it has ended, before the others
+                if not end:
+                    raise OSError(f"play(): expected images in {path}, found none; check that it is a whole video.")
+                if not loop:
+                    return
+                clock.length = min(clock.length, end)
+            begin += clock.length
+    finally:
+        clock.leave(clip)
+
+
+def _timed(path: str | Path) -> Iterator[tuple[np.ndarray, float, float]]:
+    """Yield the images of a video, BGR, with their times from its beginning and the time between two of them, s."""
+    stream = open_stream(str(path), path)
+    try:
+        interval = 1 / (stream.get(cv2.CAP_PROP_FPS) or _RATE)
+        last = -inf
+        while (read := stream.read())[0]:
+            at = stream.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            last = at if at > last else last + interval  # not all containers have times
+            yield read[1], last, interval
+    finally:
+        stream.release()

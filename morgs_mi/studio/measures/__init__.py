@@ -1,0 +1,1 @@
+"""Measures of an evaluation that need a network or marked points."""

@@ -1,0 +1,40 @@
+"""Quality of the held-out views in the first frame, from the cameras that fit their images best."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from morgs_mi.core.color_space import encode_light
+from morgs_mi.core.rig import scene_extent
+from morgs_mi.evaluate.comparison import ComparedClip, ComparedFrame, ComparedView
+from morgs_mi.evaluate.measures import Measure
+from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.fit.view import View, mean_psnr
+from morgs_mi.studio.calibration.refine import register_camera
+
+
+class Registration(Measure):
+    """PSNR of the held-out views in the first frame, from the cameras that fit their images best."""
+
+    def __init__(self, clip: ComparedClip) -> None:
+        self._clip = clip
+        self._psnr: dict[str, float] = {}
+        self._begun = False
+
+    def add_view(self, view: ComparedView) -> None:
+        clip = self._clip
+        if self._begun or view.index not in clip.recording.test_views:
+            return
+        image = view.recorded if view.light is None else encode_light(view.light)
+        given = View(clip.stream.cameras[view.index], image, view.valid)
+        extent = scene_extent([clip.stream.cameras[v] for v in clip.recording.train_views])
+        gaussians = view.frame.state.gaussians
+        registered = given._replace(camera=register_camera(gaussians, given, extent, FitConfig(), clip.render))
+        self._psnr[view.camera.name] = mean_psnr(gaussians, [registered], clip.render)
+
+    def add_frame(self, frame: ComparedFrame) -> dict[str, Any]:
+        self._begun = True
+        return {}
+
+    def result(self) -> dict[str, Any]:
+        return {"registered": self._psnr}

@@ -1,0 +1,105 @@
+"""3D point tracks of a stream, compared with the true ones of its recording."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from morgs_mi.capture.capture import Capture
+from morgs_mi.capture.timeline import read_settings
+from morgs_mi.codec.frame_source import FrameSource, play
+from morgs_mi.core.fit_names import CAPTURE
+from morgs_mi.core.rig import scene_extent
+from morgs_mi.evaluate.comparison import ComparedClip
+from morgs_mi.evaluate.measures import Measure
+from morgs_mi.evaluate.results import TrackingScores
+from morgs_mi.playback.player import render
+from morgs_mi.playback.stream_header import render_config
+from morgs_mi.studio.measures.point_tracks import seen_in_depth, track_points
+from morgs_mi.studio.measures.track_scores import DYNAMIC_3D_GAUSSIANS, MVTRACKER, TAPVID3D, Comparison, score_tracks
+from morgs_mi.studio.measures.track_truth import TrackTruth, synthetic_tracks, tapvid3d_tracks
+
+
+class Tracking(Measure):
+    """3D point tracks, see `evaluate_tracks`."""
+
+    def __init__(self, clip: ComparedClip) -> None:
+        self._clip = clip
+
+    def result(self) -> dict[str, Any]:
+        return {"tracking": evaluate_tracks(self._clip.stream, self._clip.recording, self._clip.views)}
+
+
+def evaluate_tracks(stream: FrameSource, recording: Capture, views: Sequence[int]) -> tuple[TrackingScores, ...]:
+    """Return the scores of a stream's point tracks by each protocol; empty without true tracks or a second frame.
+
+    Queries are the true points at the frames where their tracks start. In a synthetic capture, each of `views` is a
+    video of TAPVid-3D's protocol; in the other protocols a point is visible if a training view sees it. Annotations of
+    TAPVid-3D know the visibility in their own view only, which all protocols then use.
+
+    Args:
+        stream: the file.
+        recording: its capture. Its `capture.json` may state `meters_per_unit`, 1 by default.
+        views: the views that are evaluated.
+
+    Raises:
+        ValueError: a packet, an annotation or the true tracks are broken.
+    """
+    joint = synthetic_tracks(recording, recording.train_views)
+    single = [video for view in views for video in synthetic_tracks(recording, [view])]
+    single = single or tapvid3d_tracks(recording)
+    if not single:
+        return ()
+    frames = stream.frame_numbers()
+    videos = [_during(video, frames) for video in (*single, *joint)]
+    if len(frames) < 2 or not any(len(video.points) for video in videos):
+        return ()
+    compared = _compared(stream, videos, frames[0])
+    per_view = compared[: len(single)]
+    together = compared[len(single) :] or compared
+    scale = read_settings(recording.path / CAPTURE).get("meters_per_unit") or 1
+    extent = scene_extent([recording.cameras[view] for view in recording.train_views])
+    protocols = ((TAPVID3D, per_view), (DYNAMIC_3D_GAUSSIANS, together), (MVTRACKER, together))
+    return tuple(score_tracks(protocol, videos, scale, extent) for protocol, videos in protocols)
+
+
+def _during(video: TrackTruth, frames: Sequence[int]) -> TrackTruth:
+    """Return the part of true tracks in the consecutive frames of a stream, without tracks that start in others."""
+    start = frames[0]
+    stop = min(frames[-1] + 1, video.points.shape[1])
+    kept = (video.queries >= start) & (video.queries < stop)
+    visible = None if video.visible is None else video.visible[kept, start:stop]
+    return TrackTruth(video.cameras, video.points[kept, start:stop], visible, video.queries[kept] - start)
+
+
+def _compared(stream: FrameSource, videos: Sequence[TrackTruth], start: int) -> list[Comparison]:
+    """Return the tracks of the stream beside the true ones of each video, which begins with the frame `start`."""
+    points = [video.points[np.arange(len(video.queries)), video.queries] for video in videos]
+    queries = np.concatenate([video.queries for video in videos]) + start
+    tracks = track_points(stream, np.concatenate(points), queries)
+    ends = np.cumsum([len(video.queries) for video in videos])
+    points = np.split(tracks.points, ends[:-1])
+    alive = np.split(tracks.alive, ends[:-1])
+    lengths = [video.points.shape[1] for video in videos]
+    found = [(p[:, :length], a[:, :length]) for p, a, length in zip(points, alive, lengths, strict=True)]
+    seen = _seen(stream, videos, [positions for positions, _ in found])
+    return [
+        Comparison(video.points, positions, video.visible, mask & alive, alive, video.queries, video.pixel)
+        for video, (positions, alive), mask in zip(videos, found, seen, strict=True)
+    ]
+
+
+def _seen(stream: FrameSource, videos: Sequence[TrackTruth], found: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return the masks of the tracked points [P, T, 3] that a view of their video sees, [P, T]."""
+    seen = [np.zeros(positions.shape[:2], bool) for positions in found]
+    config = render_config(stream)
+    cameras = {camera.name: camera for video in videos if video.visible is not None for camera in video.cameras}
+    for t, (_, gaussians) in enumerate(play(stream) if cameras else ()):
+        for name, camera in cameras.items():
+            maps = render(gaussians, camera, ("depth", "alpha"), config)
+            for video, positions, mask in zip(videos, found, seen, strict=True):
+                if t < positions.shape[1] and name in [view.name for view in video.cameras]:
+                    mask[:, t] |= seen_in_depth(maps["depth"][..., 0], maps["alpha"][..., 0], camera, positions[:, t])
+    return seen

@@ -1,0 +1,59 @@
+"""Light that a camera with its own clock, rolling shutter and lens receives from a moving scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from morgs_mi.core.camera import Camera
+from morgs_mi.studio.synth.disturbances import CameraDisturbance
+from morgs_mi.studio.synth.path_tracer import PathTracer
+from morgs_mi.studio.synth.synth_config import SynthConfig
+
+# Rows that a rolling shutter reads at one time; at 10 pixels per frame, objects move by 0.2 pixels in this time.
+_BAND = 4
+
+
+def check_lenses(cameras: Sequence[Camera], disturbed: Sequence[CameraDisturbance]) -> None:
+    """Check that every lens shows the scene up to the corners of its image.
+
+    Raises:
+        ValueError: the distortion is too strong for the field of view.
+    """
+    for camera, own in zip(cameras, disturbed, strict=True):
+        if own.distortion < 0:
+            corner = np.linalg.norm(camera.K[:2, 2] / np.diag(camera.K)[:2])
+            # r (1 + k r^2) grows up to r = 1 / sqrt(-3 k).
+            largest = 2 / (3 * np.sqrt(-3 * own.distortion))
+            if not corner < 0.98 * largest:
+                raise ValueError(
+                    f"synthesize(): `distortion` must be small enough for the field of view, got {own.distortion:.3g} "
+                    f"with corners at the radius {corner:.3g}, which must be below {largest:.3g}; set a smaller one."
+                )
+
+
+def record_light(
+    tracer: PathTracer, camera: Camera, own: CameraDisturbance, frame: int, config: SynthConfig
+) -> np.ndarray:
+    """Return the light of a frame that a camera with its clock, shutter and lens receives, linear [H, W, 3].
+
+    Args:
+        tracer: the scene; its time is changed.
+        camera: the view without distortion.
+        own: the camera's disturbance; its exposure and compression are not applied.
+        frame: index of the frame.
+        config: samples per pixel, their seed and the frame rate.
+    """
+    assert config.spp is not None
+    if not own.rolling_shutter and not own.distortion:
+        tracer.set_time((frame + own.time_offset) / config.fps)
+        return tracer.light(camera, config.spp, config.seed)
+    bands = np.arange(camera.height), own.row_times(frame, camera.height)
+    count = -(-camera.height // _BAND) if own.rolling_shutter else 1
+    light = []
+    for band, (rows, times) in enumerate(zip(*(np.array_split(values, count) for values in bands), strict=True)):
+        tracer.set_time(times.mean() / config.fps)
+        band_seed = int(np.random.SeedSequence([config.seed, band]).generate_state(1)[0])
+        light.append(tracer.light_of_rows(camera, rows, config.spp, band_seed, own.lens))
+    return np.concatenate(light)

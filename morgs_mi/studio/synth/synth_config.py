@@ -1,0 +1,67 @@
+"""Settings of a synthetic capture."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field, replace
+from typing import TYPE_CHECKING, Annotated, Any
+
+from morgs_mi.core.checks import check_number
+from morgs_mi.core.documentation import documented
+from morgs_mi.core.ranges import Above, AtLeast, Below, MultipleOf, check_ranges
+from morgs_mi.studio.synth.disturbances import Disturbances
+
+if TYPE_CHECKING:
+    from morgs_mi.studio.synth.scene import RecordingDefaults
+
+# Frame rates that the encoders of videos take, and numbers of samples that a sampler of Mitsuba takes.
+_FPS = "(0, 1000]"
+_SPP = "[1, 1e6]"
+
+
+@documented
+@dataclass(frozen=True)
+class SynthConfig:
+    """Size, length and disturbances of a synthetic capture."""
+
+    cameras: Annotated[int, AtLeast(2)] | None = None
+    """Number of cameras, the held-out cam00 included; the scene's own, usually 10, if not given."""
+    frames: Annotated[int, AtLeast(1)] = 12
+    """Number of frames per camera."""
+    width: Annotated[int, AtLeast(2), MultipleOf(2)] = 320
+    """Width of the images in pixels, even."""
+    height: Annotated[int, AtLeast(2), MultipleOf(2)] = 240
+    """Height of the images in pixels, even."""
+    spp: Annotated[int, AtLeast(1)] | None = None
+    """Samples per pixel; 16 gives noise at 42 dB. The scene's own, usually 16, if not given."""
+    noise: Annotated[float, AtLeast(0), Below(1)] | None = None
+    """Standard deviation of sensor noise as a share of white; an indoor camera has 0.01, 2.5 grey levels. The scene's
+    own, usually 0, if not given."""
+    fps: Annotated[float, Above(0)] = 30.0
+    """Frames per second."""
+    lossless: bool = True
+    """Also write the frames as PNG files, which are read in place of the compressed videos."""
+    disturbances: Disturbances = field(default_factory=Disturbances)
+    """Disturbances of the recording."""
+    seed: Annotated[int, AtLeast(0)] = 0
+    """Seed of textures, sampling noise, disturbances and the choice of points; of everything in the scene random."""
+
+    def check(self) -> None:
+        """Raise an error unless all settings are in range.
+
+        Raises:
+            ValueError: they are not.
+        """
+        check_ranges(self, "synthesize()")
+        check_number("synthesize()", "fps", self.fps, _FPS)
+        if self.spp is not None:
+            check_number("synthesize()", "spp", self.spp, _SPP)
+
+    def completed(self, recording: RecordingDefaults) -> SynthConfig:
+        """Return the settings, with the scene's own values for missing ones."""
+        own = {"cameras": recording.num_cameras, "spp": recording.spp, "noise": recording.noise}
+        return replace(self, **{name: value for name, value in own.items() if getattr(self, name) is None})
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the settings as stored in `capture.json`."""
+        values = asdict(self)
+        return {"num_cameras": values.pop("cameras"), "num_frames": values.pop("frames"), **values}

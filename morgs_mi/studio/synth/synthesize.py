@@ -1,0 +1,302 @@
+"""Synthetic captures: a scene path-traced from a rig of cameras, with exact ground truth.
+
+Light is linear inside the path tracer and sRGB-encoded once, for the video. The ground truth is sampled at pixel
+centres, so it has no noise and does not mix foreground and background.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from importlib import metadata
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
+from morgs_mi.capture.lens import undistortion
+from morgs_mi.capture.outputs import check_output
+from morgs_mi.capture.truth import Tracks, save_tracks, save_truth
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.files import atomic_path, write_json
+from morgs_mi.core.fit_names import CAPTURE
+from morgs_mi.core.memory import check_memory
+from morgs_mi.io.bounded import read_json
+from morgs_mi.io.listing import is_added
+from morgs_mi.io.video import open_frames
+from morgs_mi.io.video_writer import PLAYABLE, write_video
+from morgs_mi.studio.synth.disturbances import (
+    CameraDisturbance,
+    compressed,
+    draw_disturbances,
+    save_disturbances,
+)
+from morgs_mi.studio.synth.ground_truth import compute_ground_truth, move_with_objects
+from morgs_mi.studio.synth.path_tracer import PathTracer, developed
+from morgs_mi.studio.synth.scene import Scene, check_scene, load_scene
+from morgs_mi.studio.synth.sensor import check_lenses, record_light
+from morgs_mi.studio.synth.synth_config import SynthConfig
+
+_LOG = logging.getLogger(__name__)
+# Bytes of a pixel of an image with its ground truth.
+_PIXEL_BYTES = 100
+_NUM_SFM_POINTS = 8000
+_NUM_TRACKS = 2000
+
+
+def synthesize(
+    scene: str | Path | Scene,
+    out: str | Path,
+    config: SynthConfig | None = None,
+    *,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Path-trace a moving scene into a multi-view capture in N3DV's layout, with exact ground truth.
+
+    Writes ``frames/cam00/0000.png`` ..., ``cam00.mp4`` ... for players, ``poses_bounds.npy``, a COLMAP text
+    model ``sparse/0`` with points as from structure from motion, ``capture.json`` and ``truth/`` (see `ground_truth`
+    and `disturbances`). ``cam00`` is the central camera of the rig and the held-out test view, as in
+    N3DV. With lens distortion there is no ``poses_bounds.npy``, which cannot represent it. The folder is written
+    atomically.
+
+    Tracks are at the times of the frames of ``cam00``, the other ground truth at the times of each camera.
+
+    Args:
+        scene: a scene, its name, or the path of its Python file.
+        out: the folder to write.
+        config: settings.
+        overwrite: replace an earlier capture in `out`.
+        progress: called with (images done, total number of images).
+
+    Returns:
+        The folder `out`.
+
+    Raises:
+        ValueError: a setting is out of range, there is no such scene, `out` lies in a capture, the scene is not as
+            `check_scene` requires, a camera sees none of its objects, or Mitsuba's variant is not vectorised.
+        FileExistsError: `out` is not empty and `overwrite` is not set, or `out` is not a synthetic capture.
+        OSError: a file cannot be written, or a mesh or texture of the scene does not exist.
+    """
+    if not str(mi.variant()).startswith(("llvm", "cuda", "metal")):
+        raise ValueError(
+            f"synthesize(): a vectorised variant is needed, got {mi.variant()!r}; "
+            'call mitsuba.set_variant("llvm_ad_rgb") first.'
+        )
+    config = config or SynthConfig()
+    config.check()
+    pixels = config.width * config.height
+    size = f"images of {config.width}x{config.height} pixels"
+    check_memory("synthesize()", _PIXEL_BYTES * pixels, size, "make them smaller (`width`, `height`)")
+    scene = scene if isinstance(scene, Scene) else load_scene(scene, config.seed)
+    rig = _Rig.of(scene, config.completed(scene.recording))
+    check_lenses(rig.cameras, rig.disturbed)
+    check_scene(scene, rig.times())
+    _check_folder(Path(out), overwrite)
+    check_output(Path(out).resolve().parent)
+    with atomic_path(out, "synthesize()") as folder:
+        folder.mkdir(parents=True)
+        tracer = PathTracer(scene)
+        _check_views(tracer, rig.cameras)
+        clips = _write_clips(tracer, rig, folder, progress)
+        _write_truth(tracer, rig, folder / "truth")
+        _write_calibration(tracer, rig, clips, folder)
+        about = {
+            "scene": scene.name,
+            "test_view": 0,
+            **rig.config.as_dict(),
+            "objects": list(scene.objects),
+            "versions": {name: metadata.version(name) for name in ("morgs-mi", "mitsuba", "drjit")},
+        }
+        write_json(folder / CAPTURE, about)
+    return Path(out)
+
+
+@dataclass(frozen=True)
+class _Rig:
+    """Cameras that record a scene."""
+
+    cameras: Sequence[Camera]  # cameras without distortion
+    disturbed: Sequence[CameraDisturbance]  # disturbance of each camera
+    config: SynthConfig  # complete settings
+
+    @classmethod
+    def of(cls, scene: Scene, config: SynthConfig) -> _Rig:
+        assert config.cameras is not None
+        cameras = scene.rig.cameras(config.cameras, config.width, config.height)
+        return cls(cameras, draw_disturbances(config.disturbances, config.cameras, config.frames, config.seed), config)
+
+    def times(self) -> list[float]:
+        """Return the times of the frames, the time after the last one, and the extreme times of read rows, seconds."""
+        ends = (0, 0), (self.config.frames, -1)
+        read = [own.row_times(frame, self.config.height)[row] for own in self.disturbed for frame, row in ends]
+        return [float(t) / self.config.fps for t in sorted({*range(self.config.frames + 1), min(read), max(read)})]
+
+
+def _write_clips(
+    tracer: PathTracer, rig: _Rig, folder: Path, progress: Callable[[int, int], None] | None
+) -> list[Path]:
+    """Write the images of all cameras; return the clips that `load_capture` reads."""
+    config = rig.config
+    count = itertools.count(1)
+
+    def render_view(index: int) -> Iterator[np.ndarray]:
+        for image in _images(tracer, rig, index):
+            yield image
+            if progress is not None:
+                progress(next(count), len(rig.cameras) * config.frames)
+
+    clips = []
+    for index, camera in enumerate(rig.cameras):
+        video = folder / f"{camera.name}.mp4"
+        png = folder / "frames" / camera.name
+        if config.lossless:
+            write_video(png, render_view(index), config.fps)
+        images = open_frames(png).frames() if config.lossless else render_view(index)
+        write_video(video, images, config.fps, PLAYABLE)
+        clips.append(png if config.lossless else video)
+    return clips
+
+
+def _images(tracer: PathTracer, rig: _Rig, index: int) -> Iterator[np.ndarray]:
+    """Yield the images of a camera."""
+    config = rig.config
+    own = rig.disturbed[index]
+    assert config.noise is not None
+    for frame in range(config.frames):
+        # The noise must differ between views and frames; otherwise it would look like a moving texture.
+        seed = int(np.random.SeedSequence([config.seed, index, frame]).generate_state(1)[0])
+        light = record_light(tracer, rig.cameras[index], own, frame, replace(config, seed=seed))
+        yield compressed(developed(own.gains[frame] * light, config.noise, seed), own.jpeg_quality)
+
+
+def _check_views(tracer: PathTracer, cameras: Sequence[Camera]) -> None:
+    """Raise `ValueError` without light or if a camera sees no object in the first frame; warn of black images."""
+    if not tracer.has_emitters:
+        raise ValueError(
+            f"scene {tracer.scene.name!r}: it has no emitter, so its images would be black; give it lights, e.g. "
+            "`lights()` of morgs_mi.studio.synth.textures."
+        )
+    for camera in cameras:
+        if not (tracer.surface_points(camera).ids >= 0).any():
+            raise ValueError(
+                f"scene {tracer.scene.name!r}: {camera.name} sees no object at 0 s; move the objects, or "
+                "the centre and distance of the rig."
+            )
+    if not tracer.render(cameras[0], 1, 0).any():
+        _LOG.warning(
+            "scene %r: %s is black at 0 s: no lamp reaches the objects that it sees; check the sides to which lamps "
+            "and surfaces face (a rectangle emits along its +z).",
+            tracer.scene.name,
+            cameras[0].name,
+        )
+
+
+def _write_truth(tracer: PathTracer, rig: _Rig, folder: Path) -> None:
+    """Write the ground truth of every camera, the tracks and the disturbances."""
+    fps = rig.config.fps
+    frames = np.arange(rig.config.frames)
+    for camera, own in zip(rig.cameras, rig.disturbed, strict=True):
+        times = (frames + own.time_offset) / fps
+        for frame, time in enumerate(times):
+            tracer.set_time(time)
+            surface = tracer.surface_points(camera)
+            before = tracer.poses(times[frame - 1]) if frame else None
+            truth = compute_ground_truth(camera, surface, tracer.poses(time), before, tracer.poses(time + 1 / fps))
+            save_truth(folder, camera.name, frame, truth)
+    rng = np.random.default_rng([rig.config.seed, 1])
+    save_tracks(folder, _sample_tracks(tracer, rig.cameras, frames / fps, rng))
+    save_disturbances(folder, dict(zip((c.name for c in rig.cameras), rig.disturbed, strict=True)))
+
+
+def _sample_tracks(
+    tracer: PathTracer, cameras: Sequence[Camera], times: np.ndarray, rng: np.random.Generator
+) -> Tracks:
+    """Return the tracks of surface points that are visible in the first, middle or last frame.
+
+    Half of the points lie on moving objects.
+    """
+    starts = sorted({0, len(times) // 2, len(times) - 1})
+    objects = tracer.scene.objects.values()
+    can_move = np.array([item.pose is not None for item in objects])
+    share = -(-_NUM_TRACKS // (2 * len(starts) * len(cameras)))
+    points = []
+    owners = []
+    poses = [tracer.poses(time) for time in times]
+    for start in starts:
+        tracer.set_time(times[start])
+        for camera in cameras:
+            visible = tracer.surface_points(camera)
+            for moving in (False, True):
+                pixels = np.flatnonzero((visible.ids >= 0) & (can_move[visible.ids] == moving))
+                pixels = rng.choice(pixels, min(share, len(pixels)), replace=False)
+                own = visible.pick(pixels)
+                points.append(np.stack([move_with_objects(own, poses[start], there) for there in poses], axis=1))
+                owners.append(own.ids)
+    tracks = np.concatenate(points)
+    visible = {camera.name: np.zeros(tracks.shape[:2], bool) for camera in cameras}
+    for frame, time in enumerate(times):
+        tracer.set_time(time)
+        for camera in cameras:
+            visible[camera.name][:, frame] = tracer.sees(camera, tracks[:, frame])
+    return Tracks(tracks, np.concatenate(owners), visible)
+
+
+def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], folder: Path) -> None:
+    """Write the cameras as `poses_bounds.npy` and as a COLMAP model with points from the training views.
+
+    The points have the colours of the `clips`, one per camera.
+    """
+    cameras = rig.cameras
+    disturbed = rig.disturbed
+    rng = np.random.default_rng([rig.config.seed, 2])
+    points = []
+    colors = []
+    bounds = []
+    for index, (camera, own) in enumerate(zip(cameras, disturbed, strict=True)):
+        tracer.set_time(own.time_offset / rig.config.fps)
+        visible = tracer.surface_points(camera)
+        lens = undistortion(camera, own.lens)
+        pixels = np.flatnonzero((visible.ids >= 0) & (lens is None or lens.mask))
+        depths = camera.project(visible.pick(pixels).positions)[1]
+        # LLFF's percentiles, which readers of the file expect.
+        bounds.append(np.percentile(depths, [0.1, 99.9]))
+        if index == 0:
+            continue  # the held-out view must not contribute points or colours
+        chosen = rng.choice(len(pixels), min(_NUM_SFM_POINTS // (len(cameras) - 1), len(pixels)), replace=False)
+        # Structure from motion has an error of about half a pixel; here it is the same along the ray.
+        noise = rng.normal(size=(len(chosen), 3)) * (0.5 * depths[chosen, None] / camera.K[0, 0])
+        points.append(visible.pick(pixels[chosen]).positions + noise)
+        image = next(open_frames(clips[index]).frames(0, 1))
+        image = image if lens is None else lens(image)
+        colors.append(image.reshape(-1, 3)[pixels[chosen]] / 255)
+    if not any(own.distortion for own in disturbed):
+        write_poses_bounds(folder / "poses_bounds.npy", cameras, np.array(bounds))
+    lenses = [own.lens for own in disturbed]
+    write_colmap(folder / "sparse" / "0", cameras, np.concatenate(points), np.concatenate(colors), lenses)
+
+
+def _check_folder(out: Path, overwrite: bool) -> None:
+    """Raise `FileExistsError` if `out` must not be replaced."""
+    if out.exists() and not out.is_dir():
+        raise FileExistsError(f"synthesize(): {out} is a file; choose another folder.")
+    occupied = out.is_dir() and not all(is_added(file.name) for file in out.iterdir())
+    if occupied and not overwrite:
+        raise FileExistsError(f"synthesize(): {out} is not empty; choose another folder, or set `overwrite`.")
+    if occupied and not _is_synthetic(out):
+        raise FileExistsError(
+            f"synthesize(): {out} is not a synthetic capture, so it is not replaced; choose another folder."
+        )
+
+
+def _is_synthetic(folder: Path) -> bool:
+    """Return whether a folder is a capture written by `synthesize`: recordings and fits have a `capture.json` too."""
+    try:
+        about = read_json(folder / CAPTURE)
+    except (OSError, ValueError):
+        return False
+    return isinstance(about, dict) and {"scene", "spp"} <= set(about)

@@ -1,0 +1,143 @@
+"""Splats and surfaces in one image.
+
+Per pixel, a fraction f is covered by surfaces at depth z, with radiance L there and E elsewhere. C(z) and T(z) are the
+blended colour of the splats in front of z and the transmittance that remains; at z = inf, of all splats:
+
+    f dec(C(z) + T(z) enc(L)) + (1 - f) dec(C(inf) + T(inf) enc(E))
+
+`enc` encodes linear light like the colours of the splats (sRGB, or not at all) and `dec` decodes it: a surface is
+blended like one more splat, and the two parts of a pixel are averaged in linear light, as a film does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from morgs_mi.core.color_space import decode_traced, encode_traced
+from morgs_mi.core.gaussians import ActivatedGaussians
+from morgs_mi.core.memory import from_numpy
+from morgs_mi.core.types import Float, Jit, Tensor
+from morgs_mi.render.channels import NORMALISED
+from morgs_mi.render.rasterize import Image, rasterize
+from morgs_mi.render.region import Region
+from morgs_mi.render.render_config import RenderConfig
+from morgs_mi.surfaces.surface_view import SurfaceView
+
+Crop = tuple[int, int, int, int]
+Columns = dict[str, list[Float]]
+
+
+def composite(
+    gaussians: ActivatedGaussians,
+    channels: Sequence[str],
+    background: Sequence[float] | Jit | None,
+    view: SurfaceView,
+    config: RenderConfig | None = None,
+) -> Columns:
+    """Return the channels of splats and surfaces, differentiable in both, each a list of floats [P].
+
+    Colour is linear light. Alpha is 1 where a surface or the environment is seen. Depth is the expected depth of splats
+    and surfaces together. Motion and the channels of attributes belong to the splats in front of the surfaces.
+
+    Args:
+        gaussians: N Gaussians.
+        channels: as for `rasterize`.
+        background: colour [3] behind all splats where no surface and no environment is seen, encoded like the splats.
+        view: the surfaces on P pixels of a camera's image.
+        config: settings of the rasteriser.
+    """
+    encode, decode = (encode_traced, decode_traced) if view.srgb else (_unchanged, _unchanged)
+    channels = tuple(dict.fromkeys(("color", "alpha", *channels)))
+    image = rasterize(gaussians, view.pixels.camera, channels, config=config)
+    crop = view.pixels.crop
+    whole = _blended(image, channels, lambda image: cropped(image, crop))
+    front = _in_front(gaussians, channels, view, config) or whole
+    f = view.coverage
+    covered = view.coverage > 0
+    t_front, t_whole = (1 - part["alpha"][0] for part in (front, whole))
+
+    shown = view.behind is not None
+    behind = view.behind if shown else mi.Color3f(0)
+    ground = [0.0] * 3 if background is None or shown else background
+    color = []
+    for k in range(3):
+        L = view.image[:, :, k].array
+        E = behind[k]
+        # Rays of its own find the coverage. Without splats, the two parts add up to L whatever it is.
+        surface = dr.maximum(L - (1 - f) * E, 0) / dr.select(covered, f, 1)
+        rest = dr.maximum(L - f * surface, 0) / dr.select(f < 1, 1 - f, 1)
+        beyond = encode(rest) + ground[k]
+        inside = decode(dr.fma(t_front, encode(surface), front["color"][k]))
+        outside = decode(dr.fma(t_whole, beyond, whole["color"][k]))
+        color.append(dr.fma(f, inside - outside, outside))
+
+    splats = {name: [dr.lerp(b, a, f) for a, b in zip(front[name], whole[name], strict=True)] for name in channels}
+    (alpha,) = splats["alpha"]
+    if "depth" in channels:
+        (depth,) = splats["depth"]
+        weight = alpha + f * t_front
+        splats["depth"] = _ratio([depth + f * t_front * dr.select(covered, view.depth, 0)], weight)
+    if "motion" in channels:
+        splats["motion"] = _ratio(splats["motion"], alpha)
+    opaque = mi.Float(1) if shown else dr.fma(f, t_whole, 1 - t_whole)
+    return {**splats, "color": color, "alpha": [opaque]}
+
+
+def _in_front(
+    gaussians: ActivatedGaussians, channels: tuple[str, ...], view: SurfaceView, config: RenderConfig | None
+) -> Columns | None:
+    """Return the blended sums of the splats in front of the surfaces [P], 0 where there are none; None: nowhere.
+
+    Only the blocks of pixels in which a surface is seen are drawn.
+    """
+    camera = view.pixels.camera
+    x, y, width, height = view.pixels.crop
+    mask = np.zeros((camera.height, camera.width), bool)
+    mask[y : y + height, x : x + width] = view.mask
+    if not mask.any():
+        return None
+    pixel = dr.arange(mi.UInt32, width * height)
+    row = pixel // dr.opaque(mi.UInt32, width)
+    limit = dr.full(mi.Float, dr.inf, mask.size)
+    inside = dr.fma(row + y, dr.opaque(mi.UInt32, camera.width), pixel - row * dr.opaque(mi.UInt32, width) + x)
+    dr.scatter(limit, view.depth, inside, mode=dr.ReduceMode.Permute)
+    region = Region(mask)
+    depth_limit = mi.TensorXf(limit, mask.shape)
+    part = rasterize(gaussians, camera, channels, region=region, config=config, depth_limit=depth_limit)
+    place = region.paste(
+        np.arange(int(np.prod(region.shape(1)))).reshape(region.shape(1)[:3]), np.zeros(mask.shape, int)
+    )
+    index = from_numpy(mi.UInt32, place[y : y + height, x : x + width])
+    drawn = view.coverage > 0
+
+    def on_crop(image: Tensor) -> list[Float]:
+        size = image.shape[-1]
+        mode = dr.ReduceMode.NoConflicts
+        return [dr.gather(mi.Float, image.array, index * size + k, active=drawn, mode=mode) for k in range(size)]
+
+    return _blended(part, channels, on_crop)
+
+
+def _blended(image: Image, channels: tuple[str, ...], columns: Callable[[Tensor], list[Float]]) -> Columns:
+    """Return the columns of every channel as sums weighted by T alpha."""
+    values = {name: columns(image[name]) for name in channels}
+    (alpha,) = values["alpha"]
+    return {name: [v * alpha for v in value] if name in NORMALISED else value for name, value in values.items()}
+
+
+def cropped(image: Tensor, crop: Crop) -> list[Float]:
+    """Return the columns [P] of an image [H, W, C] on the pixels of a crop (x, y, width, height)."""
+    x, y, width, height = crop
+    return [image[y : y + height, x : x + width, k].array for k in range(image.shape[2])]
+
+
+def _ratio(sums: list[Float], weight: Float) -> list[Float]:
+    return [dr.select(weight > 0, value / dr.maximum(weight, 1e-8), 0) for value in sums]
+
+
+def _unchanged(values: Float) -> Float:
+    return values

@@ -1,0 +1,362 @@
+"""The surfaces of a Mitsuba scene as one camera sees them, rendered by one of Mitsuba's own integrators.
+
+The scene's shapes other than Gaussians are put into a second scene, which shares the objects: gradients of a nested
+integrator such as `prb` reach the parameters of the whole scene.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import ActivatedGaussians
+from morgs_mi.core.types import Bool, Float, Tensor, UInt32
+from morgs_mi.render.render_config import RenderConfig
+from morgs_mi.surfaces.splat_rays import SplatRays
+
+_log = logging.getLogger(__name__)
+
+# Rays along each axis of a pixel that find its coverage and depth.
+_GRID = 3
+# Rays of the grid that are cast in every pixel, and the others, row by row.
+_FIRST = (1, 5, 6)
+_OTHERS = (0, 2, 3, 4, 7, 8)
+
+
+def rays_for(integrator: Any, gaussians: ActivatedGaussians, config: RenderConfig | None = None) -> SplatRays | None:
+    """Return N Gaussians prepared for a `splat_path`; None for other integrators."""
+    return SplatRays(gaussians, config) if hasattr(integrator, "splats") else None
+
+
+@contextmanager
+def traced(integrator: Any, splats: SplatRays | None, srgb: bool) -> Iterator[None]:
+    """Let an integrator trace rays through Gaussians inside the context.
+
+    Args:
+        integrator: any integrator.
+        splats: the Gaussians, see `rays_for`; None: the integrator is left as it is.
+        srgb: whether their colours are sRGB-encoded.
+    """
+    if splats is None:
+        yield
+        return
+    integrator.splats = splats
+    integrator.srgb = srgb
+    try:
+        yield
+    finally:
+        integrator.splats = None
+
+
+def surface_scene(scene: Any) -> Any:
+    """Return a scene of the surfaces and emitters of `scene`, or None if it has neither surfaces nor an environment.
+
+    It shares the shapes, emitters and materials with `scene`, and is built for their current state.
+
+    Raises:
+        ValueError: there is no emitter, or a surface has no BSDF or is the boundary of a volume.
+    """
+    surfaces = [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
+    if not surfaces and scene.environment() is None:
+        return None
+    if not scene.emitters():
+        raise ValueError(
+            "gaussian_splat: expected an emitter that lights the surfaces, got none; add one to the scene, such as an "
+            "`envmap` of morgs_mi.light_probe()."
+        )
+    for shape in surfaces:
+        if shape.is_medium_transition():
+            raise ValueError(
+                f"gaussian_splat: expected surfaces, got {shape.class_name()} {shape.id()!r}, the boundary of a "
+                "medium; remove the medium, because splats have no place in the order of a volume's light."
+            )
+        if shape.bsdf() is None:
+            raise ValueError(
+                f"gaussian_splat: the {shape.class_name()} {shape.id()!r} must have a BSDF, got none; set `bsdf` "
+                "where the shape is defined."
+            )
+    return shared_scene([*surfaces, *lights(scene)], scene)
+
+
+def lights(scene: Any) -> list[Any]:
+    """Return the emitters of a scene, without the emitters on its surfaces."""
+    return [emitter for emitter in scene.emitters() if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)]
+
+
+def shared_scene(parts: list[Any], whole: Any) -> Any:
+    """Return a scene of some shapes and emitters of a whole scene, which does not change.
+
+    A new scene names its parts, and sets the extent of an environment to its own; both are set back.
+    """
+    names = [part.id() for part in parts]
+    scene = mi.load_dict({"type": "scene", **{f"part{i}": part for i, part in enumerate(parts)}})
+    for part, name in zip(parts, names, strict=True):
+        part.set_id(name)
+        if isinstance(part, mi.Emitter):
+            part.set_scene(whole)
+    return scene
+
+
+def _attached(thing: Any) -> list[str]:
+    """Return the names of the parameters of a scene or shape that are attached to the gradient graph."""
+    params: Any = mi.traverse(thing)
+    return [key for key in params.keys() if dr.grad_enabled(params[key])]  # noqa: SIM118
+
+
+@contextmanager
+def _detached(shapes: list[Any]) -> Iterator[None]:
+    """Detach the parameters of shapes inside the context.
+
+    Calls of Mitsuba's virtual functions are traced for all shapes that exist, of any scene. In forward mode `prb` would
+    depend on shapes that its scene does not have, and fail.
+    """
+    attached = []
+    for shape in shapes:
+        params: Any = mi.traverse(shape)
+        attached += [(params, key, params[key]) for key in _attached(shape)]
+    for params, key, value in attached:
+        params[key] = dr.detach(value)
+    try:
+        yield
+    finally:
+        for params, key, value in attached:
+            params[key] = value
+
+
+@dataclass(frozen=True)
+class SampledPixels:
+    """Pixels of a view, and the samples of an integrator in them."""
+
+    camera: Camera  #: The view.
+    crop: tuple[int, int, int, int]  #: Its pixels, (x, y, width, height), P in all.
+    template: Any  #: Sensor with the sampler and the far plane.
+    seed: int = 0  #: Seed of the samples.
+    spp: int = 0  #: Samples per pixel; 0: the sampler's number.
+
+    def sensor(self) -> Any:
+        """Return a sensor with a film of the pixels."""
+        names = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
+        params: Any = mi.traverse(self.template)
+        more = {"far_clip": float(params["far_clip"]), "sampler": self.template.sampler()}
+        return mi.load_dict(
+            {**self.camera.sensor(pixel_format="rgba", **dict(zip(names, self.crop, strict=True))), **more}
+        )
+
+    def samples(self) -> int:
+        """Return the samples per pixel, which some samplers round up."""
+        sampler = self.template.sampler().clone()
+        sampler.set_sample_count(self.spp or sampler.sample_count())
+        return sampler.sample_count()
+
+
+@dataclass(frozen=True)
+class SurfaceView:
+    """Surfaces as seen by one camera, P pixels row by row."""
+
+    scene: Any  #: The surfaces, see `surface_scene`.
+    gaussians: list[Any]  #: The other shapes.
+    integrator: Any  #: Renders them.
+    pixels: SampledPixels  #: The pixels and their samples.
+    sensor: Any  #: The camera, with a film of those pixels.
+    #: Radiance and alpha of the nested integrator [h, w, 4], in linear light, a leaf of the gradient graph.
+    image: Tensor
+    coverage: Float  #: Fraction of each pixel in which a surface is seen [P], in [0, 1].
+    depth: Float  #: Mean camera-space z of what is seen there [P], world units; inf where there is no surface.
+    #: Radiance of the environment at the pixels' centres, `mi.Color3f` [P], a leaf of the gradient graph; None if there
+    #: is none, or the integrator hides it.
+    behind: Any
+    #: The Gaussians, for an integrator that traces rays through them; None for other integrators.
+    splats: SplatRays | None
+    srgb: bool  #: Whether their colours are sRGB-encoded.
+
+    @staticmethod
+    def of(
+        whole: Any,
+        integrator: Any,
+        pixels: SampledPixels,
+        splats: ActivatedGaussians,
+        srgb: bool,
+        config: RenderConfig | None = None,
+    ) -> SurfaceView | None:
+        """Render the surfaces of a scene, or return None if it has neither surfaces nor an environment.
+
+        Args:
+            whole: scene of Gaussians and surfaces.
+            integrator: renders them.
+            pixels: pixels that are rendered, and their samples.
+            splats: the Gaussians of the scene.
+            srgb: whether their colours are sRGB-encoded.
+            config: cut-offs of rays through them.
+
+        Raises:
+            ValueError: as for `surface_scene`.
+        """
+        scene = surface_scene(whole)
+        if scene is None:
+            return None
+        gaussians = [shape for shape in whole.shapes() if shape.is_ellipsoids()]
+        sensor = pixels.sensor()
+        rays = rays_for(integrator, splats, config)
+        with dr.suspend_grad(), traced(integrator, rays, srgb):
+            image = mi.TensorXf(integrator.render(scene, sensor, seed=pixels.seed, spp=pixels.samples()))
+            coverage, depth = coverage_and_depth(scene, sensor, pixels.camera, pixels.crop)
+            shown = scene.environment() is not None and not getattr(integrator, "hide_emitters", False)
+            behind = _environment(scene, sensor) if shown else None
+        dr.enable_grad(image, behind)
+        return SurfaceView(scene, gaussians, integrator, pixels, sensor, image, coverage, depth, behind, rays, srgb)
+
+    def forward(self, params: Any) -> None:
+        """Set the tangents of `image` and `behind` from the tangents of the surfaces' parameters."""
+        if not self._differentiates():
+            return
+        with _detached(self.gaussians), traced(self.integrator, self.splats, self.srgb):
+            tangent = self.integrator.render_forward(self.scene, params, self.sensor, **self._samples(self.pixels.seed))
+        dr.set_grad(self.image, tangent)
+        if self.behind is not None and dr.grad_enabled(values := _environment(self.scene, self.sensor)):
+            dr.set_grad(self.behind, dr.forward_to(values))
+
+    def backward(self, params: Any) -> None:
+        """Propagate the gradients of `image` and `behind` to the surfaces' parameters, adding to their gradients.
+
+        Its samples differ from the samples of `image`: where an image is no linear function of the radiance, the
+        product of two noisy factors would be biased.
+        """
+        if not self._differentiates():
+            return
+        seed, _ = mi.sample_tea_32(self.pixels.seed, 1)
+        grad = dr.grad(self.image)
+        with traced(self.integrator, self.splats, self.srgb):
+            self.integrator.render_backward(self.scene, params, grad, self.sensor, **self._samples(seed))
+        if self.behind is not None and dr.grad_enabled(values := _environment(self.scene, self.sensor)):
+            # `values` may be a parameter itself: its gradient is added to.
+            dr.backward(dr.sum(dr.dot(values, dr.grad(self.behind))))
+
+    def _differentiates(self) -> bool:
+        """Return whether any parameter of the surfaces is differentiated."""
+        params = mi.traverse(self.scene)
+        attached = _attached(self.scene)
+        moving = [key for key in attached if params.flags(key) & mi.ParamFlags.Discontinuous]
+        if moving:
+            _log.warning(
+                "gaussian_splat: gradients of the surfaces' positions lack what changes with their silhouettes and "
+                "depth; do not optimise `%s` with it.",
+                "`, `".join(moving),
+            )
+        if self.splats is not None and any(_attached(shape) for shape in self.gaussians):
+            _log.warning(
+                "splat_path: gradients of the Gaussians are those of the splats that the camera sees; they lack what "
+                "the Gaussians send to the surfaces and take from their light."
+            )
+        return bool(attached)
+
+    def _samples(self, seed: Any) -> dict[str, Any]:
+        return {"seed": seed, "spp": self.pixels.samples()}
+
+    @property
+    def mask(self) -> np.ndarray:
+        """The pixels in which a surface is seen, bool [h, w]."""
+        return np.array(self.coverage > 0).reshape(self.image.shape[:2])
+
+
+def coverage_and_depth(scene: Any, sensor: Any, camera: Camera, crop: tuple[int, int, int, int]) -> tuple[Float, Float]:
+    """Return the coverage and the mean depth z of surfaces in every pixel [P], by rays through a regular grid.
+
+    Three rays, one in each row and column of the grid, decide where all are cast: where they or the next pixels differ.
+
+    Args:
+        scene: the surfaces.
+        sensor: a camera's sensor, with a film of the pixels of `crop`.
+        camera: the same camera.
+        crop: pixels of the camera's image, (x, y, width, height), P in all.
+    """
+    first, (across, down) = _rectangle(scene.bbox(), camera, crop)
+    coverage = dr.zeros(mi.Float, crop[2] * crop[3])
+    depth = dr.full(mi.Float, dr.inf, crop[2] * crop[3])
+    if not across * down:
+        return coverage, depth
+    lane: UInt32 = dr.arange(mi.UInt32, across * down)
+    columns: UInt32 = dr.opaque(mi.UInt32, across)
+    row = lane // columns
+    pixel = (row + int(first[1])) * dr.opaque(mi.UInt32, crop[2]) + lane - row * columns + int(first[0])
+    params: Any = mi.traverse(sensor)
+    to_camera = params["to_world"].inverse()
+
+    def cast(pixel: UInt32, grid: tuple[int, ...]) -> tuple[Float, Float]:
+        """Return the number of hits of some rays of the grid in pixels, and the sum of their depths."""
+        cells = mi.UInt32(grid)
+        end = dr.opaque(mi.UInt32, len(grid))
+
+        def step(i: UInt32, count: Float, total: Float) -> tuple[UInt32, Float, Float]:
+            k = dr.gather(mi.UInt32, cells, i)
+            rays = _rays(sensor, pixel, (mi.Vector2f(k % _GRID, k // _GRID) + 0.5) / _GRID)
+            found = scene.ray_intersect_preliminary(rays, coherent=True)
+            hit = found.is_valid()
+            z = (to_camera @ rays(dr.select(hit, found.t, 0))).z
+            return i + 1, count + dr.select(hit, mi.Float(1), 0), total + dr.select(hit, z, 0)
+
+        state = (mi.UInt32(0), mi.Float(0), mi.Float(0))
+        return dr.while_loop(state, lambda i, *_: i < end, step, label="coverage")[1:]
+
+    count, total = cast(pixel, _FIRST)
+    rays = dr.full(mi.Float, len(_FIRST), across * down)
+    dr.eval(count, total, rays)
+    column = lane - row * columns
+    neighbours = ((lane - 1, column > 0), (lane + 1, column + 1 < columns), (lane - columns, row > 0))
+    neighbours = (*neighbours, (lane + columns, lane + columns < across * down))
+    mixed: Bool = (count > 0) & (count < len(_FIRST))
+    for place, inside in neighbours:
+        mixed |= dr.gather(mi.Float, count, place, active=inside) != count
+    edge: Any = dr.compress(mixed)
+    if dr.width(edge):
+        more, deeper = cast(dr.gather(mi.UInt32, pixel, edge), _OTHERS)
+        more = more + dr.gather(mi.Float, count, edge)
+        deeper = deeper + dr.gather(mi.Float, total, edge)
+        for target, values in ((count, more), (total, deeper), (rays, mi.Float(_GRID**2))):
+            dr.scatter(target, values, edge, mode=dr.ReduceMode.Permute)
+    dr.scatter(coverage, count / rays, pixel, mode=dr.ReduceMode.Permute)
+    dr.scatter(depth, dr.select(count > 0, total / count, dr.inf), pixel, mode=dr.ReduceMode.Permute)
+    dr.eval(coverage, depth)
+    return coverage, depth
+
+
+def _rectangle(box: Any, camera: Camera, crop: tuple[int, int, int, int]) -> tuple[np.ndarray, list[int]]:
+    """Return the first pixel (x, y) of a crop that a bounding box may reach, and how many from there, (x, y)."""
+    if not box.valid():  # no surface
+        return np.zeros(2, int), [0, 0]
+    ends = np.stack([np.ravel(box.min), np.ravel(box.max)])
+    corners = np.array([[ends[i, 0], ends[j, 1], ends[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    pixels, depth = camera.project(corners)
+    low = np.zeros(2)
+    high = np.array(crop[2:])
+    if (depth >= camera.near).all():
+        low, high = (
+            np.clip(end - np.array(crop[:2]), 0, high)
+            for end in (np.floor(pixels.min(0)) - 1, np.ceil(pixels.max(0)) + 1)
+        )
+    return low.astype(int), (high - low).astype(int).tolist()
+
+
+def _environment(scene: Any, sensor: Any) -> Any:
+    """Return the radiance of the environment behind every pixel's centre."""
+    pixel = dr.arange(mi.UInt32, int(dr.prod(sensor.film().crop_size())))
+    rays = _rays(sensor, pixel, mi.Point2f(0.5))
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(pixel))
+    si.wi = -rays.d
+    si.wavelengths = rays.wavelengths
+    return mi.Color3f(mi.unpolarized_spectrum(scene.environment().eval(si)))
+
+
+def _rays(sensor: Any, pixel: UInt32, inside: Any) -> Any:
+    """Return rays through the positions `inside` [0, 1]^2 of pixels of a sensor's film, numbered row by row."""
+    width, height = (dr.opaque(mi.UInt32, int(size)) for size in sensor.film().crop_size())
+    row = pixel // width
+    position = (mi.Vector2f(pixel - row * width, row) + inside) / mi.Vector2f(width, height)
+    return sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))[0]

@@ -1,0 +1,588 @@
+"""Recording: a fit that is killed and resumed leaves the same files as one that was not."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from math import ceil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.timeline import ReadConfig
+from morgs_mi.codec.codec_config import CodecConfig
+from morgs_mi.codec.container import PAYLOAD, TRAILER, Packet, StreamWriter
+from morgs_mi.codec.frame_source import play
+from morgs_mi.codec.packets import CodedFrame, coded_frames, reemitted_keyframe
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.fit_names import PROVISIONAL
+from morgs_mi.fit.fit_config import DensityConfig, ShortFitConfig
+from morgs_mi.playback.source import as_fitted
+from morgs_mi.playback.stream_header import open_stream_capture
+from morgs_mi.runs.fit_capture import stream_capture, with_next
+from morgs_mi.runs.fit_files import Recording as Files
+from morgs_mi.runs.fit_files import _without_folder, stream_metadata
+from morgs_mi.stream_loop import StreamLoop
+from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, with_forged_packets
+from tests.scenes.captures import colmap
+from tests.scenes.coded_clip import history
+from tests.scenes.recording import CONFIG, FRAMES, Recording, recording, write_recording
+from tests.scenes.short_clip import Clip, Piece
+
+# About what the fit takes here; on a slower machine all kills come early.
+SECONDS = 0.8
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The output of a fit without interruption."""
+    out = tmp_path_factory.mktemp("whole")
+    stream_capture(recording(), out, CONFIG)
+    return out
+
+
+def stream_of(out: Path) -> bytes:
+    return (out / "stream.morgs").read_bytes()
+
+
+def report_of(out: Path) -> dict:
+    """Return the report without what differs between any two runs."""
+    report = json.loads((out / "report.json").read_text())
+    return report | {"frames": [{k: v for k, v in row.items() if k != "seconds"} for row in report["frames"]]}
+
+
+def assert_same(out: Path, whole: Path) -> None:
+    assert stream_of(out) == stream_of(whole)
+    assert report_of(out) == report_of(whole)
+    assert (out / "capture.json").read_bytes() == (whole / "capture.json").read_bytes()
+    assert sorted(path.name for path in out.iterdir()) == ["capture.json", "report.json", "stream.morgs"]
+
+
+def process(out: Path, *left: int) -> subprocess.Popen:
+    args = [sys.executable, "-m", "tests.scenes.recording", str(out), *map(str, left)]
+    started = subprocess.Popen(args, stdout=subprocess.PIPE, cwd=Path(__file__).parents[2])
+    assert started.stdout is not None
+    assert started.stdout.readline() == b"ready\n"
+    return started
+
+
+def kill_and_resume(whole: Path, folder: Path, kills: int) -> None:
+    """Fit again and again, each time killed at a random byte of the stream or a random moment, until it is done."""
+    rng, size, killed, fits = np.random.default_rng(0), len(stream_of(whole)), 0, 0
+    while killed < kills:
+        out, fits, status = folder / f"{fits}", fits + 1, -9
+        while status and killed < kills:
+            written = len(stream_of(out)) if (out / "stream.morgs").exists() else 0
+            if rng.random() < 0.5 and written < size:
+                running = process(out, int(rng.integers(1, size - written + 1)))
+            else:
+                running = process(out)
+                time.sleep(rng.uniform(0, SECONDS))
+                running.kill()
+            status = running.wait()
+            assert status in (-9, 0)
+            killed += status == -9
+        stream_capture(recording(), out, CONFIG, resume=True)
+        assert_same(out, whole)
+
+
+def test_stream_capture__shows_a_provisional_first_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stream beside the one that is written has a frame for each round of density control, and is removed."""
+    shown, show = [], Files.show
+
+    def spy(files: Files, keyframe: Packet) -> None:
+        show(files, keyframe)
+        provisional = StreamReader(tmp_path / PROVISIONAL)
+        shown.append([packet.encoded for packet in provisional])
+        assert provisional.metadata == StreamReader(tmp_path / "stream.morgs").metadata
+        assert not StreamReader(tmp_path / "stream.morgs").index()
+
+    monkeypatch.setattr(Files, "show", spy)
+    fit = replace(CONFIG.fit, num_gaussians=80, first_frame_steps=20, density=DensityConfig(rounds=3))
+    stream_capture(recording(num_frames=2), tmp_path, replace(CONFIG, fit=fit))
+    first = next(iter(StreamReader(tmp_path / "stream.morgs")))
+    assert len(shown) == 3
+    assert [first.encoded] not in shown
+    assert not (tmp_path / PROVISIONAL).exists()
+
+
+def test_stream_capture__goes_on_without_a_provisional_first_frame_that_has_no_room(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    write = StreamWriter.write
+
+    def full(writer: StreamWriter, packet: Packet) -> int:
+        if "provisional" in writer.path.name:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        assert not (tmp_path / PROVISIONAL).exists(), "it would take the room of the result"
+        return write(writer, packet)
+
+    monkeypatch.setattr(StreamWriter, "write", full)
+    stream_capture(recording(), tmp_path, CONFIG)
+    assert_same(tmp_path, whole)
+    (message,) = caplog.messages
+    assert message.startswith(f"{tmp_path / PROVISIONAL}: a provisional first frame cannot be written")
+
+
+def test_stream_capture__removes_the_provisional_first_frame_before_it_writes_the_result(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write, shown = StreamWriter.write, []
+
+    def spy(writer: StreamWriter, packet: Packet) -> int:
+        is_provisional = "provisional" in writer.path.name
+        assert is_provisional or not (tmp_path / PROVISIONAL).exists()
+        shown.append(is_provisional)
+        return write(writer, packet)
+
+    monkeypatch.setattr(StreamWriter, "write", spy)
+    stream_capture(recording(), tmp_path, CONFIG)
+    assert shown[0]
+    assert_same(tmp_path, whole)
+
+
+def other_fit(out: Path, push: Callable[..., Any] | None = None) -> None:
+    """Fit with another seed into a folder; `push` replaces the fit of a frame."""
+    with pytest.MonkeyPatch.context() as patch:
+        if push is not None:
+            patch.setattr(StreamLoop, "push", push)
+        stream_capture(recording(path=Path("other")), out, replace(CONFIG, seed=1))
+
+
+def files_of(out: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in out.iterdir()}
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.ENOSPC, "full"), RuntimeError("crash")])
+def test_stream_capture__keeps_an_earlier_fit_until_its_first_frame(
+    whole: Path, tmp_path: Path, error: BaseException
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(whole, out)
+
+    def fail(*_: Any) -> None:
+        assert {name: data for name, data in files_of(out).items() if name[0] != "."} == files_of(whole)
+        raise error
+
+    with pytest.raises(type(error)):
+        other_fit(out, fail)
+    assert files_of(out) == files_of(whole)
+    stream_capture(recording(), out, CONFIG, resume=True)
+    assert files_of(out) == files_of(whole)
+
+
+def test_stream_capture__replaces_an_earlier_fit_together(whole: Path, tmp_path: Path) -> None:
+    out, push, frames = tmp_path / "out", StreamLoop.push, []
+    shutil.copytree(whole, out)
+
+    def spy(loop: StreamLoop, *args: Any) -> Any:
+        if frame := loop.state.frame:
+            about = json.loads((out / "capture.json").read_text())
+            rows = report_of(out)["frames"]
+            held = {index for _, index, _ in StreamReader(out / "stream.morgs").index()}
+            frames.append((Path(about["capture"]).name, report_of(out)["config"]["seed"], len(rows), len(held)))
+            assert len(rows) == frame
+        return push(loop, *args)
+
+    other_fit(out, spy)
+    assert frames == [("other", 1, frame, frame) for frame in range(1, FRAMES)]
+    assert sorted(files_of(out)) == ["capture.json", "report.json", "stream.morgs"]
+
+
+@pytest.mark.parametrize("calls", range(1, 5))
+def test_stream_capture__resumes_after_a_kill_between_the_files_that_it_replaces(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: int
+) -> None:
+    """Whatever has been replaced, the files that are there after the next start belong together."""
+    out, count, rename = tmp_path / "out", 0, Path.replace
+    shutil.copytree(whole, out)
+
+    class Killed(BaseException):
+        pass
+
+    def dying(path: Path, target: Path) -> Path:
+        nonlocal count
+        count += path.name.startswith(".next-") and path.suffix in (".morgs", ".json")
+        if count >= calls:
+            raise Killed
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "replace", dying)
+    monkeypatch.setattr(Files, "__exit__", lambda *_: None)  # a killed process does not clean up
+    with contextlib.suppress(Killed):
+        other_fit(out)
+    monkeypatch.undo()
+    if calls == 1:  # nothing was replaced
+        stream_capture(recording(), out, CONFIG, resume=True)
+        assert files_of(out) == files_of(whole)
+    stream_capture(recording(path=Path("other")), out, replace(CONFIG, seed=1), resume=calls > 1)
+    other_fit(tmp_path / "new")
+    assert_same(out, tmp_path / "new")
+
+
+@pytest.mark.slow
+def test_stream_capture__killed_and_resumed_is_the_same(whole: Path, tmp_path: Path) -> None:
+    kill_and_resume(whole, tmp_path, 3)
+
+
+@pytest.mark.long
+def test_stream_capture__killed_60_times_is_the_same(whole: Path, tmp_path: Path) -> None:
+    kill_and_resume(whole, tmp_path, 60)
+
+
+@pytest.mark.long
+def test_stream_capture__300_frames_play_as_they_were_fitted(tmp_path: Path) -> None:
+    """A reader gets the state of the loop after each frame, with births and deaths, from any frame on."""
+    capture = recording(num_frames=300)
+    loop = StreamLoop(capture.cameras, capture.points, capture.point_colors, CONFIG)
+    states: list[CodedFrame] = []
+    with StreamWriter(tmp_path / "s", capture.cameras, 25) as writer:
+        for frame in capture.partial_frames():
+            packet, _ = loop.push(frame.images)
+            writer.write(packet)
+            assert loop.state.coded is not None
+            states.append(loop.state.coded)
+            if frame.index and frame.index % 50 == 0:
+                writer.write(reemitted_keyframe(states[-1]))
+    assert states[0].next_id < states[-1].next_id, "some were born"
+    assert len(states[-1]) < states[-1].next_id, "some died"
+    reader = StreamReader(tmp_path / "s")
+    assert history(coded_frames(reader)) == history(states)
+    for frame in range(0, 300, 23):
+        assert history([reader.seek(frame)]) == history([states[frame]])
+
+
+def cuts(whole: Path) -> list[int]:
+    """Return bytes within and between packets of every kind."""
+    index = StreamReader(whole / "stream.morgs").index()
+    size, ends = len(stream_of(whole)), [offset for _, _, offset in index]
+    index_at = size - PAYLOAD - 16 * len(index) - TRAILER.size
+    # A re-emitted keyframe, the fourth packet, may be missing after its residual.
+    return [0, ends[0] - 1, ends[0], ends[3] - 1, ends[3], ends[4], index_at, size - 1, size]
+
+
+def test_stream_capture__resumed_from_any_cut_is_the_same(whole: Path, tmp_path: Path) -> None:
+    report = json.loads((whole / "report.json").read_text())
+    for k, at in enumerate(cuts(whole)):
+        out = interrupted(whole, tmp_path / f"{at}", at)
+        count = len(played(out / "stream.morgs"))
+        # A row of the report may be there before its packet.
+        rows = report["frames"][: count + k % 2]
+        (out / "report.json").write_text(json.dumps({**report, "frames": rows}))
+        reports = stream_capture(recording(), out, CONFIG, resume=True)
+        assert [r.frame for r in reports] == list(range(FRAMES))
+        # What was there was not fitted again.
+        assert [r.seconds for r in reports[:count]] == [row["seconds"] for row in rows[:count]]
+        assert_same(out, whole)
+
+
+def test_stream_capture__resumed_after_an_interrupt_is_the_same(whole: Path, tmp_path: Path) -> None:
+    """The stream was closed, with an index that must not stay in the middle."""
+
+    def stop(stage: str, done: float, total: float) -> None:
+        if stage == "Later frames" and done > 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        stream_capture(recording(), tmp_path / "out", CONFIG, progress=stop)
+    reader = StreamReader(tmp_path / "out" / "stream.morgs")
+    assert reader.closed()
+    assert [frame for frame, _ in play(reader)] == [0, 1, 2]
+    stream_capture(recording(), tmp_path / "out", CONFIG, resume=True)
+    assert_same(tmp_path / "out", whole)
+
+
+def interrupted(whole: Path, out: Path, at: int) -> Path:
+    shutil.copytree(whole, out)
+    os.truncate(out / "stream.morgs", at)
+    return out
+
+
+def played(path: Path) -> list[int]:
+    """Return the frames that can be played."""
+    found = []
+    with contextlib.suppress(ValueError):
+        found.extend(frame for frame, _ in play(StreamReader(path)))
+    return found
+
+
+def brighter(capture: Recording) -> Recording:
+    """Return another recording with the same cameras."""
+    return replace(capture, point_colors=capture.point_colors / 2)
+
+
+@pytest.mark.parametrize(
+    ("capture", "config", "message"),
+    [
+        (recording(), replace(CONFIG, seed=1), r"resume a fit with metadata\.config\.seed = 0, got 1"),
+        (recording(), replace(CONFIG, codec=CodecConfig(quality=2)), r"metadata\.config\.codec\.quality = 1\.0, got 2"),
+        (brighter(recording()), CONFIG, r"resume a fit with metadata\.fingerprint = "),
+        (recording(fps=50.0), CONFIG, r"resume a fit with fps = 25\.0, got 50\.0"),
+        (recording(cameras=recording().cameras[::-1]), CONFIG, "resume a fit with cameras = "),
+    ],
+)
+def test_stream_capture__does_not_resume_another_fit(
+    whole: Path, tmp_path: Path, capture, config, message: str
+) -> None:
+    out = interrupted(whole, tmp_path / "out", len(stream_of(whole)) // 2)
+    before = stream_of(out)
+    with pytest.raises(ValueError, match=message):
+        stream_capture(capture, out, config, resume=True)
+    assert stream_of(out) == before
+
+
+def test_stream_capture__does_not_resume_a_damaged_fit(whole: Path, tmp_path: Path) -> None:
+    out = interrupted(whole, tmp_path / "out", len(stream_of(whole)))
+    (out / "report.json").write_text("{")
+    with pytest.raises(ValueError, match=r"report\.json: expected JSON, got a broken file"):
+        stream_capture(recording(), out, CONFIG, resume=True)
+    (out / "report.json").unlink()
+    with pytest.raises(ValueError, match=r"report\.json: expected the report of the fit, got none; start again"):
+        stream_capture(recording(), out, CONFIG, resume=True)
+    (out / "report.json").write_text('{"frames": []}')
+    with pytest.raises(ValueError, match=r"report\.json: expected the rows of 6 frames, got 0"):
+        stream_capture(recording(), out, CONFIG, resume=True)
+    damaged = bytearray(stream_of(whole))
+    damaged[len(damaged) // 2] ^= 1
+    (out / "stream.morgs").write_bytes(damaged)
+    with pytest.raises(ValueError, match="the bytes are damaged"):
+        stream_capture(recording(), out, CONFIG, resume=True)
+    assert stream_of(out) == damaged
+
+
+def test_stream_capture__refuses_a_folder_into_which_another_fit_writes(whole: Path, tmp_path: Path) -> None:
+    """The other one goes on, and its files are whole."""
+    refused = {}
+
+    def fit_too(stage: str, done: float, total: float) -> None:
+        frame = ceil(done)
+        if stage == "Later frames" and frame in (1, 3) and frame not in refused:
+            with pytest.raises(BlockingIOError, match="out: expected a folder into which nothing else is written") as e:
+                stream_capture(recording(), tmp_path / "out", CONFIG, resume=frame == 3)
+            refused[frame] = e
+
+    stream_capture(recording(), tmp_path / "out", CONFIG, progress=fit_too)
+    assert len(refused) == 2
+    assert_same(tmp_path / "out", whole)
+
+
+@pytest.mark.parametrize("change", ["removed", "removed folder", "moved", "replaced"])
+def test_stream_capture__ends_when_its_stream_is_taken_away(whole: Path, tmp_path: Path, change: str) -> None:
+    out, seen = tmp_path / "out", []
+
+    def take_away(stage: str, done: float, total: float) -> None:
+        frame = ceil(done) if stage == "Later frames" else 0
+        if frame in seen:
+            return
+        seen.append(frame)
+        if frame != 2:
+            return
+        if change == "removed":
+            (out / "stream.morgs").unlink()
+        elif change == "replaced":
+            shutil.copy(whole / "stream.morgs", tmp_path / "other")
+            (tmp_path / "other").replace(out / "stream.morgs")
+        else:
+            out.rename(tmp_path / "moved")
+
+    found = "another file" if change == "replaced" else "none"
+    with pytest.raises(FileNotFoundError, match=rf"stream\.morgs: expected the stream that is being .*, found {found}"):
+        stream_capture(recording(), out, CONFIG, progress=take_away)
+    assert max(seen) == 2
+    if change == "replaced":
+        assert stream_of(out) == stream_of(whole)
+    elif change == "moved":
+        assert not out.exists()
+        stream_capture(recording(), tmp_path / "moved", CONFIG, resume=True)
+        assert_same(tmp_path / "moved", whole)
+
+
+def test_stream_capture__writes_no_path_into_the_stream(tmp_path: Path) -> None:
+    """A stream is shared; its capture is named in the file beside it."""
+    secret = tmp_path / "home" / "jane"
+    methods = replace(CONFIG.motion, flow_method=f"files:{secret}/flow", mask_method="none")
+    capture = recording(path=secret / "clip")
+    header = stream_metadata(capture, next(capture.partial_frames()), replace(CONFIG, motion=methods))
+    assert "jane" not in json.dumps(header)
+    assert header["config"]["motion"]["flow_method"] == "files:flow"
+    assert _without_folder("sam2:/a/encoder.onnx,/b/decoder.onnx") == "sam2:encoder.onnx,decoder.onnx"
+    stream_capture(capture, tmp_path / "out", CONFIG)
+    assert b"jane" not in stream_of(tmp_path / "out")
+    assert json.loads((tmp_path / "out" / "capture.json").read_text())["capture"] == str(secret / "clip")
+
+
+def test_stream_capture__resumes_a_stream_whose_header_has_a_path(whole: Path, tmp_path: Path) -> None:
+    """As the headers of earlier versions have; the recording may have moved."""
+    reader, out = StreamReader(whole / "stream.morgs"), tmp_path / "out"
+    shutil.copytree(whole, out)
+    about = {**reader.metadata, "capture": "/elsewhere"}
+    with StreamWriter(out / "stream.morgs", reader.cameras, reader.fps, about) as writer:
+        for packet in list(reader)[:3]:
+            writer.write(packet)
+    stream_capture(recording(), out, CONFIG, resume=True)
+    assert history(coded_frames(StreamReader(out / "stream.morgs"))) == history(coded_frames(reader))
+    assert json.loads((out / "capture.json").read_text())["capture"] == str(Path("noise").resolve())
+
+
+@pytest.mark.parametrize("text", ["[]", "[" * 100_000])
+def test_stream_capture__resumes_beside_a_hostile_description(whole: Path, tmp_path: Path, text: str) -> None:
+    out = interrupted(whole, tmp_path / "out", len(stream_of(whole)) * 3 // 4)
+    (out / "capture.json").write_text(text)
+    stream_capture(recording(), out, CONFIG, resume=True)
+    assert_same(out, whole)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[" * 100_000, "expected JSON, got a broken file"),
+        ("[]", "expected the report of the fit, got a broken one"),
+        ('{"frames": [{"seconds": "many"}]}', "expected the report of the fit, got a broken one"),
+        (f'{{"frames": [{{"seconds": {10**400}}}]}}', "expected the report of the fit, got a broken one"),
+    ],
+)
+def test_stream_capture__refuses_a_hostile_report(whole: Path, tmp_path: Path, text: str, message: str) -> None:
+    out = interrupted(whole, tmp_path / "out", len(stream_of(whole)))
+    (out / "report.json").write_text(text)
+    with pytest.raises(ValueError, match=f"report.json: {message}"):
+        stream_capture(recording(), out, CONFIG, resume=True)
+
+
+def test_stream_capture__resumes_hostile_streams_or_refuses_them_in_one_sentence(whole: Path, tmp_path: Path) -> None:
+    data = stream_of(whole)
+    index = TRAILER.unpack(data[-TRAILER.size :])[0]
+    ends = [*(offset for *_, offset in StreamReader(whole / "stream.morgs").index()), index]
+    packets = list(StreamReader(whole / "stream.morgs"))
+    pieces = [Piece(-1, 0, 0, 12), Piece(0, 0, 12, ends[0])]
+    pieces += [Piece(p.kind, p.frame, a, b) for p, (a, b) in zip(packets, pairwise(ends), strict=True)]
+    pieces.append(Piece(3, 0, index, len(data)))
+    clip, out = Clip(data, pieces, {}), tmp_path / "out"
+    for case in range(12):
+        forge = (damaged, with_forged_bytes, with_forged_packets, with_forged_header)[case % 4]
+        forged = forge(clip, np.random.default_rng(case))
+        shutil.rmtree(out, ignore_errors=True)
+        shutil.copytree(whole, out)
+        (out / "stream.morgs").write_bytes(forged if isinstance(forged, bytes) else forged.data)
+        refusal = ""
+        try:
+            stream_capture(recording(), out, CONFIG, resume=True)
+        except ValueError as error:
+            refusal = str(error)
+        assert refusal.startswith(f"{out}/") or StreamReader(out / "stream.morgs").seek(FRAMES - 1)
+
+
+@pytest.mark.parametrize("link", ["", "folder", "file"])
+def test_stream_capture__does_not_write_into_a_capture(tmp_path: Path, link: str) -> None:
+    capture, out = colmap(tmp_path / "clip"), tmp_path / "clip"
+    (capture / "capture.json").write_text("{}")
+    before = sorted(capture.rglob("*"))
+    if link == "folder":
+        out = tmp_path / "out"
+        out.symlink_to(capture / "videos")
+    elif link == "file":
+        out = tmp_path / "out"
+        out.mkdir()
+        (out / "capture.json").symlink_to(capture / "capture.json")
+    with pytest.raises(ValueError, match=rf"an output outside of captures, .* in the capture {capture}; choose"):
+        stream_capture(recording(), out, CONFIG)
+    assert sorted(capture.rglob("*")) == before
+    assert (capture / "capture.json").read_text() == "{}"
+
+
+def test_with_next__pairs_each_frame_with_its_successor() -> None:
+    assert list(with_next(iter("abc"))) == [("a", "b"), ("b", "c"), ("c", None)]
+    assert list(with_next([])) == []
+
+
+def test_with_next__yields_the_frames_before_one_that_cannot_be_read() -> None:
+    def frames():
+        yield from "ab"
+        raise OSError("the video ends here")
+
+    seen = []
+    with pytest.raises(OSError, match="the video ends here"):
+        seen.extend(with_next(frames()))
+    assert seen == [("a", "b"), ("b", None)]
+
+
+def refined_config():
+    """Return the config with refined cameras, by as little work as possible."""
+    how = ShortFitConfig(gaussians=40, steps=4, rounds=1)
+    return replace(CONFIG, fit=replace(CONFIG.fit, refine_cameras="on", short_fits=how))
+
+
+def test_stream_capture__stores_refined_cameras_and_resumes_with_them(tmp_path_factory):
+    tmp_path, config = tmp_path_factory.mktemp("out"), refined_config()
+    capture = load_capture(write_recording(tmp_path_factory.mktemp("capture"), 2), test_view=0)
+    stream_capture(capture, tmp_path, config)
+    stream, whole = StreamReader(tmp_path / "stream.morgs"), stream_of(tmp_path)
+    names = set(stream.metadata["distortions"])
+    assert names == set(capture.names[1:]), "the terms of the training views"
+    opened = open_stream_capture(stream, None, [0, 1])
+    assert np.array_equal(opened.cameras[1].viewmat, stream.cameras[1].viewmat)
+    assert [list(terms) for terms in opened.distortions[1:]] == [*stream.metadata["distortions"].values()]
+    assert np.array_equal(stream.cameras[0].viewmat, capture.cameras[0].viewmat), "the held-out view"
+    assert all(not np.array_equal(stream.cameras[v].viewmat, capture.cameras[v].viewmat) for v in (1, 2))
+    first = report_of(tmp_path)["frames"][0]["validation"]["refinement"]
+    assert first["taken"]
+    assert first["held_out"]["registered_psnr"] >= first["held_out"]["calibrated_psnr"]
+    (tmp_path / "stream.morgs").write_bytes(whole[: stream.index()[-1][2]])
+    stream_capture(capture, tmp_path, config, resume=True)
+    assert stream_of(tmp_path) == whole
+
+
+def test_stream_capture__resumes_where_cameras_have_delays(tmp_path):
+    reading = ReadConfig(offset={"cam1": 0.25, "cam2": -0.5})
+    capture = load_capture(write_recording(tmp_path / "capture"), reading=reading)
+    assert [camera.delay for camera in capture.cameras] == [0, -0.25, 0.5]
+    out = tmp_path / "out"
+    stream_capture(capture, out, CONFIG)
+    stream, whole = StreamReader(out / "stream.morgs"), stream_of(out)
+    for frame in (1, 3):
+        end = next(offset for _, index, offset in stream.index() if index == frame)
+        (out / "stream.morgs").write_bytes(whole[:end])
+        stream_capture(capture, out, CONFIG, resume=True)
+        assert stream_of(out) == whole
+    assert [c.delay for c in open_stream_capture(stream, None, [0, 1]).cameras] == [0, -0.25, 0.5]
+
+
+@pytest.mark.parametrize("found", [[1, 2], {"cam1": [0.1]}, {"cam1": ["x", "y"]}, {"cam1": None}])
+def test_as_fitted__refuses_broken_distortions(tmp_path, found):
+    capture = recording()
+    with StreamWriter(tmp_path / "stream.morgs", capture.cameras, 25.0, {"distortions": found}):
+        pass
+    with pytest.raises(ValueError, match="`distortions` must be an object with two numbers for each camera"):
+        as_fitted(capture, StreamReader(tmp_path / "stream.morgs"))
+
+
+def test_stream_capture__resumes_with_the_exposures_of_the_report(tmp_path):
+    how = ShortFitConfig(gaussians=40, steps=4, rounds=1)
+    capture, config = recording(num_frames=3), replace(CONFIG, fit=replace(CONFIG.fit, exposure="on", short_fits=how))
+    stream_capture(capture, tmp_path, config)
+    stream, whole, report = StreamReader(tmp_path / "stream.morgs"), stream_of(tmp_path), report_of(tmp_path)
+    assert all(len(row["exposures"]) == len(capture.train_views) for row in report["frames"])
+    (tmp_path / "stream.morgs").write_bytes(whole[: stream.index()[-1][2]])
+    stream_capture(capture, tmp_path, config, resume=True)
+    assert stream_of(tmp_path) == whole
+    assert [row["exposures"] for row in report_of(tmp_path)["frames"]] == [r["exposures"] for r in report["frames"]]
+
+
+def test_stream_metadata__names_the_calibration_that_cameras_are_refined_from():
+    capture = recording()
+    other = replace(capture.cameras[0], K=capture.cameras[0].K * np.array([[1.01, 1, 1], [1, 1.01, 1], [1, 1, 1]]))
+    others = replace(capture, cameras=(other, *capture.cameras[1:]))
+    first, config = next(capture.partial_frames()), refined_config()
+    same, different = (stream_metadata(c, first, config)["fingerprint"] for c in (capture, others))
+    assert same != different

@@ -1,0 +1,301 @@
+"""Calibration from clips alone, up to the scale of the world, and the errors for unsuitable clips."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import shutil
+from contextlib import closing
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from morgs_mi import cli
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.layouts.colmap import read_colmap, write_colmap
+from morgs_mi.capture.points import match_capture
+from morgs_mi.core.camera import Camera
+from morgs_mi.io.video_writer import write_video
+from morgs_mi.studio.calibration.calibrate import (
+    _DATABASE,
+    CalibrateConfig,
+    _Candidate,
+    _check,
+    _frames,
+    _map,
+    _match,
+    calibrate,
+)
+from morgs_mi.studio.calibration.checks.rig_check import CameraCheck, check_rig
+from tests.assertions import assert_close
+from tests.scenes import textured
+from tests.scenes.captures import write_timed_video
+from tests.scenes.full_disk import files_end_at
+
+
+def film(path: Path, cameras: list[Camera], suffix: str = ".mkv") -> Path:
+    planes = textured.textures()
+    for camera in cameras:
+        write_video(path / f"{camera.name}{suffix}", [textured.render(camera, planes)] * 2, 30)
+    return path
+
+
+def aligned(found: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return `found` [n, 3] aligned to `true` by translation, rotation and scale, and the rotation."""
+    a, b = found - found.mean(0), true - true.mean(0)
+    U, _, Vt = np.linalg.svd(a.T @ b)
+    R = (U @ Vt).T
+    return np.sqrt((b**2).sum() / (a**2).sum()) * a @ R.T + true.mean(0), R
+
+
+def test_calibrate__recovers_a_rig(tmp_path: Path, capsys) -> None:
+    cameras = [camera.resized(240, 180) for camera in textured.rig()]
+    film(tmp_path, cameras)
+    assert cli.main(["calibrate", str(tmp_path), "--shared-intrinsics"]) == 0
+    assert "sparse/0: 6 cameras, " in capsys.readouterr().out
+    capture = load_capture(tmp_path)
+    assert capture.names == tuple(camera.name for camera in cameras)
+    assert len(capture.points) > 500
+    true = np.array([camera.position for camera in cameras])
+    found, R = aligned(np.array([camera.position for camera in capture.cameras]), true)
+    # Features are accurate to 0.1 px of 208 px focal length; the rig is 2.8 wide and 4 from the scene.
+    assert_close(found, true, atol=5e-3)
+    for camera, expected in zip(capture.cameras, cameras, strict=True):
+        assert_close(camera.viewmat[:3, :3] @ R.T, expected.viewmat[:3, :3], atol=3e-3)
+        np.testing.assert_allclose(camera.K[0, 0], expected.K[0, 0], rtol=5e-3)
+    assert check_rig(capture, match_capture(capture)).fits
+    status = cli.main(["calibrate", str(tmp_path)])
+    assert status == 1
+    assert "sparse: expected no model, got one" in capsys.readouterr().err
+
+
+def test_calibrate__finds_the_same_poses_on_every_run(tmp_path: Path) -> None:
+    film(tmp_path, [camera.resized(240, 180) for camera in textured.rig()])
+    config = CalibrateConfig(shared_intrinsics=True)
+    images, _ = _frames(tmp_path, config, ())
+    (scratch := tmp_path / "scratch").mkdir()
+    _match(tmp_path, images, {}, scratch, config, lambda *_: None)
+    with closing(pycolmap.Database.open(scratch / _DATABASE)) as db:
+        numbered = sorted((image.image_id, Path(image.name).stem) for image in db.read_all_images())
+    assert [name for _, name in numbered] == list(images), "other numbers change the world's axes by 0.1"
+    found = []
+    for _ in range(3):
+        model = _map(tmp_path, tuple(images), scratch, config.seed).model
+        found.append(np.array([model.image(i).cam_from_world().matrix() for i, _ in numbered]))
+    assert not np.ptp(found, axis=0).any(), "threads may find a pose from other samples"
+
+
+@pytest.mark.parametrize(
+    "names",
+    [("a.JPG", "b.JPG", "c.JPG", "d.JPG"), (" a.tif", "b .webp", " c d .BMP", "e.TIFF")],
+    ids=["JPEG", "spaces and other formats"],
+)
+def test_calibrate__names_images_after_photos(tmp_path: Path, names: tuple[str, ...]) -> None:
+    planes = textured.textures()
+    for name, camera in zip(names, textured.rig(4), strict=True):
+        image = textured.render(camera.resized(240, 180), planes)[..., ::-1]
+        options = [cv2.IMWRITE_JPEG_QUALITY, 98] if name.endswith("JPG") else []
+        (tmp_path / name).write_bytes(cv2.imencode(Path(name).suffix.lower(), image, options)[1].tobytes())
+        (tmp_path / f"._{name}").write_bytes(b"\0\5\x16\7")
+    result = calibrate(tmp_path, CalibrateConfig(shared_intrinsics=True))
+    assert {camera.name for camera in read_colmap(result.model).cameras} == set(names)
+    assert load_capture(tmp_path).names == result.cameras
+
+
+def test_calibrate__shares_intrinsics_among_clips_of_a_size(tmp_path: Path) -> None:
+    sizes = [(240, 180), (320, 240)] * 3
+    cameras = [camera.resized(*size) for camera, size in zip(textured.rig(), sizes, strict=True)]
+    found = calibrate(film(tmp_path, cameras), CalibrateConfig(shared_intrinsics=True))
+    assert len(pycolmap.Reconstruction(str(found.model)).cameras) == 2
+    capture = load_capture(tmp_path)
+    assert capture.recorded_sizes == tuple(sizes)
+    for camera, expected in zip(capture.cameras, cameras, strict=True):
+        np.testing.assert_allclose(camera.K[0, 0], expected.K[0, 0], rtol=5e-3)
+
+
+def test_calibrate__moves_principal_points_that_differ(tmp_path: Path, capsys) -> None:
+    cameras = [camera.resized(240, 180) for camera in textured.rig()]
+    for camera, shift in zip(cameras, np.random.default_rng(0).uniform(-6, 6, (6, 2)), strict=True):
+        camera.K[:2, 2] += shift
+    film(tmp_path, cameras)
+    assert cli.main(["calibrate", str(tmp_path), "--shared-intrinsics"]) == 0
+    assert "with a principal point for each" in " ".join(capsys.readouterr().out.split())
+    found, true = (np.array([c.position for c in views]) for views in (load_capture(tmp_path).cameras, cameras))
+    # With principal points in the middle of the images, positions are off by 0.022.
+    assert_close(aligned(found, true)[0], true, atol=0.012)
+
+
+def test_calibrate__takes_global_mapping_where_incremental_mapping_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    film(tmp_path, [camera.resized(240, 180) for camera in textured.rig()])
+    monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *_: {})
+    assert cli.main(["calibrate", str(tmp_path), "--shared-intrinsics"]) == 0
+    assert re.search(r"6 cameras, .* by\s+global\s+mapping", capsys.readouterr().out)
+    monkeypatch.setattr(pycolmap, "global_mapping", lambda *_: {})
+    with pytest.raises(ValueError, match="neither incremental nor global mapping by COLMAP found poses"):
+        calibrate(tmp_path, overwrite=True)
+
+
+def test_candidate__ranks_fitting_cameras_then_poses_then_the_error() -> None:
+    class Model:
+        def __init__(self, error: float) -> None:
+            self.compute_mean_reprojection_error = lambda: error
+
+    def rank(error: float, *fits: bool | None) -> tuple[int, int, float]:
+        return _Candidate("global", Model(error), tuple(CameraCheck("", 0, 0.0, each) for each in fits)).rank
+
+    ordered = [
+        rank(0.1, True, None, None),
+        rank(0.9, True, False, None),
+        rank(0.3, True, True, None),
+        rank(0.2, True, True, None),
+        rank(0.9, True, True, True),
+    ]
+    assert ordered == sorted(ordered)
+
+
+@pytest.mark.filterwarnings("error")
+def test_check__of_a_camera_without_points_does_not_fit() -> None:
+    check = _check("a", pycolmap.Image(), pycolmap.Reconstruction())
+    assert (check.matches, check.fits) == (0, False)
+    assert np.isnan(check.error)
+
+
+def test_calibrate__names_a_camera_with_another_scene(tmp_path: Path) -> None:
+    film(tmp_path, [camera.resized(240, 180) for camera in textured.rig()[1:5]])
+    noise = np.random.default_rng(1).integers(0, 255, (90, 120, 3), np.uint8)
+    write_video(tmp_path / "other.mkv", [cv2.resize(noise, (240, 180), interpolation=cv2.INTER_CUBIC)] * 2, 30)
+    with pytest.raises(
+        ValueError, match=r"to register all 5 cameras, got 4, without other: .* or accept the partial model"
+    ):
+        calibrate(tmp_path)
+    assert not (tmp_path / "sparse").exists()
+    with pytest.raises(ValueError, match="`without` must name cameras of cam1, cam2, cam3, cam4, other, got cam7"):
+        calibrate(tmp_path, without=["cam7"])
+    assert calibrate(tmp_path, without=["other"]).cameras == ("cam1", "cam2", "cam3", "cam4")
+    found = calibrate(tmp_path, CalibrateConfig(partial=True), overwrite=True)
+    assert (found.cameras, found.left_out) == (("cam1", "cam2", "cam3", "cam4"), ("other",))
+    assert found.error < 0.5
+    assert load_capture(tmp_path).names == found.cameras
+
+
+def test_calibrate__prints_a_verdict_per_camera(tmp_path: Path, capsys) -> None:
+    cameras = [camera.resized(240, 180) for camera in textured.rig(4)]
+    film(tmp_path, cameras)
+    shutil.copy(tmp_path / "cam1.mkv", tmp_path / "cam9.mkv")
+    noise = np.random.default_rng(1).integers(0, 255, (90, 120, 3), np.uint8)
+    write_video(tmp_path / "other.mkv", [cv2.resize(noise, (240, 180), interpolation=cv2.INTER_CUBIC)] * 2, 30)
+    assert cli.main(["calibrate", str(tmp_path), "--shared-intrinsics", "--partial"]) == 0
+    printed = capsys.readouterr()
+    rows = {name: rest for name, rest in re.findall(r"^ (\w+)  +(.*)$", printed.out, re.MULTILINE)}
+    for name in ("cam0", "cam2", "cam3"):
+        assert re.match(r"\d{3} +0\.\d\d +fits", rows[name])
+    assert re.match(r"\d{3} +0\.\d\d +does not fit", rows["cam9"])
+    assert re.match(r"0 +- +not checked", rows["other"])
+    assert "cam9 does not fit: it has the same pose as cam1: one clip seems to be a copy" in printed.err
+    assert "other not checked: it could not be registered and has no pose" in printed.err
+
+
+def test_calibrate__of_a_full_disk_leaves_no_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_colmap(tmp_path / "found", textured.rig(4), np.random.default_rng(0).normal(size=(60, 3)))
+    found, clips = pycolmap.Reconstruction(str(tmp_path / "found")), film(tmp_path / "clips", textured.rig(4))
+    checks = tuple(CameraCheck(camera.name, 60, 0.1, True) for camera in textured.rig(4))
+    monkeypatch.setattr("morgs_mi.studio.calibration.calibrate._match", lambda *_: None)
+    monkeypatch.setattr(
+        "morgs_mi.studio.calibration.calibrate._map", lambda *_: _Candidate("incremental", found, checks)
+    )
+    size = (tmp_path / "found" / "points3D.txt").stat().st_size
+    with pytest.raises(OSError, match=r"cannot write .*sparse, the partial output was removed"), files_end_at(size - 1):
+        calibrate(clips)
+    assert not (clips / "sparse").exists()
+
+
+def test_calibrate__refuses_an_unknown_camera_model(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"calibrate\(\): `camera_model` must be SIMPLE_PINHOLE, PINHOLE, .*'PIN'"):
+        calibrate(tmp_path, CalibrateConfig(camera_model="PIN"))
+
+
+@pytest.mark.parametrize("seed", [-1, 10**23])
+def test_calibrate__refuses_a_seed_that_colmap_does_not_take(tmp_path: Path, seed: int) -> None:
+    with pytest.raises(ValueError, match=rf"`seed` must be a number in \[0, 2147483647\], got {seed}"):
+        calibrate(tmp_path, CalibrateConfig(seed=seed))
+
+
+def test_calibrate__finds_no_features_in_transparent_pixels(tmp_path: Path) -> None:
+    planes = textured.textures()
+    for camera in (camera.resized(240, 180) for camera in textured.rig(2)):
+        image = cv2.cvtColor(textured.render(camera, planes), cv2.COLOR_RGB2BGRA)
+        image[:, 10:, 3] = 0
+        (tmp_path / camera.name).mkdir()
+        cv2.imwrite(str(tmp_path / camera.name / "0000.png"), image)
+    with pytest.raises(ValueError, match=r"expected at least 100 features in every view, got \d\d? in cam"):
+        calibrate(tmp_path)
+
+
+def test_frames__are_the_nearest_in_time_at_a_variable_frame_rate(tmp_path: Path) -> None:
+    for name, times in (("a", [0, 50, 100, 150, 200, 250, 300]), ("b", [0, 50, 100, 250, 300])):
+        write_timed_video(tmp_path / f"{name}.mp4", [np.full((48, 64, 3), t // 2, np.uint8) for t in times], times)
+    images, _ = _frames(tmp_path, CalibrateConfig(frame=5), ())
+    assert_close(images["b"].astype(float), images["a"], atol=2)
+    with pytest.raises(ValueError, match="frame 7 is not in the clips of a, b"):
+        _frames(tmp_path, CalibrateConfig(frame=7), ())
+
+
+def noise_clips(path: Path) -> None:
+    for name in ("a", "b", "c"):
+        noise = np.random.default_rng(ord(name)).integers(0, 255, (60, 80, 3), np.uint8)
+        write_video(path / f"{name}.mkv", [cv2.resize(noise, (160, 120), interpolation=cv2.INTER_CUBIC)], 30)
+
+
+def grey(path: Path) -> None:
+    noise_clips(path)
+    write_video(path / "b.mkv", [np.full((120, 160, 3), 90, np.uint8)], 30)
+
+
+def one_clip(path: Path) -> None:
+    noise_clips(path)
+    (path / "a.mkv").unlink()
+    (path / "c.mkv").unlink()
+
+
+def no_clip(path: Path) -> None:
+    path.mkdir()
+
+
+def calibrated(path: Path) -> None:
+    noise_clips(path)
+    (path / "sparse").mkdir()
+
+
+def empty_clip(path: Path) -> None:
+    noise_clips(path)
+    (path / "c.mkv").write_bytes(b"")
+
+
+@pytest.mark.parametrize(
+    ("build", "config", "error", "message"),
+    [
+        (lambda path: None, {}, FileNotFoundError, "expected a folder of clips, found none"),
+        (no_clip, {}, ValueError, "the clips of at least two cameras, found none"),
+        (one_clip, {}, ValueError, "the clips of at least two cameras, found b"),
+        (empty_clip, {}, ValueError, "c.mkv: expected a video, got an empty file"),
+        (calibrated, {}, FileExistsError, "sparse: expected no model, got one"),
+        (noise_clips, {"frame": 1}, ValueError, "frame 1 is not in the clips of a, b, c"),
+        (noise_clips, {"frame": -1}, ValueError, "frame -1 is not in the clips of a, b, c"),
+        (grey, {}, ValueError, "at least 100 features in every view, got 0 in b: too dark"),
+        (noise_clips, {}, ValueError, "no two of the 3 views match"),
+    ],
+)
+def test_calibrate__refuses_clips_that_cannot_be_calibrated(
+    tmp_path: Path, build, config: dict, error: type[Exception], message: str
+) -> None:
+    path = tmp_path / "clips"
+    build(path)
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(error, match=message):
+        calibrate(path, dataclasses.replace(CalibrateConfig(), **config))
+    assert sorted(tmp_path.rglob("*")) == before

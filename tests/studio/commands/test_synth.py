@@ -1,0 +1,41 @@
+"""`morgs-mi synth`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from morgs_mi.studio.synth.disturbances import load_disturbances
+from tests.cli.commands import assert_refused
+
+SIZE = ("--cameras", 2, "--frames", 2, "--width", 32, "--height", 24, "--spp", 1)
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "[]"])
+def test_synth__replaces_no_folder_with_a_hostile_description(tmp_path: Path, run, text: str) -> None:
+    (tmp_path / "capture.json").write_text(text)
+    assert_refused(run("synth", "arm", tmp_path, "--overwrite"), "is not a synthetic capture")
+
+
+def test_synth__renders_a_scene_with_disturbances(tmp_path: Path, run) -> None:
+    hard = ("--time-offset", 0.5, "--rolling-shutter", 0.4, "--jpeg-quality", 60)
+    status, _, error = run("synth", "spheres", tmp_path / "out", *SIZE, *hard)
+    assert status == 0, error
+    found = load_disturbances(tmp_path / "out" / "truth")
+    assert list(found) == ["cam00", "cam01"]
+    assert found["cam01"].time_offset != 0
+    assert (found["cam00"].rolling_shutter, found["cam00"].jpeg_quality) == (0.4, 60)
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (("spheres", "--rolling-shutter", 2), "--rolling-shutter must be at least 0 and at most 1, got 2.0"),
+        (("model.glb",), "no scene 'model.glb'; name one of"),
+    ],
+)
+def test_synth__names_wrong_options(tmp_path: Path, run, args: tuple, message: str) -> None:
+    scene, *options = args
+    assert_refused(run("synth", scene, tmp_path / "out", *SIZE, *options), message)
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,120 @@
+"""Live sources: iterators, pipes and anything that FFmpeg opens, processed like the rig's clips, in a loop."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import threading
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.capture.lens import Lens
+from morgs_mi.io.video_writer import write_video
+from morgs_mi.studio.live.live_frames import live_frames
+from tests.scenes import captures as layouts
+
+NAMES = ("cam1", "cam2", "cam3")
+
+
+@pytest.fixture
+def rig(tmp_path: Path, small_images: None) -> Capture:
+    """Three cameras at half size, the second with lens distortion."""
+    lenses = [Lens(), Lens("SIMPLE_RADIAL", (0.2,)), Lens()]
+    write_colmap(tmp_path / "rig/sparse/0", layouts.rig(NAMES), lenses=lenses)
+    for name in NAMES:
+        write_video(tmp_path / "rig" / f"{name}.mkv", clip(), 25)
+    return load_capture(tmp_path / "rig", downscale=2)
+
+
+def clip() -> list[np.ndarray]:
+    size = (3, layouts.HEIGHT, layouts.WIDTH, 3)
+    return list(np.random.default_rng(3).integers(0, 256, size, np.uint8))
+
+
+def assert_as_recorded(rig: Capture, frames) -> None:
+    for live, recorded in zip(frames, rig.frames(), strict=True):
+        assert live.index == recorded.index
+        for a, b in zip(live.images, recorded.images, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+def test_live_frames__process_iterators_pipes_and_files_like_clips(rig: Capture, tmp_path: Path) -> None:
+    np.array(clip()).tofile(tmp_path / "raw")
+    program = f"import sys; sys.stdout.buffer.write(open({str(tmp_path / 'raw')!r}, 'rb').read())"
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) as process:
+        assert_as_recorded(rig, live_frames(rig, [iter(clip()), process.stdout, rig.path / "cam3.mkv"]))
+
+
+def test_live_frames__read_a_named_pipe_while_it_is_written(rig: Capture, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    data = (rig.path / "cam1.mkv").read_bytes()
+    writer = threading.Thread(target=(tmp_path / "pipe").write_bytes, args=(data,), daemon=True)
+    writer.start()
+    assert_as_recorded(rig, live_frames(rig, [tmp_path / "pipe", clip(), clip()]))
+    writer.join(timeout=5)
+
+
+def test_live_frames__leave_out_a_source_that_misses_an_instant_or_ends(rig: Capture) -> None:
+    a, b, c = clip()
+    frames = list(live_frames(rig, [[a, None, c], [a, b], clip()]))
+    assert [[image is not None for image in frame.images] for frame in frames] == [[1, 1, 1], [0, 1, 1], [1, 0, 1]]
+    assert [frame.problems for frame in frames] == [(), ("cam1: no image",), ("cam2: no image",)]
+
+
+def test_live_frames__read_an_endless_source(rig: Capture) -> None:
+    def endless():
+        while True:
+            yield clip()[0]
+
+    assert len(list(islice(live_frames(rig, [endless()] * 3, newest=True), 5))) == 5
+
+
+@pytest.mark.parametrize(
+    ("sources", "error", "message"),
+    [
+        ([[]], ValueError, r"`sources` must be one for each of 3 cameras \(cam1, cam2, cam3\), got 1"),
+        ([63, [], []], OSError, "cannot open the source 63; check that it exists and is not in use"),
+        ([[], [], "/nowhere/cam.sdp"], OSError, "cannot open the source /nowhere/cam.sdp"),
+        ([[np.zeros((8, 8, 3), np.uint8)], [], []], ValueError, r"of cam1 must be uint8 \[46, 62, 3\] as in its clip"),
+    ],
+)
+def test_live_frames__refuse_bad_sources(rig: Capture, sources, error, message: str) -> None:
+    with pytest.raises(error, match=message):
+        list(live_frames(rig, sources))
+
+
+def test_live_page__loop_runs(rig: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loop over live frames in docs/live.md, with raw pipes in place of FFmpeg's."""
+    text = (Path(__file__).parents[3] / "docs" / "live.md").read_text(encoding="utf-8")
+    *_, example = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    reads, pushed = iter(NAMES), []
+
+    def popen(command, stdout):
+        assert command[0] == "ffmpeg"
+        read, write = os.pipe()
+        next(reads)
+        threading.Thread(target=lambda: os.fdopen(write, "wb").write(np.array(clip()).tobytes()), daemon=True).start()
+        return type("Process", (), {"stdout": os.fdopen(read, "rb")})
+
+    class Loop:
+        def __init__(self, cameras, points, colors, config=None, masks=None):
+            assert len(cameras) == len(masks) == 3
+
+        def push(self, images):
+            pushed.append(images)
+            return None, type("Report", (), {"frame": len(pushed) - 1, "missing_views": (), "seconds": 0.0})
+
+    monkeypatch.setattr("subprocess.Popen", popen)
+    monkeypatch.setattr("morgs_mi.StreamLoop", Loop)
+    monkeypatch.setattr("morgs_mi.load_capture", lambda path, downscale: rig)
+    monkeypatch.setattr("mitsuba.set_variant", lambda name: None)
+    exec(compile(example, "live.md", "exec"), {})
+    assert len(pushed) == 3
+    assert all(image.shape == (23, 31, 3) for image in pushed[0])

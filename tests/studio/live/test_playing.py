@@ -1,0 +1,136 @@
+"""Videos that are played side by side: at their speed, at one time, again and again."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from threading import Event, Thread
+
+import numpy as np
+import pytest
+
+from morgs_mi.io.video_writer import write_video
+from morgs_mi.studio.live import playing as module
+from morgs_mi.studio.live.live_config import LiveConfig
+from morgs_mi.studio.live.playing import ClipClock, is_video, play
+from morgs_mi.studio.live.sources import open_feed
+
+
+def clip(path: Path, count: int, fps: float = 50) -> Path:
+    """Write a video of grey images, each ten levels brighter than the one before."""
+    write_video(path, [np.full((16, 16, 3), 10 * k, np.uint8) for k in range(count)], fps)
+    return path
+
+
+def played(paths: list[Path], count: int, loop: bool) -> list[list[tuple[float, int]]]:
+    """Return the time and the number of the first images of each clip."""
+    clock, found, start = ClipClock(len(paths)), [[] for _ in paths], time.monotonic()
+
+    def read(k: int) -> None:
+        for image in islice(play(paths[k], clock, Event(), k, loop), count):
+            found[k].append((time.monotonic() - start, int(image[0, 0, 0]) // 10))
+
+    threads = [Thread(target=read, args=(k,), daemon=True) for k in range(len(paths))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(20)
+    return found
+
+
+def test_play__plays_a_clip_once_at_its_own_speed(tmp_path: Path) -> None:
+    (found,) = played([clip(tmp_path / "a.mkv", 6, fps=20)], 99, loop=False)
+    times, numbers = zip(*found, strict=True)
+    assert numbers == (0, 1, 2, 3, 4, 5)
+    assert times[-1] - times[0] >= 5 / 20 - 0.01
+    assert np.all(np.diff(times) > 0.02), "not all at once"
+
+
+def test_play__repeats_clips_together_after_the_shortest(tmp_path: Path) -> None:
+    a, b, c = played([clip(tmp_path / f"{n}.mkv", n, fps) for n, fps in ((6, 50), (9, 50), (5, 25))], 20, loop=True)
+    assert [number for _, number in a] == [*range(6)] * 3 + [0, 1]
+    assert [number for _, number in b] == [number for _, number in a], "without its last three"
+    assert [number for _, number in c] == [0, 1, 2] * 6 + [0, 1], "at half the rate, without its last two"
+    starts = [np.array([time for time, number in found if number == 0][:4]) for found in (a, b, c)]
+    assert np.abs(starts - starts[0]).max() < 0.019, "within an interval"
+
+
+def test_play__waits_for_a_clip_that_is_decoded_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = {"slow": 0, "fast": 0}
+
+    def timed(path: str) -> Iterator[tuple[np.ndarray, float, float]]:
+        for k in range(20):
+            if path == "slow":
+                time.sleep(0.02)
+            yield np.zeros((2, 2, 3), np.uint8), k / 100, 1 / 100
+
+    monkeypatch.setattr(module, "_timed", timed)
+    clock, ahead = ClipClock(2), []
+
+    def read(k: int, path: str) -> None:
+        for _ in play(path, clock, Event(), k):
+            shown[path] += 1
+            ahead.append(shown["fast"] - shown["slow"])
+
+    threads = [Thread(target=read, args=item, daemon=True) for item in enumerate(shown)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(20)
+    assert shown == {"slow": 20, "fast": 20}
+    assert np.abs(ahead).max() <= 2
+
+
+def test_play__ends_when_it_is_closed(tmp_path: Path) -> None:
+    """Also while it waits for another clip, which has not begun."""
+    closed = Event()
+    reader = Thread(
+        target=list, args=(play(clip(tmp_path / "a.mkv", 3), ClipClock(2), closed, loop=True),), daemon=True
+    )
+    reader.start()
+    time.sleep(0.2)
+    assert reader.is_alive()
+    closed.set()
+    reader.join(1)
+    assert not reader.is_alive()
+
+
+def test_play__refuses_what_has_no_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "text.mkv").write_text("no video")
+    with pytest.raises(OSError, match=r"cannot open the source .*text.mkv; check"):
+        next(play(tmp_path / "text.mkv", ClipClock(), Event()))
+    monkeypatch.setattr(module, "_timed", lambda _: iter(()))
+    with pytest.raises(OSError, match=r"expected images in empty.mkv, found none; check"):
+        next(play("empty.mkv", ClipClock(), Event(), loop=True))
+
+
+def test_is_video__is_not_the_description_of_a_stream(tmp_path: Path) -> None:
+    for name in ("clip.mp4", "cam.sdp"):
+        (tmp_path / name).touch()
+    sources = (tmp_path / "clip.mp4", str(tmp_path / "cam.sdp"), tmp_path, tmp_path / "nowhere.mp4", 0)
+    assert [is_video(source) for source in sources] == [True, False, False, False, False]
+
+
+def test_open_feed__repeats_videos_alone() -> None:
+    with pytest.raises(
+        ValueError, match=r"`loop` repeats videos, got none in 2 \(0, rtsp://10.0.0.10/live\); leave it"
+    ):
+        open_feed([0, "rtsp://10.0.0.10/live"], LiveConfig(loop=True))
+
+
+@pytest.mark.parametrize("loop", [False, True])
+def test_open_feed__of_videos_begins_with_their_first_images(tmp_path: Path, loop: bool) -> None:
+    feed = open_feed([clip(tmp_path / f"{k}.mkv", 10) for k in range(2)], LiveConfig(timeout=1, loop=loop))
+    try:
+        bundle = first = feed.newest()
+        assert first is not None
+        assert max(first.numbers) < 8, "without a time to adjust the exposure"
+        while bundle is not None and bundle.numbers[0] < 25:
+            bundle = feed.newest(bundle)
+        assert (bundle is None) != loop
+        if bundle is None:
+            assert feed.ended() == "cam0, cam1: it has ended; --loop repeats videos"
+    finally:
+        feed.close()

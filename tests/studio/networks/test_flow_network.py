@@ -1,0 +1,112 @@
+"""Flow networks: order, channels, range, padding and scale of inputs and outputs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from morgs_mi.method.flow_sources.flow_registry import FramePair, flow_source
+from morgs_mi.studio.networks.flow_network import FlowNetwork
+from tests.assertions import assert_close
+from tests.scenes.tiny_network import export, export_lookup, known_flow
+
+# Float32 sums of six products of up to 255 each.
+TOLERANCE = 1e-3
+
+
+@pytest.fixture(scope="module")
+def network(tmp_path_factory):
+    return export(tmp_path_factory.mktemp("network") / "tiny.onnx")
+
+
+def image_pair(height, width):
+    return np.random.default_rng(height).integers(0, 255, (2, height, width, 3), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("size", [(32, 48), (40, 24), (17, 31), (90, 50), (33, 33)])
+def test_flow_network__returns_the_known_flow_at_any_size(network, size):
+    image, other = image_pair(*size)
+    flow = FlowNetwork(network)(image, other)
+    assert flow.shape == (*size, 2)
+    assert flow.dtype == np.float32
+    assert_close(flow, known_flow(image, other), atol=TOLERANCE)
+
+
+@pytest.mark.parametrize(("kind", "low", "high"), [("onnx", 0, 255), ("onnx-unit", 0, 1), ("onnx-signed", -1, 1)])
+def test_flow_source__runs_a_network_both_ways_in_its_value_range(network, kind, low, high):
+    image, previous = image_pair(24, 40)
+    back, forward_flow = flow_source(f"{kind}:{network}")(FramePair(image, previous))
+    a, b = (low + (high - low) / 255 * each.astype(float) for each in (image, previous))
+    assert_close(back, known_flow(a, b), atol=TOLERANCE)
+    assert_close(forward_flow, known_flow(b, a), atol=TOLERANCE)
+    floats = flow_source(f"{kind}:{network}")(FramePair(image / 255, previous / 255))
+    assert_close(floats[0], back, atol=TOLERANCE)
+
+
+def test_flow_network__of_fixed_size_resizes_images_and_flow(tmp_path):
+    # Away from the border, resizing does not change colours that vary linearly.
+    y, x = np.mgrid[:60, :100] / 100
+    image, other = np.stack([x, y, x + y], -1) / 2, np.stack([y, x, x], -1) / 2
+    flow = FlowNetwork(export(tmp_path / "fixed.onnx", 32, 40), 0, 1)(image, other)
+    expected = known_flow(image, other) * (100 / 40, 60 / 32)
+    assert flow.shape == (60, 100, 2)
+    assert_close(flow[5:-5, 5:-5], expected[5:-5, 5:-5], atol=0.01)
+
+
+def bad(tmp_path, name):
+    """Return the path of a file that is not a flow network."""
+    path = tmp_path / f"{name}.onnx"
+    content = {"text": b"not a network, but long enough to look like one", "empty": b""}
+    if name in content:
+        path.write_bytes(content[name])
+    elif name == "cut":
+        path.write_bytes(export(path).read_bytes()[:-40])
+    elif name == "three":
+        export(path, inputs=3)
+    elif name == "one":
+        export(path, inputs=1)
+    elif name == "half":
+        export(path, height=64)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "exception", "message"),
+    [
+        ("missing", FileNotFoundError, "missing.onnx: expected an ONNX file, found none"),
+        (
+            "text",
+            ValueError,
+            r"text.onnx: onnxruntime .* cannot load this network \(.*\); .* or use its flow from",
+        ),
+        ("empty", ValueError, "empty.onnx: onnxruntime .* cannot load this network"),
+        ("cut", ValueError, "cut.onnx: onnxruntime .* cannot load this network"),
+        ("one", ValueError, r"two images \[1, 3, H, W\] as its inputs, got \[1, 3, \?, \?\];"),
+        ("three", ValueError, r"two images .* and \[1, 3, \?, \?\] and"),
+        ("half", ValueError, r"both fixed or both open, got \[1, 3, 64, \?\]"),
+    ],
+)
+def test_flow_source__rejects_a_file_that_is_not_a_flow_network(tmp_path, name, exception, message):
+    path = bad(tmp_path, name)
+    with pytest.raises(exception, match=message):
+        flow_source(f"onnx:{path}")
+
+
+def test_flow_network__rejects_an_output_that_is_not_flow(tmp_path):
+    path = export(tmp_path / "scalar.onnx", channels=1)
+    with pytest.raises(ValueError, match=r"output \[1, 2, 16, 24\], the flow, got \[1, 1, 2, 3\] and \[1, 1, 16, 24\]"):
+        FlowNetwork(path)(*image_pair(16, 24))
+
+
+def test_flow_network__names_the_file_where_it_fails(network, monkeypatch):
+    monkeypatch.setattr("morgs_mi.studio.networks.flow_network._MULTIPLE", 1)
+    with pytest.raises(ValueError, match=r"tiny\.onnx: onnxruntime .* on image1 \[1, 3, 20, 30\], image2 .*from files"):
+        FlowNetwork(network)(*image_pair(20, 30))
+
+
+def test_flow_network__runs_the_lookup_of_raft(tmp_path):
+    image, other = image_pair(24, 40)
+    path = export_lookup(tmp_path / "lookup.onnx", 24, 40)
+    expected = 0.5 * (other[::-1, ::-1, :2].astype(float) - image[..., :2])
+    # With grid coordinates in float32, a lookup is up to 1e-5 px off its pixel.
+    assert_close(FlowNetwork(path)(image, other), expected, atol=0.01)

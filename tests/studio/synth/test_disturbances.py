@@ -1,0 +1,232 @@
+"""Disturbances: what is drawn, what is stored, and recordings that show exactly what the truth states."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.lens import Lens
+from morgs_mi.capture.truth import load_tracks, load_truth
+from morgs_mi.core.color_space import decode_light
+from morgs_mi.io.video import open_frames
+from morgs_mi.studio.synth.disturbances import (
+    CameraDisturbance,
+    Disturbances,
+    compressed,
+    draw_disturbances,
+    load_disturbances,
+    save_disturbances,
+    undistorted,
+)
+from morgs_mi.studio.synth.path_tracer import PathTracer, srgb_bytes
+from morgs_mi.studio.synth.scene import Light, Object, Rig, Scene, load_scene, translate
+from morgs_mi.studio.synth.shapes import box
+from morgs_mi.studio.synth.synth_config import SynthConfig
+from morgs_mi.studio.synth.synthesize import synthesize
+from tests.assertions import assert_close
+from tests.studio.synth.frames import FPS, psnr
+
+ALL = Disturbances(0.5, 0.4, 0.2, 0.1, 0.02, 0.1, 80)
+SIZE = SynthConfig(cameras=2, frames=2, width=64, height=48, spp=4)
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scene `spheres` without disturbances."""
+    return synthesize("spheres", tmp_path_factory.mktemp("synth") / "clip", SIZE)
+
+
+def frame_of(clip: Path, camera: str, frame: int) -> np.ndarray:
+    return list(open_frames(clip / "frames" / camera).frames())[frame]
+
+
+def test_draw_disturbances__stays_within_its_bounds_and_leaves_the_reference_alone() -> None:
+    drawn = draw_disturbances(ALL, 200, 5, seed=1)
+    first, *others = drawn
+    assert first.time_offset == 0
+    assert first.gains == (1.0,) * 5
+    offsets = np.array([d.time_offset for d in others])
+    gains = np.array([d.gains for d in others])
+    lenses = np.array([d.distortion for d in drawn])
+    assert 0.4 < np.abs(offsets).max() <= 0.5
+    assert offsets.min() < 0 < offsets.max()
+    assert 0.08 < np.abs(lenses).max() <= 0.1
+    assert 0.1 < np.log(gains[:, 0]).max() < np.log(1.2) + 4 * 0.02
+    second = np.log(gains[:, 2:] * gains[:, :-2] / gains[:, 1:-1] ** 2)  # without gain and drift
+    assert abs(second.std() / (0.02 * np.sqrt(6)) - 1) < 0.15
+    assert {(d.rolling_shutter, d.jpeg_quality) for d in drawn} == {(0.4, 80)}
+
+
+@pytest.mark.parametrize("name", [field.name for field in fields(Disturbances)])
+def test_draw_disturbances__a_setting_acts_and_changes_nothing_else(name: str) -> None:
+    own = {
+        "time_offset": "time_offset",
+        "rolling_shutter": "rolling_shutter",
+        "distortion": "distortion",
+        "jpeg_quality": "jpeg_quality",
+    }.get(name, "gains")
+    none, one, every = (
+        draw_disturbances(d, 3, 4, 0) for d in (Disturbances(), Disturbances(**{name: getattr(ALL, name)}), ALL)
+    )
+    for field in fields(CameraDisturbance):
+        before, found, expected = ([getattr(d, field.name) for d in drawn] for drawn in (none, one, every))
+        assert (found != before) == (field.name == own)
+        if field.name == own != "gains":
+            assert found == expected
+
+
+def test_row_times__surround_the_time_of_the_frame() -> None:
+    own = CameraDisturbance(0.25, 0.5, (1.0,), 0.0, 0)
+    times = own.row_times(3, 48)
+    assert_close(times.mean(), 3.25, atol=1e-12)
+    assert_close(np.diff(times), np.full(47, 0.5 / 48), atol=1e-12)
+
+
+def test_load_disturbances__reads_back_what_was_saved(tmp_path: Path) -> None:
+    drawn = dict(zip(("cam00", "cam01"), draw_disturbances(ALL, 2, 3, 0), strict=True))
+    save_disturbances(tmp_path, drawn)
+    assert load_disturbances(tmp_path) == drawn
+
+
+def test_load_disturbances__names_a_missing_or_broken_file(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"no file .*disturbances\.json; pass the truth folder"):
+        load_disturbances(tmp_path)
+    for text in ('{"cam00": {}}', '{"cam00": {"gains": 3}}', "[]", '{"cam00": {"gains": [], "x": 1}}'):
+        (tmp_path / "disturbances.json").write_text(text)
+        with pytest.raises(ValueError, match="expected the disturbances of each camera, got a broken file"):
+            load_disturbances(tmp_path)
+
+
+def test_draw_disturbances__refuses_values_out_of_range() -> None:
+    for name, value in (("time_offset", -1), ("rolling_shutter", 1.5), ("distortion", 2), ("jpeg_quality", 101)):
+        with pytest.raises(ValueError, match=rf"draw_disturbances\(\): `{name}` must be at least 0.*, got {value}"):
+            draw_disturbances(Disturbances(**{name: value}), 2, 1, 0)
+
+
+@pytest.mark.parametrize("k", [-0.3, 0.4])
+def test_undistorted__is_the_inverse_of_the_lens(k: float) -> None:
+    camera = Rig().cameras(2, 64, 48)[0]
+    pixels = np.random.default_rng(0).uniform(0, (64, 48), (50, 2))
+    there = undistorted(camera, Lens("SIMPLE_RADIAL", (k,)), pixels)
+    local = np.append((there - camera.K[:2, 2]) / camera.K[0, 0], np.ones((50, 1)), axis=1)
+    back = cv2.projectPoints(local, np.zeros(3), np.zeros(3), camera.K, np.array([k, 0, 0, 0.0]))[0][:, 0]
+    assert_close(back, pixels, atol=1e-6)
+    assert np.abs(there - pixels).max() > 0.5
+
+
+def test_synthesize__shows_a_camera_with_a_time_offset_at_its_own_time(tmp_path: Path) -> None:
+    """The motion of a camera's truth leads between its own times; tracks are at the reference's times."""
+    clip = synthesize("arm", tmp_path / "clip", replace(SIZE, disturbances=Disturbances(time_offset=2)))
+    offset = load_disturbances(clip / "truth")["cam01"].time_offset
+    assert abs(offset) > 0.2
+    scene = load_scene("arm")
+    tracer, camera = PathTracer(scene), scene.rig.cameras(2, 64, 48)[1]
+    tracer.set_time((1 + offset) / FPS)
+    seed = int(np.random.SeedSequence([0, 1, 1]).generate_state(1)[0])
+    np.testing.assert_array_equal(frame_of(clip, "cam01", 1), tracer.render(camera, 4, seed))
+    truth, surface = load_truth(clip / "truth", "cam01", 1), tracer.surface_points(camera)
+    assert_close(truth.depth, camera.project(surface.positions)[1], atol=1e-5)
+    tracks = load_tracks(clip / "truth")
+    hand = list(scene.objects).index("hand")
+    pose, points = scene.objects["hand"].pose, tracks.points[tracks.ids == hand]
+    moved = points[:, 0] @ (pose(1 / FPS) @ np.linalg.inv(pose(0.0)))[:3, :3].T
+    moved += (pose(1 / FPS) @ np.linalg.inv(pose(0.0)))[:3, 3]
+    assert_close(points[:, 1], moved, atol=1e-6)
+
+
+def bar_scene(speed: float) -> Scene:
+    """A bright vertical bar that moves along x, in front of nothing, in constant light."""
+    bar = Object(
+        {"bar": box((0, 0, 0), (0.1, 3, 0.02), {"type": "diffuse", "reflectance": 0.8})},
+        lambda t: translate(speed * t, 0, 0),
+    )
+    rig = Rig(center=(0, 0, 0), distance=4.0, elevation=0.0, spread=(1.0, 1.0))
+    sky = Light({"type": "directional", "direction": [0, 0, -1], "irradiance": 2.0})
+    return Scene("bar", {"bar": bar}, {"sky": sky}, rig)
+
+
+def test_synthesize__reads_the_rows_of_a_rolling_shutter_at_their_times(tmp_path: Path) -> None:
+    """A vertical bar is slanted: in every row, its middle is where the bar is at the time of that row."""
+    scene = bar_scene(speed=6.0)
+    config = replace(SIZE, width=128, height=64, disturbances=Disturbances(rolling_shutter=0.8))
+    clip = synthesize(scene, tmp_path / "clip", config)
+    own, camera = load_disturbances(clip / "truth")["cam00"], scene.rig.cameras(2, 128, 64)[0]
+    image = frame_of(clip, "cam00", 1).astype(float).mean(axis=-1)
+    found = (image * (np.arange(128) + 0.5)).sum(axis=1) / image.sum(axis=1)
+    bar = np.stack([6.0 * own.row_times(1, 64) / FPS, np.zeros(64), np.full(64, 0.02)], axis=1)
+    expected = camera.project(bar)[0][:, 0]
+    assert np.ptp(expected) > 5
+    assert np.abs(found - expected).max() < 0.5
+    truth = load_truth(clip / "truth", "cam00", 1)
+    middle = (truth.mask * (np.arange(128) + 0.5)).sum(axis=1) / truth.mask.sum(axis=1)
+    assert np.ptp(middle) < 1e-9, "the truth is that of one time"
+    assert abs(middle[0] - expected.mean()) < 0.7
+
+
+def test_synthesize__undistorted_images_are_those_of_the_pinhole_cameras(tmp_path: Path) -> None:
+    config = replace(SIZE, width=96, height=72, spp=16, frames=1, disturbances=Disturbances(distortion=0.4))
+    clip = synthesize("spheres", tmp_path / "clip", config)
+    assert abs(load_disturbances(clip / "truth")["cam01"].distortion) > 0.1
+    assert not (clip / "poses_bounds.npy").exists(), "it cannot hold a lens"
+    scene, capture = load_scene("spheres"), load_capture(clip)
+    tracer, camera = PathTracer(scene), scene.rig.cameras(2, 96, 72)[1]
+    expected, recorded = tracer.render(camera, 16, 0), frame_of(clip, "cam01", 0)
+    mask = np.ones(expected.shape[:2], bool) if capture.masks[1] is None else capture.masks[1]
+    found = next(capture.frames()).images[1]
+    assert psnr(found[mask], expected[mask]) > psnr(recorded[mask], expected[mask]) + 4
+    assert psnr(found[mask], expected[mask]) > 28
+    truth, surface = load_truth(clip / "truth", "cam01", 0), tracer.surface_points(camera)
+    np.testing.assert_array_equal(truth.ids, surface.ids)
+    assert_close(capture.cameras[1].K, camera.K, atol=1e-6)
+
+
+def test_synthesize__refuses_a_lens_that_folds_its_corners(tmp_path: Path) -> None:
+    scene = bar_scene(0.0)
+    wide = Scene("wide", scene.objects, scene.lights, Rig(center=(0, 0, 0), fov=80, elevation=0))
+    with pytest.raises(ValueError, match="`distortion` must be small enough for the field of view, got -0"):
+        synthesize(wide, tmp_path / "clip", replace(SIZE, cameras=8, disturbances=Disturbances(distortion=0.5)))
+
+
+def test_synthesize__exposes_frames_with_the_gains_of_the_truth(clean: Path, tmp_path: Path) -> None:
+    hard = Disturbances(exposure_gain=0.3, exposure_drift=0.2, exposure_flicker=0.1)
+    dimmed = synthesize("spheres", tmp_path / "clip", replace(SIZE, disturbances=hard))
+    gains = load_disturbances(dimmed / "truth")
+    for camera in ("cam00", "cam01"):
+        for frame in (0, 1):
+            before, after = (decode_light(frame_of(c, camera, frame) / 255.0) for c in (clean, dimmed))
+            usable = (before > 0.1) & (after > 0.1) & (before < 0.8) & (after < 0.95)
+            assert_close(np.median(after[usable] / before[usable]), gains[camera].gains[frame], rtol=0.01)
+    assert gains["cam00"].gains == (1.0, 1.0)
+    assert gains["cam01"].gains[0] != gains["cam01"].gains[1]
+
+
+def test_synthesize__compresses_every_image(clean: Path, tmp_path: Path) -> None:
+    lossy = synthesize("spheres", tmp_path / "clip", replace(SIZE, disturbances=Disturbances(jpeg_quality=30)))
+    whole, found = frame_of(clean, "cam01", 1), frame_of(lossy, "cam01", 1)
+    np.testing.assert_array_equal(found, compressed(whole, 30))
+    assert 18 < psnr(found, whole) < 40
+    np.testing.assert_array_equal(compressed(whole, 0), whole)
+
+
+def test_light_of_rows__agrees_with_the_image_of_the_sensor() -> None:
+    """All rows without a lens are the image of Mitsuba's sensor up to sampling noise."""
+    scene = load_scene("spheres")
+    tracer, camera = PathTracer(scene), scene.rig.cameras(2, 64, 48)[1]
+    expected = tracer.render(camera, 100, 1)
+    found = srgb_bytes(tracer.light_of_rows(camera, np.arange(48), 100, 2, None))
+    assert psnr(found, expected) > 38
+    some = srgb_bytes(tracer.light_of_rows(camera, np.arange(10, 20), 100, 3, None))
+    assert psnr(some, expected[10:20]) > 38
+
+
+def test_synthesize__checks_a_scene_at_all_times_that_are_recorded(tmp_path: Path) -> None:
+    """A pose that fails before 0 s, when a rolling shutter reads the first rows of the first frame."""
+    late = bar_scene(0.0).objects["bar"].shapes
+    scene = Scene("late", {"bar": Object(late, lambda t: translate(1 / (t >= 0), 0, 0))}, {}, Rig())
+    with pytest.raises(ValueError, match=r"object 'bar': its pose at -0\.0083.* s fails with ZeroDivisionError"):
+        synthesize(scene, tmp_path / "clip", replace(SIZE, height=1000, disturbances=Disturbances(rolling_shutter=0.5)))

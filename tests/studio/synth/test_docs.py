@@ -1,0 +1,73 @@
+"""The example of docs/scenes.md is rendered as the page describes."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morgs_mi import cli
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.truth import load_truth
+from morgs_mi.studio.synth.disturbances import Disturbances, load_disturbances
+
+TEXT = (Path(__file__).parents[3] / "docs" / "scenes.md").read_text(encoding="utf-8")
+BLOCK = re.compile(r"<!-- (file [^ ]+|run) -->\n```\w+\n(.*?)```", re.DOTALL)
+
+
+def write_example(folder: Path) -> Path:
+    """Write the files of the page and run its script in `folder`; return the scene file."""
+    for directive, text in BLOCK.findall(TEXT):
+        if directive == "run":
+            exec(compile(text, "docs/scenes.md", "exec"), {})
+        else:
+            (folder / directive.removeprefix("file ")).write_text(text)
+    return folder / "gem.py"
+
+
+def test_scenes_page__example_is_rendered_with_its_mesh_and_texture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    scene = write_example(tmp_path)
+    size = ("--cameras", "2", "--frames", "2", "--width", "64", "--height", "48", "--spp", "4")
+    assert cli.main(["synth", str(scene), "out", *size]) == 0
+    capture = load_capture("out")
+    image = next(capture.frames()).images[0]
+    truth = load_truth("out/truth", "cam00", 1)
+    gem = truth.ids == 4
+    assert gem.sum() > 40
+    assert truth.mask[gem].all()
+    assert np.linalg.norm(truth.motion[gem], axis=-1).mean() > 0.2
+    assert image[load_truth("out/truth", "cam00", 0).ids == 4].std(0).min() > 10, "the tiles are visible"
+
+
+SMALL = ("--cameras", "2", "--frames", "2", "--width", "32", "--height", "24", "--spp", "1")
+COMMANDS = [line.split() for line in re.findall(r"^    morgs-mi (synth .+)", TEXT, re.MULTILINE)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", [c for c in COMMANDS if "gem.py" not in c[1]], ids=" ".join)
+def test_scenes_page__commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: list[str]) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "out").mkdir()
+    assert cli.main([*command, *SMALL]) == 0
+    assert load_disturbances(Path(command[2]) / "truth")
+
+
+def test_scenes_page__lists_every_disturbance() -> None:
+    listed = re.findall(r"^\| `--(.+?)` \|", TEXT, re.MULTILINE)
+    assert listed == ["noise", *(field.name.replace("_", "-") for field in fields(Disturbances))]
+
+
+def test_scenes_page__lists_the_files_of_a_capture(clip: Path) -> None:
+    listed = {
+        name.split("/")[0]
+        for name in re.findall(r"^\| (.+?) \|", TEXT, re.MULTILINE)
+        for name in re.findall(r"`([^`]+)`", name)
+    }
+    files = {name for name in listed if not name.startswith("--")}
+    assert files - {"cam00.mp4"} == {f.name for f in clip.iterdir() if f.suffix != ".mp4"}

@@ -1,0 +1,244 @@
+"""Synthetic captures: their files, and the scenes that are refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.layouts.colmap import read_colmap
+from morgs_mi.capture.layouts.poses_bounds import read_poses_bounds
+from morgs_mi.capture.truth import load_truth
+from morgs_mi.io.video import open_frames
+from morgs_mi.studio.synth.path_tracer import PathTracer
+from morgs_mi.studio.synth.scene import Light, Object, Scene, load_scene
+from morgs_mi.studio.synth.synth_config import SynthConfig
+from morgs_mi.studio.synth.synthesize import synthesize
+from morgs_mi.studio.synth.textures import lights, textured
+from tests.assertions import assert_close
+from tests.studio.synth.frames import FPS, psnr
+
+TINY = SynthConfig(cameras=2, frames=1, width=16, height=16, spp=1)
+
+
+def test_synthesize__writes_the_layout_of_n3dv_with_a_colmap_model(clip):
+    about = json.loads((clip / "capture.json").read_text())
+    assert about["test_view"] == 0
+    assert (about["fps"], about["num_frames"], about["seed"]) == (30.0, 3, 0)
+    names = [f"cam{i:02d}" for i in range(3)]
+    cameras, bounds = read_poses_bounds(clip / "poses_bounds.npy", names)
+    model = read_colmap(clip / "sparse" / "0")
+    expected = load_scene("arm").rig.cameras(3, 64, 48)
+    for ours, theirs, colmaps in zip(expected, cameras, model.cameras, strict=True):
+        assert_close(theirs.viewmat, ours.viewmat, atol=1e-6)
+        assert_close(colmaps.viewmat, ours.viewmat, atol=1e-6)
+        np.testing.assert_allclose(colmaps.K, ours.K)
+        assert colmaps.name == f"{ours.name}.png"
+    assert (bounds[:, 0] > 0).all()
+    assert (bounds[:, 1] > bounds[:, 0]).all()
+    for name in names:
+        assert open_frames(clip / f"{name}.mp4").num_frames == 3
+        assert len(list((clip / "frames" / name).glob("*.png"))) == 3
+        assert len(list((clip / "truth" / name).glob("*.exr"))) == 3
+
+
+def test_synthesize__lossless_frames_equal_the_rendered_images(clip):
+    scene = load_scene("arm")
+    tracer = PathTracer(scene)
+    tracer.set_time(1 / FPS)
+    noise = int(np.random.SeedSequence([0, 1, 1]).generate_state(1)[0])
+    image = tracer.render(scene.rig.cameras(3, 64, 48)[1], 4, noise)
+    stored = list(open_frames(clip / "frames" / "cam01").frames())[1]
+    np.testing.assert_array_equal(stored, image)
+
+
+def test_synthesize__colmap_points_lie_on_the_surface_within_their_noise(clip):
+    model = read_colmap(clip / "sparse" / "0")
+    assert len(model.points) > 1000
+    best = np.full(len(model.points), np.inf)
+    for camera in load_scene("arm").rig.cameras(3, 64, 48)[1:]:
+        depth = load_truth(clip / "truth", camera.name, 0).depth
+        pixels, z = camera.project(model.points.astype(float))
+        col, row = np.clip(np.floor(pixels).astype(int), 0, [63, 47]).T
+        footprint = z / camera.K[0, 0]
+        best = np.minimum(best, np.abs(z - depth[row, col]) / footprint)
+    # Half a pixel of noise, and a surface that may slope by up to a pixel's width.
+    assert np.median(best) < 1
+    assert np.percentile(best, 95) < 4
+
+
+def test_synthesize__replaces_a_folder_of_system_files_but_no_hidden_ones(tmp_path):
+    (tmp_path / "repository" / ".git").mkdir(parents=True)
+    with pytest.raises(FileExistsError, match="not empty; choose another folder"):
+        synthesize("spheres", tmp_path / "repository", TINY)
+    (tmp_path / "new" / "__MACOSX").mkdir(parents=True)
+    (tmp_path / "new" / ".DS_Store").touch()
+    synthesize("spheres", tmp_path / "new", TINY)
+    assert (tmp_path / "new" / "capture.json").is_file()
+
+
+def test_synthesize__rejects_a_non_empty_folder_and_replaces_a_capture_with_overwrite(tmp_path, clip):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match="not empty; choose another folder"):
+        synthesize("spheres", tmp_path, TINY)
+    for content in (None, "{", '{"layout": "COLMAP"}'):  # the last belongs to a fit; a recording may have one too
+        if content is not None:
+            (tmp_path / "capture.json").write_text(content)
+        with pytest.raises(FileExistsError, match="is not a synthetic capture"):
+            synthesize("spheres", tmp_path, TINY, overwrite=True)
+    (tmp_path / "capture.json").unlink()
+    out = shutil.copytree(clip, tmp_path / "clip")
+    seen = []
+    synthesize("spheres", out, TINY, overwrite=True, progress=lambda done, total: seen.append((done, total)))
+    assert json.loads((out / "capture.json").read_text())["scene"] == "spheres"
+    assert not (out / "cam02.mp4").exists()
+    assert seen == [(1, 2), (2, 2)]
+    with pytest.raises(ValueError, match=f"expected an output outside of captures, .* in the capture {out}"):
+        synthesize("spheres", out / "clip", TINY)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["clip", "notes.txt"]
+
+
+def test_synthesize__removes_its_output_after_a_failure(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("morgs_mi.studio.synth.synthesize.write_colmap", full)
+    with pytest.raises(OSError, match=r"cannot write .*the partial output was removed.*No space left"):
+        synthesize("spheres", tmp_path / "clip", TINY)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"cameras": 1}, "`cameras` must be at least 2, got 1"),
+        ({"frames": 0}, "`frames` must be at least 1, got 0"),
+        ({"spp": 0}, "`spp` must be at least 1, got 0"),
+        ({"seed": -1}, "`seed` must be at least 0, got -1"),
+        ({"width": 63}, "`width` must be at least 2 and a multiple of 2, got 63"),
+        ({"fps": 0}, "`fps` must be above 0, got 0"),
+        ({"noise": -0.1}, "`noise` must be at least 0 and below 1, got -0.1"),
+    ],
+)
+def test_synthesize__rejects_settings_out_of_range(tmp_path, settings, message):
+    with pytest.raises(ValueError, match=message):
+        synthesize("spheres", tmp_path / "clip", SynthConfig(**settings))
+
+
+def test_synthesize__names_the_scenes(tmp_path):
+    with pytest.raises(ValueError, match=r"no scene 'nowhere'; name one of .*'arm', 'flicker', 'random', 'spheres'"):
+        synthesize("nowhere", tmp_path / "clip")
+
+
+def sphere(**entries):
+    return {"type": "sphere", "bsdf": textured(np.full((2, 2, 3), 0.5, np.float32)), **entries}
+
+
+def bitmap(file):
+    return {"type": "diffuse", "reflectance": {"type": "bitmap", "filename": file}}
+
+
+def fails(time):
+    raise KeyError("hinge")
+
+
+BALL = {"ball": Object({"ball": sphere()})}
+# Objects, lights and what is said about them.
+WRONG_SCENES = {
+    "mesh": (
+        {"fox": Object({"body": {"type": "ply", "filename": "no.ply"}})},
+        {},
+        "object 'fox', shape 'body': its file no.ply does not exist; .*__file__",
+    ),
+    "texture": (
+        {"a": Object({"b": sphere(bsdf=bitmap("no.png"))})},
+        {},
+        "shape 'b', bsdf, reflectance: its file no.png does not exist",
+    ),
+    "path": (
+        {"a": Object({"b": sphere(bsdf=bitmap(Path(__file__)))})},
+        {},
+        "`filename` must be text, got a PosixPath; wrap it in str",
+    ),
+    "image": (
+        {"a": Object({"b": sphere(bsdf=bitmap(__file__))})},
+        lights(),
+        'scene .mine.: Mitsuba cannot load it: .*"a_b.bsdf.reflectance"',
+    ),
+    "plugin": ({"a": Object({"b": {"type": "spere"}})}, lights(), 'Mitsuba cannot load it: .*"a_b".*"spere"'),
+    "no dictionary": (
+        {"a": Object({"b": None})},
+        {},
+        "shape 'b': expected a Mitsuba dictionary with a `type`, got None",
+    ),
+    "none": ({"a": Object({"b": sphere(radius=None)})}, {}, "shape 'b': `radius` must have a value, got None"),
+    "no object": ({"a": sphere()}, {}, r"object 'a': expected Object\(...\), got a value of type dict"),
+    "no light": (BALL, {"lamp": sphere()}, r"light 'lamp': expected Light\(...\), got a value of type dict"),
+    "names": (
+        {"lamp": Object({"a": sphere()}, lambda t: np.eye(4))},
+        lights(),
+        "light 'lamp': the name 'lamp' is used twice",
+    ),
+    "scaled": (
+        {"a": Object({"b": sphere()}, lambda t: 2 * np.eye(4))},
+        {},
+        "object 'a': its pose at 0 s is not rigid: .*undo any scaling",
+    ),
+    "later": (
+        {"a": Object({"b": sphere()}, lambda t: np.diag([1 + t, 1, 1, 1]))},
+        {},
+        "its pose at 0.03333 s is not rigid",
+    ),
+    "shape": (
+        {"a": Object({"b": sphere()}, lambda t: np.eye(3))},
+        {},
+        r"must be a finite matrix \[4, 4\], got the shape \(3, 3\)",
+    ),
+    "nan": ({"a": Object({"b": sphere()}, lambda t: np.nan * np.eye(4))}, {}, "must be a finite matrix .*, got NaN"),
+    "pose fails": (
+        {"a": Object({"b": sphere()}, fails)},
+        {},
+        "object 'a': its pose at 0 s fails with KeyError: 'hinge'",
+    ),
+    "lamp pose": (BALL, {"p": Light({"type": "point"}, lambda t: np.eye(4))}, "a lamp with a pose must be a shape"),
+    "black": (BALL, {}, "it has no emitter, so its images would be black; give it lights"),
+    "nothing": ({}, lights(), "cam00 sees no object at 0 s; move the objects"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_SCENES)
+def test_synthesize__refuses_a_wrong_scene_before_rendering(tmp_path, case):
+    objects, lamps, message = WRONG_SCENES[case]
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        synthesize(Scene("mine", objects, lamps), tmp_path / "clip", TINY)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_synthesize__warns_of_black_images(tmp_path, caplog):
+    dark = Light({"type": "point", "position": [0, 0, 0]})
+    synthesize(
+        Scene("mine", {"a": Object({"b": sphere(center=[0, 0.8, 0])})}, {"inside": dark}), tmp_path / "clip", TINY
+    )
+    assert "scene 'mine': cam00 is black at 0 s: no lamp reaches" in caplog.text
+
+
+def test_synthesize__writes_videos_that_browsers_play_beside_the_lossless_frames(clip):
+    video = cv2.VideoCapture(str(clip / "cam01.mp4"))
+    assert int(video.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little") == b"VP90"
+    played, stored = (np.array(list(open_frames(clip / name).frames())) for name in ("cam01.mp4", "frames/cam01"))
+    assert played.shape == stored.shape
+    assert psnr(played, stored) > 25
+    np.testing.assert_array_equal(np.array([f.images[1] for f in load_capture(clip).frames()]), stored)
+
+
+def test_synthesize__without_lossless_frames_records_the_videos(tmp_path):
+    config = SynthConfig(cameras=2, frames=2, width=32, height=32, spp=1, lossless=False)
+    out = synthesize("spheres", tmp_path / "clip", config)
+    assert not (out / "frames").exists()
+    played = np.array(list(open_frames(out / "cam01.mp4").frames()))
+    np.testing.assert_array_equal(np.array([f.images[1] for f in load_capture(out).frames()]), played)
