@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from morgs_mi.capture.color_correction import ColorCorrection
 from morgs_mi.capture.interpolation import image_between
-from morgs_mi.capture.lens import Lens, Undistortion
+from morgs_mi.capture.lens import Lens, Undistortion, undistortion
+from morgs_mi.capture.masks import used_in_clip
+from morgs_mi.capture.timeline import ClipTimes
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import decode_light, display_image, encode_light
 from morgs_mi.io.video import FrameReader, ImageOrError
@@ -33,6 +36,29 @@ class CameraSource:
     delay: float = 0.0  #: Time from an instant to the frame that shows it, in frames of the clip.
     #: Stops by which linear light is brightened and shown in 8 bits; None: it is not shown.
     display_exposure: float | None = None
+    notes: tuple[str, ...] = ()  #: Sentences on its masks.
+
+    @classmethod
+    def of(
+        cls, reader: FrameReader, lens: Lens, camera: Camera, masks: Sequence[Path], times: ClipTimes
+    ) -> CameraSource:
+        """Return the source of a clip.
+
+        Args:
+            reader: of the clip.
+            lens: the lens that it was recorded through.
+            camera: the pinhole camera at the clip's size.
+            masks: files with masks of the pixels that are used.
+            times: frames that show the instants.
+
+        Raises:
+            FileNotFoundError: a mask is missing.
+            ValueError: a mask cannot be read, or no pixel is left.
+        """
+        used, notes = used_in_clip(reader, masks, camera.name)
+        maps = undistortion(camera, lens)
+        indices = times.frame_indices
+        return cls(reader, lens, maps, indices, times.shares, used=used, delay=times.delay, notes=tuple(notes))
 
     def at_instants(self) -> CameraSource:
         """Return the source without a delay: its images are interpolated instead."""

@@ -20,7 +20,6 @@ from morgs_mi.capture.held_out import TestViews, held_out_by, held_out_views
 from morgs_mi.capture.layouts.clips import EXAMPLE
 from morgs_mi.capture.layouts.layout_registry import find_layout
 from morgs_mi.capture.lens import Lens, undistortion
-from morgs_mi.capture.masks import used_in_clip
 from morgs_mi.capture.timeline import ReadConfig, read_settings, timeline
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_points
@@ -320,30 +319,19 @@ def load_capture(
     names = [camera.name for camera in recorded]
     common = timeline(path, names, readers, reading, max_frames, settings.get("fps"))
     masks = calibration.masks or ((),) * len(readers)
-    used = [used_in_clip(*each) for each in zip(readers, masks, names, strict=True)]
-    sources = tuple(
-        CameraSource(
-            reader,
-            lens,
-            undistortion(camera, lens),
-            common.frame_indices[c],
-            common.shares[c],
-            used=used[c][0],
-            delay=common.delays[c],
-        )
-        for c, (reader, lens, camera) in enumerate(zip(readers, calibration.lenses, recorded, strict=True))
-    )
-    times = zip(common.delays, common.rates, _readouts(path, every.names, names, settings), strict=True)
+    clips = zip(readers, calibration.lenses, recorded, masks, common.clips, strict=True)
+    sources = tuple(CameraSource.of(*clip) for clip in clips)
+    readouts = _readouts(path, every.names, names, settings)
     cameras = tuple(
-        replace(_resized(camera, downscale), delay=delay / rate, readout=readout / rate)
-        for camera, (delay, rate, readout) in zip(recorded, times, strict=True)
+        replace(_resized(camera, downscale), delay=times.delay / times.rate, readout=readout / times.rate)
+        for camera, times, readout in zip(recorded, common.clips, readouts, strict=True)
     )
     _check_downscale(downscale, cameras, recorded)
     cameras = with_near_planes(cameras, calibration.points, reading.near)
     capture = Capture(
         path=path,
         cameras=cameras,
-        num_frames=len(common.frame_indices[0]),
+        num_frames=len(common.clips[0].frame_indices),
         fps=common.fps,
         points=calibration.points,
         point_colors=calibration.point_colors,
@@ -355,7 +343,7 @@ def load_capture(
         downscale=downscale,
         layout=layout.name,
         reading=reading,
-        notes=(*common.notes, *(note for _, notes in used for note in notes), *_photos(calibration.clips)),
+        notes=(*common.notes, *(note for source in sources for note in source.notes), *_photos(calibration.clips)),
     )
     if any(reader.has_light for reader in readers):
         stops = settings.get("display_exposure")

@@ -71,16 +71,22 @@ class ReadConfig:
         return self.trim or bool(self.offset)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
+class ClipTimes:
+    """Frames of one clip that show the instants of the recording."""
+
+    frame_indices: np.ndarray  #: The clip's frames in ascending order, -1 for none, int [T].
+    #: Share of the time to the next frame that has passed at each instant [T]; None: no image is interpolated.
+    shares: np.ndarray | None
+    delay: float  #: Time from an instant to the frame that shows it, in frames of the clip.
+    rate: float  #: Frames of the clip per instant.
+
+
+@dataclass(frozen=True, eq=False)
 class Timeline:
     """Frames of each clip that show the instants of the recording."""
 
-    frame_indices: tuple[np.ndarray, ...]  #: Per camera the clip's frames in ascending order, -1 for none, int [T].
-    #: Per camera the share of the time to the next frame that has passed at each instant [T]; None: no image is
-    #: interpolated.
-    shares: tuple[np.ndarray | None, ...]
-    delays: tuple[float, ...]  #: Per camera the time from an instant to the frame that shows it, in frames of its clip.
-    rates: tuple[float, ...]  #: Per camera the frames of its clip per instant.
+    clips: tuple[ClipTimes, ...]  #: Of each camera's clip.
     fps: float  #: Instants per second.
     unchanged: bool  #: Whether instant t is frame t of every clip.
     notes: tuple[str, ...] = ()  #: A sentence for each clip of variable frame rate, and on the numbers of images.
@@ -146,10 +152,8 @@ def timeline(
     unchanged = all(np.array_equal(index, np.arange(len(instants))) for index in indices)
     unchanged = unchanged and not any(config.offset.values())
     notes = tuple(_note(r, k) for r, k in zip(readers, indices, strict=True) if r.positions is not None)
-    rates = tuple(clocks.rates.tolist())
-    return Timeline(
-        tuple(indices), tuple(shares), tuple(delays), rates, clocks.fps, unchanged, (*numbers.notes, *notes)
-    )
+    clips = tuple(map(ClipTimes, indices, shares, delays, clocks.rates.tolist()))
+    return Timeline(clips, clocks.fps, unchanged, (*numbers.notes, *notes))
 
 
 def _warn_apart(path: Path, times: np.ndarray, indices: Sequence[np.ndarray], fps: float) -> None:
