@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# Two processes, each with a file at a time: tests of one file share their fixtures.
+PYTEST := $(BIN)/pytest -n 2 --dist loadfile
 WEB_PLAYER ?= morgs_mi/playback/export/web_player
 STAMP := $(VENV)/.installed
 
@@ -11,10 +13,10 @@ demo: setup
 	$(BIN)/morgs-mi demo out/demo
 
 test: setup
-	$(BIN)/pytest
+	$(PYTEST)
 
 test-slow: setup
-	$(BIN)/pytest -m "slow and not gpu"
+	$(PYTEST) -m "slow and not gpu"
 
 test-long: setup
 	$(BIN)/pytest -m "long and not gpu"

@@ -167,6 +167,7 @@ def test_push__same_seed_gives_the_same_bytes_and_no_frame_looks_ahead(clip):
     assert runs[0][2] != runs[1][2]
 
 
+@pytest.mark.slow
 def test_push__stream_carries_births_and_deaths(clip):
     """Faint ones are pruned, no more are added than the limit allows, ids are never reused, and the decoder has all."""
     density = DensityConfig(rounds=0, births=0.05, max_gaussians=590, min_error=0, min_opacity=0.3)
@@ -183,6 +184,7 @@ def test_push__stream_carries_births_and_deaths(clip):
         assert np.array_equal(value, loop.gaussians.numpy()[name]), name
 
 
+@pytest.mark.slow
 def test_push__fits_views_at_their_own_times(clip):
     """Two of four views are half a frame late and two half a frame early; at the instants nobody saw the ball."""
     delays = (0.5, -0.5, 0.5, -0.5)
@@ -205,6 +207,7 @@ def moving_psnr(loop: StreamLoop, clip, view: int) -> float:
     return psnr(color[moved], clip[2][view][moved] / 255.0)
 
 
+@pytest.mark.slow
 def test_push__modules_can_be_switched_off(clip):
     off = dataclasses.replace(
         QUICK, motion=MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
@@ -216,6 +219,7 @@ def test_push__modules_can_be_switched_off(clip):
     assert reports[1].losses.keys() == {"recon", "flow", "mask"}
 
 
+@pytest.mark.slow
 def test_push__replaces_too_few_points_and_reports_it(clip):
     """Half of the Gaussians are seeded, the others are added by density control."""
     config = dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, density=DensityConfig()))
@@ -225,6 +229,7 @@ def test_push__replaces_too_few_points_and_reports_it(clip):
     assert 590 < len(loop.gaussians) <= 600  # those pruned in the last round are not replaced
 
 
+@pytest.mark.slow
 def test_push__forecasts_other_views(clip):
     ticks = []
     _, report = new_loop(SHORT).push(clip[0][:4], lambda *tick: ticks.append(tick))
@@ -236,11 +241,13 @@ def test_push__forecasts_other_views(clip):
     assert {"quality", "expected_psnr", "interval", "loss", "margin", "is_outside", "rig"} < validation.keys()
 
 
+@pytest.mark.slow
 def test_push__forecasts_nothing_of_a_single_camera(clip):
     loop = StreamLoop(cameras()[:1], *points_and_colors(), QUICK)
     assert loop.push(clip[0][:1])[1].validation == {}
 
 
+@pytest.mark.slow
 def test_push__fits_the_first_frame_in_the_steps_that_a_time_allows(clip):
     ticks = []
     fit = dataclasses.replace(QUICK.fit, first_frame_steps=None, first_frame_seconds=1e-3)
@@ -255,6 +262,7 @@ def without(images, *views):
     return [None if view in views else image for view, image in enumerate(images[:4])]
 
 
+@pytest.mark.slow
 def test_push__without_an_image_of_one_view(clip, first, monkeypatch):
     """Flow on two key views out of those that have both images: not of the missing view, nor when it is back."""
     flow_views = []
@@ -284,6 +292,7 @@ def test_push__without_an_image_of_one_view(clip, first, monkeypatch):
     assert all(found[t][t] > found[t - 1][t] + 1 for t in (1, 2, 3)), found
 
 
+@pytest.mark.slow
 def test_push__without_any_image_nothing_moves(clip):
     loop = new_loop()
     first, _ = loop.push(without(clip[0], 1))
@@ -299,6 +308,7 @@ def test_push__without_any_image_nothing_moves(clip):
     assert "flow" not in report.losses
 
 
+@pytest.mark.slow
 def test_stream_capture__writes_a_file(clip, tmp_path):
     class Recorded(Capture):
         def partial_frames(self, start=0, stop=None):
@@ -403,6 +413,7 @@ def test_push__a_static_clip_costs_next_to_nothing(clip):
     assert moving.active["views"] == 1
 
 
+@pytest.mark.slow
 def test_push__skipping_static_views_costs_no_quality(clip):
     """With and without: the held-out image is as good in the mean of three seeds, in fewer bytes."""
     some = dataclasses.replace(QUICK, render=RenderConfig(reproducible=True))
@@ -481,6 +492,7 @@ def plain(clip, reproducible):
     return [packet.encoded for packet in (*packets, *pushed_ahead(loop, clip[1:], lambda images: None))]
 
 
+@pytest.mark.slow
 def test_push__observes_the_upcoming_frame_in_another_thread_and_changes_nothing(clip, plain, monkeypatch):
     threads, observe = [], stream_loop.observe_frame
     monkeypatch.setattr(
@@ -494,6 +506,7 @@ def test_push__observes_the_upcoming_frame_in_another_thread_and_changes_nothing
     assert [packet.encoded for packet in ahead] == plain
 
 
+@pytest.mark.slow
 def test_push__uses_no_observation_of_other_images(clip, reproducible, plain):
     wrong = pushed_ahead(copy.copy(reproducible[0]), clip[1:], lambda images: [image // 2 for image in images])
     assert [packet.encoded for packet in wrong] == plain[1:]
@@ -529,6 +542,7 @@ def auto_exposed(clip):
     return np.array(gains), frames, loop, [loop.push(images)[1] for images in frames]
 
 
+@pytest.mark.slow
 def test_push__reports_the_exposure_of_each_view_over_time(auto_exposed):
     gains, _, _, reports = auto_exposed
     middle = np.array([[np.mean(e(0.4 * np.ones(3))) for e in report.exposures] for report in reports]) / 0.4
@@ -537,6 +551,7 @@ def test_push__reports_the_exposure_of_each_view_over_time(auto_exposed):
     assert "The cameras were balanced" in reports[0].validation["exposure"]["sentence"]
 
 
+@pytest.mark.slow
 def test_push__changes_no_static_gaussian_where_only_the_exposure_changes(auto_exposed):
     _, frames, _, reports = auto_exposed
     plain = new_loop(dataclasses.replace(EXPOSED, fit=dataclasses.replace(EXPOSED.fit, exposure="off")))
@@ -545,6 +560,7 @@ def test_push__changes_no_static_gaussian_where_only_the_exposure_changes(auto_e
     assert without[0].exposures == ()
 
 
+@pytest.mark.slow
 def test_resume__continues_with_the_exposures_of_the_reports(auto_exposed, clip):
     gains, frames, loop, reports = auto_exposed
     following = brighter(clip[1][:4], gains[1])
@@ -556,6 +572,7 @@ def test_resume__continues_with_the_exposures_of_the_reports(auto_exposed, clip)
     assert same.exposures == report.exposures
 
 
+@pytest.mark.slow
 def test_push__leaves_a_change_of_light_in_the_scene(clip):
     loop = new_loop(EXPOSED)
     frames = [clip[0][:4], brighter(clip[0][:4], [0.8] * 4)]
@@ -565,6 +582,7 @@ def test_push__leaves_a_change_of_light_in_the_scene(clip):
     assert reports[1].num_bytes > 1000
 
 
+@pytest.mark.slow
 def test_push__has_the_same_bytes_with_exposures_where_cameras_are_equal(clip, plain, monkeypatch):
     # Their few short fits would find differences of 1 %.
     monkeypatch.setattr("morgs_mi.fit.balance._LEAST_DIFFERENCE", 0.1)
@@ -587,6 +605,7 @@ def garbage_of(action) -> list[object]:
         gc.enable()
 
 
+@pytest.mark.slow
 def test_push__leaves_no_arrays_to_the_garbage_collection(clip):
     """It may run in any thread, where freeing arrays of Dr.Jit can end the process."""
     loop = StreamLoop(cameras()[:4], *points_and_colors(), QUICK)
@@ -594,6 +613,7 @@ def test_push__leaves_no_arrays_to_the_garbage_collection(clip):
     assert garbage_of(lambda: loop.push(clip[1][:4])) == []
 
 
+@pytest.mark.slow
 def test_push__is_interrupted_in_a_callback_and_continues(clip, monkeypatch):
     """Dr.Jit turns the interruption into a RuntimeError; the loop is as it was before the frame."""
     loop, other = (StreamLoop(cameras()[:4], *points_and_colors(), REPRODUCIBLE) for _ in range(2))
@@ -613,6 +633,7 @@ def test_push__is_interrupted_in_a_callback_and_continues(clip, monkeypatch):
     assert [encode_packet(first), encode_packet(loop.push(clip[1][:4])[0])] == packets
 
 
+@pytest.mark.slow
 def test_push__reports_a_black_first_frame_and_a_cut(clip):
     loop = StreamLoop(cameras()[:4], *points_and_colors(), SHORT)
     black = [np.zeros_like(image) for image in clip[0][:4]]
@@ -626,6 +647,7 @@ def test_push__reports_a_black_first_frame_and_a_cut(clip):
     ]
 
 
+@pytest.mark.slow
 def test_push__light_above_white_is_fitted_and_followed():
     """The wall of the scene shines with 1 to 20 times white; images, points and packets have encoded colours."""
 

@@ -351,6 +351,7 @@ LAYOUTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_fit_command__reports_a_broken_capture_in_one_line_and_writes_nothing(tmp_path: Path, capsys, layout) -> None:
     build, table = LAYOUTS[layout]

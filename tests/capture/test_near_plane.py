@@ -90,6 +90,7 @@ def test_load_capture__near_plane_shows_a_held_out_camera_past_a_splat_around_it
     assert with_rule > without + 6
 
 
+@pytest.mark.slow
 def test_load_capture__takes_a_given_near_plane_and_the_stream_stores_it(capture: Path, tmp_path: Path) -> None:
     stream_capture(load_capture(capture, reading=ReadConfig(near=0.3)), tmp_path / "out", SHORT)
     assert {camera.near for camera in open_stream(tmp_path / "out").cameras} == {0.3}

@@ -22,6 +22,7 @@ def test_eval__replaces_no_file_of_the_fit(stream: Path, tmp_path: Path, run) ->
         )
 
 
+@pytest.mark.slow
 def test_eval__refuses_another_recording_by_the_same_cameras(tmp_path: Path, run) -> None:
     clip, out = write_recording(tmp_path / "clip", 2), tmp_path / "out"
     assert run("fit", clip, out, *QUICK, "--color", "linear")[0] == 0

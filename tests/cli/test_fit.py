@@ -33,6 +33,7 @@ from tests.scenes.recording import write_recording
 from tests.studio.calibration.checks.test_signals import brighter
 
 
+@pytest.mark.slow
 def test_fit__continues_without_a_camera_whose_clip_is_cut_off_meanwhile(
     capture: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -282,6 +283,7 @@ def test_fit__reports_progress_before_the_first_frame(capture: Path, tmp_path: P
     assert "Triangulating points: 0/1, " in error
 
 
+@pytest.mark.slow
 def test_fit__ends_with_a_whole_packet_on_a_full_disk(capture: Path, tmp_path: Path) -> None:
     """The second packet does not fit: the file ends with the first and still has the intended number of frames."""
     script = (
@@ -328,6 +330,7 @@ def test_fit__resumes_a_stream_to_the_same_bytes(capture: Path, tmp_path: Path, 
     assert_refused(run(*fit, "--resume", "--seed", 1), "stream.morgs: expected to resume", "config.seed = 0, got 1")
 
 
+@pytest.mark.slow
 def test_fit__fits_segments_side_by_side(
     tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -343,6 +346,7 @@ def test_fit__fits_segments_side_by_side(
     assert_refused(run("fit", clip, out, *QUICK, "--segments", 3), "--segments must be 1 to 2 for 4 frames", "got 3")
 
 
+@pytest.mark.slow
 def test_fit__names_what_segments_stand_when_interrupted(tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed", reason="comes with the extra `cluster`")
     clip, out = write_recording(tmp_path / "clip", 4), tmp_path / "out"

@@ -114,6 +114,7 @@ def test_main__runs_as_a_module() -> None:
     assert_one_sentence(result.stderr, "expected the folders CAPTURE and OUT")
 
 
+@pytest.mark.slow
 def test_main__names_an_output_that_cannot_be_written(capture: Path, stream: Path, tmp_path: Path, run) -> None:
     (tmp_path / "file").write_text("")
     size = ("--cameras", 2, "--frames", 1, "--width", 16, "--height", 16)
@@ -139,6 +140,7 @@ def test_main__names_an_output_that_cannot_be_written(capture: Path, stream: Pat
         assert_refused(run(*args), f"{tmp_path / 'file'} is a file; name a folder")
 
 
+@pytest.mark.slow
 def test_main__writes_nothing_into_a_capture(capture: Path, stream: Path, tmp_path: Path, run) -> None:
     (capture / "capture.json").write_text('{"fps": 25}')
     place = tmp_path / "link"
@@ -182,6 +184,7 @@ def test_main__reports_a_full_standard_output_in_one_sentence(run, monkeypatch: 
         assert run("fit", "--print-config")[::2] == (1, "standard output: No space left on device.\n")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("args", [("info", "--no-check"), ("fit", *QUICK)])
 def test_main__prints_any_path_to_an_ascii_or_a_closed_standard_output(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, args: tuple[str, ...]
@@ -197,6 +200,7 @@ def test_main__prints_any_path_to_an_ascii_or_a_closed_standard_output(
     assert (closed.returncode, closed.stderr) == (0, b"")
 
 
+@pytest.mark.slow
 def test_main__prints_its_help_to_an_ascii_standard_output(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PYTHONIOENCODING", "ascii")
     for args in ((), ("fit",)):

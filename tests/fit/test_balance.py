@@ -54,6 +54,7 @@ def balanced(gains: np.ndarray, config: FitConfig = FIT, report: Report | None =
     return balance_cameras(problem, config, 0, Progress(report))
 
 
+@pytest.mark.slow
 def test_balance_cameras__finds_the_exposures_and_takes_them():
     found = balanced(GAINS)
     for exposure, gain in zip(found.exposures, GAINS, strict=True):
@@ -88,6 +89,7 @@ def test_balance_config__takes_at_most_a_quarter_of_the_steps_of_the_first_frame
     assert balance_config(replace(FIT, first_frame_steps=1)).first_frame_steps == 1
 
 
+@pytest.mark.slow
 def test_balance_cameras__does_not_judge_where_balanced_cameras_are_wanted():
     found = balanced(GAINS, replace(FIT, exposure="on"))
     assert found.taken

@@ -121,6 +121,7 @@ def test_fit_first_frame__grows_in_the_rounds_alone_and_to_the_number_that_is_gi
     assert (counts[0], len(found.gaussians)) == (60, 100)
 
 
+@pytest.mark.slow
 def test_fit_first_frame__grows_from_too_few(images):
     config = FitConfig(sh_degree=0, first_frame_steps=160, num_gaussians=250)
     few = fit(images, ball(60), dataclasses.replace(config, density=NO_GROWTH)).gaussians
@@ -216,6 +217,7 @@ def test_fit_first_frame__keeps_the_confidence(images):
     assert_close(found.logit_confidence, np.float32(confidence))
 
 
+@pytest.mark.slow
 def test_fit_first_frame__is_the_same_for_a_seed_and_another_for_another(images):
     config = FitConfig(sh_degree=1, num_gaussians=90, first_frame_steps=12, dropping=0.2)
     first, second, other = (

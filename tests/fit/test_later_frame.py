@@ -29,6 +29,7 @@ def fit(before: Gaussians, images: list[np.ndarray], config: FitConfig, motion: 
     return fit_later_frame(problem, config, motion, np.random.default_rng(0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("motion", [PLAIN, MotionConfig(learn_motion=False)], ids=["plain", "gated"])
 def test_fit_later_frame__reports_births_and_survivors(motion):
     """Half of the ball is new: births help, survivors stay in order, births come last."""

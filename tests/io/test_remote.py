@@ -227,6 +227,7 @@ def test_mirrored__leaves_out_no_folder_that_cannot_be_listed(folder: Path, monk
             mirrored(URL)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "body", "kind", "message"),
     [

@@ -38,6 +38,7 @@ def test_depth_limit__image_agrees_with_the_reference(scene, limit, channel):
     assert_close(found, expected[channel], atol=5 * tol.IMAGE_ABS, where=solid)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("channel", "reproducible"), [*((name, False) for name in CHANNELS), ("color", True)])
 def test_depth_limit__backward_agrees_with_the_reference(scene, limit, channel, reproducible):
     raw, camera = scene

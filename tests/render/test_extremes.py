@@ -101,6 +101,7 @@ def test_rasterize__forward_and_reverse_mode_are_dual_at_the_extremes():
     assert not failed
 
 
+@pytest.mark.slow
 def test_rasterize__gradients_of_the_pose_at_the_extremes():
     """Columns are compared separately: rotating a world at 1e5 units moves it 1e5 times as far as translating it."""
     failed = []

@@ -28,6 +28,7 @@ def stack(n: int, opacity: float) -> Values:
     return {name: np.float32(value).astype(np.float64) for name, value in values.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("opacity", [1.0, 0.99, 0.02])
 def test_rasterize__blends_ten_thousand_layers_on_one_pixel(opacity):
     values, camera = stack(10_000, opacity), Camera(np.array([[9.0, 0, 0.5], [0, 9, 0.5], [0, 0, 1]]), np.eye(4), 1, 1)

@@ -118,6 +118,7 @@ def test_stream_capture__shows_a_provisional_first_frame(tmp_path: Path, monkeyp
     assert not (tmp_path / PROVISIONAL).exists()
 
 
+@pytest.mark.slow
 def test_stream_capture__goes_on_without_a_provisional_first_frame_that_has_no_room(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -136,6 +137,7 @@ def test_stream_capture__goes_on_without_a_provisional_first_frame_that_has_no_r
     assert message.startswith(f"{tmp_path / PROVISIONAL}: a provisional first frame cannot be written")
 
 
+@pytest.mark.slow
 def test_stream_capture__removes_the_provisional_first_frame_before_it_writes_the_result(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -183,6 +185,7 @@ def test_stream_capture__keeps_an_earlier_fit_until_its_first_frame(
     assert files_of(out) == files_of(whole)
 
 
+@pytest.mark.slow
 def test_stream_capture__replaces_an_earlier_fit_together(whole: Path, tmp_path: Path) -> None:
     out, push, frames = tmp_path / "out", StreamLoop.push, []
     shutil.copytree(whole, out)
@@ -201,6 +204,7 @@ def test_stream_capture__replaces_an_earlier_fit_together(whole: Path, tmp_path:
     assert sorted(files_of(out)) == ["capture.json", "report.json", "stream.morgs"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("calls", range(1, 5))
 def test_stream_capture__resumes_after_a_kill_between_the_files_that_it_replaces(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: int
@@ -273,6 +277,7 @@ def cuts(whole: Path) -> list[int]:
     return [0, ends[0] - 1, ends[0], ends[3] - 1, ends[3], ends[4], index_at, size - 1, size]
 
 
+@pytest.mark.slow
 def test_stream_capture__resumed_from_any_cut_is_the_same(whole: Path, tmp_path: Path) -> None:
     report = json.loads((whole / "report.json").read_text())
     for k, at in enumerate(cuts(whole)):
@@ -362,6 +367,7 @@ def test_stream_capture__does_not_resume_a_damaged_fit(whole: Path, tmp_path: Pa
     assert stream_of(out) == damaged
 
 
+@pytest.mark.slow
 def test_stream_capture__refuses_a_folder_into_which_another_fit_writes(whole: Path, tmp_path: Path) -> None:
     """The other one goes on, and its files are whole."""
     refused = {}
@@ -378,6 +384,7 @@ def test_stream_capture__refuses_a_folder_into_which_another_fit_writes(whole: P
     assert_same(tmp_path / "out", whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", ["removed", "removed folder", "moved", "replaced"])
 def test_stream_capture__ends_when_its_stream_is_taken_away(whole: Path, tmp_path: Path, change: str) -> None:
     out, seen = tmp_path / "out", []
@@ -409,6 +416,7 @@ def test_stream_capture__ends_when_its_stream_is_taken_away(whole: Path, tmp_pat
         assert_same(tmp_path / "moved", whole)
 
 
+@pytest.mark.slow
 def test_stream_capture__writes_no_path_into_the_stream(tmp_path: Path) -> None:
     """A stream is shared; its capture is named in the file beside it."""
     secret = tmp_path / "home" / "jane"
@@ -523,6 +531,7 @@ def refined_config():
     return replace(CONFIG, fit=replace(CONFIG.fit, refine_cameras="on", short_fits=how))
 
 
+@pytest.mark.slow
 def test_stream_capture__stores_refined_cameras_and_resumes_with_them(tmp_path_factory):
     tmp_path, config = tmp_path_factory.mktemp("out"), refined_config()
     capture = load_capture(write_recording(tmp_path_factory.mktemp("capture"), 2), test_view=0)
@@ -543,6 +552,7 @@ def test_stream_capture__stores_refined_cameras_and_resumes_with_them(tmp_path_f
     assert stream_of(tmp_path) == whole
 
 
+@pytest.mark.slow
 def test_stream_capture__resumes_where_cameras_have_delays(tmp_path):
     reading = ReadConfig(offset={"cam1": 0.25, "cam2": -0.5})
     capture = load_capture(write_recording(tmp_path / "capture"), reading=reading)

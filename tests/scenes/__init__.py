@@ -1,6 +1,15 @@
 """Small scenes that several test modules share.
 
-`gaussians`, `extremes` and `cameras` build random and simple scenes; `plugin` puts one into Mitsuba. `ball`,
-`moving_splats`, `changing_splats`, `coded_clip` and `short_clip` are fixed scenes with their images or streams.
-`captures`, `noise_capture`, `textured` and `recording` are captures.
-"""
+| what a test needs | module |
+|---|---|
+| random or flat clouds of Gaussians; cameras on a plane, an arc or a circle | `gaussians`, `cameras` |
+| the extremes of float32, with their tolerances | `extremes` |
+| a Mitsuba scene of Gaussians, alone or among surfaces | `plugin`, `surfaces` |
+| images of Gaussians that a fit reconstructs | `ball`; `shifted_ball` for the next frame |
+| a stream with known motion; with births and deaths; with the range of the codec | `moving_splats`, `changing_splats`, `coded_clip` |
+| a stream to damage | `short_clip` |
+| a capture in each layout | `captures` |
+| a capture for the command line; with matches and true poses; with a true motion | `noise_capture`, `textured`, `filmed` |
+| a fit that is killed; cameras that record meanwhile | `recording`, `live_clip` |
+| clips that are cut, true tracks, networks, a full disk | `edit_lists`, `annotations`, `tiny_network`, `full_disk` |
+"""  # noqa: E501

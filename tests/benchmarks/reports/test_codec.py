@@ -33,6 +33,7 @@ def reported(fitted_clip: Path, tmp_path_factory: pytest.TempPathFactory) -> tup
     return options, measure(load_capture(fitted_clip / "capture"), options, None)
 
 
+@pytest.mark.slow
 def test_measure__finds_coarser_streams_smaller_and_lzma_larger(reported) -> None:
     options, found = reported
     rows = found["rows"]
@@ -48,6 +49,7 @@ def test_measure__finds_coarser_streams_smaller_and_lzma_larger(reported) -> Non
     assert np.isfinite(rows[0]["loss"])
 
 
+@pytest.mark.slow
 def test_options__reuse_complete_streams_and_write_tables_json_and_plot(
     reported, fitted_clip, tmp_path, capsys
 ) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from benchmarks.reports.held_out import first_frames, later_frames, scores_of
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.core.files import write_json
@@ -12,6 +14,7 @@ from morgs_mi.runs.fit_capture import stream_capture
 from tests.scenes.recording import CONFIG
 
 
+@pytest.mark.slow
 def test_scores_of__has_the_scores_of_each_view_and_frame(clip: Path, tmp_path: Path) -> None:
     out = tmp_path / "spheres"
     stream_capture(load_capture(clip, test_view=[0, 3]), out, CONFIG)

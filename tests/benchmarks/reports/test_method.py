@@ -91,6 +91,7 @@ def interrupted(request, clip, tmp_path_factory):
     return json.loads((out / "method.json").read_text()), out, complete
 
 
+@pytest.mark.slow
 def test_method_command__continues_an_interrupted_report(interrupted):
     result, out, fits = interrupted
     # 2 epochs of a default and a baseline at 2 rates; 2 presets with 1, 2 and all 4 views at 2 epochs.
@@ -154,6 +155,7 @@ def test_gains_table__has_the_best_rates():
     assert gains[3][:4] == ["| balls", "8", "+1.50 / +1.50 / -1.50", "- / - / -"]
 
 
+@pytest.mark.slow
 def test_later_frames__has_the_scores_of_a_fit(clip, tmp_path):
     """One genuine fit; the fixture `interrupted` makes up its scores unless slow tests run."""
     options = replace(tiny(clip, tmp_path), presets=("default",), epochs=(1,), key_views=())

@@ -36,6 +36,7 @@ def reported(tmp_path_factory):
     return value["rows"]
 
 
+@pytest.mark.slow
 def test_renderer__has_the_default_once_per_option(reported):
     knobs = [row["knob"] for row in reported]
     assert set(knobs) == {"alpha_min", "stop_transmittance", "block", "reproducible"}

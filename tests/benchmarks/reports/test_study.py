@@ -102,6 +102,7 @@ def score(source: Source, config: StreamConfig) -> dict[str, float]:
 CALLS: list[int] = []
 
 
+@pytest.mark.slow
 def test_study__continues_with_the_stored_cells(clip: Path, tmp_path: Path, monkeypatch):
     source = Source.of(load_capture(clip))
     variants = [Variant({"epochs": n}, StreamConfig(FitConfig(epochs=n))) for n in (1, 2)]

@@ -47,6 +47,7 @@ def test_conformal__is_a_rank_of_captures(captures: list[list[float]], error: fl
     assert _conformal([np.array(own) for own in captures]) == pytest.approx(error)
 
 
+@pytest.mark.slow
 def test_held_out__spreads_the_training_views_over_the_rig(clip):
     capture = load_capture(clip, test_view=None)
     count = len(capture.cameras)

@@ -336,6 +336,7 @@ def test_exact_images__render_one_at_a_time_and_the_newest_wins(url, monkeypatch
     assert sum(response.status == 204 for response, _ in answers) > len(cameras) // 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("forge", [damaged, with_forged_bytes, with_forged_packets, with_forged_header])
 def test_viewer__shows_or_refuses_hostile_streams(tmp_path, forge):
     path = tmp_path / "s"

@@ -59,6 +59,7 @@ def address(cluster: subprocess.Popen[str]) -> str:
     return cluster.stdout.readline().strip()
 
 
+@pytest.mark.slow
 def test_open_client__connects_to_a_scheduler(cluster: subprocess.Popen[str]) -> None:
     with open_client(address(cluster)) as client:
         assert client.submit(os.getpid).result() not in (os.getpid(), cluster.pid)

@@ -79,6 +79,7 @@ def rows_of(out: Path) -> list[dict]:
     return [{name: value for name, value in row.items() if name != "seconds"} for row in rows]
 
 
+@pytest.mark.slow
 def test_SegmentedRun__of_one_is_the_fit_in_one_process(capture: Capture, client: Client, tmp_path: Path) -> None:
     fit(capture, tmp_path / "one", client, segments=SegmentConfig(1))
     stream_capture(capture, tmp_path / "plain", SETTINGS)
@@ -145,6 +146,7 @@ def test_SegmentedRun__interrupted_and_resumed_is_the_same(
     assert len(again) == FRAMES, "nothing is fitted twice"
 
 
+@pytest.mark.slow
 def test_SegmentedRun__resumes_after_a_cut_packet(
     capture: Capture, client: Client, whole: Path, tmp_path: Path
 ) -> None:
@@ -156,6 +158,7 @@ def test_SegmentedRun__resumes_after_a_cut_packet(
     assert stream_of(tmp_path) == stream_of(whole)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frame", [4, 8])  # after the first frame of a segment alone
 def test_SegmentedRun__resumes_after_the_beginning_of_a_segment(
     capture: Capture, client: Client, whole: Path, tmp_path: Path, frame: int
@@ -220,6 +223,7 @@ def test_SegmentedRun__does_not_resume_other_settings(capture: Capture, client: 
         fit(capture, tmp_path, client, segments=replace(SEGMENTS, count=2), resume=True)
 
 
+@pytest.mark.slow
 def test_SegmentedRun__keeps_an_earlier_fit_until_the_segments_are_joined(
     capture: Capture, client: Client, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -239,6 +243,7 @@ def test_SegmentedRun__keeps_an_earlier_fit_until_the_segments_are_joined(
     assert len(rows_of(out)) == FRAMES
 
 
+@pytest.mark.slow
 def test_SegmentedRun__triangulates_points_where_there_are_few(
     capture: Capture, client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -248,6 +253,7 @@ def test_SegmentedRun__triangulates_points_where_there_are_few(
     assert len(next(coded_frames(StreamReader(tmp_path / "few" / "stream.morgs")))) == SETTINGS.fit.num_gaussians
 
 
+@pytest.mark.slow
 def test_SegmentedRun__refines_cameras_once(capture: Capture, client: Client, tmp_path: Path) -> None:
     held_out = load_capture(capture.path, test_view=0)
     how = ShortFitConfig(gaussians=40, steps=4, rounds=1)
@@ -264,6 +270,7 @@ def test_SegmentedRun__refines_cameras_once(capture: Capture, client: Client, tm
     assert np.array_equal(first[0].means, first[1].means)
 
 
+@pytest.mark.slow
 def test_SegmentedRun__has_the_same_balance_of_the_cameras_in_all_segments(
     capture: Capture, client: Client, tmp_path: Path
 ) -> None:

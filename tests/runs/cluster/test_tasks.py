@@ -24,6 +24,7 @@ def fit(tmp_path_factory: pytest.TempPathFactory) -> Fit:
     return Fit(Source.of(capture), CONFIG, SegmentConfig(), str(mi.variant()), installed())
 
 
+@pytest.mark.slow
 def test_fit_frames__continues_the_loop_of_the_last_task_or_reads_it_again(
     fit: Fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -38,6 +39,7 @@ def test_fit_frames__continues_the_loop_of_the_last_task_or_reads_it_again(
     assert [report.frame for report in again.reports] == [3, 4]
 
 
+@pytest.mark.slow
 def test_fit_frames__begins_a_segment_with_a_keyframe_after_the_common_model(fit: Fit) -> None:
     common = fit_frames(fit, Segment(0, 2, 0), 2)
     assert common.segment.coded is not None

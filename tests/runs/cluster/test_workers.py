@@ -31,6 +31,7 @@ def threads(*about) -> tuple[int, str]:
         return dr.thread_count(), worker_name()
 
 
+@pytest.mark.slow
 def test_open_client__starts_workers_that_share_the_cores() -> None:
     import mitsuba as mi
 
@@ -45,6 +46,7 @@ def test_open_client__starts_workers_that_share_the_cores() -> None:
             client.submit(fail).result()
 
 
+@pytest.mark.slow
 def test_open_client__names_workers_that_die() -> None:
     import dask.config
 
@@ -56,6 +58,7 @@ def test_open_client__names_workers_that_die() -> None:
         client.submit(die).result()
 
 
+@pytest.mark.slow
 def test_open_client__has_workers_that_end_with_their_parent() -> None:
     script = (
         "import os, signal\n"

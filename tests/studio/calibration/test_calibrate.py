@@ -72,6 +72,7 @@ def test_calibrate__recovers_a_rig(tmp_path: Path, capsys) -> None:
     assert "sparse: expected no model, got one" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_calibrate__finds_the_same_poses_on_every_run(tmp_path: Path) -> None:
     film(tmp_path, [camera.resized(240, 180) for camera in textured.rig()])
     config = CalibrateConfig(shared_intrinsics=True)
@@ -105,6 +106,7 @@ def test_calibrate__names_images_after_photos(tmp_path: Path, names: tuple[str, 
     assert load_capture(tmp_path).names == result.cameras
 
 
+@pytest.mark.slow
 def test_calibrate__shares_intrinsics_among_clips_of_a_size(tmp_path: Path) -> None:
     sizes = [(240, 180), (320, 240)] * 3
     cameras = [camera.resized(*size) for camera, size in zip(textured.rig(), sizes, strict=True)]
@@ -116,6 +118,7 @@ def test_calibrate__shares_intrinsics_among_clips_of_a_size(tmp_path: Path) -> N
         np.testing.assert_allclose(camera.K[0, 0], expected.K[0, 0], rtol=5e-3)
 
 
+@pytest.mark.slow
 def test_calibrate__moves_principal_points_that_differ(tmp_path: Path, capsys) -> None:
     cameras = [camera.resized(240, 180) for camera in textured.rig()]
     for camera, shift in zip(cameras, np.random.default_rng(0).uniform(-6, 6, (6, 2)), strict=True):
@@ -128,6 +131,7 @@ def test_calibrate__moves_principal_points_that_differ(tmp_path: Path, capsys) -
     assert_close(aligned(found, true)[0], true, atol=0.012)
 
 
+@pytest.mark.slow
 def test_calibrate__takes_global_mapping_where_incremental_mapping_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
@@ -165,6 +169,7 @@ def test_check__of_a_camera_without_points_does_not_fit() -> None:
     assert np.isnan(check.error)
 
 
+@pytest.mark.slow
 def test_calibrate__names_a_camera_with_another_scene(tmp_path: Path) -> None:
     film(tmp_path, [camera.resized(240, 180) for camera in textured.rig()[1:5]])
     noise = np.random.default_rng(1).integers(0, 255, (90, 120, 3), np.uint8)
@@ -183,6 +188,7 @@ def test_calibrate__names_a_camera_with_another_scene(tmp_path: Path) -> None:
     assert load_capture(tmp_path).names == found.cameras
 
 
+@pytest.mark.slow
 def test_calibrate__prints_a_verdict_per_camera(tmp_path: Path, capsys) -> None:
     cameras = [camera.resized(240, 180) for camera in textured.rig(4)]
     film(tmp_path, cameras)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from morgs_mi import Gaussians, rasterize
 from morgs_mi.method.ssim import Target
@@ -92,6 +93,7 @@ def test_errors__are_large_where_a_change_of_depth_explains_an_offset() -> None:
     assert along.errors(0)[0] == 0
 
 
+@pytest.mark.slow
 def test_errors__are_those_of_repeated_noise() -> None:
     ball, rng = turning_ball(), np.random.default_rng(0)
     found = [equations(ball, 0 * OFFSETS, noise=rng.normal(0, 0.02, (5, *SIZE))) for _ in range(20)]

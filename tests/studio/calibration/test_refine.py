@@ -192,6 +192,7 @@ def test_refine_cameras__does_not_judge_where_refined_cameras_are_wanted(splat_c
     assert refined is not splat_capture
 
 
+@pytest.mark.slow
 def test_matched__finds_the_cameras_by_features(textured_capture, monkeypatch):
     monkeypatch.setattr("morgs_mi.capture.features._MAX_FEATURES", 300)
     capture = replace(textured_capture, cameras=tuple(disturbed(textured_capture.cameras)))

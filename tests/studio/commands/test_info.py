@@ -21,6 +21,7 @@ from tests.cli.commands import assert_refused
 from tests.scenes.noise_capture import FRAMES, HEIGHT, NAMES, WIDTH
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", ["--no-check", "--help"])
 def test_info__names_standard_output_if_it_is_full(capture: Path, option: str) -> None:
     with open("/dev/full", "w") as full:
@@ -90,6 +91,7 @@ def test_info__prints_the_time_offsets_as_options(capture: Path, run, monkeypatc
     assert "The offsets still change by 0.30 frames" in out
 
 
+@pytest.mark.slow
 def test_info__checks_a_whole_recording(textured_capture: Capture, tmp_path: Path, run) -> None:
     plot, measured = tmp_path / "rig.png", tmp_path / "deep.json"
     status, out, _ = run("info", textured_capture.path, "--deep", "--plot", plot, "--json", measured)

@@ -63,6 +63,7 @@ def test_Live__starts_the_viewer_at_a_provisional_first_frame(
     assert PROVISIONAL in found[0]
 
 
+@pytest.mark.slow
 def test_Live__repeats_videos(capture: Path, tmp_path: Path, videos: list[Path], run, caplog) -> None:
     args = ("--camera", *videos, "--calibration", capture, "--loop", "--seconds", 1, *QUICK)
     status, printed, _ = run("live", tmp_path / "out", *args)

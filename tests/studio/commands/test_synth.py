@@ -18,6 +18,7 @@ def test_synth__replaces_no_folder_with_a_hostile_description(tmp_path: Path, ru
     assert_refused(run("synth", "arm", tmp_path, "--overwrite"), "is not a synthetic capture")
 
 
+@pytest.mark.slow
 def test_synth__renders_a_scene_with_disturbances(tmp_path: Path, run) -> None:
     hard = ("--time-offset", 0.5, "--rolling-shutter", 0.4, "--jpeg-quality", 60)
     status, _, error = run("synth", "spheres", tmp_path / "out", *SIZE, *hard)

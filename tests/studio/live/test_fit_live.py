@@ -55,6 +55,7 @@ def packets(path: Path) -> list[bytes]:
     return [packet.encoded for packet in StreamReader(path / "stream.morgs")]
 
 
+@pytest.mark.slow
 def test_fit_live__follows_a_folder_that_is_filled(tmp_path: Path, rig: Path, images: Path) -> None:
     out, grown = tmp_path / "out", []
     with in_background(filling(images)):
@@ -98,6 +99,7 @@ def grey_psnr(image: np.ndarray) -> float:
     return psnr_of(((values - values.mean((0, 1))) ** 2).mean())
 
 
+@pytest.mark.slow
 def test_fit_live__reads_videos_through_pipes(tmp_path: Path, rig: Path) -> None:
     # Long enough for a slow machine; the pipes are closed when the fit ends.
     repeats, pipes = 120, [tmp_path / f"pipe{k}" for k in range(len(NAMES))]
@@ -124,6 +126,7 @@ def write(images: Path, number: int, names: Sequence[str] = NAMES, **sizes: tupl
             file.write_bytes(png_bytes(cv2.resize(clip[number], sizes.get(name, (200, 150)))))
 
 
+@pytest.mark.slow
 def test_fit_live__leaves_out_a_camera_that_stops(tmp_path: Path, rig: Path, images: Path, caplog) -> None:
     write(images, 0)
     live, others = LiveConfig(rig, downscale=4, frames=3, timeout=0.5), ("cam0", "cam2", "cam3")
@@ -136,6 +139,7 @@ def test_fit_live__leaves_out_a_camera_that_stops(tmp_path: Path, rig: Path, ima
     assert [np.isnan(views[name].psnr) for name in NAMES] == [False, True, False, False]
 
 
+@pytest.mark.slow
 def test_fit_live__needs_no_images_of_a_camera_that_is_left_out(tmp_path: Path, rig: Path, images: Path) -> None:
     with in_background(filling(images)):
         fit_live([images], tmp_path / "out", LiveConfig(rig, without=("cam1",), downscale=4, frames=1), CONFIG)
@@ -143,6 +147,7 @@ def test_fit_live__needs_no_images_of_a_camera_that_is_left_out(tmp_path: Path, 
     assert not (tmp_path / "out" / "capture" / "cam1").exists()
 
 
+@pytest.mark.slow
 def test_fit_live__leaves_out_images_of_another_size(tmp_path: Path, rig: Path, images: Path) -> None:
     write(images, 0)
     live = LiveConfig(rig, downscale=4, frames=2, timeout=5)
@@ -162,6 +167,7 @@ def test_fit_live__calibrates_the_cameras_once(tmp_path: Path, images: Path) -> 
     assert capture.num_frames == 1, "only the first frame is recorded"
 
 
+@pytest.mark.slow
 def test_fit_live__ends_with_a_whole_stream_when_it_is_interrupted(tmp_path: Path, rig: Path, images: Path) -> None:
     def interrupt(row, report) -> None:
         if row.frame == 1:

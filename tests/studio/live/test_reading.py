@@ -135,6 +135,7 @@ def test_read_camera__of_a_pipe_with_something_else_ends_with_an_error(pipe: Pat
     ended.set()
 
 
+@pytest.mark.slow
 def test_read_camera__lets_the_interpreter_end_while_it_waits_for_a_pipe(pipe: Path, tmp_path: Path) -> None:
     """A thread that returns from OpenCV after the end of the interpreter aborts the process."""
     write_video(tmp_path / "clip.mkv", [IMAGE] * 6, 20)

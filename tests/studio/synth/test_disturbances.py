@@ -119,6 +119,7 @@ def test_undistorted__is_the_inverse_of_the_lens(k: float) -> None:
     assert np.abs(there - pixels).max() > 0.5
 
 
+@pytest.mark.slow
 def test_synthesize__shows_a_camera_with_a_time_offset_at_its_own_time(tmp_path: Path) -> None:
     """The motion of a camera's truth leads between its own times; tracks are at the reference's times."""
     clip = synthesize("arm", tmp_path / "clip", replace(SIZE, disturbances=Disturbances(time_offset=2)))
@@ -168,6 +169,7 @@ def test_synthesize__reads_the_rows_of_a_rolling_shutter_at_their_times(tmp_path
     assert abs(middle[0] - expected.mean()) < 0.7
 
 
+@pytest.mark.slow
 def test_synthesize__undistorted_images_are_those_of_the_pinhole_cameras(tmp_path: Path) -> None:
     config = replace(SIZE, width=96, height=72, spp=16, frames=1, disturbances=Disturbances(distortion=0.4))
     clip = synthesize("spheres", tmp_path / "clip", config)
@@ -192,6 +194,7 @@ def test_synthesize__refuses_a_lens_that_folds_its_corners(tmp_path: Path) -> No
         synthesize(wide, tmp_path / "clip", replace(SIZE, cameras=8, disturbances=Disturbances(distortion=0.5)))
 
 
+@pytest.mark.slow
 def test_synthesize__exposes_frames_with_the_gains_of_the_truth(clean: Path, tmp_path: Path) -> None:
     hard = Disturbances(exposure_gain=0.3, exposure_drift=0.2, exposure_flicker=0.1)
     dimmed = synthesize("spheres", tmp_path / "clip", replace(SIZE, disturbances=hard))
@@ -213,6 +216,7 @@ def test_synthesize__compresses_every_image(clean: Path, tmp_path: Path) -> None
     np.testing.assert_array_equal(compressed(whole, 0), whole)
 
 
+@pytest.mark.slow
 def test_light_of_rows__agrees_with_the_image_of_the_sensor() -> None:
     """All rows without a lens are the image of Mitsuba's sensor up to sampling noise."""
     scene = load_scene("spheres")

@@ -28,6 +28,7 @@ def write_example(folder: Path) -> Path:
     return folder / "gem.py"
 
 
+@pytest.mark.slow
 def test_scenes_page__example_is_rendered_with_its_mesh_and_texture(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -20,6 +20,7 @@ def pair(tracer):
     return camera, render_frame(tracer, camera, 4), render_frame(tracer, camera, 5)
 
 
+@pytest.mark.slow
 def test_compute_ground_truth__motion_map_warps_the_previous_frame_onto_the_current_one(pair):
     _, (before, truth_before), (now, truth) = pair
     grid = np.stack(np.meshgrid(np.arange(320), np.arange(240)), axis=-1).astype(np.float32)

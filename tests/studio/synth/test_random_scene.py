@@ -46,6 +46,7 @@ def surface(body: Body, times: np.ndarray) -> np.ndarray:
     return np.einsum("tij,pj->tpi", poses[:, :3, :3], points) + poses[:, None, :3, 3]
 
 
+@pytest.mark.slow
 def test_draw_scene__is_determined_by_the_seed(scenes):
     for seed in (0, 7):
         again = draw_scene(seed)
@@ -123,6 +124,7 @@ def test_draw_scene__draws_all_parameters_from_their_ranges(scenes):
     assert any(map(thin_and_fast, scenes[3:9]))
 
 
+@pytest.mark.slow
 def test_build__objects_are_where_they_were_drawn_and_static_ones_do_not_move(clip):
     scene = draw_scene(1)
     names = json.loads((clip / "capture.json").read_text())["objects"]

@@ -54,6 +54,7 @@ def test_spheres__balls_roll_without_slipping(name, radius):
         assert np.linalg.norm(pose(time + step)[:3, 3] - here[:3, 3]) / step > 0.1
 
 
+@pytest.mark.slow
 def test_thin__objects_move_farther_than_their_width():
     tracer = PathTracer(load_scene("thin"))
     camera = tracer.scene.rig.cameras(3, 320, 240)[0]
@@ -66,6 +67,7 @@ def test_thin__objects_move_farther_than_their_width():
     assert opened.sum() < 0.15 * truth.mask.sum()
 
 
+@pytest.mark.slow
 def test_flicker__images_change_where_surfaces_are_static():
     tracer = PathTracer(load_scene("flicker"))
     camera = tracer.scene.rig.cameras(3, 160, 120)[0]

@@ -26,6 +26,7 @@ from tests.studio.synth.frames import FPS, psnr
 TINY = SynthConfig(cameras=2, frames=1, width=16, height=16, spp=1)
 
 
+@pytest.mark.slow
 def test_synthesize__writes_the_layout_of_n3dv_with_a_colmap_model(clip):
     about = json.loads((clip / "capture.json").read_text())
     assert about["test_view"] == 0
@@ -82,6 +83,7 @@ def test_synthesize__replaces_a_folder_of_system_files_but_no_hidden_ones(tmp_pa
     assert (tmp_path / "new" / "capture.json").is_file()
 
 
+@pytest.mark.slow
 def test_synthesize__rejects_a_non_empty_folder_and_replaces_a_capture_with_overwrite(tmp_path, clip):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(FileExistsError, match="not empty; choose another folder"):
@@ -236,6 +238,7 @@ def test_synthesize__writes_videos_that_browsers_play_beside_the_lossless_frames
     np.testing.assert_array_equal(np.array([f.images[1] for f in load_capture(clip).frames()]), stored)
 
 
+@pytest.mark.slow
 def test_synthesize__without_lossless_frames_records_the_videos(tmp_path):
     config = SynthConfig(cameras=2, frames=2, width=32, height=32, spp=1, lossless=False)
     out = synthesize("spheres", tmp_path / "clip", config)

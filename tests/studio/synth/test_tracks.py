@@ -20,6 +20,7 @@ from morgs_mi.studio.synth.shapes import ball
 from tests.scenes.gaussians import isotropic
 
 
+@pytest.mark.slow
 def test_load_tracks__visible_points_have_the_depth_of_the_view(clip: Path) -> None:
     """Visible points lie on the surface of their pixel, up to its slope; hidden ones behind it or outside."""
     tracks, compared = load_tracks(clip / "truth"), np.zeros(2, int)

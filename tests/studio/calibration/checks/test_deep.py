@@ -82,6 +82,7 @@ def test_check_deep__finds_nothing_in_a_clip_without_faults(clips: Clips) -> Non
     assert check.unmeasured == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sentence", FAULTS)
 def test_check_deep__finds_a_fault_and_no_other(sentence: str, clips: Clips) -> None:
     found = [finding.sentence for finding in checked(FAULTS[sentence](clips)).findings]

@@ -45,6 +45,7 @@ def interpreted(matrix: np.ndarray, direction: str, axes: str) -> np.ndarray:
     return FLIP @ matrix if axes == "OpenGL" else matrix
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", list(POSES), ids=" ".join)
 @pytest.mark.parametrize("layout", list(EXPECTED))
 def test_check_rig__names_another_pose_convention(
@@ -81,6 +82,7 @@ WRONG_CAMERAS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", WRONG_CAMERAS)
 def test_check_rig__names_a_single_wrong_camera(capture: Capture, shared: SharedFeatures, kind: str) -> None:
     change, sentence = WRONG_CAMERAS[kind]
