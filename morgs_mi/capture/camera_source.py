@@ -32,7 +32,7 @@ class CameraSource:
     shares: np.ndarray | None = None
     color_correction: ColorCorrection | None = None  #: The colour correction, or None.
     #: The mask of the recorded pixels that are neither transparent nor masked out [H, W], or None if all are.
-    used: np.ndarray | None = None
+    recorded_mask: np.ndarray | None = None
     delay: float = 0.0  #: Time from an instant to the frame that shows it, in frames of the clip.
     #: Stops by which linear light is brightened and shown in 8 bits; None: it is not shown.
     display_exposure: float | None = None
@@ -55,18 +55,18 @@ class CameraSource:
             FileNotFoundError: a mask is missing.
             ValueError: a mask cannot be read, or no pixel is left.
         """
-        used, notes = used_in_clip(reader, masks, camera.name)
+        mask, notes = used_in_clip(reader, masks, camera.name)
         maps = undistortion(camera, lens)
         indices = times.frame_indices
-        return cls(reader, lens, maps, indices, times.shares, used=used, delay=times.delay, notes=tuple(notes))
+        return cls(reader, lens, maps, indices, times.shares, recorded_mask=mask, delay=times.delay, notes=tuple(notes))
 
     def at_instants(self) -> CameraSource:
         """Return the source without a delay: its images are interpolated instead."""
         if not self.delay:
             return self
         positions = self.frame_indices - self.delay
-        before = np.floor(positions).astype(int)
-        return replace(self, frame_indices=before, shares=positions - before, delay=0.0)
+        indices = np.floor(positions).astype(int)
+        return replace(self, frame_indices=indices, shares=positions - indices, delay=0.0)
 
     def images(self, camera: Camera, start: int, stop: int) -> Generator[ImageOrError, None, None]:
         """Yield the processed images of the instants start..stop-1, with an error in place of a missing image."""
@@ -104,12 +104,12 @@ class CameraSource:
 
     def mask(self, camera: Camera) -> np.ndarray | None:
         """Return the mask of the valid pixels of `camera` [H, W] bool, or None if all are valid."""
-        valid = self.used
+        valid = self.recorded_mask
         if self.undistortion is not None:
             valid = self.undistortion.mask
-            if self.used is not None:
+            if self.recorded_mask is not None:
                 # Other pixels must not contribute; cubic weights can also be negative.
-                valid = valid & (np.abs(self.undistortion(self.used.astype(np.float32)) - 1) < 1e-3)
+                valid = valid & (np.abs(self.undistortion(self.recorded_mask.astype(np.float32)) - 1) < 1e-3)
         if valid is None or valid.all():
             return None
         # A downscaled pixel is valid if all pixels that it averages are.

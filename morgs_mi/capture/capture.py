@@ -156,13 +156,13 @@ class Capture:
         if not np.any(distortions):
             return rig
         sources = list(self._sources)
-        left = tuple((float(k1), float(k2)) for k1, k2 in distortions)
-        views = zip(self.at_recorded_size().cameras, rig.at_recorded_size().cameras, left, strict=True)
-        for v, (given, refined, terms) in enumerate(views):
-            both = undistortion(given, sources[v].lens, (refined, Lens("RADIAL", terms)))
+        radial_terms = tuple((float(k1), float(k2)) for k1, k2 in distortions)
+        views = zip(self.at_recorded_size().cameras, rig.at_recorded_size().cameras, radial_terms, strict=True)
+        for v, (calibrated_camera, refined, terms) in enumerate(views):
+            both = undistortion(calibrated_camera, sources[v].lens, (refined, Lens("RADIAL", terms)))
             sources[v] = replace(sources[v], undistortion=both)
         masks = tuple(source.mask(camera) for source, camera in zip(sources, rig.cameras, strict=True))
-        return replace(rig, masks=masks, _sources=tuple(sources), distortions=left)
+        return replace(rig, masks=masks, _sources=tuple(sources), distortions=radial_terms)
 
     def holding_out(self, views: int | str | Sequence[int | str] | None) -> Capture:
         """Return the capture with other held-out cameras, by indices or names; None for none.
@@ -235,21 +235,21 @@ class Capture:
     def with_delays(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
         """Return the cameras of a stream of this capture with the delays and readouts of the capture's cameras."""
         pairs = zip(cameras, self.cameras, strict=True)
-        return tuple(replace(camera, delay=own.delay, readout=own.readout) for camera, own in pairs)
+        return tuple(replace(camera, delay=original.delay, readout=original.readout) for camera, original in pairs)
 
     def _decoded(self, start: int, stop: int | None, strict: bool) -> Generator[PartialFrame, None, None]:
         stop = self.num_frames if stop is None else min(stop, self.num_frames)
         streams = [s.images(c, start, stop) for s, c in zip(self._sources, self.cameras, strict=True)]
         missing: set[str] = set()
         try:
-            for index, found in enumerate(zip(*streams, strict=True), start=start):
-                errors = {n: f for n, f in zip(self.names, found, strict=True) if isinstance(f, Exception)}
+            for index, results in enumerate(zip(*streams, strict=True), start=start):
+                errors = {n: f for n, f in zip(self.names, results, strict=True) if isinstance(f, Exception)}
                 if strict and errors:
                     raise next(iter(errors.values()))
                 for name in errors.keys() - missing:
                     _LOG.warning("frame %d: %s is left out: %s", index, name, errors[name])
                 missing = set(errors)
-                images = tuple(None if isinstance(f, Exception) else f for f in found)
+                images = tuple(None if isinstance(f, Exception) else f for f in results)
                 problems = tuple(f"{name}: {error}" for name, error in errors.items())
                 if index == 0 and any(source.delay for source in self._sources):
                     yield PartialFrame(index, self._at_first_instant(images), problems, images)
@@ -265,8 +265,10 @@ class Capture:
         The motion in the first frame is unknown, so delays cannot be rendered.
         """
         views = zip(images, self._sources, self.cameras, strict=True)
-        found = (next(s.at_instants().images(c, 0, 1)) if s.delay and i is not None else i for i, s, c in views)
-        return tuple(own if isinstance(new, Exception) else new for own, new in zip(images, found, strict=True))
+        results = (next(s.at_instants().images(c, 0, 1)) if s.delay and i is not None else i for i, s, c in views)
+        return tuple(
+            image if isinstance(result, Exception) else result for image, result in zip(images, results, strict=True)
+        )
 
 
 def load_capture(
@@ -298,8 +300,8 @@ def load_capture(
     """
     path = mirrored(str(path)) if is_url(path) else Path(path)
     if not path.is_dir():
-        found = "a file" if path.is_file() else "none"
-        raise FileNotFoundError(f"{path}: expected a capture folder, found {found}; check the path.")
+        kind = "a file" if path.is_file() else "none"
+        raise FileNotFoundError(f"{path}: expected a capture folder, found {kind}; check the path.")
     if not downscale >= 1:
         raise ValueError(f"load_capture(): `downscale` must be at least 1, got {downscale}.")
     if max_frames is not None and max_frames < 1:
@@ -311,10 +313,10 @@ def load_capture(
     calibration = every.without(path, reading.without)
     readers = open_clips(calibration.clips, reading.gaps)
     recorded = [at_clip_size(c, r) for c, r in zip(calibration.cameras, readers, strict=True)]
-    if scaled := [new for old, new in zip(calibration.cameras, recorded, strict=True) if new is not old]:
+    if scaled_cameras := [new for old, new in zip(calibration.cameras, recorded, strict=True) if new is not old]:
         _LOG.warning(
             "%s: the clips of %s do not have the calibrated size (the first has %dx%d); the intrinsics are scaled.",
-            *(path, ", ".join(c.name for c in scaled), scaled[0].width, scaled[0].height),
+            *(path, ", ".join(c.name for c in scaled_cameras), scaled_cameras[0].width, scaled_cameras[0].height),
         )
     names = [camera.name for camera in recorded]
     common = timeline(path, names, readers, reading, max_frames, settings.get("fps"))

@@ -88,23 +88,23 @@ def fit_colors(
     corrected: dict[int, np.ndarray] = {start: colors[start]}
     matrices: list[np.ndarray | None] = [None] * len(cameras)
     while len(corrected) < len(cameras):
-        known = counts[:, list(corrected)].sum(1)
-        known[list(corrected)] = -1
-        view = int(known.argmax())
-        if known[view] >= _MIN_SAMPLES:
+        shared_counts = counts[:, list(corrected)].sum(1)
+        shared_counts[list(corrected)] = -1
+        view = int(shared_counts.argmax())
+        if shared_counts[view] >= _MIN_SAMPLES:
             matrices[view] = matrix = _fit(*_shared_colors(view, pairs, colors, corrected))
             corrected[view] = _corrected(colors[view], matrix)
         else:
             _LOG.warning("%s keeps its colours: too few points in common with the others.", cameras[view].name)
             corrected[view] = colors[view]
             counts[view] = counts[:, view] = 0  # no other view is corrected towards it
-    after = [corrected[view] for view in range(len(cameras))]
+    final_colors = [corrected[view] for view in range(len(cameras))]
     return ColorFit(
         start,
         tuple(matrices),
         tuple(sum(len(pair.features) for pair in pairs if view in pair.views) for view in range(len(cameras))),
         _differences(pairs, colors),
-        _differences(pairs, after),
+        _differences(pairs, final_colors),
     )
 
 
@@ -143,8 +143,8 @@ def _reliable(
     """Return the features of a match that fit the poses and are well exposed in both views."""
     good = reprojection_errors(match, features, cameras) <= _MAX_ERROR
     for k, view in enumerate(match.views):
-        matched = colors[view][match.features[:, k]]
-        good &= ((matched > _LINEAR[_DARK]) & (matched < _LINEAR[_BRIGHT])).all(1)
+        feature_colors = colors[view][match.features[:, k]]
+        good &= ((feature_colors > _LINEAR[_DARK]) & (feature_colors < _LINEAR[_BRIGHT])).all(1)
     return Match(match.views, match.features[good])
 
 
@@ -188,13 +188,13 @@ def delta_e(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _differences(pairs: Sequence[Match], colors: Sequence[np.ndarray]) -> tuple[float, ...]:
     """Return per view the mean dE2000 of its points against their colours in the other views."""
-    found: list[list[np.ndarray]] = [[] for _ in colors]
+    differences: list[list[np.ndarray]] = [[] for _ in colors]
     for pair in pairs:
         a, b = (colors[view][pair.features[:, k]] for k, view in enumerate(pair.views))
         if len(a):
             for view in pair.views:
-                found[view].append(delta_e(a, b))
-    return tuple(float(np.mean(np.concatenate(values))) if values else float("nan") for values in found)
+                differences[view].append(delta_e(a, b))
+    return tuple(float(np.mean(np.concatenate(values))) if values else float("nan") for values in differences)
 
 
 def _encode(light: np.ndarray) -> np.ndarray:

@@ -83,13 +83,13 @@ def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features
     where = None if mask is None else cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
     # Without precise upscaling OpenCV's features are off by a quarter of a pixel.
     sift = cv2.SIFT.create(nfeatures=_MAX_FEATURES, enable_precise_upscale=True)
-    found, descriptors = sift.detectAndCompute(grey, where)
+    keypoints, descriptors = sift.detectAndCompute(grey, where)
     if descriptors is None:
         return none
     enlarged = width / size[0], height / size[1]
-    points = (np.array([k.pt for k in found]) + 0.5) * enlarged
-    angles = np.deg2rad([k.angle for k in found])
-    sizes = np.array([k.size for k in found])
+    points = (np.array([k.pt for k in keypoints]) + 0.5) * enlarged
+    angles = np.deg2rad([k.angle for k in keypoints])
+    sizes = np.array([k.size for k in keypoints])
     axes = 0.5 * sizes[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1) * enlarged
     # RootSIFT: square roots of the normalised descriptors are easier to distinguish (Arandjelovic 2012).
     descriptors = np.sqrt(descriptors / descriptors.sum(1, keepdims=True))
@@ -135,8 +135,8 @@ def _matches(a: Features, b: Features) -> np.ndarray:
         _, inliers = cv2.findFundamentalMat(*points, cv2.USAC_MAGSAC, 2.0, 0.999, 5000)
     except cv2.error:  # raised for some matches that fit no geometry
         return none
-    kept = pairs[inliers.ravel() > 0] if inliers is not None else none
-    return kept if len(kept) >= _MIN_MATCHES else none
+    inlier_pairs = pairs[inliers.ravel() > 0] if inliers is not None else none
+    return inlier_pairs if len(inlier_pairs) >= _MIN_MATCHES else none
 
 
 def descriptor_distances(a: Features, b: Features) -> np.ndarray:
@@ -216,10 +216,10 @@ def join_matches(matches: Sequence[Match], features: Sequence[Features]) -> Trac
     # A track is valid if it has at least two features, all in different views.
     sizes = np.bincount(track)
     distinct = np.bincount(np.unique(np.stack([track, views]), axis=1)[0], minlength=len(sizes))
-    used = np.flatnonzero(((sizes >= 2) & (distinct == sizes))[track])
-    _, track = np.unique(track[used], return_inverse=True)
-    pixels, colors = (np.concatenate([getattr(f, name) for f in features])[used] for name in ("points", "colors"))
-    return Tracks(track, views[used], pixels, colors)
+    members = np.flatnonzero(((sizes >= 2) & (distinct == sizes))[track])
+    _, track = np.unique(track[members], return_inverse=True)
+    pixels, colors = (np.concatenate([getattr(f, name) for f in features])[members] for name in ("points", "colors"))
+    return Tracks(track, views[members], pixels, colors)
 
 
 def intersect(

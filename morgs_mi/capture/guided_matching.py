@@ -37,10 +37,10 @@ def match_guided(
             continue
         distances = descriptor_distances(a, b)
         near = _line_distances(a.points, b.points, cameras[i], cameras[j]) <= _BAND
-        found = mutual_neighbours(np.where(near & (distances <= _MAX_DISTANCE), distances, 2.0))
-        found = found[_patches_agree(a, b, found, cameras[i], cameras[j])]
-        if len(found):
-            matches.append(Match((i, j), found))
+        index_pairs = mutual_neighbours(np.where(near & (distances <= _MAX_DISTANCE), distances, 2.0))
+        index_pairs = index_pairs[_patches_agree(a, b, index_pairs, cameras[i], cameras[j])]
+        if len(index_pairs):
+            matches.append(Match((i, j), index_pairs))
     return matches
 
 
@@ -84,5 +84,5 @@ def _carried(points: np.ndarray, vectors: np.ndarray, first: Camera, second: Cam
     normals = sum(ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
     directions = first.unproject(first.project(points)[0] + vectors, np.ones(len(points))) - first.position
     scale = (rays[0] * normals).sum(axis=1) / (directions * normals).sum(axis=1)
-    moved = first.position + scale[:, None] * directions
-    return second.project(moved)[0] - second.project(points)[0]
+    ends = first.position + scale[:, None] * directions
+    return second.project(ends)[0] - second.project(points)[0]

@@ -16,7 +16,7 @@ _MANY = 6
 
 
 def held_out_by(
-    path: Path, requested: TestViews, settings: dict[str, Any], every: Calibration, used: Calibration
+    path: Path, requested: TestViews, settings: dict[str, Any], every: Calibration, subset: Calibration
 ) -> tuple[int, ...]:
     """Return the indices of the held-out cameras among the used ones.
 
@@ -25,23 +25,23 @@ def held_out_by(
         requested: as for `load_capture`; "auto": by the settings, by the layout, or by the number of cameras.
         settings: content of the capture's `capture.json`, whose indices count all cameras.
         every: all cameras.
-        used: the cameras that are not left out.
+        subset: the cameras that are not left out.
 
     Raises:
         ValueError: a camera is unknown, or none is left for training.
     """
     if requested != "auto":
-        return held_out_views(path, requested, used.names)
+        return held_out_views(path, requested, subset.names)
     if "test_view" in settings:
         views = _indices(path / CAPTURE, settings["test_view"], every.names)
         if not views:
             return ()
     else:
         views = every.test_views or ()
-    names = [every.names[view] for view in views if every.names[view] in used.names]
-    if not names and every.test_views != () and len(used.names) >= _MANY:
+    names = [every.names[view] for view in views if every.names[view] in subset.names]
+    if not names and every.test_views != () and len(subset.names) >= _MANY:
         return (0,)
-    return held_out_views(path, names, used.names)
+    return held_out_views(path, names, subset.names)
 
 
 def held_out_views(path: Path, views: int | str | Sequence[int | str] | None, names: Sequence[str]) -> tuple[int, ...]:

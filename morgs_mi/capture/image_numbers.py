@@ -69,9 +69,9 @@ def align_numbers(
 
 def _aligned(readers: Sequence[FrameReader], numbers: _Numbers, begin: int, notes: tuple[str, ...]) -> ImageNumbers:
     """Return the alignment to common numbers that start with `begin`; other clips start with the first of `numbers`."""
-    step = lcm(*(own.step for own in numbers.values()))
-    finest = min(own.step for own in numbers.values())
-    first = min(own[0] for own in numbers.values())
+    step = lcm(*(clip_numbers.step for clip_numbers in numbers.values()))
+    finest = min(clip_numbers.step for clip_numbers in numbers.values())
+    first = min(clip_numbers[0] for clip_numbers in numbers.values())
     clips = [numbers.get(c, range(first, first + 1, finest)) for c in range(len(readers))]
     offsets = np.array([(begin - clip[0]) / clip.step for clip in clips])
     rates = np.array([step / clip.step for clip in clips])
@@ -80,7 +80,7 @@ def _aligned(readers: Sequence[FrameReader], numbers: _Numbers, begin: int, note
 
 def _separate(names: Sequence[str], numbers: _Numbers, groups: Sequence[Sequence[int]]) -> tuple[str, ...]:
     """Return a note on cameras that count separately, none if there are none or single images."""
-    if len(groups) < 2 or all(len(own) == 1 for own in numbers.values()):
+    if len(groups) < 2 or all(len(clip_numbers) == 1 for clip_numbers in numbers.values()):
         return ()
     table = "; ".join(_table(names, numbers, group[:1]) for group in groups)
     return (f"The numbers of the images do not overlap: {table}. Cameras with such numbers begin at the same time.",)

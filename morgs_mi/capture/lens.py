@@ -105,9 +105,9 @@ def undistortion(camera: Camera, lens: Lens, refined: tuple[Camera, Lens] | None
         return None
     x, y, mask = _maps(*stages[0])
     for stage in stages[1:]:
-        columns, rows, inside = _maps(*stage)
+        columns, rows, stage_mask = _maps(*stage)
         x, y = (cv2.remap(v, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for v in (x, y))
-        mask = inside & (cv2.remap(mask.astype(np.float32), columns, rows, cv2.INTER_LINEAR) > 1 - 1e-3)
+        mask = stage_mask & (cv2.remap(mask.astype(np.float32), columns, rows, cv2.INTER_LINEAR) > 1 - 1e-3)
     # Fixed point halves the memory of a rig's maps; its 1/32 px is far below the error of any calibration.
     return Undistortion(cv2.convertMaps(x, y, cv2.CV_16SC2), mask)
 

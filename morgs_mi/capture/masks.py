@@ -20,8 +20,8 @@ def used_in_clip(reader: FrameReader, masks: Sequence[Path], name: str) -> tuple
         ValueError: a mask cannot be read, or no pixel is left.
     """
     opaque, *notes = opaque_pixels(reader, name)
-    used, note = used_pixels(masks, reader.width, reader.height, name)
-    both = opaque if used is None else used if opaque is None else used & opaque
+    mask, note = used_pixels(masks, reader.width, reader.height, name)
+    both = opaque if mask is None else mask if opaque is None else mask & opaque
     if both is not None and not both.any():
         raise ValueError(f"{masks[0]}: expected pixels that are used, got a mask of transparent ones; correct it.")
     return both, [text for text in (*notes, note) if text]
@@ -61,18 +61,18 @@ def used_pixels(files: Sequence[Path], width: int, height: int, name: str) -> tu
         FileNotFoundError: an image is missing.
         ValueError: an image cannot be read or has another aspect ratio, or all pixels are masked out.
     """
-    used = np.ones((height, width), bool)
+    combined_mask = np.ones((height, width), bool)
     varies = False
     for file in files:
         mask = _at_size(file, _not_black(file), width, height)
-        varies = varies or (file != files[0] and not np.array_equal(used & mask, used))
-        used &= mask
-    if used.all():
+        varies = varies or (file != files[0] and not np.array_equal(combined_mask & mask, combined_mask))
+        combined_mask &= mask
+    if combined_mask.all():
         return None, ""
-    if not used.any():
+    if not combined_mask.any():
         raise ValueError(f"{files[0]}: expected pixels that are used, got a black mask of {name}; correct it.")
     several = f": all that any of {len(files)} different masks has black" if varies else f" by {files[0].name}"
-    return used, f"{name}: {100 * (1 - used.mean()):.1f} % of its pixels are masked out{several}."
+    return combined_mask, f"{name}: {100 * (1 - combined_mask.mean()):.1f} % of its pixels are masked out{several}."
 
 
 def _not_black(file: Path) -> np.ndarray:

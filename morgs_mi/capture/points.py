@@ -95,7 +95,7 @@ def dense_points(capture: Capture, shared: SharedFeatures, seed: int = 0) -> Cap
 
 def _unmatched(views: Sequence[int], matches: Sequence[Match]) -> list[tuple[int, int]]:
     """Return the unmatched pairs of views that match few others."""
-    matched = {match.views for match in matches}
-    partners = Counter(view for pair in matched for view in pair)
+    matched_pairs = {match.views for match in matches}
+    partners = Counter(view for pair in matched_pairs for view in pair)
     few = {view for view in views if partners[view] < _MIN_PARTNERS}
-    return [pair for pair in combinations(views, 2) if pair not in matched and few & set(pair)]
+    return [pair for pair in combinations(views, 2) if pair not in matched_pairs and few & set(pair)]

@@ -41,7 +41,7 @@ def stereo_points(
     cameras: Sequence[Camera],
     images: Sequence[np.ndarray],
     masks: Sequence[np.ndarray | None],
-    known: np.ndarray,
+    scene_points: np.ndarray,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return points [P, 3], world units, and their colours [P, 3] in [0, 1]; none if no cameras are close.
@@ -50,16 +50,16 @@ def stereo_points(
         cameras: C views.
         images: per view uint8 [H, W, 3], RGB.
         masks: per view the mask of valid pixels [H, W] bool, or None.
-        known: points [K, 3] of the scene, which limit the depths.
+        scene_points: points [K, 3] of the scene, which limit the depths.
         rng: random generator for the selection of points.
     """
     views = [_View.of(*view) for view in zip(cameras, images, masks, strict=True)]
-    found = [np.zeros((0, 6))]
-    for i, j in _neighbours(cameras, known):
-        points = _matched(views[i], views[j], _depth_range(cameras, i, known))
+    batches = [np.zeros((0, 6))]
+    for i, j in _neighbours(cameras, scene_points):
+        points = _matched(views[i], views[j], _depth_range(cameras, i, scene_points))
         others = [view for k, view in enumerate(views) if k not in (i, j)]
-        found.append(_some_confirmed(rng.permutation(points), others))
-    points, colors = np.split(np.concatenate(found), 2, axis=1)
+        batches.append(_some_confirmed(rng.permutation(points), others))
+    points, colors = np.split(np.concatenate(batches), 2, axis=1)
     return points.astype(np.float32), colors.astype(np.float32)
 
 
@@ -82,10 +82,10 @@ class _View:
         return cls(camera.resized(*size), reduced, cv2.blur(reduced, (3, 3)), valid)
 
 
-def _neighbours(cameras: Sequence[Camera], known: np.ndarray) -> list[tuple[int, int]]:
+def _neighbours(cameras: Sequence[Camera], scene_points: np.ndarray) -> list[tuple[int, int]]:
     """Return the pairs of cameras that are close enough."""
     pairs = set()
-    for i, (camera, depth) in enumerate(zip(cameras, scene_depths(cameras, known), strict=True)):
+    for i, (camera, depth) in enumerate(zip(cameras, scene_depths(cameras, scene_points), strict=True)):
         angles = angles_to(camera, depth, cameras)
         angles[i] = np.inf
         for j in np.argsort(angles)[:_NEIGHBOURS]:
@@ -94,13 +94,13 @@ def _neighbours(cameras: Sequence[Camera], known: np.ndarray) -> list[tuple[int,
     return sorted(pairs)
 
 
-def _depth_range(cameras: Sequence[Camera], view: int, known: np.ndarray) -> tuple[float, float]:
+def _depth_range(cameras: Sequence[Camera], view: int, scene_points: np.ndarray) -> tuple[float, float]:
     """Return the smallest and the largest depth in a view."""
-    _, _, depths = seen_points(cameras[view], known)
+    _, _, depths = seen_points(cameras[view], scene_points)
     if len(depths) >= _KNOWN:
         near, far = np.quantile(depths, (0.02, 0.98))
         return _NEAR * float(near), _FAR * float(far)
-    middle = scene_depths(cameras, known)[view]
+    middle = scene_depths(cameras, scene_points)[view]
     return middle / _BLIND, middle * _BLIND
 
 
@@ -172,15 +172,17 @@ def _matched(a: _View, b: _View, depths: tuple[float, float]) -> np.ndarray:
     back = _disparity(right, left, 1 - lowest - count, count)
     rows, columns = np.mgrid[:height, :width]
     partner = np.round(columns - forth).astype(int)
-    inside = (partner >= 0) & (partner < width)
+    has_partner = (partner >= 0) & (partner < width)
     partner = np.clip(partner, 0, width - 1)
     agree = np.abs(forth + back[rows, partner]) <= _MAX_DIFFERENCE
-    kept = agree & inside & (forth >= lowest) & (forth - shift > 0) & (valid[0] > 0) & (valid[1][rows, partner] > 0)
-    depth = product / (forth[kept] - shift)
-    x = columns[kept] + 0.5 + rig.corners[0]
-    y = rows[kept] + 0.5 + rig.corners[2]
+    mask = (
+        agree & has_partner & (forth >= lowest) & (forth - shift > 0) & (valid[0] > 0) & (valid[1][rows, partner] > 0)
+    )
+    depth = product / (forth[mask] - shift)
+    x = columns[mask] + 0.5 + rig.corners[0]
+    y = rows[mask] + 0.5 + rig.corners[2]
     points = np.stack([x * depth / rig.focal, y * depth / rig.focal, depth], axis=1) @ rig.axes + a.camera.position
-    return np.concatenate([points, left[kept] / 255.0], axis=1)
+    return np.concatenate([points, left[mask] / 255.0], axis=1)
 
 
 def _disparity(left: np.ndarray, right: np.ndarray, lowest: int, count: int) -> np.ndarray:
@@ -222,11 +224,11 @@ def _confirmed(points: np.ndarray, others: Sequence[_View]) -> np.ndarray:
     """Return the mask of points with colours [P, 6] that have their colour in a valid pixel of another view."""
     confirmed = np.zeros(len(points), bool)
     for view in others:
-        seen, pixels, _ = seen_points(view.camera, points[:, :3])
+        visible, pixels, _ = seen_points(view.camera, points[:, :3])
         columns, rows = pixels.astype(int).T
         shown = view.blurred[rows, columns] / 255.0
-        same = np.abs(shown - points[seen, 3:]).max(axis=1) < _MAX_COLOR
-        confirmed[seen] |= same & (view.valid[rows, columns] > 0)
+        same = np.abs(shown - points[visible, 3:]).max(axis=1) < _MAX_COLOR
+        confirmed[visible] |= same & (view.valid[rows, columns] > 0)
     return confirmed
 
 

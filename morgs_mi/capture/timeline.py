@@ -162,9 +162,9 @@ def _warn_apart(path: Path, times: np.ndarray, indices: Sequence[np.ndarray], fp
     images = times[:, np.isfinite(times).any(0)]
     if not images.size:
         return
-    apart = float((np.nanmax(images, axis=0) - np.nanmin(images, axis=0)).max()) / fps
-    if apart > 1e-3:
-        _LOG.warning("%s: images of one instant are up to %.1f ms apart.", path, 1e3 * apart)
+    spread = float((np.nanmax(images, axis=0) - np.nanmin(images, axis=0)).max()) / fps
+    if spread > 1e-3:
+        _LOG.warning("%s: images of one instant are up to %.1f ms apart.", path, 1e3 * spread)
 
 
 @dataclass(frozen=True)

@@ -169,15 +169,15 @@ def _line_report() -> Report:
 
     def report(stage: str, done: float, total: float) -> None:
         nonlocal last
-        now = time.monotonic()
-        begin.setdefault(stage, (now, done))
-        if now - last < _PERIOD:
+        moment = time.monotonic()
+        begin.setdefault(stage, (moment, done))
+        if moment - last < _PERIOD:
             return
-        start, before = begin[stage]
-        last = now
-        seconds = now - start
-        left = f", about {_clock(seconds * (total - done) / (done - before))} left" if done > before else ""
-        print_warning(f"{stage}: {int(done)}/{total:.0f}, {_clock(seconds)} elapsed{left}.")
+        start, base = begin[stage]
+        last = moment
+        seconds = moment - start
+        estimate = f", about {_clock(seconds * (total - done) / (done - base))} left" if done > base else ""
+        print_warning(f"{stage}: {int(done)}/{total:.0f}, {_clock(seconds)} elapsed{estimate}.")
 
     return report
 

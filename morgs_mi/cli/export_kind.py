@@ -32,9 +32,9 @@ class ExportKind:
     arguments: ClassVar[Mapping[str, str]] = {"span": "--frames", "least": "--least-seconds"}
 
     def run(self, stream: FrameSource) -> None:
-        given: Mapping[str, Any] = vars(self)
-        stem = Path(given.get("path", "")).stem
-        output, chosen = destination(stream.path, given["output"], self.formats, given.get("format"), stem)
+        options: Mapping[str, Any] = vars(self)
+        stem = Path(options.get("path", "")).stem
+        output, chosen = destination(stream.path, options["output"], self.formats, options.get("format"), stem)
         with progress() as report:
             summary = self.write(stream, output, chosen, report)
         print_result(f"{output}: {summary}.")

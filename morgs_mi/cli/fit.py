@@ -102,10 +102,10 @@ def _print_summary(stream: Path, reports: Sequence[FrameReport]) -> None:
     """Print the size of a stream and the time that its frames took."""
     first = reports[0]
     seconds = [row.seconds for row in reports[1:]]
-    later = f", {sum(seconds) / len(seconds):.1f} s for each later one" if seconds else ""
+    later_text = f", {sum(seconds) / len(seconds):.1f} s for each later one" if seconds else ""
     print_result(
         f"{stream}: {len(reports)} frames, {stream.stat().st_size / 1e6:.1f} MB, "
-        f"{first.seconds:.1f} s for the first one ({first.num_gaussians} Gaussians, {first.steps} steps){later}."
+        f"{first.seconds:.1f} s for the first one ({first.num_gaussians} Gaussians, {first.steps} steps){later_text}."
     )
     for sentence in first_frame_sentences(first.validation):
         print_result(sentence)

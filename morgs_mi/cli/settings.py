@@ -99,15 +99,15 @@ def _offsets(words: list[str]) -> dict[str, float]:
     if not words or len(names) > len(numbers):
         last = f"{words[-1]!r} without one" if words else "nothing"
         raise ValueError(f"expected pairs of a camera and a number, such as cam01 -0.5, got {last}.")
-    found: dict[str, float] = {}
+    offsets: dict[str, float] = {}
     for name, number in zip(names, numbers, strict=True):
-        if name in found:
+        if name in offsets:
             raise ValueError(f"expected each camera once, got {name} twice.")
         try:
-            found[name] = float(number)
+            offsets[name] = float(number)
         except ValueError:
             raise ValueError(f"the offset of {name} must be a number of frames, got {number!r}.") from None
-    return found
+    return offsets
 
 
 _OFFSETS = PrimitiveConstructorSpec(

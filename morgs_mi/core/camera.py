@@ -121,14 +121,15 @@ class Camera:
         forward = vectors["target"] - vectors["origin"]
         right = np.cross(forward, vectors["up"])
         if not np.linalg.norm(right) > 1e-12 * np.linalg.norm(forward) * np.linalg.norm(vectors["up"]):
-            found = ", ".join(f"{key} {value.tolist()}" for key, value in vectors.items())
-            raise ValueError(f"{where}: `up` must not be parallel to the direction of view, got {found}; tilt it.")
+            text = ", ".join(f"{key} {value.tolist()}" for key, value in vectors.items())
+            raise ValueError(f"{where}: `up` must not be parallel to the direction of view, got {text}; tilt it.")
         distance = float(np.linalg.norm(forward))
         forward /= distance
         right /= np.linalg.norm(right)
         R = np.stack([right, np.cross(forward, right), forward])
         viewmat = np.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = R, -R @ vectors["origin"]
+        viewmat[:3, :3] = R
+        viewmat[:3, 3] = -R @ vectors["origin"]
         f = 0.5 * width / np.tan(np.deg2rad(0.5 * fov_x))
         K = np.array([[f, 0, 0.5 * width], [0, f, 0.5 * height], [0, 0, 1.0]])
         return cls(K, viewmat, width, height, name, min(0.01, distance / 100) if near is None else near)

@@ -69,9 +69,9 @@ def check_mask(place: str, mask: Any, height: int, width: int) -> None:
         ValueError: it is not.
     """
     if not isinstance(mask, np.ndarray) or mask.shape != (height, width) or mask.dtype != bool:
-        found = f"{mask.dtype} {list(mask.shape)}" if isinstance(mask, np.ndarray) else type(mask).__name__
+        kind = f"{mask.dtype} {list(mask.shape)}" if isinstance(mask, np.ndarray) else type(mask).__name__
         raise ValueError(
-            f"{place}: the mask must be bool [{height}, {width}] like its image, got {found}; resize it without "
+            f"{place}: the mask must be bool [{height}, {width}] like its image, got {kind}; resize it without "
             "interpolation, or compare it with a threshold."
         )
 
@@ -87,8 +87,8 @@ def numbers(place: str, name: str, values: ArrayLike) -> np.ndarray:
     except (TypeError, ValueError, RuntimeError):  # for instance rows of different lengths
         array = np.array(None)
     if array.dtype.kind not in "fiub":
-        found = f"{array.dtype} {list(array.shape)}" if isinstance(values, np.ndarray) else repr(values)[:80]
-        raise ValueError(f"{place}: `{name}` must be an array of real numbers, got {found}; convert it to floats.")
+        kind = f"{array.dtype} {list(array.shape)}" if isinstance(values, np.ndarray) else repr(values)[:80]
+        raise ValueError(f"{place}: `{name}` must be an array of real numbers, got {kind}; convert it to floats.")
     return array
 
 

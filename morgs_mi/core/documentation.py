@@ -41,9 +41,9 @@ def field_docs(config_type: type) -> dict[str, str]:
         except (OSError, TypeError, SyntaxError):
             continue
         body = definition.body if isinstance(definition, ast.ClassDef) else []
-        for node, after in pairwise(body):
-            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and isinstance(after, ast.Expr):
-                text = after.value.value if isinstance(after.value, ast.Constant) else None
+        for node, sibling in pairwise(body):
+            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and isinstance(sibling, ast.Expr):
+                text = sibling.value.value if isinstance(sibling.value, ast.Constant) else None
                 if isinstance(text, str):
                     docs[node.target.id] = inspect.cleandoc(text)
     return docs

@@ -36,8 +36,8 @@ def atomic_path(path: str | os.PathLike[str], place: str) -> Generator[Path, Non
     replaces_folder = os.path.isdir(final)  # unlike Path's, never raises
     if os.path.exists(final) and not (replaces_folder or os.path.isfile(final)):
         raise FileExistsError(f"{place}: {path} is a device or a pipe, which would be replaced; name a file.")
-    for left in _left_behind(final):
-        _remove(left)
+    for leftover in _left_behind(final):
+        _remove(leftover)
     try:
         yield partial
         if replaces_folder and partial.is_dir():
@@ -131,10 +131,10 @@ def json_finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def write_error(start: str, error: Exception, own: Path) -> OSError:
-    """Return an error with the reason of another one, and its file unless that is `own`."""
+def write_error(start: str, error: Exception, target: Path) -> OSError:
+    """Return an error with the reason of another one, and its file unless that is `target`."""
     reason = (getattr(error, "strerror", None) or str(error)).rstrip(".")
-    if (file := getattr(error, "filename", None)) and str(file) != str(own):
+    if (file := getattr(error, "filename", None)) and str(file) != str(target):
         reason += f": {file}"
     failure = OSError(f"{start}: {reason}; check that its folder is writable and the disk has room.")
     failure.strerror = reason  # otherwise a folder's sentence would contain the sentence of a file in it
@@ -167,10 +167,10 @@ def _remove_empty(folders: Iterable[Path]) -> None:
 
 def _left_behind(final: Path) -> list[Path]:
     """Return the partial files of `final` of killed processes, one of which may have had this process's number."""
-    own = str(os.getpid())
+    process_id = str(os.getpid())
     named = re.compile(rf"\.partial-(\d+)-{re.escape(final.name)}")
-    found = ((path, named.fullmatch(path.name)) for path in final.parent.glob(".partial-*"))
-    return [path for path, match in found if match and (match[1] == own or not _alive(int(match[1])))]
+    candidates = ((path, named.fullmatch(path.name)) for path in final.parent.glob(".partial-*"))
+    return [path for path, match in candidates if match and (match[1] == process_id or not _alive(int(match[1])))]
 
 
 def _alive(process: int) -> bool:

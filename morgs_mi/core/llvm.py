@@ -97,24 +97,24 @@ def usable(path: Path) -> bool:
     return major >= SAFE_MAJOR
 
 
-def choose_llvm(wanted: str | None = None, folders: Iterable[Path] | None = None) -> tuple[Path | None, str]:
+def choose_llvm(choice: str | None = None, folders: Iterable[Path] | None = None) -> tuple[Path | None, str]:
     """Return the library to use (None if there is none) and a sentence that describes the problem (empty if none).
 
     Args:
-        wanted: the user's choice, which takes precedence if it is usable.
+        choice: the user's choice, which takes precedence if it is usable.
         folders: folders to search otherwise, by default `search_folders`.
     """
-    if wanted and usable(Path(wanted)):
-        return Path(wanted), ""
-    found = find_llvm(folders)
-    best = next((path for path in found if usable(path)), None)
-    if wanted:
+    if choice and usable(Path(choice)):
+        return Path(choice), ""
+    libraries = find_llvm(folders)
+    best = next((path for path in libraries if usable(path)), None)
+    if choice:
         rest = f"{best} is used instead." if best else f"No other was found: {REMEDY}."
-        return best, f"{VARIABLE}={wanted} is not a libLLVM that Dr.Jit can use here. {rest}"
+        return best, f"{VARIABLE}={choice} is not a libLLVM that Dr.Jit can use here. {rest}"
     if best:
         return best, ""
-    seen = f" (only {', '.join(map(str, found))}, too old for this CPU)" if found else ""
-    return None, f"Dr.Jit's CPU backend needs LLVM {SAFE_MAJOR} or newer and none was found{seen}: {REMEDY}."
+    remark = f" (only {', '.join(map(str, libraries))}, too old for this CPU)" if libraries else ""
+    return None, f"Dr.Jit's CPU backend needs LLVM {SAFE_MAJOR} or newer and none was found{remark}: {REMEDY}."
 
 
 def has_cuda() -> bool:
@@ -137,10 +137,10 @@ def ensure_llvm() -> None:
     """
     if not sys.platform.startswith("linux"):
         return
-    wanted = os.environ.get(VARIABLE)
-    if wanted == _NOWHERE:  # a parent process has already warned
+    choice = os.environ.get(VARIABLE)
+    if choice == _NOWHERE:  # a parent process has already warned
         return
-    path, problem = choose_llvm(wanted)
+    path, problem = choose_llvm(choice)
     if not path and not has_cuda():
         raise RuntimeError(problem)
     if problem:

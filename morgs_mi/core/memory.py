@@ -119,8 +119,8 @@ def _free_in_machine() -> float:
 def _free_in_group() -> float:
     """Return the free bytes of a container."""
     limit = "".join(_lines("/sys/fs/cgroup/memory.max")).strip()
-    used = "".join(_lines("/sys/fs/cgroup/memory.current")).strip()
-    return float(limit) - float(used) if limit.isdigit() and used.isdigit() else float("inf")
+    usage = "".join(_lines("/sys/fs/cgroup/memory.current")).strip()
+    return float(limit) - float(usage) if limit.isdigit() and usage.isdigit() else float("inf")
 
 
 def _free_in_limit() -> float:

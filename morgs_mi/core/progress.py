@@ -65,11 +65,11 @@ class ProgressBar:
     def __call__(self, done: float, total: float | None = None) -> None:
         """Show that `done` steps of `total` are done."""
         total = total or self._total
-        now = time.monotonic() - self._begin
-        if now - self._shown < _PERIOD and done != total:
+        seconds = time.monotonic() - self._begin
+        if seconds - self._shown < _PERIOD and done != total:
             return
-        self._shown = now
-        text = f"{done:.0f}{'' if total is None else f'/{total:.0f}'}, {timedelta(seconds=round(now))}"
+        self._shown = seconds
+        text = f"{done:.0f}{'' if total is None else f'/{total:.0f}'}, {timedelta(seconds=round(seconds))}"
         if self._is_notebook:
             self._show_html(done, total, text)
         elif sys.stderr.isatty():

@@ -67,8 +67,8 @@ def seen_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Return which points [P, 3] lie in a view [P], the n pixel positions [n, 2] of those, and their depths [n]."""
     with np.errstate(divide="ignore", invalid="ignore"):  # points beside the camera
         pixels, depths = camera.project(np.asarray(points, np.float64).reshape(-1, 3))
-    inside = (depths > camera.near) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
-    return inside, pixels[inside], depths[inside]
+    visible = (depths > camera.near) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+    return visible, pixels[visible], depths[visible]
 
 
 def with_near_planes(cameras: Sequence[Camera], points: np.ndarray, near: float | None = None) -> tuple[Camera, ...]:
@@ -174,8 +174,8 @@ def scene_depths(cameras: Sequence[Camera], points: np.ndarray) -> list[float]:
     far = 1e6 * scene_extent(cameras)
     depths = []
     for camera, focus in zip(cameras, focus_depths(cameras), strict=True):
-        _, _, seen = seen_points(camera, points)
-        middle = float(np.median(seen)) if len(seen) else min(float(focus), far)
+        _, _, point_depths = seen_points(camera, points)
+        middle = float(np.median(point_depths)) if len(point_depths) else min(float(focus), far)
         depths.append(middle if middle > camera.near else far)
     return depths
 

@@ -96,11 +96,11 @@ class ComparedFrame:
 
     def _changed(self, view: int) -> np.ndarray | None:
         """Return the mask of pixels that changed since the last image; None without one, and beside ground truth."""
-        before = None if self.last is None else self.last[view]
-        now = self.images[view]
-        if before is None or now is None or self.clip.recording.truth is not None:
+        last_image = None if self.last is None else self.last[view]
+        image = self.images[view]
+        if last_image is None or image is None or self.clip.recording.truth is not None:
             return None
-        return recorded_change(before, now)
+        return recorded_change(last_image, image)
 
 
 @dataclass(frozen=True, eq=False)

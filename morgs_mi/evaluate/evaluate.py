@@ -101,9 +101,9 @@ def _of_fit(stream: Path) -> tuple[dict[int, float], dict[str, Any]]:
     report = read_json(path)
     try:
         seconds = {row["frame"]: float(row["seconds"]) for row in report["frames"]}
-        found = next((row["validation"] for row in report["frames"] if "sentence" in row.get("validation", {})), {})
-        psnr = float("nan") if found.get("expected_psnr") is None else float(found["expected_psnr"])
-        return seconds, {"expected": str(found["sentence"]), "expected_psnr": psnr} if found else {}
+        forecast = next((row["validation"] for row in report["frames"] if "sentence" in row.get("validation", {})), {})
+        psnr = float("nan") if forecast.get("expected_psnr") is None else float(forecast["expected_psnr"])
+        return seconds, {"expected": str(forecast["sentence"]), "expected_psnr": psnr} if forecast else {}
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{path}: expected a fit's report, got a broken one ({error!r}); remove it.") from None
 

@@ -67,8 +67,8 @@ def draw_stream(
     view = recording.reference_view
     camera = recording.with_delays(stream.cameras)[view]
     # Nothing moves up to the first frame.
-    later = frames[1:] or frames
-    chosen = {later[i] for i in np.linspace(0, len(later) - 1, min(_ROWS, len(later))).astype(int)}
+    later_frames = frames[1:] or frames
+    chosen = {later_frames[i] for i in np.linspace(0, len(later_frames) - 1, min(_ROWS, len(later_frames))).astype(int)}
     scale = motion_scale(recording, camera)
     column, still = _busiest_column(recording, view, frames)
     shown = []
@@ -83,16 +83,16 @@ def draw_stream(
     for (index, images), frame in zip(played, recording.partial_frames(frames[0], frames[-1] + 1), strict=False):
         # Copies: views would keep all images of a long clip in memory.
         shown.append(to_uint8(exposed(images["color"], stops))[:, column].copy())
-        seen = frame.images[view]
-        recorded.append(np.zeros_like(shown[-1]) if seen is None else seen[:, column].copy())
+        pixels = frame.images[view]
+        recorded.append(np.zeros_like(shown[-1]) if pixels is None else pixels[:, column].copy())
         if index in chosen:
             truth = truth_for_camera(recording, camera, index)
             true_motion, mask = (None, None) if truth is None else (truth.motion, truth.mask)
-            moved = {"true motion": true_motion, "motion": images["motion"]}
-            motions.append(_row(index, partial(motion_image, scale_px=scale), moved))
+            motion_maps = {"true motion": true_motion, "motion": images["motion"]}
+            motions.append(_row(index, partial(motion_image, scale_px=scale), motion_maps))
             if with_confidence:
-                found = {"true mask": mask, "confidence": images["confidence"]}
-                confidences.append(_row(index, confidence_image, found))
+                confidence_maps = {"true mask": mask, "confidence": images["confidence"]}
+                confidences.append(_row(index, confidence_image, confidence_maps))
             if with_offset:
                 whole = channel_image("motion", images["motion"], scale)
                 offset = channel_image("offset", images["offset"], scale)
@@ -124,9 +124,9 @@ def _busiest_column(recording: Capture, view: int, frames: Sequence[int]) -> tup
     change = np.zeros(recording.cameras[view].width)
     last = None
     for frame in recording.partial_frames(frames[0], frames[-1] + 1):
-        if (seen := frame.images[view]) is None:
+        if (pixels := frame.images[view]) is None:
             continue
-        image = seen.astype(float)
+        image = pixels.astype(float)
         if last is not None:
             change += np.abs(image - last).sum((0, 2))
         last = image

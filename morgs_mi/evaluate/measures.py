@@ -119,18 +119,18 @@ class Motion3D(Measure):
         self._truth = clip.recording.truth
         folder = self._truth
         self._tracks = load_tracks(folder) if folder is not None and (folder / "tracks.npz").is_file() else None
-        self._before: FrameState | None = None
+        self._last_state: FrameState | None = None
 
     def add_frame(self, frame: ComparedFrame) -> dict[str, Any]:
-        before = self._before
-        self._before = frame.state
-        if frame.kind != PacketKind.RESIDUAL or before is None:
+        last_state = self._last_state
+        self._last_state = frame.state
+        if frame.kind != PacketKind.RESIDUAL or last_state is None:
             return {"motion_3d": None}
-        return {"motion_3d": self._motion(before, frame.state)}
+        return {"motion_3d": self._motion(last_state, frame.state)}
 
-    def _motion(self, before: FrameState, now: FrameState) -> Motion3DScores | None:
+    def _motion(self, last_state: FrameState, state: FrameState) -> Motion3DScores | None:
         """Return the errors between two frames; None without truth."""
-        frame = now.frame
+        frame = state.frame
         tracks = self._tracks
         if tracks is None or self._truth is None or frame >= tracks.points.shape[1]:
             return None
@@ -138,11 +138,11 @@ class Motion3D(Measure):
         for camera in self._cameras:
             truth = load_truth(self._truth, camera.name, frame - 1)
             views.append((camera.resized(*truth.mask.shape[::-1]), truth))
-        _, then, later = np.intersect1d(before.ids, now.ids, return_indices=True)
-        old = before.gaussians.numpy()["means"][then].astype(float)
-        new = now.gaussians.numpy()["means"][later].astype(float)
+        _, last_rows, rows = np.intersect1d(last_state.ids, state.ids, return_indices=True)
+        old = last_state.gaussians.numpy()["means"][last_rows].astype(float)
+        new = state.gaussians.numpy()["means"][rows].astype(float)
         points = tracks.points[:, frame - 1], tracks.points[:, frame], tracks.ids
-        return evaluate_motion(old, new - old, np.asarray(before.gaussians.opacities)[then], points, views)
+        return evaluate_motion(old, new - old, np.asarray(last_state.gaussians.opacities)[last_rows], points, views)
 
 
 def _image_scores(view: ComparedView, lpips: ImageDistance | None) -> dict[str, float]:
@@ -156,8 +156,8 @@ def _image_scores(view: ComparedView, lpips: ImageDistance | None) -> dict[str, 
     maps = {"psnr": np.square(a - b), "delta_e": delta_e_map(a, b)}
     if min(whole.shape) >= WINDOW:
         maps["ssim"] = ssim_map(a, b)
-    matched = follow_exposure(rendered, view.recorded, view.valid)(a).clip(0, 1)
-    scores = {"psnr_matched": psnr_of(mean_over(np.square(matched - b), whole))}
+    exposure_image = follow_exposure(rendered, view.recorded, view.valid)(a).clip(0, 1)
+    scores = {"psnr_matched": psnr_of(mean_over(np.square(exposure_image - b), whole))}
     if view.light is not None:
         scores["psnr_mu"] = psnr_mu(decode_light(view.maps["color"]), view.light, view.valid)
     for name, values in maps.items():

@@ -57,8 +57,8 @@ def evaluate_motion(
     true = np.zeros_like(means, float)
     evaluated = np.zeros(len(means), bool)
     for index in np.unique(tracks[2]):
-        before, after = (points[tracks[2] == index] for points in tracks[:2])
-        longest = np.linalg.norm(after - before, axis=-1).max()
+        starts, ends = (points[tracks[2] == index] for points in tracks[:2])
+        longest = np.linalg.norm(ends - starts, axis=-1).max()
         on = (ids == index) & (opacities >= _LEAST_OPACITY)
         if not longest:
             continue
@@ -66,31 +66,31 @@ def evaluate_motion(
             rotation, shift = rigid[index]
             true[on] = means[on] @ (rotation - np.eye(3)).T + shift
         else:
-            true[on] = local_motion(means[on], before, after)
+            true[on] = local_motion(means[on], starts, ends)
         evaluated |= on & (np.linalg.norm(true, axis=-1) >= _LEAST_SHARE * longest)
     return compare_motion(displacements[evaluated], true[evaluated])
 
 
-def local_motion(points: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+def local_motion(points: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
     """Return the displacement of points [M, 3] on a deforming object, NaN where the tracks around one disagree.
 
     Args:
         points: at the earlier time, world units.
-        before: tracked points of the object at that time [P, 3].
-        after: the same points one frame later.
+        starts: tracked points of the object at that time [P, 3].
+        ends: the same points one frame later.
     """
-    if len(before) < _NEIGHBOURS:
+    if len(starts) < _NEIGHBOURS:
         return np.full_like(points, np.nan)
-    _, nearest = KDTree(before).query(points, k=_NEIGHBOURS)
-    p = before[nearest]
-    q = after[nearest]
+    _, nearest = KDTree(starts).query(points, k=_NEIGHBOURS)
+    p = starts[nearest]
+    q = ends[nearest]
     center = p.mean(axis=1, keepdims=True)
     target = q.mean(axis=1, keepdims=True)
     turn = _rotation(p - center, q - target)
-    left = np.linalg.norm((p - center) @ turn.swapaxes(-1, -2) + target - q, axis=-1).max(axis=-1)
-    moved = np.einsum("mij,mj->mi", turn, points - center[:, 0]) + target[:, 0] - points
-    moved[left > _LEAST_AGREEMENT * np.linalg.norm(moved, axis=-1)] = np.nan
-    return moved
+    residuals = np.linalg.norm((p - center) @ turn.swapaxes(-1, -2) + target - q, axis=-1).max(axis=-1)
+    displacements = np.einsum("mij,mj->mi", turn, points - center[:, 0]) + target[:, 0] - points
+    displacements[residuals > _LEAST_AGREEMENT * np.linalg.norm(displacements, axis=-1)] = np.nan
+    return displacements
 
 
 def compare_motion(motion: np.ndarray, truth: np.ndarray) -> Motion3DScores:
@@ -119,36 +119,34 @@ def surface_ids(points: np.ndarray, views: Sequence[tuple[Camera, GroundTruth]])
         depth = points @ np.asarray(camera.viewmat)[2, :3] + np.asarray(camera.viewmat)[2, 3]
         front = np.flatnonzero(depth > camera.near)
         pixels = np.floor(camera.project(points[front])[0])
-        inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(-1)
-        front = front[inside]
-        column, row = pixels[inside].astype(int).T
-        seen = truth.ids[row, column]
-        on = (seen >= 0) & (np.abs(truth.depth[row, column] - depth[front]) <= _DEPTH_TOLERANCE * depth[front])
+        visible = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(-1)
+        front = front[visible]
+        column, row = pixels[visible].astype(int).T
+        pixel_ids = truth.ids[row, column]
+        on = (pixel_ids >= 0) & (np.abs(truth.depth[row, column] - depth[front]) <= _DEPTH_TOLERANCE * depth[front])
         front = front[on]
-        seen = seen[on]
-        several[front] |= (ids[front] >= 0) & (ids[front] != seen)
-        ids[front] = seen
+        pixel_ids = pixel_ids[on]
+        several[front] |= (ids[front] >= 0) & (ids[front] != pixel_ids)
+        ids[front] = pixel_ids
     ids[several] = -1
     return ids
 
 
-def rigid_motions(
-    before: np.ndarray, after: np.ndarray, ids: np.ndarray
-) -> Mapping[int, tuple[np.ndarray, np.ndarray]]:
+def rigid_motions(starts: np.ndarray, ends: np.ndarray, ids: np.ndarray) -> Mapping[int, tuple[np.ndarray, np.ndarray]]:
     """Return rotation [3, 3] and shift [3] of every moving object by its id: x -> R x + s.
 
     Least squares over the object's points (Kabsch 1976). Excluded are objects that are static or not rigid, and those
     with too few points or with all points on one line.
 
     Args:
-        before: tracked points [P, 3].
-        after: the same points one frame later.
+        starts: tracked points [P, 3].
+        ends: the same points one frame later.
         ids: ids of their objects [P].
     """
-    found = {}
+    motions = {}
     for index in np.unique(ids):
-        p = before[ids == index]
-        q = after[ids == index]
+        p = starts[ids == index]
+        q = ends[ids == index]
         if np.array_equal(p, q) or len(p) < 3:
             continue
         center = p.mean(0)
@@ -159,8 +157,8 @@ def rigid_motions(
         shift = target - rotation @ center
         off = np.linalg.norm(p @ rotation.T + shift - q, axis=-1).max()
         if spread[1] > (_FLAT * size) ** 2 and off <= _RIGID * size:
-            found[int(index)] = (rotation, shift)
-    return found
+            motions[int(index)] = (rotation, shift)
+    return motions
 
 
 def _rotation(p: np.ndarray, q: np.ndarray) -> np.ndarray:

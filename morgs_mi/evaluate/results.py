@@ -20,8 +20,8 @@ _SECONDS = (
 
 def known_mean(values: Sequence[float]) -> float:
     """Return the mean of the values that are not NaN; NaN if there are none."""
-    known = [value for value in values if not np.isnan(value)]
-    return float(np.mean(known)) if known else _NAN
+    numbers = [value for value in values if not np.isnan(value)]
+    return float(np.mean(numbers)) if numbers else _NAN
 
 
 @dataclass(frozen=True)
@@ -214,8 +214,8 @@ class Evaluation:
     @property
     def seconds(self) -> Timings:
         """Times of the fit."""
-        later = [frame.seconds for frame in self.frames[1:] if frame.seconds is not None]
-        return Timings(self.frames[0].seconds, known_mean(later))
+        later_seconds = [frame.seconds for frame in self.frames[1:] if frame.seconds is not None]
+        return Timings(self.frames[0].seconds, known_mean(later_seconds))
 
     def as_dict(self) -> dict[str, Any]:
         """Return the evaluation as JSON can hold it, apart from scores that are infinite or NaN."""

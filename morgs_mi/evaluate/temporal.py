@@ -37,12 +37,12 @@ class StillVariation:
         self._frames = 0
         self._last: tuple[np.ndarray, np.ndarray] | None = None
         self._sums: list[np.ndarray] = []
-        self._moved = np.zeros((1, 1), int)
+        self._motion_counts = np.zeros((1, 1), int)
 
     def add(self, image: np.ndarray, recorded: np.ndarray, moving: np.ndarray) -> None:
         """Add the next frame: rendered and recorded image [H, W, 3], and the mask of moving pixels [H, W] bool."""
         pair = unit_pair("StillVariation.add", image, recorded, moving)
-        self._moved = self._moved + moving
+        self._motion_counts = self._motion_counts + moving
         self._frames += 1
         if self._last is not None:
             changes = [np.abs(new - old).mean(-1) for new, old in zip(pair, self._last, strict=True)]
@@ -53,8 +53,8 @@ class StillVariation:
         """Return the mTV of I and of I', and the mask's share of the view; NaN without two frames or a static pixel."""
         if self._frames < 2:
             return VariationScores()
-        valid = np.ones(self._moved.shape, bool) if self._valid is None else self._valid
-        still = (self._moved <= self._false_alarms * self._frames) & valid
+        valid = np.ones(self._motion_counts.shape, bool) if self._valid is None else self._valid
+        still = (self._motion_counts <= self._false_alarms * self._frames) & valid
         render, recorded = (100 * mean_over(total, still) / (self._frames - 1) for total in self._sums)
         return VariationScores(render, recorded, float(still.sum() / max(valid.sum(), 1)))
 
@@ -63,7 +63,7 @@ class StillVariation:
 # image's brightness (it subtracts the median), accepts any noise level, and marks changes above four standard
 # deviations; the fit must react to such a brightness change, assumes static noise of at most a grey level, and marks
 # changes above five. Sharing one definition would change the regions of all published scores.
-def recorded_change(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+def recorded_change(last_image: np.ndarray, image: np.ndarray) -> np.ndarray:
     """Return the mask of pixels [H, W] in which a recording changes by more than its noise; it replaces a true mask.
 
     Changes of brightness are averaged over 5x5 pixels. The noise is estimated from their median absolute deviation
@@ -72,10 +72,10 @@ def recorded_change(before: np.ndarray, after: np.ndarray) -> np.ndarray:
     marked; a moving shadow is.
 
     Args:
-        before: I'_{t-1} [H, W, 3].
-        after: I'_t, likewise.
+        last_image: I'_{t-1} [H, W, 3].
+        image: I'_t, likewise.
     """
-    old, new = unit_pair("recorded_change", before, after)
+    old, new = unit_pair("recorded_change", last_image, image)
     change = cv2.blur((new - old).mean(-1), (_WINDOW, _WINDOW))
     change = np.abs(change - np.median(change))
     return change > max(_SIGMAS * 1.4826 * float(np.median(change)), _GREY_LEVEL)
@@ -87,8 +87,8 @@ def slope(values: Sequence[float]) -> float:
     NaN if fewer than two scores are known or one is infinite.
     """
     scores = np.asarray(values, float)
-    known = np.flatnonzero(~np.isnan(scores))
-    if len(known) < 2 or np.isinf(scores).any():
+    frames = np.flatnonzero(~np.isnan(scores))
+    if len(frames) < 2 or np.isinf(scores).any():
         return float("nan")
-    time = known - known.mean()
-    return float(time @ scores[known] / (time @ time))
+    time = frames - frames.mean()
+    return float(time @ scores[frames] / (time @ time))

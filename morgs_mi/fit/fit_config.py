@@ -206,8 +206,8 @@ class FitConfig:
         """
         means = min(1.0, _CONSTANT_EPOCHS / (epoch + 1)) if self.decay_means_rate else 1.0
         others = (_USUAL_EPOCHS / self.epochs) ** 0.5
-        scaled = {n: (means if n == "means" else others) * rate for n, rate in asdict(self.rates).items()}
-        return LearningRates(**scaled)
+        rates = {n: (means if n == "means" else others) * rate for n, rate in asdict(self.rates).items()}
+        return LearningRates(**rates)
 
     @property
     def momentum(self) -> float:

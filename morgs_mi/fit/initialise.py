@@ -106,10 +106,10 @@ def _in_light(points: Points, views: Sequence[View]) -> Points:
         return points
     colors = np.full((len(hdr_views), *positions.shape), np.nan)
     for k, (camera, image, mask) in enumerate(hdr_views):
-        inside, pixels, _ = seen_points(camera, positions)
+        visible, pixels, _ = seen_points(camera, positions)
         columns, rows = pixels.astype(int).T
         recorded = np.ones(len(rows), bool) if mask is None else mask[rows, columns]
-        colors[k, inside] = np.where(recorded[:, None], image[rows, columns], np.nan)
+        colors[k, visible] = np.where(recorded[:, None], image[rows, columns], np.nan)
     unseen = np.isnan(colors).all(axis=(0, 2))
     colors[:, unseen] = own_colors[unseen]
     return positions, np.nanmedian(colors, axis=0)

@@ -200,11 +200,13 @@ def _squares(color: np.ndarray, points: np.ndarray, is_drawn: np.ndarray, view: 
     camera = view.camera
     with np.errstate(divide="ignore", invalid="ignore"):  # points beside the camera
         pixels, depths = camera.project(points)
-    inside = is_drawn & (depths > camera.near) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=-1)
-    pixels = np.where(inside[..., None], pixels, 0)
+    visible = (
+        is_drawn & (depths > camera.near) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=-1)
+    )
+    pixels = np.where(visible[..., None], pixels, 0)
     if view.mask is not None:
         columns, rows = pixels.astype(int).transpose(2, 0, 1)
-        inside &= view.mask[rows, columns]
+        visible &= view.mask[rows, columns]
     x, y = (pixels - 0.5).astype(np.float32).transpose(2, 0, 1)
     recorded = cv2.remap(view.image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.where(inside, ((unit_values(recorded) - color) ** 2).mean(axis=-1), np.inf)
+    return np.where(visible, ((unit_values(recorded) - color) ** 2).mean(axis=-1), np.inf)

@@ -110,8 +110,8 @@ def true_rate(fps: float, frames: float, duration: float) -> float:
         duration: time between the two, s.
     """
     # A header may have a rounded rate or a mean over pauses, and the time of a frame may be rounded.
-    apart = abs(fps * duration - frames)
-    return fps if not duration or apart <= _JITTER + _ROUNDING * fps else frames / duration
+    difference = abs(fps * duration - frames)
+    return fps if not duration or difference <= _JITTER + _ROUNDING * fps else frames / duration
 
 
 def _packet_times(path: Path) -> np.ndarray:

@@ -47,7 +47,8 @@ def _camera(file: Path, index: int, row: dict[str, Any]) -> Camera:
         R = np.asarray(row["rotation"], np.float64)
         position = np.asarray(row["position"], np.float64)
         viewmat = np.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = R.T, -R.T @ position
+        viewmat[:3, :3] = R.T
+        viewmat[:3, 3] = -R.T @ position
         width, height, fx, fy = (float(row[key]) for key in ("width", "height", "fx", "fy"))
         K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
         return Camera(K, viewmat, round(width), round(height), str(row.get("img_name", index)))

@@ -178,12 +178,12 @@ def read_elements(
     try:
         with path.open("rb") as file:
             order, elements = _read_header(file)
-            wanted = {element.name for element in elements}.intersection((*required, *optional))
-            if lacking := [name for name in required if name not in wanted]:
+            element_names = {element.name for element in elements}.intersection((*required, *optional))
+            if lacking := [name for name in required if name not in element_names]:
                 raise ValueError(f"it has no element {lacking[0]}")
-            found: dict[str, dict[str, np.ndarray]] = {}
+            properties: dict[str, dict[str, np.ndarray]] = {}
             for element in elements:
-                if found.keys() == wanted:
+                if properties.keys() == element_names:
                     break
                 dtype = element.dtype(order)
                 held = path.stat().st_size - file.tell()
@@ -191,13 +191,13 @@ def read_elements(
                 size = element.count * (dtype.itemsize if order else 2 * len(element.properties)) - (not order)
                 if element.count < 0 or size > held:
                     raise ValueError(f"{element.count} {element.name} need at least {size} bytes, {held} follow")
-                if element.name in wanted:
-                    found[element.name] = _read_rows(file, element, dtype, text=not order)
+                if element.name in element_names:
+                    properties[element.name] = _read_rows(file, element, dtype, text=not order)
                 elif order:
                     file.seek(element.count * dtype.itemsize, 1)
                 else:
                     next(islice(file, element.count, element.count), None)
-            return found
+            return properties
     except (ValueError, KeyError, IndexError, OverflowError) as error:
         raise ValueError(f"{path}: expected a complete PLY file, got one that cannot be read: {error}.") from error
 

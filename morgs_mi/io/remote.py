@@ -57,7 +57,7 @@ def mirrored(url: str) -> Path:
     base = root.rstrip("/")
     with _failures(url):
         system.invalidate_cache()
-        files = {path.removeprefix(base).lstrip("/"): about for path, about in _listing(system, base).items()}
+        files = {path.removeprefix(base).lstrip("/"): entry for path, entry in _listing(system, base).items()}
     # A name with a query is a link of a server's listing, by which it is sorted.
     files = {name: files[name] for name in sorted(files) if name and "?" not in name}
     if not files:
@@ -68,7 +68,7 @@ def mirrored(url: str) -> Path:
         with _failures(url), ThreadPoolExecutor(_REQUESTS) as requests:
             files = dict(zip(files, requests.map(lambda name: system.info(f"{base}/{name}"), files), strict=True))
     folder = _folder(url, files) / base.rpartition("/")[2]
-    sizes = {name: about.get("size") for name, about in files.items()}
+    sizes = {name: entry.get("size") for name, entry in files.items()}
     for name, size in sizes.items():
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -105,34 +105,34 @@ def _cache() -> Path:
 
 def _listing(system: Any, base: str) -> dict[str, Mapping[str, Any]]:
     """Return the files below a folder by path; fsspec's `find` would leave out folders that it cannot list."""
-    found = {}
+    entries = {}
     folders = [base]
     for folder in folders:  # which grows
-        for about in system.ls(folder, detail=True):
-            path = about["name"].rstrip("/")
+        for entry in system.ls(folder, detail=True):
+            path = entry["name"].rstrip("/")
             if not is_listed(path.rpartition("/")[2]):
                 continue
-            if about["type"] != "directory":
-                found[path] = about
+            if entry["type"] != "directory":
+                entries[path] = entry
             elif path not in (*folders, f"{base}/{_IGNORED}"):
                 folders.append(path)
-    return found
+    return entries
 
 
 def _folder(url: str, files: Mapping[str, Mapping[str, Any]]) -> Path:
     """Return the folder of these versions of files; a new one, until the process ends, if one has no version."""
-    known = all(map(_versions, files.values()))
-    versions = [(name, about.get("size"), _versions(about)) for name, about in files.items()]
-    content = repr((url, versions)) if known else uuid.uuid4().hex
+    has_versions = all(map(_versions, files.values()))
+    versions = [(name, entry.get("size"), _versions(entry)) for name, entry in files.items()]
+    content = repr((url, versions)) if has_versions else uuid.uuid4().hex
     folder = _cache() / blake2b(content.encode(), digest_size=8).hexdigest()
-    if not known:
+    if not has_versions:
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
 
 
-def _versions(about: Mapping[str, Any]) -> list[str]:
+def _versions(entry: Mapping[str, Any]) -> list[str]:
     """Return the values of `_VERSION` in an entry of a listing, which change with its file; empty without any."""
-    return [f"{key} {about[key]}" for key in _VERSION if about.get(key)]
+    return [f"{key} {entry[key]}" for key in _VERSION if entry.get(key)]
 
 
 def _mirror_of(file: Path) -> Path | None:

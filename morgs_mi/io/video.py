@@ -185,7 +185,8 @@ class FolderReader:
             FileNotFoundError: the folder or the images are missing.
             ValueError: a number is missing or occurs twice, or the first image cannot be decoded.
         """
-        path, files = Path(path), _images(Path(path))
+        path = Path(path)
+        files = _images(path)
         if gap := numbering_gap([f.stem for f in files]):
             raise ValueError(
                 f"{path}: the images must be numbered without gaps, got {files[gap - 1].name} followed by "
@@ -282,11 +283,11 @@ def _instants(group: Sequence[Mapping[int, Path]]) -> range:
     numbers = sorted(set().union(*group))
     step = int(np.gcd.reduce(np.diff(numbers))) if len(numbers) > 1 else 1
     if (numbers[-1] - numbers[0]) // step > 10 * len(numbers) + 1000:
-        after = int(np.argmax(np.diff(numbers)))
-        file = next(files[numbers[after + 1]] for files in group if numbers[after + 1] in files)
+        gap = int(np.argmax(np.diff(numbers)))
+        file = next(files[numbers[gap + 1]] for files in group if numbers[gap + 1] in files)
         raise ValueError(
             f"{file}: expected images numbered without large gaps, got this after "
-            f"number {numbers[after]} among {len(numbers)} images; rename or remove it."
+            f"number {numbers[gap]} among {len(numbers)} images; rename or remove it."
         )
     return range(numbers[0], numbers[-1] + 1, step)
 

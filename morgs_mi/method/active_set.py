@@ -124,10 +124,10 @@ def find_active_set(
     active = (shares > config.min_responsibility) & (overlap(len(gaussians), changed.values()) > config.min_overlap)
     if gaussians.logit_confidence is not None:
         active |= np.asarray(gaussians.logit_confidence) > 0
-    for found in changed.values():
-        grid = found.view.grid
-        boxes = found.boxes
-        unexplained = _unexplained(found.counts, boxes.union(active, grid), grid.block)
+    for changed_view in changed.values():
+        grid = changed_view.view.grid
+        boxes = changed_view.boxes
+        unexplained = _unexplained(changed_view.counts, boxes.union(active, grid), grid.block)
         if unexplained.any():
             table = from_numpy(mi.UInt32, summed_area(unexplained))
             active |= np.asarray(boxes.within(table, grid) > 0.5 * boxes.area)
@@ -152,9 +152,9 @@ def _drawn(
 ) -> dict[int, np.ndarray]:
     """Return the drawn blocks [rows, columns], by view index: changes, and boxes of active Gaussians [N]."""
     indices = list(views)
-    some = {indices[k] for k in choose_key_views([found.view.camera for found in views.values()], config.quiet_views)}
+    some = {indices[k] for k in choose_key_views([entry.view.camera for entry in views.values()], config.quiet_views)}
     chosen = {v: active if v in some else active & changing for v in views}
-    return {v: found.boxes.union(chosen[v], found.view.grid) | (found.counts > 0) for v, found in views.items()}
+    return {v: entry.boxes.union(chosen[v], entry.view.grid) | (entry.counts > 0) for v, entry in views.items()}
 
 
 def _unexplained(counts: np.ndarray, covered: np.ndarray, block: tuple[int, int]) -> np.ndarray:
@@ -170,7 +170,7 @@ def _unexplained(counts: np.ndarray, covered: np.ndarray, block: tuple[int, int]
         return np.zeros_like(changed)
     count, components = cv2.connectedComponents(changed.astype(np.uint8))
     labels = np.asarray(components, np.int32)
-    area, inside = (np.bincount(labels[blocks], counts[blocks], count) for blocks in (changed, changed & covered))
-    missing = inside < _EXPLAINED * area
+    area, covered_area = (np.bincount(labels[blocks], counts[blocks], count) for blocks in (changed, changed & covered))
+    missing = covered_area < _EXPLAINED * area
     missing[0] = False
     return missing[labels]

@@ -60,23 +60,23 @@ class ChangeConfig:
 
 
 def change_mask(
-    before: np.ndarray, after: np.ndarray, valid: np.ndarray | None = None, config: ChangeConfig | None = None
+    reference: np.ndarray, image: np.ndarray, valid: np.ndarray | None = None, config: ChangeConfig | None = None
 ) -> np.ndarray:
     """Return the mask of changed pixels [H, W], bool.
 
     Args:
-        before: an earlier image of the same camera [H, W, 3], uint8 or float in [0, 1].
-        after: a later one, likewise.
+        reference: an earlier image of the same camera [H, W, 3], uint8 or float in [0, 1].
+        image: a later one, likewise.
         valid: [H, W] bool, pixels that count; None: all.
         config: settings.
     """
     config = config or ChangeConfig()
-    H, W = before.shape[:2]
-    if before.dtype == np.uint8 and after.dtype == np.uint8:
-        difference = cv2.subtract(after, before, dtype=cv2.CV_16S)
+    H, W = reference.shape[:2]
+    if reference.dtype == np.uint8 and image.dtype == np.uint8:
+        difference = cv2.subtract(image, reference, dtype=cv2.CV_16S)
         unit = _GREY_LEVEL
     else:
-        difference = np.subtract(after, before, dtype=np.float32)
+        difference = np.subtract(image, reference, dtype=np.float32)
         unit = 1.0
     # Integers as long as possible: these images are large.
     levels = _levels(cv2.transform(difference, _SUM) * np.float32(unit / 3), 1, config)

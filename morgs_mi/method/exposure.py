@@ -176,11 +176,11 @@ def follow_exposure(
     """
     height, width = image.shape[:2]
     size = (min(width, _WIDTH), max(1, round(height * min(1, _WIDTH / width))))
-    before, now = (
+    small_reference, small_image = (
         cv2.resize(x.astype(np.float32) / 255, size, interpolation=cv2.INTER_AREA) for x in (reference, image)
     )
     small = None if mask is None else cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
-    return fit_exposure(before, now, small, last)
+    return fit_exposure(small_reference, small_image, small, last)
 
 
 def _straightened(encoded: np.ndarray) -> np.ndarray:

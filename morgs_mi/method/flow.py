@@ -77,8 +77,8 @@ def _reliable(
     reliable, forward_reliable = (
         consistency_mask(*flows, config) for flows in ((backward, forward), (forward, backward))
     )
-    known = pair.valid
+    valid = pair.valid
     if pair.box is not None:
-        known = np.zeros(reliable.shape, bool)
-        known[pair.box] = True if pair.valid is None else pair.valid[pair.box]
-    return (reliable, forward_reliable) if known is None else (reliable & known, forward_reliable & known)
+        valid = np.zeros(reliable.shape, bool)
+        valid[pair.box] = True if pair.valid is None else pair.valid[pair.box]
+    return (reliable, forward_reliable) if valid is None else (reliable & valid, forward_reliable & valid)

@@ -124,17 +124,17 @@ def lift_flow(
     flow = group.crop([observations[v].forward_flow for v in chosen])
     maps = _flow_maps(flow, group.crop([observations[v].forward_reliable for v in chosen]))
     sums = group.draw(gaussians).sums(from_numpy(mi.Float, maps), _FLOW_MAPS).astype(float)
-    seen = [
-        _lift_view(own, means, camera, motion_floor(camera.width, masks), config.noise_px)
-        for own, camera in zip(sums, [views[v].camera for v in chosen], strict=True)
+    view_motions = [
+        _lift_view(view_sums, means, camera, motion_floor(camera.width, masks), config.noise_px)
+        for view_sums, camera in zip(sums, [views[v].camera for v in chosen], strict=True)
     ]
-    d = _solve(seen, [np.ones(len(means))] * len(seen))
+    d = _solve(view_motions, [np.ones(len(means))] * len(view_motions))
     for _ in range(_ROUNDS):
-        d = _solve(seen, [np.exp(-view.cost(d, view.project(d))) for view in seen])
+        d = _solve(view_motions, [np.exp(-view.cost(d, view.project(d))) for view in view_motions])
     gain = np.zeros(len(means))
     total = np.full(len(means), 1e-6)
     moves = np.zeros(len(means), bool)
-    for view in seen:
+    for view in view_motions:
         motion = view.project(d)
         a = view.weight / (view.weight + _HALF_WEIGHT_PIXELS)
         gain += a * (view.cost(np.zeros_like(d), motion) - view.cost(d, motion))
@@ -148,7 +148,9 @@ def lift_flow(
 def _flow_maps(flow: np.ndarray, reliable: np.ndarray) -> np.ndarray:
     """Return u, |u|^2 and 1 [..., 4] where the flow u [..., 2] is reliable [...]; 0 elsewhere."""
     maps = np.empty((*reliable.shape, _FLOW_MAPS), np.float32)
-    maps[..., :2], maps[..., 2], maps[..., 3] = flow, np.sum(flow**2, axis=-1), 1
+    maps[..., :2] = flow
+    maps[..., 2] = np.sum(flow**2, axis=-1)
+    maps[..., 3] = 1
     return maps * reliable[..., None]
 
 

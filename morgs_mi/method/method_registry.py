@@ -43,7 +43,8 @@ class Registry(Generic[Made, Config]):
             raise ValueError(f"register(): `name` must be new, got {name!r}, which is registered already; rename one.")
 
         def add(factory: Callable[[str, Config], Made]) -> Callable[[str, Config], Made]:
-            self._factories[name], self._arguments[name] = factory, argument
+            self._factories[name] = factory
+            self._arguments[name] = argument
             return factory
 
         return add

@@ -102,5 +102,5 @@ def _carried_confidence(start: MotionStart, gaussians: Gaussians) -> np.ndarray:
     """Return the logits [M] of the previous frame, slightly lowered, or the start's logits where these are higher."""
     if gaussians.logit_confidence is None:
         return start.logit_confidence
-    before = np.asarray(gaussians.logit_confidence)
-    return np.maximum(start.logit_confidence, before - np.float32(_CONFIDENCE_DECAY))
+    last_logit = np.asarray(gaussians.logit_confidence)
+    return np.maximum(start.logit_confidence, last_logit - np.float32(_CONFIDENCE_DECAY))

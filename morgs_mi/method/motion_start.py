@@ -77,5 +77,5 @@ class MotionProblem:
         for index, view in self.views.items():
             boxes = [boxes_around(place, view.camera, view.config, 1.0) for place in places]
             narrowed[index] = view.narrowed(np.any([box.union(everyone, view.grid) for box in boxes], axis=0))
-        seen = {index: view for index, view in narrowed.items() if view is not None}
-        return KeyImages(seen, self.targets) if seen else None
+        views = {index: view for index, view in narrowed.items() if view is not None}
+        return KeyImages(views, self.targets) if views else None

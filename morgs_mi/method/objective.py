@@ -241,8 +241,8 @@ def active_terms(observations: Observations, parameters: Mapping[str, Tensor], c
     """Return the terms that act in a view with these observations."""
 
     def acts(term: Term) -> bool:
-        given = all(name in observations for name in term.observations)
-        return given and all(name in parameters for name in term.parameters)
+        has_observations = all(name in observations for name in term.observations)
+        return has_observations and all(name in parameters for name in term.parameters)
 
     return [term for term in _terms_of(config) if term.weight(config) and acts(term)]
 

@@ -49,17 +49,17 @@ def refine_start(problem: MotionProblem, start: MotionStart) -> MotionStart:
         return replace(start, color_change=np.zeros((len(problem.gaussians), 3), np.float32))
     d = start.displacement
     moves = np.any(d, axis=1)
-    before = problem.sums_at(d)
+    start_sums = problem.sums_at(d)
     if not moves.any():
-        return replace(start, color_change=_color_change(before["color"], before["weight"]))
+        return replace(start, color_change=_color_change(start_sums["color"], start_sums["weight"]))
     near = problem.neighbours.nearest(_NEIGHBOURS)
     places = np.asarray(problem.gaussians.means) + d
     jacobians = np.stack([view.camera.projection_jacobian(places) for view in problem.views.values()])
-    step = np.where(moves[:, None], _step(jacobians, before, near, moves), 0).astype(np.float32)
-    after = problem.images.sums(displaced(problem.gaussians, d + step), ("error", "weight", "color"))
-    better = relative_error(after) < relative_error(before)
-    color = np.where(better[:, None], after["color"], before["color"])
-    weight = np.where(better, after["weight"], before["weight"])
+    step = np.where(moves[:, None], _step(jacobians, start_sums, near, moves), 0).astype(np.float32)
+    step_sums = problem.images.sums(displaced(problem.gaussians, d + step), ("error", "weight", "color"))
+    better = relative_error(step_sums) < relative_error(start_sums)
+    color = np.where(better[:, None], step_sums["color"], start_sums["color"])
+    weight = np.where(better, step_sums["weight"], start_sums["weight"])
     return replace(
         start,
         displacement=(d + np.where(better[:, None], step, 0)).astype(np.float32),

@@ -39,13 +39,14 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
         problem: N Gaussians, the key views and their images.
         start: by lifted flow.
     """
-    d, logit = start.displacement, start.logit_confidence  # [N, 3], [N]
-    before = _previous_motion(problem.gaussians)
-    if not problem.views or not (d.any() or before.any()):
+    d = start.displacement  # [N, 3]
+    logit = start.logit_confidence  # [N]
+    last_motion = _previous_motion(problem.gaussians)
+    if not problem.views or not (d.any() or last_motion.any()):
         return start
     near = problem.neighbours.nearest(_NEIGHBOURS)
     rounds = _ROUNDS if near.size else 0
-    images = problem.images_around(_reached(near, np.any([d, before], axis=(0, 2)), rounds), (d, before))
+    images = problem.images_around(_reached(near, np.any([d, last_motion], axis=(0, 2)), rounds), (d, last_motion))
     if images is None:
         return start
 
@@ -53,9 +54,9 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
         return relative_error(images.sums(displaced(problem.gaussians, d), ("error", "weight")))
 
     error = error_of(d)
-    continues = np.any(before, axis=1, keepdims=True)
+    continues = np.any(last_motion, axis=1, keepdims=True)
     for k in range(1 + rounds):
-        proposal = d[_moving_neighbour(near, d, problem.rng)] if k else np.where(continues, before, d)
+        proposal = d[_moving_neighbour(near, d, problem.rng)] if k else np.where(continues, last_motion, d)
         differs = np.any(proposal != d, axis=1)
         if not differs.any():
             continue

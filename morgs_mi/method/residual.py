@@ -92,9 +92,11 @@ def apply_residual(previous: Gaussians, parameters: Mapping[str, Tensor], config
 
     motion = gated("motion")
     offset = gated("offset") if "offset" in parameters else dr.zeros(mi.TensorXf, tuple(motion.shape))
-    known = previous.parameters()
-    others = [name for name in parameters if name in known and name not in ("motion", "offset", "logit_confidence")]
-    updated = {name: known[name] + gated(name) for name in others}
+    attributes = previous.parameters()
+    others = [
+        name for name in parameters if name in attributes and name not in ("motion", "offset", "logit_confidence")
+    ]
+    updated = {name: attributes[name] + gated(name) for name in others}
     displacement = motion + offset
-    updated |= {"means": known["means"] + displacement, "motion": displacement, "offset": offset}
+    updated |= {"means": attributes["means"] + displacement, "motion": displacement, "offset": offset}
     return previous.with_parameters(updated if logit is None else {**updated, "logit_confidence": logit})

@@ -86,10 +86,10 @@ def responsibility(
     area_of = np.repeat(np.square(factors), blocks)[:, None, None]  # px of the view per reduced pixel
     maps = from_numpy(mi.Float, np.stack([area_of * change, np.broadcast_to(area_of, change.shape)], axis=-1))
     changed, weight = group.draw(gaussians).totals(maps, 2).T
-    seen = weight > min_weight
+    visible = weight > min_weight
     # At least 1: the box of a Gaussian beside the view may be empty, although it reaches into the view.
     elsewhere = np.maximum(np.asarray(area / dr.maximum(near, 1)), 1)
-    return np.where(seen, changed / np.where(seen, weight * elsewhere, 1), 0)
+    return np.where(visible, changed / np.where(visible, weight * elsewhere, 1), 0)
 
 
 def overlap(count: int, views: Iterable[ChangedView]) -> np.ndarray:

@@ -107,9 +107,9 @@ def isometry_loss(gaussians: Gaussians, neighbours: Neighbours) -> Tensor:
 
 def _turns(gaussians: Gaussians, neighbours: Neighbours) -> Tensor:
     """Return the rotations r [N, 4] since the previous frame, unit quaternions wxyz."""
-    now = dr.normalize(_columns(gaussians.quats, 4))
+    rotations = dr.normalize(_columns(gaussians.quats, 4))
     unit = neighbours.inverse * dr.rcp(dr.norm(neighbours.inverse))
-    turns: Jit = dr.ravel(quaternion_product(now, unit))
+    turns: Jit = dr.ravel(quaternion_product(rotations, unit))
     return mi.TensorXf(turns, (len(gaussians), 4))
 
 

@@ -83,8 +83,8 @@ def search_motion(problem: MotionProblem, start: MotionStart, config: SearchConf
         around = problem.images_around(part, [displacement, proposal])
         if around is None:
             continue
-        before, after = (around.total_error(displaced(problem.gaussians, at)) for at in (displacement, proposal))
-        if after < _ERROR_RATIO * before:
+        old_error, new_error = (around.total_error(displaced(problem.gaussians, at)) for at in (displacement, proposal))
+        if new_error < _ERROR_RATIO * old_error:
             displacement = proposal
             logit = np.where(part, np.maximum(logit, _LOGIT), logit)
     if displacement is start.displacement:
@@ -98,10 +98,10 @@ def _unexplained_parts(problem: MotionProblem, displacement: np.ndarray, count: 
     attributed = sums["error"].sum(0)
     weight = sums["weight"].sum(0)
     error = attributed / (weight + 1)
-    seen = weight > 1
-    if not seen.any():
+    visible = weight > 1
+    if not visible.any():
         return []
-    unexplained = seen & (error > _UNEXPLAINED * max(float(np.median(error[seen])), 1 / 255))
+    unexplained = visible & (error > _UNEXPLAINED * max(float(np.median(error[visible])), 1 / 255))
     if np.count_nonzero(unexplained) < _MIN_SIZE:
         return []
     near = NeighbourIndex(np.asarray(problem.gaussians.means) + displacement).nearest(_NEIGHBOURS)
@@ -122,7 +122,7 @@ def _find(
     if not parts:
         return []
     previous = problem.gaussians
-    found = []
+    displaced_parts = []
     for first in range(0, len(parts), 3):
         few = parts[first : first + 3]
         images = problem.images_around(np.any(few, axis=0), [])
@@ -130,19 +130,19 @@ def _find(
             continue
         factor = _reduction(images.group, config.reach)
         renderings = [images.rendered(gaussians, factor) for gaussians in (previous, _brighter(previous, few))]
-        matched = [
+        matched_views = [
             _MatchedView(view.camera, color, _reduced(problem.targets[v].image(), factor), 1 / factor)
             for (v, view), color in zip(images.views.items(), renderings[0], strict=True)
         ]
         # The weight of a part is the increase of a pixel if the part is brighter by 1.
         weights = [np.clip(brighter - color, 0, 1) for color, brighter in zip(*renderings, strict=True)]
         for k, part in enumerate(few):
-            pairs = zip(matched, weights, strict=True)
+            pairs = zip(matched_views, weights, strict=True)
             surfaces = [view.cost_surface(weight[..., k]) for view, weight in pairs if weight[..., k].any()]
             d = _best_displacement(np.asarray(previous.means)[part].mean(axis=0), surfaces, config.reach)
             if d.any():
-                found.append((part, d))
-    return found
+                displaced_parts.append((part, d))
+    return displaced_parts
 
 
 def _brighter(gaussians: Gaussians, parts: Sequence[np.ndarray]) -> Gaussians:
@@ -193,8 +193,8 @@ class _MatchedView:
     """A view in which parts are looked for, with images reduced to 2 px or more per step of the grid."""
 
     camera: Camera  # the view
-    before: np.ndarray  # rendering of the previous Gaussians around the parts, reduced [h, w, 3]
-    after: np.ndarray  # the target, reduced [h, w, 3]
+    rendering: np.ndarray  # rendering of the previous Gaussians around the parts, reduced [h, w, 3]
+    target: np.ndarray  # the target, reduced [h, w, 3]
     scale: float  # reduced pixels per pixel
 
     def cost_surface(self, weight: np.ndarray) -> _CostSurface:
@@ -202,10 +202,10 @@ class _MatchedView:
         margin = 4 * _GRID  # in reduced pixels: twice the grid along an axis, as its corners are farther
         rows, columns = np.nonzero(weight > 0.01 * weight.max())
         box = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
-        around = cv2.copyMakeBorder(self.after, margin, margin, margin, margin, cv2.BORDER_REPLICATE)
+        around = cv2.copyMakeBorder(self.target, margin, margin, margin, margin, cv2.BORDER_REPLICATE)
         around = around[box[0].start : box[0].stop + 2 * margin, box[1].start : box[1].stop + 2 * margin]
         mask = np.repeat(np.sqrt(weight[box])[..., None], 3, axis=2)  # squared by OpenCV
-        cost = cv2.matchTemplate(around, self.before[box], cv2.TM_SQDIFF, mask=mask)
+        cost = cv2.matchTemplate(around, self.rendering[box], cv2.TM_SQDIFF, mask=mask)
         return _CostSurface(np.maximum(cost, 0) / self.scale**2, self.camera, self.scale)
 
 

@@ -125,9 +125,9 @@ class Target:
         """Return the target on a region, flat, 0 outside the view, and the weights of its numbers; None: 1."""
         if region is None or region.whole:
             return self.planes.image(self.pixels), None if self.weight is None else self.planes.image(self.weight)
-        places, inside = self.places_on(region)
+        places, valid = self.places_on(region)
         weight = None if self.weight is None else dr.gather(mi.Float, self.weight, places)
-        return dr.gather(mi.Float, self.pixels, places, active=inside), weight
+        return dr.gather(mi.Float, self.pixels, places, active=valid), weight
 
     def gradient_on(self, region: Region) -> tuple[Float, Float]:
         """Return the derivatives of the target along x and y on a region, flat, per px, by Sobel's filter."""
@@ -162,15 +162,15 @@ class Target:
 
 def _check_image(image: np.ndarray) -> None:
     if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or not image.size:
-        found = list(image.shape) if isinstance(image, np.ndarray) else type(image).__name__
-        raise ValueError(f"Target(): `image` must be [H, W, 3], got {found}; pass one RGB image.")
+        kind = list(image.shape) if isinstance(image, np.ndarray) else type(image).__name__
+        raise ValueError(f"Target(): `image` must be [H, W, 3], got {kind}; pass one RGB image.")
     if image.dtype == np.uint8:
         return
     low, high = (image.min(), image.max()) if image.dtype.kind == "f" else (np.nan, np.nan)
     if not (low >= -_MARGIN and high <= BRIGHTEST):
-        found = f"{image.dtype} from {low:g} to {high:g}" if image.dtype.kind == "f" else str(image.dtype)
+        kind = f"{image.dtype} from {low:g} to {high:g}" if image.dtype.kind == "f" else str(image.dtype)
         raise ValueError(
-            f"Target(): `image` must be uint8, or floats from 0 to {BRIGHTEST:g} with white at 1, got {found}; divide "
+            f"Target(): `image` must be uint8, or floats from 0 to {BRIGHTEST:g} with white at 1, got {kind}; divide "
             "8-bit values by 255."
         )
 
@@ -207,10 +207,10 @@ class OnRegion(_Recon):
         if target.surroundings is None:
             target.surroundings = target.pixels + 0
         image = target.surroundings
-        places, inside = target.places_on(region)
-        dr.scatter(image, target.masked(x, places), places, active=inside, mode=dr.ReduceMode.NoConflicts)
+        places, valid = target.places_on(region)
+        dr.scatter(image, target.masked(x, places), places, active=valid, mode=dr.ReduceMode.NoConflicts)
         gradient, loss = _passes(image, target, weight, target.windows_on(region))
-        return self.finish(target.masked(dr.gather(mi.Float, gradient, places, active=inside), places), loss)
+        return self.finish(target.masked(dr.gather(mi.Float, gradient, places, active=valid), places), loss)
 
 
 def _passes(image: Float, target: Target, weight: float, on: _Windows) -> tuple[Float, Float]:
@@ -329,11 +329,11 @@ def _walk(
     targets = [dr.empty(mi.Float, size) for _ in range(outputs)]
 
     def blurred(row: Int32, height: Int32, places: tuple[UInt32, UInt32, UInt32]) -> Jit:
-        inside = (row >= 0) & (row < height)
+        valid = (row >= 0) & (row < height)
         down = mi.UInt32(row) * COLUMN
 
         def wide(plane: Float) -> list[Float]:
-            numbers = [v for place in places for v in read_packet(plane, place + down, inside)]
+            numbers = [v for place in places for v in read_packet(plane, place + down, valid)]
             return numbers[STRIP - RADIUS : 2 * STRIP + RADIUS]
 
         sums = []
@@ -354,7 +354,7 @@ def _walk(
         windows = [dr.fma(a, w[k], dr.fma(b, w[k - 1], windows[k])) for k in range(2, 2 * RADIUS)]
         windows += [dr.fma(a, w[-1], b * w[-2]), b * w[-1]]
 
-        inside = [columns > k for k in range(STRIP)]
+        masks = [columns > k for k in range(STRIP)]
         for k in range(2):
             at = row + k - RADIUS
             center = places[1] + mi.UInt32(at) * COLUMN
@@ -366,8 +366,8 @@ def _walk(
             sums = list(done[k])
             written, summed = finish(narrow, [sums[STRIP * c : STRIP * (c + 1)] for c in range(inputs)])
             for target, values in zip(targets, written, strict=True):
-                write_packet(target, [dr.select(t, v, 0) for t, v in zip(inside, values, strict=True)], center, ready)
-            for t, v in zip(inside, summed, strict=True):
+                write_packet(target, [dr.select(t, v, 0) for t, v in zip(masks, values, strict=True)], center, ready)
+            for t, v in zip(masks, summed, strict=True):
                 total = total + dr.select(t & ready, v, 0)
         return row + 2, end, first, places, columns, height, windows, total, targets
 

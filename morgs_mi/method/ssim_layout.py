@@ -109,10 +109,10 @@ class Planes:
     def places_on(self, region: Region) -> tuple[UInt32, Bool]:
         """Return the places of the numbers of a flat image on a region, and the mask of those in the view."""
         component, x, y = self._pixels_of(region)
-        inside = (x < dr.opaque(mi.UInt32, self.width)) & (y < dr.opaque(mi.UInt32, self.height))
-        places = dr.select(inside, self._place(component, y, x), 0)
-        dr.eval(places, inside)
-        return places, inside
+        valid = (x < dr.opaque(mi.UInt32, self.width)) & (y < dr.opaque(mi.UInt32, self.height))
+        places = dr.select(valid, self._place(component, y, x), 0)
+        dr.eval(places, valid)
+        return places, valid
 
     def gradient_on(self, planes: Float, region: Region) -> tuple[Float, Float]:
         """Return the derivatives of an image in `planes` along x and y on a region, flat, per px, by Sobel's filter."""
@@ -151,7 +151,8 @@ class Planes:
         drawn = np.pad(drawn, ((reach, reach), (1, 1)))
         if reach:
             drawn[:, 1:-1] |= drawn[:, 2:] | drawn[:, :-2]
-            drawn[:, 0], drawn[:, -1] = drawn[:, 1], drawn[:, -2]
+            drawn[:, 0] = drawn[:, 1]
+            drawn[:, -1] = drawn[:, -2]
             count = np.pad(drawn, ((1, 0), (0, 0))).cumsum(0)
             drawn = count[2 * reach + 1 :] > count[: -2 * reach - 1]
         strip, first, end = _cell_runs(drawn.T)

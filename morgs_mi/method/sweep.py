@@ -71,8 +71,8 @@ class KeyImages:
         drawing = self.group.draw(gaussians)
         image, sizes = self._maps(drawing, names)
         ends = np.cumsum(sizes)
-        found = np.split(drawing.sums(image, int(ends[-1])), ends[:-1], axis=-1)
-        return {name: v[..., 0] if v.shape[-1] == 1 else v for name, v in zip(names, found, strict=True)}
+        parts = np.split(drawing.sums(image, int(ends[-1])), ends[:-1], axis=-1)
+        return {name: v[..., 0] if v.shape[-1] == 1 else v for name, v in zip(names, parts, strict=True)}
 
     def rendered(self, gaussians: Gaussians, factor: int = 1) -> list[np.ndarray]:
         """Return the image of Gaussians in each view [H // factor, W // factor, 3]; 0 where the view is not drawn.
@@ -117,13 +117,13 @@ class KeyImages:
     @cached_property
     def _pixels(self) -> tuple[Float, Float | None]:
         """The targets on the group, and the weights of their numbers; None: 1."""
-        found = [target.on(region) for target, region in zip(self._targets, self.group.regions, strict=True)]
-        pixels, weights = ([*column] for column in zip(*found, strict=True))
+        target_numbers = [target.on(region) for target, region in zip(self._targets, self.group.regions, strict=True)]
+        pixels, weights = ([*column] for column in zip(*target_numbers, strict=True))
         if all(weight is None for weight in weights):
             return _end_to_end(pixels), None
         pairs = zip(weights, pixels, strict=True)
-        known = [dr.full(mi.Float, 1, dr.width(part)) if weight is None else weight for weight, part in pairs]
-        return _end_to_end(pixels), _end_to_end(known)
+        full_weights = [dr.full(mi.Float, 1, dr.width(part)) if weight is None else weight for weight, part in pairs]
+        return _end_to_end(pixels), _end_to_end(full_weights)
 
     @cached_property
     def _gradient(self) -> tuple[Float, Float]:

@@ -383,7 +383,8 @@ def _transposed(rows: list[UInt32]) -> list[UInt32]:
         for k in range(32):
             if not k & size:
                 swap = ((rows[k] >> size) ^ rows[k + size]) & mask
-                rows[k], rows[k + size] = rows[k] ^ (swap << size), rows[k + size] ^ swap
+                rows[k] = rows[k] ^ (swap << size)
+                rows[k + size] = rows[k + size] ^ swap
         size >>= 1
         mask ^= (mask << size) & 0xFFFFFFFF
     return rows

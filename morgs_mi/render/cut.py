@@ -100,5 +100,5 @@ class Cut:
         """Return the change of alpha' at pixel k along tangents of (mean_x, mean_y) and the profile."""
         j, i = divmod(k, len(self.dx))
         tz, t_gx, t_gy, t_r = profile
-        moved = tz + t_gx * self.dx[i] + t_gy * self.dy[j] - self.gx * mean[0] - self.gy * mean[1]
-        return cut.by_q * (cut.behind * t_r - self.r_sigma * moved)
+        change = tz + t_gx * self.dx[i] + t_gy * self.dy[j] - self.gx * mean[0] - self.gy * mean[1]
+        return cut.by_q * (cut.behind * t_r - self.r_sigma * change)

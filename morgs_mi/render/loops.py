@@ -158,7 +158,7 @@ class _Block:
         """Return (place, in the image) of all packets of 4 in an image of `size` floats per pixel, row by row."""
         run = self.width * size // 4
         starts = [((self.place + j * self.pitch) * size, self.rows > j) for j in range(self.height)]
-        return [(start + k, inside) for start, inside in starts for k in range(run)]
+        return [(start + k, valid) for start, valid in starts for k in range(run)]
 
     def offsets(self, x: Float, y: Float, geometry: list[Float]) -> tuple[list[Float], list[Float]]:
         """Return the offsets dx [width] and dy [height] of the block's columns and rows from the mean."""
@@ -209,9 +209,9 @@ def _store(
     first = 0
     for image, size in zip(images, layout.sizes, strict=True):
         values = [value for pixel in pixels for value in pixel[first : first + size]]
-        for k, (place, inside) in enumerate(block.packets(size)):
+        for k, (place, valid) in enumerate(block.packets(size)):
             packet = mi.Vector4f(*values[4 * k : 4 * k + 4])
-            dr.scatter(image, packet, place, active=inside, mode=dr.ReduceMode.NoConflicts)
+            dr.scatter(image, packet, place, active=valid, mode=dr.ReduceMode.NoConflicts)
         first += size
     return images
 
@@ -224,7 +224,7 @@ def _load(block: _Block, layout: Layout, images: list[Float]) -> list[list[Float
 
 def _load_image(block: _Block, size: int, image: Float) -> list[list[Float]]:
     """Return the `size` floats of every pixel in an image."""
-    packets = (dr.gather(mi.Vector4f, image, place, active=inside) for place, inside in block.packets(size))
+    packets = (dr.gather(mi.Vector4f, image, place, active=valid) for place, valid in block.packets(size))
     values = [value for packet in packets for value in packet]
     return [values[k : k + size] for k in range(0, len(values), size)]
 
@@ -381,8 +381,8 @@ def _adjoint(
         geometry_grads = moments.gradients(dx[0], dy[0], geometry) if geometric else _floats(G)
         if cut and geometric:
             mean_grads, profile_grads = cut.gradients()
-            moved = [a + b for a, b in zip(geometry_grads, mean_grads, strict=False)]
-            geometry_grads = [*moved, *geometry_grads[2:], *profile_grads]
+            total_grads = [a + b for a, b in zip(geometry_grads, mean_grads, strict=False)]
+            geometry_grads = [*total_grads, *geometry_grads[2:], *profile_grads]
         add(target, [*geometry_grads, *value_grads], rank, pair)
         return walk, pair + 1, end, x, y, limits, T_next, S_next, g, records, words, entries, target
 
@@ -425,10 +425,8 @@ class _Moments:
         if i == self.width - 1:
             self.d = self.d + self.row_d
             self.du = self.du + self.row_du
-            self.dj, self.djj = (
-                dr.fma(self.row_d, float(j), self.dj),
-                dr.fma(self.row_d, float(j * j), self.djj),
-            )
+            self.dj = dr.fma(self.row_d, float(j), self.dj)
+            self.djj = dr.fma(self.row_d, float(j * j), self.djj)
             self.duj = dr.fma(self.row_du, float(j), self.duj)
 
     def gradients(self, x0: Float, y0: Float, geometry: list[Float]) -> list[Float]:

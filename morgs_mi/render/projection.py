@@ -286,9 +286,9 @@ def _intrinsics(camera: Camera | Views) -> list[Float]:
 def _numbers(kind: type[Jit], values: tuple[float, ...]) -> tuple[Jit, ...]:
     """Return numbers in memory, each an array of width 1."""
     memory = from_numpy(kind, values)
-    found = tuple(dr.gather(kind, memory, mi.UInt32(i)) for i in range(len(values)))
-    dr.eval(found)
-    return found
+    elements = tuple(dr.gather(kind, memory, mi.UInt32(i)) for i in range(len(values)))
+    dr.eval(elements)
+    return elements
 
 
 def _numbers_of(camera: Camera) -> list[float]:
@@ -308,8 +308,8 @@ def _rotation(quats: Jit) -> list[Jit]:
     largest = dr.max(dr.abs(dr.detach(quats)))
     zero = largest < 1e-30
     # Scaling prevents over- and underflow of the squares. A product with 0 preserves NaN, which a selection would not.
-    scaled = quats * dr.select(zero, 0, dr.rcp(dr.minimum(largest, 1e30)))
-    w, x, y, z = dr.normalize(scaled + mi.Vector4f(dr.select(zero, 1, 0), 0, 0, 0))
+    scaled_quats = quats * dr.select(zero, 0, dr.rcp(dr.minimum(largest, 1e30)))
+    w, x, y, z = dr.normalize(scaled_quats + mi.Vector4f(dr.select(zero, 1, 0), 0, 0, 0))
     return [
         mi.Vector3f(1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
         mi.Vector3f(2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),

@@ -205,11 +205,11 @@ def _normalised(values: Float, weight: Float) -> Float:
 
 def _over(background: Sequence[float] | Jit) -> Callable[[Float, Float], Float]:
     """Return the function that composites a colour over the background."""
-    given: Any = background
-    if dr.is_array_v(given):
-        behind = given.array if dr.is_tensor_v(given) else dr.ravel(given)
+    color: Any = background
+    if dr.is_array_v(color):
+        behind = color.array if dr.is_tensor_v(color) else dr.ravel(color)
     else:
-        behind = from_numpy(mi.Float, np.asarray(given))
+        behind = from_numpy(mi.Float, np.asarray(color))
     # Numbers of their own: the gradient of one array would be added by all pixels to three places.
     red, green, blue = (dr.gather(mi.Float, behind, mi.UInt32(k)) for k in range(3))
 
@@ -301,18 +301,18 @@ def _empty(
 
 def _check_region(region: Region, camera: Camera, config: RenderConfig) -> None:
     block = block_shape(config)
-    found = (region.width, region.height, *region.block)
-    if found != (camera.width, camera.height, *block):
+    shape = (region.width, region.height, *region.block)
+    if shape != (camera.width, camera.height, *block):
         raise ValueError(
             f"rasterize(): `region` must be of a {camera.width}x{camera.height} view with {block[0]}x{block[1]} blocks "
-            f"like the camera's and the config's, got {found[0]}x{found[1]} with {found[2]}x{found[3]}; build it for "
+            f"like the camera's and the config's, got {shape[0]}x{shape[1]} with {shape[2]}x{shape[3]}; build it for "
             "this camera with this config."
         )
 
 
-def _check_alone(given: Mapping[str, object]) -> None:
+def _check_alone(arguments: Mapping[str, object]) -> None:
     """Raise an error if what belongs to one view is given with a sequence of cameras."""
-    for name, value in given.items():
+    for name, value in arguments.items():
         if value is not None:
             raise ValueError(
                 f"rasterize(): `{name}` must be None with a sequence of cameras, got a {type(value).__name__}; render "
@@ -339,9 +339,9 @@ def _check_types(
             f"rasterize(): `camera` must be cameras of the same size, got {described}; render one camera at a time."
         )
     check_type("rasterize()", "config", config, RenderConfig)
-    for name, given in names.items():
-        if isinstance(given, str) or not isinstance(given, Sequence):
-            raise ValueError(f"rasterize(): `{name}` must be a sequence of names, got {given!r}; pass a tuple.")
+    for name, sequence in names.items():
+        if isinstance(sequence, str) or not isinstance(sequence, Sequence):
+            raise ValueError(f"rasterize(): `{name}` must be a sequence of names, got {sequence!r}; pass a tuple.")
 
 
 def _check(
@@ -357,11 +357,11 @@ def _check(
             f"got {mi.variant()!r}; call mi.set_variant() first."
         )
     attributes = attribute_channels()
-    known = ("color", "alpha", "depth", "motion", "guided_motion", *attributes)
+    choices = ("color", "alpha", "depth", "motion", "guided_motion", *attributes)
     for name in (*channels, *detach_weights):
-        if name not in known and not (name == "features" and name not in channels):
+        if name not in choices and not (name == "features" and name not in channels):
             raise ValueError(
-                f"rasterize(): `channels` must be out of {', '.join(known)}, got {name!r}; use one of these, or pass "
+                f"rasterize(): `channels` must be out of {', '.join(choices)}, got {name!r}; use one of these, or pass "
                 "other values as `features`."
             )
     motions = dict.fromkeys(("motion", "guided_motion"), BY_ACTIVATED_NAME["motion"])
@@ -411,9 +411,9 @@ def _checked_limits(depth_limit: Tensor | np.ndarray, camera: Camera, static_spl
     limits: Tensor = float_tensor("rasterize()", "depth_limit", depth_limit)
     expected = (camera.height, camera.width)
     if tuple(limits.shape) != expected or dr.any(dr.isnan(limits.array)):
-        found = list(limits.shape) if tuple(limits.shape) != expected else "NaN"
+        problem = list(limits.shape) if tuple(limits.shape) != expected else "NaN"
         raise ValueError(
-            f"rasterize(): `depth_limit` must be one depth per pixel, {list(expected)}, got {found}; use inf where "
+            f"rasterize(): `depth_limit` must be one depth per pixel, {list(expected)}, got {problem}; use inf where "
             "there is no surface."
         )
     if static_splats is not None:

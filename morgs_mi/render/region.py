@@ -104,9 +104,9 @@ class Region:
     def __init__(self, mask: np.ndarray, config: RenderConfig | None = None) -> None:
         check_type("Region()", "mask", mask, np.ndarray)
         if mask.ndim != 2 or mask.dtype != bool or not mask.any():
-            found = f"{mask.dtype} {mask.shape}" if mask.ndim != 2 or mask.dtype != bool else "none"
+            description = f"{mask.dtype} {mask.shape}" if mask.ndim != 2 or mask.dtype != bool else "none"
             raise ValueError(
-                f"Region(): `mask` must be bool [H, W] with at least one pixel set, got {found}; "
+                f"Region(): `mask` must be bool [H, W] with at least one pixel set, got {description}; "
                 "skip a view in which nothing is drawn."
             )
         grid = BlockGrid.of(mask.shape[1], mask.shape[0], config or RenderConfig())
@@ -152,8 +152,8 @@ class Region:
         self.height = views * grid.height
         self.across, self.down = grid.tiles
         self._lay_out(np.tile(blocks, (views, 1)))
-        inside = None if whole else self.inside()
-        self.weights = None if inside is None or inside.all() else from_numpy(mi.Float, inside)
+        mask = None if whole else self.inside()
+        self.weights = None if mask is None or mask.all() else from_numpy(mi.Float, mask)
 
     def _lay_out(self, blocks: np.ndarray) -> None:
         """Number the blocks of a grid bool [rows, columns]; a second view begins after `down` rows of tiles."""
@@ -179,7 +179,8 @@ class Region:
 
         self.num_blocks = len(x)
         self.num_tiles = len(tiles)
-        self.row, self.num_pixels = pitch, pitch * self.height if whole else len(x) * bw * bh
+        self.row = pitch
+        self.num_pixels = pitch * self.height if whole else len(x) * bw * bh
         # Pixels are read and written in packets of 4 floats: places and pitch count packets.
         arrays = {
             "tile": tile,
@@ -237,12 +238,12 @@ class Region:
         shape = (rows, height, columns, width, *image.shape[2:])
         # A view of the blocks that lie in the image as a whole: a copy of large images would take most of the time.
         blocks = as_strided(image, shape, (height * down, down, width * across, across, *rest))
-        inside = (row < rows) & (column < columns)
-        if inside.all():
+        is_whole = (row < rows) & (column < columns)
+        if is_whole.all():
             return blocks[row, :, column]
         cropped = np.zeros((len(row), height, width, *image.shape[2:]), image.dtype)
-        cropped[inside] = blocks[row[inside], :, column[inside]]
-        for k in np.flatnonzero(~inside):
+        cropped[is_whole] = blocks[row[is_whole], :, column[is_whole]]
+        for k in np.flatnonzero(~is_whole):
             y = row[k] * height
             x = column[k] * width
             part = image[y : y + height, x : x + width]
@@ -273,7 +274,7 @@ class Region:
         rows, columns = self.drawn.shape
         width, height = self.block
         missing = [(0, rows * height - image.shape[0]), (0, columns * width - image.shape[1])]
-        if any(after for _, after in missing):
+        if any(end for _, end in missing):
             image = np.pad(image, missing + [(0, 0)] * (image.ndim - 2))
         return image.reshape(rows, height, columns, width, *image.shape[2:])
 
@@ -291,11 +292,12 @@ def joined(regions: Sequence[Region]) -> Region:
     region.down = max(part.down for part in regions)
     rows = region.down * DOWN
     columns = region.across * ACROSS
-    region.width, region.height = columns * region.block[0], len(regions) * rows * region.block[1]
+    region.width = columns * region.block[0]
+    region.height = len(regions) * rows * region.block[1]
     padded = [np.pad(grid, ((0, rows - len(grid)), (0, columns - grid.shape[1]))) for grid in grids]
     region._lay_out(np.concatenate(padded))
-    inside = np.concatenate([part.inside() for part in regions])
-    region.weights = None if inside.all() else from_numpy(mi.Float, inside)
+    mask = np.concatenate([part.inside() for part in regions])
+    region.weights = None if mask.all() else from_numpy(mi.Float, mask)
     return region
 
 

@@ -90,16 +90,16 @@ class ViewGroup:
     @cached_property
     def _static(self) -> Splats | None:
         """The static splats of all views that touch their regions; None if there are none."""
-        found: Splats | None = None
+        splats: Splats | None = None
         for index, view in enumerate(self.views):
             if view.static_splats is not None:
-                own = replace(view.static_splats, view=dr.full(mi.UInt32, index, len(view.static_splats)))
-                own = replace(own, channels={"color": own.channels["color"]})
-                found = own if found is None else found.concatenated_with(own)
-        if found is None:
+                view_splats = replace(view.static_splats, view=dr.full(mi.UInt32, index, len(view.static_splats)))
+                view_splats = replace(view_splats, channels={"color": view_splats.channels["color"]})
+                splats = view_splats if splats is None else splats.concatenated_with(view_splats)
+        if splats is None:
             return None
-        rows = dr.compress(touches(found, self.region))
-        return _selected(found, rows) if dr.width(rows) else None
+        rows = dr.compress(touches(splats, self.region))
+        return _selected(splats, rows) if dr.width(rows) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +137,7 @@ class Drawing:
         sums = np.zeros((len(self.group.views) * self.count, channels), np.float32)
         lanes = np.asarray(self.lanes)
         if len(lanes):
-            sums[lanes] = np.stack([np.asarray(own) for own in self._sums(image, channels)], axis=1)
+            sums[lanes] = np.stack([np.asarray(channel_sums) for channel_sums in self._sums(image, channels)], axis=1)
         return sums.reshape(-1, self.count, channels)
 
     def totals(self, image: Float, channels: int) -> np.ndarray:
@@ -147,8 +147,8 @@ class Drawing:
         view = quotient(self.lanes, self.count)
         row = self.lanes - view * dr.opaque(mi.UInt32, self.count)
         totals = [dr.zeros(mi.Float, self.count) for _ in range(channels)]
-        for total, own in zip(totals, self._sums(image, channels), strict=True):
-            dr.scatter_add(total, own, row)
+        for total, channel_sums in zip(totals, self._sums(image, channels), strict=True):
+            dr.scatter_add(total, channel_sums, row)
         dr.eval(totals)
         return np.stack([np.asarray(total) for total in totals], axis=1)
 
@@ -163,9 +163,9 @@ class Drawing:
             layout = Layout((Channel(channels, False),), False, False, self.group.config)
             grads = weighted_sums([image], self.group.region, replace(lists, records=records), layout)
             place = dr.arange(mi.UInt32, dr.width(self.lanes))  # static splats come after
-            own = [dr.gather(mi.Float, grad, place) for grad in grads]
-            dr.eval(own)
-        return own
+            lane_sums = [dr.gather(mi.Float, grad, place) for grad in grads]
+            dr.eval(lane_sums)
+        return lane_sums
 
 
 def backproject(gaussians: ActivatedGaussians, view: ActiveView, image: np.ndarray) -> np.ndarray:

@@ -100,12 +100,12 @@ def _stream(capture: Capture, out: Path, config: StreamConfig, resume: bool, pro
 def _resumed(loop: StreamLoop, capture: Capture, earlier: Interrupted, progress: Progress) -> Iterator[PartialFrame]:
     """Let a loop continue after an interrupted fit, and return the frames that follow."""
     fit = loop.setup.config.fit
-    now = earlier.coded.frame
+    last_frame = earlier.coded.frame
     train = capture.train_views
     # Changes and exposures are relative to references that depend on all images so far.
-    start = 0 if fit.skip_static or fit.exposure != "off" else now
+    start = 0 if fit.skip_static or fit.exposure != "off" else last_frame
     frames = capture.partial_frames(start)
-    count = now + 1 - start
+    count = last_frame + 1 - start
     past = _counted(islice(frames, count), progress.of("Reading the fitted frames"), count)
     loop.resume(earlier.coded, (frame.comparable(train) for frame in past), earlier.reports[0].exposures)
     return frames

@@ -213,9 +213,9 @@ class Recording:
         """Raise `FileNotFoundError` if the stream has been removed, moved or replaced."""
         path = self._written_files.stream
         if not is_same_file(path, self._written):
-            found = "another file" if path.exists() else "none"
+            kind = "another file" if path.exists() else "none"
             raise FileNotFoundError(
-                f"{path}: expected the stream that is being written, found {found}: it was removed, moved or replaced; "
+                f"{path}: expected the stream that is being written, found {kind}: it was removed, moved or replaced; "
                 "start again, or resume it where it is now."
             )
 
@@ -228,7 +228,7 @@ class Interrupted:
     index: Sequence[Entry]  #: The complete packets.
     end: int  #: Offset of the end of the last one.
     coded: CodedFrame  #: State after it.
-    before: CodedFrame | None  #: State before the last frame; None if there is none.
+    previous_state: CodedFrame | None  #: State before the last frame; None if there is none.
     last: Packet  #: First packet of the last frame.
     reports: list[FrameReport]  #: Of the frames.
 
@@ -263,27 +263,29 @@ def interrupted_fit(
         return None
     frame = index[-1][1]
     coded = None
-    before = None
+    previous_state = None
     last = None
     with suppress(TruncatedStreamError):
         for packet in takewhile(lambda packet: packet.frame <= frame, stream.near(frame)):
             if coded is None or packet.frame > coded.frame:
-                before = coded
+                previous_state = coded
                 coded = decode(coded, packet)
                 last = packet
     assert coded is not None
     assert last is not None
-    return Interrupted(stream, index, end, coded, before, last, read_reports(files.report, range(first, frame + 1)))
+    return Interrupted(
+        stream, index, end, coded, previous_state, last, read_reports(files.report, range(first, frame + 1))
+    )
 
 
-def restart_of(before: CodedFrame | None, last: Packet) -> tuple[bytes, ...]:
+def restart_of(previous_state: CodedFrame | None, last: Packet) -> tuple[bytes, ...]:
     """Return encoded packets that lead a decoder to the state after a frame.
 
     Args:
-        before: state before the frame; None if its packet is a keyframe.
+        previous_state: state before the frame; None if its packet is a keyframe.
         last: packet of the frame.
     """
-    return (last.encoded,) if before is None else (reemitted_keyframe(before).encoded, last.encoded)
+    return (last.encoded,) if previous_state is None else (reemitted_keyframe(previous_state).encoded, last.encoded)
 
 
 def check_same_fit(stream: StreamReader, capture: Capture, metadata: Mapping[str, Any]) -> None:
@@ -293,8 +295,8 @@ def check_same_fit(stream: StreamReader, capture: Capture, metadata: Mapping[str
         ValueError: it belongs to another capture or other settings.
     """
     # Streams of earlier versions have paths in their headers.
-    found = ("capture", "distortions")
-    recorded = _without_folders({name: value for name, value in stream.metadata.items() if name not in found})
+    excluded_names = ("capture", "distortions")
+    recorded = _without_folders({name: value for name, value in stream.metadata.items() if name not in excluded_names})
     # Refined cameras differ from the calibrated ones, which are part of the fingerprint then.
     refined = metadata["config"]["fit"]["refine_cameras"] != "off"
     cameras = stream.cameras if refined else capture.cameras
@@ -303,10 +305,10 @@ def check_same_fit(stream: StreamReader, capture: Capture, metadata: Mapping[str
         for parts in ((stream.cameras, stream.fps, recorded), (cameras, capture.fps, metadata))
     )
     if difference := _difference(old, new):
-        name, before, now = difference
+        name, old_value, new_value = difference
         raise ValueError(
-            f"{stream.path}: expected to resume a fit with {name} = {shortened(before)}, got {shortened(now)}; give "
-            "the same capture and settings, or start again without --resume."
+            f"{stream.path}: expected to resume a fit with {name} = {shortened(old_value)}, got "
+            f"{shortened(new_value)}; give the same capture and settings, or start again without --resume."
         )
 
 
@@ -352,11 +354,14 @@ def _without_folder(method: str) -> str:
 
 def described_capture(capture: Capture, earlier: Path | None) -> dict[str, Any]:
     """Return the content of `capture.json`: an earlier fit's if there is one, with the capture's present path."""
-    about = None
+    description = None
     if earlier is not None:
         with suppress(OSError, ValueError):
-            about = read_json(earlier)
-    return {**(about if isinstance(about, dict) else capture.metadata()), "capture": str(Path(capture.path).resolve())}
+            description = read_json(earlier)
+    return {
+        **(description if isinstance(description, dict) else capture.metadata()),
+        "capture": str(Path(capture.path).resolve()),
+    }
 
 
 def _difference(old: Any, new: Any, name: str = "") -> tuple[str, Any, Any] | None:
@@ -374,8 +379,8 @@ def read_reports(path: Path, frames: range) -> list[FrameReport]:
     try:
         reports = [_report(row) for row in document["frames"][: len(frames)]]
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        found = f"a broken one ({error})" if path.exists() else "none"
-        raise ValueError(f"{path}: expected the report of the fit, got {found}; {remedy}.") from None
+        description = f"a broken one ({error})" if path.exists() else "none"
+        raise ValueError(f"{path}: expected the report of the fit, got {description}; {remedy}.") from None
     if [report.frame for report in reports] != list(frames):
         raise ValueError(f"{path}: expected the rows of {len(frames)} frames, got {len(reports)}; {remedy}.")
     return reports
@@ -383,8 +388,8 @@ def read_reports(path: Path, frames: range) -> list[FrameReport]:
 
 def _report(row: Mapping[str, Any]) -> FrameReport:
     exposures = tuple(Exposure(tuple(e["gain"]), tuple(e["bias"])) for e in row.get("exposures", ()))
-    known = {"seconds": float(row["seconds"]), "missing_views": tuple(row["missing_views"]), "exposures": exposures}
-    return FrameReport(**{**row, **known})
+    values = {"seconds": float(row["seconds"]), "missing_views": tuple(row["missing_views"]), "exposures": exposures}
+    return FrameReport(**{**row, **values})
 
 
 def due_keyframe(coded: CodedFrame | None, interval: int) -> list[Packet]:

@@ -71,9 +71,9 @@ def composite(
         surface = dr.maximum(L - (1 - f) * E, 0) / dr.select(covered, f, 1)
         rest = dr.maximum(L - f * surface, 0) / dr.select(f < 1, 1 - f, 1)
         beyond = encode(rest) + ground[k]
-        inside = decode(dr.fma(t_front, encode(surface), front["color"][k]))
-        outside = decode(dr.fma(t_whole, beyond, whole["color"][k]))
-        color.append(dr.fma(f, inside - outside, outside))
+        inner_color = decode(dr.fma(t_front, encode(surface), front["color"][k]))
+        outer_color = decode(dr.fma(t_whole, beyond, whole["color"][k]))
+        color.append(dr.fma(f, inner_color - outer_color, outer_color))
 
     splats = {name: [dr.lerp(b, a, f) for a, b in zip(front[name], whole[name], strict=True)] for name in channels}
     (alpha,) = splats["alpha"]
@@ -103,15 +103,15 @@ def _in_front(
     pixel = dr.arange(mi.UInt32, width * height)
     row = pixel // dr.opaque(mi.UInt32, width)
     limit = dr.full(mi.Float, dr.inf, mask.size)
-    inside = dr.fma(row + y, dr.opaque(mi.UInt32, camera.width), pixel - row * dr.opaque(mi.UInt32, width) + x)
-    dr.scatter(limit, view.depth, inside, mode=dr.ReduceMode.Permute)
+    place = dr.fma(row + y, dr.opaque(mi.UInt32, camera.width), pixel - row * dr.opaque(mi.UInt32, width) + x)
+    dr.scatter(limit, view.depth, place, mode=dr.ReduceMode.Permute)
     region = Region(mask)
     depth_limit = mi.TensorXf(limit, mask.shape)
     part = rasterize(gaussians, camera, channels, region=region, config=config, depth_limit=depth_limit)
-    place = region.paste(
+    index_image = region.paste(
         np.arange(int(np.prod(region.shape(1)))).reshape(region.shape(1)[:3]), np.zeros(mask.shape, int)
     )
-    index = from_numpy(mi.UInt32, place[y : y + height, x : x + width])
+    index = from_numpy(mi.UInt32, index_image[y : y + height, x : x + width])
     drawn = view.coverage > 0
 
     def on_crop(image: Tensor) -> list[Float]:

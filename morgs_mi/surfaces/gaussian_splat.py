@@ -96,7 +96,7 @@ def _shape_gaussians(shape: Any, attributes: list[str]) -> dict[str, Tensor]:
     return part
 
 
-class _Kept(NamedTuple):
+class _ForwardPass(NamedTuple):
     """A rendering with gradients: its inputs, which must not have changed for the backward pass, and the image."""
 
     inputs: list[Any]
@@ -237,7 +237,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
                 "call mi.set_variant() before the scene is loaded, because Gaussians have RGB colours."
             )
         self.warnings: set[str] = set()
-        self.kept: _Kept | None = None
+        self.forward_pass: _ForwardPass | None = None
         names = aov_attributes()
         for name in self.aovs:
             if name not in names:
@@ -267,7 +267,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
     ) -> Any:
         refuse_freezing("gaussian_splat")  # before any memory is released, which would end the process
-        self.kept = None
+        self.forward_pass = None
         with dr.resume_grad():
             inputs = self._inputs(scene, sensor)
             attached = develop and self.surfaces is None and dr.grad_enabled(inputs)
@@ -275,7 +275,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
             film, _ = self._expose(scene, sensor, seed, spp)
             image = film.develop() if develop else mi.TensorXf()
         if attached:
-            self.kept = _Kept(inputs, image)
+            self.forward_pass = _ForwardPass(inputs, image)
             image = dr.detach(image)
         film.schedule_storage()
         if evaluate:
@@ -296,11 +296,11 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
     def render_backward(
         self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
     ) -> None:
-        kept = self.kept
-        self.kept = None
+        forward_pass = self.forward_pass
+        self.forward_pass = None
         with dr.resume_grad():
-            if kept is not None and kept.fits(self._inputs(scene, sensor)):
-                image = kept.image
+            if forward_pass is not None and forward_pass.fits(self._inputs(scene, sensor)):
+                image = forward_pass.image
                 surfaces = None
             else:
                 film, surfaces = self._expose(scene, sensor, seed, spp)

@@ -79,7 +79,8 @@ class _Tree:
         low, high = (np.concatenate([levels[-1], *levels[::-1]]) for levels in (lows, highs))
         rows = np.zeros((len(low), 8))
         # An empty box is a point at infinity, which no ray reaches.
-        rows[:, :3], rows[:, 4:7] = low, np.where(low > high, np.inf, high)
+        rows[:, :3] = low
+        rows[:, 4:7] = np.where(low > high, np.inf, high)
         return _Tree(_opaque(depth), tuple(map(_opaque, flips)), from_numpy(mi.Float, rows)), order
 
     def walk(
@@ -164,7 +165,8 @@ class SplatRays:
         index = np.concatenate([drawn, [0]])[order]
         # Four floats each, which are read as one packet.
         rows = np.zeros((len(index), 4, 4))
-        rows[:, :3, :3], rows[:, :3, 3] = (axes / scales[:, None]).transpose(0, 2, 1)[index], means[index]
+        rows[:, :3, :3] = (axes / scales[:, None]).transpose(0, 2, 1)[index]
+        rows[:, :3, 3] = means[index]
         rows[:, 3, 0] = np.where(order < len(drawn), opacities.ravel()[index], 0)
         padded = np.zeros((*coeffs.shape[:2], 4))
         padded[..., :3] = coeffs
@@ -207,8 +209,8 @@ class SplatRays:
                 ((depth, *depths), (row, *rows), count) = nearest
                 alpha = self._response(ray, row)[1]
                 color = color + passed * alpha * self._color(basis, row)
-                kept = ([*depths, mi.Float(dr.inf)], [*rows, mi.UInt32(0)], count)
-                return color, passed * (1 - alpha), kept, (depth, row)
+                queue = ([*depths, mi.Float(dr.inf)], [*rows, mi.UInt32(0)], count)
+                return color, passed * (1 - alpha), queue, (depth, row)
 
             def advance(active: Bool, color: Any, passed: Float, last: Any) -> tuple[Any, ...]:
                 nearest = self._nearest(ray, active, last)
@@ -236,13 +238,17 @@ class SplatRays:
             depths = list(depths)
             rows = list(rows)
             depth, alpha = self._response(ray, row)
-            found = (alpha > 0) & _before(*last, depth, row)
-            depth = dr.select(found, depth, dr.inf)
+            hit = (alpha > 0) & _before(*last, depth, row)
+            depth = dr.select(hit, depth, dr.inf)
             for j in range(_SORTED):
-                before = _before(depth, row, depths[j], rows[j])
-                depths[j], depth = dr.select(before, depth, depths[j]), dr.select(before, depths[j], depth)
-                rows[j], row = dr.select(before, row, rows[j]), dr.select(before, rows[j], row)
-            return depths, rows, count + dr.select(found, mi.UInt32(1), 0)
+                is_nearer = _before(depth, row, depths[j], rows[j])
+                nearer_depth = dr.select(is_nearer, depth, depths[j])
+                depth = dr.select(is_nearer, depths[j], depth)
+                depths[j] = nearer_depth
+                nearer_row = dr.select(is_nearer, row, rows[j])
+                row = dr.select(is_nearer, rows[j], row)
+                rows[j] = nearer_row
+            return depths, rows, count + dr.select(hit, mi.UInt32(1), 0)
 
         def span(state: tuple[Jit, ...]) -> tuple[Float, Float]:
             # The largest response of a Gaussian that reaches into the segment may be beyond either end.

@@ -297,9 +297,9 @@ def coverage_and_depth(scene: Any, sensor: Any, camera: Camera, crop: tuple[int,
         def step(i: UInt32, count: Float, total: Float) -> tuple[UInt32, Float, Float]:
             k = dr.gather(mi.UInt32, cells, i)
             rays = _rays(sensor, pixel, (mi.Vector2f(k % _GRID, k // _GRID) + 0.5) / _GRID)
-            found = scene.ray_intersect_preliminary(rays, coherent=True)
-            hit = found.is_valid()
-            z = (to_camera @ rays(dr.select(hit, found.t, 0))).z
+            intersection = scene.ray_intersect_preliminary(rays, coherent=True)
+            hit = intersection.is_valid()
+            z = (to_camera @ rays(dr.select(hit, intersection.t, 0))).z
             return i + 1, count + dr.select(hit, mi.Float(1), 0), total + dr.select(hit, z, 0)
 
         state = (mi.UInt32(0), mi.Float(0), mi.Float(0))
@@ -312,8 +312,8 @@ def coverage_and_depth(scene: Any, sensor: Any, camera: Camera, crop: tuple[int,
     neighbours = ((lane - 1, column > 0), (lane + 1, column + 1 < columns), (lane - columns, row > 0))
     neighbours = (*neighbours, (lane + columns, lane + columns < across * down))
     mixed: Bool = (count > 0) & (count < len(_FIRST))
-    for place, inside in neighbours:
-        mixed |= dr.gather(mi.Float, count, place, active=inside) != count
+    for place, valid in neighbours:
+        mixed |= dr.gather(mi.Float, count, place, active=valid) != count
     edge: Any = dr.compress(mixed)
     if dr.width(edge):
         more, deeper = cast(dr.gather(mi.UInt32, pixel, edge), _OTHERS)
@@ -354,9 +354,9 @@ def _environment(scene: Any, sensor: Any) -> Any:
     return mi.Color3f(mi.unpolarized_spectrum(scene.environment().eval(si)))
 
 
-def _rays(sensor: Any, pixel: UInt32, inside: Any) -> Any:
-    """Return rays through the positions `inside` [0, 1]^2 of pixels of a sensor's film, numbered row by row."""
+def _rays(sensor: Any, pixel: UInt32, offset: Any) -> Any:
+    """Return rays through the positions `offset` [0, 1]^2 of pixels of a sensor's film, numbered row by row."""
     width, height = (dr.opaque(mi.UInt32, int(size)) for size in sensor.film().crop_size())
     row = pixel // width
-    position = (mi.Vector2f(pixel - row * width, row) + inside) / mi.Vector2f(width, height)
+    position = (mi.Vector2f(pixel - row * width, row) + offset) / mi.Vector2f(width, height)
     return sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))[0]

@@ -64,15 +64,15 @@ class Calibration:
         Raises:
             ValueError: there is no such camera, or none is left.
         """
-        kept = [self.names.index(name) for name in names_without(path, self.names, names)]
+        indices = [self.names.index(name) for name in names_without(path, self.names, names)]
         views = self.test_views
         return replace(
             self,
-            cameras=tuple(self.cameras[index] for index in kept),
-            lenses=tuple(self.lenses[index] for index in kept),
-            clips=tuple(self.clips[index] for index in kept),
-            test_views=views and tuple(kept.index(view) for view in views if view in kept),
-            masks=tuple(self.masks[index] for index in kept if self.masks),
+            cameras=tuple(self.cameras[index] for index in indices),
+            lenses=tuple(self.lenses[index] for index in indices),
+            clips=tuple(self.clips[index] for index in indices),
+            test_views=views and tuple(indices.index(view) for view in views if view in indices),
+            masks=tuple(self.masks[index] for index in indices if self.masks),
         )
 
 

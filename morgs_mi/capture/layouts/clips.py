@@ -102,10 +102,10 @@ def names_without(path: Path, names: Collection[str], without: Collection[str]) 
     """
     if unknown := [name for name in without if name not in names]:
         raise ValueError(f"{path}: `without` must name cameras of {', '.join(names)}, got {', '.join(unknown)}.")
-    kept = [name for name in names if name not in without]
-    if without and not kept:
+    rest = [name for name in names if name not in without]
+    if without and not rest:
         raise ValueError(f"{path}: `without` must leave at least one camera, got all: {', '.join(names)}.")
-    return kept
+    return rest
 
 
 def view_of_image(views: Collection[str], image: str, by_folder: bool = False) -> str | None:
@@ -126,8 +126,8 @@ def clip_of_camera(clips: Collection[str], camera: str) -> str | None:
     if camera in clips:
         return camera
     word = re.compile(rf"(?<![A-Za-z0-9]){re.escape(camera)}(?![A-Za-z0-9])")
-    found = [clip for clip in dict.fromkeys(clips) if word.search(clip)]
-    return found[0] if len(found) == 1 else None
+    matches = [clip for clip in dict.fromkeys(clips) if word.search(clip)]
+    return matches[0] if len(matches) == 1 else None
 
 
 class ImageSizes:
@@ -212,7 +212,7 @@ def _merged(path: Path, places: Iterable[Mapping[str, Path]]) -> dict[str, Path]
     merged: dict[str, Path] = {}
     for clips in places:
         if twice := [name for name in clips if name in merged]:
-            first, last = (found[twice[0]].relative_to(path) for found in (merged, clips))
+            first, last = (paths[twice[0]].relative_to(path) for paths in (merged, clips))
             _LOG.warning(
                 "%s: %s have two clips, such as %s and %s: the latter is used.", path, ", ".join(twice), first, last
             )

@@ -240,7 +240,8 @@ def _viewmat(pose: Sequence[float]) -> np.ndarray:
     if not abs(np.linalg.norm(quat) - 1) <= 1e-2:
         raise ValueError(f"its quaternion must have length 1, got {quat.tolist()}; check the order of the columns.")
     viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = Rotation.from_quat(quat[[1, 2, 3, 0]]).as_matrix(), t
+    viewmat[:3, :3] = Rotation.from_quat(quat[[1, 2, 3, 0]]).as_matrix()
+    viewmat[:3, 3] = t
     return viewmat
 
 

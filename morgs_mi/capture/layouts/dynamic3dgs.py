@@ -87,11 +87,11 @@ def _camera(path: Path, meta: dict[str, Any], name: str, columns: Sequence[int])
         wrong = np.flatnonzero(~np.isfinite(values).all((1, 2)))
         if len(wrong):
             raise ValueError(f"{where}, frame {wrong[0]}: the {what} must be finite, got NaN or Inf; calibrate again.")
-        moved = np.flatnonzero(np.abs(values - values[0]).max((1, 2)) > 1e-4 * (1 + np.abs(values[0]).max()))
-        if len(moved):
+        moving_frames = np.flatnonzero(np.abs(values - values[0]).max((1, 2)) > 1e-4 * (1 + np.abs(values[0]).max()))
+        if len(moving_frames):
             raise ValueError(
-                f"{where}: the {what} in frame {moved[0]} must equal that in frame 0, as moving cameras are not "
-                "supported; use a recording of fixed cameras."
+                f"{where}: the {what} in frame {moving_frames[0]} must equal that in frame 0, as moving cameras are "
+                "not supported; use a recording of fixed cameras."
             )
     sizes = meta["w"], meta["h"]
     if not all(isinstance(size, int) and size > 0 for size in sizes):

@@ -53,10 +53,10 @@ def find_layout(path: Path) -> Layout:
 def _fitted_capture(path: Path) -> str:
     """Return advice on the capture of a fit in the folder `path`; empty if the folder names none."""
     try:
-        about = read_json(path / CAPTURE)
+        description = read_json(path / CAPTURE)
     except (OSError, ValueError):
-        about = {}
-    capture = about.get("capture") if isinstance(about, dict) else None
+        description = {}
+    capture = description.get("capture") if isinstance(description, dict) else None
     return f", and `morgs-mi info {capture}` describes its capture" if isinstance(capture, str) else ""
 
 

@@ -237,10 +237,10 @@ def _split(
         ValueError: no camera is left for training.
     """
     names = [camera.name for camera in content.cameras]
-    splits = {split: _images_named(source, split, given, names) for split, given in content.splits.items()}
+    splits = {split: _images_named(source, split, split_names, names) for split, split_names in content.splits.items()}
     held_out = splits.get("val_filenames", set()) | splits.get("test_filenames", set())
     training = splits.get("train_filenames", set(range(len(names))) - held_out)
-    views = tuple(view for view, own in enumerate(images) if training.isdisjoint(own))
+    views = tuple(view for view, indices in enumerate(images) if training.isdisjoint(indices))
     if len(views) == len(images):
         raise ValueError(f"{source}: expected a camera to train on, got none in `train_filenames`; correct the splits.")
     calibration = replace(calibration, test_views=views)
@@ -249,7 +249,7 @@ def _split(
     return calibration.without(path, unused)
 
 
-def _images_named(source: Path, split: str, given: Sequence[str], names: Sequence[str]) -> set[int]:
+def _images_named(source: Path, split: str, split_names: Sequence[str], names: Sequence[str]) -> set[int]:
     """Return the indices of the images `names` that a split names, in full or by the end of one path alone."""
     places = [_parts(name) for name in names]
     whole: dict[tuple[str, ...], set[int]] = {}
@@ -259,9 +259,9 @@ def _images_named(source: Path, split: str, given: Sequence[str], names: Sequenc
         for start in range(1, len(parts)):
             ends.setdefault(parts[start:], set()).add(index)
     ends = {parts: indices for parts, indices in ends.items() if len(indices) == 1} | whole
-    if unknown := [name for name in given if _parts(name) not in ends]:
+    if unknown := [name for name in split_names if _parts(name) not in ends]:
         _LOG.warning("%s: `%s` names %d images without a frame, such as %s.", source, split, len(unknown), unknown[0])
-    return set().union(*(ends.get(_parts(name), set()) for name in given))
+    return set().union(*(ends.get(_parts(name), set()) for name in split_names))
 
 
 def _parts(name: str) -> tuple[str, ...]:

@@ -87,17 +87,17 @@ class FlowFolder:
         if frame not in self._listed.get(folder, {}):
             self._listed[folder] = _files_by_frame(folder)
         numbered = self._listed[folder]
-        found = numbered.get(frame, [])
-        if not found:
+        paths = numbered.get(frame, [])
+        if not paths:
             got = f"those of frames {min(numbered)} to {max(numbered)}" if numbered else "no flow at all"
             raise FileNotFoundError(
                 f"{folder}: expected a .flo or .exr file of frame {frame}, found {got}; name each file after the frame "
                 "on whose grid its flow lives, counting from 0."
             )
-        if len(found) > 1:
-            names = ", ".join(path.name for path in found)
+        if len(paths) > 1:
+            names = ", ".join(path.name for path in paths)
             raise ValueError(f"{folder}: expected one file of frame {frame}, got {names}; keep one.")
-        return found[0]
+        return paths[0]
 
 
 def _files_by_frame(folder: Path) -> dict[int, list[Path]]:

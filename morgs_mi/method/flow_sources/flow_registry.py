@@ -75,7 +75,8 @@ def both_directions(method: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> F
             return method(pair.image, pair.previous), method(pair.previous, pair.image)
         image, previous = (np.ascontiguousarray(whole[pair.box]) for whole in (pair.image, pair.previous))
         flows = np.zeros((2, *pair.image.shape[:2], 2), np.float32)
-        flows[0][pair.box], flows[1][pair.box] = method(image, previous), method(previous, image)
+        flows[0][pair.box] = method(image, previous)
+        flows[1][pair.box] = method(previous, image)
         return flows[0], flows[1]
 
     return source

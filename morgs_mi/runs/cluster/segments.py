@@ -225,7 +225,7 @@ class SegmentedRun:
         if earlier is None:
             return Segment(start, stop, start)
         self._open(start, earlier)
-        return Segment(start, stop, start + len(earlier.reports), restart_of(earlier.before, earlier.last))
+        return Segment(start, stop, start + len(earlier.reports), restart_of(earlier.previous_state, earlier.last))
 
     def _open(self, start: int, earlier: Interrupted | None) -> None:
         """Open the files of a segment."""

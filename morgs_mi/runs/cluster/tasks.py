@@ -126,11 +126,11 @@ def fit_frames(fit: Fit, segment: Segment, stop: int) -> Part:
         loop, capture, recorded = _opened(fit, segment)
         restart = segment.restart
         for frame, upcoming in with_next(islice(recorded, stop - segment.frame)):
-            before = loop.state.coded
+            last_state = loop.state.coded
             packet, report = push_frame(loop, frame, capture.train_views, None, upcoming)
             packets += [packet, *due_keyframe(loop.state.coded, fit.config.codec.keyframe_interval)]
             reports.append(report)
-            restart = restart_of(before, packet)
+            restart = restart_of(last_state, packet)
         segment = replace(segment, frame=stop, restart=restart)
         _OPEN[repr(fit), segment] = loop, capture, recorded
         peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -1,0 +1,78 @@
+"""Check that an assignment binds one thing and that the names of variables are nouns.
+
+`python tools/check_dialect.py FOLDER...` prints a sentence for each violation, and exits with 1 if there is one.
+"""
+
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+# Participles and adverbs, which do not say what a variable holds. `left` is absent: it is also a side.
+NO_NOUNS = (
+    *("about", "after", "apart", "before", "found", "given", "inside", "kept", "known", "later", "matched", "moved"),
+    *("now", "own", "scaled", "seen", "taken", "then", "together", "used", "wanted"),
+)
+# Fields and parameters that stay, by file: other modules, scripts and files of results have these names.
+KEPT = {
+    "benchmarks/speed/scaling.py": {"later"},
+    "morgs_mi/capture/color_correction.py": {"before", "after"},
+    "morgs_mi/fit/balance.py": {"taken"},
+    "morgs_mi/studio/calibration/checks/deep.py": {"given"},
+    "morgs_mi/studio/calibration/offset_equations.py": {"own"},
+    "morgs_mi/studio/calibration/refine.py": {"taken"},
+    "morgs_mi/studio/import_frames.py": {"before", "now"},
+    "morgs_mi/studio/live/cameras.py": {"after"},
+    "morgs_mi/studio/live/feed.py": {"after"},
+    "morgs_mi/studio/live/folder.py": {"after"},
+    "morgs_mi/studio/measures/track_scores.py": {"found"},
+    "morgs_mi/studio/synth/ground_truth.py": {"before", "after"},
+    "morgs_mi/studio/synth/sensor.py": {"own"},
+}
+
+
+def bound_name(node: ast.AST) -> str:
+    """Return the name of the variable, parameter or attribute that a node binds, without underscores; or nothing."""
+    if isinstance(node, ast.arg):
+        return node.arg.strip("_")
+    if not isinstance(node, ast.Name | ast.Attribute) or not isinstance(node.ctx, ast.Store):
+        return ""
+    return (node.id if isinstance(node, ast.Name) else node.attr).strip("_")
+
+
+def is_parallel(node: ast.Assign) -> bool:
+    """Return whether an assignment gives several targets a value each; one that only swaps names does not count."""
+    places = [target for target in node.targets if isinstance(target, ast.Tuple | ast.List)]
+    if not places or not isinstance(node.value, ast.Tuple | ast.List):
+        return False
+    targets = {ast.unparse(target) for target in places[0].elts}
+    is_swap = all(isinstance(target, ast.Name) for target in places[0].elts)
+    return not (is_swap and targets == {ast.unparse(value) for value in node.value.elts})
+
+
+def violations(tree: ast.Module, kept: set[str]) -> Iterator[tuple[int, str]]:
+    """Yield the line and the sentence of each violation in a module, in which the names `kept` may stay."""
+    for node in ast.walk(tree):
+        name = bound_name(node)
+        if name in NO_NOUNS and name not in kept:
+            yield node.lineno, f"`{name}` must be a noun; name the variable by what it holds."
+        if isinstance(node, ast.Assign) and is_parallel(node):
+            yield node.lineno, "expected an assignment of one value, got several; give each a line."
+        elif isinstance(node, ast.Assign) and len(node.targets) > 1 and node in tree.body:
+            yield node.lineno, "expected an assignment of one constant, got several; give each a line."
+
+
+def check(folders: Sequence[str]) -> list[str]:
+    """Return a line for each violation in the modules of some folders, in the order of files and lines."""
+    lines = []
+    for path in sorted(path for folder in folders for path in Path(folder).rglob("*.py")):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        rows = sorted(violations(tree, KEPT.get(path.as_posix(), set())))
+        lines += [f"{path}:{number}: {sentence}" for number, sentence in rows]
+    return lines
+
+
+if __name__ == "__main__":
+    sys.exit("\n".join(check(sys.argv[1:])) or 0)
