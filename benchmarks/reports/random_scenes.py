@@ -77,9 +77,9 @@ def fitted_frames(loop: StreamLoop, capture: Capture, frames: Iterable[PartialFr
         start = time.process_time()
         _, report = loop.push([frame.images[v] for v in capture.train_views])
         seconds = time.process_time() - start
-        recorded = frame.images[test]
-        if recorded is not None and loop.gaussians is not None:
-            scores = scores_of(loop.gaussians, capture, test, frame.index, recorded)
+        image = frame.images[test]
+        if image is not None and loop.gaussians is not None:
+            scores = scores_of(loop.gaussians, capture, test, frame.index, image)
             sizes = {"bytes": report.num_bytes, "num_gaussians": report.num_gaussians}
             yield {**scores, **sizes, "cpu_s": seconds, **report.active}
 
