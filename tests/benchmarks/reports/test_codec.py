@@ -53,7 +53,8 @@ def test_options__reuse_complete_streams_and_write_tables_json_and_plot(
 ) -> None:
     options, found = reported
     before = {path: path.read_bytes() for path in options.out.rglob("stream.morgs")}
-    path, plot = tmp_path / "codec.json", tmp_path / "codec.png"
+    path = tmp_path / "codec.json"
+    plot = tmp_path / "codec.png"
     replace(options, captures=(fitted_clip / "capture",), resume=True, json=path, plot=plot).run()
     assert {path: path.read_bytes() for path in before} == before, "nothing was fitted again"
     result = json.loads(path.read_text())

@@ -70,7 +70,8 @@ def made_up(source, first, config):
 @pytest.fixture(scope="module", params=["made up", pytest.param("fitted", marks=pytest.mark.slow)])
 def interrupted(request, clip, tmp_path_factory):
     """A report that was interrupted in its third cell and run again: its JSON, its folder and the number of fits."""
-    out, fits = tmp_path_factory.mktemp("report"), []
+    out = tmp_path_factory.mktemp("report")
+    fits = []
     fit = made_up if request.param == "made up" else method.later_frames
 
     def counted(source, first, config):
@@ -171,7 +172,8 @@ def test_measure__of_workers_is_that_of_one_process(clip, tmp_path, monkeypatch)
     """Also if a worker dies, and the report is started again."""
     monkeypatch.setattr(method, "later_frames", made_up)
     options = replace(tiny(clip, tmp_path / "alone"), seeds=2)
-    alone, options = method.measure(clip, options, None), replace(options, out=tmp_path / "workers")
+    alone = method.measure(clip, options, None)
+    options = replace(options, out=tmp_path / "workers")
     LEFT[0] = 3
     with client_here() as client, pytest.raises(ChildProcessError):
         method.measure(clip, options, client)
@@ -197,7 +199,8 @@ def test_settings_of__changes_its_own_settings_only():
 
 
 def test_aggregate__selects_the_best_rate_by_the_first_seed():
-    rows, variants = [], []
+    rows = []
+    variants = []
     for rate, values in ((1.0, (30.0, 40.0)), (2.0, (31.0, 33.0)), (4.0, (20.0,))):
         keys = {"preset": "baseline", "epochs": 2, "key_views": 4, "rates": rate}
         variants.append(Variant(keys, StreamConfig()))

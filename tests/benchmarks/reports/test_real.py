@@ -48,7 +48,8 @@ def test_measure__starts_from_points_of_the_training_views(clip: Path, monkeypat
 @pytest.mark.skipif(not FOLDER, reason="needs photos: set MORGS_MI_PHOTOS to the folder of their sets")
 @pytest.mark.parametrize("name", SETS)
 def test_photos__are_calibrated_and_reach_the_committed_quality(name: str, tmp_path: Path) -> None:
-    photos, (count, points) = tmp_path / name, SETS[name]
+    photos = tmp_path / name
+    count, points = SETS[name]
     photos.mkdir()
     for path in sorted((Path(FOLDER or ".") / name).iterdir()):
         if path.suffix.lower() in (".jpg", ".png"):
