@@ -354,7 +354,8 @@ LAYOUTS = {
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_fit_command__reports_a_broken_capture_in_one_line_and_writes_nothing(tmp_path: Path, capsys, layout) -> None:
     build, table = LAYOUTS[layout]
-    whole, mistakes = build(tmp_path / "whole"), []
+    whole = build(tmp_path / "whole")
+    mistakes = []
     for kind, (damage, message, *options) in table.items():
         folder = tmp_path / kind
         path = shutil.copytree(whole, folder / "capture")

@@ -102,7 +102,8 @@ def test_load_capture__downscaling_moves_projections_with_the_pixels(tmp_path: P
 @pytest.mark.usefixtures("small_images")
 def test_load_capture__undistorts_and_masks(tmp_path: Path) -> None:
     colmap(tmp_path, lenses=[Lens("SIMPLE_RADIAL", (0.3,)), Lens()])
-    full, small = load_capture(tmp_path), load_capture(tmp_path, 2)
+    full = load_capture(tmp_path)
+    small = load_capture(tmp_path, 2)
     assert (full.downscale, small.downscale) == (1, 2)
     assert full.masks[1] is None
     assert full.masks[0] is not None
@@ -234,7 +235,8 @@ def broken_settings(path: Path) -> None:
 
 
 def test_with_cameras__reads_as_if_the_calibration_had_the_lens(tmp_path: Path) -> None:
-    path, terms = colmap(tmp_path / "capture"), (-0.12, 0.02)
+    path = colmap(tmp_path / "capture")
+    terms = (-0.12, 0.02)
     capture = load_capture(path)
     assert capture.with_cameras(capture.cameras).distortions == ()
     cameras = [square(camera) for camera in capture.cameras]

@@ -43,7 +43,9 @@ def through(sensor: np.ndarray, image: np.ndarray, gain: float = 1.0) -> np.ndar
 @pytest.fixture(scope="module")
 def views():
     """Four views of textured planes: cameras, true images, and images recorded by the sensors with slight noise."""
-    cameras, planes, rng = textured.rig(4), textured.textures(), np.random.default_rng(0)
+    cameras = textured.rig(4)
+    planes = textured.textures()
+    rng = np.random.default_rng(0)
     true = [textured.render(camera, planes) for camera in cameras]
     noise = [rng.normal(0, 1.5, image.shape) for image in true]
     recorded = [
@@ -69,10 +71,8 @@ def test_fit_colors__removes_differences_between_sensors(views) -> None:
     assert min(fit.samples) > 100
     assert all(after < 0.5 * before for before, after in zip(fit.before, fit.after, strict=True))
     for view in (1, 2, 3):
-        before, after = (
-            error(recorded[view], true[view]),
-            error(corrected(fit, view, recorded[view]), true[view]),
-        )
+        before = error(recorded[view], true[view])
+        after = error(corrected(fit, view, recorded[view]), true[view])
         assert before > 4
         assert after < 1.3, (view, before, after)  # the noise alone causes 0.9
     found = np.array([matrix for matrix in fit.matrices[1:]])

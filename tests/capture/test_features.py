@@ -54,7 +54,8 @@ def test_detect__finds_a_blob_at_its_position() -> None:
     """A blob at a known position, at several image sizes: pixel centres lie at +0.5."""
     for width, height in ((160, 120), (1600, 1200)):
         scale = width / 160
-        u, v = 70.3 * scale, 52.6 * scale
+        u = 70.3 * scale
+        v = 52.6 * scale
         y, x = np.mgrid[:height, :width] + 0.5
         blob = 120 + 120 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * (4 * scale) ** 2))
         found = detect(np.repeat(blob[..., None], 3, -1).astype(np.uint8)).points
@@ -78,7 +79,8 @@ def test_triangulate__finds_points_on_the_planes(textured_capture: Capture, text
     assert np.percentile(distance, 90) < 0.05
     assert np.percentile(distance, 98) < 0.3
     # Their colours are the colours of the pixels onto which they project.
-    camera, image = textured_capture.cameras[2], next(textured_capture.frames()).images[2]
+    camera = textured_capture.cameras[2]
+    image = next(textured_capture.frames()).images[2]
     pixels, depths = camera.project(points)
     u, v = pixels.astype(int).T
     inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height) & (depths > 0)

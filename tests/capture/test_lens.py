@@ -10,7 +10,8 @@ from morgs_mi.capture.lens import Lens, lens_and_intrinsics, opencv_lens, undist
 from morgs_mi.core.camera import Camera
 from tests.assertions import assert_close
 
-WIDTH, HEIGHT = 160, 120
+WIDTH = 160
+HEIGHT = 120
 LENSES = {
     "SIMPLE_RADIAL": (-0.1,),
     "RADIAL": (0.08, -0.02),
@@ -34,7 +35,8 @@ def dots(centres: np.ndarray) -> np.ndarray:
 
 def project(model: str, lens: Lens, points: np.ndarray) -> np.ndarray:
     """Return the positions [N, 2] of points in the frame of `camera`, seen through the lens, with centres at +0.5."""
-    K, zero = camera().K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], np.zeros(3)
+    K = camera().K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    zero = np.zeros(3)
     through = cv2.fisheye.projectPoints if model == "OPENCV_FISHEYE" else cv2.projectPoints
     return through(points[:, None], zero, zero, K, lens.opencv_coefficients)[0].reshape(-1, 2) + 0.5
 
@@ -51,9 +53,11 @@ def assert_centred(image: np.ndarray, expected: np.ndarray) -> None:
 
 @pytest.mark.parametrize("model", LENSES)
 def test_undistortion__moves_points_to_their_pinhole_projections(model: str) -> None:
-    cam, lens = camera(), Lens(model, LENSES[model])
+    cam = camera()
+    lens = Lens(model, LENSES[model])
     points = np.array([[x, y, 2.0] for x in (-0.9, -0.1, 0.8) for y in (-0.7, 0.05, 0.6)])
-    distorted, (expected, _) = project(model, lens, points), cam.project(points)
+    distorted = project(model, lens, points)
+    expected, _ = cam.project(points)
     assert np.abs(distorted - expected).max() > 1, "the case must bend rays by more than a pixel"
 
     found = undistortion(cam, lens)
@@ -63,7 +67,10 @@ def test_undistortion__moves_points_to_their_pinhole_projections(model: str) -> 
 
 @pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"])
 def test_undistortion__removes_what_a_refined_lens_leaves(model: str) -> None:
-    cam, lens, refined, left = camera(), Lens(model, LENSES.get(model, ())), camera(112.0), (0.06, -0.01)
+    cam = camera()
+    lens = Lens(model, LENSES.get(model, ()))
+    refined = camera(112.0)
+    left = (0.06, -0.01)
     points = np.array([[x, y, 2.0] for x in (-0.8, -0.1, 0.7) for y in (-0.6, 0.05, 0.5)])
     expected, _ = refined.project(points)
     x, y = ((expected - refined.K[:2, 2]) / refined.K[[0, 1], [0, 1]]).T

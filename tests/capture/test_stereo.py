@@ -66,7 +66,8 @@ def test_stereo_points__finds_none_if_one_camera_is_before_the_other(views) -> N
 
 
 def test_stereo_points__finds_none_between_distant_cameras(textured_capture: Capture) -> None:
-    cameras, images = textured_capture.cameras, next(textured_capture.frames()).images
+    cameras = textured_capture.cameras
+    images = next(textured_capture.frames()).images
     ends = [cameras[0], cameras[5]], [images[0], images[5]]
     points, colors = stereo_points(ends[0], ends[1], [None] * 2, NO_POINTS, np.random.default_rng(0))
     assert points.shape == colors.shape == (0, 3)

@@ -29,7 +29,8 @@ from tests.scenes import captures as layouts
 from tests.scenes.captures import COUNT, FPS, HEIGHT, WIDTH, folder_per_camera, folder_per_frame, rig
 
 # Files store poses in text or float64; the focal length of a rig is near 50 px.
-POSE_ABS, PIXEL_ABS = 1e-9, 1e-6
+POSE_ABS = 1e-9
+PIXEL_ABS = 1e-6
 
 
 def assert_holds(capture: Capture, names: tuple[str, ...], order: tuple[int, ...], shift: float = 0.0) -> None:
@@ -86,7 +87,8 @@ def test_poses_bounds__reads_meet_room(tmp_path: Path, clips) -> None:
 @pytest.mark.parametrize("shared", [True, False])
 @pytest.mark.parametrize("kind", ["txt", "bin"])
 def test_colmap__reads_all_models(tmp_path: Path, model: str, shared: bool, kind: str) -> None:
-    names, (focals, coefficients) = ("cam10", "cam2", "cam1"), MODELS[model]
+    names = ("cam10", "cam2", "cam1")
+    focals, coefficients = MODELS[model]
     cameras = rig(names)
     lens = [0.01 * (k + 1) for k in range(coefficients)]
     params = [[50.0 + i] * focals + [33.0, 20.0 + i, *lens] for i in range(3)]
@@ -227,7 +229,8 @@ def test_load_capture__names_what_reads_a_fit(tmp_path: Path) -> None:
 
 def test_find_layout__finds_a_layout_that_is_added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A new layout costs its `Layout` and an entry in `LAYOUTS`."""
-    names, path = ("cam1", "cam2", "cam10"), tmp_path / "a"
+    names = ("cam1", "cam2", "cam10")
+    path = tmp_path / "a"
 
     def read(path: Path) -> Calibration:
         clips = required_clips(path)
@@ -321,7 +324,8 @@ def test_nerfstudio__reads_a_field_of_view_all_frames_and_points(tmp_path: Path)
 
     def change(meta: dict) -> None:
         meta.update(camera_angle_x=np.pi / 2, ply_file_path="cloud.ply")
-        single, meta["frames"] = meta["frames"], []
+        single = meta["frames"]
+        meta["frames"] = []
         for frame in single:
             del frame["fl_x"], frame["fl_y"]
             folder = frame["file_path"].removesuffix(".png")
