@@ -80,7 +80,8 @@ def test_console__prints_control_characters_escaped(capsys: pytest.CaptureFixtur
     print_result(HOSTILE + "\nb")
     print_table(table)
     print_warning(HOSTILE + "\nb")
-    printed, escaped = capsys.readouterr(), r"a\u001b[2J\u009b\u007f\udcff\u202e[red]b"
+    printed = capsys.readouterr()
+    escaped = r"a\u001b[2J\u009b\u007f\udcff\u202e[red]b"
     assert printed.out.count(escaped) == 4
     assert printed.out.startswith(f"{escaped}\nb\n")
     assert printed.err == f"{escaped} b\n"

@@ -58,7 +58,8 @@ def test_fit__reports_what_to_expect_of_views_between_the_cameras(capture: Path,
 @pytest.mark.slow
 def test_fit__balances_cameras_of_other_exposure(tmp_path: Path, run) -> None:
     path = textured.write_capture(tmp_path / "rig").path
-    camera, planes = textured.rig(shift=7)[2], textured.textures()
+    camera = textured.rig(shift=7)[2]
+    planes = textured.textures()
     write_video(path / "cam2.mkv", [brighter(textured.render(camera, planes), 1.25)], 30)
     sentence = r"cam2 is 2[3-6] % brighter than the other cameras: .*; fit corrects it \(not with --exposure off\)\."
     for options in ((), ("--deep",)):
@@ -73,7 +74,8 @@ def test_fit__balances_cameras_of_other_exposure(tmp_path: Path, run) -> None:
 
 def test_fit__and_eval_use_the_same_instants(capture: Path, tmp_path: Path, run) -> None:
     lengthen_clip(capture)
-    out, options = tmp_path / "out", ("--offset", "cam1", "-1", "cam2", "1", "--gaps")
+    out = tmp_path / "out"
+    options = ("--offset", "cam1", "-1", "cam2", "1", "--gaps")
     assert run("info", capture, "--no-check", *options)[1].count("2 frames at 25 fps") == 1
     assert run("fit", capture, out, *options, *QUICK)[0] == 0
     record = json.loads((out / "capture.json").read_text())
@@ -334,7 +336,8 @@ def test_fit__fits_segments_side_by_side(
     pytest.importorskip("distributed", reason="comes with the extra `cluster`")
     short = SegmentConfig(passes=1, epochs=1)
     monkeypatch.setattr(SegmentConfig.__init__, "__defaults__", astuple(short))
-    clip, out = write_recording(tmp_path / "clip", 4), tmp_path / "out"
+    clip = write_recording(tmp_path / "clip", 4)
+    out = tmp_path / "out"
     status, output, _ = run("fit", clip, out, *QUICK, "--segments", 2)
     assert status == 0
     assert "stream.morgs: 4 frames" in output
@@ -345,7 +348,8 @@ def test_fit__fits_segments_side_by_side(
 
 def test_fit__names_what_segments_stand_when_interrupted(tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed", reason="comes with the extra `cluster`")
-    clip, out = write_recording(tmp_path / "clip", 4), tmp_path / "out"
+    clip = write_recording(tmp_path / "clip", 4)
+    out = tmp_path / "out"
     add = SegmentedRun._add
 
     def add_and_stop(fit: SegmentedRun, part: Part) -> None:

@@ -260,7 +260,8 @@ def test_main__prints_a_traceback_with_debug(tmp_path: Path, run) -> None:
 
 @pytest.mark.slow
 def test_main__goes_from_a_scene_to_an_evaluation(tmp_path: Path, run) -> None:
-    clip, out = tmp_path / "clip", tmp_path / "out"
+    clip = tmp_path / "clip"
+    out = tmp_path / "out"
     size = ("--width", 64, "--height", 48, "--spp", 4)
     assert run("synth", "spheres", clip, "--cameras", 4, "--frames", 3, *size)[0] == 0
     fit = ("--test-view", 0, "--num-gaussians", 600, "--first-frame-steps", 60, "--epochs", 2)

@@ -33,7 +33,9 @@ from tests.scenes.short_clip import FRAMES, Clip, short_clip
 
 # What a stream of a few kB may take: far less than a damaged length or count may request. A thread of a library that
 # starts meanwhile reserves 64 MiB for its heap and 8 MiB for its stack (glibc).
-MEMORY_BYTES, THREAD_BYTES, THREADS = 200 * 10**6, 72 * 2**20, 4
+MEMORY_BYTES = 200 * 10**6
+THREAD_BYTES = 72 * 2**20
+THREADS = 4
 CASE_SECONDS = 30
 PLACE = re.compile(
     r"packet \d+ at byte \d+: |expected a stream that starts with|expected format version|`.*` of the header|"
@@ -164,7 +166,8 @@ def check_seek(stream: StreamReader, played: list[CodedFrame]) -> None:
     """
     digests = {state.frame: state.digest for state in played}
     for state in (*played[len(played) // 2 : -1][:1], *played[-1:]):
-        start, found = next(stream.states(state.frame)), stream.seek(state.frame)
+        start = next(stream.states(state.frame))
+        found = stream.seek(state.frame)
         assert found.frame == state.frame
         if np.array_equal(start.digest, digests.get(start.frame)):
             assert np.array_equal(found.digest, state.digest), state.frame
@@ -206,7 +209,9 @@ def run(name: str, clip: Clip, seconds: float) -> dict[str, object]:
     Raises:
         AssertionError: a case fails; its seed is the name of the fuzzer and the number of the case.
     """
-    refusals, case, end = Refusals(), 0, time.monotonic() + seconds
+    refusals = Refusals()
+    case = 0
+    end = time.monotonic() + seconds
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "s"
         while time.monotonic() < end:

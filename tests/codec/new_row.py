@@ -57,7 +57,8 @@ def check_round_trip(confidence: bool) -> None:
     assert error(state.gaussians, first) <= 0.01 / 4
     assert np.array_equal(decode(None, reemitted_keyframe(state)).digest, state.digest)
 
-    alive, relabelled = np.arange(2, 50), rng.random(48) < 0.5
+    alive = np.arange(2, 50)
+    relabelled = rng.random(48) < 0.5
     moved = jittered(state.gaussians, rng).select(alive)
     labels = state.gaussians.numpy()[ROW.name][alive] + 0.5 * relabelled[:, None]
     now = gaussians.Gaussians.concatenate([replace(moved, logit_labels=labels), labelled(3, 2)])

@@ -18,7 +18,9 @@ U64 = 2**64
 class RangeCode:
     def __init__(self, words):
         self.words = [int(w) for w in words]
-        self.low, self.range, self.at = 0, U64 - 1, 2
+        self.low = 0
+        self.range = U64 - 1
+        self.at = 2
         self.point = self.word(0) << 32 | self.word(1)
 
     def word(self, i):
@@ -33,7 +35,8 @@ class RangeCode:
         self.low = (self.low + scale * int(lefts[i])) % U64
         self.range = scale * int(lefts[i + 1] - lefts[i])
         if self.range < 2**32:
-            self.low, self.range = (self.low << 32) % U64, self.range << 32
+            self.low = (self.low << 32) % U64
+            self.range = self.range << 32
             self.point = (self.point << 32) % U64 | self.word(self.at)
             self.at += 1
         return i
@@ -42,7 +45,9 @@ class RangeCode:
         return self.symbol(np.arange(2**b + 1, dtype=np.int64) << (24 - b))
 
     def column(self, n):
-        weights, tokens, end = [max(1, 256 // (i + 1) ** 2) for i in range(85)], [], 16
+        weights = [max(1, 256 // (i + 1) ** 2) for i in range(85)]
+        tokens = []
+        end = 16
         while len(tokens) < n:
             before = np.concatenate([[0], np.cumsum(weights)[:-1]]).astype(np.float64)
             s = (2**24 - 85) / float(sum(weights))
@@ -50,7 +55,8 @@ class RangeCode:
             block = [self.symbol(lefts) for _ in range(min(end, n) - len(tokens))]
             for token in block:
                 weights[token] += 32
-            tokens, end = tokens + block, 2 * end
+            tokens = tokens + block
+            end = 2 * end
         ks = [(token + 1) // 2 - 12 if token > 30 else 0 for token in tokens]
         rest = [self.bits(min(k, 16)) if k else 0 for k in ks]
         rest = [low | self.bits(k - 16) << 16 if k > 16 else low for low, k in zip(rest, ks, strict=True)]
@@ -71,7 +77,8 @@ def packets(data):
 
 def arrays(payload):
     (size,) = struct.unpack_from("<I", payload)
-    at, found = 4 + size, {}
+    at = 4 + size
+    found = {}
     for name, dtype, shape in json.loads(payload[4:at]):
         count = math.prod(shape)
         found[name] = np.frombuffer(payload, np.dtype(dtype).newbyteorder("<"), count, at).reshape(shape)
@@ -114,10 +121,13 @@ def residual(state, payload):
     found = arrays(payload)
     assert found["parent"].tobytes() == digest(state)
     births, coarseness = (int(x) for x in found["head"])
-    code, values, dead = RangeCode(found["code"]), state["values"].copy(), np.zeros(len(state["ids"]), bool)
+    code = RangeCode(found["code"])
+    values = state["values"].copy()
+    dead = np.zeros(len(state["ids"]), bool)
     moving = values[:, -1] > 0 if state["confidence"] else np.zeros(len(values), bool)
     for members in (np.flatnonzero(~moving), np.flatnonzero(moving)):
-        geometry, appearance = code.column(len(members)), np.zeros(len(members), np.int64)
+        geometry = code.column(len(members))
+        appearance = np.zeros(len(members), np.int64)
         appearance[geometry == 0] = code.column(int((geometry == 0).sum()))
         other = (geometry > 0) & (geometry < 8)
         appearance[other] = code.column(int(other.sum()))
@@ -154,7 +164,8 @@ def residual(state, payload):
 
 def numbers(state):
     """Return the attributes of a state, by the names of the package."""
-    e, own = state["exponents"], [0, 0, 0, 1, 2, 3, 4, 4, 4, 5, 6, 6, 6]
+    e = state["exponents"]
+    own = [0, 0, 0, 1, 2, 3, 4, 4, 4, 5, 6, 6, 6]
     own += [7] * (3 * ((state["degree"] + 1) ** 2 - 1)) + [8] * state["confidence"]
     real = np.zeros(state["values"].shape)
     for column, k in enumerate(own):
@@ -179,8 +190,10 @@ def numbers(state):
 
 def states(data):
     """Yield (frame, state) of a whole stream, once for each frame."""
-    state, last = None, None
+    state = None
+    last = None
     for kind, frame, payload in packets(data):
         if kind in (1, 2) and frame != last:
-            state, last = keyframe(payload) if kind == 1 else residual(state, payload), frame
+            state = keyframe(payload) if kind == 1 else residual(state, payload)
+            last = frame
             yield frame, state

@@ -54,7 +54,8 @@ def test_residual_packet__stores_offsets_of_moving_gaussians_and_changes_nothing
         assert {"offset"} >= packet.arrays.keys() - without.arrays.keys()
         for name, array in without.arrays.items():
             assert np.array_equal(packet.arrays[name], array)
-    rng, state = np.random.default_rng(3), states[-1]
+    rng = np.random.default_rng(3)
+    state = states[-1]
     after = replace(jittered(state.gaussians, rng), offset=rng.normal(0, 0.02, (len(state), 3)))
     found = decode(state, residual_packet(state, after, None, CAMERAS, CodecConfig(offset=True))).gaussians.numpy()
     moved = found["motion"].any(1)

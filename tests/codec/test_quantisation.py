@@ -41,7 +41,8 @@ def test_residual_packet__errors_stay_within_the_tolerance() -> None:
         assert sh[:, 1:].max() < 1.001 * error * BY_NAME["sh_dc"].error
         opacity = np.abs(np.asarray(true.opacities) - np.asarray(found.gaussians.opacities))
         assert opacity.max() < 1.001 * error * BY_NAME["logit_opacities"].error
-        q, p = true.numpy()["quats"], found.gaussians.numpy()["quats"]
+        q = true.numpy()["quats"]
+        p = found.gaussians.numpy()["quats"]
         cosine = np.abs((q * p).sum(1)) / np.linalg.norm(q, axis=1)
         # The steps are chosen for about 5 px: far below a tenth of a pixel at the ends of an axis.
         assert np.rad2deg(2 * np.arccos(np.minimum(cosine, 1))).max() < 8 * error
@@ -51,7 +52,8 @@ def test_residual_packet__errors_stay_within_the_tolerance() -> None:
 def test_codec_config__more_quality_takes_more_bytes_and_has_smaller_errors() -> None:
     before = cloud(400)
     after = jittered(before, np.random.default_rng(1))
-    sizes, errors = [], []
+    sizes = []
+    errors = []
     for quality in (0.25, 1, 4, 1000):
         config = CodecConfig(quality=quality)
         state = decode(None, keyframe_packet(before, 0, CAMERAS, config))
