@@ -76,7 +76,8 @@ def test_atomic_path__reports_a_folder_that_is_not_writable(tmp_path: Path, case
             pytest.skip("root may write everywhere")
     elif case == "a folder":
         (folder / "x").mkdir(parents=True)
-    before, removed = tree(tmp_path), ", the partial output was removed" if case == "a folder" else ""
+    before = tree(tmp_path)
+    removed = ", the partial output was removed" if case == "a folder" else ""
     with (
         pytest.raises(OSError, match=rf"test\(\): cannot write {folder}/x{removed}: "),
         atomic_path(folder / "x", "test()") as partial,

@@ -42,8 +42,10 @@ def test_is_interruption__follows_causes_contexts_and_groups(error: BaseExceptio
 
 
 def test_is_interruption__is_false_for_other_errors_and_ends_in_a_cycle() -> None:
-    first, second = ValueError(), OSError()
-    first.__cause__, second.__cause__ = second, first
+    first = ValueError()
+    second = OSError()
+    first.__cause__ = second
+    second.__cause__ = first
     assert not is_interruption(first)
 
 
@@ -55,7 +57,8 @@ def test_interrupts_raised__releases_the_variables_of_what_was_interrupted() -> 
     left: list[weakref.ref[Thing]] = []
 
     def interrupted() -> None:
-        thing, cycle = Thing(), []
+        thing = Thing()
+        cycle = []
         cycle.append((cycle, thing))
         left.append(weakref.ref(thing))
         raise chained(RuntimeError, True)

@@ -219,7 +219,8 @@ def test_evaluate_stream__reports_drift_as_the_slope_of_psnr(fitted_clip: Path, 
 def test_evaluation__as_dict_holds_the_scores_under_the_keys_of_the_json(fitted_clip: Path, tmp_path: Path) -> None:
     write_stream(tmp_path / "s.morgs", {"test_view": 0}, shift=1)
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
-    found, row = result.as_dict(), result.as_dict()["frames"][1]
+    found = result.as_dict()
+    row = result.as_dict()["frames"][1]
     scores = {name + region for name in IMAGE_SCORES for region in REGIONS}
     assert scores <= row.keys()
     assert scores <= found.keys()

@@ -28,7 +28,8 @@ def test_draw_stream__writes_every_figure(fitted_clip: Path, tmp_path: Path) -> 
     slices, motion, confidence = (cv2.imread(str(path))[..., ::-1] for path in paths)
     # Three frames fill 320 pixels when each is repeated 107 times; the recording is the rendering.
     assert slices.shape == (HEIGHT, WIDTH + 2 * (GAP + 321), 3)
-    recorded, rendered = slices[:, WIDTH + GAP :][:, :321], slices[:, -321:]
+    recorded = slices[:, WIDTH + GAP :][:, :321]
+    rendered = slices[:, -321:]
     np.testing.assert_array_equal(recorded[20:], rendered[20:])
     # Two frames after the first: truth, rendering, and a legend beside the first row.
     assert motion.shape == confidence.shape == (LEGEND + GAP + HEIGHT, 2 * (WIDTH + GAP) + LEGEND, 3)

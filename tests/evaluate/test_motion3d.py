@@ -14,9 +14,11 @@ from morgs_mi.evaluate.motion3d import compare_motion, evaluate_motion, local_mo
 from tests.assertions import assert_close
 
 rng = np.random.default_rng(0)
-WIDTH, HEIGHT = 40, 30
+WIDTH = 40
+HEIGHT = 30
 FRONT = Camera.look_at((0, 0, -4), (0, 0, 0), (0, -1, 0), 50, WIDTH, HEIGHT)
-TURN, SHIFT = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), np.array([0.05, 0, -0.02])
+TURN = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix()
+SHIFT = np.array([0.05, 0, -0.02])
 
 
 def plane(depth: float, left: int, right: int) -> GroundTruth:
@@ -103,13 +105,15 @@ def test_evaluate_motion__selects_opaque_gaussians_on_a_moving_object_off_its_ax
 def bent(points: np.ndarray, curvature: float) -> np.ndarray:
     """Return points of the wall [..., 3] after it is bent to a cylinder about the y axis."""
     x, y, z = np.moveaxis(points, -1, 0)
-    angle, radius = x * curvature, 1 / curvature
+    angle = x * curvature
+    radius = 1 / curvature
     return np.stack([(radius - z) * np.sin(angle), y, radius - (radius - z) * np.cos(angle)], axis=-1)
 
 
 def test_local_motion__of_a_bending_wall():
     points, tracked = (rng.uniform(-1, 1, (n, 3)) * (1, 1, 0) for n in (200, 1500))
-    before, after = bent(tracked, 0.2), bent(tracked, 0.3)
+    before = bent(tracked, 0.2)
+    after = bent(tracked, 0.3)
     true = bent(points, 0.3) - bent(points, 0.2)
     found = local_motion(bent(points, 0.2), before, after)
     moved = np.linalg.norm(true, axis=-1) > 0.1 * np.linalg.norm(after - before, axis=-1).max()

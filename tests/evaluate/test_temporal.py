@@ -38,8 +38,10 @@ def test_still_variation__of_a_frozen_view_is_zero_and_of_its_recording_is_not()
 
 
 def test_still_variation__tolerates_false_alarms():
-    once, twice = NOTHING.copy(), NOTHING.copy()
-    once[:, :8], twice[:, :4] = True, True
+    once = NOTHING.copy()
+    twice = NOTHING.copy()
+    once[:, :8] = True
+    twice[:, :4] = True
     variation = StillVariation(false_alarms=0.1)
     for moving in (once, twice, *[NOTHING] * 8):
         variation.add(GREY, GREY, moving)
