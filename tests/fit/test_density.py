@@ -74,7 +74,8 @@ def test_plan_additions__adds_none_without_error_and_never_prunes_all():
 def test_plan_growth__clones_small_gaussians_with_the_same_coverage():
     before = cloud(scale=0.05)
     after = apply_plan(before, growth(before, [0, 0, 0, 0, 0, 1]))
-    o, scales = np.asarray(after.opacities), np.asarray(after.scales)
+    o = np.asarray(after.opacities)
+    scales = np.asarray(after.scales)
     assert 1 - (1 - o[5]) * (1 - o[6]) == pytest.approx(0.6, rel=1e-5)
     assert_close(o[:5], np.full(5, 0.6), rtol=1e-6)
     assert scales[6] == pytest.approx(np.asarray(before.scales)[5], rel=1e-5)
@@ -91,7 +92,8 @@ def test_plan_growth__splits_large_round_gaussians_and_keeps_means():
 def test_plan_growth__splits_large_long_gaussians_along_their_longest_axis():
     before = cloud(scale=1.0, shape=(1, 2, 4.1))
     after = apply_plan(before, growth(before, [0, 0, 0, 0, 0, 1]))
-    means, whole = np.asarray(after.means), np.asarray(before.means)
+    means = np.asarray(after.means)
+    whole = np.asarray(before.means)
     apart = means[6] - means[5]
     axes = Rotation.from_quat(np.asarray(before.quats)[5], scalar_first=True).as_matrix()
     assert np.asarray(after.scales)[5:] == pytest.approx(np.tile([0.893, 2 * 0.893, 4.1 * 0.55], (2, 1)), rel=1e-5)
@@ -168,7 +170,8 @@ def test_resize_optimizer__keeps_moments_of_survivors_only():
             optimizer.step()
         return np.asarray(values_of(optimizer)["x"])
 
-    whole, rebuilt = run(False), run(True)
+    whole = run(False)
+    rebuilt = run(True)
     assert rebuilt.shape == (4, 3)
     assert np.array_equal(rebuilt[:3], whole[found.parent[:3]])
     assert not np.array_equal(rebuilt[3], rebuilt[1])

@@ -37,7 +37,8 @@ def images():
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Gaussians]:
     """A list to which every step of a fit adds the Gaussians that it renders."""
-    steps, render = [], ActiveView.render
+    steps = []
+    render = ActiveView.render
 
     def spy(view, gaussians, *channels, **more):
         if dr.grad_enabled(gaussians.sh_coeffs):  # rounds of density control render without gradients
@@ -58,7 +59,8 @@ def values_of(gaussians: Gaussians) -> dict[str, bytes]:
 COLOR_ALONE = LearningRates(means=0, scales=0, quats=0, opacities=0, sh_dc=0.05, sh_rest=0)
 L1 = ObjectiveConfig(dssim_weight=0.0)
 SCHEDULED = dataclasses.replace(CONFIG, first_frame_rates=COLOR_ALONE, objective=L1)
-WHITE, DARK = [np.full((48, 64, 3), 255, np.uint8)], dataclasses.replace(ball(80), sh_coeffs=np.full((80, 1, 3), -1.0))
+WHITE = [np.full((48, 64, 3), 255, np.uint8)]
+DARK = dataclasses.replace(ball(80), sh_coeffs=np.full((80, 1, 3), -1.0))
 
 
 def lengths(drawn: list[Gaussians], found: FirstFrame) -> np.ndarray:
@@ -147,7 +149,8 @@ def test_fit_first_frame__prunes_what_is_invisible(images):
 def test_fit_first_frame__sees_images_of_half_the_size_until_it_has_grown(images, monkeypatch):
     monkeypatch.setattr("morgs_mi.fit.view._COARSE_WIDTH", 32)
     monkeypatch.setattr("morgs_mi.fit.view._MIN_SIDE", 24)
-    widths, render = [], ActiveView.render
+    widths = []
+    render = ActiveView.render
 
     def spy(view, gaussians, *channels, **more):
         if dr.grad_enabled(gaussians.sh_coeffs):
@@ -178,7 +181,8 @@ def test_fit_first_frame__does_not_see_pixels_that_are_masked(images):
     masks = [np.ones((48, 64), bool) for _ in images]
     spoiled = [image.copy() for image in images]
     for image, mask in zip(spoiled, masks, strict=True):
-        mask[10:30, 20:40], image[10:30, 20:40] = False, 1.0
+        mask[10:30, 20:40] = False
+        image[10:30, 20:40] = 1.0
     config = FitConfig(sh_degree=1, num_gaussians=90, first_frame_steps=12)
 
     def fitted(given):
@@ -188,7 +192,8 @@ def test_fit_first_frame__does_not_see_pixels_that_are_masked(images):
 
 
 def test_fit_first_frame__fits_views_of_different_sizes(images):
-    given, camera = problem(images, ball(80)), views()[1].resized(40, 30)
+    given = problem(images, ball(80))
+    camera = views()[1].resized(40, 30)
     small = View(camera, rendered(opaque_ball(), camera, RenderConfig()))
     mixed = dataclasses.replace(given, views=(given.views[0], small, *given.views[2:]))
     found = fit_first_frame(
@@ -243,7 +248,8 @@ def halves() -> dict[int, np.ndarray]:
 
 def test_fit_confidence__follows_the_masks_of_its_key_views():
     found, losses = learned(40, halves())
-    confidence, place = 1 / (1 + np.exp(-np.asarray(found.logit_confidence))), np.asarray(found.means)[:, 0]
+    confidence = 1 / (1 + np.exp(-np.asarray(found.logit_confidence)))
+    place = np.asarray(found.means)[:, 0]
     front = np.asarray(found.means)[:, 2] < 0
     assert confidence[front & (place > 0.3)].mean() > 0.8
     assert confidence[front & (place < -0.3)].mean() < 0.2
@@ -251,7 +257,8 @@ def test_fit_confidence__follows_the_masks_of_its_key_views():
 
 
 def test_fit_confidence__freezes_everything_else():
-    before, after = values_of(opaque_ball()), values_of(learned(4, halves())[0])
+    before = values_of(opaque_ball())
+    after = values_of(learned(4, halves())[0])
     assert {name: after[name] for name in before if name != "logit_confidence"} == {
         name: value for name, value in before.items() if name != "logit_confidence"
     }

@@ -33,7 +33,8 @@ def test_forecast__is_poor_for_four_cameras_60_degrees_apart():
 def test_forecast__measures_two_cameras_side_by_side_at_the_depth_of_the_points():
     cameras = [c for x in (-0.1, 0.1) for c in look_at_cameras([(x, 0, -4)], 40, target=(x, 0, 0))]
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))
-    near, far = forecast(cameras, points), forecast(cameras, points + np.array([0, 0, 4]))
+    near = forecast(cameras, points)
+    far = forecast(cameras, points + np.array([0, 0, 4]))
     assert near.spacing == pytest.approx(np.rad2deg(2 * np.arctan(0.1 / 4)), rel=0.1)
     assert far.spacing == pytest.approx(near.spacing / 2, rel=0.1)
     assert min(near.overlap, far.overlap) > 0.9

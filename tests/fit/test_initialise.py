@@ -17,7 +17,8 @@ from tests.scenes.cameras import arc, look_at_cameras
 
 def few_points():
     """Return 40 points of a wall at z = 2 that fill the right half of the views, with their colours, and the views."""
-    rng, cameras = np.random.default_rng(0), look_at_cameras(arc((-0.2, 0.0, 0.2), 3), 60)
+    rng = np.random.default_rng(0)
+    cameras = look_at_cameras(arc((-0.2, 0.0, 0.2), 3), 60)
     points = np.stack([rng.uniform(0.2, 2, 40), rng.uniform(-2, 2, 40), np.full(40, 2.0)], axis=1)
     return (points, np.full((40, 3), 0.8)), [grey_view(camera) for camera in cameras]
 
@@ -138,7 +139,8 @@ def test_in_light__points_get_the_median_colours_of_hdr_views():
     images = [np.full((30, 40, 3), light, np.float32) for light in (2.5, 2.6, 0.1)]
     masks = [None, np.ones((30, 40), bool), None]
     views = [View(*view) for view in zip(cameras, images, masks, strict=True)]
-    inside, outside = np.random.default_rng(0).uniform(-0.5, 0.5, (30, 3)), np.array([[90, 0, 0]])
+    inside = np.random.default_rng(0).uniform(-0.5, 0.5, (30, 3))
+    outside = np.array([[90, 0, 0]])
     points = np.concatenate([inside, outside]), np.full((31, 3), 0.75)
     expected = np.repeat([2.5, 0.75], (30, 1))[:, None] * np.ones(3)
     np.testing.assert_allclose(_in_light(points, views)[1], expected)

@@ -18,7 +18,8 @@ from morgs_mi.method.objective import ObjectiveConfig
 from morgs_mi.method.ssim import Target
 from tests.scenes.ball import images_of, mean_psnr, opaque_ball, views
 
-RENDER, EXTENT = RenderConfig(), 3.0
+RENDER = RenderConfig()
+EXTENT = 3.0
 PLAIN = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
 
 
@@ -39,7 +40,9 @@ def test_fit_later_frame__reports_births_and_survivors(motion):
     for births in (0.0, 0.3):
         density = DensityConfig(later_frames=True, births=births, min_error=0)
         fitted = fit(before, images, FitConfig(sh_degree=0, epochs=24, density=density), motion)
-        found, source, losses = fitted.gaussians, fitted.source, fitted.losses
+        found = fitted.gaussians
+        source = fitted.source
+        losses = fitted.losses
         survivors = source[source >= 0]
         assert len(source) == len(found)
         assert np.array_equal(survivors, np.unique(survivors))
@@ -70,7 +73,8 @@ def test_fit_later_frame__adds_none_when_no_step_is_left_to_fit_them():
 
 def shifted(shift: tuple[float, float, float]) -> tuple[Gaussians, Gaussians, np.ndarray]:
     """Return a ball, the ball after a shift, and the shift."""
-    before, by = opaque_ball(), np.array(shift, np.float32)
+    before = opaque_ball()
+    by = np.array(shift, np.float32)
     return before, replace(before, means=np.asarray(before.means) + by), by
 
 
@@ -102,7 +106,8 @@ def test_fit_later_frame__compares_the_neighbours_of_births_with_their_parents()
 
 
 def test_initial_motion__continues_with_constant_velocity():
-    before, rng = replace(opaque_ball(), motion=np.full((400, 3), 0.1)), np.random.default_rng(0)
+    before = replace(opaque_ball(), motion=np.full((400, 3), 0.1))
+    rng = np.random.default_rng(0)
     active = full_active_set(before, dict(enumerate(views())), RENDER)
     assert initial_motion(before, active, {}, {}, PLAIN, rng) is None
     start = initial_motion(before, active, {}, {}, replace(PLAIN, constant_velocity=True), rng)

@@ -52,7 +52,8 @@ def test_first_frame_problem__psnr_is_the_mean_over_its_views():
 
 
 def test_first_frame_problem__psnr_does_not_count_masked_pixels():
-    images, mask = bytes_of(images_of(opaque_ball())), np.ones((48, 64), bool)
+    images = bytes_of(images_of(opaque_ball()))
+    mask = np.ones((48, 64), bool)
     mask[:20] = False
     spoiled = [np.where(mask[..., None], image, 255) for image in images]
     masked = [problem(given, masks=[mask] * 4).psnr(ball(80)) for given in (images, spoiled)]

@@ -98,7 +98,8 @@ def test_sentence__has_the_word_by_the_angles_alone_where_they_are_wide():
 
 
 def test_unseen_views__follow_from_the_features():
-    forecast, values = unseen_views(problem(IMAGES), ball(80)), features(ball(80))
+    forecast = unseen_views(problem(IMAGES), ball(80))
+    values = features(ball(80))
     assert (forecast.loss, forecast.margin) == (REGRESSION.loss(values), REGRESSION.margin(values))
     assert forecast.training_psnr == values[1]
     assert forecast.rig.cameras == 4
