@@ -65,7 +65,8 @@ def test_gaussian_splat__backward_agrees_with_the_reference_for_every_parameter(
 def test_gaussian_splat__forward_agrees_with_the_reference(raw, weight, gradients):
     """All parameters change at once; the derivative of the loss is <gradient, direction>."""
     scene = make_mitsuba_scene(to_gaussians(raw), {"pixel_format": "rgba"}, aovs=AOVS)
-    params, rng = mi.traverse(scene), np.random.default_rng(2)
+    params = mi.traverse(scene)
+    rng = np.random.default_rng(2)
     slope = 0.0
     for name, gradient in gradients.items():
         # The direction is the sign of the gradient: no cancellation hides an error.
@@ -127,7 +128,8 @@ def test_gaussian_splat__differentiates_filter_and_crop(raw):
     }
     scene = make_mitsuba_scene(to_gaussians(raw), {**film, "pixel_format": "luminance_alpha"}, aovs=AOVS)
     params = mi.traverse(scene)
-    data, rng = params["gaussians.data"], np.random.default_rng(5)
+    data = params["gaussians.data"]
+    rng = np.random.default_rng(5)
     g, v = (np.float32(rng.normal(size=s)) for s in ((12, 11, 6), dr.width(data)))
     dr.enable_grad(data)
     dr.set_grad(data, mi.Float(v))
@@ -149,7 +151,8 @@ INTRINSICS = {
 
 @pytest.mark.parametrize("name", INTRINSICS)
 def test_gaussian_splat__gradient_of_the_sensors_intrinsics(raw, name):
-    camera, scene = make_sensor_camera(), make_mitsuba_scene(to_gaussians(raw))
+    camera = make_sensor_camera()
+    scene = make_mitsuba_scene(to_gaussians(raw))
     viewmat, K = (np.float32(matrix).astype(np.float64) for matrix in (camera.viewmat, camera.K))
 
     def loss(values):

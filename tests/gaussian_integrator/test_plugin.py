@@ -49,9 +49,11 @@ def test_gaussian_splat__reads_props_of_an_xml_scene(raw):
 
 
 def test_gaussian_splat__ignores_emitters_with_one_warning(raw, caplog):
-    shape, sensor = ellipsoids(to_gaussians(raw)), make_sensor_camera().sensor()
+    shape = ellipsoids(to_gaussians(raw))
+    sensor = make_sensor_camera().sensor()
     scene = {"type": "scene", "gaussians": shape, "sensor": sensor, "integrator": {"type": "gaussian_splat"}}
-    dark, lit = mi.load_dict(scene), mi.load_dict({**scene, "sky": {"type": "constant"}})
+    dark = mi.load_dict(scene)
+    lit = mi.load_dict({**scene, "sky": {"type": "constant"}})
     with caplog.at_level(logging.WARNING):
         images = [np.asarray(mi.render(s)) for s in (dark, lit, lit)]
     np.testing.assert_array_equal(images[0], images[1])

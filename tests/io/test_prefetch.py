@@ -82,7 +82,8 @@ def test_prefetched__closes_the_source() -> None:
 
 
 def test_prefetched__yields_the_newest_item_of_a_source_that_cannot_wait() -> None:
-    made, taken = [], threading.Event()
+    made = []
+    taken = threading.Event()
 
     def items():
         for i in range(50):

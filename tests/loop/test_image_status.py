@@ -7,7 +7,8 @@ import pytest
 
 from morgs_mi.loop.image_status import image_status
 
-H, W = 48, 64
+H = 48
+W = 64
 NAMES = ("a", "b", "c")
 
 

@@ -91,7 +91,8 @@ def test_PRESETS__have_the_names_of_the_option() -> None:
 def test_apply_preset__gives_the_rows_of_the_paper(name, epochs, modules, lifted) -> None:
     given = StreamConfig(fit=FitConfig(num_gaussians=77), motion=MotionConfig(key_views=12), seed=3)
     config = apply_preset(given, name)
-    fit, motion = config.fit, config.motion
+    fit = config.fit
+    motion = config.motion
     assert fit == FitConfig(num_gaussians=77, epochs=epochs, decay_means_rate=lifted)
     assert (motion.learn_motion, motion.learn_offset, motion.learn_confidence) == modules
     assert (motion.lift_flow, motion.propagate_motion, motion.key_views) == (lifted, lifted, 12)
