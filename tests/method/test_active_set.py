@@ -16,7 +16,9 @@ from morgs_mi.method.ssim import Target
 from tests.scenes.cameras import arc, look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
 
-RENDER, EXTENT, V = RenderConfig(), 3.0, 5
+RENDER = RenderConfig()
+EXTENT = 3.0
+V = 5
 PLAIN = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
 CHANNELS = {view: ("color",) for view in range(V)}
 HIDDEN = 300  # the wall's Gaussians come first
@@ -141,7 +143,8 @@ def test_find_active_set__takes_everything_where_most_pixels_changed(before):
 def test_fit_later_frame__with_the_active_set_equals_the_full_fit(before, after, grows):
     """Error of the moved image, and the survivors: static Gaussians are unchanged to the bit."""
     density = DensityConfig(later_frames=grows, births=0.05, min_error=0)
-    config, truth = FitConfig(sh_degree=0, epochs=12, density=density), images_of(after)
+    config = FitConfig(sh_degree=0, epochs=12, density=density)
+    truth = images_of(after)
     active = find_active_set(before, cameras(), changes(before, after), CHANNELS, RENDER)
     errors = {}
     for name, some in (("whole", full_active_set(before, cameras(), RENDER)), ("active", active)):
@@ -165,7 +168,8 @@ def test_fit_later_frame__with_the_active_set_equals_the_full_fit(before, after,
 @pytest.mark.parametrize("density", [DensityConfig(births=0.0), DensityConfig(later_frames=False)])
 def test_fit_later_frame__ends_early_once_the_loss_stops_falling(before, density):
     """With and without density control; a tolerance of 0 switches it off."""
-    whole, images = full_active_set(before, cameras(), RENDER), images_of(before)
+    whole = full_active_set(before, cameras(), RENDER)
+    images = images_of(before)
     config = FitConfig(sh_degree=0, epochs=12, density=density)
     assert fit(before, whole, images, replace(config, early_stopping_tolerance=0)).epochs == 12
     assert fit(before, whole, images, config).epochs < 12

@@ -10,7 +10,9 @@ from morgs_mi.method.change import ChangeConfig, box_around, change_mask, moving
 from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FramePair
 
-H, W, NOISE = 120, 160, 3.0
+H = 120
+W = 160
+NOISE = 3.0
 
 
 def noisy_image(rng, level=0.0, disc=None, noise=NOISE):
@@ -59,7 +61,8 @@ def test_change_mask__ignores_noise_that_is_larger_in_some_places():
 
 def test_change_mask__finds_a_change_of_colour_alone():
     rng = np.random.default_rng(7)
-    before, after = noisy_image(rng), noisy_image(rng)
+    before = noisy_image(rng)
+    after = noisy_image(rng)
     after[40:60, 50:80] = np.clip(after[40:60, 50:80] + np.array([12, -12, 0]), 0, 255)
     found = change_mask(before, after)
     assert found[42:58, 52:78].all()
@@ -68,7 +71,8 @@ def test_change_mask__finds_a_change_of_colour_alone():
 
 def test_change_mask__takes_floats_like_bytes():
     rng = np.random.default_rng(8)
-    before, after = noisy_image(rng), noisy_image(rng, disc=(70, 50))
+    before = noisy_image(rng)
+    after = noisy_image(rng, disc=(70, 50))
     floats = change_mask(before / np.float32(255), after / np.float32(255))
     assert np.mean(floats != change_mask(before, after)) < 0.01
 
@@ -76,7 +80,8 @@ def test_change_mask__takes_floats_like_bytes():
 @pytest.mark.parametrize(("size", "step"), [(8, (2, 2, 2)), (16, (3, -3, 0))])
 def test_change_mask__ignores_blocks_of_compressed_video(size: int, step: tuple[int, int, int]):
     rng = np.random.default_rng(9)
-    before, after = noisy_image(rng, noise=1), noisy_image(rng, noise=1)
+    before = noisy_image(rng, noise=1)
+    after = noisy_image(rng, noise=1)
     flips = rng.random((-(-H // size), -(-W // size))) < 0.1
     after += (np.kron(flips, np.ones((size, size)))[:H, :W, None] * step).astype(np.int8).view(np.uint8)
     assert not change_mask(before, after).any()
@@ -109,13 +114,16 @@ def test_moving_region__includes_what_changes_enclose():
 def test_update_reference__detects_slow_changes_once_they_add_up():
     """A quarter of a grey level per frame is never detected between two frames, but against the reference."""
     rng = np.random.default_rng(3)
-    reference, last, waited = noisy_image(rng), noisy_image(rng), []
+    reference = noisy_image(rng)
+    last = noisy_image(rng)
+    waited = []
     for frame in range(1, 60):
         now = noisy_image(rng, level=0.25 * frame)
         assert not change_mask(last, now).mean() > 0.01
         change = change_mask(reference, now)
         waited.append(change.mean())
-        reference, last = update_reference(reference, now, change), now
+        reference = update_reference(reference, now, change)
+        last = now
     assert max(waited[:4]) < 0.01
     # 15 grey levels in all. Five standard deviations are 2.5, and the noise lets some pixels pass earlier.
     assert 5 < sum(waited) < 20  # of 59 frames
@@ -134,9 +142,11 @@ def test_box_around__adds_margins():
 def test_observe_key_views__flow_in_a_box_equals_that_of_the_whole_image(with_masks):
     """Inside a patch that moves by 4 px."""
     rng = np.random.default_rng(4)
-    before, after = noisy_image(rng), noisy_image(rng)
+    before = noisy_image(rng)
+    after = noisy_image(rng)
     patch = cv2.resize(rng.integers(0, 255, (8, 8, 3), np.uint8), (32, 32), interpolation=cv2.INTER_CUBIC)
-    before[34:66, 54:86], after[34:66, 58:90] = patch, patch
+    before[34:66, 54:86] = patch
+    after[34:66, 58:90] = patch
     box = box_around(change_mask(before, after))
     masks = "grabcut" if with_masks else None
     found = [observe_key_views({0: FramePair(after, before, box=b)}, "dis", masks)[0] for b in (None, box)]
@@ -155,7 +165,8 @@ def test_observe_key_views__what_has_not_changed_has_not_moved():
     rng = np.random.default_rng(9)
     before, after = np.full((2, H, W, 3), 120, np.uint8)
     patch = cv2.resize(rng.integers(0, 255, (8, 8, 3), np.uint8), (32, 32), interpolation=cv2.INTER_CUBIC)
-    before[34:66, 54:86], after[34:66, 60:92] = patch, patch
+    before[34:66, 54:86] = patch
+    after[34:66, 60:92] = patch
     region = moving_region(change_mask(before, after))
     observed = {
         name: observe_key_views({0: FramePair(after, before, region=r)})[0]

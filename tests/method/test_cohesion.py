@@ -10,8 +10,10 @@ from morgs_mi.method.cohesion import share_confidence
 from morgs_mi.method.motion_config import MotionConfig
 from tests.scenes.gaussians import isotropic, random_sheet
 
-STILL, WEIGHT = -2.0, MotionConfig().cohesion_weight
-GREY, RED = (0.5, 0.5, 0.5), (0.7, 0.2, 0.2)
+STILL = -2.0
+WEIGHT = MotionConfig().cohesion_weight
+GREY = (0.5, 0.5, 0.5)
+RED = (0.7, 0.2, 0.2)
 # The wall has 600 Gaussians, the object 100.
 WALL = np.arange(700) < 600
 
@@ -88,14 +90,16 @@ def test_share_confidence__solves_its_equation(monkeypatch):
 
 
 def test_share_confidence__counts_all_but_the_chosen_as_still():
-    gaussians, chosen = wall_and_object(0.0, GREY), np.flatnonzero(~WALL)
+    gaussians = wall_and_object(0.0, GREY)
+    chosen = np.flatnonzero(~WALL)
     found = share_confidence(gaussians, chosen, np.full(100, 2.0, np.float32), STILL, WEIGHT)
     assert found.shape == (100,)
     assert (found < 0).all()
 
 
 def test_share_confidence__returns_the_logits_without_neighbours_or_weight():
-    one, logit = isotropic(np.zeros((1, 3)), 0.1, 0.9), np.array([1.5], np.float32)
+    one = isotropic(np.zeros((1, 3)), 0.1, 0.9)
+    logit = np.array([1.5], np.float32)
     np.testing.assert_array_equal(share_confidence(one, np.arange(1), logit, STILL, WEIGHT), logit)
     alone = shared(wall_and_object(0.0, GREY), moving(0.5), 0)
     np.testing.assert_array_equal(alone, moving(0.5))

@@ -62,8 +62,10 @@ def test_fit_exposure__explains_a_change_by_a_factor_on_the_light_where_images_h
 
 
 def test_fit_exposure__ignores_masked_pixels():
-    recorded, mask = WARM(scene()), np.ones((60, 80), bool)
-    recorded[:45], mask[:45] = 0.5, False
+    recorded = WARM(scene())
+    mask = np.ones((60, 80), bool)
+    recorded[:45] = 0.5
+    mask[:45] = False
     assert_close(fit_exposure(scene(), recorded, mask, weights=(0, 0)), WARM, 1e-9)
 
 
@@ -75,7 +77,8 @@ def test_exposure__corrects_to_the_colours_of_the_scene():
 
 
 def test_exposure__composes():
-    first, second = Exposure((1.2, 1, 1), (0.1, 0, 0)), Exposure((0.5, 2, 1), (0, 0, 0.3))
+    first = Exposure((1.2, 1, 1), (0.1, 0, 0))
+    second = Exposure((0.5, 2, 1), (0, 0, 0.3))
     np.testing.assert_allclose(second.after(first)(scene()), second(first(scene())))
     np.testing.assert_allclose(second.after(first).without(first)(scene()), second(scene()))
 
@@ -113,7 +116,8 @@ def test_common_change__needs_three_cameras():
 
 @pytest.mark.parametrize("noise", [0, 2])
 def test_follow_exposure__is_none_without_a_change(noise: int):
-    rng, image = np.random.default_rng(2), as_bytes(scene(size=(120, 160)))
+    rng = np.random.default_rng(2)
+    image = as_bytes(scene(size=(120, 160)))
     noisy = np.clip(image + rng.normal(0, noise, image.shape).round(), 0, 255).astype(np.uint8)
     noisy[:30] = 90  # something moved
     assert follow_exposure(image, noisy).change < LEAST_CHANGE

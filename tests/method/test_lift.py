@@ -63,7 +63,8 @@ def test_lift_flow__gives_no_motion_without_observations():
 
 def test_lift_flow__gives_no_motion_for_noise():
     """A tenth of a pixel, as smooth as flow is, independent in every view."""
-    rng, flows = np.random.default_rng(0), {}
+    rng = np.random.default_rng(0)
+    flows = {}
     for view, camera in enumerate(rig()):
         flow = cv2.resize(rng.normal(0, 0.1, (6, 8, 2)), (camera.width, camera.height)).astype(np.float32)
         everywhere = np.ones((camera.height, camera.width), bool)

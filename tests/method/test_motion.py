@@ -37,7 +37,8 @@ def test_initial_motion__runs_the_stages_that_are_on():
     off = replace(MotionConfig(), propagate_motion=False, search_motion=False, refine_start=False)
     assert [stage.acts(off) for stage in STAGES] == [True, False, False, False]
     assert all(stage.acts(MotionConfig()) for stage in STAGES)
-    lifted, found = start(off), start(MotionConfig())
+    lifted = start(off)
+    found = start(MotionConfig())
     assert lifted is not None
     assert found is not None
     assert not lifted.displacement.any()  # the flow sees no motion

@@ -16,7 +16,8 @@ from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
 
 SHIFT = np.float32([0.05, -0.03, 0.02])  # two pixels
-MOVING, STATIC = 80, 400
+MOVING = 80
+STATIC = 400
 
 
 @pytest.fixture(scope="module")

@@ -89,7 +89,8 @@ def test_propagate_motion__keeps_true_motion(scene):
 
 def test_propagate_motion__does_nothing_without_motion_or_views(scene):
     before, _, views, targets = scene
-    lifted, rng = still(460), np.random.default_rng(0)
+    lifted = still(460)
+    rng = np.random.default_rng(0)
     assert propagate_motion(MotionProblem(before, views, targets, rng), lifted) is lifted
     assert propagate_motion(MotionProblem(before, {}, targets, rng), lifted) is lifted
 

@@ -39,10 +39,12 @@ def test_apply_residual__zero_changes_nothing(degree, config):
 @pytest.mark.parametrize("degree", [0, 2])
 def test_apply_residual__gate_scales_every_attribute(degree, two_gates):
     """A_t = A_{t-1} + m R_t (eq. 12); with two gates, the appearance's gate is 1."""
-    config, previous = MotionConfig(two_gates=two_gates), to_gaussians(make_scene(degree))
+    config = MotionConfig(two_gates=two_gates)
+    previous = to_gaussians(make_scene(degree))
     parameters = random_parameters(previous, config)
     m = 1 / (1 + np.exp(-np.asarray(parameters["logit_confidence"], np.float64)))
-    current, before = apply_residual(previous, parameters, config).numpy(), previous.numpy()
+    current = apply_residual(previous, parameters, config).numpy()
+    before = previous.numpy()
     R = {name: np.asarray(value) for name, value in parameters.items()}
     displacement = m[:, None] * (R["motion"] + R["offset"])
     assert_close(current["motion"], displacement, atol=1e-6)
@@ -67,7 +69,8 @@ def test_residual_parameters__follow_the_modules():
 
 @pytest.mark.parametrize("lift_confidence", [False, True])
 def test_residual_parameters__lifted_motion_passes_the_gate_at_full_length(lift_confidence):
-    previous, rng = to_gaussians(make_scene()), np.random.default_rng(1)
+    previous = to_gaussians(make_scene())
+    rng = np.random.default_rng(1)
     lifted = MotionStart(np.float32(rng.normal(size=(10, 3))), np.float32(rng.uniform(-2, 2, 10)))
     config = MotionConfig(lift_confidence=lift_confidence)
     current = apply_residual(previous, residual_parameters(previous, config, lifted), config)
@@ -79,7 +82,8 @@ def test_residual_parameters__lifted_motion_passes_the_gate_at_full_length(lift_
 
 
 def test_apply_residual__gradient_of_the_gate_follows_the_product_rule():
-    config, previous = MotionConfig(), to_gaussians(make_scene())
+    config = MotionConfig()
+    previous = to_gaussians(make_scene())
     parameters = random_parameters(previous, config)
     dr.enable_grad(parameters["logit_confidence"], parameters["motion"])
     dr.backward(dr.sum(apply_residual(previous, parameters, config).means, axis=None))

@@ -15,7 +15,9 @@ from morgs_mi.method.rigidity import find_neighbours, isometry_loss, rigid_loss,
 from tests.scenes.gaussians import make_wide_scene, to_gaussians
 
 LOSSES = {"rigid": rigid_loss, "rotation": rotation_loss, "isometry": isometry_loss}
-COUNT, REACH, EXTENT = 5, 0.3, 2.0
+COUNT = 5
+REACH = 0.3
+EXTENT = 2.0
 BEFORE = make_wide_scene(40)
 
 
@@ -27,7 +29,8 @@ def neighbours():
 
 def other(seed: int = 0, size: float = 0.1) -> Gaussians:
     """Return the Gaussians, each moved and turned by itself."""
-    rng, before = np.random.default_rng(seed), to_gaussians(BEFORE)
+    rng = np.random.default_rng(seed)
+    before = to_gaussians(BEFORE)
     means, quats = (np.asarray(v) + size * rng.normal(size=v.shape) for v in (before.means, before.quats))
     return replace(before, means=means, quats=quats)
 
@@ -37,12 +40,15 @@ def reference(gaussians: Gaussians) -> dict[str, float]:
     before = to_gaussians(BEFORE)
     old, new = (np.asarray(g.means, np.float64) / EXTENT for g in (before, gaussians))
     q_old, q_new = (Rotation.from_quat(unit_quats(g), scalar_first=True) for g in (before, gaussians))
-    sums, count = dict.fromkeys(LOSSES, 0.0), 0
+    sums = dict.fromkeys(LOSSES, 0.0)
+    count = 0
     turns = (q_new * q_old.inv()).as_quat(scalar_first=True)
     for i in range(len(old)):
         for j in np.argsort(np.linalg.norm(old - old[i], axis=1))[1 : 1 + COUNT]:
-            e, e_now = old[j] - old[i], new[j] - new[i]
-            w, turn = np.exp(-(e @ e) / REACH**2), Rotation.from_quat(turns[i], scalar_first=True)
+            e = old[j] - old[i]
+            e_now = new[j] - new[i]
+            w = np.exp(-(e @ e) / REACH**2)
+            turn = Rotation.from_quat(turns[i], scalar_first=True)
             sums["rigid"] += w * np.linalg.norm(e_now - turn.apply(e))
             # A quaternion and its negative are one rotation; small changes keep the sign of both factors.
             sums["rotation"] += w * min(np.linalg.norm(turns[j] - s * turns[i]) for s in (1, -1))
@@ -70,11 +76,14 @@ def test_rigidity__is_zero_for_a_body_that_moves_as_a_whole(name):
     ("name", "attribute"), [("rigid", "means"), ("rigid", "quats"), ("rotation", "quats"), ("isometry", "means")]
 )
 def test_rigidity__gradients_agree_with_central_differences(name, attribute):
-    gaussians, loss, step = other(1), LOSSES[name], 1e-3
+    gaussians = other(1)
+    loss = LOSSES[name]
+    step = 1e-3
     value = getattr(gaussians, attribute)
     dr.enable_grad(value)
     dr.backward(loss(gaussians, neighbours()))
-    gradient, at = np.asarray(dr.grad(value), np.float64), np.asarray(dr.detach(value))
+    gradient = np.asarray(dr.grad(value), np.float64)
+    at = np.asarray(dr.detach(value))
     direction = np.random.default_rng(2).normal(size=at.shape).astype(np.float32)
     # Float32 leaves 1e-3 of a difference this small.
     ends = [

@@ -21,7 +21,8 @@ from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
 
 SHIFT = np.float32([0.15, 0.05, 0.08])  # 12 px; the rod is 6 px wide
-ROD, WALL = 24, 1500
+ROD = 24
+WALL = 1500
 MOVES = np.arange(ROD + WALL) < ROD
 
 
@@ -82,7 +83,8 @@ def test_search_motion__keeps_a_start_that_explains_the_images(scene):
 
 def test_search_motion__keeps_a_part_that_vanished(scene):
     before, views = scene
-    gone, start = before.select(np.flatnonzero(~MOVES)), still()
+    gone = before.select(np.flatnonzero(~MOVES))
+    start = still()
     assert searched(before, start, views, targets(gone, views)) is start
 
 
@@ -122,7 +124,8 @@ def test_initial_motion__searches_where_flow_sees_nothing(scene):
     flows = {v: FlowObservation(*flow, *flow) for v in views}
     active = ActiveSet(np.arange(len(MOVES)), len(MOVES), views, len(views))
     for searches in (True, False):
-        config, rng = MotionConfig(search_motion=searches), np.random.default_rng(0)
+        config = MotionConfig(search_motion=searches)
+        rng = np.random.default_rng(0)
         initial = initial_motion(before, active, flows, targets(moved(before), views), config, rng)
         assert initial.displacement[MOVES].any() == searches
 
@@ -139,7 +142,8 @@ def test_cost_surface__is_the_weighted_squared_difference():
         np.sum(weight[..., None].astype(float) * (np.roll(after, (-y, -x), (0, 1)).astype(float) - before) ** 2)
         for x, y in shifts
     ]
-    origin, depth = np.array([[32.0, 24.0]]), np.array([3.0])
+    origin = np.array([[32.0, 24.0]])
+    depth = np.array([3.0])
     center = camera.unproject(origin, depth)[0]
     d = camera.unproject(origin + shifts, np.full(3, 3.0)) - center
     assert np.allclose(surface.at(center, d), expected, rtol=1e-3)
