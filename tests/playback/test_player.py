@@ -187,7 +187,8 @@ def test_channel_image__draws_other_channels_as_grey_values() -> None:
 
 @pytest.mark.parametrize("stored", ["beside", "header", "header, then moved and resumed"])
 def test_open_stream_capture__finds_the_capture_of_the_fit(fitted_clip: Path, tmp_path: Path, stored: str) -> None:
-    capture, header = str(fitted_clip / "capture"), {"test_view": 0}
+    capture = str(fitted_clip / "capture")
+    header = {"test_view": 0}
     if stored != "beside":
         header |= {"capture": capture if stored == "header" else str(tmp_path / "moved")}
     write_stream(tmp_path / "stream.morgs", header)

@@ -72,8 +72,11 @@ def site(clip, tmp_path_factory):
     write_web_folder(open_stream(clip[0]), folder)
     (folder / "node_modules").symlink_to(packages)
     (folder / "scene.html").write_text(example(), encoding="utf-8")
-    data, index = (folder / "stream.morgs").read_bytes(), open_stream(folder).index()
-    version, first, later = bytearray(data), bytearray(data), bytearray(data)
+    data = (folder / "stream.morgs").read_bytes()
+    index = open_stream(folder).index()
+    version = bytearray(data)
+    first = bytearray(data)
+    later = bytearray(data)
     version[8] += 1
     first[index[0][2] + 100] ^= 1
     later[index[2][2] + 100] ^= 1

@@ -19,7 +19,8 @@ def rows(gaussians) -> dict[bytes, int]:
 
 def test_by_place__yields_the_gaussians_of_every_frame_in_one_order(tmp_path):
     write_stream(tmp_path / "s.morgs", keyframe_interval=2)
-    stream, before = StreamReader(tmp_path / "s.morgs"), None
+    stream = StreamReader(tmp_path / "s.morgs")
+    before = None
     for (frame, ordered), (expected, gaussians) in zip(by_place(stream), play(stream), strict=True):
         assert frame == expected
         assert rows(ordered).keys() == rows(gaussians).keys()

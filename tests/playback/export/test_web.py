@@ -115,8 +115,11 @@ def test_write_web_page__replaces_bytes_of_a_name_that_are_not_utf_8(tmp_path):
 
 def test_write_web_page__scales_motion_by_its_99th_percentile(tmp_path):
     start = splats(600)
-    means, log_scales = start.numpy()["means"].copy(), start.numpy()["log_scales"].copy()
-    means[0], log_scales[0] = (0, -3.4, 0.9), -5  # small and close to the camera in the middle
+    means = start.numpy()["means"].copy()
+    log_scales = start.numpy()["log_scales"].copy()
+    # Small and close to the camera in the middle.
+    means[0] = (0, -3.4, 0.9)
+    log_scales[0] = -5
     states = write_stream(tmp_path / "stream.morgs", start=replace(start, means=means, log_scales=log_scales))
     write_web_folder(open_stream(tmp_path), tmp_path / "folder")
     speeds = np.hstack([screen_speeds(state.gaussians, camera) for state in states[1:] for camera in rig()])
@@ -146,11 +149,13 @@ def screen_speeds(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """
     motion = np.asarray(gaussians.motion, np.float64)
     moves = motion.any(axis=1)
-    means, motion = gaussians.numpy()["means"][moves].astype(np.float64), motion[moves]
+    means = gaussians.numpy()["means"][moves].astype(np.float64)
+    motion = motion[moves]
     pixels, depths = camera.project(means)
     seen = (depths > camera.near) & (pixels > 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
     step = 1e-4 * motion[seen]
-    ahead, behind = camera.project(means[seen] + step)[0], camera.project(means[seen] - step)[0]
+    ahead = camera.project(means[seen] + step)[0]
+    behind = camera.project(means[seen] - step)[0]
     scales = np.asarray(gaussians.scales, np.float64)[moves][seen]
     areas = np.prod(scales, axis=1) ** (2 / 3) / depths[seen] ** 2
     speeds = np.linalg.norm(ahead - behind, axis=1) / 2e-4 / camera.width
@@ -235,7 +240,8 @@ def test_page__decodes_the_same_integers(page, clip):
 
 
 def test_page__plays_a_stream_with_a_missing_frame(browser, clip, tmp_path):
-    states, packets = clip[1], list(open_stream(clip[0]))
+    states = clip[1]
+    packets = list(open_stream(clip[0]))
     # Frame 1 is lost; keyframes were re-emitted at frames 2 and 3.
     kept = [packets[0], reemitted_keyframe(states[2]), packets[3], reemitted_keyframe(states[3])]
     with StreamWriter(tmp_path / "stream.morgs", rig(WIDTH, HEIGHT), 10) as writer:
@@ -387,7 +393,8 @@ def drag(page: Player, pixels: int, cameras: Sequence[Camera]) -> float:
     page.wait(AT_REST)
     position, target = (np.array(page.page.evaluate(f"player.view.{name}.toArray()")) for name in VIEW)
     unit = page.page.evaluate("player.view.unit")
-    offset, directions = position - target, unit * np.stack([camera.position for camera in cameras]) - target
+    offset = position - target
+    directions = unit * np.stack([camera.position for camera in cameras]) - target
     cosines = directions @ offset / np.linalg.norm(directions, axis=1) / np.linalg.norm(offset)
     return float(np.degrees(np.arccos(cosines.max())))
 
