@@ -56,7 +56,8 @@ def test_rasterize__backward_agrees_with_central_differences_after_a_delay(movin
     rng = np.random.default_rng(4)
     for name in ("means", "motion"):
         grad = np.asarray(dr.grad(getattr(gaussians, name)), np.float64)
-        v, h = np.sign(grad) * rng.uniform(0.5, 1, grad.shape), 2e-3
+        v = np.sign(grad) * rng.uniform(0.5, 1, grad.shape)
+        h = 2e-3
         up, down = (loss(to_gaussians({**raw, name: raw[name] + s * h * v})) for s in (1, -1))
         difference = (np.asarray(up).item() - np.asarray(down).item()) / (2 * h)
         assert difference == pytest.approx(np.vdot(grad, v), rel=tol.CENTRAL_DIFFERENCE_REL), name
@@ -65,7 +66,8 @@ def test_rasterize__backward_agrees_with_central_differences_after_a_delay(movin
 def test_rasterize__shows_decoded_gaussians_with_their_offset_once(moving) -> None:
     """The decoded motion is the whole displacement, whether or not the packet stores its learned part."""
     raw, camera = moving
-    before, config = replace(to_gaussians(raw), motion=None, offset=None), CodecConfig(quality=8, offset=True)
+    before = replace(to_gaussians(raw), motion=None, offset=None)
+    config = CodecConfig(quality=8, offset=True)
     coded = decode(None, keyframe_packet(before, 0, [camera], config))
     offset = 0.02 * raw["offset"] / np.abs(raw["offset"]).max()
     now = replace(before, means=raw["means"] + 2 * offset, motion=2 * offset, offset=offset)

@@ -25,7 +25,8 @@ def limit(scene) -> np.ndarray:
     _, camera = scene
     x, y = np.meshgrid(np.linspace(-1, 1, camera.width), np.linspace(-1, 1, camera.height))
     limit = np.float32(3.0 + 0.5 * x - 0.3 * y)
-    limit[:3], limit[-2:] = np.inf, 0.0
+    limit[:3] = np.inf
+    limit[-2:] = 0.0
     return limit
 
 
@@ -41,7 +42,8 @@ def test_depth_limit__image_agrees_with_the_reference(scene, limit, channel):
 @pytest.mark.parametrize(("channel", "reproducible"), [*((name, False) for name in CHANNELS), ("color", True)])
 def test_depth_limit__backward_agrees_with_the_reference(scene, limit, channel, reproducible):
     raw, camera = scene
-    rng, size = np.random.default_rng(1), {"color": 3, "motion": 2}.get(channel, 1)
+    rng = np.random.default_rng(1)
+    size = {"color": 3, "motion": 2}.get(channel, 1)
     weight = rng.normal(size=(camera.height, camera.width, size))
     weight *= rasterize_view(raw, camera, depth_limit=limit)["alpha"] > 0.1
     gaussians = to_gaussians(raw, grad=True)

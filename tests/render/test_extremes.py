@@ -33,7 +33,8 @@ from tests.scenes.gaussians import CHANNELS
 
 def errors(case: Case) -> dict[str, float]:
     """Return the errors of the image and of each attribute's gradient against the reference."""
-    values, camera = case.values, case.camera
+    values = case.values
+    camera = case.camera
     expected = exact_image(values, camera)
     weight = weights(expected, clear_pixels(values, camera))
     found, grads = run(values, camera, weight)
@@ -105,7 +106,8 @@ def test_rasterize__gradients_of_the_pose_at_the_extremes():
     """Columns are compared separately: rotating a world at 1e5 units moves it 1e5 times as far as translating it."""
     failed = []
     for case in CASES:
-        camera, exact = case.camera, np.zeros((3, 4))
+        camera = case.camera
+        exact = np.zeros((3, 4))
         posed = Camera(camera.K, mi.TensorXf(np.float32(camera.viewmat)), camera.width, camera.height, near=camera.near)
         dr.enable_grad(posed.viewmat)
         weight = weights(exact_image(case.values, camera), clear_pixels(case.values, camera))

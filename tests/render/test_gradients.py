@@ -160,7 +160,8 @@ def test_rasterize__backward_agrees_with_the_reference_in_a_dense_scene():
 
 
 def test_rasterize__reproducible_gradients_have_the_same_bytes_and_values():
-    raw, camera = as_float32(make_scene(1, 400, seed=9)), make_camera(120, 90)
+    raw = as_float32(make_scene(1, 400, seed=9))
+    camera = make_camera(120, 90)
 
     def gradients(config, threads):
         dr.set_thread_count(threads)

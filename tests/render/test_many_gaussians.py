@@ -30,7 +30,8 @@ def stack(n: int, opacity: float) -> Values:
 
 @pytest.mark.parametrize("opacity", [1.0, 0.99, 0.02])
 def test_rasterize__blends_ten_thousand_layers_on_one_pixel(opacity):
-    values, camera = stack(10_000, opacity), Camera(np.array([[9.0, 0, 0.5], [0, 9, 0.5], [0, 0, 1]]), np.eye(4), 1, 1)
+    values = stack(10_000, opacity)
+    camera = Camera(np.array([[9.0, 0, 0.5], [0, 9, 0.5], [0, 0, 1]]), np.eye(4), 1, 1)
     expected = exact_image(values, camera)
     for config in (CONFIG, RenderConfig()):
         found, grads = run(values, camera, config=config)
@@ -58,7 +59,8 @@ def test_rasterize__blends_many_equal_depths_in_the_order_of_the_input():
 @pytest.mark.long
 def test_rasterize__two_million_gaussians_mostly_out_of_view():
     """All but 1,000 are out of view: the image shows the 1,000, and their gradients are complete and finite."""
-    N, in_view = 2_000_000, 1_000
+    N = 2_000_000
+    in_view = 1_000
     rng = np.random.default_rng(0)
     values = {name: np.repeat(value, N // 1000, axis=0) for name, value in cloud(1000).items()}
     values["means"] += rng.normal(size=(N, 3)) * 0.3

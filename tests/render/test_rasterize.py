@@ -26,18 +26,22 @@ from tests.scenes.gaussians import (
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_rasterize__agrees_with_the_reference_at_every_sh_degree(degree):
-    raw, camera = as_float32(make_scene(degree)), make_camera()
-    image, expected = rasterize(to_gaussians(raw), camera, ("color", "alpha")), rasterize_view(raw, camera)
+    raw = as_float32(make_scene(degree))
+    camera = make_camera()
+    image = rasterize(to_gaussians(raw), camera, ("color", "alpha"))
+    expected = rasterize_view(raw, camera)
     for name in ("color", "alpha"):
         assert_close(image[name], expected[name], atol=tol.IMAGE_ABS, name=name)
 
 
 def test_rasterize__agrees_with_the_reference_in_every_channel(scene):
     raw, camera = scene
-    image, expected = rasterize(to_gaussians(raw), camera, CHANNELS), rasterize_view(raw, camera)
+    image = rasterize(to_gaussians(raw), camera, CHANNELS)
+    expected = rasterize_view(raw, camera)
     for name in CHANNELS:
         # Where alpha is small, a normalised channel divides rounding errors by it.
-        solid, scale = expected["alpha"] > 0.02, max(1.0, np.abs(expected[name]).max())
+        solid = expected["alpha"] > 0.02
+        scale = max(1.0, np.abs(expected[name]).max())
         assert_close(image[name], expected[name], atol=tol.IMAGE_ABS * scale, where=solid, name=name)
 
 
@@ -61,7 +65,8 @@ def test_rasterize__blends_features_like_the_confidence(scene):
     """Twelve columns beside the colour have the image and the gradients of the confidence channel."""
     raw, camera = scene
     rng = np.random.default_rng(2)
-    values, seed = rng.normal(size=(len(raw["means"]), 12)), rng.normal(size=(camera.height, camera.width, 12))
+    values = rng.normal(size=(len(raw["means"]), 12))
+    seed = rng.normal(size=(camera.height, camera.width, 12))
 
     def differentiated(column):
         gaussians = to_gaussians(raw, grad=True)
@@ -111,7 +116,8 @@ def test_rasterize__stops_early_within_its_bound_in_a_dense_opaque_scene():
     raw["logit_opacities"] = rng.uniform(2, 8, 300)
     raw = as_float32(raw)
     camera = make_camera(70, 45)
-    found, expected = rasterize(to_gaussians(raw), camera), rasterize_view(raw, camera)
+    found = rasterize(to_gaussians(raw), camera)
+    expected = rasterize_view(raw, camera)
     assert expected["alpha"].max() > 1 - 1e-5
     assert_close(found.color, expected["color"], atol=tol.STOPPED_IMAGE_ABS)
 
@@ -234,7 +240,8 @@ def test_rasterize__refuses_to_be_frozen(scene):
 
 def test_rasterize__copies_features_and_background_before_it_returns(scene):
     raw, camera = scene
-    features, background = np.ones((10, 2), np.float32), np.full(3, 0.5)
+    features = np.ones((10, 2), np.float32)
+    background = np.full(3, 0.5)
     images = []
     for overwritten in (False, True):
         gaussians = to_gaussians(raw, grad=True)

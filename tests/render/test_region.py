@@ -52,7 +52,8 @@ def run(raw, camera, region=None, weight=None, config=None):
 @pytest.fixture(scope="module")
 def weight(camera: Camera, mask: np.ndarray) -> dict[str, np.ndarray]:
     """Random weights on the pixels of the region's blocks, 0 elsewhere."""
-    rng, drawn = np.random.default_rng(3), drawn_pixels(Region(mask), mask)
+    rng = np.random.default_rng(3)
+    drawn = drawn_pixels(Region(mask), mask)
     sizes = {"color": 3, "motion": 2}
     return {name: rng.normal(size=(*mask.shape, sizes.get(name, 1))) * drawn for name in CHANNELS}
 
@@ -83,7 +84,8 @@ def test_rasterize__on_a_region_renders_and_differentiates_like_the_full_view(ra
 
 
 def test_rasterize__blends_features_on_a_region(raw, camera, mask):
-    rng, region = np.random.default_rng(0), Region(mask)
+    rng = np.random.default_rng(0)
+    region = Region(mask)
     values = np.float32(rng.normal(size=(len(raw["means"]), 5)))
 
     def run_features(**restriction):
@@ -115,7 +117,9 @@ def test_rasterize__equal_depths_keep_their_order(camera):
 
 
 def test_rasterize__forward_mode_on_a_region_agrees_with_the_full_view(raw, camera, mask):
-    rng, region, tangents = np.random.default_rng(1), Region(mask), []
+    rng = np.random.default_rng(1)
+    region = Region(mask)
+    tangents = []
     direction = {name: np.float32(rng.normal(size=raw[name].shape)) for name in RAW}
     for where in (region, None):
         gaussians = Gaussians(**raw)
@@ -140,7 +144,8 @@ def test_rasterize__on_an_empty_region_is_the_background(raw, camera, mask):
 
 
 def test_region__crop_and_paste_are_inverse(camera, mask):
-    region, rng = Region(mask), np.random.default_rng(0)
+    region = Region(mask)
+    rng = np.random.default_rng(0)
     image, other = (rng.normal(size=(*mask.shape, 3)) for _ in range(2))
     pasted = region.paste(region.crop(image), other)
     assert (pasted[mask] == image[mask]).all()

@@ -80,9 +80,14 @@ def process(out: Path, *left: int) -> subprocess.Popen:
 
 def kill_and_resume(whole: Path, folder: Path, kills: int) -> None:
     """Fit again and again, each time killed at a random byte of the stream or a random moment, until it is done."""
-    rng, size, killed, fits = np.random.default_rng(0), len(stream_of(whole)), 0, 0
+    rng = np.random.default_rng(0)
+    size = len(stream_of(whole))
+    killed = 0
+    fits = 0
     while killed < kills:
-        out, fits, status = folder / f"{fits}", fits + 1, -9
+        out = folder / f"{fits}"
+        fits = fits + 1
+        status = -9
         while status and killed < kills:
             written = len(stream_of(out)) if (out / "stream.morgs").exists() else 0
             if rng.random() < 0.5 and written < size:
@@ -100,7 +105,8 @@ def kill_and_resume(whole: Path, folder: Path, kills: int) -> None:
 
 def test_stream_capture__shows_a_provisional_first_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A stream beside the one that is written has a frame for each round of density control, and is removed."""
-    shown, show = [], Files.show
+    shown = []
+    show = Files.show
 
     def spy(files: Files, keyframe: Packet) -> None:
         show(files, keyframe)
@@ -139,7 +145,8 @@ def test_stream_capture__goes_on_without_a_provisional_first_frame_that_has_no_r
 def test_stream_capture__removes_the_provisional_first_frame_before_it_writes_the_result(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write, shown = StreamWriter.write, []
+    write = StreamWriter.write
+    shown = []
 
     def spy(writer: StreamWriter, packet: Packet) -> int:
         is_provisional = "provisional" in writer.path.name
@@ -184,7 +191,9 @@ def test_stream_capture__keeps_an_earlier_fit_until_its_first_frame(
 
 
 def test_stream_capture__replaces_an_earlier_fit_together(whole: Path, tmp_path: Path) -> None:
-    out, push, frames = tmp_path / "out", StreamLoop.push, []
+    out = tmp_path / "out"
+    push = StreamLoop.push
+    frames = []
     shutil.copytree(whole, out)
 
     def spy(loop: StreamLoop, *args: Any) -> Any:
@@ -206,7 +215,9 @@ def test_stream_capture__resumes_after_a_kill_between_the_files_that_it_replaces
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: int
 ) -> None:
     """Whatever has been replaced, the files that are there after the next start belong together."""
-    out, count, rename = tmp_path / "out", 0, Path.replace
+    out = tmp_path / "out"
+    count = 0
+    rename = Path.replace
     shutil.copytree(whole, out)
 
     class Killed(BaseException):
@@ -267,7 +278,8 @@ def test_stream_capture__300_frames_play_as_they_were_fitted(tmp_path: Path) -> 
 def cuts(whole: Path) -> list[int]:
     """Return bytes within and between packets of every kind."""
     index = StreamReader(whole / "stream.morgs").index()
-    size, ends = len(stream_of(whole)), [offset for _, _, offset in index]
+    size = len(stream_of(whole))
+    ends = [offset for _, _, offset in index]
     index_at = size - PAYLOAD - 16 * len(index) - TRAILER.size
     # A re-emitted keyframe, the fourth packet, may be missing after its residual.
     return [0, ends[0] - 1, ends[0], ends[3] - 1, ends[3], ends[4], index_at, size - 1, size]
@@ -380,7 +392,8 @@ def test_stream_capture__refuses_a_folder_into_which_another_fit_writes(whole: P
 
 @pytest.mark.parametrize("change", ["removed", "removed folder", "moved", "replaced"])
 def test_stream_capture__ends_when_its_stream_is_taken_away(whole: Path, tmp_path: Path, change: str) -> None:
-    out, seen = tmp_path / "out", []
+    out = tmp_path / "out"
+    seen = []
 
     def take_away(stage: str, done: float, total: float) -> None:
         frame = ceil(done) if stage == "Later frames" else 0
@@ -425,7 +438,8 @@ def test_stream_capture__writes_no_path_into_the_stream(tmp_path: Path) -> None:
 
 def test_stream_capture__resumes_a_stream_whose_header_has_a_path(whole: Path, tmp_path: Path) -> None:
     """As the headers of earlier versions have; the recording may have moved."""
-    reader, out = StreamReader(whole / "stream.morgs"), tmp_path / "out"
+    reader = StreamReader(whole / "stream.morgs")
+    out = tmp_path / "out"
     shutil.copytree(whole, out)
     about = {**reader.metadata, "capture": "/elsewhere"}
     with StreamWriter(out / "stream.morgs", reader.cameras, reader.fps, about) as writer:
@@ -468,7 +482,8 @@ def test_stream_capture__resumes_hostile_streams_or_refuses_them_in_one_sentence
     pieces = [Piece(-1, 0, 0, 12), Piece(0, 0, 12, ends[0])]
     pieces += [Piece(p.kind, p.frame, a, b) for p, (a, b) in zip(packets, pairwise(ends), strict=True)]
     pieces.append(Piece(3, 0, index, len(data)))
-    clip, out = Clip(data, pieces, {}), tmp_path / "out"
+    clip = Clip(data, pieces, {})
+    out = tmp_path / "out"
     for case in range(12):
         forge = (damaged, with_forged_bytes, with_forged_packets, with_forged_header)[case % 4]
         forged = forge(clip, np.random.default_rng(case))
@@ -485,7 +500,8 @@ def test_stream_capture__resumes_hostile_streams_or_refuses_them_in_one_sentence
 
 @pytest.mark.parametrize("link", ["", "folder", "file"])
 def test_stream_capture__does_not_write_into_a_capture(tmp_path: Path, link: str) -> None:
-    capture, out = colmap(tmp_path / "clip"), tmp_path / "clip"
+    capture = colmap(tmp_path / "clip")
+    out = tmp_path / "clip"
     (capture / "capture.json").write_text("{}")
     before = sorted(capture.rglob("*"))
     if link == "folder":
@@ -524,10 +540,12 @@ def refined_config():
 
 
 def test_stream_capture__stores_refined_cameras_and_resumes_with_them(tmp_path_factory):
-    tmp_path, config = tmp_path_factory.mktemp("out"), refined_config()
+    tmp_path = tmp_path_factory.mktemp("out")
+    config = refined_config()
     capture = load_capture(write_recording(tmp_path_factory.mktemp("capture"), 2), test_view=0)
     stream_capture(capture, tmp_path, config)
-    stream, whole = StreamReader(tmp_path / "stream.morgs"), stream_of(tmp_path)
+    stream = StreamReader(tmp_path / "stream.morgs")
+    whole = stream_of(tmp_path)
     names = set(stream.metadata["distortions"])
     assert names == set(capture.names[1:]), "the terms of the training views"
     opened = open_stream_capture(stream, None, [0, 1])
@@ -549,7 +567,8 @@ def test_stream_capture__resumes_where_cameras_have_delays(tmp_path):
     assert [camera.delay for camera in capture.cameras] == [0, -0.25, 0.5]
     out = tmp_path / "out"
     stream_capture(capture, out, CONFIG)
-    stream, whole = StreamReader(out / "stream.morgs"), stream_of(out)
+    stream = StreamReader(out / "stream.morgs")
+    whole = stream_of(out)
     for frame in (1, 3):
         end = next(offset for _, index, offset in stream.index() if index == frame)
         (out / "stream.morgs").write_bytes(whole[:end])
@@ -569,9 +588,12 @@ def test_as_fitted__refuses_broken_distortions(tmp_path, found):
 
 def test_stream_capture__resumes_with_the_exposures_of_the_report(tmp_path):
     how = ShortFitConfig(gaussians=40, steps=4, rounds=1)
-    capture, config = recording(num_frames=3), replace(CONFIG, fit=replace(CONFIG.fit, exposure="on", short_fits=how))
+    capture = recording(num_frames=3)
+    config = replace(CONFIG, fit=replace(CONFIG.fit, exposure="on", short_fits=how))
     stream_capture(capture, tmp_path, config)
-    stream, whole, report = StreamReader(tmp_path / "stream.morgs"), stream_of(tmp_path), report_of(tmp_path)
+    stream = StreamReader(tmp_path / "stream.morgs")
+    whole = stream_of(tmp_path)
+    report = report_of(tmp_path)
     assert all(len(row["exposures"]) == len(capture.train_views) for row in report["frames"])
     (tmp_path / "stream.morgs").write_bytes(whole[: stream.index()[-1][2]])
     stream_capture(capture, tmp_path, config, resume=True)
@@ -583,6 +605,7 @@ def test_stream_metadata__names_the_calibration_that_cameras_are_refined_from():
     capture = recording()
     other = replace(capture.cameras[0], K=capture.cameras[0].K * np.array([[1.01, 1, 1], [1, 1.01, 1], [1, 1, 1]]))
     others = replace(capture, cameras=(other, *capture.cameras[1:]))
-    first, config = next(capture.partial_frames()), refined_config()
+    first = next(capture.partial_frames())
+    config = refined_config()
     same, different = (stream_metadata(c, first, config)["fingerprint"] for c in (capture, others))
     assert same != different

@@ -85,7 +85,8 @@ def test_surfaces__around_the_camera_are_behind_all_splats():
 
 
 def test_surfaces__between_splats_hide_those_behind():
-    near, far = cloud(-0.5, seed=1), cloud(0.5, seed=2)
+    near = cloud(-0.5, seed=1)
+    far = cloud(0.5, seed=2)
     found = render(scene(Gaussians.concatenate([near, far]), wall=wall(0, **glowing())))
     assert_close(found, over(near, COLOR), atol=tol.IMAGE_ABS)
 
@@ -121,7 +122,8 @@ def test_surfaces__cover_a_pixel_by_the_fraction_that_they_fill():
 
 
 def test_surfaces__background_is_behind_all():
-    gaussians, background = cloud(0.0), (0.1, 0.4, 0.8)
+    gaussians = cloud(0.0)
+    background = (0.1, 0.4, 0.8)
     found = render(scene(gaussians, card=wall(1, 0.5, **glowing()), props={"background": list(background)}))
     expected = over(gaussians, decode_light(np.array(background)))
     outside = np.hypot(*np.meshgrid(np.arange(32) - 15.5, np.arange(24) - 11.5)) > 10
@@ -158,7 +160,8 @@ def test_surfaces__of_an_environment_alone_are_its_light():
 def test_surfaces__leave_the_whole_scene_as_it_is():
     """Its parameters keep their names, and its environment its extent."""
     whole = scene(cloud(), ball={"type": "sphere"}, sky={"type": "constant"}, wall=wall(90))
-    it, names = dr.zeros(mi.Interaction3f), list(mi.traverse(whole).keys())
+    it = dr.zeros(mi.Interaction3f)
+    names = list(mi.traverse(whole).keys())
 
     def distance() -> float:
         return float(whole.environment().sample_direction(it, mi.Point2f(0.5))[0].dist[0])

@@ -33,7 +33,8 @@ def cloud(n: int = 300, scale: float = 0.1, degree: int = 1, seed: int = 0) -> G
 def segments(n: int = 400, seed: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return origins, directions and lengths of segments, most of which begin and end among the Gaussians."""
     rng = np.random.default_rng(seed)
-    origins, directions = rng.uniform(-1.2, 1.2, (n, 3)), rng.normal(size=(n, 3))
+    origins = rng.uniform(-1.2, 1.2, (n, 3))
+    directions = rng.normal(size=(n, 3))
     directions[:6] = [*np.eye(3), *-np.eye(3)]
     return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True), rng.uniform(0.1, 3, n)
 
@@ -75,7 +76,8 @@ def reference(gaussians: Gaussians, *segment: np.ndarray) -> tuple[np.ndarray, n
 
 @pytest.mark.parametrize("n", [1, 2, 37, 300])
 def test_splat_rays__of_segments_agree_with_the_sum_over_all_gaussians(n):
-    gaussians, segment = cloud(n), segments()
+    gaussians = cloud(n)
+    segment = segments()
     color, transmittance = reference(gaussians, *segment)
     traced = SplatRays(gaussians)
     found = traced.trace(rays(*segment))
@@ -103,7 +105,8 @@ def test_splat_rays__blend_more_gaussians_than_one_walk_sorts():
 
 
 def test_splat_rays__transmittance_of_two_halves_is_that_of_the_whole():
-    traced, (origins, directions, lengths) = SplatRays(cloud(100)), segments()
+    traced = SplatRays(cloud(100))
+    origins, directions, lengths = segments()
     first, whole = (np.array(traced.transmittance(rays(origins, directions, s * lengths))) for s in (0.4, 1.0))
     rest = rays(origins + 0.4 * lengths[:, None] * directions, directions, 0.6 * lengths)
     assert_close(first * np.array(traced.transmittance(rest)), whole, atol=2e-3)
@@ -123,7 +126,8 @@ def test_splat_rays__of_a_camera_agree_with_the_rasteriser():
 
 
 def test_splat_rays__inactive_rays_meet_nothing():
-    ray, active = rays(*segments(8)), mi.Bool([True] * 4 + [False] * 4)
+    ray = rays(*segments(8))
+    active = mi.Bool([True] * 4 + [False] * 4)
     traced = SplatRays(cloud())
     color, transmittance = traced.trace(ray, active)
     for value in (transmittance, traced.transmittance(ray, active)):

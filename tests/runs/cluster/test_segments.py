@@ -33,7 +33,8 @@ from morgs_mi.runs.fit_files import FILES
 from tests.scenes.coded_clip import history
 from tests.scenes.recording import CONFIG, write_recording
 
-FRAMES, STARTS = 10, (0, 3, 7)
+FRAMES = 10
+STARTS = (0, 3, 7)
 # A keyframe that is re-emitted within a segment, and one that falls on a seam.
 SETTINGS = replace(CONFIG, codec=replace(CONFIG.codec, keyframe_interval=3))
 SEGMENTS = SegmentConfig(3, passes=2, epochs=1, overlap=2)
@@ -253,7 +254,8 @@ def test_SegmentedRun__refines_cameras_once(capture: Capture, client: Client, tm
     how = ShortFitConfig(gaussians=40, steps=4, rounds=1)
     config = replace(SETTINGS, fit=replace(SETTINGS.fit, refine_cameras="on", short_fits=how))
     fit(held_out, tmp_path / "three", client, config=config)
-    stream, row = StreamReader(tmp_path / "three" / "stream.morgs"), rows_of(tmp_path / "three")[0]
+    stream = StreamReader(tmp_path / "three" / "stream.morgs")
+    row = rows_of(tmp_path / "three")[0]
     assert not np.array_equal(stream.cameras[1].viewmat, capture.cameras[1].viewmat)
     assert row["validation"]["refinement"]["held_out"]["registered_psnr"] > 0
     stream_capture(held_out, tmp_path / "plain", config)
