@@ -51,7 +51,8 @@ def write_stream(
 
     The first half of the splats moves from frame 1. In frame 2 one dies and two are born.
     """
-    cameras, states = cameras or rig(), []
+    cameras = cameras or rig()
+    states = []
     with StreamWriter(path, cameras, 10, metadata) as writer:
         packet = keyframe_packet(start or splats(), 0, cameras)
         for t in range(frames):
@@ -59,7 +60,8 @@ def write_stream(
             states.append(decode(states[-1] if states else None, packet))
             if t and keyframe_interval and t % keyframe_interval == 0:
                 writer.write(reemitted_keyframe(states[-1]))
-            before, source = states[-1].gaussians, np.arange(len(states[-1]))
+            before = states[-1].gaussians
+            source = np.arange(len(states[-1]))
             moves = np.asarray(before.logit_confidence) > 0
             after = replace(before, means=before.numpy()["means"] + 0.1 * moves[:, None] * np.float32([1, 0, 0]))
             if t == 1:

@@ -16,7 +16,8 @@ from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, reemitte
 from morgs_mi.core.gaussians import Gaussians
 from tests.scenes.coded_clip import CAMERAS, cloud, jittered
 
-FRAMES, EVERY = 8, 3
+FRAMES = 8
+EVERY = 3
 METADATA = {
     "num_frames": FRAMES,
     "config": {"render": {"eps2d": 0.3, "block_width": None}, "motion": {"learn_confidence": True}},
@@ -45,7 +46,8 @@ class Clip(NamedTuple):
 
 def short_clip() -> Clip:
     """Return a stream in which every frame has a birth and a death, with a keyframe after every third frame."""
-    file, rng = io.BytesIO(), np.random.default_rng(0)
+    file = io.BytesIO()
+    rng = np.random.default_rng(0)
     config = CodecConfig(quality=0.3, offset=True)
     with StreamWriter(file, CAMERAS[:1], 25, METADATA) as writer:
         packet = keyframe_packet(cloud(6, 0), 0, CAMERAS, config)
@@ -62,7 +64,8 @@ def short_clip() -> Clip:
             if frame % EVERY == 0:
                 writer.write(reemitted_keyframe(states[-1]))
     data = file.getvalue()
-    pieces, at = [Piece(-1, 0, 0, 12)], 12
+    pieces = [Piece(-1, 0, 0, 12)]
+    at = 12
     while at < len(data):
         kind, frame, length = struct.unpack_from("<IIQ", data, at)
         pieces.append(Piece(kind, frame, at, at + PAYLOAD + length))

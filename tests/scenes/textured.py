@@ -37,7 +37,8 @@ def rig(count: int = 6, width: int = 320, height: int = 240, shift: float = 0.0)
 
 def write_capture(path: Path) -> Capture:
     """Write and read six cameras with off-centre principal points and one frame, without points."""
-    cameras, planes = rig(shift=7), textures()
+    cameras = rig(shift=7)
+    planes = textures()
     write_colmap(path / "sparse", cameras)
     for camera in cameras:
         write_video(path / f"{camera.name}.mkv", [render(camera, planes)], 30)
@@ -51,7 +52,8 @@ def with_cameras(capture: Capture, change: Callable[[int, Camera], Camera]) -> C
 
 def turned(camera: Camera, degrees: float) -> Camera:
     """Return the camera rotated about its optical axis."""
-    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    c = np.cos(np.deg2rad(degrees))
+    s = np.sin(np.deg2rad(degrees))
     return replace(camera, viewmat=np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ camera.viewmat)
 
 
@@ -74,7 +76,8 @@ def render(
 ) -> np.ndarray:
     """Return the image of the planes in a camera, RGB uint8 [H, W, 3], in front of a `background` image."""
     image = np.zeros((camera.height, camera.width, 3), np.uint8) if background is None else background.copy()
-    R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
+    R = camera.viewmat[:3, :3]
+    t = camera.viewmat[:3, 3]
     centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV's pixel centres are integers
     for (corner, across, down), texture in zip(places, planes, strict=True):
         plane = np.stack([R @ across, R @ down, R @ corner + t], axis=1) @ np.diag([1 / _TEXTURE, 1 / _TEXTURE, 1])
@@ -95,7 +98,8 @@ def render(
 def points(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return random points [count, 3] on the planes, and their colours in [0, 1]."""
     corners, across, down = (np.array(column) for column in zip(*_PLANES, strict=True))
-    rows, (x, y) = rng.integers(0, len(corners), count), rng.uniform(0, 1, (2, count, 1))
+    rows = rng.integers(0, len(corners), count)
+    x, y = rng.uniform(0, 1, (2, count, 1))
     columns, lines = (np.minimum(_TEXTURE * place[:, 0], _TEXTURE - 1).astype(int) for place in (x, y))
     return corners[rows] + x * across[rows] + y * down[rows], np.array(textures())[rows, lines, columns] / 255
 
