@@ -44,7 +44,8 @@ def disturbed(cameras, rng):
 
 @pytest.mark.parametrize("distortion", [(0, 0), (-0.15, 0.04)])
 def test_camera_jacobian__is_that_of_finite_differences(distortion):
-    camera, step = rig(shift=7)[1], 1e-6
+    camera = rig(shift=7)[1]
+    step = 1e-6
     before = np.array([0, 0, 0, 0.02, -0.01, 0.03, 0.02, 0.001, -0.002, *distortion])
 
     def seen(changes, points=POINTS):
@@ -60,13 +61,15 @@ def test_camera_jacobian__is_that_of_finite_differences(distortion):
 
 
 def test_undistorted__inverts_distorted():
-    camera, k = rig()[0], np.array([-0.12, 0.03])
+    camera = rig()[0]
+    k = np.array([-0.12, 0.03])
     pixels = np.random.default_rng(0).uniform(0, (camera.width, camera.height), (50, 2))
     assert_close(undistorted(camera, distorted(camera, pixels, k), k), pixels, atol=1e-3)
 
 
 def test_bundle_adjust__finds_the_distortion_of_each_camera():
-    true, rng = rig(shift=7), np.random.default_rng(2)
+    true = rig(shift=7)
+    rng = np.random.default_rng(2)
     terms = rng.normal(scale=(0.03, 0.01), size=(len(true), 2))
     tracks = seen_by(true)
     for v, (camera, k) in enumerate(zip(true, terms, strict=True)):
@@ -80,8 +83,10 @@ def test_bundle_adjust__finds_the_distortion_of_each_camera():
 
 
 def test_bundle_adjust__finds_the_reprojections_despite_wrong_matches():
-    true, rng = rig(shift=7), np.random.default_rng(1)
-    tracks, given = seen_by(true), disturbed(true, rng)
+    true = rig(shift=7)
+    rng = np.random.default_rng(1)
+    tracks = seen_by(true)
+    given = disturbed(true, rng)
     wrong = rng.random(len(tracks.ids)) < 0.1
     tracks.pixels[wrong] += rng.normal(scale=30, size=(wrong.sum(), 2))
     changes, points = bundle_adjust(given, tracks, priors_of(given))
@@ -100,9 +105,12 @@ def test_bundle_adjust__leaves_cameras_that_fit():
 
 @pytest.mark.parametrize("seed", [3, 5])
 def test_bundle_adjust__keeps_points_in_place_for_a_camera_that_takes_no_part(seed):
-    places, rng = [(x, y, 0) for y in (-0.5, 0, 0.5) for x in (-1, 0, 1)], np.random.default_rng(seed)
+    places = [(x, y, 0) for y in (-0.5, 0, 0.5) for x in (-1, 0, 1)]
+    rng = np.random.default_rng(seed)
     nine = look_at_cameras(places, 50, 320, 240, target=(0, 0, 10))
-    given, unseen, points = nine[:4] + nine[5:], nine[4], rng.uniform((-3, -2, 6), (3, 2, 14), (300, 3))
+    given = nine[:4] + nine[5:]
+    unseen = nine[4]
+    points = rng.uniform((-3, -2, 6), (3, 2, 14), (300, 3))
     tracks = seen_by(given, points)
     tracks.pixels[:] += rng.normal(scale=0.3, size=tracks.pixels.shape)
     before = intersect(tracks.ids, tracks.views, tracks.pixels, given, tracks.count)

@@ -45,7 +45,8 @@ def film(path: Path, cameras: list[Camera], suffix: str = ".mkv") -> Path:
 
 def aligned(found: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return `found` [n, 3] aligned to `true` by translation, rotation and scale, and the rotation."""
-    a, b = found - found.mean(0), true - true.mean(0)
+    a = found - found.mean(0)
+    b = true - true.mean(0)
     U, _, Vt = np.linalg.svd(a.T @ b)
     R = (U @ Vt).T
     return np.sqrt((b**2).sum() / (a**2).sum()) * a @ R.T + true.mean(0), R
@@ -202,7 +203,8 @@ def test_calibrate__prints_a_verdict_per_camera(tmp_path: Path, capsys) -> None:
 
 def test_calibrate__of_a_full_disk_leaves_no_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_colmap(tmp_path / "found", textured.rig(4), np.random.default_rng(0).normal(size=(60, 3)))
-    found, clips = pycolmap.Reconstruction(str(tmp_path / "found")), film(tmp_path / "clips", textured.rig(4))
+    found = pycolmap.Reconstruction(str(tmp_path / "found"))
+    clips = film(tmp_path / "clips", textured.rig(4))
     checks = tuple(CameraCheck(camera.name, 60, 0.1, True) for camera in textured.rig(4))
     monkeypatch.setattr("morgs_mi.studio.calibration.calibrate._match", lambda *_: None)
     monkeypatch.setattr(

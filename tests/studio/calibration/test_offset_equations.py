@@ -38,7 +38,8 @@ def equations(
     noise: np.ndarray | None = None,
 ) -> OffsetEquations:
     """Return the equations of a ball that is shown at offsets, with Gaussians that are away from their places."""
-    cameras, targets = look_at_cameras(list(positions), 40), []
+    cameras = look_at_cameras(list(positions), 40)
+    targets = []
     for view, (camera, offset) in enumerate(zip(cameras, offsets, strict=True)):
         later = replace(ball, means=np.asarray(ball.means) + np.float32(offset) * np.asarray(ball.motion))
         image = np.asarray(rasterize(later, camera, ("color",)).color) + (0 if noise is None else noise[view])
@@ -59,7 +60,8 @@ def test_solution__has_a_mean_of_zero_over_the_training_views() -> None:
 
 
 def test_solution__does_not_depend_on_gaussians_that_are_away_from_their_places() -> None:
-    ball, away = turning_ball(), np.float32((0.02, -0.02, 0.01))
+    ball = turning_ball()
+    away = np.float32((0.02, -0.02, 0.01))
     np.testing.assert_allclose(equations(ball, away=away).solution(), equations(ball).solution(), atol=0.03)
 
 
@@ -81,7 +83,8 @@ def test_matrix__does_not_change_with_a_common_offset() -> None:
 
 
 def test_errors__are_large_where_a_change_of_depth_explains_an_offset() -> None:
-    ball, pair = opaque_ball(), [(-0.8, 0.0, -4.0), (0.8, 0.0, -4.0)]
+    ball = opaque_ball()
+    pair = [(-0.8, 0.0, -4.0), (0.8, 0.0, -4.0)]
     noise = np.random.default_rng(0).normal(0, 0.02, (2, *SIZE))
     along, across = (
         equations(replace(ball, motion=np.tile(np.float32(motion), (400, 1))), np.zeros(2), positions=pair, noise=noise)
@@ -93,7 +96,8 @@ def test_errors__are_large_where_a_change_of_depth_explains_an_offset() -> None:
 
 
 def test_errors__are_those_of_repeated_noise() -> None:
-    ball, rng = turning_ball(), np.random.default_rng(0)
+    ball = turning_ball()
+    rng = np.random.default_rng(0)
     found = [equations(ball, 0 * OFFSETS, noise=rng.normal(0, 0.02, (5, *SIZE))) for _ in range(20)]
     spread = np.std([each.solution() - each.solution()[0] for each in found], axis=0)[1:]
     np.testing.assert_allclose(np.mean([each.errors(0) for each in found], axis=0)[1:], spread, rtol=0.4)

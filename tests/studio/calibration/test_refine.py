@@ -41,7 +41,8 @@ CAMERAS = look_at_cameras(PLACES, 60, 64, 48)
 def splats():
     """Return a cloud of coloured splats."""
     rng = np.random.default_rng(0)
-    means, sh = rng.uniform(-1, 1, (60, 3)), rng.uniform(-1, 1.5, (60, 1, 3))
+    means = rng.uniform(-1, 1, (60, 3))
+    sh = rng.uniform(-1, 1.5, (60, 1, 3))
     return isotropic(means.astype(np.float32), 0.15, 0.9, sh.astype(np.float32))
 
 
@@ -64,7 +65,8 @@ def relative_turns(cameras) -> np.ndarray:
 @pytest.fixture(scope="module")
 def splat_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     """A capture of the splats in five views, the first of which is held out."""
-    path, cameras = tmp_path_factory.mktemp("splats"), look_at_cameras([(0, 0, -4), *PLACES], 60, 64, 48)
+    path = tmp_path_factory.mktemp("splats")
+    cameras = look_at_cameras([(0, 0, -4), *PLACES], 60, 64, 48)
     gaussians = splats()
     write_colmap(path / "sparse", cameras, np.asarray(gaussians.means), np.full((60, 3), 0.5))
     for camera in cameras:
@@ -75,8 +77,10 @@ def splat_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 @pytest.fixture(scope="module")
 def far_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     """A capture of distant splats in nine noisy views on a plane, the middle one of which is held out."""
-    path, rng = tmp_path_factory.mktemp("far"), np.random.default_rng(0)
-    means, sh = rng.uniform((-3, -2.2, 6), (3, 2.2, 12), (150, 3)), rng.uniform(-1, 1.5, (150, 1, 3))
+    path = tmp_path_factory.mktemp("far")
+    rng = np.random.default_rng(0)
+    means = rng.uniform((-3, -2.2, 6), (3, 2.2, 12), (150, 3))
+    sh = rng.uniform(-1, 1.5, (150, 1, 3))
     gaussians = isotropic(means.astype(np.float32), 0.35, 0.9, sh.astype(np.float32))
     places = [(x, y, 0) for y in (-0.5, 0, 0.5) for x in (-1, 0, 1)]
     cameras = look_at_cameras(places, 45, 96, 72, target=(0, 0, 10))
@@ -110,7 +114,9 @@ def test_refine_cameras__stays_in_the_frame_of_what_takes_no_part(far_capture, s
 
 
 def test_joint_step__turns_cameras_to_where_the_images_were_taken():
-    given, gaussians, changes = disturbed(CAMERAS), splats(), np.zeros((4, 11))
+    given = disturbed(CAMERAS)
+    gaussians = splats()
+    changes = np.zeros((4, 11))
     views = [View(camera, image_of(true)) for camera, true in zip(given, CAMERAS, strict=True)]
     deviations = prior_deviations(1.0, CameraPriors())
     for _ in range(8):
@@ -136,7 +142,8 @@ def test_register_camera__keeps_a_camera_that_fits():
 
 
 def test_moved__keeps_the_projections_of_points():
-    points, changes = np.asarray(splats().means), np.tile([0, 0, 0, 0.1, -0.2, 0.05, 0, 0, 0, 0, 0], (4, 1))
+    points = np.asarray(splats().means)
+    changes = np.tile([0, 0, 0, 0.1, -0.2, 0.05, 0, 0, 0, 0, 0], (4, 1))
     assert_close(_moved(points, CAMERAS, changes), points + changes[0, 3:6], rtol=0, atol=1e-5)
 
 

@@ -101,7 +101,8 @@ def test_match_capture__finds_features_at_the_recorded_size(capture: Capture, sh
     found = match_capture(small)
     assert [len(f.points) for f in found.features] == [len(f.points) for f in shared.features]
     assert check_rig(small, found).error == pytest.approx(check_rig(capture, shared).error, abs=0.01)
-    few, all_ = triangulate_points(small, found), triangulate_points(capture, shared)
+    few = triangulate_points(small, found)
+    all_ = triangulate_points(capture, shared)
     assert len(few.points) == pytest.approx(len(all_.points), rel=0.01)
     assert few.cameras is small.cameras
 
@@ -119,7 +120,8 @@ def test_triangulate_points__matches_distant_views_with_their_poses(capture: Cap
 
 def test_check_rig__fits_with_undistortion_only(tmp_path: Path) -> None:
     """The recorded images are distorted by OpenCV's own model; the poses fit only if the lens is read."""
-    planes, k1 = textured.textures(), -0.25
+    planes = textured.textures()
+    k1 = -0.25
     cameras = textured.rig(4)
     for camera in cameras:
         rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float64)

@@ -24,7 +24,8 @@ def brighter(image: np.ndarray, gain: float) -> np.ndarray:
 
 def flickering(mains: float, fps: float, amplitude: float = 0.03, count: int = 60) -> np.ndarray:
     """Return the log brightness of six bands of rows under lamps, with noise and a drift."""
-    times, phases = np.arange(count)[:, None] / fps, np.linspace(0, 2, 6)
+    times = np.arange(count)[:, None] / fps
+    phases = np.linspace(0, 2, 6)
     noise = 0.002 * np.random.default_rng(0).standard_normal((count, 6))
     return amplitude * np.sin(4 * np.pi * mains * times + phases) + 0.02 * times + noise
 
