@@ -20,7 +20,8 @@ from morgs_mi.studio.import_frames import find_frames, import_frames, matched_ro
 from tests.assertions import assert_close
 from tests.scenes.changing_splats import splats
 
-T, N = 5, 300
+T = 5
+N = 300
 
 
 def moving(frame: int, seed: int = 0) -> Gaussians:
@@ -54,12 +55,14 @@ def test_import_frames__keeps_the_ids_of_the_same_gaussians(clip, tmp_path):
     stream = StreamReader(result.path)
     assert (stream.fps, stream.metadata["num_frames"]) == (25, T)
     kinds = [(kind, frame) for kind, frame, _ in stream.index()]
-    key, change = PacketKind.KEYFRAME, PacketKind.RESIDUAL
+    key = PacketKind.KEYFRAME
+    change = PacketKind.RESIDUAL
     assert kinds == [(key, 0), (change, 1), (change, 2), (key, 2), (change, 3), (change, 4), (key, 4)]
     pixel = 5 / stream.cameras[0].K[0, 0]  # at the distance of the camera
     for coded in coded_frames(stream):
         np.testing.assert_array_equal(coded.ids, np.arange(N))
-        raw, expected = coded.gaussians.numpy(), moving(coded.frame).numpy()
+        raw = coded.gaussians.numpy()
+        expected = moving(coded.frame).numpy()
         assert_close(raw["means"], expected["means"], atol=0.2 * pixel)
         moved = np.abs(raw["motion"] - 0.1 * (coded.frame > 0) * (np.arange(N) < N // 2)[:, None] * [1, 0, 0])
         assert moved.max() < 0.4 * pixel
@@ -84,7 +87,8 @@ def test_import_frames__keeps_ids_where_gaussians_are_added_and_removed(tmp_path
     def part(frame: int, rows: np.ndarray) -> Gaussians:
         return moving(frame).select(rows)
 
-    everything, even = np.arange(N), np.arange(0, N, 2)
+    everything = np.arange(N)
+    even = np.arange(0, N, 2)
     # The rows of each frame: it grows at the end, loses rows, and gets some back in the middle.
     shown = [everything[:200], everything[:260], everything, np.setdiff1d(everything, even[5:25])]
     shown.append(np.union1d(shown[3], even[10:20]))
@@ -93,7 +97,8 @@ def test_import_frames__keeps_ids_where_gaussians_are_added_and_removed(tmp_path
     number: dict[int, int] = {}  # id by row of `moving`
     for coded, rows in zip(coded_frames(StreamReader(tmp_path / "s.morgs")), shown, strict=True):
         assert len(coded) == len(rows)
-        raw, expected = coded.gaussians.numpy(), moving(coded.frame).numpy()
+        raw = coded.gaussians.numpy()
+        expected = moving(coded.frame).numpy()
         distances = np.linalg.norm(raw["means"][:, None] - expected["means"][rows], axis=2)
         assert distances.min(axis=1).max() < 2e-3
         nearest = rows[distances.argmin(axis=1)]

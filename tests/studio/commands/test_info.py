@@ -91,7 +91,8 @@ def test_info__prints_the_time_offsets_as_options(capture: Path, run, monkeypatc
 
 
 def test_info__checks_a_whole_recording(textured_capture: Capture, tmp_path: Path, run) -> None:
-    plot, measured = tmp_path / "rig.png", tmp_path / "deep.json"
+    plot = tmp_path / "rig.png"
+    measured = tmp_path / "deep.json"
     status, out, _ = run("info", textured_capture.path, "--deep", "--plot", plot, "--json", measured)
     assert status == 0
     assert "Check of 1 frames: no findings." in out

@@ -135,7 +135,8 @@ def test_Live__names_the_output_after_the_time(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_Lines__count_what_was_dropped_since_the_last_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    printed, now = [], 100.0
+    printed = []
+    now = 100.0
     monkeypatch.setattr(module, "print_warning", printed.append)
     monkeypatch.setattr("time.monotonic", lambda: now)
     lines = _Lines()

@@ -18,8 +18,12 @@ from tests.assertions import assert_close
 from tests.scenes.changing_splats import rig, splats
 from tests.scenes.gaussians import isotropic
 
-WIDTH, HEIGHT = 64, 32
-DISTANCE, SIZE, OPACITY, WHITE = 3.0, 0.7, 0.9, 0.5 / SH_C0  # the coefficient of white
+WIDTH = 64
+HEIGHT = 32
+DISTANCE = 3.0
+SIZE = 0.7
+OPACITY = 0.9
+WHITE = 0.5 / SH_C0  # the coefficient of white
 CAMERA = Camera.look_at((0.3, -0.2, 0.1), (0.3, -0.2, 1.1), (0, -1, 0), 60, 48, 36)  # the axes of the world
 
 
@@ -27,7 +31,8 @@ def directions(width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
     """Return the direction of each pixel's centre [height, width, 3], x right, y down, z forward."""
     longitude = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
     latitude = np.pi * (0.5 - (np.arange(height)[:, None] + 0.5) / height)
-    x, z = np.cos(latitude) * np.sin(longitude), np.cos(latitude) * np.cos(longitude)
+    x = np.cos(latitude) * np.sin(longitude)
+    z = np.cos(latitude) * np.cos(longitude)
     return np.stack([x, np.broadcast_to(-np.sin(latitude), x.shape), z], axis=-1)
 
 
@@ -69,7 +74,8 @@ def test_panorama__has_no_seam_and_is_the_same_at_all_longitudes_of_a_pole():
 
 @pytest.mark.parametrize("longitude", [0.0, 1.0, 3.0])
 def test_panorama__of_two_eyes_has_the_disparity_of_the_distance(longitude):
-    apart, width = 0.4, 512
+    apart = 0.4
+    width = 512
     middle = np.array([np.sin(longitude), 0, np.cos(longitude)])
     image = panorama(ball_at(middle, 0.05), CAMERA, width, apart, samples=1)
     assert image.shape == (width, width, 3)
@@ -85,7 +91,8 @@ def test_panorama__of_two_eyes_has_the_disparity_of_the_distance(longitude):
 
 
 def test_panorama__shows_in_its_middle_what_the_camera_sees():
-    scene, camera = splats(300), rig()[1]
+    scene = splats(300)
+    camera = rig()[1]
     image = panorama(scene, levelled(camera, np.array([0.0, 0, 1])), 512, samples=1)
     level = levelled(camera, np.array([0.0, 0, 1]))
     view = Camera(np.array([[256, 0, 32], [0, 256, 24], [0, 0, 1.0]]), level.viewmat, 64, 48)

@@ -136,7 +136,8 @@ def test_write_usd__half_precision_is_about_half_as_large(tmp_path):
         write_usd(stream, tmp_path / name, [0], half)
     stages = [Usd.Stage.Open(str(tmp_path / name)) for name in ("full.usdc", "half.usdc")]
     prims = [stage.GetPrimAtPath("/Stream/Gaussians") for stage in stages]
-    full, half = values(prims[0], 0), values(prims[1], 0, half=True)
+    full = values(prims[0], 0)
+    half = values(prims[1], 0, half=True)
     assert_close(half["positions"], full["positions"], atol=0)
     for name, value in full.items():
         assert_close(half[name], value, rtol=2**-11, atol=1e-4)
@@ -148,7 +149,8 @@ def test_write_usd__extent_contains_three_standard_deviations(tmp_path):
     states, stage = written(tmp_path / "a.usdc")
     prim = stage.GetPrimAtPath("/Stream/Gaussians")
     turned = rotated(states[2].gaussians, gltf_axes(rig()))
-    means, sigmas = turned.numpy()["means"], np.sqrt(np.diagonal(covariances(turned), axis1=1, axis2=2))
+    means = turned.numpy()["means"]
+    sigmas = np.sqrt(np.diagonal(covariances(turned), axis1=1, axis2=2))
     low, high = np.array(prim.GetAttribute("extent").Get(2))
     assert_close(low, (means - 3 * sigmas).min(axis=0), atol=1e-5)
     assert_close(high, (means + 3 * sigmas).max(axis=0), atol=1e-5)

@@ -28,10 +28,12 @@ from tests.scenes.surfaces import (
 )
 
 # Light that falls on the middle of the wall at z = 1 from a place that the camera does not see.
-ASIDE, TO_WALL = np.array([3.0, 0, -1]), np.array([-3.0, 0, 2]) / np.sqrt(13)
+ASIDE = np.array([3.0, 0, -1])
+TO_WALL = np.array([-3.0, 0, 2]) / np.sqrt(13)
 SUN = {"type": "directional", "direction": TO_WALL.tolist(), "irradiance": 2.0}
 TRACED = {"type": "splat_path", "max_depth": 2, "clipped": 1.0}
-WHITE, BLACK = 0.5 / SH_C0, -0.5 / SH_C0
+WHITE = 0.5 / SH_C0
+BLACK = -0.5 / SH_C0
 
 
 def ratio(gaussians: Gaussians, integrator: dict = TRACED, spp: int = 128, **more: Any) -> np.ndarray:
@@ -88,8 +90,10 @@ def test_splat_path__shadow_of_a_dense_shell_is_that_of_the_mesh():
         ASIDE + 0.6 * directions, np.tile([0.03, 0.03, 1e-3], (3000, 1)), quats, np.full(3000, 0.95), black
     )
     mesh = {"type": "sphere", "center": ASIDE.tolist(), "radius": 0.6}
-    found, expected = ratio(shell), ratio(isotropic([(0, 0, -90)], 0.1, 0.5), {"type": "direct"}, ball=mesh)
-    inside, outside = distance_to_aside() < 0.45, distance_to_aside() > 0.7
+    found = ratio(shell)
+    expected = ratio(isotropic([(0, 0, -90)], 0.1, 0.5), {"type": "direct"}, ball=mesh)
+    inside = distance_to_aside() < 0.45
+    outside = distance_to_aside() > 0.7
     for region, value in ((inside, 0), (outside, 1)):
         assert_close(expected[region], value, atol=1e-5)
         assert_close(found[region], value, atol=5e-3)

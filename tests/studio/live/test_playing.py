@@ -26,7 +26,9 @@ def clip(path: Path, count: int, fps: float = 50) -> Path:
 
 def played(paths: list[Path], count: int, loop: bool) -> list[list[tuple[float, int]]]:
     """Return the time and the number of the first images of each clip."""
-    clock, found, start = ClipClock(len(paths)), [[] for _ in paths], time.monotonic()
+    clock = ClipClock(len(paths))
+    found = [[] for _ in paths]
+    start = time.monotonic()
 
     def read(k: int) -> None:
         for image in islice(play(paths[k], clock, Event(), k, loop), count):
@@ -67,7 +69,8 @@ def test_play__waits_for_a_clip_that_is_decoded_slowly(monkeypatch: pytest.Monke
             yield np.zeros((2, 2, 3), np.uint8), k / 100, 1 / 100
 
     monkeypatch.setattr(module, "_timed", timed)
-    clock, ahead = ClipClock(2), []
+    clock = ClipClock(2)
+    ahead = []
 
     def read(k: int, path: str) -> None:
         for _ in play(path, clock, Event(), k):

@@ -107,7 +107,8 @@ def pipe(tmp_path: Path) -> Path:
 def test_read_camera__of_a_silent_pipe_ends_when_it_is_closed(pipe: Path, tmp_path: Path, written: int) -> None:
     """Before its writer begins, within the header, and after some images."""
     write_video(tmp_path / "clip.mkv", list(np.random.default_rng(0).integers(0, 256, (9, 64, 64, 3), np.uint8)), 20)
-    closed, images = Event(), []
+    closed = Event()
+    images = []
     reader = Thread(target=lambda: images.extend(read_camera(pipe, closed)), daemon=True)
     with os.fdopen(os.open(pipe, os.O_RDWR), "wb", 0) if written else nullcontext() as writer:
         reader.start()

@@ -39,7 +39,8 @@ def test_read_annotation__converts_the_tracks_to_the_world(tmp_path: Path) -> No
 
 def test_read_annotation__names_what_is_wrong(tmp_path: Path) -> None:
     path = annotated(tmp_path / "juggle", ("1",)) / "juggle_1.npz"
-    camera, good = rig(("2", "1"), shift=3)[1], dict(np.load(path, allow_pickle=True))
+    camera = rig(("2", "1"), shift=3)[1]
+    good = dict(np.load(path, allow_pickle=True))
     for name, value, message in (
         (
             "visibility",

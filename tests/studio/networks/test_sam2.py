@@ -15,7 +15,9 @@ from tests.studio.networks.tiny_segmenter import export_decoder, export_encoder
 
 pytest.importorskip("onnxruntime")
 
-RED, BLUE, BACK = (0.9, 0.3, 0.2), (0.1, 0.3, 0.9), (0.4, 0.5, 0.45)
+RED = (0.9, 0.3, 0.2)
+BLUE = (0.1, 0.3, 0.9)
+BACK = (0.4, 0.5, 0.45)
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +129,8 @@ def test_segment_network__accepts_an_encoder_of_open_size(tmp_path, files):
 def bad(folder, files, name):
     """Return the pair of files of one bad case."""
     encoder, decoder = files
-    text, other = folder / "text.onnx", folder / "other.onnx"
+    text = folder / "text.onnx"
+    other = folder / "other.onnx"
     text.write_text("no network " * 20)
     if name == "missing":
         return folder / "missing.onnx", decoder

@@ -125,15 +125,18 @@ def test_synthesize__shows_a_camera_with_a_time_offset_at_its_own_time(tmp_path:
     offset = load_disturbances(clip / "truth")["cam01"].time_offset
     assert abs(offset) > 0.2
     scene = load_scene("arm")
-    tracer, camera = PathTracer(scene), scene.rig.cameras(2, 64, 48)[1]
+    tracer = PathTracer(scene)
+    camera = scene.rig.cameras(2, 64, 48)[1]
     tracer.set_time((1 + offset) / FPS)
     seed = int(np.random.SeedSequence([0, 1, 1]).generate_state(1)[0])
     np.testing.assert_array_equal(frame_of(clip, "cam01", 1), tracer.render(camera, 4, seed))
-    truth, surface = load_truth(clip / "truth", "cam01", 1), tracer.surface_points(camera)
+    truth = load_truth(clip / "truth", "cam01", 1)
+    surface = tracer.surface_points(camera)
     assert_close(truth.depth, camera.project(surface.positions)[1], atol=1e-5)
     tracks = load_tracks(clip / "truth")
     hand = list(scene.objects).index("hand")
-    pose, points = scene.objects["hand"].pose, tracks.points[tracks.ids == hand]
+    pose = scene.objects["hand"].pose
+    points = tracks.points[tracks.ids == hand]
     moved = points[:, 0] @ (pose(1 / FPS) @ np.linalg.inv(pose(0.0)))[:3, :3].T
     moved += (pose(1 / FPS) @ np.linalg.inv(pose(0.0)))[:3, 3]
     assert_close(points[:, 1], moved, atol=1e-6)
@@ -155,7 +158,8 @@ def test_synthesize__reads_the_rows_of_a_rolling_shutter_at_their_times(tmp_path
     scene = bar_scene(speed=6.0)
     config = replace(SIZE, width=128, height=64, disturbances=Disturbances(rolling_shutter=0.8))
     clip = synthesize(scene, tmp_path / "clip", config)
-    own, camera = load_disturbances(clip / "truth")["cam00"], scene.rig.cameras(2, 128, 64)[0]
+    own = load_disturbances(clip / "truth")["cam00"]
+    camera = scene.rig.cameras(2, 128, 64)[0]
     image = frame_of(clip, "cam00", 1).astype(float).mean(axis=-1)
     found = (image * (np.arange(128) + 0.5)).sum(axis=1) / image.sum(axis=1)
     bar = np.stack([6.0 * own.row_times(1, 64) / FPS, np.zeros(64), np.full(64, 0.02)], axis=1)
@@ -173,14 +177,18 @@ def test_synthesize__undistorted_images_are_those_of_the_pinhole_cameras(tmp_pat
     clip = synthesize("spheres", tmp_path / "clip", config)
     assert abs(load_disturbances(clip / "truth")["cam01"].distortion) > 0.1
     assert not (clip / "poses_bounds.npy").exists(), "it cannot hold a lens"
-    scene, capture = load_scene("spheres"), load_capture(clip)
-    tracer, camera = PathTracer(scene), scene.rig.cameras(2, 96, 72)[1]
-    expected, recorded = tracer.render(camera, 16, 0), frame_of(clip, "cam01", 0)
+    scene = load_scene("spheres")
+    capture = load_capture(clip)
+    tracer = PathTracer(scene)
+    camera = scene.rig.cameras(2, 96, 72)[1]
+    expected = tracer.render(camera, 16, 0)
+    recorded = frame_of(clip, "cam01", 0)
     mask = np.ones(expected.shape[:2], bool) if capture.masks[1] is None else capture.masks[1]
     found = next(capture.frames()).images[1]
     assert psnr(found[mask], expected[mask]) > psnr(recorded[mask], expected[mask]) + 4
     assert psnr(found[mask], expected[mask]) > 28
-    truth, surface = load_truth(clip / "truth", "cam01", 0), tracer.surface_points(camera)
+    truth = load_truth(clip / "truth", "cam01", 0)
+    surface = tracer.surface_points(camera)
     np.testing.assert_array_equal(truth.ids, surface.ids)
     assert_close(capture.cameras[1].K, camera.K, atol=1e-6)
 
@@ -207,7 +215,8 @@ def test_synthesize__exposes_frames_with_the_gains_of_the_truth(clean: Path, tmp
 
 def test_synthesize__compresses_every_image(clean: Path, tmp_path: Path) -> None:
     lossy = synthesize("spheres", tmp_path / "clip", replace(SIZE, disturbances=Disturbances(jpeg_quality=30)))
-    whole, found = frame_of(clean, "cam01", 1), frame_of(lossy, "cam01", 1)
+    whole = frame_of(clean, "cam01", 1)
+    found = frame_of(lossy, "cam01", 1)
     np.testing.assert_array_equal(found, compressed(whole, 30))
     assert 18 < psnr(found, whole) < 40
     np.testing.assert_array_equal(compressed(whole, 0), whole)
@@ -216,7 +225,8 @@ def test_synthesize__compresses_every_image(clean: Path, tmp_path: Path) -> None
 def test_light_of_rows__agrees_with_the_image_of_the_sensor() -> None:
     """All rows without a lens are the image of Mitsuba's sensor up to sampling noise."""
     scene = load_scene("spheres")
-    tracer, camera = PathTracer(scene), scene.rig.cameras(2, 64, 48)[1]
+    tracer = PathTracer(scene)
+    camera = scene.rig.cameras(2, 64, 48)[1]
     expected = tracer.render(camera, 100, 1)
     found = srgb_bytes(tracer.light_of_rows(camera, np.arange(48), 100, 2, None))
     assert psnr(found, expected) > 38

@@ -75,7 +75,8 @@ def test_load_tracks__tracks_reproject_to_the_motion_map(clip):
             col, row = (np.floor(now).astype(int) * [1, 1]).T
             at_centre = np.abs(now - np.floor(now) - 0.5).max(axis=1) < 1e-3
             at_centre &= (col >= 0) & (col < 64) & (row >= 0) & (row < 48)
-            col, row = np.clip(col, 0, 63), np.clip(row, 0, 47)
+            col = np.clip(col, 0, 63)
+            row = np.clip(row, 0, 47)
             at_centre &= np.abs(depth - truth.depth[row, col]) < 1e-4
             np.testing.assert_array_equal(truth.ids[row, col][at_centre], tracks.ids[at_centre])
             assert_close((now - before)[at_centre], truth.motion[row, col][at_centre], atol=2e-3)

@@ -64,7 +64,8 @@ def test_draw_scene__objects_stay_in_the_room(scenes):
     for scene in scenes:
         for name, body in scene.bodies.items():
             points = surface(body, TIMES[::3])
-            low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
+            low = points.min(axis=(0, 1))
+            high = points.max(axis=(0, 1))
             assert low[1] > -1e-6, name
             assert high[1] < 3.2, name
             assert np.abs([low[0], high[0]]).max() < scene.half_width, name

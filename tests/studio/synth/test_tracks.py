@@ -22,7 +22,8 @@ from tests.scenes.gaussians import isotropic
 
 def test_load_tracks__visible_points_have_the_depth_of_the_view(clip: Path) -> None:
     """Visible points lie on the surface of their pixel, up to its slope; hidden ones behind it or outside."""
-    tracks, compared = load_tracks(clip / "truth"), np.zeros(2, int)
+    tracks = load_tracks(clip / "truth")
+    compared = np.zeros(2, int)
     cameras = load_capture(clip).cameras
     assert list(tracks.visible) == [camera.name for camera in cameras]
     for camera in cameras:
@@ -60,7 +61,8 @@ def test_sees__a_ball_hides_what_is_behind_it(x: float, expected: list[bool]) ->
 
 
 def test_save_tracks__load_tracks_reads_them_back(tmp_path: Path) -> None:
-    points, ids = np.arange(12.0).reshape(2, 2, 3), np.array([1, 2], np.int32)
+    points = np.arange(12.0).reshape(2, 2, 3)
+    ids = np.array([1, 2], np.int32)
     for visible in ({}, {"cam00": np.array([[True, False], [False, False]])}):
         save_tracks(tmp_path, Tracks(points, ids, visible))
         found = load_tracks(tmp_path)
@@ -72,7 +74,8 @@ def test_save_tracks__load_tracks_reads_them_back(tmp_path: Path) -> None:
 
 def test_synthesize__tracks_score_a_stream_that_moves_like_them(clip: Path, tmp_path: Path) -> None:
     """The splats lie on the tracked points; the surface that they render decides which points are visible."""
-    capture, tracks = load_capture(clip, test_view=0), load_tracks(clip / "truth")
+    capture = load_capture(clip, test_view=0)
+    tracks = load_tracks(clip / "truth")
     states = [isotropic(tracks.points[:, t], 0.05, 0.95) for t in range(capture.num_frames)]
     config = CodecConfig(quality=1e3)
     with StreamWriter(tmp_path / "s.morgs", capture.cameras, 30, {"test_view": 0}) as writer:
