@@ -56,7 +56,8 @@ def imported_names(tree: ast.AST, package: list[str]) -> list[list[str]]:
 
 def mistakes(path: Path) -> list[str]:
     """Return a line for each of the module's imports from a later subpackage."""
-    own, place = subpackage_of(path), path.relative_to(ROOT)
+    own = subpackage_of(path)
+    place = path.relative_to(ROOT)
     if own not in SUBPACKAGES:
         return [f"{place}: add {own} to SUBPACKAGES, after all that it imports"]
     names = imported_names(ast.parse(path.read_text(encoding="utf-8")), ["morgs_mi", *place.parent.parts])

@@ -75,7 +75,8 @@ def leaves(config: Any, path: str = "") -> list[str]:
     """Return the dotted names of all fields that hold no further config."""
     found = []
     for field in fields(config):
-        value, name = getattr(config, field.name), f"{path}{field.name}"
+        value = getattr(config, field.name)
+        name = f"{path}{field.name}"
         found += leaves(value, f"{name}.") if is_dataclass(value) else [name]
     return found
 
@@ -107,7 +108,8 @@ def clip() -> tuple[list[Camera], np.ndarray, np.ndarray, list[list[np.ndarray]]
     rng = np.random.default_rng(0)
     origins = [(x, y, -3) for x, y in ((-1, 0), (1, 0), (0, 0.8), (0, -0.8), (0.4, 0.4))]
     views = look_at_cameras(origins)
-    wall, square = random_sheet(rng, 260, 1.5, 0.5), random_sheet(rng, 80, 0.35, -0.4)
+    wall = random_sheet(rng, 260, 1.5, 0.5)
+    square = random_sheet(rng, 80, 0.35, -0.4)
     points = np.concatenate([wall, square])
     colors = np.concatenate([rng.uniform(0.1, 0.6, (260, 3)), rng.uniform(0.5, 1.0, (80, 3))])
     frames = [
@@ -149,7 +151,8 @@ def test_settings__every_field_acts(clip, base, name):
 
 def bounds() -> list[tuple[Any, str, Any]]:
     """Return a config, the name of a field, and a value beyond each of its bounds, for all settings of a fit."""
-    found, configs = [], [StreamConfig()]
+    found = []
+    configs = [StreamConfig()]
     for config in configs:
         configs += [value for value in vars(config).values() if is_dataclass(value)]
         for name, kind in types_of(type(config)).items():

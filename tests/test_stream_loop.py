@@ -98,7 +98,8 @@ def first(clip):
 
 @pytest.fixture(scope="module")
 def full(clip, first):
-    loop, packets, reports = copy.copy(first[0]), *first[1:]
+    loop = copy.copy(first[0])
+    packets, reports = first[1:]
     later_packets, later_reports = zip(*(loop.push(images[:4]) for images in clip[1:3]), strict=True)
     return loop, (*packets, *later_packets), (*reports, *later_reports)
 
@@ -119,9 +120,11 @@ def test_push__motion_follows_the_truth_and_not_the_static_wall(full):
     """The modules' claim: per-Gaussian motion is the scene's, not the residual's."""
     loop, _, reports = full
     maps = held_out(loop.gaussians)
-    before, now = scene(1)[0].numpy()["means"], scene(2)[0]
+    before = scene(1)[0].numpy()["means"]
+    now = scene(2)[0]
     truth = rasterize(dataclasses.replace(now, motion=now.numpy()["means"] - before), cameras()[4], ("motion",))
-    truth, found = np.asarray(truth.motion), np.asarray(maps.motion)
+    truth = np.asarray(truth.motion)
+    found = np.asarray(maps.motion)
     moving = np.linalg.norm(truth, axis=-1) > 1.5
     assert 0.03 < moving.mean() < 0.4
     assert endpoint_error(found, truth, moving) < 0.5 * endpoint_error(np.zeros_like(truth), truth, moving)
@@ -272,7 +275,8 @@ def test_push__without_an_image_of_one_view(clip, first, monkeypatch):
         shown = np.clip(np.asarray(held_out(loop.gaussians, ("color",)).color), 0, 1)
         return [psnr(shown, images[4] / 255) for images in clip]
 
-    found, missing = [scores()], []
+    found = [scores()]
+    missing = []
     for images in (without(clip[1], gone), clip[2][:4], clip[3][:4]):
         missing.append(loop.push(images)[1].missing_views)
         found.append(scores())
@@ -406,7 +410,8 @@ def test_push__a_static_clip_costs_next_to_nothing(clip):
 def test_push__skipping_static_views_costs_no_quality(clip):
     """With and without: the held-out image is as good in the mean of three seeds, in fewer bytes."""
     some = dataclasses.replace(QUICK, render=RenderConfig(reproducible=True))
-    quality, sizes = np.zeros((3, 2)), np.zeros((3, 2))
+    quality = np.zeros((3, 2))
+    sizes = np.zeros((3, 2))
     for seed in range(3):
         begun = new_loop(dataclasses.replace(some, seed=seed))
         begun.push(clip[0][:4])
@@ -447,7 +452,8 @@ def test_step__is_pure_and_complete(clip):
 
 
 def test_resume__copies_its_images_and_refuses_those_of_another_size(clip, full):
-    loop, buffers = new_loop(), [image.copy() for image in clip[0][:4]]
+    loop = new_loop()
+    buffers = [image.copy() for image in clip[0][:4]]
     coded = full[0].state.coded
     loop.resume(coded, [buffers])
     for buffer in buffers:
@@ -477,12 +483,14 @@ def reproducible(clip):
 @pytest.fixture(scope="module")
 def plain(clip, reproducible):
     """The packets of three frames."""
-    loop, packets, _ = copy.copy(reproducible[0]), *reproducible[1:]
+    loop = copy.copy(reproducible[0])
+    packets = reproducible[1]
     return [packet.encoded for packet in (*packets, *pushed_ahead(loop, clip[1:], lambda images: None))]
 
 
 def test_push__observes_the_upcoming_frame_in_another_thread_and_changes_nothing(clip, plain, monkeypatch):
-    threads, observe = [], stream_loop.observe_frame
+    threads = []
+    observe = stream_loop.observe_frame
     monkeypatch.setattr(
         stream_loop, "observe_frame", lambda *given: threads.append(threading.current_thread()) or observe(*given)
     )
@@ -500,7 +508,8 @@ def test_push__uses_no_observation_of_other_images(clip, reproducible, plain):
 
 
 def test_push__refuses_upcoming_images_of_another_size_in_their_turn(clip, first):
-    loop, small = copy.copy(first[0]), [image[:50] for image in clip[2][:4]]
+    loop = copy.copy(first[0])
+    small = [image[:50] for image in clip[2][:4]]
     loop.push(clip[1][:4], upcoming=small)
     with pytest.raises(ValueError, match=r"frame 2 of view 'cam00' must be uint8 \[72, 96, 3\]"):
         loop.push(small)
