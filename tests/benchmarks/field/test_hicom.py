@@ -27,8 +27,8 @@ def test_coherent_motion__sums_the_levels():
     translation = np.zeros(tuple(model.parameters["translation"].shape), np.float32)
     translation[0] = (1, 2, 3)  # of the one cell of the coarse level
     translation[1] = (0.5, 0, 0)
-    found, rotation = model.motion({**model.parameters, "translation": mi.TensorXf(translation)})
-    fine = np.asarray(found) - (1, 2, 3)
+    translations, rotation = model.motion({**model.parameters, "translation": mi.TensorXf(translation)})
+    fine = np.asarray(translations) - (1, 2, 3)
     inside = fine.any(axis=1)
     assert 0 < inside.sum() < len(gaussians)
     assert_close(fine[inside], np.tile(np.array([0.5, 0, 0]), (inside.sum(), 1)), atol=1e-6)

@@ -89,9 +89,9 @@ def test_fit_later_frame__finds_the_motion_that_gaussians_share(name):
 def test_motion_model__has_the_models_by_name(name):
     factory = motion_model(replace(PLAIN, model=name))
     assert factory is not None
-    found = factory(opaque_ball(), EXTENT, np.random.default_rng(0))
-    assert found.parameters.keys() == found.rates.keys()
-    assert found.motion(found.parameters)[0].shape == (400, 3)
+    model = factory(opaque_ball(), EXTENT, np.random.default_rng(0))
+    assert model.parameters.keys() == model.rates.keys()
+    assert model.motion(model.parameters)[0].shape == (400, 3)
 
 
 def behaviour(config: Any) -> list[np.ndarray]:

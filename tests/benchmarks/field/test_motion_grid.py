@@ -38,16 +38,16 @@ def test_bits__are_those_of_the_logistic_density():
     def sigmoid(x):
         return 1 / (1 + np.exp(-x))
 
-    found = bits(mi.Float(X), mi.Float(0.8))
+    rates = bits(mi.Float(X), mi.Float(0.8))
     x = X.astype(np.float64)
-    assert_close(found, -np.log2(sigmoid((x + 0.5) / 0.8) - sigmoid((x - 0.5) / 0.8)), atol=1e-2)
+    assert_close(rates, -np.log2(sigmoid((x + 0.5) / 0.8) - sigmoid((x - 0.5) / 0.8)), atol=1e-2)
     whole = np.arange(-30, 31, dtype=np.float32)
     assert np.sum(2.0 ** -np.asarray(bits(mi.Float(whole), mi.Float(2.0)))) == pytest.approx(1, abs=1e-3)
 
 
 def test_bits__are_finite_far_away():
-    found = np.asarray(bits(mi.Float([1e4, -1e4]), mi.Float(0.1)))
-    assert (found < 20).all()
+    rates = np.asarray(bits(mi.Float([1e4, -1e4]), mi.Float(0.1)))
+    assert (rates < 20).all()
 
 
 @pytest.mark.parametrize("name", ["translation", "rotation", "log_scales"])

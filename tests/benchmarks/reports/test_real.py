@@ -56,9 +56,9 @@ def test_photos__are_calibrated_and_reach_the_committed_quality(name: str, tmp_p
             shutil.copy(path, photos)
     assert cli.main(["calibrate", str(photos), "--shared-intrinsics"]) == 0
     real.Options(json=tmp_path / "out.json", captures=(photos,)).run()
-    (found,) = json.loads((tmp_path / "out.json").read_text())["fits"]
-    assert found["views"] + found["held_out_views"] == count, "every photo is registered"
-    assert found["principal_points"] == points
+    (row,) = json.loads((tmp_path / "out.json").read_text())["fits"]
+    assert row["views"] + row["held_out_views"] == count, "every photo is registered"
+    assert row["principal_points"] == points
     fits = [f for f in committed("real")["fits"] if (f["set"], f["principal_points"]) == (name, points)]
     # Two fits of Sceaux, with one held-out photo, differ by 1 dB, the others by 0.4 dB at most.
-    assert found["held_out"] > np.mean([fit["held_out"] for fit in fits]) - 1
+    assert row["held_out"] > np.mean([fit["held_out"] for fit in fits]) - 1

@@ -73,7 +73,7 @@ def test_study_options__of_workers_write_the_rows_of_one_process(report, clip: P
         (tmp_path / name).symlink_to(clip)
     given, num_rows = STUDIES[report]
     place = {"captures": (clip,)} if report in (real, unseen) else {"clips": tmp_path}
-    found = {}
+    tables = {}
     monkeypatch.setattr(fits, "StreamLoop", tiny_loop)
     monkeypatch.setattr(cameras, "refine_cameras", lambda capture, *_: (capture, Scene({}, ())))  # needs larger images
     monkeypatch.setattr(timing, "estimate_time_offsets", true_offsets)
@@ -82,15 +82,15 @@ def test_study_options__of_workers_write_the_rows_of_one_process(report, clip: P
         options = report.Options(json=tmp_path / "out.json", workers=count, **place, **given)
         options.run()
         result = json.loads((tmp_path / "out.json").read_text())
-        found[count] = result["fits"]
-    assert len(found[None]) == num_rows
+        tables[count] = result["fits"]
+    assert len(tables[None]) == num_rows
     assert {"settings", "commit", "date", "machine", "versions"} <= result.keys()
     assert "clips" not in result["settings"]
-    assert "|" in options.table(found[None])
+    assert "|" in options.table(tables[None])
     if report is timing:
-        assert max(row["largest_error"] for row in found[None]) == 0
-        assert [row["fit_seed"] for row in found[None]] == [0, 1]
-    assert all(without_times(rows) == without_times(found[None]) for rows in found.values())
+        assert max(row["largest_error"] for row in tables[None]) == 0
+        assert [row["fit_seed"] for row in tables[None]] == [0, 1]
+    assert all(without_times(rows) == without_times(tables[None]) for rows in tables.values())
 
 
 def score(source: Source, config: StreamConfig) -> dict[str, float]:
