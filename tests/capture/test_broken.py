@@ -360,9 +360,9 @@ def test_fit_command__reports_a_broken_capture_in_one_line_and_writes_nothing(tm
         folder = tmp_path / kind
         path = shutil.copytree(whole, folder / "capture")
         damage(path)
-        before = sorted(folder.rglob("*"))
+        old_files = sorted(folder.rglob("*"))
         status = cli.main(["fit", str(path), str(folder / "out"), *options])
         lines = [line for line in capsys.readouterr().err.splitlines() if line.strip() and "━" not in line]
-        if status != 1 or len(lines) != 1 or not re.search(message, lines[0]) or sorted(folder.rglob("*")) != before:
+        if status != 1 or len(lines) != 1 or not re.search(message, lines[0]) or sorted(folder.rglob("*")) != old_files:
             mistakes.append((kind, status, lines))
     assert mistakes == []

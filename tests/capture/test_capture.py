@@ -240,14 +240,14 @@ def test_with_cameras__reads_as_if_the_calibration_had_the_lens(tmp_path: Path) 
     capture = load_capture(path)
     assert capture.with_cameras(capture.cameras).distortions == ()
     cameras = [square(camera) for camera in capture.cameras]
-    found = replace(capture, cameras=tuple(cameras)).with_cameras(cameras, [terms] * len(cameras))
+    recording = replace(capture, cameras=tuple(cameras)).with_cameras(cameras, [terms] * len(cameras))
     points = np.zeros((1, 3))
     write_colmap(path / "sparse" / "0", cameras, points, points, [Lens("RADIAL", terms)] * len(cameras))
     expected = load_capture(path)
-    for images in zip(*(next(c.frames(0, 1)).images for c in (expected, found)), strict=True):
+    for images in zip(*(next(c.frames(0, 1)).images for c in (expected, recording)), strict=True):
         assert np.array_equal(*images)
-    assert all(np.array_equal(a, b) for a, b in zip(expected.masks, found.masks, strict=True))
-    assert found.distortions == (terms,) * len(cameras)
+    assert all(np.array_equal(a, b) for a, b in zip(expected.masks, recording.masks, strict=True))
+    assert recording.distortions == (terms,) * len(cameras)
 
 
 def square(camera: Camera) -> Camera:

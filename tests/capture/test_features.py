@@ -58,8 +58,8 @@ def test_detect__finds_a_blob_at_its_position() -> None:
         v = 52.6 * scale
         y, x = np.mgrid[:height, :width] + 0.5
         blob = 120 + 120 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * (4 * scale) ** 2))
-        found = detect(np.repeat(blob[..., None], 3, -1).astype(np.uint8)).points
-        nearest = found[np.argmin(np.linalg.norm(found - (u, v), axis=1))]
+        points = detect(np.repeat(blob[..., None], 3, -1).astype(np.uint8)).points
+        nearest = points[np.argmin(np.linalg.norm(points - (u, v), axis=1))]
         assert_close(nearest, (u, v), atol=0.1 * scale)
 
 

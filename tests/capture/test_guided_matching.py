@@ -21,8 +21,8 @@ def test_match_guided__finds_true_matches(textured_capture: Capture, textured_fe
     assert len(match.features) > 100
     assert reprojection_errors(match, features, cameras).max() < 1
     free = next(m for m in textured_features.matches if m.views == (0, 4))
-    known = dict(free.features[reprojection_errors(free, features, cameras) < 0.2].tolist())
-    assert np.mean([known[a] == b for a, b in match.features.tolist() if a in known]) > 0.95
+    partners = dict(free.features[reprojection_errors(free, features, cameras) < 0.2].tolist())
+    assert np.mean([partners[a] == b for a, b in match.features.tolist() if a in partners]) > 0.95
 
 
 def test_match_guided__finds_next_to_nothing_with_wrong_poses(

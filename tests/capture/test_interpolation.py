@@ -37,12 +37,12 @@ def test_image_between__shows_things_where_they_have_moved_to(share: float) -> N
     first = moving_square(0)
     second = moving_square(4)
     wanted = moving_square(4 * share)
-    found = image_between(first, second, share)
+    image = image_between(first, second, share)
     blended = (1 - share) * first + share * second
-    assert found.dtype == np.uint8
+    assert image.dtype == np.uint8
     inside = slice(24, 48), slice(38, 58)
-    assert psnr(found[inside] / 255, wanted[inside] / 255) > psnr(blended[inside] / 255, wanted[inside] / 255) + 10
-    assert psnr(found / 255, wanted / 255) > psnr(blended / 255, wanted / 255) + 2
+    assert psnr(image[inside] / 255, wanted[inside] / 255) > psnr(blended[inside] / 255, wanted[inside] / 255) + 10
+    assert psnr(image / 255, wanted / 255) > psnr(blended / 255, wanted / 255) + 2
 
 
 @pytest.mark.parametrize("share", [0, 1])

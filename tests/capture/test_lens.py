@@ -60,9 +60,9 @@ def test_undistortion__moves_points_to_their_pinhole_projections(model: str) -> 
     expected, _ = cam.project(points)
     assert np.abs(distorted - expected).max() > 1, "the case must bend rays by more than a pixel"
 
-    found = undistortion(cam, lens)
-    assert found is not None
-    assert_centred(found(dots(distorted)).astype(float)[..., 0], expected)
+    lens_map = undistortion(cam, lens)
+    assert lens_map is not None
+    assert_centred(lens_map(dots(distorted)).astype(float)[..., 0], expected)
 
 
 @pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"])
@@ -77,11 +77,11 @@ def test_undistortion__removes_what_a_refined_lens_leaves(model: str) -> None:
     square = x**2 + y**2
     # Where the refined lens, and then the calibrated one, shows the points.
     rays = np.stack([x, y], axis=1) * (1 + left[0] * square + left[1] * square**2)[:, None]
-    seen = (rays * refined.K[[0, 1], [0, 1]] + refined.K[:2, 2] - cam.K[:2, 2]) / cam.K[[0, 1], [0, 1]]
-    distorted = project(model, lens, np.concatenate([seen, np.ones((len(seen), 1))], axis=1))
-    found = undistortion(cam, lens, (refined, Lens("RADIAL", left)))
-    assert found is not None
-    assert_centred(found(dots(distorted)).astype(float)[..., 0], expected)
+    positions = (rays * refined.K[[0, 1], [0, 1]] + refined.K[:2, 2] - cam.K[:2, 2]) / cam.K[[0, 1], [0, 1]]
+    distorted = project(model, lens, np.concatenate([positions, np.ones((len(positions), 1))], axis=1))
+    lens_map = undistortion(cam, lens, (refined, Lens("RADIAL", left)))
+    assert lens_map is not None
+    assert_centred(lens_map(dots(distorted)).astype(float)[..., 0], expected)
 
 
 def test_undistortion__is_none_without_distortion() -> None:
@@ -106,15 +106,15 @@ def test_undistortion__mask_ends_where_the_polynomial_folds(model: str, fold: fl
     """R (1 - 0.5 r^2) decreases beyond r = 0.816; theta (1 - 0.5 theta^2) beyond that angle, of tangent 1.066."""
     radius = fold or np.tan((3 * 0.5) ** -0.5)
     cam = camera(focal=60.0)
-    found = undistortion(cam, Lens(model, (-0.5,)))
-    assert found is not None
+    lens_map = undistortion(cam, Lens(model, (-0.5,)))
+    assert lens_map is not None
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     x, y, _ = np.moveaxis(cam.unproject(np.stack([columns, rows], -1), np.ones((HEIGHT, WIDTH))), -1, 0)
     r = np.hypot(x, y)
     assert r.max() > 1.2 * radius
     pixel = 1.5 / cam.K[0, 0]
-    assert found.mask[r < radius - pixel].all()
-    assert not found.mask[r > radius + pixel].any()
+    assert lens_map.mask[r < radius - pixel].all()
+    assert not lens_map.mask[r > radius + pixel].any()
 
 
 @pytest.mark.parametrize(

@@ -227,9 +227,9 @@ def test_fit__refuses_to_leave_fewer_than_32_pixels(tmp_path: Path, run, monkeyp
 @pytest.fixture
 def heeds_interrupts() -> Iterator[None]:
     """Python's handler of SIGINT, which a shell ignores for the processes that it starts in the background."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
-    signal.signal(signal.SIGINT, before)
+    signal.signal(signal.SIGINT, handler)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

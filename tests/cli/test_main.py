@@ -143,7 +143,7 @@ def test_main__writes_nothing_into_a_capture(capture: Path, stream: Path, tmp_pa
     (capture / "capture.json").write_text('{"fps": 25}')
     place = tmp_path / "link"
     place.symlink_to(capture)
-    before = tree(capture)
+    old_tree = tree(capture)
     for args in (
         ("fit", capture, capture, *QUICK),
         ("fit", capture, place, *QUICK, "--resume"),
@@ -168,7 +168,7 @@ def test_main__writes_nothing_into_a_capture(capture: Path, stream: Path, tmp_pa
             run(*args), "expected an output outside of captures, which stay as they were recorded, got one in"
         )
     assert_refused(run("synth", "spheres", capture, "--overwrite"), f"{capture} is not a synthetic capture")
-    assert tree(capture) == before
+    assert tree(capture) == old_tree
 
 
 def tree(path: Path) -> dict[str, bytes | None]:

@@ -57,9 +57,9 @@ def test_commands__of_a_page_run_to_the_end(page: str, recordings: Path, tmp_pat
     shutil.copytree(recordings, tmp_path / "there")
     monkeypatch.chdir(tmp_path / "there")
     cameras = " ".join(str(clip) for clip in sorted(Path("CAPTURE").glob("*.mp4")))
-    found = commands(page)
-    assert found, f"{page} has no commands"
-    for command in found:
+    lines = commands(page)
+    assert lines, f"{page} has no commands"
+    for command in lines:
         given = command.replace("--camera 0 1 2 3", f"--camera {cameras}").replace(" > settings.toml", "")
         if given.startswith("morgs-mi import frames"):
             assert run("export", "ply", "out/arm_fit", "frames")[0] == 0

@@ -104,8 +104,8 @@ def test_colmap__reads_all_models(tmp_path: Path, model: str, shared: bool, kind
     assert (capture.layout, capture.names) == ("COLMAP", ("cam1", "cam2", "cam10"))
     for camera, i in zip(capture.cameras, (2, 1, 0), strict=True):
         assert_close(camera.viewmat, cameras[i].viewmat, atol=POSE_ABS)
-        own = 0 if shared else i
-        np.testing.assert_allclose(camera.K, [[50 + own, 0, 33], [0, 50 + own, 20 + own], [0, 0, 1]])
+        number = 0 if shared else i
+        np.testing.assert_allclose(camera.K, [[50 + number, 0, 33], [0, 50 + number, 20 + number], [0, 0, 1]])
     metadata = capture.metadata()
     assert [view["lens"] for view in metadata["cameras"]] == [model] * 3
     np.testing.assert_allclose(metadata["cameras"][0]["distortion"], lens)
@@ -428,13 +428,13 @@ def test_load_capture__ignores_what_systems_add(
 def test_load_capture__reads_texts_of_windows(tmp_path: Path, mark: str, build: Callable[[Path], Path]) -> None:
     path = build(tmp_path / "a")
     (path / "capture.json").write_text('{"fps": 12}')
-    before = load_capture(path)
+    unix_capture = load_capture(path)
     for file in [file for file in path.rglob("*") if file.suffix in (".txt", ".json", ".toml")]:
         declared = "<?xml version='1.0' encoding='utf-8'?>\n" if file.name.endswith(".qca.txt") else ""
         file.write_bytes((declared + file.read_text()).replace("\n", "\r\n").encode(mark))
-    after = load_capture(path)
-    assert (after.names, after.fps) == (before.names, 12)
-    for camera, expected in zip(after.cameras, before.cameras, strict=True):
+    result = load_capture(path)
+    assert (result.names, result.fps) == (unix_capture.names, 12)
+    for camera, expected in zip(result.cameras, unix_capture.cameras, strict=True):
         np.testing.assert_array_equal(camera.K, expected.K)
         np.testing.assert_array_equal(camera.viewmat, expected.viewmat)
 
