@@ -49,9 +49,9 @@ class RangeCode:
         tokens = []
         end = 16
         while len(tokens) < n:
-            before = np.concatenate([[0], np.cumsum(weights)[:-1]]).astype(np.float64)
+            sums = np.concatenate([[0], np.cumsum(weights)[:-1]]).astype(np.float64)
             s = (2**24 - 85) / float(sum(weights))
-            lefts = np.append(np.floor(s * before).astype(np.int64) + np.arange(85), 2**24)
+            lefts = np.append(np.floor(s * sums).astype(np.int64) + np.arange(85), 2**24)
             block = [self.symbol(lefts) for _ in range(min(end, n) - len(tokens))]
             for token in block:
                 weights[token] += 32
@@ -78,13 +78,13 @@ def packets(data):
 def arrays(payload):
     (size,) = struct.unpack_from("<I", payload)
     at = 4 + size
-    found = {}
+    values = {}
     for name, dtype, shape in json.loads(payload[4:at]):
         count = math.prod(shape)
-        found[name] = np.frombuffer(payload, np.dtype(dtype).newbyteorder("<"), count, at).reshape(shape)
-        at += found[name].nbytes
+        values[name] = np.frombuffer(payload, np.dtype(dtype).newbyteorder("<"), count, at).reshape(shape)
+        at += values[name].nbytes
     assert at == len(payload)
-    return found
+    return values
 
 
 def born(code, N, degree, confidence):
@@ -101,10 +101,10 @@ def groups(state):
 
 
 def keyframe(payload):
-    found = arrays(payload)
-    N, degree, confidence, next_id = (int(x) for x in found["head"])
+    values = arrays(payload)
+    N, degree, confidence, next_id = (int(x) for x in values["head"])
     assert confidence <= 1, "unknown optional attributes"
-    code = RangeCode(found["code"])
+    code = RangeCode(values["code"])
     ids = np.cumsum(code.column(N) + 1) - 1
     state = {"ids": ids, "degree": degree, "confidence": confidence, "next_id": next_id}
     state["largest_components"], state["exponents"], state["values"] = born(code, N, degree, confidence)
@@ -118,10 +118,10 @@ def digest(state):
 
 
 def residual(state, payload):
-    found = arrays(payload)
-    assert found["parent"].tobytes() == digest(state)
-    births, coarseness = (int(x) for x in found["head"])
-    code = RangeCode(found["code"])
+    changes = arrays(payload)
+    assert changes["parent"].tobytes() == digest(state)
+    births, coarseness = (int(x) for x in changes["head"])
+    code = RangeCode(changes["code"])
     values = state["values"].copy()
     dead = np.zeros(len(state["ids"]), bool)
     moving = values[:, -1] > 0 if state["confidence"] else np.zeros(len(values), bool)
@@ -144,10 +144,10 @@ def residual(state, payload):
         "values": values[~dead],
     }
     new.pop("offset", None)
-    if "offset" in found:
+    if "offset" in changes:
         new["offset"] = np.zeros((len(new["ids"]) + births, 3))
         moved = np.flatnonzero((new["values"][:, :3] != state["values"][~dead, :3]).any(1))
-        code_of_offsets = RangeCode(found["offset"])
+        code_of_offsets = RangeCode(changes["offset"])
         for axis in range(3):
             for i, r in zip(moved, code_of_offsets.column(len(moved)), strict=True):
                 e = int(new["exponents"][i, 0])
@@ -165,10 +165,10 @@ def residual(state, payload):
 def numbers(state):
     """Return the attributes of a state, by the names of the package."""
     e = state["exponents"]
-    own = [0, 0, 0, 1, 2, 3, 4, 4, 4, 5, 6, 6, 6]
-    own += [7] * (3 * ((state["degree"] + 1) ** 2 - 1)) + [8] * state["confidence"]
+    group_of_column = [0, 0, 0, 1, 2, 3, 4, 4, 4, 5, 6, 6, 6]
+    group_of_column += [7] * (3 * ((state["degree"] + 1) ** 2 - 1)) + [8] * state["confidence"]
     real = np.zeros(state["values"].shape)
-    for column, k in enumerate(own):
+    for column, k in enumerate(group_of_column):
         real[:, column] = [
             int(q) * F[int(x) % 4] * 2.0 ** (int(x) // 4)
             for q, x in zip(state["values"][:, column], e[:, k], strict=True)
@@ -179,13 +179,13 @@ def numbers(state):
         length = math.sqrt(((1 + u * u) + v * v) + w * w)
         quats[i] = np.insert([u / length, v / length, w / length], int(largest), 1 / length)
     end = 10 + 3 * (state["degree"] + 1) ** 2
-    found = {"means": real[:, :3], "log_scales": real[:, 3:6], "quats": quats, "logit_opacities": real[:, 9]}
-    found["sh_coeffs"] = real[:, 10:end].reshape(len(real), -1, 3)
+    values = {"means": real[:, :3], "log_scales": real[:, 3:6], "quats": quats, "logit_opacities": real[:, 9]}
+    values["sh_coeffs"] = real[:, 10:end].reshape(len(real), -1, 3)
     if state["confidence"]:
-        found["logit_confidence"] = real[:, end]
+        values["logit_confidence"] = real[:, end]
     if "offset" in state:
-        found["offset"] = state["offset"]
-    return {name: value.astype(np.float32) for name, value in found.items()}
+        values["offset"] = state["offset"]
+    return {name: value.astype(np.float32) for name, value in values.items()}
 
 
 def states(data):

@@ -31,9 +31,9 @@ def test_project__agrees_with_the_mitsuba_sensor(camera):
     scene = mi.load_dict({"type": "scene", "lamp": lamp, "sensor": camera.sensor()})
     image = np.array(mi.render(scene, integrator=mi.load_dict({"type": "direct"}), spp=64))[..., 0]
     y, x = np.mgrid[:48, :64] + 0.5
-    seen = np.array([(image * x).sum(), (image * y).sum()]) / image.sum()
+    centre = np.array([(image * x).sum(), (image * y).sum()]) / image.sum()
     # A ball's image is an ellipse; its middle is not quite the image of the ball's centre; noise is 0.02 px.
-    assert_close(seen, camera.project(point)[0], atol=0.1)
+    assert_close(centre, camera.project(point)[0], atol=0.1)
 
 
 def test_project__inverts_the_rays_of_the_mitsuba_sensor(camera):

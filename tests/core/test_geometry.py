@@ -33,8 +33,8 @@ def cloud(N: int = 30, degree: int = 3) -> Gaussians:
 
 def test_covariances__agree_with_the_reference():
     raw = cloud().numpy()
-    found = covariances(cloud())
-    for log_scale, quat, covariance in zip(raw["log_scales"], raw["quats"].astype(float), found, strict=True):
+    matrices = covariances(cloud())
+    for log_scale, quat, covariance in zip(raw["log_scales"], raw["quats"].astype(float), matrices, strict=True):
         M = reference.rotation(quat) * np.exp(log_scale)
         np.testing.assert_allclose(covariance, M @ M.T, rtol=1e-6, atol=1e-9)
 

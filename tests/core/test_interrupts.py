@@ -79,9 +79,9 @@ def test_interrupts_raised__leaves_other_errors_as_they_are() -> None:
 @pytest.fixture
 def heeds_interrupts() -> Iterator[None]:
     """Python's handler of SIGINT, which a shell ignores for the processes that it starts in the background."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
-    signal.signal(signal.SIGINT, before)
+    signal.signal(signal.SIGINT, handler)
 
 
 class Swallowing:
@@ -116,12 +116,12 @@ def test_interruptible__raises_once_for_each_signal(heeds_interrupts: None, inte
 
 
 def test_interruptible__lets_a_background_process_ignore_ctrl_c() -> None:
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         with interruptible():
             signal.raise_signal(signal.SIGINT)
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, handler)
 
 
 STARTING = """

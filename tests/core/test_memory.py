@@ -20,10 +20,10 @@ from tests.scenes.changing_splats import splats
 def test_from_numpy__converts_to_the_type_in_aligned_memory(kind):
     kind = getattr(mi, kind)
     values = np.arange(12.0).reshape(3, 4)
-    found = np.asarray(from_numpy(kind, values))
+    array = np.asarray(from_numpy(kind, values))
     expected = values if dr.is_tensor_v(kind) else values.ravel()
-    np.testing.assert_array_equal(found, expected.astype(found.dtype))
-    assert found.__array_interface__["data"][0] % 64 == 0
+    np.testing.assert_array_equal(array, expected.astype(array.dtype))
+    assert array.__array_interface__["data"][0] % 64 == 0
 
 
 def test_from_numpy__copies_before_kernels_read():
