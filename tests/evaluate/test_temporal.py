@@ -58,11 +58,11 @@ def test_still_variation__of_too_few_frames_or_pixels_is_nan():
 
 def test_recorded_change__is_distinguished_from_noise():
     scene = rng.random((*SIZE, 3))
-    before, after = (scene + rng.normal(0, 0.02, scene.shape) for _ in range(2))
+    image, next_image = (scene + rng.normal(0, 0.02, scene.shape) for _ in range(2))
     # Four deviations are exceeded by 6 in 100,000 pixels.
-    assert recorded_change(before, after).mean() < 0.01
-    after[4:14, 6:18] += 0.3
-    changed = recorded_change(before, after)
+    assert recorded_change(image, next_image).mean() < 0.01
+    next_image[4:14, 6:18] += 0.3
+    changed = recorded_change(image, next_image)
     assert changed[5:13, 7:17].all()
     assert not changed[18:].any()
 

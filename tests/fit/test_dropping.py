@@ -42,9 +42,9 @@ def test_dropped__passes_gradients_to_the_kept_alone():
     logits = mi.TensorXf(np.zeros(20, np.float32))
     dr.enable_grad(logits)
     few = GAUSSIANS.select(np.arange(20)).with_parameters({"logit_opacities": logits})
-    found = dropped(few, 0.5, np.random.default_rng(1))
-    dr.backward(dr.sum(found.opacities, axis=None))
-    kept = np.asarray(found.opacities) > 1e-6
+    survivors = dropped(few, 0.5, np.random.default_rng(1))
+    dr.backward(dr.sum(survivors.opacities, axis=None))
+    kept = np.asarray(survivors.opacities) > 1e-6
     # d(2 sigmoid(l)) / dl at l = 0; the largest opacity is 0.999, where nothing is passed on.
     assert not np.asarray(dr.grad(logits))[~kept].any()
     assert kept.any()

@@ -76,14 +76,14 @@ def test_fit_first_frame__reports_its_steps(images):
 
 
 def test_fit_first_frame__lets_the_rates_fall_to_the_final_one(drawn):
-    found = fit(WHITE, DARK, SCHEDULED)
-    assert_close(lengths(drawn, found), 0.05 * 0.1 ** (np.arange(8) / 8), rtol=1e-4)
+    result = fit(WHITE, DARK, SCHEDULED)
+    assert_close(lengths(drawn, result), 0.05 * 0.1 ** (np.arange(8) / 8), rtol=1e-4)
 
 
 def test_fit_first_frame__moves_means_by_fractions_of_the_extent(images, drawn):
     rates = dataclasses.replace(CONFIG.first_frame_rates, means=1e-3)
-    found = fit(images, ball(80), dataclasses.replace(CONFIG, first_frame_steps=1, first_frame_rates=rates))
-    shift = np.abs(np.asarray(found.gaussians.means) - np.asarray(drawn[0].means))
+    result = fit(images, ball(80), dataclasses.replace(CONFIG, first_frame_steps=1, first_frame_rates=rates))
+    shift = np.abs(np.asarray(result.gaussians.means) - np.asarray(drawn[0].means))
     # The extent is 3. The first step of Adam has the length of the rate where there is a gradient.
     assert np.median(shift) == pytest.approx(3e-3, rel=1e-3)
 
@@ -94,15 +94,15 @@ def test_fit_first_frame__moves_means_by_fractions_of_the_extent(images, drawn):
 def test_fit_first_frame__adds_sh_bands_at_equal_distances(images, drawn, monkeypatch):
     monkeypatch.setattr("morgs_mi.fit.first_frame._BAND", 0.15)
     config = dataclasses.replace(CONFIG, sh_degree=3, first_frame_steps=20)
-    found = fit(images, ball(50, sh_degree=3), config)
+    result = fit(images, ball(50, sh_degree=3), config)
     assert [gaussians.sh_degree for gaussians in drawn] == 3 * [0] + 3 * [1] + 3 * [2] + 11 * [3]
-    bands = np.abs(np.asarray(found.gaussians.sh_coeffs)).mean(axis=(0, 2))
+    bands = np.abs(np.asarray(result.gaussians.sh_coeffs)).mean(axis=(0, 2))
     assert bands[1:4].mean() > bands[4:9].mean() > bands[9:].mean() > 0
 
 
 def test_fit_first_frame__has_all_sh_bands_after_one_step(images):
-    found = fit(images, ball(50, sh_degree=3), FitConfig(sh_degree=3, first_frame_steps=1))
-    assert found.gaussians.sh_degree == 3
+    result = fit(images, ball(50, sh_degree=3), FitConfig(sh_degree=3, first_frame_steps=1))
+    assert result.gaussians.sh_degree == 3
 
 
 # ---- growth ----------------------------------------------------------------------------------------------
@@ -116,11 +116,11 @@ def test_density_rounds__lie_between_a_tenth_and_a_half():
 
 def test_fit_first_frame__grows_in_the_rounds_alone_and_to_the_number_that_is_given(images, drawn):
     config = FitConfig(sh_degree=0, first_frame_steps=20, num_gaussians=100, density=DensityConfig(rounds=3))
-    found = fit(images, ball(60), config)
+    result = fit(images, ball(60), config)
     counts = [len(gaussians) for gaussians in drawn]
     assert [step for step, (a, b) in enumerate(pairwise(counts), 1) if a != b] == density_rounds(config) == [2, 6, 10]
     assert counts == sorted(counts)
-    assert (counts[0], len(found.gaussians)) == (60, 100)
+    assert (counts[0], len(result.gaussians)) == (60, 100)
 
 
 def test_fit_first_frame__grows_from_too_few(images):
@@ -196,11 +196,11 @@ def test_fit_first_frame__fits_views_of_different_sizes(images):
     camera = views()[1].resized(40, 30)
     small = View(camera, rendered(opaque_ball(), camera, RenderConfig()))
     mixed = dataclasses.replace(given, views=(given.views[0], small, *given.views[2:]))
-    found = fit_first_frame(
+    result = fit_first_frame(
         mixed, dataclasses.replace(CONFIG, first_frame_steps=60), np.random.default_rng(0)
     ).gaussians
     for view in mixed.views:
-        errors = [np.abs(rendered(now, view.camera, RenderConfig()) - view.image).mean() for now in (ball(80), found)]
+        errors = [np.abs(rendered(now, view.camera, RenderConfig()) - view.image).mean() for now in (ball(80), result)]
         assert errors[1] < 0.5 * errors[0]
 
 
@@ -208,17 +208,17 @@ def test_fit_first_frame__fits_views_of_different_sizes(images):
 
 
 def test_fit_first_frame__leaves_gaussians_out_of_its_steps_but_not_of_the_result(images, drawn):
-    found = fit(images, ball(80), dataclasses.replace(CONFIG, dropping=0.25))
+    result = fit(images, ball(80), dataclasses.replace(CONFIG, dropping=0.25))
     left_out = np.array([np.asarray(gaussians.opacities) < 1e-6 for gaussians in drawn])
     assert left_out.mean() == pytest.approx(0.25, abs=0.05)
     assert len(np.unique(left_out, axis=0)) == len(drawn)  # others in each step
-    assert np.asarray(found.gaussians.opacities).min() > 0.01
+    assert np.asarray(result.gaussians.opacities).min() > 0.01
 
 
 def test_fit_first_frame__keeps_the_confidence(images):
     confidence = np.linspace(-2, 2, 80)
-    found = fit(images, dataclasses.replace(ball(80), logit_confidence=confidence), CONFIG).gaussians
-    assert_close(found.logit_confidence, np.float32(confidence))
+    gaussians = fit(images, dataclasses.replace(ball(80), logit_confidence=confidence), CONFIG).gaussians
+    assert_close(gaussians.logit_confidence, np.float32(confidence))
 
 
 def test_fit_first_frame__is_the_same_for_a_seed_and_another_for_another(images):
@@ -247,18 +247,18 @@ def halves() -> dict[int, np.ndarray]:
 
 
 def test_fit_confidence__follows_the_masks_of_its_key_views():
-    found, losses = learned(40, halves())
-    confidence = 1 / (1 + np.exp(-np.asarray(found.logit_confidence)))
-    place = np.asarray(found.means)[:, 0]
-    front = np.asarray(found.means)[:, 2] < 0
+    gaussians, losses = learned(40, halves())
+    confidence = 1 / (1 + np.exp(-np.asarray(gaussians.logit_confidence)))
+    place = np.asarray(gaussians.means)[:, 0]
+    front = np.asarray(gaussians.means)[:, 2] < 0
     assert confidence[front & (place > 0.3)].mean() > 0.8
     assert confidence[front & (place < -0.3)].mean() < 0.2
     assert 0 < losses["mask"] < learned(4, halves())[1]["mask"]
 
 
 def test_fit_confidence__freezes_everything_else():
-    before = values_of(opaque_ball())
-    after = values_of(learned(4, halves())[0])
-    assert {name: after[name] for name in before if name != "logit_confidence"} == {
-        name: value for name, value in before.items() if name != "logit_confidence"
+    old_values = values_of(opaque_ball())
+    new_values = values_of(learned(4, halves())[0])
+    assert {name: new_values[name] for name in old_values if name != "logit_confidence"} == {
+        name: value for name, value in old_values.items() if name != "logit_confidence"
     }

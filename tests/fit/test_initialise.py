@@ -52,9 +52,9 @@ def test_fill_points__adds_none_where_pixels_are_not_valid():
 def test_initial_points__are_given_ones_with_random_ones_where_these_are_few(known: int):
     (points, colors), views = few_points()
     given = np.resize(points, (known, 3)), np.resize(colors, (known, 3))
-    found, found_colors = initial_points(views, given, 1000, np.random.default_rng(1))
-    assert found.shape == found_colors.shape == (1000, 3)
-    random = np.isclose(found_colors, 0.2).all(axis=1)
+    result, result_colors = initial_points(views, given, 1000, np.random.default_rng(1))
+    assert result.shape == result_colors.shape == (1000, 3)
+    random = np.isclose(result_colors, 0.2).all(axis=1)
     expected = 1 if known < MIN_POINTS else 0.3 if known < 1000 else 0
     assert random.mean() >= expected
     assert (random.mean() > 0) == (expected > 0)
@@ -119,9 +119,9 @@ def test_seed_points__lie_on_valid_pixels_in_their_colours():
     np.testing.assert_allclose(colors, 0.2)
     shown = np.zeros(101, bool)
     for camera, mask in zip(cameras, masks, strict=True):
-        seen, pixels, _ = seen_points(camera, points)
+        rows_of_points, pixels, _ = seen_points(camera, points)
         columns, rows = pixels.astype(int).T
-        shown[seen] |= mask[rows, columns]
+        shown[rows_of_points] |= mask[rows, columns]
     assert shown.all()
 
 

@@ -55,11 +55,11 @@ def test_fit_later_frame__continues_from_a_start():
 
 
 def test_fit_later_frame__fits_the_model_alone_in_a_single_epoch():
-    found = fit(replace(FIT, epochs=1))
-    assert found.epochs == 1
-    assert found.losses["recon"] > 0
-    assert found.losses["length"] > 0
-    assert not np.asarray(found.gaussians.offset).any()
+    result = fit(replace(FIT, epochs=1))
+    assert result.epochs == 1
+    assert result.losses["recon"] > 0
+    assert result.losses["length"] > 0
+    assert not np.asarray(result.gaussians.offset).any()
 
 
 def test_fit_later_frame__shares_its_epochs_with_the_model():

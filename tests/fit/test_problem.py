@@ -28,12 +28,12 @@ def test_first_frame_problem__starts_from_the_points_with_the_settings_of_the_fi
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (300, 3)), np.full((300, 3), 0.25)
     config = FitConfig(sh_degree=2, num_gaussians=100, density=DensityConfig(rounds=1))
     given = [View(*view) for view in zip(views(), bytes_of(images_of(opaque_ball())), strict=True)]
-    found = FirstFrameProblem.of(given, points, config, RenderConfig(), np.random.default_rng(0))
-    assert (len(found.start), found.start.sh_degree) == (50, 2)  # half, as it grows to all
-    np.testing.assert_allclose(found.start.opacities, 0.3, rtol=1e-6)
-    assert found.points is points[0]
-    assert found.extent == scene_extent(views())
-    assert [camera.name for camera in found.cameras] == [camera.name for camera in views()]
+    result = FirstFrameProblem.of(given, points, config, RenderConfig(), np.random.default_rng(0))
+    assert (len(result.start), result.start.sh_degree) == (50, 2)  # half, as it grows to all
+    np.testing.assert_allclose(result.start.opacities, 0.3, rtol=1e-6)
+    assert result.points is points[0]
+    assert result.extent == scene_extent(views())
+    assert [camera.name for camera in result.cameras] == [camera.name for camera in views()]
 
 
 def test_first_frame_problem__only_takes_some_of_the_views():
