@@ -76,8 +76,8 @@ def test_gaussian_splat__forward_agrees_with_the_reference(raw, weight, gradient
         slope += np.vdot(gradient, direction)
     image = mi.render(scene, params)
     dr.forward_to(image)
-    found = np.sum(np.asarray(dr.grad(image), np.float64) * weight)
-    assert found == pytest.approx(slope, rel=tol.GRADIENT_REL)
+    derivative = np.sum(np.asarray(dr.grad(image), np.float64) * weight)
+    assert derivative == pytest.approx(slope, rel=tol.GRADIENT_REL)
 
 
 def test_gaussian_splat__backward_agrees_with_central_differences(raw):

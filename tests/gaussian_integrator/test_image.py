@@ -142,8 +142,8 @@ def test_gaussian_splat__renders_shapes_of_several_degrees_as_one_cloud():
         dr.enable_grad([p[key] for key in keys])
     for s, p in ((scene, params), (one, expected)):
         dr.backward(dr.sum(dr.square(mi.render(s, p)[..., :3]), axis=None))
-    found = np.concatenate([np.asarray(dr.grad(params[f"shape{i}.data"])) for i in range(3)])
-    assert_close(found, dr.grad(expected["gaussians.data"]), rtol=tol.GRADIENT_REL)
+    gradient = np.concatenate([np.asarray(dr.grad(params[f"shape{i}.data"])) for i in range(3)])
+    assert_close(gradient, dr.grad(expected["gaussians.data"]), rtol=tol.GRADIENT_REL)
 
 
 def test_gaussian_splat__agrees_with_mitsubas_own_integrator():

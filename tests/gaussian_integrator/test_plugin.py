@@ -75,8 +75,8 @@ for variant in ("scalar_rgb", "llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
     except ValueError as error:
         print("\n>", error)
 """
-    found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
-    assert [line for line in found.splitlines() if line.startswith(">")] == [
+    output = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    assert [line for line in output.splitlines() if line.startswith(">")] == [
         "> gaussian_splat: expected a variant such as 'llvm_ad_rgb' or 'cuda_ad_rgb', got 'scalar_rgb'; call "
         "mi.set_variant() before the scene is loaded.",
         "> llvm_ad_rgb ['depth.Y']",

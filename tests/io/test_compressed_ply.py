@@ -20,14 +20,14 @@ def round_trip(path, gaussians: Gaussians) -> Gaussians:
 
 @pytest.mark.parametrize("degree", range(4))
 def test_read_compressed_ply__returns_what_was_written_up_to_the_steps(tmp_path, degree):
-    before = splats(300, degree)
-    after = round_trip(tmp_path / "g.compressed.ply", before)
-    old = before.numpy()
-    new = after.numpy()
+    gaussians = splats(300, degree)
+    result = round_trip(tmp_path / "g.compressed.ply", gaussians)
+    old = gaussians.numpy()
+    new = result.numpy()
     extent = np.ptp(old["means"], axis=0).max()
     assert_close(new["means"], old["means"], atol=0.51 * extent / 1023)
     assert_close(new["log_scales"], old["log_scales"], atol=0.51 * np.ptp(old["log_scales"], axis=0).max() / 1023)
-    assert_close(np.asarray(after.opacities), np.asarray(before.opacities), atol=0.51 / 255)
+    assert_close(np.asarray(result.opacities), np.asarray(gaussians.opacities), atol=0.51 / 255)
     units = old["quats"] / np.linalg.norm(old["quats"], axis=1, keepdims=True)
     # The largest component follows from three with steps of sqrt(2) / 1023 and is at least a half.
     assert_close(np.abs((units * new["quats"]).sum(axis=1)), 1, atol=1e-5)

@@ -202,13 +202,13 @@ def first_images(url: str) -> list[np.ndarray]:
 @pytest.mark.parametrize("versions", [("Last-Modified",), ("ETag",), ("ETag", "Last-Modified"), ()])
 def test_mirrored__reuses_http_files_only_while_their_versions_are_equal(server: Server, tmp_path, versions) -> None:
     server.versions = versions
-    before = load_capture(server.url).cameras[0].K[0, 0]
+    focal_length = load_capture(server.url).cameras[0].K[0, 0]
     server.fetched.clear()
-    assert load_capture(server.url).cameras[0].K[0, 0] == before
+    assert load_capture(server.url).cameras[0].K[0, 0] == focal_length
     assert bool(server.fetched) == (not versions)
     file = tmp_path / "clip" / "sparse" / "0" / "cameras.txt"
     text = file.read_text()
-    old = f" {before:g}"[:2]
+    old = f" {focal_length:g}"[:2]
     file.write_text(text.replace(f"PINHOLE 32 24{old}", "PINHOLE 32 24 9"))  # as many bytes as before
     os.utime(file, (1e9, 1e9))
     assert load_capture(server.url).cameras[0].K[0, 0] > 90

@@ -101,8 +101,8 @@ def test_find_active_set__covers_what_appears_in_front_of_a_static_wall(before, 
     for min_explained in (0.0, 1.0):
         monkeypatch.setattr("morgs_mi.method.active_set._EXPLAINED", min_explained)
         config = ActiveSetConfig(min_responsibility=0.5)
-        found = find_active_set(wall, cameras(), changes(wall, before), CHANNELS, RENDER, config)
-        counts.append(len(found.indices))
+        active_set = find_active_set(wall, cameras(), changes(wall, before), CHANNELS, RENDER, config)
+        counts.append(len(active_set.indices))
     assert counts[0] < counts[1]
 
 
@@ -112,8 +112,8 @@ def test_find_active_set__draws_what_hardly_changed_in_some_views_only(before, a
     def drawn(quiet_views, quiet=0.9):
         monkeypatch.setattr("morgs_mi.method.active_set._QUIET", quiet)
         config = ActiveSetConfig(quiet_views=quiet_views)
-        found = find_active_set(before, cameras(), changed, CHANNELS, RENDER, config)
-        return found, {view: found.views[view].region.mask for view in range(V)}
+        active_set = find_active_set(before, cameras(), changed, CHANNELS, RENDER, config)
+        return active_set, {view: active_set.views[view].region.mask for view in range(V)}
 
     every, everywhere = drawn(V)
     some, masks = drawn(2)
@@ -161,8 +161,8 @@ def test_fit_later_frame__with_the_active_set_equals_the_full_fit(before, after,
     assert not np.asarray(fitted.gaussians.motion)[where].any()
     assert not np.asarray(fitted.gaussians.offset)[where].any()
     for attribute in ("means", "quats", "log_scales", "sh_coeffs", "logit_opacities"):
-        found = np.asarray(getattr(fitted.gaussians, attribute))[where]
-        assert np.array_equal(found, np.asarray(getattr(before, attribute))[still]), attribute
+        values = np.asarray(getattr(fitted.gaussians, attribute))[where]
+        assert np.array_equal(values, np.asarray(getattr(before, attribute))[still]), attribute
 
 
 @pytest.mark.parametrize("density", [DensityConfig(births=0.0), DensityConfig(later_frames=False)])

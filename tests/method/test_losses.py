@@ -56,8 +56,8 @@ def slow_recon(image, target, weight, window=11, sigma=1.5):
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
 def test_recon_loss__agrees_with_the_reference(images, weight):
     image, target = images
-    found = item(recon_loss(mi.TensorXf(image), Target(target), weight))
-    assert found == pytest.approx(slow_recon(image, target, weight), rel=tol.LOSS_REL)
+    loss = item(recon_loss(mi.TensorXf(image), Target(target), weight))
+    assert loss == pytest.approx(slow_recon(image, target, weight), rel=tol.LOSS_REL)
 
 
 def test_recon_loss__of_identical_images_is_zero(images):
@@ -133,8 +133,8 @@ def test_mask_loss__is_the_mean_absolute_difference():
     rng = np.random.default_rng(4)
     confidence = rng.uniform(size=(6, 5, 1)).astype(np.float32)
     mask = rng.uniform(size=(6, 5)) > 0.5
-    found = item(mask_loss(mi.TensorXf(confidence), mi.TensorXf(mask.astype(np.float32))))
-    assert found == pytest.approx(np.abs(confidence[..., 0] - mask).mean(), rel=1e-5)
+    loss = item(mask_loss(mi.TensorXf(confidence), mi.TensorXf(mask.astype(np.float32))))
+    assert loss == pytest.approx(np.abs(confidence[..., 0] - mask).mean(), rel=1e-5)
 
 
 def test_offset_loss__is_the_mean_l1_norm_in_scene_extents():
@@ -152,11 +152,11 @@ def test_recon_loss__gradient_on_a_region_agrees_with_the_full_view(width, maske
     drawn = (x - 30) ** 2 + (y - 100) ** 2 < 15**2
     drawn[0, 0] = drawn[-1, -1] = drawn[70, 5] = True
     region = Region(drawn)
-    truth, before = (np.float32(rng.uniform(size=(height, width, 3))) for _ in range(2))
-    changed = region.crop(before) + np.float32(rng.normal(size=region.shape(3))) * region.inside()[..., None] * 0.1
-    after = region.paste(changed, before)
+    truth, old_image = (np.float32(rng.uniform(size=(height, width, 3))) for _ in range(2))
+    changed = region.crop(old_image) + np.float32(rng.normal(size=region.shape(3))) * region.inside()[..., None] * 0.1
+    new_image = region.paste(changed, old_image)
     target = Target(truth, rng.uniform(size=drawn.shape) < 0.8 if masked else None)
-    target.set_surroundings(mi.TensorXf(before))
+    target.set_surroundings(mi.TensorXf(old_image))
 
     def evaluate(image, where):
         tensor = mi.TensorXf(np.float32(image))
@@ -165,15 +165,15 @@ def test_recon_loss__gradient_on_a_region_agrees_with_the_full_view(width, maske
         dr.backward(loss)
         return item(loss), np.asarray(dr.grad(tensor))
 
-    found, found_grad = evaluate(changed, region)
-    expected, expected_grad = evaluate(after, None)
+    region_loss, region_grad = evaluate(changed, region)
+    expected, expected_grad = evaluate(new_image, None)
     scale = np.abs(expected_grad).max()
-    assert_close(found_grad, region.crop(expected_grad), atol=tol.SUM_ORDER_REL * scale)
-    old, _ = evaluate(before, None)
-    old_on_region, _ = evaluate(region.crop(before), region)
-    assert found - old_on_region == pytest.approx(expected - old, abs=tol.LOSS_REL * expected)
+    assert_close(region_grad, region.crop(expected_grad), atol=tol.SUM_ORDER_REL * scale)
+    old, _ = evaluate(old_image, None)
+    old_on_region, _ = evaluate(region.crop(old_image), region)
+    assert region_loss - old_on_region == pytest.approx(expected - old, abs=tol.LOSS_REL * expected)
     again, again_grad = evaluate(changed, region)  # the surroundings are unchanged
-    assert (again, np.abs(again_grad - found_grad).max()) == (found, 0)
+    assert (again, np.abs(again_grad - region_grad).max()) == (region_loss, 0)
 
 
 @pytest.mark.parametrize("width", [23, 24])
@@ -187,8 +187,8 @@ def test_target__difference_is_that_of_every_pixel(width):
     drawn = np.zeros(mask.shape, bool)
     drawn[-1, -1] = drawn[3, 5] = True
     region = Region(drawn)
-    found = target.difference(mi.TensorXf(region.crop(image)), region)
-    assert np.allclose(found, region.crop(expected), atol=1e-6)
+    difference = target.difference(mi.TensorXf(region.crop(image)), region)
+    assert np.allclose(difference, region.crop(expected), atol=1e-6)
 
 
 def test_target__is_its_own_surroundings_by_default():

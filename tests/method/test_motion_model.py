@@ -54,8 +54,8 @@ def test_moved__shifts_means_and_turns_rotations():
     quats = turns.as_quat(scalar_first=True) - (1, 0, 0, 0)
     now = moved(gaussians, shift, mi.TensorXf(quats.astype(np.float32)))
     assert_close(now.means, np.asarray(gaussians.means) + np.asarray(shift), atol=1e-6)
-    before, after = (Rotation.from_quat(unit_quats(g), scalar_first=True) for g in (gaussians, now))
-    assert_close(after.as_matrix(), (turns * before).as_matrix(), atol=1e-5)
+    rotations, new_rotations = (Rotation.from_quat(unit_quats(g), scalar_first=True) for g in (gaussians, now))
+    assert_close(new_rotations.as_matrix(), (turns * rotations).as_matrix(), atol=1e-5)
 
 
 def test_moved__without_motion_changes_no_bit():
@@ -75,7 +75,7 @@ def test_moved__gradients_agree_with_central_differences():
 
     dr.enable_grad(rotation)
     dr.backward(value(rotation))
-    found = np.vdot(np.asarray(dr.grad(rotation)), direction)
+    derivative = np.vdot(np.asarray(dr.grad(rotation)), direction)
     at = np.asarray(dr.detach(rotation))
     ends = [np.asarray(value(mi.TensorXf(np.asarray(at + h * direction, np.float32)))).item() for h in (0.5, -0.5)]
-    assert abs(found - (ends[0] - ends[1])) < 1e-4 * abs(found)  # linear in the rotation
+    assert abs(derivative - (ends[0] - ends[1])) < 1e-4 * abs(derivative)  # linear in the rotation

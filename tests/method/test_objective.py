@@ -74,7 +74,7 @@ def test_losses_of__every_term_acts_where_its_inputs_exist_and_has_a_gradient():
 
     guided = {"guided_motion": tensor(H, W, 2)}
     image = Image(color=tensor(H, W, 3), confidence=tensor(H, W, 1), others=guided)
-    before = to_gaussians(make_scene())
+    previous_gaussians = to_gaussians(make_scene())
     moved = replace(to_gaussians(make_scene()), means=tensor(10, 3), quats=tensor(10, 4))
     inputs = {"recon": image.color, "flow": image["guided_motion"], "mask": image.confidence, "offset": tensor(5, 3)}
     inputs |= {"rigid": moved.means, "rotation": moved.quats, "isometry": moved.means}
@@ -85,7 +85,7 @@ def test_losses_of__every_term_acts_where_its_inputs_exist_and_has_a_gradient():
         "motion": mi.TensorXf(np.zeros((H, W, 2), np.float32)),
         "reliable": mi.TensorXf(np.ones((H, W), np.float32)),
         "mask": mi.TensorXf(np.zeros((H, W), np.float32)),
-        "neighbours": find_neighbours(before, 2.0),
+        "neighbours": find_neighbours(previous_gaussians, 2.0),
     }
     assert losses_of(prediction, {"target": observations["target"]}, ObjectiveConfig()).keys() == {"recon", "offset"}
     assert losses_of(prediction, observations, ObjectiveConfig()).keys() == {*NAMES[:4]}, "the others are off"

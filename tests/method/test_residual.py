@@ -44,17 +44,17 @@ def test_apply_residual__gate_scales_every_attribute(degree, two_gates):
     parameters = random_parameters(previous, config)
     m = 1 / (1 + np.exp(-np.asarray(parameters["logit_confidence"], np.float64)))
     current = apply_residual(previous, parameters, config).numpy()
-    before = previous.numpy()
+    old_values = previous.numpy()
     R = {name: np.asarray(value) for name, value in parameters.items()}
     displacement = m[:, None] * (R["motion"] + R["offset"])
     assert_close(current["motion"], displacement, atol=1e-6)
     assert_close(current["offset"], m[:, None] * R["offset"], atol=1e-6)
-    assert_close(current["means"] - before["means"], displacement, atol=1e-6)
-    assert_close(current["quats"] - before["quats"], m[:, None] * R["quats"], atol=1e-6)
-    change = current["sh_coeffs"] - before["sh_coeffs"]
+    assert_close(current["means"] - old_values["means"], displacement, atol=1e-6)
+    assert_close(current["quats"] - old_values["quats"], m[:, None] * R["quats"], atol=1e-6)
+    change = current["sh_coeffs"] - old_values["sh_coeffs"]
     m = np.ones_like(m) if two_gates else m
-    assert_close(current["log_scales"] - before["log_scales"], m[:, None] * R["log_scales"], atol=1e-6)
-    assert_close(current["logit_opacities"] - before["logit_opacities"], m * R["logit_opacities"], atol=1e-6)
+    assert_close(current["log_scales"] - old_values["log_scales"], m[:, None] * R["log_scales"], atol=1e-6)
+    assert_close(current["logit_opacities"] - old_values["logit_opacities"], m * R["logit_opacities"], atol=1e-6)
     assert_close(change[:, :1], m[:, None, None] * R["sh_dc"], atol=1e-6)
     if degree:
         assert_close(change[:, 1:], m[:, None, None] * R["sh_rest"], atol=1e-6)
@@ -76,8 +76,8 @@ def test_residual_parameters__lifted_motion_passes_the_gate_at_full_length(lift_
     current = apply_residual(previous, residual_parameters(previous, config, lifted), config)
     assert (np.asarray(current.confidence) > 0.1).all()
     assert np.asarray(current.motion) == pytest.approx(lifted.displacement, rel=1e-5, abs=1e-6)
-    before = np.asarray(previous.logit_confidence)
-    logit = lifted.logit_confidence if lift_confidence else before
+    old_logits = np.asarray(previous.logit_confidence)
+    logit = lifted.logit_confidence if lift_confidence else old_logits
     assert np.array_equal(current.logit_confidence, logit)
 
 

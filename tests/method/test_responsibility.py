@@ -56,13 +56,13 @@ def ball_moves():
 
 @pytest.mark.parametrize("width", [SIDE, SIDE // 2])
 def test_responsibility__is_close_to_the_exact_ratio(gaussians, width):
-    found = responsibility_for(gaussians, ball_moves(), width)
+    ratio = responsibility_for(gaussians, ball_moves(), width)
     exact, weight = exact_ratio(gaussians, ball_moves())
     visible = weight > 5
     assert visible[WALL:].sum() > 30
-    assert np.all(found[WALL:][visible[WALL:]] > 0.4)
-    assert np.corrcoef(found[visible], exact[visible])[0, 1] > 0.95
-    assert np.mean(np.abs(found - exact)[visible]) < 0.05
+    assert np.all(ratio[WALL:][visible[WALL:]] > 0.4)
+    assert np.corrcoef(ratio[visible], exact[visible])[0, 1] > 0.95
+    assert np.mean(np.abs(ratio - exact)[visible]) < 0.05
 
 
 def test_responsibility__is_small_for_a_background_that_other_views_see(gaussians):

@@ -22,24 +22,24 @@ BEFORE = make_wide_scene(40)
 
 
 def neighbours():
-    found = find_neighbours(to_gaussians(BEFORE), EXTENT, COUNT, REACH)
-    assert found is not None
-    return found
+    pairs = find_neighbours(to_gaussians(BEFORE), EXTENT, COUNT, REACH)
+    assert pairs is not None
+    return pairs
 
 
 def other(seed: int = 0, size: float = 0.1) -> Gaussians:
     """Return the Gaussians, each moved and turned by itself."""
     rng = np.random.default_rng(seed)
-    before = to_gaussians(BEFORE)
-    means, quats = (np.asarray(v) + size * rng.normal(size=v.shape) for v in (before.means, before.quats))
-    return replace(before, means=means, quats=quats)
+    start = to_gaussians(BEFORE)
+    means, quats = (np.asarray(v) + size * rng.normal(size=v.shape) for v in (start.means, start.quats))
+    return replace(start, means=means, quats=quats)
 
 
 def reference(gaussians: Gaussians) -> dict[str, float]:
     """Return the losses in float64, pair by pair."""
-    before = to_gaussians(BEFORE)
-    old, new = (np.asarray(g.means, np.float64) / EXTENT for g in (before, gaussians))
-    q_old, q_new = (Rotation.from_quat(unit_quats(g), scalar_first=True) for g in (before, gaussians))
+    start = to_gaussians(BEFORE)
+    old, new = (np.asarray(g.means, np.float64) / EXTENT for g in (start, gaussians))
+    q_old, q_new = (Rotation.from_quat(unit_quats(g), scalar_first=True) for g in (start, gaussians))
     sums = dict.fromkeys(LOSSES, 0.0)
     count = 0
     turns = (q_new * q_old.inv()).as_quat(scalar_first=True)
@@ -59,14 +59,14 @@ def reference(gaussians: Gaussians) -> dict[str, float]:
 
 @pytest.mark.parametrize("name", LOSSES)
 def test_rigidity__is_that_of_its_definition(name):
-    found = np.asarray(LOSSES[name](other(), neighbours())).item()
-    assert found == pytest.approx(reference(other())[name], rel=1e-4)
+    loss = np.asarray(LOSSES[name](other(), neighbours())).item()
+    assert loss == pytest.approx(reference(other())[name], rel=1e-4)
 
 
 @pytest.mark.parametrize("name", LOSSES)
 def test_rigidity__is_zero_for_a_body_that_moves_as_a_whole(name):
-    before = to_gaussians(BEFORE)
-    turned = rotated(before, Rotation.from_euler("xyz", (30, -20, 50), degrees=True).as_matrix())
+    start = to_gaussians(BEFORE)
+    turned = rotated(start, Rotation.from_euler("xyz", (30, -20, 50), degrees=True).as_matrix())
     body = replace(turned, means=np.asarray(turned.means) + np.array([0.4, 0, -0.2]))
     assert np.asarray(LOSSES[name](body, neighbours())).item() < 1e-5
     assert np.asarray(LOSSES[name](other(), neighbours())).item() > 1e-2
@@ -103,11 +103,11 @@ def test_rigidity__has_a_finite_gradient_where_nothing_moves(name):
 
 
 def test_find_neighbours__weighs_near_ones_more():
-    found = neighbours()
-    lengths = np.asarray(dr.norm(found.edges))
-    weights = np.asarray(found.weights) * len(lengths)
+    pairs = neighbours()
+    lengths = np.asarray(dr.norm(pairs.edges))
+    weights = np.asarray(pairs.weights) * len(lengths)
     assert weights == pytest.approx(np.exp(-((lengths / REACH) ** 2)), rel=1e-4)
-    assert np.asarray(found.difference @ np.ones(40)) == pytest.approx(np.zeros(200), abs=0)
+    assert np.asarray(pairs.difference @ np.ones(40)) == pytest.approx(np.zeros(200), abs=0)
 
 
 def test_find_neighbours__has_none_for_a_single_gaussian():
