@@ -57,8 +57,8 @@ def test_default_rig__ignores_far_floaters_and_what_is_nearly_transparent():
     means[100:150] = 50
     logits[100:150] = -8
     shown = replace(scene, means=means, logit_opacities=logits)
-    positions = ({camera.name: camera.position for camera in default_rig([found])} for found in (shown, scene))
-    assert_close(*(np.stack([found[name] for name in sorted(found)]) for found in positions), atol=0.5)
+    positions = ({camera.name: camera.position for camera in default_rig([gaussians])} for gaussians in (shown, scene))
+    assert_close(*(np.stack([rig[name] for name in sorted(rig)]) for rig in positions), atol=0.5)
 
 
 def test_default_rig__sees_a_single_gaussian():

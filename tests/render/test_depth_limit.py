@@ -35,8 +35,8 @@ def test_depth_limit__image_agrees_with_the_reference(scene, limit, channel):
     raw, camera = scene
     expected = rasterize_view(raw, camera, depth_limit=limit)
     solid = expected["alpha"] > 0.2 if channel in ("depth", "motion") else True
-    found = rasterize(to_gaussians(raw), camera, (channel,), depth_limit=limit)[channel]
-    assert_close(found, expected[channel], atol=5 * tol.IMAGE_ABS, where=solid)
+    image = rasterize(to_gaussians(raw), camera, (channel,), depth_limit=limit)[channel]
+    assert_close(image, expected[channel], atol=5 * tol.IMAGE_ABS, where=solid)
 
 
 @pytest.mark.parametrize(("channel", "reproducible"), [*((name, False) for name in CHANNELS), ("color", True)])
@@ -79,10 +79,10 @@ def test_depth_limit__forward_mode_agrees_with_the_reference(scene, limit):
 def test_depth_limit__at_infinity_changes_no_bit(scene):
     raw, camera = scene
     limit = np.full((camera.height, camera.width), np.inf)
-    found = rasterize(to_gaussians(raw), camera, CHANNELS, depth_limit=limit)
+    image = rasterize(to_gaussians(raw), camera, CHANNELS, depth_limit=limit)
     expected = rasterize(to_gaussians(raw), camera, CHANNELS)
     for name in CHANNELS:
-        np.testing.assert_array_equal(found[name], expected[name])
+        np.testing.assert_array_equal(image[name], expected[name])
 
 
 def test_depth_limit__in_front_of_everything_leaves_nothing(scene):
@@ -96,9 +96,9 @@ def test_depth_limit__draws_nothing_where_the_gaussian_is_too_faint(scene):
     faint = to_gaussians({**raw, "log_scales": np.full_like(raw["log_scales"], np.log(0.1))})
     limit = np.full((camera.height, camera.width), np.linalg.norm(camera.position))
     uncut = np.array(rasterize(faint, camera, ("alpha",)).alpha)
-    found = np.array(rasterize(faint, camera, ("alpha",), depth_limit=limit).alpha)
+    alpha = np.array(rasterize(faint, camera, ("alpha",), depth_limit=limit).alpha)
     assert (uncut == 0).any()
-    assert not found[uncut == 0].any()
+    assert not alpha[uncut == 0].any()
 
 
 def test_depth_limit__inside_equals_the_list_cut_at_that_depth():
@@ -109,10 +109,10 @@ def test_depth_limit__inside_equals_the_list_cut_at_that_depth():
     colors = rng.uniform(-1, 1, (60, 1, 3))
     cloud = isotropic(means, 0.05, 0.7, colors)
     near = isotropic(means[:30], 0.05, 0.7, colors[:30])
-    found = rasterize(cloud, camera, depth_limit=np.full((camera.height, camera.width), 4.0))
+    image = rasterize(cloud, camera, depth_limit=np.full((camera.height, camera.width), 4.0))
     expected = rasterize(near, camera)
     for name in ("color", "alpha"):
-        assert_close(found[name], expected[name], atol=tol.IMAGE_ABS, name=name)
+        assert_close(image[name], expected[name], atol=tol.IMAGE_ABS, name=name)
 
 
 def _large_gaussian() -> tuple[Gaussians, Camera]:
@@ -139,10 +139,10 @@ def test_depth_limit__plane_through_a_gaussian_agrees_with_the_integral_along_th
     fraction = np.sum(density * (points @ normal < 0), axis=0) / np.sum(density, axis=0)
 
     alpha = np.asarray(rasterize(gaussians, camera, ("alpha",)).alpha, np.float64)[rows, columns, 0]
-    found = np.asarray(rasterize(gaussians, camera, ("alpha",), depth_limit=limit).alpha)[rows, columns, 0]
+    cut_alpha = np.asarray(rasterize(gaussians, camera, ("alpha",), depth_limit=limit).alpha)[rows, columns, 0]
     assert 0.1 < fraction[alpha > 0.5].min() < 0.4 < fraction[alpha > 0.5].max() < 0.9
     # Low-pass filter, affine approximation over 3 degrees, and approximation of the distribution function.
-    assert_close(found, 1 - (1 - alpha) ** fraction, atol=4e-3)
+    assert_close(cut_alpha, 1 - (1 - alpha) ** fraction, atol=4e-3)
 
 
 def test_profile__is_the_depth_of_the_largest_response_along_the_ray():

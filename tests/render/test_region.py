@@ -97,8 +97,8 @@ def test_rasterize__blends_features_on_a_region(raw, camera, mask):
         return np.asarray(dr.detach(image)), np.asarray(dr.grad(features))
 
     expected, full = run_features()
-    found, grad = run_features(region=region)
-    assert np.array_equal(found, region.crop(expected))
+    blend, grad = run_features(region=region)
+    assert np.array_equal(blend, region.crop(expected))
     assert np.abs(full).max() > 0
     assert_close(grad, full, atol=tol.SUM_ORDER_REL * np.abs(full).max())
 
@@ -130,8 +130,8 @@ def test_rasterize__forward_mode_on_a_region_agrees_with_the_full_view(raw, came
         outputs = [image[name] for name in CHANNELS]
         dr.forward_to(outputs)
         tangents.append([np.asarray(dr.grad(output)) for output in outputs])
-    for name, found, expected in zip(CHANNELS, *tangents, strict=True):
-        assert_close(found, region.crop(expected), atol=tol.SUM_ORDER_REL * np.abs(expected).max(), name=name)
+    for name, tangent, expected in zip(CHANNELS, *tangents, strict=True):
+        assert_close(tangent, region.crop(expected), atol=tol.SUM_ORDER_REL * np.abs(expected).max(), name=name)
 
 
 def test_rasterize__on_an_empty_region_is_the_background(raw, camera, mask):

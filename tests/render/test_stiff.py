@@ -73,14 +73,14 @@ def test_stiff_truth__is_stiff():
 
 
 def test_rasterize__adam_converges_on_a_stiff_problem():
-    losses, found = descend(0.02, 150)
+    losses, values = descend(0.02, 150)
     assert np.isfinite(losses).all()
     assert losses[-1] < 1e-3 * losses[0]
     for name, value in stiff_truth().items():
-        assert np.abs(found[name] - value).max() < (4 if name == "logit_opacities" else 1), name
+        assert np.abs(values[name] - value).max() < (4 if name == "logit_opacities" else 1), name
 
 
 def test_rasterize__stays_finite_with_an_excessive_learning_rate():
-    losses, found = descend(10.0, 60)
+    losses, values = descend(10.0, 60)
     assert np.isfinite(losses).all()
-    assert all(np.isfinite(value).all() for value in found.values())
+    assert all(np.isfinite(value).all() for value in values.values())

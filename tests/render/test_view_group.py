@@ -56,10 +56,10 @@ def test_view_group__draws_what_each_view_draws(gaussians):
     images = group.split(np.asarray(drawing.color).reshape(group.region.shape(3)))
     weights = [np.random.default_rng(k).normal(size=region.shape(2)) for k, region in enumerate(group.regions)]
     sums = drawing.sums(from_numpy(mi.Float, np.concatenate(weights)), 2)
-    for view, region, image, weight, found in zip(views, group.regions, images, weights, sums, strict=True):
+    for view, region, image, weight, part in zip(views, group.regions, images, weights, sums, strict=True):
         blocks = replace(view, region=region)
         assert_close(image, np.asarray(blocks.render(active).color), rtol=1e-6, atol=1e-6)
-        assert_close(found, backproject(active, blocks, np.float32(weight)), rtol=1e-5, atol=1e-4)
+        assert_close(part, backproject(active, blocks, np.float32(weight)), rtol=1e-5, atol=1e-4)
 
 
 def test_view_group__crops_images_of_its_views(gaussians):
@@ -67,8 +67,8 @@ def test_view_group__crops_images_of_its_views(gaussians):
     images = [
         np.random.default_rng(k).normal(size=(v.camera.height, v.camera.width)) for k, v in enumerate(group.views)
     ]
-    for region, image, found in zip(group.regions, images, group.split(group.crop(images)), strict=True):
-        assert np.array_equal(found, region.crop(image))
+    for region, image, part in zip(group.regions, images, group.split(group.crop(images)), strict=True):
+        assert np.array_equal(part, region.crop(image))
 
 
 def test_view_group__of_gaussians_that_no_view_shows_is_black(gaussians):

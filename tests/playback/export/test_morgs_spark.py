@@ -133,15 +133,15 @@ def test_module__places_cameras_with_an_off_centre_principal_point(scene, site, 
 
 
 def test_module__follows_the_mesh(scene):
-    before = scene.show(1)
+    image = scene.show(1)
     scene.page.evaluate("splats.mesh.position.set(3, 1, -2); splats.mesh.rotateY(1); splats.mesh.scale.setScalar(0.5)")
     moved = scene.show(1)
     scene.page.evaluate("splats.mesh.position.set(0, 0, 0); splats.mesh.rotateY(-1); splats.mesh.scale.setScalar(1)")
-    assert psnr(moved / 255, before / 255) > 40
+    assert psnr(moved / 255, image / 255) > 40
 
 
 def test_module__is_hidden_by_other_meshes(scene):
-    before = scene.show(1)
+    image = scene.show(1)
     scene.page.evaluate("""{
       const wall = new THREE.Mesh(new THREE.PlaneGeometry(4, 4), new THREE.MeshBasicMaterial({ color: 0x00ff00 }));
       wall.quaternion.copy(camera.quaternion);
@@ -156,7 +156,7 @@ def test_module__is_hidden_by_other_meshes(scene):
     green = np.array([0, 255, 0])
     assert (ahead[:, -100:] == green).all()
     assert not (behind[:, -100:] == green).all()
-    assert psnr(behind[:, :100] / 255, before[:, :100] / 255) > 40
+    assert psnr(behind[:, :100] / 255, image[:, :100] / 255) > 40
 
 
 @pytest.mark.parametrize(("seconds", "frame"), [(0.15, 1), (0.2, 2), (0.7, 3), (-0.1, 3), (1.25, 0)])

@@ -152,14 +152,14 @@ def screen_speeds(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     means = gaussians.numpy()["means"][moves].astype(np.float64)
     motion = motion[moves]
     pixels, depths = camera.project(means)
-    seen = (depths > camera.near) & (pixels > 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
-    step = 1e-4 * motion[seen]
-    ahead = camera.project(means[seen] + step)[0]
-    behind = camera.project(means[seen] - step)[0]
-    scales = np.asarray(gaussians.scales, np.float64)[moves][seen]
-    areas = np.prod(scales, axis=1) ** (2 / 3) / depths[seen] ** 2
+    mask = (depths > camera.near) & (pixels > 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+    step = 1e-4 * motion[mask]
+    ahead = camera.project(means[mask] + step)[0]
+    behind = camera.project(means[mask] - step)[0]
+    scales = np.asarray(gaussians.scales, np.float64)[moves][mask]
+    areas = np.prod(scales, axis=1) ** (2 / 3) / depths[mask] ** 2
     speeds = np.linalg.norm(ahead - behind, axis=1) / 2e-4 / camera.width
-    return np.stack([speeds, np.asarray(gaussians.opacities)[moves][seen] * areas])
+    return np.stack([speeds, np.asarray(gaussians.opacities)[moves][mask] * areas])
 
 
 def test_notice__names_the_runtime_of_assemblyscript():
@@ -224,7 +224,7 @@ def page(opened):
 
 def decodes(page: Player, position: int, coded: CodedFrame) -> bool:
     """Return whether the page decodes a position to the integers of a state."""
-    found = page.page.evaluate(
+    values = page.page.evaluate(
         """async (position) => {
           const { ids, largest, exponents, values } = await player.playback.state(position);
           return [ids, largest, ...exponents, ...values].map((column) => [...column]);
@@ -232,7 +232,7 @@ def decodes(page: Player, position: int, coded: CodedFrame) -> bool:
         position,
     )
     expected = [coded.ids, coded.grid.largest_components, *coded.grid.exponents.T, *coded.grid.values.T]
-    return all(itertools.starmap(np.array_equal, zip(found, expected, strict=True)))
+    return all(itertools.starmap(np.array_equal, zip(values, expected, strict=True)))
 
 
 def test_page__decodes_the_same_integers(page, clip):
@@ -358,18 +358,18 @@ def test_page__repeats(page):
 
 
 def test_page__orbits_and_returns_to_the_camera(page):
-    before = page.image()
+    first_image = page.image()
     page.page.mouse.move(WIDTH / 2, HEIGHT / 2)
     page.page.mouse.down()
     page.page.mouse.move(WIDTH / 2 + 60, HEIGHT / 2, steps=4)
     page.page.mouse.up()
     page.page.wait_for_timeout(500)
     page.wait("player.settled")
-    assert psnr(page.image() / 255, before / 255) < 30
+    assert psnr(page.image() / 255, first_image / 255) < 30
     page.page.keyboard.press("r")
     page.page.wait_for_timeout(500)
     page.wait("player.settled")
-    assert psnr(page.image() / 255, before / 255) > 40
+    assert psnr(page.image() / 255, first_image / 255) > 40
 
 
 VIEW = ("camera.position", "controls.target")

@@ -366,8 +366,8 @@ def live(tmp_path):
     write_colmap(capture / "sparse" / "0", noise_capture.rig())
     (tmp_path / "capture.json").write_text(json.dumps({"capture": str(capture)}))
     splat = isotropic([[0, 0, 0]], 0.3, 0.9, (1.0, 0, 0))
-    about = {"reading": {"gaps": True}, "test_view": None}
-    with StreamWriter(tmp_path / "stream.morgs", noise_capture.rig(), 25, about) as writer:
+    metadata = {"reading": {"gaps": True}, "test_view": None}
+    with StreamWriter(tmp_path / "stream.morgs", noise_capture.rig(), 25, metadata) as writer:
 
         def add(frame: int) -> None:
             write_images(capture, noise_capture.NAMES, [images[frame]] * 3, frame)
