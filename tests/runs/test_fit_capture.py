@@ -198,10 +198,10 @@ def test_stream_capture__replaces_an_earlier_fit_together(whole: Path, tmp_path:
 
     def spy(loop: StreamLoop, *args: Any) -> Any:
         if frame := loop.state.frame:
-            about = json.loads((out / "capture.json").read_text())
+            metadata = json.loads((out / "capture.json").read_text())
             rows = report_of(out)["frames"]
             held = {index for _, index, _ in StreamReader(out / "stream.morgs").index()}
-            frames.append((Path(about["capture"]).name, report_of(out)["config"]["seed"], len(rows), len(held)))
+            frames.append((Path(metadata["capture"]).name, report_of(out)["config"]["seed"], len(rows), len(held)))
             assert len(rows) == frame
         return push(loop, *args)
 
@@ -324,10 +324,10 @@ def interrupted(whole: Path, out: Path, at: int) -> Path:
 
 def played(path: Path) -> list[int]:
     """Return the frames that can be played."""
-    found = []
+    numbers = []
     with contextlib.suppress(ValueError):
-        found.extend(frame for frame, _ in play(StreamReader(path)))
-    return found
+        numbers.extend(frame for frame, _ in play(StreamReader(path)))
+    return numbers
 
 
 def brighter(capture: Recording) -> Recording:
@@ -349,10 +349,10 @@ def test_stream_capture__does_not_resume_another_fit(
     whole: Path, tmp_path: Path, capture, config, message: str
 ) -> None:
     out = interrupted(whole, tmp_path / "out", len(stream_of(whole)) // 2)
-    before = stream_of(out)
+    old_stream = stream_of(out)
     with pytest.raises(ValueError, match=message):
         stream_capture(capture, out, config, resume=True)
-    assert stream_of(out) == before
+    assert stream_of(out) == old_stream
 
 
 def test_stream_capture__does_not_resume_a_damaged_fit(whole: Path, tmp_path: Path) -> None:
@@ -393,13 +393,13 @@ def test_stream_capture__refuses_a_folder_into_which_another_fit_writes(whole: P
 @pytest.mark.parametrize("change", ["removed", "removed folder", "moved", "replaced"])
 def test_stream_capture__ends_when_its_stream_is_taken_away(whole: Path, tmp_path: Path, change: str) -> None:
     out = tmp_path / "out"
-    seen = []
+    reports = []
 
     def take_away(stage: str, done: float, total: float) -> None:
         frame = ceil(done) if stage == "Later frames" else 0
-        if frame in seen:
+        if frame in reports:
             return
-        seen.append(frame)
+        reports.append(frame)
         if frame != 2:
             return
         if change == "removed":
@@ -410,10 +410,10 @@ def test_stream_capture__ends_when_its_stream_is_taken_away(whole: Path, tmp_pat
         else:
             out.rename(tmp_path / "moved")
 
-    found = "another file" if change == "replaced" else "none"
-    with pytest.raises(FileNotFoundError, match=rf"stream\.morgs: expected the stream that is being .*, found {found}"):
+    place = "another file" if change == "replaced" else "none"
+    with pytest.raises(FileNotFoundError, match=rf"stream\.morgs: expected the stream that is being .*, found {place}"):
         stream_capture(recording(), out, CONFIG, progress=take_away)
-    assert max(seen) == 2
+    assert max(reports) == 2
     if change == "replaced":
         assert stream_of(out) == stream_of(whole)
     elif change == "moved":
@@ -441,8 +441,8 @@ def test_stream_capture__resumes_a_stream_whose_header_has_a_path(whole: Path, t
     reader = StreamReader(whole / "stream.morgs")
     out = tmp_path / "out"
     shutil.copytree(whole, out)
-    about = {**reader.metadata, "capture": "/elsewhere"}
-    with StreamWriter(out / "stream.morgs", reader.cameras, reader.fps, about) as writer:
+    metadata = {**reader.metadata, "capture": "/elsewhere"}
+    with StreamWriter(out / "stream.morgs", reader.cameras, reader.fps, metadata) as writer:
         for packet in list(reader)[:3]:
             writer.write(packet)
     stream_capture(recording(), out, CONFIG, resume=True)
@@ -503,7 +503,7 @@ def test_stream_capture__does_not_write_into_a_capture(tmp_path: Path, link: str
     capture = colmap(tmp_path / "clip")
     out = tmp_path / "clip"
     (capture / "capture.json").write_text("{}")
-    before = sorted(capture.rglob("*"))
+    old_files = sorted(capture.rglob("*"))
     if link == "folder":
         out = tmp_path / "out"
         out.symlink_to(capture / "videos")
@@ -513,7 +513,7 @@ def test_stream_capture__does_not_write_into_a_capture(tmp_path: Path, link: str
         (out / "capture.json").symlink_to(capture / "capture.json")
     with pytest.raises(ValueError, match=rf"an output outside of captures, .* in the capture {capture}; choose"):
         stream_capture(recording(), out, CONFIG)
-    assert sorted(capture.rglob("*")) == before
+    assert sorted(capture.rglob("*")) == old_files
     assert (capture / "capture.json").read_text() == "{}"
 
 
@@ -527,10 +527,10 @@ def test_with_next__yields_the_frames_before_one_that_cannot_be_read() -> None:
         yield from "ab"
         raise OSError("the video ends here")
 
-    seen = []
+    numbers = []
     with pytest.raises(OSError, match="the video ends here"):
-        seen.extend(with_next(frames()))
-    assert seen == [("a", "b"), ("b", None)]
+        numbers.extend(with_next(frames()))
+    assert numbers == [("a", "b"), ("b", None)]
 
 
 def refined_config():

@@ -82,6 +82,6 @@ def assert_same(got: CodedFrame, expected: CodedFrame) -> None:
     """Assert that two states agree to the bit."""
     assert (got.frame, got.next_id) == (expected.frame, expected.next_id)
     assert np.array_equal(got.digest, expected.digest)
-    found = got.gaussians.numpy()
+    values = got.gaussians.numpy()
     for name, value in expected.gaussians.numpy().items():
-        assert np.array_equal(found[name], value), name
+        assert np.array_equal(values[name], value), name

@@ -54,12 +54,12 @@ def short_clip() -> Clip:
         states = [decode(None, packet)]
         writer.write(packet)
         for frame in range(1, FRAMES):
-            before = states[-1]
-            alive = np.arange(1, len(before))
-            now = Gaussians.concatenate([jittered(before.gaussians, rng).select(alive), cloud(1, 0, seed=frame)])
+            old_state = states[-1]
+            alive = np.arange(1, len(old_state))
+            now = Gaussians.concatenate([jittered(old_state.gaussians, rng).select(alive), cloud(1, 0, seed=frame)])
             now = replace(now, offset=rng.normal(0, 0.05, (len(now), 3)))
-            packet = residual_packet(before, now, np.r_[alive, -1], CAMERAS, config)
-            states.append(decode(before, packet))
+            packet = residual_packet(old_state, now, np.r_[alive, -1], CAMERAS, config)
+            states.append(decode(old_state, packet))
             writer.write(packet)
             if frame % EVERY == 0:
                 writer.write(reemitted_keyframe(states[-1]))

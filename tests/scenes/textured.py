@@ -60,12 +60,12 @@ def turned(camera: Camera, degrees: float) -> Camera:
 def textures() -> list[np.ndarray]:
     """Return one texture per plane, RGB uint8, with detail at several scales."""
     rng = np.random.default_rng(0)
-    found = []
+    images = []
     for _ in _PLANES:
         octaves = [rng.uniform(0, 1, (n, n, 3)) for n in (16, 32, 64, 128)]
         sum_ = sum(cv2.resize(o, (_TEXTURE, _TEXTURE), interpolation=cv2.INTER_CUBIC) for o in octaves)
-        found.append((255 * np.clip(sum_ / 3 - 0.1, 0, 1)).astype(np.uint8))
-    return found
+        images.append((255 * np.clip(sum_ / 3 - 0.1, 0, 1)).astype(np.uint8))
+    return images
 
 
 def render(
@@ -106,8 +106,8 @@ def points(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray
 
 def distance_to_planes(points: np.ndarray) -> np.ndarray:
     """Return the distance of each point [n, 3] from the nearest of the planes (taken as infinite), world units."""
-    found = []
+    distances = []
     for corner, across, down in _PLANES:
         normal = np.cross(across, down)
-        found.append(np.abs((points - corner) @ normal) / np.linalg.norm(normal))
-    return np.min(found, axis=0)
+        distances.append(np.abs((points - corner) @ normal) / np.linalg.norm(normal))
+    return np.min(distances, axis=0)

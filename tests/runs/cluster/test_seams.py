@@ -41,6 +41,6 @@ def test_fit_config__has_other_seeds_and_rates_for_each_pass() -> None:
 
 def test_overlap_config__has_more_epochs_and_the_same_other_settings() -> None:
     given = StreamConfig(fit=FitConfig(epochs=3))
-    found = SegmentConfig().overlap_config(given)
-    assert found.fit.epochs == 6
-    assert replace(found, fit=given.fit) == given
+    config = SegmentConfig().overlap_config(given)
+    assert config.fit.epochs == 6
+    assert replace(config, fit=given.fit) == given

@@ -164,7 +164,7 @@ def test_SegmentedRun__resumes_after_the_beginning_of_a_segment(
     with pytest.raises(KeyboardInterrupt):
         fit(capture, tmp_path, client, on_stage=when_fitted(FRAMES, interrupt))
     for path in (tmp_path / "segments").glob("*.morgs"):
-        offset = next((at for _, found, at in StreamReader(path).index() if found >= frame), None)
+        offset = next((at for _, number, at in StreamReader(path).index() if number >= frame), None)
         if offset is not None:
             os.truncate(path, offset)
     fit(capture, tmp_path, client, resume=True)
