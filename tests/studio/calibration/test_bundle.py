@@ -46,17 +46,17 @@ def disturbed(cameras, rng):
 def test_camera_jacobian__is_that_of_finite_differences(distortion):
     camera = rig(shift=7)[1]
     step = 1e-6
-    before = np.array([0, 0, 0, 0.02, -0.01, 0.03, 0.02, 0.001, -0.002, *distortion])
+    start = np.array([0, 0, 0, 0.02, -0.01, 0.03, 0.02, 0.001, -0.002, *distortion])
 
     def seen(changes, points=POINTS):
         now = changed_camera(camera, changes)
         return distorted(now, now.project(points)[0], changes[9:])
 
-    of_changes, of_points = camera_jacobian(changed_camera(camera, before), 1.02, POINTS, before[9:])
+    of_changes, of_points = camera_jacobian(changed_camera(camera, start), 1.02, POINTS, start[9:])
     for k in range(11):
-        ahead, back = (seen(before + sign * step * np.eye(11)[k]) for sign in (1, -1))
+        ahead, back = (seen(start + sign * step * np.eye(11)[k]) for sign in (1, -1))
         assert_close(of_changes[:, :, k], (ahead - back) / (2 * step), rtol=1e-5, atol=1e-4, name=str(k))
-    moved = [seen(before, POINTS + sign * step * np.eye(3)[0]) for sign in (1, -1)]
+    moved = [seen(start, POINTS + sign * step * np.eye(3)[0]) for sign in (1, -1)]
     assert_close(of_points[:, :, 0], (moved[0] - moved[1]) / (2 * step), rtol=1e-5, atol=1e-4)
 
 
@@ -90,10 +90,10 @@ def test_bundle_adjust__finds_the_reprojections_despite_wrong_matches():
     wrong = rng.random(len(tracks.ids)) < 0.1
     tracks.pixels[wrong] += rng.normal(scale=30, size=(wrong.sum(), 2))
     changes, points = bundle_adjust(given, tracks, priors_of(given))
-    found = [changed_camera(*pair) for pair in zip(given, changes, strict=True)]
-    projected = np.concatenate([camera.project(points)[0] for camera in found])
+    cameras = [changed_camera(*pair) for pair in zip(given, changes, strict=True)]
+    projected = np.concatenate([camera.project(points)[0] for camera in cameras])
     assert np.median(np.linalg.norm(projected - tracks.pixels, axis=1)[~wrong]) < 0.02
-    relative = [rig[0].viewmat[:3, :3] @ rig[-1].viewmat[:3, :3].T for rig in (found, true)]
+    relative = [rig[0].viewmat[:3, :3] @ rig[-1].viewmat[:3, :3].T for rig in (cameras, true)]
     assert np.rad2deg(np.arccos((np.trace(relative[0].T @ relative[1]) - 1) / 2)) < 0.02
 
 
@@ -113,9 +113,9 @@ def test_bundle_adjust__keeps_points_in_place_for_a_camera_that_takes_no_part(se
     points = rng.uniform((-3, -2, 6), (3, 2, 14), (300, 3))
     tracks = seen_by(given, points)
     tracks.pixels[:] += rng.normal(scale=0.3, size=tracks.pixels.shape)
-    before = intersect(tracks.ids, tracks.views, tracks.pixels, given, tracks.count)
-    _, after = bundle_adjust(given, tracks, priors_of(given))
-    shifts = [unseen.project(found)[0] - unseen.project(points)[0] for found in (before, after)]
+    start = intersect(tracks.ids, tracks.views, tracks.pixels, given, tracks.count)
+    _, end = bundle_adjust(given, tracks, priors_of(given))
+    shifts = [unseen.project(positions)[0] - unseen.project(points)[0] for positions in (start, end)]
     errors = [np.median(np.linalg.norm(shift, axis=1)) for shift in shifts]
     assert errors[1] < errors[0] + 0.03
 

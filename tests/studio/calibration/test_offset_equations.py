@@ -66,8 +66,8 @@ def test_solution__does_not_depend_on_gaussians_that_are_away_from_their_places(
 
 
 def test_solution__adds_what_the_fit_hides() -> None:
-    found = equations(turning_ball())
-    np.testing.assert_allclose(found.solution(share=0.5), 2 * found.solution())
+    system = equations(turning_ball())
+    np.testing.assert_allclose(system.solution(share=0.5), 2 * system.solution())
 
 
 def test_sum__is_between_its_instants() -> None:
@@ -77,9 +77,9 @@ def test_sum__is_between_its_instants() -> None:
 
 
 def test_matrix__does_not_change_with_a_common_offset() -> None:
-    found = equations(turning_ball(), held_out=[2])
-    common = np.delete(found.matrix, 2, axis=1).sum(axis=1)
-    assert np.abs(np.delete(common, 2) / np.delete(found.own, 2)).max() < 0.01
+    system = equations(turning_ball(), held_out=[2])
+    common = np.delete(system.matrix, 2, axis=1).sum(axis=1)
+    assert np.abs(np.delete(common, 2) / np.delete(system.own, 2)).max() < 0.01
 
 
 def test_errors__are_large_where_a_change_of_depth_explains_an_offset() -> None:
@@ -98,13 +98,13 @@ def test_errors__are_large_where_a_change_of_depth_explains_an_offset() -> None:
 def test_errors__are_those_of_repeated_noise() -> None:
     ball = turning_ball()
     rng = np.random.default_rng(0)
-    found = [equations(ball, 0 * OFFSETS, noise=rng.normal(0, 0.02, (5, *SIZE))) for _ in range(20)]
-    spread = np.std([each.solution() - each.solution()[0] for each in found], axis=0)[1:]
-    np.testing.assert_allclose(np.mean([each.errors(0) for each in found], axis=0)[1:], spread, rtol=0.4)
+    systems = [equations(ball, 0 * OFFSETS, noise=rng.normal(0, 0.02, (5, *SIZE))) for _ in range(20)]
+    spread = np.std([each.solution() - each.solution()[0] for each in systems], axis=0)[1:]
+    np.testing.assert_allclose(np.mean([each.errors(0) for each in systems], axis=0)[1:], spread, rtol=0.4)
 
 
 def test_solution__leaves_views_where_they_are_without_motion() -> None:
     still = replace(opaque_ball(), motion=np.zeros((400, 3), np.float32))
-    found = equations(still)
-    assert not found.own.any()
-    np.testing.assert_array_equal(found.solution(), 0)
+    system = equations(still)
+    assert not system.own.any()
+    np.testing.assert_array_equal(system.solution(), 0)

@@ -109,8 +109,8 @@ def test_refine_cameras__stays_in_the_frame_of_what_takes_no_part(far_capture, s
     capture = replace(far_capture, cameras=tuple(cameras))
     config = FitConfig(refine_cameras="on", short_fits=replace(SHORT, steps=100))
     refined, _ = refine_cameras(capture, config, REPRODUCIBLE, seed)
-    before, after = (shift_of_splats(each, far_capture) for each in (capture, refined))
-    assert after < max(most, 0.9 * before)
+    old_shift, new_shift = (shift_of_splats(each, far_capture) for each in (capture, refined))
+    assert new_shift < max(most, 0.9 * old_shift)
 
 
 def test_joint_step__turns_cameras_to_where_the_images_were_taken():
@@ -121,8 +121,8 @@ def test_joint_step__turns_cameras_to_where_the_images_were_taken():
     deviations = prior_deviations(1.0, CameraPriors())
     for _ in range(8):
         gaussians, changes = _joint_step(gaussians, views, changes, deviations, 0.0, RenderConfig())
-    found = [changed_camera(*pair) for pair in zip(given, changes, strict=True)]
-    errors = [np.abs(relative_turns(rig) - relative_turns(CAMERAS)).max() for rig in (given, found)]
+    cameras = [changed_camera(*pair) for pair in zip(given, changes, strict=True)]
+    errors = [np.abs(relative_turns(rig) - relative_turns(CAMERAS)).max() for rig in (given, cameras)]
     assert errors[1] < 0.15 * errors[0]
     assert abs(changes[:, 6].mean()) < 1e-6, "a camera that takes no part keeps its focal length"
 
@@ -131,14 +131,14 @@ def test_joint_step__turns_cameras_to_where_the_images_were_taken():
 def test_register_camera__finds_the_camera_of_an_image(scale):
     given = disturbed(CAMERAS[:1], scale)[0]
     image = image_of(CAMERAS[0])
-    found = register_camera(splats(), View(given, image), 1.0, FitConfig())
-    error = np.square(rendered(splats(), found, RenderConfig()) - image / 255).mean()
+    camera = register_camera(splats(), View(given, image), 1.0, FitConfig())
+    error = np.square(rendered(splats(), camera, RenderConfig()) - image / 255).mean()
     assert error < 1e-5, "the rounding to 8 bits alone has 1e-6"
 
 
 def test_register_camera__keeps_a_camera_that_fits():
-    found = register_camera(splats(), View(CAMERAS[0], image_of(CAMERAS[0])), 1.0, FitConfig())
-    assert_close(found.viewmat, CAMERAS[0].viewmat, rtol=0, atol=1e-3)
+    camera = register_camera(splats(), View(CAMERAS[0], image_of(CAMERAS[0])), 1.0, FitConfig())
+    assert_close(camera.viewmat, CAMERAS[0].viewmat, rtol=0, atol=1e-3)
 
 
 def test_moved__keeps_the_projections_of_points():
@@ -150,18 +150,18 @@ def test_moved__keeps_the_projections_of_points():
 def test_refine_cameras__returns_the_calibrated_cameras_without_a_gain(splat_capture, monkeypatch):
     # So short fits differ by tenths of a dB by chance, but by less than this.
     monkeypatch.setattr("morgs_mi.studio.calibration.refine.LEAST_GAIN", 3)
-    refined, found = refine_cameras(splat_capture, LEAST)
-    assert not found.taken
+    refined, refinement = refine_cameras(splat_capture, LEAST)
+    assert not refinement.taken
     assert refined is splat_capture
-    assert "stay as calibrated" in found.sentence
+    assert "stay as calibrated" in refinement.sentence
 
 
 @pytest.mark.parametrize(("gain", "taken"), [(0.05, False), (0.2, True)])
 def test_refine_cameras__takes_cameras_with_which_withheld_pixels_gain(splat_capture, monkeypatch, gain, taken):
     scores = iter((25.0, 25.0 + gain))
     monkeypatch.setattr("morgs_mi.studio.calibration.refine.mean_psnr", lambda *_: next(scores))
-    refined, found = refine_cameras(splat_capture, LEAST)
-    assert found.taken is taken
+    refined, refinement = refine_cameras(splat_capture, LEAST)
+    assert refinement.taken is taken
     assert (refined is splat_capture) is not taken
     assert refined.cameras[0] is splat_capture.cameras[0], "the held-out view stays as calibrated"
     assert np.array_equal(refined.points, splat_capture.points) is not taken
@@ -175,8 +175,8 @@ def test_refine_cameras__compares_the_views_that_have_withheld_pixels(splat_capt
         return kept, [unseen[0]._replace(mask=np.zeros(unseen[0].image.shape[:2], bool)), *unseen[1:]]
 
     monkeypatch.setattr("morgs_mi.studio.calibration.refine.withheld_blocks", with_an_empty_view)
-    _, found = refine_cameras(splat_capture, LEAST)
-    assert np.isfinite(found.calibrated_psnr)
+    _, refinement = refine_cameras(splat_capture, LEAST)
+    assert np.isfinite(refinement.calibrated_psnr)
 
 
 @pytest.mark.long
@@ -184,18 +184,18 @@ def test_refine_cameras__improves_withheld_pixels_of_disturbed_cameras(textured_
     disturbed_capture = replace(textured_capture, cameras=tuple(disturbed(textured_capture.cameras, 1.5)))
     capture = with_points(disturbed_capture, 0, Progress())
     how = ShortFitConfig(steps=200, rounds=2, width=160)
-    refined, found = refine_cameras(capture, FitConfig(refine_cameras="auto", short_fits=how))
-    assert found.taken
-    assert found.refined_psnr > found.calibrated_psnr + 0.5
-    true, before, after = ([c.cameras[v] for v in capture.train_views] for c in (textured_capture, capture, refined))
-    errors = [np.abs(relative_turns(rig) - relative_turns(true)).max() for rig in (before, after)]
+    refined, refinement = refine_cameras(capture, FitConfig(refine_cameras="auto", short_fits=how))
+    assert refinement.taken
+    assert refinement.refined_psnr > refinement.calibrated_psnr + 0.5
+    true, start, result = ([c.cameras[v] for v in capture.train_views] for c in (textured_capture, capture, refined))
+    errors = [np.abs(relative_turns(rig) - relative_turns(true)).max() for rig in (start, result)]
     assert errors[1] < 0.5 * errors[0], "two rounds, where the default has five"
 
 
 def test_refine_cameras__does_not_judge_where_refined_cameras_are_wanted(splat_capture):
-    refined, found = refine_cameras(splat_capture, replace(LEAST, refine_cameras="on"))
-    assert found.taken
-    assert np.isnan(found.calibrated_psnr)
+    refined, refinement = refine_cameras(splat_capture, replace(LEAST, refine_cameras="on"))
+    assert refinement.taken
+    assert np.isnan(refinement.calibrated_psnr)
     assert refined is not splat_capture
 
 
@@ -204,8 +204,8 @@ def test_matched__finds_the_cameras_by_features(textured_capture, monkeypatch):
     capture = replace(textured_capture, cameras=tuple(disturbed(textured_capture.cameras)))
     given, true = ([c.cameras[v] for v in capture.train_views] for c in (capture, textured_capture))
     changes, tracks, _ = _matched(capture, capture.train_views, prior_deviations(scene_extent(given), CameraPriors()))
-    found = [changed_camera(*pair) for pair in zip(given, changes, strict=True)]
-    errors = [np.abs(relative_turns(rig) - relative_turns(true)).max() for rig in (given, found)]
+    cameras = [changed_camera(*pair) for pair in zip(given, changes, strict=True)]
+    errors = [np.abs(relative_turns(rig) - relative_turns(true)).max() for rig in (given, cameras)]
     assert tracks > 100
     assert errors[1] < 0.1 * errors[0]
 
@@ -227,9 +227,9 @@ def test_refine_cameras__needs_two_images(splat_capture):
 
 
 def test_Refinement__reports_the_changes_and_the_gain():
-    found = Refinement(True, 26.0, 31.5, 200, 0.51, 0.02, 0.011, 0.003)
-    assert found.sentence == (
+    refinement = Refinement(True, 26.0, 31.5, 200, 0.51, 0.02, 0.011, 0.003)
+    assert refinement.sentence == (
         "The cameras were refined, by up to 0.51 degrees, 0.02 units, 1.1 % of the focal length and 0.3 % of the "
         "image's width by the lens: withheld pixels have 31.50 dB instead of 26.00 dB."
     )
-    assert "dB" not in replace(found, calibrated_psnr=np.nan, refined_psnr=np.nan).sentence
+    assert "dB" not in replace(refinement, calibrated_psnr=np.nan, refined_psnr=np.nan).sentence

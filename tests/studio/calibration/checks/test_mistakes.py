@@ -186,7 +186,7 @@ def test_check_rig__names_columns_of_another_convention(
     np.save(tmp_path / "p.npy", rows)
     read, _ = read_poses_bounds(tmp_path / "p.npy", capture.names)
     # The principal points of the images, which the format cannot represent.
-    read = tuple(replace(c, K=own.K) for c, own in zip(read, capture.cameras, strict=True))
+    read = tuple(replace(c, K=camera.K) for c, camera in zip(read, capture.cameras, strict=True))
     check = check_rig(replace(capture, cameras=read, layout="poses_bounds"), shared)
     assert check.fits is False
     assert "the columns seem to be the camera's right, up and backward axes" in check.advice
