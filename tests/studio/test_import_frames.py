@@ -102,11 +102,11 @@ def test_import_frames__keeps_ids_where_gaussians_are_added_and_removed(tmp_path
         distances = np.linalg.norm(raw["means"][:, None] - expected["means"][rows], axis=2)
         assert distances.min(axis=1).max() < 2e-3
         nearest = rows[distances.argmin(axis=1)]
-        found = {int(row): int(number) for row, number in zip(nearest, coded.ids, strict=True)}
-        lasting = found.keys() & number.keys()
-        assert {row: found[row] for row in lasting} == {row: number[row] for row in lasting}
+        id_of_row = {int(row): int(number) for row, number in zip(nearest, coded.ids, strict=True)}
+        lasting = id_of_row.keys() & number.keys()
+        assert {row: id_of_row[row] for row in lasting} == {row: number[row] for row in lasting}
         assert len(lasting) == min(len(number), len(rows) - (10 if coded.frame == 4 else 0))
-        number = found
+        number = id_of_row
 
 
 @pytest.mark.parametrize(
@@ -125,8 +125,8 @@ def test_import_frames__keeps_ids_where_gaussians_are_added_and_removed(tmp_path
     ids=["same", "grows", "loses one", "loses and grows", "grows inside", "loses many", "shuffled", "others", "none"],
 )
 def test_matched_rows__follow_the_order_of_both_frames(rows, expected):
-    found = matched_rows(moving(0).select(np.arange(100)), moving(1).select(rows))
-    np.testing.assert_array_equal(np.array(found), np.array(expected))
+    matches = matched_rows(moving(0).select(np.arange(100)), moving(1).select(rows))
+    np.testing.assert_array_equal(np.array(matches), np.array(expected))
 
 
 def test_matched_rows__finds_none_among_equal_gaussians():
@@ -197,10 +197,10 @@ def test_import_frames__leaves_nothing_where_a_frame_is_broken(clip, tmp_path):
 
 def test_import_frames__refuses_to_replace_a_stream(clip, tmp_path):
     import_frames([clip], tmp_path / "s.morgs")
-    before = (tmp_path / "s.morgs").read_bytes()
+    old_bytes = (tmp_path / "s.morgs").read_bytes()
     with pytest.raises(FileExistsError, match="expected a new stream, got a file that exists"):
         import_frames([clip], tmp_path / "s.morgs")
-    assert (tmp_path / "s.morgs").read_bytes() == before
+    assert (tmp_path / "s.morgs").read_bytes() == old_bytes
 
 
 def test_import_frames__reads_gaussians_without_extent(tmp_path):

@@ -52,15 +52,15 @@ def test_Live__fits_videos_until_they_end(
 def test_Live__starts_the_viewer_at_a_provisional_first_frame(
     capture: Path, tmp_path: Path, videos: list[Path], run, monkeypatch
 ) -> None:
-    found = []
+    states = []
     monkeypatch.setattr(
-        module, "_start_viewer", lambda out, _: found.append(sorted(path.name for path in out.iterdir()))
+        module, "_start_viewer", lambda out, _: states.append(sorted(path.name for path in out.iterdir()))
     )
     monkeypatch.setattr(module, "_stop", lambda _: None)
     args = ("--camera", *videos, "--calibration", capture, "--view", "--frames", 1, *QUICK, "--first-frame-steps", 20)
     assert run("live", tmp_path / "out", *args)[0] == 0
-    assert len(found) == 1
-    assert PROVISIONAL in found[0]
+    assert len(states) == 1
+    assert PROVISIONAL in states[0]
 
 
 def test_Live__repeats_videos(capture: Path, tmp_path: Path, videos: list[Path], run, caplog) -> None:

@@ -80,14 +80,14 @@ def test_panorama__of_two_eyes_has_the_disparity_of_the_distance(longitude):
     image = panorama(ball_at(middle, 0.05), CAMERA, width, apart, samples=1)
     assert image.shape == (width, width, 3)
     angles = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
-    found = []
+    disparities = []
     for eye in (image[: width // 2], image[width // 2 :]):
         weights = eye[..., 0].sum(axis=0)
         assert weights.max() > 0.5
-        found.append(np.angle(np.sum(weights * np.exp(1j * angles))))
+        disparities.append(np.angle(np.sum(weights * np.exp(1j * angles))))
     # The ray of an eye starts beside the centre: sin of the angle between both rays is (b / 2) / distance.
     shift = np.arcsin(0.5 * apart / DISTANCE)
-    assert_close(np.angle(np.exp(1j * (np.array(found) - longitude))), [shift, -shift], atol=1e-3)
+    assert_close(np.angle(np.exp(1j * (np.array(disparities) - longitude))), [shift, -shift], atol=1e-3)
 
 
 def test_panorama__shows_in_its_middle_what_the_camera_sees():
@@ -96,13 +96,13 @@ def test_panorama__shows_in_its_middle_what_the_camera_sees():
     image = panorama(scene, levelled(camera, np.array([0.0, 0, 1])), 512, samples=1)
     level = levelled(camera, np.array([0.0, 0, 1]))
     view = Camera(np.array([[256, 0, 32], [0, 256, 24], [0, 0, 1.0]]), level.viewmat, 64, 48)
-    seen = np.array(rasterize(scene, view).color)
+    picture = np.array(rasterize(scene, view).color)
     x, y = np.meshgrid((np.arange(64) - 31.5) / 256, (np.arange(48) - 23.5) / 256)
     u = (np.arctan2(x, 1) / (2 * np.pi) + 0.5) * 512 - 0.5
     v = (0.5 - np.arctan2(-y, np.hypot(x, 1)) / np.pi) * 256 - 0.5
     warped = cv2.remap(image, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
-    assert seen.max() > 0.3
-    assert np.abs(warped - seen).mean() < 0.02
+    assert picture.max() > 0.3
+    assert np.abs(warped - picture).mean() < 0.02
 
 
 @pytest.mark.parametrize("target", [(0, 0, -5), (0, 1, -5), (3, 1, 0)], ids=["down", "nearly down", "level"])

@@ -63,8 +63,8 @@ def test_fit_live__follows_a_folder_that_is_filled(tmp_path: Path, rig: Path, im
         rows = fit_live([images], out, live, CONFIG, lambda *_: grown.append(open_stream(out).index()[-1][1]))
     assert grown == [0, 1, 2, 3], "the stream can be read while it grows"
     assert [row.frame for row in rows] == [0, 1, 2, 3]
-    for before, row in pairwise(rows):
-        assert row.time > before.time
+    for previous_row, row in pairwise(rows):
+        assert row.time > previous_row.time
         assert row.latency >= 0
         assert not row.problems
     assert sum(row.dropped for row in rows) > 0, "the fit is slower than the clip"

@@ -195,9 +195,9 @@ def test_FolderFeed__that_is_removed_is_an_error(tmp_path: Path) -> None:
     feed = FolderFeed(fill(tmp_path / "images", range(2), "a", "b"), 0.1, ["a", "b"])
     first = feed.newest()
     shutil.rmtree(tmp_path / "images")
-    for after in (first, None):
+    for bundle in (first, None):
         with pytest.raises(FileNotFoundError, match="images: expected the images of the cameras, but the folder was"):
-            feed.newest(after)
+            feed.newest(bundle)
 
 
 def test_FolderFeed__begins_with_the_only_number(tmp_path: Path, caplog) -> None:

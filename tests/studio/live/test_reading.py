@@ -58,8 +58,8 @@ def test_read_camera__opens_a_broken_connection_again(monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(cv2, "VideoCapture", open_stream)
     url = "rtsp://10.0.0.10/live"
-    found = list(islice(read_camera(url, Event()), 16))
-    assert sum(image is not None for image in found) == 4
+    images = list(islice(read_camera(url, Event()), 16))
+    assert sum(image is not None for image in images) == 4
     assert opened == [url] * 3
     for once in (read_camera(url, Event(), reconnect=False), read_camera("pipe", Event())):
         assert sum(image is not None for image in once) == 2

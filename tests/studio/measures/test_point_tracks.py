@@ -154,5 +154,5 @@ def test_seen_in_depth__compares_with_the_rendered_surface() -> None:
     wall = np.arange(40) + 0 * np.arange(30)[:, None] < 20
     points = np.array([(-1, 0, 0), (-1, 0, -1), (-1, 0, 0.05), (-1, 0, 1), (1, 0, 1), (9, 0, 0), (0, 0, -9)])
     # On it, in front of it, behind it by 1 % and by 25 %, beside it, outside the image, behind the camera.
-    seen = seen_in_depth(np.where(wall, 4.0, 0), wall.astype(float), CAMERA, points)
-    assert seen.tolist() == [True, True, True, False, True, False, False]
+    mask = seen_in_depth(np.where(wall, 4.0, 0), wall.astype(float), CAMERA, points)
+    assert mask.tolist() == [True, True, True, False, True, False, False]

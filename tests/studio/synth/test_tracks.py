@@ -31,13 +31,13 @@ def test_load_tracks__visible_points_have_the_depth_of_the_view(clip: Path) -> N
             truth = load_truth(clip / "truth", camera.name, frame)
             pixels, depth = camera.project(tracks.points[:, frame])
             inside = ((pixels >= 0) & (pixels < (64, 48))).all(-1)
-            seen = tracks.visible[camera.name][:, frame]
-            assert not (seen & ~inside).any()
+            mask = tracks.visible[camera.name][:, frame]
+            assert not (mask & ~inside).any()
             column, row = np.floor(pixels[inside]).astype(int).T
             ahead = depth[inside] / truth.depth[row, column] - 1
-            assert np.mean(np.abs(ahead[seen[inside]]) < 0.03) > 0.95
-            assert np.median(ahead[~seen[inside]]) > 0.01
-            compared += seen.sum(), (inside & ~seen).sum()
+            assert np.mean(np.abs(ahead[mask[inside]]) < 0.03) > 0.95
+            assert np.median(ahead[~mask[inside]]) > 0.01
+            compared += mask.sum(), (inside & ~mask).sum()
     assert (compared > (5000, 500)).all(), compared
 
 
@@ -65,9 +65,9 @@ def test_save_tracks__load_tracks_reads_them_back(tmp_path: Path) -> None:
     ids = np.array([1, 2], np.int32)
     for visible in ({}, {"cam00": np.array([[True, False], [False, False]])}):
         save_tracks(tmp_path, Tracks(points, ids, visible))
-        found = load_tracks(tmp_path)
-        assert (found.points.tolist(), found.ids.tolist()) == (points.tolist(), ids.tolist())
-        assert {name: mask.tolist() for name, mask in found.visible.items()} == {
+        tracks_of_file = load_tracks(tmp_path)
+        assert (tracks_of_file.points.tolist(), tracks_of_file.ids.tolist()) == (points.tolist(), ids.tolist())
+        assert {name: mask.tolist() for name, mask in tracks_of_file.visible.items()} == {
             n: m.tolist() for n, m in visible.items()
         }
 
