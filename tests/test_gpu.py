@@ -175,13 +175,13 @@ def test_stream_loop__fits_two_frames_alike_on_cuda_and_llvm():
     )
 
     def run():
-        before = opaque_ball()
+        ball = opaque_ball()
         shift = np.array([0.06, -0.03, 0.02], np.float32)
         frames = [
-            images_of(before),
-            images_of(Gaussians(**{**before.numpy(), "means": before.numpy()["means"] + shift})),
+            images_of(ball),
+            images_of(Gaussians(**{**ball.numpy(), "means": ball.numpy()["means"] + shift})),
         ]
-        loop = StreamLoop(views(), before.numpy()["means"], np.full((400, 3), 0.5), config)
+        loop = StreamLoop(views(), ball.numpy()["means"], np.full((400, 3), 0.5), config)
         scores = []
         for images in frames:
             loop.push([np.uint8(255 * image + 0.5) for image in images])

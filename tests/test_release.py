@@ -35,8 +35,8 @@ def test_check_release__compares_the_files_with_the_tag(checkout):
     version = PROJECT["version"]
     pyproject = (checkout / "pyproject.toml").read_text()
     if "Source" not in PROJECT["urls"]:
-        found = check_release(checkout, f"v{version}")
-        assert (found.returncode, "expected the addresses Source and Issues" in found.stderr) == (1, True)
+        problems = check_release(checkout, f"v{version}")
+        assert (problems.returncode, "expected the addresses Source and Issues" in problems.stderr) == (1, True)
         addresses = '[project.urls]\nSource = "https://example.org"\nIssues = "https://example.org"\n'
         (checkout / "pyproject.toml").write_text(pyproject.replace("[project.urls]\n", addresses))
     assert check_release(checkout, f"v{version}").returncode == 0

@@ -120,26 +120,26 @@ def test_push__motion_follows_the_truth_and_not_the_static_wall(full):
     """The modules' claim: per-Gaussian motion is the scene's, not the residual's."""
     loop, _, reports = full
     maps = held_out(loop.gaussians)
-    before = scene(1)[0].numpy()["means"]
+    means = scene(1)[0].numpy()["means"]
     now = scene(2)[0]
-    truth = rasterize(dataclasses.replace(now, motion=now.numpy()["means"] - before), cameras()[4], ("motion",))
+    truth = rasterize(dataclasses.replace(now, motion=now.numpy()["means"] - means), cameras()[4], ("motion",))
     truth = np.asarray(truth.motion)
-    found = np.asarray(maps.motion)
+    motion = np.asarray(maps.motion)
     moving = np.linalg.norm(truth, axis=-1) > 1.5
     assert 0.03 < moving.mean() < 0.4
-    assert endpoint_error(found, truth, moving) < 0.5 * endpoint_error(np.zeros_like(truth), truth, moving)
+    assert endpoint_error(motion, truth, moving) < 0.5 * endpoint_error(np.zeros_like(truth), truth, moving)
     still = np.linalg.norm(truth, axis=-1) < 0.01
-    assert endpoint_error(found, truth, still) < 0.5
+    assert endpoint_error(motion, truth, still) < 0.5
     assert {"recon", "flow", "offset"} <= reports[2].losses.keys()
 
 
 def test_push__confidence_is_high_where_things_move(full):
     loop = full[0]
-    found = np.asarray(held_out(loop.gaussians).confidence)[..., 0]
+    confidence = np.asarray(held_out(loop.gaussians).confidence)[..., 0]
     _, moves = scene(2)
     labelled = dataclasses.replace(scene(2)[0], logit_confidence=np.where(moves, 20.0, -20.0))
     truth = np.asarray(held_out(labelled, ("confidence",)).confidence)[..., 0]
-    assert found[truth > 0.9].mean() > found[truth < 0.1].mean() + 0.4
+    assert confidence[truth > 0.9].mean() > confidence[truth < 0.1].mean() + 0.4
 
 
 def test_push__decoder_has_the_encoders_state_to_the_bit(full):
@@ -175,11 +175,11 @@ def test_push__stream_carries_births_and_deaths(clip):
     density = DensityConfig(rounds=0, births=0.05, max_gaussians=590, min_error=0, min_opacity=0.3)
     loop, packets, reports = run(clip, dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, density=density)))
     frames = list(coded_frames(packets))
-    for before, after, report in zip(frames, frames[1:], reports[1:], strict=False):
-        births = np.setdiff1d(after.ids, before.ids)
-        survivors = len(np.intersect1d(after.ids, before.ids))
-        assert births.tolist() == list(range(before.next_id, before.next_id + len(births)))
-        assert 0 < len(births) == min(round(0.05 * len(before.ids)), 590 - survivors)
+    for state, next_state, report in zip(frames, frames[1:], reports[1:], strict=False):
+        births = np.setdiff1d(next_state.ids, state.ids)
+        survivors = len(np.intersect1d(next_state.ids, state.ids))
+        assert births.tolist() == list(range(state.next_id, state.next_id + len(births)))
+        assert 0 < len(births) == min(round(0.05 * len(state.ids)), 590 - survivors)
         assert report.num_gaussians == survivors + len(births)
     assert len(np.intersect1d(frames[0].ids, frames[2].ids)) < 590
     for name, value in frames[-1].gaussians.numpy().items():
@@ -275,29 +275,29 @@ def test_push__without_an_image_of_one_view(clip, first, monkeypatch):
         shown = np.clip(np.asarray(held_out(loop.gaussians, ("color",)).color), 0, 1)
         return [psnr(shown, images[4] / 255) for images in clip]
 
-    found = [scores()]
+    score_list = [scores()]
     missing = []
     for images in (without(clip[1], gone), clip[2][:4], clip[3][:4]):
         missing.append(loop.push(images)[1].missing_views)
-        found.append(scores())
+        score_list.append(scores())
     assert missing == [(f"cam{gone:02d}",), (), ()]
     assert [len(views) for views in flow_views] == [2, 2, 2]
     assert all(f"cam{gone:02d}" not in views for views in flow_views[:2])
     assert flow_views[2] == usual
     # Every frame follows the motion, from three of four views too: it shows its own instant better than the last did.
-    assert all(found[t][t] > found[t - 1][t] + 1 for t in (1, 2, 3)), found
+    assert all(score_list[t][t] > score_list[t - 1][t] + 1 for t in (1, 2, 3)), score_list
 
 
 def test_push__without_any_image_nothing_moves(clip):
     loop = new_loop()
     first, _ = loop.push(without(clip[0], 1))
-    before = loop.gaussians.numpy()
+    old_values = loop.gaussians.numpy()
     packet, report = loop.push([None] * 4)
     assert report.status == "no view has an image"
     assert report.missing_views == ("cam00", "cam01", "cam02", "cam03")
     assert report.num_bytes < 200 < len(encode_packet(first))  # the packet's frame, and nothing in it
     for name, value in loop.gaussians.numpy().items():
-        assert name == "motion" or np.array_equal(value, before[name]), name
+        assert name == "motion" or np.array_equal(value, old_values[name]), name
     packet, report = loop.push(clip[1][:4])
     assert (packet.frame, report.status, report.missing_views) == (2, "ok", ())
     assert "flow" not in report.losses
@@ -335,8 +335,8 @@ def test_stream_capture__writes_a_file(clip, tmp_path):
     assert sum(r.num_bytes for r in reports) < path.stat().st_size
     assert ticks[-1] == ("Later frames", 1, 1)
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["capture.json", "report.json", "stream.morgs"]
-    about = json.loads((tmp_path / "out" / "capture.json").read_text())
-    assert about == {"layout": "in memory", "capture": str(capture.path)}
+    settings = json.loads((tmp_path / "out" / "capture.json").read_text())
+    assert settings == {"layout": "in memory", "capture": str(capture.path)}
 
 
 def masked(masks):
@@ -420,8 +420,8 @@ def test_push__skipping_static_views_costs_no_quality(clip):
             loop = new_loop(dataclasses.replace(some, fit=fit, seed=seed))
             loop.state = begun.state  # the first frame skips nothing
             reports = [loop.push(images[:4])[1] for images in clip[1:3]]
-            found = np.asarray(rasterize(loop.gaussians, cameras()[4], ("color",)).color)
-            quality[seed, column] = psnr(np.clip(found, 0, 1), clip[2][4] / 255)
+            image = np.asarray(rasterize(loop.gaussians, cameras()[4], ("color",)).color)
+            quality[seed, column] = psnr(np.clip(image, 0, 1), clip[2][4] / 255)
             sizes[seed, column] = sum(report.num_bytes for report in reports)
             assert (reports[-1].active["pixels"] < 1) == skip
     # One seed differs by up to a decibel: five small views, and a first frame that is far from done.
