@@ -230,7 +230,7 @@ class _Problem:
         for done in range(self.config.short_fits.rounds):
             report(done)
             posed_problem = replace(problem, views=tuple(_changed(self.views, changes)))
-            gaussians = self._fitted(posed_problem, later=done > 0)
+            gaussians = self._fitted(posed_problem, is_later=done > 0)
             blur = _BLURS[done] if done < len(_BLURS) else 0.0
             for _ in range(_STEPS):
                 gaussians, changes = _joint_step(gaussians, self.views, changes, deviations, blur, self.render)
@@ -267,8 +267,8 @@ class _Problem:
         rng = rng_of(self.seed, Stream.REFINED_POINTS)
         return FirstFrameProblem.of(_changed(self.views, changes), points, _short(self.config), self.render, rng)
 
-    def _fitted(self, problem: FirstFrameProblem, later: bool = False) -> Gaussians:
-        return fit_first_frame(problem, _short(self.config, later), rng_of(self.seed, Stream.REFINEMENT)).gaussians
+    def _fitted(self, problem: FirstFrameProblem, is_later: bool = False) -> Gaussians:
+        return fit_first_frame(problem, _short(self.config, is_later), rng_of(self.seed, Stream.REFINEMENT)).gaussians
 
 
 def register_camera(
@@ -363,20 +363,20 @@ def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -
     return moved_points.astype(np.float32)
 
 
-def _short(config: FitConfig, later: bool = False) -> FitConfig:
+def _short(config: FitConfig, is_later: bool = False) -> FitConfig:
     """Return the settings of a short fit; a later one continues with half the steps and lower rates.
 
     It has no view-dependent colours, which would hide wrong poses.
     """
     how = config.short_fits
     rates = config.first_frame_rates
-    if later:
+    if is_later:
         rates = replace(rates, **{name: factor * getattr(rates, name) for name, factor in _LATER_RATES.items()})
     return replace(
         config,
         sh_degree=0,
         num_gaussians=how.gaussians,
-        first_frame_steps=how.steps // 2 if later else how.steps,
+        first_frame_steps=how.steps // 2 if is_later else how.steps,
         first_frame_rates=rates,
         dropping=0.0,
         density=replace(config.density, rounds=0),

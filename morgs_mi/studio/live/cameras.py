@@ -60,19 +60,19 @@ class CameraFeed:
                 self._wait_for_first()
             deadline = time.monotonic() + self._timeout
             while True:
-                left = deadline - time.monotonic()
+                time_left = deadline - time.monotonic()
                 is_running = any(camera.reason is None for camera in self._cameras)
                 new = [camera.newer(after.numbers[k] if after else -1) for k, camera in enumerate(self._cameras)]
                 if after is not None and is_running:
-                    expected = self._expected(new, after, late=left <= 0)
+                    expected = self._expected(new, after, late=time_left <= 0)
                 else:  # the first images have to be complete, and so have the last ones
                     expected = [after is None or after.images[k] is not None for k in range(len(new))]
                 if shots := _nearest(new, expected):
                     times = [shot.time for shot in shots if shot is not None]
                     numbers = [camera.shots[-1].number for camera in self._cameras]
                     return bundled(shots, numbers, max(times) - min(times), _dropped(shots, after))
-                if is_running and left > 0:
-                    self._change.wait(left)
+                if is_running and time_left > 0:
+                    self._change.wait(time_left)
                 elif after is not None:
                     return None
                 else:
@@ -120,19 +120,19 @@ class CameraFeed:
         """
         deadline = time.monotonic() + self._timeout
         while silent := [k for k, camera in enumerate(self._cameras) if not camera.shots]:
-            left = deadline - time.monotonic()
+            time_left = deadline - time.monotonic()
             for name, camera in ((self.names[k], self._cameras[k]) for k in silent):
                 if camera.error is not None:
                     raise camera.error
-                if camera.reason is not None or left <= 0:
+                if camera.reason is not None or time_left <= 0:
                     raise ValueError(
                         f"CameraFeed(): expected images of {name}, got none ({camera.reason or 'it is silent'}); check "
                         f"that it records, or wait for it longer than {self._timeout:g} s (--timeout)."
                     )
-            self._change.wait(left)
+            self._change.wait(time_left)
         end = time.monotonic() + self._warm_up
-        while (left := end - time.monotonic()) > 0 and all(camera.reason is None for camera in self._cameras):
-            self._change.wait(left)
+        while (time_left := end - time.monotonic()) > 0 and all(camera.reason is None for camera in self._cameras):
+            self._change.wait(time_left)
 
 
 class _Camera(Thread):

@@ -57,8 +57,8 @@ class ClipClock:
             while min(self._times) < due - interval / 2 and not closed.is_set():
                 self._change.wait(_POLL)
             self._start = max(self._start, time.monotonic() - due)  # a late clip does not hurry afterwards
-            left = self._start + due - time.monotonic()
-        closed.wait(max(0.0, left))
+            time_left = self._start + due - time.monotonic()
+        closed.wait(max(0.0, time_left))
 
     def leave(self, clip: int) -> None:
         """Let the others go on without a clip."""
