@@ -153,12 +153,12 @@ def _fit(source: Source, folder: Path, config: StreamConfig, resume: bool) -> No
 def _evaluated(folder: Path, capture: Capture) -> dict[str, Any]:
     """Return the quality and the bytes of the decoded stream."""
     evaluation = evaluate_stream(folder, capture.path)
-    first, *later = evaluation.frames
+    first, *later_frames = evaluation.frames
     return {
-        "psnr": {"first": first.scores.psnr, "later": float(np.mean([row.scores.psnr for row in later]))},
+        "psnr": {"first": first.scores.psnr, "later": float(np.mean([row.scores.psnr for row in later_frames]))},
         "file": evaluation.sizes.file,
         "first": first.num_bytes,
-        "later": float(np.mean([row.num_bytes for row in later])),
+        "later": float(np.mean([row.num_bytes for row in later_frames])),
     }
 
 

@@ -120,10 +120,10 @@ def measure(source: Source, methods: Mapping[str, StreamConfig]) -> dict[str, di
 
 def scores_of(found: Evaluation, reports: Sequence[FrameReport], seconds: Sequence[float]) -> dict[str, Any]:
     """Return the scores of a stream as JSON."""
-    later = found.frames[1:]
-    motion = [asdict(row.motion_3d) for row in later if row.motion_3d is not None]
+    later_frames = found.frames[1:]
+    motion = [asdict(row.motion_3d) for row in later_frames if row.motion_3d is not None]
     scores = {
-        **{name: known_mean([getattr(row.scores, name) for row in later]) for name in _IMAGES},
+        **{name: known_mean([getattr(row.scores, name) for row in later_frames]) for name in _IMAGES},
         **{f"motion_3d_{name}": known_mean([row[name] for row in motion]) for name in ("error", "relative_error")},
         **{f"{row.protocol} {name}": getattr(row.moving, name) for row in found.tracking for name in _TRACKS},
         "num_bytes": known_mean([report.num_bytes for report in reports]),
@@ -131,7 +131,7 @@ def scores_of(found: Evaluation, reports: Sequence[FrameReport], seconds: Sequen
         "steps": known_mean([report.steps for report in reports]),
     }
     figures = {name: float(f"{value:.4g}") for name, value in scores.items()}
-    series = {name: [float(f"{getattr(row.scores, name):.4g}") for row in later] for name in _OVER_TIME}
+    series = {name: [float(f"{getattr(row.scores, name):.4g}") for row in later_frames] for name in _OVER_TIME}
     return json_finite({**figures, "by_frame": series})
 
 

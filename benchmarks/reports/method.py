@@ -273,17 +273,17 @@ def later_frames(source: Source, first: str, config: StreamConfig) -> dict[str, 
 
 def summary(found: Evaluation, reports: Sequence[FrameReport]) -> dict[str, Any]:
     """Return the scores of a stream, see `later_frames`."""
-    later = found.frames[1:]
-    motion = [row.motion_3d for row in later if row.motion_3d is not None]
+    evaluations = found.frames[1:]
+    motion = [row.motion_3d for row in evaluations if row.motion_3d is not None]
     return {
-        **{name: known_mean([getattr(row.scores, name) for row in later]) for name in _MEANS},
-        "num_bytes": known_mean([row.num_bytes for row in later]),
+        **{name: known_mean([getattr(row.scores, name) for row in evaluations]) for name in _MEANS},
+        "num_bytes": known_mean([row.num_bytes for row in evaluations]),
         **{f"motion_3d_{name}": known_mean([getattr(scores, name) for scores in motion]) for name in _MOTION_3D},
         "mtv": found.variation.render,
         "mtv_input": found.variation.input,
         "psnr_slope": found.psnr_slope,
         "seconds": float(np.median([report.seconds for report in reports])),
-        "by_frame": {name: [getattr(row.scores, name) for row in later] for name in _BY_FRAME},
+        "by_frame": {name: [getattr(row.scores, name) for row in evaluations] for name in _BY_FRAME},
     }
 
 
