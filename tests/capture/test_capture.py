@@ -172,12 +172,12 @@ def test_load_capture__leaves_cameras_out(tmp_path: Path, without: list[str]) ->
     (path / "cam02.mp4").write_bytes(b"")  # a clip that is not used is not opened
     (path / "capture.json").write_text('{"test_view": 4, "readout": {"cam02": 0.5, "cam05": 0.2}}')
     capture = load_capture(path, reading=ReadConfig(without=tuple(without)))
-    kept = [name for name in names if name not in without]
-    assert capture.names == tuple(kept)
+    remainder = [name for name in names if name not in without]
+    assert capture.names == tuple(remainder)
     (test_view,) = capture.test_views
     assert capture.names[test_view] == "cam04", "the setting counts all cameras"
     assert {c.name: c.readout for c in capture.cameras if c.readout} == {"cam05": 0.2}
-    assert [image[0, 0, 0] for image in next(capture.frames()).images] == [names.index(name) for name in kept]
+    assert [image[0, 0, 0] for image in next(capture.frames()).images] == [names.index(name) for name in remainder]
     assert load_capture(path, test_view=2, reading=ReadConfig(without=tuple(without))).test_views == (2,)
 
 

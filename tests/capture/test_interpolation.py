@@ -36,13 +36,13 @@ def moving_square(position: float) -> np.ndarray:
 def test_image_between__shows_things_where_they_have_moved_to(share: float) -> None:
     first = moving_square(0)
     second = moving_square(4)
-    wanted = moving_square(4 * share)
+    expected = moving_square(4 * share)
     image = image_between(first, second, share)
     blended = (1 - share) * first + share * second
     assert image.dtype == np.uint8
-    inside = slice(24, 48), slice(38, 58)
-    assert psnr(image[inside] / 255, wanted[inside] / 255) > psnr(blended[inside] / 255, wanted[inside] / 255) + 10
-    assert psnr(image / 255, wanted / 255) > psnr(blended / 255, wanted / 255) + 2
+    window = slice(24, 48), slice(38, 58)
+    assert psnr(image[window] / 255, expected[window] / 255) > psnr(blended[window] / 255, expected[window] / 255) + 10
+    assert psnr(image / 255, expected / 255) > psnr(blended / 255, expected / 255) + 2
 
 
 @pytest.mark.parametrize("share", [0, 1])

@@ -70,16 +70,16 @@ def test_undistortion__removes_what_a_refined_lens_leaves(model: str) -> None:
     cam = camera()
     lens = Lens(model, LENSES.get(model, ()))
     refined = camera(112.0)
-    left = (0.06, -0.01)
+    remainder = (0.06, -0.01)
     points = np.array([[x, y, 2.0] for x in (-0.8, -0.1, 0.7) for y in (-0.6, 0.05, 0.5)])
     expected, _ = refined.project(points)
     x, y = ((expected - refined.K[:2, 2]) / refined.K[[0, 1], [0, 1]]).T
     square = x**2 + y**2
     # Where the refined lens, and then the calibrated one, shows the points.
-    rays = np.stack([x, y], axis=1) * (1 + left[0] * square + left[1] * square**2)[:, None]
+    rays = np.stack([x, y], axis=1) * (1 + remainder[0] * square + remainder[1] * square**2)[:, None]
     positions = (rays * refined.K[[0, 1], [0, 1]] + refined.K[:2, 2] - cam.K[:2, 2]) / cam.K[[0, 1], [0, 1]]
     distorted = project(model, lens, np.concatenate([positions, np.ones((len(positions), 1))], axis=1))
-    lens_map = undistortion(cam, lens, (refined, Lens("RADIAL", left)))
+    lens_map = undistortion(cam, lens, (refined, Lens("RADIAL", remainder)))
     assert lens_map is not None
     assert_centred(lens_map(dots(distorted)).astype(float)[..., 0], expected)
 

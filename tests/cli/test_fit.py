@@ -275,8 +275,8 @@ def test_fit__does_not_offer_to_resume_a_stream_of_an_earlier_fit(
 
 def test_fit__reports_progress_before_the_first_frame(capture: Path, tmp_path: Path, run, monkeypatch) -> None:
     write_colmap(capture / "sparse" / "0", rig(), np.zeros((0, 3)), np.zeros((0, 3)))
-    now = iter(range(0, 10**9, 40))
-    monkeypatch.setattr("morgs_mi.cli.console.time.monotonic", lambda: float(next(now)))
+    clock = iter(range(0, 10**9, 40))
+    monkeypatch.setattr("morgs_mi.cli.console.time.monotonic", lambda: float(next(clock)))
     monkeypatch.setattr("morgs_mi.runs.fit_capture.StreamLoop.of", interrupt)
     status, _, error = run("fit", capture, tmp_path / "out", *QUICK)
     assert status == 130

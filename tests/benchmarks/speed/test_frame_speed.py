@@ -15,8 +15,8 @@ def test_scene__moves_the_given_number_of_balls():
     scene = Scene(SIZE, seed=0)
     first, second = (np.asarray(scene.at(t).means) for t in (0, 1))
     assert len(first) <= SIZE.gaussians
-    moved = np.linalg.norm(second - first, axis=1) > 0
-    assert set(scene.owner[moved]) == set(scene.moving)
+    mask = np.linalg.norm(second - first, axis=1) > 0
+    assert set(scene.owner[mask]) == set(scene.moving)
     assert len(scene.cameras()) == SIZE.views + 1
 
 

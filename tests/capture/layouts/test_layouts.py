@@ -364,8 +364,8 @@ def test_dynamic3dgs__reads_cameras(tmp_path: Path) -> None:
 def split_meta(path: Path, **cameras: tuple[int, ...]) -> Path:
     """Keep the `cameras` of `train_meta.json` in the files of these names."""
     meta = json.loads((path / "train_meta.json").read_text())
-    for name, kept in cameras.items():
-        picks = [[row.index(i) for i in kept] for row in meta["cam_id"]]
+    for name, members in cameras.items():
+        picks = [[row.index(i) for i in members] for row in meta["cam_id"]]
         lists = {
             key: [[row[c] for c in pick] for row, pick in zip(meta[key], picks, strict=True)]
             for key in ("k", "w2c", "fn", "cam_id")
