@@ -146,10 +146,10 @@ def residual(state, payload):
     new.pop("offset", None)
     if "offset" in changes:
         new["offset"] = np.zeros((len(new["ids"]) + births, 3))
-        moved = np.flatnonzero((new["values"][:, :3] != state["values"][~dead, :3]).any(1))
+        rows = np.flatnonzero((new["values"][:, :3] != state["values"][~dead, :3]).any(1))
         code_of_offsets = RangeCode(changes["offset"])
         for axis in range(3):
-            for i, r in zip(moved, code_of_offsets.column(len(moved)), strict=True):
+            for i, r in zip(rows, code_of_offsets.column(len(rows)), strict=True):
                 e = int(new["exponents"][i, 0])
                 step = (F[e % 4] * 2.0 ** (e // 4)) * (F[coarseness % 4] * 2.0 ** (coarseness // 4))
                 new["offset"][i, axis] = int(r) * step

@@ -98,18 +98,18 @@ def single_at(x: float) -> Gaussians:
 @pytest.mark.parametrize(("degree", "confidence"), [(0, False), (0, True), (2, False), (3, True)])
 def test_decode__round_trips_every_degree_with_and_without_confidence(degree: int, confidence: bool) -> None:
     state = decode(None, keyframe_packet(cloud(20, degree, confidence), 3, CAMERAS))
-    now = jittered(state.gaussians, np.random.default_rng(0))
-    result = decode(state, residual_packet(state, now, None, CAMERAS))
+    target = jittered(state.gaussians, np.random.default_rng(0))
+    result = decode(state, residual_packet(state, target, None, CAMERAS))
     assert result.frame == 4
     assert result.gaussians.sh_degree == degree
     assert (result.gaussians.logit_confidence is not None) == confidence
-    assert_close(result.gaussians.numpy()["sh_coeffs"], now.numpy()["sh_coeffs"], atol=0.02)
+    assert_close(result.gaussians.numpy()["sh_coeffs"], target.numpy()["sh_coeffs"], atol=0.02)
 
 
 def test_residual_packet__removes_all_gaussians() -> None:
     state = decode(None, keyframe_packet(cloud(5), 0, CAMERAS))
-    now = decode(state, residual_packet(state, single_at(7.0), np.array([-1]), CAMERAS))
-    assert (now.ids.tolist(), now.next_id) == ([5], 6)
+    new_state = decode(state, residual_packet(state, single_at(7.0), np.array([-1]), CAMERAS))
+    assert (new_state.ids.tolist(), new_state.next_id) == ([5], 6)
 
 
 def test_decode__names_a_missing_packet() -> None:

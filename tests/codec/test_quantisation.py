@@ -28,8 +28,8 @@ def test_residual_packet__errors_stay_within_the_tolerance() -> None:
     start = cloud(400)
     state = decode(None, keyframe_packet(start, 0, CAMERAS, config))
     target = jittered(start, np.random.default_rng(1))
-    moved = decode(state, residual_packet(state, target, None, CAMERAS, config))
-    for true, result, error, color_error in ((start, state, 0.5, 0.5), (target, moved, 2.0, 1.0)):
+    new_state = decode(state, residual_packet(state, target, None, CAMERAS, config))
+    for true, result, error, color_error in ((start, state, 0.5, 0.5), (target, new_state, 2.0, 1.0)):
         for camera in CAMERAS:
             view = camera.viewmat
             a, b = (g.numpy()["means"].astype(float) @ view[:3, :3].T + view[:3, 3] for g in (true, result.gaussians))

@@ -54,18 +54,18 @@ class Thing:
 
 
 def test_interrupts_raised__releases_the_variables_of_what_was_interrupted() -> None:
-    left: list[weakref.ref[Thing]] = []
+    references: list[weakref.ref[Thing]] = []
 
     def interrupted() -> None:
         thing = Thing()
         cycle = []
         cycle.append((cycle, thing))
-        left.append(weakref.ref(thing))
+        references.append(weakref.ref(thing))
         raise chained(RuntimeError, True)
 
     with pytest.raises(KeyboardInterrupt) as caught:
         interrupts_raised()(interrupted)()
-    assert left[0]() is None
+    assert references[0]() is None
     assert caught.value is not None
 
 

@@ -14,10 +14,10 @@ NOTHING = np.zeros(SIZE, bool)
 
 
 def test_still_variation__is_the_mean_change_of_pixels_that_never_move():
-    left = NOTHING.copy()
-    left[:, :8] = True
+    left_half = NOTHING.copy()
+    left_half[:, :8] = True
     variation = StillVariation()
-    for step, moving in ((0.0, NOTHING), (0.01, left), (-0.02, NOTHING)):
+    for step, moving in ((0.0, NOTHING), (0.01, left_half), (-0.02, NOTHING)):
         image = GREY + step
         image[:, :8] += 10 * step  # pixels that moved once are not counted
         variation.add(image, GREY + step / 2, moving)

@@ -192,15 +192,15 @@ def test_fit_first_frame__does_not_see_pixels_that_are_masked(images):
 
 
 def test_fit_first_frame__fits_views_of_different_sizes(images):
-    given = problem(images, ball(80))
+    start = problem(images, ball(80))
     camera = views()[1].resized(40, 30)
     small = View(camera, rendered(opaque_ball(), camera, RenderConfig()))
-    mixed = dataclasses.replace(given, views=(given.views[0], small, *given.views[2:]))
+    mixed = dataclasses.replace(start, views=(start.views[0], small, *start.views[2:]))
     result = fit_first_frame(
         mixed, dataclasses.replace(CONFIG, first_frame_steps=60), np.random.default_rng(0)
     ).gaussians
     for view in mixed.views:
-        errors = [np.abs(rendered(now, view.camera, RenderConfig()) - view.image).mean() for now in (ball(80), result)]
+        errors = [np.abs(rendered(g, view.camera, RenderConfig()) - view.image).mean() for g in (ball(80), result)]
         assert errors[1] < 0.5 * errors[0]
 
 

@@ -50,8 +50,8 @@ def test_fit_later_frame__reports_births_and_survivors(motion):
         assert (source == -1).sum() == round(births * len(start))
         assert np.isfinite(losses["recon"])
         raw = gaussians.numpy()
-        moved = raw["means"][: len(survivors)] - start.numpy()["means"][survivors]
-        assert raw["motion"][: len(survivors)] == pytest.approx(moved, abs=1e-6), "the whole displacement"
+        moves = raw["means"][: len(survivors)] - start.numpy()["means"][survivors]
+        assert raw["motion"][: len(survivors)] == pytest.approx(moves, abs=1e-6), "the whole displacement"
         assert raw["offset"].any() == motion.learn_offset
         results[births] = mean_psnr(gaussians, images)
     assert results[0.3] > results[0.0] + 0.05  # dB; runs differ by 1e-5

@@ -21,8 +21,8 @@ IMAGES = bytes_of(images_of(opaque_ball()))
 
 def features(gaussians, images=IMAGES, masks=(None,) * 4, cameras=None) -> tuple[float, float]:
     """Return the disagreement and the training PSNR of the four views."""
-    given = tuple(map(View, cameras or views(), images, masks))
-    return features_of(gaussians, given, NO_POINTS, RenderConfig())
+    view_tuple = tuple(map(View, cameras or views(), images, masks))
+    return features_of(gaussians, view_tuple, NO_POINTS, RenderConfig())
 
 
 def squares(gaussians, *args, **kwargs) -> float:
