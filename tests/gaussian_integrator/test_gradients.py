@@ -216,15 +216,15 @@ def test_gaussian_splat__backward_uses_the_rendering_of_the_same_parameters(raw,
     calls = counting_renders(monkeypatch)
     dr.backward(dr.sum(dr.square(mi.render(scene, params)), axis=None))
     assert len(calls) == 1
-    kept = np.array(dr.grad(opacities))
-    assert np.abs(kept).max() > 0
+    derivative = np.array(dr.grad(opacities))
+    assert np.abs(derivative).max() > 0
 
     # Only the last rendering is kept: the earlier one of two images is rendered again.
     dr.set_grad(opacities, 0)
     images = [mi.render(scene, params) for _ in range(2)]
     dr.backward(dr.sum(dr.square(images[0]), axis=None) + dr.sum(dr.square(images[1]), axis=None))
     assert len(calls) == 1 + 2 + 1
-    assert_close(np.array(dr.grad(opacities)), 2 * kept, rtol=1e-6)
+    assert_close(np.array(dr.grad(opacities)), 2 * derivative, rtol=1e-6)
 
 
 def test_gaussian_splat__backward_renders_what_has_changed_since(raw):

@@ -223,11 +223,11 @@ def test_gaussian_splat__differentiates_a_batch_of_sensors(raw):
     data = params["gaussians.data"]
     dr.enable_grad(data)
     dr.backward(dr.sum(dr.square(mi.render(scene, params)), axis=None))
-    together = np.array(dr.grad(data))
+    gradient = np.array(dr.grad(data))
     dr.set_grad(data, 0)
     for sensor in apart:
         dr.backward(dr.sum(dr.square(mi.render(scene, params, sensor=sensor)), axis=None))
-    assert_close(together, np.array(dr.grad(data)), rtol=1e-5)
+    assert_close(gradient, np.array(dr.grad(data)), rtol=1e-5)
 
 
 def test_gaussian_splat__refuses_a_batch_with_a_border(raw):

@@ -128,8 +128,8 @@ def test_find_active_set__keeps_what_moved_for_one_more_frame(before):
     """Its confidence can fall in that frame."""
     logits = np.where(np.arange(len(before)) == 7, 2.0, -2.0)
     nothing = {view: np.zeros((96, 128), bool) for view in range(V)}
-    moved = replace(before, logit_confidence=logits)
-    assert find_active_set(moved, cameras(), nothing, CHANNELS, RENDER).indices.tolist() == [7]
+    previous_gaussians = replace(before, logit_confidence=logits)
+    assert find_active_set(previous_gaussians, cameras(), nothing, CHANNELS, RENDER).indices.tolist() == [7]
 
 
 def test_find_active_set__takes_everything_where_most_pixels_changed(before):

@@ -33,8 +33,8 @@ def test_change_mask__finds_a_disc():
     rng = np.random.default_rng(1)
     mask = change_mask(noisy_image(rng), noisy_image(rng, disc=(70, 50)))
     y, x = np.mgrid[:H, :W]
-    inside = (x - 70) ** 2 + (y - 50) ** 2 < 15**2
-    assert mask[inside].all()
+    disc = (x - 70) ** 2 + (y - 50) ** 2 < 15**2
+    assert mask[disc].all()
     assert not mask[(x - 70) ** 2 + (y - 50) ** 2 > 19**2].any()
     valid = x < 70
     assert not change_mask(noisy_image(rng), noisy_image(rng, disc=(70, 50)), valid)[~valid].any()
@@ -118,12 +118,12 @@ def test_update_reference__detects_slow_changes_once_they_add_up():
     last = noisy_image(rng)
     waited = []
     for frame in range(1, 60):
-        now = noisy_image(rng, level=0.25 * frame)
-        assert not change_mask(last, now).mean() > 0.01
-        change = change_mask(reference, now)
+        image = noisy_image(rng, level=0.25 * frame)
+        assert not change_mask(last, image).mean() > 0.01
+        change = change_mask(reference, image)
         waited.append(change.mean())
-        reference = update_reference(reference, now, change)
-        last = now
+        reference = update_reference(reference, image, change)
+        last = image
     assert max(waited[:4]) < 0.01
     # 15 grey levels in all. Five standard deviations are 2.5, and the noise lets some pixels pass earlier.
     assert 5 < sum(waited) < 20  # of 59 frames

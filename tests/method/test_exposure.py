@@ -84,13 +84,13 @@ def test_exposure__composes():
 
 
 def test_centred__leaves_differences_between_cameras():
-    given = {0: WARM, 3: Exposure((1.3, 1.2, 1.1), (0.1, 0.1, 0.0))}
-    exposures = centred(given)
+    truth = {0: WARM, 3: Exposure((1.3, 1.2, 1.1), (0.1, 0.1, 0.0))}
+    exposures = centred(truth)
     middle = np.full(3, 0.4)
     np.testing.assert_allclose(np.mean([e(middle) for e in exposures.values()], axis=0), middle, atol=0.01)
     # The map from one camera's image to another's is the same.
     colors = scene()
-    np.testing.assert_allclose(exposures[3](exposures[0].inverse(colors)), given[3](given[0].inverse(colors)))
+    np.testing.assert_allclose(exposures[3](exposures[0].inverse(colors)), truth[3](truth[0].inverse(colors)))
 
 
 def test_centred__is_not_moved_by_a_few_dark_cameras():

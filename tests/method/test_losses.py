@@ -98,10 +98,10 @@ def test_recon_loss__dssim_agrees_with_the_metric_away_from_the_border():
     for image in (a, b):
         image[12:-12, 12:-12] = rng.uniform(0, 1, (24, 24, 3))
     dssim = item(recon_loss(mi.TensorXf(a), Target(b), 1.0))
-    inside = ssim(a, b)
+    similarity = ssim(a, b)
     full = 1 - dssim
     # Outside, SSIM is 1 in both; they differ in the number of such pixels that they count.
-    assert (1 - full) * 48**2 == pytest.approx((1 - inside) * _counted(48), rel=1e-3)
+    assert (1 - full) * 48**2 == pytest.approx((1 - similarity) * _counted(48), rel=1e-3)
 
 
 def _counted(side):
@@ -197,11 +197,11 @@ def test_target__is_its_own_surroundings_by_default():
     mask = np.zeros((32, 40), bool)
     mask[3, 4] = True
     region = Region(mask)
-    given = Target(truth)
+    target = Target(truth)
     default = Target(truth)
-    given.set_surroundings(mi.TensorXf(truth))
+    target.set_surroundings(mi.TensorXf(truth))
     image = mi.TensorXf(region.crop(truth) + 0.1)
-    assert item(recon_loss(image, default, region=region)) == item(recon_loss(image, given, region=region)) > 0
+    assert item(recon_loss(image, default, region=region)) == item(recon_loss(image, target, region=region)) > 0
 
 
 def test_recon_loss__refuses_an_image_of_another_size(images):

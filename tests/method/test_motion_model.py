@@ -52,16 +52,16 @@ def test_moved__shifts_means_and_turns_rotations():
     shift = tensor(10, 3)
     turns = Rotation.random(10, rng=RNG)
     quats = turns.as_quat(scalar_first=True) - (1, 0, 0, 0)
-    now = moved(gaussians, shift, mi.TensorXf(quats.astype(np.float32)))
-    assert_close(now.means, np.asarray(gaussians.means) + np.asarray(shift), atol=1e-6)
-    rotations, new_rotations = (Rotation.from_quat(unit_quats(g), scalar_first=True) for g in (gaussians, now))
+    result = moved(gaussians, shift, mi.TensorXf(quats.astype(np.float32)))
+    assert_close(result.means, np.asarray(gaussians.means) + np.asarray(shift), atol=1e-6)
+    rotations, new_rotations = (Rotation.from_quat(unit_quats(g), scalar_first=True) for g in (gaussians, result))
     assert_close(new_rotations.as_matrix(), (turns * rotations).as_matrix(), atol=1e-5)
 
 
 def test_moved__without_motion_changes_no_bit():
     gaussians = to_gaussians(make_scene())
-    now = moved(gaussians, dr.zeros(mi.TensorXf, (10, 3)), dr.zeros(mi.TensorXf, (10, 4)))
-    assert all(np.array_equal(now.numpy()[name], value) for name, value in gaussians.numpy().items())
+    result = moved(gaussians, dr.zeros(mi.TensorXf, (10, 3)), dr.zeros(mi.TensorXf, (10, 4)))
+    assert all(np.array_equal(result.numpy()[name], value) for name, value in gaussians.numpy().items())
 
 
 def test_moved__gradients_agree_with_central_differences():

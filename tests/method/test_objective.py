@@ -75,11 +75,11 @@ def test_losses_of__every_term_acts_where_its_inputs_exist_and_has_a_gradient():
     guided = {"guided_motion": tensor(H, W, 2)}
     image = Image(color=tensor(H, W, 3), confidence=tensor(H, W, 1), others=guided)
     previous_gaussians = to_gaussians(make_scene())
-    moved = replace(to_gaussians(make_scene()), means=tensor(10, 3), quats=tensor(10, 4))
+    moved_gaussians = replace(to_gaussians(make_scene()), means=tensor(10, 3), quats=tensor(10, 4))
     inputs = {"recon": image.color, "flow": image["guided_motion"], "mask": image.confidence, "offset": tensor(5, 3)}
-    inputs |= {"rigid": moved.means, "rotation": moved.quats, "isometry": moved.means}
+    inputs |= {"rigid": moved_gaussians.means, "rotation": moved_gaussians.quats, "isometry": moved_gaussians.means}
     assert list(inputs) == NAMES, "a new term needs an input here"
-    prediction = Prediction(image, {"offset": inputs["offset"]}, None, H * W, 10, 2.0, moved)
+    prediction = Prediction(image, {"offset": inputs["offset"]}, None, H * W, 10, 2.0, moved_gaussians)
     observations = {
         "target": Target(np.zeros((H, W, 3), np.float32)),
         "motion": mi.TensorXf(np.zeros((H, W, 2), np.float32)),

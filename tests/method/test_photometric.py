@@ -95,9 +95,11 @@ def test_refine_start__follows_a_change_of_light(scene):
     brighter = with_colors(gaussians, 0.1 / SH_C0)
     bright_targets = targets(brighter, views)
     followed = with_colors(gaussians, color_change(gaussians, views, bright_targets)[:, None])
-    left = [np.abs(bright_targets[v].difference(view.render(followed).color)).mean() for v, view in views.items()]
+    differences = [
+        np.abs(bright_targets[v].difference(view.render(followed).color)).mean() for v, view in views.items()
+    ]
     there = [np.abs(bright_targets[v].difference(view.render(gaussians).color)).mean() for v, view in views.items()]
-    assert max(left) < 0.5 * min(there)  # the rest is at the border, and from the weight of ten pixels
+    assert max(differences) < 0.5 * min(there)  # the rest is at the border, and from the weight of ten pixels
 
 
 def test_refine_start__trusts_few_pixels_less(scene):
@@ -117,6 +119,6 @@ def test_refine_start__changes_no_colour_without_views(scene):
 def test_refine_start__takes_colours_where_the_step_leads(scene):
     gaussians, views, images = scene
     displaced = replace(gaussians, means=np.asarray(gaussians.means) + start(0.6).displacement)
-    left = color_change(displaced, views, images)[:MOVING]
+    rest = color_change(displaced, views, images)[:MOVING]
     changes = refined_from(scene, start(0.6)).color_change[:MOVING]
-    assert np.abs(changes).mean() < 0.3 * np.abs(left).mean()
+    assert np.abs(changes).mean() < 0.3 * np.abs(rest).mean()

@@ -70,8 +70,8 @@ def test_rasterize__shows_decoded_gaussians_with_their_offset_once(moving) -> No
     config = CodecConfig(quality=8, offset=True)
     coded = decode(None, keyframe_packet(start, 0, [camera], config))
     offset = 0.02 * raw["offset"] / np.abs(raw["offset"]).max()
-    now = replace(start, means=raw["means"] + 2 * offset, motion=2 * offset, offset=offset)
-    packet = residual_packet(coded, now, np.arange(len(raw["means"])), [camera], config)
+    target = replace(start, means=raw["means"] + 2 * offset, motion=2 * offset, offset=offset)
+    packet = residual_packet(coded, target, np.arange(len(raw["means"])), [camera], config)
     gaussians = decode(coded, packet).gaussians
     assert gaussians.offset is not None
     late = replace(gaussians, means=gaussians.means + 0.7 * gaussians.motion, motion=None, offset=None)

@@ -137,9 +137,9 @@ def test_rasterize__forward_mode_on_a_region_agrees_with_the_full_view(raw, came
 def test_rasterize__on_an_empty_region_is_the_background(raw, camera, mask):
     raw = raw | {"means": raw["means"] * (1, 1, 0) + (0, 0, -50)}
     image = rasterize(Gaussians(**raw), camera, ("color", "depth"), BACKGROUND, region=Region(mask))
-    inside = Region(mask).inside()
-    assert np.array_equal(np.asarray(image.color)[inside], np.tile(np.float32(BACKGROUND), (inside.sum(), 1)))
-    assert (np.asarray(image.color)[~inside] == 0).all()
+    pixels = Region(mask).inside()
+    assert np.array_equal(np.asarray(image.color)[pixels], np.tile(np.float32(BACKGROUND), (pixels.sum(), 1)))
+    assert (np.asarray(image.color)[~pixels] == 0).all()
     assert (np.asarray(image.depth) == 0).all()
 
 

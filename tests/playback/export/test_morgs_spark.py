@@ -76,11 +76,11 @@ def site(clip, tmp_path_factory):
     index = open_stream(folder).index()
     version = bytearray(data)
     first = bytearray(data)
-    later = bytearray(data)
+    late_bytes = bytearray(data)
     version[8] += 1
     first[index[0][2] + 100] ^= 1
-    later[index[2][2] + 100] ^= 1
-    broken = {"page": b"something else", "version": version, "first": first, "later": later, "cut": data[:-10]}
+    late_bytes[index[2][2] + 100] ^= 1
+    broken = {"page": b"something else", "version": version, "first": first, "later": late_bytes, "cut": data[:-10]}
     for name, content in broken.items():
         (folder / f"{name}.morgs").write_bytes(content)
     with served(folder) as address:
@@ -135,9 +135,9 @@ def test_module__places_cameras_with_an_off_centre_principal_point(scene, site, 
 def test_module__follows_the_mesh(scene):
     image = scene.show(1)
     scene.page.evaluate("splats.mesh.position.set(3, 1, -2); splats.mesh.rotateY(1); splats.mesh.scale.setScalar(0.5)")
-    moved = scene.show(1)
+    moved_image = scene.show(1)
     scene.page.evaluate("splats.mesh.position.set(0, 0, 0); splats.mesh.rotateY(-1); splats.mesh.scale.setScalar(1)")
-    assert psnr(moved / 255, image / 255) > 40
+    assert psnr(moved_image / 255, image / 255) > 40
 
 
 def test_module__is_hidden_by_other_meshes(scene):

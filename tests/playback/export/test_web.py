@@ -243,9 +243,9 @@ def test_page__plays_a_stream_with_a_missing_frame(browser, clip, tmp_path):
     states = clip[1]
     packets = list(open_stream(clip[0]))
     # Frame 1 is lost; keyframes were re-emitted at frames 2 and 3.
-    kept = [packets[0], reemitted_keyframe(states[2]), packets[3], reemitted_keyframe(states[3])]
+    rest = [packets[0], reemitted_keyframe(states[2]), packets[3], reemitted_keyframe(states[3])]
     with StreamWriter(tmp_path / "stream.morgs", rig(WIDTH, HEIGHT), 10) as writer:
-        for packet in kept:
+        for packet in rest:
             writer.write(packet)
     write_web_page(open_stream(tmp_path), tmp_path / "page.html")
     with Player(browser, (tmp_path / "page.html").as_uri() + "#pause&frame=3") as page:

@@ -447,8 +447,8 @@ def test_view__prints_a_link_with_a_token_where_other_machines_can_reach_it(clip
 
 
 def test_view__refuses_a_port_that_is_taken(clip, capsys):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0)) as socket_in_use:
+        port = socket_in_use.getsockname()[1]
         assert cli.main(["view", str(clip[0]), "--port", str(port), "--no-browser"]) == 1
     assert f"127.0.0.1:{port}: cannot serve the page there" in " ".join(capsys.readouterr().err.split())
 
