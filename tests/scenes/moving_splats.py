@@ -50,10 +50,10 @@ def write_stream(
     state = decode(None, first)
     packets = [first]
     for frame in range(1, FRAMES):
-        now = moved(frame + shift, logit)
+        gaussians = moved(frame + shift, logit)
         config = replace(EXACT, offset=offset is not None)
-        now = replace(now, offset=np.tile((STEP * (offset or 0), 0, 0), (len(now), 1)))
-        packets.append(residual_packet(state, now, None, CAMERAS, config))
+        gaussians = replace(gaussians, offset=np.tile((STEP * (offset or 0), 0, 0), (len(gaussians), 1)))
+        packets.append(residual_packet(state, gaussians, None, CAMERAS, config))
         state = decode(state, packets[-1])
     with StreamWriter(path, CAMERAS, 25, metadata) as writer:
         for packet in packets:

@@ -56,9 +56,9 @@ def short_clip() -> Clip:
         for frame in range(1, FRAMES):
             old_state = states[-1]
             alive = np.arange(1, len(old_state))
-            now = Gaussians.concatenate([jittered(old_state.gaussians, rng).select(alive), cloud(1, 0, seed=frame)])
-            now = replace(now, offset=rng.normal(0, 0.05, (len(now), 3)))
-            packet = residual_packet(old_state, now, np.r_[alive, -1], CAMERAS, config)
+            target = Gaussians.concatenate([jittered(old_state.gaussians, rng).select(alive), cloud(1, 0, seed=frame)])
+            target = replace(target, offset=rng.normal(0, 0.05, (len(target), 3)))
+            packet = residual_packet(old_state, target, np.r_[alive, -1], CAMERAS, config)
             states.append(decode(old_state, packet))
             writer.write(packet)
             if frame % EVERY == 0:

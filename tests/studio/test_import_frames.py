@@ -64,8 +64,8 @@ def test_import_frames__keeps_the_ids_of_the_same_gaussians(clip, tmp_path):
         raw = coded.gaussians.numpy()
         expected = moving(coded.frame).numpy()
         assert_close(raw["means"], expected["means"], atol=0.2 * pixel)
-        moved = np.abs(raw["motion"] - 0.1 * (coded.frame > 0) * (np.arange(N) < N // 2)[:, None] * [1, 0, 0])
-        assert moved.max() < 0.4 * pixel
+        errors = np.abs(raw["motion"] - 0.1 * (coded.frame > 0) * (np.arange(N) < N // 2)[:, None] * [1, 0, 0])
+        assert errors.max() < 0.4 * pixel
     np.testing.assert_array_equal(stream.seek(3).gaussians.means, coded_frame(stream, 3).means)
 
 
@@ -163,8 +163,8 @@ def test_find_frames__orders_by_number(tmp_path):
     for name in [*names, "notes.txt", "cameras.json", "._f1.ply", ".DS_Store", "Thumbs.db"]:
         (tmp_path / name).touch()
     assert [path.name for path in find_frames([tmp_path])] == ["f1.ply", "f9.ply", "f10.ply", "f100.ply"]
-    given = [tmp_path / name for name in names]
-    assert find_frames(given) == given
+    paths = [tmp_path / name for name in names]
+    assert find_frames(paths) == paths
 
 
 @pytest.mark.parametrize(

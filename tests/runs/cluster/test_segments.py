@@ -58,9 +58,9 @@ def short_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def fit(capture: Capture, out: Path, client: Client, **options) -> list[FrameReport]:
-    given = {"config": SETTINGS, "segments": SEGMENTS} | options
-    resume = given.pop("resume", False)
-    return SegmentedRun(capture, out, client, **given).fit(resume)
+    metadata = {"config": SETTINGS, "segments": SEGMENTS} | options
+    resume = metadata.pop("resume", False)
+    return SegmentedRun(capture, out, client, **metadata).fit(resume)
 
 
 @pytest.fixture(scope="module")
@@ -120,11 +120,11 @@ def test_SegmentedRun__is_read_by_the_commands(whole: Path, tmp_path: Path, comm
 
 def when_fitted(count: int, action: Callable[[], object]) -> Callable[[str, float, float], None]:
     """Return a function that acts once, as soon as so many frames are fitted."""
-    left = [action]
+    actions = [action]
 
     def on_stage(stage: str, done: float, total: float) -> None:
-        if stage == "Fitting frames" and done >= count and left:
-            left.pop()()
+        if stage == "Fitting frames" and done >= count and actions:
+            actions.pop()()
 
     return on_stage
 

@@ -49,15 +49,15 @@ def test_camera_jacobian__is_that_of_finite_differences(distortion):
     start = np.array([0, 0, 0, 0.02, -0.01, 0.03, 0.02, 0.001, -0.002, *distortion])
 
     def seen(changes, points=POINTS):
-        now = changed_camera(camera, changes)
-        return distorted(now, now.project(points)[0], changes[9:])
+        changed_view = changed_camera(camera, changes)
+        return distorted(changed_view, changed_view.project(points)[0], changes[9:])
 
     of_changes, of_points = camera_jacobian(changed_camera(camera, start), 1.02, POINTS, start[9:])
     for k in range(11):
         ahead, back = (seen(start + sign * step * np.eye(11)[k]) for sign in (1, -1))
         assert_close(of_changes[:, :, k], (ahead - back) / (2 * step), rtol=1e-5, atol=1e-4, name=str(k))
-    moved = [seen(start, POINTS + sign * step * np.eye(3)[0]) for sign in (1, -1)]
-    assert_close(of_points[:, :, 0], (moved[0] - moved[1]) / (2 * step), rtol=1e-5, atol=1e-4)
+    ends = [seen(start, POINTS + sign * step * np.eye(3)[0]) for sign in (1, -1)]
+    assert_close(of_points[:, :, 0], (ends[0] - ends[1]) / (2 * step), rtol=1e-5, atol=1e-4)
 
 
 def test_undistorted__inverts_distorted():
@@ -86,11 +86,11 @@ def test_bundle_adjust__finds_the_reprojections_despite_wrong_matches():
     true = rig(shift=7)
     rng = np.random.default_rng(1)
     tracks = seen_by(true)
-    given = disturbed(true, rng)
+    start = disturbed(true, rng)
     wrong = rng.random(len(tracks.ids)) < 0.1
     tracks.pixels[wrong] += rng.normal(scale=30, size=(wrong.sum(), 2))
-    changes, points = bundle_adjust(given, tracks, priors_of(given))
-    cameras = [changed_camera(*pair) for pair in zip(given, changes, strict=True)]
+    changes, points = bundle_adjust(start, tracks, priors_of(start))
+    cameras = [changed_camera(*pair) for pair in zip(start, changes, strict=True)]
     projected = np.concatenate([camera.project(points)[0] for camera in cameras])
     assert np.median(np.linalg.norm(projected - tracks.pixels, axis=1)[~wrong]) < 0.02
     relative = [rig[0].viewmat[:3, :3] @ rig[-1].viewmat[:3, :3].T for rig in (cameras, true)]
@@ -108,21 +108,21 @@ def test_bundle_adjust__keeps_points_in_place_for_a_camera_that_takes_no_part(se
     places = [(x, y, 0) for y in (-0.5, 0, 0.5) for x in (-1, 0, 1)]
     rng = np.random.default_rng(seed)
     nine = look_at_cameras(places, 50, 320, 240, target=(0, 0, 10))
-    given = nine[:4] + nine[5:]
+    rig_of_nine = nine[:4] + nine[5:]
     unseen = nine[4]
     points = rng.uniform((-3, -2, 6), (3, 2, 14), (300, 3))
-    tracks = seen_by(given, points)
+    tracks = seen_by(rig_of_nine, points)
     tracks.pixels[:] += rng.normal(scale=0.3, size=tracks.pixels.shape)
-    start = intersect(tracks.ids, tracks.views, tracks.pixels, given, tracks.count)
-    _, end = bundle_adjust(given, tracks, priors_of(given))
+    start = intersect(tracks.ids, tracks.views, tracks.pixels, rig_of_nine, tracks.count)
+    _, end = bundle_adjust(rig_of_nine, tracks, priors_of(rig_of_nine))
     shifts = [unseen.project(positions)[0] - unseen.project(points)[0] for positions in (start, end)]
     errors = [np.median(np.linalg.norm(shift, axis=1)) for shift in shifts]
     assert errors[1] < errors[0] + 0.03
 
 
 def test_bundle_adjust__changes_focal_lengths_by_zero_on_average():
-    given = disturbed(rig(shift=7), np.random.default_rng(1))
-    changes, _ = bundle_adjust(given, seen_by(rig(shift=7)), priors_of(given))
+    start = disturbed(rig(shift=7), np.random.default_rng(1))
+    changes, _ = bundle_adjust(start, seen_by(rig(shift=7)), priors_of(start))
     assert np.abs(changes[:, 6]).max() > 1e-3
     assert abs(changes[:, 6].mean()) < 1e-6
 

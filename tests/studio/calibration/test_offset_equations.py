@@ -41,8 +41,8 @@ def equations(
     cameras = look_at_cameras(list(positions), 40)
     targets = []
     for view, (camera, offset) in enumerate(zip(cameras, offsets, strict=True)):
-        later = replace(ball, means=np.asarray(ball.means) + np.float32(offset) * np.asarray(ball.motion))
-        image = np.asarray(rasterize(later, camera, ("color",)).color) + (0 if noise is None else noise[view])
+        moved_ball = replace(ball, means=np.asarray(ball.means) + np.float32(offset) * np.asarray(ball.motion))
+        image = np.asarray(rasterize(moved_ball, camera, ("color",)).color) + (0 if noise is None else noise[view])
         targets.append(Target(np.clip(image, 0, 1).astype(np.float32)))
     displaced = replace(ball, means=(np.asarray(ball.means) + away).astype(np.float32))
     train = ~np.isin(np.arange(len(cameras)), held_out)

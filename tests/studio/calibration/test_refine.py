@@ -114,24 +114,24 @@ def test_refine_cameras__stays_in_the_frame_of_what_takes_no_part(far_capture, s
 
 
 def test_joint_step__turns_cameras_to_where_the_images_were_taken():
-    given = disturbed(CAMERAS)
+    start = disturbed(CAMERAS)
     gaussians = splats()
     changes = np.zeros((4, 11))
-    views = [View(camera, image_of(true)) for camera, true in zip(given, CAMERAS, strict=True)]
+    views = [View(camera, image_of(true)) for camera, true in zip(start, CAMERAS, strict=True)]
     deviations = prior_deviations(1.0, CameraPriors())
     for _ in range(8):
         gaussians, changes = _joint_step(gaussians, views, changes, deviations, 0.0, RenderConfig())
-    cameras = [changed_camera(*pair) for pair in zip(given, changes, strict=True)]
-    errors = [np.abs(relative_turns(rig) - relative_turns(CAMERAS)).max() for rig in (given, cameras)]
+    cameras = [changed_camera(*pair) for pair in zip(start, changes, strict=True)]
+    errors = [np.abs(relative_turns(rig) - relative_turns(CAMERAS)).max() for rig in (start, cameras)]
     assert errors[1] < 0.15 * errors[0]
     assert abs(changes[:, 6].mean()) < 1e-6, "a camera that takes no part keeps its focal length"
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0])
 def test_register_camera__finds_the_camera_of_an_image(scale):
-    given = disturbed(CAMERAS[:1], scale)[0]
+    start = disturbed(CAMERAS[:1], scale)[0]
     image = image_of(CAMERAS[0])
-    camera = register_camera(splats(), View(given, image), 1.0, FitConfig())
+    camera = register_camera(splats(), View(start, image), 1.0, FitConfig())
     error = np.square(rendered(splats(), camera, RenderConfig()) - image / 255).mean()
     assert error < 1e-5, "the rounding to 8 bits alone has 1e-6"
 
@@ -171,8 +171,8 @@ def test_refine_cameras__compares_the_views_that_have_withheld_pixels(splat_capt
     """Small views may have none."""
 
     def with_an_empty_view(views, width, rng):
-        kept, unseen = withheld_blocks(views, width, rng)
-        return kept, [unseen[0]._replace(mask=np.zeros(unseen[0].image.shape[:2], bool)), *unseen[1:]]
+        rest, unseen = withheld_blocks(views, width, rng)
+        return rest, [unseen[0]._replace(mask=np.zeros(unseen[0].image.shape[:2], bool)), *unseen[1:]]
 
     monkeypatch.setattr("morgs_mi.studio.calibration.refine.withheld_blocks", with_an_empty_view)
     _, refinement = refine_cameras(splat_capture, LEAST)
@@ -202,10 +202,10 @@ def test_refine_cameras__does_not_judge_where_refined_cameras_are_wanted(splat_c
 def test_matched__finds_the_cameras_by_features(textured_capture, monkeypatch):
     monkeypatch.setattr("morgs_mi.capture.features._MAX_FEATURES", 300)
     capture = replace(textured_capture, cameras=tuple(disturbed(textured_capture.cameras)))
-    given, true = ([c.cameras[v] for v in capture.train_views] for c in (capture, textured_capture))
-    changes, tracks, _ = _matched(capture, capture.train_views, prior_deviations(scene_extent(given), CameraPriors()))
-    cameras = [changed_camera(*pair) for pair in zip(given, changes, strict=True)]
-    errors = [np.abs(relative_turns(rig) - relative_turns(true)).max() for rig in (given, cameras)]
+    start, true = ([c.cameras[v] for v in capture.train_views] for c in (capture, textured_capture))
+    changes, tracks, _ = _matched(capture, capture.train_views, prior_deviations(scene_extent(start), CameraPriors()))
+    cameras = [changed_camera(*pair) for pair in zip(start, changes, strict=True)]
+    errors = [np.abs(relative_turns(rig) - relative_turns(true)).max() for rig in (start, cameras)]
     assert tracks > 100
     assert errors[1] < 0.1 * errors[0]
 

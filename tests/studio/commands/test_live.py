@@ -107,16 +107,16 @@ def test_Live__ends_with_a_summary_on_ctrl_c(capture: Path, tmp_path: Path, vide
     ],
 )
 def test_Live__refuses_in_one_sentence(capture: Path, tmp_path: Path, videos, run, args, parts) -> None:
-    given = [arg for a in args for arg in (videos if a == "VIDEOS" else [a])]
-    assert_refused(run("live", tmp_path / "out", "--calibration", capture, *given), *parts)
+    arguments = [arg for a in args for arg in (videos if a == "VIDEOS" else [a])]
+    assert_refused(run("live", tmp_path / "out", "--calibration", capture, *arguments), *parts)
     assert not (tmp_path / "out").exists()
 
 
 def test_Live__names_the_output_after_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    given: dict[str, Any] = {}
+    arguments: dict[str, Any] = {}
 
     def fit(sources, out, live, config, *_):
-        given.update(out=out, sources=sources, fit=config.fit)
+        arguments.update(out=out, sources=sources, fit=config.fit)
         raise KeyboardInterrupt
 
     monkeypatch.setattr("morgs_mi.studio.live.fit_live.fit_live", fit)
@@ -128,21 +128,21 @@ def test_Live__names_the_output_after_the_time(monkeypatch: pytest.MonkeyPatch) 
     for settings, seconds, epochs in cases:
         with pytest.raises(KeyboardInterrupt):
             Live(camera=("0", "rtsp://10.0.0.10/live"), settings=settings).run()
-        assert re.fullmatch(r"live-\d{8}-\d{6}", given["out"].name)
-        assert given["sources"] == [0, "rtsp://10.0.0.10/live"]
-        assert given["fit"].first_frame_seconds == seconds
-        assert given["fit"].epochs == epochs
+        assert re.fullmatch(r"live-\d{8}-\d{6}", arguments["out"].name)
+        assert arguments["sources"] == [0, "rtsp://10.0.0.10/live"]
+        assert arguments["fit"].first_frame_seconds == seconds
+        assert arguments["fit"].epochs == epochs
 
 
 def test_Lines__count_what_was_dropped_since_the_last_one(monkeypatch: pytest.MonkeyPatch) -> None:
     printed = []
-    now = 100.0
+    clock = 100.0
     monkeypatch.setattr(module, "print_warning", printed.append)
-    monkeypatch.setattr("time.monotonic", lambda: now)
+    monkeypatch.setattr("time.monotonic", lambda: clock)
     lines = _Lines()
     for frame, seconds in enumerate((0, 0.4, 0.4, 0.4)):
-        now += seconds
-        lines.add(LiveFrame(frame, now - 100, 0.25, 0.004, 3 * (frame > 0)))
+        clock += seconds
+        lines.add(LiveFrame(frame, clock - 100, 0.25, 0.004, 3 * (frame > 0)))
     assert printed == [
         "Frame 0: 0.0 s after the first, latency 0.25 s, 0 frames dropped, skew 4 ms.",
         "Frame 3: 1.2 s after the first, latency 0.25 s, 9 frames dropped, skew 4 ms.",

@@ -49,8 +49,8 @@ def test_shadow_ratio__of_a_directional_light_is_the_projected_outline():
     positions = np.stack([np.linspace(-1, 1, 81), np.zeros(81)], axis=1)
     ratios = shadow_ratio(floor(positions), scene(sun=SUN, disk=disk(1.0)), EYE, 4)
     # Light that passes (x, 0, z) was at (x - 0.3, 1, z - 0.2).
-    inside = np.hypot(positions[:, 0] - 0.3, positions[:, 1] - 0.2) < 0.5
-    np.testing.assert_array_equal(ratios, ~inside)
+    mask = np.hypot(positions[:, 0] - 0.3, positions[:, 1] - 0.2) < 0.5
+    np.testing.assert_array_equal(ratios, ~mask)
 
 
 @pytest.mark.parametrize("up", [True, False])

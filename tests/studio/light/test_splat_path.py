@@ -92,9 +92,9 @@ def test_splat_path__shadow_of_a_dense_shell_is_that_of_the_mesh():
     mesh = {"type": "sphere", "center": ASIDE.tolist(), "radius": 0.6}
     shadow = ratio(shell)
     expected = ratio(isotropic([(0, 0, -90)], 0.1, 0.5), {"type": "direct"}, ball=mesh)
-    inside = distance_to_aside() < 0.45
+    mask = distance_to_aside() < 0.45
     outside = distance_to_aside() > 0.7
-    for region, value in ((inside, 0), (outside, 1)):
+    for region, value in ((mask, 0), (outside, 1)):
         assert_close(expected[region], value, atol=1e-5)
         assert_close(shadow[region], value, atol=5e-3)
     assert shadow.mean() == pytest.approx(expected.mean(), abs=0.015)

@@ -247,8 +247,8 @@ def stamp(folder: Path, **clocks: float) -> None:
     for name, ahead in clocks.items():
         for file in (folder / name).iterdir():
             if abs(file.stat().st_mtime - time.time()) < 60:
-                now = file.stat().st_mtime + ahead
-                os.utime(file, times=(now, now))
+                time_of_file = file.stat().st_mtime + ahead
+                os.utime(file, times=(time_of_file, time_of_file))
 
 
 CLOCKS = [{"a": -300, "b": -300}, {"a": 300, "b": 300}, {"a": -300, "b": 0}, {"a": 300, "b": -4000}]

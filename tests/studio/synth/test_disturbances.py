@@ -137,9 +137,9 @@ def test_synthesize__shows_a_camera_with_a_time_offset_at_its_own_time(tmp_path:
     hand = list(scene.objects).index("hand")
     pose = scene.objects["hand"].pose
     points = tracks.points[tracks.ids == hand]
-    moved = points[:, 0] @ (pose(1 / FPS) @ np.linalg.inv(pose(0.0)))[:3, :3].T
-    moved += (pose(1 / FPS) @ np.linalg.inv(pose(0.0)))[:3, 3]
-    assert_close(points[:, 1], moved, atol=1e-6)
+    expected = points[:, 0] @ (pose(1 / FPS) @ np.linalg.inv(pose(0.0)))[:3, :3].T
+    expected += (pose(1 / FPS) @ np.linalg.inv(pose(0.0)))[:3, 3]
+    assert_close(points[:, 1], expected, atol=1e-6)
 
 
 def bar_scene(speed: float) -> Scene:

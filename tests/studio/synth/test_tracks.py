@@ -30,14 +30,14 @@ def test_load_tracks__visible_points_have_the_depth_of_the_view(clip: Path) -> N
         for frame in range(3):
             truth = load_truth(clip / "truth", camera.name, frame)
             pixels, depth = camera.project(tracks.points[:, frame])
-            inside = ((pixels >= 0) & (pixels < (64, 48))).all(-1)
+            in_image = ((pixels >= 0) & (pixels < (64, 48))).all(-1)
             mask = tracks.visible[camera.name][:, frame]
-            assert not (mask & ~inside).any()
-            column, row = np.floor(pixels[inside]).astype(int).T
-            ahead = depth[inside] / truth.depth[row, column] - 1
-            assert np.mean(np.abs(ahead[mask[inside]]) < 0.03) > 0.95
-            assert np.median(ahead[~mask[inside]]) > 0.01
-            compared += mask.sum(), (inside & ~mask).sum()
+            assert not (mask & ~in_image).any()
+            column, row = np.floor(pixels[in_image]).astype(int).T
+            ahead = depth[in_image] / truth.depth[row, column] - 1
+            assert np.mean(np.abs(ahead[mask[in_image]]) < 0.03) > 0.95
+            assert np.median(ahead[~mask[in_image]]) > 0.01
+            compared += mask.sum(), (in_image & ~mask).sum()
     assert (compared > (5000, 500)).all(), compared
 
 

@@ -60,8 +60,8 @@ def test_check_rig__names_another_pose_convention(
     toy = replace(layout_registry.LAYOUTS[0], name=layout, poses=PoseConvention(*expected))
     if layout.startswith("toy"):
         monkeypatch.setattr(layout_registry, "LAYOUTS", (*layout_registry.LAYOUTS, toy))
-    given = [interpreted(POSES[kind](camera), *expected) for camera in capture.cameras]
-    read = with_cameras(replace(capture, layout=layout), lambda i, c: replace(c, viewmat=given[i]))
+    cameras = [interpreted(POSES[kind](camera), *expected) for camera in capture.cameras]
+    read = with_cameras(replace(capture, layout=layout), lambda i, c: replace(c, viewmat=cameras[i]))
     check = check_rig(read, shared)
     assert check.fits is (kind == expected)
     if not check.fits:
