@@ -96,17 +96,17 @@ def test_losses__agree_between_cuda_and_llvm(masked):
     mask = rng.random((37, 45)) > 0.4
 
     def run():
-        given = {"recon": from_numpy(mi.TensorXf, image), "flow": from_numpy(mi.TensorXf, drawn)}
-        given["mask"] = from_numpy(mi.TensorXf, image[..., :1].copy())
-        dr.enable_grad(list(given.values()))
+        observations = {"recon": from_numpy(mi.TensorXf, image), "flow": from_numpy(mi.TensorXf, drawn)}
+        observations["mask"] = from_numpy(mi.TensorXf, image[..., :1].copy())
+        dr.enable_grad(list(observations.values()))
         reliable = from_numpy(mi.TensorXf, mask.astype(np.float32))
         losses = {
-            "recon": recon_loss(given["recon"], Target(target, mask if masked else None)),
-            "flow": flow_loss(given["flow"], from_numpy(mi.TensorXf, flow), reliable),
-            "mask": mask_loss(given["mask"], reliable),
+            "recon": recon_loss(observations["recon"], Target(target, mask if masked else None)),
+            "flow": flow_loss(observations["flow"], from_numpy(mi.TensorXf, flow), reliable),
+            "mask": mask_loss(observations["mask"], reliable),
         }
         dr.backward(sum(losses.values()))
-        gradients = {f"gradient of {name}": dr.grad(value) for name, value in given.items()}
+        gradients = {f"gradient of {name}": dr.grad(value) for name, value in observations.items()}
         return {name: dr.detach(value) for name, value in losses.items()} | gradients
 
     assert_variants_agree(run, rtol=tol.LOSS_GRADIENT_REL)

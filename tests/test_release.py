@@ -55,9 +55,9 @@ def test_project__names_its_pythons_and_dependencies_as_the_pages_do():
 
 
 def test_workflows__pin_their_actions():
-    used = [step["uses"] for _, job in JOBS for step in job["steps"] if "uses" in step]
-    assert len(used) > 8
-    assert [use for use in used if not re.fullmatch(r"[\w./-]+@[0-9a-f]{40}", use)] == []
+    actions = [step["uses"] for _, job in JOBS for step in job["steps"] if "uses" in step]
+    assert len(actions) > 8
+    assert [use for use in actions if not re.fullmatch(r"[\w./-]+@[0-9a-f]{40}", use)] == []
 
 
 def test_workflows__read_only_but_for_the_publication():

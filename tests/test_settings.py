@@ -156,8 +156,8 @@ def bounds() -> list[tuple[Any, str, Any]]:
     for config in configs:
         configs += [value for value in vars(config).values() if is_dataclass(value)]
         for name, kind in types_of(type(config)).items():
-            given = [bound for arm in arms_of(kind) for bound in getattr(arm, "__metadata__", ())]
-            bounds_of_fields += [(config, name, BEYOND[type(bound)](bound.limit)) for bound in given]
+            bounds_of_arms = [bound for arm in arms_of(kind) for bound in getattr(arm, "__metadata__", ())]
+            bounds_of_fields += [(config, name, BEYOND[type(bound)](bound.limit)) for bound in bounds_of_arms]
     return bounds_of_fields
 
 

@@ -121,8 +121,8 @@ def test_push__motion_follows_the_truth_and_not_the_static_wall(full):
     loop, _, reports = full
     maps = held_out(loop.gaussians)
     means = scene(1)[0].numpy()["means"]
-    now = scene(2)[0]
-    truth = rasterize(dataclasses.replace(now, motion=now.numpy()["means"] - means), cameras()[4], ("motion",))
+    state = scene(2)[0]
+    truth = rasterize(dataclasses.replace(state, motion=state.numpy()["means"] - means), cameras()[4], ("motion",))
     truth = np.asarray(truth.motion)
     motion = np.asarray(maps.motion)
     moving = np.linalg.norm(truth, axis=-1) > 1.5
@@ -203,9 +203,9 @@ def test_push__fits_views_at_their_own_times(clip):
 
 def moving_psnr(loop: StreamLoop, clip, view: int) -> float:
     """Return the PSNR of a view at frame 2, where it has changed."""
-    moved = np.abs(np.int16(clip[2][view]) - clip[1][view]).max(axis=-1) > 20
+    mask = np.abs(np.int16(clip[2][view]) - clip[1][view]).max(axis=-1) > 20
     color = np.clip(np.asarray(rasterize(loop.gaussians, cameras()[view], ("color",)).color), 0, 1)
-    return psnr(color[moved], clip[2][view][moved] / 255.0)
+    return psnr(color[mask], clip[2][view][mask] / 255.0)
 
 
 def test_push__modules_can_be_switched_off(clip):

@@ -42,7 +42,7 @@ def over(gaussians: Gaussians, linear: Any) -> np.ndarray:
 
 
 def test_surfaces__in_front_equal_themselves_alone():
-    wanted = mi.load_dict(
+    expected = mi.load_dict(
         {
             "type": "scene",
             "sensor": camera().sensor(),
@@ -53,9 +53,9 @@ def test_surfaces__in_front_equal_themselves_alone():
         }
     )
     path = {"type": "path", "max_depth": 3}
-    shapes = {f"shape{i}": shape for i, shape in enumerate(wanted.shapes())}
+    shapes = {f"shape{i}": shape for i, shape in enumerate(expected.shapes())}
     scene_with_splats = scene(cloud(0.3), path, lamp=LAMP, **shapes)
-    assert_close(render(scene_with_splats, seed=1), render(wanted, seed=1), atol=tol.IMAGE_ABS)
+    assert_close(render(scene_with_splats, seed=1), render(expected, seed=1), atol=tol.IMAGE_ABS)
 
 
 def test_surfaces__alone_keep_their_antialiased_outline():
@@ -64,9 +64,9 @@ def test_surfaces__alone_keep_their_antialiased_outline():
         "ball": {"type": "sphere", "center": [0, 0, 0], "radius": 0.7},
         "sky": {"type": "constant", "radiance": 0.4},
     }
-    wanted = mi.load_dict({"type": "scene", "sensor": camera().sensor(), "integrator": {"type": "path"}, **shapes})
+    expected = mi.load_dict({"type": "scene", "sensor": camera().sensor(), "integrator": {"type": "path"}, **shapes})
     scene_with_splats = scene(isotropic([(0, 0, -90)], 0.1, 0.5), {"type": "path"}, **shapes)
-    assert_close(render(scene_with_splats, seed=1), render(wanted, seed=1), atol=tol.IMAGE_ABS)
+    assert_close(render(scene_with_splats, seed=1), render(expected, seed=1), atol=tol.IMAGE_ABS)
 
 
 def test_surfaces__behind_show_through_the_splats():
