@@ -67,23 +67,23 @@ def draw(loop: StreamLoop, images: Sequence[np.ndarray | None]) -> dict[str, np.
     """Push the next frame and return the image [H, W, 3] of each stage in the key view that changes most, by name."""
     setup = loop.setup
     state = loop.state
-    observed = observe_frame(setup, state.frame, state.history, images)
-    changes = observed.changes or {}
-    view = max(observed.flows, key=lambda v: changes[v].sum())
+    observation = observe_frame(setup, state.frame, state.history, images)
+    changes = observation.changes or {}
+    view = max(observation.flows, key=lambda v: changes[v].sum())
     camera = setup.cameras[view]
-    flow = observed.flows[view]
-    before = loop.gaussians
-    image = observed.history.images[view]
-    assert before is not None
+    flow = observation.flows[view]
+    old_gaussians = loop.gaussians
+    image = observation.history.images[view]
+    assert old_gaussians is not None
     assert state.coded is not None
     assert flow.mask is not None, "motion masks are computed at multiples of `mask_interval`"
-    lifted = _lifted(before, loop, observed)
+    lifted_gaussians = _lifted(old_gaussians, loop, observation)
     loop.push(images)
-    after = loop.gaussians
-    coded = loop.state.coded
-    assert after is not None
-    assert coded is not None
-    rendered = _channel(after, camera, "color")
+    new_gaussians = loop.gaussians
+    state_after = loop.state.coded
+    assert new_gaussians is not None
+    assert state_after is not None
+    picture = _channel(new_gaussians, camera, "color")
     # Fully saturated at a speed that the fastest pixels reach.
     scale = float(np.percentile(np.linalg.norm(flow.motion[flow.mask], axis=-1), 95))
     return {
@@ -91,36 +91,36 @@ def draw(loop: StreamLoop, images: Sequence[np.ndarray | None]) -> dict[str, np.
         "changes": grey_image(changes[view].astype(float)),
         "flow": motion_image(np.where(flow.reliable[..., None], flow.motion, np.nan), scale),
         "mask": grey_image(flow.mask.astype(float)),
-        "lifted": motion_image(_channel(lifted, camera, "motion"), scale),
-        "motion": motion_image(_channel(after, camera, "motion"), scale),
-        "confidence": confidence_image(_channel(after, camera, "confidence")),
-        "residual": confidence_image(_changed_share(state.coded, coded, camera)),
-        "render": to_uint8(np.clip(rendered, 0, 1)),
-        "error": to_uint8(np.clip(_ERROR_GAIN * np.abs(rendered - image / 255), 0, 1)),
+        "lifted": motion_image(_channel(lifted_gaussians, camera, "motion"), scale),
+        "motion": motion_image(_channel(new_gaussians, camera, "motion"), scale),
+        "confidence": confidence_image(_channel(new_gaussians, camera, "confidence")),
+        "residual": confidence_image(_changed_share(state.coded, state_after, camera)),
+        "render": to_uint8(np.clip(picture, 0, 1)),
+        "error": to_uint8(np.clip(_ERROR_GAIN * np.abs(picture - image / 255), 0, 1)),
     }
 
 
-def _lifted(gaussians: Gaussians, loop: StreamLoop, observed: FrameObservation) -> Gaussians:
+def _lifted(gaussians: Gaussians, loop: StreamLoop, observation: FrameObservation) -> Gaussians:
     """Return the Gaussians after the displacement that explains the flow of the key views best (`lift_flow`)."""
-    cameras = {v: loop.setup.cameras[v] for v in observed.flows}
+    cameras = {v: loop.setup.cameras[v] for v in observation.flows}
     views = full_active_set(gaussians, cameras, loop.setup.config.render).views
-    return displaced(gaussians, lift_flow(gaussians, views, observed.flows).displacement)
+    return displaced(gaussians, lift_flow(gaussians, views, observation.flows).displacement)
 
 
 def _channel(gaussians: Gaussians, camera: Camera, name: str) -> np.ndarray:
     return np.asarray(morgs_mi.rasterize(gaussians, camera, (name,))[name])
 
 
-def _changed_share(before: CodedFrame, after: CodedFrame, camera: Camera) -> np.ndarray:
+def _changed_share(old_state: CodedFrame, new_state: CodedFrame, camera: Camera) -> np.ndarray:
     """Return the share [H, W, 1] of each pixel that Gaussians have which the residual packet changed."""
-    rows = {number: row for row, number in enumerate(before.ids)}
+    rows = {number: row for row, number in enumerate(old_state.ids)}
     same = [
-        number in rows and np.array_equal(before.grid.values[rows[number]], values)
-        for number, values in zip(after.ids, after.grid.values, strict=True)
+        number in rows and np.array_equal(old_state.grid.values[rows[number]], values)
+        for number, values in zip(new_state.ids, new_state.grid.values, strict=True)
     ]
-    changed = np.logical_not(same)[:, None].astype(np.float32)
-    gaussians = replace(after.gaussians, motion=None, offset=None)
-    return np.asarray(morgs_mi.rasterize(gaussians, camera, ("alpha",), features=changed).features)
+    mask = np.logical_not(same)[:, None].astype(np.float32)
+    gaussians = replace(new_state.gaussians, motion=None, offset=None)
+    return np.asarray(morgs_mi.rasterize(gaussians, camera, ("alpha",), features=mask).features)
 
 
 if __name__ == "__main__":

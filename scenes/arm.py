@@ -11,7 +11,8 @@ from morgs_mi.studio.synth.scene import Object, Rig, Scene, rotate, translate
 from morgs_mi.studio.synth.shapes import ball, box, disk, rod
 from morgs_mi.studio.synth.textures import lights, pattern, room, textured
 
-UPPER, FORE = 0.70, 0.60
+UPPER = 0.70
+FORE = 0.60
 
 
 def build(seed: int = 0) -> Scene:

@@ -21,11 +21,15 @@ from morgs_mi.studio.synth.scene import Light, Object, RecordingDefaults, Rig, S
 from morgs_mi.studio.synth.shapes import ball, box, disk, rod
 from morgs_mi.studio.synth.textures import lights, pattern, room, textured
 
-WIDTH, HEIGHT, FPS = 320, 240, 30.0
+WIDTH = 320
+HEIGHT = 240
+FPS = 30.0
 MOTIONS = ("slide", "spin", "swing", "bounce")
 SPEEDS = (2.0, 12.0)
 THIN_SPEEDS = (7.0, 12.0)
-ROOM_HEIGHT, ROOM_DEPTH, FRONT = 3.2, 1.7, 2.0
+ROOM_HEIGHT = 3.2
+ROOM_DEPTH = 1.7
+FRONT = 2.0
 GAP = 0.04
 # Period of all paths in the phase, radians.
 PHASES = np.linspace(0, 4 * np.pi, 129)
@@ -98,14 +102,16 @@ class RandomScene:
 
 def build(seed: int = 0) -> Scene:
     """Return the scene of a seed."""
-    drawn = draw_scene(seed)
+    random_scene = draw_scene(seed)
     rng = np.random.default_rng([seed, 1])
     walls = {
         name: Object({part: {**shape, "bsdf": _wall(rng)} for part, shape in wall.shapes.items()})
-        for name, wall in room(seed, drawn.half_width, ROOM_HEIGHT, ROOM_DEPTH).items()
+        for name, wall in room(seed, random_scene.half_width, ROOM_HEIGHT, ROOM_DEPTH).items()
     }
-    objects = {name: _object(body, rng) for name, body in drawn.bodies.items()}
-    return Scene("random", walls | objects, _lights(rng, drawn.swing), drawn.rig, recording=drawn.recording)
+    objects = {name: _object(body, rng) for name, body in random_scene.bodies.items()}
+    return Scene(
+        "random", walls | objects, _lights(rng, random_scene.swing), random_scene.rig, recording=random_scene.recording
+    )
 
 
 def draw_scene(seed: int) -> RandomScene:
@@ -125,11 +131,11 @@ def draw_scene(seed: int) -> RandomScene:
 
     pace = _log_uniform(rng, 3.0, 10.0)
     kinds = rng.permutation(MOTIONS)
-    wanted = [(str(kinds[k % len(kinds)]), False) for k in range(rng.integers(2, 6))]
+    kinds_of_bodies = [(str(kinds[k % len(kinds)]), False) for k in range(rng.integers(2, 6))]
     if rng.random() < 0.6:
-        wanted[0] = wanted[0][0], True
-    wanted += [("static", bool(rng.random() < 0.25)) for _ in range(rng.integers(1, 6))]
-    for motion, thin in wanted:
+        kinds_of_bodies[0] = kinds_of_bodies[0][0], True
+    kinds_of_bodies += [("static", bool(rng.random() < 0.25)) for _ in range(rng.integers(1, 6))]
+    for motion, thin in kinds_of_bodies:
         body = _place(rng, motion, thin, pace, cameras[0], fits)
         if body is not None:
             bodies[f"{body.motion}_{body.solid.kind}_{len(bodies)}"] = body
@@ -137,7 +143,8 @@ def draw_scene(seed: int) -> RandomScene:
 
 
 def _rig(rng: np.random.Generator, half_width: float) -> Rig:
-    distance, view = rng.uniform(3.9, 4.8), rng.uniform(1.45, 1.75)
+    distance = rng.uniform(3.9, 4.8)
+    view = rng.uniform(1.45, 1.75)
     elevation = rng.uniform(11, 26)
     # All cameras are in front of the open side of the room.
     widest = np.rad2deg(np.arcsin(0.85 * half_width / distance))
@@ -215,10 +222,12 @@ def _block(kind: str, half: np.ndarray) -> Solid:
 
 
 def _column(rng: np.random.Generator) -> Solid:
-    radius, half = rng.uniform(0.09, 0.26), rng.uniform(0.15, 0.5)
+    radius = rng.uniform(0.09, 0.26)
+    half = rng.uniform(0.15, 0.5)
 
     def parts(paint: Paint) -> Shapes:
-        side, end = paint(half / (np.pi * radius)), paint(1)
+        side = paint(half / (np.pi * radius))
+        end = paint(1)
         ends = {name: disk((0, y, 0), radius, end) for name, y in (("top", half), ("bottom", -half))}
         return {"side": rod((0, -half, 0), (0, half, 0), radius, side), **ends}
 
@@ -231,7 +240,8 @@ def _dumbbell(rng: np.random.Generator) -> Solid:
 
 
 def _cross(rng: np.random.Generator) -> Solid:
-    half, thickness = rng.uniform(0.25, 0.42), rng.uniform(0.04, 0.09)
+    half = rng.uniform(0.25, 0.42)
+    thickness = rng.uniform(0.04, 0.09)
     beams = {"x": (half, thickness, thickness), "y": (thickness, half, thickness), "z": (thickness, thickness, half)}
 
     def parts(paint: Paint) -> Shapes:
@@ -242,7 +252,8 @@ def _cross(rng: np.random.Generator) -> Solid:
 
 
 def _rod(rng: np.random.Generator, hangs: bool) -> Solid:
-    length, radius = rng.uniform(0.6, 1.1), rng.uniform(0.018, 0.035)
+    length = rng.uniform(0.6, 1.1)
+    radius = rng.uniform(0.018, 0.035)
     high = 0.0 if hangs else 0.5 * length
     return _bar("rod", high - length, high, radius, radius)
 
@@ -258,7 +269,8 @@ def _bar(kind: str, low: float, high: float, radius: float, knob: float) -> Soli
 
 
 def _pendulum(rng: np.random.Generator) -> Solid:
-    length, string = rng.uniform(0.5, 1.0), rng.uniform(0.015, 0.03)
+    length = rng.uniform(0.5, 1.0)
+    string = rng.uniform(0.015, 0.03)
     half = rng.uniform(0.10, 0.24) * np.ones(3) if rng.random() < 0.5 else rng.uniform(0.08, 0.22, 3)
     round_bob = half[0] == half[1]
 
@@ -280,17 +292,17 @@ def _path(rng: np.random.Generator, motion: str, solid: Solid) -> tuple[Path, bo
     free = solid.kind in ("rod", "dumbbell", "cross") and motion != "static"
     attitude = upright @ rotate("z", rng.uniform(-0.6, 0.6)) if free else upright
     heading = rng.uniform(-0.6, 0.6)
-    along = np.array([np.cos(heading), 0, np.sin(heading)]) * rng.choice([-1, 1])
+    direction = np.array([np.cos(heading), 0, np.sin(heading)]) * rng.choice([-1, 1])
     reach = rng.uniform(0.2, 0.6)
     if motion == "static":
         return lambda s: np.broadcast_to(attitude, (*np.shape(s), 4, 4)), False
     if motion == "slide":
         # A ball rolls; others turn a little.
-        turn = np.cross(Y, along) / solid.margin if solid.kind == "ball" else rng.uniform(-1, 1) * Y
+        turn = np.cross(Y, direction) / solid.margin if solid.kind == "ball" else rng.uniform(-1, 1) * Y
 
         def slide(s: Any) -> np.ndarray:
             way = reach * np.sin(s)
-            return _rigid(np.multiply.outer(way, along), np.multiply.outer(way, turn)) @ attitude
+            return _rigid(np.multiply.outer(way, direction), np.multiply.outer(way, turn)) @ attitude
 
         return slide, free
     if motion == "spin":
@@ -298,9 +310,11 @@ def _path(rng: np.random.Generator, motion: str, solid: Solid) -> tuple[Path, bo
         axis = rotate("y", heading) @ rotate("x", rng.uniform(-0.4, 0.4)) if tilted else np.eye(4)
         return lambda s: axis @ _rigid(0, np.multiply.outer(s, Z if free else Y)), free
     if motion == "swing":
-        plane, turn = rotate("y", heading), rng.uniform(0.35, 0.75) * Z
+        plane = rotate("y", heading)
+        turn = rng.uniform(0.35, 0.75) * Z
         return lambda s: plane @ _rigid(0, np.multiply.outer(np.sin(s), turn)), True
-    up, drift = rng.uniform(0.2, 0.6) * Y, rng.uniform(0, 0.4) * along
+    up = rng.uniform(0.2, 0.6) * Y
+    drift = rng.uniform(0, 0.4) * direction
     tumble = rng.uniform(-1, 1, 3) if solid.kind == "ball" else np.zeros(3)
 
     def bounce(s: Any) -> np.ndarray:
@@ -331,7 +345,8 @@ def _peak(camera: Camera, solid: Solid, place: np.ndarray, path: Path) -> float:
 
 def _inside(bounds: np.ndarray, half_width: float) -> bool:
     """Return whether a box stands on or above the floor, away from the walls."""
-    lowest, highest = [GAP - half_width, -1e-9, GAP - ROOM_DEPTH], [half_width - GAP, ROOM_HEIGHT - GAP, FRONT]
+    lowest = [GAP - half_width, -1e-9, GAP - ROOM_DEPTH]
+    highest = [half_width - GAP, ROOM_HEIGHT - GAP, FRONT]
     return bool((bounds[0] >= lowest).all() and (bounds[1] <= highest).all())
 
 
@@ -339,8 +354,8 @@ def _seen(bounds: np.ndarray, cameras: list[Camera]) -> bool:
     """Return whether the held-out camera, and at least three quarters of all cameras, see a box."""
     corners = np.stack(np.meshgrid(*bounds.T), axis=-1).reshape(-1, 3)
     pixels = np.stack([camera.project(corners)[0] for camera in cameras])
-    seen: np.ndarray = np.all((pixels > 0) & (pixels < [WIDTH, HEIGHT]), axis=(1, 2))
-    return bool(seen[0] and seen.mean() >= 0.75)
+    mask: np.ndarray = np.all((pixels > 0) & (pixels < [WIDTH, HEIGHT]), axis=(1, 2))
+    return bool(mask[0] and mask.mean() >= 0.75)
 
 
 def _touch(a: np.ndarray, b: np.ndarray) -> bool:
@@ -374,11 +389,11 @@ def _object(body: Body, rng: np.random.Generator) -> Object:
     if body.motion != "static":
         return Object(shapes, body.pose)
     to_world = mi.ScalarTransform4f(body.pose(0))
-    placed = {
+    world_shapes = {
         name: {**shape, "to_world": to_world @ shape.get("to_world", mi.ScalarTransform4f())}
         for name, shape in shapes.items()
     }
-    return Object(placed)
+    return Object(world_shapes)
 
 
 def _wall(rng: np.random.Generator) -> dict[str, Any]:
@@ -402,7 +417,9 @@ def _color(rng: np.random.Generator, hue: float) -> tuple[float, float, float]:
 
 def _lights(rng: np.random.Generator, swing: float) -> dict[str, Light]:
     """Return the lamps of `textures.lights`, turned about the vertical axis, with other strengths and tints."""
-    side, rate, phase = rng.uniform(-1.2, 0.4), rng.uniform(2, 5), rng.uniform(-0.9, 0.1)
+    side = rng.uniform(-1.2, 0.4)
+    rate = rng.uniform(2, 5)
+    phase = rng.uniform(-0.9, 0.1)
     poses = {"lamp": lambda t: rotate("y", side + swing * np.sin(phase + rate * t)), "fill": None}
     strength = {"lamp": rng.uniform(0.75, 1.1), "fill": rng.uniform(0.5, 1.4)}
 

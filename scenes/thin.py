@@ -15,8 +15,10 @@ from morgs_mi.studio.synth.scene import Object, Scene, rotate, translate
 from morgs_mi.studio.synth.shapes import ball, box, rod
 from morgs_mi.studio.synth.textures import RGB, lights, pattern, room, textured
 
-BLADES, BLADE = 3, 0.62
-LINKS, LINK = 7, 0.19
+BLADES = 3
+BLADE = 0.62
+LINKS = 7
+LINK = 0.19
 STRING = 1.10
 MAST = (-0.85, 1.12, -0.25)
 HOOK = (0.12, 2.02, -0.75)
@@ -25,8 +27,10 @@ HINGES = {"pendulum": (0.62, 2.08, 0.05), "far_pendulum": (1.35, 2.16, -0.60)}
 
 def build(seed: int = 0) -> Scene:
     """Return the scene; `seed` determines its textures."""
-    wood, steel = _paint(seed + 30, (0.50, 0.34, 0.18), (0.26, 0.16, 0.10), 5), _paint(seed + 31, repeat=4)
-    blue, green = _paint(seed + 33, (0.10, 0.28, 0.70), repeat=6), _paint(seed + 34, (0.16, 0.58, 0.26), repeat=6)
+    wood = _paint(seed + 30, (0.50, 0.34, 0.18), (0.26, 0.16, 0.10), 5)
+    steel = _paint(seed + 31, repeat=4)
+    blue = _paint(seed + 33, (0.10, 0.28, 0.70), repeat=6)
+    green = _paint(seed + 34, (0.16, 0.58, 0.26), repeat=6)
     hemp = _paint(seed + 35, (0.72, 0.60, 0.30), (0.26, 0.18, 0.10))
     red = textured(pattern(seed + 32, (0.76, 0.16, 0.10), (0.80, 0.72, 0.40), 2, 6), repeat=(1, 7))
     blade = box((0.5 * BLADE, 0, 0), (0.5 * BLADE, 0.045, 0.012), red)

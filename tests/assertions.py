@@ -29,7 +29,8 @@ def assert_close(
     expected = expected if expected.ndim else np.broadcast_to(expected, found.shape)
     assert found.shape == expected.shape, f"{label}shape {list(found.shape)}, expected {list(expected.shape)}"
     if found.dtype != np.longdouble and expected.dtype != np.longdouble:
-        found, expected = np.asarray(found, np.float64), np.asarray(expected, np.float64)
+        found = np.asarray(found, np.float64)
+        expected = np.asarray(expected, np.float64)
     where = np.broadcast_to(where, found.shape)
     error = np.where(where, np.abs(found - expected), 0)
     bound = atol + rtol * float(np.abs(np.where(where, expected, 0)).max(initial=0))

@@ -62,8 +62,8 @@ def fitted_clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     steps = np.arange(FRAMES)[:, None] * (STEP, 0, 0)
     corners = np.array([(0.0, 0, 0), (1, 0, 0), (0, 1, 0)])
     np.savez(folder / "capture" / "truth" / "tracks.npz", points=corners[:, None] + steps, ids=np.zeros(3, np.int32))
-    about = {"capture": str(folder / "capture"), "downscale": 1, "test_view": 0}
-    write_stream(folder / "stream.morgs", about)
+    metadata = {"capture": str(folder / "capture"), "downscale": 1, "test_view": 0}
+    write_stream(folder / "stream.morgs", metadata)
     rows = [{"frame": t, "seconds": 3.0 - t} for t in range(FRAMES)]
     (folder / "report.json").write_text(json.dumps({"frames": rows}))
     return folder

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from morgs_mi import Camera
 
-SH_C0, SH_C1 = 0.28209479177387814, 0.4886025119029199
+SH_C0 = 0.28209479177387814
+SH_C1 = 0.4886025119029199
 SH_C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 SH_C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
 
@@ -76,12 +77,18 @@ def rasterize(
 
     Returns all five channels [H, W, D], and `margin`: the smallest relative distance of any alpha to a cut-off.
     """
-    means, quats = raw["means"], raw["quats"]
-    scales, opacities = np.exp(raw["log_scales"]), 1 / (1 + np.exp(-raw["logit_opacities"]))
+    means = raw["means"]
+    quats = raw["quats"]
+    scales = np.exp(raw["log_scales"])
+    opacities = 1 / (1 + np.exp(-raw["logit_opacities"]))
     degree = int(np.sqrt(raw["sh_coeffs"].shape[1])) - 1
     dtype = np.result_type(np.float64, *(np.asarray(v).dtype for v in raw.values()), viewmat.dtype, K.dtype)
-    R, t = viewmat[:3, :3], viewmat[:3, 3]
-    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    R = viewmat[:3, :3]
+    t = viewmat[:3, 3]
+    fx = K[0, 0]
+    fy = K[1, 1]
+    cx = K[0, 2]
+    cy = K[1, 2]
     eye = -R.T @ t
 
     gx, gy = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
@@ -96,19 +103,23 @@ def rasterize(
             continue
 
         def clamp(value, size, f, c):
-            low, high = -c / f - 0.15 * size / f, (size - c) / f + 0.15 * size / f
+            low = -c / f - 0.15 * size / f
+            high = (size - c) / f + 0.15 * size / f
             return low if value.real < low else high if value.real > high else value
 
-        tx, ty = clamp(x / z, width, fx, cx), clamp(y / z, height, fy, cy)
+        tx = clamp(x / z, width, fx, cx)
+        ty = clamp(y / z, height, fy, cy)
         J = np.array([[fx / z, 0, -fx * tx / z], [0, fy / z, -fy * ty / z]])
         M = J @ R @ rotation(quats[i]) @ np.diag(scales[i])
         cov = M @ M.T + eps2d * np.eye(2)
         det = cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2
-        dx, dy = gx - (fx * x / z + cx), gy - (fy * y / z + cy)
+        dx = gx - (fx * x / z + cx)
+        dy = gy - (fy * y / z + cy)
         sigma = 0.5 * (cov[1, 1] * dx * dx - 2 * cov[0, 1] * dx * dy + cov[0, 0] * dy * dy) / det
         faded = np.sqrt(np.linalg.det(M @ M.T) / det) if antialiased else 1
         full = opacities[i] * faded * np.exp(-sigma)
-        drawn, capped = full.real >= alpha_min, full.real > alpha_max
+        drawn = full.real >= alpha_min
+        capped = full.real > alpha_max
         margin = min(margin, np.abs(full.real / alpha_min - 1).min(), np.abs(full.real / alpha_max - 1).min())
         alpha = np.where(drawn, np.where(capped, alpha_max, full), 0)
         if depth_limit is not None:

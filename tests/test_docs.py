@@ -34,13 +34,13 @@ def resolve(path: str) -> Any:
     names = path.split(".")
     for count in range(len(names), 0, -1):
         try:
-            found: Any = importlib.import_module(".".join(names[:count]))
+            value: Any = importlib.import_module(".".join(names[:count]))
         except ModuleNotFoundError:
             continue
         for name in names[count:]:
             # A field without a default is no attribute of its dataclass.
-            found = None if name in getattr(found, "__dataclass_fields__", ()) else getattr(found, name)
-        return found
+            value = None if name in getattr(value, "__dataclass_fields__", ()) else getattr(value, name)
+        return value
     raise AttributeError(path)
 
 
@@ -62,7 +62,7 @@ def compiles(example: str) -> bool:
 
 def offenders(pages: dict[str, str], wrong: Callable[[str, str], list]) -> dict[str, list]:
     """Return the mistakes of each page; pages without mistakes are left out."""
-    return {page: found for page, text in pages.items() if (found := wrong(page, text))}
+    return {page: problems for page, text in pages.items() if (problems := wrong(page, text))}
 
 
 def test_equation_table__has_every_equation():
@@ -73,7 +73,7 @@ def test_equation_table__functions_name_their_equation():
     def named(name: str) -> set[str]:
         # "eq. 12", or a list such as "eqs. 3, 8 and 12".
         lists = re.findall(r"\beqs?\. ((?:\d+(?:, | and |-)?)+)", inspect.getsource(resolve(name)))
-        return {number for found in lists for number in re.findall(r"\d+", found)}
+        return {number for text in lists for number in re.findall(r"\d+", text)}
 
     assert [f"{name} does not name eq. {number}" for number, name in EQUATIONS if number not in named(name)] == []
 

@@ -35,7 +35,8 @@ def on(variant, function):
 
 
 def assert_variants_agree(function, rtol=tol.GRADIENT_REL):
-    cpu, gpu = on("llvm_ad_rgb", function), on("cuda_ad_rgb", function)
+    cpu = on("llvm_ad_rgb", function)
+    gpu = on("cuda_ad_rgb", function)
     assert cpu.keys() == gpu.keys()
     for name in cpu:
         assert np.isfinite(gpu[name]).all(), name
@@ -95,29 +96,31 @@ def test_losses__agree_between_cuda_and_llvm(masked):
     mask = rng.random((37, 45)) > 0.4
 
     def run():
-        given = {"recon": from_numpy(mi.TensorXf, image), "flow": from_numpy(mi.TensorXf, drawn)}
-        given["mask"] = from_numpy(mi.TensorXf, image[..., :1].copy())
-        dr.enable_grad(list(given.values()))
+        observations = {"recon": from_numpy(mi.TensorXf, image), "flow": from_numpy(mi.TensorXf, drawn)}
+        observations["mask"] = from_numpy(mi.TensorXf, image[..., :1].copy())
+        dr.enable_grad(list(observations.values()))
         reliable = from_numpy(mi.TensorXf, mask.astype(np.float32))
         losses = {
-            "recon": recon_loss(given["recon"], Target(target, mask if masked else None)),
-            "flow": flow_loss(given["flow"], from_numpy(mi.TensorXf, flow), reliable),
-            "mask": mask_loss(given["mask"], reliable),
+            "recon": recon_loss(observations["recon"], Target(target, mask if masked else None)),
+            "flow": flow_loss(observations["flow"], from_numpy(mi.TensorXf, flow), reliable),
+            "mask": mask_loss(observations["mask"], reliable),
         }
         dr.backward(sum(losses.values()))
-        gradients = {f"gradient of {name}": dr.grad(value) for name, value in given.items()}
+        gradients = {f"gradient of {name}": dr.grad(value) for name, value in observations.items()}
         return {name: dr.detach(value) for name, value in losses.items()} | gradients
 
     assert_variants_agree(run, rtol=tol.LOSS_GRADIENT_REL)
 
 
 def test_rasterize__agrees_between_cuda_and_llvm_on_a_region():
-    camera, raw = make_wide_camera(), make_wide_scene()
+    camera = make_wide_camera()
+    raw = make_wide_scene()
     y, x = np.mgrid[: camera.height, : camera.width]
     mask = (x - 30) ** 2 + (y - 20) ** 2 < 12**2
 
     def run():
-        gaussians, region = Gaussians(**raw), Region(mask)
+        gaussians = Gaussians(**raw)
+        region = Region(mask)
         dr.enable_grad(*gaussians.items().values())
         image = rasterize(gaussians, camera, CHANNELS, region=region)
         dr.backward(dr.sum(dr.square(image.color), axis=None) + dr.sum(image.confidence, axis=None))
@@ -128,7 +131,8 @@ def test_rasterize__agrees_between_cuda_and_llvm_on_a_region():
 
 
 def test_rasterize__repeats_gradients_to_the_bit_in_reproducible_mode_on_cuda():
-    camera, raw = make_camera(70, 45), make_scene(n=300)
+    camera = make_camera(70, 45)
+    raw = make_scene(n=300)
 
     def run():
         gaussians = to_gaussians(raw, grad=True)
@@ -136,7 +140,8 @@ def test_rasterize__repeats_gradients_to_the_bit_in_reproducible_mode_on_cuda():
         dr.backward(dr.sum(dr.square(image.color), axis=None))
         return {name: dr.grad(getattr(gaussians, name)) for name in RAW}
 
-    one, other = on("cuda_ad_rgb", run), on("cuda_ad_rgb", run)
+    one = on("cuda_ad_rgb", run)
+    other = on("cuda_ad_rgb", run)
     for name in one:
         np.testing.assert_array_equal(one[name], other[name], err_msg=name)
     assert_variants_agree(run)
@@ -148,7 +153,8 @@ def test_gaussian_splat__agrees_between_cuda_and_llvm_among_surfaces():
         return {"image": surfaces.render(surfaces.scene(surfaces.cloud(0.3), **lit), seed=1)}
 
     # Rays of the path tracer that just miss an edge on one backend may hit it on the other.
-    cpu, gpu = on("llvm_ad_rgb", run)["image"], on("cuda_ad_rgb", run)["image"]
+    cpu = on("llvm_ad_rgb", run)["image"]
+    gpu = on("cuda_ad_rgb", run)["image"]
     assert np.median(np.abs(gpu - cpu)) < tol.IMAGE_ABS
     assert np.abs(gpu - cpu).mean() < 1e-3
 
@@ -169,19 +175,20 @@ def test_stream_loop__fits_two_frames_alike_on_cuda_and_llvm():
     )
 
     def run():
-        before = opaque_ball()
+        ball = opaque_ball()
         shift = np.array([0.06, -0.03, 0.02], np.float32)
         frames = [
-            images_of(before),
-            images_of(Gaussians(**{**before.numpy(), "means": before.numpy()["means"] + shift})),
+            images_of(ball),
+            images_of(Gaussians(**{**ball.numpy(), "means": ball.numpy()["means"] + shift})),
         ]
-        loop = StreamLoop(views(), before.numpy()["means"], np.full((400, 3), 0.5), config)
+        loop = StreamLoop(views(), ball.numpy()["means"], np.full((400, 3), 0.5), config)
         scores = []
         for images in frames:
             loop.push([np.uint8(255 * image + 0.5) for image in images])
             scores.append(mean_psnr(loop.gaussians, images))
         return {"psnr": scores}
 
-    cpu, gpu = on("llvm_ad_rgb", run)["psnr"], on("cuda_ad_rgb", run)["psnr"]
+    cpu = on("llvm_ad_rgb", run)["psnr"]
+    gpu = on("cuda_ad_rgb", run)["psnr"]
     assert_close(gpu, cpu, atol=0.2)
     assert cpu.min() > 22

@@ -56,16 +56,17 @@ def imported_names(tree: ast.AST, package: list[str]) -> list[list[str]]:
 
 def mistakes(path: Path) -> list[str]:
     """Return a line for each of the module's imports from a later subpackage."""
-    own, place = subpackage_of(path), path.relative_to(ROOT)
-    if own not in SUBPACKAGES:
-        return [f"{place}: add {own} to SUBPACKAGES, after all that it imports"]
+    subpackage = subpackage_of(path)
+    place = path.relative_to(ROOT)
+    if subpackage not in SUBPACKAGES:
+        return [f"{place}: add {subpackage} to SUBPACKAGES, after all that it imports"]
     names = imported_names(ast.parse(path.read_text(encoding="utf-8")), ["morgs_mi", *place.parent.parts])
-    inside = sorted({name[1] for name in names if name[0] == "morgs_mi" and len(name) > 1})
-    later = SUBPACKAGES[SUBPACKAGES.index(own) + 1 :]
+    subpackages = sorted({name[1] for name in names if name[0] == "morgs_mi" and len(name) > 1})
+    successors = SUBPACKAGES[SUBPACKAGES.index(subpackage) + 1 :]
     return [
-        *(f"{place} imports from {name}, which comes after {own}" for name in inside if name in later),
+        *(f"{place} imports from {name}, which comes after {subpackage}" for name in subpackages if name in successors),
         # A name imported from `morgs_mi` itself would hide its subpackage.
-        *(f"{place} imports {name} from morgs_mi itself" for name in inside if name not in SUBPACKAGES),
+        *(f"{place} imports {name} from morgs_mi itself" for name in subpackages if name not in SUBPACKAGES),
     ]
 
 

@@ -62,11 +62,11 @@ def test_cells__show_images_streams_and_progress():
     assert base64.b64decode(shown(image)["image/png"]).startswith(b"\x89PNG")
     assert "<iframe sandbox=" in shown(stream)["text/html"]
     for title, bar in zip(LONG_CALLS, bars, strict=True):
-        found = re.fullmatch(
+        match = re.fullmatch(
             r'<div>(\w+)(?:: [\w ]+)? <progress value="([\d.]+)" max="([\d.]+)".*', shown(bar)["text/html"]
         )
-        assert found is not None
-        assert (found[1], float(found[2])) == (title, float(found[3]))
+        assert match is not None
+        assert (match[1], float(match[2])) == (title, float(match[3]))
 
 
 @pytest.mark.slow

@@ -65,7 +65,7 @@ def test_readme__cites_the_paper_as_the_other_pages_do():
     assert entry in (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     (authors,) = re.findall(r"author += \{(.*)\}", entry)
-    names = [f"{given} {family}" for family, given in (name.split(", ") for name in authors.split(" and "))]
+    names = [f"{first_name} {family}" for family, first_name in (name.split(", ") for name in authors.split(" and "))]
     cited = zip(re.findall(r"family-names: (\w+)", citation), re.findall(r"given-names: (\w+)", citation), strict=True)
-    assert names == [f"{given} {family}" for family, given in cited]
+    assert names == [f"{first_name} {family}" for family, first_name in cited]
     assert all(name in " ".join(README.split()) for name in names)

@@ -35,8 +35,8 @@ def test_check_release__compares_the_files_with_the_tag(checkout):
     version = PROJECT["version"]
     pyproject = (checkout / "pyproject.toml").read_text()
     if "Source" not in PROJECT["urls"]:
-        found = check_release(checkout, f"v{version}")
-        assert (found.returncode, "expected the addresses Source and Issues" in found.stderr) == (1, True)
+        problems = check_release(checkout, f"v{version}")
+        assert (problems.returncode, "expected the addresses Source and Issues" in problems.stderr) == (1, True)
         addresses = '[project.urls]\nSource = "https://example.org"\nIssues = "https://example.org"\n'
         (checkout / "pyproject.toml").write_text(pyproject.replace("[project.urls]\n", addresses))
     assert check_release(checkout, f"v{version}").returncode == 0
@@ -55,9 +55,9 @@ def test_project__names_its_pythons_and_dependencies_as_the_pages_do():
 
 
 def test_workflows__pin_their_actions():
-    used = [step["uses"] for _, job in JOBS for step in job["steps"] if "uses" in step]
-    assert len(used) > 8
-    assert [use for use in used if not re.fullmatch(r"[\w./-]+@[0-9a-f]{40}", use)] == []
+    actions = [step["uses"] for _, job in JOBS for step in job["steps"] if "uses" in step]
+    assert len(actions) > 8
+    assert [use for use in actions if not re.fullmatch(r"[\w./-]+@[0-9a-f]{40}", use)] == []
 
 
 def test_workflows__read_only_but_for_the_publication():

@@ -73,11 +73,12 @@ ELSEWHERE: dict[str, str] = {
 
 def leaves(config: Any, path: str = "") -> list[str]:
     """Return the dotted names of all fields that hold no further config."""
-    found = []
+    names = []
     for field in fields(config):
-        value, name = getattr(config, field.name), f"{path}{field.name}"
-        found += leaves(value, f"{name}.") if is_dataclass(value) else [name]
-    return found
+        value = getattr(config, field.name)
+        name = f"{path}{field.name}"
+        names += leaves(value, f"{name}.") if is_dataclass(value) else [name]
+    return names
 
 
 def with_value(config: Any, name: str, value: Any) -> Any:
@@ -107,7 +108,8 @@ def clip() -> tuple[list[Camera], np.ndarray, np.ndarray, list[list[np.ndarray]]
     rng = np.random.default_rng(0)
     origins = [(x, y, -3) for x, y in ((-1, 0), (1, 0), (0, 0.8), (0, -0.8), (0.4, 0.4))]
     views = look_at_cameras(origins)
-    wall, square = random_sheet(rng, 260, 1.5, 0.5), random_sheet(rng, 80, 0.35, -0.4)
+    wall = random_sheet(rng, 260, 1.5, 0.5)
+    square = random_sheet(rng, 80, 0.35, -0.4)
     points = np.concatenate([wall, square])
     colors = np.concatenate([rng.uniform(0.1, 0.6, (260, 3)), rng.uniform(0.5, 1.0, (80, 3))])
     frames = [
@@ -122,8 +124,8 @@ def image(
 ) -> np.ndarray:
     """Draw the points as squares, the far ones first, with noise of a grey level."""
     drawn = np.full((48, 64, 3), 0.2)
-    for points, own, radius in ((wall, colors[:260], 4), (square, colors[260:], 3)):
-        for (x, y), color in zip(view.project(points)[0].astype(int), own, strict=True):
+    for points, part, radius in ((wall, colors[:260], 4), (square, colors[260:], 3)):
+        for (x, y), color in zip(view.project(points)[0].astype(int), part, strict=True):
             drawn[max(y - radius, 0) : max(y + radius, 0), max(x - radius, 0) : max(x + radius, 0)] = color
     noisy = drawn * (1 + 0.01 * t) * 255 + rng.normal(0, 1, drawn.shape)
     return np.clip(noisy, 0, 255).astype(np.uint8)
@@ -149,13 +151,14 @@ def test_settings__every_field_acts(clip, base, name):
 
 def bounds() -> list[tuple[Any, str, Any]]:
     """Return a config, the name of a field, and a value beyond each of its bounds, for all settings of a fit."""
-    found, configs = [], [StreamConfig()]
+    bounds_of_fields = []
+    configs = [StreamConfig()]
     for config in configs:
         configs += [value for value in vars(config).values() if is_dataclass(value)]
         for name, kind in types_of(type(config)).items():
-            given = [bound for arm in arms_of(kind) for bound in getattr(arm, "__metadata__", ())]
-            found += [(config, name, BEYOND[type(bound)](bound.limit)) for bound in given]
-    return found
+            bounds_of_arms = [bound for arm in arms_of(kind) for bound in getattr(arm, "__metadata__", ())]
+            bounds_of_fields += [(config, name, BEYOND[type(bound)](bound.limit)) for bound in bounds_of_arms]
+    return bounds_of_fields
 
 
 BEYOND = {

@@ -98,7 +98,8 @@ def first(clip):
 
 @pytest.fixture(scope="module")
 def full(clip, first):
-    loop, packets, reports = copy.copy(first[0]), *first[1:]
+    loop = copy.copy(first[0])
+    packets, reports = first[1:]
     later_packets, later_reports = zip(*(loop.push(images[:4]) for images in clip[1:3]), strict=True)
     return loop, (*packets, *later_packets), (*reports, *later_reports)
 
@@ -119,24 +120,26 @@ def test_push__motion_follows_the_truth_and_not_the_static_wall(full):
     """The modules' claim: per-Gaussian motion is the scene's, not the residual's."""
     loop, _, reports = full
     maps = held_out(loop.gaussians)
-    before, now = scene(1)[0].numpy()["means"], scene(2)[0]
-    truth = rasterize(dataclasses.replace(now, motion=now.numpy()["means"] - before), cameras()[4], ("motion",))
-    truth, found = np.asarray(truth.motion), np.asarray(maps.motion)
+    means = scene(1)[0].numpy()["means"]
+    state = scene(2)[0]
+    truth = rasterize(dataclasses.replace(state, motion=state.numpy()["means"] - means), cameras()[4], ("motion",))
+    truth = np.asarray(truth.motion)
+    motion = np.asarray(maps.motion)
     moving = np.linalg.norm(truth, axis=-1) > 1.5
     assert 0.03 < moving.mean() < 0.4
-    assert endpoint_error(found, truth, moving) < 0.5 * endpoint_error(np.zeros_like(truth), truth, moving)
+    assert endpoint_error(motion, truth, moving) < 0.5 * endpoint_error(np.zeros_like(truth), truth, moving)
     still = np.linalg.norm(truth, axis=-1) < 0.01
-    assert endpoint_error(found, truth, still) < 0.5
+    assert endpoint_error(motion, truth, still) < 0.5
     assert {"recon", "flow", "offset"} <= reports[2].losses.keys()
 
 
 def test_push__confidence_is_high_where_things_move(full):
     loop = full[0]
-    found = np.asarray(held_out(loop.gaussians).confidence)[..., 0]
+    confidence = np.asarray(held_out(loop.gaussians).confidence)[..., 0]
     _, moves = scene(2)
     labelled = dataclasses.replace(scene(2)[0], logit_confidence=np.where(moves, 20.0, -20.0))
     truth = np.asarray(held_out(labelled, ("confidence",)).confidence)[..., 0]
-    assert found[truth > 0.9].mean() > found[truth < 0.1].mean() + 0.4
+    assert confidence[truth > 0.9].mean() > confidence[truth < 0.1].mean() + 0.4
 
 
 def test_push__decoder_has_the_encoders_state_to_the_bit(full):
@@ -173,11 +176,11 @@ def test_push__stream_carries_births_and_deaths(clip):
     density = DensityConfig(rounds=0, births=0.05, max_gaussians=590, min_error=0, min_opacity=0.3)
     loop, packets, reports = run(clip, dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, density=density)))
     frames = list(coded_frames(packets))
-    for before, after, report in zip(frames, frames[1:], reports[1:], strict=False):
-        births = np.setdiff1d(after.ids, before.ids)
-        survivors = len(np.intersect1d(after.ids, before.ids))
-        assert births.tolist() == list(range(before.next_id, before.next_id + len(births)))
-        assert 0 < len(births) == min(round(0.05 * len(before.ids)), 590 - survivors)
+    for state, next_state, report in zip(frames, frames[1:], reports[1:], strict=False):
+        births = np.setdiff1d(next_state.ids, state.ids)
+        survivors = len(np.intersect1d(next_state.ids, state.ids))
+        assert births.tolist() == list(range(state.next_id, state.next_id + len(births)))
+        assert 0 < len(births) == min(round(0.05 * len(state.ids)), 590 - survivors)
         assert report.num_gaussians == survivors + len(births)
     assert len(np.intersect1d(frames[0].ids, frames[2].ids)) < 590
     for name, value in frames[-1].gaussians.numpy().items():
@@ -202,9 +205,9 @@ def test_push__fits_views_at_their_own_times(clip):
 
 def moving_psnr(loop: StreamLoop, clip, view: int) -> float:
     """Return the PSNR of a view at frame 2, where it has changed."""
-    moved = np.abs(np.int16(clip[2][view]) - clip[1][view]).max(axis=-1) > 20
+    mask = np.abs(np.int16(clip[2][view]) - clip[1][view]).max(axis=-1) > 20
     color = np.clip(np.asarray(rasterize(loop.gaussians, cameras()[view], ("color",)).color), 0, 1)
-    return psnr(color[moved], clip[2][view][moved] / 255.0)
+    return psnr(color[mask], clip[2][view][mask] / 255.0)
 
 
 @pytest.mark.slow
@@ -280,29 +283,30 @@ def test_push__without_an_image_of_one_view(clip, first, monkeypatch):
         shown = np.clip(np.asarray(held_out(loop.gaussians, ("color",)).color), 0, 1)
         return [psnr(shown, images[4] / 255) for images in clip]
 
-    found, missing = [scores()], []
+    score_list = [scores()]
+    missing = []
     for images in (without(clip[1], gone), clip[2][:4], clip[3][:4]):
         missing.append(loop.push(images)[1].missing_views)
-        found.append(scores())
+        score_list.append(scores())
     assert missing == [(f"cam{gone:02d}",), (), ()]
     assert [len(views) for views in flow_views] == [2, 2, 2]
     assert all(f"cam{gone:02d}" not in views for views in flow_views[:2])
     assert flow_views[2] == usual
     # Every frame follows the motion, from three of four views too: it shows its own instant better than the last did.
-    assert all(found[t][t] > found[t - 1][t] + 1 for t in (1, 2, 3)), found
+    assert all(score_list[t][t] > score_list[t - 1][t] + 1 for t in (1, 2, 3)), score_list
 
 
 @pytest.mark.slow
 def test_push__without_any_image_nothing_moves(clip):
     loop = new_loop()
     first, _ = loop.push(without(clip[0], 1))
-    before = loop.gaussians.numpy()
+    old_values = loop.gaussians.numpy()
     packet, report = loop.push([None] * 4)
     assert report.status == "no view has an image"
     assert report.missing_views == ("cam00", "cam01", "cam02", "cam03")
     assert report.num_bytes < 200 < len(encode_packet(first))  # the packet's frame, and nothing in it
     for name, value in loop.gaussians.numpy().items():
-        assert name == "motion" or np.array_equal(value, before[name]), name
+        assert name == "motion" or np.array_equal(value, old_values[name]), name
     packet, report = loop.push(clip[1][:4])
     assert (packet.frame, report.status, report.missing_views) == (2, "ok", ())
     assert "flow" not in report.losses
@@ -341,8 +345,8 @@ def test_stream_capture__writes_a_file(clip, tmp_path):
     assert sum(r.num_bytes for r in reports) < path.stat().st_size
     assert ticks[-1] == ("Later frames", 1, 1)
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["capture.json", "report.json", "stream.morgs"]
-    about = json.loads((tmp_path / "out" / "capture.json").read_text())
-    assert about == {"layout": "in memory", "capture": str(capture.path)}
+    settings = json.loads((tmp_path / "out" / "capture.json").read_text())
+    assert settings == {"layout": "in memory", "capture": str(capture.path)}
 
 
 def masked(masks):
@@ -417,7 +421,8 @@ def test_push__a_static_clip_costs_next_to_nothing(clip):
 def test_push__skipping_static_views_costs_no_quality(clip):
     """With and without: the held-out image is as good in the mean of three seeds, in fewer bytes."""
     some = dataclasses.replace(QUICK, render=RenderConfig(reproducible=True))
-    quality, sizes = np.zeros((3, 2)), np.zeros((3, 2))
+    quality = np.zeros((3, 2))
+    sizes = np.zeros((3, 2))
     for seed in range(3):
         begun = new_loop(dataclasses.replace(some, seed=seed))
         begun.push(clip[0][:4])
@@ -426,8 +431,8 @@ def test_push__skipping_static_views_costs_no_quality(clip):
             loop = new_loop(dataclasses.replace(some, fit=fit, seed=seed))
             loop.state = begun.state  # the first frame skips nothing
             reports = [loop.push(images[:4])[1] for images in clip[1:3]]
-            found = np.asarray(rasterize(loop.gaussians, cameras()[4], ("color",)).color)
-            quality[seed, column] = psnr(np.clip(found, 0, 1), clip[2][4] / 255)
+            image = np.asarray(rasterize(loop.gaussians, cameras()[4], ("color",)).color)
+            quality[seed, column] = psnr(np.clip(image, 0, 1), clip[2][4] / 255)
             sizes[seed, column] = sum(report.num_bytes for report in reports)
             assert (reports[-1].active["pixels"] < 1) == skip
     # One seed differs by up to a decibel: five small views, and a first frame that is far from done.
@@ -458,7 +463,8 @@ def test_step__is_pure_and_complete(clip):
 
 
 def test_resume__copies_its_images_and_refuses_those_of_another_size(clip, full):
-    loop, buffers = new_loop(), [image.copy() for image in clip[0][:4]]
+    loop = new_loop()
+    buffers = [image.copy() for image in clip[0][:4]]
     coded = full[0].state.coded
     loop.resume(coded, [buffers])
     for buffer in buffers:
@@ -488,13 +494,15 @@ def reproducible(clip):
 @pytest.fixture(scope="module")
 def plain(clip, reproducible):
     """The packets of three frames."""
-    loop, packets, _ = copy.copy(reproducible[0]), *reproducible[1:]
+    loop = copy.copy(reproducible[0])
+    packets = reproducible[1]
     return [packet.encoded for packet in (*packets, *pushed_ahead(loop, clip[1:], lambda images: None))]
 
 
 @pytest.mark.slow
 def test_push__observes_the_upcoming_frame_in_another_thread_and_changes_nothing(clip, plain, monkeypatch):
-    threads, observe = [], stream_loop.observe_frame
+    threads = []
+    observe = stream_loop.observe_frame
     monkeypatch.setattr(
         stream_loop, "observe_frame", lambda *given: threads.append(threading.current_thread()) or observe(*given)
     )
@@ -513,7 +521,8 @@ def test_push__uses_no_observation_of_other_images(clip, reproducible, plain):
 
 
 def test_push__refuses_upcoming_images_of_another_size_in_their_turn(clip, first):
-    loop, small = copy.copy(first[0]), [image[:50] for image in clip[2][:4]]
+    loop = copy.copy(first[0])
+    small = [image[:50] for image in clip[2][:4]]
     loop.push(clip[1][:4], upcoming=small)
     with pytest.raises(ValueError, match=r"frame 2 of view 'cam00' must be uint8 \[72, 96, 3\]"):
         loop.push(small)

@@ -26,7 +26,7 @@ def with_tables(text: str) -> str:
     """
     return re.sub(
         r"<!-- table: (\w+) -->\n\n(?:(?:\|.*\n)+\n)?",
-        lambda found: f"<!-- table: {found[1]} -->\n\n{TABLES[found[1]]()}\n",
+        lambda match: f"<!-- table: {match[1]} -->\n\n{TABLES[match[1]]()}\n",
         text,
     )
 

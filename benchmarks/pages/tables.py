@@ -49,10 +49,10 @@ def gains() -> str:
         best = {(row["preset"], row["epochs"]): row["mean"] for row in best_rows(clip)}
         for epochs in (2, 8):
             ours, theirs, paper = (best[preset, epochs] for preset in ("default", "baseline", "paper"))
-            added = (f"{ours[name] - theirs[name]:.2f}" for name in ("psnr", "psnr_moving"))
+            gains_in_db = (f"{ours[name] - theirs[name]:.2f}" for name in ("psnr", "psnr_moving"))
             share = ours["motion_error_moving"] / theirs["motion_error_moving"]
             over_paper = ours["psnr_moving"] - paper["psnr_moving"]
-            rows.append((f"`{clip['name']}`", f"{epochs}", *added, f"{share:.2f}", f"{over_paper:.2f}"))
+            rows.append((f"`{clip['name']}`", f"{epochs}", *gains_in_db, f"{share:.2f}", f"{over_paper:.2f}"))
     titles = "PSNR, dB", "moving, dB", "motion error, share", "moving, over `paper`, dB"
     return markdown(("clip", "epochs", *titles), rows)
 

@@ -104,14 +104,14 @@ def disturbed(cameras: Sequence[Camera], degrees: float, seed: int) -> tuple[Cam
     """Return cameras with wrong poses and focal lengths."""
     rng = np.random.default_rng([seed, 7])
     extent = scene_extent(cameras)
-    found = []
+    result = []
     focal = _FOCAL_ERROR if degrees else 0.0
     for camera in cameras:
         axis, direction = rng.normal(size=(2, 3))
         rotation = np.deg2rad(degrees) * axis / np.linalg.norm(axis)
         displacement = degrees / 100 * extent * direction / np.linalg.norm(direction)
-        found.append(changed_camera(camera, np.array([*rotation, *displacement, focal * rng.choice([-1, 1]), 0, 0])))
-    return tuple(found)
+        result.append(changed_camera(camera, np.array([*rotation, *displacement, focal * rng.choice([-1, 1]), 0, 0])))
+    return tuple(result)
 
 
 def pose_errors(cameras: Sequence[Camera], true: Sequence[Camera]) -> dict[str, float]:
@@ -143,13 +143,13 @@ def scores(capture: Capture, config: StreamConfig) -> dict[str, float]:
     test = capture.reference_view
     assert gaussians is not None
     view = View(capture.cameras[test], images[test], capture.masks[test])
-    registered = register_camera(gaussians, view, loop.setup.extent, config.fit, config.render)
+    camera = register_camera(gaussians, view, loop.setup.extent, config.fit, config.render)
     views = {
         "training": [View(capture.cameras[v], images[v], capture.masks[v]) for v in train],
         "calibrated": [view],
-        "registered": [view._replace(camera=registered)],
+        "registered": [view._replace(camera=camera)],
     }
-    return {name: mean_psnr(gaussians, given, config.render) for name, given in views.items()}
+    return {name: mean_psnr(gaussians, group, config.render) for name, group in views.items()}
 
 
 def measure(
@@ -168,20 +168,20 @@ def measure(
     wrong = calibrated.open()
     if degrees:
         wrong = replace(wrong, cameras=disturbed(wrong.cameras, degrees, disturbance))
-    better, found = refine_cameras(wrong, config.fit, config.render, config.seed)
+    better, refinement = refine_cameras(wrong, config.fit, config.render, config.seed)
     return {
         "true": scores(capture, config),
         "disturbed": scores(wrong, config) | camera_errors(wrong, capture),
         "refined": scores(better, config) | camera_errors(better, capture),
-        "refinement": asdict(found),
+        "refinement": asdict(refinement),
     }
 
 
 def camera_errors(given: Capture, capture: Capture) -> dict[str, float]:
     """Return the errors of the training cameras, and by how much their lenses shift a corner of the image, px."""
     truth = load_disturbances(capture.path / "truth")
-    none = [(0.0, 0.0)] * len(capture.cameras)
-    terms = given.distortions or none
+    zeros = [(0.0, 0.0)] * len(capture.cameras)
+    terms = given.distortions or zeros
     train = capture.train_views
     corners = [
         _at_corner(given.cameras[v], terms[v]) - _at_corner(capture.cameras[v], (truth[capture.names[v]].distortion, 0))
@@ -193,16 +193,16 @@ def camera_errors(given: Capture, capture: Capture) -> dict[str, float]:
 
 def lens_clips(options: Options, seed: int) -> tuple[Path, Path]:
     """Return a clip through lenses with distortion, and a copy with a calibration without it for the training views."""
-    true = options.clips / f"random-{seed}-lens-{options.lens:g}"
-    denied = true.with_name(f"{true.name}-denied")
-    own = Disturbances(distortion=options.lens)
-    capture = synthetic("random", true, SynthConfig(frames=1, seed=seed, disturbances=own))
+    path = options.clips / f"random-{seed}-lens-{options.lens:g}"
+    denied = path.with_name(f"{path.name}-denied")
+    disturbances = Disturbances(distortion=options.lens)
+    capture = synthetic("random", path, SynthConfig(frames=1, seed=seed, disturbances=disturbances))
     if not denied.exists():
-        truth = load_disturbances(true / "truth")
+        truth = load_disturbances(path / "truth")
         lenses = [truth[n].lens if v in capture.test_views else Lens() for v, n in enumerate(capture.names)]
-        shutil.copytree(true, denied)
+        shutil.copytree(path, denied)
         write_colmap(denied / "sparse" / "0", capture.cameras, capture.points, capture.point_colors, lenses)
-    return true, denied
+    return path, denied
 
 
 def _at_corner(camera: Camera, terms: Sequence[float]) -> np.ndarray:
@@ -215,8 +215,8 @@ def recovered(row: Mapping[str, Any]) -> float:
     """Return the share of the lost PSNR of the registered view that refinement brings back; NaN of true cameras."""
     if not row["degrees"] and not row["lens"]:
         return float("nan")
-    true, before, after = (row[name]["registered"] for name in ("true", "disturbed", "refined"))
-    return (after - before) / (true - before) if true != before else float("nan")
+    best, worst, result = (row[name]["registered"] for name in ("true", "disturbed", "refined"))
+    return (result - worst) / (best - worst) if best != worst else float("nan")
 
 
 if __name__ == "__main__":

@@ -125,18 +125,18 @@ def plot_codec(clips: Sequence[Row], path: Path) -> None:
     figure = blank_figure(10, 3.8 * len(clips))
     for (left, right), clip in zip(figure.subplots(len(clips), 2, squeeze=False), clips, strict=True):
         rows = clip["rows"]
-        later, packed = (
+        stream_sizes, lzma_sizes = (
             1e-3 * np.array(column) for column in zip(*((r["later"], r["lzma"]) for r in rows), strict=True)
         )
         psnr = [row["psnr"]["later"] for row in rows]
         times = [row["encode_ms"] for row in rows], [row["lzma_ms"] for row in rows]
-        for axis, (own, other) in ((left, (psnr, psnr)), (right, times)):
-            axis.plot(later, own, "o-", label="stream")
-            axis.plot(packed, other, "s--", label="lzma over float32 residuals")
+        for axis, (stream_values, lzma_values) in ((left, (psnr, psnr)), (right, times)):
+            axis.plot(stream_sizes, stream_values, "o-", label="stream")
+            axis.plot(lzma_sizes, lzma_values, "s--", label="lzma over float32 residuals")
             axis.set(xscale="log", xlabel="kB per later frame")
             axis.grid(alpha=0.3, which="both")
             axis.tick_params(axis="x", which="minor", labelsize=6, rotation=45)
-            points = zip(later, own, strict=True)
+            points = zip(stream_sizes, stream_values, strict=True)
             label_points(axis, points, [f"{row['quality']:g}" for row in rows], (4, -12), 8)
         left.set(ylabel="PSNR of later frames, dB", title=f"{clip['name']}: quality")
         right.set(ylabel="ms to encode a frame", yscale="log", title=f"{clip['name']}: encoding time")
@@ -152,13 +152,13 @@ def _fit(source: Source, folder: Path, config: StreamConfig, resume: bool) -> No
 
 def _evaluated(folder: Path, capture: Capture) -> dict[str, Any]:
     """Return the quality and the bytes of the decoded stream."""
-    found = evaluate_stream(folder, capture.path)
-    first, *later = found.frames
+    evaluation = evaluate_stream(folder, capture.path)
+    first, *later_frames = evaluation.frames
     return {
-        "psnr": {"first": first.scores.psnr, "later": float(np.mean([row.scores.psnr for row in later]))},
-        "file": found.sizes.file,
+        "psnr": {"first": first.scores.psnr, "later": float(np.mean([row.scores.psnr for row in later_frames]))},
+        "file": evaluation.sizes.file,
         "first": first.num_bytes,
-        "later": float(np.mean([row.num_bytes for row in later])),
+        "later": float(np.mean([row.num_bytes for row in later_frames])),
     }
 
 
@@ -167,40 +167,42 @@ def _measured(folder: Path, settings: StreamConfig) -> dict[str, Any]:
     stream = open_stream(folder)
     cameras = stream.cameras
     rows = []
-    before = None
+    old_state = None
     for state in coded_frames(stream):
-        if before is not None:
-            rows.append(_frame(before, state, cameras, settings))
-        before = state
+        if old_state is not None:
+            rows.append(_frame(old_state, state, cameras, settings))
+        old_state = state
     means = {name: float(np.mean([row[name] for row in rows])) for name in ("raw", "lzma")}
     medians = {name: float(np.median([row[name] for row in rows])) for name in ("encode_ms", "decode_ms", "lzma_ms")}
     return means | medians
 
 
-def _frame(before: CodedFrame, now: CodedFrame, cameras: Sequence[Any], settings: StreamConfig) -> dict[str, Any]:
+def _frame(
+    old_state: CodedFrame, new_state: CodedFrame, cameras: Sequence[Any], settings: StreamConfig
+) -> dict[str, Any]:
     """Return times and bytes of one frame, encoded again with the codec and with lzma."""
-    source = np.searchsorted(before.ids, now.ids)
-    born = now.ids >= before.next_id
+    source = np.searchsorted(old_state.ids, new_state.ids)
+    born = new_state.ids >= old_state.next_id
     source[born] = -1
     start = time.perf_counter()
-    packet = residual_packet(before, now.gaussians, source, cameras, settings.codec)
-    encoded = time.perf_counter()
-    decode(before, packet)
-    decoded = time.perf_counter()
+    packet = residual_packet(old_state, new_state.gaussians, source, cameras, settings.codec)
+    encode_end = time.perf_counter()
+    decode(old_state, packet)
+    decode_end = time.perf_counter()
     survivors = source[~born]
-    old = before.gaussians.numpy()
-    new = now.gaussians.numpy()
+    old = old_state.gaussians.numpy()
+    new = new_state.gaussians.numpy()
     raw = b"".join(
         np.concatenate([new[name][~born] - old[name][survivors], new[name][born]]).tobytes()
         for name in new
         if name != "motion"
     )
-    started = time.perf_counter()
-    packed = lzma.compress(raw, preset=_LZMA_PRESET)
+    lzma_start = time.perf_counter()
+    archive = lzma.compress(raw, preset=_LZMA_PRESET)
     return {
-        "encode_ms": 1e3 * (encoded - start),
-        "decode_ms": 1e3 * (decoded - encoded),
-        "lzma_ms": 1e3 * (time.perf_counter() - started),
+        "encode_ms": 1e3 * (encode_end - start),
+        "decode_ms": 1e3 * (decode_end - encode_end),
+        "lzma_ms": 1e3 * (time.perf_counter() - lzma_start),
         "raw": len(raw),
-        "lzma": len(packed),
+        "lzma": len(archive),
     }

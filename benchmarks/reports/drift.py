@@ -77,8 +77,8 @@ def measure(source: Source, num_frames: int, config: StreamConfig) -> dict[str, 
     rows = list(fitted_frames(loop, capture, frames))
     series = {name: [row[name] for row in rows] for name in rows[0]}
     moving = np.array(series["psnr_moving"])
-    seen = np.isfinite(moving)
-    return {"slope_moving_db_a_frame": np.polyfit(np.flatnonzero(seen), moving[seen], 1)[0], **series}
+    mask = np.isfinite(moving)
+    return {"slope_moving_db_a_frame": np.polyfit(np.flatnonzero(mask), moving[mask], 1)[0], **series}
 
 
 if __name__ == "__main__":

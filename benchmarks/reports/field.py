@@ -120,19 +120,19 @@ def measure(source: Source, methods: Mapping[str, StreamConfig]) -> dict[str, di
 
 def scores_of(found: Evaluation, reports: Sequence[FrameReport], seconds: Sequence[float]) -> dict[str, Any]:
     """Return the scores of a stream as JSON."""
-    later = found.frames[1:]
-    motion = [asdict(row.motion_3d) for row in later if row.motion_3d is not None]
+    later_frames = found.frames[1:]
+    motion = [asdict(row.motion_3d) for row in later_frames if row.motion_3d is not None]
     scores = {
-        **{name: known_mean([getattr(row.scores, name) for row in later]) for name in _IMAGES},
+        **{name: known_mean([getattr(row.scores, name) for row in later_frames]) for name in _IMAGES},
         **{f"motion_3d_{name}": known_mean([row[name] for row in motion]) for name in ("error", "relative_error")},
         **{f"{row.protocol} {name}": getattr(row.moving, name) for row in found.tracking for name in _TRACKS},
         "num_bytes": known_mean([report.num_bytes for report in reports]),
         "cpu_s": known_mean(seconds),
         "steps": known_mean([report.steps for report in reports]),
     }
-    rounded = {name: float(f"{value:.4g}") for name, value in scores.items()}
-    series = {name: [float(f"{getattr(row.scores, name):.4g}") for row in later] for name in _OVER_TIME}
-    return json_finite({**rounded, "by_frame": series})
+    figures = {name: float(f"{value:.4g}") for name, value in scores.items()}
+    series = {name: [float(f"{getattr(row.scores, name):.4g}") for row in later_frames] for name in _OVER_TIME}
+    return json_finite({**figures, "by_frame": series})
 
 
 Cells = Mapping[str, Mapping[str, Mapping[str, Any]]]
@@ -176,8 +176,8 @@ def plot_field(cells: Cells, path: Path) -> None:
             axis.plot(range(1, len(values) + 1), values, **style)
             axis.set(xlabel=f"frame ({most} epochs)", ylabel=title, xticks=range(1, len(values) + 1))
         for axis, (score, title) in zip(axes[1], _PLOTTED, strict=True):
-            found = [mean_scores(cells, name) for name in names if name.split("/")[0] == method]
-            axis.plot([s["num_bytes"] / 1000 for s in found], [s[score] for s in found], marker="o", **style)
+            means = [mean_scores(cells, name) for name in names if name.split("/")[0] == method]
+            axis.plot([s["num_bytes"] / 1000 for s in means], [s[score] for s in means], marker="o", **style)
             axis.set(xlabel="kB per later frame (by epochs)", ylabel=title)
     for axis in axes.flat:
         axis.grid(alpha=0.3)
@@ -193,8 +193,8 @@ def main(options: Options) -> None:
     print(field_table(cells))
     if options.plot is not None:
         plot_field(cells, options.plot)
-    about = {name: getattr(options, name) for name in ("downscale", "frames", "epochs", "num_gaussians")}
-    options.write({**about, "cells": cells}, unprinted=["cells"])
+    settings = {name: getattr(options, name) for name in ("downscale", "frames", "epochs", "num_gaussians")}
+    options.write({**settings, "cells": cells}, unprinted=["cells"])
 
 
 if __name__ == "__main__":

@@ -115,15 +115,15 @@ class Clip:
 
     def writer(self, path: Path, config: StreamConfig) -> StreamWriter:
         """Return a writer of a new stream of this clip."""
-        about = {"capture": str(self.capture.path.resolve()), "downscale": self.capture.downscale}
-        about |= {"test_view": list(self.capture.test_views), "config": asdict(config)}
-        return StreamWriter(path, self.capture.cameras, self.capture.fps, about)
+        metadata = {"capture": str(self.capture.path.resolve()), "downscale": self.capture.downscale}
+        metadata |= {"test_view": list(self.capture.test_views), "config": asdict(config)}
+        return StreamWriter(path, self.capture.cameras, self.capture.fps, metadata)
 
     def continued(self, keyframe: Packet, config: StreamConfig) -> Continuation:
         """Fit all later frames after the packet of the first one."""
-        (coded,) = coded_frames([keyframe])
+        (state,) = coded_frames([keyframe])
         loop = self.loop(config)
-        loop.resume(coded, self.images[:1])
+        loop.resume(state, self.images[:1])
         reports = []
         seconds = []
         with TemporaryDirectory() as folder:

@@ -172,9 +172,9 @@ def surface_points(cameras: list[Camera]) -> tuple[np.ndarray, np.ndarray]:
         hit: Any = scene.ray_intersect(mi.Ray3f(mi.Point3f(origins), mi.Vector3f(directions.T)))
         valid = np.array(hit.is_valid())
         points.append(np.array(hit.p).T[valid])
-        shown = display_image(traced(scene, camera, 16, seed=1))
+        picture = display_image(traced(scene, camera, 16, seed=1))
         columns, rows = pixels[valid].astype(int).T
-        colors.append(unit_values(shown[rows, columns]))
+        colors.append(unit_values(picture[rows, columns]))
     return np.concatenate(points), np.concatenate(colors)
 
 
@@ -223,12 +223,12 @@ def main(options: Options) -> None:
         streams[name] = morgs_mi.open_stream(options.out / f"fit-{name}")
     truth = received(room(0, ball=small_ball()))
     rows: dict[str, Any] = {}
-    for name, stream, clipped in (
+    for name, stream, white in (
         ("hdr", streams["hdr"], 1.0),
         ("8-bit", streams["8-bit"], 1.0),
         ("8-bit, guessed", streams["8-bit"], CLIPPED),
     ):
-        lamp = probe(stream, clipped)
+        lamp = probe(stream, white)
         rows[name] = compare(received(mi.load_dict({"type": "scene", "ball": small_ball(), "light": lamp})), truth)
     scores = {name: evaluate_stream(options.out / f"fit-{name}") for name in streams}
     for name, result in scores.items():
@@ -266,21 +266,21 @@ def draw(streams: Mapping[str, Any], options: Options) -> np.ndarray:
     for name, stream in streams.items():
         plain = np.asarray(morgs_mi.rasterize(first_gaussians(stream), camera).color)
         # The map itself would shine through walls that are not quite opaque.
-        hidden = {"type": "path", "hide_emitters": True}
-        entries = {"ball": ball, "light": lamps[name], "integrator": hidden}
+        integrator = {"type": "path", "hide_emitters": True}
+        entries = {"ball": ball, "light": lamps[name], "integrator": integrator}
         (_, images), *_ = render_inserted(
             stream, camera, partial(as_given, entries), [0], ("color",), InsertConfig(128, shadows=False)
         )
-        decoded = (decode_light(image) for image in (plain, images["color"]))
-        rows[f"fit of the {name} recording"] = next(decoded), next(decoded)
+        light_images = (decode_light(image) for image in (plain, images["color"]))
+        rows[f"fit of the {name} recording"] = next(light_images), next(light_images)
     return contact_sheet(
         [
             [
                 label(display_image(plain, 0), name),
                 label(display_image(plain, -4), "4 stops darker"),
-                label(display_image(inserted, 0), "with a white sphere"),
+                label(display_image(with_sphere, 0), "with a white sphere"),
             ]
-            for name, (plain, inserted) in rows.items()
+            for name, (plain, with_sphere) in rows.items()
         ]
     )
 

@@ -92,11 +92,11 @@ class Options(OnWorkers):
     """Settings of the fit; presets, epochs, key views, rates and seeds override them."""
 
     def __post_init__(self) -> None:
-        unknown = [name for name in (*self.presets, *self.tuned) if name not in (DEFAULT, *PRESETS)]
-        if unknown or not self.presets or not self.epochs or self.seeds < 1:
+        names = [name for name in (*self.presets, *self.tuned) if name not in (DEFAULT, *PRESETS)]
+        if names or not self.presets or not self.epochs or self.seeds < 1:
             raise ValueError(
                 f"method: `presets` and `tuned` must be among {', '.join((DEFAULT, *PRESETS))}, with one preset, one "
-                f"number of epochs and one seed or more, got {', '.join(unknown) or 'none'}."
+                f"number of epochs and one seed or more, got {', '.join(names) or 'none'}."
             )
 
     @property
@@ -125,13 +125,13 @@ class Options(OnWorkers):
             )
         clips = []
         settings = {n: v for n, v in asdict(self).items() if n not in _WORK}
-        about = {"table_epochs": self.table_epochs, "version": self.version or method_version()}
+        metadata = {"table_epochs": self.table_epochs, "version": self.version or method_version()}
         with self.opened() as client:
             for path in self.captures:
                 clips.append(measure(path, self, client))
                 page = method_page(clips, self.table_epochs)
                 (self.out / "method.md").write_text(page, encoding="utf-8")
-                result = {"clips": clips, **about, "settings": settings}
+                result = {"clips": clips, **metadata, "settings": settings}
                 Output(self.out / "method.json").write(result, unprinted=["clips", "settings"])
                 if find_spec("matplotlib"):
                     plot_method(clips, self.out / "method.png")
@@ -185,8 +185,8 @@ def settings_of(base: StreamConfig, preset: str, epochs: int, key_views: int, ra
     """Return `base` with a setting; `rates` is a factor on all learning rates of later frames."""
     if preset != DEFAULT:
         base = apply_preset(base, preset)  # pyright: ignore[reportArgumentType]
-    scaled = {name: rates * rate for name, rate in asdict(base.fit.rates).items()}
-    fit = replace(base.fit, epochs=epochs, rates=replace(base.fit.rates, **scaled))
+    new_rates = {name: rates * rate for name, rate in asdict(base.fit.rates).items()}
+    fit = replace(base.fit, epochs=epochs, rates=replace(base.fit.rates, **new_rates))
     return replace(base, fit=fit, motion=replace(base.motion, key_views=key_views))
 
 
@@ -207,11 +207,11 @@ def fitted(
     for seed in range(options.seeds):
         if seed:
             best = [row for row in aggregate(rows, presets) if row["best"]]
-            chosen = [v for v in variants if v not in presets or v.keys in [_setting(row) for row in best]]
+            choice = [v for v in variants if v not in presets or v.keys in [_setting(row) for row in best]]
         else:
-            chosen = variants
+            choice = variants
         scenes = [Scene({}, (source, firsts[seed]))]
-        rows += Study(later_frames, scenes, chosen, (seed,), version=options.version).run(client, options.out)
+        rows += Study(later_frames, scenes, choice, (seed,), version=options.version).run(client, options.out)
     return rows
 
 
@@ -221,26 +221,28 @@ def aggregate(rows: Sequence[Row], variants: Sequence[Variant]) -> list[dict[str
     `best` marks the rates of the first run with the best mean PSNR for their preset, epochs and key views.
     """
     keys = [variant.keys for variant in variants]
-    groups = [own for own in grouped(rows, *_SETTING).values() if _setting(own[0]) in keys]
+    groups = [group for group in grouped(rows, *_SETTING).values() if _setting(group[0]) in keys]
     best: dict[tuple[Any, ...], Row] = {}
-    for first in (own[0] for own in groups):
+    for first in (group[0] for group in groups):
         setting = first["preset"], first["epochs"], first["key_views"]
         best[setting] = max(best.get(setting, first), first, key=lambda row: row["psnr"])
-    found = []
-    for own in groups:
-        names = [name for name in own[0] if name not in (*_SETTING, "fit_seed", "by_frame")]
-        table = {name: np.array([row[name] for row in own], float) for name in names}
-        series = {n: np.mean([np.array(row["by_frame"][n], float) for row in own], axis=0) for n in own[0]["by_frame"]}
+    means = []
+    for group in groups:
+        names = [name for name in group[0] if name not in (*_SETTING, "fit_seed", "by_frame")]
+        table = {name: np.array([row[name] for row in group], float) for name in names}
+        series = {
+            n: np.mean([np.array(row["by_frame"][n], float) for row in group], axis=0) for n in group[0]["by_frame"]
+        }
         row = {
-            **_setting(own[0]),
-            "runs": len(own),
+            **_setting(group[0]),
+            "runs": len(group),
             "mean": {name: float(values.mean()) for name, values in table.items()},
             "std": {name: float(v.std(ddof=1)) if len(v) > 1 else None for name, v in table.items()},
             "by_frame": {name: values.tolist() for name, values in series.items()},
-            "best": any(own[0] is row for row in best.values()),
+            "best": any(group[0] is row for row in best.values()),
         }
-        found.append(json_finite(row))
-    return found
+        means.append(json_finite(row))
+    return means
 
 
 def _setting(row: Row) -> dict[str, Any]:
@@ -271,17 +273,17 @@ def later_frames(source: Source, first: str, config: StreamConfig) -> dict[str, 
 
 def summary(found: Evaluation, reports: Sequence[FrameReport]) -> dict[str, Any]:
     """Return the scores of a stream, see `later_frames`."""
-    later = found.frames[1:]
-    motion = [row.motion_3d for row in later if row.motion_3d is not None]
+    evaluations = found.frames[1:]
+    motion = [row.motion_3d for row in evaluations if row.motion_3d is not None]
     return {
-        **{name: known_mean([getattr(row.scores, name) for row in later]) for name in _MEANS},
-        "num_bytes": known_mean([row.num_bytes for row in later]),
+        **{name: known_mean([getattr(row.scores, name) for row in evaluations]) for name in _MEANS},
+        "num_bytes": known_mean([row.num_bytes for row in evaluations]),
         **{f"motion_3d_{name}": known_mean([getattr(scores, name) for scores in motion]) for name in _MOTION_3D},
         "mtv": found.variation.render,
         "mtv_input": found.variation.input,
         "psnr_slope": found.psnr_slope,
         "seconds": float(np.median([report.seconds for report in reports])),
-        "by_frame": {name: [getattr(row.scores, name) for row in later] for name in _BY_FRAME},
+        "by_frame": {name: [getattr(row.scores, name) for row in evaluations] for name in _BY_FRAME},
     }
 
 

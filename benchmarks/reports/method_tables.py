@@ -166,14 +166,16 @@ def _references(clip: Row) -> str:
 
 def _edges(clip: Row) -> str:
     """Return a warning about presets with their best rate at the largest one measured, empty if there are none."""
-    tried: dict[str, set[float]] = {row["preset"]: set() for row in clip["rows"]}
+    rates_by_preset: dict[str, set[float]] = {row["preset"]: set() for row in clip["rows"]}
     for row in clip["rows"]:
-        tried[row["preset"]].add(row["rates"])
+        rates_by_preset[row["preset"]].add(row["rates"])
     edges = [
-        row for row in best_rows(clip) if len(tried[row["preset"]]) > 1 and row["rates"] == max(tried[row["preset"]])
+        row
+        for row in best_rows(clip)
+        if len(rates_by_preset[row["preset"]]) > 1 and row["rates"] == max(rates_by_preset[row["preset"]])
     ]
-    found = ", ".join(f"`{row['preset']}` at {row['epochs']} epochs" for row in edges)
-    return f"Larger rates than were tried may be better for {found}.\n" if found else ""
+    names = ", ".join(f"`{row['preset']}` at {row['epochs']} epochs" for row in edges)
+    return f"Larger rates than were tried may be better for {names}.\n" if names else ""
 
 
 def _spread(row: Row, name: str, digits: int, unit: float) -> str:

@@ -41,8 +41,8 @@ class Column(NamedTuple):
         rows = [row for row in rows if self.only is None or self.only.items() <= row.items()]
         values = [self.score(row) if callable(self.score) else row[self.score] for row in rows]
         values = [self.factor * float("nan" if value is None else value) for value in values]
-        found = plus_minus(values, self.decimals) if self.spread else figure(float(np.mean(values)), self.decimals)
-        return found + self.unit
+        text = plus_minus(values, self.decimals) if self.spread else figure(float(np.mean(values)), self.decimals)
+        return text + self.unit
 
 
 def scores_table(
@@ -63,18 +63,18 @@ def scores_table(
     for row in rows:
         values = (key(row) if callable(key) else row[key] for key in keys.values())
         groups.setdefault(tuple(map(str, values)), []).append(row)
-    lines = [(*names, *(column.of(own) for column in columns)) for names, own in groups.items()]
+    lines = [(*names, *(column.of(group) for column in columns)) for names, group in groups.items()]
     return markdown((*keys, *(column.title for column in columns)), lines, left)
 
 
 def means_over(rows: Sequence[Mapping[str, Any]], key: str, **about: Any) -> list[dict[str, Any]]:
     """Return the means of the numbers of the rows that have `key` in common, as rows with the entries `about`."""
-    found = []
-    for (value,), own in grouped(rows, key).items():
-        names = [name for name, entry in own[0].items() if isinstance(entry, Real) and name not in (key, *about)]
-        table = {name: np.array([row[name] for row in own], float) for name in names}
-        found.append({key: value, **about, **{name: float(np.nanmean(column)) for name, column in table.items()}})
-    return found
+    means = []
+    for (value,), group in grouped(rows, key).items():
+        names = [name for name, entry in group[0].items() if isinstance(entry, Real) and name not in (key, *about)]
+        table = {name: np.array([row[name] for row in group], float) for name in names}
+        means.append({key: value, **about, **{name: float(np.nanmean(column)) for name, column in table.items()}})
+    return means
 
 
 def markdown(titles: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> str:
@@ -101,9 +101,9 @@ def plus_minus(values: Sequence[float], digits: int = 2) -> str:
 
 def span(values: Iterable[float], digits: int = 1) -> str:
     """Return the smallest and the largest value, or the only one."""
-    ordered = sorted(values)
-    least = f"{ordered[0]:.{digits}f}"
-    most = f"{ordered[-1]:.{digits}f}"
+    numbers = sorted(values)
+    least = f"{numbers[0]:.{digits}f}"
+    most = f"{numbers[-1]:.{digits}f}"
     return least if least == most else f"{least} to {most}"
 
 

@@ -63,10 +63,10 @@ class Options(StudyOptions):
 def measure(source: Source, num_frames: int, config: StreamConfig) -> dict[str, float]:
     """Fit a clip and return the means of the scores of its later frames."""
     capture = source.open()
-    first, *later = capture.partial_frames(0, num_frames)
+    first, *later_frames = capture.partial_frames(0, num_frames)
     loop = new_loop(capture, config)
     loop.push([first.images[v] for v in capture.train_views])
-    rows = list(fitted_frames(loop, capture, later))
+    rows = list(fitted_frames(loop, capture, later_frames))
     return {name: float(np.nanmean([row[name] for row in rows])) for name in rows[0]}
 
 
@@ -77,9 +77,9 @@ def fitted_frames(loop: StreamLoop, capture: Capture, frames: Iterable[PartialFr
         start = time.process_time()
         _, report = loop.push([frame.images[v] for v in capture.train_views])
         seconds = time.process_time() - start
-        recorded = frame.images[test]
-        if recorded is not None and loop.gaussians is not None:
-            scores = scores_of(loop.gaussians, capture, test, frame.index, recorded)
+        image = frame.images[test]
+        if image is not None and loop.gaussians is not None:
+            scores = scores_of(loop.gaussians, capture, test, frame.index, image)
             sizes = {"bytes": report.num_bytes, "num_gaussians": report.num_gaussians}
             yield {**scores, **sizes, "cpu_s": seconds, **report.active}
 

@@ -75,8 +75,8 @@ class Options(StudyOptions):
                 Scene(keys | {"test": test}, (Source.of(capture.holding_out(test)), self.pictures))
                 for test in held_out(len(full.cameras))
             ]
-        given = FitConfig(num_gaussians=self.gaussians, first_frame_steps=self.steps)
-        fits = {seconds: FitConfig(first_frame_seconds=seconds) for seconds in self.seconds} or {None: given}
+        settings = FitConfig(num_gaussians=self.gaussians, first_frame_steps=self.steps)
+        fits = {seconds: FitConfig(first_frame_seconds=seconds) for seconds in self.seconds} or {None: settings}
         variants = [Variant({"seconds": seconds}, StreamConfig(fit)) for seconds, fit in fits.items()]
         return Study(measure, scenes, variants, self.fit_seeds)
 
@@ -120,28 +120,28 @@ def measure(source: Source, pictures: Path | None, config: StreamConfig) -> dict
     capture = with_points(source.open(), config.seed, Progress())
     images = next(capture.frames(0, 1)).images
     views = [View(*view) for view in zip(capture.cameras, images, capture.masks, strict=True)]
-    trained = [views[v] for v in capture.train_views]
+    train = [views[v] for v in capture.train_views]
     test = [views[v] for v in capture.test_views]
     stages: list[str] = []
     loop = new_loop(capture, config)
     start = time.process_time()
-    _, report = loop.push([view.image for view in trained], lambda stage, *_: stages.append(stage))
+    _, report = loop.push([view.image for view in train], lambda stage, *_: stages.append(stage))
     seconds = time.process_time() - start
     gaussians = loop.gaussians
     assert gaussians is not None
     extent = loop.setup.extent
     cameras = [register_camera(gaussians, view, extent, config.fit, config.render) for view in test]
-    compared = {
-        "training": trained,
+    groups = {
+        "training": train,
         "held_out": test,
         "registered": [view._replace(camera=camera) for view, camera in zip(test, cameras, strict=True)],
     }
     if pictures is not None:
         _write_picture(pictures / f"{capture.path.name}.jpg", gaussians, test[0])
-    scores = {name: mean_psnr(gaussians, given, config.render) for name, given in compared.items()}
+    scores = {name: mean_psnr(gaussians, group, config.render) for name, group in groups.items()}
     announcement = re.search(r"about (\d+) s", stages[-1])
     return scores | {
-        "views": len(trained),
+        "views": len(train),
         "held_out_views": len(test),
         "gaussians": len(gaussians),
         "steps": report.steps,
@@ -152,9 +152,9 @@ def measure(source: Source, pictures: Path | None, config: StreamConfig) -> dict
 
 def _write_picture(path: Path, gaussians: Gaussians, view: View) -> None:
     """Write a recorded image and its rendering side by side."""
-    rendered = np.asarray(rasterize(gaussians, view.camera, ("color",)).color)
+    image = np.asarray(rasterize(gaussians, view.camera, ("color",)).color)
     path.parent.mkdir(parents=True, exist_ok=True)
-    picture = side_by_side([label(view.image, "held-out image"), label(rendered, "rendered")])
+    picture = side_by_side([label(view.image, "held-out image"), label(image, "rendered")])
     cv2.imwrite(str(path), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
 
 

@@ -60,8 +60,8 @@ class Reference64:
             g = gradient[chunk]
             product = g @ values[order].T  # <g, c_i>
             inner = weights * product
-            behind = inner[:, ::-1].cumsum(axis=1)[:, ::-1] - inner
-            to_full = np.where(free, light * product - behind / (1 - alpha), 0) * alpha  # dL/dA A
+            light_behind = inner[:, ::-1].cumsum(axis=1)[:, ::-1] - inner
+            to_full = np.where(free, light * product - light_behind / (1 - alpha), 0) * alpha  # dL/dA A
             dx, dy = distance
             _, _, a, b, c, opacity = splats[order].T
             moments = (
@@ -80,9 +80,9 @@ class Reference64:
         """Return splats (mean, conic, opacity) [N, 6], values (colour, 1) [N, 4] and the drawn indices by depth."""
         numbers, depths = _project(self._float64(), self.camera, self.config.eps2d)
         order = np.argsort(depths, kind="stable")
-        drawn = (depths >= self.camera.near) & (numbers[:, 5] > self.config.alpha_min)
+        visible = (depths >= self.camera.near) & (numbers[:, 5] > self.config.alpha_min)
         values = np.column_stack([numbers[:, 6:], np.ones(len(numbers))])
-        return numbers[:, :6], values, order[drawn[order]]
+        return numbers[:, :6], values, order[visible[order]]
 
     def _blended(self, splats: np.ndarray, order: np.ndarray, pixels: np.ndarray) -> Iterator[tuple]:
         """Yield (chunk, (dx, dy), w, T, alpha, whether alpha is A) for one chunk of the pixels at a time."""
@@ -93,28 +93,28 @@ class Reference64:
             dx = pixels[chunk, :1] + 0.5 - mean_x
             dy = pixels[chunk, 1:] + 0.5 - mean_y
             full = opacity * np.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
-            drawn = full >= self.config.alpha_min
+            visible = full >= self.config.alpha_min
             free = full <= self.config.alpha_max
-            alpha = np.where(drawn, np.minimum(full, self.config.alpha_max), 0)
+            alpha = np.where(visible, np.minimum(full, self.config.alpha_max), 0)
             light = np.cumprod(np.column_stack([np.ones(len(alpha)), 1 - alpha]), axis=1)[:, :-1]
-            yield chunk, (dx, dy), light * alpha, light, alpha, drawn & free
+            yield chunk, (dx, dy), light * alpha, light, alpha, visible & free
 
-    def _to_attributes(self, incoming: np.ndarray) -> dict[str, np.ndarray]:
+    def _to_attributes(self, gradients: np.ndarray) -> dict[str, np.ndarray]:
         """Return the gradients of the attributes, given the gradients of splats and colours [N, 9]."""
         raw = self._float64()
         grads = {}
         for name in _GEOMETRY:
-            columns = raw[name].reshape(len(incoming), -1)
+            columns = raw[name].reshape(len(gradients), -1)
             grad = np.zeros(columns.shape)
             for k in range(columns.shape[1]):
-                nudged = columns.astype(np.complex128)
-                nudged[:, k] += 1j * _STEP
-                numbers, _ = _project({**raw, name: nudged.reshape(raw[name].shape)}, self.camera, self.config.eps2d)
-                grad[:, k] = (np.imag(numbers) / _STEP * incoming).sum(axis=1)
+                trial = columns.astype(np.complex128)
+                trial[:, k] += 1j * _STEP
+                numbers, _ = _project({**raw, name: trial.reshape(raw[name].shape)}, self.camera, self.config.eps2d)
+                grad[:, k] = (np.imag(numbers) / _STEP * gradients).sum(axis=1)
             grads[name] = grad.reshape(raw[name].shape)
         positive = _project(raw, self.camera, self.config.eps2d)[0][:, 6:] > 0
         basis = _sh_basis(_directions(raw["means"], self.camera), raw["sh_coeffs"].shape[1])
-        return grads | {"sh_coeffs": basis[:, :, None] * (positive * incoming[:, 6:])[:, None, :]}
+        return grads | {"sh_coeffs": basis[:, :, None] * (positive * gradients[:, 6:])[:, None, :]}
 
     def _float64(self) -> dict[str, np.ndarray]:
         return {name: np.asarray(self.raw[name], np.float64) for name in ATTRIBUTES}
@@ -139,8 +139,9 @@ def _project(raw: Mapping[str, np.ndarray], camera: Camera, eps2d: float) -> tup
         c = K[axis, 2]
         low = -c / f - 0.15 * size / f
         high = (size - c) / f + 0.15 * size / f
-        clamped = np.where(slope.real < low, low, np.where(slope.real > high, high, slope))
-        jacobian[:, axis, axis], jacobian[:, axis, 2] = f / z, -f * clamped / z
+        slope_in_view = np.where(slope.real < low, low, np.where(slope.real > high, high, slope))
+        jacobian[:, axis, axis] = f / z
+        jacobian[:, axis, 2] = -f * slope_in_view / z
         means2d.append(f * slope + c)
     axes = jacobian @ R @ _rotation(raw["quats"]) * np.exp(raw["log_scales"])[:, None, :]
     covariance = axes @ axes.transpose(0, 2, 1)

@@ -96,9 +96,9 @@ def ladder() -> list[Setting]:
         settings.append(Setting("alpha_min", name, replace(default, alpha_min=default.alpha_min * factor)))
     for stop in (0.0, 1e-5, 1e-4, 1e-3, 1e-2):
         settings.append(Setting("stop_transmittance", f"{stop:g}", replace(default, stop_transmittance=stop)))
-    own = block_shape(default)
-    for shape in dict.fromkeys([(4, 4), (8, 4), (8, 8), own]):
-        width, height = (None, None) if shape == own else shape
+    default_shape = block_shape(default)
+    for shape in dict.fromkeys([(4, 4), (8, 4), (8, 8), default_shape]):
+        width, height = (None, None) if shape == default_shape else shape
         config = replace(default, block_width=width, block_height=height)
         settings.append(Setting("block", f"{shape[0]}x{shape[1]}", config))
     for flag in (False, True):
@@ -113,8 +113,8 @@ def measure(options: Options) -> list[dict[str, Any]]:
     settings = ladder()
     rng = np.random.default_rng(options.seed)
     count = options.width * options.height
-    chosen = rng.choice(count, min(options.pixels, count), replace=False)
-    pixels = np.stack([chosen % options.width, chosen // options.width], axis=1)
+    choice = rng.choice(count, min(options.pixels, count), replace=False)
+    pixels = np.stack([choice % options.width, choice // options.width], axis=1)
     weights = rng.normal(size=(len(pixels), 3))
 
     references: dict[float, Values] = {}
@@ -129,10 +129,10 @@ def measure(options: Options) -> list[dict[str, Any]]:
     rows = []
     for setting, times in zip(settings, _times(gaussians, camera, settings, options.repeats), strict=True):
         image, gradients = _rendered(gaussians, camera, setting.config, mi.TensorXf(target))
-        found = image[pixels[:, 1], pixels[:, 0]], gradients
-        exact, same = (_errors(found, references[cut]) for cut in (_EXACT_ALPHA_MIN, setting.config.alpha_min))
-        about = {"knob": setting.knob, "value": setting.value, "default": setting.is_default}
-        rows.append({**about, **exact, "rounding": same, **times})
+        result = image[pixels[:, 1], pixels[:, 0]], gradients
+        exact, same = (_errors(result, references[cut]) for cut in (_EXACT_ALPHA_MIN, setting.config.alpha_min))
+        keys = {"knob": setting.knob, "value": setting.value, "default": setting.is_default}
+        rows.append({**keys, **exact, "rounding": same, **times})
     return rows
 
 
@@ -169,13 +169,15 @@ def plot_renderer(rows: Sequence[Row], path: Path) -> None:
     default = next(row for row in rows if row["default"])
     for axis, (title, error) in zip(figure.subplots(2, 2).flat, panels, strict=True):
         for knob in dict.fromkeys(row["knob"] for row in rows):
-            own = [row for row in rows if row["knob"] == knob]
-            points = [(row["step_ratio"], error(row)) for row in own]
+            rows_of_knob = [row for row in rows if row["knob"] == knob]
+            points = [(row["step_ratio"], error(row)) for row in rows_of_knob]
             axis.plot(*zip(*points, strict=True), _MARKS.get(knob, "o-"), label=knob, alpha=0.8, markersize=5)
             # Labels would overlap if an option has no effect.
             spread = max(y for _, y in points) > 1.5 * min(y for _, y in points)
-            named = [(row, point) for row, point in zip(own, points, strict=True) if spread and not row["default"]]
-            label_points(axis, [point for _, point in named], [row["value"] for row, _ in named], (5, 3))
+            labels = [
+                (row, point) for row, point in zip(rows_of_knob, points, strict=True) if spread and not row["default"]
+            ]
+            label_points(axis, [point for _, point in labels], [row["value"] for row, _ in labels], (5, 3))
         axis.plot(1, error(default), "k*", markersize=13, label="default", zorder=5)
         axis.set(
             title=title,
@@ -200,14 +202,14 @@ def _rendered(gaussians: Gaussians, camera: Camera, config: RenderConfig, weight
     return np.array(dr.detach(image), np.float64), gradients
 
 
-def _errors(found: Values, expected: Values) -> dict[str, Any]:
+def _errors(result: Values, expected: Values) -> dict[str, Any]:
     """Return the errors of image and gradients."""
-    difference = np.abs(found[0] - expected[0])
+    difference = np.abs(result[0] - expected[0])
     rms = float(np.sqrt(np.mean(np.square(difference))))
     psnr = -20 * float(np.log10(rms)) if rms > 0 else float("inf")
     gradients = {}
     for name in ATTRIBUTES:
-        a = found[1][name].ravel()
+        a = result[1][name].ravel()
         b = expected[1][name].ravel()
         length = np.linalg.norm(b)
         cosine = float(a @ b / (np.linalg.norm(a) * length))

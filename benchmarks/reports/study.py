@@ -100,20 +100,24 @@ class Study:
         cells = {}
         keys = {}
         for scene, variant, seed in product(self.scenes, self.variants, self.seeds):
-            about = {**scene.keys, **variant.keys, self.seed_key: seed}
-            name = ", ".join(f"{key} {value}" for key, value in about.items())
-            cells[name], keys[name] = (*scene.args, replace(variant.config, seed=seed)), about
+            cell_keys = {**scene.keys, **variant.keys, self.seed_key: seed}
+            name = ", ".join(f"{key} {value}" for key, value in cell_keys.items())
+            cells[name] = (*scene.args, replace(variant.config, seed=seed))
+            keys[name] = cell_keys
         files = {name: self.stored_file(store, args) for name, args in cells.items()} if store else {}
-        found = {name: json.loads(file.read_text("utf-8")) for name, file in files.items() if file.is_file()}
+        results_by_name = {name: json.loads(file.read_text("utf-8")) for name, file in files.items() if file.is_file()}
 
         def arrived(name: str, result: Any) -> None:
-            found[name] = json_finite(rounded(result))
-            print(f"{name}: {str(found[name])[:_SHOWN]}", flush=True)
+            results_by_name[name] = json_finite(rounded(result))
+            print(f"{name}: {str(results_by_name[name])[:_SHOWN]}", flush=True)
             if store:
-                write_json(files[name], found[name])
+                write_json(files[name], results_by_name[name])
 
-        run_cells(self.measure, {n: args for n, args in cells.items() if n not in found}, client, arrived)
-        results = {name: found[name] if isinstance(found[name], list) else [found[name]] for name in cells}
+        run_cells(self.measure, {n: args for n, args in cells.items() if n not in results_by_name}, client, arrived)
+        results = {
+            name: results_by_name[name] if isinstance(results_by_name[name], list) else [results_by_name[name]]
+            for name in cells
+        }
         return [{**keys[name], **row} for name, rows in results.items() for row in rows]
 
     def stored_file(self, store: Path, args: tuple[Any, ...]) -> Path:

@@ -77,18 +77,18 @@ def measure(
 ) -> list[dict[str, float]]:
     """Return the errors of a scene's offsets, and the scores of its fits by the way in which it is read, by seed."""
     synchronised = clock.open()
-    recorded = apart.open()
-    errors, offsets, reference = offset_errors(recorded)
-    aligned = load_capture(recorded.path, reading=replace(recorded.reading, offset=offsets))
-    first = int(aligned.metadata()["cameras"][recorded.names.index(reference)]["first_frame"])
-    fits = {"synchronised": (synchronised, first), "recorded": (recorded, first), "aligned": (aligned, 0)}
+    recording = apart.open()
+    errors, offsets, reference = offset_errors(recording)
+    aligned_capture = load_capture(recording.path, reading=replace(recording.reading, offset=offsets))
+    first = int(aligned_capture.metadata()["cameras"][recording.names.index(reference)]["first_frame"])
+    fits = {"synchronised": (synchronised, first), "recorded": (recording, first), "aligned": (aligned_capture, 0)}
     rows = []
     for seed in seeds:
         row = {"fit_seed": seed, **errors}
-        own = replace(config, seed=seed)
+        seed_config = replace(config, seed=seed)
         for name, (capture, begin) in fits.items():
-            found = scores(capture, range(begin, begin + num_frames), first, own)
-            row |= {f"{name}_{score}": value for score, value in found.items()}
+            result = scores(capture, range(begin, begin + num_frames), first, seed_config)
+            row |= {f"{name}_{score}": value for score, value in result.items()}
         rows.append(row)
     return rows
 
@@ -96,20 +96,20 @@ def measure(
 def offset_errors(recorded: Capture) -> tuple[dict[str, float], dict[str, float], str]:
     """Return the errors of a clip's offsets, the offsets by camera, and the reference."""
     start = time.perf_counter()
-    found = estimate_time_offsets(recorded)
+    estimate = estimate_time_offsets(recorded)
     seconds = time.perf_counter() - start
     truth = load_disturbances(recorded.path / "truth")
-    others = [name for name in found.offsets if name != found.reference]
-    errors = np.abs([found.offsets[name] + truth[name].time_offset for name in others])
+    others = [name for name in estimate.offsets if name != estimate.reference]
+    errors = np.abs([estimate.offsets[name] + truth[name].time_offset for name in others])
     figures = {
         "views": len(recorded.cameras),
         "largest_offset": max(abs(camera.time_offset) for camera in truth.values()),
         "mean_error": errors.mean(),
         "largest_error": errors.max(),
-        "standard_error": np.mean([found.errors[name] for name in others]),
+        "standard_error": np.mean([estimate.errors[name] for name in others]),
         "seconds": seconds,
     }
-    return figures, dict(found.offsets), found.reference
+    return figures, dict(estimate.offsets), estimate.reference
 
 
 def scores(capture: Capture, frames: range, first: int, config: StreamConfig) -> dict[str, Any]:

@@ -96,8 +96,8 @@ def held_out(capture: Capture, shares: Sequence[float]) -> list[list[int]]:
     if count <= _FEW:
         return [[view] for view in range(count)]
     every = range(count)
-    trained = [spread_views(capture.cameras, round(share * count), every) for share in shares]
-    return [[view for view in every if view not in views] for views in trained]
+    train_sets = [spread_views(capture.cameras, round(share * count), every) for share in shares]
+    return [[view for view in every if view not in views] for views in train_sets]
 
 
 def measure(source: Source, config: StreamConfig) -> dict[str, Any]:
@@ -120,16 +120,16 @@ def row_of(
     """Return the row of a fit; held-out views are compared in the colours of the scene if it is balanced."""
     is_balanced = any(exposure != Exposure() for exposure in exposures)
     views = [View(*view) for view in zip(capture.cameras, images, capture.masks, strict=True)]
-    trained = [views[index] for index in capture.train_views]
+    train = [views[index] for index in capture.train_views]
     test = [views[index] for index in capture.test_views[:: -(-len(capture.test_views) // _MOST_VIEWS)]]
     render = setup.config.render
     if is_balanced:
-        pairs = zip(trained, exposures, strict=True)
-        trained = [view._replace(image=exposure.corrected(view.image)) for view, exposure in pairs]
+        pairs = zip(train, exposures, strict=True)
+        train = [view._replace(image=exposure.corrected(view.image)) for view, exposure in pairs]
         fits = [fit_exposure(rendered(gaussians, view.camera, render), view.image / 255, view.mask) for view in test]
         test = [view._replace(image=exposure.corrected(view.image)) for view, exposure in zip(test, fits, strict=True)]
-    rig = forecast([view.camera for view in trained], setup.points)
-    features = features_of(gaussians, trained, setup.points, render)
+    rig = forecast([view.camera for view in train], setup.points)
+    features = features_of(gaussians, train, setup.points, render)
     psnrs = [mean_psnr(gaussians, [view], render) for view in test]
     return {"views": rig.cameras, "reach": rig.reach, "features": list(features), "held_out": psnrs}
 
@@ -205,8 +205,8 @@ def _conformal(errors: Sequence[np.ndarray]) -> float:
     values = np.concatenate(errors)
     weights = np.concatenate([np.full(len(group), 1 / len(group)) for group in errors])
     order = values.argsort()
-    reached = weights[order].cumsum() >= _HELD * (len(errors) + 1) - 1e-9
-    return float(values[order][reached.argmax()]) if reached.any() else float("inf")
+    is_enough = weights[order].cumsum() >= _HELD * (len(errors) + 1) - 1e-9
+    return float(values[order][is_enough.argmax()]) if is_enough.any() else float("inf")
 
 
 if __name__ == "__main__":

@@ -102,9 +102,9 @@ class Scene:
         """Return the true Gaussians of a frame."""
         angle = 0.05 * frame
         turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
-        own = self.owner[len(self.ground) :]
-        moves = np.isin(own, self.moving)[:, None]
-        balls = self.centers[own] + np.where(moves, self.local @ turn.T + frame * self.direction[own], self.local)
+        owner = self.owner[len(self.ground) :]
+        moves = np.isin(owner, self.moving)[:, None]
+        balls = self.centers[owner] + np.where(moves, self.local @ turn.T + frame * self.direction[owner], self.local)
         return self.gaussians(np.concatenate([self.ground, balls]))
 
     def gaussians(self, means: np.ndarray, noise: float = 0.0, seed: int = 0) -> Gaussians:
@@ -158,8 +158,8 @@ def measure(scene: Scene, config: StreamConfig, recorded: list[list[np.ndarray]]
         dr.sync_thread()
         _, report = loop.push(images[1:], upcoming=None if live else upcoming[1:])
         assert loop.gaussians is not None
-        found = np.asarray(rasterize(loop.gaussians, cameras[0], ("color",)).color)
-        squares = (np.clip(found, 0, 1) - images[0] / 255.0) ** 2
+        image = np.asarray(rasterize(loop.gaussians, cameras[0], ("color",)).color)
+        squares = (np.clip(image, 0, 1) - images[0] / 255.0) ** 2
         rows.append(
             {
                 "seconds": report.seconds,
@@ -187,11 +187,11 @@ def main(options: Options) -> None:
     for name in options.sizes:
         scene = Scene(SIZES[name], options.seed)
         rows = {}
-        recorded = scene.recorded(options.frames + 2, options.seed)
+        images = scene.recorded(options.frames + 2, options.seed)
         for label, config in settings(options, name).items():
             for live in (False, True) if label.startswith("default") else (True,):
                 row = f"{label}, live" if live and label.startswith("default") else label
-                rows[row] = measure(scene, config, recorded, live)
+                rows[row] = measure(scene, config, images, live)
                 print(f"{name:6s} {row:28s}", json.dumps(rows[row]), flush=True)
         result[name] = {"size": vars(SIZES[name]), "runs": rows}
     options.write(result, unprinted=options.sizes)

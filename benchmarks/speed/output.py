@@ -28,23 +28,23 @@ class Output:
             figures: by name.
             unprinted: names of figures that only the file has.
         """
-        found = {
+        result = {
             **figures,
             "commit": commit(),
             "date": date.today().isoformat(),
             "machine": machine(),
             "versions": versions(),
         }
-        print(json.dumps({name: value for name, value in found.items() if name not in unprinted}, indent=2))
+        print(json.dumps({name: value for name, value in result.items() if name not in unprinted}, indent=2))
         if self.json is not None:
-            write_json(self.json, found)
+            write_json(self.json, result)
 
 
 def commit() -> str:
     """Return the commit of this checkout, with -dirty if files differ from it; empty outside of a repository."""
     command = ["git", "describe", "--always", "--dirty", "--exclude=*"]
     try:
-        done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
+        process = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
     except (OSError, subprocess.CalledProcessError):
         return ""
-    return done.stdout.strip()
+    return process.stdout.strip()

@@ -99,12 +99,12 @@ def measure(capture: Capture, options: Options, folder: Path) -> list[Run]:
 @contextmanager
 def _limited_to(count: int) -> Iterator[None]:
     """Limit this process, and those that it starts, to so many cores."""
-    before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, sorted(before)[:count])
+    cores = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, sorted(cores)[:count])
     try:
         yield
     finally:
-        os.sched_setaffinity(0, before)
+        os.sched_setaffinity(0, cores)
 
 
 def _config(options: Options) -> StreamConfig:
@@ -119,15 +119,15 @@ def _run(workers: int, start: float, seconds: float, reports: Sequence[FrameRepo
     common = reports[:COMMON_FRAMES]
     frames = reports[COMMON_FRAMES:]
     seams = [report.seconds for report in frames if report.frame in starts]
-    later = [report for report in frames if report.frame not in starts]
+    others = [report for report in frames if report.frame not in starts]
     return Run(
         workers,
         seconds,
         start,
         sum(report.seconds for report in common),
         float(np.mean(seams)),
-        float(np.mean([report.seconds for report in later])),
-        float(np.mean([report.num_bytes for report in later])),
+        float(np.mean([report.seconds for report in others])),
+        float(np.mean([report.num_bytes for report in others])),
     )
 
 

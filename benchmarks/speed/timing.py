@@ -72,15 +72,15 @@ def stages(gaussians: Gaussians, camera: Camera, seed: int = 1) -> dict[str, Cal
         with dr.suspend_grad():
             region = full_view(camera.width, camera.height, config)
             splats = project(gaussians, camera, ("color",), config)
-            built = build_lists(splats, list(splats.channels["color"]), region, config)
-        return built.words, built.order
+            block_lists = build_lists(splats, list(splats.channels["color"]), region, config)
+        return block_lists.words, block_lists.order
 
     def forward() -> Any:
         with dr.suspend_grad():
             return rasterize(gaussians, camera, ("color",)).color
 
-    def distance(color: Any, wanted: Any = full) -> Any:
-        return dr.sum(dr.abs(color - wanted), axis=None) / target.size
+    def distance(color: Any, reference: Any = full) -> Any:
+        return dr.sum(dr.abs(color - reference), axis=None) / target.size
 
     def gradients(loss: Any) -> Any:
         dr.backward(loss)
@@ -89,8 +89,8 @@ def stages(gaussians: Gaussians, camera: Camera, seed: int = 1) -> dict[str, Cal
         dr.clear_grad(attributes)
         return grads
 
-    def step(region: Region | None = None, wanted: Any = full) -> Any:
-        return gradients(distance(rasterize(gaussians, camera, ("color",), region=region).color, wanted))
+    def step(region: Region | None = None, reference: Any = full) -> Any:
+        return gradients(distance(rasterize(gaussians, camera, ("color",), region=region).color, reference))
 
     def adjoint() -> Callable[[], Any]:
         color = rasterize(gaussians, camera, ("color",)).color
@@ -108,9 +108,9 @@ def stages(gaussians: Gaussians, camera: Camera, seed: int = 1) -> dict[str, Cal
 
     @cache
     def optimizer() -> Adam:
-        made = adam({name: dr.detach(value) for name, value in gaussians.parameters().items()})
-        made.set_learning_rate(1e-9)  # the workload stays as it is
-        return made
+        result = adam({name: dr.detach(value) for name, value in gaussians.parameters().items()})
+        result.set_learning_rate(1e-9)  # the workload stays as it is
+        return result
 
     def optimised_step() -> Any:
         image = rasterize(gaussians.with_parameters(dict(optimizer().items())), camera, ("color",))
@@ -125,8 +125,8 @@ def stages(gaussians: Gaussians, camera: Camera, seed: int = 1) -> dict[str, Cal
         return image, Target(target)
 
     def loss() -> Any:
-        image, matched = compared()
-        dr.backward(recon_loss(image, matched))
+        image, reference = compared()
+        dr.backward(recon_loss(image, reference))
         grad = dr.grad(image)
         dr.clear_grad(image)
         return grad
@@ -165,8 +165,8 @@ def peak_megabytes(work: Callable[[], Any]) -> float:
 def error(gaussians: Gaussians, camera: Camera, seed: int) -> dict[str, float]:
     """Return the largest and the RMS error of the colour at a sample of pixels, compared with float64."""
     count = max(16, min(256, _REFERENCE_PAIRS // len(gaussians)))
-    chosen = np.random.default_rng(seed).choice(camera.width * camera.height, count, replace=False)
-    pixels = np.stack([chosen % camera.width, chosen // camera.width], axis=1)
+    choice = np.random.default_rng(seed).choice(camera.width * camera.height, count, replace=False)
+    pixels = np.stack([choice % camera.width, choice // camera.width], axis=1)
     with dr.suspend_grad():
         image = np.asarray(rasterize(gaussians, camera, ("color",)).color, np.float64)
     reference = Reference64(gaussians.numpy(), camera, RenderConfig()).render(pixels)[:, :3]
@@ -227,7 +227,7 @@ class Yardstick:
             write_bin(gaussians, camera, workload)
             command = [self.program, workload, str(repeats), str(dr.thread_count())]
             output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-        found = re.search(r"fwd\+bwd ms: median ([\d.]+)", output)
-        if not found:
+        match = re.search(r"fwd\+bwd ms: median ([\d.]+)", output)
+        if not match:
             raise SystemExit(f"{self.program}: expected a line 'fwd+bwd ms: median ...', got {output!r}")
-        return float(found[1])
+        return float(match[1])

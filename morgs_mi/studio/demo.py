@@ -106,13 +106,13 @@ def run_demo(out: str | Path, config: DemoConfig | None = None, progress: Report
         return _run(root, config or DemoConfig(), progress)
 
 
-def _run(root: Path, config: DemoConfig, shown: Report | None) -> DemoReport:
+def _run(root: Path, config: DemoConfig, report_stage: Report | None) -> DemoReport:
     """Run the demonstration in a locked folder."""
     seconds: dict[str, float] = {}
 
     def run_step(name: str, work: Callable[[Progress], Any]) -> Any:
         start = time.perf_counter()
-        result = work(Progress(shown, name))
+        result = work(Progress(report_stage, name))
         seconds[name] = time.perf_counter() - start
         return result
 
@@ -128,8 +128,8 @@ def _run(root: Path, config: DemoConfig, shown: Report | None) -> DemoReport:
         fit(capture, "stream_plain", plain, progress, resume=True)
 
     run_step("Path-tracing the clip", lambda report: _synthesize_clip(root / "capture", config, report))
-    off = {"learn_motion": False, "learn_offset": False, "learn_confidence": False}
-    plain = replace(config.stream, motion=replace(config.stream.motion, **off))
+    switches = {"learn_motion": False, "learn_offset": False, "learn_confidence": False}
+    plain = replace(config.stream, motion=replace(config.stream.motion, **switches))
     run_step("Fitting", lambda report: fit(load_capture(root / "capture"), "stream", config.stream, report))
     run_step("Fitting without ML, MO, MC", fit_plain)
     results = {
@@ -151,13 +151,13 @@ def _run(root: Path, config: DemoConfig, shown: Report | None) -> DemoReport:
 def _synthesize_clip(folder: Path, config: DemoConfig, report: Callable[[float, float], None]) -> None:
     """Path-trace the clip unless `folder` has it already; captures are written atomically, so it is complete."""
     clip = replace(config.clip, seed=config.stream.seed)
-    wanted = {"scene": config.scene, **clip.as_dict()}
-    given = {name: value for name, value in wanted.items() if value is not None}
+    settings = {"scene": config.scene, **clip.as_dict()}
+    set_values = {name: value for name, value in settings.items() if value is not None}
     try:
-        about = read_json(folder / CAPTURE)
+        metadata = read_json(folder / CAPTURE)
     except (OSError, ValueError):
-        about = None
-    if isinstance(about, dict) and all(about.get(name) == value for name, value in given.items()):
+        metadata = None
+    if isinstance(metadata, dict) and all(metadata.get(name) == value for name, value in set_values.items()):
         report(1, 1)
         return
     synthesize(config.scene, folder, clip, overwrite=True, progress=report)
@@ -198,8 +198,8 @@ def _draw(out: Path, capture: Capture, report: Callable[[float, float], None]) -
     scale = motion_scale(capture, capture.cameras[capture.reference_view])
     full = _panels(capture, out / "stream", scale)
     plain = _panels(capture, out / "stream_plain", scale, ", no ML, MO, MC")
-    shown = ("truth", "render", "motion", "confidence")
-    rows = [side_by_side([panels[name] for name in shown if name in panels]) for panels in full]
+    names = ("truth", "render", "motion", "confidence")
+    rows = [side_by_side([panels[name] for name in names if name in panels]) for panels in full]
     fps = min(capture.fps, len(rows) / _LEAST_SECONDS)
     write_video(out / "side_by_side.mp4", map(pad_to_even, rows), fps, PLAYABLE)
     report(1, 2)
@@ -207,8 +207,8 @@ def _draw(out: Path, capture: Capture, report: Callable[[float, float], None]) -
     frames = sorted({min(1, len(full) - 1), last, len(full) - 1})
     sheet = [list(full[frame].values()) for frame in frames]
     # The plain fit does not learn the confidence.
-    without = [panel for name, panel in plain[last].items() if name != "confidence"]
-    sheet.append([*without, motion_legend(scale)])
+    plain_panels = [panel for name, panel in plain[last].items() if name != "confidence"]
+    sheet.append([*plain_panels, motion_legend(scale)])
     write_png(out / "contact_sheet.png", contact_sheet(sheet))
     report(2, 2)
 
@@ -219,11 +219,11 @@ def _panels(capture: Capture, stream: Path, scale: float, note: str = "") -> lis
     view = capture.reference_view
     camera = reader.cameras[view]
     frames = []
-    for recorded, (index, images) in zip(capture.frames(), render_stream(reader, camera), strict=False):
+    for frame, (index, images) in zip(capture.frames(), render_stream(reader, camera), strict=False):
         truth = truth_for_camera(capture, camera, index)
-        rendered = channel_image("color", images["color"])
-        error = np.abs(rendered.astype(float) - recorded.images[view]) * _ERROR_GAIN / 255
-        panels = {"truth": recorded.images[view], "render": rendered, "error": channel_image("color", error)}
+        picture = channel_image("color", images["color"])
+        error = np.abs(picture.astype(float) - frame.images[view]) * _ERROR_GAIN / 255
+        panels = {"truth": frame.images[view], "render": picture, "error": channel_image("color", error)}
         if truth is not None:
             panels["true motion"] = channel_image("motion", truth.motion, scale)
         panels |= {n: channel_image(n, images[n], scale) for n in ("motion", "confidence") if n in images}

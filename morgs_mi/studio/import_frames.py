@@ -94,25 +94,25 @@ def import_frames(
             raise
         raise ValueError(f"{paths[0].parent}: {error}") from None
     path.parent.mkdir(parents=True, exist_ok=True)
-    coded = None
+    state = None
     order = np.zeros(0, np.int64)
     keyframes = 0
     metadata = {"num_frames": len(paths), DEFAULT_RIG: True, "config": {"codec": asdict(config)}}
     with atomic_path(path, "import_frames()") as partial, StreamWriter(partial, cameras, fps, metadata) as writer:
         for frame, source in enumerate(paths):
             gaussians = read_splats(source, most_invalid)
-            rows = None if coded is None else matched_rows(coded.gaussians.select(np.argsort(order)), gaussians)
-            if coded is None or rows is None:
+            rows = None if state is None else matched_rows(state.gaussians.select(np.argsort(order)), gaussians)
+            if state is None or rows is None:
                 order = np.arange(len(gaussians))
                 packet = keyframe_packet(gaussians, frame, cameras, config)
             else:
                 rows = np.where(rows < 0, -1, np.argsort(order)[rows])  # of the state, where births are last
-                order = np.argsort(np.where(rows < 0, len(coded), rows), kind="stable")
-                packet = residual_packet(coded, gaussians.select(order), rows[order], cameras, config)
-            coded = decode(coded, packet)
+                order = np.argsort(np.where(rows < 0, len(state), rows), kind="stable")
+                packet = residual_packet(state, gaussians.select(order), rows[order], cameras, config)
+            state = decode(state, packet)
             is_keyframe = packet.kind == PacketKind.KEYFRAME
             keyframes += is_keyframe
-            for each in (packet, *([] if is_keyframe else due_keyframe(coded, config.keyframe_interval))):
+            for each in (packet, *([] if is_keyframe else due_keyframe(state, config.keyframe_interval))):
                 writer.write(each)
             if progress is not None:
                 progress(frame + 1, len(paths))
@@ -154,9 +154,9 @@ def find_frames(sources: Sequence[str | Path]) -> list[Path]:
             "convert it, or leave it out."
         )
     if len(first) > 1:
-        found = " and ".join(path.name for path in first.values())
+        names = " and ".join(path.name for path in first.values())
         raise ValueError(
-            f"{paths[0].parent}: expected frames of one format, got {found}; name the files of one of them."
+            f"{paths[0].parent}: expected frames of one format, got {names}; name the files of one of them."
         )
     return paths
 
@@ -166,9 +166,9 @@ def same_gaussians(before: Gaussians, now: Gaussians) -> bool:
     if len(before) != len(now) or before.sh_degree != now.sh_degree or not len(now):
         return False
     old, new = _scaled_features(before, now)
-    own = np.square(new - old).sum(axis=1)
-    other = np.square(new - np.roll(old, -1, axis=0)).sum(axis=1)
-    return bool(np.mean(own <= other) >= _LEAST_SHARE)
+    distances = np.square(new - old).sum(axis=1)
+    other_distances = np.square(new - np.roll(old, -1, axis=0)).sum(axis=1)
+    return bool(np.mean(distances <= other_distances) >= _LEAST_SHARE)
 
 
 def matched_rows(before: Gaussians, now: Gaussians) -> np.ndarray | None:
@@ -192,13 +192,13 @@ def matched_rows(before: Gaussians, now: Gaussians) -> np.ndarray | None:
     # The search takes forever among many that are equal.
     distinct, first = np.unique(old, axis=0, return_index=True)
     nearest = first[KDTree(distinct).query(new)[1]]
-    kept = _increasing(nearest)
-    if len(kept) < _LEAST_SURVIVORS * fewer:
+    survivors = _increasing(nearest)
+    if len(survivors) < _LEAST_SURVIVORS * fewer:
         return None
     rows = np.full(len(now), -1)
-    rows[kept] = nearest[kept]
+    rows[survivors] = nearest[survivors]
     # Between two survivors with as many rows between them in both frames, those are the same ones, too.
-    ends = np.concatenate([[[-1, -1]], np.stack([kept, nearest[kept]], axis=1), [[len(now), len(before)]]])
+    ends = np.concatenate([[[-1, -1]], np.stack([survivors, nearest[survivors]], axis=1), [[len(now), len(before)]]])
     gap, gap_before = np.diff(ends, axis=0).T
     for k in np.flatnonzero((gap == gap_before) & (gap > 1)):
         row, row_before = ends[k] + 1
@@ -206,10 +206,10 @@ def matched_rows(before: Gaussians, now: Gaussians) -> np.ndarray | None:
     return rows
 
 
-def _scaled_features(before: Gaussians, now: Gaussians) -> tuple[np.ndarray, np.ndarray]:
+def _scaled_features(old_gaussians: Gaussians, new_gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
     """Return the features of two frames in units of their spread in the first, without those that are equal there."""
-    old = _features(before)
-    new = _features(now)
+    old = _features(old_gaussians)
+    new = _features(new_gaussians)
     spread = old.std(axis=0)
     return old[:, spread > 0] / spread[spread > 0], new[:, spread > 0] / spread[spread > 0]
 
@@ -222,12 +222,14 @@ def _increasing(numbers: np.ndarray) -> np.ndarray:
     for index, number in enumerate(numbers.tolist()):
         length = bisect_left(ends, number)
         previous[index] = lasts[length - 1] if length else -1
-        ends[length : length + 1], lasts[length : length + 1] = [number], [index]
-    found = np.empty(len(ends), np.int64)
+        ends[length : length + 1] = [number]
+        lasts[length : length + 1] = [index]
+    indices = np.empty(len(ends), np.int64)
     index = lasts[-1] if lasts else -1
-    for place in reversed(range(len(found))):
-        found[place], index = index, previous[index]
-    return found
+    for place in reversed(range(len(indices))):
+        indices[place] = index
+        index = previous[index]
+    return indices
 
 
 def _features(gaussians: Gaussians) -> np.ndarray:

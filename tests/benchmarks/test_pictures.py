@@ -18,8 +18,8 @@ PAGE = Path(__file__).parents[2] / "docs/how-it-works.md"
 def test_draw__returns_every_picture_of_the_page():
     capture = recording()
     loop = StreamLoop.of(capture, CONFIG)
-    *before, last = [frame.images for frame in capture.partial_frames(0, CONFIG.motion.mask_interval + 1)]
-    for images in before:
+    *others, last = [frame.images for frame in capture.partial_frames(0, CONFIG.motion.mask_interval + 1)]
+    for images in others:
         loop.push(images)
     pictures = draw(loop, last)
     assert set(pictures) == set(re.findall(r"\(how-it-works/(\w+)\.jpg\)", PAGE.read_text(encoding="utf-8")))

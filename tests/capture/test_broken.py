@@ -355,14 +355,15 @@ LAYOUTS = {
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_fit_command__reports_a_broken_capture_in_one_line_and_writes_nothing(tmp_path: Path, capsys, layout) -> None:
     build, table = LAYOUTS[layout]
-    whole, mistakes = build(tmp_path / "whole"), []
+    whole = build(tmp_path / "whole")
+    mistakes = []
     for kind, (damage, message, *options) in table.items():
         folder = tmp_path / kind
         path = shutil.copytree(whole, folder / "capture")
         damage(path)
-        before = sorted(folder.rglob("*"))
+        old_files = sorted(folder.rglob("*"))
         status = cli.main(["fit", str(path), str(folder / "out"), *options])
         lines = [line for line in capsys.readouterr().err.splitlines() if line.strip() and "━" not in line]
-        if status != 1 or len(lines) != 1 or not re.search(message, lines[0]) or sorted(folder.rglob("*")) != before:
+        if status != 1 or len(lines) != 1 or not re.search(message, lines[0]) or sorted(folder.rglob("*")) != old_files:
             mistakes.append((kind, status, lines))
     assert mistakes == []

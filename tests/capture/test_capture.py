@@ -102,7 +102,8 @@ def test_load_capture__downscaling_moves_projections_with_the_pixels(tmp_path: P
 @pytest.mark.usefixtures("small_images")
 def test_load_capture__undistorts_and_masks(tmp_path: Path) -> None:
     colmap(tmp_path, lenses=[Lens("SIMPLE_RADIAL", (0.3,)), Lens()])
-    full, small = load_capture(tmp_path), load_capture(tmp_path, 2)
+    full = load_capture(tmp_path)
+    small = load_capture(tmp_path, 2)
     assert (full.downscale, small.downscale) == (1, 2)
     assert full.masks[1] is None
     assert full.masks[0] is not None
@@ -171,12 +172,12 @@ def test_load_capture__leaves_cameras_out(tmp_path: Path, without: list[str]) ->
     (path / "cam02.mp4").write_bytes(b"")  # a clip that is not used is not opened
     (path / "capture.json").write_text('{"test_view": 4, "readout": {"cam02": 0.5, "cam05": 0.2}}')
     capture = load_capture(path, reading=ReadConfig(without=tuple(without)))
-    kept = [name for name in names if name not in without]
-    assert capture.names == tuple(kept)
+    remainder = [name for name in names if name not in without]
+    assert capture.names == tuple(remainder)
     (test_view,) = capture.test_views
     assert capture.names[test_view] == "cam04", "the setting counts all cameras"
     assert {c.name: c.readout for c in capture.cameras if c.readout} == {"cam05": 0.2}
-    assert [image[0, 0, 0] for image in next(capture.frames()).images] == [names.index(name) for name in kept]
+    assert [image[0, 0, 0] for image in next(capture.frames()).images] == [names.index(name) for name in remainder]
     assert load_capture(path, test_view=2, reading=ReadConfig(without=tuple(without))).test_views == (2,)
 
 
@@ -234,18 +235,19 @@ def broken_settings(path: Path) -> None:
 
 
 def test_with_cameras__reads_as_if_the_calibration_had_the_lens(tmp_path: Path) -> None:
-    path, terms = colmap(tmp_path / "capture"), (-0.12, 0.02)
+    path = colmap(tmp_path / "capture")
+    terms = (-0.12, 0.02)
     capture = load_capture(path)
     assert capture.with_cameras(capture.cameras).distortions == ()
     cameras = [square(camera) for camera in capture.cameras]
-    found = replace(capture, cameras=tuple(cameras)).with_cameras(cameras, [terms] * len(cameras))
+    recording = replace(capture, cameras=tuple(cameras)).with_cameras(cameras, [terms] * len(cameras))
     points = np.zeros((1, 3))
     write_colmap(path / "sparse" / "0", cameras, points, points, [Lens("RADIAL", terms)] * len(cameras))
     expected = load_capture(path)
-    for images in zip(*(next(c.frames(0, 1)).images for c in (expected, found)), strict=True):
+    for images in zip(*(next(c.frames(0, 1)).images for c in (expected, recording)), strict=True):
         assert np.array_equal(*images)
-    assert all(np.array_equal(a, b) for a, b in zip(expected.masks, found.masks, strict=True))
-    assert found.distortions == (terms,) * len(cameras)
+    assert all(np.array_equal(a, b) for a, b in zip(expected.masks, recording.masks, strict=True))
+    assert recording.distortions == (terms,) * len(cameras)
 
 
 def square(camera: Camera) -> Camera:

@@ -43,7 +43,9 @@ def through(sensor: np.ndarray, image: np.ndarray, gain: float = 1.0) -> np.ndar
 @pytest.fixture(scope="module")
 def views():
     """Four views of textured planes: cameras, true images, and images recorded by the sensors with slight noise."""
-    cameras, planes, rng = textured.rig(4), textured.textures(), np.random.default_rng(0)
+    cameras = textured.rig(4)
+    planes = textured.textures()
+    rng = np.random.default_rng(0)
     true = [textured.render(camera, planes) for camera in cameras]
     noise = [rng.normal(0, 1.5, image.shape) for image in true]
     recorded = [
@@ -67,16 +69,14 @@ def test_fit_colors__removes_differences_between_sensors(views) -> None:
     fit = fit_colors(cameras, recorded, [None] * 4, 0)
     assert (fit.reference, fit.matrices[0]) == (0, None)
     assert min(fit.samples) > 100
-    assert all(after < 0.5 * before for before, after in zip(fit.before, fit.after, strict=True))
+    assert all(new_error < 0.5 * old_error for old_error, new_error in zip(fit.before, fit.after, strict=True))
     for view in (1, 2, 3):
-        before, after = (
-            error(recorded[view], true[view]),
-            error(corrected(fit, view, recorded[view]), true[view]),
-        )
-        assert before > 4
-        assert after < 1.3, (view, before, after)  # the noise alone causes 0.9
-    found = np.array([matrix for matrix in fit.matrices[1:]])
-    assert_close(found @ SENSORS[1:], np.tile(np.eye(3), (3, 1, 1)), atol=0.03)
+        old_error = error(recorded[view], true[view])
+        new_error = error(corrected(fit, view, recorded[view]), true[view])
+        assert old_error > 4
+        assert new_error < 1.3, (view, old_error, new_error)  # the noise alone causes 0.9
+    matrices = np.array([matrix for matrix in fit.matrices[1:]])
+    assert_close(matrices @ SENSORS[1:], np.tile(np.eye(3), (3, 1, 1)), atol=0.03)
 
 
 def test_fit_colors__leaves_matching_cameras_unchanged(views) -> None:
@@ -84,7 +84,7 @@ def test_fit_colors__leaves_matching_cameras_unchanged(views) -> None:
     fit = fit_colors(cameras, true, [None] * 4)
     for view in range(4):
         assert error(corrected(fit, view, true[view]), true[view]) < 0.5
-    assert all(after <= before + 0.1 for before, after in zip(fit.before, fit.after, strict=True))
+    assert all(new_error <= old_error + 0.1 for old_error, new_error in zip(fit.before, fit.after, strict=True))
 
 
 def test_fit_colors__leaves_a_camera_without_shared_points_unchanged(views, caplog) -> None:

@@ -18,9 +18,9 @@ def test_match_views__returns_none_for_matches_without_a_common_geometry():
     rng = np.random.default_rng(257)
     count = int(rng.integers(16, 24))
     points = rng.uniform(0, 96, (count, 2)).round(1)
-    moved = points + rng.normal(0, 3, (count, 2))
+    places = points + rng.normal(0, 3, (count, 2))
     descriptors = np.eye(count, 128, dtype=np.float32)
-    features = [Features(p, descriptors, np.zeros((count, 3), np.float32), moved - points) for p in (points, moved)]
+    features = [Features(p, descriptors, np.zeros((count, 3), np.float32), places - points) for p in (points, places)]
     camera = Camera.look_at((0, 0, -3), (0, 0, 0), (0, -1, 0), 60, 96, 72)
     assert match_views(features, [camera, camera]) == []
 
@@ -29,10 +29,10 @@ def test_reprojection_errors__are_bounded_by_epipolar_distances(
     textured_capture: Capture, textured_features: SharedFeatures
 ) -> None:
     """No point can be nearer to both features than half their distance to the epipolar lines."""
-    moved = with_cameras(textured_capture, lambda i, c: turned(c, 4) if i == 2 else c).cameras
+    turned_cameras = with_cameras(textured_capture, lambda i, c: turned(c, 4) if i == 2 else c).cameras
     match = next(m for m in textured_features.matches if m.views == (1, 2))
-    errors = reprojection_errors(match, textured_features.features, moved)
-    a, b = (moved[v] for v in match.views)
+    errors = reprojection_errors(match, textured_features.features, turned_cameras)
+    a, b = (turned_cameras[v] for v in match.views)
     relative = b.viewmat @ np.linalg.inv(a.viewmat)
     x, y, z = relative[:3, 3]
     E = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ relative[:3, :3]
@@ -54,11 +54,12 @@ def test_detect__finds_a_blob_at_its_position() -> None:
     """A blob at a known position, at several image sizes: pixel centres lie at +0.5."""
     for width, height in ((160, 120), (1600, 1200)):
         scale = width / 160
-        u, v = 70.3 * scale, 52.6 * scale
+        u = 70.3 * scale
+        v = 52.6 * scale
         y, x = np.mgrid[:height, :width] + 0.5
         blob = 120 + 120 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * (4 * scale) ** 2))
-        found = detect(np.repeat(blob[..., None], 3, -1).astype(np.uint8)).points
-        nearest = found[np.argmin(np.linalg.norm(found - (u, v), axis=1))]
+        points = detect(np.repeat(blob[..., None], 3, -1).astype(np.uint8)).points
+        nearest = points[np.argmin(np.linalg.norm(points - (u, v), axis=1))]
         assert_close(nearest, (u, v), atol=0.1 * scale)
 
 
@@ -78,11 +79,12 @@ def test_triangulate__finds_points_on_the_planes(textured_capture: Capture, text
     assert np.percentile(distance, 90) < 0.05
     assert np.percentile(distance, 98) < 0.3
     # Their colours are the colours of the pixels onto which they project.
-    camera, image = textured_capture.cameras[2], next(textured_capture.frames()).images[2]
+    camera = textured_capture.cameras[2]
+    image = next(textured_capture.frames()).images[2]
     pixels, depths = camera.project(points)
     u, v = pixels.astype(int).T
-    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height) & (depths > 0)
-    assert np.median(np.abs(image[v[inside], u[inside]] / 255 - colors[inside])) < 0.05
+    mask = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height) & (depths > 0)
+    assert np.median(np.abs(image[v[mask], u[mask]] / 255 - colors[mask])) < 0.05
 
 
 def test_triangulate__leaves_out_points_with_a_small_angle(

@@ -16,7 +16,8 @@ from morgs_mi.io.numbering import counting_together
 from morgs_mi.io.video_writer import write_video
 from tests.scenes import captures as layouts
 
-TRIM, GAPS = ReadConfig(trim=True), ReadConfig(gaps=True)
+TRIM = ReadConfig(trim=True)
+GAPS = ReadConfig(gaps=True)
 
 
 def capture_of(path: Path, **cameras: Iterable[int]) -> Path:

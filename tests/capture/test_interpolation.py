@@ -9,7 +9,8 @@ import pytest
 from morgs_mi.capture.interpolation import image_between
 from morgs_mi.evaluate.metrics import psnr
 
-HEIGHT, WIDTH = 72, 96
+HEIGHT = 72
+WIDTH = 96
 
 
 def texture() -> np.ndarray:
@@ -20,7 +21,8 @@ def texture() -> np.ndarray:
 
 def moving_square(position: float) -> np.ndarray:
     """Return a textured square at some column before a static background, uint8."""
-    background, square = texture()[HEIGHT:, WIDTH:], np.zeros((HEIGHT, WIDTH, 3))
+    background = texture()[HEIGHT:, WIDTH:]
+    square = np.zeros((HEIGHT, WIDTH, 3))
     square[20:52, 30:62] = texture()[20:52, 30:62]
     opaque = np.zeros((HEIGHT, WIDTH))
     opaque[20:52, 30:62] = 1
@@ -32,12 +34,15 @@ def moving_square(position: float) -> np.ndarray:
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 0.8])
 def test_image_between__shows_things_where_they_have_moved_to(share: float) -> None:
-    first, second, wanted = moving_square(0), moving_square(4), moving_square(4 * share)
-    found, blended = image_between(first, second, share), (1 - share) * first + share * second
-    assert found.dtype == np.uint8
-    inside = slice(24, 48), slice(38, 58)
-    assert psnr(found[inside] / 255, wanted[inside] / 255) > psnr(blended[inside] / 255, wanted[inside] / 255) + 10
-    assert psnr(found / 255, wanted / 255) > psnr(blended / 255, wanted / 255) + 2
+    first = moving_square(0)
+    second = moving_square(4)
+    expected = moving_square(4 * share)
+    image = image_between(first, second, share)
+    blended = (1 - share) * first + share * second
+    assert image.dtype == np.uint8
+    window = slice(24, 48), slice(38, 58)
+    assert psnr(image[window] / 255, expected[window] / 255) > psnr(blended[window] / 255, expected[window] / 255) + 10
+    assert psnr(image / 255, expected / 255) > psnr(blended / 255, expected / 255) + 2
 
 
 @pytest.mark.parametrize("share", [0, 1])

@@ -10,7 +10,8 @@ from morgs_mi.capture.lens import Lens, lens_and_intrinsics, opencv_lens, undist
 from morgs_mi.core.camera import Camera
 from tests.assertions import assert_close
 
-WIDTH, HEIGHT = 160, 120
+WIDTH = 160
+HEIGHT = 120
 LENSES = {
     "SIMPLE_RADIAL": (-0.1,),
     "RADIAL": (0.08, -0.02),
@@ -34,7 +35,8 @@ def dots(centres: np.ndarray) -> np.ndarray:
 
 def project(model: str, lens: Lens, points: np.ndarray) -> np.ndarray:
     """Return the positions [N, 2] of points in the frame of `camera`, seen through the lens, with centres at +0.5."""
-    K, zero = camera().K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], np.zeros(3)
+    K = camera().K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    zero = np.zeros(3)
     through = cv2.fisheye.projectPoints if model == "OPENCV_FISHEYE" else cv2.projectPoints
     return through(points[:, None], zero, zero, K, lens.opencv_coefficients)[0].reshape(-1, 2) + 0.5
 
@@ -51,30 +53,35 @@ def assert_centred(image: np.ndarray, expected: np.ndarray) -> None:
 
 @pytest.mark.parametrize("model", LENSES)
 def test_undistortion__moves_points_to_their_pinhole_projections(model: str) -> None:
-    cam, lens = camera(), Lens(model, LENSES[model])
+    cam = camera()
+    lens = Lens(model, LENSES[model])
     points = np.array([[x, y, 2.0] for x in (-0.9, -0.1, 0.8) for y in (-0.7, 0.05, 0.6)])
-    distorted, (expected, _) = project(model, lens, points), cam.project(points)
+    distorted = project(model, lens, points)
+    expected, _ = cam.project(points)
     assert np.abs(distorted - expected).max() > 1, "the case must bend rays by more than a pixel"
 
-    found = undistortion(cam, lens)
-    assert found is not None
-    assert_centred(found(dots(distorted)).astype(float)[..., 0], expected)
+    lens_map = undistortion(cam, lens)
+    assert lens_map is not None
+    assert_centred(lens_map(dots(distorted)).astype(float)[..., 0], expected)
 
 
 @pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"])
 def test_undistortion__removes_what_a_refined_lens_leaves(model: str) -> None:
-    cam, lens, refined, left = camera(), Lens(model, LENSES.get(model, ())), camera(112.0), (0.06, -0.01)
+    cam = camera()
+    lens = Lens(model, LENSES.get(model, ()))
+    refined = camera(112.0)
+    remainder = (0.06, -0.01)
     points = np.array([[x, y, 2.0] for x in (-0.8, -0.1, 0.7) for y in (-0.6, 0.05, 0.5)])
     expected, _ = refined.project(points)
     x, y = ((expected - refined.K[:2, 2]) / refined.K[[0, 1], [0, 1]]).T
     square = x**2 + y**2
     # Where the refined lens, and then the calibrated one, shows the points.
-    rays = np.stack([x, y], axis=1) * (1 + left[0] * square + left[1] * square**2)[:, None]
-    seen = (rays * refined.K[[0, 1], [0, 1]] + refined.K[:2, 2] - cam.K[:2, 2]) / cam.K[[0, 1], [0, 1]]
-    distorted = project(model, lens, np.concatenate([seen, np.ones((len(seen), 1))], axis=1))
-    found = undistortion(cam, lens, (refined, Lens("RADIAL", left)))
-    assert found is not None
-    assert_centred(found(dots(distorted)).astype(float)[..., 0], expected)
+    rays = np.stack([x, y], axis=1) * (1 + remainder[0] * square + remainder[1] * square**2)[:, None]
+    positions = (rays * refined.K[[0, 1], [0, 1]] + refined.K[:2, 2] - cam.K[:2, 2]) / cam.K[[0, 1], [0, 1]]
+    distorted = project(model, lens, np.concatenate([positions, np.ones((len(positions), 1))], axis=1))
+    lens_map = undistortion(cam, lens, (refined, Lens("RADIAL", remainder)))
+    assert lens_map is not None
+    assert_centred(lens_map(dots(distorted)).astype(float)[..., 0], expected)
 
 
 def test_undistortion__is_none_without_distortion() -> None:
@@ -99,15 +106,15 @@ def test_undistortion__mask_ends_where_the_polynomial_folds(model: str, fold: fl
     """R (1 - 0.5 r^2) decreases beyond r = 0.816; theta (1 - 0.5 theta^2) beyond that angle, of tangent 1.066."""
     radius = fold or np.tan((3 * 0.5) ** -0.5)
     cam = camera(focal=60.0)
-    found = undistortion(cam, Lens(model, (-0.5,)))
-    assert found is not None
+    lens_map = undistortion(cam, Lens(model, (-0.5,)))
+    assert lens_map is not None
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     x, y, _ = np.moveaxis(cam.unproject(np.stack([columns, rows], -1), np.ones((HEIGHT, WIDTH))), -1, 0)
     r = np.hypot(x, y)
     assert r.max() > 1.2 * radius
     pixel = 1.5 / cam.K[0, 0]
-    assert found.mask[r < radius - pixel].all()
-    assert not found.mask[r > radius + pixel].any()
+    assert lens_map.mask[r < radius - pixel].all()
+    assert not lens_map.mask[r > radius + pixel].any()
 
 
 @pytest.mark.parametrize(

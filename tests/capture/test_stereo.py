@@ -33,9 +33,9 @@ def test_stereo_points__lie_on_the_surfaces(views, found) -> None:
     distance = distance_to_planes(points)
     assert np.median(distance) < 0.02
     assert np.mean(distance < 0.1) > 0.9
-    inside, pixels, _ = seen_points(camera, points)
+    mask, pixels, _ = seen_points(camera, points)
     columns, rows = pixels.astype(int).T
-    assert np.median(np.abs(image[rows, columns] / 255.0 - colors[inside])) < 0.05
+    assert np.median(np.abs(image[rows, columns] / 255.0 - colors[mask])) < 0.05
 
 
 def test_stereo_points__are_the_same_every_time(views, found) -> None:
@@ -46,8 +46,8 @@ def test_stereo_points__are_the_same_every_time(views, found) -> None:
 
 def test_stereo_points__leaves_out_pixels_that_are_not_valid(views) -> None:
     cameras, images = views
-    left = [np.arange(camera.width) < camera.width // 2 for camera in cameras]
-    masks = [np.tile(of_row, (camera.height, 1)) for of_row, camera in zip(left, cameras, strict=True)]
+    halves = [np.arange(camera.width) < camera.width // 2 for camera in cameras]
+    masks = [np.tile(of_row, (camera.height, 1)) for of_row, camera in zip(halves, cameras, strict=True)]
     points, _ = stereo_points(cameras, images, masks, NO_POINTS, np.random.default_rng(0))
     assert len(points) > 1000
     # Valid pixels of the third view confirm what the other two have in common.
@@ -58,15 +58,16 @@ def test_stereo_points__leaves_out_pixels_that_are_not_valid(views) -> None:
 def test_stereo_points__finds_none_if_one_camera_is_before_the_other(views) -> None:
     (camera, *_), (image, *_) = views
     for shift in ((0.1, 0, -0.5), (0, 0, -1)):
-        moved = np.eye(4)
-        moved[:3, 3] = shift
-        ahead = replace(camera, viewmat=moved @ camera.viewmat)
+        pose = np.eye(4)
+        pose[:3, 3] = shift
+        ahead = replace(camera, viewmat=pose @ camera.viewmat)
         points, _ = stereo_points([camera, ahead], [image, image], [None] * 2, NO_POINTS, np.random.default_rng(0))
         assert len(points) == 0
 
 
 def test_stereo_points__finds_none_between_distant_cameras(textured_capture: Capture) -> None:
-    cameras, images = textured_capture.cameras, next(textured_capture.frames()).images
+    cameras = textured_capture.cameras
+    images = next(textured_capture.frames()).images
     ends = [cameras[0], cameras[5]], [images[0], images[5]]
     points, colors = stereo_points(ends[0], ends[1], [None] * 2, NO_POINTS, np.random.default_rng(0))
     assert points.shape == colors.shape == (0, 3)

@@ -209,7 +209,9 @@ def test_timeline__truncated_clip_can_be_trimmed_or_left_out_but_not_shifted(tmp
 
 
 # Clips at 20 fps, the second with two frames that come 0.1 s late, the third with jitter within half a frame.
-REGULAR, LATE, JITTER = [50 * t for t in range(7)], [0, 50, 100, 250, 300], [0, 60, 95, 140, 200, 255, 300]
+REGULAR = [50 * t for t in range(7)]
+LATE = [0, 50, 100, 250, 300]
+JITTER = [0, 60, 95, 140, 200, 255, 300]
 
 
 def timed(path: Path, **times: list[int]) -> Path:

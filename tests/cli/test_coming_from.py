@@ -26,7 +26,8 @@ from tests.scenes.changing_splats import splats
 PAGE = (Path(__file__).parents[2] / "docs/coming-from.md").read_text(encoding="utf-8")
 COMMANDS = re.findall(r"^    ((?:morgs-mi|ln) .*)$", PAGE, re.MULTILINE)
 QUICK = "--num-gaussians 400 --first-frame-steps 20 --epochs 1"
-CAMERAS, FRAMES = 7, 2
+CAMERAS = 7
+FRAMES = 2
 
 
 @pytest.fixture(scope="module")
@@ -111,7 +112,8 @@ def test_coming_from__commands_run_on_the_folders_of_the_tools(recording, tmp_pa
         write(recording)
     write_ply("splat.ply", splats())
     os.mkdir("out")
-    frames, outputs = {}, {}
+    frames = {}
+    outputs = {}
     for command in COMMANDS:
         name, *rest = shlex.split(command)
         if name == "ln":

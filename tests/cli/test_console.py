@@ -24,12 +24,12 @@ from morgs_mi.cli.console import (
 def test_progress__prints_a_line_every_30_seconds_without_a_terminal(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    now = 1000.0
-    monkeypatch.setattr(time, "monotonic", lambda: now)
+    clock = 1000.0
+    monkeypatch.setattr(time, "monotonic", lambda: clock)
     with progress() as report:
         for done in range(13):
             report("Fitting frames", done, 12)
-            now += 10.0
+            clock += 10.0
         report("Drawing", 0, 2)
     assert capsys.readouterr().err.splitlines() == [
         "Fitting frames: 3/12, 0:00:30 elapsed, about 0:01:30 left.",
@@ -42,14 +42,14 @@ def test_progress__prints_a_line_every_30_seconds_without_a_terminal(
 def test_progress__estimates_the_time_left_from_the_pace_of_the_stage_alone(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    now = 1000.0
-    monkeypatch.setattr(time, "monotonic", lambda: now)
+    clock = 1000.0
+    monkeypatch.setattr(time, "monotonic", lambda: clock)
     with progress() as report:
         report("First frame", 0, 1)
-        now += 3600.0
+        clock += 3600.0
         for done in (6.5, 7, 7.5, 8):  # a resumed fit: six frames were there before
             report("Later frames", done, 10)
-            now += 20.0
+            clock += 20.0
     assert capsys.readouterr().err.splitlines() == [
         "Later frames: 6/10, 0:00:00 elapsed.",
         "Later frames: 7/10, 0:00:40 elapsed, about 0:01:40 left.",
@@ -80,7 +80,8 @@ def test_console__prints_control_characters_escaped(capsys: pytest.CaptureFixtur
     print_result(HOSTILE + "\nb")
     print_table(table)
     print_warning(HOSTILE + "\nb")
-    printed, escaped = capsys.readouterr(), r"a\u001b[2J\u009b\u007f\udcff\u202e[red]b"
+    printed = capsys.readouterr()
+    escaped = r"a\u001b[2J\u009b\u007f\udcff\u202e[red]b"
     assert printed.out.count(escaped) == 4
     assert printed.out.startswith(f"{escaped}\nb\n")
     assert printed.err == f"{escaped} b\n"

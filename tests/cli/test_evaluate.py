@@ -24,7 +24,8 @@ def test_eval__replaces_no_file_of_the_fit(stream: Path, tmp_path: Path, run) ->
 
 @pytest.mark.slow
 def test_eval__refuses_another_recording_by_the_same_cameras(tmp_path: Path, run) -> None:
-    clip, out = write_recording(tmp_path / "clip", 2), tmp_path / "out"
+    clip = write_recording(tmp_path / "clip", 2)
+    out = tmp_path / "out"
     assert run("fit", clip, out, *QUICK, "--color", "linear")[0] == 0
     other = shutil.copytree(clip, tmp_path / "other")
     for image in other.glob("cam*/*.png"):
@@ -39,7 +40,8 @@ def test_eval__refuses_another_recording_by_the_same_cameras(tmp_path: Path, run
 
 
 def test_eval__says_that_a_first_frame_is_provisional(tmp_path: Path, run, caplog: pytest.LogCaptureFixture) -> None:
-    clip, out = write_recording(tmp_path / "clip", 1), tmp_path / "out"
+    clip = write_recording(tmp_path / "clip", 1)
+    out = tmp_path / "out"
     assert run("fit", clip, out, *QUICK)[0] == 0
     assert not caplog.messages
     provisional = (out / "stream.morgs").rename(out / PROVISIONAL)

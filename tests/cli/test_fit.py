@@ -59,7 +59,8 @@ def test_fit__reports_what_to_expect_of_views_between_the_cameras(capture: Path,
 @pytest.mark.slow
 def test_fit__balances_cameras_of_other_exposure(tmp_path: Path, run) -> None:
     path = textured.write_capture(tmp_path / "rig").path
-    camera, planes = textured.rig(shift=7)[2], textured.textures()
+    camera = textured.rig(shift=7)[2]
+    planes = textured.textures()
     write_video(path / "cam2.mkv", [brighter(textured.render(camera, planes), 1.25)], 30)
     sentence = r"cam2 is 2[3-6] % brighter than the other cameras: .*; fit corrects it \(not with --exposure off\)\."
     for options in ((), ("--deep",)):
@@ -74,7 +75,8 @@ def test_fit__balances_cameras_of_other_exposure(tmp_path: Path, run) -> None:
 
 def test_fit__and_eval_use_the_same_instants(capture: Path, tmp_path: Path, run) -> None:
     lengthen_clip(capture)
-    out, options = tmp_path / "out", ("--offset", "cam1", "-1", "cam2", "1", "--gaps")
+    out = tmp_path / "out"
+    options = ("--offset", "cam1", "-1", "cam2", "1", "--gaps")
     assert run("info", capture, "--no-check", *options)[1].count("2 frames at 25 fps") == 1
     assert run("fit", capture, out, *options, *QUICK)[0] == 0
     record = json.loads((out / "capture.json").read_text())
@@ -226,9 +228,9 @@ def test_fit__refuses_to_leave_fewer_than_32_pixels(tmp_path: Path, run, monkeyp
 @pytest.fixture
 def heeds_interrupts() -> Iterator[None]:
     """Python's handler of SIGINT, which a shell ignores for the processes that it starts in the background."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
-    signal.signal(signal.SIGINT, before)
+    signal.signal(signal.SIGINT, handler)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -274,8 +276,8 @@ def test_fit__does_not_offer_to_resume_a_stream_of_an_earlier_fit(
 
 def test_fit__reports_progress_before_the_first_frame(capture: Path, tmp_path: Path, run, monkeypatch) -> None:
     write_colmap(capture / "sparse" / "0", rig(), np.zeros((0, 3)), np.zeros((0, 3)))
-    now = iter(range(0, 10**9, 40))
-    monkeypatch.setattr("morgs_mi.cli.console.time.monotonic", lambda: float(next(now)))
+    clock = iter(range(0, 10**9, 40))
+    monkeypatch.setattr("morgs_mi.cli.console.time.monotonic", lambda: float(next(clock)))
     monkeypatch.setattr("morgs_mi.runs.fit_capture.StreamLoop.of", interrupt)
     status, _, error = run("fit", capture, tmp_path / "out", *QUICK)
     assert status == 130
@@ -337,7 +339,8 @@ def test_fit__fits_segments_side_by_side(
     pytest.importorskip("distributed", reason="comes with the extra `cluster`")
     short = SegmentConfig(passes=1, epochs=1)
     monkeypatch.setattr(SegmentConfig.__init__, "__defaults__", astuple(short))
-    clip, out = write_recording(tmp_path / "clip", 4), tmp_path / "out"
+    clip = write_recording(tmp_path / "clip", 4)
+    out = tmp_path / "out"
     status, output, _ = run("fit", clip, out, *QUICK, "--segments", 2)
     assert status == 0
     assert "stream.morgs: 4 frames" in output
@@ -349,7 +352,8 @@ def test_fit__fits_segments_side_by_side(
 @pytest.mark.slow
 def test_fit__names_what_segments_stand_when_interrupted(tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed", reason="comes with the extra `cluster`")
-    clip, out = write_recording(tmp_path / "clip", 4), tmp_path / "out"
+    clip = write_recording(tmp_path / "clip", 4)
+    out = tmp_path / "out"
     add = SegmentedRun._add
 
     def add_and_stop(fit: SegmentedRun, part: Part) -> None:

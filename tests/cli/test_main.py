@@ -145,7 +145,7 @@ def test_main__writes_nothing_into_a_capture(capture: Path, stream: Path, tmp_pa
     (capture / "capture.json").write_text('{"fps": 25}')
     place = tmp_path / "link"
     place.symlink_to(capture)
-    before = tree(capture)
+    old_tree = tree(capture)
     for args in (
         ("fit", capture, capture, *QUICK),
         ("fit", capture, place, *QUICK, "--resume"),
@@ -170,7 +170,7 @@ def test_main__writes_nothing_into_a_capture(capture: Path, stream: Path, tmp_pa
             run(*args), "expected an output outside of captures, which stay as they were recorded, got one in"
         )
     assert_refused(run("synth", "spheres", capture, "--overwrite"), f"{capture} is not a synthetic capture")
-    assert tree(capture) == before
+    assert tree(capture) == old_tree
 
 
 def tree(path: Path) -> dict[str, bytes | None]:
@@ -264,7 +264,8 @@ def test_main__prints_a_traceback_with_debug(tmp_path: Path, run) -> None:
 
 @pytest.mark.slow
 def test_main__goes_from_a_scene_to_an_evaluation(tmp_path: Path, run) -> None:
-    clip, out = tmp_path / "clip", tmp_path / "out"
+    clip = tmp_path / "clip"
+    out = tmp_path / "out"
     size = ("--width", 64, "--height", 48, "--spp", 4)
     assert run("synth", "spheres", clip, "--cameras", 4, "--frames", 3, *size)[0] == 0
     fit = ("--test-view", 0, "--num-gaussians", 600, "--first-frame-steps", 60, "--epochs", 2)

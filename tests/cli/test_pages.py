@@ -57,14 +57,14 @@ def test_commands__of_a_page_run_to_the_end(page: str, recordings: Path, tmp_pat
     shutil.copytree(recordings, tmp_path / "there")
     monkeypatch.chdir(tmp_path / "there")
     cameras = " ".join(str(clip) for clip in sorted(Path("CAPTURE").glob("*.mp4")))
-    found = commands(page)
-    assert found, f"{page} has no commands"
-    for command in found:
-        given = command.replace("--camera 0 1 2 3", f"--camera {cameras}").replace(" > settings.toml", "")
-        if given.startswith("morgs-mi import frames"):
+    lines = commands(page)
+    assert lines, f"{page} has no commands"
+    for command in lines:
+        short_command = command.replace("--camera 0 1 2 3", f"--camera {cameras}").replace(" > settings.toml", "")
+        if short_command.startswith("morgs-mi import frames"):
             assert run("export", "ply", "out/arm_fit", "frames")[0] == 0
-        name, *rest = shlex.split(given)[1:]
+        name, *rest = shlex.split(short_command)[1:]
         status, output, error = run(name, *rest, *shlex.split(SMALLER.get(name, "")))
-        assert status == 0, f"{given}\n{error}"
+        assert status == 0, f"{short_command}\n{error}"
         if command.endswith("settings.toml"):
             Path("settings.toml").write_text(output, encoding="utf-8")

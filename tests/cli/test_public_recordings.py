@@ -45,7 +45,7 @@ def test_commands_for_public_recordings__give_scores_of_camera_0(tmp_path, run, 
         status, _, error = run(*shlex.split(smaller))
         assert status == 0, error
     for name, held_out in (("cut_roasted_beef", "cam00"), ("discussion", "cam_0")):
-        found = json.loads((tmp_path / "out" / name / "eval.json").read_text())
-        assert found["held_out"] is True
-        assert [*found["views"]] == [held_out]
-        assert found["psnr"]["mean"] > 25
+        scores = json.loads((tmp_path / "out" / name / "eval.json").read_text())
+        assert scores["held_out"] is True
+        assert [*scores["views"]] == [held_out]
+        assert scores["psnr"]["mean"] > 25

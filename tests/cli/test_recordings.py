@@ -30,6 +30,6 @@ def test_recording__is_fitted_evaluated_and_exported_by_default(capture: Path, t
     ):
         status, _, error = run(*command)
         assert status == 0, f"{command}\n{error}"
-    found = json.loads((tmp_path / "eval.json").read_text())
-    assert found["num_frames"] == FRAMES
-    assert found["psnr"]["mean"] > 25, "of the training views, or of one between many"
+    scores = json.loads((tmp_path / "eval.json").read_text())
+    assert scores["num_frames"] == FRAMES
+    assert scores["psnr"]["mean"] > 25, "of the training views, or of one between many"

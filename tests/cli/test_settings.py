@@ -80,8 +80,8 @@ def test_fit__prints_a_config_that_it_reads_back(tmp_path: Path, run, args: tupl
     (tmp_path / "a.toml").write_text(config_toml(config))
     assert printed_config(run, "--config", tmp_path / "a.toml") == config
     if len(args) > 2:
-        default, given = (flattened(asdict(c)) for c in (StreamConfig(), config))
-        assert {key for key in given if given[key] != default[key]} == set(SETTINGS.values())
+        default, values = (flattened(asdict(c)) for c in (StreamConfig(), config))
+        assert {key for key in values if values[key] != default[key]} == set(SETTINGS.values())
 
 
 def flattened(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:

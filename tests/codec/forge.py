@@ -38,11 +38,13 @@ class Forgery(NamedTuple):
 def damaged(clip: Clip, rng: np.random.Generator) -> bytes:
     """Return the stream truncated, with one or several flipped bits, or with an overwritten range."""
     data = clip.data
-    spoilt, kind = bytearray(data), rng.integers(4)
+    spoilt = bytearray(data)
+    kind = rng.integers(4)
     if kind == 0:
         return data[: rng.integers(len(data))]
     if kind == 3:
-        start, length = rng.integers(len(data)), rng.integers(1, 200)
+        start = rng.integers(len(data))
+        length = rng.integers(1, 200)
         size = len(spoilt[start : start + length])
         spoilt[start : start + length] = bytes(size) if rng.random() < 0.5 else rng.bytes(size)
     for at in rng.choice(8 * len(data), 1 if kind == 1 else rng.integers(2, 9) if kind == 2 else 0, replace=False):
@@ -99,7 +101,8 @@ def forged_streams(clip: Clip) -> tuple[bytes, bytes]:
     Both play from the start as the clip does.
     """
     forged = keyframe_packet(cloud(9, 0), 3, CAMERAS).encoded
-    keyframe, at = clip.pieces[6], clip.pieces[-1].start
+    keyframe = clip.pieces[6]
+    at = clip.pieces[-1].start
     assert (keyframe.kind, keyframe.frame) == (1, 3)
     entries = [(1, 0, clip.pieces[2].start), (1, 3, clip.pieces[4].start)]
     index = b"".join(struct.pack("<IIQ", *entry) for entry in entries)
@@ -159,7 +162,9 @@ def _with_arrays(packets: list[Draft], rng: np.random.Generator) -> Draft:
 
 def _table(packets: list[Draft], rng: np.random.Generator) -> None:
     packet = _with_arrays(packets, rng)
-    table, place, choice = packet.rows(), rng.integers(3), rng.integers(4)
+    table = packet.rows()
+    place = rng.integers(3)
+    choice = rng.integers(4)
     row = _any(table, rng)
     if choice == 0:
         table.append(row)
@@ -179,7 +184,8 @@ def _head(packets: list[Draft], rng: np.random.Generator) -> None:
 def _code(packets: list[Draft], rng: np.random.Generator) -> None:
     """Replace the code by other words, of the same or another number."""
     arrays = _with_arrays(packets, rng).arrays
-    words, choice = arrays["code"], rng.integers(4)
+    words = arrays["code"]
+    choice = rng.integers(4)
     if choice == 0 and len(words):
         words[rng.integers(len(words), size=3)] ^= np.uint32(1 << int(rng.integers(32)))
     elif choice == 1:

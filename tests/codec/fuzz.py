@@ -33,7 +33,9 @@ from tests.scenes.short_clip import FRAMES, Clip, short_clip
 
 # What a stream of a few kB may take: far less than a damaged length or count may request. A thread of a library that
 # starts meanwhile reserves 64 MiB for its heap and 8 MiB for its stack (glibc).
-MEMORY_BYTES, THREAD_BYTES, THREADS = 200 * 10**6, 72 * 2**20, 4
+MEMORY_BYTES = 200 * 10**6
+THREAD_BYTES = 72 * 2**20
+THREADS = 4
 CASE_SECONDS = 30
 PLACE = re.compile(
     r"packet \d+ at byte \d+: |expected a stream that starts with|expected format version|`.*` of the header|"
@@ -101,8 +103,8 @@ def playable(clip: Clip, intact: list[bool]) -> list[int]:
     """Return the playable frames; their packets are intact back to a keyframe."""
     frames: list[int] = []
     for piece, ok in zip(clip.pieces, intact, strict=True):
-        known = bool(frames) and piece.frame in (frames[-1], frames[-1] + 1)
-        if ok and piece.frame not in frames and (piece.kind == 1 or (piece.kind == 2 and known)):
+        has_base = bool(frames) and piece.frame in (frames[-1], frames[-1] + 1)
+        if ok and piece.frame not in frames and (piece.kind == 1 or (piece.kind == 2 and has_base)):
             frames.append(piece.frame)
     return frames
 
@@ -164,10 +166,11 @@ def check_seek(stream: StreamReader, played: list[CodedFrame]) -> None:
     """
     digests = {state.frame: state.digest for state in played}
     for state in (*played[len(played) // 2 : -1][:1], *played[-1:]):
-        start, found = next(stream.states(state.frame)), stream.seek(state.frame)
-        assert found.frame == state.frame
+        start = next(stream.states(state.frame))
+        decoded_state = stream.seek(state.frame)
+        assert decoded_state.frame == state.frame
         if np.array_equal(start.digest, digests.get(start.frame)):
-            assert np.array_equal(found.digest, state.digest), state.frame
+            assert np.array_equal(decoded_state.digest, state.digest), state.frame
 
 
 def play(path: Path) -> tuple[list[CodedFrame], ValueError | None]:
@@ -181,8 +184,8 @@ def play(path: Path) -> tuple[list[CodedFrame], ValueError | None]:
 
 
 def differs(state: CodedFrame, clip: Clip) -> bool:
-    known = clip.states.get(state.frame)
-    return known is None or not np.array_equal(state.digest, known.digest)
+    expected = clip.states.get(state.frame)
+    return expected is None or not np.array_equal(state.digest, expected.digest)
 
 
 FUZZERS: dict[str, Callable[[Clip, Path, np.random.Generator, Refusals], None]] = {
@@ -206,7 +209,9 @@ def run(name: str, clip: Clip, seconds: float) -> dict[str, object]:
     Raises:
         AssertionError: a case fails; its seed is the name of the fuzzer and the number of the case.
     """
-    refusals, case, end = Refusals(), 0, time.monotonic() + seconds
+    refusals = Refusals()
+    case = 0
+    end = time.monotonic() + seconds
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "s"
         while time.monotonic() < end:
@@ -231,9 +236,9 @@ def main(seconds: str, *names: str) -> None:
         (Path(folder) / "s").write_bytes(clip.data)
         check_readers(Path(folder) / "s", Refusals())  # what is loaded and cached once does not count
     limit_memory()
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     results = {name: run(name, clip, float(seconds)) for name in names or FUZZERS}
-    grown = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+    grown = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory)
     print(json.dumps({"seconds": float(seconds), "memory_bytes": grown, "fuzzers": results}, indent=1))
 
 

@@ -57,17 +57,18 @@ def check_round_trip(confidence: bool) -> None:
     assert error(state.gaussians, first) <= 0.01 / 4
     assert np.array_equal(decode(None, reemitted_keyframe(state)).digest, state.digest)
 
-    alive, relabelled = np.arange(2, 50), rng.random(48) < 0.5
-    moved = jittered(state.gaussians, rng).select(alive)
+    alive = np.arange(2, 50)
+    relabelled = rng.random(48) < 0.5
+    survivors = jittered(state.gaussians, rng).select(alive)
     labels = state.gaussians.numpy()[ROW.name][alive] + 0.5 * relabelled[:, None]
-    now = gaussians.Gaussians.concatenate([replace(moved, logit_labels=labels), labelled(3, 2)])
-    after = decode(state, residual_packet(state, now, np.r_[alive, -1, -1, -1], CAMERAS))
-    assert after.ids.tolist() == list(range(2, 53))
-    integers = (after.grid.values[:48], state.grid.values[alive])
+    target = gaussians.Gaussians.concatenate([replace(survivors, logit_labels=labels), labelled(3, 2)])
+    new_state = decode(state, residual_packet(state, target, np.r_[alive, -1, -1, -1], CAMERAS))
+    assert new_state.ids.tolist() == list(range(2, 53))
+    integers = (new_state.grid.values[:48], state.grid.values[alive])
     changed = np.not_equal(*(values[:, state.grid.columns[ROW.name]] for values in integers)).any(1)
     assert np.array_equal(changed, relabelled)
-    assert error(after.gaussians, now) <= 0.02
-    assert (after.gaussians.logit_confidence is None) == (not confidence)
+    assert error(new_state.gaussians, target) <= 0.02
+    assert (new_state.gaussians.logit_confidence is None) == (not confidence)
 
 
 def main() -> None:

@@ -18,7 +18,9 @@ U64 = 2**64
 class RangeCode:
     def __init__(self, words):
         self.words = [int(w) for w in words]
-        self.low, self.range, self.at = 0, U64 - 1, 2
+        self.low = 0
+        self.range = U64 - 1
+        self.at = 2
         self.point = self.word(0) << 32 | self.word(1)
 
     def word(self, i):
@@ -33,7 +35,8 @@ class RangeCode:
         self.low = (self.low + scale * int(lefts[i])) % U64
         self.range = scale * int(lefts[i + 1] - lefts[i])
         if self.range < 2**32:
-            self.low, self.range = (self.low << 32) % U64, self.range << 32
+            self.low = (self.low << 32) % U64
+            self.range = self.range << 32
             self.point = (self.point << 32) % U64 | self.word(self.at)
             self.at += 1
         return i
@@ -42,15 +45,18 @@ class RangeCode:
         return self.symbol(np.arange(2**b + 1, dtype=np.int64) << (24 - b))
 
     def column(self, n):
-        weights, tokens, end = [max(1, 256 // (i + 1) ** 2) for i in range(85)], [], 16
+        weights = [max(1, 256 // (i + 1) ** 2) for i in range(85)]
+        tokens = []
+        end = 16
         while len(tokens) < n:
-            before = np.concatenate([[0], np.cumsum(weights)[:-1]]).astype(np.float64)
+            sums = np.concatenate([[0], np.cumsum(weights)[:-1]]).astype(np.float64)
             s = (2**24 - 85) / float(sum(weights))
-            lefts = np.append(np.floor(s * before).astype(np.int64) + np.arange(85), 2**24)
+            lefts = np.append(np.floor(s * sums).astype(np.int64) + np.arange(85), 2**24)
             block = [self.symbol(lefts) for _ in range(min(end, n) - len(tokens))]
             for token in block:
                 weights[token] += 32
-            tokens, end = tokens + block, 2 * end
+            tokens = tokens + block
+            end = 2 * end
         ks = [(token + 1) // 2 - 12 if token > 30 else 0 for token in tokens]
         rest = [self.bits(min(k, 16)) if k else 0 for k in ks]
         rest = [low | self.bits(k - 16) << 16 if k > 16 else low for low, k in zip(rest, ks, strict=True)]
@@ -71,13 +77,14 @@ def packets(data):
 
 def arrays(payload):
     (size,) = struct.unpack_from("<I", payload)
-    at, found = 4 + size, {}
+    at = 4 + size
+    values = {}
     for name, dtype, shape in json.loads(payload[4:at]):
         count = math.prod(shape)
-        found[name] = np.frombuffer(payload, np.dtype(dtype).newbyteorder("<"), count, at).reshape(shape)
-        at += found[name].nbytes
+        values[name] = np.frombuffer(payload, np.dtype(dtype).newbyteorder("<"), count, at).reshape(shape)
+        at += values[name].nbytes
     assert at == len(payload)
-    return found
+    return values
 
 
 def born(code, N, degree, confidence):
@@ -94,10 +101,10 @@ def groups(state):
 
 
 def keyframe(payload):
-    found = arrays(payload)
-    N, degree, confidence, next_id = (int(x) for x in found["head"])
+    values = arrays(payload)
+    N, degree, confidence, next_id = (int(x) for x in values["head"])
     assert confidence <= 1, "unknown optional attributes"
-    code = RangeCode(found["code"])
+    code = RangeCode(values["code"])
     ids = np.cumsum(code.column(N) + 1) - 1
     state = {"ids": ids, "degree": degree, "confidence": confidence, "next_id": next_id}
     state["largest_components"], state["exponents"], state["values"] = born(code, N, degree, confidence)
@@ -111,13 +118,16 @@ def digest(state):
 
 
 def residual(state, payload):
-    found = arrays(payload)
-    assert found["parent"].tobytes() == digest(state)
-    births, coarseness = (int(x) for x in found["head"])
-    code, values, dead = RangeCode(found["code"]), state["values"].copy(), np.zeros(len(state["ids"]), bool)
+    changes = arrays(payload)
+    assert changes["parent"].tobytes() == digest(state)
+    births, coarseness = (int(x) for x in changes["head"])
+    code = RangeCode(changes["code"])
+    values = state["values"].copy()
+    dead = np.zeros(len(state["ids"]), bool)
     moving = values[:, -1] > 0 if state["confidence"] else np.zeros(len(values), bool)
     for members in (np.flatnonzero(~moving), np.flatnonzero(moving)):
-        geometry, appearance = code.column(len(members)), np.zeros(len(members), np.int64)
+        geometry = code.column(len(members))
+        appearance = np.zeros(len(members), np.int64)
         appearance[geometry == 0] = code.column(int((geometry == 0).sum()))
         other = (geometry > 0) & (geometry < 8)
         appearance[other] = code.column(int(other.sum()))
@@ -134,12 +144,12 @@ def residual(state, payload):
         "values": values[~dead],
     }
     new.pop("offset", None)
-    if "offset" in found:
+    if "offset" in changes:
         new["offset"] = np.zeros((len(new["ids"]) + births, 3))
-        moved = np.flatnonzero((new["values"][:, :3] != state["values"][~dead, :3]).any(1))
-        code_of_offsets = RangeCode(found["offset"])
+        rows = np.flatnonzero((new["values"][:, :3] != state["values"][~dead, :3]).any(1))
+        code_of_offsets = RangeCode(changes["offset"])
         for axis in range(3):
-            for i, r in zip(moved, code_of_offsets.column(len(moved)), strict=True):
+            for i, r in zip(rows, code_of_offsets.column(len(rows)), strict=True):
                 e = int(new["exponents"][i, 0])
                 step = (F[e % 4] * 2.0 ** (e // 4)) * (F[coarseness % 4] * 2.0 ** (coarseness // 4))
                 new["offset"][i, axis] = int(r) * step
@@ -154,10 +164,11 @@ def residual(state, payload):
 
 def numbers(state):
     """Return the attributes of a state, by the names of the package."""
-    e, own = state["exponents"], [0, 0, 0, 1, 2, 3, 4, 4, 4, 5, 6, 6, 6]
-    own += [7] * (3 * ((state["degree"] + 1) ** 2 - 1)) + [8] * state["confidence"]
+    e = state["exponents"]
+    group_of_column = [0, 0, 0, 1, 2, 3, 4, 4, 4, 5, 6, 6, 6]
+    group_of_column += [7] * (3 * ((state["degree"] + 1) ** 2 - 1)) + [8] * state["confidence"]
     real = np.zeros(state["values"].shape)
-    for column, k in enumerate(own):
+    for column, k in enumerate(group_of_column):
         real[:, column] = [
             int(q) * F[int(x) % 4] * 2.0 ** (int(x) // 4)
             for q, x in zip(state["values"][:, column], e[:, k], strict=True)
@@ -168,19 +179,21 @@ def numbers(state):
         length = math.sqrt(((1 + u * u) + v * v) + w * w)
         quats[i] = np.insert([u / length, v / length, w / length], int(largest), 1 / length)
     end = 10 + 3 * (state["degree"] + 1) ** 2
-    found = {"means": real[:, :3], "log_scales": real[:, 3:6], "quats": quats, "logit_opacities": real[:, 9]}
-    found["sh_coeffs"] = real[:, 10:end].reshape(len(real), -1, 3)
+    values = {"means": real[:, :3], "log_scales": real[:, 3:6], "quats": quats, "logit_opacities": real[:, 9]}
+    values["sh_coeffs"] = real[:, 10:end].reshape(len(real), -1, 3)
     if state["confidence"]:
-        found["logit_confidence"] = real[:, end]
+        values["logit_confidence"] = real[:, end]
     if "offset" in state:
-        found["offset"] = state["offset"]
-    return {name: value.astype(np.float32) for name, value in found.items()}
+        values["offset"] = state["offset"]
+    return {name: value.astype(np.float32) for name, value in values.items()}
 
 
 def states(data):
     """Yield (frame, state) of a whole stream, once for each frame."""
-    state, last = None, None
+    state = None
+    last = None
     for kind, frame, payload in packets(data):
         if kind in (1, 2) and frame != last:
-            state, last = keyframe(payload) if kind == 1 else residual(state, payload), frame
+            state = keyframe(payload) if kind == 1 else residual(state, payload)
+            last = frame
             yield frame, state

@@ -30,11 +30,11 @@ def test_decode__equals_a_decoder_from_the_specification(tmp_path: Path, config:
     write(tmp_path / "s", packets, states, every=3)
     plain = list(plain_decoder.states((tmp_path / "s").read_bytes()))
     assert [frame for frame, _ in plain] == [state.frame for state in states]
-    for (_, found), state in zip(plain, states, strict=True):
-        assert np.array_equal(found["ids"], state.ids)
+    for (_, values), state in zip(plain, states, strict=True):
+        assert np.array_equal(values["ids"], state.ids)
         expected = state.gaussians.numpy()
-        assert plain_decoder.numbers(found).keys() == expected.keys() - {"motion"}
-        for name, value in plain_decoder.numbers(found).items():
+        assert plain_decoder.numbers(values).keys() == expected.keys() - {"motion"}
+        for name, value in plain_decoder.numbers(values).items():
             assert np.array_equal(value, expected[name]), name
 
 
@@ -46,33 +46,34 @@ def test_residual_packet__of_a_static_frame_is_nearly_empty() -> None:
 
 
 def test_residual_packet__stores_offsets_of_moving_gaussians_and_changes_nothing_else() -> None:
-    plain, before = encoded_clip(4)
+    plain, plain_states = encoded_clip(4)
     packets, states = encoded_clip(4, CodecConfig(offset=True))
     assert [state.gaussians.offset is None for state in states] == [True, False, False, False]
-    assert all(state.gaussians.offset is None for state in before)
+    assert all(state.gaussians.offset is None for state in plain_states)
     for without, packet in zip(plain, packets, strict=True):
         assert {"offset"} >= packet.arrays.keys() - without.arrays.keys()
         for name, array in without.arrays.items():
             assert np.array_equal(packet.arrays[name], array)
-    rng, state = np.random.default_rng(3), states[-1]
-    after = replace(jittered(state.gaussians, rng), offset=rng.normal(0, 0.02, (len(state), 3)))
-    found = decode(state, residual_packet(state, after, None, CAMERAS, CodecConfig(offset=True))).gaussians.numpy()
-    moved = found["motion"].any(1)
-    assert 0.2 < moved.mean() < 0.6
+    rng = np.random.default_rng(3)
+    state = states[-1]
+    moved = replace(jittered(state.gaussians, rng), offset=rng.normal(0, 0.02, (len(state), 3)))
+    values = decode(state, residual_packet(state, moved, None, CAMERAS, CodecConfig(offset=True))).gaussians.numpy()
+    mask = values["motion"].any(1)
+    assert 0.2 < mask.mean() < 0.6
     # The step of a moved mean is four times the step of its birth.
-    error = np.abs(found["offset"] - after.numpy()["offset"])[moved] / (4 * state.grid.steps("means")[moved])
+    error = np.abs(values["offset"] - moved.numpy()["offset"])[mask] / (4 * state.grid.steps("means")[mask])
     assert 0.45 < error.max() <= 0.5 + 1e-4
-    assert not found["offset"][~moved].any()
+    assert not values["offset"][~mask].any()
 
 
 def test_residual_packet__of_a_decoded_state_reproduces_it() -> None:
     """Encoding a stream again, with the same steps, loses nothing more."""
     _, states = encoded_clip(5)
-    for before, after in pairwise(states):
-        source = np.searchsorted(before.ids, after.ids)
-        survivors = np.flatnonzero(after.ids < before.next_id)  # births would choose new steps
-        found = decode(before, residual_packet(before, after.gaussians.select(survivors), source[survivors], CAMERAS))
-        assert np.array_equal(found.grid.values, after.grid.values[survivors])
+    for old, new in pairwise(states):
+        source = np.searchsorted(old.ids, new.ids)
+        survivors = np.flatnonzero(new.ids < old.next_id)  # births would choose new steps
+        result = decode(old, residual_packet(old, new.gaussians.select(survivors), source[survivors], CAMERAS))
+        assert np.array_equal(result.grid.values, new.grid.values[survivors])
 
 
 def test_decode__ids_follow_a_gaussian_from_birth_to_death() -> None:
@@ -97,18 +98,18 @@ def single_at(x: float) -> Gaussians:
 @pytest.mark.parametrize(("degree", "confidence"), [(0, False), (0, True), (2, False), (3, True)])
 def test_decode__round_trips_every_degree_with_and_without_confidence(degree: int, confidence: bool) -> None:
     state = decode(None, keyframe_packet(cloud(20, degree, confidence), 3, CAMERAS))
-    now = jittered(state.gaussians, np.random.default_rng(0))
-    found = decode(state, residual_packet(state, now, None, CAMERAS))
-    assert found.frame == 4
-    assert found.gaussians.sh_degree == degree
-    assert (found.gaussians.logit_confidence is not None) == confidence
-    assert_close(found.gaussians.numpy()["sh_coeffs"], now.numpy()["sh_coeffs"], atol=0.02)
+    target = jittered(state.gaussians, np.random.default_rng(0))
+    result = decode(state, residual_packet(state, target, None, CAMERAS))
+    assert result.frame == 4
+    assert result.gaussians.sh_degree == degree
+    assert (result.gaussians.logit_confidence is not None) == confidence
+    assert_close(result.gaussians.numpy()["sh_coeffs"], target.numpy()["sh_coeffs"], atol=0.02)
 
 
 def test_residual_packet__removes_all_gaussians() -> None:
     state = decode(None, keyframe_packet(cloud(5), 0, CAMERAS))
-    now = decode(state, residual_packet(state, single_at(7.0), np.array([-1]), CAMERAS))
-    assert (now.ids.tolist(), now.next_id) == ([5], 6)
+    new_state = decode(state, residual_packet(state, single_at(7.0), np.array([-1]), CAMERAS))
+    assert (new_state.ids.tolist(), new_state.next_id) == ([5], 6)
 
 
 def test_decode__names_a_missing_packet() -> None:
@@ -196,5 +197,5 @@ def test_lasting_ids__continue_after_those_of_the_set_before() -> None:
     first = keyframe_packet(cloud(3), 0)
     state = decode(None, first)
     packets = [first, reemitted_keyframe(state), residual_packet(state, cloud(3)), keyframe_packet(cloud(2), 2)]
-    found = [(coded.frame, coded.lasting_ids.tolist()) for coded in coded_frames(packets)]
-    assert found == [(0, [0, 1, 2]), (1, [0, 1, 2]), (2, [3, 4])]
+    ids = [(coded.frame, coded.lasting_ids.tolist()) for coded in coded_frames(packets)]
+    assert ids == [(0, [0, 1, 2]), (1, [0, 1, 2]), (2, [3, 4])]

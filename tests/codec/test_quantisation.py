@@ -25,23 +25,24 @@ from tests.scenes.coded_clip import CAMERAS, cloud, encoded_clip, history, jitte
 def test_residual_packet__errors_stay_within_the_tolerance() -> None:
     """The error is at most half a step for a new Gaussian, a step for a moved one, half a step for its base colour."""
     config = CodecConfig(birth_precision=2)
-    before = cloud(400)
-    state = decode(None, keyframe_packet(before, 0, CAMERAS, config))
-    after = jittered(before, np.random.default_rng(1))
-    moved = decode(state, residual_packet(state, after, None, CAMERAS, config))
-    for true, found, error, color_error in ((before, state, 0.5, 0.5), (after, moved, 2.0, 1.0)):
+    start = cloud(400)
+    state = decode(None, keyframe_packet(start, 0, CAMERAS, config))
+    target = jittered(start, np.random.default_rng(1))
+    new_state = decode(state, residual_packet(state, target, None, CAMERAS, config))
+    for true, result, error, color_error in ((start, state, 0.5, 0.5), (target, new_state, 2.0, 1.0)):
         for camera in CAMERAS:
             view = camera.viewmat
-            a, b = (g.numpy()["means"].astype(float) @ view[:3, :3].T + view[:3, 3] for g in (true, found.gaussians))
+            a, b = (g.numpy()["means"].astype(float) @ view[:3, :3].T + view[:3, 3] for g in (true, result.gaussians))
             # At most, the errors of three coordinates add up.
             pixels = camera.K[0, 0] * np.abs(a - b)[:, :2] / a[:, 2:]
             assert pixels.max() < error * BY_NAME["means"].error * np.sqrt(3)
-        sh = np.abs(true.numpy()["sh_coeffs"] - found.gaussians.numpy()["sh_coeffs"])
+        sh = np.abs(true.numpy()["sh_coeffs"] - result.gaussians.numpy()["sh_coeffs"])
         assert 0.2821 * sh[:, 0].max() < 1.001 * color_error * BY_NAME["sh_dc"].error
         assert sh[:, 1:].max() < 1.001 * error * BY_NAME["sh_dc"].error
-        opacity = np.abs(np.asarray(true.opacities) - np.asarray(found.gaussians.opacities))
+        opacity = np.abs(np.asarray(true.opacities) - np.asarray(result.gaussians.opacities))
         assert opacity.max() < 1.001 * error * BY_NAME["logit_opacities"].error
-        q, p = true.numpy()["quats"], found.gaussians.numpy()["quats"]
+        q = true.numpy()["quats"]
+        p = result.gaussians.numpy()["quats"]
         cosine = np.abs((q * p).sum(1)) / np.linalg.norm(q, axis=1)
         # The steps are chosen for about 5 px: far below a tenth of a pixel at the ends of an axis.
         assert np.rad2deg(2 * np.arccos(np.minimum(cosine, 1))).max() < 8 * error
@@ -49,15 +50,18 @@ def test_residual_packet__errors_stay_within_the_tolerance() -> None:
 
 
 def test_codec_config__more_quality_takes_more_bytes_and_has_smaller_errors() -> None:
-    before = cloud(400)
-    after = jittered(before, np.random.default_rng(1))
-    sizes, errors = [], []
+    gaussians = cloud(400)
+    changed_gaussians = jittered(gaussians, np.random.default_rng(1))
+    sizes = []
+    errors = []
     for quality in (0.25, 1, 4, 1000):
         config = CodecConfig(quality=quality)
-        state = decode(None, keyframe_packet(before, 0, CAMERAS, config))
-        packet = residual_packet(state, after, None, CAMERAS, config)
+        state = decode(None, keyframe_packet(gaussians, 0, CAMERAS, config))
+        packet = residual_packet(state, changed_gaussians, None, CAMERAS, config)
         sizes.append(len(encode_packet(packet)))
-        errors.append(np.abs(decode(state, packet).gaussians.numpy()["means"] - after.numpy()["means"]).max())
+        errors.append(
+            np.abs(decode(state, packet).gaussians.numpy()["means"] - changed_gaussians.numpy()["means"]).max()
+        )
     assert sizes == sorted(sizes)
     assert errors == sorted(errors, reverse=True)
     # A thousandth of 0.04 px of 0.03 units.
@@ -67,8 +71,8 @@ def test_codec_config__more_quality_takes_more_bytes_and_has_smaller_errors() ->
 @pytest.mark.parametrize("target", [2000, 4000, 8000])
 def test_residual_packet__stays_below_its_target_size_and_comes_near_it(target: int) -> None:
     state = decode(None, keyframe_packet(cloud(1500), 0, CAMERAS))
-    after = jittered(state.gaussians, np.random.default_rng(1), share=1)
-    packet = residual_packet(state, after, None, CAMERAS, CodecConfig(target_size=target))
+    changed_gaussians = jittered(state.gaussians, np.random.default_rng(1), share=1)
+    packet = residual_packet(state, changed_gaussians, None, CAMERAS, CodecConfig(target_size=target))
     # The coarseness has steps of 2^(1/4), up to a fifth of the bytes where few numbers are left.
     assert 0.75 * target < packet.arrays["code"].nbytes <= target
     assert len(decode(state, packet)) == 1500
@@ -82,16 +86,16 @@ def test_residual_packet__stores_changes_of_a_step_and_colours_of_half_a_step() 
         raw["means"][i] += steps * state.grid.steps("means")[i]
     for i, steps in ((17, 0.51), (18, 0.49)):
         raw["sh_coeffs"][i, 0] += steps * state.grid.steps("sh_dc")[i]
-    found = decode(state, residual_packet(state, Gaussians(**raw), None, CAMERAS, config))
-    assert np.flatnonzero((found.grid.values != state.grid.values).any(1)).tolist() == [7, 8, 17]
-    assert np.flatnonzero(found.gaussians.numpy()["motion"].any(1)).tolist() == [7, 8]
+    result = decode(state, residual_packet(state, Gaussians(**raw), None, CAMERAS, config))
+    assert np.flatnonzero((result.grid.values != state.grid.values).any(1)).tolist() == [7, 8, 17]
+    assert np.flatnonzero(result.gaussians.numpy()["motion"].any(1)).tolist() == [7, 8]
 
 
 def test_residual_packet__counts_offsets_towards_the_target_size() -> None:
     state = decode(None, keyframe_packet(cloud(1500), 0, CAMERAS))
     rng = np.random.default_rng(1)
-    after = replace(jittered(state.gaussians, rng, share=1), offset=rng.normal(0, 0.02, (1500, 3)))
-    arrays = residual_packet(state, after, None, CAMERAS, CodecConfig(target_size=8000, offset=True)).arrays
+    changed_gaussians = replace(jittered(state.gaussians, rng, share=1), offset=rng.normal(0, 0.02, (1500, 3)))
+    arrays = residual_packet(state, changed_gaussians, None, CAMERAS, CodecConfig(target_size=8000, offset=True)).arrays
     assert arrays["offset"].nbytes > 400
     assert 0.75 * 8000 < arrays["code"].nbytes + arrays["offset"].nbytes <= 8000
 
@@ -126,10 +130,10 @@ def test_keyframe_packet__codes_extremes_as_exactly_as_float32() -> None:
     extreme = Gaussians(**raw)
     first = decode(None, keyframe_packet(extreme, 0, CAMERAS))
     for name in ("means", "log_scales", "sh_coeffs"):
-        before, now = (np.asarray(getattr(g, name)).astype(np.float64) for g in (extreme, first.gaussians))
-        largest = np.abs(before).reshape(40, -1).max(1).reshape(40, *[1] * (before.ndim - 1))
-        usual = 2 * np.abs(now[16:] - before[16:]).max()  # of the other Gaussians; twice, because steps come in octaves
-        assert np.all(np.abs(now - before) <= np.maximum(2.0**-23 * largest, usual)), name
+        exact, code = (np.asarray(getattr(g, name)).astype(np.float64) for g in (extreme, first.gaussians))
+        largest = np.abs(exact).reshape(40, -1).max(1).reshape(40, *[1] * (exact.ndim - 1))
+        usual = 2 * np.abs(code[16:] - exact[16:]).max()  # of the other Gaussians; twice, because steps come in octaves
+        assert np.all(np.abs(code - exact) <= np.maximum(2.0**-23 * largest, usual)), name
 
     # A Gaussian that is born close and small and flies off stops at the limit of its integers.
     gone = replace(first.gaussians, means=first.gaussians.means + np.float32(1e30))

@@ -74,8 +74,8 @@ def test_stream_reader__receives_frames_while_they_are_written(channel) -> None:
                 assert arrived.acquire(timeout=20), "a frame arrives as soon as it was written"
         assert not sink.closed
     receiver.join(20)
-    for found, state in zip(got, states, strict=True):
-        assert_same(found, state)
+    for received_state, state in zip(got, states, strict=True):
+        assert_same(received_state, state)
 
 
 def test_stream_reader__reports_a_lost_connection_after_complete_frames() -> None:

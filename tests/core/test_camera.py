@@ -31,9 +31,9 @@ def test_project__agrees_with_the_mitsuba_sensor(camera):
     scene = mi.load_dict({"type": "scene", "lamp": lamp, "sensor": camera.sensor()})
     image = np.array(mi.render(scene, integrator=mi.load_dict({"type": "direct"}), spp=64))[..., 0]
     y, x = np.mgrid[:48, :64] + 0.5
-    seen = np.array([(image * x).sum(), (image * y).sum()]) / image.sum()
+    centre = np.array([(image * x).sum(), (image * y).sum()]) / image.sum()
     # A ball's image is an ellipse; its middle is not quite the image of the ball's centre; noise is 0.02 px.
-    assert_close(seen, camera.project(point)[0], atol=0.1)
+    assert_close(centre, camera.project(point)[0], atol=0.1)
 
 
 def test_project__inverts_the_rays_of_the_mitsuba_sensor(camera):
@@ -96,7 +96,8 @@ def test_rays__start_at_the_camera_and_pass_through_their_pixels(camera):
 
 
 def test_projection_jacobian__agrees_with_central_differences(camera):
-    points, h = np.random.default_rng(2).uniform(-0.5, 0.5, (6, 3)), 1e-5
+    points = np.random.default_rng(2).uniform(-0.5, 0.5, (6, 3))
+    h = 1e-5
     J = camera.projection_jacobian(points)
     for k in range(3):
         step = h * np.eye(3)[k]
@@ -106,13 +107,16 @@ def test_projection_jacobian__agrees_with_central_differences(camera):
     assert not camera.projection_jacobian(behind).any()
 
 
-K, VIEWMAT = np.array([[40.0, 0, 16], [0, 40, 8], [0, 0, 1]]), np.eye(4)
+K = np.array([[40.0, 0, 16], [0, 40, 8], [0, 0, 1]])
+VIEWMAT = np.eye(4)
 
 
 def test_camera__copies_its_matrices():
-    intrinsics, viewmat = K.copy(), VIEWMAT.copy()
+    intrinsics = K.copy()
+    viewmat = VIEWMAT.copy()
     camera = Camera(intrinsics, viewmat, 32, 16)
-    intrinsics[:], viewmat[:] = 7, 7
+    intrinsics[:] = 7
+    viewmat[:] = 7
     np.testing.assert_array_equal(camera.K, K)
     np.testing.assert_array_equal(camera.viewmat, VIEWMAT)
 

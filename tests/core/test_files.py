@@ -31,10 +31,10 @@ def write(partial: Path, kind: str, text: str = "new") -> None:
 def test_atomic_path__appears_at_the_end_and_replaces_the_old(tmp_path: Path, kind: str, old: bool) -> None:
     if old:
         write(tmp_path / "x", kind, "old")
-    before = tree(tmp_path)
+    old_tree = tree(tmp_path)
     with atomic_path(tmp_path / "x", "test()") as partial:
         write(partial, kind)
-        assert {name: text for name, text in tree(tmp_path).items() if not name.startswith(".")} == before
+        assert {name: text for name, text in tree(tmp_path).items() if not name.startswith(".")} == old_tree
     assert tree(tmp_path) == ({"x": "new"} if kind == "file" else {"x": None, "x/a": "new"})
 
 
@@ -44,7 +44,7 @@ def test_atomic_path__appears_at_the_end_and_replaces_the_old(tmp_path: Path, ki
 def test_atomic_path__is_unchanged_after_an_error_in_the_body(tmp_path: Path, kind: str, old: bool, error) -> None:
     if old:
         write(tmp_path / "x", kind, "old")
-    before = tree(tmp_path)
+    old_tree = tree(tmp_path)
 
     def fail() -> None:
         with atomic_path(tmp_path / "x", "test()") as partial:
@@ -54,15 +54,15 @@ def test_atomic_path__is_unchanged_after_an_error_in_the_body(tmp_path: Path, ki
     message = r"^test\(\): cannot write .*/x, .*: No space left; check .* disk has room\.$"
     with pytest.raises(type(error), match=message if isinstance(error, OSError) else str(error)):
         fail()
-    assert tree(tmp_path) == before
+    assert tree(tmp_path) == old_tree
 
 
 def test_write_json__leaves_the_old_file_on_a_full_disk(tmp_path: Path) -> None:
     write_json(tmp_path / "x.json", {"a": 1})
-    before = tree(tmp_path)
+    old_tree = tree(tmp_path)
     with files_end_at(100), pytest.raises(OSError, match=r"x\.json, .*: File too large; check"):
         write_json(tmp_path / "x.json", {"a": "b" * 1000})
-    assert tree(tmp_path) == before
+    assert tree(tmp_path) == old_tree
 
 
 @pytest.mark.parametrize("case", ["a file", "read-only", "a folder", "missing"])
@@ -76,13 +76,14 @@ def test_atomic_path__reports_a_folder_that_is_not_writable(tmp_path: Path, case
             pytest.skip("root may write everywhere")
     elif case == "a folder":
         (folder / "x").mkdir(parents=True)
-    before, removed = tree(tmp_path), ", the partial output was removed" if case == "a folder" else ""
+    old_tree = tree(tmp_path)
+    removed = ", the partial output was removed" if case == "a folder" else ""
     with (
         pytest.raises(OSError, match=rf"test\(\): cannot write {folder}/x{removed}: "),
         atomic_path(folder / "x", "test()") as partial,
     ):
         partial.write_text("new")
-    assert tree(tmp_path) == before
+    assert tree(tmp_path) == old_tree
 
 
 def test_atomic_path__replaces_no_device_and_no_pipe(tmp_path: Path) -> None:
@@ -96,7 +97,7 @@ def test_atomic_path__restores_the_old_folder_after_a_failed_swap(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write(tmp_path / "x", "folder", "old")
-    before = tree(tmp_path)
+    old_tree = tree(tmp_path)
 
     def failing(*_: Path) -> None:
         raise OSError(5, "Input/output error")
@@ -104,7 +105,7 @@ def test_atomic_path__restores_the_old_folder_after_a_failed_swap(
     monkeypatch.setattr(Path, "replace", failing)
     with pytest.raises(OSError, match="Input/output error"), atomic_path(tmp_path / "x", "test()") as partial:
         write(partial, "folder")
-    assert tree(tmp_path) == before
+    assert tree(tmp_path) == old_tree
 
 
 def test_atomic_folder__removes_partial_output_of_killed_processes(tmp_path: Path) -> None:

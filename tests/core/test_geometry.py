@@ -32,8 +32,9 @@ def cloud(N: int = 30, degree: int = 3) -> Gaussians:
 
 
 def test_covariances__agree_with_the_reference():
-    raw, found = cloud().numpy(), covariances(cloud())
-    for log_scale, quat, covariance in zip(raw["log_scales"], raw["quats"].astype(float), found, strict=True):
+    raw = cloud().numpy()
+    matrices = covariances(cloud())
+    for log_scale, quat, covariance in zip(raw["log_scales"], raw["quats"].astype(float), matrices, strict=True):
         M = reference.rotation(quat) * np.exp(log_scale)
         np.testing.assert_allclose(covariance, M @ M.T, rtol=1e-6, atol=1e-9)
 
@@ -52,8 +53,10 @@ def test_rotated__looks_the_same_to_a_rotated_camera(degree):
     turn = np.eye(4)
     turn[:3, :3] = R.T
     turned = replace(camera, viewmat=camera.viewmat @ turn)
-    gaussians, channels = cloud(degree=degree), ("color", "motion", "depth", "confidence")
-    a, b = rasterize(gaussians, camera, channels), rasterize(rotated(gaussians, R), turned, channels)
+    gaussians = cloud(degree=degree)
+    channels = ("color", "motion", "depth", "confidence")
+    a = rasterize(gaussians, camera, channels)
+    b = rasterize(rotated(gaussians, R), turned, channels)
     vectors = replace(gaussians, offset=gaussians.motion)
     np.testing.assert_array_equal(rotated(vectors, R).offset, rotated(vectors, R).motion)
     for name in channels:

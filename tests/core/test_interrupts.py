@@ -42,8 +42,10 @@ def test_is_interruption__follows_causes_contexts_and_groups(error: BaseExceptio
 
 
 def test_is_interruption__is_false_for_other_errors_and_ends_in_a_cycle() -> None:
-    first, second = ValueError(), OSError()
-    first.__cause__, second.__cause__ = second, first
+    first = ValueError()
+    second = OSError()
+    first.__cause__ = second
+    second.__cause__ = first
     assert not is_interruption(first)
 
 
@@ -52,17 +54,18 @@ class Thing:
 
 
 def test_interrupts_raised__releases_the_variables_of_what_was_interrupted() -> None:
-    left: list[weakref.ref[Thing]] = []
+    references: list[weakref.ref[Thing]] = []
 
     def interrupted() -> None:
-        thing, cycle = Thing(), []
+        thing = Thing()
+        cycle = []
         cycle.append((cycle, thing))
-        left.append(weakref.ref(thing))
+        references.append(weakref.ref(thing))
         raise chained(RuntimeError, True)
 
     with pytest.raises(KeyboardInterrupt) as caught:
         interrupts_raised()(interrupted)()
-    assert left[0]() is None
+    assert references[0]() is None
     assert caught.value is not None
 
 
@@ -76,9 +79,9 @@ def test_interrupts_raised__leaves_other_errors_as_they_are() -> None:
 @pytest.fixture
 def heeds_interrupts() -> Iterator[None]:
     """Python's handler of SIGINT, which a shell ignores for the processes that it starts in the background."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
-    signal.signal(signal.SIGINT, before)
+    signal.signal(signal.SIGINT, handler)
 
 
 class Swallowing:
@@ -113,12 +116,12 @@ def test_interruptible__raises_once_for_each_signal(heeds_interrupts: None, inte
 
 
 def test_interruptible__lets_a_background_process_ignore_ctrl_c() -> None:
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         with interruptible():
             signal.raise_signal(signal.SIGINT)
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(signal.SIGINT, handler)
 
 
 STARTING = """

@@ -64,7 +64,8 @@ def test_find_llvm__returns_the_newest_first(libraries):
 @pytest.mark.usefixtures("old_fails")
 def test_choose_llvm__prefers_the_users_choice_if_it_is_usable(libraries):
     folders = libraries("libLLVM.so.19.1", "libLLVM.so.22.1", "libLLVM-15.so.1")
-    good, bad = folders[0] / "libLLVM.so.19.1", folders[0] / "libLLVM-15.so.1"
+    good = folders[0] / "libLLVM.so.19.1"
+    bad = folders[0] / "libLLVM-15.so.1"
     assert llvm.choose_llvm(str(good), folders) == (good, "")
     path, problem = llvm.choose_llvm(str(bad), folders)
     assert path == folders[0] / "libLLVM.so.22.1"

@@ -18,11 +18,12 @@ from tests.scenes.changing_splats import splats
 
 @pytest.mark.parametrize("kind", ["Float", "Float64", "Int32", "UInt32", "Bool", "TensorXf"])
 def test_from_numpy__converts_to_the_type_in_aligned_memory(kind):
-    kind, values = getattr(mi, kind), np.arange(12.0).reshape(3, 4)
-    found = np.asarray(from_numpy(kind, values))
+    kind = getattr(mi, kind)
+    values = np.arange(12.0).reshape(3, 4)
+    array = np.asarray(from_numpy(kind, values))
     expected = values if dr.is_tensor_v(kind) else values.ravel()
-    np.testing.assert_array_equal(found, expected.astype(found.dtype))
-    assert found.__array_interface__["data"][0] % 64 == 0
+    np.testing.assert_array_equal(array, expected.astype(array.dtype))
+    assert array.__array_interface__["data"][0] % 64 == 0
 
 
 def test_from_numpy__copies_before_kernels_read():

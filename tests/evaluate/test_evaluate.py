@@ -83,10 +83,10 @@ def test_evaluate_stream__compares_3d_motion_of_gaussians_in_both_frames_only(
 ) -> None:
     """The first splat is removed and one with a wrong motion is added: the motion of the others is still exact."""
     state = decode(None, keyframe_packet(moved(0), 0, CAMERAS, EXACT))
-    after = moved(1).select([1, 2, 3, 4, 0])
+    moved_gaussians = moved(1).select([1, 2, 3, 4, 0])
     with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25, {"test_view": 0}) as writer:
         writer.write(reemitted_keyframe(state))
-        writer.write(residual_packet(state, after, np.array([1, 2, 3, 4, -1]), CAMERAS, EXACT))
+        writer.write(residual_packet(state, moved_gaussians, np.array([1, 2, 3, 4, -1]), CAMERAS, EXACT))
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture").motion_3d
     assert result is not None
     assert 0 < result.num_gaussians <= 4
@@ -180,9 +180,9 @@ def test_evaluate_stream__reports_the_overlap_of_confidence_and_true_mask(fitted
     write_stream(tmp_path / "s.morgs", {"test_view": 0}, logit=20)
     alphas = [np.array(rasterize(moved(t), CAMERAS[0]).alpha) for t in range(1, FRAMES)]
     expected = np.mean([(alpha > 0.5).sum() / (alpha > 0).sum() for alpha in alphas])
-    found = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture").scores.confidence_iou
-    assert found == pytest.approx(expected)
-    assert found > 0
+    overlap = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture").scores.confidence_iou
+    assert overlap == pytest.approx(expected)
+    assert overlap > 0
 
 
 def test_evaluate_stream__uses_the_recorded_change_as_regions_without_truth(fitted_clip: Path, tmp_path: Path) -> None:
@@ -219,14 +219,15 @@ def test_evaluate_stream__reports_drift_as_the_slope_of_psnr(fitted_clip: Path, 
 def test_evaluation__as_dict_holds_the_scores_under_the_keys_of_the_json(fitted_clip: Path, tmp_path: Path) -> None:
     write_stream(tmp_path / "s.morgs", {"test_view": 0}, shift=1)
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
-    found, row = result.as_dict(), result.as_dict()["frames"][1]
+    report = result.as_dict()
+    row = result.as_dict()["frames"][1]
     scores = {name + region for name in IMAGE_SCORES for region in REGIONS}
     assert scores <= row.keys()
-    assert scores <= found.keys()
-    ends = {"mean": result.scores.psnr, "first": found["frames"][0]["psnr"], "last": found["frames"][-1]["psnr"]}
-    assert found["psnr"] == ends
-    assert found["ssim"].keys() == ends.keys()
-    assert (found["num_frames"], found["complete"], found["held_out"]) == (FRAMES, True, True)
+    assert scores <= report.keys()
+    ends = {"mean": result.scores.psnr, "first": report["frames"][0]["psnr"], "last": report["frames"][-1]["psnr"]}
+    assert report["psnr"] == ends
+    assert report["ssim"].keys() == ends.keys()
+    assert (report["num_frames"], report["complete"], report["held_out"]) == (FRAMES, True, True)
     for name, keys in (
         ("seconds", {"first", "per_later_frame", "definition"}),
         ("bytes", {"file", "overhead", "per_frame", "per_keyframe", "per_residual"}),
@@ -234,10 +235,10 @@ def test_evaluation__as_dict_holds_the_scores_under_the_keys_of_the_json(fitted_
         ("playback", {"fps", "decode_ms", "render_ms"}),
         ("motion_3d", {"num_gaussians", "error", "true_length", "relative_error", "length_ratio", "angle"}),
     ):
-        assert found[name].keys() == keys, name
+        assert report[name].keys() == keys, name
     assert {"frame", "kind", "num_bytes", "seconds", "motion_3d", "views"} <= row.keys()
     assert row["views"]["cam0"]["psnr"] == result.frames[1].views["cam0"].psnr
-    assert found["views"]["cam0"]["delta_e"] == result.views["cam0"].delta_e
+    assert report["views"]["cam0"]["delta_e"] == result.views["cam0"].delta_e
 
 
 def test_known_mean__ignores_nan() -> None:
@@ -268,8 +269,8 @@ def test_evaluate_stream__compares_the_light_of_an_hdr_recording(tmp_path: Path)
             light = 2 * decode_light(np.array(rasterize(moved(t), camera).color))
             planes = {name: light[..., k] for k, name in enumerate("RGB")}
             write_exr(tmp_path / "capture" / camera.name / f"{t:04d}.exr", planes)
-    about = {"capture": str(tmp_path / "capture"), "test_view": 0}
-    write_stream(tmp_path / "s.morgs", about | {"transfer": {"name": TRANSFER, "display_exposure": -1}})
+    metadata = {"capture": str(tmp_path / "capture"), "test_view": 0}
+    write_stream(tmp_path / "s.morgs", metadata | {"transfer": {"name": TRANSFER, "display_exposure": -1}})
     scores = evaluate_stream(tmp_path / "s.morgs").scores
     color = np.array(rasterize(moved(0), CAMERAS[0]).color)
     light, truth = (gain * decode_light(color) for gain in (1, 2))

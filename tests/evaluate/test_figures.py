@@ -28,13 +28,14 @@ def test_draw_stream__writes_every_figure(fitted_clip: Path, tmp_path: Path) -> 
     slices, motion, confidence = (cv2.imread(str(path))[..., ::-1] for path in paths)
     # Three frames fill 320 pixels when each is repeated 107 times; the recording is the rendering.
     assert slices.shape == (HEIGHT, WIDTH + 2 * (GAP + 321), 3)
-    recorded, rendered = slices[:, WIDTH + GAP :][:, :321], slices[:, -321:]
+    recorded = slices[:, WIDTH + GAP :][:, :321]
+    rendered = slices[:, -321:]
     np.testing.assert_array_equal(recorded[20:], rendered[20:])
     # Two frames after the first: truth, rendering, and a legend beside the first row.
     assert motion.shape == confidence.shape == (LEGEND + GAP + HEIGHT, 2 * (WIDTH + GAP) + LEGEND, 3)
-    seen = confidence[LEGEND + GAP + 15 :, :WIDTH].max(-1) > 128
-    true, found = (motion[LEGEND + GAP + 15 :, x : x + WIDTH][seen[: HEIGHT - 15]] for x in (0, WIDTH + GAP))
-    assert_close(found, true, atol=2)
+    mask = confidence[LEGEND + GAP + 15 :, :WIDTH].max(-1) > 128
+    true, picture = (motion[LEGEND + GAP + 15 :, x : x + WIDTH][mask[: HEIGHT - 15]] for x in (0, WIDTH + GAP))
+    assert_close(picture, true, atol=2)
 
 
 def test_draw_stream__draws_the_stream_alone_without_truth(fitted_clip: Path, tmp_path: Path) -> None:
@@ -51,10 +52,10 @@ def test_draw_stream__draws_offsets_beside_the_whole_motion(fitted_clip: Path, t
     # Two frames after the first: motion, its offset and both legends beside the first row.
     assert sheet.shape == (LEGEND + GAP + HEIGHT, 2 * (WIDTH + GAP) + 2 * LEGEND + GAP, 3)
     motion, offset = (sheet[LEGEND + GAP + 15 :, x : x + WIDTH][: HEIGHT - 15] for x in (0, WIDTH + GAP))
-    seen = motion[..., 1] < 128  # red: to the right, at full saturation
-    assert seen.any()
+    mask = motion[..., 1] < 128  # red: to the right, at full saturation
+    assert mask.any()
     # A twentieth of it at a tenth of the scale is half saturated.
-    assert np.abs(offset[seen] - (255, 127, 127)).max() <= 3
+    assert np.abs(offset[mask] - (255, 127, 127)).max() <= 3
 
 
 def test_motion_scale__is_that_of_the_truth(fitted_clip: Path, tmp_path: Path) -> None:

@@ -19,9 +19,13 @@ def ssim_by_windows(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     w /= w.sum()
     out = np.empty((image.shape[0] - 10, image.shape[1] - 10))
     for r, c in np.ndindex(out.shape):
-        x, y = image[r : r + 11, c : c + 11], truth[r : r + 11, c : c + 11]
-        mx, my = (w * x).sum(), (w * y).sum()
-        vx, vy, cov = (w * (x - mx) ** 2).sum(), (w * (y - my) ** 2).sum(), (w * (x - mx) * (y - my)).sum()
+        x = image[r : r + 11, c : c + 11]
+        y = truth[r : r + 11, c : c + 11]
+        mx = (w * x).sum()
+        my = (w * y).sum()
+        vx = (w * (x - mx) ** 2).sum()
+        vy = (w * (y - my) ** 2).sum()
+        cov = (w * (x - mx) * (y - my)).sum()
         out[r, c] = (2 * mx * my + 1e-4) * (2 * cov + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))
     return out
 
@@ -100,7 +104,8 @@ def test_endpoint_error__is_a_mean_length():
 
 def test_iou__of_known_masks():
     a, b = np.zeros((2, 4, 5), bool)
-    a[0], b[:, 0] = True, True
+    a[0] = True
+    b[:, 0] = True
     assert iou(a, b) == pytest.approx(1 / 8)
     assert iou(a, a) == 1
     assert iou(a, ~a) == 0

@@ -14,9 +14,11 @@ from morgs_mi.evaluate.motion3d import compare_motion, evaluate_motion, local_mo
 from tests.assertions import assert_close
 
 rng = np.random.default_rng(0)
-WIDTH, HEIGHT = 40, 30
+WIDTH = 40
+HEIGHT = 30
 FRONT = Camera.look_at((0, 0, -4), (0, 0, 0), (0, -1, 0), 50, WIDTH, HEIGHT)
-TURN, SHIFT = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), np.array([0.05, 0, -0.02])
+TURN = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix()
+SHIFT = np.array([0.05, 0, -0.02])
 
 
 def plane(depth: float, left: int, right: int) -> GroundTruth:
@@ -41,22 +43,22 @@ def test_surface_ids__excludes_points_on_which_views_disagree_and_combines_the_o
 
 
 def test_rigid_motions__are_recovered_from_tracks():
-    before = rng.normal(size=(40, 3))
+    points = rng.normal(size=(40, 3))
     ids = np.repeat([0, 2, 4, 5], 10)
-    after = before.copy()
-    after[ids == 2] = before[ids == 2] @ TURN.T + SHIFT
-    after[ids == 4] *= 1.1  # it swells: not rigid
-    before[ids == 5] *= (1, 0, 0)
-    after[ids == 5] = before[ids == 5] + SHIFT  # on a line: a turn about it would not show
-    found = rigid_motions(before, after, ids)
-    assert list(found) == [2]
-    assert_close(found[2][0], TURN, atol=1e-12)
-    assert_close(found[2][1], SHIFT, atol=1e-12)
+    moved_points = points.copy()
+    moved_points[ids == 2] = points[ids == 2] @ TURN.T + SHIFT
+    moved_points[ids == 4] *= 1.1  # it swells: not rigid
+    points[ids == 5] *= (1, 0, 0)
+    moved_points[ids == 5] = points[ids == 5] + SHIFT  # on a line: a turn about it would not show
+    motions = rigid_motions(points, moved_points, ids)
+    assert list(motions) == [2]
+    assert_close(motions[2][0], TURN, atol=1e-12)
+    assert_close(motions[2][1], SHIFT, atol=1e-12)
 
 
 def test_rigid_motions__are_recovered_from_points_in_a_plane():
-    before = rng.normal(size=(5, 3)) * (1, 1, 0)
-    rotation, shift = rigid_motions(before, before @ TURN.T + SHIFT, np.zeros(5, int))[0]
+    points = rng.normal(size=(5, 3)) * (1, 1, 0)
+    rotation, shift = rigid_motions(points, points @ TURN.T + SHIFT, np.zeros(5, int))[0]
     assert_close(rotation, TURN, atol=1e-12)
     assert_close(shift, SHIFT, atol=1e-12)
 
@@ -87,13 +89,13 @@ def test_evaluate_motion__selects_opaque_gaussians_on_a_moving_object_off_its_ax
     centre = np.array([-1.0, 0, 0])
     tracked = np.array([(-1.6, 0, 0), (-0.4, 0, 0), (-1, 0.6, 0), (0.5, 0, 0), (0.6, 0, 0), (0.5, 0.1, 0)])
     ids = np.array([3, 3, 3, 5, 5, 5])
-    after = np.where(ids[:, None] == 3, (tracked - centre) @ turn.T + centre, tracked)
+    moved_points = np.where(ids[:, None] == 3, (tracked - centre) @ turn.T + centre, tracked)
     means = np.array([(-0.6, 0, 0), (-1.01, 0, 0), (-0.6, 0.2, 0), (0.5, 0, 0), (-0.6, 0, 1)])
     true = (means - centre) @ turn.T + centre - means
     opacities = np.array([0.9, 0.9, 0.05, 0.9, 0.9])
     views = [(FRONT, plane(4, 3, 5))]
     # Only the first is evaluated: on the axis, too transparent, on the static half, off the surface.
-    score = evaluate_motion(means, 1.5 * true, opacities, (tracked, after, ids), views)
+    score = evaluate_motion(means, 1.5 * true, opacities, (tracked, moved_points, ids), views)
     assert score.num_gaussians == 1
     assert score.true_length == pytest.approx(2 * 0.4 * np.sin(0.1))
     assert (score.relative_error, score.length_ratio) == pytest.approx((0.5, 1.5))
@@ -103,37 +105,39 @@ def test_evaluate_motion__selects_opaque_gaussians_on_a_moving_object_off_its_ax
 def bent(points: np.ndarray, curvature: float) -> np.ndarray:
     """Return points of the wall [..., 3] after it is bent to a cylinder about the y axis."""
     x, y, z = np.moveaxis(points, -1, 0)
-    angle, radius = x * curvature, 1 / curvature
+    angle = x * curvature
+    radius = 1 / curvature
     return np.stack([(radius - z) * np.sin(angle), y, radius - (radius - z) * np.cos(angle)], axis=-1)
 
 
 def test_local_motion__of_a_bending_wall():
     points, tracked = (rng.uniform(-1, 1, (n, 3)) * (1, 1, 0) for n in (200, 1500))
-    before, after = bent(tracked, 0.2), bent(tracked, 0.3)
+    positions = bent(tracked, 0.2)
+    new_positions = bent(tracked, 0.3)
     true = bent(points, 0.3) - bent(points, 0.2)
-    found = local_motion(bent(points, 0.2), before, after)
-    moved = np.linalg.norm(true, axis=-1) > 0.1 * np.linalg.norm(after - before, axis=-1).max()
-    kept = moved & np.isfinite(found[:, 0])
-    assert kept.sum() > 0.9 * moved.sum()
-    error = np.linalg.norm(found - true, axis=-1)[kept] / np.linalg.norm(true, axis=-1)[kept]
+    motion = local_motion(bent(points, 0.2), positions, new_positions)
+    moves = np.linalg.norm(true, axis=-1) > 0.1 * np.linalg.norm(new_positions - positions, axis=-1).max()
+    mask = moves & np.isfinite(motion[:, 0])
+    assert mask.sum() > 0.9 * moves.sum()
+    error = np.linalg.norm(motion - true, axis=-1)[mask] / np.linalg.norm(true, axis=-1)[mask]
     assert np.median(error) < 0.01
     assert error.max() < 0.1
 
 
 def test_local_motion__excludes_points_between_parts_that_move_apart():
     tracked = rng.uniform(0.2, 1, (400, 3)) * (1, 1, 0) * np.where(np.arange(400) % 2, 1, -1)[:, None]
-    after = tracked + np.sign(tracked[:, :1]) * [0, 0, 0.1]
-    found = local_motion(np.array([(0.6, 0.6, 0.0), (0.0, 0.0, 0.0)]), tracked, after)
-    assert_close(found[0], [0, 0, 0.1], atol=1e-12)
-    assert np.isnan(found[1]).all()
+    new_positions = tracked + np.sign(tracked[:, :1]) * [0, 0, 0.1]
+    motion = local_motion(np.array([(0.6, 0.6, 0.0), (0.0, 0.0, 0.0)]), tracked, new_positions)
+    assert_close(motion[0], [0, 0, 0.1], atol=1e-12)
+    assert np.isnan(motion[1]).all()
 
 
 def test_evaluate_motion__evaluates_gaussians_on_a_deforming_object():
     tracked = rng.uniform(-1.5, 0, (600, 3)) * (1, 1, 0)
-    after = tracked + 0.02 * tracked**2 @ [[0, 0, 1], [0, 0, 0], [0, 0, 0]]
+    new_positions = tracked + 0.02 * tracked**2 @ [[0, 0, 1], [0, 0, 0], [0, 0, 0]]
     means = np.array([(-1.0, -0.5, 0), (-1.2, -0.2, 0)])
     true = 0.02 * means**2 @ [[0, 0, 1], [0, 0, 0], [0, 0, 0]]
     views = [(FRONT, plane(4, 3, -1))]
-    score = evaluate_motion(means, true, np.full(2, 0.9), (tracked, after, np.full(600, 3)), views)
+    score = evaluate_motion(means, true, np.full(2, 0.9), (tracked, new_positions, np.full(600, 3)), views)
     assert score.num_gaussians == 2
     assert score.relative_error < 0.02

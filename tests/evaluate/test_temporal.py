@@ -14,10 +14,10 @@ NOTHING = np.zeros(SIZE, bool)
 
 
 def test_still_variation__is_the_mean_change_of_pixels_that_never_move():
-    left = NOTHING.copy()
-    left[:, :8] = True
+    left_half = NOTHING.copy()
+    left_half[:, :8] = True
     variation = StillVariation()
-    for step, moving in ((0.0, NOTHING), (0.01, left), (-0.02, NOTHING)):
+    for step, moving in ((0.0, NOTHING), (0.01, left_half), (-0.02, NOTHING)):
         image = GREY + step
         image[:, :8] += 10 * step  # pixels that moved once are not counted
         variation.add(image, GREY + step / 2, moving)
@@ -38,8 +38,10 @@ def test_still_variation__of_a_frozen_view_is_zero_and_of_its_recording_is_not()
 
 
 def test_still_variation__tolerates_false_alarms():
-    once, twice = NOTHING.copy(), NOTHING.copy()
-    once[:, :8], twice[:, :4] = True, True
+    once = NOTHING.copy()
+    twice = NOTHING.copy()
+    once[:, :8] = True
+    twice[:, :4] = True
     variation = StillVariation(false_alarms=0.1)
     for moving in (once, twice, *[NOTHING] * 8):
         variation.add(GREY, GREY, moving)
@@ -56,11 +58,11 @@ def test_still_variation__of_too_few_frames_or_pixels_is_nan():
 
 def test_recorded_change__is_distinguished_from_noise():
     scene = rng.random((*SIZE, 3))
-    before, after = (scene + rng.normal(0, 0.02, scene.shape) for _ in range(2))
+    image, next_image = (scene + rng.normal(0, 0.02, scene.shape) for _ in range(2))
     # Four deviations are exceeded by 6 in 100,000 pixels.
-    assert recorded_change(before, after).mean() < 0.01
-    after[4:14, 6:18] += 0.3
-    changed = recorded_change(before, after)
+    assert recorded_change(image, next_image).mean() < 0.01
+    next_image[4:14, 6:18] += 0.3
+    changed = recorded_change(image, next_image)
     assert changed[5:13, 7:17].all()
     assert not changed[18:].any()
 

@@ -56,31 +56,31 @@ def balanced(gains: np.ndarray, config: FitConfig = FIT, report: Report | None =
 
 @pytest.mark.slow
 def test_balance_cameras__finds_the_exposures_and_takes_them():
-    found = balanced(GAINS)
-    for exposure, gain in zip(found.exposures, GAINS, strict=True):
+    balance = balanced(GAINS)
+    for exposure, gain in zip(balance.exposures, GAINS, strict=True):
         # A tenth of the largest change of a tone, 0.075, is left.
         np.testing.assert_allclose(exposure(TONES), np.repeat(exposed(TONES, gain), 3, axis=1), atol=0.007)
-    assert found.taken
-    assert found.balanced_psnr > found.recorded_psnr + 5
-    assert "The cameras were balanced" in found.sentence
+    assert balance.taken
+    assert balance.balanced_psnr > balance.recorded_psnr + 5
+    assert "The cameras were balanced" in balance.sentence
 
 
 def test_balance_cameras__leaves_equal_cameras_alone_after_one_fit():
     fits = []
-    found = balanced(np.ones(4), report=lambda *now: fits.append(now))
-    assert not found.taken
-    assert max(exposure.change for exposure in found.exposures) < 0.003
+    balance = balanced(np.ones(4), report=lambda *now: fits.append(now))
+    assert not balance.taken
+    assert max(exposure.change for exposure in balance.exposures) < 0.003
     assert fits == [("Balancing cameras", 1, 8)]
-    assert "stay as recorded" in found.sentence
+    assert "stay as recorded" in balance.sentence
 
 
 @pytest.mark.slow
 def test_balance_cameras__judges_by_withheld_pixels(monkeypatch: pytest.MonkeyPatch):
     scores = iter((25.0, 25.05))
     monkeypatch.setattr("morgs_mi.fit.balance.mean_psnr", lambda *_: next(scores))
-    found = balanced(GAINS)
-    assert not found.taken
-    assert "balanced ones are no clear gain, withheld pixels have 25.05 dB instead of 25.00 dB" in found.sentence
+    balance = balanced(GAINS)
+    assert not balance.taken
+    assert "balanced ones are no clear gain, withheld pixels have 25.05 dB instead of 25.00 dB" in balance.sentence
 
 
 def test_balance_config__takes_at_most_a_quarter_of_the_steps_of_the_first_frame():
@@ -91,11 +91,11 @@ def test_balance_config__takes_at_most_a_quarter_of_the_steps_of_the_first_frame
 
 @pytest.mark.slow
 def test_balance_cameras__does_not_judge_where_balanced_cameras_are_wanted():
-    found = balanced(GAINS, replace(FIT, exposure="on"))
-    assert found.taken
-    assert np.isnan(found.recorded_psnr)
+    balance = balanced(GAINS, replace(FIT, exposure="on"))
+    assert balance.taken
+    assert np.isnan(balance.recorded_psnr)
 
 
 def test_balance__sentence_names_the_largest_change():
-    found = Balance((Exposure((1.1, 1, 1)), Exposure()), True)
-    assert found.sentence == "The cameras were balanced: exposures differ by up to 9.0 % of white."
+    balance = Balance((Exposure((1.1, 1, 1)), Exposure()), True)
+    assert balance.sentence == "The cameras were balanced: exposures differ by up to 9.0 % of white."

@@ -19,8 +19,8 @@ CONFIG = FitConfig(sh_degree=0, detail=DETAIL, dropping=0.0, density=DensityConf
 
 
 def planned(seconds: float, config: FitConfig = CONFIG) -> Plan:
-    given = [View(*view) for view in zip(views(), bytes_of(images_of(opaque_ball())), strict=True)]
-    return plan_first_frame(given, np.zeros((0, 3)), replace(config, first_frame_seconds=seconds))
+    views_of_ball = [View(*view) for view in zip(views(), bytes_of(images_of(opaque_ball())), strict=True)]
+    return plan_first_frame(views_of_ball, np.zeros((0, 3)), replace(config, first_frame_seconds=seconds))
 
 
 def numbers(plan: Plan) -> tuple[int, int]:

@@ -49,9 +49,9 @@ def additions(gaussians, error, **settings):
 
 def test_plan_additions__survivors_come_first_and_births_last():
     faint = dataclasses.replace(cloud(), logit_opacities=np.array([1, -9, 1, 1, -9, 1.0]))
-    found = additions(faint, [0, 9, 5, 1, 8, 3], births=1 / 3)
-    assert found.source.tolist() == [0, 2, 3, 5, -1, -1]
-    assert found.parent.tolist() == [0, 2, 3, 5, 2, 5]  # the survivors with the largest error
+    plan = additions(faint, [0, 9, 5, 1, 8, 3], births=1 / 3)
+    assert plan.source.tolist() == [0, 2, 3, 5, -1, -1]
+    assert plan.parent.tolist() == [0, 2, 3, 5, 2, 5]  # the survivors with the largest error
 
 
 @pytest.mark.parametrize(("births", "limit", "expected"), [(0, 100, 6), (0.5, 100, 9), (1, 100, 12), (1, 8, 8)])
@@ -72,34 +72,36 @@ def test_plan_additions__adds_none_without_error_and_never_prunes_all():
 
 
 def test_plan_growth__clones_small_gaussians_with_the_same_coverage():
-    before = cloud(scale=0.05)
-    after = apply_plan(before, growth(before, [0, 0, 0, 0, 0, 1]))
-    o, scales = np.asarray(after.opacities), np.asarray(after.scales)
+    gaussians = cloud(scale=0.05)
+    result = apply_plan(gaussians, growth(gaussians, [0, 0, 0, 0, 0, 1]))
+    o = np.asarray(result.opacities)
+    scales = np.asarray(result.scales)
     assert 1 - (1 - o[5]) * (1 - o[6]) == pytest.approx(0.6, rel=1e-5)
     assert_close(o[:5], np.full(5, 0.6), rtol=1e-6)
-    assert scales[6] == pytest.approx(np.asarray(before.scales)[5], rel=1e-5)
+    assert scales[6] == pytest.approx(np.asarray(gaussians.scales)[5], rel=1e-5)
 
 
 def test_plan_growth__splits_large_round_gaussians_and_keeps_means():
-    before = cloud(scale=1.0, shape=(1, 2, 3.9))
-    after = apply_plan(before, growth(before, [0, 0, 0, 0, 0, 1]))
-    assert np.asarray(after.scales)[5:] == pytest.approx(np.tile([1, 2, 3.9], (2, 1)) / 1.6, rel=1e-5)
-    assert_close(after.opacities, np.full(7, 0.6), rtol=1e-5)
-    assert np.array_equal(np.asarray(after.means)[:6], np.asarray(before.means))
+    gaussians = cloud(scale=1.0, shape=(1, 2, 3.9))
+    result = apply_plan(gaussians, growth(gaussians, [0, 0, 0, 0, 0, 1]))
+    assert np.asarray(result.scales)[5:] == pytest.approx(np.tile([1, 2, 3.9], (2, 1)) / 1.6, rel=1e-5)
+    assert_close(result.opacities, np.full(7, 0.6), rtol=1e-5)
+    assert np.array_equal(np.asarray(result.means)[:6], np.asarray(gaussians.means))
 
 
 def test_plan_growth__splits_large_long_gaussians_along_their_longest_axis():
-    before = cloud(scale=1.0, shape=(1, 2, 4.1))
-    after = apply_plan(before, growth(before, [0, 0, 0, 0, 0, 1]))
-    means, whole = np.asarray(after.means), np.asarray(before.means)
+    gaussians = cloud(scale=1.0, shape=(1, 2, 4.1))
+    result = apply_plan(gaussians, growth(gaussians, [0, 0, 0, 0, 0, 1]))
+    means = np.asarray(result.means)
+    whole = np.asarray(gaussians.means)
     apart = means[6] - means[5]
-    axes = Rotation.from_quat(np.asarray(before.quats)[5], scalar_first=True).as_matrix()
-    assert np.asarray(after.scales)[5:] == pytest.approx(np.tile([0.893, 2 * 0.893, 4.1 * 0.55], (2, 1)), rel=1e-5)
-    assert_close(after.opacities, [0.6] * 5 + [0.36] * 2, rtol=1e-5)
+    axes = Rotation.from_quat(np.asarray(gaussians.quats)[5], scalar_first=True).as_matrix()
+    assert np.asarray(result.scales)[5:] == pytest.approx(np.tile([0.893, 2 * 0.893, 4.1 * 0.55], (2, 1)), rel=1e-5)
+    assert_close(result.opacities, [0.6] * 5 + [0.36] * 2, rtol=1e-5)
     assert np.array_equal(means[:5], whole[:5])
     assert (means[5] + means[6]) / 2 == pytest.approx(whole[5], abs=1e-5)
     assert np.abs(apart @ axes) == pytest.approx([0, 0, 2 * 1.35 * 4.1], abs=1e-4)
-    assert np.asarray(after.logit_confidence)[6] == 5
+    assert np.asarray(result.logit_confidence)[6] == 5
 
 
 def test_plan_growth__leaves_the_space_before_near_planes_empty():
@@ -107,27 +109,27 @@ def test_plan_growth__leaves_the_space_before_near_planes_empty():
     z = np.where(np.arange(400) < 100, -2.0, -0.99)  # before and close behind the near plane at -1
     crowd = isotropic(np.stack([0 * z, 0 * z, z], 1), 0.05, 0.6, 0.5)
     plan = growth(crowd, np.ones(400), [camera])
-    after = apply_plan(crowd, plan)
+    result = apply_plan(crowd, plan)
     assert len(plan.source) - plan.num_births == 300
     assert plan.source[:300].tolist() == list(range(100, 400))
     assert plan.num_births == 300
-    assert np.asarray(after.means)[:, 2].min() >= -1
+    assert np.asarray(result.means)[:, 2].min() >= -1
     assert np.asarray(apply_plan(crowd, growth(crowd, np.ones(400))).means)[:, 2].min() < -2
 
 
 def test_plan_additions__births_are_faint_and_parents_unchanged():
-    before = cloud(scale=1.0)
-    after = apply_plan(before, additions(before, [0, 0, 0, 0, 0, 1]))
-    for name, value in after.numpy().items():
-        assert np.array_equal(value[:6], before.numpy()[name]), name
-    assert np.asarray(after.opacities)[6] == pytest.approx(0.1, rel=1e-5)
-    assert np.asarray(after.scales)[6] == pytest.approx(np.array([1, 2, 3]) / 1.6, rel=1e-5)
+    gaussians = cloud(scale=1.0)
+    result = apply_plan(gaussians, additions(gaussians, [0, 0, 0, 0, 0, 1]))
+    for name, value in result.numpy().items():
+        assert np.array_equal(value[:6], gaussians.numpy()[name]), name
+    assert np.asarray(result.opacities)[6] == pytest.approx(0.1, rel=1e-5)
+    assert np.asarray(result.scales)[6] == pytest.approx(np.array([1, 2, 3]) / 1.6, rel=1e-5)
 
 
 def test_density_plan__opaque_parents_have_finite_births():
-    before = dataclasses.replace(cloud(), logit_opacities=np.full(6, 40.0))
-    for found in (growth(before, np.ones(6)), additions(before, np.ones(6))):
-        for name, value in apply_plan(before, found).numpy().items():
+    gaussians = dataclasses.replace(cloud(), logit_opacities=np.full(6, 40.0))
+    for plan in (growth(gaussians, np.ones(6)), additions(gaussians, np.ones(6))):
+        for name, value in apply_plan(gaussians, plan).numpy().items():
             assert np.isfinite(value).all(), name
 
 
@@ -135,7 +137,7 @@ def test_plan_growth__draws_births_from_the_parents_density():
     """Whitened by the parent's axes, thousands of births have zero mean and unit covariance."""
     n = 4000
     one = cloud(1, scale=0.05)
-    found = growth(one.select(np.zeros(n, int)), np.ones(n))
+    plan = growth(one.select(np.zeros(n, int)), np.ones(n))
     w, x, y, z = (one.numpy()["quats"][0] / np.linalg.norm(one.numpy()["quats"][0])).astype(float)
     axes = np.array(
         [
@@ -144,7 +146,7 @@ def test_plan_growth__draws_births_from_the_parents_density():
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-    white = found.edits["means"][n:] @ axes / np.asarray(one.scales)
+    white = plan.edits["means"][n:] @ axes / np.asarray(one.scales)
     # Standard errors of 4000 draws are 0.016 for means and 0.022 for variances.
     assert np.abs(white.mean(0)).max() < 0.08
     assert np.abs(np.cov(white.T) - np.eye(3)).max() < 0.1
@@ -154,7 +156,7 @@ def test_resize_optimizer__keeps_moments_of_survivors_only():
     """After a plan that only adds and removes, survivors take the same steps as without it."""
     rng = np.random.default_rng(2)
     start, slope = rng.normal(size=(2, 6, 3)).astype(np.float32)
-    found = DensityPlan(np.array([0, 2, 5, 2]), np.array([0, 2, 5, -1]))
+    plan = DensityPlan(np.array([0, 2, 5, 2]), np.array([0, 2, 5, -1]))
 
     def run(rebuild):
         optimizer = adam({"x": mi.TensorXf(start)})
@@ -162,26 +164,27 @@ def test_resize_optimizer__keeps_moments_of_survivors_only():
         gradients = slope
         for step in range(8):
             if rebuild and step == 4:
-                resize_optimizer(optimizer, found)
-                gradients = slope[found.parent]
+                resize_optimizer(optimizer, plan)
+                gradients = slope[plan.parent]
             dr.backward(dr.sum(dr.square(optimizer["x"]) * mi.TensorXf(gradients), axis=None))
             optimizer.step()
         return np.asarray(values_of(optimizer)["x"])
 
-    whole, rebuilt = run(False), run(True)
+    whole = run(False)
+    rebuilt = run(True)
     assert rebuilt.shape == (4, 3)
-    assert np.array_equal(rebuilt[:3], whole[found.parent[:3]])
+    assert np.array_equal(rebuilt[:3], whole[plan.parent[:3]])
     assert not np.array_equal(rebuilt[3], rebuilt[1])
 
 
 def test_resize_optimizer__applies_edits_to_the_parameters():
-    before = cloud()
-    found = growth(before, np.ones(6))
-    optimizer = adam({"means": before.means, "log_scales": before.log_scales})
-    resize_optimizer(optimizer, found, found.edits)
-    after = apply_plan(before, found)
+    gaussians = cloud()
+    plan = growth(gaussians, np.ones(6))
+    optimizer = adam({"means": gaussians.means, "log_scales": gaussians.log_scales})
+    resize_optimizer(optimizer, plan, plan.edits)
+    result = apply_plan(gaussians, plan)
     for name, value in values_of(optimizer).items():
-        assert np.array_equal(np.asarray(value), np.asarray(getattr(after, name))), name
+        assert np.array_equal(np.asarray(value), np.asarray(getattr(result, name))), name
 
 
 def test_densification_scores__attribute_the_error_to_the_wrong_gaussian():
@@ -192,9 +195,9 @@ def test_densification_scores__attribute_the_error_to_the_wrong_gaussian():
     sh = np.full((6, 1, 3), 0.5, np.float32)
     sh[4] = -1.0
     wrong = dataclasses.replace(truth, sh_coeffs=sh)
-    found = densification_scores(wrong, [ActiveView(camera)], [Target(image)])
-    assert found.argmax() == 4
-    assert found[[0, 1, 2]].max() < 0.01 * found[4]
+    scores = densification_scores(wrong, [ActiveView(camera)], [Target(image)])
+    assert scores.argmax() == 4
+    assert scores[[0, 1, 2]].max() < 0.01 * scores[4]
     hidden = np.ones((48, 64), bool)
     hidden[:, 32:] = False
-    assert densification_scores(wrong, [ActiveView(camera)], [Target(image, hidden)]).max() < 0.01 * found[4]
+    assert densification_scores(wrong, [ActiveView(camera)], [Target(image, hidden)]).max() < 0.01 * scores[4]

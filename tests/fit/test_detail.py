@@ -38,7 +38,8 @@ def test_count_details__counts_the_cells_of_a_texture():
 
 
 def test_count_details__counts_valid_pixels_only():
-    image, mask = texture(), np.zeros((48, 64), bool)
+    image = texture()
+    mask = np.zeros((48, 64), bool)
     assert count_details(image, mask) == 0
     mask[:, :32] = True
     assert count_details(image, mask) == pytest.approx(count_details(image, None) / 2, rel=0.1)
@@ -52,7 +53,8 @@ def count(cameras, image: np.ndarray, points: np.ndarray, config: DetailConfig =
 
 
 def test_with_num_gaussians__counts_what_several_views_see_once():
-    (camera,), image = look_at_cameras([(0, 0, -4)], 40), texture()
+    (camera,) = look_at_cameras([(0, 0, -4)], 40)
+    image = texture()
     one = count([camera], image, POINTS)
     assert count([camera] * 3, image, POINTS) == pytest.approx(one, abs=1)
     beside = [c for x in (0, 9) for c in look_at_cameras([(x, 0, -4)], 40, target=(x, 0, 0))]
@@ -62,7 +64,8 @@ def test_with_num_gaussians__counts_what_several_views_see_once():
 
 
 def test_with_num_gaussians__stays_within_its_limits():
-    cameras, image = look_at_cameras(arc((-0.2, 0, 0.2), 3), 60), texture()
+    cameras = look_at_cameras(arc((-0.2, 0, 0.2), 3), 60)
+    image = texture()
     for limit in ({"least_gaussians": 5000}, {"most_gaussians": 20}):
         assert count(cameras, image, POINTS, replace(CONFIG, **limit)) == next(iter(limit.values()))
 

@@ -26,9 +26,9 @@ GAUSSIANS = isotropic(np.zeros((COUNT, 3)), 0.1, 0.3, np.zeros((COUNT, 1, 3)))
 @pytest.mark.parametrize("probability", [0.2, 0.5])
 def test_dropped__keeps_the_expected_opacity(probability: float):
     opacities = np.asarray(dropped(GAUSSIANS, probability, np.random.default_rng(0)).opacities)
-    kept = opacities > 1e-6
-    assert kept.mean() == pytest.approx(1 - probability, abs=0.03)
-    np.testing.assert_allclose(opacities[kept], 0.3 / (1 - probability), rtol=1e-5)
+    mask = opacities > 1e-6
+    assert mask.mean() == pytest.approx(1 - probability, abs=0.03)
+    np.testing.assert_allclose(opacities[mask], 0.3 / (1 - probability), rtol=1e-5)
 
 
 def test_dropped__has_no_opacity_above_one():
@@ -42,12 +42,12 @@ def test_dropped__passes_gradients_to_the_kept_alone():
     logits = mi.TensorXf(np.zeros(20, np.float32))
     dr.enable_grad(logits)
     few = GAUSSIANS.select(np.arange(20)).with_parameters({"logit_opacities": logits})
-    found = dropped(few, 0.5, np.random.default_rng(1))
-    dr.backward(dr.sum(found.opacities, axis=None))
-    kept = np.asarray(found.opacities) > 1e-6
+    survivors = dropped(few, 0.5, np.random.default_rng(1))
+    dr.backward(dr.sum(survivors.opacities, axis=None))
+    mask = np.asarray(survivors.opacities) > 1e-6
     # d(2 sigmoid(l)) / dl at l = 0; the largest opacity is 0.999, where nothing is passed on.
-    assert not np.asarray(dr.grad(logits))[~kept].any()
-    assert kept.any()
+    assert not np.asarray(dr.grad(logits))[~mask].any()
+    assert mask.any()
 
 
 def test_dropped__returns_the_same_without_probability():

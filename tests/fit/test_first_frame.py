@@ -37,7 +37,8 @@ def images():
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Gaussians]:
     """A list to which every step of a fit adds the Gaussians that it renders."""
-    steps, render = [], ActiveView.render
+    steps = []
+    render = ActiveView.render
 
     def spy(view, gaussians, *channels, **more):
         if dr.grad_enabled(gaussians.sh_coeffs):  # rounds of density control render without gradients
@@ -58,7 +59,8 @@ def values_of(gaussians: Gaussians) -> dict[str, bytes]:
 COLOR_ALONE = LearningRates(means=0, scales=0, quats=0, opacities=0, sh_dc=0.05, sh_rest=0)
 L1 = ObjectiveConfig(dssim_weight=0.0)
 SCHEDULED = dataclasses.replace(CONFIG, first_frame_rates=COLOR_ALONE, objective=L1)
-WHITE, DARK = [np.full((48, 64, 3), 255, np.uint8)], dataclasses.replace(ball(80), sh_coeffs=np.full((80, 1, 3), -1.0))
+WHITE = [np.full((48, 64, 3), 255, np.uint8)]
+DARK = dataclasses.replace(ball(80), sh_coeffs=np.full((80, 1, 3), -1.0))
 
 
 def lengths(drawn: list[Gaussians], found: FirstFrame) -> np.ndarray:
@@ -74,14 +76,14 @@ def test_fit_first_frame__reports_its_steps(images):
 
 
 def test_fit_first_frame__lets_the_rates_fall_to_the_final_one(drawn):
-    found = fit(WHITE, DARK, SCHEDULED)
-    assert_close(lengths(drawn, found), 0.05 * 0.1 ** (np.arange(8) / 8), rtol=1e-4)
+    result = fit(WHITE, DARK, SCHEDULED)
+    assert_close(lengths(drawn, result), 0.05 * 0.1 ** (np.arange(8) / 8), rtol=1e-4)
 
 
 def test_fit_first_frame__moves_means_by_fractions_of_the_extent(images, drawn):
     rates = dataclasses.replace(CONFIG.first_frame_rates, means=1e-3)
-    found = fit(images, ball(80), dataclasses.replace(CONFIG, first_frame_steps=1, first_frame_rates=rates))
-    shift = np.abs(np.asarray(found.gaussians.means) - np.asarray(drawn[0].means))
+    result = fit(images, ball(80), dataclasses.replace(CONFIG, first_frame_steps=1, first_frame_rates=rates))
+    shift = np.abs(np.asarray(result.gaussians.means) - np.asarray(drawn[0].means))
     # The extent is 3. The first step of Adam has the length of the rate where there is a gradient.
     assert np.median(shift) == pytest.approx(3e-3, rel=1e-3)
 
@@ -92,15 +94,15 @@ def test_fit_first_frame__moves_means_by_fractions_of_the_extent(images, drawn):
 def test_fit_first_frame__adds_sh_bands_at_equal_distances(images, drawn, monkeypatch):
     monkeypatch.setattr("morgs_mi.fit.first_frame._BAND", 0.15)
     config = dataclasses.replace(CONFIG, sh_degree=3, first_frame_steps=20)
-    found = fit(images, ball(50, sh_degree=3), config)
+    result = fit(images, ball(50, sh_degree=3), config)
     assert [gaussians.sh_degree for gaussians in drawn] == 3 * [0] + 3 * [1] + 3 * [2] + 11 * [3]
-    bands = np.abs(np.asarray(found.gaussians.sh_coeffs)).mean(axis=(0, 2))
+    bands = np.abs(np.asarray(result.gaussians.sh_coeffs)).mean(axis=(0, 2))
     assert bands[1:4].mean() > bands[4:9].mean() > bands[9:].mean() > 0
 
 
 def test_fit_first_frame__has_all_sh_bands_after_one_step(images):
-    found = fit(images, ball(50, sh_degree=3), FitConfig(sh_degree=3, first_frame_steps=1))
-    assert found.gaussians.sh_degree == 3
+    result = fit(images, ball(50, sh_degree=3), FitConfig(sh_degree=3, first_frame_steps=1))
+    assert result.gaussians.sh_degree == 3
 
 
 # ---- growth ----------------------------------------------------------------------------------------------
@@ -114,11 +116,11 @@ def test_density_rounds__lie_between_a_tenth_and_a_half():
 
 def test_fit_first_frame__grows_in_the_rounds_alone_and_to_the_number_that_is_given(images, drawn):
     config = FitConfig(sh_degree=0, first_frame_steps=20, num_gaussians=100, density=DensityConfig(rounds=3))
-    found = fit(images, ball(60), config)
+    result = fit(images, ball(60), config)
     counts = [len(gaussians) for gaussians in drawn]
     assert [step for step, (a, b) in enumerate(pairwise(counts), 1) if a != b] == density_rounds(config) == [2, 6, 10]
     assert counts == sorted(counts)
-    assert (counts[0], len(found.gaussians)) == (60, 100)
+    assert (counts[0], len(result.gaussians)) == (60, 100)
 
 
 @pytest.mark.slow
@@ -148,7 +150,8 @@ def test_fit_first_frame__prunes_what_is_invisible(images):
 def test_fit_first_frame__sees_images_of_half_the_size_until_it_has_grown(images, monkeypatch):
     monkeypatch.setattr("morgs_mi.fit.view._COARSE_WIDTH", 32)
     monkeypatch.setattr("morgs_mi.fit.view._MIN_SIDE", 24)
-    widths, render = [], ActiveView.render
+    widths = []
+    render = ActiveView.render
 
     def spy(view, gaussians, *channels, **more):
         if dr.grad_enabled(gaussians.sh_coeffs):
@@ -179,7 +182,8 @@ def test_fit_first_frame__does_not_see_pixels_that_are_masked(images):
     masks = [np.ones((48, 64), bool) for _ in images]
     spoiled = [image.copy() for image in images]
     for image, mask in zip(spoiled, masks, strict=True):
-        mask[10:30, 20:40], image[10:30, 20:40] = False, 1.0
+        mask[10:30, 20:40] = False
+        image[10:30, 20:40] = 1.0
     config = FitConfig(sh_degree=1, num_gaussians=90, first_frame_steps=12)
 
     def fitted(given):
@@ -189,14 +193,15 @@ def test_fit_first_frame__does_not_see_pixels_that_are_masked(images):
 
 
 def test_fit_first_frame__fits_views_of_different_sizes(images):
-    given, camera = problem(images, ball(80)), views()[1].resized(40, 30)
+    start = problem(images, ball(80))
+    camera = views()[1].resized(40, 30)
     small = View(camera, rendered(opaque_ball(), camera, RenderConfig()))
-    mixed = dataclasses.replace(given, views=(given.views[0], small, *given.views[2:]))
-    found = fit_first_frame(
+    mixed = dataclasses.replace(start, views=(start.views[0], small, *start.views[2:]))
+    result = fit_first_frame(
         mixed, dataclasses.replace(CONFIG, first_frame_steps=60), np.random.default_rng(0)
     ).gaussians
     for view in mixed.views:
-        errors = [np.abs(rendered(now, view.camera, RenderConfig()) - view.image).mean() for now in (ball(80), found)]
+        errors = [np.abs(rendered(g, view.camera, RenderConfig()) - view.image).mean() for g in (ball(80), result)]
         assert errors[1] < 0.5 * errors[0]
 
 
@@ -204,17 +209,17 @@ def test_fit_first_frame__fits_views_of_different_sizes(images):
 
 
 def test_fit_first_frame__leaves_gaussians_out_of_its_steps_but_not_of_the_result(images, drawn):
-    found = fit(images, ball(80), dataclasses.replace(CONFIG, dropping=0.25))
+    result = fit(images, ball(80), dataclasses.replace(CONFIG, dropping=0.25))
     left_out = np.array([np.asarray(gaussians.opacities) < 1e-6 for gaussians in drawn])
     assert left_out.mean() == pytest.approx(0.25, abs=0.05)
     assert len(np.unique(left_out, axis=0)) == len(drawn)  # others in each step
-    assert np.asarray(found.gaussians.opacities).min() > 0.01
+    assert np.asarray(result.gaussians.opacities).min() > 0.01
 
 
 def test_fit_first_frame__keeps_the_confidence(images):
     confidence = np.linspace(-2, 2, 80)
-    found = fit(images, dataclasses.replace(ball(80), logit_confidence=confidence), CONFIG).gaussians
-    assert_close(found.logit_confidence, np.float32(confidence))
+    gaussians = fit(images, dataclasses.replace(ball(80), logit_confidence=confidence), CONFIG).gaussians
+    assert_close(gaussians.logit_confidence, np.float32(confidence))
 
 
 @pytest.mark.slow
@@ -244,16 +249,18 @@ def halves() -> dict[int, np.ndarray]:
 
 
 def test_fit_confidence__follows_the_masks_of_its_key_views():
-    found, losses = learned(40, halves())
-    confidence, place = 1 / (1 + np.exp(-np.asarray(found.logit_confidence))), np.asarray(found.means)[:, 0]
-    front = np.asarray(found.means)[:, 2] < 0
+    gaussians, losses = learned(40, halves())
+    confidence = 1 / (1 + np.exp(-np.asarray(gaussians.logit_confidence)))
+    place = np.asarray(gaussians.means)[:, 0]
+    front = np.asarray(gaussians.means)[:, 2] < 0
     assert confidence[front & (place > 0.3)].mean() > 0.8
     assert confidence[front & (place < -0.3)].mean() < 0.2
     assert 0 < losses["mask"] < learned(4, halves())[1]["mask"]
 
 
 def test_fit_confidence__freezes_everything_else():
-    before, after = values_of(opaque_ball()), values_of(learned(4, halves())[0])
-    assert {name: after[name] for name in before if name != "logit_confidence"} == {
-        name: value for name, value in before.items() if name != "logit_confidence"
+    old_values = values_of(opaque_ball())
+    new_values = values_of(learned(4, halves())[0])
+    assert {name: new_values[name] for name in old_values if name != "logit_confidence"} == {
+        name: value for name, value in old_values.items() if name != "logit_confidence"
     }

@@ -17,23 +17,24 @@ def ring(count: int):
 
 
 def test_forecast__is_good_for_a_ring_of_many_cameras():
-    found = forecast(ring(40), NO_POINTS)
-    assert found.spacing == pytest.approx(9)
-    assert found.overlap > 0.95
-    assert "will be good: 40 cameras, 9 degrees apart" in found.sentence
+    result = forecast(ring(40), NO_POINTS)
+    assert result.spacing == pytest.approx(9)
+    assert result.overlap > 0.95
+    assert "will be good: 40 cameras, 9 degrees apart" in result.sentence
 
 
 def test_forecast__is_poor_for_four_cameras_60_degrees_apart():
     cameras = look_at_cameras(arc(np.deg2rad([-90, -30, 30, 90]), 4), 40)
-    found = forecast(cameras, NO_POINTS)
-    assert found.spacing == pytest.approx(60)
-    assert "Views between the cameras will be poor: 4 cameras, 60 degrees apart" in found.sentence
+    result = forecast(cameras, NO_POINTS)
+    assert result.spacing == pytest.approx(60)
+    assert "Views between the cameras will be poor: 4 cameras, 60 degrees apart" in result.sentence
 
 
 def test_forecast__measures_two_cameras_side_by_side_at_the_depth_of_the_points():
     cameras = [c for x in (-0.1, 0.1) for c in look_at_cameras([(x, 0, -4)], 40, target=(x, 0, 0))]
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))
-    near, far = forecast(cameras, points), forecast(cameras, points + np.array([0, 0, 4]))
+    near = forecast(cameras, points)
+    far = forecast(cameras, points + np.array([0, 0, 4]))
     assert near.spacing == pytest.approx(np.rad2deg(2 * np.arctan(0.1 / 4)), rel=0.1)
     assert far.spacing == pytest.approx(near.spacing / 2, rel=0.1)
     assert min(near.overlap, far.overlap) > 0.9
@@ -42,9 +43,9 @@ def test_forecast__measures_two_cameras_side_by_side_at_the_depth_of_the_points(
 
 def test_forecast__sees_that_cameras_share_nothing():
     cameras = [c for x in (-1, 1) for c in look_at_cameras([(0, 0, 0)], 40, target=(x, 0, 1))]
-    found = forecast(cameras, np.array([(-1, 0, 1), (1, 0, 1)]))
-    assert found.overlap == 0
-    assert "will be poor" in found.sentence
+    result = forecast(cameras, np.array([(-1, 0, 1), (1, 0, 1)]))
+    assert result.overlap == 0
+    assert "will be poor" in result.sentence
 
 
 def test_overlaps__are_the_shares_of_an_image_that_each_camera_sees():

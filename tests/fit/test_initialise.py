@@ -17,7 +17,8 @@ from tests.scenes.cameras import arc, look_at_cameras
 
 def few_points():
     """Return 40 points of a wall at z = 2 that fill the right half of the views, with their colours, and the views."""
-    rng, cameras = np.random.default_rng(0), look_at_cameras(arc((-0.2, 0.0, 0.2), 3), 60)
+    rng = np.random.default_rng(0)
+    cameras = look_at_cameras(arc((-0.2, 0.0, 0.2), 3), 60)
     points = np.stack([rng.uniform(0.2, 2, 40), rng.uniform(-2, 2, 40), np.full(40, 2.0)], axis=1)
     return (points, np.full((40, 3), 0.8)), [grey_view(camera) for camera in cameras]
 
@@ -50,10 +51,10 @@ def test_fill_points__adds_none_where_pixels_are_not_valid():
 @pytest.mark.parametrize("known", [0, MIN_POINTS - 1, MIN_POINTS, 40, 2000])
 def test_initial_points__are_given_ones_with_random_ones_where_these_are_few(known: int):
     (points, colors), views = few_points()
-    given = np.resize(points, (known, 3)), np.resize(colors, (known, 3))
-    found, found_colors = initial_points(views, given, 1000, np.random.default_rng(1))
-    assert found.shape == found_colors.shape == (1000, 3)
-    random = np.isclose(found_colors, 0.2).all(axis=1)
+    point_cloud = np.resize(points, (known, 3)), np.resize(colors, (known, 3))
+    result, result_colors = initial_points(views, point_cloud, 1000, np.random.default_rng(1))
+    assert result.shape == result_colors.shape == (1000, 3)
+    random = np.isclose(result_colors, 0.2).all(axis=1)
     expected = 1 if known < MIN_POINTS else 0.3 if known < 1000 else 0
     assert random.mean() >= expected
     assert (random.mean() > 0) == (expected > 0)
@@ -64,8 +65,8 @@ def test_initial_points__leave_the_space_before_near_planes_empty(known: int):
     (points, colors), views = few_points()
     views = [view._replace(camera=replace(view.camera, near=5.0)) for view in views]
     points = np.concatenate([points, points - (0, 0, 4)])
-    given = np.resize(points, (known, 3)), np.resize(colors, (known, 3))
-    chosen, _ = initial_points(views, given, 1000, np.random.default_rng(1))
+    point_cloud = np.resize(points, (known, 3)), np.resize(colors, (known, 3))
+    chosen, _ = initial_points(views, point_cloud, 1000, np.random.default_rng(1))
     assert len(chosen) > 950
     assert not in_empty_space([view.camera for view in views], chosen).any()
 
@@ -118,16 +119,16 @@ def test_seed_points__lie_on_valid_pixels_in_their_colours():
     np.testing.assert_allclose(colors, 0.2)
     shown = np.zeros(101, bool)
     for camera, mask in zip(cameras, masks, strict=True):
-        seen, pixels, _ = seen_points(camera, points)
+        rows_of_points, pixels, _ = seen_points(camera, points)
         columns, rows = pixels.astype(int).T
-        shown[seen] |= mask[rows, columns]
+        shown[rows_of_points] |= mask[rows, columns]
     assert shown.all()
 
 
 def test_seen_points__leaves_out_points_behind_and_beside_the_camera():
     (camera,) = look_at_cameras([(0, 0, -3)], 60)
-    inside, pixels, depths = seen_points(camera, np.array([(0, 0, 0), (0, 0, -6), (9, 0, 0)]))
-    assert inside.tolist() == [True, False, False]
+    mask, pixels, depths = seen_points(camera, np.array([(0, 0, 0), (0, 0, -6), (9, 0, 0)]))
+    assert mask.tolist() == [True, False, False]
     np.testing.assert_allclose(pixels, [(camera.width / 2, camera.height / 2)])
     np.testing.assert_allclose(depths, [3])
 
@@ -138,8 +139,9 @@ def test_in_light__points_get_the_median_colours_of_hdr_views():
     images = [np.full((30, 40, 3), light, np.float32) for light in (2.5, 2.6, 0.1)]
     masks = [None, np.ones((30, 40), bool), None]
     views = [View(*view) for view in zip(cameras, images, masks, strict=True)]
-    inside, outside = np.random.default_rng(0).uniform(-0.5, 0.5, (30, 3)), np.array([[90, 0, 0]])
-    points = np.concatenate([inside, outside]), np.full((31, 3), 0.75)
+    cube = np.random.default_rng(0).uniform(-0.5, 0.5, (30, 3))
+    outside = np.array([[90, 0, 0]])
+    points = np.concatenate([cube, outside]), np.full((31, 3), 0.75)
     expected = np.repeat([2.5, 0.75], (30, 1))[:, None] * np.ones(3)
     np.testing.assert_allclose(_in_light(points, views)[1], expected)
     assert _in_light(points, [View(camera, np.zeros((30, 40, 3), np.uint8)) for camera in cameras]) is points

@@ -18,7 +18,8 @@ from morgs_mi.method.objective import ObjectiveConfig
 from morgs_mi.method.ssim import Target
 from tests.scenes.ball import images_of, mean_psnr, opaque_ball, views
 
-RENDER, EXTENT = RenderConfig(), 3.0
+RENDER = RenderConfig()
+EXTENT = 3.0
 PLAIN = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
 
 
@@ -35,23 +36,25 @@ def test_fit_later_frame__reports_births_and_survivors(motion):
     """Half of the ball is new: births help, survivors stay in order, births come last."""
     truth = opaque_ball()
     images = images_of(truth)
-    before = truth.select(np.flatnonzero(truth.numpy()["means"][:, 0] < 0.3))
+    start = truth.select(np.flatnonzero(truth.numpy()["means"][:, 0] < 0.3))
     results = {}
     for births in (0.0, 0.3):
         density = DensityConfig(later_frames=True, births=births, min_error=0)
-        fitted = fit(before, images, FitConfig(sh_degree=0, epochs=24, density=density), motion)
-        found, source, losses = fitted.gaussians, fitted.source, fitted.losses
+        fitted = fit(start, images, FitConfig(sh_degree=0, epochs=24, density=density), motion)
+        gaussians = fitted.gaussians
+        source = fitted.source
+        losses = fitted.losses
         survivors = source[source >= 0]
-        assert len(source) == len(found)
+        assert len(source) == len(gaussians)
         assert np.array_equal(survivors, np.unique(survivors))
         assert (source[len(survivors) :] == -1).all()
-        assert (source == -1).sum() == round(births * len(before))
+        assert (source == -1).sum() == round(births * len(start))
         assert np.isfinite(losses["recon"])
-        raw = found.numpy()
-        moved = raw["means"][: len(survivors)] - before.numpy()["means"][survivors]
-        assert raw["motion"][: len(survivors)] == pytest.approx(moved, abs=1e-6), "the whole displacement"
+        raw = gaussians.numpy()
+        moves = raw["means"][: len(survivors)] - start.numpy()["means"][survivors]
+        assert raw["motion"][: len(survivors)] == pytest.approx(moves, abs=1e-6), "the whole displacement"
         assert raw["offset"].any() == motion.learn_offset
-        results[births] = mean_psnr(found, images)
+        results[births] = mean_psnr(gaussians, images)
     assert results[0.3] > results[0.0] + 0.05  # dB; runs differ by 1e-5
 
 
@@ -71,41 +74,43 @@ def test_fit_later_frame__adds_none_when_no_step_is_left_to_fit_them():
 
 def shifted(shift: tuple[float, float, float]) -> tuple[Gaussians, Gaussians, np.ndarray]:
     """Return a ball, the ball after a shift, and the shift."""
-    before, by = opaque_ball(), np.array(shift, np.float32)
-    return before, replace(before, means=np.asarray(before.means) + by), by
+    ball = opaque_ball()
+    by = np.array(shift, np.float32)
+    return ball, replace(ball, means=np.asarray(ball.means) + by), by
 
 
 def test_fit_later_frame__rigid_neighbours_move_alike():
-    before, truth, shift = shifted((0.06, -0.03, 0.02))
+    start, truth, shift = shifted((0.06, -0.03, 0.02))
     usual = FitConfig(sh_degree=0, epochs=8, density=DensityConfig(later_frames=False))
     preset = apply_preset(StreamConfig(fit=usual), "rigidity").fit
-    results = [fit(before, images_of(truth), config) for config in (usual, preset)]
+    results = [fit(start, images_of(truth), config) for config in (usual, preset)]
     free, rigid = (np.linalg.norm(np.asarray(r.gaussians.motion) - shift, axis=1).mean() for r in results)
     assert rigid < 0.5 * free
     assert results[1].losses.keys() == {"recon", "rigid", "rotation", "isometry"}
     for name in ("log_scales", "logit_opacities", "sh_coeffs"):
-        assert np.array_equal(getattr(results[1].gaussians, name), getattr(before, name)), "the preset moves alone"
+        assert np.array_equal(getattr(results[1].gaussians, name), getattr(start, name)), "the preset moves alone"
 
 
 def test_fit_later_frame__compares_the_neighbours_of_births_with_their_parents():
     """With births, there are more Gaussians after the round of density control than before it."""
     truth = opaque_ball()
-    before = truth.select(np.flatnonzero(truth.numpy()["means"][:, 0] < 0.3))
+    start = truth.select(np.flatnonzero(truth.numpy()["means"][:, 0] < 0.3))
     config = FitConfig(
         sh_degree=0,
         epochs=4,
         objective=ObjectiveConfig(rigid_weight=1.0),
         density=DensityConfig(births=0.3, min_error=0),
     )
-    found = fit(before, images_of(truth), config)
-    assert len(found.gaussians) > len(before)
-    assert np.isfinite(found.losses["rigid"])
+    result = fit(start, images_of(truth), config)
+    assert len(result.gaussians) > len(start)
+    assert np.isfinite(result.losses["rigid"])
 
 
 def test_initial_motion__continues_with_constant_velocity():
-    before, rng = replace(opaque_ball(), motion=np.full((400, 3), 0.1)), np.random.default_rng(0)
-    active = full_active_set(before, dict(enumerate(views())), RENDER)
-    assert initial_motion(before, active, {}, {}, PLAIN, rng) is None
-    start = initial_motion(before, active, {}, {}, replace(PLAIN, constant_velocity=True), rng)
+    previous_gaussians = replace(opaque_ball(), motion=np.full((400, 3), 0.1))
+    rng = np.random.default_rng(0)
+    active = full_active_set(previous_gaussians, dict(enumerate(views())), RENDER)
+    assert initial_motion(previous_gaussians, active, {}, {}, PLAIN, rng) is None
+    start = initial_motion(previous_gaussians, active, {}, {}, replace(PLAIN, constant_velocity=True), rng)
     assert start is not None
     assert np.array_equal(start.displacement, np.full((400, 3), 0.1, np.float32))

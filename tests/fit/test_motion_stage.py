@@ -41,23 +41,25 @@ def fit(config: FitConfig = FIT, start: MotionStart | None = None, share: float 
 
 
 def test_fit_later_frame__finds_the_motion_that_gaussians_share():
-    free, shared = fit_shifted(PLAIN), fit()
+    free = fit_shifted(PLAIN)
+    shared = fit()
     assert motion_error(shared) < 0.7 * motion_error(free)
     assert psnr_of(shared) > psnr_of(free)
     assert shared.epochs == free.epochs == FIT.epochs
 
 
 def test_fit_later_frame__continues_from_a_start():
-    exact, few = MotionStart(np.tile(SHIFT, (400, 1)), np.zeros(400, np.float32)), replace(FIT, epochs=2)
+    exact = MotionStart(np.tile(SHIFT, (400, 1)), np.zeros(400, np.float32))
+    few = replace(FIT, epochs=2)
     assert motion_error(fit(few, exact)) < 0.5 * motion_error(fit(few))
 
 
 def test_fit_later_frame__fits_the_model_alone_in_a_single_epoch():
-    found = fit(replace(FIT, epochs=1))
-    assert found.epochs == 1
-    assert found.losses["recon"] > 0
-    assert found.losses["length"] > 0
-    assert not np.asarray(found.gaussians.offset).any()
+    result = fit(replace(FIT, epochs=1))
+    assert result.epochs == 1
+    assert result.losses["recon"] > 0
+    assert result.losses["length"] > 0
+    assert not np.asarray(result.gaussians.offset).any()
 
 
 def test_fit_later_frame__shares_its_epochs_with_the_model():

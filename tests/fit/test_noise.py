@@ -42,7 +42,9 @@ def test_noise_of__is_finite_in_tiny_images(shape):
 
 
 def test_is_noisy__judges_by_the_mean_of_the_views():
-    rng, flat = np.random.default_rng(3), np.full((64, 64, 3), 0.5)
-    clean, noisy = bytes_of(flat), bytes_of(flat + rng.normal(0, 0.025, flat.shape))
+    rng = np.random.default_rng(3)
+    flat = np.full((64, 64, 3), 0.5)
+    clean = bytes_of(flat)
+    noisy = bytes_of(flat + rng.normal(0, 0.025, flat.shape))
     assert not is_noisy([clean, clean, noisy])
     assert is_noisy([clean, noisy, noisy])

@@ -30,7 +30,8 @@ def test_optimise__minimises_the_weighted_sum(decay):
 
 def test_optimise__steps_are_as_long_as_the_rate():
     """Adam's steps have the length of the rate, from the first to the last."""
-    start, path = {"x": mi.TensorXf(np.zeros(1, np.float32))}, []
+    start = {"x": mi.TensorXf(np.zeros(1, np.float32))}
+    path = []
 
     def slope(values, view):
         path.append(np.asarray(dr.detach(values["x"])).item())
@@ -43,7 +44,8 @@ def test_optimise__steps_are_as_long_as_the_rate():
 @pytest.mark.parametrize(("momentum", "needed"), [(0.9, 3), (0.5, 1)])
 def test_adam__momentum_delays_a_reversal(momentum, needed):
     """With less momentum, fewer opposite gradients reverse the steps."""
-    optimizer, path = adam({"x": mi.TensorXf(np.zeros(1, np.float32))}, momentum), [0.0]
+    optimizer = adam({"x": mi.TensorXf(np.zeros(1, np.float32))}, momentum)
+    path = [0.0]
 
     def slope(values, view):
         return {"slope": (1 if view else -1) * dr.sum(values["x"], axis=None)}
@@ -66,7 +68,8 @@ def test_optimise__continues_where_it_ended():
     """Twelve steps in one go and in two are the same steps."""
     ends = []
     for stages in ([12], [5, 7]):
-        optimizer, step = adam({"x": mi.TensorXf(np.zeros(3, np.float32))}), 0
+        optimizer = adam({"x": mi.TensorXf(np.zeros(3, np.float32))})
+        step = 0
         for length in stages:
             optimise(optimizer, {"x": 0.1}, bowl, Steps([0] * length, step, lambda step: 0.9**step))
             step += length

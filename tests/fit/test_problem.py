@@ -27,13 +27,13 @@ def large_view(mask: np.ndarray | None = None) -> View:
 def test_first_frame_problem__starts_from_the_points_with_the_settings_of_the_fit():
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (300, 3)), np.full((300, 3), 0.25)
     config = FitConfig(sh_degree=2, num_gaussians=100, density=DensityConfig(rounds=1))
-    given = [View(*view) for view in zip(views(), bytes_of(images_of(opaque_ball())), strict=True)]
-    found = FirstFrameProblem.of(given, points, config, RenderConfig(), np.random.default_rng(0))
-    assert (len(found.start), found.start.sh_degree) == (50, 2)  # half, as it grows to all
-    np.testing.assert_allclose(found.start.opacities, 0.3, rtol=1e-6)
-    assert found.points is points[0]
-    assert found.extent == scene_extent(views())
-    assert [camera.name for camera in found.cameras] == [camera.name for camera in views()]
+    views_of_ball = [View(*view) for view in zip(views(), bytes_of(images_of(opaque_ball())), strict=True)]
+    result = FirstFrameProblem.of(views_of_ball, points, config, RenderConfig(), np.random.default_rng(0))
+    assert (len(result.start), result.start.sh_degree) == (50, 2)  # half, as it grows to all
+    np.testing.assert_allclose(result.start.opacities, 0.3, rtol=1e-6)
+    assert result.points is points[0]
+    assert result.extent == scene_extent(views())
+    assert [camera.name for camera in result.cameras] == [camera.name for camera in views()]
 
 
 def test_first_frame_problem__only_takes_some_of_the_views():
@@ -52,10 +52,11 @@ def test_first_frame_problem__psnr_is_the_mean_over_its_views():
 
 
 def test_first_frame_problem__psnr_does_not_count_masked_pixels():
-    images, mask = bytes_of(images_of(opaque_ball())), np.ones((48, 64), bool)
+    images = bytes_of(images_of(opaque_ball()))
+    mask = np.ones((48, 64), bool)
     mask[:20] = False
     spoiled = [np.where(mask[..., None], image, 255) for image in images]
-    masked = [problem(given, masks=[mask] * 4).psnr(ball(80)) for given in (images, spoiled)]
+    masked = [problem(pictures, masks=[mask] * 4).psnr(ball(80)) for pictures in (images, spoiled)]
     assert masked[0] == masked[1] > problem(spoiled).psnr(ball(80)) + 3
 
 
@@ -86,8 +87,8 @@ def test_first_frame_problem__reduces_all_views():
 
 def test_withheld_blocks__divide_the_valid_pixels():
     valid = np.arange(160) < 120 * np.ones((120, 1))
-    kept, unseen = withheld_blocks([large_view(), large_view(valid)], 160, np.random.default_rng(0))
-    for allowed, a, b in zip((np.ones_like(valid), valid), kept, unseen, strict=True):
+    rest, unseen = withheld_blocks([large_view(), large_view(valid)], 160, np.random.default_rng(0))
+    for allowed, a, b in zip((np.ones_like(valid), valid), rest, unseen, strict=True):
         assert a.mask is not None
         assert b.mask is not None
         np.testing.assert_array_equal(a.mask ^ b.mask, allowed)
@@ -100,10 +101,10 @@ def test_first_frame_problem__has_an_extent_of_a_sixth_of_the_depth_at_least():
 
     def extent(spread: float) -> float:
         cameras = look_at_cameras([(x, 0, -12) for x in (-spread, spread)], 40)
-        given = [View(camera, np.zeros((camera.height, camera.width, 3), np.uint8)) for camera in cameras]
+        black_views = [View(camera, np.zeros((camera.height, camera.width, 3), np.uint8)) for camera in cameras]
         config = FitConfig(num_gaussians=50)
         cloud = points, np.full_like(points, 0.5)
-        return FirstFrameProblem.of(given, cloud, config, RenderConfig(), np.random.default_rng(0)).extent
+        return FirstFrameProblem.of(black_views, cloud, config, RenderConfig(), np.random.default_rng(0)).extent
 
     assert extent(0.1) == pytest.approx(12 / 6, rel=0.1)
     assert extent(5.0) == pytest.approx(1.1 * 5.0)

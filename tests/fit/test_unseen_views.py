@@ -21,8 +21,8 @@ IMAGES = bytes_of(images_of(opaque_ball()))
 
 def features(gaussians, images=IMAGES, masks=(None,) * 4, cameras=None) -> tuple[float, float]:
     """Return the disagreement and the training PSNR of the four views."""
-    given = tuple(map(View, cameras or views(), images, masks))
-    return features_of(gaussians, given, NO_POINTS, RenderConfig())
+    view_tuple = tuple(map(View, cameras or views(), images, masks))
+    return features_of(gaussians, view_tuple, NO_POINTS, RenderConfig())
 
 
 def squares(gaussians, *args, **kwargs) -> float:
@@ -98,7 +98,8 @@ def test_sentence__has_the_word_by_the_angles_alone_where_they_are_wide():
 
 
 def test_unseen_views__follow_from_the_features():
-    forecast, values = unseen_views(problem(IMAGES), ball(80)), features(ball(80))
+    forecast = unseen_views(problem(IMAGES), ball(80))
+    values = features(ball(80))
     assert (forecast.loss, forecast.margin) == (REGRESSION.loss(values), REGRESSION.margin(values))
     assert forecast.training_psnr == values[1]
     assert forecast.rig.cameras == 4

@@ -67,7 +67,8 @@ def test_gaussian_splat__backward_agrees_with_the_reference_for_every_parameter(
 def test_gaussian_splat__forward_agrees_with_the_reference(raw, weight, gradients):
     """All parameters change at once; the derivative of the loss is <gradient, direction>."""
     scene = make_mitsuba_scene(to_gaussians(raw), {"pixel_format": "rgba"}, aovs=AOVS)
-    params, rng = mi.traverse(scene), np.random.default_rng(2)
+    params = mi.traverse(scene)
+    rng = np.random.default_rng(2)
     slope = 0.0
     for name, gradient in gradients.items():
         # The direction is the sign of the gradient: no cancellation hides an error.
@@ -77,8 +78,8 @@ def test_gaussian_splat__forward_agrees_with_the_reference(raw, weight, gradient
         slope += np.vdot(gradient, direction)
     image = mi.render(scene, params)
     dr.forward_to(image)
-    found = np.sum(np.asarray(dr.grad(image), np.float64) * weight)
-    assert found == pytest.approx(slope, rel=tol.GRADIENT_REL)
+    derivative = np.sum(np.asarray(dr.grad(image), np.float64) * weight)
+    assert derivative == pytest.approx(slope, rel=tol.GRADIENT_REL)
 
 
 def test_gaussian_splat__backward_agrees_with_central_differences(raw):
@@ -129,7 +130,8 @@ def test_gaussian_splat__differentiates_filter_and_crop(raw):
     }
     scene = make_mitsuba_scene(to_gaussians(raw), {**film, "pixel_format": "luminance_alpha"}, aovs=AOVS)
     params = mi.traverse(scene)
-    data, rng = params["gaussians.data"], np.random.default_rng(5)
+    data = params["gaussians.data"]
+    rng = np.random.default_rng(5)
     g, v = (np.float32(rng.normal(size=s)) for s in ((12, 11, 6), dr.width(data)))
     dr.enable_grad(data)
     dr.set_grad(data, mi.Float(v))
@@ -151,7 +153,8 @@ INTRINSICS = {
 
 @pytest.mark.parametrize("name", INTRINSICS)
 def test_gaussian_splat__gradient_of_the_sensors_intrinsics(raw, name):
-    camera, scene = make_sensor_camera(), make_mitsuba_scene(to_gaussians(raw))
+    camera = make_sensor_camera()
+    scene = make_mitsuba_scene(to_gaussians(raw))
     viewmat, K = (np.float32(matrix).astype(np.float64) for matrix in (camera.viewmat, camera.K))
 
     def loss(values):
@@ -217,15 +220,15 @@ def test_gaussian_splat__backward_uses_the_rendering_of_the_same_parameters(raw,
     calls = counting_renders(monkeypatch)
     dr.backward(dr.sum(dr.square(mi.render(scene, params)), axis=None))
     assert len(calls) == 1
-    kept = np.array(dr.grad(opacities))
-    assert np.abs(kept).max() > 0
+    derivative = np.array(dr.grad(opacities))
+    assert np.abs(derivative).max() > 0
 
     # Only the last rendering is kept: the earlier one of two images is rendered again.
     dr.set_grad(opacities, 0)
     images = [mi.render(scene, params) for _ in range(2)]
     dr.backward(dr.sum(dr.square(images[0]), axis=None) + dr.sum(dr.square(images[1]), axis=None))
     assert len(calls) == 1 + 2 + 1
-    assert_close(np.array(dr.grad(opacities)), 2 * kept, rtol=1e-6)
+    assert_close(np.array(dr.grad(opacities)), 2 * derivative, rtol=1e-6)
 
 
 def test_gaussian_splat__backward_renders_what_has_changed_since(raw):

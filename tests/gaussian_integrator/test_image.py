@@ -49,7 +49,8 @@ def test_gaussian_splat__has_the_settings_of_the_rasteriser(raw, settings):
 
 def test_gaussian_splat__channels_agree_with_the_reference_under_their_exr_names(raw):
     scene = make_mitsuba_scene(to_gaussians(raw), {"pixel_format": "rgba"}, aovs=AOVS)
-    image, expected = np.asarray(mi.render(scene)), expected_image(raw)
+    image = np.asarray(mi.render(scene))
+    expected = expected_image(raw)
     solid = expected[..., 3:4] > 0.02
     assert_close(image, expected, atol=tol.IMAGE_ABS * np.abs(expected).max(), where=solid)
     fields = [field.name for field in scene.sensors()[0].film().bitmap().struct_()]
@@ -84,7 +85,9 @@ def test_gaussian_splat__crop_equals_that_of_the_full_image(raw):
 @pytest.mark.parametrize("axis", ["x", "y", "diagonal", "smaller", "larger"])
 def test_gaussian_splat__supports_a_field_of_view_along_any_axis(raw, axis):
     camera = make_sensor_camera()
-    W, H, f = camera.width, camera.height, camera.K[0, 0]
+    W = camera.width
+    H = camera.height
+    f = camera.K[0, 0]
     extent = {"x": W, "y": H, "diagonal": np.hypot(W, H), "smaller": min(W, H), "larger": max(W, H)}[axis]
     sensor = {"fov_axis": axis, "fov": float(np.rad2deg(2 * np.arctan(0.5 * extent / f)))}
     image = mi.render(make_mitsuba_scene(to_gaussians(raw), sensor=sensor))
@@ -133,13 +136,14 @@ def test_gaussian_splat__renders_shapes_of_several_degrees_as_one_cloud():
     one = make_mitsuba_scene(to_gaussians(raw), aovs=AOVS)
     assert_close(mi.render(scene), mi.render(one), atol=tol.IMAGE_ABS)
 
-    params, expected = mi.traverse(scene), mi.traverse(one)
+    params = mi.traverse(scene)
+    expected = mi.traverse(one)
     for p, keys in ((params, ["shape0.data", "shape1.data", "shape2.data"]), (expected, ["gaussians.data"])):
         dr.enable_grad([p[key] for key in keys])
     for s, p in ((scene, params), (one, expected)):
         dr.backward(dr.sum(dr.square(mi.render(s, p)[..., :3]), axis=None))
-    found = np.concatenate([np.asarray(dr.grad(params[f"shape{i}.data"])) for i in range(3)])
-    assert_close(found, dr.grad(expected["gaussians.data"]), rtol=tol.GRADIENT_REL)
+    gradient = np.concatenate([np.asarray(dr.grad(params[f"shape{i}.data"])) for i in range(3)])
+    assert_close(gradient, dr.grad(expected["gaussians.data"]), rtol=tol.GRADIENT_REL)
 
 
 def test_gaussian_splat__agrees_with_mitsubas_own_integrator():
@@ -170,9 +174,7 @@ def test_gaussian_splat__renders_a_new_attribute_of_the_table(raw):
     assert np.abs(image[..., 3]).max() > 0
     assert_close(image[..., 3], image[..., 4])
     assert_close(image[..., 5:], rasterize(gaussians, make_sensor_camera(), ("normal",))["normal"], atol=tol.IMAGE_ABS)
-    integrator, bare = (
-        mi.load_dict({"type": "gaussian_splat", "aovs": "roughness"}),
-        make_mitsuba_scene(to_gaussians(raw)),
-    )
+    integrator = mi.load_dict({"type": "gaussian_splat", "aovs": "roughness"})
+    bare = make_mitsuba_scene(to_gaussians(raw))
     with pytest.raises(ValueError, match=r"must have `roughness` \[N, 1\] with N=10, got only"):
         integrator.render(bare)

@@ -49,9 +49,11 @@ def test_gaussian_splat__reads_props_of_an_xml_scene(raw):
 
 
 def test_gaussian_splat__ignores_emitters_with_one_warning(raw, caplog):
-    shape, sensor = ellipsoids(to_gaussians(raw)), make_sensor_camera().sensor()
+    shape = ellipsoids(to_gaussians(raw))
+    sensor = make_sensor_camera().sensor()
     scene = {"type": "scene", "gaussians": shape, "sensor": sensor, "integrator": {"type": "gaussian_splat"}}
-    dark, lit = mi.load_dict(scene), mi.load_dict({**scene, "sky": {"type": "constant"}})
+    dark = mi.load_dict(scene)
+    lit = mi.load_dict({**scene, "sky": {"type": "constant"}})
     with caplog.at_level(logging.WARNING):
         images = [np.asarray(mi.render(s)) for s in (dark, lit, lit)]
     np.testing.assert_array_equal(images[0], images[1])
@@ -73,8 +75,8 @@ for variant in ("scalar_rgb", "llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
     except ValueError as error:
         print("\n>", error)
 """
-    found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
-    assert [line for line in found.splitlines() if line.startswith(">")] == [
+    output = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    assert [line for line in output.splitlines() if line.startswith(">")] == [
         "> gaussian_splat: expected a variant such as 'llvm_ad_rgb' or 'cuda_ad_rgb', got 'scalar_rgb'; call "
         "mi.set_variant() before the scene is loaded.",
         "> llvm_ad_rgb ['depth.Y']",
@@ -221,11 +223,11 @@ def test_gaussian_splat__differentiates_a_batch_of_sensors(raw):
     data = params["gaussians.data"]
     dr.enable_grad(data)
     dr.backward(dr.sum(dr.square(mi.render(scene, params)), axis=None))
-    together = np.array(dr.grad(data))
+    gradient = np.array(dr.grad(data))
     dr.set_grad(data, 0)
     for sensor in apart:
         dr.backward(dr.sum(dr.square(mi.render(scene, params, sensor=sensor)), axis=None))
-    assert_close(together, np.array(dr.grad(data)), rtol=1e-5)
+    assert_close(gradient, np.array(dr.grad(data)), rtol=1e-5)
 
 
 def test_gaussian_splat__refuses_a_batch_with_a_border(raw):

@@ -20,13 +20,14 @@ def round_trip(path, gaussians: Gaussians) -> Gaussians:
 
 @pytest.mark.parametrize("degree", range(4))
 def test_read_compressed_ply__returns_what_was_written_up_to_the_steps(tmp_path, degree):
-    before = splats(300, degree)
-    after = round_trip(tmp_path / "g.compressed.ply", before)
-    old, new = before.numpy(), after.numpy()
+    gaussians = splats(300, degree)
+    result = round_trip(tmp_path / "g.compressed.ply", gaussians)
+    old = gaussians.numpy()
+    new = result.numpy()
     extent = np.ptp(old["means"], axis=0).max()
     assert_close(new["means"], old["means"], atol=0.51 * extent / 1023)
     assert_close(new["log_scales"], old["log_scales"], atol=0.51 * np.ptp(old["log_scales"], axis=0).max() / 1023)
-    assert_close(np.asarray(after.opacities), np.asarray(before.opacities), atol=0.51 / 255)
+    assert_close(np.asarray(result.opacities), np.asarray(gaussians.opacities), atol=0.51 / 255)
     units = old["quats"] / np.linalg.norm(old["quats"], axis=1, keepdims=True)
     # The largest component follows from three with steps of sqrt(2) / 1023 and is at least a half.
     assert_close(np.abs((units * new["quats"]).sum(axis=1)), 1, atol=1e-5)
@@ -50,7 +51,8 @@ def test_write_compressed_ply__has_the_bits_of_the_layout(tmp_path):
     vertices = file["vertex"]
     assert vertices["packed_position"].tolist() == [0, 2**32 - 1, 1024 << 21 | 512 << 11 | 512]
     assert vertices["packed_scale"].tolist() == [0, 2**32 - 1, 1024 << 21 | 2047]
-    zero, half = 512, 512 + 362  # round(1023 / 2) upwards, and sqrt(1/2) / 2 of 1023 beyond it
+    zero = 512  # round(1023 / 2) upwards
+    half = 512 + 362  # sqrt(1/2) / 2 of 1023 beyond it
     rotations = vertices["packed_rotation"].tolist()
     assert rotations[:2] == [zero << 20 | zero << 10 | zero, 2 << 30 | zero << 20 | zero << 10 | zero]
     low = 1023 - half

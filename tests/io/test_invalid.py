@@ -67,7 +67,8 @@ def test_without_invalid__names_rotations_of_zero(caplog):
 
 def test_read_splats__accepts_sizes_of_zero_and_opacities_of_one(tmp_path, caplog):
     raw = splats(N).numpy()
-    raw["log_scales"][0], raw["log_scales"][1] = -np.inf, -1e30
+    raw["log_scales"][0] = -np.inf
+    raw["log_scales"][1] = -1e30
     raw["logit_opacities"][:2] = np.inf, -np.inf
     write_ply(tmp_path / "f.ply", Gaussians(**raw))
     assert len(read_splats(tmp_path / "f.ply")) == N

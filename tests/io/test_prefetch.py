@@ -82,17 +82,18 @@ def test_prefetched__closes_the_source() -> None:
 
 
 def test_prefetched__yields_the_newest_item_of_a_source_that_cannot_wait() -> None:
-    made, taken = [], threading.Event()
+    made = []
+    release = threading.Event()
 
     def items():
         for i in range(50):
             made.append(i)
             yield i
-            taken.wait(10)
+            release.wait(10)
 
     ahead = prefetched(items(), newest=True)
     assert next(ahead) == 0
-    taken.set()
+    release.set()
     wait_until(lambda: len(made) == 50)
     time.sleep(0.02)
     assert list(ahead) == [49]

@@ -31,7 +31,8 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def folder(tmp_path: Path) -> Iterator[Path]:
     """A capture in a folder, which is also at the URL."""
-    folder, system = write_recording(tmp_path / "clip", 8), fsspec.filesystem("memory")
+    folder = write_recording(tmp_path / "clip", 8)
+    system = fsspec.filesystem("memory")
     (folder / "truth").mkdir()
     (folder / "truth" / "much.npz").write_bytes(bytes(10))
     system.put(str(folder), "/bucket/clip", recursive=True)
@@ -40,7 +41,8 @@ def folder(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_load_capture__reads_a_url_like_a_folder(folder: Path) -> None:
-    local, remote = load_capture(folder), load_capture(URL)
+    local = load_capture(folder)
+    remote = load_capture(URL)
     assert (remote.names, remote.num_frames, remote.path.name) == (local.names, local.num_frames, "clip")
     np.testing.assert_array_equal(remote.points, local.points)
     for ours, theirs in zip(remote.frames(), local.frames(), strict=True):
@@ -83,14 +85,16 @@ def test_fetched__leaves_empty_files_elsewhere(tmp_path: Path) -> None:
 class Refusing(fsspec.AbstractFileSystem):
     """A file system that refuses to list its files."""
 
-    protocol, error = "refusing", PermissionError("Access Denied")
+    protocol = "refusing"
+    error = PermissionError("Access Denied")
 
     def ls(self, path, detail=True, **options):
         raise self.error
 
 
 class Silent(Refusing):
-    protocol, error = "silent", TimeoutError()
+    protocol = "silent"
+    error = TimeoutError()
 
 
 @pytest.mark.parametrize(
@@ -198,12 +202,13 @@ def first_images(url: str) -> list[np.ndarray]:
 @pytest.mark.parametrize("versions", [("Last-Modified",), ("ETag",), ("ETag", "Last-Modified"), ()])
 def test_mirrored__reuses_http_files_only_while_their_versions_are_equal(server: Server, tmp_path, versions) -> None:
     server.versions = versions
-    before = load_capture(server.url).cameras[0].K[0, 0]
+    focal_length = load_capture(server.url).cameras[0].K[0, 0]
     server.fetched.clear()
-    assert load_capture(server.url).cameras[0].K[0, 0] == before
+    assert load_capture(server.url).cameras[0].K[0, 0] == focal_length
     assert bool(server.fetched) == (not versions)
     file = tmp_path / "clip" / "sparse" / "0" / "cameras.txt"
-    text, old = file.read_text(), f" {before:g}"[:2]
+    text = file.read_text()
+    old = f" {focal_length:g}"[:2]
     file.write_text(text.replace(f"PINHOLE 32 24{old}", "PINHOLE 32 24 9"))  # as many bytes as before
     os.utime(file, (1e9, 1e9))
     assert load_capture(server.url).cameras[0].K[0, 0] > 90

@@ -15,7 +15,9 @@ from morgs_mi.io.video import FolderReader, VideoReader, natural_key, open_frame
 from morgs_mi.io.video_writer import PLAYABLE, write_video
 from tests.scenes.captures import write_timed_video
 
-HEIGHT, WIDTH, COUNT = 32, 48, 6
+HEIGHT = 32
+WIDTH = 48
+COUNT = 6
 
 
 def clip(height: int = HEIGHT, width: int = WIDTH, count: int = COUNT) -> list[np.ndarray]:

@@ -7,7 +7,8 @@ import pytest
 
 from morgs_mi.loop.image_status import image_status
 
-H, W = 48, 64
+H = 48
+W = 64
 NAMES = ("a", "b", "c")
 
 
@@ -38,8 +39,8 @@ RIG = views(scene(0), scene(1), scene(2))
     ],
 )
 def test_image_status__names_views_of_one_colour(image: np.ndarray, words: str) -> None:
-    for before in ({}, RIG):
-        (problem,) = image_status(NAMES, before, {**RIG, 1: image})
+    for previous_status in ({}, RIG):
+        (problem,) = image_status(NAMES, previous_status, {**RIG, 1: image})
         assert problem.startswith(words)
         assert "--without" in problem
 

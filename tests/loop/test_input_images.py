@@ -47,10 +47,10 @@ def test_copied_images__flag_of_a_bitmap_counts():
 
 
 def test_copied_images__owns_its_memory():
-    for given in (LIGHT.copy(), GREY.copy()):
-        result = copied(given)
+    for image in (LIGHT.copy(), GREY.copy()):
+        result = copied(image)
         expected = result.copy()
-        given[:] = 0
+        image[:] = 0
         np.testing.assert_array_equal(result, expected)
 
 
@@ -92,8 +92,8 @@ def test_observe_frame__first_frame_determines_the_display_exposure():
     first = observed([LIGHT])
     white = np.percentile(LIGHT.max(axis=-1), 99)
     assert first.history.display_exposure == pytest.approx(-np.log2(white))
-    later = observed([100 * LIGHT], first.history)
-    assert later.history.display_exposure == first.history.display_exposure
+    observation = observed([100 * LIGHT], first.history)
+    assert observation.history.display_exposure == first.history.display_exposure
 
 
 def test_observe_frame__bytes_are_compared_and_shown_alike():

@@ -89,16 +89,17 @@ def test_PRESETS__have_the_names_of_the_option() -> None:
     ],
 )
 def test_apply_preset__gives_the_rows_of_the_paper(name, epochs, modules, lifted) -> None:
-    given = StreamConfig(fit=FitConfig(num_gaussians=77), motion=MotionConfig(key_views=12), seed=3)
-    config = apply_preset(given, name)
-    fit, motion = config.fit, config.motion
+    base = StreamConfig(fit=FitConfig(num_gaussians=77), motion=MotionConfig(key_views=12), seed=3)
+    config = apply_preset(base, name)
+    fit = config.fit
+    motion = config.motion
     assert fit == FitConfig(num_gaussians=77, epochs=epochs, decay_means_rate=lifted)
     assert (motion.learn_motion, motion.learn_offset, motion.learn_confidence) == modules
     assert (motion.lift_flow, motion.propagate_motion, motion.key_views) == (lifted, lifted, 12)
     assert (motion.refine_start, motion.search_motion) == (lifted, lifted)
     assert (motion.lift_confidence, motion.two_gates) == (lifted, lifted)
     assert config.render == RenderConfig(first_order_motion=not lifted)
-    assert (config.codec, config.seed) == (given.codec, 3)
+    assert (config.codec, config.seed) == (base.codec, 3)
 
 
 def test_apply_preset__overrides_earlier_settings_and_later_ones_override_it() -> None:
@@ -198,8 +199,8 @@ def test_apply_values__replaces_only_what_is_named() -> None:
 def test_apply_values__builds_and_removes_an_optional_config() -> None:
     assert apply_values(Branch(), {"extra": {"count": 5}}).extra == Leaf(count=5)
     assert apply_values(Branch(extra=Leaf(count=5)), {"extra": "none"}).extra is None
-    given = Branch(extra=Leaf(count=5))
-    assert apply_values(given, {"extra": {"on": True}}) == replace(given, extra=Leaf(count=5, on=True))
+    branch = Branch(extra=Leaf(count=5))
+    assert apply_values(branch, {"extra": {"on": True}}) == replace(branch, extra=Leaf(count=5, on=True))
 
 
 @pytest.mark.parametrize(

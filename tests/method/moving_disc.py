@@ -24,7 +24,8 @@ def moving_disc(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return I_{t-1}, I_t [H, W, 3] and the disc's mask [H, W] in frame t; `shift` is (x, y) in pixels."""
     rng = np.random.default_rng(seed)
-    background, disc = texture(height, width, 1), texture(height, width, 2) * (1.0, 0.6, 0.4)
+    background = texture(height, width, 1)
+    disc = texture(height, width, 2) * (1.0, 0.6, 0.4)
     y, x = np.mgrid[:height, :width]
     frames = []
     for dx, dy in ((0, 0), shift):

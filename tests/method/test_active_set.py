@@ -16,7 +16,9 @@ from morgs_mi.method.ssim import Target
 from tests.scenes.cameras import arc, look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
 
-RENDER, EXTENT, V = RenderConfig(), 3.0, 5
+RENDER = RenderConfig()
+EXTENT = 3.0
+V = 5
 PLAIN = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
 CHANNELS = {view: ("color",) for view in range(V)}
 HIDDEN = 300  # the wall's Gaussians come first
@@ -99,8 +101,8 @@ def test_find_active_set__covers_what_appears_in_front_of_a_static_wall(before, 
     for min_explained in (0.0, 1.0):
         monkeypatch.setattr("morgs_mi.method.active_set._EXPLAINED", min_explained)
         config = ActiveSetConfig(min_responsibility=0.5)
-        found = find_active_set(wall, cameras(), changes(wall, before), CHANNELS, RENDER, config)
-        counts.append(len(found.indices))
+        active_set = find_active_set(wall, cameras(), changes(wall, before), CHANNELS, RENDER, config)
+        counts.append(len(active_set.indices))
     assert counts[0] < counts[1]
 
 
@@ -110,8 +112,8 @@ def test_find_active_set__draws_what_hardly_changed_in_some_views_only(before, a
     def drawn(quiet_views, quiet=0.9):
         monkeypatch.setattr("morgs_mi.method.active_set._QUIET", quiet)
         config = ActiveSetConfig(quiet_views=quiet_views)
-        found = find_active_set(before, cameras(), changed, CHANNELS, RENDER, config)
-        return found, {view: found.views[view].region.mask for view in range(V)}
+        active_set = find_active_set(before, cameras(), changed, CHANNELS, RENDER, config)
+        return active_set, {view: active_set.views[view].region.mask for view in range(V)}
 
     every, everywhere = drawn(V)
     some, masks = drawn(2)
@@ -126,8 +128,8 @@ def test_find_active_set__keeps_what_moved_for_one_more_frame(before):
     """Its confidence can fall in that frame."""
     logits = np.where(np.arange(len(before)) == 7, 2.0, -2.0)
     nothing = {view: np.zeros((96, 128), bool) for view in range(V)}
-    moved = replace(before, logit_confidence=logits)
-    assert find_active_set(moved, cameras(), nothing, CHANNELS, RENDER).indices.tolist() == [7]
+    previous_gaussians = replace(before, logit_confidence=logits)
+    assert find_active_set(previous_gaussians, cameras(), nothing, CHANNELS, RENDER).indices.tolist() == [7]
 
 
 def test_find_active_set__takes_everything_where_most_pixels_changed(before):
@@ -141,7 +143,8 @@ def test_find_active_set__takes_everything_where_most_pixels_changed(before):
 def test_fit_later_frame__with_the_active_set_equals_the_full_fit(before, after, grows):
     """Error of the moved image, and the survivors: static Gaussians are unchanged to the bit."""
     density = DensityConfig(later_frames=grows, births=0.05, min_error=0)
-    config, truth = FitConfig(sh_degree=0, epochs=12, density=density), images_of(after)
+    config = FitConfig(sh_degree=0, epochs=12, density=density)
+    truth = images_of(after)
     active = find_active_set(before, cameras(), changes(before, after), CHANNELS, RENDER)
     errors = {}
     for name, some in (("whole", full_active_set(before, cameras(), RENDER)), ("active", active)):
@@ -158,14 +161,15 @@ def test_fit_later_frame__with_the_active_set_equals_the_full_fit(before, after,
     assert not np.asarray(fitted.gaussians.motion)[where].any()
     assert not np.asarray(fitted.gaussians.offset)[where].any()
     for attribute in ("means", "quats", "log_scales", "sh_coeffs", "logit_opacities"):
-        found = np.asarray(getattr(fitted.gaussians, attribute))[where]
-        assert np.array_equal(found, np.asarray(getattr(before, attribute))[still]), attribute
+        values = np.asarray(getattr(fitted.gaussians, attribute))[where]
+        assert np.array_equal(values, np.asarray(getattr(before, attribute))[still]), attribute
 
 
 @pytest.mark.parametrize("density", [DensityConfig(births=0.0), DensityConfig(later_frames=False)])
 def test_fit_later_frame__ends_early_once_the_loss_stops_falling(before, density):
     """With and without density control; a tolerance of 0 switches it off."""
-    whole, images = full_active_set(before, cameras(), RENDER), images_of(before)
+    whole = full_active_set(before, cameras(), RENDER)
+    images = images_of(before)
     config = FitConfig(sh_degree=0, epochs=12, density=density)
     assert fit(before, whole, images, replace(config, early_stopping_tolerance=0)).epochs == 12
     assert fit(before, whole, images, config).epochs < 12

@@ -49,9 +49,9 @@ def scores_of(wall, views, targets):
 
 def test_attribution__is_what_back_projection_gives(scene, monkeypatch):
     monkeypatch.setattr("morgs_mi.method.attribution._NOISE", 0.0)
-    found, gradient = scores_of(*scene)
+    scores, gradient = scores_of(*scene)
     expected = densification_scores(*scene)
-    assert_close(found, expected, rtol=1e-4)
+    assert_close(scores, expected, rtol=1e-4)
     assert not gradient.any(), "the images must not change because of the scores"
 
 
@@ -62,11 +62,11 @@ def test_attribution__ignores_noise():
     view = ActiveView(look_at_cameras([(0, 0.3, -3)], 45, 80, 60)[0])
     image = np.asarray(view.render(wall).color) + rng.normal(0, 0.02, (60, 80, 3)).astype(np.float32)
     image[20:30, 30:40] += 0.5
-    found = scores_of(wall, [view], [Target(np.clip(image, 0, 1))])[0]
+    scores = scores_of(wall, [view], [Target(np.clip(image, 0, 1))])[0]
     pixels, _ = view.camera.project(np.asarray(wall.means))
     near = (np.abs(pixels - (35, 25)) < (12, 12)).all(axis=1)
-    assert found[~near].max() < 0.02 * found[near].max()
-    assert found[~near].max() < DensityConfig().min_error
+    assert scores[~near].max() < 0.02 * scores[near].max()
+    assert scores[~near].max() < DensityConfig().min_error
 
 
 def test_attribution__without_a_step_is_zero():

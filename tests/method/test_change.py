@@ -10,7 +10,9 @@ from morgs_mi.method.change import ChangeConfig, box_around, change_mask, moving
 from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FramePair
 
-H, W, NOISE = 120, 160, 3.0
+H = 120
+W = 160
+NOISE = 3.0
 
 
 def noisy_image(rng, level=0.0, disc=None, noise=NOISE):
@@ -29,11 +31,11 @@ def test_change_mask__ignores_noise():
 
 def test_change_mask__finds_a_disc():
     rng = np.random.default_rng(1)
-    found = change_mask(noisy_image(rng), noisy_image(rng, disc=(70, 50)))
+    mask = change_mask(noisy_image(rng), noisy_image(rng, disc=(70, 50)))
     y, x = np.mgrid[:H, :W]
-    inside = (x - 70) ** 2 + (y - 50) ** 2 < 15**2
-    assert found[inside].all()
-    assert not found[(x - 70) ** 2 + (y - 50) ** 2 > 19**2].any()
+    disc = (x - 70) ** 2 + (y - 50) ** 2 < 15**2
+    assert mask[disc].all()
+    assert not mask[(x - 70) ** 2 + (y - 50) ** 2 > 19**2].any()
     valid = x < 70
     assert not change_mask(noisy_image(rng), noisy_image(rng, disc=(70, 50)), valid)[~valid].any()
 
@@ -53,43 +55,46 @@ def test_change_mask__ignores_noise_that_is_larger_in_some_places():
     """As in a penumbra of a path tracer: 20 grey levels in a part of the image, 3 elsewhere."""
     rng = np.random.default_rng(6)
     noise = np.where((np.mgrid[:H, :W][1] > 100)[..., None], 20, NOISE)
-    before, after = (np.clip(128 + rng.normal(0, 1, (H, W, 3)) * noise, 0, 255).astype(np.uint8) for _ in range(2))
-    assert change_mask(before, after).mean() < 0.005
+    image, next_image = (np.clip(128 + rng.normal(0, 1, (H, W, 3)) * noise, 0, 255).astype(np.uint8) for _ in range(2))
+    assert change_mask(image, next_image).mean() < 0.005
 
 
 def test_change_mask__finds_a_change_of_colour_alone():
     rng = np.random.default_rng(7)
-    before, after = noisy_image(rng), noisy_image(rng)
-    after[40:60, 50:80] = np.clip(after[40:60, 50:80] + np.array([12, -12, 0]), 0, 255)
-    found = change_mask(before, after)
-    assert found[42:58, 52:78].all()
-    assert not found[:34].any()
+    image = noisy_image(rng)
+    next_image = noisy_image(rng)
+    next_image[40:60, 50:80] = np.clip(next_image[40:60, 50:80] + np.array([12, -12, 0]), 0, 255)
+    mask = change_mask(image, next_image)
+    assert mask[42:58, 52:78].all()
+    assert not mask[:34].any()
 
 
 def test_change_mask__takes_floats_like_bytes():
     rng = np.random.default_rng(8)
-    before, after = noisy_image(rng), noisy_image(rng, disc=(70, 50))
-    floats = change_mask(before / np.float32(255), after / np.float32(255))
-    assert np.mean(floats != change_mask(before, after)) < 0.01
+    image = noisy_image(rng)
+    next_image = noisy_image(rng, disc=(70, 50))
+    floats = change_mask(image / np.float32(255), next_image / np.float32(255))
+    assert np.mean(floats != change_mask(image, next_image)) < 0.01
 
 
 @pytest.mark.parametrize(("size", "step"), [(8, (2, 2, 2)), (16, (3, -3, 0))])
 def test_change_mask__ignores_blocks_of_compressed_video(size: int, step: tuple[int, int, int]):
     rng = np.random.default_rng(9)
-    before, after = noisy_image(rng, noise=1), noisy_image(rng, noise=1)
+    image = noisy_image(rng, noise=1)
+    next_image = noisy_image(rng, noise=1)
     flips = rng.random((-(-H // size), -(-W // size))) < 0.1
-    after += (np.kron(flips, np.ones((size, size)))[:H, :W, None] * step).astype(np.int8).view(np.uint8)
-    assert not change_mask(before, after).any()
-    assert change_mask(before, after, config=ChangeConfig(min_peak=0)).mean() > 0.02
+    next_image += (np.kron(flips, np.ones((size, size)))[:H, :W, None] * step).astype(np.int8).view(np.uint8)
+    assert not change_mask(image, next_image).any()
+    assert change_mask(image, next_image, config=ChangeConfig(min_peak=0)).mean() > 0.02
 
 
 def test_change_mask__has_the_faint_parts_of_a_clear_change():
     """A shadow that fades from 8 grey levels to none, and another of 2."""
-    before = np.full((H, W, 3), 120.0)
-    after = before.copy()
-    after[30:50, 40:120] -= np.linspace(8, 0, 80)[:, None]
-    after[80:100, 40:120] -= 2
-    mask = change_mask(before / 255, after / 255)
+    image = np.full((H, W, 3), 120.0)
+    next_image = image.copy()
+    next_image[30:50, 40:120] -= np.linspace(8, 0, 80)[:, None]
+    next_image[80:100, 40:120] -= 2
+    mask = change_mask(image / 255, next_image / 255)
     assert mask[32:48, 42:105].all()
     assert not mask[70:].any()
 
@@ -100,22 +105,25 @@ def test_moving_region__includes_what_changes_enclose():
     cv2.rectangle(change, (20, 20), (60, 50), 1, 2)
     change[30:33, 15:25] = 0
     cv2.line(change, (100, 20), (100, 90), 1, 2)
-    found = moving_region(change.astype(bool))
-    assert found[22:49, 22:59].all()
-    assert not found[:, 105:].any()
-    assert not found[60:, :95].any()
+    region = moving_region(change.astype(bool))
+    assert region[22:49, 22:59].all()
+    assert not region[:, 105:].any()
+    assert not region[60:, :95].any()
 
 
 def test_update_reference__detects_slow_changes_once_they_add_up():
     """A quarter of a grey level per frame is never detected between two frames, but against the reference."""
     rng = np.random.default_rng(3)
-    reference, last, waited = noisy_image(rng), noisy_image(rng), []
+    reference = noisy_image(rng)
+    last = noisy_image(rng)
+    waited = []
     for frame in range(1, 60):
-        now = noisy_image(rng, level=0.25 * frame)
-        assert not change_mask(last, now).mean() > 0.01
-        change = change_mask(reference, now)
+        image = noisy_image(rng, level=0.25 * frame)
+        assert not change_mask(last, image).mean() > 0.01
+        change = change_mask(reference, image)
         waited.append(change.mean())
-        reference, last = update_reference(reference, now, change), now
+        reference = update_reference(reference, image, change)
+        last = image
     assert max(waited[:4]) < 0.01
     # 15 grey levels in all. Five standard deviations are 2.5, and the noise lets some pixels pass earlier.
     assert 5 < sum(waited) < 20  # of 59 frames
@@ -134,36 +142,39 @@ def test_box_around__adds_margins():
 def test_observe_key_views__flow_in_a_box_equals_that_of_the_whole_image(with_masks):
     """Inside a patch that moves by 4 px."""
     rng = np.random.default_rng(4)
-    before, after = noisy_image(rng), noisy_image(rng)
+    image = noisy_image(rng)
+    next_image = noisy_image(rng)
     patch = cv2.resize(rng.integers(0, 255, (8, 8, 3), np.uint8), (32, 32), interpolation=cv2.INTER_CUBIC)
-    before[34:66, 54:86], after[34:66, 58:90] = patch, patch
-    box = box_around(change_mask(before, after))
+    image[34:66, 54:86] = patch
+    next_image[34:66, 58:90] = patch
+    box = box_around(change_mask(image, next_image))
     masks = "grabcut" if with_masks else None
-    found = [observe_key_views({0: FramePair(after, before, box=b)}, "dis", masks)[0] for b in (None, box)]
-    whole, part = (observation.motion[40:60, 64:84] for observation in found)
+    observations = [observe_key_views({0: FramePair(next_image, image, box=b)}, "dis", masks)[0] for b in (None, box)]
+    whole, part = (observation.motion[40:60, 64:84] for observation in observations)
     assert np.median(whole, axis=(0, 1)) == pytest.approx((4, 0), abs=0.2)
     assert np.median(np.linalg.norm(whole - part, axis=-1)) < 0.2
     outside = np.ones((H, W), bool)
     outside[box] = False
     assert outside.any()
-    assert not found[1].reliable[outside].any()
-    assert not found[1].motion[outside].any()
+    assert not observations[1].reliable[outside].any()
+    assert not observations[1].motion[outside].any()
 
 
 def test_observe_key_views__what_has_not_changed_has_not_moved():
     """Flow bleeds over the edges of a patch that moves by 6 px before a plain wall."""
     rng = np.random.default_rng(9)
-    before, after = np.full((2, H, W, 3), 120, np.uint8)
+    image, next_image = np.full((2, H, W, 3), 120, np.uint8)
     patch = cv2.resize(rng.integers(0, 255, (8, 8, 3), np.uint8), (32, 32), interpolation=cv2.INTER_CUBIC)
-    before[34:66, 54:86], after[34:66, 60:92] = patch, patch
-    region = moving_region(change_mask(before, after))
+    image[34:66, 54:86] = patch
+    next_image[34:66, 60:92] = patch
+    region = moving_region(change_mask(image, next_image))
     observed = {
-        name: observe_key_views({0: FramePair(after, before, region=r)})[0]
+        name: observe_key_views({0: FramePair(next_image, image, region=r)})[0]
         for name, r in (("plain", None), ("with region", region))
     }
     assert np.linalg.norm(observed["plain"].motion[~region], axis=-1).max() > 1
-    found = observed["with region"]
-    assert not found.motion[~region].any()
-    assert not found.forward_flow[~region].any()
-    assert found.reliable[~region].all()
-    assert np.median(found.motion[40:60, 66:86], axis=(0, 1)) == pytest.approx((6, 0), abs=0.2)
+    observation = observed["with region"]
+    assert not observation.motion[~region].any()
+    assert not observation.forward_flow[~region].any()
+    assert observation.reliable[~region].all()
+    assert np.median(observation.motion[40:60, 66:86], axis=(0, 1)) == pytest.approx((6, 0), abs=0.2)

@@ -10,8 +10,10 @@ from morgs_mi.method.cohesion import share_confidence
 from morgs_mi.method.motion_config import MotionConfig
 from tests.scenes.gaussians import isotropic, random_sheet
 
-STILL, WEIGHT = -2.0, MotionConfig().cohesion_weight
-GREY, RED = (0.5, 0.5, 0.5), (0.7, 0.2, 0.2)
+STILL = -2.0
+WEIGHT = MotionConfig().cohesion_weight
+GREY = (0.5, 0.5, 0.5)
+RED = (0.7, 0.2, 0.2)
 # The wall has 600 Gaussians, the object 100.
 WALL = np.arange(700) < 600
 
@@ -35,21 +37,21 @@ def shared(gaussians, logit, weight=WEIGHT):
 
 
 def test_share_confidence__fills_gaps_in_an_object_that_is_separate_in_space():
-    found = shared(wall_and_object(1.0, GREY), moving(0.7))
-    assert (found[~WALL] > 0).all()
-    assert (found[WALL] < -1).all()
+    confidence = shared(wall_and_object(1.0, GREY), moving(0.7))
+    assert (confidence[~WALL] > 0).all()
+    assert (confidence[WALL] < -1).all()
 
 
 def test_share_confidence__fills_gaps_in_an_object_that_is_separate_in_color():
-    found = shared(wall_and_object(0.0, RED), moving(0.7))
-    assert (found[~WALL] > 0).mean() > 0.95
-    assert (found[WALL] < 0).mean() > 0.98
+    confidence = shared(wall_and_object(0.0, RED), moving(0.7))
+    assert (confidence[~WALL] > 0).mean() > 0.95
+    assert (confidence[WALL] < 0).mean() > 0.98
 
 
 def test_share_confidence__rejects_evidence_on_a_part_of_a_static_surface():
     """A shadow on the wall: its Gaussians are the patch's, some of them dark."""
-    found = shared(wall_and_object(0.0, GREY, brightness=0.6), moving(0.7))
-    assert (found < 0).mean() > 0.98
+    confidence = shared(wall_and_object(0.0, GREY, brightness=0.6), moving(0.7))
+    assert (confidence < 0).mean() > 0.98
 
 
 def test_share_confidence__is_not_stopped_by_transparent_neighbours():
@@ -58,8 +60,8 @@ def test_share_confidence__is_not_stopped_by_transparent_neighbours():
     ghosts = isotropic(random_sheet(rng, 100, 0.3, 1.0), 0.05, 0.01)
     everything = Gaussians.concatenate([gaussians, ghosts])
     logit = np.concatenate([moving(0.7), np.full(100, STILL, np.float32)])
-    found = share_confidence(everything, np.arange(800), logit, STILL, WEIGHT)
-    assert (found[:700][~WALL] > 0).all()
+    confidence = share_confidence(everything, np.arange(800), logit, STILL, WEIGHT)
+    assert (confidence[:700][~WALL] > 0).all()
 
 
 def test_share_confidence__leaves_a_gaussian_unlike_its_neighbours_alone():
@@ -67,8 +69,8 @@ def test_share_confidence__leaves_a_gaussian_unlike_its_neighbours_alone():
     red = isotropic([[0, 0, 0]], 0.05, 0.9, ((np.array([RED]) - 0.5) / SH_C0)[:, None])
     logit = np.full(701, STILL, np.float32)
     logit[-1] = 2.0
-    found = share_confidence(Gaussians.concatenate([wall, red]), np.arange(701), logit, STILL, WEIGHT)
-    assert found[-1] > 1.9
+    confidence = share_confidence(Gaussians.concatenate([wall, red]), np.arange(701), logit, STILL, WEIGHT)
+    assert confidence[-1] > 1.9
 
 
 def test_share_confidence__solves_its_equation(monkeypatch):
@@ -88,14 +90,16 @@ def test_share_confidence__solves_its_equation(monkeypatch):
 
 
 def test_share_confidence__counts_all_but_the_chosen_as_still():
-    gaussians, chosen = wall_and_object(0.0, GREY), np.flatnonzero(~WALL)
-    found = share_confidence(gaussians, chosen, np.full(100, 2.0, np.float32), STILL, WEIGHT)
-    assert found.shape == (100,)
-    assert (found < 0).all()
+    gaussians = wall_and_object(0.0, GREY)
+    chosen = np.flatnonzero(~WALL)
+    confidence = share_confidence(gaussians, chosen, np.full(100, 2.0, np.float32), STILL, WEIGHT)
+    assert confidence.shape == (100,)
+    assert (confidence < 0).all()
 
 
 def test_share_confidence__returns_the_logits_without_neighbours_or_weight():
-    one, logit = isotropic(np.zeros((1, 3)), 0.1, 0.9), np.array([1.5], np.float32)
+    one = isotropic(np.zeros((1, 3)), 0.1, 0.9)
+    logit = np.array([1.5], np.float32)
     np.testing.assert_array_equal(share_confidence(one, np.arange(1), logit, STILL, WEIGHT), logit)
     alone = shared(wall_and_object(0.0, GREY), moving(0.5), 0)
     np.testing.assert_array_equal(alone, moving(0.5))

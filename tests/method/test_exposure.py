@@ -43,8 +43,8 @@ def test_fit_exposure__is_not_drawn_by_a_third_of_moved_pixels():
 def test_fit_exposure__explains_a_factor_on_the_light_within_a_grey_level():
     colors = scene()
     brighter = encode_light(1.2 * decode_light(colors))
-    found = fit_exposure(colors, brighter)
-    assert np.abs(found(colors) - brighter).max() < 1 / 255
+    exposure = fit_exposure(colors, brighter)
+    assert np.abs(exposure(colors) - brighter).max() < 1 / 255
 
 
 def test_fit_exposure__is_the_prior_without_well_exposed_pixels():
@@ -57,13 +57,15 @@ def test_fit_exposure__is_the_prior_of_images_that_do_not_show_the_same():
 
 def test_fit_exposure__explains_a_change_by_a_factor_on_the_light_where_images_have_no_contrast():
     dull = encode_light(np.random.default_rng(0).uniform(0.2, 0.21, (40, 40, 3)))
-    found = fit_exposure(dull, encode_light(1.1 * decode_light(dull)))
-    np.testing.assert_allclose(found(scene()), encode_light(1.1 * decode_light(scene())), atol=0.003)
+    exposure = fit_exposure(dull, encode_light(1.1 * decode_light(dull)))
+    np.testing.assert_allclose(exposure(scene()), encode_light(1.1 * decode_light(scene())), atol=0.003)
 
 
 def test_fit_exposure__ignores_masked_pixels():
-    recorded, mask = WARM(scene()), np.ones((60, 80), bool)
-    recorded[:45], mask[:45] = 0.5, False
+    recorded = WARM(scene())
+    mask = np.ones((60, 80), bool)
+    recorded[:45] = 0.5
+    mask[:45] = False
     assert_close(fit_exposure(scene(), recorded, mask, weights=(0, 0)), WARM, 1e-9)
 
 
@@ -75,19 +77,20 @@ def test_exposure__corrects_to_the_colours_of_the_scene():
 
 
 def test_exposure__composes():
-    first, second = Exposure((1.2, 1, 1), (0.1, 0, 0)), Exposure((0.5, 2, 1), (0, 0, 0.3))
+    first = Exposure((1.2, 1, 1), (0.1, 0, 0))
+    second = Exposure((0.5, 2, 1), (0, 0, 0.3))
     np.testing.assert_allclose(second.after(first)(scene()), second(first(scene())))
     np.testing.assert_allclose(second.after(first).without(first)(scene()), second(scene()))
 
 
 def test_centred__leaves_differences_between_cameras():
-    given = {0: WARM, 3: Exposure((1.3, 1.2, 1.1), (0.1, 0.1, 0.0))}
-    found = centred(given)
+    truth = {0: WARM, 3: Exposure((1.3, 1.2, 1.1), (0.1, 0.1, 0.0))}
+    exposures = centred(truth)
     middle = np.full(3, 0.4)
-    np.testing.assert_allclose(np.mean([e(middle) for e in found.values()], axis=0), middle, atol=0.01)
+    np.testing.assert_allclose(np.mean([e(middle) for e in exposures.values()], axis=0), middle, atol=0.01)
     # The map from one camera's image to another's is the same.
     colors = scene()
-    np.testing.assert_allclose(found[3](found[0].inverse(colors)), given[3](given[0].inverse(colors)))
+    np.testing.assert_allclose(exposures[3](exposures[0].inverse(colors)), truth[3](truth[0].inverse(colors)))
 
 
 def test_centred__is_not_moved_by_a_few_dark_cameras():
@@ -113,7 +116,8 @@ def test_common_change__needs_three_cameras():
 
 @pytest.mark.parametrize("noise", [0, 2])
 def test_follow_exposure__is_none_without_a_change(noise: int):
-    rng, image = np.random.default_rng(2), as_bytes(scene(size=(120, 160)))
+    rng = np.random.default_rng(2)
+    image = as_bytes(scene(size=(120, 160)))
     noisy = np.clip(image + rng.normal(0, noise, image.shape).round(), 0, 255).astype(np.uint8)
     noisy[:30] = 90  # something moved
     assert follow_exposure(image, noisy).change < LEAST_CHANGE

@@ -32,8 +32,8 @@ def cloud(n=200, seed=0):
 
 def uniform_flow(camera, shift):
     """The flow of a plane at the scene's depth that moves by `shift`."""
-    before, after = (camera.project(p)[0] for p in (np.zeros(3), shift))
-    flow = np.broadcast_to(np.float32(after - before), (camera.height, camera.width, 2)).copy()
+    start, end = (camera.project(p)[0] for p in (np.zeros(3), shift))
+    flow = np.broadcast_to(np.float32(end - start), (camera.height, camera.width, 2)).copy()
     everywhere = np.ones((camera.height, camera.width), bool)
     return FlowObservation(flow, everywhere, flow, everywhere)
 
@@ -63,7 +63,8 @@ def test_lift_flow__gives_no_motion_without_observations():
 
 def test_lift_flow__gives_no_motion_for_noise():
     """A tenth of a pixel, as smooth as flow is, independent in every view."""
-    rng, flows = np.random.default_rng(0), {}
+    rng = np.random.default_rng(0)
+    flows = {}
     for view, camera in enumerate(rig()):
         flow = cv2.resize(rng.normal(0, 0.1, (6, 8, 2)), (camera.width, camera.height)).astype(np.float32)
         everywhere = np.ones((camera.height, camera.width), bool)
@@ -99,9 +100,9 @@ def test_lift_flow__counts_flow_that_varies_within_a_gaussian_as_weak_evidence()
     """The same mean flow everywhere, uniform or alternating from column to column as far as it bleeds."""
     flows = {view: uniform_flow(camera, SHIFT) for view, camera in enumerate(rig())}
     varying = {}
-    for view, known in flows.items():
-        spread = np.where(np.arange(known.forward_flow.shape[1]) % 2, 0, 2)[None, :, None]
-        varying[view] = replace(known, forward_flow=known.forward_flow * spread.astype(np.float32))
+    for view, observation in flows.items():
+        spread = np.where(np.arange(observation.forward_flow.shape[1]) % 2, 0, 2)[None, :, None]
+        varying[view] = replace(observation, forward_flow=observation.forward_flow * spread.astype(np.float32))
     rigid, bleeding = (lifted_from(cloud(), each).logit_confidence for each in (flows, varying))
     assert np.median(rigid) > 1.9
     assert np.median(bleeding) < np.median(rigid) - 1

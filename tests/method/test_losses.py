@@ -32,7 +32,8 @@ def item(value):
 
 def slow_recon(image, target, weight, window=11, sigma=1.5):
     """Eq. 2 in float64, window by window, zeros outside."""
-    x, y = image.astype(np.float64), target.astype(np.float64)
+    x = image.astype(np.float64)
+    y = target.astype(np.float64)
     r = window // 2
     g = np.exp(-0.5 * (np.arange(-r, r + 1) / sigma) ** 2)
     g = np.outer(g / g.sum(), g / g.sum())[..., None]
@@ -40,9 +41,13 @@ def slow_recon(image, target, weight, window=11, sigma=1.5):
     total = 0.0
     for i in range(x.shape[0]):
         for j in range(x.shape[1]):
-            a, b = px[i : i + window, j : j + window], py[i : i + window, j : j + window]
-            ma, mb = (g * a).sum((0, 1)), (g * b).sum((0, 1))
-            va, vb, cab = (g * a * a).sum((0, 1)) - ma**2, (g * b * b).sum((0, 1)) - mb**2, (g * a * b).sum((0, 1))
+            a = px[i : i + window, j : j + window]
+            b = py[i : i + window, j : j + window]
+            ma = (g * a).sum((0, 1))
+            mb = (g * b).sum((0, 1))
+            va = (g * a * a).sum((0, 1)) - ma**2
+            vb = (g * b * b).sum((0, 1)) - mb**2
+            cab = (g * a * b).sum((0, 1))
             top = (2 * ma * mb + 1e-4) * (2 * (cab - ma * mb) + 9e-4)
             total += (top / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4))).sum()
     return (1 - weight) * np.abs(x - y).mean() + weight * (1 - total / x.size)
@@ -51,8 +56,8 @@ def slow_recon(image, target, weight, window=11, sigma=1.5):
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
 def test_recon_loss__agrees_with_the_reference(images, weight):
     image, target = images
-    found = item(recon_loss(mi.TensorXf(image), Target(target), weight))
-    assert found == pytest.approx(slow_recon(image, target, weight), rel=tol.LOSS_REL)
+    loss = item(recon_loss(mi.TensorXf(image), Target(target), weight))
+    assert loss == pytest.approx(slow_recon(image, target, weight), rel=tol.LOSS_REL)
 
 
 def test_recon_loss__of_identical_images_is_zero(images):
@@ -66,7 +71,8 @@ def test_recon_loss__gradient_agrees_with_central_differences(images, weight):
     x = mi.TensorXf(image)
     dr.enable_grad(x)
     dr.backward(recon_loss(x, Target(target), weight))
-    grad, rng = np.asarray(dr.grad(x), np.float64), np.random.default_rng(1)
+    grad = np.asarray(dr.grad(x), np.float64)
+    rng = np.random.default_rng(1)
     for _ in range(3):
         # Steps that do not cross the kink of |I - I*|.
         v = rng.normal(size=SIZE) * (np.abs(image - target) > 2e-3)
@@ -92,10 +98,10 @@ def test_recon_loss__dssim_agrees_with_the_metric_away_from_the_border():
     for image in (a, b):
         image[12:-12, 12:-12] = rng.uniform(0, 1, (24, 24, 3))
     dssim = item(recon_loss(mi.TensorXf(a), Target(b), 1.0))
-    inside = ssim(a, b)
+    similarity = ssim(a, b)
     full = 1 - dssim
     # Outside, SSIM is 1 in both; they differ in the number of such pixels that they count.
-    assert (1 - full) * 48**2 == pytest.approx((1 - inside) * _counted(48), rel=1e-3)
+    assert (1 - full) * 48**2 == pytest.approx((1 - similarity) * _counted(48), rel=1e-3)
 
 
 def _counted(side):
@@ -125,9 +131,10 @@ def test_flow_loss__has_a_finite_gradient_where_both_agree():
 
 def test_mask_loss__is_the_mean_absolute_difference():
     rng = np.random.default_rng(4)
-    confidence, mask = rng.uniform(size=(6, 5, 1)).astype(np.float32), rng.uniform(size=(6, 5)) > 0.5
-    found = item(mask_loss(mi.TensorXf(confidence), mi.TensorXf(mask.astype(np.float32))))
-    assert found == pytest.approx(np.abs(confidence[..., 0] - mask).mean(), rel=1e-5)
+    confidence = rng.uniform(size=(6, 5, 1)).astype(np.float32)
+    mask = rng.uniform(size=(6, 5)) > 0.5
+    loss = item(mask_loss(mi.TensorXf(confidence), mi.TensorXf(mask.astype(np.float32))))
+    assert loss == pytest.approx(np.abs(confidence[..., 0] - mask).mean(), rel=1e-5)
 
 
 def test_offset_loss__is_the_mean_l1_norm_in_scene_extents():
@@ -139,16 +146,17 @@ def test_offset_loss__is_the_mean_l1_norm_in_scene_extents():
 @pytest.mark.parametrize("masked", [False, True])
 def test_recon_loss__gradient_on_a_region_agrees_with_the_full_view(width, masked):
     """If only a region has changed, its derivative is the full view's, and the value changes by the same amount."""
-    height, rng = 150, np.random.default_rng(4)
+    height = 150
+    rng = np.random.default_rng(4)
     y, x = np.mgrid[:height, :width]
     drawn = (x - 30) ** 2 + (y - 100) ** 2 < 15**2
     drawn[0, 0] = drawn[-1, -1] = drawn[70, 5] = True
     region = Region(drawn)
-    truth, before = (np.float32(rng.uniform(size=(height, width, 3))) for _ in range(2))
-    changed = region.crop(before) + np.float32(rng.normal(size=region.shape(3))) * region.inside()[..., None] * 0.1
-    after = region.paste(changed, before)
+    truth, old_image = (np.float32(rng.uniform(size=(height, width, 3))) for _ in range(2))
+    changed = region.crop(old_image) + np.float32(rng.normal(size=region.shape(3))) * region.inside()[..., None] * 0.1
+    new_image = region.paste(changed, old_image)
     target = Target(truth, rng.uniform(size=drawn.shape) < 0.8 if masked else None)
-    target.set_surroundings(mi.TensorXf(before))
+    target.set_surroundings(mi.TensorXf(old_image))
 
     def evaluate(image, where):
         tensor = mi.TensorXf(np.float32(image))
@@ -157,14 +165,15 @@ def test_recon_loss__gradient_on_a_region_agrees_with_the_full_view(width, maske
         dr.backward(loss)
         return item(loss), np.asarray(dr.grad(tensor))
 
-    found, found_grad = evaluate(changed, region)
-    expected, expected_grad = evaluate(after, None)
+    region_loss, region_grad = evaluate(changed, region)
+    expected, expected_grad = evaluate(new_image, None)
     scale = np.abs(expected_grad).max()
-    assert_close(found_grad, region.crop(expected_grad), atol=tol.SUM_ORDER_REL * scale)
-    (old, _), (old_on_region, _) = evaluate(before, None), evaluate(region.crop(before), region)
-    assert found - old_on_region == pytest.approx(expected - old, abs=tol.LOSS_REL * expected)
+    assert_close(region_grad, region.crop(expected_grad), atol=tol.SUM_ORDER_REL * scale)
+    old, _ = evaluate(old_image, None)
+    old_on_region, _ = evaluate(region.crop(old_image), region)
+    assert region_loss - old_on_region == pytest.approx(expected - old, abs=tol.LOSS_REL * expected)
     again, again_grad = evaluate(changed, region)  # the surroundings are unchanged
-    assert (again, np.abs(again_grad - found_grad).max()) == (found, 0)
+    assert (again, np.abs(again_grad - region_grad).max()) == (region_loss, 0)
 
 
 @pytest.mark.parametrize("width", [23, 24])
@@ -172,13 +181,14 @@ def test_target__difference_is_that_of_every_pixel(width):
     rng = np.random.default_rng(0)
     image, truth = (np.float32(rng.uniform(size=(19, width, 3))) for _ in range(2))
     mask = rng.uniform(size=(19, width)) < 0.7
-    target, expected = Target(truth, mask), (truth - image) * mask[..., None]
+    target = Target(truth, mask)
+    expected = (truth - image) * mask[..., None]
     assert np.allclose(target.difference(mi.TensorXf(image)), expected, atol=1e-6)
     drawn = np.zeros(mask.shape, bool)
     drawn[-1, -1] = drawn[3, 5] = True
     region = Region(drawn)
-    found = target.difference(mi.TensorXf(region.crop(image)), region)
-    assert np.allclose(found, region.crop(expected), atol=1e-6)
+    difference = target.difference(mi.TensorXf(region.crop(image)), region)
+    assert np.allclose(difference, region.crop(expected), atol=1e-6)
 
 
 def test_target__is_its_own_surroundings_by_default():
@@ -186,10 +196,12 @@ def test_target__is_its_own_surroundings_by_default():
     truth = np.float32(rng.uniform(size=(32, 40, 3)))
     mask = np.zeros((32, 40), bool)
     mask[3, 4] = True
-    region, given, default = Region(mask), Target(truth), Target(truth)
-    given.set_surroundings(mi.TensorXf(truth))
+    region = Region(mask)
+    target = Target(truth)
+    default = Target(truth)
+    target.set_surroundings(mi.TensorXf(truth))
     image = mi.TensorXf(region.crop(truth) + 0.1)
-    assert item(recon_loss(image, default, region=region)) == item(recon_loss(image, given, region=region)) > 0
+    assert item(recon_loss(image, default, region=region)) == item(recon_loss(image, target, region=region)) > 0
 
 
 def test_recon_loss__refuses_an_image_of_another_size(images):

@@ -24,26 +24,27 @@ SHIFT = np.float32([0.06, -0.03, 0.02])
 def start(config: MotionConfig):
     """Return the start of a ball that goes on moving by `SHIFT`, without any flow."""
     ball = opaque_ball()
-    before = replace(ball, motion=np.tile(SHIFT, (len(ball), 1)), logit_confidence=np.ones(len(ball)))
-    after = replace(ball, means=mi.TensorXf(np.asarray(ball.means) + SHIFT))
-    active = full_active_set(before, dict(enumerate(views())), RenderConfig())
-    targets = {v: Target(np.asarray(view.render(after).color)) for v, view in active.views.items()}
+    previous_gaussians = replace(ball, motion=np.tile(SHIFT, (len(ball), 1)), logit_confidence=np.ones(len(ball)))
+    moved_gaussians = replace(ball, means=mi.TensorXf(np.asarray(ball.means) + SHIFT))
+    active = full_active_set(previous_gaussians, dict(enumerate(views())), RenderConfig())
+    targets = {v: Target(np.asarray(view.render(moved_gaussians).color)) for v, view in active.views.items()}
     flow = np.zeros((*targets[0].image().shape[:2], 2), np.float32), np.ones(targets[0].image().shape[:2], bool)
     flows = {v: FlowObservation(*flow, *flow) for v in active.views}
-    return initial_motion(before, active, flows, targets, config, np.random.default_rng(0))
+    return initial_motion(previous_gaussians, active, flows, targets, config, np.random.default_rng(0))
 
 
 def test_initial_motion__runs_the_stages_that_are_on():
     off = replace(MotionConfig(), propagate_motion=False, search_motion=False, refine_start=False)
     assert [stage.acts(off) for stage in STAGES] == [True, False, False, False]
     assert all(stage.acts(MotionConfig()) for stage in STAGES)
-    lifted, found = start(off), start(MotionConfig())
+    lifted = start(off)
+    motion = start(MotionConfig())
     assert lifted is not None
-    assert found is not None
+    assert motion is not None
     assert not lifted.displacement.any()  # the flow sees no motion
     assert lifted.color_change is None
-    assert np.linalg.norm(found.displacement - SHIFT, axis=1).mean() < 0.5 * np.linalg.norm(SHIFT)
-    assert found.color_change is not None
+    assert np.linalg.norm(motion.displacement - SHIFT, axis=1).mean() < 0.5 * np.linalg.norm(SHIFT)
+    assert motion.color_change is not None
 
 
 def test_initial_motion__builds_one_index_of_the_neighbours(monkeypatch: pytest.MonkeyPatch):

@@ -35,7 +35,8 @@ def test_sparse_product__is_that_of_dense_matrices():
 
 
 def test_sparse_product__has_an_adjoint_in_both_modes():
-    x, weight = tensor(5, 3), tensor(9, 3)
+    x = tensor(5, 3)
+    weight = tensor(9, 3)
     dr.enable_grad(x)
     dr.backward(dr.sum(weight * sparse_product(MATRIX, x), axis=None))
     assert_close(dr.grad(x), MATRIX.toarray().T @ np.asarray(weight), atol=1e-6)
@@ -48,29 +49,33 @@ def test_sparse_product__has_an_adjoint_in_both_modes():
 
 def test_moved__shifts_means_and_turns_rotations():
     gaussians = to_gaussians(make_scene())
-    shift, turns = tensor(10, 3), Rotation.random(10, rng=RNG)
+    shift = tensor(10, 3)
+    turns = Rotation.random(10, rng=RNG)
     quats = turns.as_quat(scalar_first=True) - (1, 0, 0, 0)
-    now = moved(gaussians, shift, mi.TensorXf(quats.astype(np.float32)))
-    assert_close(now.means, np.asarray(gaussians.means) + np.asarray(shift), atol=1e-6)
-    before, after = (Rotation.from_quat(unit_quats(g), scalar_first=True) for g in (gaussians, now))
-    assert_close(after.as_matrix(), (turns * before).as_matrix(), atol=1e-5)
+    result = moved(gaussians, shift, mi.TensorXf(quats.astype(np.float32)))
+    assert_close(result.means, np.asarray(gaussians.means) + np.asarray(shift), atol=1e-6)
+    rotations, new_rotations = (Rotation.from_quat(unit_quats(g), scalar_first=True) for g in (gaussians, result))
+    assert_close(new_rotations.as_matrix(), (turns * rotations).as_matrix(), atol=1e-5)
 
 
 def test_moved__without_motion_changes_no_bit():
     gaussians = to_gaussians(make_scene())
-    now = moved(gaussians, dr.zeros(mi.TensorXf, (10, 3)), dr.zeros(mi.TensorXf, (10, 4)))
-    assert all(np.array_equal(now.numpy()[name], value) for name, value in gaussians.numpy().items())
+    result = moved(gaussians, dr.zeros(mi.TensorXf, (10, 3)), dr.zeros(mi.TensorXf, (10, 4)))
+    assert all(np.array_equal(result.numpy()[name], value) for name, value in gaussians.numpy().items())
 
 
 def test_moved__gradients_agree_with_central_differences():
-    gaussians, weight = to_gaussians(make_scene()), tensor(10, 4)
-    rotation, direction = tensor(10, 4), np.asarray(tensor(10, 4))
+    gaussians = to_gaussians(make_scene())
+    weight = tensor(10, 4)
+    rotation = tensor(10, 4)
+    direction = np.asarray(tensor(10, 4))
 
     def value(rotation):
         return dr.sum(weight * moved(gaussians, dr.zeros(mi.TensorXf, (10, 3)), rotation).quats, axis=None)
 
     dr.enable_grad(rotation)
     dr.backward(value(rotation))
-    found, at = np.vdot(np.asarray(dr.grad(rotation)), direction), np.asarray(dr.detach(rotation))
+    derivative = np.vdot(np.asarray(dr.grad(rotation)), direction)
+    at = np.asarray(dr.detach(rotation))
     ends = [np.asarray(value(mi.TensorXf(np.asarray(at + h * direction, np.float32)))).item() for h in (0.5, -0.5)]
-    assert abs(found - (ends[0] - ends[1])) < 1e-4 * abs(found)  # linear in the rotation
+    assert abs(derivative - (ends[0] - ends[1])) < 1e-4 * abs(derivative)  # linear in the rotation

@@ -30,12 +30,15 @@ from morgs_mi.method.ssim import Target
 from morgs_mi.render.rasterize import Image
 from tests.scenes.gaussians import make_scene, to_gaussians
 
-H, W = 16, 24
+H = 16
+W = 24
 NAMES = [term.name for term in TERMS]
 
 
 def key_view(mask: bool) -> KeyView:
-    image, flow, everywhere = np.zeros((H, W, 3), np.uint8), np.ones((H, W, 2), np.float32), np.ones((H, W), bool)
+    image = np.zeros((H, W, 3), np.uint8)
+    flow = np.ones((H, W, 2), np.float32)
+    everywhere = np.ones((H, W), bool)
     return KeyView(
         FramePair(image, image), FlowObservation(flow, everywhere, flow, everywhere, everywhere if mask else None)
     )
@@ -71,20 +74,18 @@ def test_losses_of__every_term_acts_where_its_inputs_exist_and_has_a_gradient():
 
     guided = {"guided_motion": tensor(H, W, 2)}
     image = Image(color=tensor(H, W, 3), confidence=tensor(H, W, 1), others=guided)
-    before, moved = (
-        to_gaussians(make_scene()),
-        replace(to_gaussians(make_scene()), means=tensor(10, 3), quats=tensor(10, 4)),
-    )
+    previous_gaussians = to_gaussians(make_scene())
+    moved_gaussians = replace(to_gaussians(make_scene()), means=tensor(10, 3), quats=tensor(10, 4))
     inputs = {"recon": image.color, "flow": image["guided_motion"], "mask": image.confidence, "offset": tensor(5, 3)}
-    inputs |= {"rigid": moved.means, "rotation": moved.quats, "isometry": moved.means}
+    inputs |= {"rigid": moved_gaussians.means, "rotation": moved_gaussians.quats, "isometry": moved_gaussians.means}
     assert list(inputs) == NAMES, "a new term needs an input here"
-    prediction = Prediction(image, {"offset": inputs["offset"]}, None, H * W, 10, 2.0, moved)
+    prediction = Prediction(image, {"offset": inputs["offset"]}, None, H * W, 10, 2.0, moved_gaussians)
     observations = {
         "target": Target(np.zeros((H, W, 3), np.float32)),
         "motion": mi.TensorXf(np.zeros((H, W, 2), np.float32)),
         "reliable": mi.TensorXf(np.ones((H, W), np.float32)),
         "mask": mi.TensorXf(np.zeros((H, W), np.float32)),
-        "neighbours": find_neighbours(before, 2.0),
+        "neighbours": find_neighbours(previous_gaussians, 2.0),
     }
     assert losses_of(prediction, {"target": observations["target"]}, ObjectiveConfig()).keys() == {"recon", "offset"}
     assert losses_of(prediction, observations, ObjectiveConfig()).keys() == {*NAMES[:4]}, "the others are off"

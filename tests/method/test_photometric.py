@@ -16,7 +16,8 @@ from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
 
 SHIFT = np.float32([0.05, -0.03, 0.02])  # two pixels
-MOVING, STATIC = 80, 400
+MOVING = 80
+STATIC = 400
 
 
 @pytest.fixture(scope="module")
@@ -25,9 +26,9 @@ def scene():
     rng = np.random.default_rng(0)
     means = np.concatenate([rng.normal(0, 0.15, (MOVING, 3)), random_sheet(rng, STATIC, 1.2, 0.6)])
     colors = np.concatenate([rng.uniform(0.2, 1.5, (MOVING, 1, 3)), rng.uniform(-1.5, -1, (STATIC, 1, 3))])
-    before = isotropic(means, 0.05, 0.9, colors)
+    gaussians = isotropic(means, 0.05, 0.9, colors)
     views = dict(enumerate(map(ActiveView, look_at_cameras([(x, 0.3, -3) for x in (-0.8, 0.8)], 45, 128, 96))))
-    return before, views, targets(moved(before), views)
+    return gaussians, views, targets(moved(gaussians), views)
 
 
 def moved(gaussians):
@@ -71,10 +72,10 @@ def test_refine_start__keeps_true_motion(scene):
 
 
 def test_refine_start__takes_no_step_longer_than_the_limit(scene, monkeypatch):
-    before, views, _ = scene
+    gaussians, views, _ = scene
     monkeypatch.setattr("morgs_mi.method.photometric._LONGEST_PX", 0.1)
     step = refined_from(scene, start(0.6)).displacement - start(0.6).displacement
-    px = [view.camera.projection_jacobian(np.asarray(before.means)) @ step[..., None] for view in views.values()]
+    px = [view.camera.projection_jacobian(np.asarray(gaussians.means)) @ step[..., None] for view in views.values()]
     assert 0.05 < np.linalg.norm(px, axis=2).max() < 0.11
 
 
@@ -90,20 +91,22 @@ def color_change(gaussians, views, targets):
 
 
 def test_refine_start__follows_a_change_of_light(scene):
-    before, views, _ = scene
-    brighter = with_colors(before, 0.1 / SH_C0)
-    seen = targets(brighter, views)
-    followed = with_colors(before, color_change(before, views, seen)[:, None])
-    left = [np.abs(seen[v].difference(view.render(followed).color)).mean() for v, view in views.items()]
-    there = [np.abs(seen[v].difference(view.render(before).color)).mean() for v, view in views.items()]
-    assert max(left) < 0.5 * min(there)  # the rest is at the border, and from the weight of ten pixels
+    gaussians, views, _ = scene
+    brighter = with_colors(gaussians, 0.1 / SH_C0)
+    bright_targets = targets(brighter, views)
+    followed = with_colors(gaussians, color_change(gaussians, views, bright_targets)[:, None])
+    differences = [
+        np.abs(bright_targets[v].difference(view.render(followed).color)).mean() for v, view in views.items()
+    ]
+    there = [np.abs(bright_targets[v].difference(view.render(gaussians).color)).mean() for v, view in views.items()]
+    assert max(differences) < 0.5 * min(there)  # the rest is at the border, and from the weight of ten pixels
 
 
 def test_refine_start__trusts_few_pixels_less(scene):
-    before, views, _ = scene
+    gaussians, views, _ = scene
 
     def followed(sizes):
-        smaller = replace(before, log_scales=np.asarray(before.log_scales) + np.log(sizes))
+        smaller = replace(gaussians, log_scales=np.asarray(gaussians.log_scales) + np.log(sizes))
         return np.median(color_change(smaller, views, targets(with_colors(smaller, 0.1 / SH_C0), views)))
 
     assert followed(0.2) < 0.3 * followed(1.0)
@@ -114,8 +117,8 @@ def test_refine_start__changes_no_colour_without_views(scene):
 
 
 def test_refine_start__takes_colours_where_the_step_leads(scene):
-    before, views, seen = scene
-    displaced = replace(before, means=np.asarray(before.means) + start(0.6).displacement)
-    left = color_change(displaced, views, seen)[:MOVING]
-    found = refined_from(scene, start(0.6)).color_change[:MOVING]
-    assert np.abs(found).mean() < 0.3 * np.abs(left).mean()
+    gaussians, views, images = scene
+    displaced = replace(gaussians, means=np.asarray(gaussians.means) + start(0.6).displacement)
+    rest = color_change(displaced, views, images)[:MOVING]
+    changes = refined_from(scene, start(0.6)).color_change[:MOVING]
+    assert np.abs(changes).mean() < 0.3 * np.abs(rest).mean()

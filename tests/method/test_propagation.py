@@ -25,13 +25,13 @@ def scene():
     wall = random_sheet(rng, 400, 1.2, 0.6)
     means = np.concatenate([rng.normal(0, 0.12, (60, 3)), wall])
     colors = np.concatenate([rng.uniform(0.5, 1.5, (60, 1, 3)), rng.uniform(-1.5, -1, (400, 1, 3))])
-    before = isotropic(means, 0.05, 0.9, colors)
+    gaussians = isotropic(means, 0.05, 0.9, colors)
     moves = np.arange(460) < 60
-    after = replace(before, means=mi.TensorXf(np.asarray(before.means) + SHIFT * moves[:, None]))
+    target = replace(gaussians, means=mi.TensorXf(np.asarray(gaussians.means) + SHIFT * moves[:, None]))
     cameras = look_at_cameras([(x, 0.3, -3) for x in (-0.8, 0.8)], 45)
     views = {view: ActiveView(camera) for view, camera in enumerate(cameras)}
-    targets = {v: Target(np.asarray(view.render(after).color)) for v, view in views.items()}
-    return before, moves, views, targets
+    targets = {v: Target(np.asarray(view.render(target).color)) for v, view in views.items()}
+    return gaussians, moves, views, targets
 
 
 def still(n):
@@ -39,9 +39,9 @@ def still(n):
 
 
 def start(scene, lifted, motion=None):
-    before, _, views, targets = scene
-    known = before if motion is None else replace(before, motion=mi.TensorXf(motion.astype(np.float32)))
-    return propagate_motion(MotionProblem(known, views, targets, np.random.default_rng(0)), lifted)
+    gaussians, _, views, targets = scene
+    start_gaussians = gaussians if motion is None else replace(gaussians, motion=mi.TensorXf(motion.astype(np.float32)))
+    return propagate_motion(MotionProblem(start_gaussians, views, targets, np.random.default_rng(0)), lifted)
 
 
 def found(lift, moves):
@@ -65,16 +65,16 @@ def test_propagate_motion__continues_motion_without_flow(scene):
 
 def test_propagate_motion__ends_motion_that_has_stopped(scene):
     """The images show `before`: nothing moves any more."""
-    before, moves, views, _ = scene
-    targets = {v: Target(np.asarray(view.render(before).color)) for v, view in views.items()}
-    gone_on = start((before, moves, views, targets), still(460), SHIFT * moves[:, None])
+    gaussians, moves, views, _ = scene
+    targets = {v: Target(np.asarray(view.render(gaussians).color)) for v, view in views.items()}
+    gone_on = start((gaussians, moves, views, targets), still(460), SHIFT * moves[:, None])
     assert not gone_on.displacement[moves].any()
 
 
 def test_propagate_motion__spreads_to_neighbours(scene):
     moves = scene[1]
-    seen = moves & (np.arange(460) % 3 == 0)
-    lift = MotionStart((SHIFT * seen[:, None]).astype(np.float32), np.where(seen, 2, -2).astype(np.float32))
+    mask = moves & (np.arange(460) % 3 == 0)
+    lift = MotionStart((SHIFT * mask[:, None]).astype(np.float32), np.where(mask, 2, -2).astype(np.float32))
     hit, static = found(start(scene, lift), moves)
     assert hit > 0.96  # a third to begin with
     assert static > 0.99
@@ -88,21 +88,24 @@ def test_propagate_motion__keeps_true_motion(scene):
 
 
 def test_propagate_motion__does_nothing_without_motion_or_views(scene):
-    before, _, views, targets = scene
-    lifted, rng = still(460), np.random.default_rng(0)
-    assert propagate_motion(MotionProblem(before, views, targets, rng), lifted) is lifted
-    assert propagate_motion(MotionProblem(before, {}, targets, rng), lifted) is lifted
+    gaussians, _, views, targets = scene
+    lifted = still(460)
+    rng = np.random.default_rng(0)
+    assert propagate_motion(MotionProblem(gaussians, views, targets, rng), lifted) is lifted
+    assert propagate_motion(MotionProblem(gaussians, {}, targets, rng), lifted) is lifted
 
 
 def test_propagate_motion__does_nothing_where_no_view_shows_what_may_move(scene):
-    before, moves, views, targets = scene
-    outside = replace(before, means=np.asarray(before.means) - np.float32([0, 0, 50]), motion=SHIFT * moves[:, None])
+    gaussians, moves, views, targets = scene
+    outside = replace(
+        gaussians, means=np.asarray(gaussians.means) - np.float32([0, 0, 50]), motion=SHIFT * moves[:, None]
+    )
     lifted = still(460)
     assert propagate_motion(MotionProblem(outside, views, targets, np.random.default_rng(0)), lifted) is lifted
 
 
 def test_propagate_motion__leaves_a_single_gaussian_without_neighbours_as_it_is(scene):
-    before, _, views, targets = scene
-    alone = MotionProblem(before.select(np.array([0])), views, targets, np.random.default_rng(0))
+    gaussians, _, views, targets = scene
+    alone = MotionProblem(gaussians.select(np.array([0])), views, targets, np.random.default_rng(0))
     lifted = MotionStart(SHIFT[None], np.float32([2]))
     assert np.array_equal(propagate_motion(alone, lifted).displacement, lifted.displacement)

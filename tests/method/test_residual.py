@@ -39,20 +39,22 @@ def test_apply_residual__zero_changes_nothing(degree, config):
 @pytest.mark.parametrize("degree", [0, 2])
 def test_apply_residual__gate_scales_every_attribute(degree, two_gates):
     """A_t = A_{t-1} + m R_t (eq. 12); with two gates, the appearance's gate is 1."""
-    config, previous = MotionConfig(two_gates=two_gates), to_gaussians(make_scene(degree))
+    config = MotionConfig(two_gates=two_gates)
+    previous = to_gaussians(make_scene(degree))
     parameters = random_parameters(previous, config)
     m = 1 / (1 + np.exp(-np.asarray(parameters["logit_confidence"], np.float64)))
-    current, before = apply_residual(previous, parameters, config).numpy(), previous.numpy()
+    current = apply_residual(previous, parameters, config).numpy()
+    old_values = previous.numpy()
     R = {name: np.asarray(value) for name, value in parameters.items()}
     displacement = m[:, None] * (R["motion"] + R["offset"])
     assert_close(current["motion"], displacement, atol=1e-6)
     assert_close(current["offset"], m[:, None] * R["offset"], atol=1e-6)
-    assert_close(current["means"] - before["means"], displacement, atol=1e-6)
-    assert_close(current["quats"] - before["quats"], m[:, None] * R["quats"], atol=1e-6)
-    change = current["sh_coeffs"] - before["sh_coeffs"]
+    assert_close(current["means"] - old_values["means"], displacement, atol=1e-6)
+    assert_close(current["quats"] - old_values["quats"], m[:, None] * R["quats"], atol=1e-6)
+    change = current["sh_coeffs"] - old_values["sh_coeffs"]
     m = np.ones_like(m) if two_gates else m
-    assert_close(current["log_scales"] - before["log_scales"], m[:, None] * R["log_scales"], atol=1e-6)
-    assert_close(current["logit_opacities"] - before["logit_opacities"], m * R["logit_opacities"], atol=1e-6)
+    assert_close(current["log_scales"] - old_values["log_scales"], m[:, None] * R["log_scales"], atol=1e-6)
+    assert_close(current["logit_opacities"] - old_values["logit_opacities"], m * R["logit_opacities"], atol=1e-6)
     assert_close(change[:, :1], m[:, None, None] * R["sh_dc"], atol=1e-6)
     if degree:
         assert_close(change[:, 1:], m[:, None, None] * R["sh_rest"], atol=1e-6)
@@ -67,19 +69,21 @@ def test_residual_parameters__follow_the_modules():
 
 @pytest.mark.parametrize("lift_confidence", [False, True])
 def test_residual_parameters__lifted_motion_passes_the_gate_at_full_length(lift_confidence):
-    previous, rng = to_gaussians(make_scene()), np.random.default_rng(1)
+    previous = to_gaussians(make_scene())
+    rng = np.random.default_rng(1)
     lifted = MotionStart(np.float32(rng.normal(size=(10, 3))), np.float32(rng.uniform(-2, 2, 10)))
     config = MotionConfig(lift_confidence=lift_confidence)
     current = apply_residual(previous, residual_parameters(previous, config, lifted), config)
     assert (np.asarray(current.confidence) > 0.1).all()
     assert np.asarray(current.motion) == pytest.approx(lifted.displacement, rel=1e-5, abs=1e-6)
-    before = np.asarray(previous.logit_confidence)
-    logit = lifted.logit_confidence if lift_confidence else before
+    old_logits = np.asarray(previous.logit_confidence)
+    logit = lifted.logit_confidence if lift_confidence else old_logits
     assert np.array_equal(current.logit_confidence, logit)
 
 
 def test_apply_residual__gradient_of_the_gate_follows_the_product_rule():
-    config, previous = MotionConfig(), to_gaussians(make_scene())
+    config = MotionConfig()
+    previous = to_gaussians(make_scene())
     parameters = random_parameters(previous, config)
     dr.enable_grad(parameters["logit_confidence"], parameters["motion"])
     dr.backward(dr.sum(apply_residual(previous, parameters, config).means, axis=None))

@@ -13,7 +13,10 @@ from morgs_mi.render.view_group import backproject
 from tests.scenes.cameras import arc, look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
 
-RENDER, CORE, WALL, SIDE = RenderConfig(), 0.6, 400, 96
+RENDER = RenderConfig()
+CORE = 0.6
+WALL = 400
+SIDE = 96
 CAMERAS = dict(enumerate(look_at_cameras(arc(np.linspace(-0.6, 0.6, 5), 4, y=-0.3), 40, SIDE, SIDE)))
 
 
@@ -53,12 +56,13 @@ def ball_moves():
 
 @pytest.mark.parametrize("width", [SIDE, SIDE // 2])
 def test_responsibility__is_close_to_the_exact_ratio(gaussians, width):
-    found, (exact, weight) = responsibility_for(gaussians, ball_moves(), width), exact_ratio(gaussians, ball_moves())
+    ratio = responsibility_for(gaussians, ball_moves(), width)
+    exact, weight = exact_ratio(gaussians, ball_moves())
     visible = weight > 5
     assert visible[WALL:].sum() > 30
-    assert np.all(found[WALL:][visible[WALL:]] > 0.4)
-    assert np.corrcoef(found[visible], exact[visible])[0, 1] > 0.95
-    assert np.mean(np.abs(found - exact)[visible]) < 0.05
+    assert np.all(ratio[WALL:][visible[WALL:]] > 0.4)
+    assert np.corrcoef(ratio[visible], exact[visible])[0, 1] > 0.95
+    assert np.mean(np.abs(ratio - exact)[visible]) < 0.05
 
 
 def test_responsibility__is_small_for_a_background_that_other_views_see(gaussians):

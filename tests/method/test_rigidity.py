@@ -15,34 +15,40 @@ from morgs_mi.method.rigidity import find_neighbours, isometry_loss, rigid_loss,
 from tests.scenes.gaussians import make_wide_scene, to_gaussians
 
 LOSSES = {"rigid": rigid_loss, "rotation": rotation_loss, "isometry": isometry_loss}
-COUNT, REACH, EXTENT = 5, 0.3, 2.0
+COUNT = 5
+REACH = 0.3
+EXTENT = 2.0
 BEFORE = make_wide_scene(40)
 
 
 def neighbours():
-    found = find_neighbours(to_gaussians(BEFORE), EXTENT, COUNT, REACH)
-    assert found is not None
-    return found
+    pairs = find_neighbours(to_gaussians(BEFORE), EXTENT, COUNT, REACH)
+    assert pairs is not None
+    return pairs
 
 
 def other(seed: int = 0, size: float = 0.1) -> Gaussians:
     """Return the Gaussians, each moved and turned by itself."""
-    rng, before = np.random.default_rng(seed), to_gaussians(BEFORE)
-    means, quats = (np.asarray(v) + size * rng.normal(size=v.shape) for v in (before.means, before.quats))
-    return replace(before, means=means, quats=quats)
+    rng = np.random.default_rng(seed)
+    start = to_gaussians(BEFORE)
+    means, quats = (np.asarray(v) + size * rng.normal(size=v.shape) for v in (start.means, start.quats))
+    return replace(start, means=means, quats=quats)
 
 
 def reference(gaussians: Gaussians) -> dict[str, float]:
     """Return the losses in float64, pair by pair."""
-    before = to_gaussians(BEFORE)
-    old, new = (np.asarray(g.means, np.float64) / EXTENT for g in (before, gaussians))
-    q_old, q_new = (Rotation.from_quat(unit_quats(g), scalar_first=True) for g in (before, gaussians))
-    sums, count = dict.fromkeys(LOSSES, 0.0), 0
+    start = to_gaussians(BEFORE)
+    old, new = (np.asarray(g.means, np.float64) / EXTENT for g in (start, gaussians))
+    q_old, q_new = (Rotation.from_quat(unit_quats(g), scalar_first=True) for g in (start, gaussians))
+    sums = dict.fromkeys(LOSSES, 0.0)
+    count = 0
     turns = (q_new * q_old.inv()).as_quat(scalar_first=True)
     for i in range(len(old)):
         for j in np.argsort(np.linalg.norm(old - old[i], axis=1))[1 : 1 + COUNT]:
-            e, e_now = old[j] - old[i], new[j] - new[i]
-            w, turn = np.exp(-(e @ e) / REACH**2), Rotation.from_quat(turns[i], scalar_first=True)
+            e = old[j] - old[i]
+            e_now = new[j] - new[i]
+            w = np.exp(-(e @ e) / REACH**2)
+            turn = Rotation.from_quat(turns[i], scalar_first=True)
             sums["rigid"] += w * np.linalg.norm(e_now - turn.apply(e))
             # A quaternion and its negative are one rotation; small changes keep the sign of both factors.
             sums["rotation"] += w * min(np.linalg.norm(turns[j] - s * turns[i]) for s in (1, -1))
@@ -53,14 +59,14 @@ def reference(gaussians: Gaussians) -> dict[str, float]:
 
 @pytest.mark.parametrize("name", LOSSES)
 def test_rigidity__is_that_of_its_definition(name):
-    found = np.asarray(LOSSES[name](other(), neighbours())).item()
-    assert found == pytest.approx(reference(other())[name], rel=1e-4)
+    loss = np.asarray(LOSSES[name](other(), neighbours())).item()
+    assert loss == pytest.approx(reference(other())[name], rel=1e-4)
 
 
 @pytest.mark.parametrize("name", LOSSES)
 def test_rigidity__is_zero_for_a_body_that_moves_as_a_whole(name):
-    before = to_gaussians(BEFORE)
-    turned = rotated(before, Rotation.from_euler("xyz", (30, -20, 50), degrees=True).as_matrix())
+    start = to_gaussians(BEFORE)
+    turned = rotated(start, Rotation.from_euler("xyz", (30, -20, 50), degrees=True).as_matrix())
     body = replace(turned, means=np.asarray(turned.means) + np.array([0.4, 0, -0.2]))
     assert np.asarray(LOSSES[name](body, neighbours())).item() < 1e-5
     assert np.asarray(LOSSES[name](other(), neighbours())).item() > 1e-2
@@ -70,11 +76,14 @@ def test_rigidity__is_zero_for_a_body_that_moves_as_a_whole(name):
     ("name", "attribute"), [("rigid", "means"), ("rigid", "quats"), ("rotation", "quats"), ("isometry", "means")]
 )
 def test_rigidity__gradients_agree_with_central_differences(name, attribute):
-    gaussians, loss, step = other(1), LOSSES[name], 1e-3
+    gaussians = other(1)
+    loss = LOSSES[name]
+    step = 1e-3
     value = getattr(gaussians, attribute)
     dr.enable_grad(value)
     dr.backward(loss(gaussians, neighbours()))
-    gradient, at = np.asarray(dr.grad(value), np.float64), np.asarray(dr.detach(value))
+    gradient = np.asarray(dr.grad(value), np.float64)
+    at = np.asarray(dr.detach(value))
     direction = np.random.default_rng(2).normal(size=at.shape).astype(np.float32)
     # Float32 leaves 1e-3 of a difference this small.
     ends = [
@@ -94,11 +103,11 @@ def test_rigidity__has_a_finite_gradient_where_nothing_moves(name):
 
 
 def test_find_neighbours__weighs_near_ones_more():
-    found = neighbours()
-    lengths = np.asarray(dr.norm(found.edges))
-    weights = np.asarray(found.weights) * len(lengths)
+    pairs = neighbours()
+    lengths = np.asarray(dr.norm(pairs.edges))
+    weights = np.asarray(pairs.weights) * len(lengths)
     assert weights == pytest.approx(np.exp(-((lengths / REACH) ** 2)), rel=1e-4)
-    assert np.asarray(found.difference @ np.ones(40)) == pytest.approx(np.zeros(200), abs=0)
+    assert np.asarray(pairs.difference @ np.ones(40)) == pytest.approx(np.zeros(200), abs=0)
 
 
 def test_find_neighbours__has_none_for_a_single_gaussian():

@@ -21,7 +21,8 @@ from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
 
 SHIFT = np.float32([0.15, 0.05, 0.08])  # 12 px; the rod is 6 px wide
-ROD, WALL = 24, 1500
+ROD = 24
+WALL = 1500
 MOVES = np.arange(ROD + WALL) < ROD
 
 
@@ -32,9 +33,9 @@ def scene():
     heights = np.repeat(np.linspace(-0.4, 0.4, ROD // 2), 2) + np.tile([-0.01, 0.01], ROD // 2)
     rod = np.stack([np.zeros(ROD), heights, np.full(ROD, -0.4)], axis=1)
     colors = np.concatenate([rng.uniform(0.8, 1.5, (ROD, 1, 3)), rng.uniform(-1.5, -0.5, (WALL, 1, 3))])
-    before = isotropic(np.concatenate([rod, random_sheet(rng, WALL, 1.2, 0.6)]), 0.04, 0.95, colors)
+    gaussians = isotropic(np.concatenate([rod, random_sheet(rng, WALL, 1.2, 0.6)]), 0.04, 0.95, colors)
     places = [(x, 0.3, -3) for x in (-1, 0.1, 1.2)]
-    return before, dict(enumerate(map(ActiveView, look_at_cameras(places, 45, 160, 120))))
+    return gaussians, dict(enumerate(map(ActiveView, look_at_cameras(places, 45, 160, 120))))
 
 
 def targets(gaussians, views):
@@ -55,42 +56,43 @@ def searched(gaussians, start, views, seen, config=None):
 
 @pytest.mark.parametrize("shift", [SHIFT, -SHIFT, SHIFT * [1, 1, -2]])
 def test_search_motion__finds_a_fast_thin_part(scene, shift):
-    before, views = scene
-    seen = targets(moved(before, shift), views)
-    found = searched(before, still(), views, seen)
-    distance = np.linalg.norm(found.displacement[MOVES] - shift, axis=1)
+    gaussians, views = scene
+    images = targets(moved(gaussians, shift), views)
+    motion = searched(gaussians, still(), views, images)
+    distance = np.linalg.norm(motion.displacement[MOVES] - shift, axis=1)
     assert np.all(distance < 0.1 * np.linalg.norm(shift))
-    assert not found.displacement[~MOVES].any()
-    assert np.all(found.logit_confidence[MOVES] > 0)
-    assert np.all(found.logit_confidence[~MOVES] == -2)
+    assert not motion.displacement[~MOVES].any()
+    assert np.all(motion.logit_confidence[MOVES] > 0)
+    assert np.all(motion.logit_confidence[~MOVES] == -2)
 
 
 def test_search_motion__corrects_a_wrong_start(scene):
-    before, views = scene
+    gaussians, views = scene
     wrong = MotionStart((-SHIFT * MOVES[:, None]).astype(np.float32), np.where(MOVES, 1, -2).astype(np.float32))
-    found = searched(before, wrong, views, targets(moved(before), views))
-    assert np.all(np.linalg.norm(found.displacement[MOVES] - SHIFT, axis=1) < 0.1 * np.linalg.norm(SHIFT))
-    assert np.all(found.logit_confidence[MOVES] == 1)
+    motion = searched(gaussians, wrong, views, targets(moved(gaussians), views))
+    assert np.all(np.linalg.norm(motion.displacement[MOVES] - SHIFT, axis=1) < 0.1 * np.linalg.norm(SHIFT))
+    assert np.all(motion.logit_confidence[MOVES] == 1)
 
 
 def test_search_motion__keeps_a_start_that_explains_the_images(scene):
-    before, views = scene
+    gaussians, views = scene
     right = MotionStart((SHIFT * MOVES[:, None]).astype(np.float32), np.where(MOVES, 1, -2).astype(np.float32))
-    assert searched(before, right, views, targets(moved(before), views)) is right
-    assert searched(before, right, {}, {}) is right
+    assert searched(gaussians, right, views, targets(moved(gaussians), views)) is right
+    assert searched(gaussians, right, {}, {}) is right
 
 
 def test_search_motion__keeps_a_part_that_vanished(scene):
-    before, views = scene
-    gone, start = before.select(np.flatnonzero(~MOVES)), still()
-    assert searched(before, start, views, targets(gone, views)) is start
+    gaussians, views = scene
+    gone = gaussians.select(np.flatnonzero(~MOVES))
+    start = still()
+    assert searched(gaussians, start, views, targets(gone, views)) is start
 
 
 @pytest.mark.parametrize("setting", [{"reach": 0.03}, {"max_parts": 0}], ids=lambda setting: next(iter(setting)))
 def test_search_config__each_setting_can_prevent_a_finding(scene, setting):
-    before, views = scene
+    gaussians, views = scene
     start = still()
-    assert searched(before, start, views, targets(moved(before), views), SearchConfig(**setting)) is start
+    assert searched(gaussians, start, views, targets(moved(gaussians), views), SearchConfig(**setting)) is start
 
 
 @pytest.mark.parametrize(
@@ -104,42 +106,44 @@ def test_search_config__each_setting_can_prevent_a_finding(scene, setting):
     ],
 )
 def test_search_motion__each_threshold_can_prevent_a_finding(scene, monkeypatch, threshold, value):
-    before, views = scene
+    gaussians, views = scene
     start = still()
     monkeypatch.setattr(f"morgs_mi.method.search.{threshold}", value)
-    assert searched(before, start, views, targets(moved(before), views)) is start
+    assert searched(gaussians, start, views, targets(moved(gaussians), views)) is start
 
 
 def test_search_motion__gives_a_low_confidence_to_what_is_found(scene):
-    before, views = scene
-    found = searched(before, still(), views, targets(moved(before), views))
-    assert np.allclose(found.logit_confidence[MOVES], 0.3)
+    gaussians, views = scene
+    motion = searched(gaussians, still(), views, targets(moved(gaussians), views))
+    assert np.allclose(motion.logit_confidence[MOVES], 0.3)
 
 
 def test_initial_motion__searches_where_flow_sees_nothing(scene):
-    before, views = scene
+    gaussians, views = scene
     flow = np.zeros((120, 160, 2), np.float32), np.ones((120, 160), bool)
     flows = {v: FlowObservation(*flow, *flow) for v in views}
     active = ActiveSet(np.arange(len(MOVES)), len(MOVES), views, len(views))
     for searches in (True, False):
-        config, rng = MotionConfig(search_motion=searches), np.random.default_rng(0)
-        initial = initial_motion(before, active, flows, targets(moved(before), views), config, rng)
+        config = MotionConfig(search_motion=searches)
+        rng = np.random.default_rng(0)
+        initial = initial_motion(gaussians, active, flows, targets(moved(gaussians), views), config, rng)
         assert initial.displacement[MOVES].any() == searches
 
 
 def test_cost_surface__is_the_weighted_squared_difference():
     rng = np.random.default_rng(0)
     camera = look_at_cameras([(0, 0, -3)], 45, 64, 48)[0]
-    before, after = rng.random((2, 48, 64, 3)).astype(np.float32)
+    image, next_image = rng.random((2, 48, 64, 3)).astype(np.float32)
     weight = np.zeros((48, 64), np.float32)
     weight[20:26, 30:35] = rng.random((6, 5))
-    surface = _MatchedView(camera, before, after, 1.0).cost_surface(weight)
+    surface = _MatchedView(camera, image, next_image, 1.0).cost_surface(weight)
     shifts = np.array([(0, 0), (4, -3), (-11, 9)])
     expected = [
-        np.sum(weight[..., None].astype(float) * (np.roll(after, (-y, -x), (0, 1)).astype(float) - before) ** 2)
+        np.sum(weight[..., None].astype(float) * (np.roll(next_image, (-y, -x), (0, 1)).astype(float) - image) ** 2)
         for x, y in shifts
     ]
-    origin, depth = np.array([[32.0, 24.0]]), np.array([3.0])
+    origin = np.array([[32.0, 24.0]])
+    depth = np.array([3.0])
     center = camera.unproject(origin, depth)[0]
     d = camera.unproject(origin + shifts, np.full(3, 3.0)) - center
     assert np.allclose(surface.at(center, d), expected, rtol=1e-3)

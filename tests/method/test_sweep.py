@@ -46,14 +46,14 @@ def expected(wall, view, target):
 
 def test_sums__are_the_sums_of_each_view(scene):
     wall, views, targets = scene
-    found = KeyImages(views, targets).sums(wall, [*MAPS])
+    result = KeyImages(views, targets).sums(wall, [*MAPS])
     # Sobel's filter reflects at the border in OpenCV, and repeats the last pixel here.
-    inside = np.abs(np.asarray(wall.means)[:, :2]).max(axis=1) < 0.5
-    assert inside.sum() > 20
+    mask = np.abs(np.asarray(wall.means)[:, :2]).max(axis=1) < 0.5
+    assert mask.sum() > 20
     for k, (v, view) in enumerate(views.items()):
         for name, sums in expected(wall, view, targets[v]).items():
-            mine = found[name][k].reshape(sums.shape)
-            assert_close(mine[inside], sums[inside], rtol=1e-4, name=f"{name} of view {v}")
+            mine = result[name][k].reshape(sums.shape)
+            assert_close(mine[mask], sums[mask], rtol=1e-4, name=f"{name} of view {v}")
 
 
 def test_total_error__is_the_sum_over_all_pixels(scene):

@@ -15,7 +15,8 @@ from tests.scenes.changing_splats import splats
 
 @pytest.mark.parametrize(("axes", "up"), [("y-down", (0, -1, 0)), ("y-up", (0, 1, 0)), ("z-up", (0, 0, 1))])
 def test_default_rig__sees_the_gaussians_upright_from_all_sides(axes, up):
-    cameras, means = default_rig([splats(300)], axes), splats(300).numpy()["means"]
+    cameras = default_rig([splats(300)], axes)
+    means = splats(300).numpy()["means"]
     for camera in cameras:
         pixels, depths = camera.project(means)
         assert depths.min() > 10 * camera.near
@@ -50,12 +51,14 @@ def test_default_rig__begins_where_the_scene_has_detail(side):
 def test_default_rig__ignores_far_floaters_and_what_is_nearly_transparent():
     scene = splats(300)
     raw = scene.numpy()
-    means, logits = raw["means"].copy(), raw["logit_opacities"].copy()
+    means = raw["means"].copy()
+    logits = raw["logit_opacities"].copy()
     means[:3] *= 1e4
-    means[100:150], logits[100:150] = 50, -8
+    means[100:150] = 50
+    logits[100:150] = -8
     shown = replace(scene, means=means, logit_opacities=logits)
-    positions = ({camera.name: camera.position for camera in default_rig([found])} for found in (shown, scene))
-    assert_close(*(np.stack([found[name] for name in sorted(found)]) for found in positions), atol=0.5)
+    positions = ({camera.name: camera.position for camera in default_rig([gaussians])} for gaussians in (shown, scene))
+    assert_close(*(np.stack([rig[name] for name in sorted(rig)]) for rig in positions), atol=0.5)
 
 
 def test_default_rig__sees_a_single_gaussian():

@@ -83,7 +83,8 @@ def test_render_inserted__guesses_clipped_light_of_recordings_of_8_bits_alone(st
         (frame,) = render_inserted(stream, camera(), lambda frame, time: {"ball": ball}, [0], config=config)
         return frame[1]["color"]
 
-    recorded, guessed = inserted(stream, 1.0), inserted(plain, 4.0)
+    recorded = inserted(stream, 1.0)
+    guessed = inserted(plain, 4.0)
     np.testing.assert_array_equal(inserted(stream, None), recorded)
     np.testing.assert_array_equal(inserted(plain, None), guessed)
     assert np.abs(recorded - guessed).max() > 0.1

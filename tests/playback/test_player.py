@@ -187,7 +187,8 @@ def test_channel_image__draws_other_channels_as_grey_values() -> None:
 
 @pytest.mark.parametrize("stored", ["beside", "header", "header, then moved and resumed"])
 def test_open_stream_capture__finds_the_capture_of_the_fit(fitted_clip: Path, tmp_path: Path, stored: str) -> None:
-    capture, header = str(fitted_clip / "capture"), {"test_view": 0}
+    capture = str(fitted_clip / "capture")
+    header = {"test_view": 0}
     if stored != "beside":
         header |= {"capture": capture if stored == "header" else str(tmp_path / "moved")}
     write_stream(tmp_path / "stream.morgs", header)
@@ -203,9 +204,9 @@ def test_open_stream_capture__recognises_the_recording_by_its_fingerprint(
 ) -> None:
     capture = load_capture(fitted_clip / "capture", test_view=0)
     mark = fingerprint(capture, next(capture.partial_frames()).images, refine == "on")
-    for found, refused in ((mark, False), ("0" * 16, True), (None, False)):
-        about = {"test_view": 0, "fingerprint": found, "config": {"fit": {"refine_cameras": refine}}}
-        write_stream(tmp_path / "stream.morgs", about)
+    for mark_of_stream, refused in ((mark, False), ("0" * 16, True), (None, False)):
+        metadata = {"test_view": 0, "fingerprint": mark_of_stream, "config": {"fit": {"refine_cameras": refine}}}
+        write_stream(tmp_path / "stream.morgs", metadata)
         stream = open_stream(tmp_path)
         with pytest.raises(ValueError, match="expected the recording that") if refused else nullcontext():
             open_stream_capture(stream, capture.path, [0, 1, 2])

@@ -64,9 +64,9 @@ def test_splat_file__has_the_gaussians_of_the_file_in_one_frame(file):
         next(gaussians for _, gaussians in play(stream)),
         stream.seek(0).gaussians,
     ):
-        found = gaussians.numpy()
+        arrays = gaussians.numpy()
         for name, values in expected.items():
-            np.testing.assert_array_equal(found[name], values)
+            np.testing.assert_array_equal(arrays[name], values)
     assert stream.frame_numbers() == [0]
     with pytest.raises(ValueError, match=r"scene\.ply: expected a frame of the stream, got 1"):
         stream.seek(1)
@@ -111,9 +111,9 @@ def test_splat_file__of_a_model_has_the_cameras_of_its_training(tmp_path, run):
     stream = open_stream(path)
     assert [camera.name for camera in stream.cameras] == ["left", "middle", "right"]
     assert stream.metadata["default_rig"] is False
-    for found, camera in zip(stream.cameras, rig(), strict=True):
-        assert_close(found.viewmat, camera.viewmat, atol=1e-12)
-        assert_close(found.K, camera.K, atol=1e-12)
+    for stream_camera, camera in zip(stream.cameras, rig(), strict=True):
+        assert_close(stream_camera.viewmat, camera.viewmat, atol=1e-12)
+        assert_close(stream_camera.K, camera.K, atol=1e-12)
     assert run("render", path, tmp_path / "a.png", "--camera", "middle")[0] == 0
     assert cv2.imread(str(tmp_path / "a.png")).shape == (48, 64, 3)
 

@@ -77,7 +77,8 @@ def test_depth_image__near_is_red_far_is_blue_undefined_is_grey():
 
 
 def test_contact_sheet__pads_images_to_common_sizes():
-    a, b = np.zeros((10, 20, 3), np.uint8), np.ones((30, 5))
+    a = np.zeros((10, 20, 3), np.uint8)
+    b = np.ones((30, 5))
     assert visualise.side_by_side([a, b]).shape == (30, 29, 3)
     sheet = visualise.contact_sheet([[a, b], [a]])
     assert sheet.shape == (44, 29, 3)

@@ -12,6 +12,7 @@ from tests.scenes.gaussians import Values, as_float32, make_scene
 
 @pytest.fixture(scope="session")
 def scene() -> tuple[Values, Camera]:
-    raw, camera = as_float32(make_scene()), make_camera()
+    raw = as_float32(make_scene())
+    camera = make_camera()
     assert rasterize_view(raw, camera)["margin"] > 1e-5, "the scene must stay clear of the cut-offs"
     return raw, camera

@@ -122,11 +122,11 @@ def run(
     """Return the channels and the gradients of the sum of the weighted channels; all must be finite."""
     gaussians = Activated(values)
     image = rasterize(gaussians, camera, CHANNELS, BACKGROUND, config=config)
-    found = {name: np.asarray(dr.detach(image[name]), np.float64) for name in CHANNELS}
+    channels = {name: np.asarray(dr.detach(image[name]), np.float64) for name in CHANNELS}
     if weight is None:
-        weight = weights(found, np.ones((camera.height, camera.width), bool))
+        weight = weights(channels, np.ones((camera.height, camera.width), bool))
     dr.backward(sum(dr.sum(image[name] * mi.TensorXf(weight[name]), axis=None) for name in CHANNELS))
     grads = gaussians.gradients()
-    for name, value in (*found.items(), *grads.items()):
+    for name, value in (*channels.items(), *grads.items()):
         assert np.isfinite(value).all(), f"{name} is not finite at {np.argwhere(~np.isfinite(value))[:5].tolist()}"
-    return found, grads
+    return channels, grads

@@ -16,7 +16,8 @@ from tests.assertions import assert_close
 from tests.scenes.cameras import make_wide_camera
 from tests.scenes.gaussians import CHANNELS, make_wide_scene
 
-N, ACTIVE = 120, np.arange(0, 120, 5)
+N = 120
+ACTIVE = np.arange(0, 120, 5)
 
 
 @pytest.fixture(scope="module")
@@ -52,12 +53,13 @@ def test_active_view__renders_and_differentiates_like_the_full_view(camera, gaus
     view, active = split(camera, gaussians, mask)
     assert 0.1 < view.pixel_fraction < 0.4
     dr.enable_grad(active.means, active.sh_coeffs, gaussians.means, gaussians.sh_coeffs)
-    found, full = view.render(active, CHANNELS), rasterize(gaussians, camera, CHANNELS)
+    image = view.render(active, CHANNELS)
+    full = rasterize(gaussians, camera, CHANNELS)
     for name in CHANNELS:
-        assert_close(found[name], view.crop(np.asarray(full[name])), name=name)
+        assert_close(image[name], view.crop(np.asarray(full[name])), name=name)
     weight = np.random.default_rng(0).normal(size=(camera.height, camera.width, 3))
     drawn = drawn_pixels(view)[..., None]
-    dr.backward(dr.sum(found.color * mi.TensorXf(np.float32(view.crop(weight))), axis=None))
+    dr.backward(dr.sum(image.color * mi.TensorXf(np.float32(view.crop(weight))), axis=None))
     dr.backward(dr.sum(full.color * mi.TensorXf(np.float32(weight * drawn)), axis=None))
     for name in ("means", "sh_coeffs"):
         expected = np.asarray(dr.grad(getattr(gaussians, name)))

@@ -36,12 +36,12 @@ def gaussians() -> Gaussians:
 @pytest.mark.parametrize("count", [1, 2, 3, 5])
 def test_rasterize__draws_cameras_together_as_one_by_one(gaussians, count):
     views = cameras(count)
-    together = rasterize(gaussians, views, CHANNELS, background=(0.2, 0.4, 0.6))
+    batch = rasterize(gaussians, views, CHANNELS, background=(0.2, 0.4, 0.6))
     for v, camera in enumerate(views):
         alone = rasterize(gaussians, camera, CHANNELS, background=(0.2, 0.4, 0.6))
         for name in CHANNELS:
-            assert together[name].shape == (count, *alone[name].shape)
-            np.testing.assert_array_equal(np.array(together[name])[v], np.array(alone[name]), err_msg=name)
+            assert batch[name].shape == (count, *alone[name].shape)
+            np.testing.assert_array_equal(np.array(batch[name])[v], np.array(alone[name]), err_msg=name)
 
 
 def test_rasterize__sums_the_gradients_of_cameras():
@@ -57,7 +57,7 @@ def test_rasterize__sums_the_gradients_of_cameras():
         grads = {name: np.array(dr.grad(getattr(trained, name))) for name in ("means", "log_scales", "sh_coeffs")}
         return grads | {f"pose {v}": np.array(dr.grad(pose)) for v, pose in enumerate(poses)}
 
-    together = gradients(
+    batch = gradients(
         lambda trained, posed: dr.sum(rasterize(trained, posed, config=EXACT).color * mi.TensorXf(weights), axis=None)
     )
     alone = gradients(
@@ -66,7 +66,7 @@ def test_rasterize__sums_the_gradients_of_cameras():
             for v, camera in enumerate(posed)
         )
     )
-    for name, grads in together.items():
+    for name, grads in batch.items():
         assert np.abs(grads).max() > 0
         assert_close(grads, alone[name], rtol=1e-5, atol=1e-5)
 

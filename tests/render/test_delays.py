@@ -28,8 +28,8 @@ def moving() -> tuple[dict[str, np.ndarray], Camera]:
 def test_rasterize__shows_gaussians_where_they_are_after_a_delay(moving) -> None:
     raw, camera = moving
     expected = rasterize(to_gaussians({**raw, "means": raw["means"] + 0.4 * raw["motion"]}), camera, ("color",))
-    found = rasterize(to_gaussians(raw), replace(camera, delay=0.4), ("color",))
-    assert_close(found.color, np.asarray(expected.color), atol=tol.IMAGE_ABS)
+    image = rasterize(to_gaussians(raw), replace(camera, delay=0.4), ("color",))
+    assert_close(image.color, np.asarray(expected.color), atol=tol.IMAGE_ABS)
     without = replace(to_gaussians(raw), motion=None, offset=None)
     still = rasterize(without, replace(camera, delay=0.4), ("color",)).color
     assert np.array_equal(still, rasterize(without, camera, ("color",)).color)
@@ -40,8 +40,8 @@ def test_rasterize__shows_each_gaussian_at_the_time_of_its_row(moving) -> None:
     rows = camera.project(raw["means"])[0][:, 1] / camera.height
     delays = 0.1 - 0.5 * (np.clip(rows, 0, 1) - 0.5)[:, None]
     expected = rasterize(to_gaussians({**raw, "means": raw["means"] + delays * raw["motion"]}), camera, ("color",))
-    found = rasterize(to_gaussians(raw), replace(camera, delay=0.1, readout=-0.5), ("color",))
-    assert_close(found.color, np.asarray(expected.color), atol=tol.IMAGE_ABS)
+    image = rasterize(to_gaussians(raw), replace(camera, delay=0.1, readout=-0.5), ("color",))
+    assert_close(image.color, np.asarray(expected.color), atol=tol.IMAGE_ABS)
 
 
 def test_rasterize__backward_agrees_with_central_differences_after_a_delay(moving) -> None:
@@ -56,7 +56,8 @@ def test_rasterize__backward_agrees_with_central_differences_after_a_delay(movin
     rng = np.random.default_rng(4)
     for name in ("means", "motion"):
         grad = np.asarray(dr.grad(getattr(gaussians, name)), np.float64)
-        v, h = np.sign(grad) * rng.uniform(0.5, 1, grad.shape), 2e-3
+        v = np.sign(grad) * rng.uniform(0.5, 1, grad.shape)
+        h = 2e-3
         up, down = (loss(to_gaussians({**raw, name: raw[name] + s * h * v})) for s in (1, -1))
         difference = (np.asarray(up).item() - np.asarray(down).item()) / (2 * h)
         assert difference == pytest.approx(np.vdot(grad, v), rel=tol.CENTRAL_DIFFERENCE_REL), name
@@ -65,26 +66,27 @@ def test_rasterize__backward_agrees_with_central_differences_after_a_delay(movin
 def test_rasterize__shows_decoded_gaussians_with_their_offset_once(moving) -> None:
     """The decoded motion is the whole displacement, whether or not the packet stores its learned part."""
     raw, camera = moving
-    before, config = replace(to_gaussians(raw), motion=None, offset=None), CodecConfig(quality=8, offset=True)
-    coded = decode(None, keyframe_packet(before, 0, [camera], config))
+    start = replace(to_gaussians(raw), motion=None, offset=None)
+    config = CodecConfig(quality=8, offset=True)
+    coded = decode(None, keyframe_packet(start, 0, [camera], config))
     offset = 0.02 * raw["offset"] / np.abs(raw["offset"]).max()
-    now = replace(before, means=raw["means"] + 2 * offset, motion=2 * offset, offset=offset)
-    packet = residual_packet(coded, now, np.arange(len(raw["means"])), [camera], config)
-    found = decode(coded, packet).gaussians
-    assert found.offset is not None
-    late = replace(found, means=found.means + 0.7 * found.motion, motion=None, offset=None)
+    target = replace(start, means=raw["means"] + 2 * offset, motion=2 * offset, offset=offset)
+    packet = residual_packet(coded, target, np.arange(len(raw["means"])), [camera], config)
+    gaussians = decode(coded, packet).gaussians
+    assert gaussians.offset is not None
+    late = replace(gaussians, means=gaussians.means + 0.7 * gaussians.motion, motion=None, offset=None)
     expected = rasterize(late, camera, ("color",)).color
     assert_close(
-        rasterize(found, replace(camera, delay=0.7), ("color",)).color, np.asarray(expected), atol=tol.IMAGE_ABS
+        rasterize(gaussians, replace(camera, delay=0.7), ("color",)).color, np.asarray(expected), atol=tol.IMAGE_ABS
     )
 
 
 def test_rasterize__draws_the_guided_part_of_the_motion(moving) -> None:
     raw, camera = moving
     guided = to_gaussians({**raw, "motion": raw["motion"] - raw["offset"]})
-    found = rasterize(to_gaussians(raw), camera, ("motion", "guided_motion"))
-    assert_close(found["guided_motion"], np.asarray(rasterize(guided, camera, ("motion",)).motion), atol=1e-5)
-    assert_close(found.motion, np.asarray(rasterize(replace(guided, motion=raw["motion"]), camera, ("motion",)).motion))
+    image = rasterize(to_gaussians(raw), camera, ("motion", "guided_motion"))
+    assert_close(image["guided_motion"], np.asarray(rasterize(guided, camera, ("motion",)).motion), atol=1e-5)
+    assert_close(image.motion, np.asarray(rasterize(replace(guided, motion=raw["motion"]), camera, ("motion",)).motion))
     alone = replace(to_gaussians(raw), offset=None)
-    found = rasterize(alone, camera, ("motion", "guided_motion"))
-    assert np.array_equal(found["guided_motion"], found.motion)
+    image = rasterize(alone, camera, ("motion", "guided_motion"))
+    assert np.array_equal(image["guided_motion"], image.motion)

@@ -25,7 +25,8 @@ def limit(scene) -> np.ndarray:
     _, camera = scene
     x, y = np.meshgrid(np.linspace(-1, 1, camera.width), np.linspace(-1, 1, camera.height))
     limit = np.float32(3.0 + 0.5 * x - 0.3 * y)
-    limit[:3], limit[-2:] = np.inf, 0.0
+    limit[:3] = np.inf
+    limit[-2:] = 0.0
     return limit
 
 
@@ -34,15 +35,16 @@ def test_depth_limit__image_agrees_with_the_reference(scene, limit, channel):
     raw, camera = scene
     expected = rasterize_view(raw, camera, depth_limit=limit)
     solid = expected["alpha"] > 0.2 if channel in ("depth", "motion") else True
-    found = rasterize(to_gaussians(raw), camera, (channel,), depth_limit=limit)[channel]
-    assert_close(found, expected[channel], atol=5 * tol.IMAGE_ABS, where=solid)
+    image = rasterize(to_gaussians(raw), camera, (channel,), depth_limit=limit)[channel]
+    assert_close(image, expected[channel], atol=5 * tol.IMAGE_ABS, where=solid)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("channel", "reproducible"), [*((name, False) for name in CHANNELS), ("color", True)])
 def test_depth_limit__backward_agrees_with_the_reference(scene, limit, channel, reproducible):
     raw, camera = scene
-    rng, size = np.random.default_rng(1), {"color": 3, "motion": 2}.get(channel, 1)
+    rng = np.random.default_rng(1)
+    size = {"color": 3, "motion": 2}.get(channel, 1)
     weight = rng.normal(size=(camera.height, camera.width, size))
     weight *= rasterize_view(raw, camera, depth_limit=limit)["alpha"] > 0.1
     gaussians = to_gaussians(raw, grad=True)
@@ -78,10 +80,10 @@ def test_depth_limit__forward_mode_agrees_with_the_reference(scene, limit):
 def test_depth_limit__at_infinity_changes_no_bit(scene):
     raw, camera = scene
     limit = np.full((camera.height, camera.width), np.inf)
-    found = rasterize(to_gaussians(raw), camera, CHANNELS, depth_limit=limit)
+    image = rasterize(to_gaussians(raw), camera, CHANNELS, depth_limit=limit)
     expected = rasterize(to_gaussians(raw), camera, CHANNELS)
     for name in CHANNELS:
-        np.testing.assert_array_equal(found[name], expected[name])
+        np.testing.assert_array_equal(image[name], expected[name])
 
 
 def test_depth_limit__in_front_of_everything_leaves_nothing(scene):
@@ -95,9 +97,9 @@ def test_depth_limit__draws_nothing_where_the_gaussian_is_too_faint(scene):
     faint = to_gaussians({**raw, "log_scales": np.full_like(raw["log_scales"], np.log(0.1))})
     limit = np.full((camera.height, camera.width), np.linalg.norm(camera.position))
     uncut = np.array(rasterize(faint, camera, ("alpha",)).alpha)
-    found = np.array(rasterize(faint, camera, ("alpha",), depth_limit=limit).alpha)
+    alpha = np.array(rasterize(faint, camera, ("alpha",), depth_limit=limit).alpha)
     assert (uncut == 0).any()
-    assert not found[uncut == 0].any()
+    assert not alpha[uncut == 0].any()
 
 
 def test_depth_limit__inside_equals_the_list_cut_at_that_depth():
@@ -108,10 +110,10 @@ def test_depth_limit__inside_equals_the_list_cut_at_that_depth():
     colors = rng.uniform(-1, 1, (60, 1, 3))
     cloud = isotropic(means, 0.05, 0.7, colors)
     near = isotropic(means[:30], 0.05, 0.7, colors[:30])
-    found = rasterize(cloud, camera, depth_limit=np.full((camera.height, camera.width), 4.0))
+    image = rasterize(cloud, camera, depth_limit=np.full((camera.height, camera.width), 4.0))
     expected = rasterize(near, camera)
     for name in ("color", "alpha"):
-        assert_close(found[name], expected[name], atol=tol.IMAGE_ABS, name=name)
+        assert_close(image[name], expected[name], atol=tol.IMAGE_ABS, name=name)
 
 
 def _large_gaussian() -> tuple[Gaussians, Camera]:
@@ -138,10 +140,10 @@ def test_depth_limit__plane_through_a_gaussian_agrees_with_the_integral_along_th
     fraction = np.sum(density * (points @ normal < 0), axis=0) / np.sum(density, axis=0)
 
     alpha = np.asarray(rasterize(gaussians, camera, ("alpha",)).alpha, np.float64)[rows, columns, 0]
-    found = np.asarray(rasterize(gaussians, camera, ("alpha",), depth_limit=limit).alpha)[rows, columns, 0]
+    cut_alpha = np.asarray(rasterize(gaussians, camera, ("alpha",), depth_limit=limit).alpha)[rows, columns, 0]
     assert 0.1 < fraction[alpha > 0.5].min() < 0.4 < fraction[alpha > 0.5].max() < 0.9
     # Low-pass filter, affine approximation over 3 degrees, and approximation of the distribution function.
-    assert_close(found, 1 - (1 - alpha) ** fraction, atol=4e-3)
+    assert_close(cut_alpha, 1 - (1 - alpha) ** fraction, atol=4e-3)
 
 
 def test_profile__is_the_depth_of_the_largest_response_along_the_ray():

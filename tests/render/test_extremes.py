@@ -33,13 +33,14 @@ from tests.scenes.gaussians import CHANNELS
 
 def errors(case: Case) -> dict[str, float]:
     """Return the errors of the image and of each attribute's gradient against the reference."""
-    values, camera = case.values, case.camera
+    values = case.values
+    camera = case.camera
     expected = exact_image(values, camera)
     weight = weights(expected, clear_pixels(values, camera))
-    found, grads = run(values, camera, weight)
+    image, grads = run(values, camera, weight)
     result = {"image": 0.0}
     for name in CHANNELS:
-        error = np.abs(found[name] - expected[name])[weight[name] != 0] / max(1.0, np.abs(expected[name]).max())
+        error = np.abs(image[name] - expected[name])[weight[name] != 0] / max(1.0, np.abs(expected[name]).max())
         result["image"] = max(result["image"], float(error.max(initial=0)))
     # Per relative change, as for an optimiser of logarithms.
     unit = {"scales": values["scales"], "opacities": values["opacities"]}
@@ -62,13 +63,13 @@ def errors(case: Case) -> dict[str, float]:
 def failures(case: Case) -> list[str]:
     """Return the failed comparisons of a case, empty if all pass."""
     try:
-        found = errors(case)
+        largest_errors = errors(case)
     except (AssertionError, ValueError) as error:
         return [f"{case.name}: {error}"]
-    bounds = {name: case.image if name == "image" else case.gradient for name in found}
+    bounds = {name: case.image if name == "image" else case.gradient for name in largest_errors}
     return [
         f"{case.name}: {name} off by {e:.1e}, bound {bounds[name]:.1e}"
-        for name, e in found.items()
+        for name, e in largest_errors.items()
         if not e < bounds[name]
     ]
 
@@ -106,18 +107,19 @@ def test_rasterize__gradients_of_the_pose_at_the_extremes():
     """Columns are compared separately: rotating a world at 1e5 units moves it 1e5 times as far as translating it."""
     failed = []
     for case in CASES:
-        camera, exact = case.camera, np.zeros((3, 4))
+        camera = case.camera
+        exact = np.zeros((3, 4))
         posed = Camera(camera.K, mi.TensorXf(np.float32(camera.viewmat)), camera.width, camera.height, near=camera.near)
         dr.enable_grad(posed.viewmat)
         weight = weights(exact_image(case.values, camera), clear_pixels(case.values, camera))
         run(case.values, posed, weight)
-        found = np.asarray(dr.grad(posed.viewmat), np.float64)[:3]
+        gradient = np.asarray(dr.grad(posed.viewmat), np.float64)[:3]
         for index in np.ndindex(*exact.shape):
             nudged = camera.viewmat.astype(np.clongdouble)
             nudged[index] += 1e-30j
             image = exact_image(case.values, camera, viewmat=nudged)
             exact[index] = sum(np.sum(image[c].imag * weight[c]) for c in CHANNELS) / 1e-30
-        off = np.abs(found - exact).max(axis=0) / np.maximum(np.abs(exact).max(axis=0), 1e-30)
+        off = np.abs(gradient - exact).max(axis=0) / np.maximum(np.abs(exact).max(axis=0), 1e-30)
         if not (off <= case.gradient).all():
             failed.append(f"{case.name}: columns off by {off}, bound {case.gradient:.1e}")
     assert not failed, "\n".join(failed)

@@ -37,12 +37,12 @@ def test_rasterize__backward_agrees_with_the_reference_for_every_attribute(scene
         lambda values: np.sum(rasterize_view(values, camera, background)[channel] * weight), raw, list(RAW)
     )
     for name in RAW:
-        found = np.asarray(dr.grad(getattr(gaussians, name)))
-        assert np.isfinite(found).all()
+        gradient = np.asarray(dr.grad(getattr(gaussians, name)))
+        assert np.isfinite(gradient).all()
         if np.abs(expected[name]).max() == 0:
-            assert np.abs(found).max() == 0, f"{channel} must not depend on {name}"
+            assert np.abs(gradient).max() == 0, f"{channel} must not depend on {name}"
         else:
-            assert_close(found, expected[name], rtol=tol.GRADIENT_REL, name=name)
+            assert_close(gradient, expected[name], rtol=tol.GRADIENT_REL, name=name)
 
 
 def test_rasterize__antialiased_image_and_gradient_agree_with_the_reference(scene):
@@ -160,7 +160,8 @@ def test_rasterize__backward_agrees_with_the_reference_in_a_dense_scene():
 
 
 def test_rasterize__reproducible_gradients_have_the_same_bytes_and_values():
-    raw, camera = as_float32(make_scene(1, 400, seed=9)), make_camera(120, 90)
+    raw = as_float32(make_scene(1, 400, seed=9))
+    camera = make_camera(120, 90)
 
     def gradients(config, threads):
         dr.set_thread_count(threads)

@@ -21,7 +21,8 @@ def scaled(factor: int, *arrays: Any) -> list[Any]:
 def test_recorded__bounds_the_number_of_recordings(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    made, freeze = [], dr.freeze
+    made = []
+    freeze = dr.freeze
     monkeypatch.setattr(kernel_recording, "_MOST_RECORDINGS", 10)
     monkeypatch.setattr(dr, "freeze", lambda *args, **settings: made.append(freeze(*args, **settings)) or made[-1])
     function = kernel_recording.recorded(scaled, 3)

@@ -31,14 +31,15 @@ def stack(n: int, opacity: float) -> Values:
 @pytest.mark.slow
 @pytest.mark.parametrize("opacity", [1.0, 0.99, 0.02])
 def test_rasterize__blends_ten_thousand_layers_on_one_pixel(opacity):
-    values, camera = stack(10_000, opacity), Camera(np.array([[9.0, 0, 0.5], [0, 9, 0.5], [0, 0, 1]]), np.eye(4), 1, 1)
+    values = stack(10_000, opacity)
+    camera = Camera(np.array([[9.0, 0, 0.5], [0, 9, 0.5], [0, 0, 1]]), np.eye(4), 1, 1)
     expected = exact_image(values, camera)
     for config in (CONFIG, RenderConfig()):
-        found, grads = run(values, camera, config=config)
+        image, grads = run(values, camera, config=config)
         hidden = config.stop_transmittance if config is not CONFIG else 0
         for name in CHANNELS:
             bound = (tol.IMAGE_ABS + 2 * hidden) * max(1, np.abs(expected[name]).max())
-            assert_close(found[name], np.float64(expected[name]), atol=bound, name=name)
+            assert_close(image[name], np.float64(expected[name]), atol=bound, name=name)
         if opacity > 0.9:
             assert np.abs(grads["sh_coeffs"][8:]).max() < 1e-12, "occluded Gaussians have no gradient"
 
@@ -59,7 +60,8 @@ def test_rasterize__blends_many_equal_depths_in_the_order_of_the_input():
 @pytest.mark.long
 def test_rasterize__two_million_gaussians_mostly_out_of_view():
     """All but 1,000 are out of view: the image shows the 1,000, and their gradients are complete and finite."""
-    N, in_view = 2_000_000, 1_000
+    N = 2_000_000
+    in_view = 1_000
     rng = np.random.default_rng(0)
     values = {name: np.repeat(value, N // 1000, axis=0) for name, value in cloud(1000).items()}
     values["means"] += rng.normal(size=(N, 3)) * 0.3
@@ -69,10 +71,10 @@ def test_rasterize__two_million_gaussians_mostly_out_of_view():
     away[where] = False
     values["means"][away] = values["means"][away] * 100 - (0, 0, 1e4)
     camera = eye(640, 480)
-    found, grads = run(values, camera)
+    image, grads = run(values, camera)
     few, few_grads = run({name: value[where] for name, value in values.items()}, camera)
     for name in CHANNELS:
-        assert_close(found[name], few[name], name=name)
+        assert_close(image[name], few[name], name=name)
     for name in ATTRIBUTES:
         assert_close(grads[name][where], few_grads[name], rtol=1e-5, name=name)
         assert np.abs(grads[name][away]).max() == 0, name
@@ -83,8 +85,8 @@ def test_rasterize__two_million_gaussians_in_view():
     values = {name: np.repeat(value, 2000, axis=0) for name, value in cloud(1000).items()}
     values["means"] += np.random.default_rng(0).normal(size=values["means"].shape) * 0.3
     values["scales"] *= 0.02
-    found, grads = run(values, eye(640, 480))
-    assert found["alpha"].max() > 0.999
+    image, grads = run(values, eye(640, 480))
+    assert image["alpha"].max() > 0.999
     assert np.abs(grads["means"]).max() > 0
 
 

@@ -26,18 +26,22 @@ from tests.scenes.gaussians import (
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_rasterize__agrees_with_the_reference_at_every_sh_degree(degree):
-    raw, camera = as_float32(make_scene(degree)), make_camera()
-    image, expected = rasterize(to_gaussians(raw), camera, ("color", "alpha")), rasterize_view(raw, camera)
+    raw = as_float32(make_scene(degree))
+    camera = make_camera()
+    image = rasterize(to_gaussians(raw), camera, ("color", "alpha"))
+    expected = rasterize_view(raw, camera)
     for name in ("color", "alpha"):
         assert_close(image[name], expected[name], atol=tol.IMAGE_ABS, name=name)
 
 
 def test_rasterize__agrees_with_the_reference_in_every_channel(scene):
     raw, camera = scene
-    image, expected = rasterize(to_gaussians(raw), camera, CHANNELS), rasterize_view(raw, camera)
+    image = rasterize(to_gaussians(raw), camera, CHANNELS)
+    expected = rasterize_view(raw, camera)
     for name in CHANNELS:
         # Where alpha is small, a normalised channel divides rounding errors by it.
-        solid, scale = expected["alpha"] > 0.02, max(1.0, np.abs(expected[name]).max())
+        solid = expected["alpha"] > 0.02
+        scale = max(1.0, np.abs(expected[name]).max())
         assert_close(image[name], expected[name], atol=tol.IMAGE_ABS * scale, where=solid, name=name)
 
 
@@ -61,7 +65,8 @@ def test_rasterize__blends_features_like_the_confidence(scene):
     """Twelve columns beside the colour have the image and the gradients of the confidence channel."""
     raw, camera = scene
     rng = np.random.default_rng(2)
-    values, seed = rng.normal(size=(len(raw["means"]), 12)), rng.normal(size=(camera.height, camera.width, 12))
+    values = rng.normal(size=(len(raw["means"]), 12))
+    seed = rng.normal(size=(camera.height, camera.width, 12))
 
     def differentiated(column):
         gaussians = to_gaussians(raw, grad=True)
@@ -100,8 +105,8 @@ def blend_weights(raw, camera):
 def test_rasterize__image_does_not_depend_on_the_block_shape(scene, shape):
     raw, camera = scene
     config = RenderConfig(block_width=shape[0], block_height=shape[1])
-    found = rasterize(to_gaussians(raw), camera, ("color",), config=config).color
-    assert_close(found, rasterize_view(raw, camera)["color"], atol=tol.IMAGE_ABS)
+    image = rasterize(to_gaussians(raw), camera, ("color",), config=config).color
+    assert_close(image, rasterize_view(raw, camera)["color"], atol=tol.IMAGE_ABS)
 
 
 def test_rasterize__stops_early_within_its_bound_in_a_dense_opaque_scene():
@@ -111,9 +116,10 @@ def test_rasterize__stops_early_within_its_bound_in_a_dense_opaque_scene():
     raw["logit_opacities"] = rng.uniform(2, 8, 300)
     raw = as_float32(raw)
     camera = make_camera(70, 45)
-    found, expected = rasterize(to_gaussians(raw), camera), rasterize_view(raw, camera)
+    image = rasterize(to_gaussians(raw), camera)
+    expected = rasterize_view(raw, camera)
     assert expected["alpha"].max() > 1 - 1e-5
-    assert_close(found.color, expected["color"], atol=tol.STOPPED_IMAGE_ABS)
+    assert_close(image.color, expected["color"], atol=tol.STOPPED_IMAGE_ABS)
 
 
 def test_rasterize__blends_equal_depths_in_the_order_of_the_input():
@@ -122,8 +128,8 @@ def test_rasterize__blends_equal_depths_in_the_order_of_the_input():
     raw["quats"][:] = (1, 0, 0, 0)
     raw["sh_coeffs"][:] = np.array([1.0, -1.0])[:, None, None]
     camera = make_camera()
-    found = rasterize(to_gaussians(raw), camera).color
-    assert_close(found, rasterize_view(raw, camera)["color"], atol=tol.IMAGE_ABS)
+    image = rasterize(to_gaussians(raw), camera).color
+    assert_close(image, rasterize_view(raw, camera)["color"], atol=tol.IMAGE_ABS)
 
 
 def test_rasterize__of_no_gaussians_is_the_background():
@@ -147,8 +153,8 @@ def test_rasterize__of_gaussians_out_of_view_is_empty_with_zero_gradients(scene)
 def test_rasterize__agrees_with_the_reference_in_a_one_pixel_image(scene):
     raw, _ = scene
     camera = make_camera(1, 1)
-    found = rasterize(to_gaussians(raw), camera, ("color",)).color
-    assert_close(found, rasterize_view(raw, camera)["color"], atol=tol.IMAGE_ABS)
+    image = rasterize(to_gaussians(raw), camera, ("color",)).color
+    assert_close(image, rasterize_view(raw, camera)["color"], atol=tol.IMAGE_ABS)
 
 
 @pytest.mark.parametrize(
@@ -234,7 +240,8 @@ def test_rasterize__refuses_to_be_frozen(scene):
 
 def test_rasterize__copies_features_and_background_before_it_returns(scene):
     raw, camera = scene
-    features, background = np.ones((10, 2), np.float32), np.full(3, 0.5)
+    features = np.ones((10, 2), np.float32)
+    background = np.full(3, 0.5)
     images = []
     for overwritten in (False, True):
         gaussians = to_gaussians(raw, grad=True)
@@ -244,8 +251,8 @@ def test_rasterize__copies_features_and_background_before_it_returns(scene):
             array[:] = 0
         dr.backward(dr.sum(image.color) + dr.sum(image.features))
         images.append([np.asarray(v) for v in (image.color, image.features, dr.grad(gaussians.means))])
-    for before, after in zip(*images, strict=True):
-        np.testing.assert_allclose(before, after, rtol=1e-5, atol=1e-5)
+    for expected, result in zip(*images, strict=True):
+        np.testing.assert_allclose(expected, result, rtol=1e-5, atol=1e-5)
 
 
 def test_rasterize__compiles_its_kernels_once_for_all_cameras_and_sizes():

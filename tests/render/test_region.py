@@ -52,7 +52,8 @@ def run(raw, camera, region=None, weight=None, config=None):
 @pytest.fixture(scope="module")
 def weight(camera: Camera, mask: np.ndarray) -> dict[str, np.ndarray]:
     """Random weights on the pixels of the region's blocks, 0 elsewhere."""
-    rng, drawn = np.random.default_rng(3), drawn_pixels(Region(mask), mask)
+    rng = np.random.default_rng(3)
+    drawn = drawn_pixels(Region(mask), mask)
     sizes = {"color": 3, "motion": 2}
     return {name: rng.normal(size=(*mask.shape, sizes.get(name, 1))) * drawn for name in CHANNELS}
 
@@ -83,7 +84,8 @@ def test_rasterize__on_a_region_renders_and_differentiates_like_the_full_view(ra
 
 
 def test_rasterize__blends_features_on_a_region(raw, camera, mask):
-    rng, region = np.random.default_rng(0), Region(mask)
+    rng = np.random.default_rng(0)
+    region = Region(mask)
     values = np.float32(rng.normal(size=(len(raw["means"]), 5)))
 
     def run_features(**restriction):
@@ -95,8 +97,8 @@ def test_rasterize__blends_features_on_a_region(raw, camera, mask):
         return np.asarray(dr.detach(image)), np.asarray(dr.grad(features))
 
     expected, full = run_features()
-    found, grad = run_features(region=region)
-    assert np.array_equal(found, region.crop(expected))
+    blend, grad = run_features(region=region)
+    assert np.array_equal(blend, region.crop(expected))
     assert np.abs(full).max() > 0
     assert_close(grad, full, atol=tol.SUM_ORDER_REL * np.abs(full).max())
 
@@ -115,7 +117,9 @@ def test_rasterize__equal_depths_keep_their_order(camera):
 
 
 def test_rasterize__forward_mode_on_a_region_agrees_with_the_full_view(raw, camera, mask):
-    rng, region, tangents = np.random.default_rng(1), Region(mask), []
+    rng = np.random.default_rng(1)
+    region = Region(mask)
+    tangents = []
     direction = {name: np.float32(rng.normal(size=raw[name].shape)) for name in RAW}
     for where in (region, None):
         gaussians = Gaussians(**raw)
@@ -126,21 +130,22 @@ def test_rasterize__forward_mode_on_a_region_agrees_with_the_full_view(raw, came
         outputs = [image[name] for name in CHANNELS]
         dr.forward_to(outputs)
         tangents.append([np.asarray(dr.grad(output)) for output in outputs])
-    for name, found, expected in zip(CHANNELS, *tangents, strict=True):
-        assert_close(found, region.crop(expected), atol=tol.SUM_ORDER_REL * np.abs(expected).max(), name=name)
+    for name, tangent, expected in zip(CHANNELS, *tangents, strict=True):
+        assert_close(tangent, region.crop(expected), atol=tol.SUM_ORDER_REL * np.abs(expected).max(), name=name)
 
 
 def test_rasterize__on_an_empty_region_is_the_background(raw, camera, mask):
     raw = raw | {"means": raw["means"] * (1, 1, 0) + (0, 0, -50)}
     image = rasterize(Gaussians(**raw), camera, ("color", "depth"), BACKGROUND, region=Region(mask))
-    inside = Region(mask).inside()
-    assert np.array_equal(np.asarray(image.color)[inside], np.tile(np.float32(BACKGROUND), (inside.sum(), 1)))
-    assert (np.asarray(image.color)[~inside] == 0).all()
+    pixels = Region(mask).inside()
+    assert np.array_equal(np.asarray(image.color)[pixels], np.tile(np.float32(BACKGROUND), (pixels.sum(), 1)))
+    assert (np.asarray(image.color)[~pixels] == 0).all()
     assert (np.asarray(image.depth) == 0).all()
 
 
 def test_region__crop_and_paste_are_inverse(camera, mask):
-    region, rng = Region(mask), np.random.default_rng(0)
+    region = Region(mask)
+    rng = np.random.default_rng(0)
     image, other = (rng.normal(size=(*mask.shape, 3)) for _ in range(2))
     pasted = region.paste(region.crop(image), other)
     assert (pasted[mask] == image[mask]).all()

@@ -37,12 +37,14 @@ def descend(rate: float, steps: int) -> tuple[list[float], Values]:
     def render(gaussians: Gaussians) -> Any:
         return rasterize(gaussians, CAMERA, CHANNELS, BACKGROUND, config=CONFIG).color
 
-    truth, rng = stiff_truth(), np.random.default_rng(0)
+    truth = stiff_truth()
+    rng = np.random.default_rng(0)
     target = dr.detach(render(Gaussians(**truth)))
     start = {name: value + 0.03 * rng.normal(size=value.shape) for name, value in truth.items()}
     start["log_scales"] += 0.3 * rng.normal(size=(2, 3))
     start["logit_opacities"] += (1, -3)
-    optimizer, losses = Adam(lr=rate, params=Gaussians(**start).items(), epsilon=1e-15), []
+    optimizer = Adam(lr=rate, params=Gaussians(**start).items(), epsilon=1e-15)
+    losses = []
     for step in range(steps):
         optimizer.set_learning_rate(rate * 0.01 ** (step / steps))
         loss = dr.mean(dr.square(render(Gaussians(**dict(optimizer))) - target), axis=None)
@@ -54,7 +56,8 @@ def descend(rate: float, steps: int) -> tuple[list[float], Values]:
 
 def test_stiff_truth__is_stiff():
     """The diagonal of J'J of the image spans more than 1e6, between tilts of the needle and the disc's opacity."""
-    truth, curvature = stiff_truth(), {}
+    truth = stiff_truth()
+    curvature = {}
     for name in ("means", "quats", "log_scales", "logit_opacities"):
         curvature[name] = np.zeros(truth[name].shape)
         for index in np.ndindex(*truth[name].shape):
@@ -70,14 +73,14 @@ def test_stiff_truth__is_stiff():
 
 
 def test_rasterize__adam_converges_on_a_stiff_problem():
-    losses, found = descend(0.02, 150)
+    losses, values = descend(0.02, 150)
     assert np.isfinite(losses).all()
     assert losses[-1] < 1e-3 * losses[0]
     for name, value in stiff_truth().items():
-        assert np.abs(found[name] - value).max() < (4 if name == "logit_opacities" else 1), name
+        assert np.abs(values[name] - value).max() < (4 if name == "logit_opacities" else 1), name
 
 
 def test_rasterize__stays_finite_with_an_excessive_learning_rate():
-    losses, found = descend(10.0, 60)
+    losses, values = descend(10.0, 60)
     assert np.isfinite(losses).all()
-    assert all(np.isfinite(value).all() for value in found.values())
+    assert all(np.isfinite(value).all() for value in values.values())

@@ -18,7 +18,8 @@ from tests.assertions import assert_close
 from tests.scenes.cameras import make_camera, make_wide_camera
 from tests.scenes.gaussians import as_float32, make_scene, make_wide_scene, to_gaussians
 
-N, ACTIVE = 120, np.arange(0, 120, 5)
+N = 120
+ACTIVE = np.arange(0, 120, 5)
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +36,8 @@ def moved(camera: Camera, x: float) -> Camera:
 
 def views_of(gaussians: Gaussians) -> list[ActiveView]:
     """Return views of several sizes: in part, as a whole, with a rolling shutter, and without static Gaussians."""
-    wide, static = make_wide_camera(), gaussians.select(~np.isin(np.arange(N), ACTIVE))
+    wide = make_wide_camera()
+    static = gaussians.select(~np.isin(np.arange(N), ACTIVE))
     cameras = [wide, moved(wide, 0.1), wide.resized(90, 37), replace(moved(wide, -0.2), delay=0.4, readout=0.3)]
     views = []
     for k, camera in enumerate(cameras):
@@ -47,16 +49,17 @@ def views_of(gaussians: Gaussians) -> list[ActiveView]:
 
 
 def test_view_group__draws_what_each_view_draws(gaussians):
-    views, active = views_of(gaussians), gaussians.select(ACTIVE)
+    views = views_of(gaussians)
+    active = gaussians.select(ACTIVE)
     group = ViewGroup(views)
     drawing = group.draw(active)
     images = group.split(np.asarray(drawing.color).reshape(group.region.shape(3)))
     weights = [np.random.default_rng(k).normal(size=region.shape(2)) for k, region in enumerate(group.regions)]
     sums = drawing.sums(from_numpy(mi.Float, np.concatenate(weights)), 2)
-    for view, region, image, weight, found in zip(views, group.regions, images, weights, sums, strict=True):
+    for view, region, image, weight, part in zip(views, group.regions, images, weights, sums, strict=True):
         blocks = replace(view, region=region)
         assert_close(image, np.asarray(blocks.render(active).color), rtol=1e-6, atol=1e-6)
-        assert_close(found, backproject(active, blocks, np.float32(weight)), rtol=1e-5, atol=1e-4)
+        assert_close(part, backproject(active, blocks, np.float32(weight)), rtol=1e-5, atol=1e-4)
 
 
 def test_view_group__crops_images_of_its_views(gaussians):
@@ -64,8 +67,8 @@ def test_view_group__crops_images_of_its_views(gaussians):
     images = [
         np.random.default_rng(k).normal(size=(v.camera.height, v.camera.width)) for k, v in enumerate(group.views)
     ]
-    for region, image, found in zip(group.regions, images, group.split(group.crop(images)), strict=True):
-        assert np.array_equal(found, region.crop(image))
+    for region, image, part in zip(group.regions, images, group.split(group.crop(images)), strict=True):
+        assert np.array_equal(part, region.crop(image))
 
 
 def test_view_group__of_gaussians_that_no_view_shows_is_black(gaussians):
@@ -87,7 +90,8 @@ def test_totals__are_the_sums_over_all_views(gaussians):
 
 def test_backproject__is_the_transpose_of_blending():
     """<image, sum_i w_i c_i> = sum_i c_i <image, w_i> for the confidence channel, which is plain blending."""
-    raw, camera = as_float32(make_scene()), make_camera()
+    raw = as_float32(make_scene())
+    camera = make_camera()
     gaussians = to_gaussians(raw)
     image = np.random.default_rng(0).normal(size=(camera.height, camera.width, 1)).astype(np.float32)
     sums = backproject(gaussians, ActiveView(camera), image)
@@ -97,7 +101,8 @@ def test_backproject__is_the_transpose_of_blending():
 
 
 def test_backproject__of_ones_sums_to_alpha():
-    raw, camera = as_float32(make_scene()), make_camera()
+    raw = as_float32(make_scene())
+    camera = make_camera()
     ones = np.ones((camera.height, camera.width, 3), np.float32)
     sums = backproject(to_gaussians(raw), ActiveView(camera), ones)
     alpha = np.asarray(rasterize(to_gaussians(raw), camera, ("alpha",)).alpha, np.float64)

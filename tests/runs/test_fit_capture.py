@@ -80,9 +80,14 @@ def process(out: Path, *left: int) -> subprocess.Popen:
 
 def kill_and_resume(whole: Path, folder: Path, kills: int) -> None:
     """Fit again and again, each time killed at a random byte of the stream or a random moment, until it is done."""
-    rng, size, killed, fits = np.random.default_rng(0), len(stream_of(whole)), 0, 0
+    rng = np.random.default_rng(0)
+    size = len(stream_of(whole))
+    killed = 0
+    fits = 0
     while killed < kills:
-        out, fits, status = folder / f"{fits}", fits + 1, -9
+        out = folder / f"{fits}"
+        fits = fits + 1
+        status = -9
         while status and killed < kills:
             written = len(stream_of(out)) if (out / "stream.morgs").exists() else 0
             if rng.random() < 0.5 and written < size:
@@ -100,7 +105,8 @@ def kill_and_resume(whole: Path, folder: Path, kills: int) -> None:
 
 def test_stream_capture__shows_a_provisional_first_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A stream beside the one that is written has a frame for each round of density control, and is removed."""
-    shown, show = [], Files.show
+    shown = []
+    show = Files.show
 
     def spy(files: Files, keyframe: Packet) -> None:
         show(files, keyframe)
@@ -141,7 +147,8 @@ def test_stream_capture__goes_on_without_a_provisional_first_frame_that_has_no_r
 def test_stream_capture__removes_the_provisional_first_frame_before_it_writes_the_result(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write, shown = StreamWriter.write, []
+    write = StreamWriter.write
+    shown = []
 
     def spy(writer: StreamWriter, packet: Packet) -> int:
         is_provisional = "provisional" in writer.path.name
@@ -187,15 +194,17 @@ def test_stream_capture__keeps_an_earlier_fit_until_its_first_frame(
 
 @pytest.mark.slow
 def test_stream_capture__replaces_an_earlier_fit_together(whole: Path, tmp_path: Path) -> None:
-    out, push, frames = tmp_path / "out", StreamLoop.push, []
+    out = tmp_path / "out"
+    push = StreamLoop.push
+    frames = []
     shutil.copytree(whole, out)
 
     def spy(loop: StreamLoop, *args: Any) -> Any:
         if frame := loop.state.frame:
-            about = json.loads((out / "capture.json").read_text())
+            metadata = json.loads((out / "capture.json").read_text())
             rows = report_of(out)["frames"]
             held = {index for _, index, _ in StreamReader(out / "stream.morgs").index()}
-            frames.append((Path(about["capture"]).name, report_of(out)["config"]["seed"], len(rows), len(held)))
+            frames.append((Path(metadata["capture"]).name, report_of(out)["config"]["seed"], len(rows), len(held)))
             assert len(rows) == frame
         return push(loop, *args)
 
@@ -210,7 +219,9 @@ def test_stream_capture__resumes_after_a_kill_between_the_files_that_it_replaces
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: int
 ) -> None:
     """Whatever has been replaced, the files that are there after the next start belong together."""
-    out, count, rename = tmp_path / "out", 0, Path.replace
+    out = tmp_path / "out"
+    count = 0
+    rename = Path.replace
     shutil.copytree(whole, out)
 
     class Killed(BaseException):
@@ -271,7 +282,8 @@ def test_stream_capture__300_frames_play_as_they_were_fitted(tmp_path: Path) -> 
 def cuts(whole: Path) -> list[int]:
     """Return bytes within and between packets of every kind."""
     index = StreamReader(whole / "stream.morgs").index()
-    size, ends = len(stream_of(whole)), [offset for _, _, offset in index]
+    size = len(stream_of(whole))
+    ends = [offset for _, _, offset in index]
     index_at = size - PAYLOAD - 16 * len(index) - TRAILER.size
     # A re-emitted keyframe, the fourth packet, may be missing after its residual.
     return [0, ends[0] - 1, ends[0], ends[3] - 1, ends[3], ends[4], index_at, size - 1, size]
@@ -317,10 +329,10 @@ def interrupted(whole: Path, out: Path, at: int) -> Path:
 
 def played(path: Path) -> list[int]:
     """Return the frames that can be played."""
-    found = []
+    numbers = []
     with contextlib.suppress(ValueError):
-        found.extend(frame for frame, _ in play(StreamReader(path)))
-    return found
+        numbers.extend(frame for frame, _ in play(StreamReader(path)))
+    return numbers
 
 
 def brighter(capture: Recording) -> Recording:
@@ -342,10 +354,10 @@ def test_stream_capture__does_not_resume_another_fit(
     whole: Path, tmp_path: Path, capture, config, message: str
 ) -> None:
     out = interrupted(whole, tmp_path / "out", len(stream_of(whole)) // 2)
-    before = stream_of(out)
+    old_stream = stream_of(out)
     with pytest.raises(ValueError, match=message):
         stream_capture(capture, out, config, resume=True)
-    assert stream_of(out) == before
+    assert stream_of(out) == old_stream
 
 
 def test_stream_capture__does_not_resume_a_damaged_fit(whole: Path, tmp_path: Path) -> None:
@@ -387,13 +399,14 @@ def test_stream_capture__refuses_a_folder_into_which_another_fit_writes(whole: P
 @pytest.mark.slow
 @pytest.mark.parametrize("change", ["removed", "removed folder", "moved", "replaced"])
 def test_stream_capture__ends_when_its_stream_is_taken_away(whole: Path, tmp_path: Path, change: str) -> None:
-    out, seen = tmp_path / "out", []
+    out = tmp_path / "out"
+    reports = []
 
     def take_away(stage: str, done: float, total: float) -> None:
         frame = ceil(done) if stage == "Later frames" else 0
-        if frame in seen:
+        if frame in reports:
             return
-        seen.append(frame)
+        reports.append(frame)
         if frame != 2:
             return
         if change == "removed":
@@ -404,10 +417,10 @@ def test_stream_capture__ends_when_its_stream_is_taken_away(whole: Path, tmp_pat
         else:
             out.rename(tmp_path / "moved")
 
-    found = "another file" if change == "replaced" else "none"
-    with pytest.raises(FileNotFoundError, match=rf"stream\.morgs: expected the stream that is being .*, found {found}"):
+    place = "another file" if change == "replaced" else "none"
+    with pytest.raises(FileNotFoundError, match=rf"stream\.morgs: expected the stream that is being .*, found {place}"):
         stream_capture(recording(), out, CONFIG, progress=take_away)
-    assert max(seen) == 2
+    assert max(reports) == 2
     if change == "replaced":
         assert stream_of(out) == stream_of(whole)
     elif change == "moved":
@@ -433,10 +446,11 @@ def test_stream_capture__writes_no_path_into_the_stream(tmp_path: Path) -> None:
 
 def test_stream_capture__resumes_a_stream_whose_header_has_a_path(whole: Path, tmp_path: Path) -> None:
     """As the headers of earlier versions have; the recording may have moved."""
-    reader, out = StreamReader(whole / "stream.morgs"), tmp_path / "out"
+    reader = StreamReader(whole / "stream.morgs")
+    out = tmp_path / "out"
     shutil.copytree(whole, out)
-    about = {**reader.metadata, "capture": "/elsewhere"}
-    with StreamWriter(out / "stream.morgs", reader.cameras, reader.fps, about) as writer:
+    metadata = {**reader.metadata, "capture": "/elsewhere"}
+    with StreamWriter(out / "stream.morgs", reader.cameras, reader.fps, metadata) as writer:
         for packet in list(reader)[:3]:
             writer.write(packet)
     stream_capture(recording(), out, CONFIG, resume=True)
@@ -476,7 +490,8 @@ def test_stream_capture__resumes_hostile_streams_or_refuses_them_in_one_sentence
     pieces = [Piece(-1, 0, 0, 12), Piece(0, 0, 12, ends[0])]
     pieces += [Piece(p.kind, p.frame, a, b) for p, (a, b) in zip(packets, pairwise(ends), strict=True)]
     pieces.append(Piece(3, 0, index, len(data)))
-    clip, out = Clip(data, pieces, {}), tmp_path / "out"
+    clip = Clip(data, pieces, {})
+    out = tmp_path / "out"
     for case in range(12):
         forge = (damaged, with_forged_bytes, with_forged_packets, with_forged_header)[case % 4]
         forged = forge(clip, np.random.default_rng(case))
@@ -493,9 +508,10 @@ def test_stream_capture__resumes_hostile_streams_or_refuses_them_in_one_sentence
 
 @pytest.mark.parametrize("link", ["", "folder", "file"])
 def test_stream_capture__does_not_write_into_a_capture(tmp_path: Path, link: str) -> None:
-    capture, out = colmap(tmp_path / "clip"), tmp_path / "clip"
+    capture = colmap(tmp_path / "clip")
+    out = tmp_path / "clip"
     (capture / "capture.json").write_text("{}")
-    before = sorted(capture.rglob("*"))
+    old_files = sorted(capture.rglob("*"))
     if link == "folder":
         out = tmp_path / "out"
         out.symlink_to(capture / "videos")
@@ -505,7 +521,7 @@ def test_stream_capture__does_not_write_into_a_capture(tmp_path: Path, link: str
         (out / "capture.json").symlink_to(capture / "capture.json")
     with pytest.raises(ValueError, match=rf"an output outside of captures, .* in the capture {capture}; choose"):
         stream_capture(recording(), out, CONFIG)
-    assert sorted(capture.rglob("*")) == before
+    assert sorted(capture.rglob("*")) == old_files
     assert (capture / "capture.json").read_text() == "{}"
 
 
@@ -519,10 +535,10 @@ def test_with_next__yields_the_frames_before_one_that_cannot_be_read() -> None:
         yield from "ab"
         raise OSError("the video ends here")
 
-    seen = []
+    numbers = []
     with pytest.raises(OSError, match="the video ends here"):
-        seen.extend(with_next(frames()))
-    assert seen == [("a", "b"), ("b", None)]
+        numbers.extend(with_next(frames()))
+    assert numbers == [("a", "b"), ("b", None)]
 
 
 def refined_config():
@@ -533,10 +549,12 @@ def refined_config():
 
 @pytest.mark.slow
 def test_stream_capture__stores_refined_cameras_and_resumes_with_them(tmp_path_factory):
-    tmp_path, config = tmp_path_factory.mktemp("out"), refined_config()
+    tmp_path = tmp_path_factory.mktemp("out")
+    config = refined_config()
     capture = load_capture(write_recording(tmp_path_factory.mktemp("capture"), 2), test_view=0)
     stream_capture(capture, tmp_path, config)
-    stream, whole = StreamReader(tmp_path / "stream.morgs"), stream_of(tmp_path)
+    stream = StreamReader(tmp_path / "stream.morgs")
+    whole = stream_of(tmp_path)
     names = set(stream.metadata["distortions"])
     assert names == set(capture.names[1:]), "the terms of the training views"
     opened = open_stream_capture(stream, None, [0, 1])
@@ -559,7 +577,8 @@ def test_stream_capture__resumes_where_cameras_have_delays(tmp_path):
     assert [camera.delay for camera in capture.cameras] == [0, -0.25, 0.5]
     out = tmp_path / "out"
     stream_capture(capture, out, CONFIG)
-    stream, whole = StreamReader(out / "stream.morgs"), stream_of(out)
+    stream = StreamReader(out / "stream.morgs")
+    whole = stream_of(out)
     for frame in (1, 3):
         end = next(offset for _, index, offset in stream.index() if index == frame)
         (out / "stream.morgs").write_bytes(whole[:end])
@@ -579,9 +598,12 @@ def test_as_fitted__refuses_broken_distortions(tmp_path, found):
 
 def test_stream_capture__resumes_with_the_exposures_of_the_report(tmp_path):
     how = ShortFitConfig(gaussians=40, steps=4, rounds=1)
-    capture, config = recording(num_frames=3), replace(CONFIG, fit=replace(CONFIG.fit, exposure="on", short_fits=how))
+    capture = recording(num_frames=3)
+    config = replace(CONFIG, fit=replace(CONFIG.fit, exposure="on", short_fits=how))
     stream_capture(capture, tmp_path, config)
-    stream, whole, report = StreamReader(tmp_path / "stream.morgs"), stream_of(tmp_path), report_of(tmp_path)
+    stream = StreamReader(tmp_path / "stream.morgs")
+    whole = stream_of(tmp_path)
+    report = report_of(tmp_path)
     assert all(len(row["exposures"]) == len(capture.train_views) for row in report["frames"])
     (tmp_path / "stream.morgs").write_bytes(whole[: stream.index()[-1][2]])
     stream_capture(capture, tmp_path, config, resume=True)
@@ -593,6 +615,7 @@ def test_stream_metadata__names_the_calibration_that_cameras_are_refined_from():
     capture = recording()
     other = replace(capture.cameras[0], K=capture.cameras[0].K * np.array([[1.01, 1, 1], [1, 1.01, 1], [1, 1, 1]]))
     others = replace(capture, cameras=(other, *capture.cameras[1:]))
-    first, config = next(capture.partial_frames()), refined_config()
+    first = next(capture.partial_frames())
+    config = refined_config()
     same, different = (stream_metadata(c, first, config)["fingerprint"] for c in (capture, others))
     assert same != different

@@ -22,7 +22,8 @@ def annotated(path: Path, names: tuple[str, ...]) -> Path:
     layouts.dynamic3dgs(path)
     for camera in rig(("2", "1", "10"), shift=3):
         if camera.name in names:
-            V, K = np.asarray(camera.viewmat), camera.K
+            V = np.asarray(camera.viewmat)
+            K = camera.K
             local = PATHS @ V[:3, :3].T + V[:3, 3]
             at_query = PATHS[np.arange(len(PATHS)), QUERIES]
             np.savez(

@@ -51,8 +51,8 @@ def problem(
 ) -> FirstFrameProblem:
     """Return the problem of a first frame with some or all of the `views`."""
     masks = [None] * len(images) if masks is None else masks
-    given = [View(*view) for view in zip(views()[: len(images)], images, masks, strict=True)]
-    return FirstFrameProblem(start or ball(80), tuple(given), np.zeros((0, 3)), 3.0, render or RenderConfig())
+    views_of_images = [View(*view) for view in zip(views()[: len(images)], images, masks, strict=True)]
+    return FirstFrameProblem(start or ball(80), tuple(views_of_images), np.zeros((0, 3)), 3.0, render or RenderConfig())
 
 
 def mean_psnr(gaussians: Gaussians, images: list[np.ndarray]) -> float:

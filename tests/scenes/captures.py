@@ -17,7 +17,10 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.io.video_writer import write_video
 from tests.scenes.cameras import circle, look_at_cameras, shift_principal_point
 
-WIDTH, HEIGHT, COUNT, FPS = 62, 46, 4, 25
+WIDTH = 62
+HEIGHT = 46
+COUNT = 4
+FPS = 25
 
 
 def make_camera(i: int, name: str, shift: float = 0.0) -> Camera:

@@ -51,7 +51,8 @@ def write_stream(
 
     The first half of the splats moves from frame 1. In frame 2 one dies and two are born.
     """
-    cameras, states = cameras or rig(), []
+    cameras = cameras or rig()
+    states = []
     with StreamWriter(path, cameras, 10, metadata) as writer:
         packet = keyframe_packet(start or splats(), 0, cameras)
         for t in range(frames):
@@ -59,13 +60,14 @@ def write_stream(
             states.append(decode(states[-1] if states else None, packet))
             if t and keyframe_interval and t % keyframe_interval == 0:
                 writer.write(reemitted_keyframe(states[-1]))
-            before, source = states[-1].gaussians, np.arange(len(states[-1]))
-            moves = np.asarray(before.logit_confidence) > 0
-            after = replace(before, means=before.numpy()["means"] + 0.1 * moves[:, None] * np.float32([1, 0, 0]))
+            gaussians = states[-1].gaussians
+            source = np.arange(len(states[-1]))
+            moves = np.asarray(gaussians.logit_confidence) > 0
+            target = replace(gaussians, means=gaussians.numpy()["means"] + 0.1 * moves[:, None] * np.float32([1, 0, 0]))
             if t == 1:
-                born = splats(2, before.sh_degree, seed=9)
-                after = Gaussians.concatenate([replace(after.select(source[1:]), motion=None, offset=None), born])
+                born = splats(2, gaussians.sh_degree, seed=9)
+                target = Gaussians.concatenate([replace(target.select(source[1:]), motion=None, offset=None), born])
                 source = np.concatenate([source[1:], [-1, -1]])
-            after = replace(after, offset=np.tile(np.float32(OFFSET), (len(after), 1)))
-            packet = residual_packet(states[-1], after, source, cameras, CodecConfig(offset=True))
+            target = replace(target, offset=np.tile(np.float32(OFFSET), (len(target), 1)))
+            packet = residual_packet(states[-1], target, source, cameras, CodecConfig(offset=True))
     return states

@@ -50,12 +50,12 @@ def encoded_clip(
         state = states[-1]
         alive = np.flatnonzero(rng.random(len(state)) > 0.03)
         births = int(rng.integers(0, 5))
-        moved = jittered(state.gaussians, rng).select(alive)
-        now = Gaussians.concatenate([moved, cloud(births, degree, seed=frame)]) if births else moved
+        survivors = jittered(state.gaussians, rng).select(alive)
+        target = Gaussians.concatenate([survivors, cloud(births, degree, seed=frame)]) if births else survivors
         if config is not None and config.offset:
-            now = replace(now, offset=np.random.default_rng(frame).normal(0, 0.02, (len(now), 3)))
+            target = replace(target, offset=np.random.default_rng(frame).normal(0, 0.02, (len(target), 3)))
         source = np.concatenate([alive, np.full(births, -1)])
-        packets.append(residual_packet(state, now, source, CAMERAS, config))
+        packets.append(residual_packet(state, target, source, CAMERAS, config))
         states.append(decode(state, packets[-1]))
     return packets, states
 
@@ -82,6 +82,6 @@ def assert_same(got: CodedFrame, expected: CodedFrame) -> None:
     """Assert that two states agree to the bit."""
     assert (got.frame, got.next_id) == (expected.frame, expected.next_id)
     assert np.array_equal(got.digest, expected.digest)
-    found = got.gaussians.numpy()
+    values = got.gaussians.numpy()
     for name, value in expected.gaussians.numpy().items():
-        assert np.array_equal(found[name], value), name
+        assert np.array_equal(values[name], value), name

@@ -164,7 +164,8 @@ CASES = [
 def random_case(seed: int) -> Case:
     """Return a random mixture of the cases in the table."""
     rng = np.random.default_rng(seed)
-    n, unit = int(rng.integers(1, 7)), 10 ** rng.uniform(-3, 6)
+    n = int(rng.integers(1, 7))
+    unit = 10 ** rng.uniform(-3, 6)
     values = cloud(n, seed)
     values["means"] *= 10 ** rng.uniform(-2, 0.5)
     values["motion"] *= 10 ** rng.uniform(-3, 3)
@@ -184,7 +185,8 @@ def random_case(seed: int) -> Case:
     lift = np.eye(4)
     lift[:3, 3] = unit * 10 ** rng.uniform(-2, 5) * rng.normal(size=3) * (rng.random() < 0.3)
     values["means"] = values["means"] * unit - lift[:3, 3]
-    values["scales"], values["motion"] = values["scales"] * unit, values["motion"] * unit
+    values["scales"] = values["scales"] * unit
+    values["motion"] = values["motion"] * unit
     viewmat = np.float32(camera.viewmat @ lift).astype(np.float64)
     values = {name: np.float32(value).astype(np.float64) for name, value in values.items()}
 

@@ -11,7 +11,8 @@ from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.core.camera import Camera
 from tests.scenes import textured
 
-COUNT, FPS = 4, 30.0
+COUNT = 4
+FPS = 30.0
 Clips = list[list[np.ndarray | None]]
 
 
@@ -46,7 +47,8 @@ def rig() -> list[Camera]:
 
 def film(offsets: Sequence[float] = (0.0,) * COUNT, frames: int = 32) -> Clips:
     """Return the clip of each camera with its time offset in frames."""
-    planes, clips = textured.textures(), []
+    planes = textured.textures()
+    clips = []
     for camera, offset in zip(rig(), offsets, strict=True):
         still = textured.render(camera, planes)
         times = offset + np.arange(frames)
@@ -56,7 +58,8 @@ def film(offsets: Sequence[float] = (0.0,) * COUNT, frames: int = 32) -> Clips:
 
 def _moving(t: float) -> list[tuple]:
     """Return the places of the moving planes at frame t."""
-    x, y = 0.9 * np.sin(0.21 * t), 0.6 * np.sin(0.33 * t + 0.5)
+    x = 0.9 * np.sin(0.21 * t)
+    y = 0.6 * np.sin(0.33 * t + 0.5)
     return [
         ((x - 0.3, y - 0.6, 3.2), (0.5, 0, 0), (0, 0.5, 0)),
         ((0.1 - y, 0.5 * x, 2.6), (0.3, 0, 0), (0, 0.4, 0)),

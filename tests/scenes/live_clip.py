@@ -93,7 +93,8 @@ def piping(pipe: Path, data: bytes, seconds: float):
     """Return work that writes the bytes of a video into a pipe at the speed at which it was recorded."""
 
     def write(stopped: Event) -> None:
-        start, parts = time.monotonic(), max(100, int(15 * seconds))
+        start = time.monotonic()
+        parts = max(100, int(15 * seconds))
         with suppress(BrokenPipeError), pipe.open("wb", buffering=0) as opened:
             for k in range(parts):
                 opened.write(data[len(data) * k // parts : len(data) * (k + 1) // parts])

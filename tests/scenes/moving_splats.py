@@ -14,7 +14,11 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from tests.scenes.gaussians import isotropic
 
-WIDTH, HEIGHT, DISTANCE, STEP, FRAMES = 40, 30, 4.0, 0.05, 3
+WIDTH = 40
+HEIGHT = 30
+DISTANCE = 4.0
+STEP = 0.05
+FRAMES = 3
 # Both look along +z.
 CAMERAS = [
     Camera.look_at((x, 0, -DISTANCE), (x, 0, 0), (0, -1, 0), 50, WIDTH, HEIGHT, f"cam{i}")
@@ -43,11 +47,13 @@ def write_stream(
     With an `offset`, that share of each step along x is the learned offset.
     """
     first = keyframe_packet(moved(shift, logit), 0, CAMERAS, EXACT)
-    state, packets = decode(None, first), [first]
+    state = decode(None, first)
+    packets = [first]
     for frame in range(1, FRAMES):
-        now, config = moved(frame + shift, logit), replace(EXACT, offset=offset is not None)
-        now = replace(now, offset=np.tile((STEP * (offset or 0), 0, 0), (len(now), 1)))
-        packets.append(residual_packet(state, now, None, CAMERAS, config))
+        gaussians = moved(frame + shift, logit)
+        config = replace(EXACT, offset=offset is not None)
+        gaussians = replace(gaussians, offset=np.tile((STEP * (offset or 0), 0, 0), (len(gaussians), 1)))
+        packets.append(residual_packet(state, gaussians, None, CAMERAS, config))
         state = decode(state, packets[-1])
     with StreamWriter(path, CAMERAS, 25, metadata) as writer:
         for packet in packets:

@@ -11,7 +11,9 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.io.video_writer import write_video
 from tests.scenes.cameras import look_at_cameras
 
-WIDTH, HEIGHT, FRAMES = 48, 32, 3
+WIDTH = 48
+HEIGHT = 32
+FRAMES = 3
 NAMES = ("cam0", "cam1", "cam2")
 
 

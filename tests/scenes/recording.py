@@ -90,7 +90,8 @@ class Dying:
     """A file that kills its process after `left` more bytes."""
 
     def __init__(self, file, left: int) -> None:
-        self.file, self.left = file, left
+        self.file = file
+        self.left = left
 
     def __getattr__(self, name):
         return getattr(self.file, name)

@@ -29,10 +29,10 @@ def shifted_ball() -> Gaussians:
 
 def fit_shifted(motion: MotionConfig, start: MotionStart | None = None, config: FitConfig = FIT) -> LaterFrame:
     """Fit the ball to images of its shifted self, with the same bytes on every run."""
-    before = opaque_ball()
-    active = full_active_set(before, dict(enumerate(views())), RenderConfig(reproducible=True))
+    ball = opaque_ball()
+    active = full_active_set(ball, dict(enumerate(views())), RenderConfig(reproducible=True))
     targets = {view: Target(image) for view, image in enumerate(images_of(shifted_ball()))}
-    problem = FrameProblem(before, active, targets, {}, start, EXTENT)
+    problem = FrameProblem(ball, active, targets, {}, start, EXTENT)
     return fit_later_frame(problem, config, motion, np.random.default_rng(0))
 
 

@@ -16,7 +16,8 @@ from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, reemitte
 from morgs_mi.core.gaussians import Gaussians
 from tests.scenes.coded_clip import CAMERAS, cloud, jittered
 
-FRAMES, EVERY = 8, 3
+FRAMES = 8
+EVERY = 3
 METADATA = {
     "num_frames": FRAMES,
     "config": {"render": {"eps2d": 0.3, "block_width": None}, "motion": {"learn_confidence": True}},
@@ -45,24 +46,26 @@ class Clip(NamedTuple):
 
 def short_clip() -> Clip:
     """Return a stream in which every frame has a birth and a death, with a keyframe after every third frame."""
-    file, rng = io.BytesIO(), np.random.default_rng(0)
+    file = io.BytesIO()
+    rng = np.random.default_rng(0)
     config = CodecConfig(quality=0.3, offset=True)
     with StreamWriter(file, CAMERAS[:1], 25, METADATA) as writer:
         packet = keyframe_packet(cloud(6, 0), 0, CAMERAS, config)
         states = [decode(None, packet)]
         writer.write(packet)
         for frame in range(1, FRAMES):
-            before = states[-1]
-            alive = np.arange(1, len(before))
-            now = Gaussians.concatenate([jittered(before.gaussians, rng).select(alive), cloud(1, 0, seed=frame)])
-            now = replace(now, offset=rng.normal(0, 0.05, (len(now), 3)))
-            packet = residual_packet(before, now, np.r_[alive, -1], CAMERAS, config)
-            states.append(decode(before, packet))
+            old_state = states[-1]
+            alive = np.arange(1, len(old_state))
+            target = Gaussians.concatenate([jittered(old_state.gaussians, rng).select(alive), cloud(1, 0, seed=frame)])
+            target = replace(target, offset=rng.normal(0, 0.05, (len(target), 3)))
+            packet = residual_packet(old_state, target, np.r_[alive, -1], CAMERAS, config)
+            states.append(decode(old_state, packet))
             writer.write(packet)
             if frame % EVERY == 0:
                 writer.write(reemitted_keyframe(states[-1]))
     data = file.getvalue()
-    pieces, at = [Piece(-1, 0, 0, 12)], 12
+    pieces = [Piece(-1, 0, 0, 12)]
+    at = 12
     while at < len(data):
         kind, frame, length = struct.unpack_from("<IIQ", data, at)
         pieces.append(Piece(kind, frame, at, at + PAYLOAD + length))

@@ -79,7 +79,8 @@ def slopes_of(scene: Any, name: str, step: float, loss: Callable[[Any], Any], sp
     dr.enable_grad(params[name])
     params.update()
     dr.backward(loss(mi.render(scene, params, spp=spp, seed=1, seed_grad=2)))
-    gradient, losses = np.array(dr.grad(params[name]), np.float64), []
+    gradient = np.array(dr.grad(params[name]), np.float64)
+    losses = []
     direction = np.sign(gradient) * np.random.default_rng(4).uniform(0.5, 1, gradient.shape)
     for length in (step, -step):
         params[name] = start + type(start)(np.float32(length * direction))
@@ -92,7 +93,8 @@ def slopes_of(scene: Any, name: str, step: float, loss: Callable[[Any], Any], sp
 
 def slopes_of_both_modes(scene: Any, names: Iterable[str], weights: Any, spp: int = 64) -> tuple[float, float]:
     """Return the slope of the weighted sum of the image along all parameters, in reverse and in forward mode."""
-    params, slopes = mi.traverse(scene), []
+    params = mi.traverse(scene)
+    slopes = []
     for forward in (False, True):
         for name in names:
             params[name] = dr.detach(params[name])

@@ -37,7 +37,8 @@ def rig(count: int = 6, width: int = 320, height: int = 240, shift: float = 0.0)
 
 def write_capture(path: Path) -> Capture:
     """Write and read six cameras with off-centre principal points and one frame, without points."""
-    cameras, planes = rig(shift=7), textures()
+    cameras = rig(shift=7)
+    planes = textures()
     write_colmap(path / "sparse", cameras)
     for camera in cameras:
         write_video(path / f"{camera.name}.mkv", [render(camera, planes)], 30)
@@ -51,19 +52,20 @@ def with_cameras(capture: Capture, change: Callable[[int, Camera], Camera]) -> C
 
 def turned(camera: Camera, degrees: float) -> Camera:
     """Return the camera rotated about its optical axis."""
-    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    c = np.cos(np.deg2rad(degrees))
+    s = np.sin(np.deg2rad(degrees))
     return replace(camera, viewmat=np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ camera.viewmat)
 
 
 def textures() -> list[np.ndarray]:
     """Return one texture per plane, RGB uint8, with detail at several scales."""
     rng = np.random.default_rng(0)
-    found = []
+    images = []
     for _ in _PLANES:
         octaves = [rng.uniform(0, 1, (n, n, 3)) for n in (16, 32, 64, 128)]
         sum_ = sum(cv2.resize(o, (_TEXTURE, _TEXTURE), interpolation=cv2.INTER_CUBIC) for o in octaves)
-        found.append((255 * np.clip(sum_ / 3 - 0.1, 0, 1)).astype(np.uint8))
-    return found
+        images.append((255 * np.clip(sum_ / 3 - 0.1, 0, 1)).astype(np.uint8))
+    return images
 
 
 def render(
@@ -74,7 +76,8 @@ def render(
 ) -> np.ndarray:
     """Return the image of the planes in a camera, RGB uint8 [H, W, 3], in front of a `background` image."""
     image = np.zeros((camera.height, camera.width, 3), np.uint8) if background is None else background.copy()
-    R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
+    R = camera.viewmat[:3, :3]
+    t = camera.viewmat[:3, 3]
     centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV's pixel centres are integers
     for (corner, across, down), texture in zip(places, planes, strict=True):
         plane = np.stack([R @ across, R @ down, R @ corner + t], axis=1) @ np.diag([1 / _TEXTURE, 1 / _TEXTURE, 1])
@@ -95,15 +98,16 @@ def render(
 def points(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return random points [count, 3] on the planes, and their colours in [0, 1]."""
     corners, across, down = (np.array(column) for column in zip(*_PLANES, strict=True))
-    rows, (x, y) = rng.integers(0, len(corners), count), rng.uniform(0, 1, (2, count, 1))
+    rows = rng.integers(0, len(corners), count)
+    x, y = rng.uniform(0, 1, (2, count, 1))
     columns, lines = (np.minimum(_TEXTURE * place[:, 0], _TEXTURE - 1).astype(int) for place in (x, y))
     return corners[rows] + x * across[rows] + y * down[rows], np.array(textures())[rows, lines, columns] / 255
 
 
 def distance_to_planes(points: np.ndarray) -> np.ndarray:
     """Return the distance of each point [n, 3] from the nearest of the planes (taken as infinite), world units."""
-    found = []
+    distances = []
     for corner, across, down in _PLANES:
         normal = np.cross(across, down)
-        found.append(np.abs((points - corner) @ normal) / np.linalg.norm(normal))
-    return np.min(found, axis=0)
+        distances.append(np.abs((points - corner) @ normal) / np.linalg.norm(normal))
+    return np.min(distances, axis=0)

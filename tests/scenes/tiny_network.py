@@ -45,7 +45,8 @@ def export_lookup(path: Path, height: int, width: int) -> Path:
     """Write a network that looks up the second image in the first one's grid turned by 180 degrees, as RAFT looks up
     correlations: the flow is the difference of red and of green, at half weight.
     """
-    y, x = np.linspace(1, -1, height), np.linspace(1, -1, width)
+    y = np.linspace(1, -1, height)
+    x = np.linspace(1, -1, width)
     weights = np.array([[0.5, 0, 0], [0, 0.5, 0]], np.float32)[:, :, None, None]
     grid = np.stack(np.meshgrid(x, y), axis=-1)[None].astype(np.float32)
     nodes = [

@@ -54,7 +54,8 @@ def test_run_demo__report_is_consistent(out: Path) -> None:
 def test_run_demo__fits_the_first_frame_once(out: Path) -> None:
     first, plain = (next(iter(open_stream(out / name))) for name in ("stream", "stream_plain"))
     assert first.encoded == plain.encoded
-    capture, config = load_capture(out / "capture"), replace(SMALL.stream, render=RenderConfig(reproducible=True))
+    capture = load_capture(out / "capture")
+    config = replace(SMALL.stream, render=RenderConfig(reproducible=True))
     off = replace(config, motion=MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False))
     images = next(capture.frames(0, 1)).images
     packets = [StreamLoop.of(capture, c).push([images[v] for v in capture.train_views])[0] for c in (config, off)]

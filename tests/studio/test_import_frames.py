@@ -20,7 +20,8 @@ from morgs_mi.studio.import_frames import find_frames, import_frames, matched_ro
 from tests.assertions import assert_close
 from tests.scenes.changing_splats import splats
 
-T, N = 5, 300
+T = 5
+N = 300
 
 
 def moving(frame: int, seed: int = 0) -> Gaussians:
@@ -54,15 +55,17 @@ def test_import_frames__keeps_the_ids_of_the_same_gaussians(clip, tmp_path):
     stream = StreamReader(result.path)
     assert (stream.fps, stream.metadata["num_frames"]) == (25, T)
     kinds = [(kind, frame) for kind, frame, _ in stream.index()]
-    key, change = PacketKind.KEYFRAME, PacketKind.RESIDUAL
+    key = PacketKind.KEYFRAME
+    change = PacketKind.RESIDUAL
     assert kinds == [(key, 0), (change, 1), (change, 2), (key, 2), (change, 3), (change, 4), (key, 4)]
     pixel = 5 / stream.cameras[0].K[0, 0]  # at the distance of the camera
     for coded in coded_frames(stream):
         np.testing.assert_array_equal(coded.ids, np.arange(N))
-        raw, expected = coded.gaussians.numpy(), moving(coded.frame).numpy()
+        raw = coded.gaussians.numpy()
+        expected = moving(coded.frame).numpy()
         assert_close(raw["means"], expected["means"], atol=0.2 * pixel)
-        moved = np.abs(raw["motion"] - 0.1 * (coded.frame > 0) * (np.arange(N) < N // 2)[:, None] * [1, 0, 0])
-        assert moved.max() < 0.4 * pixel
+        errors = np.abs(raw["motion"] - 0.1 * (coded.frame > 0) * (np.arange(N) < N // 2)[:, None] * [1, 0, 0])
+        assert errors.max() < 0.4 * pixel
     np.testing.assert_array_equal(stream.seek(3).gaussians.means, coded_frame(stream, 3).means)
 
 
@@ -84,7 +87,8 @@ def test_import_frames__keeps_ids_where_gaussians_are_added_and_removed(tmp_path
     def part(frame: int, rows: np.ndarray) -> Gaussians:
         return moving(frame).select(rows)
 
-    everything, even = np.arange(N), np.arange(0, N, 2)
+    everything = np.arange(N)
+    even = np.arange(0, N, 2)
     # The rows of each frame: it grows at the end, loses rows, and gets some back in the middle.
     shown = [everything[:200], everything[:260], everything, np.setdiff1d(everything, even[5:25])]
     shown.append(np.union1d(shown[3], even[10:20]))
@@ -93,15 +97,16 @@ def test_import_frames__keeps_ids_where_gaussians_are_added_and_removed(tmp_path
     number: dict[int, int] = {}  # id by row of `moving`
     for coded, rows in zip(coded_frames(StreamReader(tmp_path / "s.morgs")), shown, strict=True):
         assert len(coded) == len(rows)
-        raw, expected = coded.gaussians.numpy(), moving(coded.frame).numpy()
+        raw = coded.gaussians.numpy()
+        expected = moving(coded.frame).numpy()
         distances = np.linalg.norm(raw["means"][:, None] - expected["means"][rows], axis=2)
         assert distances.min(axis=1).max() < 2e-3
         nearest = rows[distances.argmin(axis=1)]
-        found = {int(row): int(number) for row, number in zip(nearest, coded.ids, strict=True)}
-        lasting = found.keys() & number.keys()
-        assert {row: found[row] for row in lasting} == {row: number[row] for row in lasting}
+        id_of_row = {int(row): int(number) for row, number in zip(nearest, coded.ids, strict=True)}
+        lasting = id_of_row.keys() & number.keys()
+        assert {row: id_of_row[row] for row in lasting} == {row: number[row] for row in lasting}
         assert len(lasting) == min(len(number), len(rows) - (10 if coded.frame == 4 else 0))
-        number = found
+        number = id_of_row
 
 
 @pytest.mark.parametrize(
@@ -120,8 +125,8 @@ def test_import_frames__keeps_ids_where_gaussians_are_added_and_removed(tmp_path
     ids=["same", "grows", "loses one", "loses and grows", "grows inside", "loses many", "shuffled", "others", "none"],
 )
 def test_matched_rows__follow_the_order_of_both_frames(rows, expected):
-    found = matched_rows(moving(0).select(np.arange(100)), moving(1).select(rows))
-    np.testing.assert_array_equal(np.array(found), np.array(expected))
+    matches = matched_rows(moving(0).select(np.arange(100)), moving(1).select(rows))
+    np.testing.assert_array_equal(np.array(matches), np.array(expected))
 
 
 def test_matched_rows__finds_none_among_equal_gaussians():
@@ -158,8 +163,8 @@ def test_find_frames__orders_by_number(tmp_path):
     for name in [*names, "notes.txt", "cameras.json", "._f1.ply", ".DS_Store", "Thumbs.db"]:
         (tmp_path / name).touch()
     assert [path.name for path in find_frames([tmp_path])] == ["f1.ply", "f9.ply", "f10.ply", "f100.ply"]
-    given = [tmp_path / name for name in names]
-    assert find_frames(given) == given
+    paths = [tmp_path / name for name in names]
+    assert find_frames(paths) == paths
 
 
 @pytest.mark.parametrize(
@@ -192,10 +197,10 @@ def test_import_frames__leaves_nothing_where_a_frame_is_broken(clip, tmp_path):
 
 def test_import_frames__refuses_to_replace_a_stream(clip, tmp_path):
     import_frames([clip], tmp_path / "s.morgs")
-    before = (tmp_path / "s.morgs").read_bytes()
+    old_bytes = (tmp_path / "s.morgs").read_bytes()
     with pytest.raises(FileExistsError, match="expected a new stream, got a file that exists"):
         import_frames([clip], tmp_path / "s.morgs")
-    assert (tmp_path / "s.morgs").read_bytes() == before
+    assert (tmp_path / "s.morgs").read_bytes() == old_bytes
 
 
 def test_import_frames__reads_gaussians_without_extent(tmp_path):

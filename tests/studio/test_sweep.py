@@ -46,7 +46,9 @@ def test_sweep__scores_every_number_of_epochs_with_every_seed(tmp_path, monkeypa
 
 @pytest.mark.slow
 def test_sweep__prints_a_table_and_plots(tmp_path, run):
-    clip, out, plot = write_recording(tmp_path / "clip", 2), tmp_path / "out", tmp_path / "plots/sweep.png"
+    clip = write_recording(tmp_path / "clip", 2)
+    out = tmp_path / "out"
+    plot = tmp_path / "plots/sweep.png"
     settings = tmp_path / "settings.toml"
     settings.write_text(config_toml(replace(CONFIG, seed=5)))
     status, output, _ = run("sweep", clip, out, "--epochs", 1, 2, "--config", settings, "--plot", plot)

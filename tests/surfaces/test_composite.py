@@ -42,7 +42,7 @@ def over(gaussians: Gaussians, linear: Any) -> np.ndarray:
 
 
 def test_surfaces__in_front_equal_themselves_alone():
-    wanted = mi.load_dict(
+    expected = mi.load_dict(
         {
             "type": "scene",
             "sensor": camera().sensor(),
@@ -53,9 +53,9 @@ def test_surfaces__in_front_equal_themselves_alone():
         }
     )
     path = {"type": "path", "max_depth": 3}
-    shapes = {f"shape{i}": shape for i, shape in enumerate(wanted.shapes())}
-    found = scene(cloud(0.3), path, lamp=LAMP, **shapes)
-    assert_close(render(found, seed=1), render(wanted, seed=1), atol=tol.IMAGE_ABS)
+    shapes = {f"shape{i}": shape for i, shape in enumerate(expected.shapes())}
+    scene_with_splats = scene(cloud(0.3), path, lamp=LAMP, **shapes)
+    assert_close(render(scene_with_splats, seed=1), render(expected, seed=1), atol=tol.IMAGE_ABS)
 
 
 def test_surfaces__alone_keep_their_antialiased_outline():
@@ -64,17 +64,17 @@ def test_surfaces__alone_keep_their_antialiased_outline():
         "ball": {"type": "sphere", "center": [0, 0, 0], "radius": 0.7},
         "sky": {"type": "constant", "radiance": 0.4},
     }
-    wanted = mi.load_dict({"type": "scene", "sensor": camera().sensor(), "integrator": {"type": "path"}, **shapes})
-    found = scene(isotropic([(0, 0, -90)], 0.1, 0.5), {"type": "path"}, **shapes)
-    assert_close(render(found, seed=1), render(wanted, seed=1), atol=tol.IMAGE_ABS)
+    expected = mi.load_dict({"type": "scene", "sensor": camera().sensor(), "integrator": {"type": "path"}, **shapes})
+    scene_with_splats = scene(isotropic([(0, 0, -90)], 0.1, 0.5), {"type": "path"}, **shapes)
+    assert_close(render(scene_with_splats, seed=1), render(expected, seed=1), atol=tol.IMAGE_ABS)
 
 
 def test_surfaces__behind_show_through_the_splats():
     gaussians = cloud(0.0)
     assert_close(render(scene(gaussians, wall=wall(1, **glowing()))), over(gaussians, COLOR), atol=tol.IMAGE_ABS)
     black = {"bsdf": {"type": "diffuse", "reflectance": 0.0}}
-    found = render(scene(gaussians, wall=wall(1, **black), lamp=LAMP))
-    assert_close(found, decode_light(splats(gaussians)[0]), atol=tol.IMAGE_ABS)
+    image = render(scene(gaussians, wall=wall(1, **black), lamp=LAMP))
+    assert_close(image, decode_light(splats(gaussians)[0]), atol=tol.IMAGE_ABS)
 
 
 def test_surfaces__around_the_camera_are_behind_all_splats():
@@ -85,16 +85,17 @@ def test_surfaces__around_the_camera_are_behind_all_splats():
 
 
 def test_surfaces__between_splats_hide_those_behind():
-    near, far = cloud(-0.5, seed=1), cloud(0.5, seed=2)
-    found = render(scene(Gaussians.concatenate([near, far]), wall=wall(0, **glowing())))
-    assert_close(found, over(near, COLOR), atol=tol.IMAGE_ABS)
+    near = cloud(-0.5, seed=1)
+    far = cloud(0.5, seed=2)
+    image = render(scene(Gaussians.concatenate([near, far]), wall=wall(0, **glowing())))
+    assert_close(image, over(near, COLOR), atol=tol.IMAGE_ABS)
 
 
 def test_surfaces__blend_linear_splats_in_linear_light():
     gaussians = cloud(0.0)
-    found = render(scene(gaussians, wall=wall(1, **glowing()), props={"srgb_primitives": False}))
+    image = render(scene(gaussians, wall=wall(1, **glowing()), props={"srgb_primitives": False}))
     color, transmittance = splats(gaussians)
-    assert_close(found, color + transmittance * COLOR, atol=tol.IMAGE_ABS)
+    assert_close(image, color + transmittance * COLOR, atol=tol.IMAGE_ABS)
 
 
 def test_surfaces__white_splats_around_a_white_ball_in_white_light_are_a_furnace():
@@ -102,8 +103,8 @@ def test_surfaces__white_splats_around_a_white_ball_in_white_light_are_a_furnace
     ball = {"type": "sphere", "radius": 0.8, "bsdf": {"type": "diffuse", "reflectance": 1.0}}
     # Rays by the material alone, without noise.
     integrator = {"type": "direct", "emitter_samples": 0, "bsdf_samples": 1}
-    found = render(scene(white, integrator, ball=ball, sky={"type": "constant", "radiance": 1.0}))
-    assert_close(found, 1, atol=tol.IMAGE_ABS)
+    image = render(scene(white, integrator, ball=ball, sky={"type": "constant", "radiance": 1.0}))
+    assert_close(image, 1, atol=tol.IMAGE_ABS)
 
 
 def test_surfaces__cover_a_pixel_by_the_fraction_that_they_fill():
@@ -121,11 +122,12 @@ def test_surfaces__cover_a_pixel_by_the_fraction_that_they_fill():
 
 
 def test_surfaces__background_is_behind_all():
-    gaussians, background = cloud(0.0), (0.1, 0.4, 0.8)
-    found = render(scene(gaussians, card=wall(1, 0.5, **glowing()), props={"background": list(background)}))
+    gaussians = cloud(0.0)
+    background = (0.1, 0.4, 0.8)
+    image = render(scene(gaussians, card=wall(1, 0.5, **glowing()), props={"background": list(background)}))
     expected = over(gaussians, decode_light(np.array(background)))
     outside = np.hypot(*np.meshgrid(np.arange(32) - 15.5, np.arange(24) - 11.5)) > 10
-    assert_close(found, expected, atol=tol.IMAGE_ABS, where=outside[..., None])
+    assert_close(image, expected, atol=tol.IMAGE_ABS, where=outside[..., None])
 
 
 def test_surfaces__channels_include_them():
@@ -151,21 +153,22 @@ def test_surfaces__crop_equals_that_of_the_full_image():
 
 def test_surfaces__of_an_environment_alone_are_its_light():
     gaussians = cloud(0.0)
-    found = render(scene(gaussians, sky={"type": "constant", "radiance": 0.3}))
-    assert_close(found, over(gaussians, 0.3), atol=tol.IMAGE_ABS)
+    image = render(scene(gaussians, sky={"type": "constant", "radiance": 0.3}))
+    assert_close(image, over(gaussians, 0.3), atol=tol.IMAGE_ABS)
 
 
 def test_surfaces__leave_the_whole_scene_as_it_is():
     """Its parameters keep their names, and its environment its extent."""
     whole = scene(cloud(), ball={"type": "sphere"}, sky={"type": "constant"}, wall=wall(90))
-    it, names = dr.zeros(mi.Interaction3f), list(mi.traverse(whole).keys())
+    it = dr.zeros(mi.Interaction3f)
+    names = list(mi.traverse(whole).keys())
 
     def distance() -> float:
         return float(whole.environment().sample_direction(it, mi.Point2f(0.5))[0].dist[0])
 
-    before = distance()
+    old_distance = distance()
     render(whole, spp=1)
-    assert distance() == before > 90
+    assert distance() == old_distance > 90
     assert list(mi.traverse(whole).keys()) == names
 
 

@@ -33,7 +33,8 @@ def cloud(n: int = 300, scale: float = 0.1, degree: int = 1, seed: int = 0) -> G
 def segments(n: int = 400, seed: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return origins, directions and lengths of segments, most of which begin and end among the Gaussians."""
     rng = np.random.default_rng(seed)
-    origins, directions = rng.uniform(-1.2, 1.2, (n, 3)), rng.normal(size=(n, 3))
+    origins = rng.uniform(-1.2, 1.2, (n, 3))
+    directions = rng.normal(size=(n, 3))
     directions[:6] = [*np.eye(3), *-np.eye(3)]
     return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True), rng.uniform(0.1, 3, n)
 
@@ -65,23 +66,24 @@ def reference(gaussians: Gaussians, *segment: np.ndarray) -> tuple[np.ndarray, n
     depth, alpha = responses(gaussians, *segment)
     order = depth.argsort(1, kind="stable")
     alpha = np.take_along_axis(alpha, order, 1)
-    before = np.cumprod(np.concatenate([np.ones((len(alpha), 1)), 1 - alpha], 1), 1)
+    transmittance = np.cumprod(np.concatenate([np.ones((len(alpha), 1)), 1 - alpha], 1), 1)
     values = dr.sh_eval(mi.Vector3f(np.float32(segment[1].T)), gaussians.sh_degree)
     basis = np.stack([np.broadcast_to(np.array(value, np.float64), len(alpha)) for value in values])
     colors = np.maximum(0.5 + np.einsum("km,nkc->mnc", basis, np.asarray(gaussians.sh_coeffs, np.float64)), 0)
     colors = np.take_along_axis(colors, order[..., None], 1)
-    return np.einsum("mn,mnc->mc", before[:, :-1] * alpha, colors), before[:, -1]
+    return np.einsum("mn,mnc->mc", transmittance[:, :-1] * alpha, colors), transmittance[:, -1]
 
 
 @pytest.mark.parametrize("n", [1, 2, 37, 300])
 def test_splat_rays__of_segments_agree_with_the_sum_over_all_gaussians(n):
-    gaussians, segment = cloud(n), segments()
+    gaussians = cloud(n)
+    segment = segments()
     color, transmittance = reference(gaussians, *segment)
     traced = SplatRays(gaussians)
-    found = traced.trace(rays(*segment))
+    result = traced.trace(rays(*segment))
     # alpha jumps at its lower limit, where float32 and float64 may disagree.
-    assert_close(np.array(found[0]).T, color, atol=4e-3)
-    for value in (found[1], traced.transmittance(rays(*segment))):
+    assert_close(np.array(result[0]).T, color, atol=4e-3)
+    for value in (result[1], traced.transmittance(rays(*segment))):
         assert_close(np.array(value), transmittance, atol=4e-3)
         assert np.median(np.abs(np.array(value) - transmittance)) < 1e-6
 
@@ -93,8 +95,8 @@ def test_splat_rays__blend_more_gaussians_than_one_walk_sorts():
     means[:30, 2] = rng.permutation(30) / 30
     gaussians = isotropic(means, 1.0, 0.03, rng.uniform(-1.5, 1.5, (60, 1, 3)))
     segment = np.array([[0.0, 0, -9]]), np.array([[0.0, 0, 1]]), np.array([20.0])
-    found = SplatRays(gaussians).trace(rays(*segment))
-    assert_close(np.array(found[1]), reference(gaussians, *segment)[1], atol=1e-5)
+    result = SplatRays(gaussians).trace(rays(*segment))
+    assert_close(np.array(result[1]), reference(gaussians, *segment)[1], atol=1e-5)
     same = Gaussians(**{**gaussians.numpy(), "sh_coeffs": np.full((60, 1, 3), 0.3, np.float32)})
     color, transmittance = SplatRays(same).trace(rays(*segment))
     assert_close(np.array(color), (0.5 + 0.3 * SH_C0) * (1 - float(transmittance[0])), atol=1e-5)
@@ -103,7 +105,8 @@ def test_splat_rays__blend_more_gaussians_than_one_walk_sorts():
 
 
 def test_splat_rays__transmittance_of_two_halves_is_that_of_the_whole():
-    traced, (origins, directions, lengths) = SplatRays(cloud(100)), segments()
+    traced = SplatRays(cloud(100))
+    origins, directions, lengths = segments()
     first, whole = (np.array(traced.transmittance(rays(origins, directions, s * lengths))) for s in (0.4, 1.0))
     rest = rays(origins + 0.4 * lengths[:, None] * directions, directions, 0.6 * lengths)
     assert_close(first * np.array(traced.transmittance(rest)), whole, atol=2e-3)
@@ -116,14 +119,15 @@ def test_splat_rays__of_a_camera_agree_with_the_rasteriser():
     offsets = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3) @ np.linalg.inv(camera.K).T
     directions = offsets @ np.asarray(camera.viewmat)[:3, :3]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    found = SplatRays(gaussians).trace(rays(np.broadcast_to(camera.position, directions.shape), directions))
+    result = SplatRays(gaussians).trace(rays(np.broadcast_to(camera.position, directions.shape), directions))
     image = rasterize(gaussians, camera, ("color", "alpha"), config=RenderConfig(eps2d=0.0))
-    assert psnr(np.array(found[0]).T.reshape(72, 96, 3), np.asarray(image.color)) > 38
-    assert np.abs(1 - np.array(found[1]) - np.asarray(image.alpha).ravel()).mean() < 4e-3
+    assert psnr(np.array(result[0]).T.reshape(72, 96, 3), np.asarray(image.color)) > 38
+    assert np.abs(1 - np.array(result[1]) - np.asarray(image.alpha).ravel()).mean() < 4e-3
 
 
 def test_splat_rays__inactive_rays_meet_nothing():
-    ray, active = rays(*segments(8)), mi.Bool([True] * 4 + [False] * 4)
+    ray = rays(*segments(8))
+    active = mi.Bool([True] * 4 + [False] * 4)
     traced = SplatRays(cloud())
     color, transmittance = traced.trace(ray, active)
     for value in (transmittance, traced.transmittance(ray, active)):

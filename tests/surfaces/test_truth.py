@@ -32,7 +32,8 @@ def test_render_inserted__agrees_with_the_path_traced_clip(tmp_path: Path):
     config = StreamConfig(fit=FitConfig(num_gaussians=6000, first_frame_steps=400, epochs=2))
     stream_capture(load_capture(tmp_path / "clip"), tmp_path / "fit", config)
     stream = open_stream(tmp_path / "fit")
-    scene, camera = load_scene("spheres"), stream.cameras[0]
+    scene = load_scene("spheres")
+    camera = stream.cameras[0]
 
     def traced(objects: dict[str, Object]) -> np.ndarray:
         tracer = PathTracer(replace(scene, objects={**scene.objects, **objects}))
@@ -42,17 +43,19 @@ def test_render_inserted__agrees_with_the_path_traced_clip(tmp_path: Path):
         lamps = {name: light.shape for name, light in scene.lights.items()}
         return {"ball": BALL, **lamps, "integrator": {"type": "direct", "emitter_samples": 2, "bsdf_samples": 0}}
 
-    before, truth = traced({}), traced({"ball": Object({"ball": BALL})})
-    found, unshadowed = (
+    image_without = traced({})
+    truth = traced({"ball": Object({"ball": BALL})})
+    image, unshadowed = (
         next(render_inserted(stream, camera, build, [0], ("color", "surfaces"), InsertConfig(64, shadows)))[1]
         for shadows in (True, False)
     )
-    coverage = found["surfaces"][..., 3]
-    changed = np.abs(truth - before).max(-1) > 8 / 255
+    coverage = image["surfaces"][..., 3]
+    changed = np.abs(truth - image_without).max(-1) > 8 / 255
     near_ball = cv2.dilate(np.uint8(coverage > 0), np.ones((5, 5))) > 0
-    ball, shadow = changed & (coverage > 0.99), changed & ~near_ball
+    ball = changed & (coverage > 0.99)
+    shadow = changed & ~near_ball
     assert ball.sum() > 500
     assert shadow.sum() > 100
-    assert psnr(found["color"][ball], truth[ball]) > 36
-    assert psnr(found["color"][shadow], truth[shadow]) > 25
-    assert psnr(found["color"][shadow], truth[shadow]) > psnr(unshadowed["color"][shadow], truth[shadow]) + 10
+    assert psnr(image["color"][ball], truth[ball]) > 36
+    assert psnr(image["color"][shadow], truth[shadow]) > 25
+    assert psnr(image["color"][shadow], truth[shadow]) > psnr(unshadowed["color"][shadow], truth[shadow]) + 10

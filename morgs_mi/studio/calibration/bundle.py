@@ -63,17 +63,17 @@ def bundle_adjust(cameras: Sequence[Camera], tracks: Tracks, deviations: np.ndar
     for _ in range(_STEPS):
         equations = _equations(cameras, changes, points, tracks, errors, scale)
         of_changes, of_points = equations.step(changes, deviations, damping, frame)
-        tried = changes + of_changes, points + of_points
-        found = _errors(cameras, *tried, tracks)
-        new = _loss(found, tried[0], scale, deviations)
-        if not new < loss:
+        trial = changes + of_changes, points + of_points
+        trial_errors = _errors(cameras, *trial, tracks)
+        trial_loss = _loss(trial_errors, trial[0], scale, deviations)
+        if not trial_loss < loss:
             damping *= 10
             if damping > _MOST_DAMPING:
                 break
             continue
-        converged = loss - new < _LEAST_DECREASE * loss
-        changes, points = tried
-        errors = found
+        converged = loss - trial_loss < _LEAST_DECREASE * loss
+        changes, points = trial
+        errors = trial_errors
         damping = damping / 10
         if converged:
             break
@@ -149,12 +149,14 @@ def camera_jacobian(
     x = (points - camera.position) @ R.T
     front = x[:, 2] > camera.near
     J = np.zeros((len(x), 2, CHANGES))
-    J[:, :, :3], J[:, :, 3:6] = by_point @ R.T @ -_cross(x), -by_point
+    J[:, :, :3] = by_point @ R.T @ -_cross(x)
+    J[:, :, 3:6] = -by_point
     from_centre = camera.project(points[front])[0] - camera.K[:2, 2]
     J[front, :, 6] = from_centre / factor
     ray = from_centre / camera.K[[0, 1], [0, 1]]
     square = np.sum(ray**2, axis=1, keepdims=True)
-    J[front, :, 9], J[front, :, 10] = from_centre * square, from_centre * square**2
+    J[front, :, 9] = from_centre * square
+    J[front, :, 10] = from_centre * square**2
     if distortion is not None and distortion.any():
         k1, k2 = distortion
         scale = 1 + (k1 + k2 * square) * square
@@ -162,7 +164,8 @@ def camera_jacobian(
         by_pixel = scale[..., None] * np.eye(2) + slope[..., None] * np.einsum(
             "ni,nj,j->nij", from_centre, ray, 1 / camera.K[[0, 1], [0, 1]]
         )
-        J[front, :, :7], by_point[front] = by_pixel @ J[front, :, :7], by_pixel @ by_point[front]
+        J[front, :, :7] = by_pixel @ J[front, :, :7]
+        by_point[front] = by_pixel @ by_point[front]
         J[front, :, 6] = from_centre * scale / factor
     J[front, 0, 7] = J[front, 1, 8] = camera.width
     return J, by_point
@@ -179,7 +182,7 @@ class NormalEquations:
         self._right = np.zeros((views, CHANGES))
         self._points = np.zeros((points, 3, 3))
         self._right_points = np.zeros((points, 3))
-        self._across = np.zeros((points, views, CHANGES, 3))
+        self._coupling = np.zeros((points, views, CHANGES, 3))
 
     def add(
         self, view: int, ids: np.ndarray | slice, jacobians: tuple[np.ndarray, np.ndarray], G: np.ndarray, b: np.ndarray
@@ -199,7 +202,7 @@ class NormalEquations:
         self.add_camera(view, of_camera, G, b)
         self._points[ids] += right @ of_point
         self._right_points[ids] += np.einsum("nij,ni->nj", of_point, b)
-        self._across[ids, view] += left @ of_point
+        self._coupling[ids, view] += left @ of_point
 
     def add_camera(self, view: int, of_camera: np.ndarray, G: np.ndarray, b: np.ndarray) -> None:
         """Add observations of fixed points; arguments as for `add`."""
@@ -217,7 +220,7 @@ class NormalEquations:
         shifts = np.broadcast_to(np.eye(3), (len(points), 3, 3))
         of_similarity = np.concatenate([-_cross(from_centre), shifts, from_centre[..., None]], axis=2)
         rows = np.zeros((8, *self._right.shape))
-        rows[:7] = np.einsum("pij,pvki->jvk", of_similarity, self._across)
+        rows[:7] = np.einsum("pij,pvki->jvk", of_similarity, self._coupling)
         rows[7, :, 6] = 1
         return rows.reshape(8, -1)
 
@@ -236,15 +239,15 @@ class NormalEquations:
         precision = deviations**-2.0
         system = _damped(self._cameras + np.diag(precision), damping)
         points = _damped(self._points, damping)
-        across = self._across.reshape(len(points), views * size, 3)
-        solved = across @ np.linalg.inv(points)
+        coupling = self._coupling.reshape(len(points), views * size, 3)
+        solved = coupling @ np.linalg.inv(points)
         full = np.zeros((views, size, views, size))
         full[np.arange(views), :, np.arange(views)] = system
-        reduced = full.reshape(views * size, -1) - np.tensordot(solved, across, axes=((0, 2), (0, 2)))
+        schur_complement = full.reshape(views * size, -1) - np.tensordot(solved, coupling, axes=((0, 2), (0, 2)))
         right = (self._right + precision * changes).ravel() - np.einsum("pij,pj->i", solved, self._right_points)
         frame = np.zeros((0, right.size)) if frame is None else frame
-        step = _solved(reduced, -right, frame, -frame @ changes.ravel())
-        rest = -self._right_points - np.einsum("pij,i->pj", across, step)
+        step = _solved(schur_complement, -right, frame, -frame @ changes.ravel())
+        rest = -self._right_points - np.einsum("pij,i->pj", coupling, step)
         return step.reshape(views, size), np.linalg.solve(points, rest[..., None])[..., 0]
 
 
@@ -268,8 +271,8 @@ def _cross(vectors: np.ndarray) -> np.ndarray:
 def _damped(blocks: np.ndarray, damping: float) -> np.ndarray:
     """Return blocks [..., k, k] with an increased diagonal, which is above 0 for singular blocks, too."""
     diagonal = np.einsum("...ii->...i", blocks)
-    added = damping * diagonal + 1e-9 * diagonal.max(axis=-1, keepdims=True) + 1e-30
-    return blocks + added[..., None] * np.eye(blocks.shape[-1])
+    increase = damping * diagonal + 1e-9 * diagonal.max(axis=-1, keepdims=True) + 1e-30
+    return blocks + increase[..., None] * np.eye(blocks.shape[-1])
 
 
 def _equations(
@@ -284,11 +287,11 @@ def _equations(
     equations = NormalEquations(len(cameras), tracks.count)
     weights = 1 / (scale**2 + (errors**2).sum(axis=1, keepdims=True) / _CAUCHY**2)
     for view, (camera, change) in enumerate(zip(cameras, changes, strict=True)):
-        here = tracks.views == view
-        now = changed_camera(camera, change)
-        jacobians = camera_jacobian(now, 1 + change[6], points[tracks.ids[here]], change[9:])
-        w = weights[here]
-        equations.add(view, tracks.ids[here], jacobians, w[..., None] * np.eye(2), w * errors[here])
+        rows = tracks.views == view
+        changed_view = changed_camera(camera, change)
+        jacobians = camera_jacobian(changed_view, 1 + change[6], points[tracks.ids[rows]], change[9:])
+        w = weights[rows]
+        equations.add(view, tracks.ids[rows], jacobians, w[..., None] * np.eye(2), w * errors[rows])
     return equations
 
 
@@ -298,10 +301,10 @@ def _errors(cameras: Sequence[Camera], changes: np.ndarray, points: np.ndarray, 
     depths = np.empty(len(tracks.ids))
     with np.errstate(divide="ignore", invalid="ignore"):
         for view, (camera, change) in enumerate(zip(cameras, changes, strict=True)):
-            here = tracks.views == view
-            now = changed_camera(camera, change)
-            pixels, depths[here] = now.project(points[tracks.ids[here]])
-            errors[here] = distorted(now, pixels, change[9:])
+            rows = tracks.views == view
+            changed_view = changed_camera(camera, change)
+            pixels, depths[rows] = changed_view.project(points[tracks.ids[rows]])
+            errors[rows] = distorted(changed_view, pixels, change[9:])
         errors -= tracks.pixels
     return np.where((depths[:, None] > 0) & np.isfinite(errors), errors, 1e6)
 

@@ -164,8 +164,8 @@ def calibrate(
         _name_photos(best.model, path)
         with atomic_path(path / "sparse", "calibrate()") as folder:
             write_reconstruction(best.model, folder / "0")
-    found = best.model.num_points3D(), best.error, best.checks, best.mapper, best.principal_points
-    return CalibrationResult(path / "sparse" / "0", names, left_out, *found)
+    measures = best.model.num_points3D(), best.error, best.checks, best.mapper, best.principal_points
+    return CalibrationResult(path / "sparse" / "0", names, left_out, *measures)
 
 
 def _checks(model: Any, names: Sequence[str]) -> tuple[CameraCheck, ...]:
@@ -175,9 +175,9 @@ def _checks(model: Any, names: Sequence[str]) -> tuple[CameraCheck, ...]:
     poses = {name: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for name, image in images.items()}
     cameras = [Camera(np.eye(3), pose, 1, 1, name) for name, pose in poses.items()]
     for i, j in same_poses(cameras):
-        for own, other in ((cameras[i].name, cameras[j].name), (cameras[j].name, cameras[i].name)):
-            advice = f"it has the same pose as {other}: one clip seems to be a copy of the other; replace it"
-            checks[own] = replace(checks[own], fits=False, advice=advice)
+        for name, twin in ((cameras[i].name, cameras[j].name), (cameras[j].name, cameras[i].name)):
+            advice = f"it has the same pose as {twin}: one clip seems to be a copy of the other; replace it"
+            checks[name] = replace(checks[name], fits=False, advice=advice)
     return tuple(checks.values())
 
 
@@ -192,16 +192,16 @@ def _name_photos(model: Any, path: Path) -> None:
 def _check(name: str, image: Any | None, model: Any) -> CameraCheck:
     if image is None:
         return CameraCheck(name, 0, float("nan"), None, f"it could not be registered and has no pose: {_MORE_TEXTURE}")
-    seen = [p for p in image.points2D if p.has_point3D()]
-    projected = (image.project_point(model.point3D(p.point3D_id).xyz) for p in seen)
-    errors = [np.inf if q is None else float(np.linalg.norm(q - p.xy)) for p, q in zip(seen, projected, strict=True)]
+    points = [p for p in image.points2D if p.has_point3D()]
+    pixels = (image.project_point(model.point3D(p.point3D_id).xyz) for p in points)
+    errors = [np.inf if q is None else float(np.linalg.norm(q - p.xy)) for p, q in zip(points, pixels, strict=True)]
     error = float(np.median(errors)) if errors else float("nan")
     advice = ""
-    if len(seen) < _MIN_POINTS:
-        advice = f"only {len(seen)} points, {_MIN_POINTS} are needed for a reliable pose: {_MORE_TEXTURE}"
+    if len(points) < _MIN_POINTS:
+        advice = f"only {len(points)} points, {_MIN_POINTS} are needed for a reliable pose: {_MORE_TEXTURE}"
     elif error > MAX_ERROR:
         advice = "its points do not fit: try a camera model with more parameters (--camera-model)"
-    return CameraCheck(name, len(seen), error, not advice, advice)
+    return CameraCheck(name, len(points), error, not advice, advice)
 
 
 def _frames(
@@ -211,18 +211,18 @@ def _frames(
     clips = clips_by_camera(path) or photos(path)
     clips = {name: clips[name] for name in names_without(path, clips, without)}
     if len(clips) < 2:
-        found = ", ".join(clips) or "none"
+        names = ", ".join(clips) or "none"
         raise ValueError(
-            f"{path}: expected the clips of at least two cameras, found {found}; check the path, or make {EXAMPLE}"
+            f"{path}: expected the clips of at least two cameras, found {names}; check the path, or make {EXAMPLE}"
         )
     readers = {name: open_frames(clip) for name, clip in clips.items()}
     short = [name for name, reader in readers.items() if not 0 <= config.frame <= _last_position(reader)]
     if short:
         raise ValueError(f"{path}: frame {config.frame} is not in the clips of {', '.join(short)}; choose another.")
     at = {name: int(nearest_frames(reader, np.array([config.frame]))[0]) for name, reader in readers.items()}
-    recorded = {name: next(reader.frames(at[name], at[name] + 1)) for name, reader in readers.items()}
-    stops = display_stops(recorded.values())
-    images = {name: display_image(image, stops) for name, image in recorded.items()}
+    frames = {name: next(reader.frames(at[name], at[name] + 1)) for name, reader in readers.items()}
+    stops = display_stops(frames.values())
+    images = {name: display_image(image, stops) for name, image in frames.items()}
     masks = {name: opaque_pixels(reader, name)[0] for name, reader in readers.items()}
     return images, {name: mask for name, mask in masks.items() if mask is not None}
 
@@ -244,22 +244,22 @@ def _match(
     import pycolmap
 
     folder = scratch / _IMAGES
-    masked = scratch / "masks"
+    mask_folder = scratch / "masks"
     database = scratch / _DATABASE
     folder.mkdir()
-    masked.mkdir()
+    mask_folder.mkdir()
     by_size: dict[tuple[int, ...], list[str]] = {}
     for name, image in images.items():
         by_size.setdefault(image.shape[:2], []).append(f"{name}.png")
         _write_png(folder / f"{name}.png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
         if masks:  # COLMAP needs a mask for every image, or none
             opaque = masks.get(name, np.ones(image.shape[:2], bool))
-            _write_png(masked / f"{name}.png.png", 255 * opaque.astype(np.uint8))
+            _write_png(mask_folder / f"{name}.png.png", 255 * opaque.astype(np.uint8))
     pycolmap.set_random_seed(config.seed)
     mode = pycolmap.CameraMode.SINGLE if config.shared_intrinsics else pycolmap.CameraMode.PER_IMAGE
     reader = pycolmap.ImageReaderOptions(camera_model=config.camera_model)
     if masks:
-        reader.mask_path = masked
+        reader.mask_path = mask_folder
     pycolmap.Database.open(database).close()
     for done, (size, names) in enumerate(by_size.items()):  # each call makes a camera of its own
         report("Finding features", done, len(by_size))
@@ -308,35 +308,35 @@ def _mapped(names: Sequence[str], scratch: Path, seed: int) -> list[_Candidate]:
 
     inputs = scratch / _DATABASE, scratch / _IMAGES, scratch
     incremental = pycolmap.IncrementalPipelineOptions(min_model_size=2, random_seed=seed, num_threads=1)
-    found: dict[Mapper, dict[int, Any]] = {
+    models_by_mapper: dict[Mapper, dict[int, Any]] = {
         "incremental": pycolmap.incremental_mapping(*inputs, incremental),
         "global": pycolmap.global_mapping(*inputs, pycolmap.GlobalPipelineOptions(random_seed=seed, num_threads=1)),
     }
     return [
         _Candidate(mapper, model, _checks(model, names))
-        for mapper, models in found.items()
+        for mapper, models in models_by_mapper.items()
         for model in models.values()
     ]
 
 
-def _with_principal_points(found: _Candidate, names: Sequence[str]) -> _Candidate:
+def _with_principal_points(candidate: _Candidate, names: Sequence[str]) -> _Candidate:
     """Return the model with a camera and a principal point for each image, or as it is if that fits no better."""
     import pycolmap
 
-    moved = _with_own_cameras(found.model)
+    model = _with_own_cameras(candidate.model)
     config = pycolmap.BundleAdjustmentConfig()
-    for image in moved.reg_image_ids():
+    for image in model.reg_image_ids():
         config.add_image(image)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     options = pycolmap.BundleAdjustmentOptions(
         refine_focal_length=False, refine_extra_params=False, refine_principal_point=True, print_summary=False
     )
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    pycolmap.create_default_bundle_adjuster(options, config, moved).solve()
-    before, after = (_median_error(model) for model in (found.model, moved))
-    if not after < (1 - _LEAST_DECREASE) * before:
-        return found
-    return _Candidate(found.mapper, moved, _checks(moved, names), principal_points=True)
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    old_error, new_error = (_median_error(model) for model in (candidate.model, model))
+    if not new_error < (1 - _LEAST_DECREASE) * old_error:
+        return candidate
+    return _Candidate(candidate.mapper, model, _checks(model, names), principal_points=True)
 
 
 def _with_own_cameras(model: Any) -> Any:
@@ -350,8 +350,8 @@ def _with_own_cameras(model: Any) -> Any:
         camera.camera_id = i
         copy.add_camera_with_trivial_rig(camera)
         keypoints = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
-        own = pycolmap.Image(image_id=i, camera_id=i, name=image.name, keypoints=keypoints)
-        copy.add_image_with_trivial_frame(own, image.cam_from_world())
+        image_copy = pycolmap.Image(image_id=i, camera_id=i, name=image.name, keypoints=keypoints)
+        copy.add_image_with_trivial_frame(image_copy, image.cam_from_world())
     for point in model.points3D.values():
         copy.add_point3D(point.xyz, point.track, point.color)
     return copy
@@ -395,12 +395,12 @@ def _quiet() -> Iterator[None]:
     """Silence COLMAP's log on standard error; this module reports failures itself."""
     import pycolmap
 
-    before = pycolmap.logging.minloglevel
+    level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     try:
         yield
     finally:
-        pycolmap.logging.minloglevel = before
+        pycolmap.logging.minloglevel = level
 
 
 def _write_png(file: Path, image: np.ndarray) -> None:

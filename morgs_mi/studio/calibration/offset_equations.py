@@ -81,11 +81,11 @@ class OffsetEquations:
         The parts of r of groups of neighbouring Gaussians count as independent: a sandwich estimate with clusters
         (Liang and Zeger, Biometrika 73(1), 1986). Offsets that the equations do not determine have an error of a frame.
         """
-        found = self._inverse(_FLOOR)
-        unseen = np.eye(len(found)) - found @ self.matrix
-        noise = found - found[reference]
-        missed = unseen - unseen[reference]
-        return np.sqrt(np.einsum("vi,ij,vj->v", noise, self.scatter, noise) + UNKNOWN**2 * (missed**2).sum(axis=1))
+        inverse = self._inverse(_FLOOR)
+        blindness = np.eye(len(inverse)) - inverse @ self.matrix
+        noise = inverse - inverse[reference]
+        lost_part = blindness - blindness[reference]
+        return np.sqrt(np.einsum("vi,ij,vj->v", noise, self.scatter, noise) + UNKNOWN**2 * (lost_part**2).sum(axis=1))
 
     def _inverse(self, damping: float, share: float = 1.0) -> np.ndarray:
         """Return the matrix [V, V] that turns r into o."""
@@ -98,8 +98,8 @@ class OffsetEquations:
         whole = np.zeros_like(self.matrix)
         whole[np.ix_(train, train)] = centred @ inverse @ centred / share
         for view in np.flatnonzero(~train):
-            own = self.matrix[view, view] + _FLOOR * scale
-            whole[view] = (np.eye(len(train))[view] - self.matrix[view, train] @ whole[train]) / own
+            diagonal = self.matrix[view, view] + _FLOOR * scale
+            whole[view] = (np.eye(len(train))[view] - self.matrix[view, train] @ whole[train]) / diagonal
         return whole
 
 
@@ -129,13 +129,13 @@ def offset_equations(
     total = H[train].sum(axis=0)
     prior = _PRIOR * np.trace(total, axis1=1, axis2=2) / 3 + np.finfo(float).tiny
     inverse = np.linalg.inv(total + prior[:, None, None] * np.eye(3))
-    reduced = np.einsum("vki,kij->vkj", c, inverse)
-    own = np.einsum("vki,ki->v", c, d)
-    matrix = np.diag(own)
-    matrix[:, train] -= np.einsum("vki,wki->vw", reduced, c[train])
-    parts = np.einsum("vki,ki->vk", reduced, b[train].sum(axis=0)) - np.einsum("vki,ki->vk", b, d)
+    weights = np.einsum("vki,kij->vkj", c, inverse)
+    diagonal = np.einsum("vki,ki->v", c, d)
+    matrix = np.diag(diagonal)
+    matrix[:, train] -= np.einsum("vki,wki->vw", weights, c[train])
+    parts = np.einsum("vki,ki->vk", weights, b[train].sum(axis=0)) - np.einsum("vki,ki->vk", b, d)
     groups = _grouped(parts, means)
-    return OffsetEquations(matrix, parts.sum(axis=1), groups @ groups.T, own, train)
+    return OffsetEquations(matrix, parts.sum(axis=1), groups @ groups.T, diagonal, train)
 
 
 def _grouped(parts: np.ndarray, means: np.ndarray) -> np.ndarray:

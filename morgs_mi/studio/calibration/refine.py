@@ -157,23 +157,23 @@ def refine_cameras(
     rounds = config.short_fits.rounds
     report = progress or (lambda done, count: None)
     problem = _Problem.of(capture, config, render or RenderConfig(), seed)
-    matched, tracks, deviations = _matched(capture, problem.indices, problem.deviations)
+    bundle_changes, tracks, deviations = _matched(capture, problem.indices, problem.deviations)
     # Cameras of the calibration, of the bundle adjustment, and of the images; a single set is not compared.
-    compared = config.refine_cameras == "auto"
-    estimates = [0 * matched] * compared + [matched] * bool(tracks)
+    has_rival = config.refine_cameras == "auto"
+    estimates = [0 * bundle_changes] * has_rival + [bundle_changes] * bool(tracks)
     fits = rounds + len(estimates) + bool(estimates)
-    estimates.append(problem.refined(matched, deviations, lambda done: report(done, fits)))
+    estimates.append(problem.refined(bundle_changes, deviations, lambda done: report(done, fits)))
     scores = [float("nan")]
     if len(estimates) > 1:
         scores = []
         for done, changes in enumerate(estimates, rounds):
             report(done, fits)
             scores.append(problem.score(changes))
-    best = compared + int(np.argmax(scores[compared:]))
-    calibrated = scores[0] if compared else float("nan")
-    taken = not scores[best] < calibrated + LEAST_GAIN
-    found = Refinement(taken, calibrated, scores[best], tracks, *problem.sizes(estimates[best]))
-    return problem.changed_capture(estimates[best]) if taken else capture, found
+    best = has_rival + int(np.argmax(scores[has_rival:]))
+    calibrated = scores[0] if has_rival else float("nan")
+    is_better = not scores[best] < calibrated + LEAST_GAIN
+    refinement = Refinement(is_better, calibrated, scores[best], tracks, *problem.sizes(estimates[best]))
+    return problem.changed_capture(estimates[best]) if is_better else capture, refinement
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,20 +193,20 @@ class _Problem:
     def of(cls, capture: Capture, config: FitConfig, render: RenderConfig, seed: int) -> _Problem:
         """Return the problem of the first frame of a capture; raises as `refine_cameras`."""
         images = next(capture.displayed().partial_frames(0, 1)).images
-        given = {
+        train = {
             v: View(capture.cameras[v], image, capture.masks[v])
             for v in capture.train_views
             if (image := images[v]) is not None
         }
-        if len(given) < 2:
+        if len(train) < 2:
             raise ValueError(
-                f"refine_cameras(): expected images of at least two training views, got {len(given)}; record more, or "
+                f"refine_cameras(): expected images of at least two training views, got {len(train)}; record more, or "
                 "set `refine_cameras` to off."
             )
         rng = rng_of(seed, Stream.WITHHELD_BLOCKS)
-        views, unseen = withheld_blocks(list(given.values()), config.short_fits.width, rng)
-        extent = scene_extent([view.camera for view in given.values()])
-        return cls(capture, tuple(given), tuple(views), tuple(unseen), extent, config, render, seed)
+        views, withheld_views = withheld_blocks(list(train.values()), config.short_fits.width, rng)
+        extent = scene_extent([view.camera for view in train.values()])
+        return cls(capture, tuple(train), tuple(views), tuple(withheld_views), extent, config, render, seed)
 
     @property
     def cameras(self) -> list[Camera]:
@@ -229,8 +229,8 @@ class _Problem:
         problem = self._begun(changes)
         for done in range(self.config.short_fits.rounds):
             report(done)
-            posed = replace(problem, views=tuple(_changed(self.views, changes)))
-            gaussians = self._fitted(posed, later=done > 0)
+            posed_problem = replace(problem, views=tuple(_changed(self.views, changes)))
+            gaussians = self._fitted(posed_problem, is_later=done > 0)
             blur = _BLURS[done] if done < len(_BLURS) else 0.0
             for _ in range(_STEPS):
                 gaussians, changes = _joint_step(gaussians, self.views, changes, deviations, blur, self.render)
@@ -239,8 +239,8 @@ class _Problem:
 
     def score(self, changes: np.ndarray) -> float:
         """Return the PSNR of the withheld pixels after a fit with changed cameras, dB."""
-        unseen = [view for view in _changed(self.unseen, changes) if np.any(view.mask)]
-        return mean_psnr(self._fitted(self._begun(changes)), unseen, self.render)
+        withheld_views = [view for view in _changed(self.unseen, changes) if np.any(view.mask)]
+        return mean_psnr(self._fitted(self._begun(changes)), withheld_views, self.render)
 
     def sizes(self, changes: np.ndarray) -> tuple[float, float, float, float]:
         """Return the largest change of a rotation, degrees, a position, a focal length, and a pixel by the lens."""
@@ -252,10 +252,10 @@ class _Problem:
         """Return the capture with changed cameras and moved points."""
         capture = self.capture
         pairs = zip(self.cameras, changes, strict=True)
-        refined = dict(zip(self.indices, (changed_camera(*pair) for pair in pairs), strict=True))
-        left = dict(zip(self.indices, changes[:, 9:].tolist(), strict=True))
-        every = [refined.get(v, camera) for v, camera in enumerate(capture.cameras)]
-        rig = capture.with_cameras(every, [left.get(v, (0.0, 0.0)) for v in range(len(every))])
+        refined_cameras = dict(zip(self.indices, (changed_camera(*pair) for pair in pairs), strict=True))
+        distortions = dict(zip(self.indices, changes[:, 9:].tolist(), strict=True))
+        cameras = [refined_cameras.get(v, camera) for v, camera in enumerate(capture.cameras)]
+        rig = capture.with_cameras(cameras, [distortions.get(v, (0.0, 0.0)) for v in range(len(cameras))])
         return replace(rig, points=self._points(changes))
 
     def _points(self, changes: np.ndarray) -> np.ndarray:
@@ -267,8 +267,8 @@ class _Problem:
         rng = rng_of(self.seed, Stream.REFINED_POINTS)
         return FirstFrameProblem.of(_changed(self.views, changes), points, _short(self.config), self.render, rng)
 
-    def _fitted(self, problem: FirstFrameProblem, later: bool = False) -> Gaussians:
-        return fit_first_frame(problem, _short(self.config, later), rng_of(self.seed, Stream.REFINEMENT)).gaussians
+    def _fitted(self, problem: FirstFrameProblem, is_later: bool = False) -> Gaussians:
+        return fit_first_frame(problem, _short(self.config, is_later), rng_of(self.seed, Stream.REFINEMENT)).gaussians
 
 
 def register_camera(
@@ -294,15 +294,15 @@ def register_camera(
         changes = best
         error = np.inf
         for _ in range(_REGISTRATION_STEPS):
-            now = changed_camera(camera, changes[0])
-            G, b, found = _shifts(gaussians, now, target, blur, render)
-            if not found < error:
+            changed_view = changed_camera(camera, changes[0])
+            G, b, new_error = _shifts(gaussians, changed_view, target, blur, render)
+            if not new_error < error:
                 break
             best = changes
-            error = found
+            error = new_error
             equations = NormalEquations(1, 0)
-            of_camera, _ = camera_jacobian(now, 1 + changes[0, 6], means)
-            equations.add_camera(0, of_camera, G / found / _ALIKE, b / found / _ALIKE)
+            of_camera, _ = camera_jacobian(changed_view, 1 + changes[0, 6], means)
+            equations.add_camera(0, of_camera, G / new_error / _ALIKE, b / new_error / _ALIKE)
             step, _ = equations.step(changes, deviations, 0.0)
             changes = changes + step
             if np.abs(of_camera @ step[0]).mean() < _LEAST_SHIFT:
@@ -315,10 +315,10 @@ def _matched(capture: Capture, train: Sequence[int], deviations: np.ndarray) -> 
 
     Without enough points, there are no changes, and the deviations equal the priors' deviations.
     """
-    recorded = capture.displayed().at_recorded_size()
-    images = next(recorded.partial_frames(0, 1)).images
-    cameras = [recorded.cameras[v] for v in train]
-    features = [detect(images[v], recorded.masks[v]) for v in train]
+    recording = capture.displayed().at_recorded_size()
+    images = next(recording.partial_frames(0, 1)).images
+    cameras = [recording.cameras[v] for v in train]
+    features = [detect(images[v], recording.masks[v]) for v in train]
     tracks = join_matches(match_views(features, cameras), features)
     if np.bincount(tracks.views, minlength=len(train)).min() < _MIN_TRACKS:
         return np.zeros((len(train), CHANGES)), 0, deviations
@@ -350,33 +350,33 @@ def _largest_shift(camera: Camera, change: np.ndarray) -> float:
 
 def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -> np.ndarray:
     """Return points [P, 3] moved to keep their projections in the views that show them, with changed cameras."""
-    changed = [changed_camera(*pair) for pair in zip(cameras, changes, strict=True)]
-    seen = [seen_points(camera, points)[:2] for camera in cameras]
-    ids = np.concatenate([np.flatnonzero(inside) for inside, _ in seen])
-    views = np.repeat(np.arange(len(cameras)), [len(pixels) for _, pixels in seen])
+    rig = [changed_camera(*pair) for pair in zip(cameras, changes, strict=True)]
+    hits = [seen_points(camera, points)[:2] for camera in cameras]
+    ids = np.concatenate([np.flatnonzero(mask) for mask, _ in hits])
+    views = np.repeat(np.arange(len(cameras)), [len(pixels) for _, pixels in hits])
     if not len(ids):
         return points
-    pixels = [undistorted(c, pixels, change[9:]) for c, (_, pixels), change in zip(changed, seen, changes, strict=True)]
-    found = intersect(ids, views, np.concatenate(pixels), changed, len(points))
+    pixels = [undistorted(c, pixels, change[9:]) for c, (_, pixels), change in zip(rig, hits, changes, strict=True)]
+    intersections = intersect(ids, views, np.concatenate(pixels), rig, len(points))
     several = np.bincount(ids, minlength=len(points)) >= 2
-    moved = np.where((several & np.isfinite(found).all(axis=1))[:, None], found, points)
-    return moved.astype(np.float32)
+    moved_points = np.where((several & np.isfinite(intersections).all(axis=1))[:, None], intersections, points)
+    return moved_points.astype(np.float32)
 
 
-def _short(config: FitConfig, later: bool = False) -> FitConfig:
+def _short(config: FitConfig, is_later: bool = False) -> FitConfig:
     """Return the settings of a short fit; a later one continues with half the steps and lower rates.
 
     It has no view-dependent colours, which would hide wrong poses.
     """
     how = config.short_fits
     rates = config.first_frame_rates
-    if later:
+    if is_later:
         rates = replace(rates, **{name: factor * getattr(rates, name) for name, factor in _LATER_RATES.items()})
     return replace(
         config,
         sh_degree=0,
         num_gaussians=how.gaussians,
-        first_frame_steps=how.steps // 2 if later else how.steps,
+        first_frame_steps=how.steps // 2 if is_later else how.steps,
         first_frame_rates=rates,
         dropping=0.0,
         density=replace(config.density, rounds=0),
@@ -393,11 +393,11 @@ def _joint_step(
 ) -> tuple[Gaussians, np.ndarray]:
     """Return the Gaussians and the changes of the cameras [V, 11] after one Gauss-Newton step of both."""
     means = np.asarray(gaussians.means, np.float64)
-    changed = _changed(views, changes)
-    shifts = [_shifts(gaussians, view.camera, view.target, blur, render) for view in changed]
+    changed_views = _changed(views, changes)
+    shifts = [_shifts(gaussians, view.camera, view.target, blur, render) for view in changed_views]
     variance = _ALIKE * np.mean([error for *_, error in shifts])
     equations = NormalEquations(len(views), len(means))
-    for v, (view, (G, b, _)) in enumerate(zip(changed, shifts, strict=True)):
+    for v, (view, (G, b, _)) in enumerate(zip(changed_views, shifts, strict=True)):
         jacobian = camera_jacobian(view.camera, 1 + changes[v, 6], means)
         equations.add(v, slice(None), jacobian, G / variance, b / variance)
     of_changes, of_means = equations.step(changes, deviations, _DAMPING, equations.frame(means))

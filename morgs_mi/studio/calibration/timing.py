@@ -133,9 +133,9 @@ def _aligned(rounds: _Rounds, largest: int) -> tuple[np.ndarray, np.ndarray, Off
         previous = solution if blur in _BLUR_OF_ROUND[:index] else None
         solution = equations.solution()
         share = 1.0 if previous is None else _share(step[clips.train], (solution - previous)[clips.train])
-        moved = np.clip(offsets + np.clip(equations.solution(share), -_LONGEST_STEP, _LONGEST_STEP), -largest, largest)
-        step = moved - offsets
-        offsets = moved
+        result = np.clip(offsets + np.clip(equations.solution(share), -_LONGEST_STEP, _LONGEST_STEP), -largest, largest)
+        step = result - offsets
+        offsets = result
         if not blur and np.abs(step).max() < _TOLERANCE:
             break
     return offsets, step, equations
@@ -148,10 +148,10 @@ def _share(step: np.ndarray, change: np.ndarray) -> float:
 
 def _found_back(rounds: _Rounds, offsets: np.ndarray, equations: OffsetEquations, reference: int) -> np.ndarray:
     """Return the part [V] that the equations recover of a move of the clocks relative to the clock of `reference`."""
-    moved = np.where(np.arange(len(offsets)) % 2, _MOVED, -_MOVED)
-    moved[reference] = 0
-    change = rounds.equations(offsets + moved, 0.0).solution() - equations.solution()
-    part = (change[reference] - change) / np.where(moved != 0, moved, 1)
+    moves = np.where(np.arange(len(offsets)) % 2, _MOVED, -_MOVED)
+    moves[reference] = 0
+    change = rounds.equations(offsets + moves, 0.0).solution() - equations.solution()
+    part = (change[reference] - change) / np.where(moves != 0, moves, 1)
     return np.clip(part, _LEAST_FOUND, 1)
 
 
@@ -167,13 +167,13 @@ class _Rounds:
 
     def equations(self, offsets: np.ndarray, blur: float) -> OffsetEquations:
         """Return the sum of the equations of all instants, with images interpolated by offsets [V] and blurred."""
-        found = []
+        instants_equations = []
         for instant in self.instants:
-            found.append(_equations_at(self.clips, instant - offsets, blur, self.seed))
+            instants_equations.append(_equations_at(self.clips, instant - offsets, blur, self.seed))
             self.done += 1
             if self.progress is not None:
                 self.progress(self.done, (len(_BLUR_OF_ROUND) + 1) * len(self.instants))
-        equations = reduce(add, found)
+        equations = reduce(add, instants_equations)
         if not equations.own.any():
             raise ValueError(
                 f"{self.clips.path}: expected motion in the first {self.clips.num_frames} frames, found none; record "
@@ -196,8 +196,8 @@ class _Clips:
 
     @classmethod
     def of(cls, capture: Capture) -> _Clips:
-        shown = capture.displayed()
-        clips = [[_checked(image) for image in shown.images(v, 0, _FRAMES)] for v in range(len(capture.cameras))]
+        display = capture.displayed()
+        clips = [[_checked(image) for image in display.images(v, 0, _FRAMES)] for v in range(len(capture.cameras))]
         views = zip(capture.cameras, (clip[0] for clip in clips), capture.masks, strict=True)
         small, _, masks = zip(*(View(*view).reduced(_WIDTH) for view in views), strict=True)
         # The images are whole frames: with the capture's delays they would be displaced twice.
@@ -232,14 +232,14 @@ def _checked(image: ImageOrError) -> np.ndarray:
 def _equations_at(clips: _Clips, times: np.ndarray, blur: float, seed: int) -> OffsetEquations:
     """Return the equations of an instant, which each view shows at its own time [V]."""
     images = clips.at(times)
-    after = clips.at(times + 1)
+    next_images = clips.at(times + 1)
     targets = [Target(image, mask) for image, mask in zip(images, clips.masks, strict=True)]
     gaussians = _fitted(clips, images, 2 if blur else 1, seed)
-    pairs = {v: FramePair(after[v], images[v], valid=clips.masks[v]) for v in clips.train}
+    pairs = {v: FramePair(next_images[v], images[v], valid=clips.masks[v]) for v in clips.train}
     views = [ActiveView(camera) for camera in clips.cameras]
-    lifted = lift_flow(gaussians, {v: views[v] for v in clips.train}, observe_key_views(pairs))
+    flow = lift_flow(gaussians, {v: views[v] for v in clips.train}, observe_key_views(pairs))
     train = np.isin(np.arange(len(views)), clips.train)
-    return offset_equations(replace(gaussians, motion=lifted.displacement), views, targets, train, blur)
+    return offset_equations(replace(gaussians, motion=flow.displacement), views, targets, train, blur)
 
 
 def _fitted(clips: _Clips, images: Sequence[np.ndarray], divisor: int, seed: int) -> Gaussians:
@@ -268,9 +268,9 @@ def _fitted(clips: _Clips, images: Sequence[np.ndarray], divisor: int, seed: int
 def _relative(capture: Capture, offsets: np.ndarray, errors: np.ndarray, change: float) -> TimeOffsets:
     """Return the result with the offsets relative to the reference, in addition to the capture's offsets."""
     reference = capture.reference_view
-    known = capture.reading.offset
-    apart = offsets - [camera.delay for camera in capture.cameras]
-    own = {n: known.get(n, 0.0) - (o - apart[reference]) for n, o in zip(capture.names, apart, strict=True)}
-    rounded = {name: round(float(offset), 3) + 0.0 for name, offset in own.items()}
-    uncertain = dict(zip(capture.names, np.round(errors, 3).tolist(), strict=True))
-    return TimeOffsets(rounded, uncertain, capture.names[reference], change, change < _TOLERANCE)
+    settings = capture.reading.offset
+    clocks = offsets - [camera.delay for camera in capture.cameras]
+    options = {n: settings.get(n, 0.0) - (o - clocks[reference]) for n, o in zip(capture.names, clocks, strict=True)}
+    rounded_offsets = {name: round(float(offset), 3) + 0.0 for name, offset in options.items()}
+    rounded_errors = dict(zip(capture.names, np.round(errors, 3).tolist(), strict=True))
+    return TimeOffsets(rounded_offsets, rounded_errors, capture.names[reference], change, change < _TOLERANCE)

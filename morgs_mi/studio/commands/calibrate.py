@@ -32,17 +32,17 @@ class Calibrate:
         from morgs_mi.studio.calibration.calibrate import calibrate
 
         with progress() as report:
-            found = calibrate(self.folder, self.config, self.overwrite, lambda *stage: report(*stage), self.without)
-        table = Table(title=str(found.model), box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+            result = calibrate(self.folder, self.config, self.overwrite, lambda *stage: report(*stage), self.without)
+        table = Table(title=str(result.model), box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
         for column in ("camera", "points", "error, px", "pose"):
             table.add_column(column, no_wrap=True)
-        for check in found.checks:
+        for check in result.checks:
             table.add_row(check.name, *check_cells(check))
         print_table(table)
-        for line in advice_lines(found.checks):
+        for line in advice_lines(result.checks):
             print_warning(line)
-        how = f"{found.mapper} mapping" + (", with a principal point for each" if found.principal_points else "")
+        how = f"{result.mapper} mapping" + (", with a principal point for each" if result.principal_points else "")
         print_result(
-            f"{found.model}: {len(found.cameras)} cameras, {found.points} points, mean reprojection error "
-            f"{found.error:.2f} px, by {how}; scale and up direction of its world are arbitrary."
+            f"{result.model}: {len(result.cameras)} cameras, {result.points} points, mean reprojection error "
+            f"{result.error:.2f} px, by {how}; scale and up direction of its world are arbitrary."
         )

@@ -47,8 +47,8 @@ class Import:
         if len(self.paths) < 2:
             raise ValueError("morgs-mi import: expected FRAMES and OUT, got fewer; see morgs-mi import --help.")
         *frames, out = self.paths
-        given = {name: value for name in ("quality", "target_size") if (value := getattr(self, name)) is not None}
-        config = replace(CodecConfig(), keyframe_interval=self.keyframe_interval, **given)
+        options = {name: value for name in ("quality", "target_size") if (value := getattr(self, name)) is not None}
+        config = replace(CodecConfig(), keyframe_interval=self.keyframe_interval, **options)
         with progress() as report:
             result = import_frames(
                 frames,

@@ -102,11 +102,11 @@ class Info:
             print_result(f"Plot of the rig: {self.plot}")
 
 
-def _deep_check(capture: Capture, shared: SharedFeatures, found: RigCheck) -> DeepCheck:
+def _deep_check(capture: Capture, shared: SharedFeatures, rig_check: RigCheck) -> DeepCheck:
     """Return the check of the first frames."""
     with progress() as report:
         signals = read_signals(capture, MAX_FRAMES, partial(report, "Reading frames"))
-    return check_deep(capture, shared, found, signals)
+    return check_deep(capture, shared, rig_check, signals)
 
 
 def _deep_lines(deep: DeepCheck | None) -> list[str]:
@@ -119,7 +119,7 @@ def _deep_lines(deep: DeepCheck | None) -> list[str]:
     return [f"Check of {deep.frames} frames: {result}.", *sentences, *filter(None, [deep.unmeasured])]
 
 
-def _camera_table(capture: Capture, found: RigCheck | None) -> Table:
+def _camera_table(capture: Capture, rig_check: RigCheck | None) -> Table:
     """Return a row per camera: size, intrinsics, use, and how well its pose fits the matches."""
     table = Table(title=f"{capture.path}: {capture.layout}", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for column in ("", "camera", "size", "focal, px", "centre, px", "seen", "use", "matches", "error, px", "pose"):
@@ -134,40 +134,40 @@ def _camera_table(capture: Capture, found: RigCheck | None) -> Table:
             f"{K[0, 2]:.1f} {K[1, 2]:.1f}",
             "100 %" if mask is None else f"{100 * mask.mean():.0f} %",
             "test" if index in capture.test_views else "train",
-            *check_cells(found.cameras[index] if found else None),
+            *check_cells(rig_check.cameras[index] if rig_check else None),
         )
     return table
 
 
-def _check_lines(found: RigCheck | None) -> list[str]:
+def _check_lines(rig_check: RigCheck | None) -> list[str]:
     """Return the result of the reprojection check and its advice."""
-    if found is None:
+    if rig_check is None:
         return []
-    error = f"median {found.error:.2f} px over " if found.matches else ""
-    result = f"Reprojection check: {error}{found.matches} matches in {found.pairs} pairs; {found.advice}"
-    return [result, *advice_lines(found.cameras)]
+    error = f"median {rig_check.error:.2f} px over " if rig_check.matches else ""
+    result = f"Reprojection check: {error}{rig_check.matches} matches in {rig_check.pairs} pairs; {rig_check.advice}"
+    return [result, *advice_lines(rig_check.cameras)]
 
 
-def _time_lines(found: TimeOffsets) -> list[str]:
+def _time_lines(offsets: TimeOffsets) -> list[str]:
     """Return the time offsets as the options that align the clips, and how certain they are."""
-    errors = {name: error for name, error in found.errors.items() if name != found.reference}
-    known = {name: error for name, error in errors.items() if error < _NOT_FOUND}
+    errors = {name: error for name, error in offsets.errors.items() if name != offsets.reference}
+    measured_errors = {name: error for name, error in errors.items() if error < _NOT_FOUND}
     lines = []
-    if known:
-        listed = " ".join(f"{name} {found.offsets[name]:.2f}" for name in known)
-        worst = max(known, key=lambda name: known[name])
+    if measured_errors:
+        options = " ".join(f"{name} {offsets.offsets[name]:.2f}" for name in measured_errors)
+        worst = max(measured_errors, key=lambda name: measured_errors[name])
         lines += [
-            f"Clocks: pass --offset {listed} for the time of {found.reference}.",
-            f"Standard errors of these offsets: up to {known[worst]:.2f} frames ({worst}).",
+            f"Clocks: pass --offset {options} for the time of {offsets.reference}.",
+            f"Standard errors of these offsets: up to {measured_errors[worst]:.2f} frames ({worst}).",
         ]
-    doubts = [f"{name} ({error:.2f})" for name, error in known.items() if error > _UNCERTAIN]
+    doubts = [f"{name} ({error:.2f})" for name, error in measured_errors.items() if error > _UNCERTAIN]
     if doubts:
         lines.append(f"Uncertain: {', '.join(doubts)}. {_UNCERTAIN_WHY}")
-    if len(known) < len(errors):
-        missing = ", ".join(name for name in errors if name not in known)
-        lines.append(f"Clocks not found: {missing}; keep what is known of them. {_UNCERTAIN_WHY}")
-    if not found.converged:
-        lines.append(f"The offsets still change by {found.change:.2f} frames: the clips may not show enough.")
+    if len(measured_errors) < len(errors):
+        names = ", ".join(name for name in errors if name not in measured_errors)
+        lines.append(f"Clocks not found: {names}; keep what is known of them. {_UNCERTAIN_WHY}")
+    if not offsets.converged:
+        lines.append(f"The offsets still change by {offsets.change:.2f} frames: the clips may not show enough.")
     return lines
 
 

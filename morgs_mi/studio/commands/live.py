@@ -90,32 +90,30 @@ class _Lines:
 
     def __init__(self) -> None:
         self._last = float("-inf")
-        self._dropped = 0
+        self._drops = 0
 
     def add(self, row: LiveFrame) -> None:
-        self._dropped += row.dropped
-        if (now := time.monotonic()) - self._last < _PERIOD:
+        self._drops += row.dropped
+        if (time_now := time.monotonic()) - self._last < _PERIOD:
             return
         print_warning(
-            f"Frame {row.frame}: {row.time:.1f} s after the first, latency {row.latency:.2f} s, {self._dropped} frames "
+            f"Frame {row.frame}: {row.time:.1f} s after the first, latency {row.latency:.2f} s, {self._drops} frames "
             f"dropped, skew {1e3 * row.skew:.0f} ms."
         )
-        self._last = now
-        self._dropped = 0
+        self._last = time_now
+        self._drops = 0
 
 
 def _summary(out: Path, rows: Sequence[LiveFrame]) -> str:
     """Return a summary of a live fit in one sentence."""
     stream = out / STREAM
-    later = rows[1:]
-    dropped = sum(row.dropped for row in rows)
-    text = (
-        f"{stream}: fitted {len(rows)} of {len(rows) + dropped} frames ({dropped} dropped) in {rows[-1].time:.1f} s, "
-    )
+    later_rows = rows[1:]
+    drops = sum(row.dropped for row in rows)
+    text = f"{stream}: fitted {len(rows)} of {len(rows) + drops} frames ({drops} dropped) in {rows[-1].time:.1f} s, "
     text += f"{stream.stat().st_size / 1e6:.1f} MB, {rows[0].latency:.1f} s for the first one"
-    if not later:
+    if not later_rows:
         return f"{text}."
-    latency = np.mean([row.latency for row in later])
+    latency = np.mean([row.latency for row in later_rows])
     skew = max(row.skew for row in rows)
     return f"{text}, mean latency of the others {latency:.2f} s, largest skew {1e3 * skew:.0f} ms."
 

@@ -90,9 +90,9 @@ def _strip(
 ) -> np.ndarray:
     """Return rows of a panorama [R, W, 3] of an eye that is `shift` to the right."""
     width, height, samples = size
-    within = (np.arange(samples) + 0.5) / samples
-    longitude = 2 * np.pi * ((np.arange(width)[:, None] + within) / width - 0.5)
-    latitude = np.pi * (0.5 - (rows[:, None] + within) / height)
+    offsets = (np.arange(samples) + 0.5) / samples
+    longitude = 2 * np.pi * ((np.arange(width)[:, None] + offsets) / width - 0.5)
+    latitude = np.pi * (0.5 - (rows[:, None] + offsets) / height)
     latitude, longitude = np.broadcast_arrays(latitude[:, None, :, None], longitude[None, :, None, :])
     level = np.stack([np.sin(longitude), np.zeros_like(longitude), np.cos(longitude)], axis=-1)
     right = np.stack([np.cos(longitude), np.zeros_like(longitude), -np.sin(longitude)], axis=-1)

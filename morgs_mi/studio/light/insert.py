@@ -172,9 +172,9 @@ def _resized(name: str, image: np.ndarray, camera: Camera) -> np.ndarray:
     scale = camera.height / image.shape[0]
     if scale == 1:
         return image
-    resized = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
+    values = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
     unit = np.array([1, scale] if name == "motion" else 1, np.float32)  # motion is in pixels
-    return resized.reshape(camera.height, camera.width, -1) * unit
+    return values.reshape(camera.height, camera.width, -1) * unit
 
 
 def captured_light(
@@ -224,19 +224,21 @@ def _render(
     nested = _integrator(entries.pop("integrator", None), config.light, clipped)
     ratio = np.ones(len(gaussians), np.float32)
     try:
-        inserted = _inserted_scene(entries)
-        lit = inserted
-        if not inserted.emitters():
-            lamp = captured_light(gaussians, camera, np.array(inserted.bbox().center()).ravel(), clipped)
-            lit = mi.load_dict({"type": "scene", **entries, "captured light": lamp})
-            inserted = lit if config.light == "probe" else _in_background_light(entries, gaussians, camera, clipped)
+        surfaces = _inserted_scene(entries)
+        lit_scene = surfaces
+        if not surfaces.emitters():
+            lamp = captured_light(gaussians, camera, np.array(surfaces.bbox().center()).ravel(), clipped)
+            lit_scene = mi.load_dict({"type": "scene", **entries, "captured light": lamp})
+            surfaces = (
+                lit_scene if config.light == "probe" else _in_background_light(entries, gaussians, camera, clipped)
+            )
         if config.shadows:
-            ratio = shadow_ratio(gaussians, lit, camera.position)
+            ratio = shadow_ratio(gaussians, lit_scene, camera.position)
         dark = shadowed(gaussians, ratio)
-        images = _plugin_images(dark, camera, inserted, nested, channels, config.samples)
+        images = _plugin_images(dark, camera, surfaces, nested, channels, config.samples)
         if "surfaces" in channels:
             with traced(nested, rays_for(nested, dark), srgb=True):
-                images["surfaces"] = np.asarray(nested.render(inserted, _sensor(camera), spp=config.samples))
+                images["surfaces"] = np.asarray(nested.render(surfaces, _sensor(camera), spp=config.samples))
     except RuntimeError as error:
         raise ValueError(f"The inserted scene: {_reason(error)}; correct it.") from error
     if {"splats", "shadow"} & set(channels):
@@ -274,7 +276,7 @@ def _splat_layers(gaussians: Gaussians, shadowed_gaussians: Gaussians, camera: C
 
 
 def _plugin_images(
-    gaussians: Gaussians, camera: Camera, inserted: Any, nested: Any, channels: Sequence[str], samples: int
+    gaussians: Gaussians, camera: Camera, surfaces: Any, nested: Any, channels: Sequence[str], samples: int
 ) -> dict[str, np.ndarray]:
     """Return the colour, alpha and AOVs of `gaussian_splat` with an inserted scene."""
     aovs = [name for name in channels if name not in ("color", "alpha", *LAYERS)]
@@ -284,7 +286,7 @@ def _plugin_images(
             "gaussians": ellipsoids(gaussians),
             "sensor": _sensor(camera),
             "integrator": {"type": "gaussian_splat", "surfaces": nested, "aovs": ",".join(aovs)},
-            **{f"part{i}": part for i, part in enumerate(_parts(inserted))},
+            **{f"part{i}": part for i, part in enumerate(_parts(surfaces))},
         }
     )
     image = np.asarray(scene.integrator().render(scene, spp=samples))

@@ -100,10 +100,10 @@ class _Receivers:
     def __init__(self, gaussians: Gaussians, eye: np.ndarray) -> None:
         means: np.ndarray = np.array(dr.detach(gaussians.means), np.float64)
         normals, flat = _orientation(gaussians, means)
-        behind = np.sum(normals * (eye - means), axis=1) < 0
-        facing = np.where(behind[:, None], -normals, normals)
+        is_back = np.sum(normals * (eye - means), axis=1) < 0
+        front_normals = np.where(is_back[:, None], -normals, normals)
         self.centers = mi.Point3f([from_numpy(mi.Float, means[:, k]) for k in range(3)])
-        self.normals = mi.Vector3f([from_numpy(mi.Float, facing[:, k]) for k in range(3)])
+        self.normals = mi.Vector3f([from_numpy(mi.Float, front_normals[:, k]) for k in range(3)])
         self.flat = from_numpy(mi.Float, flat)
 
     def response(self, direction: Any) -> Float:
@@ -147,12 +147,12 @@ def _irradiance(emitter: Any, receivers: _Receivers, blockers: Any, samples: int
     def step(k: UInt32, blocked: Float, total: Float) -> tuple[UInt32, Float, Float]:
         sample = mi.Point2f((mi.Float(k) + 0.5) * step_size, mi.radical_inverse_2(k, no_scramble))
         ds, weight = emitter.sample_direction(it, sample)
-        received = dr.mean(mi.unpolarized_spectrum(weight)) * receivers.response(ds.d)
+        irradiance = dr.mean(mi.unpolarized_spectrum(weight)) * receivers.response(ds.d)
         ray = mi.Ray3f(receivers.centers, ds.d)
         if not far:
             ray.maxt = ds.dist * (1 - 1e-4)
-        hidden = blockers.ray_test(ray, received > 0)
-        return k + 1, blocked + dr.select(hidden, received, 0), total + received
+        is_hidden = blockers.ray_test(ray, irradiance > 0)
+        return k + 1, blocked + dr.select(is_hidden, irradiance, 0), total + irradiance
 
     state = (mi.UInt32(0), mi.Float(0), mi.Float(0))
     _, blocked, total = dr.while_loop(state, lambda k, *_: k < count, step, label="shadow")

@@ -106,40 +106,40 @@ class SplatPathIntegrator(RBIntegrator):
             # --------------------- Gaussians on the segment ---------------------
 
             ray.maxt = dr.select(si.is_valid(), si.t, dr.largest(mi.Float))
-            emitted, passed = self._layer(ray, active & (depth > 0))
-            L += sign * β * emitted
-            β *= passed
+            emission, transmittance = self._layer(ray, active & (depth > 0))
+            L += sign * β * emission
+            β *= transmittance
 
             # ------------------------- Direct emission --------------------------
 
-            seen = active & ~((depth == 0) & ~si.is_valid()) if self.hide_emitters else active
+            visible = active & ~((depth == 0) & ~si.is_valid()) if self.hide_emitters else active
             ds = mi.DirectionSample3f(scene, si, last_si)
             mis = mis_weight(last_pdf, scene.pdf_emitter_direction(last_si, ds, ~last_delta))
             with dr.resume_grad(when=not primal):
-                Le = β * mis * ds.emitter.eval(si, seen)
+                Le = β * mis * ds.emitter.eval(si, visible)
 
             # ------------------------- Emitter sampling -------------------------
 
             proceed = active & (depth + 1 < self.max_depth) & si.is_valid()
-            lit = proceed & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(lit), True, lit)
-            lit &= ds.pdf != 0
-            weight *= self._to_light(si, ds, lit & (dr.max(mi.unpolarized_spectrum(weight)) > 0))
+            with_light = proceed & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+            ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(with_light), True, with_light)
+            with_light &= ds.pdf != 0
+            weight *= self._to_light(si, ds, with_light & (dr.max(mi.unpolarized_spectrum(weight)) > 0))
             wo = si.to_local(ds.d)
             with dr.resume_grad(when=not primal):
                 if not primal:
-                    attached = scene.eval_emitter_direction(si, ds, lit)
+                    attached = scene.eval_emitter_direction(si, ds, with_light)
                     weight = weight * dr.relative_grad(attached)
-                value, pdf = bsdf.eval_pdf(ctx, si, wo, lit)
+                value, pdf = bsdf.eval_pdf(ctx, si, wo, with_light)
                 Ld = β * dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf)) * value * weight
 
             # -------------------------- BSDF sampling ---------------------------
 
-            chosen, scale = bsdf.sample(ctx, si, sampler.next_1d(proceed), sampler.next_2d(proceed), proceed)
+            direction_sample, scale = bsdf.sample(ctx, si, sampler.next_1d(proceed), sampler.next_2d(proceed), proceed)
             L += sign * dr.detach(Le + Ld)
             with dr.resume_grad(when=not primal):
                 if not primal:
-                    onward = L * dr.relative_grad(bsdf.eval(ctx, si, chosen.wo, proceed))
+                    onward = L * dr.relative_grad(bsdf.eval(ctx, si, direction_sample.wo, proceed))
                     Lo = Le + Ld + onward
                     # Not attached where positions alone are differentiated.
                     if dr.grad_enabled(Lo):
@@ -148,8 +148,8 @@ class SplatPathIntegrator(RBIntegrator):
                         else:
                             δL = δL + dr.forward_to(Lo)
             β = β * scale
-            η = η * chosen.eta
-            onwards = si.spawn_ray(si.to_world(chosen.wo))
+            η = η * direction_sample.eta
+            onwards = si.spawn_ray(si.to_world(direction_sample.wo))
 
             # ------------------------ Stopping criterion ------------------------
 
@@ -158,9 +158,9 @@ class SplatPathIntegrator(RBIntegrator):
             roulette = depth >= self.rr_depth
             proceed &= (largest > 0) & (~roulette | (sampler.next_1d(proceed) < survival))
             β = dr.select(roulette, β * dr.rcp(survival), β)
-            delta = mi.has_flag(chosen.sampled_type, mi.BSDFFlags.Delta)
+            delta = mi.has_flag(direction_sample.sampled_type, mi.BSDFFlags.Delta)
             depth = dr.select(si.is_valid(), depth + 1, depth)
-            return proceed, sampler, onwards, depth, L, δL, β, η, dr.detach(si), chosen.pdf, delta
+            return proceed, sampler, onwards, depth, L, δL, β, η, dr.detach(si), direction_sample.pdf, delta
 
         state = (
             mi.Bool(active),
@@ -182,10 +182,10 @@ class SplatPathIntegrator(RBIntegrator):
     def _layer(self, ray: Any, active: Bool) -> tuple[Any, Float]:
         """Return the radiance that the Gaussians on a segment emit, and their transmittance."""
         assert self.splats
-        color, passed = self.splats.trace(ray, active)
-        covered = 1 - passed
-        mean = color * dr.select(covered > 0, dr.rcp(covered), 0)
-        return covered * radiance(mean, self.clipped, self.srgb), passed
+        color, transmittance = self.splats.trace(ray, active)
+        alpha = 1 - transmittance
+        mean = color * dr.select(alpha > 0, dr.rcp(alpha), 0)
+        return alpha * radiance(mean, self.clipped, self.srgb), transmittance
 
     def _to_light(self, si: Any, ds: Any, active: Bool) -> Float:
         """Return the transmittance between a surface and a sampled light."""

@@ -45,9 +45,9 @@ class CameraFeed:
         self.names = tuple(cameras)
         self._timeout = timeout
         self._warm_up = warm_up
-        self._changed = Condition()
-        self._closed = closed or Event()
-        self._cameras = [_Camera(images, self._changed, self._closed, ended) for images in cameras.values()]
+        self._change = Condition()
+        self._stop_event = closed or Event()
+        self._cameras = [_Camera(images, self._change, self._stop_event, ended) for images in cameras.values()]
         # A thread that executes library code when the interpreter ends aborts the process.
         atexit.register(self.close)
         for camera in self._cameras:
@@ -55,24 +55,24 @@ class CameraFeed:
 
     def newest(self, after: Bundle | None = None) -> Bundle | None:
         """Wait for the newest bundle and return it; None if no camera delivers images any more."""
-        with self._changed:
+        with self._change:
             if after is None:
                 self._wait_for_first()
             deadline = time.monotonic() + self._timeout
             while True:
-                left = deadline - time.monotonic()
-                running = any(camera.ended is None for camera in self._cameras)
+                time_left = deadline - time.monotonic()
+                is_running = any(camera.reason is None for camera in self._cameras)
                 new = [camera.newer(after.numbers[k] if after else -1) for k, camera in enumerate(self._cameras)]
-                if after is not None and running:
-                    expected = self._expected(new, after, late=left <= 0)
+                if after is not None and is_running:
+                    expected = self._expected(new, after, late=time_left <= 0)
                 else:  # the first images have to be complete, and so have the last ones
                     expected = [after is None or after.images[k] is not None for k in range(len(new))]
                 if shots := _nearest(new, expected):
                     times = [shot.time for shot in shots if shot is not None]
                     numbers = [camera.shots[-1].number for camera in self._cameras]
                     return bundled(shots, numbers, max(times) - min(times), _dropped(shots, after))
-                if running and left > 0:
-                    self._changed.wait(left)
+                if is_running and time_left > 0:
+                    self._change.wait(time_left)
                 elif after is not None:
                     return None
                 else:
@@ -83,7 +83,7 @@ class CameraFeed:
 
     def problem(self, camera: int) -> str:
         """Return why a camera has no image in the last bundle."""
-        return self._cameras[camera].ended or f"no image for {self._timeout:g} s"
+        return self._cameras[camera].reason or f"no image for {self._timeout:g} s"
 
     def ended(self) -> str:
         """Return why no camera delivers images any more."""
@@ -95,21 +95,21 @@ class CameraFeed:
     def close(self) -> None:
         """End the reading."""
         atexit.unregister(self.close)
-        self._closed.set()
+        self._stop_event.set()
         deadline = time.monotonic() + _CLOSING
         for camera in self._cameras:
             camera.join(max(0.0, deadline - time.monotonic()))
 
-    def _expected(self, new: Sequence[Sequence[Shot]], after: Bundle, late: bool) -> list[bool]:
+    def _expected(self, new: Sequence[Sequence[Shot]], bundle: Bundle, late: bool) -> list[bool]:
         """Return for each camera whether the bundle has to have its image.
 
         A camera that runs is waited for, unless it is late or was missing before; an image of another has to be of the
         time of the newest.
         """
-        waited = [not late and camera.ended is None for camera in self._cameras]
+        waits = [not late and camera.reason is None for camera in self._cameras]
         return [
             image is not None or bool(shots) if wait else recent
-            for wait, image, shots, recent in zip(waited, after.images, new, _simultaneous(new), strict=True)
+            for wait, image, shots, recent in zip(waits, bundle.images, new, _simultaneous(new), strict=True)
         ]
 
     def _wait_for_first(self) -> None:
@@ -120,33 +120,33 @@ class CameraFeed:
         """
         deadline = time.monotonic() + self._timeout
         while silent := [k for k, camera in enumerate(self._cameras) if not camera.shots]:
-            left = deadline - time.monotonic()
+            time_left = deadline - time.monotonic()
             for name, camera in ((self.names[k], self._cameras[k]) for k in silent):
                 if camera.error is not None:
                     raise camera.error
-                if camera.ended is not None or left <= 0:
+                if camera.reason is not None or time_left <= 0:
                     raise ValueError(
-                        f"CameraFeed(): expected images of {name}, got none ({camera.ended or 'it is silent'}); check "
+                        f"CameraFeed(): expected images of {name}, got none ({camera.reason or 'it is silent'}); check "
                         f"that it records, or wait for it longer than {self._timeout:g} s (--timeout)."
                     )
-            self._changed.wait(left)
+            self._change.wait(time_left)
         end = time.monotonic() + self._warm_up
-        while (left := end - time.monotonic()) > 0 and all(camera.ended is None for camera in self._cameras):
-            self._changed.wait(left)
+        while (time_left := end - time.monotonic()) > 0 and all(camera.reason is None for camera in self._cameras):
+            self._change.wait(time_left)
 
 
 class _Camera(Thread):
     """Thread that reads the images of a camera; its state is guarded by `changed`."""
 
-    def __init__(self, images: Iterable[np.ndarray | None], changed: Condition, closed: Event, ended: str) -> None:
+    def __init__(self, images: Iterable[np.ndarray | None], change: Condition, stop: Event, end_text: str) -> None:
         super().__init__(daemon=True, name="camera")
         self.shots: deque[Shot] = deque(maxlen=_KEPT)
-        self.ended: str | None = None  # why there are no images any more
+        self.reason: str | None = None  # why there are no images any more
         self.error: Exception | None = None
         self._images = images
-        self._changed = changed
-        self._closed = closed
-        self._ended = ended
+        self._change = change
+        self._stop_event = stop
+        self._end_text = end_text
 
     def run(self) -> None:
         """Read until the source ends or the feed is closed."""
@@ -154,20 +154,20 @@ class _Camera(Thread):
         try:
             for image in self._images:
                 if image is not None:
-                    with self._changed:
+                    with self._change:
                         self.shots.append(Shot(image, time.monotonic(), number))
-                        self._changed.notify_all()
+                        self._change.notify_all()
                     number += 1
-                if self._closed.is_set():
+                if self._stop_event.is_set():
                     break
         except Exception as error:
             self.error = error
         finally:
             if (close := getattr(self._images, "close", None)) is not None:
                 close()
-            with self._changed:
-                self.ended = str(self.error or self._ended)
-                self._changed.notify_all()
+            with self._change:
+                self.reason = str(self.error or self._end_text)
+                self._change.notify_all()
 
     def newer(self, number: int) -> list[Shot]:
         """Return the stored shots after the one with a number."""
@@ -182,20 +182,20 @@ def _simultaneous(new: Sequence[Sequence[Shot]]) -> list[bool]:
 
 def _nearest(new: Sequence[Sequence[Shot]], expected: Sequence[bool]) -> list[Shot | None] | None:
     """Return a shot of each expected camera, all within `_MAX_SKEW`; None if one has none yet, or none is expected."""
-    groups = [shots for shots, wanted in zip(new, expected, strict=True) if wanted]
+    groups = [shots for shots, is_expected in zip(new, expected, strict=True) if is_expected]
     if not groups or not all(groups):
         return None
     time_of_slowest = min(shots[-1].time for shots in groups)
-    chosen = [
-        min(shots, key=lambda shot: abs(shot.time - time_of_slowest)) if wanted else None
-        for shots, wanted in zip(new, expected, strict=True)
+    choice = [
+        min(shots, key=lambda shot: abs(shot.time - time_of_slowest)) if is_expected else None
+        for shots, is_expected in zip(new, expected, strict=True)
     ]
-    times = [shot.time for shot in chosen if shot is not None]
-    return chosen if max(times) - min(times) <= _MAX_SKEW else None
+    times = [shot.time for shot in choice if shot is not None]
+    return choice if max(times) - min(times) <= _MAX_SKEW else None
 
 
-def _dropped(shots: Sequence[Shot | None], after: Bundle | None) -> int:
+def _dropped(shots: Sequence[Shot | None], bundle: Bundle | None) -> int:
     """Return the number of images that each camera delivered between two bundles."""
-    if after is None:
+    if bundle is None:
         return 0
-    return min(shot.number - last - 1 for shot, last in zip(shots, after.numbers, strict=True) if shot is not None)
+    return min(shot.number - last - 1 for shot, last in zip(shots, bundle.numbers, strict=True) if shot is not None)

@@ -128,7 +128,7 @@ class _LiveFrames:
         self.config = config
         self._feed = feed
         self._first = first
-        self._missing: set[str] = set()
+        self._missing_names: set[str] = set()
 
     def __iter__(self) -> Iterator[tuple[Bundle, PartialFrame]]:
         """Yield whenever the next frame is asked for the newest images, as recorded and as processed."""
@@ -155,9 +155,9 @@ class _LiveFrames:
         problems = {k: self._problem(k, image) for k, image in enumerate(bundle.images)}
         problems = {k: problem for k, problem in problems.items() if problem}
         names = {self.capture.names[k]: problem for k, problem in problems.items()}
-        for name in names.keys() - self._missing:
+        for name in names.keys() - self._missing_names:
             _LOG.warning("frame %d: %s is left out: %s", frame, name, names[name].rstrip("."))
-        self._missing = set(names)
+        self._missing_names = set(names)
 
         def process(view: int) -> np.ndarray | None:
             image = bundle.images[view]
@@ -171,8 +171,8 @@ class _LiveFrames:
         if image is None:
             return self._feed.problem(view)
         size = image.shape[1::-1]
-        recorded = self.capture.recorded_sizes[view]
-        return "" if size == recorded else "expected an image of {}x{}, got {}x{}".format(*recorded, *size)
+        recorded_size = self.capture.recorded_sizes[view]
+        return "" if size == recorded_size else "expected an image of {}x{}, got {}x{}".format(*recorded_size, *size)
 
 
 def _fit(
@@ -194,10 +194,10 @@ def _fit(
     with Recording(FitFiles.of(out), prepared.capture, metadata | prepared.metadata) as recording:
         try:
             for bundle, frame in frames:
-                recorded = in_background(partial(_record, frames, out, bundle, frame))
+                writing_task = in_background(partial(_record, frames, out, bundle, frame))
                 packet, report = push_frame(loop, frame, train, None if rows else on_stage, None, recording.show)
                 report = prepared.completed(report, loop.gaussians, frame, config)
-                recorded.result()
+                writing_task.result()
                 row = frames.report(bundle, frame)
                 live = [asdict(r) for r in (*rows, row)]
                 recording.push(packet, report, loop.state.coded, live=live)
@@ -217,5 +217,5 @@ def _fit(
 def _record(frames: _LiveFrames, out: Path, bundle: Bundle, frame: PartialFrame) -> None:
     """Write the recorded images of a frame into the capture; the first frame's are there already."""
     if frames.config.record and frame.index:
-        kept = [None if done is None else image for image, done in zip(bundle.images, frame.images, strict=True)]
-        write_images(out / "capture", frames.capture.names, kept, frame.index)
+        images = [None if result is None else image for image, result in zip(bundle.images, frame.images, strict=True)]
+        write_images(out / "capture", frames.capture.names, images, frame.index)

@@ -38,11 +38,11 @@ class _Images:
     files: Mapping[int, Path]  # by number
     # time by which `time.monotonic` is ahead of the times of the files, s: the program that writes them may run on a
     # machine with another clock
-    ahead: float = 0.0
+    lead: float = 0.0
 
     def arrival(self, number: int) -> float:
         """Return when an image was written, s of `time.monotonic`."""
-        return _written(self.files[number]) + self.ahead
+        return _written(self.files[number]) + self.lead
 
     def since(self, begin: float) -> _Images:
         """Return the images that did not arrive before `begin`, s of `time.monotonic`."""
@@ -76,33 +76,33 @@ class FolderFeed:
         self._folder = folder
         self._timeout = timeout
         # By camera, see `_Images.ahead`.
-        self._ahead: dict[str, float] = {}
+        self._leads: dict[str, float] = {}
         # When the last bundle was returned, s of `time.monotonic`.
-        self._returned = time.monotonic()
+        self._return_time = time.monotonic()
         # By camera, when the images of the last bundle were written, and those before the ones that are counted
         # together with it, s of their files.
-        self._written: dict[str, float] = {}
-        self._before: dict[str, float] = {}
+        self._write_times: dict[str, float] = {}
+        self._old_write_times: dict[str, float] = {}
 
     def newest(self, after: Bundle | None = None) -> Bundle | None:
         """Wait for the newest bundle and return it; None if no camera delivers images any more."""
         start = time.monotonic()
         pause_end = start + _PAUSE
-        searched = self._returned
+        search_time = self._return_time
         while True:
-            now = time.monotonic()
-            late = now - start >= self._timeout
-            paused = now >= pause_end or late
-            for found in self._newer(after, paused):
-                bundle = self._first(found, late) if after is None else self._next(found, after, late)
+            current_time = time.monotonic()
+            late = current_time - start >= self._timeout
+            has_paused = current_time >= pause_end or late
+            for images in self._newer(after, has_paused):
+                bundle = self._first(images, late) if after is None else self._next(images, after, late)
                 if bundle is not None:
-                    self._take(found, max(bundle.numbers), after)
+                    self._take(images, max(bundle.numbers), after)
                     # Images that are not waited for may have been there for longer.
-                    return self._arrived(bundle, self._returned if paused else searched)
+                    return self._arrived(bundle, self._return_time if has_paused else search_time)
             if late:
                 return self._end(after)
-            pause_end = now + _PAUSE if paused else pause_end
-            searched = now
+            pause_end = current_time + _PAUSE if has_paused else pause_end
+            search_time = current_time
             time.sleep(_POLL)
 
     def problem(self, camera: int) -> str:
@@ -116,22 +116,22 @@ class FolderFeed:
     def close(self) -> None:
         """Do nothing: no file is open."""
 
-    def _newer(self, after: Bundle | None, paused: bool) -> Iterator[_Found]:
+    def _newer(self, bundle: Bundle | None, has_paused: bool) -> Iterator[_Found]:
         """Yield the images with larger numbers than a bundle; after a pause also all that were written since."""
-        yield self._found(-1 if after is None else max(after.numbers), self._before)
-        if paused and after is not None:
-            yield self._found(-1, self._written)
+        yield self._found(-1 if bundle is None else max(bundle.numbers), self._old_write_times)
+        if has_paused and bundle is not None:
+            yield self._found(-1, self._write_times)
 
-    def _first(self, found: _Found, late: bool) -> Bundle | None:
+    def _first(self, by_name: _Found, late: bool) -> Bundle | None:
         """Return the newest bundle of all cameras."""
-        names = self.names or tuple(found)
-        common = _common(found, names)
+        names = self.names or tuple(by_name)
+        common = _common(by_name, names)
         if not self.names and not late:
             # Which cameras there are is known when the next number begins.
-            common -= {max(number for images in found.values() for number in images.files)} if found else set()
-        bundle = _bundle([found.get(name, _NONE) for name in names], common)
+            common -= {max(number for images in by_name.values() for number in images.files)} if by_name else set()
+        bundle = _bundle([by_name.get(name, _NONE) for name in names], common)
         if bundle is not None:
-            if not self.names and not late and set(self._found(-1, self._before)) - set(names):
+            if not self.names and not late and set(self._found(-1, self._old_write_times)) - set(names):
                 # The first image of a camera came while the folders were read.
                 return None
             if silent := [name for name in self._cameras() if name not in names and not self.names]:
@@ -139,33 +139,33 @@ class FolderFeed:
             self.names = names
         return bundle
 
-    def _next(self, found: _Found, after: Bundle, late: bool) -> Bundle | None:
+    def _next(self, by_name: _Found, last_bundle: Bundle, late: bool) -> Bundle | None:
         """Return the newest bundle of the cameras that are expected; if it is late, of those that have an image."""
-        cameras = [found.get(name, _NONE) for name in self.names]
-        pairs = zip(cameras, after.images, strict=True)
+        cameras = [by_name.get(name, _NONE) for name in self.names]
+        pairs = zip(cameras, last_bundle.images, strict=True)
         numbers = [set(camera.files) for camera, image in pairs if camera.files or image is not None]
         if late:
-            return _bundle(cameras, set.union(*numbers), after, partial=True)
-        bundle = _bundle(cameras, set.intersection(*numbers), after)
+            return _bundle(cameras, set.union(*numbers), last_bundle, partial=True)
+        bundle = _bundle(cameras, set.intersection(*numbers), last_bundle)
         # A camera that has stopped during a fit has images that the others had, too, but long ago.
         newest = max((camera.arrival(max(camera.files)) for camera in cameras if camera.files), default=0.0)
         return bundle if bundle is not None and newest - bundle.time <= self._timeout else None
 
-    def _take(self, found: _Found, number: int, after: Bundle | None) -> None:
+    def _take(self, by_name: _Found, number: int, last_bundle: Bundle | None) -> None:
         """Store when the images of a number were written, and whether the count has begun again."""
-        if after is not None and number <= (last := max(after.numbers)):
-            if not self._before:
+        if last_bundle is not None and number <= (last := max(last_bundle.numbers)):
+            if not self._old_write_times:
                 _LOG.warning("%s: the numbers go on with %d after %d", self._folder, number, last)
-            self._before = self._written
-        images = {name: images.files[number] for name, images in found.items() if number in images.files}
-        self._written = {name: _written(file) for name, file in images.items()}
+            self._old_write_times = self._write_times
+        images = {name: images.files[number] for name, images in by_name.items() if number in images.files}
+        self._write_times = {name: _written(file) for name, file in images.items()}
 
     def _arrived(self, bundle: Bundle, begin: float) -> Bundle:
         """Return a bundle that was not there at the time `begin`, whatever the clock of its files."""
-        self._returned = time.monotonic()
-        return replace(bundle, time=min(max(bundle.time, begin), self._returned))
+        self._return_time = time.monotonic()
+        return replace(bundle, time=min(max(bundle.time, begin), self._return_time))
 
-    def _end(self, after: Bundle | None) -> None:
+    def _end(self, last_bundle: Bundle | None) -> None:
         """End the images.
 
         Raises:
@@ -174,7 +174,7 @@ class FolderFeed:
         """
         if not self._folder.is_dir():
             raise FileNotFoundError(f"{self._folder}: expected the images of the cameras, but the folder was removed.")
-        if after is None:
+        if last_bundle is None:
             raise ValueError(
                 f"{self._folder}: expected images of {', '.join(self.names) or 'the cameras'} that have the same "
                 f"number, such as CAM/0000.png, found folders called {', '.join(self._cameras()) or 'nothing'}"
@@ -183,34 +183,34 @@ class FolderFeed:
 
     def _lack(self) -> str:
         """Return a description of the images that are missing for a first bundle."""
-        found = self._found(-1, {})
-        names = self.names or tuple(found)
-        if silent := [name for name in names if name not in found]:
+        by_name = self._found(-1, {})
+        names = self.names or tuple(by_name)
+        if silent := [name for name in names if name not in by_name]:
             return f", but no image of {', '.join(silent)}"
-        if common := _common(found, names):
-            broken = [name for name in names if _shot(found[name], max(common)) is None]
-            return f", but no complete image {max(common)} of {', '.join(broken)}"
-        numbers = ", ".join(f"{min(own.files)} to {max(own.files)} of {name}" for name, own in found.items())
+        if common := _common(by_name, names):
+            incomplete = [name for name in names if _shot(by_name[name], max(common)) is None]
+            return f", but no complete image {max(common)} of {', '.join(incomplete)}"
+        numbers = ", ".join(f"{min(i.files)} to {max(i.files)} of {name}" for name, i in by_name.items())
         return f", with {numbers}" if numbers else ""
 
-    def _found(self, after: int, before: Mapping[str, float]) -> dict[str, _Images]:
-        """Return the images of each camera with numbers larger than `after`, without images of the time of `before`.
+    def _found(self, limit: int, write_times: Mapping[str, float]) -> dict[str, _Images]:
+        """Return the images of each camera with numbers larger than `limit`, without images of the time of others.
 
         Args:
-            after: number.
-            before: by camera, when its image was written, s of the file; images written up to `_PAUSE` later are of
+            limit: number.
+            write_times: by camera, when an image was written, s of the file; images written up to `_PAUSE` later are of
                 the same time. Empty: no image is left out.
         """
-        found = {}
+        by_name = {}
         for name in self.names or self._cameras():
-            if files := _files(self._folder / name, after):
+            if files := _files(self._folder / name, limit):
                 self._compare_clocks(name, files[max(files)])
-                found[name] = _Images(files, self._ahead.get(name, 0.0))
-        if not before:
-            return found
-        begin = _PAUSE + max(written + self._ahead.get(name, 0.0) for name, written in before.items())
-        found = {name: images.since(begin) for name, images in found.items()}
-        return {name: images for name, images in found.items() if images.files}
+                by_name[name] = _Images(files, self._leads.get(name, 0.0))
+        if not write_times:
+            return by_name
+        begin = _PAUSE + max(write_time + self._leads.get(name, 0.0) for name, write_time in write_times.items())
+        by_name = {name: images.since(begin) for name, images in by_name.items()}
+        return {name: images for name, images in by_name.items() if images.files}
 
     def _compare_clocks(self, name: str, file: Path) -> None:
         """Compare the clock of a camera's files with this machine's by one of its images.
@@ -218,8 +218,8 @@ class FolderFeed:
         An image is found after it was written, so the smallest difference is the most accurate one.
         """
         with suppress(FileNotFoundError):
-            ahead = time.monotonic() - file.stat().st_mtime
-            self._ahead[name] = min(ahead, self._ahead.get(name, inf))
+            lead = time.monotonic() - file.stat().st_mtime
+            self._leads[name] = min(lead, self._leads.get(name, inf))
 
     def _cameras(self) -> list[str]:
         """Return the names of the folders, in numerical order."""
@@ -229,13 +229,13 @@ class FolderFeed:
         return []
 
 
-def _common(found: _Found, names: Sequence[str]) -> set[int]:
+def _common(by_name: _Found, names: Sequence[str]) -> set[int]:
     """Return the numbers that all cameras have."""
-    return set.intersection(*(set(found.get(name, _NONE).files) for name in names)) if names else set()
+    return set.intersection(*(set(by_name.get(name, _NONE).files) for name in names)) if names else set()
 
 
 def _bundle(
-    cameras: Sequence[_Images], numbers: Collection[int], after: Bundle | None = None, partial: bool = False
+    cameras: Sequence[_Images], numbers: Collection[int], last_bundle: Bundle | None = None, partial: bool = False
 ) -> Bundle | None:
     """Return the bundle of the largest of `numbers` of which every file is complete; `partial`: or at least one."""
     for number in sorted(numbers, reverse=True):
@@ -243,29 +243,29 @@ def _bundle(
         complete = all(shot or number not in images.files for shot, images in zip(shots, cameras, strict=True))
         if complete or (partial and any(shots)):
             bundle = bundled(shots, [number] * len(shots), 0.0)
-            return bundle if after is None else replace(bundle, dropped=_dropped(cameras, bundle, after))
+            return bundle if last_bundle is None else replace(bundle, dropped=_dropped(cameras, bundle, last_bundle))
     return None
 
 
-def _dropped(cameras: Sequence[_Images], bundle: Bundle, after: Bundle) -> int:
+def _dropped(cameras: Sequence[_Images], bundle: Bundle, last_bundle: Bundle) -> int:
     """Return the number of images that each camera delivered between two bundles."""
     number = max(bundle.numbers)
-    between = number - max(after.numbers) - 1
-    if 0 <= between <= _MAX_RATE * (1 + bundle.time - after.time):
-        return between
+    count = number - max(last_bundle.numbers) - 1
+    if 0 <= count <= _MAX_RATE * (1 + bundle.time - last_bundle.time):
+        return count
     pairs = zip(cameras, bundle.images, strict=True)
     return min(sum(n < number for n in images.files) for images, image in pairs if image is not None)
 
 
-def _files(folder: Path, after: int) -> dict[int, Path]:
-    """Return the images in a folder, by their numbers, that are larger than `after`."""
+def _files(folder: Path, limit: int) -> dict[int, Path]:
+    """Return the images in a folder, by their numbers, that are larger than `limit`."""
     files = {}
     with suppress(FileNotFoundError, NotADirectoryError):
         for name in os.listdir(folder):
             if name.lower().endswith(_SUFFIXES) and is_listed(name):
                 with suppress(ValueError):
                     files[image_number(Path(name))] = folder / name
-    return {number: file for number, file in files.items() if number > after}
+    return {number: file for number, file in files.items() if number > limit}
 
 
 def _shot(images: _Images, number: int) -> Shot | None:

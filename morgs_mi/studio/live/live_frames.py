@@ -47,9 +47,9 @@ def live_frames(rig: Capture, sources: Sequence[Source], newest: bool = False) -
             f"live_frames(): `sources` must be one for each of {len(rig.cameras)} cameras ({', '.join(rig.names)}), "
             f"got {len(sources)}."
         )
-    closed = Event()
-    streams = [_images(source, *size, closed) for source, size in zip(sources, rig.recorded_sizes, strict=True)]
-    return prefetched(_frames(rig, streams), newest=newest, closed=closed)
+    stop = Event()
+    streams = [_images(source, *size, stop) for source, size in zip(sources, rig.recorded_sizes, strict=True)]
+    return prefetched(_frames(rig, streams), newest=newest, closed=stop)
 
 
 def _frames(rig: Capture, streams: Sequence[Iterator[np.ndarray | None]]) -> Iterator[PartialFrame]:
@@ -78,11 +78,11 @@ def _check_size(rig: Capture, view: int, image: np.ndarray | None) -> None:
         )
 
 
-def _images(source: Source, width: int, height: int, closed: Event) -> Iterator[np.ndarray | None]:
+def _images(source: Source, width: int, height: int, stop: Event) -> Iterator[np.ndarray | None]:
     if isinstance(source, int | str | Path):
         if is_video(source):
-            return play(source, ClipClock(), closed)
-        return read_camera(source, closed, reconnect=False)  # the other cameras would wait for it
+            return play(source, ClipClock(), stop)
+        return read_camera(source, stop, reconnect=False)  # the other cameras would wait for it
     if hasattr(source, "read"):
         return raw_images(cast(BinaryIO, source), width, height)
     return iter(cast(Iterable[np.ndarray | None], source))

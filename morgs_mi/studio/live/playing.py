@@ -40,7 +40,7 @@ class ClipClock:
         self.length = inf
         self._times = [-inf] * clips
         self._start = -inf
-        self._changed = Condition()
+        self._change = Condition()
 
     def wait(self, clip: int, due: float, interval: float, closed: Event) -> None:
         """Wait until it is time for an image of a clip, or `closed` is set.
@@ -51,20 +51,20 @@ class ClipClock:
             interval: time between two images of the clip, s.
             closed: is set by another thread to end the clips.
         """
-        with self._changed:
+        with self._change:
             self._times[clip] = due
-            self._changed.notify_all()
+            self._change.notify_all()
             while min(self._times) < due - interval / 2 and not closed.is_set():
-                self._changed.wait(_POLL)
+                self._change.wait(_POLL)
             self._start = max(self._start, time.monotonic() - due)  # a late clip does not hurry afterwards
-            left = self._start + due - time.monotonic()
-        closed.wait(max(0.0, left))
+            time_left = self._start + due - time.monotonic()
+        closed.wait(max(0.0, time_left))
 
     def leave(self, clip: int) -> None:
         """Let the others go on without a clip."""
-        with self._changed:
+        with self._change:
             self._times[clip] = inf
-            self._changed.notify_all()
+            self._change.notify_all()
 
 
 def play(path: str | Path, clock: ClipClock, closed: Event, clip: int = 0, loop: bool = False) -> Iterator[np.ndarray]:
@@ -109,9 +109,9 @@ def _timed(path: str | Path) -> Iterator[tuple[np.ndarray, float, float]]:
     try:
         interval = 1 / (stream.get(cv2.CAP_PROP_FPS) or _RATE)
         last = -inf
-        while (read := stream.read())[0]:
+        while (result := stream.read())[0]:
             at = stream.get(cv2.CAP_PROP_POS_MSEC) / 1000
             last = at if at > last else last + interval  # not all containers have times
-            yield read[1], last, interval
+            yield result[1], last, interval
     finally:
         stream.release()

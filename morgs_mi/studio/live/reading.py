@@ -47,10 +47,10 @@ def read_camera(
             yield from _until_end(source, closed, size)
 
 
-def _until_end(source: int | str | Path, closed: Event, size: tuple[int, int] | None) -> Iterator[np.ndarray | None]:
+def _until_end(source: int | str | Path, stop: Event, size: tuple[int, int] | None) -> Iterator[np.ndarray | None]:
     """Yield the images of a source, which is opened once; see `read_camera`."""
-    with _place(source, closed) as place:
-        if closed.is_set():
+    with _place(source, stop) as place:
+        if stop.is_set():
             return
         stream = open_stream(place, source)
         if isinstance(source, int) and size is not None:
@@ -58,12 +58,12 @@ def _until_end(source: int | str | Path, closed: Event, size: tuple[int, int] | 
             stream.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
         failures = 0
         try:
-            while failures < _FAILURES and not closed.is_set():
-                read, image = stream.read()
-                failures = 0 if read else failures + 1
-                yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if read else None
-                if not read:
-                    closed.wait(_PAUSE)
+            while failures < _FAILURES and not stop.is_set():
+                is_read, image = stream.read()
+                failures = 0 if is_read else failures + 1
+                yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if is_read else None
+                if not is_read:
+                    stop.wait(_PAUSE)
         finally:
             stream.release()
 
@@ -85,7 +85,7 @@ def open_stream(place: int | str, source: int | str | Path) -> cv2.VideoCapture:
 
 
 @contextmanager
-def _place(source: int | str | Path, closed: Event) -> Iterator[int | str]:
+def _place(source: int | str | Path, stop: Event) -> Iterator[int | str]:
     """Yield what OpenCV is to open for a source; a named pipe is relayed.
 
     FFmpeg itself waits for a silent named pipe, or for one without a writer, and cannot be interrupted. A thread that
@@ -94,44 +94,44 @@ def _place(source: int | str | Path, closed: Event) -> Iterator[int | str]:
     if isinstance(source, int) or not Path(source).is_fifo():
         yield source if isinstance(source, int) else str(source)
         return
-    done = Event()
+    exit_event = Event()
     with open(source, "rb", 0, opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK)) as pipe:
-        first = _next_bytes(pipe, False, closed.is_set)
-        reading, writing = os.pipe()
-        ended = lambda: closed.is_set() or done.is_set()  # noqa: E731
-        relay = Thread(target=_relay, args=(pipe, first, writing, ended), daemon=True, name="pipe")
+        first = _next_bytes(pipe, False, stop.is_set)
+        reader, writer = os.pipe()
+        has_ended = lambda: stop.is_set() or exit_event.is_set()  # noqa: E731
+        relay = Thread(target=_relay, args=(pipe, first, writer, has_ended), daemon=True, name="pipe")
         relay.start()
         try:
-            yield f"/dev/fd/{reading}"
+            yield f"/dev/fd/{reader}"
         finally:
-            done.set()
-            os.close(reading)  # so a relay that waits for its reader ends, too
+            exit_event.set()
+            os.close(reader)  # so a relay that waits for its reader ends, too
             relay.join()
 
 
-def _relay(pipe: FileIO, data: bytes, writing: int, ended: Callable[[], bool]) -> None:
-    """Write `data` and the further bytes of a pipe to the file descriptor `writing` until one side ends."""
-    with suppress(BrokenPipeError), open(writing, "wb", 0) as copy:
+def _relay(pipe: FileIO, data: bytes, writer: int, has_ended: Callable[[], bool]) -> None:
+    """Write `data` and the further bytes of a pipe to the file descriptor `writer` until one side ends."""
+    with suppress(BrokenPipeError), open(writer, "wb", 0) as copy:
         while data:
             rest = memoryview(data)
             while rest:
                 rest = rest[copy.write(rest) :]
-            data = _next_bytes(pipe, True, ended)
+            data = _next_bytes(pipe, True, has_ended)
 
 
-def _next_bytes(pipe: FileIO, begun: bool, ended: Callable[[], bool]) -> bytes:
-    """Wait for the next bytes of a pipe and return them; none if its writer has ended, or if it is silent and `ended`.
+def _next_bytes(pipe: FileIO, had_writer: bool, has_ended: Callable[[], bool]) -> bytes:
+    """Wait for the next bytes of a pipe and return them; none if its writer ended, or if it is silent and `has_ended`.
 
     Args:
         pipe: is opened without waiting for its writer.
-        begun: whether there was a writer before.
-        ended: returns whether to give up.
+        had_writer: whether there was a writer before.
+        has_ended: returns whether to give up.
     """
     while True:
         data = pipe.read(_CHUNK) if select([pipe], [], [], _POLL)[0] else None
-        if data or (begun and data == b""):
+        if data or (had_writer and data == b""):
             return data
-        if ended():
+        if has_ended():
             return b""
         if data == b"":
             time.sleep(_POLL)  # on some systems, a pipe without a writer is readable

@@ -51,7 +51,7 @@ def open_feed(sources: Sequence[Source], config: LiveConfig, names: Sequence[str
             f"open_feed(): `camera` must have a source for each of the {len(names)} calibrated cameras "
             f"({', '.join(names)}), got {_listed(sources)}; name them in that order."
         )
-    closed = Event()
+    stop = Event()
     videos = [source for source in sources if is_video(source)]
     if config.loop and not videos:
         raise ValueError(f"open_feed(): `loop` repeats videos, got none in {_listed(sources)}; leave it out.")
@@ -59,13 +59,13 @@ def open_feed(sources: Sequence[Source], config: LiveConfig, names: Sequence[str
 
     def images(source: Source) -> Iterator[np.ndarray | None]:
         if is_video(source):
-            return play(source, clock, closed, videos.index(source), config.loop)
-        return read_camera(source, closed, config.size)
+            return play(source, clock, stop, videos.index(source), config.loop)
+        return read_camera(source, stop, config.size)
 
-    ended = "it has ended; --loop repeats videos" if videos and not config.loop else "it has ended"
+    end_text = "it has ended; --loop repeats videos" if videos and not config.loop else "it has ended"
     cameras = {name: images(source) for name, source in zip(names, sources, strict=True)}
     warm_up = 0.0 if len(videos) == len(sources) else config.warm_up
-    return CameraFeed(cameras, config.timeout, warm_up, closed, ended)
+    return CameraFeed(cameras, config.timeout, warm_up, stop, end_text)
 
 
 def _listed(sources: Sequence[Source]) -> str:

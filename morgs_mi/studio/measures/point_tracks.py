@@ -94,11 +94,11 @@ def track_points(
     frames = []
     positions = []
     alive = []
-    for t, found, (means, axes) in _bound(stream, ids):
-        carried = means + np.einsum("pkij,pkj->pki", axes, local)
-        weight = weights * found
+    for t, living_mask, (means, axes) in _bound(stream, ids):
+        candidates = means + np.einsum("pkij,pkj->pki", axes, local)
+        weight = weights * living_mask
         total = weight.sum(1, keepdims=True)
-        positions.append(np.einsum("pk,pki->pi", weight / np.where(total > 0, total, 1), carried))
+        positions.append(np.einsum("pk,pki->pi", weight / np.where(total > 0, total, 1), candidates))
         alive.append(total[:, 0] > 0)
         frames.append(t)
         if progress is not None:
@@ -148,7 +148,8 @@ def bind(gaussians: Gaussians, points: np.ndarray, num_gaussians: int) -> tuple[
         largest = np.zeros((len(x), count))
         for k in range(count):  # several times faster than a partition of the rows
             best = response.argmax(1)
-            rows[part, k], largest[:, k] = best, response[np.arange(len(x)), best]
+            rows[part, k] = best
+            largest[:, k] = response[np.arange(len(x)), best]
             response[np.arange(len(x)), best] = -np.inf
         # Relative to the largest: far from all Gaussians every response underflows.
         weights[part] = np.exp(largest - largest[:, :1])
@@ -171,14 +172,14 @@ def seen_in_depth(depth: np.ndarray, alpha: np.ndarray, camera: Camera, points: 
     z = points @ V[2, :3] + V[2, 3]
     front = np.flatnonzero(z > camera.near)
     pixels = np.floor(camera.project(points[front])[0])
-    inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(-1)
-    front = front[inside]
-    column, row = pixels[inside].astype(int).T
+    mask = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(-1)
+    front = front[mask]
+    column, row = pixels[mask].astype(int).T
     surface = np.pad(np.where(alpha < 0.5, np.inf, depth), 1, mode="edge")
     farthest = np.max([surface[row + dy, column + dx] for dy in range(3) for dx in range(3)], axis=0, initial=0)
-    seen = np.zeros(len(points), bool)
-    seen[front] = z[front] <= (1 + _DEPTH_TOLERANCE) * farthest
-    return seen
+    visible = np.zeros(len(points), bool)
+    visible[front] = z[front] <= (1 + _DEPTH_TOLERANCE) * farthest
+    return visible
 
 
 def _bindings(
@@ -190,22 +191,22 @@ def _bindings(
     weights = np.zeros(shape)
     local = np.zeros((*shape, 3))
     last = int(queries.max(initial=-1))
-    left = set(queries.tolist())
+    rest = set(queries.tolist())
     for state in stream.states():
-        left.discard(state.frame)
-        own = np.flatnonzero(queries == state.frame)
-        if len(own):
-            rows, weight = bind(state.gaussians, points[own], num_gaussians)
+        rest.discard(state.frame)
+        rows_of_frame = np.flatnonzero(queries == state.frame)
+        if len(rows_of_frame):
+            rows, weight = bind(state.gaussians, points[rows_of_frame], num_gaussians)
             means, axes = _means_and_axes(state.gaussians, rows)
             columns = slice(rows.shape[1])
-            ids[own, columns] = state.lasting_ids[rows]
-            weights[own, columns] = weight
-            local[own, columns] = np.einsum("pkji,pkj->pki", axes, points[own][:, None] - means)
+            ids[rows_of_frame, columns] = state.lasting_ids[rows]
+            weights[rows_of_frame, columns] = weight
+            local[rows_of_frame, columns] = np.einsum("pkji,pkj->pki", axes, points[rows_of_frame][:, None] - means)
         if state.frame >= last:
             break
-    if left:
+    if rest:
         raise ValueError(
-            f"track_points(): `frame` must be a frame of {stream.path}, got {min(left)}; choose one that it contains."
+            f"track_points(): `frame` must be a frame of {stream.path}, got {min(rest)}; choose one that it contains."
         )
     return ids, weights, local
 
@@ -215,12 +216,12 @@ def _bound(stream: FrameSource, ids: np.ndarray) -> Iterator[tuple[int, np.ndarr
     for state in stream.states():
         present = state.lasting_ids
         rows = np.searchsorted(present, ids)
-        found = rows < len(present)
-        found[found] = present[rows[found]] == ids[found]
+        mask = rows < len(present)
+        mask[mask] = present[rows[mask]] == ids[mask]
         means = np.zeros((*ids.shape, 3))
         axes = np.zeros((*ids.shape, 3, 3))
-        means[found], axes[found] = _means_and_axes(state.gaussians, rows[found])
-        yield state.frame, found, (means, axes)
+        means[mask], axes[mask] = _means_and_axes(state.gaussians, rows[mask])
+        yield state.frame, mask, (means, axes)
 
 
 def _means_and_axes(gaussians: Gaussians, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -230,15 +231,15 @@ def _means_and_axes(gaussians: Gaussians, rows: np.ndarray) -> tuple[np.ndarray,
     return means, Rotation.from_quat(quats, scalar_first=True).as_matrix().reshape(*rows.shape, 3, 3)
 
 
-def _held(tracks: np.ndarray, known: np.ndarray, forward: np.ndarray) -> np.ndarray:
+def _held(tracks: np.ndarray, known_mask: np.ndarray, forward: np.ndarray) -> np.ndarray:
     """Return tracks [P, T, 3] that keep their last known position, in the direction away from the query.
 
     Args:
         tracks: positions [P, T, 3], meaningless where they are not known.
-        known: [P, T], true at each query.
+        known_mask: [P, T], true at each query.
         forward: [P, T], whether a frame is the query's or a later one.
     """
-    time = np.arange(known.shape[1])
-    before = np.maximum.accumulate(np.where(known, time, -1), axis=1)
-    after = np.minimum.accumulate(np.where(known, time, len(time))[:, ::-1], axis=1)[:, ::-1]
-    return np.take_along_axis(tracks, np.where(forward, before, after)[..., None], axis=1)
+    time = np.arange(known_mask.shape[1])
+    last_known = np.maximum.accumulate(np.where(known_mask, time, -1), axis=1)
+    next_known = np.minimum.accumulate(np.where(known_mask, time, len(time))[:, ::-1], axis=1)[:, ::-1]
+    return np.take_along_axis(tracks, np.where(forward, last_known, next_known)[..., None], axis=1)

@@ -19,21 +19,21 @@ class Registration(Measure):
     def __init__(self, clip: ComparedClip) -> None:
         self._clip = clip
         self._psnr: dict[str, float] = {}
-        self._begun = False
+        self._has_begun = False
 
     def add_view(self, view: ComparedView) -> None:
         clip = self._clip
-        if self._begun or view.index not in clip.recording.test_views:
+        if self._has_begun or view.index not in clip.recording.test_views:
             return
         image = view.recorded if view.light is None else encode_light(view.light)
-        given = View(clip.stream.cameras[view.index], image, view.valid)
+        target = View(clip.stream.cameras[view.index], image, view.valid)
         extent = scene_extent([clip.stream.cameras[v] for v in clip.recording.train_views])
         gaussians = view.frame.state.gaussians
-        registered = given._replace(camera=register_camera(gaussians, given, extent, FitConfig(), clip.render))
-        self._psnr[view.camera.name] = mean_psnr(gaussians, [registered], clip.render)
+        registered_view = target._replace(camera=register_camera(gaussians, target, extent, FitConfig(), clip.render))
+        self._psnr[view.camera.name] = mean_psnr(gaussians, [registered_view], clip.render)
 
     def add_frame(self, frame: ComparedFrame) -> dict[str, Any]:
-        self._begun = True
+        self._has_begun = True
         return {}
 
     def result(self) -> dict[str, Any]:

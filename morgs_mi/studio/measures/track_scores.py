@@ -134,22 +134,22 @@ def score(protocol: Protocol, videos: Sequence[Comparison], meters_per_unit: flo
 
 def _evaluated(protocol: Protocol, video: Comparison) -> np.ndarray:
     """Return the mask [P, T] of the points and frames that count for all scores but MTE and survival."""
-    later = np.arange(video.truth.shape[1]) > video.queries[:, None]
-    return np.ones_like(later) if protocol.per_view else later
+    mask = np.arange(video.truth.shape[1]) > video.queries[:, None]
+    return np.ones_like(mask) if protocol.per_view else mask
 
 
 def _counts(protocol: Protocol, video: Comparison, evaluated: np.ndarray, meters_per_unit: float) -> np.ndarray:
     """Return numbers of points [6, P, D] for D thresholds: those that `_shares` needs."""
-    visible, found = (mask[..., None] for mask in _visibility(video))
+    visible, found_mask = (mask[..., None] for mask in _visibility(video))
     error = np.linalg.norm(video.found - video.truth, axis=-1)[..., None]
     unit = np.array(_CENTIMETRE / meters_per_unit)
     if protocol.per_view:
         assert video.pixel is not None
         unit = video.pixel[..., None]
-    within = visible & (error < np.array(protocol.thresholds) * unit)
-    hits = within & found
-    masks = (visible, within, hits, found & ~hits, visible == found, evaluated[..., None])
-    return np.stack([(np.broadcast_to(mask, within.shape) & evaluated[..., None]).sum(1) for mask in masks])
+    accurate = visible & (error < np.array(protocol.thresholds) * unit)
+    hits = accurate & found_mask
+    masks = (visible, accurate, hits, found_mask & ~hits, visible == found_mask, evaluated[..., None])
+    return np.stack([(np.broadcast_to(mask, accurate.shape) & evaluated[..., None]).sum(1) for mask in masks])
 
 
 def _shares(counts: np.ndarray) -> np.ndarray:
@@ -158,10 +158,10 @@ def _shares(counts: np.ndarray) -> np.ndarray:
     The numbers count visible points, visible points within the threshold, true positives, false positives, points with
     the right visibility, and all points.
     """
-    visible, within, hits, false_positives, right, everything = counts
+    visible, accurate, hits, false_positives, right, everything = counts
     with np.errstate(invalid="ignore", divide="ignore"):
         jaccard = np.where(visible > 0, hits / (visible + false_positives), np.nan)
-        return np.stack([values.mean(1) for values in (jaccard, within / visible, right / everything)], axis=1)
+        return np.stack([values.mean(1) for values in (jaccard, accurate / visible, right / everything)], axis=1)
 
 
 def _median_error_and_survival(video: Comparison, failure: float) -> np.ndarray:
@@ -169,8 +169,8 @@ def _median_error_and_survival(video: Comparison, failure: float) -> np.ndarray:
     num_frames = video.truth.shape[1]
     queries = video.queries
     error = np.linalg.norm(video.found - video.truth, axis=-1)
-    failed = video.counts & (error > failure)
-    first = np.where(failed.any(1), failed.argmax(1), num_frames)
+    failures = video.counts & (error > failure)
+    first = np.where(failures.any(1), failures.argmax(1), num_frames)
     median = [np.median(row[mask]) for row, mask in zip(error, video.counts, strict=True)]
     return np.stack([np.array(median), (first - queries) / (num_frames - queries)], axis=1).reshape(-1, 2)
 

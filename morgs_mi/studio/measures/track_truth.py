@@ -55,8 +55,8 @@ def synthetic_tracks(capture: Capture, views: Sequence[int]) -> list[TrackTruth]
     if not all(camera.name in tracks.visible for camera in cameras):
         return [TrackTruth(cameras, tracks.points, None, np.zeros(len(tracks.points), int))]
     visible = np.any([tracks.visible[camera.name] for camera in cameras], axis=0)
-    seen = visible.any(1)
-    return [TrackTruth(cameras, tracks.points[seen], visible[seen], visible[seen].argmax(1))]
+    mask = visible.any(1)
+    return [TrackTruth(cameras, tracks.points[mask], visible[mask], visible[mask].argmax(1))]
 
 
 def tapvid3d_tracks(capture: Capture) -> list[TrackTruth]:
@@ -74,8 +74,8 @@ def tapvid3d_tracks(capture: Capture) -> list[TrackTruth]:
         return []
     metas = [file for name in ("train_meta", "test_meta") if (file := folder / f"{name}.json").is_file()]
     rig = {view.camera.name: view.camera for meta in metas for view in read_meta(meta)}
-    named = {file.stem.removeprefix(f"{folder.name}_"): file for file in reversed(files)}
-    return [read_annotation(file, rig[name]) for name, file in sorted(named.items()) if name in rig]
+    file_by_name = {file.stem.removeprefix(f"{folder.name}_"): file for file in reversed(files)}
+    return [read_annotation(file, rig[name]) for name, file in sorted(file_by_name.items()) if name in rig]
 
 
 def read_annotation(path: Path, camera: Camera) -> TrackTruth:
@@ -94,11 +94,11 @@ def read_annotation(path: Path, camera: Camera) -> TrackTruth:
     intrinsics = read_array(path, "fx_fy_cx_cy")
     T, P = tracks.shape[:2] if tracks.ndim == 3 else (0, 0)
     shapes = {"tracks_XYZ": (T, P, 3), "visibility": (T, P), "queries_xyt": (P, 3), "fx_fy_cx_cy": (4,)}
-    for (name, shape), found in zip(shapes.items(), (tracks, visible, queries, intrinsics), strict=True):
-        if found.shape != shape or found.dtype.kind not in "fiub":
+    for (name, shape), array in zip(shapes.items(), (tracks, visible, queries, intrinsics), strict=True):
+        if array.shape != shape or array.dtype.kind not in "fiub":
             raise ValueError(
-                f"{path}: expected `{name}` {[*shape]} with {T} frames and {P} points, got {found.dtype} "
-                f"{[*found.shape]}; download the annotation again."
+                f"{path}: expected `{name}` {[*shape]} with {T} frames and {P} points, got {array.dtype} "
+                f"{[*array.shape]}; download the annotation again."
             )
     K = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]
     if not np.allclose(intrinsics, K, rtol=1e-3):

@@ -56,12 +56,12 @@ def evaluate_tracks(stream: FrameSource, recording: Capture, views: Sequence[int
     videos = [_during(video, frames) for video in (*single, *joint)]
     if len(frames) < 2 or not any(len(video.points) for video in videos):
         return ()
-    compared = _compared(stream, videos, frames[0])
-    per_view = compared[: len(single)]
-    together = compared[len(single) :] or compared
+    comparisons = _compared(stream, videos, frames[0])
+    per_view = comparisons[: len(single)]
+    joint_comparisons = comparisons[len(single) :] or comparisons
     scale = read_settings(recording.path / CAPTURE).get("meters_per_unit") or 1
     extent = scene_extent([recording.cameras[view] for view in recording.train_views])
-    protocols = ((TAPVID3D, per_view), (DYNAMIC_3D_GAUSSIANS, together), (MVTRACKER, together))
+    protocols = ((TAPVID3D, per_view), (DYNAMIC_3D_GAUSSIANS, joint_comparisons), (MVTRACKER, joint_comparisons))
     return tuple(score_tracks(protocol, videos, scale, extent) for protocol, videos in protocols)
 
 
@@ -69,9 +69,9 @@ def _during(video: TrackTruth, frames: Sequence[int]) -> TrackTruth:
     """Return the part of true tracks in the consecutive frames of a stream, without tracks that start in others."""
     start = frames[0]
     stop = min(frames[-1] + 1, video.points.shape[1])
-    kept = (video.queries >= start) & (video.queries < stop)
-    visible = None if video.visible is None else video.visible[kept, start:stop]
-    return TrackTruth(video.cameras, video.points[kept, start:stop], visible, video.queries[kept] - start)
+    mask = (video.queries >= start) & (video.queries < stop)
+    visible = None if video.visible is None else video.visible[mask, start:stop]
+    return TrackTruth(video.cameras, video.points[mask, start:stop], visible, video.queries[mask] - start)
 
 
 def _compared(stream: FrameSource, videos: Sequence[TrackTruth], start: int) -> list[Comparison]:
@@ -83,23 +83,23 @@ def _compared(stream: FrameSource, videos: Sequence[TrackTruth], start: int) -> 
     points = np.split(tracks.points, ends[:-1])
     alive = np.split(tracks.alive, ends[:-1])
     lengths = [video.points.shape[1] for video in videos]
-    found = [(p[:, :length], a[:, :length]) for p, a, length in zip(points, alive, lengths, strict=True)]
-    seen = _seen(stream, videos, [positions for positions, _ in found])
+    pairs = [(p[:, :length], a[:, :length]) for p, a, length in zip(points, alive, lengths, strict=True)]
+    masks = _seen(stream, videos, [positions for positions, _ in pairs])
     return [
         Comparison(video.points, positions, video.visible, mask & alive, alive, video.queries, video.pixel)
-        for video, (positions, alive), mask in zip(videos, found, seen, strict=True)
+        for video, (positions, alive), mask in zip(videos, pairs, masks, strict=True)
     ]
 
 
-def _seen(stream: FrameSource, videos: Sequence[TrackTruth], found: Sequence[np.ndarray]) -> list[np.ndarray]:
+def _seen(stream: FrameSource, videos: Sequence[TrackTruth], tracks: Sequence[np.ndarray]) -> list[np.ndarray]:
     """Return the masks of the tracked points [P, T, 3] that a view of their video sees, [P, T]."""
-    seen = [np.zeros(positions.shape[:2], bool) for positions in found]
+    masks = [np.zeros(positions.shape[:2], bool) for positions in tracks]
     config = render_config(stream)
     cameras = {camera.name: camera for video in videos if video.visible is not None for camera in video.cameras}
     for t, (_, gaussians) in enumerate(play(stream) if cameras else ()):
         for name, camera in cameras.items():
             maps = render(gaussians, camera, ("depth", "alpha"), config)
-            for video, positions, mask in zip(videos, found, seen, strict=True):
+            for video, positions, mask in zip(videos, tracks, masks, strict=True):
                 if t < positions.shape[1] and name in [view.name for view in video.cameras]:
                     mask[:, t] |= seen_in_depth(maps["depth"][..., 0], maps["alpha"][..., 0], camera, positions[:, t])
-    return seen
+    return masks

@@ -84,11 +84,11 @@ class FlowNetwork:
         right = -width % _MULTIPLE
         top = down // 2
         left = right // 2
-        padded = (
+        images = (
             cv2.copyMakeBorder(each, top, down - top, left, right - left, cv2.BORDER_REPLICATE)
             for each in (image, other)
         )
-        return self._run(*padded)[top : top + height, left : left + width]
+        return self._run(*images)[top : top + height, left : left + width]
 
     def _run(self, image: np.ndarray, other: np.ndarray) -> np.ndarray:
         height, width = image.shape[:2]

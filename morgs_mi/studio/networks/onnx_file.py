@@ -41,7 +41,7 @@ class OnnxNetwork:
 
     def __init__(self, path: str | Path, instead: str = "") -> None:
         self.path = Path(path)
-        self._instead = instead
+        self._alternative = instead
         if not self.path.is_file():
             raise FileNotFoundError(f"{path}: expected an ONNX file, found none; check the path.")
         try:
@@ -83,13 +83,13 @@ class OnnxNetwork:
         try:
             results = self._session.run(None, dict(inputs))
         except Exception as error:  # its errors have no class in common
-            given = ", ".join(f"{name} {list(value.shape)}" for name, value in inputs.items())
+            shapes = ", ".join(f"{name} {list(value.shape)}" for name, value in inputs.items())
             raise ValueError(
-                f"{self.path}: {self._runtime} cannot run this network on {given} ({_reason(error)}); export it for "
-                f"these sizes{self._instead}."
+                f"{self.path}: {self._runtime} cannot run this network on {shapes} ({_reason(error)}); export it for "
+                f"these sizes{self._alternative}."
             ) from error
-        named = zip(self.outputs, results, strict=True)
-        arrays = {name: x for name, x in named if isinstance(x, np.ndarray) and x.dtype.kind in "biuf"}
+        pairs = zip(self.outputs, results, strict=True)
+        arrays = {name: x for name, x in pairs if isinstance(x, np.ndarray) and x.dtype.kind in "biuf"}
         if others := [name for name in self.outputs if name not in arrays]:
             raise ValueError(
                 f"{self.path}: expected arrays of numbers, got others from {', '.join(others)}; export again."
@@ -113,8 +113,8 @@ def imagenet_blob(image: np.ndarray, width: int, height: int) -> np.ndarray:
 
 def written_shapes(shapes: Iterable[tuple[int | None, ...]]) -> str:
     """Return shapes as in an error message, with ? for a size that is left open."""
-    written = ("[" + ", ".join("?" if size is None else str(size) for size in shape) + "]" for shape in shapes)
-    return " and ".join(written) or "none"
+    texts = ("[" + ", ".join("?" if size is None else str(size) for size in shape) + "]" for shape in shapes)
+    return " and ".join(texts) or "none"
 
 
 def _shape(sizes: Iterable[int | str | None]) -> tuple[int | None, ...]:

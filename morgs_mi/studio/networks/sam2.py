@@ -63,11 +63,11 @@ class SegmentNetwork:
             )
         height, width = (side or _SIZE for side in shapes[0][2:])
         self._size = width, height
-        known = {*self._encoder.outputs, *_PROMPTS}
-        missing = {*_PROMPTS[:2]} - {*self._decoder.inputs}
-        if missing or not set(self._decoder.inputs) <= known or not set(_RESULTS) <= set(self._decoder.outputs):
+        names = {*self._encoder.outputs, *_PROMPTS}
+        missing_names = {*_PROMPTS[:2]} - {*self._decoder.inputs}
+        if missing_names or not set(self._decoder.inputs) <= names or not set(_RESULTS) <= set(self._decoder.outputs):
             raise ValueError(
-                f"{decoder}: expected a mask decoder with inputs among {', '.join(sorted(known))} and outputs "
+                f"{decoder}: expected a mask decoder with inputs among {', '.join(sorted(names))} and outputs "
                 f"{' and '.join(_RESULTS)}, got {', '.join(self._decoder.inputs)} and "
                 f"{', '.join(self._decoder.outputs)}; export both networks as described in {page('masks')}."
             )
@@ -94,19 +94,20 @@ class SegmentNetwork:
     def _segment(self, features: Mapping[str, np.ndarray], component: np.ndarray) -> np.ndarray:
         """Return the object [H, W] under one component: the decoder's mask with the highest predicted IoU."""
         height, width = component.shape
-        across, down = self._size
+        input_width, input_height = self._size
         points, labels = prompts(component)
         # The decoder adds half a pixel: its pixel centres have whole coordinates.
-        scaled = points * np.array((across / width, down / height), np.float32) - np.float32(0.5)
-        quarter = down // _MASK_SHRINK, across // _MASK_SHRINK
-        given = {
+        scale = np.array((input_width / width, input_height / height), np.float32)
+        coordinates = points * scale - np.float32(0.5)
+        quarter = input_height // _MASK_SHRINK, input_width // _MASK_SHRINK
+        inputs = {
             **features,
-            "point_coords": scaled[None],
+            "point_coords": coordinates[None],
             "point_labels": labels[None],
             "mask_input": np.zeros((1, 1, *quarter), np.float32),
             "has_mask_input": np.zeros(1, np.float32),
         }
-        results = self._decoder.run({name: given[name] for name in self._decoder.inputs})
+        results = self._decoder.run({name: inputs[name] for name in self._decoder.inputs})
         masks, quality = (results[name] for name in _RESULTS)
         if masks.ndim != 4 or quality.shape != masks.shape[:2] or len(masks) != 1:
             raise ValueError(
@@ -138,13 +139,13 @@ def prompts(component: np.ndarray, count: int = 3, spacing: float = 0.25) -> tup
     upper_left = (columns[0], rows[0])
     lower_right = (columns[-1] + 1, rows[-1] + 1)
     depth = cv2.distanceTransform(np.pad(component, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
-    apart = max(np.subtract(lower_right, upper_left)) * spacing
+    distance = max(np.subtract(lower_right, upper_left)) * spacing
     y, x = np.mgrid[: component.shape[0], : component.shape[1]]
     points = []
     while len(points) < count and depth.any():
         row, column = np.unravel_index(np.argmax(depth), depth.shape)
         points.append((column + 0.5, row + 0.5))
-        depth = np.where(np.hypot(x - column, y - row) < apart, 0, depth)
+        depth = np.where(np.hypot(x - column, y - row) < distance, 0, depth)
     labels = [_UPPER_LEFT, _LOWER_RIGHT] + [_ON_OBJECT] * len(points)
     return np.array([upper_left, lower_right, *points], np.float32), np.array(labels, np.float32)
 

@@ -84,7 +84,8 @@ def draw_disturbances(
     log_gain = (np.log1p(d.exposure_gain) * gains.uniform(-1, 1, num_cameras))[:, None] + np.zeros(num_frames)
     drift = np.log1p(d.exposure_drift) * drifts.uniform(-1, 1, num_cameras)
     log_gain += drift[:, None] * np.linspace(0, 1, num_frames) + d.exposure_flicker * flicker.standard_normal(shape)
-    offset[0], log_gain[0] = 0, 0
+    offset[0] = 0
+    log_gain[0] = 0
     k = d.distortion * lenses.uniform(-1, 1, num_cameras) + 0.0  # not -0
     return tuple(
         CameraDisturbance(
@@ -112,9 +113,9 @@ def compressed(image: np.ndarray, quality: int) -> np.ndarray:
     if not quality:
         return image
     data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-    decoded = cv2.imdecode(data, cv2.IMREAD_COLOR)
-    assert decoded is not None
-    return cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
+    result = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    assert result is not None
+    return cv2.cvtColor(result, cv2.COLOR_BGR2RGB)
 
 
 def save_disturbances(folder: str | Path, cameras: Mapping[str, CameraDisturbance]) -> None:

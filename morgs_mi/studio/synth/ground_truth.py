@@ -46,13 +46,13 @@ def move_with_objects(
         poses: object-to-world [4, 4] of each object.
         new_poses: the same after the motion.
     """
-    moved = surface.positions.copy()
+    positions = surface.positions.copy()
     for index, (pose, new_pose) in enumerate(zip(poses, new_poses, strict=True)):
         if not np.array_equal(pose, new_pose):
             points = surface.ids == index
             motion = new_pose @ np.linalg.inv(pose)
-            moved[points] = surface.positions[points] @ motion[:3, :3].T + motion[:3, 3]
-    return moved
+            positions[points] = surface.positions[points] @ motion[:3, :3].T + motion[:3, 3]
+    return positions
 
 
 def compute_ground_truth(

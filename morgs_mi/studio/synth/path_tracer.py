@@ -25,8 +25,8 @@ def srgb_bytes(linear: np.ndarray, noise: np.ndarray | float = 0.0) -> np.ndarra
 
     Mitsuba's bitmap conversion is not used because it dithers, and dither looks like noise in a static scene.
     """
-    encoded = encode_light(np.clip(linear, 0, 1))
-    return np.rint(255 * np.clip(encoded + noise, 0, 1)).astype(np.uint8)
+    values = encode_light(np.clip(linear, 0, 1))
+    return np.rint(255 * np.clip(values + noise, 0, 1)).astype(np.uint8)
 
 
 def developed(linear: np.ndarray, noise: float, seed: int) -> np.ndarray:
@@ -173,10 +173,10 @@ class PathTracer:
     def sees(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         """Return the mask of the surface points [P, 3] that a camera sees: inside its image, with nothing in front."""
         pixels, depth = camera.project(points)
-        inside = ((depth > camera.near)[:, None] & (pixels >= 0) & (pixels < (camera.width, camera.height))).all(-1)
+        mask = ((depth > camera.near)[:, None] & (pixels >= 0) & (pixels < (camera.width, camera.height))).all(-1)
         offset = points - camera.position
         distance = np.linalg.norm(offset, axis=-1)
         origins = np.repeat(camera.position[:, None], len(points), axis=1)
         ray: Any = mi.Ray3f(mi.Point3f(origins), mi.Vector3f((offset / distance[:, None]).T))
         ray.maxt = mi.Float((1 - _OWN_SURFACE) * distance)
-        return inside & ~np.array(self._scene.ray_test(ray))
+        return mask & ~np.array(self._scene.ray_test(ray))

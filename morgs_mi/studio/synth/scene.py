@@ -96,11 +96,11 @@ def load_scene(scene: str | Path, seed: int = 0) -> Scene:
         ValueError: there is no such scene, its file has no ``build(seed) -> Scene``, or running the file fails; the
             message names the file and its line.
     """
-    known = _scene_files()
-    path = Path(scene) if Path(scene).suffix == ".py" else known.get(str(scene))
+    files = _scene_files()
+    path = Path(scene) if Path(scene).suffix == ".py" else files.get(str(scene))
     if path is None or not path.is_file():
         raise ValueError(
-            f"load_scene(): no scene {str(scene)!r}; name one of {sorted(known)} or pass the path of a .py file."
+            f"load_scene(): no scene {str(scene)!r}; name one of {sorted(files)} or pass the path of a .py file."
         )
     spec = importlib.util.spec_from_file_location(f"morgs_mi_scene_{path.stem}", path)
     assert spec
@@ -115,11 +115,11 @@ def load_scene(scene: str | Path, seed: int = 0) -> Scene:
         raise ValueError(f"load_scene(): {path} must define `build(seed) -> Scene`; add that function.")
     _check_signature(path, build)
     with failures_in(path):
-        built = build(seed)
-    if not isinstance(built, Scene):
-        got = "None" if built is None else f"a {type(built).__name__}"
-        raise ValueError(f"load_scene(): `build` in {path} must return a Scene, got {got}; return Scene(...).")
-    return built
+        result = build(seed)
+    if not isinstance(result, Scene):
+        value_text = "None" if result is None else f"a {type(result).__name__}"
+        raise ValueError(f"load_scene(): `build` in {path} must return a Scene, got {value_text}; return Scene(...).")
+    return result
 
 
 @contextmanager
@@ -167,10 +167,10 @@ def check_scene(scene: Scene, times: Sequence[float]) -> None:
                     f"{where}: expected {expected.__name__}(...), got a value of type {type(item).__name__}; see "
                     f"{page('scenes')}."
                 )
-            for used in _ids(name, item):
-                if used in names:
-                    raise ValueError(f"{where}: the name {used!r} is used twice; rename one of the two.")
-                names.add(used)
+            for identifier in _ids(name, item):
+                if identifier in names:
+                    raise ValueError(f"{where}: the name {identifier!r} is used twice; rename one of the two.")
+                names.add(identifier)
             shapes = item.shapes if isinstance(item, Object) else {"": item.shape}
             for shape_name, shape in shapes.items():
                 _check_node(f"{where}, shape {shape_name!r}" if shape_name else where, shape)
@@ -212,9 +212,9 @@ def _check_pose(where: str, pose: Pose, time: float) -> None:
         reason = f"{type(error).__name__}: {error}".rstrip(".")
         raise ValueError(f"{where}: its pose at {time:.4g} s fails with {reason}; correct the function.") from error
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        got = f"the shape {matrix.shape}" if matrix.shape != (4, 4) else "NaN or infinity"
+        value = f"the shape {matrix.shape}" if matrix.shape != (4, 4) else "NaN or infinity"
         raise ValueError(
-            f"{where}: its pose at {time:.4g} s must be a finite matrix [4, 4], got {got}; multiply translate() and "
+            f"{where}: its pose at {time:.4g} s must be a finite matrix [4, 4], got {value}; multiply translate() and "
             "rotate()."
         )
     rigid(f"{where}: its pose at {time:.4g} s is not rigid", matrix)

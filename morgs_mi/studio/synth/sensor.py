@@ -21,14 +21,14 @@ def check_lenses(cameras: Sequence[Camera], disturbed: Sequence[CameraDisturbanc
     Raises:
         ValueError: the distortion is too strong for the field of view.
     """
-    for camera, own in zip(cameras, disturbed, strict=True):
-        if own.distortion < 0:
+    for camera, item in zip(cameras, disturbed, strict=True):
+        if item.distortion < 0:
             corner = np.linalg.norm(camera.K[:2, 2] / np.diag(camera.K)[:2])
             # r (1 + k r^2) grows up to r = 1 / sqrt(-3 k).
-            largest = 2 / (3 * np.sqrt(-3 * own.distortion))
+            largest = 2 / (3 * np.sqrt(-3 * item.distortion))
             if not corner < 0.98 * largest:
                 raise ValueError(
-                    f"synthesize(): `distortion` must be small enough for the field of view, got {own.distortion:.3g} "
+                    f"synthesize(): `distortion` must be small enough for the field of view, got {item.distortion:.3g} "
                     f"with corners at the radius {corner:.3g}, which must be below {largest:.3g}; set a smaller one."
                 )
 

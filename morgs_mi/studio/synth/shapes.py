@@ -14,8 +14,8 @@ Material = dict[str, Any]
 
 def ball(radius: float, material: Material, center: Sequence[float] = (0, 0, 0)) -> dict[str, Any]:
     """Return a sphere."""
-    placed = {} if tuple(center) == (0, 0, 0) else {"center": list(center)}
-    return {"type": "sphere", **placed, "radius": radius, "bsdf": material}
+    placement = {} if tuple(center) == (0, 0, 0) else {"center": list(center)}
+    return {"type": "sphere", **placement, "radius": radius, "bsdf": material}
 
 
 def box(center: Sequence[float], half: Sequence[float], material: Material) -> dict[str, Any]:

@@ -58,8 +58,8 @@ class SynthConfig:
 
     def completed(self, recording: RecordingDefaults) -> SynthConfig:
         """Return the settings, with the scene's own values for missing ones."""
-        own = {"cameras": recording.num_cameras, "spp": recording.spp, "noise": recording.noise}
-        return replace(self, **{name: value for name, value in own.items() if getattr(self, name) is None})
+        defaults = {"cameras": recording.num_cameras, "spp": recording.spp, "noise": recording.noise}
+        return replace(self, **{name: value for name, value in defaults.items() if getattr(self, name) is None})
 
     def as_dict(self) -> dict[str, Any]:
         """Return the settings as stored in `capture.json`."""

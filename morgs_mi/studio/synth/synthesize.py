@@ -105,14 +105,14 @@ def synthesize(
         clips = _write_clips(tracer, rig, folder, progress)
         _write_truth(tracer, rig, folder / "truth")
         _write_calibration(tracer, rig, clips, folder)
-        about = {
+        settings = {
             "scene": scene.name,
             "test_view": 0,
             **rig.config.as_dict(),
             "objects": list(scene.objects),
             "versions": {name: metadata.version(name) for name in ("morgs-mi", "mitsuba", "drjit")},
         }
-        write_json(folder / CAPTURE, about)
+        write_json(folder / CAPTURE, settings)
     return Path(out)
 
 
@@ -133,8 +133,8 @@ class _Rig:
     def times(self) -> list[float]:
         """Return the times of the frames, the time after the last one, and the extreme times of read rows, seconds."""
         ends = (0, 0), (self.config.frames, -1)
-        read = [own.row_times(frame, self.config.height)[row] for own in self.disturbed for frame, row in ends]
-        return [float(t) / self.config.fps for t in sorted({*range(self.config.frames + 1), min(read), max(read)})]
+        times = [camera.row_times(frame, self.config.height)[row] for camera in self.disturbed for frame, row in ends]
+        return [float(t) / self.config.fps for t in sorted({*range(self.config.frames + 1), min(times), max(times)})]
 
 
 def _write_clips(
@@ -165,13 +165,13 @@ def _write_clips(
 def _images(tracer: PathTracer, rig: _Rig, index: int) -> Iterator[np.ndarray]:
     """Yield the images of a camera."""
     config = rig.config
-    own = rig.disturbed[index]
+    disturbance = rig.disturbed[index]
     assert config.noise is not None
     for frame in range(config.frames):
         # The noise must differ between views and frames; otherwise it would look like a moving texture.
         seed = int(np.random.SeedSequence([config.seed, index, frame]).generate_state(1)[0])
-        light = record_light(tracer, rig.cameras[index], own, frame, replace(config, seed=seed))
-        yield compressed(developed(own.gains[frame] * light, config.noise, seed), own.jpeg_quality)
+        light = record_light(tracer, rig.cameras[index], disturbance, frame, replace(config, seed=seed))
+        yield compressed(developed(disturbance.gains[frame] * light, config.noise, seed), disturbance.jpeg_quality)
 
 
 def _check_views(tracer: PathTracer, cameras: Sequence[Camera]) -> None:
@@ -200,13 +200,13 @@ def _write_truth(tracer: PathTracer, rig: _Rig, folder: Path) -> None:
     """Write the ground truth of every camera, the tracks and the disturbances."""
     fps = rig.config.fps
     frames = np.arange(rig.config.frames)
-    for camera, own in zip(rig.cameras, rig.disturbed, strict=True):
-        times = (frames + own.time_offset) / fps
+    for camera, disturbance in zip(rig.cameras, rig.disturbed, strict=True):
+        times = (frames + disturbance.time_offset) / fps
         for frame, time in enumerate(times):
             tracer.set_time(time)
             surface = tracer.surface_points(camera)
-            before = tracer.poses(times[frame - 1]) if frame else None
-            truth = compute_ground_truth(camera, surface, tracer.poses(time), before, tracer.poses(time + 1 / fps))
+            old_poses = tracer.poses(times[frame - 1]) if frame else None
+            truth = compute_ground_truth(camera, surface, tracer.poses(time), old_poses, tracer.poses(time + 1 / fps))
             save_truth(folder, camera.name, frame, truth)
     rng = np.random.default_rng([rig.config.seed, 1])
     save_tracks(folder, _sample_tracks(tracer, rig.cameras, frames / fps, rng))
@@ -234,9 +234,9 @@ def _sample_tracks(
             for moving in (False, True):
                 pixels = np.flatnonzero((visible.ids >= 0) & (can_move[visible.ids] == moving))
                 pixels = rng.choice(pixels, min(share, len(pixels)), replace=False)
-                own = visible.pick(pixels)
-                points.append(np.stack([move_with_objects(own, poses[start], there) for there in poses], axis=1))
-                owners.append(own.ids)
+                sample = visible.pick(pixels)
+                points.append(np.stack([move_with_objects(sample, poses[start], pose) for pose in poses], axis=1))
+                owners.append(sample.ids)
     tracks = np.concatenate(points)
     visible = {camera.name: np.zeros(tracks.shape[:2], bool) for camera in cameras}
     for frame, time in enumerate(times):
@@ -257,26 +257,26 @@ def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], fol
     points = []
     colors = []
     bounds = []
-    for index, (camera, own) in enumerate(zip(cameras, disturbed, strict=True)):
-        tracer.set_time(own.time_offset / rig.config.fps)
+    for index, (camera, disturbance) in enumerate(zip(cameras, disturbed, strict=True)):
+        tracer.set_time(disturbance.time_offset / rig.config.fps)
         visible = tracer.surface_points(camera)
-        lens = undistortion(camera, own.lens)
+        lens = undistortion(camera, disturbance.lens)
         pixels = np.flatnonzero((visible.ids >= 0) & (lens is None or lens.mask))
         depths = camera.project(visible.pick(pixels).positions)[1]
         # LLFF's percentiles, which readers of the file expect.
         bounds.append(np.percentile(depths, [0.1, 99.9]))
         if index == 0:
             continue  # the held-out view must not contribute points or colours
-        chosen = rng.choice(len(pixels), min(_NUM_SFM_POINTS // (len(cameras) - 1), len(pixels)), replace=False)
+        choice = rng.choice(len(pixels), min(_NUM_SFM_POINTS // (len(cameras) - 1), len(pixels)), replace=False)
         # Structure from motion has an error of about half a pixel; here it is the same along the ray.
-        noise = rng.normal(size=(len(chosen), 3)) * (0.5 * depths[chosen, None] / camera.K[0, 0])
-        points.append(visible.pick(pixels[chosen]).positions + noise)
+        noise = rng.normal(size=(len(choice), 3)) * (0.5 * depths[choice, None] / camera.K[0, 0])
+        points.append(visible.pick(pixels[choice]).positions + noise)
         image = next(open_frames(clips[index]).frames(0, 1))
         image = image if lens is None else lens(image)
-        colors.append(image.reshape(-1, 3)[pixels[chosen]] / 255)
-    if not any(own.distortion for own in disturbed):
+        colors.append(image.reshape(-1, 3)[pixels[choice]] / 255)
+    if not any(disturbance.distortion for disturbance in disturbed):
         write_poses_bounds(folder / "poses_bounds.npy", cameras, np.array(bounds))
-    lenses = [own.lens for own in disturbed]
+    lenses = [disturbance.lens for disturbance in disturbed]
     write_colmap(folder / "sparse" / "0", cameras, np.concatenate(points), np.concatenate(colors), lenses)
 
 
@@ -296,7 +296,7 @@ def _check_folder(out: Path, overwrite: bool) -> None:
 def _is_synthetic(folder: Path) -> bool:
     """Return whether a folder is a capture written by `synthesize`: recordings and fits have a `capture.json` too."""
     try:
-        about = read_json(folder / CAPTURE)
+        settings = read_json(folder / CAPTURE)
     except (OSError, ValueError):
         return False
-    return isinstance(about, dict) and {"scene", "spp"} <= set(about)
+    return isinstance(settings, dict) and {"scene", "spp"} <= set(settings)

@@ -33,6 +33,6 @@ def test_anchored_motion__sums_the_rounded_motions_of_the_levels():
     rotation = np.zeros(tuple(model.parameters["rotation"].shape), np.float32)
     translation[-1] = (0.97, 0.09, -0.49)  # of the one anchor of the coarse level; the step is 0.2 world units
     rotation[-1] = (0, 0.2, 0.1, 0.4)
-    found, turned = model.motion({"translation": mi.TensorXf(translation), "rotation": mi.TensorXf(rotation)})
-    assert_close(np.asarray(found), np.tile([1.0, 0, -0.4], (len(gaussians), 1)), atol=1e-6)
+    translations, turned = model.motion({"translation": mi.TensorXf(translation), "rotation": mi.TensorXf(rotation)})
+    assert_close(np.asarray(translations), np.tile([1.0, 0, -0.4], (len(gaussians), 1)), atol=1e-6)
     assert_close(np.asarray(turned), np.tile([0, 0.25, 0, 0.5], (len(gaussians), 1)), atol=1e-6)

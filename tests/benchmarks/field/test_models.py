@@ -77,7 +77,8 @@ for _name, _config in SMALL.items():
 @pytest.mark.parametrize("name", SMALL)
 def test_fit_later_frame__finds_the_motion_that_gaussians_share(name):
     """With as many steps, the motion of a rigid body is nearer to the truth than the motion of free Gaussians."""
-    free, *shared = fit_shifted(PLAIN), *(fit_shifted(replace(PLAIN, model=f"small-{name}")) for _ in range(2))
+    free = fit_shifted(PLAIN)
+    shared = [fit_shifted(replace(PLAIN, model=f"small-{name}")) for _ in range(2)]
     assert motion_error(shared[0]) < 0.7 * motion_error(free)
     assert psnr_of(shared[0]) > psnr_of(free)
     other = shared[1].gaussians.numpy()
@@ -88,14 +89,15 @@ def test_fit_later_frame__finds_the_motion_that_gaussians_share(name):
 def test_motion_model__has_the_models_by_name(name):
     factory = motion_model(replace(PLAIN, model=name))
     assert factory is not None
-    found = factory(opaque_ball(), EXTENT, np.random.default_rng(0))
-    assert found.parameters.keys() == found.rates.keys()
-    assert found.motion(found.parameters)[0].shape == (400, 3)
+    model = factory(opaque_ball(), EXTENT, np.random.default_rng(0))
+    assert model.parameters.keys() == model.rates.keys()
+    assert model.motion(model.parameters)[0].shape == (400, 3)
 
 
 def behaviour(config: Any) -> list[np.ndarray]:
     """Return start, rates, motions and losses of a model at random parameters."""
-    model, rng = model_of(config), np.random.default_rng(1)
+    model = model_of(config)
+    rng = np.random.default_rng(1)
     drawn = {n: np.float32(rng.normal(0, 0.01, tuple(x.shape))) for n, x in model.parameters.items()}
     p = {name: mi.TensorXf(value) for name, value in drawn.items()}
     starts = [np.asarray(value) for value in model.parameters.values()]

@@ -16,7 +16,8 @@ X = np.array([-9, -2.5, -0.6, 0, 0.3, 1, 4], np.float32)
 
 def test_corner_matrix__reproduces_linear_fields():
     """Each level interpolates a linear field exactly from its values at the corners."""
-    points, side = np.random.default_rng(0).uniform(-1, 1, (40, 3)), 0.3
+    points = np.random.default_rng(0).uniform(-1, 1, (40, 3))
+    side = 0.3
     matrix, levels = corner_matrix(points, [side])
     corner = np.unique(
         (np.floor(points / side)[:, None] + np.indices((2, 2, 2)).reshape(3, 8).T).reshape(-1, 3), axis=0
@@ -37,37 +38,38 @@ def test_bits__are_those_of_the_logistic_density():
     def sigmoid(x):
         return 1 / (1 + np.exp(-x))
 
-    found = bits(mi.Float(X), mi.Float(0.8))
+    rates = bits(mi.Float(X), mi.Float(0.8))
     x = X.astype(np.float64)
-    assert_close(found, -np.log2(sigmoid((x + 0.5) / 0.8) - sigmoid((x - 0.5) / 0.8)), atol=1e-2)
+    assert_close(rates, -np.log2(sigmoid((x + 0.5) / 0.8) - sigmoid((x - 0.5) / 0.8)), atol=1e-2)
     whole = np.arange(-30, 31, dtype=np.float32)
     assert np.sum(2.0 ** -np.asarray(bits(mi.Float(whole), mi.Float(2.0)))) == pytest.approx(1, abs=1e-3)
 
 
 def test_bits__are_finite_far_away():
-    found = np.asarray(bits(mi.Float([1e4, -1e4]), mi.Float(0.1)))
-    assert (found < 20).all()
+    rates = np.asarray(bits(mi.Float([1e4, -1e4]), mi.Float(0.1)))
+    assert (rates < 20).all()
 
 
 @pytest.mark.parametrize("name", ["translation", "rotation", "log_scales"])
 def test_motion_grid__gradients_of_the_rate_agree_with_central_differences(name):
-    model, rng = (
-        motion_grid(to_gaussians(make_wide_scene(30)), 2.0, GridConfig(cells=(1.0, 0.3))),
-        np.random.default_rng(2),
-    )
+    model = motion_grid(to_gaussians(make_wide_scene(30)), 2.0, GridConfig(cells=(1.0, 0.3)))
+    rng = np.random.default_rng(2)
     shapes = {n: tuple(v.shape) for n, v in model.parameters.items()}
     p = {n: mi.TensorXf(rng.normal(0, 1, shape).astype(np.float32)) for n, shape in shapes.items()}
     dr.enable_grad(p[name])
     dr.backward(model.losses(p)["rate"])
-    gradient, at = np.asarray(dr.grad(p[name]), np.float64), dr.detach(p[name])
-    direction, step = mi.TensorXf(rng.normal(size=shapes[name]).astype(np.float32)), 1e-2
+    gradient = np.asarray(dr.grad(p[name]), np.float64)
+    at = dr.detach(p[name])
+    direction = mi.TensorXf(rng.normal(size=shapes[name]).astype(np.float32))
+    step = 1e-2
     ends = [np.asarray(model.losses({**p, name: at + s * step * direction})["rate"]).item() for s in (1, -1)]
     expected = (ends[0] - ends[1]) / (2 * step)
     assert np.vdot(gradient, np.asarray(direction)) == pytest.approx(expected, rel=0.01)
 
 
 def test_motion_grid__moves_in_steps():
-    config, extent = GridConfig(cells=(10.0,), translation_step=0.01), 2.0
+    config = GridConfig(cells=(10.0,), translation_step=0.01)
+    extent = 2.0
     model = motion_grid(to_gaussians(make_wide_scene(30)), extent, config)
     corner_values = mi.TensorXf(np.full(tuple(model.parameters["translation"].shape), 3.4, np.float32))
     displacement, rotation = model.motion({**model.parameters, "translation": corner_values})

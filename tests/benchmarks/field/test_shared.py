@@ -13,7 +13,8 @@ from tests.assertions import assert_close
 def test_quantised__rounds_values_and_passes_gradients():
     values = mi.TensorXf(np.array([0.04, 0.06, -0.26, 0.31], np.float32))
     dr.enable_grad(values)
-    rounded, weight = quantised(values, 0.1), mi.TensorXf(np.array([1, 2, 3, 4], np.float32))
+    rounded = quantised(values, 0.1)
+    weight = mi.TensorXf(np.array([1, 2, 3, 4], np.float32))
     assert_close(rounded, [0, 0.1, -0.3, 0.3], atol=1e-6)
     dr.backward(dr.sum(weight * rounded, axis=None))
     assert_close(dr.grad(values), weight, atol=0)

@@ -11,7 +11,8 @@ from benchmarks.field.transformation_cache import CacheConfig, hash_matrix, tran
 from tests.assertions import assert_close
 from tests.scenes.gaussians import make_wide_scene, to_gaussians
 
-GAUSSIANS, EXTENT = to_gaussians(make_wide_scene(30)), 2.0
+GAUSSIANS = to_gaussians(make_wide_scene(30))
+EXTENT = 2.0
 CONFIG = CacheConfig(levels=3, table=64, features=2, hidden=8)
 
 
@@ -61,12 +62,15 @@ def test_transformation_cache__is_the_network_of_its_definition():
 
 @pytest.mark.parametrize("name", ["table", "first", "second", "last"])
 def test_transformation_cache__gradients_agree_with_central_differences(name):
-    model, rng = transformation_cache(GAUSSIANS, EXTENT, np.random.default_rng(0), CONFIG), np.random.default_rng(1)
-    p, weight = random_parameters(model), rng.normal(size=(30, 4)).astype(np.float32)
+    model = transformation_cache(GAUSSIANS, EXTENT, np.random.default_rng(0), CONFIG)
+    rng = np.random.default_rng(1)
+    p = random_parameters(model)
+    weight = rng.normal(size=(30, 4)).astype(np.float32)
     values = {n: np.asarray(v, np.float64) for n, v in p.items()}
     dr.enable_grad(p[name])
     dr.backward(dr.sum(mi.TensorXf(weight) * model.motion(p)[1], axis=None))
-    direction, step = rng.normal(size=values[name].shape), 1e-6
+    direction = rng.normal(size=values[name].shape)
+    step = 1e-6
     ends = [reference({**values, name: values[name] + s * step * direction})[:, 3:] for s in (1, -1)]
     expected = np.vdot(weight, ends[0] - ends[1]) / (2 * step)
     assert np.vdot(np.asarray(dr.grad(p[name])), direction) == pytest.approx(expected, rel=1e-4)

@@ -62,7 +62,8 @@ def test_index__lists_every_page():
 
 
 def test_index__quotes_the_demo():
-    frames, arm = committed("demo")["full"]["frames"], committed("arm")["frames"]
+    frames = committed("demo")["full"]["frames"]
+    arm = committed("arm")["frames"]
     assert not missing(
         "index.md",
         [

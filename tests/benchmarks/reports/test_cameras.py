@@ -26,11 +26,11 @@ def moved(camera: Camera) -> Camera:
 def test_disturbed__turns_and_displaces_every_camera_as_far_as_it_should():
     true = rig()
     wrong = disturbed(true, 0.5, 0)
-    for before, after in zip(true, wrong, strict=True):
-        turn = Rotation.from_matrix(after.viewmat[:3, :3] @ before.viewmat[:3, :3].T)
+    for true_camera, wrong_camera in zip(true, wrong, strict=True):
+        turn = Rotation.from_matrix(wrong_camera.viewmat[:3, :3] @ true_camera.viewmat[:3, :3].T)
         assert np.rad2deg(turn.magnitude()) == pytest.approx(0.5)
-        assert np.linalg.norm(after.position - before.position) == pytest.approx(0.005 * scene_extent(true))
-        assert abs(after.K[0, 0] / before.K[0, 0] - 1) == pytest.approx(0.01)
+        assert np.linalg.norm(wrong_camera.position - true_camera.position) == pytest.approx(0.005 * scene_extent(true))
+        assert abs(wrong_camera.K[0, 0] / true_camera.K[0, 0] - 1) == pytest.approx(0.01)
 
 
 def test_pose_errors__are_those_after_the_best_similarity():

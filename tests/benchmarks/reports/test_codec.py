@@ -35,8 +35,8 @@ def reported(fitted_clip: Path, tmp_path_factory: pytest.TempPathFactory) -> tup
 
 @pytest.mark.slow
 def test_measure__finds_coarser_streams_smaller_and_lzma_larger(reported) -> None:
-    options, found = reported
-    rows = found["rows"]
+    options, clips = reported
+    rows = clips["rows"]
     assert [row["quality"] for row in rows] == [4, 40, 1000]
     for row in rows:
         assert row["file"] == (options.out / "capture" / f"{row['quality']:g}" / "stream.morgs").stat().st_size
@@ -53,14 +53,15 @@ def test_measure__finds_coarser_streams_smaller_and_lzma_larger(reported) -> Non
 def test_options__reuse_complete_streams_and_write_tables_json_and_plot(
     reported, fitted_clip, tmp_path, capsys
 ) -> None:
-    options, found = reported
-    before = {path: path.read_bytes() for path in options.out.rglob("stream.morgs")}
-    path, plot = tmp_path / "codec.json", tmp_path / "codec.png"
+    options, clips = reported
+    streams = {path: path.read_bytes() for path in options.out.rglob("stream.morgs")}
+    path = tmp_path / "codec.json"
+    plot = tmp_path / "codec.png"
     replace(options, captures=(fitted_clip / "capture",), resume=True, json=path, plot=plot).run()
-    assert {path: path.read_bytes() for path in before} == before, "nothing was fitted again"
+    assert {path: path.read_bytes() for path in streams} == streams, "nothing was fitted again"
     result = json.loads(path.read_text())
     (again,) = result["clips"]
-    assert [row["psnr"] for row in again["rows"]] == [row["psnr"] for row in found["rows"]]
+    assert [row["psnr"] for row in again["rows"]] == [row["psnr"] for row in clips["rows"]]
     assert {"settings", "machine", "versions", "commit"} <= result.keys()
     assert quality_table([again]) in capsys.readouterr().out
     assert plot.stat().st_size > 10_000
@@ -73,11 +74,11 @@ def test_measure__of_workers_is_that_of_one_process(fitted_clip: Path, tmp_path:
     with client_here() as here:
         for name, client in (("alone", None), ("workers", here)):
             measure(capture, replace(QUICK, qualities=(4,), stream=stream, out=tmp_path / name), client)
-    alone, found = (
+    alone, streams = (
         {path.relative_to(folder): path.read_bytes() for path in folder.rglob("stream.morgs")}
         for folder in (tmp_path / "alone", tmp_path / "workers")
     )
-    assert found == alone
+    assert streams == alone
 
 
 def test_options__refuse_captures_without_later_frames(fitted_clip: Path, tmp_path: Path) -> None:

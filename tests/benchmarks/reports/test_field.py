@@ -15,10 +15,10 @@ from morgs_mi.studio.synth.synthesize import synthesize
 
 def test_settings__differ_between_methods_alone() -> None:
     options = Options(num_gaussians=77)
-    found = {method: options.settings(method, epochs=3, seed=5) for method in METHODS}
-    assert len({repr(config) for config in found.values()}) == len(METHODS)
-    assert {(c.fit.num_gaussians, c.fit.epochs, c.seed, c.codec) for c in found.values()} == {
-        (77, 3, 5, found["default"].codec)
+    settings = {method: options.settings(method, epochs=3, seed=5) for method in METHODS}
+    assert len({repr(config) for config in settings.values()}) == len(METHODS)
+    assert {(c.fit.num_gaussians, c.fit.epochs, c.seed, c.codec) for c in settings.values()} == {
+        (77, 3, 5, settings["default"].codec)
     }
 
 
@@ -36,12 +36,12 @@ def test_main__measures_a_tiny_clip(tmp_path: Path) -> None:
     field.main(
         Options(json=tmp_path / "out.json", plot=tmp_path / "out.png", seeds=(3,), clips=tmp_path / "clips", **work)
     )
-    found = json.loads((tmp_path / "out.json").read_text())["cells"]
-    assert list(found) == ["3/0"]
-    assert list(found["3/0"]) == ["hicom/2", "default/2"]
-    for scores in found["3/0"].values():
+    cells = json.loads((tmp_path / "out.json").read_text())["cells"]
+    assert list(cells) == ["3/0"]
+    assert list(cells["3/0"]) == ["hicom/2", "default/2"]
+    for scores in cells["3/0"].values():
         assert scores["num_bytes"] > 0
         assert len(scores["by_frame"]["psnr"]) == 2
         assert "TAPVid-3D delta_avg" in scores
-    assert field_table(found).count("\n") == 4
+    assert field_table(cells).count("\n") == 4
     assert (tmp_path / "out.png").stat().st_size > 1000

@@ -70,7 +70,8 @@ def made_up(source, first, config):
 @pytest.fixture(scope="module", params=["made up", pytest.param("fitted", marks=pytest.mark.slow)])
 def interrupted(request, clip, tmp_path_factory):
     """A report that was interrupted in its third cell and run again: its JSON, its folder and the number of fits."""
-    out, fits = tmp_path_factory.mktemp("report"), []
+    out = tmp_path_factory.mktemp("report")
+    fits = []
     fit = made_up if request.param == "made up" else method.later_frames
 
     def counted(source, first, config):
@@ -96,36 +97,36 @@ def test_method_command__continues_an_interrupted_report(interrupted):
     result, out, fits = interrupted
     # 2 epochs of a default and a baseline at 2 rates; 2 presets with 1, 2 and all 4 views at 2 epochs.
     assert fits == 6 + 6 + 1
-    (found,) = result["clips"]
-    assert [(row["preset"], row["epochs"], row["rates"]) for row in best_rows(found)[2:]] == [
+    (clip,) = result["clips"]
+    assert [(row["preset"], row["epochs"], row["rates"]) for row in best_rows(clip)[2:]] == [
         ("default", 1, 1.0),
         ("default", 2, 1.0),
     ]
-    order = [(row["preset"], row["key_views"]) for row in key_views_rows(found)]
+    order = [(row["preset"], row["key_views"]) for row in key_views_rows(clip)]
     assert order == [(preset, views) for preset in ("ml", "ml-mo") for views in (1, 2, 4)]
     text = (out / "method.md").read_text()
-    for table in (ablation_table(found, 2), epochs_table(found)):
+    for table in (ablation_table(clip, 2), epochs_table(clip)):
         assert table in text
     pytest.importorskip("matplotlib")
     assert (out / "method.png").stat().st_size > 10_000
 
 
 def test_method_command__scores_are_those_of_the_held_out_view(interrupted):
-    (found,) = interrupted[0]["clips"]
-    for row in found["rows"] + found["key_view_rows"]:
+    (clip,) = interrupted[0]["clips"]
+    for row in clip["rows"] + clip["key_view_rows"]:
         mean = row["mean"]
         assert mean["psnr"] == pytest.approx(sum(row["by_frame"]["psnr"]) / 2, rel=1e-4)
         assert 5 < mean["psnr"] < 40
         assert mean["seconds"] > 0
         assert 0 < mean["motion_error_moving"] < 5 * mean["true_motion_moving"]
-        assert mean["mtv_input"] == found["rows"][0]["mean"]["mtv_input"]
+        assert mean["mtv_input"] == clip["rows"][0]["mean"]["mtv_input"]
         assert set(row["std"].values()) == {None}, "of a single run"
-    assert 0 < found["cue"]["error"] < 2
+    assert 0 < clip["cue"]["error"] < 2
 
 
 def test_method_tables__are_complete(interrupted):
-    (found,) = interrupted[0]["clips"]
-    for table, rows in ((ablation_table(found, 2), 2), (epochs_table(found), 4), (key_views_table(found), 6)):
+    (clip,) = interrupted[0]["clips"]
+    for table, rows in ((ablation_table(clip, 2), 2), (epochs_table(clip), 4), (key_views_table(clip), 6)):
         lines = table.splitlines()
         assert len(lines) == 2 + rows
         assert len({line.count("|") for line in lines}) == 1
@@ -134,11 +135,11 @@ def test_method_tables__are_complete(interrupted):
 
 def test_method_page__warns_of_a_best_rate_that_is_the_largest_one(interrupted):
     def warns(best: float) -> bool:
-        rows = [{**row, "best": row["rates"] == best or row["preset"] == "default"} for row in found["rows"]]
-        page = method_page([{**found, "rows": rows}], 2)
+        rows = [{**row, "best": row["rates"] == best or row["preset"] == "default"} for row in clip["rows"]]
+        page = method_page([{**clip, "rows": rows}], 2)
         return "Larger rates than were tried may be better for `baseline` at 1 epochs, `baseline` at 2 epochs." in page
 
-    (found,) = interrupted[0]["clips"]
+    (clip,) = interrupted[0]["clips"]
     assert warns(2.0)
     assert not warns(1.0)
 
@@ -173,19 +174,20 @@ def test_measure__of_workers_is_that_of_one_process(clip, tmp_path, monkeypatch)
     """Also if a worker dies, and the report is started again."""
     monkeypatch.setattr(method, "later_frames", made_up)
     options = replace(tiny(clip, tmp_path / "alone"), seeds=2)
-    alone, options = method.measure(clip, options, None), replace(options, out=tmp_path / "workers")
+    alone = method.measure(clip, options, None)
+    options = replace(options, out=tmp_path / "workers")
     LEFT[0] = 3
     with client_here() as client, pytest.raises(ChildProcessError):
         method.measure(clip, options, client)
     LEFT[0] = MANY
-    before = len(list((tmp_path / "workers").glob("*made_up-*.json")))
-    assert before > 1
+    old_count = len(list((tmp_path / "workers").glob("*made_up-*.json")))
+    assert old_count > 1
     with client_here() as client:
-        found = method.measure(clip, options, client)
-    after = len(list((tmp_path / "workers").glob("*made_up-*.json")))
-    assert MANY - LEFT[0] == after - before
-    assert len(list((tmp_path / "alone").glob("*made_up-*.json"))) == after
-    assert all(found[name] == alone[name] for name in ("rows", "key_view_rows"))
+        result = method.measure(clip, options, client)
+    new_count = len(list((tmp_path / "workers").glob("*made_up-*.json")))
+    assert MANY - LEFT[0] == new_count - old_count
+    assert len(list((tmp_path / "alone").glob("*made_up-*.json"))) == new_count
+    assert all(result[name] == alone[name] for name in ("rows", "key_view_rows"))
 
 
 def test_settings_of__changes_its_own_settings_only():
@@ -199,23 +201,24 @@ def test_settings_of__changes_its_own_settings_only():
 
 
 def test_aggregate__selects_the_best_rate_by_the_first_seed():
-    rows, variants = [], []
+    rows = []
+    variants = []
     for rate, values in ((1.0, (30.0, 40.0)), (2.0, (31.0, 33.0)), (4.0, (20.0,))):
         keys = {"preset": "baseline", "epochs": 2, "key_views": 4, "rates": rate}
         variants.append(Variant(keys, StreamConfig()))
         for seed, psnr in enumerate(values):
             rows.append({**keys, "fit_seed": seed, "psnr": psnr, "ssim": None, "by_frame": {"psnr": [psnr, 1.0]}})
-    found = aggregate(rows, variants)
-    assert [row["best"] for row in found] == [False, True, False]
-    assert found[1]["mean"]["psnr"] == 32
-    assert found[1]["std"]["psnr"] == pytest.approx(2**0.5)
-    assert found[1]["by_frame"]["psnr"] == [32, 1]
-    assert found[1]["mean"]["ssim"] is None
+    table = aggregate(rows, variants)
+    assert [row["best"] for row in table] == [False, True, False]
+    assert table[1]["mean"]["psnr"] == 32
+    assert table[1]["std"]["psnr"] == pytest.approx(2**0.5)
+    assert table[1]["by_frame"]["psnr"] == [32, 1]
+    assert table[1]["mean"]["ssim"] is None
     assert len(aggregate(rows, variants[:1])) == 1
 
 
 def test_variants_of__tunes_the_given_presets_and_limits_the_key_views():
-    presets, key_views = ([v.keys for v in own] for own in variants_of(tiny(Path(), Path()), num_views=3))
+    presets, key_views = ([v.keys for v in group] for group in variants_of(tiny(Path(), Path()), num_views=3))
     assert len(presets) == 2 * 3
     assert {keys["rates"] for keys in presets if keys["preset"] == "default"} == {1.0}
     assert {keys["key_views"] for keys in presets} == {3}
@@ -238,11 +241,11 @@ def test_fitted__runs_later_seeds_at_the_best_rate_only(clip, tmp_path, monkeypa
     monkeypatch.setattr(method, "later_frames", scores)
     monkeypatch.setattr(method, "first_frame", no_packet)
     options = replace(tiny(clip, tmp_path), rates=(1, 2, 4), seeds=3, key_views=())
-    found = method.measure(clip, options, None)
+    result = method.measure(clip, options, None)
     assert [seed for seed, *_ in ran] == 8 * [0] + 4 * [1] + 4 * [2]
     expected = {("baseline", 1, 1), ("baseline", 2, 2), ("default", 1, 1), ("default", 2, 1)}
     assert {tuple(cell) for seed, *cell in ran if seed == 1} == expected
-    best = {(row["preset"], row["epochs"]): row for row in best_rows(found)}
+    best = {(row["preset"], row["epochs"]): row for row in best_rows(result)}
     for epochs, rates, psnr in ((1, 1, 39), (2, 2, 43)):
         row = best["baseline", epochs]
         assert (row["rates"], row["runs"], row["mean"]["psnr"]) == (rates, 3, psnr)
@@ -267,7 +270,7 @@ def test_options__refuse_bad_settings_and_captures(clip, tmp_path):
 def test_method_page__has_no_other_figures_than_the_report():
     for name, section in (("method_report", "Four clips"), ("method_parts", "Parts")):
         result = json.loads((ROOT / f"benchmarks/results/{name}.json").read_text(encoding="utf-8"))
-        (found,) = re.findall(rf"^## {section}\n(.*?)^##", page("method.md"), re.DOTALL | re.MULTILINE)
+        (section_text,) = re.findall(rf"^## {section}\n(.*?)^##", page("method.md"), re.DOTALL | re.MULTILINE)
         tables = method_page(result["clips"], result["table_epochs"])
         figures = set(re.findall(r"\d+\.\d+", tables))
         for clip in result["clips"]:
@@ -275,6 +278,6 @@ def test_method_page__has_no_other_figures_than_the_report():
             figures |= {f"{row['by_frame']['psnr'][-1]:.2f}" for row in best_rows(clip)}
             errors = (row["mean"]["motion_error_moving"] for row in best_rows(clip))
             figures |= {f"{error / clip['cue']['error']:.2f}" for error in errors}
-        assert set(re.findall(r"\d+\.\d+", found)) - figures == set()
+        assert set(re.findall(r"\d+\.\d+", section_text)) - figures == set()
         # Null means all frames.
-        assert f"{result['settings']['frames'] or result['clips'][0]['frames']} frames" in found
+        assert f"{result['settings']['frames'] or result['clips'][0]['frames']} frames" in section_text

@@ -48,16 +48,17 @@ def test_measure__starts_from_points_of_the_training_views(clip: Path, monkeypat
 @pytest.mark.skipif(not FOLDER, reason="needs photos: set MORGS_MI_PHOTOS to the folder of their sets")
 @pytest.mark.parametrize("name", SETS)
 def test_photos__are_calibrated_and_reach_the_committed_quality(name: str, tmp_path: Path) -> None:
-    photos, (count, points) = tmp_path / name, SETS[name]
+    photos = tmp_path / name
+    count, points = SETS[name]
     photos.mkdir()
     for path in sorted((Path(FOLDER or ".") / name).iterdir()):
         if path.suffix.lower() in (".jpg", ".png"):
             shutil.copy(path, photos)
     assert cli.main(["calibrate", str(photos), "--shared-intrinsics"]) == 0
     real.Options(json=tmp_path / "out.json", captures=(photos,)).run()
-    (found,) = json.loads((tmp_path / "out.json").read_text())["fits"]
-    assert found["views"] + found["held_out_views"] == count, "every photo is registered"
-    assert found["principal_points"] == points
+    (row,) = json.loads((tmp_path / "out.json").read_text())["fits"]
+    assert row["views"] + row["held_out_views"] == count, "every photo is registered"
+    assert row["principal_points"] == points
     fits = [f for f in committed("real")["fits"] if (f["set"], f["principal_points"]) == (name, points)]
     # Two fits of Sceaux, with one held-out photo, differ by 1 dB, the others by 0.4 dB at most.
-    assert found["held_out"] > np.mean([fit["held_out"] for fit in fits]) - 1
+    assert row["held_out"] > np.mean([fit["held_out"] for fit in fits]) - 1

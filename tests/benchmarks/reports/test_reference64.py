@@ -41,8 +41,8 @@ def test_reference64__renders_like_the_reference_of_the_tests(degree, pairs, mon
     raw, camera = scene(degree)
     expected = slow(raw, camera)
     pixels = np.random.default_rng(1).permutation(np.argwhere(np.ones((13, 9))))[:80]
-    found = Reference64(raw, camera, CONFIG).render(pixels)
-    assert np.abs(found - expected[pixels[:, 1], pixels[:, 0]]).max() < 1e-13
+    colors = Reference64(raw, camera, CONFIG).render(pixels)
+    assert np.abs(colors - expected[pixels[:, 1], pixels[:, 0]]).max() < 1e-13
 
 
 @pytest.mark.parametrize("degree", [0, 3])
@@ -56,8 +56,8 @@ def test_reference64__gradients_agree_with_complex_steps_through_everything(degr
         return np.sum(slow(values, camera)[pixels[:, 1], pixels[:, 0]] * weight)
 
     expected = reference.complex_step(loss, raw, list(ATTRIBUTES))
-    found = Reference64(raw, camera, CONFIG).gradients(pixels, weight)
+    gradients = Reference64(raw, camera, CONFIG).gradients(pixels, weight)
     for name in ATTRIBUTES:
-        assert found[name].shape == raw[name].shape
+        assert gradients[name].shape == raw[name].shape
         assert np.abs(expected[name]).max() > 0
-        assert np.abs(found[name] - expected[name]).max() < 1e-11 * np.abs(expected[name]).max(), name
+        assert np.abs(gradients[name] - expected[name]).max() < 1e-11 * np.abs(expected[name]).max(), name

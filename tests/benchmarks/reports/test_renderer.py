@@ -16,7 +16,8 @@ SMALL += ["--pixels", "200", "--repeats", "1"]
 
 
 def test_ball__depends_on_the_seed_and_is_in_view():
-    (first, camera), (again, _) = ball(3, 50, 64, 48, 0.02, 1), ball(3, 50, 64, 48, 0.02, 1)
+    first, camera = ball(3, 50, 64, 48, 0.02, 1)
+    again, _ = ball(3, 50, 64, 48, 0.02, 1)
     assert all(np.array_equal(v, again.numpy()[k]) for k, v in first.numpy().items())
     means = first.numpy()["means"]
     assert np.linalg.norm(means, axis=1).max() <= 1 + 1e-6
@@ -27,7 +28,8 @@ def test_ball__depends_on_the_seed_and_is_in_view():
 def reported(tmp_path_factory):
     """The rows of the command for a small scene."""
     folder = tmp_path_factory.mktemp("report")
-    path, plot = folder / "report.json", folder / "report.png"
+    path = folder / "report.json"
+    plot = folder / "report.png"
     pytest.importorskip("matplotlib")
     assert cli.main(["renderer", *SMALL, "--json", str(path), "--plot", str(plot)]) == 0
     assert plot.stat().st_size > 1000

@@ -71,26 +71,26 @@ def without_times(value):
 def test_study_options__of_workers_write_the_rows_of_one_process(report, clip: Path, tmp_path: Path, monkeypatch):
     for name in ("random-1", "random-2", "random-1-lens-0.1", "spheres-3x64"):
         (tmp_path / name).symlink_to(clip)
-    given, num_rows = STUDIES[report]
+    study_options, num_rows = STUDIES[report]
     place = {"captures": (clip,)} if report in (real, unseen) else {"clips": tmp_path}
-    found = {}
+    tables = {}
     monkeypatch.setattr(fits, "StreamLoop", tiny_loop)
     monkeypatch.setattr(cameras, "refine_cameras", lambda capture, *_: (capture, Scene({}, ())))  # needs larger images
     monkeypatch.setattr(timing, "estimate_time_offsets", true_offsets)
     monkeypatch.setattr(cells, "open_client", lambda scheduler, count: client_here())
     for count in (None, 2):
-        options = report.Options(json=tmp_path / "out.json", workers=count, **place, **given)
+        options = report.Options(json=tmp_path / "out.json", workers=count, **place, **study_options)
         options.run()
         result = json.loads((tmp_path / "out.json").read_text())
-        found[count] = result["fits"]
-    assert len(found[None]) == num_rows
+        tables[count] = result["fits"]
+    assert len(tables[None]) == num_rows
     assert {"settings", "commit", "date", "machine", "versions"} <= result.keys()
     assert "clips" not in result["settings"]
-    assert "|" in options.table(found[None])
+    assert "|" in options.table(tables[None])
     if report is timing:
-        assert max(row["largest_error"] for row in found[None]) == 0
-        assert [row["fit_seed"] for row in found[None]] == [0, 1]
-    assert all(without_times(rows) == without_times(found[None]) for rows in found.values())
+        assert max(row["largest_error"] for row in tables[None]) == 0
+        assert [row["fit_seed"] for row in tables[None]] == [0, 1]
+    assert all(without_times(rows) == without_times(tables[None]) for rows in tables.values())
 
 
 def score(source: Source, config: StreamConfig) -> dict[str, float]:
@@ -106,21 +106,21 @@ CALLS: list[int] = []
 def test_study__continues_with_the_stored_cells(clip: Path, tmp_path: Path, monkeypatch):
     source = Source.of(load_capture(clip))
     variants = [Variant({"epochs": n}, StreamConfig(FitConfig(epochs=n))) for n in (1, 2)]
-    given = Study(score, [Scene({"clip": "a"}, (source,))], variants, (0, 1))
+    small_study = Study(score, [Scene({"clip": "a"}, (source,))], variants, (0, 1))
     CALLS.clear()
-    rows = given.run(None, tmp_path)
+    rows = small_study.run(None, tmp_path)
     assert rows[1] == {"clip": "a", "epochs": 1, "fit_seed": 1, "psnr": 31.333}
-    assert given.run(None, tmp_path) == rows
+    assert small_study.run(None, tmp_path) == rows
     assert CALLS == [0, 1, 0, 1], "the second run fits nothing"
-    assert len(replace(given, seeds=(0, 1, 2)).run(None, tmp_path)) == 6
+    assert len(replace(small_study, seeds=(0, 1, 2)).run(None, tmp_path)) == 6
     assert CALLS[4:] == [2, 2], "only another seed is fitted"
     shorter = Scene({"clip": "a"}, (replace(source, num_frames=2),))
-    replace(given, scenes=[shorter], seeds=(0,)).run(None, tmp_path)
+    replace(small_study, scenes=[shorter], seeds=(0,)).run(None, tmp_path)
     assert CALLS[6:] == [0, 0], "another part of the recording is fitted"
     monkeypatch.setattr(study, "method_version", lambda: "another")
-    given.run(None, tmp_path)
+    small_study.run(None, tmp_path)
     assert CALLS[8:] == [0, 1, 0, 1], "another version of the method fits again"
-    assert len(given.run(None)) == 4
+    assert len(small_study.run(None)) == 4
     assert len(CALLS) == 16, "nothing is stored without a folder"
 
 

@@ -11,7 +11,8 @@ import pytest
 @pytest.fixture
 def workload(tmp_path: Path) -> Path:
     """Sixty Gaussians in front of a small camera."""
-    rng, path = np.random.default_rng(0), tmp_path / "tiny.npz"
+    rng = np.random.default_rng(0)
+    path = tmp_path / "tiny.npz"
     viewmat = np.eye(4, dtype=np.float32)
     viewmat[2, 3] = 3
     np.savez(

@@ -13,10 +13,10 @@ SIZE = Size(64, 48, 3, 600, 2)
 
 def test_scene__moves_the_given_number_of_balls():
     scene = Scene(SIZE, seed=0)
-    before, after = (np.asarray(scene.at(t).means) for t in (0, 1))
-    assert len(before) <= SIZE.gaussians
-    moved = np.linalg.norm(after - before, axis=1) > 0
-    assert set(scene.owner[moved]) == set(scene.moving)
+    first, second = (np.asarray(scene.at(t).means) for t in (0, 1))
+    assert len(first) <= SIZE.gaussians
+    mask = np.linalg.norm(second - first, axis=1) > 0
+    assert set(scene.owner[mask]) == set(scene.moving)
     assert len(scene.cameras()) == SIZE.views + 1
 
 

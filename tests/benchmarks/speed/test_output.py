@@ -18,11 +18,11 @@ class Options(Output):
 
 def test_output__records_commit_date_machine_and_versions(tmp_path, capsys):
     Options(json=tmp_path / "out.json").write({"error": 0.5, "rows": [1, 2]}, unprinted=["rows"])
-    found = json.loads((tmp_path / "out.json").read_text())
-    assert (found["error"], found["rows"]) == (0.5, [1, 2])
-    assert found["date"] == date.today().isoformat()
-    assert found["commit"] == commit()
-    assert {"machine", "versions"} <= found.keys()
+    figures = json.loads((tmp_path / "out.json").read_text())
+    assert (figures["error"], figures["rows"]) == (0.5, [1, 2])
+    assert figures["date"] == date.today().isoformat()
+    assert figures["commit"] == commit()
+    assert {"machine", "versions"} <= figures.keys()
     assert "rows" not in json.loads(capsys.readouterr().out)
 
 

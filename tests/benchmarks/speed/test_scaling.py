@@ -26,6 +26,6 @@ def test_main__measures_a_tiny_clip(tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="comes with the extra `cluster`")
     size = {"cameras": 3, "frames": 6, "width": 64, "gaussians": 100, "first_frame_steps": 8, "epochs": 1}
     scaling.main(Options(json=tmp_path / "scaling.json", segments=2, **size))
-    found = json.loads((tmp_path / "scaling.json").read_text())
-    assert [run["workers"] for run in found["runs"]] == [1, 2]
-    assert found["efficiency"][0]["whole"] == 1
+    output = json.loads((tmp_path / "scaling.json").read_text())
+    assert [run["workers"] for run in output["runs"]] == [1, 2]
+    assert output["efficiency"][0]["whole"] == 1

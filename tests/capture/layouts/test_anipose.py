@@ -74,9 +74,9 @@ def test_anipose__reads_the_tables_of_caliscope(tmp_path: Path) -> None:
         f"distortions = [0.0, 0.0, 0.0, 0.0, 0.0]\nrotation = {rotation}\n"
         f"translation = {camera.viewmat[:3, 3].tolist()}\n"
     )
-    (found,), _ = read_anipose(path / "calibration.toml")
-    assert found.name == "cam_1"
-    assert_close(found.viewmat, camera.viewmat, atol=1e-9)
+    (result,), _ = read_anipose(path / "calibration.toml")
+    assert result.name == "cam_1"
+    assert_close(result.viewmat, camera.viewmat, atol=1e-9)
 
 
 def test_anipose__finds_the_calibration_of_pose2sim_and_ignores_other_toml_files(tmp_path: Path) -> None:
@@ -98,10 +98,10 @@ def test_clip_of_camera__finds_a_word_in_one_name() -> None:
 
 def test_read_anipose__accepts_a_rotation_of_any_axis(tmp_path: Path) -> None:
     path = layouts.anipose(tmp_path / "a")
-    found, _ = read_anipose(path / "calibration.toml")
+    cameras, _ = read_anipose(path / "calibration.toml")
     table = tomllib.loads((path / "calibration.toml").read_text())["cam_2"]
-    assert_close(found[2].viewmat[:3, :3], cv2.Rodrigues(np.array(table["rotation"]))[0], atol=1e-12)
-    assert Rotation.from_matrix(found[2].viewmat[:3, :3]).magnitude() > 1
+    assert_close(cameras[2].viewmat[:3, :3], cv2.Rodrigues(np.array(table["rotation"]))[0], atol=1e-12)
+    assert Rotation.from_matrix(cameras[2].viewmat[:3, :3]).magnitude() > 1
 
 
 def test_captures_page__anipose_example_is_read_as_described(tmp_path: Path) -> None:

@@ -84,12 +84,13 @@ def test_write_colmap__of_a_full_disk_leaves_the_model_before(tmp_path: Path) ->
     points = RNG.normal(size=(100, 3))
     write_colmap(tmp_path / "new", cameras(), points)
     sizes = [file.stat().st_size for file in (tmp_path / "new").iterdir()]
-    size, before = max(sizes), {file.name: file.read_bytes() for file in write(tmp_path / "sparse").iterdir()}
+    size = max(sizes)
+    old_files = {file.name: file.read_bytes() for file in write(tmp_path / "sparse").iterdir()}
     assert sorted(sizes)[-2] < size // 2, "of the points"
     for limit in (0, 100, size // 2, *range(size - 200, size, 7), size - 1):
         with pytest.raises(OSError, match="sparse: the COLMAP model could not be written: "), files_end_at(limit):
             write_colmap(tmp_path / "sparse", cameras(), points)
-        assert {file.name: file.read_bytes() for file in (tmp_path / "sparse").iterdir()} == before
+        assert {file.name: file.read_bytes() for file in (tmp_path / "sparse").iterdir()} == old_files
     with files_end_at(size):
         write_colmap(tmp_path / "sparse", cameras(), points)
     assert len(read_colmap(tmp_path / "sparse").points) == 100

@@ -29,7 +29,8 @@ from tests.scenes import captures as layouts
 from tests.scenes.captures import COUNT, FPS, HEIGHT, WIDTH, folder_per_camera, folder_per_frame, rig
 
 # Files store poses in text or float64; the focal length of a rig is near 50 px.
-POSE_ABS, PIXEL_ABS = 1e-9, 1e-6
+POSE_ABS = 1e-9
+PIXEL_ABS = 1e-6
 
 
 def assert_holds(capture: Capture, names: tuple[str, ...], order: tuple[int, ...], shift: float = 0.0) -> None:
@@ -86,7 +87,8 @@ def test_poses_bounds__reads_meet_room(tmp_path: Path, clips) -> None:
 @pytest.mark.parametrize("shared", [True, False])
 @pytest.mark.parametrize("kind", ["txt", "bin"])
 def test_colmap__reads_all_models(tmp_path: Path, model: str, shared: bool, kind: str) -> None:
-    names, (focals, coefficients) = ("cam10", "cam2", "cam1"), MODELS[model]
+    names = ("cam10", "cam2", "cam1")
+    focals, coefficients = MODELS[model]
     cameras = rig(names)
     lens = [0.01 * (k + 1) for k in range(coefficients)]
     params = [[50.0 + i] * focals + [33.0, 20.0 + i, *lens] for i in range(3)]
@@ -102,8 +104,8 @@ def test_colmap__reads_all_models(tmp_path: Path, model: str, shared: bool, kind
     assert (capture.layout, capture.names) == ("COLMAP", ("cam1", "cam2", "cam10"))
     for camera, i in zip(capture.cameras, (2, 1, 0), strict=True):
         assert_close(camera.viewmat, cameras[i].viewmat, atol=POSE_ABS)
-        own = 0 if shared else i
-        np.testing.assert_allclose(camera.K, [[50 + own, 0, 33], [0, 50 + own, 20 + own], [0, 0, 1]])
+        number = 0 if shared else i
+        np.testing.assert_allclose(camera.K, [[50 + number, 0, 33], [0, 50 + number, 20 + number], [0, 0, 1]])
     metadata = capture.metadata()
     assert [view["lens"] for view in metadata["cameras"]] == [model] * 3
     np.testing.assert_allclose(metadata["cameras"][0]["distortion"], lens)
@@ -227,7 +229,8 @@ def test_load_capture__names_what_reads_a_fit(tmp_path: Path) -> None:
 
 def test_find_layout__finds_a_layout_that_is_added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A new layout costs its `Layout` and an entry in `LAYOUTS`."""
-    names, path = ("cam1", "cam2", "cam10"), tmp_path / "a"
+    names = ("cam1", "cam2", "cam10")
+    path = tmp_path / "a"
 
     def read(path: Path) -> Calibration:
         clips = required_clips(path)
@@ -321,7 +324,8 @@ def test_nerfstudio__reads_a_field_of_view_all_frames_and_points(tmp_path: Path)
 
     def change(meta: dict) -> None:
         meta.update(camera_angle_x=np.pi / 2, ply_file_path="cloud.ply")
-        single, meta["frames"] = meta["frames"], []
+        single = meta["frames"]
+        meta["frames"] = []
         for frame in single:
             del frame["fl_x"], frame["fl_y"]
             folder = frame["file_path"].removesuffix(".png")
@@ -360,8 +364,8 @@ def test_dynamic3dgs__reads_cameras(tmp_path: Path) -> None:
 def split_meta(path: Path, **cameras: tuple[int, ...]) -> Path:
     """Keep the `cameras` of `train_meta.json` in the files of these names."""
     meta = json.loads((path / "train_meta.json").read_text())
-    for name, kept in cameras.items():
-        picks = [[row.index(i) for i in kept] for row in meta["cam_id"]]
+    for name, members in cameras.items():
+        picks = [[row.index(i) for i in members] for row in meta["cam_id"]]
         lists = {
             key: [[row[c] for c in pick] for row, pick in zip(meta[key], picks, strict=True)]
             for key in ("k", "w2c", "fn", "cam_id")
@@ -424,13 +428,13 @@ def test_load_capture__ignores_what_systems_add(
 def test_load_capture__reads_texts_of_windows(tmp_path: Path, mark: str, build: Callable[[Path], Path]) -> None:
     path = build(tmp_path / "a")
     (path / "capture.json").write_text('{"fps": 12}')
-    before = load_capture(path)
+    unix_capture = load_capture(path)
     for file in [file for file in path.rglob("*") if file.suffix in (".txt", ".json", ".toml")]:
         declared = "<?xml version='1.0' encoding='utf-8'?>\n" if file.name.endswith(".qca.txt") else ""
         file.write_bytes((declared + file.read_text()).replace("\n", "\r\n").encode(mark))
-    after = load_capture(path)
-    assert (after.names, after.fps) == (before.names, 12)
-    for camera, expected in zip(after.cameras, before.cameras, strict=True):
+    result = load_capture(path)
+    assert (result.names, result.fps) == (unix_capture.names, 12)
+    for camera, expected in zip(result.cameras, unix_capture.cameras, strict=True):
         np.testing.assert_array_equal(camera.K, expected.K)
         np.testing.assert_array_equal(camera.viewmat, expected.viewmat)
 

@@ -90,7 +90,8 @@ def test_nerfstudio__combines_masks_with_alpha_lens_and_downscaling(tmp_path: Pa
     write_mask(path / "masks/all.png", left_half())
     rows = np.where(np.arange(HEIGHT) < 10, 0, 255)[:, None] + np.zeros((1, WIDTH), int)
     cv2.imwrite(str(path / "images/cam1.png"), np.dstack([*[np.full((HEIGHT, WIDTH), 9)] * 3, rows]).astype(np.uint8))
-    full, small = load_capture(path), load_capture(path, 2)
+    full = load_capture(path)
+    small = load_capture(path, 2)
     alone = full.at_recorded_size()._sources[0].undistortion.mask
     for mask in full.masks:
         assert mask is not None

@@ -37,11 +37,11 @@ def test_read_poses_bounds__reads_what_write_poses_bounds_writes(tmp_path: Path)
 def test_write_poses_bounds__of_a_full_disk_leaves_the_file_before(tmp_path: Path) -> None:
     path = tmp_path / "poses_bounds.npy"
     write_poses_bounds(path, cameras(), BOUNDS)
-    before = path.read_bytes()
-    for limit in (0, len(before) // 2, len(before) - 1):
+    old_bytes = path.read_bytes()
+    for limit in (0, len(old_bytes) // 2, len(old_bytes) - 1):
         with pytest.raises(OSError, match=r"cannot write .*poses_bounds.npy"), files_end_at(limit):
             write_poses_bounds(path, cameras(), BOUNDS + 1)
-        assert [file.read_bytes() for file in tmp_path.iterdir()] == [before]
+        assert [file.read_bytes() for file in tmp_path.iterdir()] == [old_bytes]
 
 
 def test_read_poses_bounds__columns_are_down_right_back(tmp_path: Path) -> None:

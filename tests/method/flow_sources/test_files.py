@@ -50,7 +50,8 @@ def test_write_flow__writes_flo_files_as_opencv_does(tmp_path):
 @pytest.mark.parametrize("names", ["XY", "uv", "RG", "RGB"])
 def test_read_flow__accepts_exr_channels_of_other_programs(tmp_path, names):
     flow = random_flow()
-    x, y = flow[..., 0], flow[..., 1]
+    x = flow[..., 0]
+    y = flow[..., 1]
     write_exr(tmp_path / "a.exr", dict(zip(names, (x, y, 0 * x), strict=False)))
     np.testing.assert_array_equal(read_flow(tmp_path / "a.exr"), flow)
 

@@ -16,7 +16,8 @@ from tests.method.moving_disc import moving_disc, observed, texture
 def test_optical_flow__recovers_a_translation_with_its_sign(method):
     scene = texture(140, 180, seed=1)
     for dx, dy in ((5, 3), (-4, 0), (0, -2)):
-        previous, image = scene[10:130, 10:170], scene[10 - dy : 130 - dy, 10 - dx : 170 - dx]
+        previous = scene[10:130, 10:170]
+        image = scene[10 - dy : 130 - dy, 10 - dx : 170 - dx]
         motion = -optical_flow(image, previous, method)
         error = np.linalg.norm(motion - (dx, dy), axis=-1)[10:-10, 10:-10]
         assert np.median(error) < 0.5, (dx, dy)  # `dis-ultrafast` stops at a quarter of the resolution
@@ -25,7 +26,8 @@ def test_optical_flow__recovers_a_translation_with_its_sign(method):
 def test_observe_key_views__motion_is_the_shift_on_frame_ts_grid():
     previous, image, disc = moving_disc(240, 320, shift=(6, -4))
     observation = observed(image, previous)
-    motion, reliable = observation.motion, observation.reliable
+    motion = observation.motion
+    reliable = observation.reliable
     # 0.25 px: DIS smooths over 8x8 patches.
     assert np.abs(motion[disc & reliable] - (6, -4)).mean() < 0.25
     assert np.linalg.norm(motion[~disc & reliable], axis=-1).mean() < 0.25
@@ -60,7 +62,8 @@ def test_optical_flow__is_finite_at_any_size(method, size):
 @pytest.mark.parametrize("method", FLOW_METHODS)
 def test_optical_flow__is_finite_with_nothing_to_match(method):
     scene = (255 * texture(130, 150, seed=3)).astype(np.uint8)
-    image, flat = scene[:60, :80], np.full((60, 80, 3), 90, np.uint8)
+    image = scene[:60, :80]
+    flat = np.full((60, 80, 3), 90, np.uint8)
     textured_left = np.where(np.arange(80)[:, None] < 20, image, flat)
     same = ((flat, flat), (textured_left, textured_left))
     for previous, following in (*same, (flat, image), (image, flat), (image, scene[70:, 70:])):

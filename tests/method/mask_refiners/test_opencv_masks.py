@@ -39,7 +39,9 @@ def test_vote_superpixels__removes_specks():
 @pytest.mark.parametrize("size", [(1, 1), (40, 30), (700, 20)])
 @pytest.mark.parametrize("refine", [refine_mask, vote_superpixels])
 def test_refine_mask__and_vote_superpixels_accept_any_mask(refine, size):
-    image, rows, center = np.random.default_rng(0).random((*size, 3)), np.arange(size[0]), (size[0] // 2, size[1] // 2)
+    image = np.random.default_rng(0).random((*size, 3))
+    rows = np.arange(size[0])
+    center = (size[0] // 2, size[1] // 2)
     masks = {name: np.full(size, name == "all") for name in ("nothing", "speck", "all", "half")}
     masks["speck"][center] = True
     masks["half"][rows < size[0] // 2] = True

@@ -13,7 +13,8 @@ import numpy as np
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
-WIDTH, HEIGHT = 480, 360
+WIDTH = 480
+HEIGHT = 360
 # A software rasteriser on a busy machine starts slowly.
 TIMEOUT_MS = 60_000
 HIDDEN = "#bar, #legend, #message {visibility: hidden}"

@@ -34,7 +34,8 @@ def run(*args: object) -> int:
 
 
 def video(path) -> list[np.ndarray]:
-    file, frames = cv2.VideoCapture(str(path)), []
+    file = cv2.VideoCapture(str(path))
+    frames = []
     while (result := file.read())[0]:
         frames.append(cv2.cvtColor(result[1], cv2.COLOR_BGR2RGB))
     return frames

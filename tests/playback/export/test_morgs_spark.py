@@ -72,12 +72,15 @@ def site(clip, tmp_path_factory):
     write_web_folder(open_stream(clip[0]), folder)
     (folder / "node_modules").symlink_to(packages)
     (folder / "scene.html").write_text(example(), encoding="utf-8")
-    data, index = (folder / "stream.morgs").read_bytes(), open_stream(folder).index()
-    version, first, later = bytearray(data), bytearray(data), bytearray(data)
+    data = (folder / "stream.morgs").read_bytes()
+    index = open_stream(folder).index()
+    version = bytearray(data)
+    first = bytearray(data)
+    late_bytes = bytearray(data)
     version[8] += 1
     first[index[0][2] + 100] ^= 1
-    later[index[2][2] + 100] ^= 1
-    broken = {"page": b"something else", "version": version, "first": first, "later": later, "cut": data[:-10]}
+    late_bytes[index[2][2] + 100] ^= 1
+    broken = {"page": b"something else", "version": version, "first": first, "later": late_bytes, "cut": data[:-10]}
     for name, content in broken.items():
         (folder / f"{name}.morgs").write_bytes(content)
     with served(folder) as address:
@@ -130,15 +133,15 @@ def test_module__places_cameras_with_an_off_centre_principal_point(scene, site, 
 
 
 def test_module__follows_the_mesh(scene):
-    before = scene.show(1)
+    image = scene.show(1)
     scene.page.evaluate("splats.mesh.position.set(3, 1, -2); splats.mesh.rotateY(1); splats.mesh.scale.setScalar(0.5)")
-    moved = scene.show(1)
+    moved_image = scene.show(1)
     scene.page.evaluate("splats.mesh.position.set(0, 0, 0); splats.mesh.rotateY(-1); splats.mesh.scale.setScalar(1)")
-    assert psnr(moved / 255, before / 255) > 40
+    assert psnr(moved_image / 255, image / 255) > 40
 
 
 def test_module__is_hidden_by_other_meshes(scene):
-    before = scene.show(1)
+    image = scene.show(1)
     scene.page.evaluate("""{
       const wall = new THREE.Mesh(new THREE.PlaneGeometry(4, 4), new THREE.MeshBasicMaterial({ color: 0x00ff00 }));
       wall.quaternion.copy(camera.quaternion);
@@ -153,7 +156,7 @@ def test_module__is_hidden_by_other_meshes(scene):
     green = np.array([0, 255, 0])
     assert (ahead[:, -100:] == green).all()
     assert not (behind[:, -100:] == green).all()
-    assert psnr(behind[:, :100] / 255, before[:, :100] / 255) > 40
+    assert psnr(behind[:, :100] / 255, image[:, :100] / 255) > 40
 
 
 @pytest.mark.parametrize(("seconds", "frame"), [(0.15, 1), (0.2, 2), (0.7, 3), (-0.1, 3), (1.25, 0)])

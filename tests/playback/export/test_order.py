@@ -19,15 +19,16 @@ def rows(gaussians) -> dict[bytes, int]:
 
 def test_by_place__yields_the_gaussians_of_every_frame_in_one_order(tmp_path):
     write_stream(tmp_path / "s.morgs", keyframe_interval=2)
-    stream, before = StreamReader(tmp_path / "s.morgs"), None
+    stream = StreamReader(tmp_path / "s.morgs")
+    previous_rows = None
     for (frame, ordered), (expected, gaussians) in zip(by_place(stream), play(stream), strict=True):
         assert frame == expected
         assert rows(ordered).keys() == rows(gaussians).keys()
-        if before is not None:
-            shared = [color for color in before if color in rows(ordered)]
+        if previous_rows is not None:
+            shared = [color for color in previous_rows if color in rows(ordered)]
             assert len(shared) >= 39
             assert np.all(np.diff([rows(ordered)[color] for color in shared]) > 0)
-        before = rows(ordered)
+        previous_rows = rows(ordered)
 
 
 def test_by_place__puts_neighbours_side_by_side(tmp_path):

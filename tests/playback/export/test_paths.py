@@ -31,8 +31,8 @@ def test_camera_path__interpolates_its_keys_smoothly():
         assert_close(path.at(time).K, key.K, atol=1e-9)
     np.testing.assert_array_equal(path.at(9).viewmat, path.at(2.5).viewmat)
     # No kinks: the steps to both sides of a key differ by the acceleration times their square.
-    before, at, after = (path.at(1 + h).position for h in (-1e-4, 0, 1e-4))
-    assert_close(after - at, at - before, atol=1e-7)
+    left, middle, right = (path.at(1 + h).position for h in (-1e-4, 0, 1e-4))
+    assert_close(right - middle, middle - left, atol=1e-7)
 
 
 def test_camera_path__rotations_are_orthonormal():

@@ -92,7 +92,8 @@ def test_exports_page__commands_convert_every_frame(program, tmp_path, command, 
     subprocess.run(["bash", "-c", command.replace("OUT", str(tmp_path))], check=True, timeout=300)
     assert len(list((tmp_path / "ply").glob(f"*{suffix}"))) == 2
     convert(program, tmp_path / "ply" / f"0001{suffix}", tmp_path / "back.ply")
-    frame, back = read_ply(tmp_path / "ply" / "0001.ply"), read_ply(tmp_path / "back.ply")
+    frame = read_ply(tmp_path / "ply" / "0001.ply")
+    back = read_ply(tmp_path / "back.ply")
     # Both formats quantise colours and harmonics coarsely, positions finely.
     order, places = (np.sort(gaussians.numpy()["means"], axis=0) for gaussians in (frame, back))
     assert_close(places, order, atol=2e-3)

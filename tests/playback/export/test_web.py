@@ -115,8 +115,11 @@ def test_write_web_page__replaces_bytes_of_a_name_that_are_not_utf_8(tmp_path):
 
 def test_write_web_page__scales_motion_by_its_99th_percentile(tmp_path):
     start = splats(600)
-    means, log_scales = start.numpy()["means"].copy(), start.numpy()["log_scales"].copy()
-    means[0], log_scales[0] = (0, -3.4, 0.9), -5  # small and close to the camera in the middle
+    means = start.numpy()["means"].copy()
+    log_scales = start.numpy()["log_scales"].copy()
+    # Small and close to the camera in the middle.
+    means[0] = (0, -3.4, 0.9)
+    log_scales[0] = -5
     states = write_stream(tmp_path / "stream.morgs", start=replace(start, means=means, log_scales=log_scales))
     write_web_folder(open_stream(tmp_path), tmp_path / "folder")
     speeds = np.hstack([screen_speeds(state.gaussians, camera) for state in states[1:] for camera in rig()])
@@ -146,15 +149,17 @@ def screen_speeds(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """
     motion = np.asarray(gaussians.motion, np.float64)
     moves = motion.any(axis=1)
-    means, motion = gaussians.numpy()["means"][moves].astype(np.float64), motion[moves]
+    means = gaussians.numpy()["means"][moves].astype(np.float64)
+    motion = motion[moves]
     pixels, depths = camera.project(means)
-    seen = (depths > camera.near) & (pixels > 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
-    step = 1e-4 * motion[seen]
-    ahead, behind = camera.project(means[seen] + step)[0], camera.project(means[seen] - step)[0]
-    scales = np.asarray(gaussians.scales, np.float64)[moves][seen]
-    areas = np.prod(scales, axis=1) ** (2 / 3) / depths[seen] ** 2
+    mask = (depths > camera.near) & (pixels > 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+    step = 1e-4 * motion[mask]
+    ahead = camera.project(means[mask] + step)[0]
+    behind = camera.project(means[mask] - step)[0]
+    scales = np.asarray(gaussians.scales, np.float64)[moves][mask]
+    areas = np.prod(scales, axis=1) ** (2 / 3) / depths[mask] ** 2
     speeds = np.linalg.norm(ahead - behind, axis=1) / 2e-4 / camera.width
-    return np.stack([speeds, np.asarray(gaussians.opacities)[moves][seen] * areas])
+    return np.stack([speeds, np.asarray(gaussians.opacities)[moves][mask] * areas])
 
 
 def test_notice__names_the_runtime_of_assemblyscript():
@@ -219,7 +224,7 @@ def page(opened):
 
 def decodes(page: Player, position: int, coded: CodedFrame) -> bool:
     """Return whether the page decodes a position to the integers of a state."""
-    found = page.page.evaluate(
+    values = page.page.evaluate(
         """async (position) => {
           const { ids, largest, exponents, values } = await player.playback.state(position);
           return [ids, largest, ...exponents, ...values].map((column) => [...column]);
@@ -227,7 +232,7 @@ def decodes(page: Player, position: int, coded: CodedFrame) -> bool:
         position,
     )
     expected = [coded.ids, coded.grid.largest_components, *coded.grid.exponents.T, *coded.grid.values.T]
-    return all(itertools.starmap(np.array_equal, zip(found, expected, strict=True)))
+    return all(itertools.starmap(np.array_equal, zip(values, expected, strict=True)))
 
 
 def test_page__decodes_the_same_integers(page, clip):
@@ -235,11 +240,12 @@ def test_page__decodes_the_same_integers(page, clip):
 
 
 def test_page__plays_a_stream_with_a_missing_frame(browser, clip, tmp_path):
-    states, packets = clip[1], list(open_stream(clip[0]))
+    states = clip[1]
+    packets = list(open_stream(clip[0]))
     # Frame 1 is lost; keyframes were re-emitted at frames 2 and 3.
-    kept = [packets[0], reemitted_keyframe(states[2]), packets[3], reemitted_keyframe(states[3])]
+    rest = [packets[0], reemitted_keyframe(states[2]), packets[3], reemitted_keyframe(states[3])]
     with StreamWriter(tmp_path / "stream.morgs", rig(WIDTH, HEIGHT), 10) as writer:
-        for packet in kept:
+        for packet in rest:
             writer.write(packet)
     write_web_page(open_stream(tmp_path), tmp_path / "page.html")
     with Player(browser, (tmp_path / "page.html").as_uri() + "#pause&frame=3") as page:
@@ -352,18 +358,18 @@ def test_page__repeats(page):
 
 
 def test_page__orbits_and_returns_to_the_camera(page):
-    before = page.image()
+    first_image = page.image()
     page.page.mouse.move(WIDTH / 2, HEIGHT / 2)
     page.page.mouse.down()
     page.page.mouse.move(WIDTH / 2 + 60, HEIGHT / 2, steps=4)
     page.page.mouse.up()
     page.page.wait_for_timeout(500)
     page.wait("player.settled")
-    assert psnr(page.image() / 255, before / 255) < 30
+    assert psnr(page.image() / 255, first_image / 255) < 30
     page.page.keyboard.press("r")
     page.page.wait_for_timeout(500)
     page.wait("player.settled")
-    assert psnr(page.image() / 255, before / 255) > 40
+    assert psnr(page.image() / 255, first_image / 255) > 40
 
 
 VIEW = ("camera.position", "controls.target")
@@ -387,7 +393,8 @@ def drag(page: Player, pixels: int, cameras: Sequence[Camera]) -> float:
     page.wait(AT_REST)
     position, target = (np.array(page.page.evaluate(f"player.view.{name}.toArray()")) for name in VIEW)
     unit = page.page.evaluate("player.view.unit")
-    offset, directions = position - target, unit * np.stack([camera.position for camera in cameras]) - target
+    offset = position - target
+    directions = unit * np.stack([camera.position for camera in cameras]) - target
     cosines = directions @ offset / np.linalg.norm(directions, axis=1) / np.linalg.norm(offset)
     return float(np.degrees(np.arccos(cosines.max())))
 

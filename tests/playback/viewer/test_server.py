@@ -367,8 +367,8 @@ def live(tmp_path):
     write_colmap(capture / "sparse" / "0", noise_capture.rig())
     (tmp_path / "capture.json").write_text(json.dumps({"capture": str(capture)}))
     splat = isotropic([[0, 0, 0]], 0.3, 0.9, (1.0, 0, 0))
-    about = {"reading": {"gaps": True}, "test_view": None}
-    with StreamWriter(tmp_path / "stream.morgs", noise_capture.rig(), 25, about) as writer:
+    metadata = {"reading": {"gaps": True}, "test_view": None}
+    with StreamWriter(tmp_path / "stream.morgs", noise_capture.rig(), 25, metadata) as writer:
 
         def add(frame: int) -> None:
             write_images(capture, noise_capture.NAMES, [images[frame]] * 3, frame)
@@ -448,8 +448,8 @@ def test_view__prints_a_link_with_a_token_where_other_machines_can_reach_it(clip
 
 
 def test_view__refuses_a_port_that_is_taken(clip, capsys):
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0)) as socket_in_use:
+        port = socket_in_use.getsockname()[1]
         assert cli.main(["view", str(clip[0]), "--port", str(port), "--no-browser"]) == 1
     assert f"127.0.0.1:{port}: cannot serve the page there" in " ".join(capsys.readouterr().err.split())
 

@@ -27,8 +27,8 @@ def test_fit_seam_frame__leaves_what_is_static_as_it_is() -> None:
     config = SegmentConfig(passes=2, epochs=1)
     coded, report = fit_seam_frame(loop.setup, loop.state, 4, images[4], config)
     assert (coded.frame, report.frame) == (4, 4)
-    _, then, now = np.intersect1d(base.ids, coded.ids, return_indices=True)
-    same = np.all(base.grid.values[then] == coded.grid.values[now], axis=1)
+    _, base_rows, coded_rows = np.intersect1d(base.ids, coded.ids, return_indices=True)
+    same = np.all(base.grid.values[base_rows] == coded.grid.values[coded_rows], axis=1)
     assert 0.1 < same.mean() < 1
     assert decode(None, reemitted_keyframe(coded)).next_id >= base.next_id, "ids go on"
 
@@ -40,7 +40,7 @@ def test_fit_config__has_other_seeds_and_rates_for_each_pass() -> None:
 
 
 def test_overlap_config__has_more_epochs_and_the_same_other_settings() -> None:
-    given = StreamConfig(fit=FitConfig(epochs=3))
-    found = SegmentConfig().overlap_config(given)
-    assert found.fit.epochs == 6
-    assert replace(found, fit=given.fit) == given
+    config_of_fit = StreamConfig(fit=FitConfig(epochs=3))
+    config = SegmentConfig().overlap_config(config_of_fit)
+    assert config.fit.epochs == 6
+    assert replace(config, fit=config_of_fit.fit) == config_of_fit

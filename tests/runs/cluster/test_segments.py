@@ -33,7 +33,8 @@ from morgs_mi.runs.fit_files import FILES
 from tests.scenes.coded_clip import history
 from tests.scenes.recording import CONFIG, write_recording
 
-FRAMES, STARTS = 10, (0, 3, 7)
+FRAMES = 10
+STARTS = (0, 3, 7)
 # A keyframe that is re-emitted within a segment, and one that falls on a seam.
 SETTINGS = replace(CONFIG, codec=replace(CONFIG.codec, keyframe_interval=3))
 SEGMENTS = SegmentConfig(3, passes=2, epochs=1, overlap=2)
@@ -57,9 +58,9 @@ def short_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def fit(capture: Capture, out: Path, client: Client, **options) -> list[FrameReport]:
-    given = {"config": SETTINGS, "segments": SEGMENTS} | options
-    resume = given.pop("resume", False)
-    return SegmentedRun(capture, out, client, **given).fit(resume)
+    metadata = {"config": SETTINGS, "segments": SEGMENTS} | options
+    resume = metadata.pop("resume", False)
+    return SegmentedRun(capture, out, client, **metadata).fit(resume)
 
 
 @pytest.fixture(scope="module")
@@ -120,11 +121,11 @@ def test_SegmentedRun__is_read_by_the_commands(whole: Path, tmp_path: Path, comm
 
 def when_fitted(count: int, action: Callable[[], object]) -> Callable[[str, float, float], None]:
     """Return a function that acts once, as soon as so many frames are fitted."""
-    left = [action]
+    actions = [action]
 
     def on_stage(stage: str, done: float, total: float) -> None:
-        if stage == "Fitting frames" and done >= count and left:
-            left.pop()()
+        if stage == "Fitting frames" and done >= count and actions:
+            actions.pop()()
 
     return on_stage
 
@@ -166,7 +167,7 @@ def test_SegmentedRun__resumes_after_the_beginning_of_a_segment(
     with pytest.raises(KeyboardInterrupt):
         fit(capture, tmp_path, client, on_stage=when_fitted(FRAMES, interrupt))
     for path in (tmp_path / "segments").glob("*.morgs"):
-        offset = next((at for _, found, at in StreamReader(path).index() if found >= frame), None)
+        offset = next((at for _, number, at in StreamReader(path).index() if number >= frame), None)
         if offset is not None:
             os.truncate(path, offset)
     fit(capture, tmp_path, client, resume=True)
@@ -259,7 +260,8 @@ def test_SegmentedRun__refines_cameras_once(capture: Capture, client: Client, tm
     how = ShortFitConfig(gaussians=40, steps=4, rounds=1)
     config = replace(SETTINGS, fit=replace(SETTINGS.fit, refine_cameras="on", short_fits=how))
     fit(held_out, tmp_path / "three", client, config=config)
-    stream, row = StreamReader(tmp_path / "three" / "stream.morgs"), rows_of(tmp_path / "three")[0]
+    stream = StreamReader(tmp_path / "three" / "stream.morgs")
+    row = rows_of(tmp_path / "three")[0]
     assert not np.array_equal(stream.cameras[1].viewmat, capture.cameras[1].viewmat)
     assert row["validation"]["refinement"]["held_out"]["registered_psnr"] > 0
     stream_capture(held_out, tmp_path / "plain", config)

@@ -31,11 +31,11 @@ def test_fit_frames__continues_the_loop_of_the_last_task_or_reads_it_again(
     first = fit_frames(fit, Segment(0, 5, 0), 3)
     assert first.segment == replace(first.segment, start=0, stop=5, frame=3)
     monkeypatch.setattr(Source, "open", None)
-    kept = fit_frames(fit, first.segment, 5)
+    result = fit_frames(fit, first.segment, 5)
     monkeypatch.undo()
     again = fit_frames(fit, first.segment, 5)
-    assert again.packets == kept.packets
-    assert again.segment == kept.segment
+    assert again.packets == result.packets
+    assert again.segment == result.segment
     assert [report.frame for report in again.reports] == [3, 4]
 
 

@@ -44,29 +44,32 @@ def disturbed(cameras, rng):
 
 @pytest.mark.parametrize("distortion", [(0, 0), (-0.15, 0.04)])
 def test_camera_jacobian__is_that_of_finite_differences(distortion):
-    camera, step = rig(shift=7)[1], 1e-6
-    before = np.array([0, 0, 0, 0.02, -0.01, 0.03, 0.02, 0.001, -0.002, *distortion])
+    camera = rig(shift=7)[1]
+    step = 1e-6
+    start = np.array([0, 0, 0, 0.02, -0.01, 0.03, 0.02, 0.001, -0.002, *distortion])
 
     def seen(changes, points=POINTS):
-        now = changed_camera(camera, changes)
-        return distorted(now, now.project(points)[0], changes[9:])
+        changed_view = changed_camera(camera, changes)
+        return distorted(changed_view, changed_view.project(points)[0], changes[9:])
 
-    of_changes, of_points = camera_jacobian(changed_camera(camera, before), 1.02, POINTS, before[9:])
+    of_changes, of_points = camera_jacobian(changed_camera(camera, start), 1.02, POINTS, start[9:])
     for k in range(11):
-        ahead, back = (seen(before + sign * step * np.eye(11)[k]) for sign in (1, -1))
+        ahead, back = (seen(start + sign * step * np.eye(11)[k]) for sign in (1, -1))
         assert_close(of_changes[:, :, k], (ahead - back) / (2 * step), rtol=1e-5, atol=1e-4, name=str(k))
-    moved = [seen(before, POINTS + sign * step * np.eye(3)[0]) for sign in (1, -1)]
-    assert_close(of_points[:, :, 0], (moved[0] - moved[1]) / (2 * step), rtol=1e-5, atol=1e-4)
+    ends = [seen(start, POINTS + sign * step * np.eye(3)[0]) for sign in (1, -1)]
+    assert_close(of_points[:, :, 0], (ends[0] - ends[1]) / (2 * step), rtol=1e-5, atol=1e-4)
 
 
 def test_undistorted__inverts_distorted():
-    camera, k = rig()[0], np.array([-0.12, 0.03])
+    camera = rig()[0]
+    k = np.array([-0.12, 0.03])
     pixels = np.random.default_rng(0).uniform(0, (camera.width, camera.height), (50, 2))
     assert_close(undistorted(camera, distorted(camera, pixels, k), k), pixels, atol=1e-3)
 
 
 def test_bundle_adjust__finds_the_distortion_of_each_camera():
-    true, rng = rig(shift=7), np.random.default_rng(2)
+    true = rig(shift=7)
+    rng = np.random.default_rng(2)
     terms = rng.normal(scale=(0.03, 0.01), size=(len(true), 2))
     tracks = seen_by(true)
     for v, (camera, k) in enumerate(zip(true, terms, strict=True)):
@@ -80,15 +83,17 @@ def test_bundle_adjust__finds_the_distortion_of_each_camera():
 
 
 def test_bundle_adjust__finds_the_reprojections_despite_wrong_matches():
-    true, rng = rig(shift=7), np.random.default_rng(1)
-    tracks, given = seen_by(true), disturbed(true, rng)
+    true = rig(shift=7)
+    rng = np.random.default_rng(1)
+    tracks = seen_by(true)
+    start = disturbed(true, rng)
     wrong = rng.random(len(tracks.ids)) < 0.1
     tracks.pixels[wrong] += rng.normal(scale=30, size=(wrong.sum(), 2))
-    changes, points = bundle_adjust(given, tracks, priors_of(given))
-    found = [changed_camera(*pair) for pair in zip(given, changes, strict=True)]
-    projected = np.concatenate([camera.project(points)[0] for camera in found])
+    changes, points = bundle_adjust(start, tracks, priors_of(start))
+    cameras = [changed_camera(*pair) for pair in zip(start, changes, strict=True)]
+    projected = np.concatenate([camera.project(points)[0] for camera in cameras])
     assert np.median(np.linalg.norm(projected - tracks.pixels, axis=1)[~wrong]) < 0.02
-    relative = [rig[0].viewmat[:3, :3] @ rig[-1].viewmat[:3, :3].T for rig in (found, true)]
+    relative = [rig[0].viewmat[:3, :3] @ rig[-1].viewmat[:3, :3].T for rig in (cameras, true)]
     assert np.rad2deg(np.arccos((np.trace(relative[0].T @ relative[1]) - 1) / 2)) < 0.02
 
 
@@ -100,21 +105,24 @@ def test_bundle_adjust__leaves_cameras_that_fit():
 
 @pytest.mark.parametrize("seed", [3, 5])
 def test_bundle_adjust__keeps_points_in_place_for_a_camera_that_takes_no_part(seed):
-    places, rng = [(x, y, 0) for y in (-0.5, 0, 0.5) for x in (-1, 0, 1)], np.random.default_rng(seed)
+    places = [(x, y, 0) for y in (-0.5, 0, 0.5) for x in (-1, 0, 1)]
+    rng = np.random.default_rng(seed)
     nine = look_at_cameras(places, 50, 320, 240, target=(0, 0, 10))
-    given, unseen, points = nine[:4] + nine[5:], nine[4], rng.uniform((-3, -2, 6), (3, 2, 14), (300, 3))
-    tracks = seen_by(given, points)
+    rig_of_nine = nine[:4] + nine[5:]
+    unseen = nine[4]
+    points = rng.uniform((-3, -2, 6), (3, 2, 14), (300, 3))
+    tracks = seen_by(rig_of_nine, points)
     tracks.pixels[:] += rng.normal(scale=0.3, size=tracks.pixels.shape)
-    before = intersect(tracks.ids, tracks.views, tracks.pixels, given, tracks.count)
-    _, after = bundle_adjust(given, tracks, priors_of(given))
-    shifts = [unseen.project(found)[0] - unseen.project(points)[0] for found in (before, after)]
+    start = intersect(tracks.ids, tracks.views, tracks.pixels, rig_of_nine, tracks.count)
+    _, end = bundle_adjust(rig_of_nine, tracks, priors_of(rig_of_nine))
+    shifts = [unseen.project(positions)[0] - unseen.project(points)[0] for positions in (start, end)]
     errors = [np.median(np.linalg.norm(shift, axis=1)) for shift in shifts]
     assert errors[1] < errors[0] + 0.03
 
 
 def test_bundle_adjust__changes_focal_lengths_by_zero_on_average():
-    given = disturbed(rig(shift=7), np.random.default_rng(1))
-    changes, _ = bundle_adjust(given, seen_by(rig(shift=7)), priors_of(given))
+    start = disturbed(rig(shift=7), np.random.default_rng(1))
+    changes, _ = bundle_adjust(start, seen_by(rig(shift=7)), priors_of(start))
     assert np.abs(changes[:, 6]).max() > 1e-3
     assert abs(changes[:, 6].mean()) < 1e-6
 

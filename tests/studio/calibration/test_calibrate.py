@@ -45,7 +45,8 @@ def film(path: Path, cameras: list[Camera], suffix: str = ".mkv") -> Path:
 
 def aligned(found: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return `found` [n, 3] aligned to `true` by translation, rotation and scale, and the rotation."""
-    a, b = found - found.mean(0), true - true.mean(0)
+    a = found - found.mean(0)
+    b = true - true.mean(0)
     U, _, Vt = np.linalg.svd(a.T @ b)
     R = (U @ Vt).T
     return np.sqrt((b**2).sum() / (a**2).sum()) * a @ R.T + true.mean(0), R
@@ -60,9 +61,9 @@ def test_calibrate__recovers_a_rig(tmp_path: Path, capsys) -> None:
     assert capture.names == tuple(camera.name for camera in cameras)
     assert len(capture.points) > 500
     true = np.array([camera.position for camera in cameras])
-    found, R = aligned(np.array([camera.position for camera in capture.cameras]), true)
+    positions, R = aligned(np.array([camera.position for camera in capture.cameras]), true)
     # Features are accurate to 0.1 px of 208 px focal length; the rig is 2.8 wide and 4 from the scene.
-    assert_close(found, true, atol=5e-3)
+    assert_close(positions, true, atol=5e-3)
     for camera, expected in zip(capture.cameras, cameras, strict=True):
         assert_close(camera.viewmat[:3, :3] @ R.T, expected.viewmat[:3, :3], atol=3e-3)
         np.testing.assert_allclose(camera.K[0, 0], expected.K[0, 0], rtol=5e-3)
@@ -82,11 +83,11 @@ def test_calibrate__finds_the_same_poses_on_every_run(tmp_path: Path) -> None:
     with closing(pycolmap.Database.open(scratch / _DATABASE)) as db:
         numbered = sorted((image.image_id, Path(image.name).stem) for image in db.read_all_images())
     assert [name for _, name in numbered] == list(images), "other numbers change the world's axes by 0.1"
-    found = []
+    poses = []
     for _ in range(3):
         model = _map(tmp_path, tuple(images), scratch, config.seed).model
-        found.append(np.array([model.image(i).cam_from_world().matrix() for i, _ in numbered]))
-    assert not np.ptp(found, axis=0).any(), "threads may find a pose from other samples"
+        poses.append(np.array([model.image(i).cam_from_world().matrix() for i, _ in numbered]))
+    assert not np.ptp(poses, axis=0).any(), "threads may find a pose from other samples"
 
 
 @pytest.mark.parametrize(
@@ -110,8 +111,8 @@ def test_calibrate__names_images_after_photos(tmp_path: Path, names: tuple[str, 
 def test_calibrate__shares_intrinsics_among_clips_of_a_size(tmp_path: Path) -> None:
     sizes = [(240, 180), (320, 240)] * 3
     cameras = [camera.resized(*size) for camera, size in zip(textured.rig(), sizes, strict=True)]
-    found = calibrate(film(tmp_path, cameras), CalibrateConfig(shared_intrinsics=True))
-    assert len(pycolmap.Reconstruction(str(found.model)).cameras) == 2
+    result = calibrate(film(tmp_path, cameras), CalibrateConfig(shared_intrinsics=True))
+    assert len(pycolmap.Reconstruction(str(result.model)).cameras) == 2
     capture = load_capture(tmp_path)
     assert capture.recorded_sizes == tuple(sizes)
     for camera, expected in zip(capture.cameras, cameras, strict=True):
@@ -126,9 +127,9 @@ def test_calibrate__moves_principal_points_that_differ(tmp_path: Path, capsys) -
     film(tmp_path, cameras)
     assert cli.main(["calibrate", str(tmp_path), "--shared-intrinsics"]) == 0
     assert "with a principal point for each" in " ".join(capsys.readouterr().out.split())
-    found, true = (np.array([c.position for c in views]) for views in (load_capture(tmp_path).cameras, cameras))
+    positions, true = (np.array([c.position for c in views]) for views in (load_capture(tmp_path).cameras, cameras))
     # With principal points in the middle of the images, positions are off by 0.022.
-    assert_close(aligned(found, true)[0], true, atol=0.012)
+    assert_close(aligned(positions, true)[0], true, atol=0.012)
 
 
 @pytest.mark.slow
@@ -182,10 +183,10 @@ def test_calibrate__names_a_camera_with_another_scene(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="`without` must name cameras of cam1, cam2, cam3, cam4, other, got cam7"):
         calibrate(tmp_path, without=["cam7"])
     assert calibrate(tmp_path, without=["other"]).cameras == ("cam1", "cam2", "cam3", "cam4")
-    found = calibrate(tmp_path, CalibrateConfig(partial=True), overwrite=True)
-    assert (found.cameras, found.left_out) == (("cam1", "cam2", "cam3", "cam4"), ("other",))
-    assert found.error < 0.5
-    assert load_capture(tmp_path).names == found.cameras
+    result = calibrate(tmp_path, CalibrateConfig(partial=True), overwrite=True)
+    assert (result.cameras, result.left_out) == (("cam1", "cam2", "cam3", "cam4"), ("other",))
+    assert result.error < 0.5
+    assert load_capture(tmp_path).names == result.cameras
 
 
 @pytest.mark.slow
@@ -208,11 +209,12 @@ def test_calibrate__prints_a_verdict_per_camera(tmp_path: Path, capsys) -> None:
 
 def test_calibrate__of_a_full_disk_leaves_no_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_colmap(tmp_path / "found", textured.rig(4), np.random.default_rng(0).normal(size=(60, 3)))
-    found, clips = pycolmap.Reconstruction(str(tmp_path / "found")), film(tmp_path / "clips", textured.rig(4))
+    model = pycolmap.Reconstruction(str(tmp_path / "found"))
+    clips = film(tmp_path / "clips", textured.rig(4))
     checks = tuple(CameraCheck(camera.name, 60, 0.1, True) for camera in textured.rig(4))
     monkeypatch.setattr("morgs_mi.studio.calibration.calibrate._match", lambda *_: None)
     monkeypatch.setattr(
-        "morgs_mi.studio.calibration.calibrate._map", lambda *_: _Candidate("incremental", found, checks)
+        "morgs_mi.studio.calibration.calibrate._map", lambda *_: _Candidate("incremental", model, checks)
     )
     size = (tmp_path / "found" / "points3D.txt").stat().st_size
     with pytest.raises(OSError, match=r"cannot write .*sparse, the partial output was removed"), files_end_at(size - 1):
@@ -301,7 +303,7 @@ def test_calibrate__refuses_clips_that_cannot_be_calibrated(
 ) -> None:
     path = tmp_path / "clips"
     build(path)
-    before = sorted(tmp_path.rglob("*"))
+    old_files = sorted(tmp_path.rglob("*"))
     with pytest.raises(error, match=message):
         calibrate(path, dataclasses.replace(CalibrateConfig(), **config))
-    assert sorted(tmp_path.rglob("*")) == before
+    assert sorted(tmp_path.rglob("*")) == old_files

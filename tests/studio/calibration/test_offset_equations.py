@@ -39,10 +39,11 @@ def equations(
     noise: np.ndarray | None = None,
 ) -> OffsetEquations:
     """Return the equations of a ball that is shown at offsets, with Gaussians that are away from their places."""
-    cameras, targets = look_at_cameras(list(positions), 40), []
+    cameras = look_at_cameras(list(positions), 40)
+    targets = []
     for view, (camera, offset) in enumerate(zip(cameras, offsets, strict=True)):
-        later = replace(ball, means=np.asarray(ball.means) + np.float32(offset) * np.asarray(ball.motion))
-        image = np.asarray(rasterize(later, camera, ("color",)).color) + (0 if noise is None else noise[view])
+        moved_ball = replace(ball, means=np.asarray(ball.means) + np.float32(offset) * np.asarray(ball.motion))
+        image = np.asarray(rasterize(moved_ball, camera, ("color",)).color) + (0 if noise is None else noise[view])
         targets.append(Target(np.clip(image, 0, 1).astype(np.float32)))
     displaced = replace(ball, means=(np.asarray(ball.means) + away).astype(np.float32))
     train = ~np.isin(np.arange(len(cameras)), held_out)
@@ -60,13 +61,14 @@ def test_solution__has_a_mean_of_zero_over_the_training_views() -> None:
 
 
 def test_solution__does_not_depend_on_gaussians_that_are_away_from_their_places() -> None:
-    ball, away = turning_ball(), np.float32((0.02, -0.02, 0.01))
+    ball = turning_ball()
+    away = np.float32((0.02, -0.02, 0.01))
     np.testing.assert_allclose(equations(ball, away=away).solution(), equations(ball).solution(), atol=0.03)
 
 
 def test_solution__adds_what_the_fit_hides() -> None:
-    found = equations(turning_ball())
-    np.testing.assert_allclose(found.solution(share=0.5), 2 * found.solution())
+    system = equations(turning_ball())
+    np.testing.assert_allclose(system.solution(share=0.5), 2 * system.solution())
 
 
 def test_sum__is_between_its_instants() -> None:
@@ -76,13 +78,14 @@ def test_sum__is_between_its_instants() -> None:
 
 
 def test_matrix__does_not_change_with_a_common_offset() -> None:
-    found = equations(turning_ball(), held_out=[2])
-    common = np.delete(found.matrix, 2, axis=1).sum(axis=1)
-    assert np.abs(np.delete(common, 2) / np.delete(found.own, 2)).max() < 0.01
+    system = equations(turning_ball(), held_out=[2])
+    common = np.delete(system.matrix, 2, axis=1).sum(axis=1)
+    assert np.abs(np.delete(common, 2) / np.delete(system.own, 2)).max() < 0.01
 
 
 def test_errors__are_large_where_a_change_of_depth_explains_an_offset() -> None:
-    ball, pair = opaque_ball(), [(-0.8, 0.0, -4.0), (0.8, 0.0, -4.0)]
+    ball = opaque_ball()
+    pair = [(-0.8, 0.0, -4.0), (0.8, 0.0, -4.0)]
     noise = np.random.default_rng(0).normal(0, 0.02, (2, *SIZE))
     along, across = (
         equations(replace(ball, motion=np.tile(np.float32(motion), (400, 1))), np.zeros(2), positions=pair, noise=noise)
@@ -95,14 +98,15 @@ def test_errors__are_large_where_a_change_of_depth_explains_an_offset() -> None:
 
 @pytest.mark.slow
 def test_errors__are_those_of_repeated_noise() -> None:
-    ball, rng = turning_ball(), np.random.default_rng(0)
-    found = [equations(ball, 0 * OFFSETS, noise=rng.normal(0, 0.02, (5, *SIZE))) for _ in range(20)]
-    spread = np.std([each.solution() - each.solution()[0] for each in found], axis=0)[1:]
-    np.testing.assert_allclose(np.mean([each.errors(0) for each in found], axis=0)[1:], spread, rtol=0.4)
+    ball = turning_ball()
+    rng = np.random.default_rng(0)
+    systems = [equations(ball, 0 * OFFSETS, noise=rng.normal(0, 0.02, (5, *SIZE))) for _ in range(20)]
+    spread = np.std([each.solution() - each.solution()[0] for each in systems], axis=0)[1:]
+    np.testing.assert_allclose(np.mean([each.errors(0) for each in systems], axis=0)[1:], spread, rtol=0.4)
 
 
 def test_solution__leaves_views_where_they_are_without_motion() -> None:
     still = replace(opaque_ball(), motion=np.zeros((400, 3), np.float32))
-    found = equations(still)
-    assert not found.own.any()
-    np.testing.assert_array_equal(found.solution(), 0)
+    system = equations(still)
+    assert not system.own.any()
+    np.testing.assert_array_equal(system.solution(), 0)

@@ -41,7 +41,8 @@ CAMERAS = look_at_cameras(PLACES, 60, 64, 48)
 def splats():
     """Return a cloud of coloured splats."""
     rng = np.random.default_rng(0)
-    means, sh = rng.uniform(-1, 1, (60, 3)), rng.uniform(-1, 1.5, (60, 1, 3))
+    means = rng.uniform(-1, 1, (60, 3))
+    sh = rng.uniform(-1, 1.5, (60, 1, 3))
     return isotropic(means.astype(np.float32), 0.15, 0.9, sh.astype(np.float32))
 
 
@@ -64,7 +65,8 @@ def relative_turns(cameras) -> np.ndarray:
 @pytest.fixture(scope="module")
 def splat_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     """A capture of the splats in five views, the first of which is held out."""
-    path, cameras = tmp_path_factory.mktemp("splats"), look_at_cameras([(0, 0, -4), *PLACES], 60, 64, 48)
+    path = tmp_path_factory.mktemp("splats")
+    cameras = look_at_cameras([(0, 0, -4), *PLACES], 60, 64, 48)
     gaussians = splats()
     write_colmap(path / "sparse", cameras, np.asarray(gaussians.means), np.full((60, 3), 0.5))
     for camera in cameras:
@@ -75,8 +77,10 @@ def splat_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 @pytest.fixture(scope="module")
 def far_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     """A capture of distant splats in nine noisy views on a plane, the middle one of which is held out."""
-    path, rng = tmp_path_factory.mktemp("far"), np.random.default_rng(0)
-    means, sh = rng.uniform((-3, -2.2, 6), (3, 2.2, 12), (150, 3)), rng.uniform(-1, 1.5, (150, 1, 3))
+    path = tmp_path_factory.mktemp("far")
+    rng = np.random.default_rng(0)
+    means = rng.uniform((-3, -2.2, 6), (3, 2.2, 12), (150, 3))
+    sh = rng.uniform(-1, 1.5, (150, 1, 3))
     gaussians = isotropic(means.astype(np.float32), 0.35, 0.9, sh.astype(np.float32))
     places = [(x, y, 0) for y in (-0.5, 0, 0.5) for x in (-1, 0, 1)]
     cameras = look_at_cameras(places, 45, 96, 72, target=(0, 0, 10))
@@ -105,56 +109,59 @@ def test_refine_cameras__stays_in_the_frame_of_what_takes_no_part(far_capture, s
     capture = replace(far_capture, cameras=tuple(cameras))
     config = FitConfig(refine_cameras="on", short_fits=replace(SHORT, steps=100))
     refined, _ = refine_cameras(capture, config, REPRODUCIBLE, seed)
-    before, after = (shift_of_splats(each, far_capture) for each in (capture, refined))
-    assert after < max(most, 0.9 * before)
+    old_shift, new_shift = (shift_of_splats(each, far_capture) for each in (capture, refined))
+    assert new_shift < max(most, 0.9 * old_shift)
 
 
 def test_joint_step__turns_cameras_to_where_the_images_were_taken():
-    given, gaussians, changes = disturbed(CAMERAS), splats(), np.zeros((4, 11))
-    views = [View(camera, image_of(true)) for camera, true in zip(given, CAMERAS, strict=True)]
+    start = disturbed(CAMERAS)
+    gaussians = splats()
+    changes = np.zeros((4, 11))
+    views = [View(camera, image_of(true)) for camera, true in zip(start, CAMERAS, strict=True)]
     deviations = prior_deviations(1.0, CameraPriors())
     for _ in range(8):
         gaussians, changes = _joint_step(gaussians, views, changes, deviations, 0.0, RenderConfig())
-    found = [changed_camera(*pair) for pair in zip(given, changes, strict=True)]
-    errors = [np.abs(relative_turns(rig) - relative_turns(CAMERAS)).max() for rig in (given, found)]
+    cameras = [changed_camera(*pair) for pair in zip(start, changes, strict=True)]
+    errors = [np.abs(relative_turns(rig) - relative_turns(CAMERAS)).max() for rig in (start, cameras)]
     assert errors[1] < 0.15 * errors[0]
     assert abs(changes[:, 6].mean()) < 1e-6, "a camera that takes no part keeps its focal length"
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0])
 def test_register_camera__finds_the_camera_of_an_image(scale):
-    given = disturbed(CAMERAS[:1], scale)[0]
+    start = disturbed(CAMERAS[:1], scale)[0]
     image = image_of(CAMERAS[0])
-    found = register_camera(splats(), View(given, image), 1.0, FitConfig())
-    error = np.square(rendered(splats(), found, RenderConfig()) - image / 255).mean()
+    camera = register_camera(splats(), View(start, image), 1.0, FitConfig())
+    error = np.square(rendered(splats(), camera, RenderConfig()) - image / 255).mean()
     assert error < 1e-5, "the rounding to 8 bits alone has 1e-6"
 
 
 def test_register_camera__keeps_a_camera_that_fits():
-    found = register_camera(splats(), View(CAMERAS[0], image_of(CAMERAS[0])), 1.0, FitConfig())
-    assert_close(found.viewmat, CAMERAS[0].viewmat, rtol=0, atol=1e-3)
+    camera = register_camera(splats(), View(CAMERAS[0], image_of(CAMERAS[0])), 1.0, FitConfig())
+    assert_close(camera.viewmat, CAMERAS[0].viewmat, rtol=0, atol=1e-3)
 
 
 def test_moved__keeps_the_projections_of_points():
-    points, changes = np.asarray(splats().means), np.tile([0, 0, 0, 0.1, -0.2, 0.05, 0, 0, 0, 0, 0], (4, 1))
+    points = np.asarray(splats().means)
+    changes = np.tile([0, 0, 0, 0.1, -0.2, 0.05, 0, 0, 0, 0, 0], (4, 1))
     assert_close(_moved(points, CAMERAS, changes), points + changes[0, 3:6], rtol=0, atol=1e-5)
 
 
 def test_refine_cameras__returns_the_calibrated_cameras_without_a_gain(splat_capture, monkeypatch):
     # So short fits differ by tenths of a dB by chance, but by less than this.
     monkeypatch.setattr("morgs_mi.studio.calibration.refine.LEAST_GAIN", 3)
-    refined, found = refine_cameras(splat_capture, LEAST)
-    assert not found.taken
+    refined, refinement = refine_cameras(splat_capture, LEAST)
+    assert not refinement.taken
     assert refined is splat_capture
-    assert "stay as calibrated" in found.sentence
+    assert "stay as calibrated" in refinement.sentence
 
 
 @pytest.mark.parametrize(("gain", "taken"), [(0.05, False), (0.2, True)])
 def test_refine_cameras__takes_cameras_with_which_withheld_pixels_gain(splat_capture, monkeypatch, gain, taken):
     scores = iter((25.0, 25.0 + gain))
     monkeypatch.setattr("morgs_mi.studio.calibration.refine.mean_psnr", lambda *_: next(scores))
-    refined, found = refine_cameras(splat_capture, LEAST)
-    assert found.taken is taken
+    refined, refinement = refine_cameras(splat_capture, LEAST)
+    assert refinement.taken is taken
     assert (refined is splat_capture) is not taken
     assert refined.cameras[0] is splat_capture.cameras[0], "the held-out view stays as calibrated"
     assert np.array_equal(refined.points, splat_capture.points) is not taken
@@ -164,12 +171,12 @@ def test_refine_cameras__compares_the_views_that_have_withheld_pixels(splat_capt
     """Small views may have none."""
 
     def with_an_empty_view(views, width, rng):
-        kept, unseen = withheld_blocks(views, width, rng)
-        return kept, [unseen[0]._replace(mask=np.zeros(unseen[0].image.shape[:2], bool)), *unseen[1:]]
+        rest, unseen = withheld_blocks(views, width, rng)
+        return rest, [unseen[0]._replace(mask=np.zeros(unseen[0].image.shape[:2], bool)), *unseen[1:]]
 
     monkeypatch.setattr("morgs_mi.studio.calibration.refine.withheld_blocks", with_an_empty_view)
-    _, found = refine_cameras(splat_capture, LEAST)
-    assert np.isfinite(found.calibrated_psnr)
+    _, refinement = refine_cameras(splat_capture, LEAST)
+    assert np.isfinite(refinement.calibrated_psnr)
 
 
 @pytest.mark.long
@@ -177,18 +184,18 @@ def test_refine_cameras__improves_withheld_pixels_of_disturbed_cameras(textured_
     disturbed_capture = replace(textured_capture, cameras=tuple(disturbed(textured_capture.cameras, 1.5)))
     capture = with_points(disturbed_capture, 0, Progress())
     how = ShortFitConfig(steps=200, rounds=2, width=160)
-    refined, found = refine_cameras(capture, FitConfig(refine_cameras="auto", short_fits=how))
-    assert found.taken
-    assert found.refined_psnr > found.calibrated_psnr + 0.5
-    true, before, after = ([c.cameras[v] for v in capture.train_views] for c in (textured_capture, capture, refined))
-    errors = [np.abs(relative_turns(rig) - relative_turns(true)).max() for rig in (before, after)]
+    refined, refinement = refine_cameras(capture, FitConfig(refine_cameras="auto", short_fits=how))
+    assert refinement.taken
+    assert refinement.refined_psnr > refinement.calibrated_psnr + 0.5
+    true, start, result = ([c.cameras[v] for v in capture.train_views] for c in (textured_capture, capture, refined))
+    errors = [np.abs(relative_turns(rig) - relative_turns(true)).max() for rig in (start, result)]
     assert errors[1] < 0.5 * errors[0], "two rounds, where the default has five"
 
 
 def test_refine_cameras__does_not_judge_where_refined_cameras_are_wanted(splat_capture):
-    refined, found = refine_cameras(splat_capture, replace(LEAST, refine_cameras="on"))
-    assert found.taken
-    assert np.isnan(found.calibrated_psnr)
+    refined, refinement = refine_cameras(splat_capture, replace(LEAST, refine_cameras="on"))
+    assert refinement.taken
+    assert np.isnan(refinement.calibrated_psnr)
     assert refined is not splat_capture
 
 
@@ -196,10 +203,10 @@ def test_refine_cameras__does_not_judge_where_refined_cameras_are_wanted(splat_c
 def test_matched__finds_the_cameras_by_features(textured_capture, monkeypatch):
     monkeypatch.setattr("morgs_mi.capture.features._MAX_FEATURES", 300)
     capture = replace(textured_capture, cameras=tuple(disturbed(textured_capture.cameras)))
-    given, true = ([c.cameras[v] for v in capture.train_views] for c in (capture, textured_capture))
-    changes, tracks, _ = _matched(capture, capture.train_views, prior_deviations(scene_extent(given), CameraPriors()))
-    found = [changed_camera(*pair) for pair in zip(given, changes, strict=True)]
-    errors = [np.abs(relative_turns(rig) - relative_turns(true)).max() for rig in (given, found)]
+    start, true = ([c.cameras[v] for v in capture.train_views] for c in (capture, textured_capture))
+    changes, tracks, _ = _matched(capture, capture.train_views, prior_deviations(scene_extent(start), CameraPriors()))
+    cameras = [changed_camera(*pair) for pair in zip(start, changes, strict=True)]
+    errors = [np.abs(relative_turns(rig) - relative_turns(true)).max() for rig in (start, cameras)]
     assert tracks > 100
     assert errors[1] < 0.1 * errors[0]
 
@@ -221,9 +228,9 @@ def test_refine_cameras__needs_two_images(splat_capture):
 
 
 def test_Refinement__reports_the_changes_and_the_gain():
-    found = Refinement(True, 26.0, 31.5, 200, 0.51, 0.02, 0.011, 0.003)
-    assert found.sentence == (
+    refinement = Refinement(True, 26.0, 31.5, 200, 0.51, 0.02, 0.011, 0.003)
+    assert refinement.sentence == (
         "The cameras were refined, by up to 0.51 degrees, 0.02 units, 1.1 % of the focal length and 0.3 % of the "
         "image's width by the lens: withheld pixels have 31.50 dB instead of 26.00 dB."
     )
-    assert "dB" not in replace(found, calibrated_psnr=np.nan, refined_psnr=np.nan).sentence
+    assert "dB" not in replace(refinement, calibrated_psnr=np.nan, refined_psnr=np.nan).sentence

@@ -32,11 +32,11 @@ def test_estimate_time_offsets__finds_the_offsets_of_a_clip(tmp_path: Path) -> N
     synthesize(
         "spheres", clip, SynthConfig(cameras=7, width=128, height=96, disturbances=Disturbances(time_offset=1.5))
     )
-    found = estimate_time_offsets(load_capture(clip))
+    estimate = estimate_time_offsets(load_capture(clip))
     truth = {name: -camera.time_offset for name, camera in load_disturbances(clip / "truth").items()}
-    assert found.reference == "cam00"
+    assert estimate.reference == "cam00"
     # Things move by about a pixel per frame in images of 128 pixels.
-    assert found.offsets == pytest.approx(truth, abs=0.15)
-    assert all(error < 0.1 for error in found.errors.values())
-    known = estimate_time_offsets(load_capture(clip, reading=ReadConfig(offset=found.offsets)))
-    assert known.offsets == pytest.approx(truth, abs=0.15)
+    assert estimate.offsets == pytest.approx(truth, abs=0.15)
+    assert all(error < 0.1 for error in estimate.errors.values())
+    second_estimate = estimate_time_offsets(load_capture(clip, reading=ReadConfig(offset=estimate.offsets)))
+    assert second_estimate.offsets == pytest.approx(truth, abs=0.15)

@@ -57,7 +57,7 @@ def test_info__prints_complete_columns_and_a_verdict_per_camera(textured_capture
 
 def test_info__prints_the_check_and_draws_the_rig(textured_capture: Capture, tmp_path: Path, run) -> None:
     plot = tmp_path / "new" / "rig.png"
-    before = {file: file.stat().st_mtime_ns for file in textured_capture.path.rglob("*")}
+    times = {file: file.stat().st_mtime_ns for file in textured_capture.path.rglob("*")}
     status, out, _ = run("info", textured_capture.path, "--plot", plot)
     assert status == 0
     assert "COLMAP" in out
@@ -67,7 +67,7 @@ def test_info__prints_the_check_and_draws_the_rig(textured_capture: Capture, tmp
     assert "Views between the cameras will be good: 5 cameras, 7 degrees apart" in " ".join(out.split())
     image = cv2.imread(str(plot))
     assert image.shape == (760, 1440, 3)
-    assert {file: file.stat().st_mtime_ns for file in textured_capture.path.rglob("*")} == before
+    assert {file: file.stat().st_mtime_ns for file in textured_capture.path.rglob("*")} == times
     status, out, _ = run("info", textured_capture.path, "--no-check")
     assert status == 0
     assert "Reprojection" not in out
@@ -79,8 +79,8 @@ def test_info__prints_the_time_offsets_as_options(capture: Path, run, monkeypatc
     names = (*NAMES[:3], "other")
     offsets = dict(zip(names, (0.0, -0.254, 1.5, 0.7), strict=True))
     errors = dict(zip(names, (0.0, 0.023, 0.41, 1.0), strict=True))
-    found = TimeOffsets(offsets, errors, NAMES[0], 0.3, converged=False)
-    monkeypatch.setattr(info, "estimate_time_offsets", lambda *_: found)
+    time_offsets = TimeOffsets(offsets, errors, NAMES[0], 0.3, converged=False)
+    monkeypatch.setattr(info, "estimate_time_offsets", lambda *_: time_offsets)
     status, out, _ = run("info", capture, "--no-check", "--time")
     assert status == 0
     out = " ".join(out.split())
@@ -93,7 +93,8 @@ def test_info__prints_the_time_offsets_as_options(capture: Path, run, monkeypatc
 
 @pytest.mark.slow
 def test_info__checks_a_whole_recording(textured_capture: Capture, tmp_path: Path, run) -> None:
-    plot, measured = tmp_path / "rig.png", tmp_path / "deep.json"
+    plot = tmp_path / "rig.png"
+    measured = tmp_path / "deep.json"
     status, out, _ = run("info", textured_capture.path, "--deep", "--plot", plot, "--json", measured)
     assert status == 0
     assert "Check of 1 frames: no findings." in out

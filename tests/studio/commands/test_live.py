@@ -52,15 +52,15 @@ def test_Live__fits_videos_until_they_end(
 def test_Live__starts_the_viewer_at_a_provisional_first_frame(
     capture: Path, tmp_path: Path, videos: list[Path], run, monkeypatch
 ) -> None:
-    found = []
+    states = []
     monkeypatch.setattr(
-        module, "_start_viewer", lambda out, _: found.append(sorted(path.name for path in out.iterdir()))
+        module, "_start_viewer", lambda out, _: states.append(sorted(path.name for path in out.iterdir()))
     )
     monkeypatch.setattr(module, "_stop", lambda _: None)
     args = ("--camera", *videos, "--calibration", capture, "--view", "--frames", 1, *QUICK, "--first-frame-steps", 20)
     assert run("live", tmp_path / "out", *args)[0] == 0
-    assert len(found) == 1
-    assert PROVISIONAL in found[0]
+    assert len(states) == 1
+    assert PROVISIONAL in states[0]
 
 
 @pytest.mark.slow
@@ -108,16 +108,16 @@ def test_Live__ends_with_a_summary_on_ctrl_c(capture: Path, tmp_path: Path, vide
     ],
 )
 def test_Live__refuses_in_one_sentence(capture: Path, tmp_path: Path, videos, run, args, parts) -> None:
-    given = [arg for a in args for arg in (videos if a == "VIDEOS" else [a])]
-    assert_refused(run("live", tmp_path / "out", "--calibration", capture, *given), *parts)
+    arguments = [arg for a in args for arg in (videos if a == "VIDEOS" else [a])]
+    assert_refused(run("live", tmp_path / "out", "--calibration", capture, *arguments), *parts)
     assert not (tmp_path / "out").exists()
 
 
 def test_Live__names_the_output_after_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    given: dict[str, Any] = {}
+    arguments: dict[str, Any] = {}
 
     def fit(sources, out, live, config, *_):
-        given.update(out=out, sources=sources, fit=config.fit)
+        arguments.update(out=out, sources=sources, fit=config.fit)
         raise KeyboardInterrupt
 
     monkeypatch.setattr("morgs_mi.studio.live.fit_live.fit_live", fit)
@@ -129,20 +129,21 @@ def test_Live__names_the_output_after_the_time(monkeypatch: pytest.MonkeyPatch) 
     for settings, seconds, epochs in cases:
         with pytest.raises(KeyboardInterrupt):
             Live(camera=("0", "rtsp://10.0.0.10/live"), settings=settings).run()
-        assert re.fullmatch(r"live-\d{8}-\d{6}", given["out"].name)
-        assert given["sources"] == [0, "rtsp://10.0.0.10/live"]
-        assert given["fit"].first_frame_seconds == seconds
-        assert given["fit"].epochs == epochs
+        assert re.fullmatch(r"live-\d{8}-\d{6}", arguments["out"].name)
+        assert arguments["sources"] == [0, "rtsp://10.0.0.10/live"]
+        assert arguments["fit"].first_frame_seconds == seconds
+        assert arguments["fit"].epochs == epochs
 
 
 def test_Lines__count_what_was_dropped_since_the_last_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    printed, now = [], 100.0
+    printed = []
+    clock = 100.0
     monkeypatch.setattr(module, "print_warning", printed.append)
-    monkeypatch.setattr("time.monotonic", lambda: now)
+    monkeypatch.setattr("time.monotonic", lambda: clock)
     lines = _Lines()
     for frame, seconds in enumerate((0, 0.4, 0.4, 0.4)):
-        now += seconds
-        lines.add(LiveFrame(frame, now - 100, 0.25, 0.004, 3 * (frame > 0)))
+        clock += seconds
+        lines.add(LiveFrame(frame, clock - 100, 0.25, 0.004, 3 * (frame > 0)))
     assert printed == [
         "Frame 0: 0.0 s after the first, latency 0.25 s, 0 frames dropped, skew 4 ms.",
         "Frame 3: 1.2 s after the first, latency 0.25 s, 9 frames dropped, skew 4 ms.",

@@ -25,7 +25,8 @@ TYPES = {f"{KHR}:ROTATION": "VEC4", f"{KHR}:OPACITY": "SCALAR", "COLOR_0": "VEC4
 def read_glb(data: bytes) -> tuple[dict, bytes]:
     """Return the JSON and binary chunks of a .glb file, according to glTF 2.0's section on the binary format."""
     assert struct.unpack_from("<4sII", data) == (b"glTF", 2, len(data))
-    chunks, at = [], 12
+    chunks = []
+    at = 12
     while at < len(data):
         size, kind = struct.unpack_from("<I4s", data, at)
         assert (at % 4, size % 4) == (0, 0)
@@ -45,7 +46,8 @@ def attributes(document: dict, binary: bytes) -> dict[str, np.ndarray]:
         accessor = document["accessors"][index]
         view = document["bufferViews"][accessor["bufferView"]]
         assert accessor["componentType"] == 5126
-        start, width = view.get("byteOffset", 0) + accessor.get("byteOffset", 0), SIZES[accessor["type"]]
+        start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+        width = SIZES[accessor["type"]]
         assert start % 4 == 0
         assert "byteStride" not in view
         assert accessor["count"] * width * 4 <= view["byteLength"]
@@ -100,7 +102,9 @@ def test_glb__fallback_colour_is_linear():
 
 @pytest.mark.parametrize("degree", range(4))
 def test_write_gltf__renders_the_same_image_in_gltf_axes(tmp_path, degree):
-    gaussians, camera, axes = splats(degree=degree), rig()[0], gltf_axes(rig())
+    gaussians = splats(degree=degree)
+    camera = rig()[0]
+    axes = gltf_axes(rig())
     write_gltf(tmp_path / "g.glb", gaussians, axes)
     document, binary = read_glb((tmp_path / "g.glb").read_bytes())
     rotation = np.eye(4)

@@ -18,8 +18,12 @@ from tests.assertions import assert_close
 from tests.scenes.changing_splats import rig, splats
 from tests.scenes.gaussians import isotropic
 
-WIDTH, HEIGHT = 64, 32
-DISTANCE, SIZE, OPACITY, WHITE = 3.0, 0.7, 0.9, 0.5 / SH_C0  # the coefficient of white
+WIDTH = 64
+HEIGHT = 32
+DISTANCE = 3.0
+SIZE = 0.7
+OPACITY = 0.9
+WHITE = 0.5 / SH_C0  # the coefficient of white
 CAMERA = Camera.look_at((0.3, -0.2, 0.1), (0.3, -0.2, 1.1), (0, -1, 0), 60, 48, 36)  # the axes of the world
 
 
@@ -27,7 +31,8 @@ def directions(width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
     """Return the direction of each pixel's centre [height, width, 3], x right, y down, z forward."""
     longitude = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
     latitude = np.pi * (0.5 - (np.arange(height)[:, None] + 0.5) / height)
-    x, z = np.cos(latitude) * np.sin(longitude), np.cos(latitude) * np.cos(longitude)
+    x = np.cos(latitude) * np.sin(longitude)
+    z = np.cos(latitude) * np.cos(longitude)
     return np.stack([x, np.broadcast_to(-np.sin(latitude), x.shape), z], axis=-1)
 
 
@@ -69,33 +74,35 @@ def test_panorama__has_no_seam_and_is_the_same_at_all_longitudes_of_a_pole():
 
 @pytest.mark.parametrize("longitude", [0.0, 1.0, 3.0])
 def test_panorama__of_two_eyes_has_the_disparity_of_the_distance(longitude):
-    apart, width = 0.4, 512
+    apart = 0.4
+    width = 512
     middle = np.array([np.sin(longitude), 0, np.cos(longitude)])
     image = panorama(ball_at(middle, 0.05), CAMERA, width, apart, samples=1)
     assert image.shape == (width, width, 3)
     angles = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
-    found = []
+    disparities = []
     for eye in (image[: width // 2], image[width // 2 :]):
         weights = eye[..., 0].sum(axis=0)
         assert weights.max() > 0.5
-        found.append(np.angle(np.sum(weights * np.exp(1j * angles))))
+        disparities.append(np.angle(np.sum(weights * np.exp(1j * angles))))
     # The ray of an eye starts beside the centre: sin of the angle between both rays is (b / 2) / distance.
     shift = np.arcsin(0.5 * apart / DISTANCE)
-    assert_close(np.angle(np.exp(1j * (np.array(found) - longitude))), [shift, -shift], atol=1e-3)
+    assert_close(np.angle(np.exp(1j * (np.array(disparities) - longitude))), [shift, -shift], atol=1e-3)
 
 
 def test_panorama__shows_in_its_middle_what_the_camera_sees():
-    scene, camera = splats(300), rig()[1]
+    scene = splats(300)
+    camera = rig()[1]
     image = panorama(scene, levelled(camera, np.array([0.0, 0, 1])), 512, samples=1)
     level = levelled(camera, np.array([0.0, 0, 1]))
     view = Camera(np.array([[256, 0, 32], [0, 256, 24], [0, 0, 1.0]]), level.viewmat, 64, 48)
-    seen = np.array(rasterize(scene, view).color)
+    picture = np.array(rasterize(scene, view).color)
     x, y = np.meshgrid((np.arange(64) - 31.5) / 256, (np.arange(48) - 23.5) / 256)
     u = (np.arctan2(x, 1) / (2 * np.pi) + 0.5) * 512 - 0.5
     v = (0.5 - np.arctan2(-y, np.hypot(x, 1)) / np.pi) * 256 - 0.5
     warped = cv2.remap(image, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR)
-    assert seen.max() > 0.3
-    assert np.abs(warped - seen).mean() < 0.02
+    assert picture.max() > 0.3
+    assert np.abs(warped - picture).mean() < 0.02
 
 
 @pytest.mark.parametrize("target", [(0, 0, -5), (0, 1, -5), (3, 1, 0)], ids=["down", "nearly down", "level"])

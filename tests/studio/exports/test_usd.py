@@ -67,13 +67,13 @@ def test_write_usd__attributes_are_read_back(tmp_path, suffix):
     assert prim.GetAttribute("radiance:sphericalHarmonicsDegree").Get() == 1
     assert prim.GetAttribute("sortingModeHint").Get() == "zDepth"
     for state in states:
-        found = values(prim, state.frame)
+        arrays = values(prim, state.frame)
         alive = np.isin(np.arange(42), state.ids)
-        assert [len(array) for array in found.values()] == [42, 42, 42, 42, 4 * 42]
-        found[SH] = found[SH].reshape(42, 4, 3)
+        assert [len(array) for array in arrays.values()] == [42, 42, 42, 42, 4 * 42]
+        arrays[SH] = arrays[SH].reshape(42, 4, 3)
         for name, value in expected(state.gaussians).items():
-            assert_close(found[name][alive].reshape(value.shape), value, rtol=1e-6, atol=1e-6)
-        np.testing.assert_array_equal(found["opacities"][~alive], 0)
+            assert_close(arrays[name][alive].reshape(value.shape), value, rtol=1e-6, atol=1e-6)
+        np.testing.assert_array_equal(arrays["opacities"][~alive], 0)
 
 
 def test_write_usd__describes_the_stage(tmp_path):
@@ -107,15 +107,15 @@ def test_write_usd__interpolates_the_same_gaussians_between_frames(tmp_path):
     """In frame 2 one dies and two are born."""
     states, stage = written(tmp_path / "a.usdc")
     prim = stage.GetPrimAtPath("/Stream/Gaussians")
-    between, before, after = (values(prim, time) for time in (1.5, 1, 2))
+    middle, left, right = (values(prim, time) for time in (1.5, 1, 2))
     survivors = np.isin(np.arange(42), np.intersect1d(states[1].ids, states[2].ids))
-    assert_close(between["positions"], (before["positions"] + after["positions"]) / 2, atol=1e-6)
-    assert np.linalg.norm(after["positions"] - before["positions"], axis=1)[survivors].max() > 0.09
+    assert_close(middle["positions"], (left["positions"] + right["positions"]) / 2, atol=1e-6)
+    assert np.linalg.norm(right["positions"] - left["positions"], axis=1)[survivors].max() > 0.09
     # Births and deaths stay in their places and fade.
-    assert_close(after["positions"][~survivors], before["positions"][~survivors], atol=0)
-    assert_close(between["opacities"], (before["opacities"] + after["opacities"]) / 2, atol=1e-6)
-    assert before["opacities"][0] > 0
-    assert after["opacities"][0] == 0
+    assert_close(right["positions"][~survivors], left["positions"][~survivors], atol=0)
+    assert_close(middle["opacities"], (left["opacities"] + right["opacities"]) / 2, atol=1e-6)
+    assert left["opacities"][0] > 0
+    assert right["opacities"][0] == 0
 
 
 def test_write_usd__has_no_samples_of_what_does_not_change(tmp_path):
@@ -136,7 +136,8 @@ def test_write_usd__half_precision_is_about_half_as_large(tmp_path):
         write_usd(stream, tmp_path / name, [0], half)
     stages = [Usd.Stage.Open(str(tmp_path / name)) for name in ("full.usdc", "half.usdc")]
     prims = [stage.GetPrimAtPath("/Stream/Gaussians") for stage in stages]
-    full, half = values(prims[0], 0), values(prims[1], 0, half=True)
+    full = values(prims[0], 0)
+    half = values(prims[1], 0, half=True)
     assert_close(half["positions"], full["positions"], atol=0)
     for name, value in full.items():
         assert_close(half[name], value, rtol=2**-11, atol=1e-4)
@@ -148,7 +149,8 @@ def test_write_usd__extent_contains_three_standard_deviations(tmp_path):
     states, stage = written(tmp_path / "a.usdc")
     prim = stage.GetPrimAtPath("/Stream/Gaussians")
     turned = rotated(states[2].gaussians, gltf_axes(rig()))
-    means, sigmas = turned.numpy()["means"], np.sqrt(np.diagonal(covariances(turned), axis1=1, axis2=2))
+    means = turned.numpy()["means"]
+    sigmas = np.sqrt(np.diagonal(covariances(turned), axis1=1, axis2=2))
     low, high = np.array(prim.GetAttribute("extent").Get(2))
     assert_close(low, (means - 3 * sigmas).min(axis=0), atol=1e-5)
     assert_close(high, (means + 3 * sigmas).max(axis=0), atol=1e-5)
@@ -175,8 +177,8 @@ def test_write_usd__saves_now_and_then(tmp_path, monkeypatch):
     states, stage = written(tmp_path / "a.usdc")
     for state in states:
         alive = np.isin(np.arange(42), state.ids)
-        found = values(stage.GetPrimAtPath("/Stream/Gaussians"), state.frame)["positions"][alive]
-        assert_close(found, expected(state.gaussians)["positions"], atol=1e-6)
+        positions = values(stage.GetPrimAtPath("/Stream/Gaussians"), state.frame)["positions"][alive]
+        assert_close(positions, expected(state.gaussians)["positions"], atol=1e-6)
 
 
 def test_export_usd__writes_selected_frames(tmp_path, capsys):

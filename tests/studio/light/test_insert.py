@@ -86,13 +86,13 @@ def test_render_inserted__traces_rays_through_the_stream(stream, tmp_path):
         '    return {"ball": {"type": "sphere", "center": [0, 0, 1.3], "radius": 0.5, "bsdf": mirror}}\n'
     )
     build = load_insert(tmp_path / "mirror.py")
-    found = [
+    images = [
         dict(render_inserted(stream, camera(), build, [0], ("color", "surfaces"), InsertConfig(light=light)))[0]
         for light in ("probe", "traced")
     ]
-    assert np.abs(found[0]["color"] - found[1]["color"]).max() > 0.05
-    assert np.abs(found[0]["color"] - found[1]["color"]).mean() < 0.05
-    assert found[1]["surfaces"][..., 3].max() == 1
+    assert np.abs(images[0]["color"] - images[1]["color"]).max() > 0.05
+    assert np.abs(images[0]["color"] - images[1]["color"]).mean() < 0.05
+    assert images[1]["surfaces"][..., 3].max() == 1
 
 
 def test_render_inserted__refuses_an_integrator_that_does_not_trace_the_light(stream):

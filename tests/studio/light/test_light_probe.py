@@ -43,8 +43,8 @@ def test_light_probe__shows_every_direction_where_it_is():
 
 def test_light_probe__of_a_uniform_shell_is_uniform():
     rng = np.random.default_rng(2)
-    found = radiance(light_probe(shell(), CENTER, height=32), rng.normal(size=(100, 3)))
-    assert_close(found, decode_light(np.array(0.5)), atol=2e-3)
+    values = radiance(light_probe(shell(), CENTER, height=32), rng.normal(size=(100, 3)))
+    assert_close(values, decode_light(np.array(0.5)), atol=2e-3)
 
 
 def test_light_probe__assigns_a_radiance_to_what_is_clipped():

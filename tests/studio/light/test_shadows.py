@@ -47,31 +47,31 @@ def test_shadow_ratio__is_one_where_nothing_is_in_the_way():
 
 def test_shadow_ratio__of_a_directional_light_is_the_projected_outline():
     positions = np.stack([np.linspace(-1, 1, 81), np.zeros(81)], axis=1)
-    found = shadow_ratio(floor(positions), scene(sun=SUN, disk=disk(1.0)), EYE, 4)
+    ratios = shadow_ratio(floor(positions), scene(sun=SUN, disk=disk(1.0)), EYE, 4)
     # Light that passes (x, 0, z) was at (x - 0.3, 1, z - 0.2).
-    inside = np.hypot(positions[:, 0] - 0.3, positions[:, 1] - 0.2) < 0.5
-    np.testing.assert_array_equal(found, ~inside)
+    mask = np.hypot(positions[:, 0] - 0.3, positions[:, 1] - 0.2) < 0.5
+    np.testing.assert_array_equal(ratios, ~mask)
 
 
 @pytest.mark.parametrize("up", [True, False])
 def test_shadow_ratio__under_a_disk_in_a_uniform_sky_is_its_form_factor(up):
     """A disk of radius r at height h above the point takes r^2 / (r^2 + h^2) of the irradiance of the hemisphere."""
     heights = (0.25, 0.5, 1.0)
-    found = [shadow_ratio(floor(np.zeros((1, 2)), up), scene(sky=SKY, disk=disk(h)), EYE, 4096)[0] for h in heights]
-    assert_close(np.array(found), 1 - 0.25 / (0.25 + np.square(heights)), atol=6e-3)
+    ratios = [shadow_ratio(floor(np.zeros((1, 2)), up), scene(sky=SKY, disk=disk(h)), EYE, 4096)[0] for h in heights]
+    assert_close(np.array(ratios), 1 - 0.25 / (0.25 + np.square(heights)), atol=6e-3)
 
 
 def test_shadow_ratio__of_a_round_gaussian_is_the_solid_angle():
     ball = isotropic([(0, 0, 0)], 0.1, 0.9)
-    found = shadow_ratio(ball, scene(sky=SKY, disk=disk(0.5)), EYE, 4096)
-    assert found[0] == pytest.approx(1 - 0.5 * (1 - np.sqrt(0.5)), abs=4e-3)
+    ratios = shadow_ratio(ball, scene(sky=SKY, disk=disk(0.5)), EYE, 4096)
+    assert ratios[0] == pytest.approx(1 - 0.5 * (1 - np.sqrt(0.5)), abs=4e-3)
 
 
 def test_shadow_ratio__weighs_lights_by_their_irradiance():
     """A point light of intensity 1 at height 2 gives 1/4, the sky pi; the disk hides the light and some sky."""
-    found = shadow_ratio(floor(np.zeros((1, 2))), scene(bulb=BULB, sky=SKY, disk=disk(1.0, 0.05)), EYE, 4096)
+    ratios = shadow_ratio(floor(np.zeros((1, 2))), scene(bulb=BULB, sky=SKY, disk=disk(1.0, 0.05)), EYE, 4096)
     sky = np.pi * (1 - 0.0025 / 1.0025)
-    assert found[0] == pytest.approx(sky / (np.pi + 0.25), abs=2e-3)
+    assert ratios[0] == pytest.approx(sky / (np.pi + 0.25), abs=2e-3)
 
 
 def test_shadow_ratio__of_an_area_light_is_the_hidden_part_of_it():
@@ -79,11 +79,11 @@ def test_shadow_ratio__of_an_area_light_is_the_hidden_part_of_it():
     down = mi.ScalarTransform4f().translate([0, 2, 0]).rotate([1, 0, 0], 90).scale([0.1, 0.1, 1])
     lamp = {"type": "rectangle", "to_world": down, "emitter": {"type": "area", "radiance": 1.0}}
     edge = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([1, 1, 0]).rotate([1, 0, 0], 90)}
-    found = shadow_ratio(
+    ratios = shadow_ratio(
         floor(np.array([[0.0, 0], [-0.05, 0], [-1, 0], [1, 0]])), scene(lamp=lamp, edge=edge), EYE, 4096
     )
     # From x, the edge at x = 0 is seen on the lamp at -x.
-    assert_close(found, np.array([0.5, 0.75, 1, 0]), atol=0.01)
+    assert_close(ratios, np.array([0.5, 0.75, 1, 0]), atol=0.01)
 
 
 def test_shadow_ratio__ends_at_the_light():
@@ -95,11 +95,11 @@ def test_shadowed__scales_the_linear_light_of_an_image():
     rng = np.random.default_rng(1)
     wall = isotropic([(0, 0, 0)], 20.0, 0.98, rng.uniform(-1, 1, (1, 1, 3)))
     camera = Camera.look_at((0, 0, -3), (0, 0, 0), (0, -1, 0), 40, 16, 12)
-    before, after = (
+    light, shadowed_light = (
         np.asarray(rasterize(gaussians, camera, ("color", "alpha")).color, np.float64)
         for gaussians in (wall, shadowed(wall, np.array([0.3])))
     )
-    assert_close(after / 0.98, encode_light(0.3 * decode_light(before / 0.98)), atol=1e-4)
+    assert_close(shadowed_light / 0.98, encode_light(0.3 * decode_light(light / 0.98)), atol=1e-4)
 
 
 def test_shadowed__scales_all_directions_alike_and_one_changes_nothing():
@@ -107,8 +107,8 @@ def test_shadowed__scales_all_directions_alike_and_one_changes_nothing():
     gaussians = isotropic(np.zeros((3, 3)), 0.1, 0.9, np.zeros((1, 3)))
     gaussians = Gaussians(**{**gaussians.numpy(), "sh_coeffs": coeffs})
     assert_close(shadowed(gaussians, np.ones(3)).sh_coeffs, coeffs, atol=1e-6)
-    found = np.asarray(shadowed(gaussians, np.full(3, 0.5)).sh_coeffs)
-    ratios = found[:, 1:] / coeffs[:, 1:]
+    coefficients = np.asarray(shadowed(gaussians, np.full(3, 0.5)).sh_coeffs)
+    ratios = coefficients[:, 1:] / coeffs[:, 1:]
     assert_close(ratios, np.broadcast_to(ratios[:, :1], ratios.shape), atol=1e-3)
     assert ((ratios > 0.7) & (ratios < 0.8)).all()
 

@@ -28,20 +28,22 @@ from tests.scenes.surfaces import (
 )
 
 # Light that falls on the middle of the wall at z = 1 from a place that the camera does not see.
-ASIDE, TO_WALL = np.array([3.0, 0, -1]), np.array([-3.0, 0, 2]) / np.sqrt(13)
+ASIDE = np.array([3.0, 0, -1])
+TO_WALL = np.array([-3.0, 0, 2]) / np.sqrt(13)
 SUN = {"type": "directional", "direction": TO_WALL.tolist(), "irradiance": 2.0}
 TRACED = {"type": "splat_path", "max_depth": 2, "clipped": 1.0}
-WHITE, BLACK = 0.5 / SH_C0, -0.5 / SH_C0
+WHITE = 0.5 / SH_C0
+BLACK = -0.5 / SH_C0
 
 
 def ratio(gaussians: Gaussians, integrator: dict = TRACED, spp: int = 128, **more: Any) -> np.ndarray:
     """Return the image of the lit wall with Gaussians beside the view, over that without them."""
     far = isotropic([(0, 0, -90)], 0.1, 0.5)
     shapes = {"wall": wall(1), "sun": SUN}
-    found, alone = (
+    light, alone = (
         render(scene(g, integrator, **shapes, **entries), spp=spp) for g, entries in ((gaussians, more), (far, {}))
     )
-    return (found / alone)[..., 0]
+    return (light / alone)[..., 0]
 
 
 def points_on_wall() -> np.ndarray:
@@ -63,10 +65,10 @@ def distance_to_aside() -> np.ndarray:
 
 
 def test_splat_path__shadow_of_one_gaussian_is_its_transmittance():
-    found = ratio(isotropic([ASIDE], 0.3, 0.8, BLACK))
+    shadow = ratio(isotropic([ASIDE], 0.3, 0.8, BLACK))
     alpha = 0.8 * np.exp(-0.5 * (distance_to_aside() / 0.3) ** 2)
-    assert found.min() < 0.25
-    assert_close(found, 1 - np.where(alpha < 1 / 255, 0, alpha), atol=0.02)
+    assert shadow.min() < 0.25
+    assert_close(shadow, 1 - np.where(alpha < 1 / 255, 0, alpha), atol=0.02)
 
 
 def test_splat_path__shadows_have_the_cut_off_of_the_plugin():
@@ -88,12 +90,14 @@ def test_splat_path__shadow_of_a_dense_shell_is_that_of_the_mesh():
         ASIDE + 0.6 * directions, np.tile([0.03, 0.03, 1e-3], (3000, 1)), quats, np.full(3000, 0.95), black
     )
     mesh = {"type": "sphere", "center": ASIDE.tolist(), "radius": 0.6}
-    found, expected = ratio(shell), ratio(isotropic([(0, 0, -90)], 0.1, 0.5), {"type": "direct"}, ball=mesh)
-    inside, outside = distance_to_aside() < 0.45, distance_to_aside() > 0.7
-    for region, value in ((inside, 0), (outside, 1)):
+    shadow = ratio(shell)
+    expected = ratio(isotropic([(0, 0, -90)], 0.1, 0.5), {"type": "direct"}, ball=mesh)
+    mask = distance_to_aside() < 0.45
+    outside = distance_to_aside() > 0.7
+    for region, value in ((mask, 0), (outside, 1)):
         assert_close(expected[region], value, atol=1e-5)
-        assert_close(found[region], value, atol=5e-3)
-    assert found.mean() == pytest.approx(expected.mean(), abs=0.015)
+        assert_close(shadow[region], value, atol=5e-3)
+    assert shadow.mean() == pytest.approx(expected.mean(), abs=0.015)
 
 
 def test_splat_path__shadow_of_a_point_light_ends_at_the_light():
@@ -162,9 +166,9 @@ def test_splat_path__white_splats_around_a_white_ball_in_white_light_are_a_furna
     white = isotropic(np.random.default_rng(0).uniform(-1.5, 1.5, (80, 3)), 0.15, 0.6, WHITE)
     ball = {"type": "sphere", "radius": 0.8, "bsdf": {"type": "diffuse", "reflectance": 1.0}}
     endless = {**TRACED, "max_depth": -1, "rr_depth": 100}
-    found = render(scene(white, endless, ball=ball, sky={"type": "constant", "radiance": 1.0}), spp=128)
-    assert found.mean() == pytest.approx(1, abs=1e-3)
-    assert_close(found, 1, atol=0.06)
+    image = render(scene(white, endless, ball=ball, sky={"type": "constant", "radiance": 1.0}), spp=128)
+    assert image.mean() == pytest.approx(1, abs=1e-3)
+    assert_close(image, 1, atol=0.06)
 
 
 # --------------------------------------------------------------------------------------------------

@@ -66,7 +66,8 @@ def wait_for(feed: CameraFeed, *counts: int) -> None:
 
 
 def test_nearest__is_the_newest_shot_of_the_slowest_camera_and_those_nearest_to_it() -> None:
-    fast, slow = [shot(0.0), shot(0.033), shot(0.066)], [shot(0.01), shot(0.04)]
+    fast = [shot(0.0), shot(0.033), shot(0.066)]
+    slow = [shot(0.01), shot(0.04)]
     chosen = _nearest([fast, slow], [True, True])
     assert chosen is not None
     assert [s.time for s in chosen if s is not None] == [0.033, 0.04]
@@ -150,8 +151,10 @@ def test_CameraFeed__names_a_camera_without_a_first_image(opened) -> None:
 
 
 def test_CameraFeed__lets_the_cameras_adjust_their_exposure() -> None:
-    a, b = Source(1), Source()
-    feed, start = CameraFeed({"a": a, "b": b}, 5, warm_up=0.2), time.monotonic()
+    a = Source(1)
+    b = Source()
+    feed = CameraFeed({"a": a, "b": b}, 5, warm_up=0.2)
+    start = time.monotonic()
     Timer(0.1, b.deliver).start()
     Timer(0.25, lambda: (a.deliver(), b.deliver())).start()
     first = feed.newest()
@@ -162,7 +165,8 @@ def test_CameraFeed__lets_the_cameras_adjust_their_exposure() -> None:
     for source in (a, b):
         source.end()
     feed.close()
-    c, start = Source(2), time.monotonic()
+    c = Source(2)
+    start = time.monotonic()
     c.end()
     short = CameraFeed({"c": c}, 5, warm_up=5)
     assert short.newest() is not None, "a short clip"

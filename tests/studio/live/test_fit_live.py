@@ -57,14 +57,15 @@ def packets(path: Path) -> list[bytes]:
 
 @pytest.mark.slow
 def test_fit_live__follows_a_folder_that_is_filled(tmp_path: Path, rig: Path, images: Path) -> None:
-    out, grown = tmp_path / "out", []
+    out = tmp_path / "out"
+    grown = []
     with in_background(filling(images)):
         live = LiveConfig(rig, downscale=4, frames=4)
         rows = fit_live([images], out, live, CONFIG, lambda *_: grown.append(open_stream(out).index()[-1][1]))
     assert grown == [0, 1, 2, 3], "the stream can be read while it grows"
     assert [row.frame for row in rows] == [0, 1, 2, 3]
-    for before, row in pairwise(rows):
-        assert row.time > before.time
+    for previous_row, row in pairwise(rows):
+        assert row.time > previous_row.time
         assert row.latency >= 0
         assert not row.problems
     assert sum(row.dropped for row in rows) > 0, "the fit is slower than the clip"
@@ -102,7 +103,8 @@ def grey_psnr(image: np.ndarray) -> float:
 @pytest.mark.slow
 def test_fit_live__reads_videos_through_pipes(tmp_path: Path, rig: Path) -> None:
     # Long enough for a slow machine; the pipes are closed when the fit ends.
-    repeats, pipes = 120, [tmp_path / f"pipe{k}" for k in range(len(NAMES))]
+    repeats = 120
+    pipes = [tmp_path / f"pipe{k}" for k in range(len(NAMES))]
     with ExitStack() as playing:
         for pipe, clip in zip(pipes, clips(), strict=True):
             os.mkfifo(pipe)
@@ -129,7 +131,8 @@ def write(images: Path, number: int, names: Sequence[str] = NAMES, **sizes: tupl
 @pytest.mark.slow
 def test_fit_live__leaves_out_a_camera_that_stops(tmp_path: Path, rig: Path, images: Path, caplog) -> None:
     write(images, 0)
-    live, others = LiveConfig(rig, downscale=4, frames=3, timeout=0.5), ("cam0", "cam2", "cam3")
+    live = LiveConfig(rig, downscale=4, frames=3, timeout=0.5)
+    others = ("cam0", "cam2", "cam3")
     rows = fit_live([images], tmp_path / "out", live, CONFIG, lambda row, _: write(images, row.frame + 1, names=others))
     assert [bool(row.problems) for row in rows] == [False, True, True]
     assert [record.message for record in caplog.records if "left out" in record.message] == [
@@ -256,7 +259,8 @@ def test_fit_live__can_be_started_again_after_a_full_disk(tmp_path: Path, rig: P
     write(images, 0)
     largest, least = (end(file.stat().st_size for file in images.rglob("*.png")) for end in (max, min))
     assert (rig / "sparse" / "0" / "points3D.txt").stat().st_size > largest
-    live, full = LiveConfig(rig, timeout=0.2), "check that its folder is writable and the disk has room"
+    live = LiveConfig(rig, timeout=0.2)
+    full = "check that its folder is writable and the disk has room"
     for limit in (largest, least - 1):  # the calibration does not fit, then not even the images
         with pytest.raises(OSError, match=full), files_end_at(limit):
             fit_live([images], tmp_path / "out", live, CONFIG)

@@ -195,9 +195,9 @@ def test_FolderFeed__that_is_removed_is_an_error(tmp_path: Path) -> None:
     feed = FolderFeed(fill(tmp_path / "images", range(2), "a", "b"), 0.1, ["a", "b"])
     first = feed.newest()
     shutil.rmtree(tmp_path / "images")
-    for after in (first, None):
+    for bundle in (first, None):
         with pytest.raises(FileNotFoundError, match="images: expected the images of the cameras, but the folder was"):
-            feed.newest(after)
+            feed.newest(bundle)
 
 
 def test_FolderFeed__begins_with_the_only_number(tmp_path: Path, caplog) -> None:
@@ -247,8 +247,8 @@ def stamp(folder: Path, **clocks: float) -> None:
     for name, ahead in clocks.items():
         for file in (folder / name).iterdir():
             if abs(file.stat().st_mtime - time.time()) < 60:
-                now = file.stat().st_mtime + ahead
-                os.utime(file, times=(now, now))
+                time_of_file = file.stat().st_mtime + ahead
+                os.utime(file, times=(time_of_file, time_of_file))
 
 
 CLOCKS = [{"a": -300, "b": -300}, {"a": 300, "b": 300}, {"a": -300, "b": 0}, {"a": 300, "b": -4000}]

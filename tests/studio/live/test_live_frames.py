@@ -94,7 +94,8 @@ def test_live_page__loop_runs(rig: Capture, monkeypatch: pytest.MonkeyPatch) -> 
     """The loop over live frames in docs/live.md, with raw pipes in place of FFmpeg's."""
     text = (Path(__file__).parents[3] / "docs" / "live.md").read_text(encoding="utf-8")
     *_, example = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    reads, pushed = iter(NAMES), []
+    reads = iter(NAMES)
+    pushed = []
 
     def popen(command, stdout):
         assert command[0] == "ffmpeg"

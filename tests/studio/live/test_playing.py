@@ -26,23 +26,25 @@ def clip(path: Path, count: int, fps: float = 50) -> Path:
 
 def played(paths: list[Path], count: int, loop: bool) -> list[list[tuple[float, int]]]:
     """Return the time and the number of the first images of each clip."""
-    clock, found, start = ClipClock(len(paths)), [[] for _ in paths], time.monotonic()
+    clock = ClipClock(len(paths))
+    rows = [[] for _ in paths]
+    start = time.monotonic()
 
     def read(k: int) -> None:
         for image in islice(play(paths[k], clock, Event(), k, loop), count):
-            found[k].append((time.monotonic() - start, int(image[0, 0, 0]) // 10))
+            rows[k].append((time.monotonic() - start, int(image[0, 0, 0]) // 10))
 
     threads = [Thread(target=read, args=(k,), daemon=True) for k in range(len(paths))]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join(20)
-    return found
+    return rows
 
 
 def test_play__plays_a_clip_once_at_its_own_speed(tmp_path: Path) -> None:
-    (found,) = played([clip(tmp_path / "a.mkv", 6, fps=20)], 99, loop=False)
-    times, numbers = zip(*found, strict=True)
+    (rows,) = played([clip(tmp_path / "a.mkv", 6, fps=20)], 99, loop=False)
+    times, numbers = zip(*rows, strict=True)
     assert numbers == (0, 1, 2, 3, 4, 5)
     assert times[-1] - times[0] >= 5 / 20 - 0.01
     assert np.all(np.diff(times) > 0.02), "not all at once"
@@ -53,7 +55,7 @@ def test_play__repeats_clips_together_after_the_shortest(tmp_path: Path) -> None
     assert [number for _, number in a] == [*range(6)] * 3 + [0, 1]
     assert [number for _, number in b] == [number for _, number in a], "without its last three"
     assert [number for _, number in c] == [0, 1, 2] * 6 + [0, 1], "at half the rate, without its last two"
-    starts = [np.array([time for time, number in found if number == 0][:4]) for found in (a, b, c)]
+    starts = [np.array([time for time, number in rows if number == 0][:4]) for rows in (a, b, c)]
     # The median, because a busy machine may show one image late.
     assert np.median(np.abs(starts - starts[0]), axis=1).max() < 0.019, "within an interval"
 
@@ -68,7 +70,8 @@ def test_play__waits_for_a_clip_that_is_decoded_slowly(monkeypatch: pytest.Monke
             yield np.zeros((2, 2, 3), np.uint8), k / 100, 1 / 100
 
     monkeypatch.setattr(module, "_timed", timed)
-    clock, ahead = ClipClock(2), []
+    clock = ClipClock(2)
+    ahead = []
 
     def read(k: int, path: str) -> None:
         for _ in play(path, clock, Event(), k):

@@ -58,8 +58,8 @@ def test_read_camera__opens_a_broken_connection_again(monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(cv2, "VideoCapture", open_stream)
     url = "rtsp://10.0.0.10/live"
-    found = list(islice(read_camera(url, Event()), 16))
-    assert sum(image is not None for image in found) == 4
+    images = list(islice(read_camera(url, Event()), 16))
+    assert sum(image is not None for image in images) == 4
     assert opened == [url] * 3
     for once in (read_camera(url, Event(), reconnect=False), read_camera("pipe", Event())):
         assert sum(image is not None for image in once) == 2
@@ -107,7 +107,8 @@ def pipe(tmp_path: Path) -> Path:
 def test_read_camera__of_a_silent_pipe_ends_when_it_is_closed(pipe: Path, tmp_path: Path, written: int) -> None:
     """Before its writer begins, within the header, and after some images."""
     write_video(tmp_path / "clip.mkv", list(np.random.default_rng(0).integers(0, 256, (9, 64, 64, 3), np.uint8)), 20)
-    closed, images = Event(), []
+    closed = Event()
+    images = []
     reader = Thread(target=lambda: images.extend(read_camera(pipe, closed)), daemon=True)
     with os.fdopen(os.open(pipe, os.O_RDWR), "wb", 0) if written else nullcontext() as writer:
         reader.start()

@@ -9,7 +9,8 @@ from morgs_mi.studio.measures.lpips import Lpips
 from tests.assertions import assert_close
 from tests.evaluate.tiny_onnx import squared_difference
 
-H, W = 12, 17
+H = 12
+W = 17
 IMAGE, TRUTH = np.random.default_rng(0).random((2, H, W, 3))
 # The network receives images from -1 to 1, in float32.
 EXPECTED = (4 * (IMAGE - TRUTH) ** 2).mean(-1)

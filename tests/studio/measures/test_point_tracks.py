@@ -76,7 +76,8 @@ def test_bind__works_far_from_all_gaussians_and_for_flat_ones() -> None:
 def test_track_points__follow_a_rigid_motion_in_both_directions(tmp_path: Path, num_gaussians: int, query: int) -> None:
     """Points between the means move exactly with them, because each Gaussian carries them with its rotation too."""
     start = splats(30)
-    step, shift = Rotation.from_rotvec([0.1, -0.2, 0.3]), np.array([0.05, 0, -0.02])
+    step = Rotation.from_rotvec([0.1, -0.2, 0.3])
+    shift = np.array([0.05, 0, -0.02])
     states = [start, turned(start, step, shift)]
     states.append(turned(states[1], step, shift))
     points = [np.random.default_rng(2).uniform(-0.6, 0.6, (7, 3))]
@@ -153,5 +154,5 @@ def test_seen_in_depth__compares_with_the_rendered_surface() -> None:
     wall = np.arange(40) + 0 * np.arange(30)[:, None] < 20
     points = np.array([(-1, 0, 0), (-1, 0, -1), (-1, 0, 0.05), (-1, 0, 1), (1, 0, 1), (9, 0, 0), (0, 0, -9)])
     # On it, in front of it, behind it by 1 % and by 25 %, beside it, outside the image, behind the camera.
-    seen = seen_in_depth(np.where(wall, 4.0, 0), wall.astype(float), CAMERA, points)
-    assert seen.tolist() == [True, True, True, False, True, False, False]
+    mask = seen_in_depth(np.where(wall, 4.0, 0), wall.astype(float), CAMERA, points)
+    assert mask.tolist() == [True, True, True, False, True, False, False]

@@ -23,8 +23,8 @@ def test_tapvid3d_tracks__finds_files_in_the_capture_and_beside_it(tmp_path: Pat
     (path / "juggle_10.npz").rename(tmp_path / "juggle_10.npz")
     (tmp_path / "juggle_7.npz").write_bytes(b"")
     (tmp_path / "boxes_2.npz").write_bytes(b"")
-    found = tapvid3d_tracks(load_capture(path))
-    assert [truth.cameras[0].name for truth in found] == ["1", "10"]
+    tracks = tapvid3d_tracks(load_capture(path))
+    assert [truth.cameras[0].name for truth in tracks] == ["1", "10"]
     assert tapvid3d_tracks(load_capture(path, reading=ReadConfig(offset={"1": 1}))) == []
     assert tapvid3d_tracks(load_capture(layouts.nerfstudio(tmp_path / "boxes"))) == []
 
@@ -39,7 +39,8 @@ def test_read_annotation__converts_the_tracks_to_the_world(tmp_path: Path) -> No
 
 def test_read_annotation__names_what_is_wrong(tmp_path: Path) -> None:
     path = annotated(tmp_path / "juggle", ("1",)) / "juggle_1.npz"
-    camera, good = rig(("2", "1"), shift=3)[1], dict(np.load(path, allow_pickle=True))
+    camera = rig(("2", "1"), shift=3)[1]
+    good = dict(np.load(path, allow_pickle=True))
     for name, value, message in (
         (
             "visibility",
@@ -77,8 +78,8 @@ def test_synthetic_tracks__start_where_a_view_first_sees_them(fitted_clip: Path,
     (unknown,) = synthetic_tracks(capture, [0])
     assert unknown.visible is None
     assert unknown.queries.tolist() == [0, 0, 0]
-    seen = {"cam0": ["001", "000", "000"], "cam1": ["010", "110", "000"]}
-    masks = {name: np.array([[c == "1" for c in row] for row in rows]) for name, rows in seen.items()}
+    visibility = {"cam0": ["001", "000", "000"], "cam1": ["010", "110", "000"]}
+    masks = {name: np.array([[c == "1" for c in row] for row in rows]) for name, rows in visibility.items()}
     save_tracks(tmp_path, Tracks(unknown.points, np.zeros(3, np.int32), masks))
     capture = type(capture)(**{**vars(capture), "truth": tmp_path})
     (both,) = synthetic_tracks(capture, [0, 1])

@@ -102,16 +102,16 @@ def test_evaluate_stream__compares_the_visibility_of_tracked_points(fitted_clip:
     """Points count as visible that lie in the image of a view with nothing in front."""
     shutil.copytree(fitted_clip / "capture", tmp_path / "capture")
     tracks = load_tracks(tmp_path / "capture" / "truth")
-    inside = {}
+    masks = {}
     for camera in load_capture(tmp_path / "capture").cameras:
         pixels, _ = camera.project(tracks.points)
-        inside[camera.name] = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(-1)
-    save_tracks(tmp_path / "capture" / "truth", Tracks(tracks.points, tracks.ids, inside))
+        masks[camera.name] = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(-1)
+    save_tracks(tmp_path / "capture" / "truth", Tracks(tracks.points, tracks.ids, masks))
     write_stream(tmp_path / "s.morgs", {"test_view": 0})
     perfect = evaluate_stream(tmp_path / "s.morgs", tmp_path / "capture")
     assert all(row.all.occlusion_accuracy == row.all.average_jaccard == 1 for row in perfect.tracking)
     # Hidden in the truth of every frame but the first two: the stream claims to see the points.
-    hidden = {name: mask & (np.arange(FRAMES) < 2) for name, mask in inside.items()}
+    hidden = {name: mask & (np.arange(FRAMES) < 2) for name, mask in masks.items()}
     save_tracks(tmp_path / "capture" / "truth", Tracks(tracks.points, tracks.ids, hidden))
     scores = evaluate_stream(tmp_path / "s.morgs", tmp_path / "capture").tracking[1].all
     assert (scores.occlusion_accuracy, scores.average_jaccard) == (0.5, 0.5)

@@ -46,7 +46,8 @@ def test_flow_source__runs_a_network_both_ways_in_its_value_range(network, kind,
 def test_flow_network__of_fixed_size_resizes_images_and_flow(tmp_path):
     # Away from the border, resizing does not change colours that vary linearly.
     y, x = np.mgrid[:60, :100] / 100
-    image, other = np.stack([x, y, x + y], -1) / 2, np.stack([y, x, x], -1) / 2
+    image = np.stack([x, y, x + y], -1) / 2
+    other = np.stack([y, x, x], -1) / 2
     flow = FlowNetwork(export(tmp_path / "fixed.onnx", 32, 40), 0, 1)(image, other)
     expected = known_flow(image, other) * (100 / 40, 60 / 32)
     assert flow.shape == (60, 100, 2)

@@ -92,8 +92,10 @@ def test_onnx_network__refuses_a_hostile_file(tmp_path, make, kind, message):
 
 
 def test_onnx_network__refuses_damaged_files_with_one_sentence(tmp_path, capfd):
-    path, rng = tmp_path / "a.onnx", np.random.default_rng(0)
-    whole, failed = export(path).read_bytes(), []
+    path = tmp_path / "a.onnx"
+    rng = np.random.default_rng(0)
+    whole = export(path).read_bytes()
+    failed = []
     inputs = dict.fromkeys(("image1", "image2"), np.zeros((1, 3, 16, 24), np.float32))
     for _ in range(200):
         damaged = bytearray(whole)

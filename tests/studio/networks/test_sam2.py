@@ -15,7 +15,9 @@ from tests.studio.networks.tiny_segmenter import export_decoder, export_encoder
 
 pytest.importorskip("onnxruntime")
 
-RED, BLUE, BACK = (0.9, 0.3, 0.2), (0.1, 0.3, 0.9), (0.4, 0.5, 0.45)
+RED = (0.9, 0.3, 0.2)
+BLUE = (0.1, 0.3, 0.9)
+BACK = (0.4, 0.5, 0.45)
 
 
 @pytest.fixture(scope="module")
@@ -54,9 +56,9 @@ def test_segment_network__returns_an_empty_mask_for_an_empty_mask(network):
 
 def test_segment_network__prompts_with_each_connected_component(network):
     image, (one, other, still) = discs(240, 320, (60, 60), (220, 60), (140, 180))
-    found = network(image, one | other)
-    assert iou(found, one | other) > 0.9
-    assert not found[still].any()
+    result = network(image, one | other)
+    assert iou(result, one | other) > 0.9
+    assert not result[still].any()
 
 
 def test_segment_network__passes_colours_as_rgb(network):
@@ -76,9 +78,9 @@ def test_segment_network__normalises_as_imagenet(network):
     image[..., 0] = (np.arange(256) + 0.5) / 256
     mask = np.ones((64, 256), bool)
     mask[:, :100] = False
-    found = network(image, mask)[32]
+    row = network(image, mask)[32]
     # R >= 0.5 within reach of the points; half a cell on either side.
-    assert np.flatnonzero(found)[0] == pytest.approx(128, abs=1)
+    assert np.flatnonzero(row)[0] == pytest.approx(128, abs=1)
 
 
 def test_prompts__points_lie_deep_and_apart_inside_the_box():
@@ -120,14 +122,15 @@ def test_motion_mask__is_the_union_of_flow_mask_and_sam2_objects(files):
 
 def test_segment_network__accepts_an_encoder_of_open_size(tmp_path, files):
     image, (disc,) = discs(120, 160, (80, 60))
-    found = SegmentNetwork(export_encoder(tmp_path / "open.onnx", open_size=True), files[1])(image, disc)
-    assert iou(found, disc) > 0.9
+    result = SegmentNetwork(export_encoder(tmp_path / "open.onnx", open_size=True), files[1])(image, disc)
+    assert iou(result, disc) > 0.9
 
 
 def bad(folder, files, name):
     """Return the pair of files of one bad case."""
     encoder, decoder = files
-    text, other = folder / "text.onnx", folder / "other.onnx"
+    text = folder / "text.onnx"
+    other = folder / "other.onnx"
     text.write_text("no network " * 20)
     if name == "missing":
         return folder / "missing.onnx", decoder
@@ -177,6 +180,6 @@ def test_mask_config__limits_prompts_to_the_largest(files):
     hole[55:65, 55:65] = hole[115:122, 215:222] = True
     mask = (small | large) & ~hole
     config = MaskConfig(prompts=1)
-    for found, filled in ((mask_refiner(f"sam2:{files[0]},{files[1]}", config), large), (SegmentNetwork(*files), hole)):
-        assert found(image, mask)[hole & filled].mean() > 0.9
+    for model, filled in ((mask_refiner(f"sam2:{files[0]},{files[1]}", config), large), (SegmentNetwork(*files), hole)):
+        assert model(image, mask)[hole & filled].mean() > 0.9
     assert not mask_refiner(f"sam2:{files[0]},{files[1]}", config)(image, mask)[hole & small].any()

@@ -9,12 +9,14 @@ from onnx import helper
 
 from tests.scenes.tiny_network import write
 
-SIZE, CELL = 1024, 4
+SIZE = 1024
+CELL = 4
 # Radius around a point on the object within which pixels are segmented, in pixels of the network's image.
 REACH = 300.0
 # Index of the decoder's mask with the highest predicted IoU, of three.
 BEST = 1
-MEAN, DEVIATION = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
+MEAN = np.array([0.485, 0.456, 0.406])
+DEVIATION = np.array([0.229, 0.224, 0.225])
 
 
 def export_encoder(path: Path, open_size: bool = False) -> Path:
@@ -37,7 +39,8 @@ def export_decoder(path: Path, extra: str = "", scale: float = 1.0) -> Path:
     """
     cells = SIZE // CELL
     centres = (np.arange(cells, dtype=np.float32) + 0.5) * CELL - 0.5
-    x, y = np.broadcast_to(centres, (1, 1, cells, cells)), np.broadcast_to(centres[:, None], (1, 1, cells, cells))
+    x = np.broadcast_to(centres, (1, 1, cells, cells))
+    y = np.broadcast_to(centres[:, None], (1, 1, cells, cells))
     # Of normalised colours, R - B - 0.2 of the colours themselves.
     color = np.array([DEVIATION[0], 0, -DEVIATION[2]], np.float32)[None, :, None, None]
     constants = {

@@ -64,7 +64,7 @@ def test_draw_disturbances__stays_within_its_bounds_and_leaves_the_reference_alo
 
 @pytest.mark.parametrize("name", [field.name for field in fields(Disturbances)])
 def test_draw_disturbances__a_setting_acts_and_changes_nothing_else(name: str) -> None:
-    own = {
+    field_of_setting = {
         "time_offset": "time_offset",
         "rolling_shutter": "rolling_shutter",
         "distortion": "distortion",
@@ -74,15 +74,15 @@ def test_draw_disturbances__a_setting_acts_and_changes_nothing_else(name: str) -
         draw_disturbances(d, 3, 4, 0) for d in (Disturbances(), Disturbances(**{name: getattr(ALL, name)}), ALL)
     )
     for field in fields(CameraDisturbance):
-        before, found, expected = ([getattr(d, field.name) for d in drawn] for drawn in (none, one, every))
-        assert (found != before) == (field.name == own)
-        if field.name == own != "gains":
-            assert found == expected
+        zeros, values, expected = ([getattr(d, field.name) for d in drawn] for drawn in (none, one, every))
+        assert (values != zeros) == (field.name == field_of_setting)
+        if field.name == field_of_setting != "gains":
+            assert values == expected
 
 
 def test_row_times__surround_the_time_of_the_frame() -> None:
-    own = CameraDisturbance(0.25, 0.5, (1.0,), 0.0, 0)
-    times = own.row_times(3, 48)
+    camera = CameraDisturbance(0.25, 0.5, (1.0,), 0.0, 0)
+    times = camera.row_times(3, 48)
     assert_close(times.mean(), 3.25, atol=1e-12)
     assert_close(np.diff(times), np.full(47, 0.5 / 48), atol=1e-12)
 
@@ -126,18 +126,21 @@ def test_synthesize__shows_a_camera_with_a_time_offset_at_its_own_time(tmp_path:
     offset = load_disturbances(clip / "truth")["cam01"].time_offset
     assert abs(offset) > 0.2
     scene = load_scene("arm")
-    tracer, camera = PathTracer(scene), scene.rig.cameras(2, 64, 48)[1]
+    tracer = PathTracer(scene)
+    camera = scene.rig.cameras(2, 64, 48)[1]
     tracer.set_time((1 + offset) / FPS)
     seed = int(np.random.SeedSequence([0, 1, 1]).generate_state(1)[0])
     np.testing.assert_array_equal(frame_of(clip, "cam01", 1), tracer.render(camera, 4, seed))
-    truth, surface = load_truth(clip / "truth", "cam01", 1), tracer.surface_points(camera)
+    truth = load_truth(clip / "truth", "cam01", 1)
+    surface = tracer.surface_points(camera)
     assert_close(truth.depth, camera.project(surface.positions)[1], atol=1e-5)
     tracks = load_tracks(clip / "truth")
     hand = list(scene.objects).index("hand")
-    pose, points = scene.objects["hand"].pose, tracks.points[tracks.ids == hand]
-    moved = points[:, 0] @ (pose(1 / FPS) @ np.linalg.inv(pose(0.0)))[:3, :3].T
-    moved += (pose(1 / FPS) @ np.linalg.inv(pose(0.0)))[:3, 3]
-    assert_close(points[:, 1], moved, atol=1e-6)
+    pose = scene.objects["hand"].pose
+    points = tracks.points[tracks.ids == hand]
+    expected = points[:, 0] @ (pose(1 / FPS) @ np.linalg.inv(pose(0.0)))[:3, :3].T
+    expected += (pose(1 / FPS) @ np.linalg.inv(pose(0.0)))[:3, 3]
+    assert_close(points[:, 1], expected, atol=1e-6)
 
 
 def bar_scene(speed: float) -> Scene:
@@ -156,13 +159,14 @@ def test_synthesize__reads_the_rows_of_a_rolling_shutter_at_their_times(tmp_path
     scene = bar_scene(speed=6.0)
     config = replace(SIZE, width=128, height=64, disturbances=Disturbances(rolling_shutter=0.8))
     clip = synthesize(scene, tmp_path / "clip", config)
-    own, camera = load_disturbances(clip / "truth")["cam00"], scene.rig.cameras(2, 128, 64)[0]
+    disturbance = load_disturbances(clip / "truth")["cam00"]
+    camera = scene.rig.cameras(2, 128, 64)[0]
     image = frame_of(clip, "cam00", 1).astype(float).mean(axis=-1)
-    found = (image * (np.arange(128) + 0.5)).sum(axis=1) / image.sum(axis=1)
-    bar = np.stack([6.0 * own.row_times(1, 64) / FPS, np.zeros(64), np.full(64, 0.02)], axis=1)
+    columns = (image * (np.arange(128) + 0.5)).sum(axis=1) / image.sum(axis=1)
+    bar = np.stack([6.0 * disturbance.row_times(1, 64) / FPS, np.zeros(64), np.full(64, 0.02)], axis=1)
     expected = camera.project(bar)[0][:, 0]
     assert np.ptp(expected) > 5
-    assert np.abs(found - expected).max() < 0.5
+    assert np.abs(columns - expected).max() < 0.5
     truth = load_truth(clip / "truth", "cam00", 1)
     middle = (truth.mask * (np.arange(128) + 0.5)).sum(axis=1) / truth.mask.sum(axis=1)
     assert np.ptp(middle) < 1e-9, "the truth is that of one time"
@@ -175,14 +179,18 @@ def test_synthesize__undistorted_images_are_those_of_the_pinhole_cameras(tmp_pat
     clip = synthesize("spheres", tmp_path / "clip", config)
     assert abs(load_disturbances(clip / "truth")["cam01"].distortion) > 0.1
     assert not (clip / "poses_bounds.npy").exists(), "it cannot hold a lens"
-    scene, capture = load_scene("spheres"), load_capture(clip)
-    tracer, camera = PathTracer(scene), scene.rig.cameras(2, 96, 72)[1]
-    expected, recorded = tracer.render(camera, 16, 0), frame_of(clip, "cam01", 0)
+    scene = load_scene("spheres")
+    capture = load_capture(clip)
+    tracer = PathTracer(scene)
+    camera = scene.rig.cameras(2, 96, 72)[1]
+    expected = tracer.render(camera, 16, 0)
+    recorded = frame_of(clip, "cam01", 0)
     mask = np.ones(expected.shape[:2], bool) if capture.masks[1] is None else capture.masks[1]
-    found = next(capture.frames()).images[1]
-    assert psnr(found[mask], expected[mask]) > psnr(recorded[mask], expected[mask]) + 4
-    assert psnr(found[mask], expected[mask]) > 28
-    truth, surface = load_truth(clip / "truth", "cam01", 0), tracer.surface_points(camera)
+    pinhole_image = next(capture.frames()).images[1]
+    assert psnr(pinhole_image[mask], expected[mask]) > psnr(recorded[mask], expected[mask]) + 4
+    assert psnr(pinhole_image[mask], expected[mask]) > 28
+    truth = load_truth(clip / "truth", "cam01", 0)
+    surface = tracer.surface_points(camera)
     np.testing.assert_array_equal(truth.ids, surface.ids)
     assert_close(capture.cameras[1].K, camera.K, atol=1e-6)
 
@@ -201,18 +209,19 @@ def test_synthesize__exposes_frames_with_the_gains_of_the_truth(clean: Path, tmp
     gains = load_disturbances(dimmed / "truth")
     for camera in ("cam00", "cam01"):
         for frame in (0, 1):
-            before, after = (decode_light(frame_of(c, camera, frame) / 255.0) for c in (clean, dimmed))
-            usable = (before > 0.1) & (after > 0.1) & (before < 0.8) & (after < 0.95)
-            assert_close(np.median(after[usable] / before[usable]), gains[camera].gains[frame], rtol=0.01)
+            light, dimmed_light = (decode_light(frame_of(c, camera, frame) / 255.0) for c in (clean, dimmed))
+            usable = (light > 0.1) & (dimmed_light > 0.1) & (light < 0.8) & (dimmed_light < 0.95)
+            assert_close(np.median(dimmed_light[usable] / light[usable]), gains[camera].gains[frame], rtol=0.01)
     assert gains["cam00"].gains == (1.0, 1.0)
     assert gains["cam01"].gains[0] != gains["cam01"].gains[1]
 
 
 def test_synthesize__compresses_every_image(clean: Path, tmp_path: Path) -> None:
     lossy = synthesize("spheres", tmp_path / "clip", replace(SIZE, disturbances=Disturbances(jpeg_quality=30)))
-    whole, found = frame_of(clean, "cam01", 1), frame_of(lossy, "cam01", 1)
-    np.testing.assert_array_equal(found, compressed(whole, 30))
-    assert 18 < psnr(found, whole) < 40
+    whole = frame_of(clean, "cam01", 1)
+    pixels = frame_of(lossy, "cam01", 1)
+    np.testing.assert_array_equal(pixels, compressed(whole, 30))
+    assert 18 < psnr(pixels, whole) < 40
     np.testing.assert_array_equal(compressed(whole, 0), whole)
 
 
@@ -220,10 +229,11 @@ def test_synthesize__compresses_every_image(clean: Path, tmp_path: Path) -> None
 def test_light_of_rows__agrees_with_the_image_of_the_sensor() -> None:
     """All rows without a lens are the image of Mitsuba's sensor up to sampling noise."""
     scene = load_scene("spheres")
-    tracer, camera = PathTracer(scene), scene.rig.cameras(2, 64, 48)[1]
+    tracer = PathTracer(scene)
+    camera = scene.rig.cameras(2, 64, 48)[1]
     expected = tracer.render(camera, 100, 1)
-    found = srgb_bytes(tracer.light_of_rows(camera, np.arange(48), 100, 2, None))
-    assert psnr(found, expected) > 38
+    pixels = srgb_bytes(tracer.light_of_rows(camera, np.arange(48), 100, 2, None))
+    assert psnr(pixels, expected) > 38
     some = srgb_bytes(tracer.light_of_rows(camera, np.arange(10, 20), 100, 3, None))
     assert psnr(some, expected[10:20]) > 38
 

@@ -22,19 +22,19 @@ def pair(tracer):
 
 @pytest.mark.slow
 def test_compute_ground_truth__motion_map_warps_the_previous_frame_onto_the_current_one(pair):
-    _, (before, truth_before), (now, truth) = pair
+    _, (previous_image, truth_before), (image, truth) = pair
     grid = np.stack(np.meshgrid(np.arange(320), np.arange(240)), axis=-1).astype(np.float32)
     source = grid - truth.motion
     # Visible in both frames: all neighbours of the source belong to the same object.
     corners = [np.floor(source).astype(int) + corner for corner in ((0, 0), (0, 1), (1, 0), (1, 1))]
-    found = [truth_before.ids[np.clip(c[..., 1], 0, 239), np.clip(c[..., 0], 0, 319)] for c in corners]
-    same = truth.mask & (np.stack(found) == truth.ids).all(axis=0)
+    ids = [truth_before.ids[np.clip(c[..., 1], 0, 239), np.clip(c[..., 0], 0, 319)] for c in corners]
+    same = truth.mask & (np.stack(ids) == truth.ids).all(axis=0)
     same = cv2.erode(same.astype(np.uint8), np.ones((3, 3))) > 0
     assert same.sum() > 5000
 
     def score(motion: np.ndarray) -> float:
-        warped = cv2.remap(before, grid - motion, None, cv2.INTER_CUBIC)
-        return psnr(warped[same], now[same])
+        warped = cv2.remap(previous_image, grid - motion, None, cv2.INTER_CUBIC)
+        return psnr(warped[same], image[same])
 
     # Resampling and changes of shading limit the score to 31 dB, of which noise costs 0.2 dB (measured).
     assert score(truth.motion) > 29
@@ -70,16 +70,17 @@ def test_load_tracks__tracks_reproject_to_the_motion_map(clip):
     for camera in load_scene("arm").rig.cameras(3, 64, 48):
         for frame in (1, 2):
             truth = load_truth(clip / "truth", camera.name, frame)
-            now, depth = camera.project(tracks.points[:, frame])
-            before, _ = camera.project(tracks.points[:, frame - 1])
+            pixels, depth = camera.project(tracks.points[:, frame])
+            old_pixels, _ = camera.project(tracks.points[:, frame - 1])
             # Points that were sampled at a pixel centre of this view and frame.
-            col, row = (np.floor(now).astype(int) * [1, 1]).T
-            at_centre = np.abs(now - np.floor(now) - 0.5).max(axis=1) < 1e-3
+            col, row = (np.floor(pixels).astype(int) * [1, 1]).T
+            at_centre = np.abs(pixels - np.floor(pixels) - 0.5).max(axis=1) < 1e-3
             at_centre &= (col >= 0) & (col < 64) & (row >= 0) & (row < 48)
-            col, row = np.clip(col, 0, 63), np.clip(row, 0, 47)
+            col = np.clip(col, 0, 63)
+            row = np.clip(row, 0, 47)
             at_centre &= np.abs(depth - truth.depth[row, col]) < 1e-4
             np.testing.assert_array_equal(truth.ids[row, col][at_centre], tracks.ids[at_centre])
-            assert_close((now - before)[at_centre], truth.motion[row, col][at_centre], atol=2e-3)
+            assert_close((pixels - old_pixels)[at_centre], truth.motion[row, col][at_centre], atol=2e-3)
             compared += int((truth.mask[row, col] & at_centre).sum())
     assert compared > 100
 

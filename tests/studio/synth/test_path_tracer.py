@@ -55,7 +55,7 @@ def test_render__sensor_noise_has_the_requested_standard_deviation(tracer):
     clean = tracer.render(camera, 64, 0).astype(float)
     noisy, again = (tracer.render(camera, 64, 0, 0.02).astype(float) for _ in range(2))
     np.testing.assert_array_equal(noisy, again)
-    inside = (clean > 30) & (clean < 225)
+    mask = (clean > 30) & (clean < 225)
     # Rounding two images to bytes adds 1/6 to a variance of 26 squared grey levels.
-    assert abs((noisy - clean)[inside].std() / (255 * 0.02) - 1) < 0.03
-    assert abs((noisy - clean)[inside].mean()) < 0.15
+    assert abs((noisy - clean)[mask].std() / (255 * 0.02) - 1) < 0.03
+    assert abs((noisy - clean)[mask].mean()) < 0.15

@@ -65,7 +65,8 @@ def test_draw_scene__objects_stay_in_the_room(scenes):
     for scene in scenes:
         for name, body in scene.bodies.items():
             points = surface(body, TIMES[::3])
-            low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
+            low = points.min(axis=(0, 1))
+            high = points.max(axis=(0, 1))
             assert low[1] > -1e-6, name
             assert high[1] < 3.2, name
             assert np.abs([low[0], high[0]]).max() < scene.half_width, name
@@ -85,9 +86,9 @@ def test_draw_scene__held_out_view_and_most_others_see_every_object(scenes):
         cameras = scene.rig.cameras(scene.recording.num_cameras, 320, 240)
         for body in scene.bodies.values():
             points = surface(body, TIMES[:8])
-            seen = [((p > 0) & (p < [320, 240])).all() for p in (camera.project(points)[0] for camera in cameras)]
-            assert seen[0]
-            assert np.mean(seen) >= 0.75
+            views = [((p > 0) & (p < [320, 240])).all() for p in (camera.project(points)[0] for camera in cameras)]
+            assert views[0]
+            assert np.mean(views) >= 0.75
 
 
 def test_draw_scene__speed_is_that_of_the_fastest_point_in_the_held_out_view(scenes):
@@ -133,19 +134,23 @@ def test_build__objects_are_where_they_were_drawn_and_static_ones_do_not_move(cl
     truth = load_truth(clip / "truth", "cam00", 1)
     pixels = np.stack(np.meshgrid(np.arange(64), np.arange(48)), axis=-1) + 0.5
     for name, body in scene.bodies.items():
-        own = truth.ids == names.index(name)
-        points = camera.unproject(pixels[own], truth.depth[own])
+        mask = truth.ids == names.index(name)
+        points = camera.unproject(pixels[mask], truth.depth[mask])
         assert len(points) > 3
         assert (points > body.bounds[0] - 0.01).all()
         assert (points < body.bounds[1] + 0.01).all()
-        assert (truth.mask[own] == (body.motion != "static")).all()
+        assert (truth.mask[mask] == (body.motion != "static")).all()
 
 
 def test_synthesize__records_a_random_scene_as_its_seed_determines(clip):
-    about = json.loads((clip / "capture.json").read_text())
+    settings = json.loads((clip / "capture.json").read_text())
     recording = draw_scene(1).recording
-    assert [about[name] for name in ("scene", "num_cameras", "spp")] == ["random", recording.num_cameras, recording.spp]
-    assert_close(about["noise"], recording.noise, rtol=1e-9)
+    assert [settings[name] for name in ("scene", "num_cameras", "spp")] == [
+        "random",
+        recording.num_cameras,
+        recording.spp,
+    ]
+    assert_close(settings["noise"], recording.noise, rtol=1e-9)
     for index in range(recording.num_cameras):
         truth = load_truth(clip / "truth", f"cam{index:02d}", 1)
         assert (truth.ids >= 0).all()

@@ -43,7 +43,8 @@ def test_load_scene__accepts_dataclasses_with_postponed_annotations(tmp_path):
 
 @pytest.mark.parametrize(("name", "radius"), [("roller", 0.38), ("circler", 0.28)])
 def test_spheres__balls_roll_without_slipping(name, radius):
-    pose, step = load_scene("spheres").objects[name].pose, 1e-5
+    pose = load_scene("spheres").objects[name].pose
+    step = 1e-5
     for time in (0.0, 0.4, 2.0):
         here = pose(time)
         contact = here[:3, 3] - [0, radius, 0]

@@ -28,9 +28,9 @@ TINY = SynthConfig(cameras=2, frames=1, width=16, height=16, spp=1)
 
 @pytest.mark.slow
 def test_synthesize__writes_the_layout_of_n3dv_with_a_colmap_model(clip):
-    about = json.loads((clip / "capture.json").read_text())
-    assert about["test_view"] == 0
-    assert (about["fps"], about["num_frames"], about["seed"]) == (30.0, 3, 0)
+    metadata = json.loads((clip / "capture.json").read_text())
+    assert metadata["test_view"] == 0
+    assert (metadata["fps"], metadata["num_frames"], metadata["seed"]) == (30.0, 3, 0)
     names = [f"cam{i:02d}" for i in range(3)]
     cameras, bounds = read_poses_bounds(clip / "poses_bounds.npy", names)
     model = read_colmap(clip / "sparse" / "0")
@@ -95,11 +95,11 @@ def test_synthesize__rejects_a_non_empty_folder_and_replaces_a_capture_with_over
             synthesize("spheres", tmp_path, TINY, overwrite=True)
     (tmp_path / "capture.json").unlink()
     out = shutil.copytree(clip, tmp_path / "clip")
-    seen = []
-    synthesize("spheres", out, TINY, overwrite=True, progress=lambda done, total: seen.append((done, total)))
+    counts = []
+    synthesize("spheres", out, TINY, overwrite=True, progress=lambda done, total: counts.append((done, total)))
     assert json.loads((out / "capture.json").read_text())["scene"] == "spheres"
     assert not (out / "cam02.mp4").exists()
-    assert seen == [(1, 2), (2, 2)]
+    assert counts == [(1, 2), (2, 2)]
     with pytest.raises(ValueError, match=f"expected an output outside of captures, .* in the capture {out}"):
         synthesize("spheres", out / "clip", TINY)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["clip", "notes.txt"]

@@ -23,21 +23,22 @@ from tests.scenes.gaussians import isotropic
 @pytest.mark.slow
 def test_load_tracks__visible_points_have_the_depth_of_the_view(clip: Path) -> None:
     """Visible points lie on the surface of their pixel, up to its slope; hidden ones behind it or outside."""
-    tracks, compared = load_tracks(clip / "truth"), np.zeros(2, int)
+    tracks = load_tracks(clip / "truth")
+    compared = np.zeros(2, int)
     cameras = load_capture(clip).cameras
     assert list(tracks.visible) == [camera.name for camera in cameras]
     for camera in cameras:
         for frame in range(3):
             truth = load_truth(clip / "truth", camera.name, frame)
             pixels, depth = camera.project(tracks.points[:, frame])
-            inside = ((pixels >= 0) & (pixels < (64, 48))).all(-1)
-            seen = tracks.visible[camera.name][:, frame]
-            assert not (seen & ~inside).any()
-            column, row = np.floor(pixels[inside]).astype(int).T
-            ahead = depth[inside] / truth.depth[row, column] - 1
-            assert np.mean(np.abs(ahead[seen[inside]]) < 0.03) > 0.95
-            assert np.median(ahead[~seen[inside]]) > 0.01
-            compared += seen.sum(), (inside & ~seen).sum()
+            in_image = ((pixels >= 0) & (pixels < (64, 48))).all(-1)
+            mask = tracks.visible[camera.name][:, frame]
+            assert not (mask & ~in_image).any()
+            column, row = np.floor(pixels[in_image]).astype(int).T
+            ahead = depth[in_image] / truth.depth[row, column] - 1
+            assert np.mean(np.abs(ahead[mask[in_image]]) < 0.03) > 0.95
+            assert np.median(ahead[~mask[in_image]]) > 0.01
+            compared += mask.sum(), (in_image & ~mask).sum()
     assert (compared > (5000, 500)).all(), compared
 
 
@@ -61,19 +62,21 @@ def test_sees__a_ball_hides_what_is_behind_it(x: float, expected: list[bool]) ->
 
 
 def test_save_tracks__load_tracks_reads_them_back(tmp_path: Path) -> None:
-    points, ids = np.arange(12.0).reshape(2, 2, 3), np.array([1, 2], np.int32)
+    points = np.arange(12.0).reshape(2, 2, 3)
+    ids = np.array([1, 2], np.int32)
     for visible in ({}, {"cam00": np.array([[True, False], [False, False]])}):
         save_tracks(tmp_path, Tracks(points, ids, visible))
-        found = load_tracks(tmp_path)
-        assert (found.points.tolist(), found.ids.tolist()) == (points.tolist(), ids.tolist())
-        assert {name: mask.tolist() for name, mask in found.visible.items()} == {
+        tracks_of_file = load_tracks(tmp_path)
+        assert (tracks_of_file.points.tolist(), tracks_of_file.ids.tolist()) == (points.tolist(), ids.tolist())
+        assert {name: mask.tolist() for name, mask in tracks_of_file.visible.items()} == {
             n: m.tolist() for n, m in visible.items()
         }
 
 
 def test_synthesize__tracks_score_a_stream_that_moves_like_them(clip: Path, tmp_path: Path) -> None:
     """The splats lie on the tracked points; the surface that they render decides which points are visible."""
-    capture, tracks = load_capture(clip, test_view=0), load_tracks(clip / "truth")
+    capture = load_capture(clip, test_view=0)
+    tracks = load_tracks(clip / "truth")
     states = [isotropic(tracks.points[:, t], 0.05, 0.95) for t in range(capture.num_frames)]
     config = CodecConfig(quality=1e3)
     with StreamWriter(tmp_path / "s.morgs", capture.cameras, 30, {"test_view": 0}) as writer:

@@ -88,10 +88,10 @@ class DeepCheck:
         values = {"time offsets": self.offsets, "exposure against the other cameras": self.gains.mean(axis=1)}
         parts = []
         for quantity, value in values.items():
-            cameras = [name for name, missing in zip(self.names, np.isnan(value), strict=True) if missing]
+            cameras = [name for name, is_missing in zip(self.names, np.isnan(value), strict=True) if is_missing]
             if cameras:
-                listed = "all cameras" if len(cameras) == len(self.names) else ", ".join(cameras)
-                parts.append(f"{quantity} of {listed}")
+                subject = "all cameras" if len(cameras) == len(self.names) else ", ".join(cameras)
+                parts.append(f"{quantity} of {subject}")
         return f"Not measured, without enough common motion or matches: {'; '.join(parts)}." if parts else ""
 
     def as_dict(self) -> dict[str, Any]:
@@ -261,7 +261,7 @@ def _blurred_frames(check: DeepCheck) -> _Values:
     # Compression changes from frame to frame, equally in all cameras if they share an encoder.
     dips = relative - np.nan_to_num(others_median(relative))
     spread = 1.5 * known_median(np.abs(dips - known_median(dips, axis=0)), axis=0)
-    return _listed([np.flatnonzero(blurred) for blurred in (dips < -np.fmax(_BLURRED_FRAME, _SPREADS * spread)).T])
+    return _listed([np.flatnonzero(mask) for mask in (dips < -np.fmax(_BLURRED_FRAME, _SPREADS * spread)).T])
 
 
 def _listed(frames: Sequence[Sequence[int] | np.ndarray]) -> _Values:

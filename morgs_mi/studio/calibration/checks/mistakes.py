@@ -146,11 +146,11 @@ def _other_rows(capture: Capture) -> list[tuple[Sequence[Camera], str]]:
     cameras = capture.cameras
     alphabetical = sorted(capture.names)
     rows = [cameras[alphabetical.index(name)] for name in capture.names]
-    turned = [replace(c, viewmat=_UPRIGHT @ c.viewmat) for c in cameras]
+    rig = [replace(c, viewmat=_UPRIGHT @ c.viewmat) for c in cameras]
     order = ", ".join(alphabetical[:4])
     return [
         (rows, f"the rows seem to be in alphabetical order ({order}, ...); put them in numerical order"),
-        (turned, "the columns seem to be the camera's right, up and backward axes; expected down, right, backward"),
+        (rig, "the columns seem to be the camera's right, up and backward axes; expected down, right, backward"),
     ]
 
 
@@ -163,12 +163,13 @@ def _other_conventions(cameras: Sequence[Camera], expected: PoseConvention) -> l
     inverses = [replace(c, viewmat=np.linalg.inv(c.viewmat)) for c in cameras]
     other_axes = "OpenCV" if expected.axes == "OpenGL" else "OpenGL"
     inverse = "world to camera" if expected.direction == "camera to world" else "camera to world"
-    found = [
+    options = [
         ([replace(c, viewmat=_FLIP @ c.viewmat) for c in cameras], expected.direction, other_axes),
         (inverses, inverse, "OpenCV"),
         ([replace(c, viewmat=_FLIP @ c.viewmat) for c in inverses], inverse, "OpenGL"),
     ]
     remedy = f"expected {expected.direction} in {_AXES[expected.axes]}; convert them"
     return [
-        (cameras, f"the poses seem to be {direction} in {_AXES[axes]}; {remedy}") for cameras, direction, axes in found
+        (cameras, f"the poses seem to be {direction} in {_AXES[axes]}; {remedy}")
+        for cameras, direction, axes in options
     ]

@@ -198,8 +198,8 @@ def _bars(axes: Any, values: np.ndarray, names: Sequence[str], colors: Sequence[
 def _curves(axes: Any, values: np.ndarray, names: Sequence[str], colors: Sequence[str]) -> None:
     """Draw a curve per camera, for values [T, C]; cameras with a finding are drawn last and named in a legend."""
     for name, color, curve in zip(names, colors, values.T, strict=True):
-        marked = color == _MARKED
-        axes.plot(curve, color=color, linewidth=1, zorder=3 if marked else 2, label=name if marked else "_")
+        has_finding = color == _MARKED
+        axes.plot(curve, color=color, linewidth=1, zorder=3 if has_finding else 2, label=name if has_finding else "_")
     if _MARKED in colors:
         axes.legend(fontsize=8)
     axes.set_xlim(-0.5, len(values) - 0.5)
@@ -209,8 +209,8 @@ def _curves(axes: Any, values: np.ndarray, names: Sequence[str], colors: Sequenc
 def _events(axes: Any, check: DeepCheck) -> None:
     """Draw a row per camera with the frames that repeat another or are missing."""
     states = np.isnan(check.sharpness.T).astype(int)
-    for row, repeated in zip(states, check.repeated, strict=True):
-        row[list(repeated)] = 2
+    for row, frames in zip(states, check.repeated, strict=True):
+        row[list(frames)] = 2
     colors = np.array([(255, 255, 255), (190, 190, 190), (214, 39, 40)], np.uint8)
     axes.imshow(colors[states], aspect="auto", interpolation="none")
     _name_cameras(axes.yaxis, check.names, _colors(check, "repeats"))
@@ -225,5 +225,5 @@ def _name_cameras(axis: Any, names: Sequence[str], colors: Sequence[str], rotati
 
 def _colors(check: DeepCheck, *questions: str) -> list[str]:
     """Return the colour of each camera, red with a finding about one of the questions."""
-    marked = {name for finding in check.findings if finding.question in questions for name in finding.cameras}
-    return [_MARKED if name in marked else _USUAL for name in check.names]
+    names = {name for finding in check.findings if finding.question in questions for name in finding.cameras}
+    return [_MARKED if name in names else _USUAL for name in check.names]

@@ -83,10 +83,10 @@ def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
     correction = _correct_rig(capture, pairs.sampled(), checks) if len(errors) else None
     if correction:
         cameras, explanation = correction
-        changed = {view for view in views if cameras[view] is not capture.cameras[view]}
-        checks = [_check(view, pairs, set(views) - changed) for view in views]
+        culprits = {view for view in views if cameras[view] is not capture.cameras[view]}
+        checks = [_check(view, pairs, set(views) - culprits) for view in views]
         checks = [
-            replace(c, fits=False, advice="") if view in changed and c.matches else c for view, c in enumerate(checks)
+            replace(c, fits=False, advice="") if view in culprits and c.matches else c for view, c in enumerate(checks)
         ]
         advice = f"the poses do not fit the images: {explanation}."
     else:
@@ -116,8 +116,8 @@ class _Pairs:
     def of_view(self, view: int, partners: Collection[int] | None = None) -> np.ndarray:
         """Return the errors of a view's matches with `partners`, by default with all views, px."""
         pairs = zip(self.shared.matches, self.errors, strict=True)
-        found = [errors for match, errors in pairs if _is_shared(match, view, partners)]
-        return np.concatenate([np.zeros(0), *found])
+        parts = [errors for match, errors in pairs if _is_shared(match, view, partners)]
+        return np.concatenate([np.zeros(0), *parts])
 
     def of_replaced(self, view: int, camera: Camera, partners: Collection[int]) -> float:
         """Return the median error of a view's matches with `partners` if it had another camera, px."""
@@ -145,7 +145,7 @@ class _Pairs:
         group = {view for match in self.shared.matches for view in match.views}
         while group:
             errors = {view: self.of_view(view, group) for view in sorted(group)}
-            shares = {view: np.mean(own > MAX_ERROR) if len(own) else 1.0 for view, own in errors.items()}
+            shares = {view: np.mean(values > MAX_ERROR) if len(values) else 1.0 for view, values in errors.items()}
             worst = max(shares, key=lambda view: shares[view])
             if shares[worst] <= 0.5:
                 break
@@ -165,21 +165,21 @@ def _median(errors: np.ndarray) -> float:
 def _check(view: int, pairs: _Pairs, group: set[int]) -> CameraCheck:
     """Return the result of a view; its advice is empty if the pose does not fit."""
     name = pairs.cameras[view].name
-    every = pairs.of_view(view)
-    agreed = pairs.of_view(view, group)
-    used = agreed if len(agreed) else every
-    fits = bool(_median(used) <= MAX_ERROR)
+    all_errors = pairs.of_view(view)
+    group_errors = pairs.of_view(view, group)
+    errors = group_errors if len(group_errors) else all_errors
+    fits = bool(_median(errors) <= MAX_ERROR)
     advice = ""
-    if not len(every):
+    if not len(all_errors):
         fits = None
         advice = f"no matches with any other camera: {_NO_OVERLAP}"
-    elif group and not len(agreed):
+    elif group and not len(group_errors):
         fits = None
         advice = "matches only with cameras that do not fit: correct those first"
-    elif len(used) < _MIN_MATCHES:
+    elif len(errors) < _MIN_MATCHES:
         fits = None
-        advice = f"only {len(used)} matches, {_MIN_MATCHES} are needed: {_NO_OVERLAP}"
-    return CameraCheck(name, len(every), _median(used), fits, advice)
+        advice = f"only {len(errors)} matches, {_MIN_MATCHES} are needed: {_NO_OVERLAP}"
+    return CameraCheck(name, len(all_errors), _median(errors), fits, advice)
 
 
 def _correct_rig(capture: Capture, pairs: _Pairs, checks: Sequence[CameraCheck]) -> tuple[Sequence[Camera], str] | None:
@@ -222,12 +222,12 @@ def _explain_camera(view: int, check: CameraCheck, pairs: _Pairs, group: set[int
     """Return the common mistake that explains the matches of a view, and a remedy."""
     # Without views that agree, a correction can only be compared with all others.
     partners = group or set(range(len(pairs.cameras)))
-    given = pairs.cameras[view]
+    calibration = pairs.cameras[view]
     candidates = [
-        *camera_candidates(given),
+        *camera_candidates(calibration),
         *focal_candidates(
             "its focal length seems",
-            lambda factor: with_focal_factor(given, factor),
+            lambda factor: with_focal_factor(calibration, factor),
             lambda camera: pairs.of_replaced(view, camera, partners),
         ),
     ]

@@ -100,10 +100,10 @@ def repeated_frames(signals: Signals) -> tuple[tuple[int, ...], ...]:
         # The upper quartile is the usual change even if every second frame is repeated.
         relative = changes / np.nanpercentile(changes, 75, axis=0)
     # Motion in a view pauses gradually, so a frame before or after a repeated one has changed.
-    padded = np.pad(relative, ((1, 1), (0, 0)), constant_values=np.nan)
-    isolated = np.fmax(padded[:-2], padded[2:]) > _CHANGING
-    repeated = (relative < _REPEATED) & (others_median(relative) > _CHANGING) & isolated
-    return tuple(tuple((np.flatnonzero(camera) + 1).tolist()) for camera in repeated.T)
+    neighbours = np.pad(relative, ((1, 1), (0, 0)), constant_values=np.nan)
+    isolated = np.fmax(neighbours[:-2], neighbours[2:]) > _CHANGING
+    repeats = (relative < _REPEATED) & (others_median(relative) > _CHANGING) & isolated
+    return tuple(tuple((np.flatnonzero(camera) + 1).tolist()) for camera in repeats.T)
 
 
 def lamp_flicker(bands: np.ndarray, fps: float) -> Lamp | None:
@@ -156,9 +156,9 @@ def _rms(amplitudes: np.ndarray) -> np.ndarray:
 
 def _sharpness(grey: np.ndarray, mask: np.ndarray | None) -> float:
     """Return the sharpness of an image: a blur removes detail at the finest scale, a change of contrast at both."""
-    once = cv2.GaussianBlur(grey, (0, 0), 1.0)
-    twice = cv2.GaussianBlur(once, (0, 0), 2.0)
-    fine, coarse = (float(np.abs(x if mask is None else x[mask]).mean()) for x in (grey - once, once - twice))
+    blur = cv2.GaussianBlur(grey, (0, 0), 1.0)
+    strong_blur = cv2.GaussianBlur(blur, (0, 0), 2.0)
+    fine, coarse = (float(np.abs(x if mask is None else x[mask]).mean()) for x in (grey - blur, blur - strong_blur))
     return float(np.log2(fine / coarse)) if fine > 0 and coarse > 0 else float("nan")
 
 

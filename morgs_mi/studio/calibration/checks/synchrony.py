@@ -57,8 +57,8 @@ def time_offsets(cameras: Sequence[Camera], thumbs: Sequence[np.ndarray]) -> np.
     offsets = consensus(len(cameras), views, frames, pairs[:, 3])
     agreeing = np.abs(offsets[views[:, 1]] - offsets[views[:, 0]] - frames) <= _AGREEING
     of_camera = (views[:, :, None] == np.arange(len(cameras))).any(axis=1)
-    enough = (of_camera & agreeing[:, None]).sum(axis=0) >= _MIN_AGREEMENT * of_camera.sum(axis=0)
-    return np.where(enough, offsets, np.nan)
+    is_determined = (of_camera & agreeing[:, None]).sum(axis=0) >= _MIN_AGREEMENT * of_camera.sum(axis=0)
+    return np.where(is_determined, offsets, np.nan)
 
 
 def consensus(count: int, views: ArrayLike, differences: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -75,8 +75,8 @@ def consensus(count: int, views: ArrayLike, differences: np.ndarray, weights: np
     for _ in range(_ITERATIONS):
         solution = np.linalg.lstsq(system * scale[:, None], differences * scale, rcond=None)[0]
         scale = np.sqrt(weights / np.maximum(np.abs(system @ solution - differences), 1e-2))
-    paired = np.unique(pairs)
-    values[paired] = solution[paired] - np.quantile(solution[paired], 0.5, method="lower")
+    members = np.unique(pairs)
+    values[members] = solution[members] - np.quantile(solution[members], 0.5, method="lower")
     return values
 
 
@@ -125,9 +125,9 @@ def _plane_angles(a: Camera, b: Camera, *rays: np.ndarray) -> list[np.ndarray]:
 def _profile(changes: np.ndarray, angles: np.ndarray, low: float, high: float) -> np.ndarray:
     """Return the epipolar profile [T - 1, planes], relative to the mean over time and over the planes."""
     planes = np.floor((angles - low) / (high - low) * _PLANES).astype(int)
-    used = (planes >= 0) & (planes < _PLANES)
-    pixels = np.maximum(np.bincount(planes[used], minlength=_PLANES), 1)
-    sums = [np.bincount(planes[used], change[used], _PLANES) for change in changes]
+    mask = (planes >= 0) & (planes < _PLANES)
+    pixels = np.maximum(np.bincount(planes[mask], minlength=_PLANES), 1)
+    sums = [np.bincount(planes[mask], change[mask], _PLANES) for change in changes]
     return np.sqrt(np.array(sums).reshape(len(changes), _PLANES) / pixels)
 
 

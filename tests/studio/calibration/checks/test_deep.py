@@ -85,9 +85,9 @@ def test_check_deep__finds_nothing_in_a_clip_without_faults(clips: Clips) -> Non
 @pytest.mark.slow
 @pytest.mark.parametrize("sentence", FAULTS)
 def test_check_deep__finds_a_fault_and_no_other(sentence: str, clips: Clips) -> None:
-    found = [finding.sentence for finding in checked(FAULTS[sentence](clips)).findings]
-    assert len(found) == 1, found
-    assert found[0].startswith(sentence)
+    sentences = [finding.sentence for finding in checked(FAULTS[sentence](clips)).findings]
+    assert len(sentences) == 1, sentences
+    assert sentences[0].startswith(sentence)
 
 
 def test_check_deep__states_what_it_cannot_measure(clips: Clips) -> None:
@@ -113,8 +113,8 @@ def test_draw_deep__marks_the_cameras_with_findings(clips: Clips) -> None:
     sound = checked(clips)
     assert red_names(drawn(sound)) == {}
     finding = Finding("time", (sound.names[1],), "cam1 is 1.4 frames ahead.")
-    found = replace(sound, offsets=np.array([0, 1.4, 0, np.nan]), findings=(finding,))
-    figure = drawn(found)
+    check = replace(sound, offsets=np.array([0, 1.4, 0, np.nan]), findings=(finding,))
+    figure = drawn(check)
     assert red_names(figure) == {"Time offset, frames": ["cam1"]}
     time = panel_of(figure, "Time offset, frames")
     heights = [bar.get_height() for bar in time.patches]
@@ -135,9 +135,9 @@ def panel_of(figure: Figure, title: str) -> Any:
 
 def red_names(figure: Figure) -> dict[str, list[str]]:
     """Return the names of cameras that are red, by the title of the panel."""
-    found = {}
+    names_by_plot = {}
     for panel in figure.axes:
         labels = [*panel.get_xticklabels(), *panel.get_yticklabels()]
         if names := [label.get_text() for label in labels if same_color(label.get_color(), "tab:red")]:
-            found[panel.get_title(loc="left")] = names
-    return found
+            names_by_plot[panel.get_title(loc="left")] = names
+    return names_by_plot

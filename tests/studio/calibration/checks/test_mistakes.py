@@ -22,7 +22,8 @@ from tests.scenes import textured
 from tests.scenes.textured import turned, with_cameras
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-TO_WORLD, TO_CAMERA = "camera to world", "world to camera"
+TO_WORLD = "camera to world"
+TO_CAMERA = "world to camera"
 POSES = {
     (TO_CAMERA, "OpenCV"): lambda c: c.viewmat,
     (TO_CAMERA, "OpenGL"): lambda c: FLIP @ c.viewmat,
@@ -60,8 +61,8 @@ def test_check_rig__names_another_pose_convention(
     toy = replace(layout_registry.LAYOUTS[0], name=layout, poses=PoseConvention(*expected))
     if layout.startswith("toy"):
         monkeypatch.setattr(layout_registry, "LAYOUTS", (*layout_registry.LAYOUTS, toy))
-    given = [interpreted(POSES[kind](camera), *expected) for camera in capture.cameras]
-    read = with_cameras(replace(capture, layout=layout), lambda i, c: replace(c, viewmat=given[i]))
+    cameras = [interpreted(POSES[kind](camera), *expected) for camera in capture.cameras]
+    read = with_cameras(replace(capture, layout=layout), lambda i, c: replace(c, viewmat=cameras[i]))
     check = check_rig(read, shared)
     assert check.fits is (kind == expected)
     if not check.fits:
@@ -160,7 +161,8 @@ def test_check_rig__names_a_copied_clip(capture: Capture, shared: SharedFeatures
 
 def test_check_rig__names_rows_in_alphabetical_order(tmp_path: Path) -> None:
     """Meet Room's names have no leading zeros: alphabetically cam_10 precedes cam_2, numerically it follows."""
-    names, planes = ("cam_0", "cam_1", "cam_2", "cam_10"), textured.textures()
+    names = ("cam_0", "cam_1", "cam_2", "cam_10")
+    planes = textured.textures()
     cameras = dict(zip(names, textured.rig(4, 240, 180), strict=True))
     for name, camera in cameras.items():
         write_video(tmp_path / f"{name}.mkv", [textured.render(camera, planes)], 30)
@@ -179,12 +181,14 @@ def test_check_rig__names_columns_of_another_convention(
     write_poses_bounds(tmp_path / "p.npy", cameras, [[1, 9]] * 6)
     rows = np.load(tmp_path / "p.npy")
     matrices = rows[:, :15].reshape(6, 3, 5)
-    down, right = matrices[..., 0].copy(), matrices[..., 1].copy()
-    matrices[..., 0], matrices[..., 1] = right, -down
+    down = matrices[..., 0].copy()
+    right = matrices[..., 1].copy()
+    matrices[..., 0] = right
+    matrices[..., 1] = -down
     np.save(tmp_path / "p.npy", rows)
     read, _ = read_poses_bounds(tmp_path / "p.npy", capture.names)
     # The principal points of the images, which the format cannot represent.
-    read = tuple(replace(c, K=own.K) for c, own in zip(read, capture.cameras, strict=True))
+    read = tuple(replace(c, K=camera.K) for c, camera in zip(read, capture.cameras, strict=True))
     check = check_rig(replace(capture, cameras=read, layout="poses_bounds"), shared)
     assert check.fits is False
     assert "the columns seem to be the camera's right, up and backward axes" in check.advice

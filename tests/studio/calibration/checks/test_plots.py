@@ -21,7 +21,8 @@ from tests.scenes.cameras import circle, look_at_cameras
 def test_draw_rig__draws_cameras_at_their_positions() -> None:
     """Cameras on a line lie side by side seen from above; the held-out one is red, and distant points are cut off."""
     cameras = [Camera.look_at((x, 0, 0), (x, 0, 5), (0, -1, 0), 60, 64, 48, "") for x in (-1.0, 0.0, 1.0)]
-    points, green = np.array([[0.0, 0, 3], [1e6, 0, 0]]), np.array([[0, 1.0, 0], [0, 1, 0]])
+    points = np.array([[0.0, 0, 3], [1e6, 0, 0]])
+    green = np.array([[0, 1.0, 0], [0, 1, 0]])
     figure = Figure()
     draw_rig(figure, cameras, (points, green), test_views=(1,))
     above = figure.axes[0]

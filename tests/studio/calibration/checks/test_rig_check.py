@@ -82,8 +82,8 @@ def test_check_rig__hardly_detects_a_common_shift_of_principal_points(capture: C
 
 
 def test_triangulate_points__ignores_the_held_out_view(capture: Capture, shared: SharedFeatures) -> None:
-    found = triangulate_points(capture, shared)
-    assert len(found.points) == len(found.point_colors) > 1000
+    points = triangulate_points(capture, shared)
+    assert len(points.points) == len(points.point_colors) > 1000
     held_out = replace(capture, test_views=(3,))
     fewer = triangulate_points(held_out, shared)
     blind = SharedFeatures(
@@ -91,17 +91,18 @@ def test_triangulate_points__ignores_the_held_out_view(capture: Capture, shared:
         tuple(match for match in shared.matches if 3 not in match.views),
     )
     np.testing.assert_array_equal(fewer.points, triangulate_points(held_out, blind).points)
-    assert len(fewer.points) < len(found.points)
+    assert len(fewer.points) < len(points.points)
     wrong = with_cameras(capture, lambda i, c: replace(c, viewmat=np.diag([1.0, -1, -1, 1]) @ c.viewmat))
     assert len(triangulate_points(wrong, shared).points) == 0
 
 
 def test_match_capture__finds_features_at_the_recorded_size(capture: Capture, shared: SharedFeatures) -> None:
     small = load_capture(capture.path, 4)
-    found = match_capture(small)
-    assert [len(f.points) for f in found.features] == [len(f.points) for f in shared.features]
-    assert check_rig(small, found).error == pytest.approx(check_rig(capture, shared).error, abs=0.01)
-    few, all_ = triangulate_points(small, found), triangulate_points(capture, shared)
+    matches = match_capture(small)
+    assert [len(f.points) for f in matches.features] == [len(f.points) for f in shared.features]
+    assert check_rig(small, matches).error == pytest.approx(check_rig(capture, shared).error, abs=0.01)
+    few = triangulate_points(small, matches)
+    all_ = triangulate_points(capture, shared)
     assert len(few.points) == pytest.approx(len(all_.points), rel=0.01)
     assert few.cameras is small.cameras
 
@@ -109,17 +110,18 @@ def test_match_capture__finds_features_at_the_recorded_size(capture: Capture, sh
 def test_triangulate_points__matches_distant_views_with_their_poses(capture: Capture, shared: SharedFeatures) -> None:
     ends = replace(capture, cameras=(capture.cameras[0], capture.cameras[5]), masks=(None, None), test_views=())
     unmatched = SharedFeatures((shared.features[0], shared.features[5]), ())
-    found = triangulate_points(ends, unmatched)
-    assert len(found.points) > 50
-    depth = [camera.project(found.points)[1] for camera in ends.cameras]
+    points = triangulate_points(ends, unmatched)
+    assert len(points.points) > 50
+    depth = [camera.project(points.points)[1] for camera in ends.cameras]
     assert np.min(depth) > 1
     wrong = with_cameras(ends, lambda i, c: replace(c, viewmat=np.diag([1.0, -1, -1, 1]) @ c.viewmat) if i else c)
-    assert len(triangulate_points(wrong, unmatched).points) < 0.2 * len(found.points)
+    assert len(triangulate_points(wrong, unmatched).points) < 0.2 * len(points.points)
 
 
 def test_check_rig__fits_with_undistortion_only(tmp_path: Path) -> None:
     """The recorded images are distorted by OpenCV's own model; the poses fit only if the lens is read."""
-    planes, k1 = textured.textures(), -0.25
+    planes = textured.textures()
+    k1 = -0.25
     cameras = textured.rig(4)
     for camera in cameras:
         rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float64)

@@ -24,7 +24,8 @@ def brighter(image: np.ndarray, gain: float) -> np.ndarray:
 
 def flickering(mains: float, fps: float, amplitude: float = 0.03, count: int = 60) -> np.ndarray:
     """Return the log brightness of six bands of rows under lamps, with noise and a drift."""
-    times, phases = np.arange(count)[:, None] / fps, np.linspace(0, 2, 6)
+    times = np.arange(count)[:, None] / fps
+    phases = np.linspace(0, 2, 6)
     noise = 0.002 * np.random.default_rng(0).standard_normal((count, 6))
     return amplitude * np.sin(4 * np.pi * mains * times + phases) + 0.02 * times + noise
 
@@ -32,8 +33,8 @@ def flickering(mains: float, fps: float, amplitude: float = 0.03, count: int = 6
 def test_brightness__is_the_log_of_the_gain(clips: Clips) -> None:
     gains = np.exp(np.linspace(-0.2, 0.2, 9))
     signals = read_signals(filmed([[brighter(clip[0], gain) for gain in gains] for clip in clips]), 9)
-    found = known_median(brightness(signals), axis=2)
-    assert_close(found, np.repeat(np.log(gains)[:, None], len(clips), 1), atol=0.01)
+    log_gains = known_median(brightness(signals), axis=2)
+    assert_close(log_gains, np.repeat(np.log(gains)[:, None], len(clips), 1), atol=0.01)
 
 
 @pytest.mark.parametrize(
