@@ -86,11 +86,11 @@ def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features
     keypoints, descriptors = sift.detectAndCompute(grey, where)
     if descriptors is None:
         return none
-    enlarged = width / size[0], height / size[1]
-    points = (np.array([k.pt for k in keypoints]) + 0.5) * enlarged
+    pixel_scale = width / size[0], height / size[1]
+    points = (np.array([k.pt for k in keypoints]) + 0.5) * pixel_scale
     angles = np.deg2rad([k.angle for k in keypoints])
     sizes = np.array([k.size for k in keypoints])
-    axes = 0.5 * sizes[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1) * enlarged
+    axes = 0.5 * sizes[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1) * pixel_scale
     # RootSIFT: square roots of the normalised descriptors are easier to distinguish (Arandjelovic 2012).
     descriptors = np.sqrt(descriptors / descriptors.sum(1, keepdims=True))
     columns, rows = np.clip(points.astype(int), 0, (width - 1, height - 1)).T
@@ -251,13 +251,13 @@ def intersect(
 
 def _distances(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
     """Return the distance of each point's projection [n] from its pixel, px, infinite behind the camera."""
-    projected = np.empty_like(pixels)
+    projections = np.empty_like(pixels)
     depths = np.empty(len(points))
     with np.errstate(divide="ignore", invalid="ignore"):
         for view in np.unique(views):
             of_view = views == view
-            projected[of_view], depths[of_view] = cameras[view].project(points[of_view])
-        error = np.linalg.norm(projected - pixels, axis=1)
+            projections[of_view], depths[of_view] = cameras[view].project(points[of_view])
+        error = np.linalg.norm(projections - pixels, axis=1)
     return np.where((depths > 0) & np.isfinite(error), error, np.inf)
 
 

@@ -67,8 +67,8 @@ def _indices(place: Path, views: int | str | Sequence[int | str] | None, names: 
     """Return the ascending indices of cameras; `place` is where they were requested."""
     if views is None:
         return ()
-    requested = [views] if isinstance(views, int | str) else list(views)
-    return tuple(sorted({_index(place, view, names) for view in requested}))
+    entries = [views] if isinstance(views, int | str) else list(views)
+    return tuple(sorted({_index(place, view, names) for view in entries}))
 
 
 def _index(place: Path, view: int | str, names: Sequence[str]) -> int:

@@ -40,10 +40,10 @@ def image_between(first: np.ndarray, second: np.ndarray, share: float) -> np.nda
     both = (first, forward, backward, share), (second, backward, forward, 1 - share)
     total = np.zeros(first.shape, np.float32)
     weights = np.zeros((*first.shape[:2], 1), np.float32)
-    for image, flow, back, passed in both:
-        places = _origins(flow, passed)
+    for image, flow, back, fraction in both:
+        places = _origins(flow, fraction)
         reliable = _sampled(consistency_mask(flow, back).astype(np.float32), places, cv2.INTER_LINEAR)[..., None]
-        weight = np.float32(1 - passed) * (reliable + np.float32(_LEAST_WEIGHT))
+        weight = np.float32(1 - fraction) * (reliable + np.float32(_LEAST_WEIGHT))
         total += weight * _sampled(image.astype(np.float32), places, cv2.INTER_CUBIC)
         weights += weight
     if has_light:

@@ -143,5 +143,5 @@ def _folded(x: np.ndarray, y: np.ndarray, camera: Camera) -> np.ndarray:
     across = local.unproject(np.stack([columns, columns], axis=1), np.ones_like(columns))[:, 0]
     down = local.unproject(np.stack([rows, rows], axis=1), np.ones_like(rows))[:, 1]
     radius = np.hypot(across, down[:, None])
-    folded = x_right * y_down - x_down * y_right <= 0
-    return radius >= np.min(radius[::step, ::step][folded], initial=np.inf)
+    fold = x_right * y_down - x_down * y_right <= 0
+    return radius >= np.min(radius[::step, ::step][fold], initial=np.inf)

@@ -88,8 +88,8 @@ def _not_black(file: Path) -> np.ndarray:
 def _opaque(file: Path, shape: tuple[int, int]) -> np.ndarray:
     """Return the mask of an image's opaque pixels [H, W]: all without an alpha channel, or if it is not readable."""
     try:
-        with fetched(file).open("rb") as opened:
-            header = opened.read(26)
+        with fetched(file).open("rb") as stream:
+            header = stream.read(26)
         image = _decoded(file) if _may_be_transparent(header) else None
     except (ValueError, OSError):
         image = None

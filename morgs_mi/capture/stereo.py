@@ -78,8 +78,8 @@ class _View:
         size = round(camera.width * scale), round(camera.height * scale)
         valid = np.full(image.shape[:2], 255, np.uint8) if mask is None else np.uint8(255) * mask.astype(np.uint8)
         valid = cv2.resize(valid, size, interpolation=cv2.INTER_NEAREST)
-        reduced = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        return cls(camera.resized(*size), reduced, cv2.blur(reduced, (3, 3)), valid)
+        small_image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        return cls(camera.resized(*size), small_image, cv2.blur(small_image, (3, 3)), valid)
 
 
 def _neighbours(cameras: Sequence[Camera], scene_points: np.ndarray) -> list[tuple[int, int]]:
@@ -141,8 +141,8 @@ class _Rectified:
         top = max(a0[1], b0[1])
         bottom = min(a1[1], b1[1])
         size = int(np.ceil(max(a1[0] - a0[0], b1[0] - b0[0]))), int(np.ceil(bottom - top))
-        shifted = [_shift(-box[0][0], -top) @ H for box, H in zip(boxes, homographies, strict=True)]
-        return cls(axes, focal, baseline, (shifted[0], shifted[1]), (a0[0], b0[0], top), size)
+        transforms = [_shift(-box[0][0], -top) @ H for box, H in zip(boxes, homographies, strict=True)]
+        return cls(axes, focal, baseline, (transforms[0], transforms[1]), (a0[0], b0[0], top), size)
 
     def warped(self, index: int, image: np.ndarray, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
         """Return an image of one of the views, rectified; OpenCV's pixel centres lie at whole numbers."""
@@ -226,8 +226,8 @@ def _confirmed(points: np.ndarray, others: Sequence[_View]) -> np.ndarray:
     for view in others:
         visible, pixels, _ = seen_points(view.camera, points[:, :3])
         columns, rows = pixels.astype(int).T
-        shown = view.blurred[rows, columns] / 255.0
-        same = np.abs(shown - points[visible, 3:]).max(axis=1) < _MAX_COLOR
+        view_colors = view.blurred[rows, columns] / 255.0
+        same = np.abs(view_colors - points[visible, 3:]).max(axis=1) < _MAX_COLOR
         confirmed[visible] |= same & (view.valid[rows, columns] > 0)
     return confirmed
 

@@ -131,7 +131,7 @@ def timeline(
         _check_rates(path, readers, exact, instants)
     positions = clocks.offsets[:, None] + clocks.rates[:, None] * instants
     indices = [nearest_frames(reader, places) for reader, places in zip(readers, positions, strict=True)]
-    shown = np.array([_positions(reader, index) for reader, index in zip(readers, indices, strict=True)])
+    image_places = np.array([_positions(reader, index) for reader, index in zip(readers, indices, strict=True)])
     shares: list[np.ndarray | None] = [None] * len(readers)
     delays = [0.0] * len(readers)
     for c, (name, reader) in enumerate(zip(names, readers, strict=True)):
@@ -140,15 +140,15 @@ def timeline(
         if clocks.rates[c] % 1 == 0:
             delays[c] = float(np.floor(positions[c][0] + 0.5) - positions[c][0])  # the same for all of its frames
             indices[c] = np.rint(positions[c] + delays[c]).astype(int)
-            shown[c] = indices[c] - delays[c]
+            image_places[c] = indices[c] - delays[c]
         else:
             indices[c] = np.clip(np.floor(positions[c]).astype(int), 0, reader.num_frames - 2)
             shares[c] = positions[c] - indices[c]
-            shown[c] = positions[c]
+            image_places[c] = positions[c]
     if config.gaps:
-        far = np.abs(shown - positions) > _NEAR
+        far = np.abs(image_places - positions) > _NEAR
         indices = list(np.where(far, -1, indices))
-    _warn_apart(path, (shown - exact.offsets[:, None]) / exact.rates[:, None], indices, exact.fps)
+    _warn_apart(path, (image_places - exact.offsets[:, None]) / exact.rates[:, None], indices, exact.fps)
     unchanged = all(np.array_equal(index, np.arange(len(instants))) for index in indices)
     unchanged = unchanged and not any(config.offset.values())
     notes = tuple(_note(r, k) for r, k in zip(readers, indices, strict=True) if r.positions is not None)
@@ -228,8 +228,8 @@ def _position(reader: FrameReader, offset: float) -> float:
     if reader.positions is None:
         return offset
     index = round(offset)
-    held = min(max(index, 0), len(reader.positions) - 1)
-    return round(reader.positions[held]) + index - held
+    nearest = min(max(index, 0), len(reader.positions) - 1)
+    return round(reader.positions[nearest]) + index - nearest
 
 
 def nearest_frames(reader: FrameReader, positions: np.ndarray) -> np.ndarray:
@@ -250,12 +250,12 @@ def _note(reader: FrameReader, indices: np.ndarray) -> str:
     assert reader.fps
     late = np.abs(reader.positions - np.rint(reader.positions)).max() / reader.fps
     missing = int(np.sum(indices < 0))
-    shown = indices[indices >= 0]
-    repeated = len(shown) - len(np.unique(shown))
+    frames = indices[indices >= 0]
+    repeats = len(frames) - len(np.unique(frames))
     return (
         f"{reader.path.name}: variable frame rate, {len(reader.positions)} frames in {_periods(reader)} periods "
         f"of {1e3 / reader.fps:.1f} ms, up to {1e3 * late:.1f} ms off; each instant has the frame nearest in time: "
-        f"{repeated} repeat one, {missing} have none."
+        f"{repeats} repeat one, {missing} have none."
     )
 
 

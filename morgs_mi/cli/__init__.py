@@ -94,8 +94,8 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
         interrupted = is_interruption(error)
         place = str(getattr(command, "capture", None) or "")
         sentence = "Interrupted." if interrupted else sentence_of(error, _option_names(command), place)
-        again = shlex.join([prog, *args, *([] if "--resume" in args else ["--resume"])])
-        notes = [note.replace("`--resume`", f"`{again}`") for note in getattr(error, "__notes__", [])]
+        command_line = shlex.join([prog, *args, *([] if "--resume" in args else ["--resume"])])
+        notes = [note.replace("`--resume`", f"`{command_line}`") for note in getattr(error, "__notes__", [])]
         print_warning(" ".join([sentence, *notes]))
         # The error may come from parsing, before `options` exist.
         if "--debug" in args:

@@ -70,9 +70,9 @@ def print_result(text: str) -> None:
 
 def print_table(table: Table) -> None:
     """Print to standard output with complete columns, even where the terminal is narrower than the table."""
-    needed = Measurement.get(OUT, OUT.options.update(max_width=10_000), table).maximum
+    table_width = Measurement.get(OUT, OUT.options.update(max_width=10_000), table).maximum
     with naming_output():
-        _Console(width=max(OUT.width, needed)).print(table)
+        _Console(width=max(OUT.width, table_width)).print(table)
 
 
 def print_warning(text: str) -> None:
@@ -123,10 +123,10 @@ def with_option_names(sentence: str, names: Mapping[str, str], place: str = "") 
     if start is None:
         return sentence
     text = sentence[start.end() :]
-    named = re.sub(r"`([\w.]+)(?:=(\w+))?`", lambda m: _option(names, *m.groups()) or m[0], text)
-    if named == text:
+    new_text = re.sub(r"`([\w.]+)(?:=(\w+))?`", lambda m: _option(names, *m.groups()) or m[0], text)
+    if new_text == text:
         return sentence
-    return named if function else start[0] + named
+    return new_text if function else start[0] + new_text
 
 
 def _option(names: Mapping[str, str], name: str, value: str | None) -> str | None:

@@ -146,6 +146,6 @@ def _noting_frames(stream: Path, count: int, resume: bool) -> Iterator[None]:
         with suppress(OSError, ValueError):
             if resume or stream.stat().st_mtime >= begin:
                 index = StreamReader(stream).index()
-                held = f"frames 0 to {index[-1][1]} of {count}; continue with `--resume`" if index else "no frame yet"
-                error.add_note(f"{stream} holds {held}.")
+                span = f"frames 0 to {index[-1][1]} of {count}; continue with `--resume`" if index else "no frame yet"
+                error.add_note(f"{stream} holds {span}.")
         raise

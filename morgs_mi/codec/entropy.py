@@ -108,8 +108,8 @@ def _tokens(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     size = np.abs(values.astype(np.int64))
     assert size.max(initial=0) < LIMIT
     if size.max(initial=0) < _DIRECT:
-        nothing = np.zeros(len(size), np.int64)
-        return np.where(values > 0, 2 * size - 1, 2 * size).astype(np.int32), nothing, nothing
+        zeros = np.zeros(len(size), np.int64)
+        return np.where(values > 0, 2 * size - 1, 2 * size).astype(np.int32), zeros, zeros
     bits = np.where(size < _DIRECT, 0, np.frexp(size.astype(np.float64))[1] - 1)
     m = np.where(bits > 0, 12 + bits, size)
     tokens = np.where(values > 0, 2 * m - 1, 2 * m).astype(np.int32)

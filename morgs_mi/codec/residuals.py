@@ -49,9 +49,9 @@ class Coder:
         """Yield the columns of changes `r` [C, N] and of the deaths; `take_change` reads them."""
         dead = np.ones(len(self.grid), bool)
         dead[self.survivors] = False
-        changed = {name: np.any(r[at], axis=0) for name, at in self.grid.columns.items()}
-        geometry = np.where(dead, _DEAD, _flags(changed, _GEOMETRY, len(self.grid)))
-        appearance = _flags(changed, _APPEARANCE, len(self.grid))
+        change_masks = {name: np.any(r[at], axis=0) for name, at in self.grid.columns.items()}
+        geometry = np.where(dead, _DEAD, _flags(change_masks, _GEOMETRY, len(self.grid)))
+        appearance = _flags(change_masks, _APPEARANCE, len(self.grid))
         for rows in _classes(self.grid):
             shape = geometry[rows]
             shading = appearance[rows]
@@ -59,7 +59,7 @@ class Coder:
             yield shading[shape == 0]
             yield shading[(shape > 0) & (shape < _DEAD)]
             for name, at in self.grid.columns.items():
-                yield from r[at].take(rows[changed[name][rows]], axis=1)
+                yield from r[at].take(rows[change_masks[name][rows]], axis=1)
 
     def offsets(self, r: np.ndarray, coarseness: int) -> Iterator[np.ndarray]:
         """Yield the columns of the offsets of the survivors with changed means; none if they are not stored."""
@@ -95,19 +95,19 @@ def take_change(reader: ColumnReader, grid: Grid, coarseness: int) -> tuple[np.n
         flags = {name: (geometry >> bit & 1) & (geometry < _DEAD) for bit, name in enumerate(_GEOMETRY)}
         flags |= {name: appearance >> bit & 1 for bit, name in enumerate(_APPEARANCE)}
         for name, at in grid.columns.items():
-            changed = rows[flags[name] == 1]
+            change_rows = rows[flags[name] == 1]
             for column in range(at.start, at.stop):
-                new = values[changed, column] + np.rint(reader.take(len(changed)) * step).astype(np.int64)
-                values[changed, column] = bounded(new, LIMIT, "value")
+                new = values[change_rows, column] + np.rint(reader.take(len(change_rows)) * step).astype(np.int64)
+                values[change_rows, column] = bounded(new, LIMIT, "value")
     return values, dead
 
 
-def _flags(changed: dict[str, np.ndarray], names: tuple[str, ...], N: int) -> np.ndarray:
+def _flags(change_masks: dict[str, np.ndarray], names: tuple[str, ...], N: int) -> np.ndarray:
     """Return the sum of 2^k [N] over the groups `names` that change; k is the place of a group."""
     flags = np.zeros(N, np.int32)
     for bit, name in enumerate(names):
-        if name in changed:
-            flags |= changed[name].astype(np.int32) << bit
+        if name in change_masks:
+            flags |= change_masks[name].astype(np.int32) << bit
     return flags
 
 

@@ -44,8 +44,8 @@ def atomic_path(path: str | os.PathLike[str], place: str) -> Generator[Path, Non
             final.rename(old)  # deleting takes time, and a half-deleted folder would look complete
         partial.replace(final)
     except OSError as error:
-        removed = ", the partial output was removed" if os.path.lexists(partial) else ""
-        raise write_error(f"{place}: cannot write {path}{removed}", error, partial) from error
+        remark = ", the partial output was removed" if os.path.lexists(partial) else ""
+        raise write_error(f"{place}: cannot write {path}{remark}", error, partial) from error
     finally:
         if os.path.exists(old) and not os.path.exists(final):
             old.rename(final)
@@ -81,9 +81,9 @@ def locked_folder(path: str | os.PathLike[str], place: str) -> Generator[None, N
     """
     folder = Path(path)
     file = Path(path) / _LOCK
-    created = [parent for parent in (folder, *folder.parents) if not os.path.lexists(parent)]
+    new_folders = [parent for parent in (folder, *folder.parents) if not os.path.lexists(parent)]
     with ExitStack() as undo:
-        undo.callback(_remove_empty, created)
+        undo.callback(_remove_empty, new_folders)
         try:
             folder.mkdir(parents=True, exist_ok=True)
             lock = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
@@ -102,10 +102,10 @@ def locked_folder(path: str | os.PathLike[str], place: str) -> Generator[None, N
         yield
 
 
-def is_same_file(path: str | os.PathLike[str], opened: os.stat_result) -> bool:
+def is_same_file(path: str | os.PathLike[str], status: os.stat_result) -> bool:
     """Return whether `path` still is the file that was opened: it was not removed, moved or replaced since."""
     try:
-        return os.path.samestat(os.stat(path), opened)
+        return os.path.samestat(os.stat(path), status)
     except OSError:
         return False
 
@@ -168,8 +168,8 @@ def _remove_empty(folders: Iterable[Path]) -> None:
 def _left_behind(final: Path) -> list[Path]:
     """Return the partial files of `final` of killed processes, one of which may have had this process's number."""
     process_id = str(os.getpid())
-    named = re.compile(rf"\.partial-(\d+)-{re.escape(final.name)}")
-    candidates = ((path, named.fullmatch(path.name)) for path in final.parent.glob(".partial-*"))
+    pattern = re.compile(rf"\.partial-(\d+)-{re.escape(final.name)}")
+    candidates = ((path, pattern.fullmatch(path.name)) for path in final.parent.glob(".partial-*"))
     return [path for path, match in candidates if match and (match[1] == process_id or not _alive(int(match[1])))]
 
 

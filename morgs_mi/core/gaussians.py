@@ -313,6 +313,6 @@ def join_sh(sh_dc: Tensor, sh_rest: Tensor | None) -> Tensor:
     column = lane % (3 * K)
     is_dc = column < 3
     mode = dr.ReduceMode.NoConflicts
-    concatenated = dr.gather(mi.Float, sh_dc.array, row * 3 + column, active=is_dc, mode=mode)
-    concatenated += dr.gather(mi.Float, sh_rest.array, row * (3 * K - 3) + column - 3, active=~is_dc, mode=mode)
-    return mi.TensorXf(concatenated, (N, K, 3))
+    coeffs = dr.gather(mi.Float, sh_dc.array, row * 3 + column, active=is_dc, mode=mode)
+    coeffs += dr.gather(mi.Float, sh_rest.array, row * (3 * K - 3) + column - 3, active=~is_dc, mode=mode)
+    return mi.TensorXf(coeffs, (N, K, 3))

@@ -120,15 +120,15 @@ def _release(error: BaseException) -> None:
 def _chain(error: BaseException) -> list[BaseException]:
     """Return an error with all its causes, contexts and members."""
     links: list[BaseException] = []
-    waiting: list[BaseException | None] = [error]
-    while waiting:
-        link = waiting.pop()
+    stack: list[BaseException | None] = [error]
+    while stack:
+        link = stack.pop()
         if link is None or any(link is other for other in links):
             continue
         links.append(link)
-        waiting += [link.__cause__, link.__context__]
+        stack += [link.__cause__, link.__context__]
         if isinstance(link, BaseExceptionGroup):
-            waiting += link.exceptions
+            stack += link.exceptions
     return links
 
 

@@ -54,8 +54,8 @@ def find_llvm(folders: Iterable[Path] | None = None) -> list[Path]:
     """Return the libLLVM files in `folders` (default: `search_folders`), newest first, without duplicates."""
     folders = search_folders() if folders is None else folders
     files = {path.resolve(): path for folder in folders for path in folder.glob("libLLVM*.so*")}
-    named = [path for path in files.values() if _NAME.fullmatch(path.name)]
-    return sorted(named, key=lambda path: llvm_major(path) or 0, reverse=True)
+    libraries = [path for path in files.values() if _NAME.fullmatch(path.name)]
+    return sorted(libraries, key=lambda path: llvm_major(path) or 0, reverse=True)
 
 
 def cache_folder() -> Path:

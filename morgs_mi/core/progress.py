@@ -73,9 +73,9 @@ class ProgressBar:
         if self._is_notebook:
             self._show_html(done, total, text)
         elif sys.stderr.isatty():
-            filled = round(_WIDTH * done / total) if total else 0
+            bar_length = round(_WIDTH * done / total) if total else 0
             end = "\n" if done == total else ""
-            sys.stderr.write(f"\r{self._name} {'━' * filled:{_WIDTH}} {text}{end}")
+            sys.stderr.write(f"\r{self._name} {'━' * bar_length:{_WIDTH}} {text}{end}")
             sys.stderr.flush()
 
     def report(self, stage: str, done: float, total: float) -> None:

@@ -138,11 +138,11 @@ def choose_key_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:
     if not cameras:
         return ()
     positions = np.array([camera.position for camera in cameras])
-    chosen = [int(np.argmin(np.linalg.norm(positions - positions.mean(0), axis=1)))]
-    while len(chosen) < min(count, len(cameras)):
-        distance = np.linalg.norm(positions[:, None] - positions[chosen], axis=-1).min(1)
-        chosen.append(int(np.argmax(distance)))
-    return tuple(sorted(chosen))
+    views = [int(np.argmin(np.linalg.norm(positions - positions.mean(0), axis=1)))]
+    while len(views) < min(count, len(cameras)):
+        distance = np.linalg.norm(positions[:, None] - positions[views], axis=-1).min(1)
+        views.append(int(np.argmax(distance)))
+    return tuple(sorted(views))
 
 
 def mean_views(cameras: Sequence[Camera], points: np.ndarray) -> float:

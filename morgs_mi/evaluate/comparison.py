@@ -60,9 +60,9 @@ class ComparedClip:
         last = None
         stops = self.recording.display_exposure or 0.0
         # The file may have grown since it was read.
-        decoded = islice(self.stream.states(), len(self.packets))
+        states = islice(self.stream.states(), len(self.packets))
         recorded = self.recording.partial_frames(min(self.packets), max(self.packets) + 1)
-        for state, frame in zip(decoded, recorded, strict=True):
+        for state, frame in zip(states, recorded, strict=True):
             kind, num_bytes = self.packets[state.frame]
             images = [None if image is None else display_image(image, stops) for image in frame.images]
             yield ComparedFrame(self, state, kind, num_bytes, images, last, frame.images)

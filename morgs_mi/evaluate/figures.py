@@ -68,10 +68,12 @@ def draw_stream(
     camera = recording.with_delays(stream.cameras)[view]
     # Nothing moves up to the first frame.
     later_frames = frames[1:] or frames
-    chosen = {later_frames[i] for i in np.linspace(0, len(later_frames) - 1, min(_ROWS, len(later_frames))).astype(int)}
+    row_frames = {
+        later_frames[i] for i in np.linspace(0, len(later_frames) - 1, min(_ROWS, len(later_frames))).astype(int)
+    }
     scale = motion_scale(recording, camera)
     column, still = _busiest_column(recording, view, frames)
-    shown = []
+    renders = []
     recorded = []
     motions = []
     confidences = []
@@ -79,13 +81,13 @@ def draw_stream(
     with_confidence = has_confidence(stream)
     with_offset = has_offset(stream)
     maps = (*(("confidence",) if with_confidence else ()), *(("offset",) if with_offset else ()))
-    played = render_stream(stream, camera, ("color", "motion", *maps))
-    for (index, images), frame in zip(played, recording.partial_frames(frames[0], frames[-1] + 1), strict=False):
+    playback = render_stream(stream, camera, ("color", "motion", *maps))
+    for (index, images), frame in zip(playback, recording.partial_frames(frames[0], frames[-1] + 1), strict=False):
         # Copies: views would keep all images of a long clip in memory.
-        shown.append(to_uint8(exposed(images["color"], stops))[:, column].copy())
+        renders.append(to_uint8(exposed(images["color"], stops))[:, column].copy())
         pixels = frame.images[view]
-        recorded.append(np.zeros_like(shown[-1]) if pixels is None else pixels[:, column].copy())
-        if index in chosen:
+        recorded.append(np.zeros_like(renders[-1]) if pixels is None else pixels[:, column].copy())
+        if index in row_frames:
             truth = truth_for_camera(recording, camera, index)
             true_motion, mask = (None, None) if truth is None else (truth.motion, truth.mask)
             motion_maps = {"true motion": true_motion, "motion": images["motion"]}
@@ -98,8 +100,8 @@ def draw_stream(
                 offset = channel_image("offset", images["offset"], scale)
                 offsets.append(_row(index, to_uint8, {"motion": whole, "its offset": offset}))
         if progress is not None:
-            progress(len(shown), len(frames))
-    sheets = {"slice": _slices(still, column, recorded, shown), "motion": _with_legend(motions, motion_legend(scale))}
+            progress(len(renders), len(frames))
+    sheets = {"slice": _slices(still, column, recorded, renders), "motion": _with_legend(motions, motion_legend(scale))}
     if confidences:
         sheets["confidence"] = _with_legend(confidences, confidence_legend())
     if offsets:
@@ -134,13 +136,15 @@ def _busiest_column(recording: Capture, view: int, frames: Sequence[int]) -> tup
     return int(change.argmax()), last.astype(np.uint8)
 
 
-def _slices(still: np.ndarray, column: int, recorded: Sequence[np.ndarray], shown: Sequence[np.ndarray]) -> np.ndarray:
+def _slices(
+    still: np.ndarray, column: int, recorded: Sequence[np.ndarray], renders: Sequence[np.ndarray]
+) -> np.ndarray:
     """Return an image with the column marked, beside the recorded and the rendered column over time."""
-    marked = still.copy()
-    marked[:, column] = _MARK
-    over_time = [(recorded, "recorded, over time"), (shown, "rendered, over time")]
+    picture = still.copy()
+    picture[:, column] = _MARK
+    over_time = [(recorded, "recorded, over time"), (renders, "rendered, over time")]
     slices = [label(time_slice(columns), title) for columns, title in over_time]
-    return side_by_side([label(marked, f"column {column}"), *slices])
+    return side_by_side([label(picture, f"column {column}"), *slices])
 
 
 def _row(

@@ -150,8 +150,8 @@ def _image_scores(view: ComparedView, lpips: ImageDistance | None) -> dict[str, 
     rendered = view.rendered
     moving = view.moving
     whole = np.ones(rendered.shape[:2], bool) if view.valid is None else view.valid
-    nothing = np.zeros_like(whole)
-    regions = (whole, *((nothing, nothing) if moving is None else (whole & moving, whole & ~moving)))
+    no_pixels = np.zeros_like(whole)
+    regions = (whole, *((no_pixels, no_pixels) if moving is None else (whole & moving, whole & ~moving)))
     a, b = unit_pair("evaluate_stream", rendered, view.recorded)
     maps = {"psnr": np.square(a - b), "delta_e": delta_e_map(a, b)}
     if min(whole.shape) >= WINDOW:

@@ -44,8 +44,8 @@ def psnr_mu(light: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None
     apart from their encoding, and errors are as for `psnr`.
     """
     most = max(float(truth.max()), 1e-12)
-    mapped = (np.log1p(_MU * np.clip(x.astype(np.float64) / most, 0, 1)) / np.log1p(_MU) for x in (light, truth))
-    return psnr(*mapped, mask=mask)
+    tones = (np.log1p(_MU * np.clip(x.astype(np.float64) / most, 0, 1)) / np.log1p(_MU) for x in (light, truth))
+    return psnr(*tones, mask=mask)
 
 
 def psnr_of(error: float) -> float:

@@ -55,7 +55,7 @@ def evaluate_motion(
     ids = surface_ids(means, views)
     rigid = rigid_motions(*tracks)
     true = np.zeros_like(means, float)
-    evaluated = np.zeros(len(means), bool)
+    mask = np.zeros(len(means), bool)
     for index in np.unique(tracks[2]):
         starts, ends = (points[tracks[2] == index] for points in tracks[:2])
         longest = np.linalg.norm(ends - starts, axis=-1).max()
@@ -67,8 +67,8 @@ def evaluate_motion(
             true[on] = means[on] @ (rotation - np.eye(3)).T + shift
         else:
             true[on] = local_motion(means[on], starts, ends)
-        evaluated |= on & (np.linalg.norm(true, axis=-1) >= _LEAST_SHARE * longest)
-    return compare_motion(displacements[evaluated], true[evaluated])
+        mask |= on & (np.linalg.norm(true, axis=-1) >= _LEAST_SHARE * longest)
+    return compare_motion(displacements[mask], true[mask])
 
 
 def local_motion(points: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:

@@ -116,8 +116,8 @@ class _ShortFits:
 
     def fit(self, start: Gaussians, exposures: Mapping[int, Exposure], steps: int) -> Gaussians:
         """Return Gaussians after some steps, from a start."""
-        corrected = [view._replace(image=exposures[v].corrected(view.image)) for v, view in enumerate(self._visible)]
-        problem = replace(self._problem, start=start, views=tuple(corrected))
+        views = [view._replace(image=exposures[v].corrected(view.image)) for v, view in enumerate(self._visible)]
+        problem = replace(self._problem, start=start, views=tuple(views))
         config = replace(self._config, first_frame_steps=steps)
         gaussians = fit_first_frame(problem, config, rng_of(self._seed, Stream.BALANCE)).gaussians
         self._count += 1

@@ -204,9 +204,9 @@ def _logit(x: np.ndarray | float) -> np.ndarray:
 
 def apply_plan(gaussians: Gaussians, plan: DensityPlan) -> Gaussians:
     """Return the M Gaussians of a plan."""
-    selected = gaussians.select(plan.parent)
-    columns = selected.numpy()
-    return replace(selected, **{name: columns[name] + edit for name, edit in plan.edits.items()})
+    parents = gaussians.select(plan.parent)
+    columns = parents.numpy()
+    return replace(parents, **{name: columns[name] + edit for name, edit in plan.edits.items()})
 
 
 def resize_optimizer(optimizer: Adam, plan: DensityPlan, edits: Mapping[str, np.ndarray] | None = None) -> None:

@@ -210,11 +210,11 @@ class _Fit:
         observations = {**self._observations[index], **self._neighbours}
         channels = channels_of(observations, objective)
         # The other terms are about motion and confidence, and must not move opacity and geometry.
-        detached = [name for name in channels if name != "color"]
+        other_channels = [name for name in channels if name != "color"]
         gaussians = apply_residual(self._base, parameters, self._motion)
         scores = self._attribution
         features = None if scores is None else scores.features()
-        image = view.render(gaussians, channels, [*detached, "features"] if scores else detached, features)
+        image = view.render(gaussians, channels, [*other_channels, "features"] if scores else other_channels, features)
         num_pixels = view.camera.width * view.camera.height
         num_gaussians = problem.active.num_gaussians
         prediction = Prediction(image, parameters, view.region, num_pixels, num_gaussians, problem.extent, gaussians)

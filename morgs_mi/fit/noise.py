@@ -36,8 +36,8 @@ def noise_of(image: np.ndarray) -> float:
     Args:
         image: uint8 or encoded floats.
     """
-    filtered = cv2.filter2D(unit_values(image, np.float32), -1, _FILTER)
-    return float(np.median(np.abs(filtered))) / _MEDIAN
+    response = cv2.filter2D(unit_values(image, np.float32), -1, _FILTER)
+    return float(np.median(np.abs(response))) / _MEDIAN
 
 
 def white_noise_of(image: np.ndarray) -> float:

@@ -43,12 +43,12 @@ def replace_parameter(optimizer: Adam, name: str, value: np.ndarray, carry: Call
         value: the new one.
         carry: maps a moment of the old shape to one of the new shape.
     """
-    _, promoted, rate, (steps, first, second, largest) = optimizer.state[name]
+    _, is_promoted, rate, (steps, first, second, largest) = optimizer.state[name]
     shape = tuple(optimizer[name].shape)
     moments = [from_numpy(mi.Float, carry(np.asarray(m).reshape(shape))) for m in (first, second)]
     dr.make_opaque(moments)
     optimizer[name] = from_numpy(mi.TensorXf, value)
-    state: Any = (optimizer.state[name][0], promoted, rate, (steps, *moments, largest))
+    state: Any = (optimizer.state[name][0], is_promoted, rate, (steps, *moments, largest))
     optimizer.state[name] = state
 
 
@@ -106,10 +106,10 @@ def optimise(
     final = {
         name: float(np.mean([np.asarray(v).item() for v in losses[-steps.last :]])) for name, losses in history.items()
     }
-    broken = [name for name, value in final.items() if not np.isfinite(value)]
-    if broken:
+    names = [name for name, value in final.items() if not np.isfinite(value)]
+    if names:
         raise FloatingPointError(
-            f"optimise(): the losses {', '.join(broken)} are not finite after {steps.first + len(history[broken[0]])} "
+            f"optimise(): the losses {', '.join(names)} are not finite after {steps.first + len(history[names[0]])} "
             "steps; lower the learning rates."
         )
     return final

@@ -147,10 +147,10 @@ def read_json(path: str | Path) -> Any:
         ValueError: it is no regular file, is broken, nested too deeply, or has too many tiny values.
     """
     text = read_text(path)
-    claimed, values = _json_claim(text)
-    if claimed > _ALLOWANCE:  # the punctuation of texts takes no memory
-        claimed, values = _json_claim(_TEXT.sub("", text))
-    check_claim(path, claimed, f"{values} values")
+    claim, values = _json_claim(text)
+    if claim > _ALLOWANCE:  # the punctuation of texts takes no memory
+        claim, values = _json_claim(_TEXT.sub("", text))
+    check_claim(path, claim, f"{values} values")
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -179,9 +179,9 @@ def read_array(path: str | Path, name: str | None = None) -> np.ndarray:
         if dtype.hasobject:
             raise ValueError("it holds Python objects, not numbers")
         count = math.prod(shape)
-        held = len(data) - stream.tell()
-        if min(shape, default=0) < 0 or count * dtype.itemsize != held:
-            raise ValueError(f"its header claims {dtype} {shape}, but {held} bytes follow")
+        num_bytes = len(data) - stream.tell()
+        if min(shape, default=0) < 0 or count * dtype.itemsize != num_bytes:
+            raise ValueError(f"its header claims {dtype} {shape}, but {num_bytes} bytes follow")
         flat = np.frombuffer(data, dtype, count, stream.tell())
         return flat.reshape(shape, order="F" if in_columns else "C")
     except _BROKEN as error:

@@ -160,26 +160,26 @@ def _between(path: str | Path, chunks: dict[str, np.ndarray], key: str, fraction
 def _check_columns(
     path: str | Path, element: str, columns: dict[str, np.ndarray], names: Sequence[str], dtype: str
 ) -> None:
-    if wrong := [name for name in names if name not in columns or columns[name].dtype.newbyteorder("<") != dtype]:
+    if faults := [name for name in names if name not in columns or columns[name].dtype.newbyteorder("<") != dtype]:
         raise ValueError(
-            f"{path}: expected a compressed PLY, got an element {element} without {', '.join(wrong)} as "
+            f"{path}: expected a compressed PLY, got an element {element} without {', '.join(faults)} as "
             f"{np.dtype(dtype).name}; export it again."
         )
 
 
 def _packed(fractions: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
     """Return fractions [N, k] rounded to integers of these numbers of bits, the first one in the highest bits."""
-    packed = np.zeros(len(fractions), np.uint32)
+    words = np.zeros(len(fractions), np.uint32)
     for column, count in zip(fractions.T, bits, strict=True):
         most = 2**count - 1
-        packed = packed << np.uint32(count) | np.floor(np.clip(column, 0, 1) * most + 0.5).astype(np.uint32)
-    return packed
+        words = words << np.uint32(count) | np.floor(np.clip(column, 0, 1) * most + 0.5).astype(np.uint32)
+    return words
 
 
-def _unpacked(packed: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
+def _unpacked(words: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
     """Return the fractions [N, k] of the lowest bits, the inverse of `_packed`."""
     columns = []
-    rest = packed.astype(np.uint32)
+    rest = words.astype(np.uint32)
     for count in reversed(bits):
         most = 2**count - 1
         columns.append((rest & np.uint32(most)) / most)
@@ -195,10 +195,10 @@ def _packed_rotations(quats: np.ndarray) -> np.ndarray:
     return largest.astype(np.uint32) << np.uint32(30) | _packed(others * np.sqrt(0.5) + 0.5, _ROTATION_BITS)
 
 
-def _unpacked_rotations(packed: np.ndarray) -> np.ndarray:
-    others = (_unpacked(packed, _ROTATION_BITS) - 0.5) * np.sqrt(2)
-    largest = (packed >> np.uint32(30)).astype(np.int64)
-    quats = np.empty((len(packed), 4))
+def _unpacked_rotations(words: np.ndarray) -> np.ndarray:
+    others = (_unpacked(words, _ROTATION_BITS) - 0.5) * np.sqrt(2)
+    largest = (words >> np.uint32(30)).astype(np.int64)
+    quats = np.empty((len(words), 4))
     np.put_along_axis(quats, _OTHERS[largest], others, axis=1)
     rest = np.sqrt(np.maximum(1 - (others**2).sum(axis=1), 0))
     np.put_along_axis(quats, largest[:, None], rest[:, None], axis=1)

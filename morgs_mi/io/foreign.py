@@ -67,18 +67,18 @@ def _format(path: Path) -> _Format | None:
         with path.open("rb") as file:
             head = file.read(_HEAD)
     name = path.name.lower()
-    named = next((kind for kind in _FORMATS if name.endswith(kind.endings)), None)
-    return _by_content(head, named, name) or named
+    name_format = next((kind for kind in _FORMATS if name.endswith(kind.endings)), None)
+    return _by_content(head, name_format, name) or name_format
 
 
-def _by_content(head: bytes, named: _Format | None, name: str) -> _Format | None:
+def _by_content(head: bytes, name_format: _Format | None, name: str) -> _Format | None:
     """Return the format that begins with these bytes."""
     if head[:4] == b"NGSP" or (head[:2] == b"\x1f\x8b" and _unzipped(head)[:4] == b"NGSP"):
         return _SPZ
     if head[:2] == b"\x1f\x8b":
-        return named or _ARCHIVE
+        return name_format or _ARCHIVE
     if head[:4] == b"PK\x03\x04":
-        return _SOG if b"meta.json" in head else named or _ARCHIVE
+        return _SOG if b"meta.json" in head else name_format or _ARCHIVE
     if head[:4] == b"glTF" or b"KHR_gaussian_splatting" in head:
         return _GLTF
     if head[:8] == b"PXR-USDC" or head[:5] == b"#usda":

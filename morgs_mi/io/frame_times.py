@@ -65,18 +65,18 @@ def read_header(path: Path) -> VideoHeader:
         fps = stream.get(cv2.CAP_PROP_FPS)
         movie = read_movie(path)
         packets = _packet_times(path)
-        stored = path.suffix.lower() not in _WITHOUT_TIMES
-        times = _shown(path, stream, movie, packets) if stored else packets
+        has_times = path.suffix.lower() not in _WITHOUT_TIMES
+        times = _shown(path, stream, movie, packets) if has_times else packets
     finally:
         stream.release()
     if movie is not None and movie.complete:
         num_frames = len(times)  # the header counts hidden frames
-    elif stored:
+    elif has_times:
         num_frames -= len(packets) - len(times)
-    if movie is None and stored:
+    if movie is None and has_times:
         num_frames -= frames_before  # the header has the end of the file, also where the sound begins first
     height, width = first.shape[:2]
-    if stored and (np.diff(times) > 0).all():
+    if has_times and (np.diff(times) > 0).all():
         return VideoHeader(width, height, num_frames, len(times), fps, times)
     # The decoder skips packets without a time.
     return VideoHeader(width, height, num_frames, min(len(times), num_frames or len(times)), fps, None)

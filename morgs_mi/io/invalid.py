@@ -53,12 +53,12 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
     count = int(N - every.sum())
     if not count:
         return gaussians
-    named = "; ".join(
+    details = "; ".join(
         f"{_WORDS.get(name, name)} of {_few(np.flatnonzero(~rows))}" for name, rows in valid.items() if not rows.all()
     )
     if count > most_invalid * N:
         raise ValueError(
-            f"{path}: expected finite numbers of at most {LARGEST:g}, others in {count} of {N} Gaussians ({named}); "
+            f"{path}: expected finite numbers of at most {LARGEST:g}, others in {count} of {N} Gaussians ({details}); "
             "leave them out with --drop-invalid, in Python with `most_invalid=1`, or export the file again."
         )
     _log.warning(
@@ -67,7 +67,7 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
         count,
         N,
         LARGEST,
-        named,
+        details,
     )
     return gaussians.select(every)
 

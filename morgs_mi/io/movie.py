@@ -65,8 +65,8 @@ def _durations(file: BinaryIO, edits: _Box, per_second: int) -> tuple[float, ...
     # An entry has the length of the part, its start in the track, -1 for a pause, and its speed.
     width = 8 if data[:1] == b"\1" else 4
     entries = [data[at : at + 2 * width] for at in range(8, len(data) - 2 * width - 3, 2 * width + 4)]
-    shown = [entry for entry in entries if int.from_bytes(entry[width:], "big", signed=True) >= 0]
-    return tuple(int.from_bytes(entry[:width], "big") / max(per_second, 1) for entry in shown)
+    visible_entries = [entry for entry in entries if int.from_bytes(entry[width:], "big", signed=True) >= 0]
+    return tuple(int.from_bytes(entry[:width], "big") / max(per_second, 1) for entry in visible_entries)
 
 
 def _time_scale(file: BinaryIO, header: _Box) -> int:

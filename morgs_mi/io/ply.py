@@ -179,18 +179,18 @@ def read_elements(
         with path.open("rb") as file:
             order, elements = _read_header(file)
             element_names = {element.name for element in elements}.intersection((*required, *optional))
-            if lacking := [name for name in required if name not in element_names]:
-                raise ValueError(f"it has no element {lacking[0]}")
+            if missing_names := [name for name in required if name not in element_names]:
+                raise ValueError(f"it has no element {missing_names[0]}")
             properties: dict[str, dict[str, np.ndarray]] = {}
             for element in elements:
                 if properties.keys() == element_names:
                     break
                 dtype = element.dtype(order)
-                held = path.stat().st_size - file.tell()
+                num_bytes = path.stat().st_size - file.tell()
                 # A number in a text takes a digit and a separator.
                 size = element.count * (dtype.itemsize if order else 2 * len(element.properties)) - (not order)
-                if element.count < 0 or size > held:
-                    raise ValueError(f"{element.count} {element.name} need at least {size} bytes, {held} follow")
+                if element.count < 0 or size > num_bytes:
+                    raise ValueError(f"{element.count} {element.name} need at least {size} bytes, {num_bytes} follow")
                 if element.name in element_names:
                     properties[element.name] = _read_rows(file, element, dtype, text=not order)
                 elif order:

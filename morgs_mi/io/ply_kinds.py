@@ -73,9 +73,9 @@ def as_3dgs(path: str | Path, vertices: Vertices) -> Vertices:
 
 def _refuse_instants(path: str | Path, vertices: Vertices) -> None:
     """Raise an error if the Gaussians of several instants are in one file: all of them are never in one image."""
-    varying = [name for name, values in vertices.items() if _TIME.fullmatch(name) and (values != values[:1]).any()]
+    time_names = [name for name, values in vertices.items() if _TIME.fullmatch(name) and (values != values[:1]).any()]
     moving = [name for name, values in vertices.items() if _MOTION.fullmatch(name) and (values != 0).any()]
-    if evidence := [*varying, *moving, *_matching(vertices, _FOURTH)]:
+    if evidence := [*time_names, *moving, *_matching(vertices, _FOURTH)]:
         raise ValueError(
             f"{path}: expected the Gaussians of one instant, got several instants, as of Spacetime Gaussians or 4D "
             f"Gaussian Splatting ({_listed(evidence)}); export a .ply of each instant with the program that trained "
@@ -133,5 +133,5 @@ def _name_unread(path: Path, names: Iterable[str]) -> None:
 
 def _listed(names: Iterable[str]) -> str:
     """Return names in order, the first few of many."""
-    listed = sorted(names)
-    return ", ".join(listed[:6]) + (f" and {len(listed) - 6} more" if len(listed) > 6 else "")
+    ordered_names = sorted(names)
+    return ", ".join(ordered_names[:6]) + (f" and {len(ordered_names) - 6} more" if len(ordered_names) > 6 else "")

@@ -186,8 +186,8 @@ def _fetch(system: Any, url: str, remote: str, file: Path, size: int | None) -> 
 
 def _check_content(place: str, file: Path, size: int | None) -> None:
     """Raise `ConnectionError` if a fetched file has another size, or is a page of HTML, such as one to log in."""
-    with file.open("rb") as opened:
-        head = opened.read(512).lower()
+    with file.open("rb") as stream:
+        head = stream.read(512).lower()
     got = file.stat().st_size
     if any(mark in head for mark in _PAGE):
         raise ConnectionError(f"{place}: expected a file, got a page of HTML; check the URL, or log in, and try again.")

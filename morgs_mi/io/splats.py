@@ -53,8 +53,8 @@ def read_splats(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
         )
     if suffix == ".splat":
         return _read_splat(Path(path), most_invalid)
-    compressed = suffix == ".compressed.ply" or _is_compressed(Path(path))
-    return (read_compressed_ply if compressed else read_ply)(path, most_invalid)
+    is_compressed = suffix == ".compressed.ply" or _is_compressed(Path(path))
+    return (read_compressed_ply if is_compressed else read_ply)(path, most_invalid)
 
 
 def _is_compressed(path: Path) -> bool:

@@ -81,28 +81,28 @@ class VideoReader:
         """
         path = Path(path)
         header = read_header(path)
-        held = header.num_held
+        num_held = header.num_held
         fps = header.fps
         times = header.times
         positions = None
         # Some containers do not store the number, and a frame takes more than a byte.
-        declared = header.num_frames if 0 < header.num_frames <= path.stat().st_size else held
+        num_frames = header.num_frames if 0 < header.num_frames <= path.stat().st_size else num_held
         if times is not None and len(times) > 1:
             periods = len(times) - 1.0
             if (regular := clock(times)) is not None:
                 positions, rate = regular
                 periods = float(positions[-1] - positions[0])
-                if positions[-1] > 10 * held + _MAX_PAUSE:
+                if positions[-1] > 10 * num_held + _MAX_PAUSE:
                     raise ValueError(
-                        f"{path}: expected {held} frames at about {rate:.3g} per second, got time stamps that span "
+                        f"{path}: expected {num_held} frames at about {rate:.3g} per second, got time stamps that span "
                         f"{times[-1]:.3g} s; they are broken, convert the clip."
                     )
                 # Where the number is not stored, it is the duration times the mean rate; a clip of this length is
                 # complete.
-                if fps > 0 and declared / fps <= times[-1] + 1.5 / rate:
-                    declared = held
+                if fps > 0 and num_frames / fps <= times[-1] + 1.5 / rate:
+                    num_frames = num_held
             fps = true_rate(fps, periods, float(times[-1] - times[0]))
-        return cls(path, declared, fps if fps > 0 else None, header.width, header.height, held, positions, times)
+        return cls(path, num_frames, fps if fps > 0 else None, header.width, header.height, num_held, positions, times)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
         """Yield frames start..stop-1, by default up to `num_frames`.
@@ -263,12 +263,12 @@ def open_clips(clips: Sequence[Clip], gaps: bool = False) -> list[FrameReader]:
         ValueError: as `VideoReader.open` and `FolderReader.open`.
     """
     folders = [clip for clip in clips if gaps and isinstance(clip, Path) and clip.is_dir()]
-    numbered = {folder: {image_number(file): file for file in _images(folder)} for folder in folders}
+    folder_files = {folder: {image_number(file): file for file in _images(folder)} for folder in folders}
     readers: dict[Clip, FrameReader] = {}
-    for group in counting_together({folder: sorted(files) for folder, files in numbered.items()}):
-        numbers = _instants([numbered[folder] for folder in group])
+    for group in counting_together({folder: sorted(files) for folder, files in folder_files.items()}):
+        numbers = _instants([folder_files[folder] for folder in group])
         for folder in group:
-            files = numbered[folder]
+            files = folder_files[folder]
             images = [files.get(number, _missing_name(folder, files, number)) for number in numbers]
             readers[folder] = replace(FolderReader.of_files(images, gaps), numbers=numbers)
     return [readers[clip] if clip in readers else open_frames(clip, gaps) for clip in clips]

@@ -116,26 +116,28 @@ def find_active_set(
     config = config or ActiveSetConfig()
     if sum(c.mean() for c in changes.values()) > _MOST_CHANGED * len(cameras):
         return full_active_set(gaussians, cameras, render)
-    changed = {
+    changed_views = {
         v: ChangedView(ActiveView(camera, render), changes[v], boxes_around(gaussians, camera, render, _CORE))
         for v, camera in cameras.items()
     }
-    shares = responsibility(gaussians, changed.values(), config.min_weight)
-    active = (shares > config.min_responsibility) & (overlap(len(gaussians), changed.values()) > config.min_overlap)
+    shares = responsibility(gaussians, changed_views.values(), config.min_weight)
+    active = (shares > config.min_responsibility) & (
+        overlap(len(gaussians), changed_views.values()) > config.min_overlap
+    )
     if gaussians.logit_confidence is not None:
         active |= np.asarray(gaussians.logit_confidence) > 0
-    for changed_view in changed.values():
+    for changed_view in changed_views.values():
         grid = changed_view.view.grid
         boxes = changed_view.boxes
         unexplained = _unexplained(changed_view.counts, boxes.union(active, grid), grid.block)
         if unexplained.any():
             table = from_numpy(mi.UInt32, summed_area(unexplained))
             active |= np.asarray(boxes.within(table, grid) > 0.5 * boxes.area)
-    drawn = _drawn(active, shares > _QUIET, changed, config)
+    blocks_by_view = _drawn(active, shares > _QUIET, changed_views, config)
     static = with_zero_motion(gaussians.select(~active))
     views = {
-        v: make_active_view(cameras[v], Region.of(changed[v].view.grid, blocks), static, channels[v], render)
-        for v, blocks in drawn.items()
+        v: make_active_view(cameras[v], Region.of(changed_views[v].view.grid, blocks), static, channels[v], render)
+        for v, blocks in blocks_by_view.items()
         if blocks.any()
     }
     return ActiveSet(np.flatnonzero(active), len(gaussians), views, len(cameras))
@@ -153,8 +155,8 @@ def _drawn(
     """Return the drawn blocks [rows, columns], by view index: changes, and boxes of active Gaussians [N]."""
     indices = list(views)
     some = {indices[k] for k in choose_key_views([entry.view.camera for entry in views.values()], config.quiet_views)}
-    chosen = {v: active if v in some else active & changing for v in views}
-    return {v: entry.boxes.union(chosen[v], entry.view.grid) | (entry.counts > 0) for v, entry in views.items()}
+    selections = {v: active if v in some else active & changing for v in views}
+    return {v: entry.boxes.union(selections[v], entry.view.grid) | (entry.counts > 0) for v, entry in views.items()}
 
 
 def _unexplained(counts: np.ndarray, covered: np.ndarray, block: tuple[int, int]) -> np.ndarray:
@@ -165,12 +167,12 @@ def _unexplained(counts: np.ndarray, covered: np.ndarray, block: tuple[int, int]
         covered: blocks that active Gaussians cover.
         block: width and height of a block in pixels.
     """
-    changed = counts > _CHANGED * block[0] * block[1]
-    if not (changed & ~covered).any():
-        return np.zeros_like(changed)
-    count, components = cv2.connectedComponents(changed.astype(np.uint8))
+    changes = counts > _CHANGED * block[0] * block[1]
+    if not (changes & ~covered).any():
+        return np.zeros_like(changes)
+    count, components = cv2.connectedComponents(changes.astype(np.uint8))
     labels = np.asarray(components, np.int32)
-    area, covered_area = (np.bincount(labels[blocks], counts[blocks], count) for blocks in (changed, changed & covered))
+    area, covered_area = (np.bincount(labels[blocks], counts[blocks], count) for blocks in (changes, changes & covered))
     missing = covered_area < _EXPLAINED * area
     missing[0] = False
     return missing[labels]

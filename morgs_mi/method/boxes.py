@@ -59,10 +59,10 @@ class Boxes:
         left = before(self.left, self.bottom) - before(self.left, self.top)
         return (right - left) * (width * height)
 
-    def union(self, chosen: np.ndarray, grid: BlockGrid) -> np.ndarray:
-        """Return the blocks, bool [rows, columns], that any of the `chosen` boxes [N] touches."""
+    def union(self, selection: np.ndarray, grid: BlockGrid) -> np.ndarray:
+        """Return the blocks, bool [rows, columns], that any box of a `selection` [N] touches."""
         x0, y0, x1, y1 = (
-            np.asarray(v)[chosen].astype(np.int64) for v in (self.left, self.top, self.right, self.bottom)
+            np.asarray(v)[selection].astype(np.int64) for v in (self.left, self.top, self.right, self.bottom)
         )
         some = (x1 > x0) & (y1 > y0)
         width, height = grid.block

@@ -82,8 +82,8 @@ def change_mask(
     levels = _levels(cv2.transform(difference, _SUM) * np.float32(unit / 3), 1, config)
     half = cv2.resize(difference, (max(W // 2, 1), max(H // 2, 1)), interpolation=cv2.INTER_AREA).astype(np.float32)
     for channel in cv2.split(cv2.transform(half, unit * _COLORS)):
-        enlarged = cv2.resize(_levels(channel, 2, config), (W, H), interpolation=cv2.INTER_NEAREST)
-        levels = np.maximum(levels, enlarged)
+        pixel_levels = cv2.resize(_levels(channel, 2, config), (W, H), interpolation=cv2.INTER_NEAREST)
+        levels = np.maximum(levels, pixel_levels)
     return _with_peaks(levels if valid is None else levels * valid)
 
 
@@ -137,10 +137,10 @@ def moving_region(change: np.ndarray) -> np.ndarray:
         change: the `change_mask` [H, W].
     """
     margin = 2 * _CLOSING
-    closed = np.pad(change.astype(np.uint8), margin)
-    closed = cv2.morphologyEx(closed, cv2.MORPH_CLOSE, np.ones((_CLOSING, _CLOSING), np.uint8))
-    cv2.floodFill(closed, None, (0, 0), 2)  # pyright: ignore[reportCallIssue, reportArgumentType]
-    return (closed != 2)[margin:-margin, margin:-margin]
+    closing = np.pad(change.astype(np.uint8), margin)
+    closing = cv2.morphologyEx(closing, cv2.MORPH_CLOSE, np.ones((_CLOSING, _CLOSING), np.uint8))
+    cv2.floodFill(closing, None, (0, 0), 2)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    return (closing != 2)[margin:-margin, margin:-margin]
 
 
 def update_reference(reference: np.ndarray, image: np.ndarray, change: np.ndarray) -> np.ndarray:

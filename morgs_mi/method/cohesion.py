@@ -34,7 +34,7 @@ _ROUNDS = 150
 
 def share_confidence(
     gaussians: Gaussians,
-    chosen: np.ndarray,
+    indices: np.ndarray,
     logit: np.ndarray,
     still: float,
     weight: float,
@@ -44,28 +44,28 @@ def share_confidence(
 
     Args:
         gaussians: N Gaussians, detached.
-        chosen: int [M], indices of the active ones.
+        indices: int [M], indices of the active ones.
         logit: u [M], their own logits.
         still: logit of all others.
         weight: lambda, of an opaque neighbour of the same colour; 0: no cohesion.
         neighbours: index of all means; None: it is built.
     """
     neighbours = neighbours or NeighbourIndex(np.asarray(gaussians.means))
-    near = neighbours.nearest_of(chosen, _NEIGHBOURS)
+    near = neighbours.nearest_of(indices, _NEIGHBOURS)
     if not near.size:
         return logit
     chroma = _chromaticity(gaussians)
     opacity = np.asarray(gaussians.opacities)
-    affinity = np.exp(-np.sum((chroma[chosen][:, None] - chroma[near]) ** 2, axis=2) / (2 * _CHROMA_SCALE**2))
+    affinity = np.exp(-np.sum((chroma[indices][:, None] - chroma[near]) ** 2, axis=2) / (2 * _CHROMA_SCALE**2))
     affinity = weight * (opacity[near] * affinity).astype(np.float32)
     starts = np.arange(0, near.size + 1, near.shape[1])
-    weights = csr_array((affinity.ravel(), near.ravel(), starts), (len(chosen), len(gaussians)))
+    weights = csr_array((affinity.ravel(), near.ravel(), starts), (len(indices), len(gaussians)))
     total = 1 + affinity.sum(axis=1)
     everywhere = np.full(len(gaussians), still, np.float32)
-    everywhere[chosen] = logit
+    everywhere[indices] = logit
     for _ in range(_ROUNDS):
-        everywhere[chosen] = (logit + weights @ everywhere) / total
-    return everywhere[chosen]
+        everywhere[indices] = (logit + weights @ everywhere) / total
+    return everywhere[indices]
 
 
 def _chromaticity(gaussians: Gaussians) -> np.ndarray:

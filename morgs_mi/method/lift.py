@@ -117,16 +117,16 @@ def lift_flow(
     config = config or LiftConfig()
     means = gaussians.numpy()["means"].astype(np.float64)
     top = config.max_logit
-    chosen = sorted(observations.keys() & views.keys())
-    if not chosen:
+    indices = sorted(observations.keys() & views.keys())
+    if not indices:
         return MotionStart(np.zeros((len(means), 3), np.float32), np.full(len(means), -top, np.float32))
-    group = ViewGroup([views[v] for v in chosen])
-    flow = group.crop([observations[v].forward_flow for v in chosen])
-    maps = _flow_maps(flow, group.crop([observations[v].forward_reliable for v in chosen]))
+    group = ViewGroup([views[v] for v in indices])
+    flow = group.crop([observations[v].forward_flow for v in indices])
+    maps = _flow_maps(flow, group.crop([observations[v].forward_reliable for v in indices]))
     sums = group.draw(gaussians).sums(from_numpy(mi.Float, maps), _FLOW_MAPS).astype(float)
     view_motions = [
         _lift_view(view_sums, means, camera, motion_floor(camera.width, masks), config.noise_px)
-        for view_sums, camera in zip(sums, [views[v].camera for v in chosen], strict=True)
+        for view_sums, camera in zip(sums, [views[v].camera for v in indices], strict=True)
     ]
     d = _solve(view_motions, [np.ones(len(means))] * len(view_motions))
     for _ in range(_ROUNDS):

@@ -86,9 +86,11 @@ def initial_motion(
     for stage in STAGES:
         if stage.acts(config):
             start = stage.run(problem, start, config)
-    everyone = problem.neighbours if gaussians is previous else NeighbourIndex(np.asarray(previous.means))
+    neighbours = problem.neighbours if gaussians is previous else NeighbourIndex(np.asarray(previous.means))
     logit = _carried_confidence(start, gaussians)
-    shared = share_confidence(previous, active.indices, logit, -config.lift.max_logit, config.cohesion_weight, everyone)
+    shared = share_confidence(
+        previous, active.indices, logit, -config.lift.max_logit, config.cohesion_weight, neighbours
+    )
     return replace(start, logit_confidence=shared)
 
 

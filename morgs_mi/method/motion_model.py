@@ -67,8 +67,8 @@ def motion_model(config: MotionConfig) -> MotionModelFactory | None:
 def moved(gaussians: Gaussians, displacement: Tensor, rotation: Tensor) -> Gaussians:
     """Return N Gaussians after a motion, as a `MotionModel` gives it."""
     q, r = (dr.unravel(mi.Vector4f, tensor.array) for tensor in (gaussians.quats, rotation))
-    turned: Jit = dr.ravel(quaternion_product(r + mi.Vector4f(1, 0, 0, 0), q))
-    quats = mi.TensorXf(turned, tuple(gaussians.quats.shape))
+    product: Jit = dr.ravel(quaternion_product(r + mi.Vector4f(1, 0, 0, 0), q))
+    quats = mi.TensorXf(product, tuple(gaussians.quats.shape))
     motion = displacement if gaussians.motion is None else gaussians.motion + displacement
     return replace(gaussians, means=gaussians.means + displacement, motion=motion, quats=quats)
 

@@ -63,19 +63,19 @@ class MotionProblem:
             self._last.update(displacement=displacement, sums=sums)
         return self._last["sums"]
 
-    def images_around(self, chosen: np.ndarray, displacements: Sequence[np.ndarray]) -> KeyImages | None:
+    def images_around(self, selection: np.ndarray, displacements: Sequence[np.ndarray]) -> KeyImages | None:
         """Return the images in the blocks that some Gaussians reach, in place or displaced; None if there are none.
 
         Args:
-            chosen: which Gaussians, bool [N].
+            selection: which Gaussians, bool [N].
             displacements: of all Gaussians, [N, 3] each.
         """
-        some = self.gaussians.select(np.flatnonzero(chosen))
-        places = [some, *(displaced(some, d[chosen]) for d in displacements if d.any())]
-        narrowed = {}
-        everyone = np.ones(len(some), bool)
+        some = self.gaussians.select(np.flatnonzero(selection))
+        places = [some, *(displaced(some, d[selection]) for d in displacements if d.any())]
+        narrow_views = {}
+        all_rows = np.ones(len(some), bool)
         for index, view in self.views.items():
             boxes = [boxes_around(place, view.camera, view.config, 1.0) for place in places]
-            narrowed[index] = view.narrowed(np.any([box.union(everyone, view.grid) for box in boxes], axis=0))
-        views = {index: view for index, view in narrowed.items() if view is not None}
+            narrow_views[index] = view.narrowed(np.any([box.union(all_rows, view.grid) for box in boxes], axis=0))
+        views = {index: view for index, view in narrow_views.items() if view is not None}
         return KeyImages(views, self.targets) if views else None

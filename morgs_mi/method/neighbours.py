@@ -29,8 +29,8 @@ class NeighbourIndex:
             self._of_all[count] = self.nearest_of(np.arange(len(self.points)), count)
         return self._of_all[count]
 
-    def nearest_of(self, chosen: np.ndarray, count: int) -> np.ndarray:
+    def nearest_of(self, rows: np.ndarray, count: int) -> np.ndarray:
         """Return the same of the chosen points, int [M]: [M, min(count, N - 1)]."""
         count = min(count, len(self.points) - 1)
-        _, near = self._tree.query(self.points[chosen], count + 1, workers=-1)
-        return np.asarray(near).reshape(len(chosen), count + 1)[:, 1:]  # the first is the point itself
+        _, near = self._tree.query(self.points[rows], count + 1, workers=-1)
+        return np.asarray(near).reshape(len(rows), count + 1)[:, 1:]  # the first is the point itself

@@ -62,11 +62,11 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
             continue
         new_error = error_of(proposal)
         ratio = np.where(d.any(axis=1), _ERROR_RATIO, _ERROR_RATIO_STATIC)
-        accepted = differs & (new_error < ratio * error)
-        d = np.where(accepted[:, None], proposal, d)
-        error = np.where(accepted, new_error, error)
+        is_better = differs & (new_error < ratio * error)
+        d = np.where(is_better[:, None], proposal, d)
+        error = np.where(is_better, new_error, error)
         moves = np.where(d.any(axis=1), np.maximum(logit, _LOGIT), np.minimum(logit, -_LOGIT))
-        logit = np.where(accepted, moves, logit)
+        logit = np.where(is_better, moves, logit)
     return MotionStart(d, logit.astype(np.float32))
 
 

@@ -96,7 +96,7 @@ def apply_residual(previous: Gaussians, parameters: Mapping[str, Tensor], config
     others = [
         name for name in parameters if name in attributes and name not in ("motion", "offset", "logit_confidence")
     ]
-    updated = {name: attributes[name] + gated(name) for name in others}
+    values = {name: attributes[name] + gated(name) for name in others}
     displacement = motion + offset
-    updated |= {"means": attributes["means"] + displacement, "motion": displacement, "offset": offset}
-    return previous.with_parameters(updated if logit is None else {**updated, "logit_confidence": logit})
+    values |= {"means": attributes["means"] + displacement, "motion": displacement, "offset": offset}
+    return previous.with_parameters(values if logit is None else {**values, "logit_confidence": logit})

@@ -64,7 +64,7 @@ def responsibility(
     """
     near = dr.zeros(mi.Float, len(gaussians))
     area = dr.zeros(mi.Float, len(gaussians))
-    drawn = list[ActiveView]()
+    active_views = list[ActiveView]()
     shares = list[np.ndarray]()
     factors = list[int]()
     for changed_view in views:
@@ -76,20 +76,20 @@ def responsibility(
         factors.append(max(view.camera.width // width, 1))
         shares.append(_reduced(changed_view.change, factors[-1]))
         region = Region(shares[-1] > 0, view.config)
-        drawn.append(ActiveView(view.camera.resized(*shares[-1].shape[::-1]), view.config, region))
+        active_views.append(ActiveView(view.camera.resized(*shares[-1].shape[::-1]), view.config, region))
         near += boxes.within(region.block_table, region.grid, factors[-1])
-    if not drawn:
+    if not active_views:
         return np.zeros(len(gaussians), np.float32)
-    group = ViewGroup(drawn)
+    group = ViewGroup(active_views)
     change = group.crop(shares)
     blocks = [region.num_blocks for region in group.regions]
     area_of = np.repeat(np.square(factors), blocks)[:, None, None]  # px of the view per reduced pixel
     maps = from_numpy(mi.Float, np.stack([area_of * change, np.broadcast_to(area_of, change.shape)], axis=-1))
-    changed, weight = group.draw(gaussians).totals(maps, 2).T
+    change_weight, weight = group.draw(gaussians).totals(maps, 2).T
     visible = weight > min_weight
     # At least 1: the box of a Gaussian beside the view may be empty, although it reaches into the view.
-    elsewhere = np.maximum(np.asarray(area / dr.maximum(near, 1)), 1)
-    return np.where(visible, changed / np.where(visible, weight * elsewhere, 1), 0)
+    area_ratio = np.maximum(np.asarray(area / dr.maximum(near, 1)), 1)
+    return np.where(visible, change_weight / np.where(visible, weight * area_ratio, 1), 0)
 
 
 def overlap(count: int, views: Iterable[ChangedView]) -> np.ndarray:

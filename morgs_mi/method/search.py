@@ -80,10 +80,10 @@ def search_motion(problem: MotionProblem, start: MotionStart, config: SearchConf
     parts = _unexplained_parts(problem, displacement, config.max_parts)
     for part, d in _find(problem, parts, config):
         proposal = np.where(part[:, None], d, displacement).astype(np.float32)
-        around = problem.images_around(part, [displacement, proposal])
-        if around is None:
+        images = problem.images_around(part, [displacement, proposal])
+        if images is None:
             continue
-        old_error, new_error = (around.total_error(displaced(problem.gaussians, at)) for at in (displacement, proposal))
+        old_error, new_error = (images.total_error(displaced(problem.gaussians, at)) for at in (displacement, proposal))
         if new_error < _ERROR_RATIO * old_error:
             displacement = proposal
             logit = np.where(part, np.maximum(logit, _LOGIT), logit)
@@ -95,9 +95,9 @@ def search_motion(problem: MotionProblem, start: MotionStart, config: SearchConf
 def _unexplained_parts(problem: MotionProblem, displacement: np.ndarray, count: int) -> list[np.ndarray]:
     """Return the `count` parts with the largest errors that are not explained, or fewer, each as a mask [N]."""
     sums = problem.sums_at(displacement)
-    attributed = sums["error"].sum(0)
+    error_sums = sums["error"].sum(0)
     weight = sums["weight"].sum(0)
-    error = attributed / (weight + 1)
+    error = error_sums / (weight + 1)
     visible = weight > 1
     if not visible.any():
         return []
@@ -110,7 +110,7 @@ def _unexplained_parts(problem: MotionProblem, displacement: np.ndarray, count: 
     graph = coo_array((np.ones(len(rows), bool), (rows, near[ends])), (len(near), len(near)))
     label = connected_components(graph, directed=False)[1]
     size = np.bincount(label, unexplained)
-    total = np.bincount(label, np.where(unexplained, attributed, 0))
+    total = np.bincount(label, np.where(unexplained, error_sums, 0))
     largest = np.argsort(-total, kind="stable")[:count]
     return [label == part for part in largest if size[part] >= _MIN_SIZE]
 
@@ -202,10 +202,10 @@ class _MatchedView:
         margin = 4 * _GRID  # in reduced pixels: twice the grid along an axis, as its corners are farther
         rows, columns = np.nonzero(weight > 0.01 * weight.max())
         box = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
-        around = cv2.copyMakeBorder(self.target, margin, margin, margin, margin, cv2.BORDER_REPLICATE)
-        around = around[box[0].start : box[0].stop + 2 * margin, box[1].start : box[1].stop + 2 * margin]
+        surroundings = cv2.copyMakeBorder(self.target, margin, margin, margin, margin, cv2.BORDER_REPLICATE)
+        surroundings = surroundings[box[0].start : box[0].stop + 2 * margin, box[1].start : box[1].stop + 2 * margin]
         mask = np.repeat(np.sqrt(weight[box])[..., None], 3, axis=2)  # squared by OpenCV
-        cost = cv2.matchTemplate(around, self.rendering[box], cv2.TM_SQDIFF, mask=mask)
+        cost = cv2.matchTemplate(surroundings, self.rendering[box], cv2.TM_SQDIFF, mask=mask)
         return _CostSurface(np.maximum(cost, 0) / self.scale**2, self.camera, self.scale)
 
 

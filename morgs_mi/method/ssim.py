@@ -116,10 +116,10 @@ class Target:
             return np.asarray(self.planes.image(error)).reshape(self.shape)
         return np.asarray(self.minus(dr.detach(image).array, region)).reshape(region.shape(3))
 
-    def minus(self, drawn: Float, region: Region | None) -> Float:
+    def minus(self, image: Float, region: Region | None) -> Float:
         """Return the target minus an image, both flat on a region or the whole view; 0 where masked."""
         pixels, weight = self.on(region)
-        return pixels - (drawn if weight is None else drawn * weight)
+        return pixels - (image if weight is None else image * weight)
 
     def on(self, region: Region | None) -> tuple[Float, Float | None]:
         """Return the target on a region, flat, 0 outside the view, and the weights of its numbers; None: 1."""
@@ -234,8 +234,8 @@ def _statistics_pass(size: int, lanes: Lanes, height: Int32, target: Float) -> t
         y = read(target)
         return [y, [v * v for v in y]]
 
-    def statistics(read: _Read, blurred: list[list[Float]]) -> tuple[list[list[Float]], list[Float]]:
-        mean, square = blurred
+    def statistics(read: _Read, means: list[list[Float]]) -> tuple[list[list[Float]], list[Float]]:
+        mean, square = means
         return [mean, [dr.fma(-m, m, s) for m, s in zip(mean, square, strict=True)]], mean
 
     return _walk(size, lanes, height, moments, statistics, 2, 2)
@@ -251,8 +251,8 @@ def _similarity_pass(
         y = read(target)
         return [x, [v * v for v in x], [v * w for v, w in zip(x, y, strict=True)]]
 
-    def similarity(read: _Read, blurred: list[list[Float]]) -> tuple[list[list[Float]], list[Float]]:
-        terms = [_similarity(*values) for values in zip(*blurred, read(mean), read(variance), strict=True)]
+    def similarity(read: _Read, means: list[list[Float]]) -> tuple[list[list[Float]], list[Float]]:
+        terms = [_similarity(*values) for values in zip(*means, read(mean), read(variance), strict=True)]
         ssim, *derivatives = map(list, zip(*terms, strict=True))
         return derivatives, ssim
 
@@ -288,10 +288,10 @@ def _gradient_pass(
     def unchanged(read: _Read) -> list[list[Float]]:
         return [read(plane) for plane in derivatives]
 
-    def gradient(read: _Read, blurred: list[list[Float]]) -> tuple[list[list[Float]], list[Float]]:
+    def gradient(read: _Read, means: list[list[Float]]) -> tuple[list[list[Float]], list[Float]]:
         row = []
         errors = []
-        for x, y, d_x, d_xx, d_xy in zip(read(image), read(target), *blurred, strict=True):
+        for x, y, d_x, d_xx, d_xy in zip(read(image), read(target), *means, strict=True):
             error = x - y
             structure = dr.fma(y, d_xy, dr.fma(2 * x, d_xx, d_x))
             sign = dr.select(error > 0, 1.0, dr.select(error < 0, -1.0, 0.0))
@@ -364,10 +364,10 @@ def _walk(
                 return list(read_packet(plane, center, ready))
 
             sums = list(done[k])
-            written, summed = finish(narrow, [sums[STRIP * c : STRIP * (c + 1)] for c in range(inputs)])
-            for target, values in zip(targets, written, strict=True):
+            planes, numbers = finish(narrow, [sums[STRIP * c : STRIP * (c + 1)] for c in range(inputs)])
+            for target, values in zip(targets, planes, strict=True):
                 write_packet(target, [dr.select(t, v, 0) for t, v in zip(masks, values, strict=True)], center, ready)
-            for t, v in zip(masks, summed, strict=True):
+            for t, v in zip(masks, numbers, strict=True):
                 total = total + dr.select(t & ready, v, 0)
         return row + 2, end, first, places, columns, height, windows, total, targets
 

@@ -144,18 +144,18 @@ class Planes:
 
     def runs(self, region: Region | None, reach: int) -> Runs:
         """Return the runs that cover a region, or the whole view, and `reach` <= 8 pixels around it."""
-        drawn = np.ones((self.height, self.num_strips), bool)
+        cells = np.ones((self.height, self.num_strips), bool)
         if region is not None:
             mask = np.pad(region.mask, ((0, 0), (0, self.num_strips * STRIP - self.width)))
-            drawn = mask.reshape(self.height, self.num_strips, STRIP).any(axis=2)
-        drawn = np.pad(drawn, ((reach, reach), (1, 1)))
+            cells = mask.reshape(self.height, self.num_strips, STRIP).any(axis=2)
+        cells = np.pad(cells, ((reach, reach), (1, 1)))
         if reach:
-            drawn[:, 1:-1] |= drawn[:, 2:] | drawn[:, :-2]
-            drawn[:, 0] = drawn[:, 1]
-            drawn[:, -1] = drawn[:, -2]
-            count = np.pad(drawn, ((1, 0), (0, 0))).cumsum(0)
-            drawn = count[2 * reach + 1 :] > count[: -2 * reach - 1]
-        strip, first, end = _cell_runs(drawn.T)
+            cells[:, 1:-1] |= cells[:, 2:] | cells[:, :-2]
+            cells[:, 0] = cells[:, 1]
+            cells[:, -1] = cells[:, -2]
+            count = np.pad(cells, ((1, 0), (0, 0))).cumsum(0)
+            cells = count[2 * reach + 1 :] > count[: -2 * reach - 1]
+        strip, first, end = _cell_runs(cells.T)
         columns = np.clip(self.width - (strip - 1) * STRIP, 0, STRIP) * (strip > 0)
         component = np.repeat(np.arange(3), len(strip))
         x = np.tile(strip - 1, 3) * STRIP

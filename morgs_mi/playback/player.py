@@ -130,11 +130,11 @@ def render(
     gaussians: Gaussians, camera: Camera, channels: Sequence[str], config: RenderConfig
 ) -> dict[str, np.ndarray]:
     """Return rendered channels as float32 arrays [H, W, C] by name; the offset is zero where none is stored."""
-    rendered = [name for name in channels if name != "offset"]
+    names = [name for name in channels if name != "offset"]
     images: dict[str, Tensor] = {}
-    if rendered:
-        image = rasterize(gaussians, camera, rendered, config=config)
-        images = {name: image[name] for name in rendered}
+    if names:
+        image = rasterize(gaussians, camera, names, config=config)
+        images = {name: image[name] for name in names}
     if "offset" in channels:
         offset = np.zeros((len(gaussians), 3)) if gaussians.offset is None else gaussians.offset
         images["offset"] = rasterize(replace(gaussians, motion=offset), camera, ("motion",), config=config).motion

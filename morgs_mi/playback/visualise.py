@@ -197,10 +197,10 @@ def _concatenate(images: list[np.ndarray], axis: int) -> np.ndarray:
         raise ValueError("side_by_side(), contact_sheet(): expected at least one image, got none.")
     across = 1 - axis
     largest = max(image.shape[across] for image in images)
-    padded = []
+    parts = []
     for image in images:
         border = [(0, 0)] * 3
         border[across] = (0, largest - image.shape[across])
-        border[axis] = (GAP if padded else 0, 0)
-        padded.append(np.pad(image, border, constant_values=BACKGROUND))
-    return np.concatenate(padded, axis)
+        border[axis] = (GAP if parts else 0, 0)
+        parts.append(np.pad(image, border, constant_values=BACKGROUND))
+    return np.concatenate(parts, axis)

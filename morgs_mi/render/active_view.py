@@ -83,14 +83,14 @@ def make_active_view(
         channels: all channels that will be rendered.
         config: cut-offs and block shape.
     """
-    blended = tuple(name for name in channels if name != "alpha")
+    names = tuple(name for name in channels if name != "alpha")
     if not int(static.means.shape[0]):
         return ActiveView(camera, config, region)
     with dr.suspend_grad():
         rows = dr.compress(touches(project(static, camera, (), config), region))
         if not dr.width(rows):
             return ActiveView(camera, config, region)
-        static_splats = project(static, camera, blended, config, rows)
+        static_splats = project(static, camera, names, config, rows)
         dr.eval(
             static_splats.shape,
             static_splats.channels,

@@ -95,10 +95,10 @@ def next_entry(place: UInt32, word: UInt32, base: UInt32, end: UInt32, words: UI
         return place + 32, dr.gather(mi.UInt32, words, place), base + 32, end, words
 
     state = (place, word, base, end, words)
-    walked = dr.while_loop(
+    result = dr.while_loop(
         state, lambda place, word, base, end, _: (word == 0) & (place < end), step, label="next word"
     )
-    return walked[:3]
+    return result[:3]
 
 
 def pack_records(columns: list[Float], order: UInt32) -> Float:
@@ -121,8 +121,8 @@ def pack_records(columns: list[Float], order: UInt32) -> Float:
 
 def fetch_record(records: Float, rank: UInt32, length: int, packets: int | None = None) -> list[Float]:
     """Return the first `length` floats of the record at `rank`, which has `packets`, by default as many as needed."""
-    needed = -(-length // 4)
-    reads = (dr.gather(mi.Vector4f, records, rank * (packets or needed) + j) for j in range(needed))
+    count = -(-length // 4)
+    reads = (dr.gather(mi.Vector4f, records, rank * (packets or count) + j) for j in range(count))
     return [v for packet in reads for v in packet][:length]
 
 
@@ -199,10 +199,10 @@ def _tile_lists(rectangles: list[UInt32], region: Region) -> _Tiles:
 
     def enter(place, end, column, tile, columns, rank, across, slot_of, slot_at, rank_at):
         slot = tile if region.whole else dr.gather(mi.UInt32, slot_of, tile)
-        drawn = region.whole or slot != NO_SLOT
-        dr.scatter(slot_at, slot, place, active=drawn, mode=dr.ReduceMode.NoConflicts)
-        dr.scatter(rank_at, rank, place, active=drawn, mode=dr.ReduceMode.NoConflicts)
-        place = place + 1 if region.whole else dr.select(drawn, place + 1, place)
+        is_drawn = region.whole or slot != NO_SLOT
+        dr.scatter(slot_at, slot, place, active=is_drawn, mode=dr.ReduceMode.NoConflicts)
+        dr.scatter(rank_at, rank, place, active=is_drawn, mode=dr.ReduceMode.NoConflicts)
+        place = place + 1 if region.whole else dr.select(is_drawn, place + 1, place)
         wrap = column + 1 == columns
         column = dr.select(wrap, 0, column + 1)
         tile = dr.select(wrap, tile + across + 1 - columns, tile + 1)
@@ -233,18 +233,18 @@ def sorted_buckets(keys: UInt32, buckets: int) -> tuple[UInt32, UInt32, UInt32, 
     """Return (permutation that sorts `keys` stably, sorted keys, first place of each bucket, end of each bucket)."""
     total = dr.width(keys)
     perm = stable_order(keys, buckets)
-    ordered = dr.gather(mi.UInt32, keys, perm)
-    dr.eval(ordered)
+    sorted_keys = dr.gather(mi.UInt32, keys, perm)
+    dr.eval(sorted_keys)
     first = dr.zeros(mi.UInt32, buckets)
     end = dr.zeros(mi.UInt32, buckets)
     j = dr.arange(mi.UInt32, total)
     is_last = j + 1 == dr.opaque(mi.UInt32, total)
-    following = dr.gather(mi.UInt32, ordered, j + 1, active=~is_last)
-    edge = is_last | (following != ordered)
-    dr.scatter(end, j + 1, ordered, active=edge)
-    dr.scatter(first, j + 1, following, active=edge & ~is_last)
+    next_key = dr.gather(mi.UInt32, sorted_keys, j + 1, active=~is_last)
+    edge = is_last | (next_key != sorted_keys)
+    dr.scatter(end, j + 1, sorted_keys, active=edge)
+    dr.scatter(first, j + 1, next_key, active=edge & ~is_last)
     dr.eval(first, end)
-    return perm, ordered, first, end
+    return perm, sorted_keys, first, end
 
 
 def _block_bits(

@@ -132,8 +132,8 @@ def _gradients(
     else:
         sums = _run(adjoint, layout, _rounded_up(N), *arrays)
     lane = lists.rank_of * stride
-    skipped = 0 if layout.reaches_weights else layout.geometry
-    return [dr.gather(mi.Float, sums, lane + k) for k in range(skipped, layout.geometry + layout.columns)]
+    start = 0 if layout.reaches_weights else layout.geometry
+    return [dr.gather(mi.Float, sums, lane + k) for k in range(start, layout.geometry + layout.columns)]
 
 
 def _run(loop: Callable[..., Any], *arguments: Any) -> Any:

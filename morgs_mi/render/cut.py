@@ -69,14 +69,14 @@ class Cut:
         q = dr.select(near, q, dr.copysign(mi.Float(FARTHEST_CUT), q))
         qq = q * q
         fraction = dr.rcp(1 + exp2(-_SLOPE * q * dr.fma(_CUBIC, qq, 1)))
-        log_transmitted = dr.log2(1 - alpha)
-        transmitted = exp2(fraction * log_transmitted)
+        log_transmittance = dr.log2(1 - alpha)
+        transmittance = exp2(fraction * log_transmittance)
         slope = fraction * (1 - fraction) * (_SLOPE * _LN2) * dr.fma(3 * _CUBIC, qq, 1)
         return CutAlpha(
             # All or nothing without rounding where the limit is far away; a Gaussian that is not drawn stays so.
-            dr.select(near & (alpha > 0), 1 - transmitted, dr.select(behind > 0, alpha, 0)),
-            fraction * transmitted * dr.rcp(1 - alpha),
-            dr.select(near, -_LN2 * transmitted * log_transmitted * slope, 0),
+            dr.select(near & (alpha > 0), 1 - transmittance, dr.select(behind > 0, alpha, 0)),
+            fraction * transmittance * dr.rcp(1 - alpha),
+            dr.select(near, -_LN2 * transmittance * log_transmittance * slope, 0),
             behind,
         )
 

@@ -16,11 +16,11 @@ def exp2(p: Float) -> Float:
 
     Adding 1.5 * 2^23 rounds to an integer in the low mantissa bits, which is then shifted into the exponent.
     """
-    shifted = p + 12582912.0
-    f = p - (shifted - 12582912.0)
+    total = p + 12582912.0
+    f = p - (total - 12582912.0)
     value = mi.Float(_EXP2[0])
     for coefficient in _EXP2[1:]:
         value = dr.fma(value, f, coefficient)
-    exponent = dr.reinterpret_array(mi.Int32, shifted) << 23  # pyright: ignore[reportOperatorIssue]
+    exponent = dr.reinterpret_array(mi.Int32, total) << 23  # pyright: ignore[reportOperatorIssue]
     bits = dr.reinterpret_array(mi.Int32, value) + exponent
     return dr.reinterpret_array(mi.Float, bits)

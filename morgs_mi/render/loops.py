@@ -184,8 +184,8 @@ class _Block:
         """Return (alpha, alpha before the cap and the cut-off)."""
         full = exp2(p)
         # One instruction; `dr.minimum` takes three to handle NaN.
-        capped = dr.select(full < self.alpha_max, full, self.alpha_max)
-        return dr.select(p >= self.log_min, capped, 0), full
+        value = dr.select(full < self.alpha_max, full, self.alpha_max)
+        return dr.select(p >= self.log_min, value, 0), full
 
 
 def _advance(
@@ -218,8 +218,8 @@ def _store(
 
 def _load(block: _Block, layout: Layout, images: list[Float]) -> list[list[Float]]:
     """Return every pixel's columns, and alpha if it is an output; zeros outside the image."""
-    loaded = (_load_image(block, size, image) for image, size in zip(images, layout.sizes, strict=True))
-    return [[value for values in pixel for value in values] for pixel in zip(*loaded, strict=True)]
+    channels = (_load_image(block, size, image) for image, size in zip(images, layout.sizes, strict=True))
+    return [[value for values in pixel for value in values] for pixel in zip(*channels, strict=True)]
 
 
 def _load_image(block: _Block, size: int, image: Float) -> list[list[Float]]:

@@ -78,13 +78,13 @@ class Splats:
         """Return these splats followed by the others, which are 0 in the channels that they lack."""
 
         def columns_of(splats: Splats) -> tuple[Any, ...]:
-            blended = tuple(splats.channels.get(n) or _zeros(v, len(splats)) for n, v in self.channels.items())
-            culled = splats.depths, splats.extent, splats.valid, splats.finite
-            return splats.shape, blended, *culled, splats.profile, () if splats.view is None else splats.view
+            columns = tuple(splats.channels.get(n) or _zeros(v, len(splats)) for n, v in self.channels.items())
+            bounds = splats.depths, splats.extent, splats.valid, splats.finite
+            return splats.shape, columns, *bounds, splats.profile, () if splats.view is None else splats.view
 
-        shape, blended, *culled, profile, view = concatenated(columns_of(self), columns_of(other))
-        channels = dict(zip(self.channels, blended, strict=True))
-        depths, extent, valid, finite = culled
+        shape, columns, *bounds, profile, view = concatenated(columns_of(self), columns_of(other))
+        channels = dict(zip(self.channels, columns, strict=True))
+        depths, extent, valid, finite = bounds
         view = None if self.view is None else view
         return Splats(shape, channels, depths, extent, valid, finite, profile, view)
 

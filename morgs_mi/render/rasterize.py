@@ -79,8 +79,8 @@ class Image:
         return png_bytes(np.rint(255 * np.clip(np.nan_to_num(np.array(dr.detach(self.color))), 0, 1)).astype(np.uint8))
 
     def _tensors(self) -> dict[str, Tensor]:
-        named = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "others"}
-        return {name: tensor for name, tensor in {**named, **self.others}.items() if tensor is not None}
+        tensors = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "others"}
+        return {name: tensor for name, tensor in {**tensors, **self.others}.items() if tensor is not None}
 
     @staticmethod
     def _of(tensors: Mapping[str, Tensor]) -> Image:
@@ -294,8 +294,8 @@ def _empty(
     """Return the image of no Gaussians; `shape` is that of a tensor without its channels."""
     images = {name: dr.zeros(mi.TensorXf, (*shape, sizes[name])) for name in channels}
     if background is not None and "color" in images:
-        nothing = dr.zeros(mi.Float, prod((*shape, 3)))
-        images["color"] = _tensor(_over(background)(nothing, nothing), region, (*shape, 3))
+        zeros = dr.zeros(mi.Float, prod((*shape, 3)))
+        images["color"] = _tensor(_over(background)(zeros, zeros), region, (*shape, 3))
     return Image._of(images)
 
 
@@ -334,9 +334,9 @@ def _check_types(
         check_type("rasterize()", "camera", camera, Camera)
     sizes = list(dict.fromkeys((camera.width, camera.height) for camera in cameras))
     if len(sizes) > 1:
-        described = " and ".join(f"{width}x{height}" for width, height in sizes[:2])
+        sizes_text = " and ".join(f"{width}x{height}" for width, height in sizes[:2])
         raise ValueError(
-            f"rasterize(): `camera` must be cameras of the same size, got {described}; render one camera at a time."
+            f"rasterize(): `camera` must be cameras of the same size, got {sizes_text}; render one camera at a time."
         )
     check_type("rasterize()", "config", config, RenderConfig)
     for name, sequence in names.items():
@@ -438,16 +438,16 @@ def _check_finite(
     """
     if dr.all(finite):
         return
-    blended = ["sh_coeffs", "motion", *(attribute.activated_name for attribute in attribute_channels().values())]
-    names = ["means", "scales", "quats", "opacities", *blended]
+    blend_names = ["sh_coeffs", "motion", *(attribute.activated_name for attribute in attribute_channels().values())]
+    names = ["means", "scales", "quats", "opacities", *blend_names]
     poses = [("camera.viewmat", camera.viewmat) for camera in cameras]
     attributes = [(name, getattr(gaussians, name, None)) for name in names]
     for name, value in [*poses, *attributes, ("features", features)]:
         if value is None:
             continue
         array = np.asarray(dr.detach(value))
-        bounded = name in (*blended, "features")
-        bad = np.argwhere(~(np.abs(array) <= FARTHEST) if bounded else ~np.isfinite(array))
+        is_bounded = name in (*blend_names, "features")
+        bad = np.argwhere(~(np.abs(array) <= FARTHEST) if is_bounded else ~np.isfinite(array))
         if len(bad):
             worst = array[tuple(bad[0])]
             index = ", ".join(map(str, bad[0]))

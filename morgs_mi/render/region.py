@@ -58,8 +58,8 @@ class BlockGrid:
         """Return the blocks with a pixel of a mask [H, W], bool [rows, columns]."""
         # Several pixels of a row as one integer: NumPy reduces a few small groups of booleans 50 times more slowly.
         word = gcd(self.block[0], 8)
-        padded = self._padded(mask).reshape(self.shape[0], self.block[1], -1)
-        rows = np.bitwise_or.reduce(padded.view(f"u{word}"), axis=1)
+        pixels = self._padded(mask).reshape(self.shape[0], self.block[1], -1)
+        rows = np.bitwise_or.reduce(pixels.view(f"u{word}"), axis=1)
         return rows.reshape(*self.shape, self.block[0] // word).any(axis=2)
 
     def counts(self, mask: np.ndarray) -> np.ndarray:
@@ -74,9 +74,9 @@ class BlockGrid:
         """Return a mask [H, W] with rows and columns of False up to whole tiles."""
         rows, columns = self.shape
         width, height = self.block
-        padded = np.zeros((rows * height, columns * width), bool)
-        padded[: self.height, : self.width] = mask
-        return padded
+        pixels = np.zeros((rows * height, columns * width), bool)
+        pixels[: self.height, : self.width] = mask
+        return pixels
 
 
 class Region:
@@ -241,14 +241,14 @@ class Region:
         is_whole = (row < rows) & (column < columns)
         if is_whole.all():
             return blocks[row, :, column]
-        cropped = np.zeros((len(row), height, width, *image.shape[2:]), image.dtype)
-        cropped[is_whole] = blocks[row[is_whole], :, column[is_whole]]
+        pixels = np.zeros((len(row), height, width, *image.shape[2:]), image.dtype)
+        pixels[is_whole] = blocks[row[is_whole], :, column[is_whole]]
         for k in np.flatnonzero(~is_whole):
             y = row[k] * height
             x = column[k] * width
             part = image[y : y + height, x : x + width]
-            cropped[k, : part.shape[0], : part.shape[1]] = part
-        return cropped
+            pixels[k, : part.shape[0], : part.shape[1]] = part
+        return pixels
 
     def uncropped(self, values: np.ndarray) -> np.ndarray:
         """Return an image in whole blocks from this region's values [A, height, width, ...], 0 in all other blocks."""
@@ -294,8 +294,8 @@ def joined(regions: Sequence[Region]) -> Region:
     columns = region.across * ACROSS
     region.width = columns * region.block[0]
     region.height = len(regions) * rows * region.block[1]
-    padded = [np.pad(grid, ((0, rows - len(grid)), (0, columns - grid.shape[1]))) for grid in grids]
-    region._lay_out(np.concatenate(padded))
+    blocks = [np.pad(grid, ((0, rows - len(grid)), (0, columns - grid.shape[1]))) for grid in grids]
+    region._lay_out(np.concatenate(blocks))
     mask = np.concatenate([part.inside() for part in regions])
     region.weights = None if mask.all() else from_numpy(mi.Float, mask)
     return region

@@ -57,18 +57,18 @@ def composite(
     whole = _blended(image, channels, lambda image: cropped(image, crop))
     front = _in_front(gaussians, channels, view, config) or whole
     f = view.coverage
-    covered = view.coverage > 0
+    has_surface = view.coverage > 0
     t_front, t_whole = (1 - part["alpha"][0] for part in (front, whole))
 
-    shown = view.behind is not None
-    behind = view.behind if shown else mi.Color3f(0)
-    ground = [0.0] * 3 if background is None or shown else background
+    has_environment = view.behind is not None
+    behind = view.behind if has_environment else mi.Color3f(0)
+    ground = [0.0] * 3 if background is None or has_environment else background
     color = []
     for k in range(3):
         L = view.image[:, :, k].array
         E = behind[k]
         # Rays of its own find the coverage. Without splats, the two parts add up to L whatever it is.
-        surface = dr.maximum(L - (1 - f) * E, 0) / dr.select(covered, f, 1)
+        surface = dr.maximum(L - (1 - f) * E, 0) / dr.select(has_surface, f, 1)
         rest = dr.maximum(L - f * surface, 0) / dr.select(f < 1, 1 - f, 1)
         beyond = encode(rest) + ground[k]
         inner_color = decode(dr.fma(t_front, encode(surface), front["color"][k]))
@@ -80,10 +80,10 @@ def composite(
     if "depth" in channels:
         (depth,) = splats["depth"]
         weight = alpha + f * t_front
-        splats["depth"] = _ratio([depth + f * t_front * dr.select(covered, view.depth, 0)], weight)
+        splats["depth"] = _ratio([depth + f * t_front * dr.select(has_surface, view.depth, 0)], weight)
     if "motion" in channels:
         splats["motion"] = _ratio(splats["motion"], alpha)
-    opaque = mi.Float(1) if shown else dr.fma(f, t_whole, 1 - t_whole)
+    opaque = mi.Float(1) if has_environment else dr.fma(f, t_whole, 1 - t_whole)
     return {**splats, "color": color, "alpha": [opaque]}
 
 
@@ -112,12 +112,12 @@ def _in_front(
         np.arange(int(np.prod(region.shape(1)))).reshape(region.shape(1)[:3]), np.zeros(mask.shape, int)
     )
     index = from_numpy(mi.UInt32, index_image[y : y + height, x : x + width])
-    drawn = view.coverage > 0
+    has_surface = view.coverage > 0
 
     def on_crop(image: Tensor) -> list[Float]:
         size = image.shape[-1]
         mode = dr.ReduceMode.NoConflicts
-        return [dr.gather(mi.Float, image.array, index * size + k, active=drawn, mode=mode) for k in range(size)]
+        return [dr.gather(mi.Float, image.array, index * size + k, active=has_surface, mode=mode) for k in range(size)]
 
     return _blended(part, channels, on_crop)
 

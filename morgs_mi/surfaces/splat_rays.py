@@ -61,12 +61,12 @@ class _Tree:
         order = np.arange(1 << depth)
         flips = [0, 0, 0]
         # Leaves without a box are at the end of every axis.
-        placed = np.concatenate([centers, np.full((len(order) - N, 3), np.inf)])
+        places = np.concatenate([centers, np.full((len(order) - N, 3), np.inf)])
         for level in range(depth):
             order = order.reshape(1 << level, -1)
-            axis = _longest_axis(placed[order])
+            axis = _longest_axis(places[order])
             flips[axis] |= 1 << (depth - 1 - level)
-            order = np.take_along_axis(order, placed[order, axis].argpartition(order.shape[1] // 2 - 1, axis=1), axis=1)
+            order = np.take_along_axis(order, places[order, axis].argpartition(order.shape[1] // 2 - 1, axis=1), axis=1)
         order = np.minimum(order.ravel(), N)
         # Rounding must not make a box smaller.
         halves = halves * (1 + 1e-5) + 1e-6 * np.abs(centers)
@@ -159,19 +159,19 @@ class SplatRays:
         quats = np.where(np.linalg.norm(quats, axis=1, keepdims=True) > 0, quats, [1, 0, 0, 0])
         axes = Rotation.from_quat(quats, scalar_first=True).as_matrix()
         reach = np.sqrt(2 * np.log(np.maximum(opacities.ravel() / self._config.alpha_min, 1)))
-        drawn = np.flatnonzero(reach > 0)
+        indices = np.flatnonzero(reach > 0)
         halves = reach[:, None] * np.linalg.norm(axes * scales[:, None], axis=2)
-        self._tree, order = _Tree.of(means[drawn], halves[drawn])
-        index = np.concatenate([drawn, [0]])[order]
+        self._tree, order = _Tree.of(means[indices], halves[indices])
+        index = np.concatenate([indices, [0]])[order]
         # Four floats each, which are read as one packet.
         rows = np.zeros((len(index), 4, 4))
         rows[:, :3, :3] = (axes / scales[:, None]).transpose(0, 2, 1)[index]
         rows[:, :3, 3] = means[index]
-        rows[:, 3, 0] = np.where(order < len(drawn), opacities.ravel()[index], 0)
-        padded = np.zeros((*coeffs.shape[:2], 4))
-        padded[..., :3] = coeffs
+        rows[:, 3, 0] = np.where(order < len(indices), opacities.ravel()[index], 0)
+        packets = np.zeros((*coeffs.shape[:2], 4))
+        packets[..., :3] = coeffs
         self._rows = from_numpy(mi.Float, rows)
-        self._coeffs = from_numpy(mi.Float, padded[index])
+        self._coeffs = from_numpy(mi.Float, packets[index])
         self._degree = round(sqrt(coeffs.shape[1])) - 1
 
     def transmittance(self, ray: Any, active: Bool = True) -> Float:
@@ -205,30 +205,30 @@ class SplatRays:
             ray = mi.Ray3f(dr.detach(ray))
             basis = dr.sh_eval(ray.d, self._degree)
 
-            def blend(color: Any, passed: Float, nearest: Any, last: Any) -> tuple[Any, ...]:
+            def blend(color: Any, transmittance: Float, nearest: Any, last: Any) -> tuple[Any, ...]:
                 ((depth, *depths), (row, *rows), count) = nearest
                 alpha = self._response(ray, row)[1]
-                color = color + passed * alpha * self._color(basis, row)
+                color = color + transmittance * alpha * self._color(basis, row)
                 queue = ([*depths, mi.Float(dr.inf)], [*rows, mi.UInt32(0)], count)
-                return color, passed * (1 - alpha), queue, (depth, row)
+                return color, transmittance * (1 - alpha), queue, (depth, row)
 
-            def advance(active: Bool, color: Any, passed: Float, last: Any) -> tuple[Any, ...]:
+            def advance(active: Bool, color: Any, transmittance: Float, last: Any) -> tuple[Any, ...]:
                 nearest = self._nearest(ray, active, last)
-                color, passed, nearest, last = dr.while_loop(
-                    (color, passed, nearest, last),
-                    lambda color, passed, nearest, last: (nearest[0][0] < dr.inf) & self._open(passed),
+                color, transmittance, nearest, last = dr.while_loop(
+                    (color, transmittance, nearest, last),
+                    lambda color, transmittance, nearest, last: (nearest[0][0] < dr.inf) & self._open(transmittance),
                     blend,
                     label="blend",
                 )
                 # Where fewer were found than can be sorted, none is left.
-                return active & self._open(passed) & (nearest[2] >= _SORTED), color, passed, last
+                return active & self._open(transmittance) & (nearest[2] >= _SORTED), color, transmittance, last
 
             state = (mi.Bool(active), mi.Color3f(0), mi.Float(1), (mi.Float(-dr.inf), mi.UInt32(0)))
-            _, color, passed, _ = dr.while_loop(state, lambda active, *_: active, advance, label="trace")
-            return color, passed
+            _, color, transmittance, _ = dr.while_loop(state, lambda active, *_: active, advance, label="trace")
+            return color, transmittance
 
-    def _open(self, passed: Float) -> Bool:
-        return passed >= self._config.stop_transmittance
+    def _open(self, transmittance: Float) -> Bool:
+        return transmittance >= self._config.stop_transmittance
 
     def _nearest(self, ray: Any, active: Bool, last: tuple[Float, UInt32]) -> tuple[list[Float], list[UInt32], UInt32]:
         """Return depths and rows of the next Gaussians after `last`, ordered by both, and how many were found."""
@@ -269,8 +269,8 @@ class SplatRays:
         # The distance as a cross product: a difference of squares would cancel for thin Gaussians.
         alpha = more.x * dr.exp(-0.5 * dr.squared_norm(dr.cross(o, d)) / dd)
         alpha = dr.select(alpha >= self._config.alpha_min, dr.minimum(alpha, self._config.alpha_max), 0)
-        passed = _phi(r_sigma * (dr.minimum(ray.maxt, FARTHEST) - depth)) - _phi(-r_sigma * depth)
-        return depth, 1 - dr.exp2(passed * dr.log2(1 - alpha))
+        segment_share = _phi(r_sigma * (dr.minimum(ray.maxt, FARTHEST) - depth)) - _phi(-r_sigma * depth)
+        return depth, 1 - dr.exp2(segment_share * dr.log2(1 - alpha))
 
     def _color(self, basis: list[Float], row: UInt32) -> Any:
         """Return max(0.5 + SH, 0) of a Gaussian."""

@@ -208,8 +208,8 @@ class SurfaceView:
         with dr.suspend_grad(), traced(integrator, rays, srgb):
             image = mi.TensorXf(integrator.render(scene, sensor, seed=pixels.seed, spp=pixels.samples()))
             coverage, depth = coverage_and_depth(scene, sensor, pixels.camera, pixels.crop)
-            shown = scene.environment() is not None and not getattr(integrator, "hide_emitters", False)
-            behind = _environment(scene, sensor) if shown else None
+            has_environment = scene.environment() is not None and not getattr(integrator, "hide_emitters", False)
+            behind = _environment(scene, sensor) if has_environment else None
         dr.enable_grad(image, behind)
         return SurfaceView(scene, gaussians, integrator, pixels, sensor, image, coverage, depth, behind, rays, srgb)
 
@@ -311,10 +311,10 @@ def coverage_and_depth(scene: Any, sensor: Any, camera: Camera, crop: tuple[int,
     column = lane - row * columns
     neighbours = ((lane - 1, column > 0), (lane + 1, column + 1 < columns), (lane - columns, row > 0))
     neighbours = (*neighbours, (lane + columns, lane + columns < across * down))
-    mixed: Bool = (count > 0) & (count < len(_FIRST))
+    is_mixed: Bool = (count > 0) & (count < len(_FIRST))
     for place, valid in neighbours:
-        mixed |= dr.gather(mi.Float, count, place, active=valid) != count
-    edge: Any = dr.compress(mixed)
+        is_mixed |= dr.gather(mi.Float, count, place, active=valid) != count
+    edge: Any = dr.compress(is_mixed)
     if dr.width(edge):
         more, deeper = cast(dr.gather(mi.UInt32, pixel, edge), _OTHERS)
         more = more + dr.gather(mi.Float, count, edge)

@@ -167,8 +167,8 @@ def match_clips(
         count = len(match.without) - _MAX_LISTED
         rest = f" and {count} others" if count > 0 else ""
         _LOG.warning("%s: no clip is named after %s%s: left out.", source, names, rest)
-    if unused := [name for name in clips if name not in match.images]:
-        _LOG.warning("%s does not calibrate %s: not used.", source, ", ".join(unused))
+    if extras := [name for name in clips if name not in match.images]:
+        _LOG.warning("%s does not calibrate %s: not used.", source, ", ".join(extras))
     names = sorted(match.images, key=natural_key)
     images = tuple(tuple(match.images[name]) for name in names)
     calibration = Calibration(

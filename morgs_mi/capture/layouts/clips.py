@@ -197,27 +197,27 @@ def _by_stem(files: Iterable[Path]) -> dict[str, Path]:
     Raises:
         ValueError: two have the same.
     """
-    named: dict[str, Path] = {}
+    files_by_stem: dict[str, Path] = {}
     for file in files:
-        if (other := named.setdefault(file.stem, file)) != file:
+        if (other := files_by_stem.setdefault(file.stem, file)) != file:
             raise ValueError(
                 f"{file.parent}: expected one file per camera, got {other.name} and {file.name}; keep one of them, or "
                 "rename it."
             )
-    return named
+    return files_by_stem
 
 
 def _merged(path: Path, places: Iterable[Mapping[str, Path]]) -> dict[str, Path]:
     """Return the clips in folders of the capture `path`, the last one of each name, with a warning if it has others."""
-    merged: dict[str, Path] = {}
+    result: dict[str, Path] = {}
     for clips in places:
-        if twice := [name for name in clips if name in merged]:
-            first, last = (paths[twice[0]].relative_to(path) for paths in (merged, clips))
+        if repeats := [name for name in clips if name in result]:
+            first, last = (paths[repeats[0]].relative_to(path) for paths in (result, clips))
             _LOG.warning(
-                "%s: %s have two clips, such as %s and %s: the latter is used.", path, ", ".join(twice), first, last
+                "%s: %s have two clips, such as %s and %s: the latter is used.", path, ", ".join(repeats), first, last
             )
-        merged |= clips
-    return merged
+        result |= clips
+    return result
 
 
 def _image_folder(folder: Path) -> Path | None:

@@ -72,15 +72,15 @@ def _models(folder: Path) -> list[Path]:
     """Return the folders of the models of a capture, of which the first is used."""
     for place in (folder / "sparse", folder / "colmap" / "sparse"):
         inner = [model for model in listed(place) if _holds_model(model)] if place.is_dir() else []
-        if numbered := [model for model in inner if model.name.isdecimal()]:
-            return _largest_first(numbered)
+        if models := [model for model in inner if model.name.isdecimal()]:
+            return _largest_first(models)
         if _holds_model(place):
             return [place]
         if inner:
             return _largest_first(inner)
     # In the capture folder itself all three files are required: a single name may have another meaning.
-    here = any(all((folder / f"{name}.{kind}").exists() for name in _FILES) for kind in ("bin", "txt"))
-    return [folder] if here else []
+    has_model = any(all((folder / f"{name}.{kind}").exists() for name in _FILES) for kind in ("bin", "txt"))
+    return [folder] if has_model else []
 
 
 def _largest_first(models: Sequence[Path]) -> list[Path]:
@@ -223,11 +223,11 @@ def _check_written(file: Path, expected: int) -> None:
     Raises:
         OSError: it did not.
     """
-    with file.open("rb") as opened:
-        os.fsync(opened.fileno())
-        written = [line for line in opened if not line.startswith(b"#")]
-    if len(written) != expected or (written and not written[-1].endswith(b"\n")):
-        raise OSError(f"{file.name} was cut off after {len(written)} of {expected} lines")
+    with file.open("rb") as stream:
+        os.fsync(stream.fileno())
+        lines = [line for line in stream if not line.startswith(b"#")]
+    if len(lines) != expected or (lines and not lines[-1].endswith(b"\n")):
+        raise OSError(f"{file.name} was cut off after {len(lines)} of {expected} lines")
 
 
 def _viewmat(pose: Sequence[float]) -> np.ndarray:

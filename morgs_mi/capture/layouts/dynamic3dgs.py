@@ -63,10 +63,10 @@ def _check_counts(path: Path, meta: dict[str, Any]) -> None:
         table = ", ".join(f"{key} {len(c)} frames of {min(c)} to {max(c)} cameras" for key, c in counts.items())
         raise ValueError(f"{path}: expected as many cameras in every frame and list, got {table}; export it again.")
     ids = [sorted(map(str, row)) for row in meta["cam_id"]]
-    wrong = next((t for t, row in enumerate(ids) if row != ids[0] or len(set(row)) < len(row)), None)
-    if wrong is not None:
+    frame = next((t for t, row in enumerate(ids) if row != ids[0] or len(set(row)) < len(row)), None)
+    if frame is not None:
         raise ValueError(
-            f"{path}: frame {wrong}: `cam_id` must name each camera of frame 0 once, got {meta['cam_id'][wrong]}; "
+            f"{path}: frame {frame}: `cam_id` must name each camera of frame 0 once, got {meta['cam_id'][frame]}; "
             "export it again."
         )
 
@@ -84,9 +84,9 @@ def _camera(path: Path, meta: dict[str, Any], name: str, columns: Sequence[int])
     if K.shape[1:] != (3, 3) or w2c.shape[1:] not in ((4, 4), (3, 4)):
         raise ValueError(f"{where}: `k` must be [3, 3] and `w2c` [4, 4] in every frame; export it again.")
     for values, what in ((w2c, "pose"), (K, "intrinsics")):
-        wrong = np.flatnonzero(~np.isfinite(values).all((1, 2)))
-        if len(wrong):
-            raise ValueError(f"{where}, frame {wrong[0]}: the {what} must be finite, got NaN or Inf; calibrate again.")
+        frames = np.flatnonzero(~np.isfinite(values).all((1, 2)))
+        if len(frames):
+            raise ValueError(f"{where}, frame {frames[0]}: the {what} must be finite, got NaN or Inf; calibrate again.")
         moving_frames = np.flatnonzero(np.abs(values - values[0]).max((1, 2)) > 1e-4 * (1 + np.abs(values[0]).max()))
         if len(moving_frames):
             raise ValueError(

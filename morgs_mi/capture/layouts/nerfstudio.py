@@ -244,9 +244,9 @@ def _split(
     if len(views) == len(images):
         raise ValueError(f"{source}: expected a camera to train on, got none in `train_filenames`; correct the splits.")
     calibration = replace(calibration, test_views=views)
-    if unused := [calibration.names[view] for view in views if held_out.isdisjoint(images[view])]:
-        _LOG.warning("%s: %s in none of the splits: left out.", source, ", ".join(unused))
-    return calibration.without(path, unused)
+    if extras := [calibration.names[view] for view in views if held_out.isdisjoint(images[view])]:
+        _LOG.warning("%s: %s in none of the splits: left out.", source, ", ".join(extras))
+    return calibration.without(path, extras)
 
 
 def _images_named(source: Path, split: str, split_names: Sequence[str], names: Sequence[str]) -> set[int]:

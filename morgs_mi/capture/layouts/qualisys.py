@@ -87,10 +87,10 @@ def read_qualisys(path: Path) -> tuple[list[Camera], list[Lens]]:
         raise ValueError(
             f"{path}: expected an element `camera` for each camera, found none; export the calibration again."
         )
-    if turned := [element.get("serial", "?") for element in active if element.get("viewrotation", "0") != "0"]:
+    if serials := [element.get("serial", "?") for element in active if element.get("viewrotation", "0") != "0"]:
         _LOG.warning(
             "%s: QTM displays %s rotated (viewrotation); their clips must show the images as the sensor recorded them.",
-            *(path, ", ".join(turned)),
+            *(path, ", ".join(serials)),
         )
     warn_unread(path, (name for element in active for name in _unread(element)))
     pairs = [_camera(path, element) for element in active]

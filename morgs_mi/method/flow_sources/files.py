@@ -86,10 +86,10 @@ class FlowFolder:
         # Files may have been added since.
         if frame not in self._listed.get(folder, {}):
             self._listed[folder] = _files_by_frame(folder)
-        numbered = self._listed[folder]
-        paths = numbered.get(frame, [])
+        files = self._listed[folder]
+        paths = files.get(frame, [])
         if not paths:
-            got = f"those of frames {min(numbered)} to {max(numbered)}" if numbered else "no flow at all"
+            got = f"those of frames {min(files)} to {max(files)}" if files else "no flow at all"
             raise FileNotFoundError(
                 f"{folder}: expected a .flo or .exr file of frame {frame}, found {got}; name each file after the frame "
                 "on whose grid its flow lives, counting from 0."
@@ -101,11 +101,11 @@ class FlowFolder:
 
 
 def _files_by_frame(folder: Path) -> dict[int, list[Path]]:
-    numbered: dict[int, list[Path]] = {}
+    paths: dict[int, list[Path]] = {}
     for path in listed(folder) if folder.is_dir() else ():
         if path.suffix.lower() in SUFFIXES and (digits := re.findall(r"\d+", path.stem)):
-            numbered.setdefault(int(digits[-1]), []).append(path)
-    return numbered
+            paths.setdefault(int(digits[-1]), []).append(path)
+    return paths
 
 
 def read_flow(path: str | Path) -> np.ndarray:

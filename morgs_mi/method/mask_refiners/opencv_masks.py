@@ -93,8 +93,8 @@ def clean_mask(mask: np.ndarray) -> np.ndarray:
     Args:
         mask: [H, W] bool.
     """
-    opened = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, _disc(_OPENING))
-    return cv2.morphologyEx(opened, cv2.MORPH_CLOSE, _disc(max(1, int(mask.shape[1] * _CLOSING)))) > 0
+    opening = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, _disc(_OPENING))
+    return cv2.morphologyEx(opening, cv2.MORPH_CLOSE, _disc(max(1, int(mask.shape[1] * _CLOSING)))) > 0
 
 
 @MASK_REFINERS.register("grabcut")

@@ -54,11 +54,11 @@ def select_frames(stream: FrameSource, span: str | None) -> list[int]:
     low = numbers[0] if start is None else start
     high = numbers[-1] + 1 if stop is None else stop
     indices = range(low, high, step or 1)
-    if not (selected := [number for number in numbers if number in indices]):
+    if not (frames := [number for number in numbers if number in indices]):
         raise ValueError(
             f"select_frames(): `span` must select frames of {stream.path}, {numbers[0]} to {numbers[-1]}, got {span!r}."
         )
-    return selected
+    return frames
 
 
 def write_each(

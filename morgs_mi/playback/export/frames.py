@@ -78,8 +78,8 @@ def write_images(
                 progress(count)
 
     if kind == "mp4":
-        padded = (pad_to_even(_combined_image(images)) for _, images in frames())
-        write_video(output, padded, fps, PLAYABLE)
+        movie = (pad_to_even(_combined_image(images)) for _, images in frames())
+        write_video(output, movie, fps, PLAYABLE)
         return
     write = _write_png if kind == "png" else _write_exr
     if Path(output).name.lower().endswith(f".{kind}"):

@@ -166,11 +166,11 @@ def through_cameras(cameras: Sequence[Camera], seconds: float = 1) -> CameraPath
             f"through_cameras(): at least two cameras were expected to move between, got {len(cameras)}; use the path "
             "`orbit`."
         )
-    remaining = [camera.resized(cameras[0].width, cameras[0].height) for camera in cameras]
-    keys = [remaining.pop(0)]
-    while remaining:
-        distances = [np.linalg.norm(camera.position - keys[-1].position) for camera in remaining]
-        keys.append(remaining.pop(int(np.argmin(distances))))
+    candidates = [camera.resized(cameras[0].width, cameras[0].height) for camera in cameras]
+    keys = [candidates.pop(0)]
+    while candidates:
+        distances = [np.linalg.norm(camera.position - keys[-1].position) for camera in candidates]
+        keys.append(candidates.pop(int(np.argmin(distances))))
     steps = np.linalg.norm(np.diff([key.position for key in keys], axis=0), axis=-1)
     # A rotation between cameras at the same position takes time too.
     steps = np.maximum(steps, 0.1 * steps.mean() if steps.any() else 1)

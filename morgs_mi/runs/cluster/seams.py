@@ -80,9 +80,9 @@ def fit_seam_frame(
     history = common.history
     seconds = 0.0
     for number in range(config.passes):
-        repeated = replace(setup, config=config.fit_config(setup.config, number))
+        pass_setup = replace(setup, config=config.fit_config(setup.config, number))
         state = replace(common, frame=frame, coded=replace(coded, frame=frame - 1), history=history)
-        state, _, report = step(repeated, state, images)
+        state, _, report = step(pass_setup, state, images)
         coded = state.coded
         assert coded is not None
         history = replace(common.history, images=state.history.images)  # changes are relative to the common model again

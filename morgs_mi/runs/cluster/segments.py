@@ -73,11 +73,11 @@ def noting_segments(out: Path) -> Iterator[None]:
 
 def _remove(folder: Path) -> None:
     """Remove a folder, if there is one; after a kill it has all its files, or another name."""
-    removed = folder.with_name(f".removed-{folder.name}")
-    shutil.rmtree(removed, ignore_errors=True)
+    trash = folder.with_name(f".removed-{folder.name}")
+    shutil.rmtree(trash, ignore_errors=True)
     with suppress(FileNotFoundError):
-        folder.rename(removed)
-    shutil.rmtree(removed, ignore_errors=True)
+        folder.rename(trash)
+    shutil.rmtree(trash, ignore_errors=True)
 
 
 def _starts(num_frames: int, segments: int) -> list[int]:
@@ -185,16 +185,16 @@ class SegmentedRun:
         """Fit what is missing of segments. Each worker continues the loop of one of them, until it is fitted."""
         from distributed import as_completed
 
-        waiting = (segment for segment in segments if segment.frame < segment.stop)
-        begun = self._submitted(islice(waiting, num_workers(self.client)))
-        running = as_completed(begun, loop=self.client.loop)
-        for future in running:
+        queue = (segment for segment in segments if segment.frame < segment.stop)
+        begun = self._submitted(islice(queue, num_workers(self.client)))
+        tasks = as_completed(begun, loop=self.client.loop)
+        for future in tasks:
             part = future.result()
             self._add(part)
             if part.segment.frame < part.segment.stop:
-                running.update(self._submitted([part.segment], part.worker))
-            idle = max(1, num_workers(self.client)) - running.count()
-            running.update(self._submitted(islice(waiting, max(0, idle))))
+                tasks.update(self._submitted([part.segment], part.worker))
+            idle = max(1, num_workers(self.client)) - tasks.count()
+            tasks.update(self._submitted(islice(queue, max(0, idle))))
 
     def _submitted(self, segments: Iterable[Segment], worker: str | None = None) -> list[Future[Part]]:
         """Return the tasks of the next frames of segments, if possible on a worker."""

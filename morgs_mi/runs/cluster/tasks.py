@@ -134,8 +134,8 @@ def fit_frames(fit: Fit, segment: Segment, stop: int) -> Part:
         segment = replace(segment, frame=stop, restart=restart)
         _OPEN[repr(fit), segment] = loop, capture, recorded
         peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        encoded = tuple(packet.encoded for packet in packets)
-        return Part(segment, encoded, tuple(reports), worker_name(), peak, tuple(messages))
+        contents = tuple(packet.encoded for packet in packets)
+        return Part(segment, contents, tuple(reports), worker_name(), peak, tuple(messages))
 
 
 def _first_frame(fit: Fit, segment: Segment) -> tuple[Packet, FrameReport]:
