@@ -11,7 +11,7 @@ import pytest
 from morgs_mi.capture.truth import load_truth
 from morgs_mi.studio.synth.synth_config import SynthConfig
 from morgs_mi.studio.synth.synthesize import synthesize
-from scenes.random import MOTIONS, Body, RandomScene, draw_scene
+from scenes.random import MOTIONS, Body, RandomScene, draw_scene  # pyright: ignore[reportMissingImports]  (not tests.scenes)
 from tests.assertions import assert_close
 
 NUM_SEEDS = 50
