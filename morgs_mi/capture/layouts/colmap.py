@@ -33,6 +33,7 @@ from morgs_mi.capture.layouts.colmap_files import (
 from morgs_mi.capture.lens import Lens, lens_and_intrinsics
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import LARGEST, bounded
+from morgs_mi.core.colmap_library import import_pycolmap
 from morgs_mi.core.files import write_error
 from morgs_mi.io.bounded import check_claim
 from morgs_mi.io.listing import listed
@@ -166,7 +167,7 @@ def write_colmap(
     Raises:
         OSError: a file could not be written.
     """
-    import pycolmap  # takes 0.3 s to import, and only the writer needs it
+    pycolmap = import_pycolmap()  # takes 0.3 s to import, and only the writer needs it
 
     model = pycolmap.Reconstruction()
     lenses = [Lens()] * len(cameras) if lenses is None else lenses

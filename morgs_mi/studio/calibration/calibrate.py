@@ -26,6 +26,7 @@ from morgs_mi.capture.points import MAX_ERROR
 from morgs_mi.capture.timeline import nearest_frames
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_number
+from morgs_mi.core.colmap_library import import_pycolmap
 from morgs_mi.core.color_space import display_image, display_stops
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.ranges import check_ranges
@@ -241,7 +242,7 @@ def _match(
     report: Callable[[str, int, int], None],
 ) -> None:
     """Write images, features and the matches of all pairs of views into a folder, for `_map`."""
-    import pycolmap
+    pycolmap = import_pycolmap()
 
     folder = scratch / _IMAGES
     mask_folder = scratch / "masks"
@@ -284,7 +285,7 @@ def _map(path: Path, names: Sequence[str], scratch: Path, seed: int) -> _Candida
 
     If none is complete, both map the matches that agree with focal lengths found from pairs of views, too.
     """
-    import pycolmap
+    pycolmap = import_pycolmap()
 
     candidates = _mapped(names, scratch, seed)
     if not any(candidate.complete for candidate in candidates):
@@ -304,7 +305,7 @@ def _mapped(names: Sequence[str], scratch: Path, seed: int) -> list[_Candidate]:
 
     Threads of a mapper share its random samples, which makes other models on some runs; one thread takes as long.
     """
-    import pycolmap
+    pycolmap = import_pycolmap()
 
     inputs = scratch / _DATABASE, scratch / _IMAGES, scratch
     incremental = pycolmap.IncrementalPipelineOptions(min_model_size=2, random_seed=seed, num_threads=1)
@@ -321,7 +322,7 @@ def _mapped(names: Sequence[str], scratch: Path, seed: int) -> list[_Candidate]:
 
 def _with_principal_points(candidate: _Candidate, names: Sequence[str]) -> _Candidate:
     """Return the model with a camera and a principal point for each image, or as it is if that fits no better."""
-    import pycolmap
+    pycolmap = import_pycolmap()
 
     model = _with_own_cameras(candidate.model)
     config = pycolmap.BundleAdjustmentConfig()
@@ -341,7 +342,7 @@ def _with_principal_points(candidate: _Candidate, names: Sequence[str]) -> _Cand
 
 def _with_own_cameras(model: Any) -> Any:
     """Return a copy of a model in which no two images share a camera."""
-    import pycolmap
+    pycolmap = import_pycolmap()
 
     copy = pycolmap.Reconstruction()
     for i in model.reg_image_ids():
@@ -365,7 +366,7 @@ def _median_error(model: Any) -> float:
 
 
 def _check_features(path: Path, database: Path) -> None:
-    import pycolmap
+    pycolmap = import_pycolmap()
 
     with closing(pycolmap.Database.open(database)) as db:
         counts = {Path(i.name).stem: db.num_keypoints_for_image(i.image_id) for i in db.read_all_images()}
@@ -378,7 +379,7 @@ def _check_features(path: Path, database: Path) -> None:
 
 
 def _check_pairs(path: Path, database: Path) -> None:
-    import pycolmap
+    pycolmap = import_pycolmap()
 
     with closing(pycolmap.Database.open(database)) as db:
         count = len(db.read_all_images())
@@ -393,7 +394,7 @@ def _check_pairs(path: Path, database: Path) -> None:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Silence COLMAP's log on standard error; this module reports failures itself."""
-    import pycolmap
+    pycolmap = import_pycolmap()
 
     level = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
