@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 
 import morgs_mi
+from morgs_mi.cli import COMMANDS
+from morgs_mi.cli.export import EXPORTS
 from morgs_mi.core.entries import STUDIO, studio_entry
 
 ROOT = Path(morgs_mi.__file__).parent
@@ -84,3 +86,8 @@ def test_layers__only_the_table_of_entries_names_the_studio():
 )
 def test_layers__entries_of_the_studio_exist(registry, name):
     assert studio_entry(registry, name) is not None
+
+
+def test_layers__commands_and_exports_of_the_studio_are_registered():
+    assert set(STUDIO["commands"]) <= set(COMMANDS)
+    assert set(STUDIO["exports"]) <= set(EXPORTS)

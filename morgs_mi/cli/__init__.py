@@ -27,20 +27,27 @@ from tyro.conf import arg
 from morgs_mi.cli.console import ERR, LogHandler, naming_output, print_result, print_warning, sentence_of
 from morgs_mi.cli.settings import Flag, Settings
 from morgs_mi.cli.suggestion import one_command, suggesting_command
-from morgs_mi.core.entries import STUDIO, place_of
+from morgs_mi.core.entries import place_of
 from morgs_mi.core.interrupts import INTERRUPTED, interruptible, is_interruption
 
-_PLACES = {
-    "fit": f"{__name__}.fit:Fit",
-    "render": f"{__name__}.render:Render",
-    "export": f"{__name__}.export:Export",
-    "view": f"{__name__}.view:View",
-    "eval": f"{__name__}.evaluate:Eval",
-    **{name: place_of("commands", name) for name in STUDIO["commands"]},
+# The class of each command, in the order of the help: a dataclass of its options, with `run`.
+COMMANDS: Mapping[str, type] = {
+    name: resolve_name(place)
+    for name, place in {
+        "synth": place_of("commands", "synth"),
+        "info": place_of("commands", "info"),
+        "calibrate": place_of("commands", "calibrate"),
+        "fit": f"{__name__}.fit:Fit",
+        "live": place_of("commands", "live"),
+        "render": f"{__name__}.render:Render",
+        "export": f"{__name__}.export:Export",
+        "import": place_of("commands", "import"),
+        "view": f"{__name__}.view:View",
+        "eval": f"{__name__}.evaluate:Eval",
+        "sweep": place_of("commands", "sweep"),
+        "demo": place_of("commands", "demo"),
+    }.items()
 }
-_ORDER = ("synth", "info", "calibrate", "fit", "live", "render", "export", "import", "view", "eval", "sweep", "demo")
-# The class of each command: a dataclass of its options, with `run`.
-COMMANDS: Mapping[str, type] = {name: resolve_name(_PLACES[name]) for name in _ORDER}
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ from typing import Any
 
 
 def import_pycolmap() -> Any:
-    """Import pycolmap, and set the handlers of Ctrl-C and SIGTERM again.
+    """Return the module pycolmap, and restore the signal handlers of Ctrl-C and SIGTERM after its import.
 
-    Its logging library replaces that of SIGTERM by one that prints a trace and aborts the process.
+    The logging library of pycolmap installs a handler for SIGTERM that prints a stack trace and aborts the process.
     """
     pycolmap = import_module("pycolmap")
     if threading.current_thread() is threading.main_thread():

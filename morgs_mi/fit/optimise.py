@@ -106,11 +106,11 @@ def optimise(
     final = {
         name: float(np.mean([np.asarray(v).item() for v in losses[-steps.last :]])) for name, losses in history.items()
     }
-    names = [name for name, value in final.items() if not np.isfinite(value)]
-    if names:
+    broken_losses = [name for name, value in final.items() if not np.isfinite(value)]
+    if broken_losses:
         raise FloatingPointError(
-            f"optimise(): the losses {', '.join(names)} are not finite after {steps.first + len(history[names[0]])} "
-            "steps; lower the learning rates."
+            f"optimise(): the losses {', '.join(broken_losses)} are not finite after "
+            f"{steps.first + len(history[broken_losses[0]])} steps; lower the learning rates."
         )
     return final
 

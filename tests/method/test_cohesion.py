@@ -91,8 +91,8 @@ def test_share_confidence__solves_its_equation(monkeypatch):
 
 def test_share_confidence__counts_all_but_the_chosen_as_still():
     gaussians = wall_and_object(0.0, GREY)
-    chosen = np.flatnonzero(~WALL)
-    confidence = share_confidence(gaussians, chosen, np.full(100, 2.0, np.float32), STILL, WEIGHT)
+    indices = np.flatnonzero(~WALL)
+    confidence = share_confidence(gaussians, indices, np.full(100, 2.0, np.float32), STILL, WEIGHT)
     assert confidence.shape == (100,)
     assert (confidence < 0).all()
 

@@ -89,10 +89,10 @@ class FlowFolder:
         files = self._listed[folder]
         paths = files.get(frame, [])
         if not paths:
-            got = f"those of frames {min(files)} to {max(files)}" if files else "no flow at all"
+            content = f"files of frames {min(files)} to {max(files)}" if files else "no flow at all"
             raise FileNotFoundError(
-                f"{folder}: expected a .flo or .exr file of frame {frame}, found {got}; name each file after the frame "
-                "on whose grid its flow lives, counting from 0."
+                f"{folder}: expected a .flo or .exr file of frame {frame}, found {content}; name each file after the "
+                "frame on whose grid its flow lives, counting from 0."
             )
         if len(paths) > 1:
             names = ", ".join(path.name for path in paths)

@@ -111,9 +111,9 @@ class Refinement:
     def validation(
         self, capture: Capture, gaussians: Gaussians, frame: PartialFrame, config: StreamConfig
     ) -> dict[str, Any]:
-        """Return the result with its sentence, and the mean PSNR of the held-out views, if there are any.
+        """Return the result with its sentence, and the PSNR of the held-out views, if there are any.
 
-        Their PSNR is that of their calibrated cameras and that of registered cameras.
+        The PSNR is the mean over these views, in dB: once with the calibrated cameras, once with registered ones.
 
         Args:
             capture: with the refined cameras.

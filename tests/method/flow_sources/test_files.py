@@ -135,7 +135,7 @@ def test_read_flow__rejects_channels_that_are_not_flow(tmp_path, names):
 @pytest.mark.parametrize(
     ("camera", "frame", "size", "exception", "message"),
     [
-        ("cam00", 3, (6, 9), FileNotFoundError, "cam00/backward: .* of frame 3, found those of frames 1 to 2; name"),
+        ("cam00", 3, (6, 9), FileNotFoundError, "cam00/backward: .* of frame 3, found files of frames 1 to 2; name"),
         ("cam01", 1, (6, 9), FileNotFoundError, "cam01/backward: .* of frame 1, found no flow at all"),
         ("cam00", 1, (9, 6), ValueError, r"0001\.flo: expected 6x9 pixels as the images of cam00 have, got 9x6"),
     ],
