@@ -90,6 +90,23 @@ def fit_later_frame(
     return LaterFrame(gaussians, source, fit.losses, fit.steps // len(active.views))
 
 
+@dataclass(frozen=True)
+class Epoch:
+    """Steps of one or several epochs, each with a step in every active view."""
+
+    first: int  #: Number of the first step.
+    stop: int  #: Number of the step after the last one.
+    #: Number of the step from which densification scores are collected: the first steps of an epoch still correct what
+    #: the last ones show.
+    first_score: int
+
+    @classmethod
+    def after(cls, steps: int, num_views: int, count: int = 1) -> Epoch:
+        """Return the next `count` epochs after some steps."""
+        stop = steps + count * num_views
+        return cls(steps, stop, stop - (num_views + 3) // 4)
+
+
 class _Fit:
     """Optimiser of a later frame's residual: the stage of a motion model, epochs, and a round of density control.
 
@@ -149,7 +166,8 @@ class _Fit:
             model = factory(self._base, problem.extent, self._rng)
             shared = MotionProblem(self._base, problem.active.views, problem.targets, self._rng)
             weight = self._config.objective.dssim_weight
-            start, self.losses = fit_motion(shared, model, start, self._next_steps(epochs), weight)
+            steps = self._begin(Epoch.after(self.steps, len(self._views), epochs))
+            start, self.losses = fit_motion(shared, model, start, steps, weight)
         self._optimizer = adam(residual_parameters(self._base, motion, start), self._config.momentum)
         return epochs
 
@@ -157,7 +175,8 @@ class _Fit:
         """Make one step in every active view."""
         rates = self._config.rates_at(epoch).by_parameter(self._problem.extent)
         weights = weights_of(self._config.objective)
-        self.losses = optimise(self._optimizer, rates, self._losses_at, self._next_steps(1), weights)
+        steps = self._begin(Epoch.after(self.steps, len(self._views)))
+        self.losses = optimise(self._optimizer, rates, self._losses_at, steps, weights)
         self.losses.pop(_SCORES, None)
         self._objectives.append(sum(weights[name] * loss for name, loss in self.losses.items()))
 
@@ -182,25 +201,23 @@ class _Fit:
         self._densifies = False
         self._attribution = None
 
-    def _next_steps(self, epochs: int) -> Steps:
-        """Return the steps of the next epochs."""
-        first = self.steps
-        progress = self._progress
-        total = len(self._order)
-        self.steps += epochs * len(self._views)
-        # The first steps of an epoch still correct what the last ones show.
-        half = self.steps - (len(self._views) + 3) // 4
-        self._attribution = Attribution(len(self.source)) if self._densifies and half == first else None
+    def _begin(self, epoch: Epoch) -> Steps:
+        """Begin an epoch, and return its steps."""
+        self.steps = epoch.stop
+        self._attribution = self._new_attribution(epoch, epoch.first)
 
         def on_step(step: int) -> None:
             if self._attribution is not None:
                 self._attribution.collect()
-            if self._densifies and step == half:
-                self._attribution = Attribution(len(self.source))
-            if progress is not None:
-                progress(step, total)
+            self._attribution = self._new_attribution(epoch, step) or self._attribution
+            if self._progress is not None:
+                self._progress(step, len(self._order))
 
-        return Steps(self._order[first : self.steps], first, on_step=on_step, last=len(self._views))
+        return Steps(self._order[epoch.first : epoch.stop], epoch.first, on_step=on_step, last=len(self._views))
+
+    def _new_attribution(self, epoch: Epoch, step: int) -> Attribution | None:
+        """Return the densification scores that begin at a step, if they do."""
+        return Attribution(len(self.source)) if self._densifies and step == epoch.first_score else None
 
     def _losses_at(self, parameters: Mapping[str, Tensor], index: int) -> dict[str, Tensor]:
         """Render one view and return its losses by name."""
