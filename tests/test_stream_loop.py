@@ -116,6 +116,7 @@ def test_push__reconstructs_the_first_frame_in_the_held_out_view(clip, first):
     assert reports[0].status == "ok"
 
 
+@pytest.mark.slow
 def test_push__motion_follows_the_truth_and_not_the_static_wall(full):
     """The modules' claim: per-Gaussian motion is the scene's, not the residual's."""
     loop, _, reports = full
@@ -396,6 +397,7 @@ def test_stream_loop__refuses_bad_input(clip, call, message):
         call(clip)
 
 
+@pytest.mark.slow
 def test_push__a_static_clip_costs_next_to_nothing(clip):
     """Camera noise of 2 grey levels is no change: nothing is active, and the packets have a few bytes."""
     rng = np.random.default_rng(0)

@@ -109,6 +109,7 @@ def recording(views, tmp_path_factory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_load_capture__corrects_colors_and_reports_it(recording: Path, views, capsys) -> None:
     _, true, recorded = views
     capture = load_capture(recording, reading=ReadConfig(color="linear:cam0"))

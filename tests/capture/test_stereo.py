@@ -26,6 +26,7 @@ def found(views):
     return stereo_points(cameras, images, [None] * 3, NO_POINTS, np.random.default_rng(0))
 
 
+@pytest.mark.slow
 def test_stereo_points__lie_on_the_surfaces(views, found) -> None:
     (camera, *_), (image, *_) = views
     points, colors = found

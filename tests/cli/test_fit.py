@@ -49,6 +49,7 @@ def test_fit__continues_without_a_camera_whose_clip_is_cut_off_meanwhile(
     assert all(frame["psnr"] > 0 for frame in frames)
 
 
+@pytest.mark.slow
 def test_fit__reports_what_to_expect_of_views_between_the_cameras(capture: Path, tmp_path: Path, run) -> None:
     code, output, _ = run("fit", capture, tmp_path / "out", *QUICK, "--test-view", "none")
     (first, *_) = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
@@ -73,6 +74,7 @@ def test_fit__balances_cameras_of_other_exposure(tmp_path: Path, run) -> None:
         assert ("The cameras were balanced: exposures differ by up to" in output) == is_balanced
 
 
+@pytest.mark.slow
 def test_fit__and_eval_use_the_same_instants(capture: Path, tmp_path: Path, run) -> None:
     lengthen_clip(capture)
     out = tmp_path / "out"
@@ -99,6 +101,7 @@ def before_frame_2(monkeypatch: pytest.MonkeyPatch, action: Callable[[], None]) 
     monkeypatch.setattr(StreamLoop, "push", acting_push)
 
 
+@pytest.mark.slow
 def test_fit__leaves_a_stream_marked_as_unfinished_when_interrupted(
     capture: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -233,6 +236,7 @@ def heeds_interrupts() -> Iterator[None]:
     signal.signal(signal.SIGINT, handler)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_fit__names_what_stands_and_how_to_go_on_when_interrupted(
     capture: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch, number: signal.Signals, heeds_interrupts: None
@@ -246,6 +250,7 @@ def test_fit__names_what_stands_and_how_to_go_on_when_interrupted(
     assert error.splitlines()[-1] == stands  # after lines of progress, on a slow machine
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("raised_in", ["a callback", "the clean-up"])
 def test_fit__is_interrupted_whatever_a_library_makes_of_ctrl_c(
     capture: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch, raised_in: str

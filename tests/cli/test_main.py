@@ -43,6 +43,7 @@ def test_main__names_what_is_broken_in_a_capture(capture: Path, tmp_path: Path, 
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_main__leaves_cameras_out(capture: Path, tmp_path: Path, run) -> None:
     lengthen_clip(capture)
     assert_refused(run("info", capture), "morgs-mi fit --frames 3,", "leave cameras out with --without.")

@@ -140,6 +140,7 @@ def constant(N: int, degree: int) -> CodedFrame:
     return CodedFrame(0, np.arange(N, dtype=np.uint32), cloud(1), grid, N)
 
 
+@pytest.mark.slow
 def test_reemitted_keyframe__is_padded_to_the_words_that_its_integers_need() -> None:
     free = 2**22 // 67
     assert len(reemitted_keyframe(constant(free, 3)).arrays["code"]) == -(-free // 16)

@@ -107,6 +107,7 @@ def test_stream_reader__refuses_to_seek_in_a_pipe() -> None:
         reader.check()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frames", [60, pytest.param(300, marks=pytest.mark.long)])
 def test_coded_frames__equal_the_encoders_states_on_one_thread_and_on_many(tmp_path: Path, frames: int) -> None:
     packets, states = encoded_clip(frames, degree=0)

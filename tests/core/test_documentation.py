@@ -95,6 +95,7 @@ def messages(path: Path) -> list[str]:
     return [node.value for node in texts if isinstance(node.value, str)]
 
 
+@pytest.mark.slow
 def test_page__gives_every_page_that_a_message_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     named = {str(path): text for path in SOURCES for text in messages(path) if re.search(r"docs/[\w/-]+\.md", text)}
     assert named == {}
@@ -102,6 +103,7 @@ def test_page__gives_every_page_that_a_message_names(tmp_path: Path, monkeypatch
     assert "docs/" not in config_toml(StreamConfig())
 
 
+@pytest.mark.slow
 def test_page__exists_for_every_call() -> None:
     calls = [
         node.args[0]

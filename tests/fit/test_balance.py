@@ -65,6 +65,7 @@ def test_balance_cameras__finds_the_exposures_and_takes_them():
     assert "The cameras were balanced" in balance.sentence
 
 
+@pytest.mark.slow
 def test_balance_cameras__leaves_equal_cameras_alone_after_one_fit():
     fits = []
     balance = balanced(np.ones(4), report=lambda *now: fits.append(now))

@@ -270,6 +270,7 @@ def test_gaussian_splat__refuses_an_integrator_around_it(outer):
     assert "expected to be the scene's integrator, got an integrator around it" in str(error.value.__cause__)
 
 
+@pytest.mark.slow
 def test_gaussian_splat__names_variants_that_it_does_not_work_in():
     """All of `splat_path` and `surfaces` have RGB colours."""
     script = r"""
@@ -318,6 +319,7 @@ def test_gaussian_splat__renders_the_same_channels_from_a_file_as_from_a_diction
     assert_close(image, expected, atol=tol.IMAGE_ABS)
 
 
+@pytest.mark.slow
 def test_gaussian_splat__renders_a_scene_file_as_the_page_describes(tmp_path, raw):
     """The command `mitsuba` does not find the plugin; the Python command in docs/mitsuba.md renders the same file."""
     write_ply(tmp_path / "gaussians.ply", to_gaussians(raw))

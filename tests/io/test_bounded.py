@@ -154,6 +154,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("read", "content", "message"), CASES.values(), ids=CASES)
 def test_readers__refuse_a_hostile_file_in_one_sentence(tmp_path: Path, read, content, message: str) -> None:
     path = tmp_path / ("0.ply" if read is read_splats else "0.png")
@@ -171,6 +172,7 @@ def test_readers__refuse_pipes_and_folders(tmp_path: Path, read) -> None:
             read(path)
 
 
+@pytest.mark.slow
 def test_read_toml__counts_keys_and_not_texts(tmp_path: Path) -> None:
     """Dots and brackets in comments and texts, and the points of numbers, take nothing."""
     dots = "a." * 100_000

@@ -165,6 +165,7 @@ def test_fit_later_frame__with_the_active_set_equals_the_full_fit(before, after,
         assert np.array_equal(values, np.asarray(getattr(before, attribute))[still]), attribute
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("density", [DensityConfig(births=0.0), DensityConfig(later_frames=False)])
 def test_fit_later_frame__ends_early_once_the_loss_stops_falling(before, density):
     """With and without density control; a tolerance of 0 switches it off."""

@@ -85,6 +85,7 @@ assert "onnxruntime" not in sys.modules  # imported by the refiner that needs it
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("page", "module", "program"),
     [

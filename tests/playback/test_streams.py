@@ -152,6 +152,7 @@ def test_render__draws_a_file_of_gaussians(tmp_path, run, text):
     assert read_exr(tmp_path / "a.exr")["depth.Y"].shape == (36, 64)
 
 
+@pytest.mark.slow
 def test_render__orbits_a_file_of_gaussians(tmp_path, run):
     write_ply(tmp_path / "scene.ply", splats())
     assert run("render", tmp_path / "scene.ply", "--width", 32)[:2] == (
@@ -251,6 +252,7 @@ def test_splat_file__keeps_cameras_that_see_a_single_gaussian(tmp_path):
     assert open_stream(path).cameras_file == tmp_path / "cameras.json"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [("render",), ("export", "video"), ("export", "web")], ids=" ".join)
 def test_commands__name_the_cameras_that_they_use(tmp_path, run, command):
     path = write_model(tmp_path, rig())
@@ -270,6 +272,7 @@ DRAWING = [("render",), ("export", "video"), ("export", "web")]
 WRITING = [("export", kind) for kind in ("ply", "gltf", "usd", "tracks")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", DRAWING, ids=" ".join)
 def test_commands__draw_without_invalid_gaussians(tmp_path, run, caplog, command):
     path = with_nan(tmp_path / "a.ply", 2)

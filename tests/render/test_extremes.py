@@ -74,6 +74,7 @@ def failures(case: Case) -> list[str]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_rasterize__agrees_with_the_reference_at_the_extremes(case):
     assert not failures(case)

@@ -147,6 +147,7 @@ def test_rasterize__detached_weights_give_geometry_no_gradient(scene):
         assert np.abs(np.asarray(dr.grad(getattr(gaussians, name)))).max() == 0, name
 
 
+@pytest.mark.slow
 def test_rasterize__backward_agrees_with_the_reference_in_a_dense_scene():
     raw = as_float32(make_scene(0, 40, seed=7))
     camera = make_camera(30, 25)

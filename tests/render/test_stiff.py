@@ -6,6 +6,7 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
+import pytest
 from drjit.opt import Adam
 
 from morgs_mi import Camera, Gaussians, rasterize
@@ -72,6 +73,7 @@ def test_stiff_truth__is_stiff():
     assert curvature["quats"][0].max() > 1e6 * curvature["logit_opacities"][1] > 0
 
 
+@pytest.mark.slow
 def test_rasterize__adam_converges_on_a_stiff_problem():
     losses, values = descend(0.02, 150)
     assert np.isfinite(losses).all()

@@ -103,6 +103,7 @@ def kill_and_resume(whole: Path, folder: Path, kills: int) -> None:
         assert_same(out, whole)
 
 
+@pytest.mark.slow
 def test_stream_capture__shows_a_provisional_first_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A stream beside the one that is written has a frame for each round of density control, and is removed."""
     shown = []
@@ -174,6 +175,7 @@ def files_of(out: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in out.iterdir()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.ENOSPC, "full"), RuntimeError("crash")])
 def test_stream_capture__keeps_an_earlier_fit_until_its_first_frame(
     whole: Path, tmp_path: Path, error: BaseException
@@ -482,6 +484,7 @@ def test_stream_capture__refuses_a_hostile_report(whole: Path, tmp_path: Path, t
         stream_capture(recording(), out, CONFIG, resume=True)
 
 
+@pytest.mark.slow
 def test_stream_capture__resumes_hostile_streams_or_refuses_them_in_one_sentence(whole: Path, tmp_path: Path) -> None:
     data = stream_of(whole)
     index = TRAILER.unpack(data[-TRAILER.size :])[0]
@@ -596,6 +599,7 @@ def test_as_fitted__refuses_broken_distortions(tmp_path, found):
         as_fitted(capture, StreamReader(tmp_path / "stream.morgs"))
 
 
+@pytest.mark.slow
 def test_stream_capture__resumes_with_the_exposures_of_the_report(tmp_path):
     how = ShortFitConfig(gaussians=40, steps=4, rounds=1)
     capture = recording(num_frames=3)

@@ -74,6 +74,7 @@ for _name, _config in SMALL.items():
     MOTION_MODELS.register(f"small-{_name}")(lambda *_, config=_config: lambda *__: model_of(config))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SMALL)
 def test_fit_later_frame__finds_the_motion_that_gaussians_share(name):
     """With as many steps, the motion of a rigid body is nearer to the truth than the motion of free Gaussians."""

@@ -111,6 +111,7 @@ def test_method_command__continues_an_interrupted_report(interrupted):
     assert (out / "method.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_method_command__scores_are_those_of_the_held_out_view(interrupted):
     (clip,) = interrupted[0]["clips"]
     for row in clip["rows"] + clip["key_view_rows"]:

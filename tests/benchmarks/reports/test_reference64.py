@@ -45,6 +45,7 @@ def test_reference64__renders_like_the_reference_of_the_tests(degree, pairs, mon
     assert np.abs(colors - expected[pixels[:, 1], pixels[:, 0]]).max() < 1e-13
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [0, 3])
 def test_reference64__gradients_agree_with_complex_steps_through_everything(degree):
     raw, camera = scene(degree)

@@ -46,6 +46,7 @@ def test_renderer__has_the_default_once_per_option(reported):
     assert all(min(row["forward_ms"], row["step_ms"], row["step_ratio"]) > 0 for row in reported)
 
 
+@pytest.mark.slow
 def test_renderer__errors_are_those_of_the_cut_offs(reported):
     rows = {(row["knob"], row["value"]): row for row in reported}
     cuts = [rows["alpha_min", value] for value in ("1/16320", "1/2040", "1/255", "4/255")]

@@ -63,6 +63,7 @@ def without_times(value):
     return {name: without_times(entry) for name, entry in value.items() if name not in TIMES}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "report",
     [pytest.param(report, marks=[pytest.mark.slow] * (report not in FAST)) for report in STUDIES],

@@ -51,6 +51,7 @@ def test_poses_bounds__reads_n3dv_with_missing_camera_numbers(tmp_path: Path) ->
     assert_holds(capture, ("cam00", "cam02", "cam11"), (0, 1, 2))
 
 
+@pytest.mark.slow
 def test_poses_bounds__halves_n3dv_at_its_own_size(tmp_path: Path) -> None:
     camera = rig(("cam00",))[0].resized(2704, 2028)
     K = np.array([[1460.0, 0, 1352], [0, 1460, 1014], [0, 0, 1]])

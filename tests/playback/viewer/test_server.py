@@ -469,6 +469,7 @@ def test_view__ends_on_ctrl_c(clip):
     assert "Traceback" not in errors
 
 
+@pytest.mark.slow
 def test_starlette__is_not_imported_by_the_other_commands():
     code = "import sys, morgs_mi.cli; sys.exit('starlette' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -15,6 +15,7 @@ from morgs_mi.stream_loop import StreamLoop
 from tests.scenes.recording import CONFIG, recording
 
 
+@pytest.mark.slow
 def test_fit_seam_frame__leaves_what_is_static_as_it_is() -> None:
     capture = recording()
     settings = replace(CONFIG, fit=replace(CONFIG.fit, num_gaussians=400))

@@ -89,6 +89,7 @@ def test_SegmentedRun__of_one_is_the_fit_in_one_process(capture: Capture, client
     assert sorted(path.name for path in (tmp_path / "one").iterdir()) == sorted(FILES)
 
 
+@pytest.mark.slow
 def test_SegmentedRun__joins_them_to_an_ordinary_stream(whole: Path) -> None:
     reader = StreamReader(whole / "stream.morgs")
     assert reader.closed()
@@ -134,6 +135,7 @@ def interrupt() -> None:
     raise KeyboardInterrupt
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [5, *(pytest.param(count, marks=pytest.mark.slow) for count in (0, 2, 9))])
 def test_SegmentedRun__interrupted_and_resumed_is_the_same(
     capture: Capture, client: Client, whole: Path, tmp_path: Path, count: int
@@ -215,6 +217,7 @@ def test_SegmentedRun__refuses_too_many(capture: Capture, client, tmp_path: Path
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_SegmentedRun__does_not_resume_other_settings(capture: Capture, client: Client, tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         fit(capture, tmp_path, client, on_stage=when_fitted(2, interrupt))

@@ -97,6 +97,7 @@ def test_bundle_adjust__finds_the_reprojections_despite_wrong_matches():
     assert np.rad2deg(np.arccos((np.trace(relative[0].T @ relative[1]) - 1) / 2)) < 0.02
 
 
+@pytest.mark.slow
 def test_bundle_adjust__leaves_cameras_that_fit():
     true = rig()
     changes, _ = bundle_adjust(true, seen_by(true), priors_of(true))

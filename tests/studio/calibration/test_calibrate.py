@@ -90,6 +90,7 @@ def test_calibrate__finds_the_same_poses_on_every_run(tmp_path: Path) -> None:
     assert not np.ptp(poses, axis=0).any(), "threads may find a pose from other samples"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "names",
     [("a.JPG", "b.JPG", "c.JPG", "d.JPG"), (" a.tif", "b .webp", " c d .BMP", "e.TIFF")],

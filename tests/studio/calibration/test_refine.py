@@ -98,6 +98,7 @@ def shift_of_splats(capture: Capture, true: Capture) -> float:
     return float(np.median([np.linalg.norm(a.project(means)[0] - b.project(means)[0], axis=1) for a, b in pairs]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scale", "most"), [(0.0, 0.35), (1.0, 0.35)])
 @pytest.mark.parametrize("seed", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_refine_cameras__stays_in_the_frame_of_what_takes_no_part(far_capture, scale, most, seed):
@@ -211,6 +212,7 @@ def test_matched__finds_the_cameras_by_features(textured_capture, monkeypatch):
     assert errors[1] < 0.1 * errors[0]
 
 
+@pytest.mark.slow
 def test_matched__finds_the_distortion_that_is_left(textured_capture, monkeypatch):
     monkeypatch.setattr("morgs_mi.capture.features._MAX_FEATURES", 300)
     terms = [(0.08 * (-1) ** v, 0.0) for v in range(len(textured_capture.cameras))]

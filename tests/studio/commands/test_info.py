@@ -37,6 +37,7 @@ def test_info__lists_the_cameras_of_a_capture(capture: Path, run) -> None:
     assert f"{FRAMES} frames at 25 fps, 150 points, without ground truth." in out
 
 
+@pytest.mark.slow
 def test_info__prints_complete_columns_and_a_verdict_per_camera(textured_capture: Capture, tmp_path: Path, run) -> None:
     path = tmp_path / ("capture of a rig in a folder with a long name" * 2)
     shutil.copytree(textured_capture.path, path)
@@ -55,6 +56,7 @@ def test_info__prints_complete_columns_and_a_verdict_per_camera(textured_capture
     assert "cam2 does not fit: its images are upside down" in out
 
 
+@pytest.mark.slow
 def test_info__prints_the_check_and_draws_the_rig(textured_capture: Capture, tmp_path: Path, run) -> None:
     plot = tmp_path / "new" / "rig.png"
     times = {file: file.stat().st_mtime_ns for file in textured_capture.path.rglob("*")}

@@ -49,6 +49,7 @@ def test_Live__fits_videos_until_they_end(
     assert {path.name for path in out.iterdir()} == {"stream.morgs", "report.json", "capture.json", "capture"}
 
 
+@pytest.mark.slow
 def test_Live__starts_the_viewer_at_a_provisional_first_frame(
     capture: Path, tmp_path: Path, videos: list[Path], run, monkeypatch
 ) -> None:

@@ -201,6 +201,7 @@ def loss(image: Any) -> Any:
     return dr.mean(image * mi.TensorXf(WEIGHTS), axis=None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DIFFERENTIATED)
 def test_splat_path__gradients_agree_with_central_differences(differentiated, name):
     gradient, difference = slopes_of(differentiated, name, DIFFERENTIATED[name], loss, 128)

@@ -190,6 +190,7 @@ def test_fit_live__ends_with_a_whole_stream_when_it_is_interrupted(tmp_path: Pat
             fit_live([images], tmp_path / "first", LiveConfig(rig, downscale=2), CONFIG, on_stage=interrupt_first)
 
 
+@pytest.mark.slow
 def test_fit_live__ends_with_a_reason(tmp_path: Path, rig: Path, images: Path, caplog) -> None:
     """Without further images, and with an error when the folder of the images is removed."""
     write(images, 0)

@@ -216,6 +216,7 @@ def test_synthesize__exposes_frames_with_the_gains_of_the_truth(clean: Path, tmp
     assert gains["cam01"].gains[0] != gains["cam01"].gains[1]
 
 
+@pytest.mark.slow
 def test_synthesize__compresses_every_image(clean: Path, tmp_path: Path) -> None:
     lossy = synthesize("spheres", tmp_path / "clip", replace(SIZE, disturbances=Disturbances(jpeg_quality=30)))
     whole = frame_of(clean, "cam01", 1)

@@ -56,6 +56,7 @@ def test_compute_ground_truth__only_moving_objects_have_motion(pair, tracer):
     assert 2 < np.linalg.norm(truth.motion[truth.mask], axis=-1).mean() < 6
 
 
+@pytest.mark.slow
 def test_compute_ground_truth__first_frame_has_no_motion_and_the_mask_of_the_next_step(clip):
     first, second = (load_truth(clip / "truth", "cam01", frame) for frame in (0, 1))
     assert (first.motion == 0).all()

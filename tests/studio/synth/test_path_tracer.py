@@ -42,6 +42,7 @@ def test_render__returns_srgb_encoded_images(radiance):
     np.testing.assert_array_equal(image, np.uint8(round(255 * encoded)))
 
 
+@pytest.mark.slow
 def test_render__sampling_noise_is_below_that_of_a_camera(tracer):
     camera = tracer.scene.rig.cameras(3, 96, 72)[1]
     tracer.set_time(0.1)

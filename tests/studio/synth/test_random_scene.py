@@ -56,6 +56,7 @@ def test_draw_scene__is_determined_by_the_seed(scenes):
             np.testing.assert_array_equal(body.pose(0.3), scenes[seed].bodies[name].pose(0.3))
 
 
+@pytest.mark.slow
 def test_draw_scene__differs_between_seeds(scenes):
     assert len({scene.rig for scene in scenes}) == NUM_SEEDS
     assert len({tuple(scene.bodies) for scene in scenes}) > 0.9 * NUM_SEEDS
@@ -142,6 +143,7 @@ def test_build__objects_are_where_they_were_drawn_and_static_ones_do_not_move(cl
         assert (truth.mask[mask] == (body.motion != "static")).all()
 
 
+@pytest.mark.slow
 def test_synthesize__records_a_random_scene_as_its_seed_determines(clip):
     settings = json.loads((clip / "capture.json").read_text())
     recording = draw_scene(1).recording

@@ -15,6 +15,7 @@ from tests.assertions import assert_close
 from tests.studio.synth.frames import render_frame
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["spheres", "arm", "thin", "flicker", "random"])
 def test_load_scene__poses_are_rigid_and_repeatable(name):
     for item in load_scene(name).objects.values():

@@ -48,6 +48,7 @@ def test_synthesize__writes_the_layout_of_n3dv_with_a_colmap_model(clip):
         assert len(list((clip / "truth" / name).glob("*.exr"))) == 3
 
 
+@pytest.mark.slow
 def test_synthesize__lossless_frames_equal_the_rendered_images(clip):
     scene = load_scene("arm")
     tracer = PathTracer(scene)
@@ -73,6 +74,7 @@ def test_synthesize__colmap_points_lie_on_the_surface_within_their_noise(clip):
     assert np.percentile(best, 95) < 4
 
 
+@pytest.mark.slow
 def test_synthesize__replaces_a_folder_of_system_files_but_no_hidden_ones(tmp_path):
     (tmp_path / "repository" / ".git").mkdir(parents=True)
     with pytest.raises(FileExistsError, match="not empty; choose another folder"):
@@ -105,6 +107,7 @@ def test_synthesize__rejects_a_non_empty_folder_and_replaces_a_capture_with_over
     assert sorted(path.name for path in tmp_path.iterdir()) == ["clip", "notes.txt"]
 
 
+@pytest.mark.slow
 def test_synthesize__removes_its_output_after_a_failure(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")

@@ -109,6 +109,7 @@ def test_check_deep__finds_nothing_in_few_cameras_or_frames(cameras: int, frames
     drawn(check).canvas.draw()
 
 
+@pytest.mark.slow
 def test_draw_deep__marks_the_cameras_with_findings(clips: Clips) -> None:
     sound = checked(clips)
     assert red_names(drawn(sound)) == {}

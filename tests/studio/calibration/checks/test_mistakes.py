@@ -112,6 +112,7 @@ def test_check_rig__names_a_common_factor_on_all_focal_lengths(capture: Capture,
     assert "0.5 times the given value fits" in check.advice
 
 
+@pytest.mark.slow
 def test_check_rig__names_cameras_with_one_pose(capture: Capture, shared: SharedFeatures) -> None:
     pose = capture.cameras[2].viewmat
     one = check_rig(with_cameras(capture, lambda i, c: replace(c, viewmat=pose) if i == 3 else c), shared)
@@ -128,6 +129,7 @@ def with_images(shared: SharedFeatures, capture: Capture, order: tuple[int, ...]
     return SharedFeatures(tuple(features), tuple(match_views(features, capture.cameras)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("order", "wrong", "sentence"),
     [
@@ -153,12 +155,14 @@ def test_check_rig__names_swapped_images_in_a_small_rig(capture: Capture, shared
     assert "the clips of cam0 and cam1, or their poses, seem to be swapped" in check.advice
 
 
+@pytest.mark.slow
 def test_check_rig__names_a_copied_clip(capture: Capture, shared: SharedFeatures) -> None:
     check = check_rig(capture, with_images(shared, capture, (0, 1, 2, 3, 3, 5)))
     assert [camera.fits for camera in check.cameras] == [True, True, True, True, False, True]
     assert "its clip is a copy of the clip of cam3" in check.cameras[4].advice
 
 
+@pytest.mark.slow
 def test_check_rig__names_rows_in_alphabetical_order(tmp_path: Path) -> None:
     """Meet Room's names have no leading zeros: alphabetically cam_10 precedes cam_2, numerically it follows."""
     names = ("cam_0", "cam_1", "cam_2", "cam_10")
@@ -174,6 +178,7 @@ def test_check_rig__names_rows_in_alphabetical_order(tmp_path: Path) -> None:
     assert "the rows seem to be in alphabetical order (cam_0, cam_1, cam_10, cam_2, ...)" in check.advice
 
 
+@pytest.mark.slow
 def test_check_rig__names_columns_of_another_convention(
     tmp_path: Path, capture: Capture, shared: SharedFeatures
 ) -> None:

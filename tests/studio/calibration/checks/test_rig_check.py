@@ -73,6 +73,7 @@ def test_check_rig__is_undecided_with_fewer_than_fifty_matches(capture: Capture,
     assert "the poses of 2 of 6 cameras fit the images; not checked: cam2, cam3" in check.advice
 
 
+@pytest.mark.slow
 def test_check_rig__hardly_detects_a_common_shift_of_principal_points(capture: Capture, shared: SharedFeatures) -> None:
     """A limitation of comparing two views at a time: principal points that are all off by 5 px still fit."""
     shift = np.array([[0, 0, 5], [0, 0, 5], [0, 0, 0]])
@@ -96,6 +97,7 @@ def test_triangulate_points__ignores_the_held_out_view(capture: Capture, shared:
     assert len(triangulate_points(wrong, shared).points) == 0
 
 
+@pytest.mark.slow
 def test_match_capture__finds_features_at_the_recorded_size(capture: Capture, shared: SharedFeatures) -> None:
     small = load_capture(capture.path, 4)
     matches = match_capture(small)
@@ -118,6 +120,7 @@ def test_triangulate_points__matches_distant_views_with_their_poses(capture: Cap
     assert len(triangulate_points(wrong, unmatched).points) < 0.2 * len(points.points)
 
 
+@pytest.mark.slow
 def test_check_rig__fits_with_undistortion_only(tmp_path: Path) -> None:
     """The recorded images are distorted by OpenCV's own model; the poses fit only if the lens is read."""
     planes = textured.textures()
