@@ -134,6 +134,7 @@ def test_push__motion_follows_the_truth_and_not_the_static_wall(full):
     assert {"recon", "flow", "offset"} <= reports[2].losses.keys()
 
 
+@pytest.mark.slow
 def test_push__confidence_is_high_where_things_move(full):
     loop = full[0]
     confidence = np.asarray(held_out(loop.gaussians).confidence)[..., 0]

@@ -313,6 +313,7 @@ def test_fit__ends_with_a_whole_packet_on_a_full_disk(capture: Path, tmp_path: P
     assert reader.metadata["num_frames"] == FRAMES
 
 
+@pytest.mark.slow
 def test_fit__prints_the_first_problem_of_its_frames(tmp_path: Path, run) -> None:
     clip = write_recording(tmp_path / "clip", 2)
     for image in clip.glob("cam*/0000.png"):

@@ -91,6 +91,7 @@ def test_fit_first_frame__moves_means_by_fractions_of_the_extent(images, drawn):
 # ---- bands of the spherical harmonics --------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_fit_first_frame__adds_sh_bands_at_equal_distances(images, drawn, monkeypatch):
     monkeypatch.setattr("morgs_mi.fit.first_frame._BAND", 0.15)
     config = dataclasses.replace(CONFIG, sh_degree=3, first_frame_steps=20)
@@ -100,6 +101,7 @@ def test_fit_first_frame__adds_sh_bands_at_equal_distances(images, drawn, monkey
     assert bands[1:4].mean() > bands[4:9].mean() > bands[9:].mean() > 0
 
 
+@pytest.mark.slow
 def test_fit_first_frame__has_all_sh_bands_after_one_step(images):
     result = fit(images, ball(50, sh_degree=3), FitConfig(sh_degree=3, first_frame_steps=1))
     assert result.gaussians.sh_degree == 3
@@ -178,6 +180,7 @@ def test_fit_first_frame__reports_l1_where_dssim_has_no_weight(images, weight):
     assert (loss == pytest.approx(l1, rel=1e-4)) == (weight == 0)
 
 
+@pytest.mark.slow
 def test_fit_first_frame__does_not_see_pixels_that_are_masked(images):
     masks = [np.ones((48, 64), bool) for _ in images]
     spoiled = [image.copy() for image in images]

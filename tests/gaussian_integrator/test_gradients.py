@@ -119,6 +119,7 @@ def test_gaussian_splat__gradient_of_the_sensors_pose(raw):
     assert dr.grad(t)[0] == pytest.approx(expected, rel=10 * tol.GRADIENT_REL)
 
 
+@pytest.mark.slow
 def test_gaussian_splat__differentiates_filter_and_crop(raw):
     """<g, J v> = <J' g, v> through a film that blurs, crops and normalises."""
     film = {

@@ -123,6 +123,7 @@ def test_gaussian_splat__reconstruction_filter_weights_the_pixel_centres(raw, sa
     assert_close(image, expected, atol=1e-3 if sample_border else tol.IMAGE_ABS)
 
 
+@pytest.mark.slow
 def test_gaussian_splat__renders_shapes_of_several_degrees_as_one_cloud():
     raw = make_unit_scene(degree=2)
     raw["sh_coeffs"][4:, 1:] = 0

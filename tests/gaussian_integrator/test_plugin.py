@@ -217,6 +217,7 @@ def test_gaussian_splat__renders_a_batch_of_sensors_beside_each_other(raw):
     np.testing.assert_array_equal(image, expected)
 
 
+@pytest.mark.slow
 def test_gaussian_splat__differentiates_a_batch_of_sensors(raw):
     scene, apart = batch_scene(raw, {}, reproducible=True)
     params = mi.traverse(scene)

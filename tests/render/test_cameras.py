@@ -44,6 +44,7 @@ def test_rasterize__draws_cameras_together_as_one_by_one(gaussians, count):
             np.testing.assert_array_equal(np.array(batch[name])[v], np.array(alone[name]), err_msg=name)
 
 
+@pytest.mark.slow
 def test_rasterize__sums_the_gradients_of_cameras():
     views = cameras(3)
     weights = np.random.default_rng(0).normal(size=(3, 37, 45, 3)).astype(np.float32)

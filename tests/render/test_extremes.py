@@ -80,6 +80,7 @@ def test_rasterize__agrees_with_the_reference_at_the_extremes(case):
     assert not failures(case)
 
 
+@pytest.mark.slow
 def test_rasterize__forward_and_reverse_mode_are_dual_at_the_extremes():
     """<g, J v> = <J' g, v> along the signs of J' g, where nothing cancels."""
     failed = []

@@ -67,5 +67,6 @@ assert gc.isenabled()
 """
 
 
+@pytest.mark.slow
 def test_recorded__does_not_deadlock_with_garbage_collection_in_another_thread():
     subprocess.run([sys.executable, "-c", BUSY], check=True, timeout=120)

@@ -61,6 +61,7 @@ def test_rasterize__motion_of_one_gaussian_has_the_closed_form(motion, first_ord
     assert np.asarray(image.motion)[8, 8] == pytest.approx(expected, abs=6e-4)
 
 
+@pytest.mark.slow
 def test_rasterize__blends_features_like_the_confidence(scene):
     """Twelve columns beside the colour have the image and the gradients of the confidence channel."""
     raw, camera = scene

@@ -48,6 +48,7 @@ def views_of(gaussians: Gaussians) -> list[ActiveView]:
     return [*views, ActiveView(wide), none]
 
 
+@pytest.mark.slow
 def test_view_group__draws_what_each_view_draws(gaussians):
     views = views_of(gaussians)
     active = gaussians.select(ACTIVE)

@@ -41,6 +41,7 @@ def over(gaussians: Gaussians, linear: Any) -> np.ndarray:
     return decode_light(color + transmittance * encode_light(np.asarray(linear)))
 
 
+@pytest.mark.slow
 def test_surfaces__in_front_equal_themselves_alone():
     expected = mi.load_dict(
         {
@@ -212,11 +213,13 @@ def test_surfaces__backward_agrees_with_central_differences(differentiated, targ
     assert difference == pytest.approx(gradient, rel=2 * tol.CENTRAL_DIFFERENCE_REL)
 
 
+@pytest.mark.slow
 def test_surfaces__forward_mode_is_dual_to_reverse_mode(differentiated, target):
     reverse, forward = slopes_of_both_modes(differentiated, DIFFERENTIATED, target)
     assert forward == pytest.approx(reverse, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_surfaces__gradients_of_positions_warn(target, caplog):
     card = scene(cloud(0.0), "prb", card=wall(0.5, **glowing()))
     params = mi.traverse(card)

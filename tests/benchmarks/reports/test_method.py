@@ -125,6 +125,7 @@ def test_method_command__scores_are_those_of_the_held_out_view(interrupted):
     assert 0 < clip["cue"]["error"] < 2
 
 
+@pytest.mark.slow
 def test_method_tables__are_complete(interrupted):
     (clip,) = interrupted[0]["clips"]
     for table, rows in ((ablation_table(clip, 2), 2), (epochs_table(clip), 4), (key_views_table(clip), 6)):

@@ -106,6 +106,7 @@ def test_SegmentedRun__joins_them_to_an_ordinary_stream(whole: Path) -> None:
     assert len(set().union(*sets)) == sum(map(len, sets)), "no id is in two segments"
 
 
+@pytest.mark.slow
 def test_SegmentedRun__reports_frames_and_workers(whole: Path) -> None:
     report = json.loads((whole / "report.json").read_text())
     assert [row["frame"] for row in report["frames"]] == list(range(FRAMES))

@@ -79,6 +79,7 @@ def test_render_inserted__lights_a_scene_without_emitters_by_the_stream(stream, 
     assert images[0]["color"][12, 16].min() > 0.05
 
 
+@pytest.mark.slow
 def test_render_inserted__traces_rays_through_the_stream(stream, tmp_path):
     (tmp_path / "mirror.py").write_text(
         "def build(frame, time):\n"

@@ -208,6 +208,7 @@ def test_splat_path__gradients_agree_with_central_differences(differentiated, na
     assert gradient == pytest.approx(difference, rel=3e-2)
 
 
+@pytest.mark.slow
 def test_splat_path__forward_mode_is_dual_to_reverse_mode(differentiated):
     reverse, forward = slopes_of_both_modes(differentiated, DIFFERENTIATED, mi.TensorXf(WEIGHTS))
     assert forward == pytest.approx(reverse, rel=1e-2)

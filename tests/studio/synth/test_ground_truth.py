@@ -47,6 +47,7 @@ def test_compute_ground_truth__motion_map_warps_the_previous_frame_onto_the_curr
         assert score(wrong) < score(truth.motion) - 1.5
 
 
+@pytest.mark.slow
 def test_compute_ground_truth__only_moving_objects_have_motion(pair, tracer):
     _, _, (_, truth) = pair
     moves = np.array([item.pose is not None for item in tracer.scene.objects.values()])

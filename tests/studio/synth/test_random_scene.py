@@ -62,6 +62,7 @@ def test_draw_scene__differs_between_seeds(scenes):
     assert len({tuple(scene.bodies) for scene in scenes}) > 0.9 * NUM_SEEDS
 
 
+@pytest.mark.slow
 def test_draw_scene__objects_stay_in_the_room(scenes):
     for scene in scenes:
         for name, body in scene.bodies.items():

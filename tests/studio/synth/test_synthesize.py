@@ -59,6 +59,7 @@ def test_synthesize__lossless_frames_equal_the_rendered_images(clip):
     np.testing.assert_array_equal(stored, image)
 
 
+@pytest.mark.slow
 def test_synthesize__colmap_points_lie_on_the_surface_within_their_noise(clip):
     model = read_colmap(clip / "sparse" / "0")
     assert len(model.points) > 1000

@@ -42,6 +42,7 @@ def test_load_tracks__visible_points_have_the_depth_of_the_view(clip: Path) -> N
     assert (compared > (5000, 500)).all(), compared
 
 
+@pytest.mark.slow
 def test_load_tracks__every_point_is_visible_where_it_was_sampled(clip: Path) -> None:
     visible = np.stack(list(load_tracks(clip / "truth").visible.values()))
     assert visible.any((0, 2)).all()

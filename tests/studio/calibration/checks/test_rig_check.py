@@ -20,6 +20,7 @@ from tests.scenes import textured
 from tests.scenes.textured import turned, with_cameras
 
 
+@pytest.mark.slow
 def test_check_rig__accepts_true_poses(capture: Capture, shared: SharedFeatures) -> None:
     check = check_rig(capture, shared)
     assert check.fits
