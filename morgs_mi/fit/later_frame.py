@@ -28,7 +28,6 @@ from morgs_mi.method.rigidity import find_neighbours
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 
-_SCORES = "scores"  # name of the loss of the densification scores, which is 0
 # The round of density control is due when the loss hardly falls, and at this fraction of the epochs at the latest: the
 # residual has shown by then where Gaussians are missing, and enough steps are left to fit the births.
 _DENSITY_ROUND = 0.625
@@ -128,7 +127,7 @@ class _Fit:
         self._config = config
         self._motion = motion
         self._rng = rng
-        self._progress = progress
+        self._progress = progress or Progress()
         self._views = sorted(problem.active.views)
         count = len(self._views)
         self._order = [self._views[k] for k in view_order(count, config.epochs * count, rng)]
@@ -177,7 +176,6 @@ class _Fit:
         weights = weights_of(self._config.objective)
         steps = self._begin(Epoch.after(self.steps, len(self._views)))
         self.losses = optimise(self._optimizer, rates, self._losses_at, steps, weights)
-        self.losses.pop(_SCORES, None)
         self._objectives.append(sum(weights[name] * loss for name, loss in self.losses.items()))
 
     @property
@@ -204,20 +202,13 @@ class _Fit:
     def _begin(self, epoch: Epoch) -> Steps:
         """Begin an epoch, and return its steps."""
         self.steps = epoch.stop
-        self._attribution = self._new_attribution(epoch, epoch.first)
+        if self._densifies:
+            self._attribution = Attribution(len(self.source), epoch.first_score - epoch.first)
+        views = self._order[epoch.first : epoch.stop]
+        return Steps(views, epoch.first, on_step=self._report_step, observer=self._attribution, last=len(self._views))
 
-        def on_step(step: int) -> None:
-            if self._attribution is not None:
-                self._attribution.collect()
-            self._attribution = self._new_attribution(epoch, step) or self._attribution
-            if self._progress is not None:
-                self._progress(step, len(self._order))
-
-        return Steps(self._order[epoch.first : epoch.stop], epoch.first, on_step=on_step, last=len(self._views))
-
-    def _new_attribution(self, epoch: Epoch, step: int) -> Attribution | None:
-        """Return the densification scores that begin at a step, if they do."""
-        return Attribution(len(self.source)) if self._densifies and step == epoch.first_score else None
+    def _report_step(self, step: int) -> None:
+        self._progress(step, len(self._order))
 
     def _losses_at(self, parameters: Mapping[str, Tensor], index: int) -> dict[str, Tensor]:
         """Render one view and return its losses by name."""
@@ -229,14 +220,15 @@ class _Fit:
         # The other terms are about motion and confidence, and must not move opacity and geometry.
         other_channels = [name for name in channels if name != "color"]
         gaussians = apply_residual(self._base, parameters, self._motion)
-        scores = self._attribution
-        features = None if scores is None else scores.features()
-        image = view.render(gaussians, channels, [*other_channels, "features"] if scores else other_channels, features)
+        features = None if self._attribution is None else self._attribution.features()
+        gradients = other_channels if features is None else [*other_channels, "features"]
+        image = view.render(gaussians, channels, gradients, features)
+        if self._attribution is not None and features is not None:
+            self._attribution.observe(image, problem.targets[index], view.region)
         num_pixels = view.camera.width * view.camera.height
         num_gaussians = problem.active.num_gaussians
         prediction = Prediction(image, parameters, view.region, num_pixels, num_gaussians, problem.extent, gaussians)
-        losses = losses_of(prediction, observations, objective)
-        return losses if scores is None else losses | {_SCORES: scores.loss(image, problem.targets[index], view.region)}
+        return losses_of(prediction, observations, objective)
 
     def _neighbour_observation(self) -> Observations:
         """Return the observation of all views that compares neighbours, if a term does."""

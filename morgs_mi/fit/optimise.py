@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -52,6 +52,18 @@ def replace_parameter(optimizer: Adam, name: str, value: np.ndarray, carry: Call
     optimizer.state[name] = state
 
 
+class Observer(Protocol):
+    """Reads further gradients from the backward pass of every step, without a pass of its own."""
+
+    def term(self) -> Tensor | None:
+        """Return a term of value 0, which joins the losses of the step in its backward pass; None: no term."""
+        ...
+
+    def collect(self) -> None:
+        """Read the gradients of the term, after the backward pass."""
+        ...
+
+
 @dataclass(frozen=True)
 class Steps:
     """Steps of an optimisation, one view each."""
@@ -60,6 +72,7 @@ class Steps:
     first: int = 0  #: Number of steps before these.
     decay: Callable[[int], float] | None = None  #: Step -> factor on all learning rates; None: 1.
     on_step: Callable[[int], None] | None = None  #: Called with the number of steps done.
+    observer: Observer | None = None  #: Of the backward passes.
     last: int = 8  #: Number of steps over which the losses are averaged.
 
 
@@ -96,8 +109,7 @@ def optimise(
             optimizer.set_learning_rate({name: factor * rate for name, rate in scale.items()})
         losses = losses_at(optimizer, view)
         total: Tensor = sum(weights.get(name, 1.0) * loss for name, loss in losses.items())
-        with render_lock:
-            dr.backward(total)
+        _backward(total, steps.observer)
         optimizer.step()
         for name, loss in losses.items():
             history.setdefault(name, []).append(dr.detach(loss))
@@ -113,6 +125,15 @@ def optimise(
             f"{steps.first + len(history[broken_losses[0]])} steps; lower the learning rates."
         )
     return final
+
+
+def _backward(total: Tensor, observer: Observer | None) -> None:
+    """Compute the gradients of a step, also those that an observer reads."""
+    term = None if observer is None else observer.term()
+    with render_lock:
+        dr.backward(total if term is None else total + term)
+    if observer is not None:
+        observer.collect()
 
 
 def view_order(num_views: int, steps: int, rng: np.random.Generator) -> list[int]:

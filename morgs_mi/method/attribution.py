@@ -25,29 +25,34 @@ from morgs_mi.render.region import Region
 
 # Error that counts as noise, in typical errors of the image: normal noise, independent in three colours, exceeds 3 at
 # 3 of 10,000 pixels.
-_NOISE = 3.0
+NOISE = 3.0
 
 
 class Attribution:
-    """Densification scores of N Gaussians from the steps of an optimisation, without a pass of their own.
+    """Densification scores of N Gaussians from the steps of an optimisation that it observes, without a pass of their own.
 
     Args:
         count: N.
+        skip: number of steps before the first one that counts.
     """
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, skip: int = 0) -> None:
         self._count = count
-        self._probe = None
+        self._skip = skip
+        self._probe: Tensor | None = None
+        self._term: Tensor | None = None
         self._largest = dr.zeros(mi.Float, count)
 
-    def features(self) -> Tensor:
-        """Return the features [N, 1] to render in the next step, with detached weights."""
+    def features(self) -> Tensor | None:
+        """Return the features [N, 1] to render in the next step, with detached weights; None: the step does not count."""
+        if self._skip > 0:
+            return None
         self._probe = probe = dr.zeros(mi.TensorXf, (self._count, 1))
         dr.enable_grad(probe)
         return probe
 
-    def loss(self, image: Image, target: Target, region: Region | None) -> Tensor:
-        """Return a loss of 0, of which the gradients of the features are E.
+    def observe(self, image: Image, target: Target, region: Region | None) -> None:
+        """Attribute the error of a step's image to its features.
 
         Errors below three times the typical error of the image do not count: they are noise.
 
@@ -59,15 +64,21 @@ class Attribution:
         difference = dr.abs(target.minus(dr.detach(image.color).array, region))
         pixel = dr.arange(mi.UInt32, dr.width(difference) // 3) * 3
         error = sum(dr.gather(mi.Float, difference, pixel + c) for c in range(3)) / 3
-        error = dr.maximum(error - _NOISE * _typical(error), 0)
-        return dr.sum(image.features * mi.TensorXf(error, image.features.shape), axis=None)
+        error = dr.maximum(error - NOISE * _typical(error), 0)
+        self._term = dr.sum(image.features * mi.TensorXf(error, image.features.shape), axis=None)
+
+    def term(self) -> Tensor | None:
+        """Return the sum over the image of feature times error, which is 0: the gradients of the features are E."""
+        return self._term
 
     def collect(self) -> None:
-        """Take the scores of a step, if its features were rendered, after its gradients have been computed."""
+        """Update the scores from the gradients of a step."""
+        self._skip -= 1
         if self._probe is not None:
             self._largest = dr.maximum(self._largest, dr.grad(self._probe).array)
             dr.eval(self._largest)
             self._probe = None
+            self._term = None
 
     def scores(self) -> np.ndarray:
         """Return the scores [N] of the steps so far."""

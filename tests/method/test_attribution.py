@@ -35,20 +35,21 @@ def scene():
 
 
 def scores_of(wall, views, targets):
-    """Return the scores of one step in each view, and the gradient of the colours from its loss."""
+    """Return the scores of one step in each view, and the gradient of the colours from its term."""
     scores = Attribution(N)
     for view, target in zip(views, targets, strict=True):
         dr.enable_grad(wall.sh_coeffs)
         image = view.render(wall, ("color",), ("features",), scores.features())
-        loss = scores.loss(image, target, view.region)
-        assert np.asarray(loss).item() == 0
-        dr.backward(loss)
+        scores.observe(image, target, view.region)
+        term = scores.term()
+        assert np.asarray(term).item() == 0
+        dr.backward(term)
         scores.collect()
     return scores.scores(), np.asarray(dr.grad(wall.sh_coeffs))
 
 
 def test_attribution__is_what_back_projection_gives(scene, monkeypatch):
-    monkeypatch.setattr("morgs_mi.method.attribution._NOISE", 0.0)
+    monkeypatch.setattr("morgs_mi.method.attribution.NOISE", 0.0)
     scores, gradient = scores_of(*scene)
     expected = densification_scores(*scene)
     assert_close(scores, expected, rtol=1e-4)
@@ -73,3 +74,13 @@ def test_attribution__without_a_step_is_zero():
     scores = Attribution(3)
     scores.collect()
     assert not scores.scores().any()
+
+
+def test_attribution__skips_the_first_steps():
+    scores = Attribution(3, skip=2)
+    rendered = []
+    for _ in range(3):
+        rendered.append(scores.features() is not None)
+        scores.collect()
+    assert rendered == [False, False, True]
+    assert scores.term() is None
