@@ -24,7 +24,7 @@ test-long: setup
 lint: setup
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
-	$(BIN)/python tools/check_dialect.py morgs_mi benchmarks examples scenes
+	$(BIN)/python tools/check_dialect.py morgs_mi benchmarks examples scenes tests tools
 	$(BIN)/pyright
 	$(BIN)/typos
 

@@ -36,7 +36,7 @@ def llvm_variant():
 @pytest.fixture
 def small_images(monkeypatch: pytest.MonkeyPatch) -> None:
     """Accept downscaled images that are too small for a fit, which makes tests fast."""
-    monkeypatch.setattr("morgs_mi.capture.capture._MIN_SIDE", 1)
+    monkeypatch.setattr("morgs_mi.capture.capture.MIN_SIDE", 1)
 
 
 @pytest.fixture

@@ -34,6 +34,8 @@ def checked(folder: Path, source: str) -> tuple[int, str]:
         ("def f(*, given): pass\n", 1, "`given`"),
         ("f = lambda after: 1\n", 1, "`after`"),
         ("self._kept = 1\n", 1, "`kept`"),
+        ('monkeypatch.setattr(module, "_LIMIT", 1)\n', 1, "a public name"),
+        ('monkeypatch.setattr("package.module._LIMIT", 1)\n', 1, "a public name"),
     ],
 )
 def test_check_dialect__names_a_violation(tmp_path: Path, source: str, line: int, part: str) -> None:
@@ -54,6 +56,8 @@ def test_check_dialect__names_a_violation(tmp_path: Path, source: str, line: int
         "x = y.found\n",
         "f(found=1)\n",
         "def found(): pass\n",
+        'monkeypatch.setattr(module, "LIMIT", 1)\n',
+        'monkeypatch.setattr(Value, "__exit__", None)\n',
     ],
 )
 def test_check_dialect__accepts_other_code(tmp_path: Path, source: str) -> None:

@@ -7,15 +7,15 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi import Gaussians, RenderConfig, StreamConfig, StreamLoop, rasterize
+from morgs_mi import Gaussians, RenderConfig, StreamLoop, rasterize
 from morgs_mi.core.memory import from_numpy
-from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.method.losses import flow_loss, mask_loss, recon_loss
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.region import Region
 from tests import tolerances as tol
 from tests.assertions import assert_close
+from tests.quick import NO_DENSITY, quick
 from tests.scenes import surfaces
 from tests.scenes.ball import images_of, mean_psnr, opaque_ball, views
 from tests.scenes.cameras import make_camera, make_wide_camera
@@ -161,18 +161,8 @@ def test_gaussian_splat__agrees_between_cuda_and_llvm_among_surfaces():
 
 def test_stream_loop__fits_two_frames_alike_on_cuda_and_llvm():
     """Steps amplify the rounding of sums, so the quality of the fits is compared."""
-    config = StreamConfig(
-        fit=FitConfig(
-            sh_degree=0,
-            num_gaussians=400,
-            first_frame_steps=150,
-            epochs=4,
-            dropping=0.0,
-            density=DensityConfig(rounds=0, later_frames=False),
-        ),
-        motion=MotionConfig(key_views=2),
-        render=RenderConfig(reproducible=True),
-    )
+    changes = {"num_gaussians": 400, "first_frame_steps": 150, "confidence_steps": 20, "epochs": 4}
+    config = quick(MotionConfig(key_views=2), dropping=0.0, density=NO_DENSITY, **changes)
 
     def run():
         ball = opaque_ball()

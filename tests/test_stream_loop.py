@@ -26,21 +26,20 @@ from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.runs.fit_capture import stream_capture
 from morgs_mi.stream_loop import StreamLoop
+from tests.quick import NO_DENSITY, quick
 from tests.scenes.cameras import QUAD, look_at_cameras
 from tests.scenes.gaussians import isotropic
 
 SHIFT = np.array([0.06, 0.02, 0.0])  # about 3 px a frame
-QUICK = StreamConfig(  # from all points, as the images were made of them
-    fit=FitConfig(
-        sh_degree=0,
-        num_gaussians=600,
-        first_frame_steps=150,
-        dropping=0.0,
-        confidence_steps=20,
-        epochs=4,
-        density=DensityConfig(rounds=0, later_frames=False),
-    ),
-    motion=MotionConfig(key_views=2),
+QUICK = quick(  # from all points, as the images were made of them
+    MotionConfig(key_views=2),
+    RenderConfig(),
+    num_gaussians=600,
+    first_frame_steps=150,
+    dropping=0.0,
+    confidence_steps=20,
+    epochs=4,
+    density=NO_DENSITY,
 )
 REPRODUCIBLE = dataclasses.replace(QUICK, render=RenderConfig(reproducible=True))
 SHORT = dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, first_frame_steps=20))
@@ -507,7 +506,7 @@ def test_push__observes_the_upcoming_frame_in_another_thread_and_changes_nothing
     threads = []
     observe = stream_loop.observe_frame
     monkeypatch.setattr(
-        stream_loop, "observe_frame", lambda *given: threads.append(threading.current_thread()) or observe(*given)
+        stream_loop, "observe_frame", lambda *args: threads.append(threading.current_thread()) or observe(*args)
     )
     loop = new_loop(dataclasses.replace(QUICK, render=RenderConfig(reproducible=True)))
     ahead = pushed_ahead(loop, clip, lambda images: [image.copy() for image in images])
@@ -597,7 +596,7 @@ def test_push__leaves_a_change_of_light_in_the_scene(clip):
 @pytest.mark.slow
 def test_push__has_the_same_bytes_with_exposures_where_cameras_are_equal(clip, plain, monkeypatch):
     # Their few short fits would find differences of 1 %.
-    monkeypatch.setattr("morgs_mi.fit.balance._LEAST_DIFFERENCE", 0.1)
+    monkeypatch.setattr("morgs_mi.fit.balance.LEAST_DIFFERENCE", 0.1)
     loop = new_loop(dataclasses.replace(EXPOSED, fit=dataclasses.replace(EXPOSED.fit, exposure="auto")))
     assert [loop.push(images[:4])[0].encoded for images in clip[:3]] == plain
 

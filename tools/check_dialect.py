@@ -1,4 +1,4 @@
-"""Check that an assignment binds one thing and that the names of variables are nouns.
+"""Check that an assignment binds one thing, that names of variables are nouns, and that tests patch public names.
 
 `python tools/check_dialect.py FOLDER...` prints a sentence for each violation, and exits with 1 if there is one.
 """
@@ -16,7 +16,7 @@ NO_NOUNS = (
     *("own", "seen", "taken", "then", "together", "used", "wanted"),
 )
 # Fields and parameters that stay, by file: other modules, scripts and files of results have these names.
-KEPT = {
+EXCEPTIONS = {
     "benchmarks/reports/cameras.py": {"given"},
     "benchmarks/reports/field.py": {"found"},
     "benchmarks/reports/method.py": {"found"},
@@ -56,11 +56,21 @@ def is_parallel(node: ast.Assign) -> bool:
     return not (is_swap and targets == {ast.unparse(value) for value in node.value.elts})
 
 
-def violations(tree: ast.Module, kept: set[str]) -> Iterator[tuple[int, str]]:
-    """Yield the line and the sentence of each violation in a module, in which the names `kept` may stay."""
+def patches_private_name(node: ast.Call) -> bool:
+    """Return whether a call is `setattr` of pytest's `monkeypatch` with a private name."""
+    is_patch = isinstance(node.func, ast.Attribute) and node.func.attr == "setattr"
+    names = [arg.value for arg in node.args[:2] if isinstance(arg, ast.Constant) and isinstance(arg.value, str)]
+    last_parts = [name.rpartition(".")[2] for name in names]
+    return is_patch and any(name.startswith("_") and not name.endswith("__") for name in last_parts)
+
+
+def violations(tree: ast.Module, exceptions: set[str]) -> Iterator[tuple[int, str]]:
+    """Yield the line and the sentence of each violation in a module, in which some names may stay."""
     for node in ast.walk(tree):
-        if isinstance(node, ast.expr | ast.arg) and (name := bound_name(node)) in NO_NOUNS and name not in kept:
+        if isinstance(node, ast.expr | ast.arg) and (name := bound_name(node)) in NO_NOUNS and name not in exceptions:
             yield node.lineno, f"`{name}` must be a noun; name the variable by what it holds."
+        if isinstance(node, ast.Call) and patches_private_name(node):
+            yield node.lineno, "expected a public name to patch, got a private one; make it public."
         if isinstance(node, ast.Assign) and is_parallel(node):
             yield node.lineno, "expected an assignment of one value, got several; give each a line."
         elif isinstance(node, ast.Assign) and len(node.targets) > 1 and node in tree.body:
@@ -72,7 +82,7 @@ def check(folders: Sequence[str]) -> list[str]:
     lines = []
     for path in sorted(path for folder in folders for path in Path(folder).rglob("*.py")):
         tree = ast.parse(path.read_text(encoding="utf-8"))
-        rows = sorted(violations(tree, KEPT.get(path.as_posix(), set())))
+        rows = sorted(violations(tree, EXCEPTIONS.get(path.as_posix(), set())))
         lines += [f"{path}:{number}: {sentence}" for number, sentence in rows]
     return lines
 

@@ -18,8 +18,10 @@ def problems(tag: str) -> list[str]:
     citation = re.findall(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text(encoding="utf-8"), re.MULTILINE)
     log = re.findall(r"^## \[(\d.*)\] - (\S+)$", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
     newest, day = log[0]
-    found = {"pyproject.toml": project["version"], "CITATION.cff": citation[0], "CHANGELOG.md": newest}
-    wrong = [f"{name}: expected version {version}, got {value}." for name, value in found.items() if value != version]
+    versions = {"pyproject.toml": project["version"], "CITATION.cff": citation[0], "CHANGELOG.md": newest}
+    wrong = [
+        f"{name}: expected version {version}, got {value}." for name, value in versions.items() if value != version
+    ]
     if not re.fullmatch(r"\d{4}-\d\d-\d\d", day) or day > date.today().isoformat():
         wrong.append(f"CHANGELOG.md: expected the day of the release, got {day}.")
     if not {"Source", "Issues"} <= project["urls"].keys():

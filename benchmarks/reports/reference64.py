@@ -28,7 +28,7 @@ ATTRIBUTES = ("means", "log_scales", "quats", "logit_opacities", "sh_coeffs")
 _GEOMETRY = ATTRIBUTES[:4]
 _STEP = 1e-30
 # Pairs of pixel and Gaussian per chunk: 8 MB per array.
-_PAIRS = 1_000_000
+PAIRS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class Reference64:
     def _blended(self, splats: np.ndarray, order: np.ndarray, pixels: np.ndarray) -> Iterator[tuple]:
         """Yield (chunk, (dx, dy), w, T, alpha, whether alpha is A) for one chunk of the pixels at a time."""
         mean_x, mean_y, a, b, c, opacity = splats[order].T
-        rows = max(1, _PAIRS // max(len(order), 1))
+        rows = max(1, PAIRS // max(len(order), 1))
         for first in range(0, len(pixels), rows):
             chunk = slice(first, first + rows)
             dx = pixels[chunk, :1] + 0.5 - mean_x

@@ -32,7 +32,7 @@ from morgs_mi.io.video import Clip, ImageOrError, open_clips
 
 _LOG = logging.getLogger(__name__)
 # Pixels of the shorter side that a downscaled image needs.
-_MIN_SIDE = 32
+MIN_SIDE = 32
 
 
 @dataclass(frozen=True)
@@ -378,11 +378,11 @@ def _photos(clips: Sequence[Clip]) -> tuple[str, ...]:
 
 
 def _check_downscale(downscale: float, cameras: Sequence[Camera], recorded: Sequence[Camera]) -> None:
-    if downscale > 1 and min(min(camera.width, camera.height) for camera in cameras) < _MIN_SIDE:
-        largest = min(min(camera.width, camera.height) for camera in recorded) / _MIN_SIDE
+    if downscale > 1 and min(min(camera.width, camera.height) for camera in cameras) < MIN_SIDE:
+        largest = min(min(camera.width, camera.height) for camera in recorded) / MIN_SIDE
         remedy = f"use at most {np.floor(100 * largest) / 100:g}" if largest >= 1 else "use 1"
         raise ValueError(
-            f"load_capture(): `downscale` must leave images of at least {_MIN_SIDE} pixels on each side, got "
+            f"load_capture(): `downscale` must leave images of at least {MIN_SIDE} pixels on each side, got "
             f"{downscale:g}; {remedy}."
         )
 

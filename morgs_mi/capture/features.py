@@ -16,7 +16,7 @@ from morgs_mi.core.camera import Camera
 
 # Larger images add no corners that other views also see, and SIFT is slow.
 _DETECTION_PIXELS = 1.3e6
-_MAX_FEATURES = 2500
+MAX_FEATURES = 2500
 # Lowe's ratio; with more cameras than this, each is matched with its nearest neighbours only.
 _RATIO = 0.8
 _ALL_PAIRS = 24
@@ -82,7 +82,7 @@ def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features
     grey = cv2.cvtColor(cv2.resize(image, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
     where = None if mask is None else cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
     # Without precise upscaling OpenCV's features are off by a quarter of a pixel.
-    sift = cv2.SIFT.create(nfeatures=_MAX_FEATURES, enable_precise_upscale=True)
+    sift = cv2.SIFT.create(nfeatures=MAX_FEATURES, enable_precise_upscale=True)
     keypoints, descriptors = sift.detectAndCompute(grey, where)
     if descriptors is None:
         return none

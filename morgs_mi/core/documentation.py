@@ -17,13 +17,13 @@ Class = TypeVar("Class")
 DOCUMENTATION = "https://morgs-mi.readthedocs.io/"
 """Address of the documentation."""
 
-_CHECKOUT = Path(__file__).parents[2]
+CHECKOUT = Path(__file__).parents[2]
 
 
 def page(name: str) -> str:
     """Return the path of a page in the checkout, such as docs/flow.md, or its address where there is no checkout."""
     path = f"docs/{name}.md"
-    return path if (_CHECKOUT / path).is_file() else f"{DOCUMENTATION}en/latest/{name}.html"
+    return path if (CHECKOUT / path).is_file() else f"{DOCUMENTATION}en/latest/{name}.html"
 
 
 def with_pages(text: str) -> str:

@@ -60,7 +60,7 @@ class ProgressBar:
         self._begin = time.monotonic()
         self._shown = -_PERIOD
         self._output: Any = None
-        self._is_notebook = _is_notebook()
+        self._is_notebook = is_notebook()
 
     def __call__(self, done: float, total: float | None = None) -> None:
         """Show that `done` steps of `total` are done."""
@@ -101,7 +101,7 @@ class ProgressBar:
             self._output.update(content)
 
 
-def _is_notebook() -> bool:
+def is_notebook() -> bool:
     """Return whether this is a cell of a notebook, and not a script or IPython on a terminal."""
     ipython = sys.modules.get("IPython")
     shell = ipython.get_ipython() if ipython is not None else None

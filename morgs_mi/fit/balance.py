@@ -27,7 +27,7 @@ from morgs_mi.method.exposure import Exposure, centred, fit_exposure
 _COMPARED = 2
 # Difference of tones, of 1, below which `auto` takes cameras as alike. The first round measures up to 0.002 on
 # path-traced cameras without differences, 0.003 and 0.009 on real ones, and 0.16 and more on rigs that `info` warns of.
-_LEAST_DIFFERENCE = 0.01
+LEAST_DIFFERENCE = 0.01
 # Steps of the first frame per step of a short fit, at least: the balance must not cost more than it.
 _LEAST_SHARE = 4
 
@@ -87,7 +87,7 @@ def balance_cameras(
         gaussians = fits.fit(gaussians, exposures, -(-fits.steps // 2) if k else fits.steps)
         exposures = fits.exposures_of(gaussians)
         largest = max(exposure.change for exposure in exposures.values())
-        if config.exposure == "auto" and largest < _LEAST_DIFFERENCE:
+        if config.exposure == "auto" and largest < LEAST_DIFFERENCE:
             return Balance(tuple(exposures.values()), False)
     if config.exposure == "on":
         return Balance(tuple(exposures.values()), True)

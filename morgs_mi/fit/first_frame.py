@@ -36,7 +36,7 @@ _PASSES = 4
 # Least number of steps of which it is averaged.
 _LEAST = 8
 # Fraction of the steps after which another SH band is added, as in 3DGS.
-_BAND = 1 / 30
+BAND = 1 / 30
 _FIRST_ROUND = 0.1
 LAST_ROUND = 0.5
 """Last round of density control, as a fraction of the steps: the remaining steps fit the births."""
@@ -98,9 +98,7 @@ class _Fit:
         self._base = problem.start
         self._optimizer = adam(_start(problem.start))
         self._rates = config.first_frame_rates.by_parameter(problem.extent)
-        self._bands = [
-            int(band * config.planned_steps * _BAND + 1e-9) for band in range(1, problem.start.sh_degree + 1)
-        ]
+        self._bands = [int(band * config.planned_steps * BAND + 1e-9) for band in range(1, problem.start.sh_degree + 1)]
         self._rounds = density_rounds(config)
         self._look_at(problem.halved() if self._rounds else problem)
 

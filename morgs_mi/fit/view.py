@@ -18,9 +18,9 @@ from morgs_mi.render.render_config import RenderConfig
 LEAST_GAIN = 0.1
 """Increase of the PSNR of withheld pixels from which a change of the cameras is taken, dB: less is chance."""
 
-_MIN_SIDE = 32  # px, of a reduced image
+MIN_SIDE = 32  # px, of a reduced image
 # Least width of views of half the size, px.
-_COARSE_WIDTH = 160
+COARSE_WIDTH = 160
 # Side of the withheld blocks, px.
 _BLOCK = 12
 # One of so many blocks is withheld.
@@ -50,7 +50,7 @@ class View(NamedTuple):
         A reduced pixel is valid if all pixels that it covers are.
         """
         factor = self.camera.width // width
-        if factor < 2 or self.camera.height // factor < _MIN_SIDE:
+        if factor < 2 or self.camera.height // factor < MIN_SIDE:
             return self
         size = (self.camera.width // factor, self.camera.height // factor)
         image = np.asarray(cv2.resize(self.image, size, interpolation=cv2.INTER_AREA))
@@ -62,7 +62,7 @@ class View(NamedTuple):
 
 def half_sized(views: Sequence[View]) -> list[View]:
     """Return views of half the size; a view narrower than 320 px keeps its own."""
-    return [view.reduced(max(view.camera.width // 2, _COARSE_WIDTH)) for view in views]
+    return [view.reduced(max(view.camera.width // 2, COARSE_WIDTH)) for view in views]
 
 
 def withheld_blocks(views: Sequence[View], width: int, rng: np.random.Generator) -> tuple[list[View], list[View]]:

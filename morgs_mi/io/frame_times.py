@@ -64,7 +64,7 @@ def read_header(path: Path) -> VideoHeader:
         frames_before = int(stream.get(cv2.CAP_PROP_PTS))
         fps = stream.get(cv2.CAP_PROP_FPS)
         movie = read_movie(path)
-        packets = _packet_times(path)
+        packets = packet_times(path)
         has_times = path.suffix.lower() not in _WITHOUT_TIMES
         times = _shown(path, stream, movie, packets) if has_times else packets
     finally:
@@ -114,7 +114,7 @@ def true_rate(fps: float, frames: float, duration: float) -> float:
     return fps if not duration or difference <= _JITTER + _ROUNDING * fps else frames / duration
 
 
-def _packet_times(path: Path) -> np.ndarray:
+def packet_times(path: Path) -> np.ndarray:
     """Return the times of the packets in a video file, s.
 
     The packets are read but not decoded, 0.2 ms each at 1080x1920. They are in the order of decoding, which differs

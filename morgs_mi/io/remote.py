@@ -35,7 +35,7 @@ _PAGE = (b"<!doctype html", b"<html")
 _IGNORED = "truth"
 _INDEX = ".remote.json"  # file in a mirrored folder: its URL, and the sizes of the files
 # Seconds to wait for a connection and for each further piece of a file, and requests at a time.
-_PATIENCE = 60
+PATIENCE = 60
 _REQUESTS = 16
 
 
@@ -168,7 +168,7 @@ def _options(url: str) -> dict[str, Any]:
         return {}
     from aiohttp import ClientTimeout
 
-    return {"client_kwargs": {"timeout": ClientTimeout(sock_connect=_PATIENCE, sock_read=_PATIENCE)}}
+    return {"client_kwargs": {"timeout": ClientTimeout(sock_connect=PATIENCE, sock_read=PATIENCE)}}
 
 
 def _fetch(system: Any, url: str, remote: str, file: Path, size: int | None) -> None:

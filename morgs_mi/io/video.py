@@ -30,7 +30,7 @@ from morgs_mi.io.remote import fetched
 _BYTES_PER_PIXEL = 6
 # First frame that is worth a search, and the frames before it at which the search aims: those shown right after a
 # keyframe may refer to frames before it, and a file may be indexed by the times of decoding.
-_FAR = 100
+FAR = 100
 _BEFORE = 32
 # Frames that a clip may pause; the instants of the pause are listed.
 _MAX_PAUSE = 1_000_000
@@ -136,7 +136,7 @@ class VideoReader:
 
     def _opened_before(self, index: int) -> tuple[cv2.VideoCapture, int]:
         """Return the decoder of the file, and the number of frames that it has passed: none, or all up to `index`."""
-        if self.times is None or not _FAR <= index < len(self.times):
+        if self.times is None or not FAR <= index < len(self.times):
             return self._opened(), 0
         stream = self._opened()
         stream.set(cv2.CAP_PROP_POS_MSEC, 1000 * self.times[index - _BEFORE])

@@ -34,7 +34,7 @@ from morgs_mi.render.region import Region, summed_area
 from morgs_mi.render.render_config import RenderConfig
 
 # Fraction of a connected change that active Gaussians must cover to explain it.
-_EXPLAINED = 0.5
+EXPLAINED = 0.5
 # Fraction of a block's pixels above which it belongs to a connected change: fewer are noise, or the rim of one.
 _CHANGED = 0.25
 # Fraction of all pixels above which all Gaussians are active: leaving out the others would cost more than it saves.
@@ -43,7 +43,7 @@ _MOST_CHANGED = 0.5
 # extent reaches the alpha cut-off at three and a third.
 _CORE = 0.6
 # Responsibility below which an active Gaussian is rendered in `quiet_views` only.
-_QUIET = 0.2
+QUIET = 0.2
 
 
 @documented
@@ -133,7 +133,7 @@ def find_active_set(
         if unexplained.any():
             table = from_numpy(mi.UInt32, summed_area(unexplained))
             active |= np.asarray(boxes.within(table, grid) > 0.5 * boxes.area)
-    blocks_by_view = _drawn(active, shares > _QUIET, changed_views, config)
+    blocks_by_view = _drawn(active, shares > QUIET, changed_views, config)
     static = with_zero_motion(gaussians.select(~active))
     views = {
         v: make_active_view(cameras[v], Region.of(changed_views[v].view.grid, blocks), static, channels[v], render)
@@ -173,6 +173,6 @@ def _unexplained(counts: np.ndarray, covered: np.ndarray, block: tuple[int, int]
     count, components = cv2.connectedComponents(changes.astype(np.uint8))
     labels = np.asarray(components, np.int32)
     area, covered_area = (np.bincount(labels[blocks], counts[blocks], count) for blocks in (changes, changes & covered))
-    missing = covered_area < _EXPLAINED * area
+    missing = covered_area < EXPLAINED * area
     missing[0] = False
     return missing[labels]

@@ -29,7 +29,7 @@ _NEIGHBOURS = 12
 # Difference of chromaticity s at which the affinity has fallen to 0.61.
 _CHROMA_SCALE = 0.03
 # Rounds of averaging (Jacobi's method). With more of them, and a larger weight, evidence spreads farther.
-_ROUNDS = 150
+ROUNDS = 150
 
 
 def share_confidence(
@@ -63,7 +63,7 @@ def share_confidence(
     total = 1 + affinity.sum(axis=1)
     everywhere = np.full(len(gaussians), still, np.float32)
     everywhere[indices] = logit
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         everywhere[indices] = (logit + weights @ everywhere) / total
     return everywhere[indices]
 

@@ -33,7 +33,7 @@ _NEIGHBOURS = 8
 # Weight of the prior that a step is 0, in pixels on which the contrast is 1 per px.
 _PRIOR_PIXELS = 1e-3
 # Longest step, in px of the view where it is longest: farther away, the image is not linear.
-_LONGEST_PX = 2.0
+LONGEST_PX = 2.0
 # Covered pixels at which the colour changes by half of the mean error: the mean of few pixels is noise.
 _HALF_COLOR_PIXELS = 10.0
 
@@ -83,4 +83,4 @@ def _step(jacobians: np.ndarray, sums: Mapping[str, np.ndarray], near: np.ndarra
     prior = _PRIOR_PIXELS * np.median(np.sum(jacobians[:, :, 0] ** 2, axis=-1))
     step = np.linalg.solve(system + max(prior, 1e-30) * np.eye(3), right[..., None])[..., 0]
     length = np.linalg.norm(np.einsum("vnij,nj->vni", jacobians, step), axis=-1).max(axis=0)
-    return step * np.minimum(1, _LONGEST_PX / np.maximum(length, 1e-30))[:, None]
+    return step * np.minimum(1, LONGEST_PX / np.maximum(length, 1e-30))[:, None]

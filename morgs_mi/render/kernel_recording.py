@@ -24,7 +24,7 @@ from morgs_mi.core.types import Jit
 P = ParamSpec("P")
 R = TypeVar("R")
 
-_MOST_RECORDINGS = 500
+MOST_RECORDINGS = 500
 
 render_lock = RLock()
 """Lock of the renderer, which a thread may take more than once.
@@ -72,7 +72,7 @@ def _recording(
     # Dr.Jit also inspects the variables of a closure; what is in a `partial` it compares by identity.
     rebuilt = partial(_rebuilt, function, static, classes)
     # A long fit meets new combinations of sizes again and again; the least used recordings are evicted.
-    return dr.freeze(lambda *plain: rebuilt(plain), limit=_MOST_RECORDINGS, warn_after=2**31 - 1)
+    return dr.freeze(lambda *plain: rebuilt(plain), limit=MOST_RECORDINGS, warn_after=2**31 - 1)
 
 
 def _rebuilt(

@@ -14,22 +14,16 @@ from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.evaluate.evaluate import evaluate_stream
-from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.initialise import from_points
-from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.playback.visualise import to_uint8, write_png
 from morgs_mi.render.rasterize import rasterize
-from morgs_mi.render.render_config import RenderConfig
 from morgs_mi.runs.fit_capture import stream_capture
+from tests.quick import quick
 from tests.scenes.cameras import circle, look_at_cameras
 
 RADIUS = 0.08  # of the dark ball around camera 0
-CONFIG = StreamConfig(
-    fit=FitConfig(sh_degree=0, num_gaussians=600, first_frame_steps=150, dropping=0.0),
-    render=RenderConfig(reproducible=True),
-)
-SHORT = replace(CONFIG, fit=replace(CONFIG.fit, num_gaussians=60, first_frame_steps=2))
+CONFIG = quick(num_gaussians=600, first_frame_steps=150, dropping=0.0)
 
 
 def dome() -> list[Camera]:
@@ -92,7 +86,7 @@ def test_load_capture__near_plane_shows_a_held_out_camera_past_a_splat_around_it
 
 @pytest.mark.slow
 def test_load_capture__takes_a_given_near_plane_and_the_stream_stores_it(capture: Path, tmp_path: Path) -> None:
-    stream_capture(load_capture(capture, reading=ReadConfig(near=0.3)), tmp_path / "out", SHORT)
+    stream_capture(load_capture(capture, reading=ReadConfig(near=0.3)), tmp_path / "out", quick())
     assert {camera.near for camera in open_stream(tmp_path / "out").cameras} == {0.3}
 
 

@@ -21,15 +21,15 @@ def views(textured_capture: Capture):
 
 
 @pytest.fixture(scope="module")
-def found(views):
+def points_and_colors(views):
     cameras, images = views
     return stereo_points(cameras, images, [None] * 3, NO_POINTS, np.random.default_rng(0))
 
 
 @pytest.mark.slow
-def test_stereo_points__lie_on_the_surfaces(views, found) -> None:
+def test_stereo_points__lie_on_the_surfaces(views, points_and_colors) -> None:
     (camera, *_), (image, *_) = views
-    points, colors = found
+    points, colors = points_and_colors
     assert len(points) == len(colors) > 6000
     distance = distance_to_planes(points)
     assert np.median(distance) < 0.02
@@ -39,10 +39,10 @@ def test_stereo_points__lie_on_the_surfaces(views, found) -> None:
     assert np.median(np.abs(image[rows, columns] / 255.0 - colors[mask])) < 0.05
 
 
-def test_stereo_points__are_the_same_every_time(views, found) -> None:
+def test_stereo_points__are_the_same_every_time(views, points_and_colors) -> None:
     cameras, images = views
     again = stereo_points(cameras, images, [None] * 3, NO_POINTS, np.random.default_rng(0))
-    np.testing.assert_array_equal(found[0], again[0])
+    np.testing.assert_array_equal(points_and_colors[0], again[0])
 
 
 def test_stereo_points__leaves_out_pixels_that_are_not_valid(views) -> None:

@@ -143,8 +143,8 @@ def test_timeline__uses_rates_that_are_less_than_a_percent_apart(tmp_path: Path,
     assert capture.fps == pytest.approx(29.7, abs=0.01)
     times = moments(capture, RATES)
     np.testing.assert_allclose(times[:, 1], np.arange(len(times)) / 29.7, atol=1e-3)
-    apart = np.ptp(times, axis=1).max()
-    assert apart < 1 / 29.7
+    spread = np.ptp(times, axis=1).max()
+    assert spread < 1 / 29.7
     assert f"images of one instant are up to {1e3 * apart:.0f}"[:-1] in caplog.text
 
 

@@ -1,9 +1,6 @@
-"""Helpers of the tests of commands: the smallest fit, an interruption, and the refusal of a command."""
+"""Helpers of the tests of commands: an interruption, and the refusal of a command."""
 
 from __future__ import annotations
-
-# The smallest possible fit.
-QUICK = ["--num-gaussians", "120", "--first-frame-steps", "4", "--epochs", "1", "--sh-degree", "0"]
 
 
 def interrupt(*_: object, **__: object) -> None:

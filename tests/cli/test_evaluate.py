@@ -10,7 +10,8 @@ import pytest
 
 from morgs_mi.core.fit_names import PROVISIONAL
 from morgs_mi.playback.visualise import write_png
-from tests.cli.commands import QUICK, assert_refused
+from tests.cli.commands import assert_refused
+from tests.quick import OPTIONS
 from tests.scenes.recording import write_recording
 
 
@@ -26,7 +27,7 @@ def test_eval__replaces_no_file_of_the_fit(stream: Path, tmp_path: Path, run) ->
 def test_eval__refuses_another_recording_by_the_same_cameras(tmp_path: Path, run) -> None:
     clip = write_recording(tmp_path / "clip", 2)
     out = tmp_path / "out"
-    assert run("fit", clip, out, *QUICK, "--color", "linear")[0] == 0
+    assert run("fit", clip, out, *OPTIONS, "--color", "linear")[0] == 0
     other = shutil.copytree(clip, tmp_path / "other")
     for image in other.glob("cam*/*.png"):
         write_png(image, 255 - cv2.imread(str(image))[..., ::-1])
@@ -42,7 +43,7 @@ def test_eval__refuses_another_recording_by_the_same_cameras(tmp_path: Path, run
 def test_eval__says_that_a_first_frame_is_provisional(tmp_path: Path, run, caplog: pytest.LogCaptureFixture) -> None:
     clip = write_recording(tmp_path / "clip", 1)
     out = tmp_path / "out"
-    assert run("fit", clip, out, *QUICK)[0] == 0
+    assert run("fit", clip, out, *OPTIONS)[0] == 0
     assert not caplog.messages
     provisional = (out / "stream.morgs").rename(out / PROVISIONAL)
     assert run("eval", provisional)[0] == 0

@@ -25,7 +25,8 @@ from morgs_mi.runs.cluster.seams import SegmentConfig
 from morgs_mi.runs.cluster.segments import SegmentedRun
 from morgs_mi.runs.cluster.tasks import Part
 from morgs_mi.stream_loop import StreamLoop
-from tests.cli.commands import QUICK, assert_one_sentence, assert_refused, interrupt
+from tests.cli.commands import assert_one_sentence, assert_refused, interrupt
+from tests.quick import OPTIONS
 from tests.scenes import textured
 from tests.scenes.captures import colmap
 from tests.scenes.noise_capture import FRAMES, lengthen_clip, rig, truncate_clip
@@ -38,8 +39,8 @@ def test_fit__continues_without_a_camera_whose_clip_is_cut_off_meanwhile(
     capture: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     truncate_clip(capture)
-    monkeypatch.setattr("morgs_mi.io.frame_times._packet_times", lambda path: np.arange(FRAMES) / 25)
-    assert run("fit", capture, tmp_path / "out", *QUICK)[0] == 0
+    monkeypatch.setattr("morgs_mi.io.frame_times.packet_times", lambda path: np.arange(FRAMES) / 25)
+    assert run("fit", capture, tmp_path / "out", *OPTIONS)[0] == 0
     frames = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
     assert [frame["missing_views"] for frame in frames] == [[], ["cam1"], ["cam1"]]
     assert "cam1.mkv: frame 1 of 3 cannot be decoded" in frames[2]["status"]
@@ -51,7 +52,7 @@ def test_fit__continues_without_a_camera_whose_clip_is_cut_off_meanwhile(
 
 @pytest.mark.slow
 def test_fit__reports_what_to_expect_of_views_between_the_cameras(capture: Path, tmp_path: Path, run) -> None:
-    code, output, _ = run("fit", capture, tmp_path / "out", *QUICK, "--test-view", "none")
+    code, output, _ = run("fit", capture, tmp_path / "out", *OPTIONS, "--test-view", "none")
     (first, *_) = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
     assert code == 0
     assert first["validation"]["sentence"] in " ".join(output.split())
@@ -67,7 +68,7 @@ def test_fit__balances_cameras_of_other_exposure(tmp_path: Path, run) -> None:
     for options in ((), ("--deep",)):
         assert len(re.findall(sentence, run("info", path, *options)[1])) == 1
     (tmp_path / "a.toml").write_text("[fit.short_fits]\ngaussians = 40\nsteps = 2\nrounds = 1\n")
-    quick = (*QUICK, "--downscale", 2, "--config", tmp_path / "a.toml")
+    quick = (*OPTIONS, "--downscale", 2, "--config", tmp_path / "a.toml")
     for options, is_balanced in ((("--exposure", "on"), True), (("--exposure", "off"), False)):
         status, output, _ = run("fit", path, tmp_path / "out", *quick, *options)
         assert status == 0
@@ -80,7 +81,7 @@ def test_fit__and_eval_use_the_same_instants(capture: Path, tmp_path: Path, run)
     out = tmp_path / "out"
     options = ("--offset", "cam1", "-1", "cam2", "1", "--gaps")
     assert run("info", capture, "--no-check", *options)[1].count("2 frames at 25 fps") == 1
-    assert run("fit", capture, out, *options, *QUICK)[0] == 0
+    assert run("fit", capture, out, *options, *OPTIONS)[0] == 0
     record = json.loads((out / "capture.json").read_text())
     assert (record["frames"], record["reading"]["offset"]) == (2, {"cam1": -1, "cam2": 1})
     assert [camera["first_frame"] for camera in record["cameras"]] == [1, 0, 2]
@@ -106,7 +107,7 @@ def test_fit__leaves_a_stream_marked_as_unfinished_when_interrupted(
     capture: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before_frame_2(monkeypatch, interrupt)
-    assert run("fit", capture, tmp_path / "out", *QUICK)[0] == 130
+    assert run("fit", capture, tmp_path / "out", *OPTIONS)[0] == 130
     status, _, error = run("eval", tmp_path / "out", "--json", tmp_path / "eval.json")
     assert status == 0
     assert "the fit was not finished" in error
@@ -242,7 +243,7 @@ def test_fit__names_what_stands_and_how_to_go_on_when_interrupted(
     capture: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch, number: signal.Signals, heeds_interrupts: None
 ) -> None:
     before_frame_2(monkeypatch, lambda: signal.raise_signal(number))
-    args = ["fit", str(capture), str(tmp_path / "my out"), *QUICK]
+    args = ["fit", str(capture), str(tmp_path / "my out"), *OPTIONS]
     status, _, error = run(*args)
     again = shlex.join(["morgs-mi", *args, "--resume"])
     stands = f"Interrupted. {tmp_path / 'my out'}/stream.morgs holds frames 0 to 1 of 3; continue with `{again}`."
@@ -262,7 +263,7 @@ def test_fit__is_interrupted_whatever_a_library_makes_of_ctrl_c(
             raise RuntimeError("drjit: an exception in a callback") from error if raised_in == "a callback" else None
 
     before_frame_2(monkeypatch, library)
-    status, _, error = run("fit", capture, tmp_path / "out", *QUICK)
+    status, _, error = run("fit", capture, tmp_path / "out", *OPTIONS)
     assert status == 130
     assert error.splitlines()[-1].startswith(f"Interrupted. {tmp_path / 'out'}/stream.morgs holds frames 0 to 1 of 3; ")
 
@@ -273,7 +274,7 @@ def test_fit__does_not_offer_to_resume_a_stream_of_an_earlier_fit(
     (tmp_path / "out").mkdir()
     stream.rename(tmp_path / "out" / "stream.morgs")
     monkeypatch.setattr("morgs_mi.runs.fit_capture.StreamLoop.of", interrupt)
-    status, _, error = run("fit", capture, tmp_path / "out", *QUICK)
+    status, _, error = run("fit", capture, tmp_path / "out", *OPTIONS)
     assert status == 130
     assert error.splitlines()[-1] == "Interrupted."
     assert len(StreamReader(tmp_path / "out" / "stream.morgs").index()) == 2
@@ -284,7 +285,7 @@ def test_fit__reports_progress_before_the_first_frame(capture: Path, tmp_path: P
     clock = iter(range(0, 10**9, 40))
     monkeypatch.setattr("morgs_mi.cli.console.time.monotonic", lambda: float(next(clock)))
     monkeypatch.setattr("morgs_mi.runs.fit_capture.StreamLoop.of", interrupt)
-    status, _, error = run("fit", capture, tmp_path / "out", *QUICK)
+    status, _, error = run("fit", capture, tmp_path / "out", *OPTIONS)
     assert status == 130
     assert error.startswith("Matching views: 0/3, 0:00:00 elapsed.\nMatching views: 1/3, ")
     assert "Triangulating points: 0/1, " in error
@@ -303,7 +304,7 @@ def test_fit__ends_with_a_whole_packet_on_a_full_disk(capture: Path, tmp_path: P
         "container.StreamWriter.write = limited\n"
         "sys.exit(cli.main(sys.argv[1:]))\n"
     )
-    args = [sys.executable, "-c", script, "fit", str(capture), str(tmp_path / "out"), *QUICK]
+    args = [sys.executable, "-c", script, "fit", str(capture), str(tmp_path / "out"), *OPTIONS]
     result = subprocess.run(args, capture_output=True, text=True, check=False)
     assert result.returncode == 1
     assert_one_sentence(result.stderr, "stream.morgs", "could not be written", "free space on the disk. ", "--resume`.")
@@ -318,7 +319,7 @@ def test_fit__prints_the_first_problem_of_its_frames(tmp_path: Path, run) -> Non
     clip = write_recording(tmp_path / "clip", 2)
     for image in clip.glob("cam*/0000.png"):
         write_png(image, np.zeros((24, 32, 3), np.uint8))
-    status, output, _ = run("fit", clip, tmp_path / "out", *QUICK)
+    status, output, _ = run("fit", clip, tmp_path / "out", *OPTIONS)
     (first, second) = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
     assert (status, second["status"]) == (0, "ok")
     assert "the image is black; cut such frames off" in first["status"]
@@ -327,7 +328,7 @@ def test_fit__prints_the_first_problem_of_its_frames(tmp_path: Path, run) -> Non
 
 def test_fit__resumes_a_stream_to_the_same_bytes(capture: Path, tmp_path: Path, run) -> None:
     out = tmp_path / "out"
-    fit = ("fit", capture, out, *QUICK, "--reproducible")
+    fit = ("fit", capture, out, *OPTIONS, "--reproducible")
     assert run(*fit)[0] == 0
     whole = (out / "stream.morgs").read_bytes()
     (out / "stream.morgs").write_bytes(whole[: len(whole) * 3 // 4])
@@ -347,12 +348,12 @@ def test_fit__fits_segments_side_by_side(
     monkeypatch.setattr(SegmentConfig.__init__, "__defaults__", astuple(short))
     clip = write_recording(tmp_path / "clip", 4)
     out = tmp_path / "out"
-    status, output, _ = run("fit", clip, out, *QUICK, "--segments", 2)
+    status, output, _ = run("fit", clip, out, *OPTIONS, "--segments", 2)
     assert status == 0
     assert "stream.morgs: 4 frames" in output
     assert not any(record.name.startswith("distributed") for record in caplog.records)
     assert len({frame for _, frame, _ in StreamReader(out / "stream.morgs").index()}) == 4
-    assert_refused(run("fit", clip, out, *QUICK, "--segments", 3), "--segments must be 1 to 2 for 4 frames", "got 3")
+    assert_refused(run("fit", clip, out, *OPTIONS, "--segments", 3), "--segments must be 1 to 2 for 4 frames", "got 3")
 
 
 @pytest.mark.slow
@@ -360,14 +361,14 @@ def test_fit__names_what_segments_stand_when_interrupted(tmp_path: Path, run, mo
     pytest.importorskip("distributed", reason="comes with the extra `cluster`")
     clip = write_recording(tmp_path / "clip", 4)
     out = tmp_path / "out"
-    add = SegmentedRun._add
+    add = SegmentedRun.add_part
 
     def add_and_stop(fit: SegmentedRun, part: Part) -> None:
         add(fit, part)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(SegmentedRun, "_add", add_and_stop)
-    args = ["fit", str(clip), str(out), *QUICK, "--segments", "2"]
+    monkeypatch.setattr(SegmentedRun, "add_part", add_and_stop)
+    args = ["fit", str(clip), str(out), *OPTIONS, "--segments", "2"]
     status, _, error = run(*args)
     again = shlex.join(["morgs-mi", *args, "--resume"])
     assert status == 130

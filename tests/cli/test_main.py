@@ -15,7 +15,8 @@ import pytest
 from morgs_mi import cli
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.io.exr import read_exr
-from tests.cli.commands import QUICK, assert_one_sentence, assert_refused
+from tests.cli.commands import assert_one_sentence, assert_refused
+from tests.quick import OPTIONS
 from tests.scenes.noise_capture import lengthen_clip, rig
 
 
@@ -38,7 +39,7 @@ def broken_json(path: Path) -> tuple[str, ...]:
 @pytest.mark.parametrize("spoil", [no_capture, no_video, broken_json])
 def test_main__names_what_is_broken_in_a_capture(capture: Path, tmp_path: Path, run, spoil) -> None:
     parts = spoil(capture)
-    for args in (("info", capture), ("fit", capture, tmp_path / "out", *QUICK)):
+    for args in (("info", capture), ("fit", capture, tmp_path / "out", *OPTIONS)):
         assert_refused(run(*args), *parts)
     assert not (tmp_path / "out").exists()
 
@@ -47,16 +48,16 @@ def test_main__names_what_is_broken_in_a_capture(capture: Path, tmp_path: Path, 
 def test_main__leaves_cameras_out(capture: Path, tmp_path: Path, run) -> None:
     lengthen_clip(capture)
     assert_refused(run("info", capture), "morgs-mi fit --frames 3,", "leave cameras out with --without.")
-    assert_refused(run("fit", capture, tmp_path / "out", *QUICK), "use the first frames with --frames 3,")
+    assert_refused(run("fit", capture, tmp_path / "out", *OPTIONS), "use the first frames with --frames 3,")
     (capture / "cam2.mkv").write_bytes(b"")
     status, out, _ = run("info", capture, "--without", "cam2")
     assert (status, "cam2" in out, "3 frames" in out) == (0, False, True)
-    assert run("fit", capture, tmp_path / "out", *QUICK, "--without", "cam2")[0] == 0
-    assert run("fit", capture, tmp_path / "out", *QUICK, "--without", "cam2", "--resume")[0] == 0
+    assert run("fit", capture, tmp_path / "out", *OPTIONS, "--without", "cam2")[0] == 0
+    assert run("fit", capture, tmp_path / "out", *OPTIONS, "--without", "cam2", "--resume")[0] == 0
     status, out, _ = run("eval", tmp_path / "out", "--json", "-")
     assert (status, list(json.loads(out)["views"])) == (0, ["cam0", "cam1"])
     refused = "--without must name cameras of cam0, cam1, cam2, got cam7."
-    for args in (("info", capture), ("fit", capture, tmp_path / "other", *QUICK)):
+    for args in (("info", capture), ("fit", capture, tmp_path / "other", *OPTIONS)):
         assert_refused(run(*args, "--without", "cam7", "cam2"), refused)
 
 
@@ -64,7 +65,7 @@ def test_main__leaves_out_a_camera_without_a_clip(capture: Path, tmp_path: Path,
     (capture / "cam1.mkv").unlink()
     status, out, _ = run("info", capture)
     assert (status, "cam1" in out) == (0, False)
-    assert run("fit", capture, tmp_path / "out", *QUICK)[0] == 0
+    assert run("fit", capture, tmp_path / "out", *OPTIONS)[0] == 0
     assert [m.endswith("sparse/0: no clip is named after cam1.png: left out.") for m in caplog.messages] == [True] * 2
 
 
@@ -121,7 +122,7 @@ def test_main__names_an_output_that_cannot_be_written(capture: Path, stream: Pat
     size = ("--cameras", 2, "--frames", 1, "--width", 16, "--height", 16)
     for folder in (tmp_path / "file", Path("/sys")):  # /sys accepts no new files, even from root
         for args in (
-            ("fit", capture, folder / "out", *QUICK),
+            ("fit", capture, folder / "out", *OPTIONS),
             ("synth", "spheres", folder / "out", *size),
             ("render", stream, folder / "a.mp4", "--camera", 0),
             ("render", stream, folder / "exr", "--camera", 0),
@@ -137,7 +138,7 @@ def test_main__names_an_output_that_cannot_be_written(capture: Path, stream: Pat
                 error.splitlines()[-1], "Cannot write ", str(folder), "check that its folder is writable"
             )
             assert "Errno" not in error
-    for args in (("fit", capture, tmp_path / "file", *QUICK), ("demo", tmp_path / "file")):
+    for args in (("fit", capture, tmp_path / "file", *OPTIONS), ("demo", tmp_path / "file")):
         assert_refused(run(*args), f"{tmp_path / 'file'} is a file; name a folder")
 
 
@@ -148,9 +149,9 @@ def test_main__writes_nothing_into_a_capture(capture: Path, stream: Path, tmp_pa
     place.symlink_to(capture)
     old_tree = tree(capture)
     for args in (
-        ("fit", capture, capture, *QUICK),
-        ("fit", capture, place, *QUICK, "--resume"),
-        ("fit", capture, capture / "new" / "out", *QUICK),
+        ("fit", capture, capture, *OPTIONS),
+        ("fit", capture, place, *OPTIONS, "--resume"),
+        ("fit", capture, capture / "new" / "out", *OPTIONS),
         ("demo", place),
         ("synth", "spheres", place / "clip"),
         ("render", stream, place / "cam0.mkv.mp4", "--camera", 0),
@@ -186,7 +187,7 @@ def test_main__reports_a_full_standard_output_in_one_sentence(run, monkeypatch: 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("args", [("info", "--no-check"), ("fit", *QUICK)])
+@pytest.mark.parametrize("args", [("info", "--no-check"), ("fit", *OPTIONS)])
 def test_main__prints_any_path_to_an_ascii_or_a_closed_standard_output(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, args: tuple[str, ...]
 ) -> None:

@@ -42,8 +42,8 @@ def check_round_trip(confidence: bool) -> None:
         base = cloud(N, confidence=confidence, seed=seed)
         return LabelledGaussians(**base.items(), logit_labels=rng.normal(0, 1, (N, 2)))
 
-    def error(found: Any, true: Any) -> float:
-        return float(np.abs(np.asarray(found.labels) - np.asarray(true.labels)).max())
+    def error(value: Any, true: Any) -> float:
+        return float(np.abs(np.asarray(value.labels) - np.asarray(true.labels)).max())
 
     first = labelled(50, 1)
     packet = keyframe_packet(first, 0, CAMERAS)

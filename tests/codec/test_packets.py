@@ -56,12 +56,14 @@ def test_residual_packet__stores_offsets_of_moving_gaussians_and_changes_nothing
             assert np.array_equal(packet.arrays[name], array)
     rng = np.random.default_rng(3)
     state = states[-1]
-    moved = replace(jittered(state.gaussians, rng), offset=rng.normal(0, 0.02, (len(state), 3)))
-    values = decode(state, residual_packet(state, moved, None, CAMERAS, CodecConfig(offset=True))).gaussians.numpy()
+    next_gaussians = replace(jittered(state.gaussians, rng), offset=rng.normal(0, 0.02, (len(state), 3)))
+    values = decode(
+        state, residual_packet(state, next_gaussians, None, CAMERAS, CodecConfig(offset=True))
+    ).gaussians.numpy()
     mask = values["motion"].any(1)
     assert 0.2 < mask.mean() < 0.6
     # The step of a moved mean is four times the step of its birth.
-    error = np.abs(values["offset"] - moved.numpy()["offset"])[mask] / (4 * state.grid.steps("means")[mask])
+    error = np.abs(values["offset"] - next_gaussians.numpy()["offset"])[mask] / (4 * state.grid.steps("means")[mask])
     assert 0.45 < error.max() <= 0.5 + 1e-4
     assert not values["offset"][~mask].any()
 

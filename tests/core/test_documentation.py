@@ -81,7 +81,7 @@ def test_page__is_a_path_in_the_checkout() -> None:
 
 
 def test_page__is_an_address_without_a_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(documentation, "_CHECKOUT", tmp_path)
+    monkeypatch.setattr(documentation, "CHECKOUT", tmp_path)
     assert page("experiments/field") == "https://morgs-mi.readthedocs.io/en/latest/experiments/field.html"
     assert with_pages("a, see docs/flow.md.") == "a, see https://morgs-mi.readthedocs.io/en/latest/flow.html."
     assert with_pages("mydocs/flow.md, docs/flow.toml") == "mydocs/flow.md, docs/flow.toml"
@@ -99,7 +99,7 @@ def messages(path: Path) -> list[str]:
 def test_page__gives_every_page_that_a_message_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     named = {str(path): text for path in SOURCES for text in messages(path) if re.search(r"docs/[\w/-]+\.md", text)}
     assert named == {}
-    monkeypatch.setattr(documentation, "_CHECKOUT", tmp_path)
+    monkeypatch.setattr(documentation, "CHECKOUT", tmp_path)
     assert "docs/" not in config_toml(StreamConfig())
 
 

@@ -46,7 +46,7 @@ def test_progress_bar__updates_one_element_of_a_notebook(monkeypatch):
         return SimpleNamespace(update=lambda content: shown.append("updated: " + content.data))
 
     monkeypatch.setattr(display, "display", show)
-    monkeypatch.setattr(progress, "_is_notebook", lambda: True)
+    monkeypatch.setattr(progress, "is_notebook", lambda: True)
     bar = ProgressBar("Fitting <arm>")
     bar.report("First frame", 0.5, 3)
     bar.report("First frame", 3, 3)
@@ -58,7 +58,7 @@ def test_progress_bar__updates_one_element_of_a_notebook(monkeypatch):
 
 def test_progress__reports_its_stage():
     reported = []
-    progress = Progress(lambda *now: reported.append(now))
+    progress = Progress(lambda *state: reported.append(state))
     progress.of("Trial")(1, 4)
     progress.of("Later frames").part(2, 9)(3, 6)
     Progress()(1, 2)  # reports nothing

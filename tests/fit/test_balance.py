@@ -68,7 +68,7 @@ def test_balance_cameras__finds_the_exposures_and_takes_them():
 @pytest.mark.slow
 def test_balance_cameras__leaves_equal_cameras_alone_after_one_fit():
     fits = []
-    balance = balanced(np.ones(4), report=lambda *now: fits.append(now))
+    balance = balanced(np.ones(4), report=lambda *state: fits.append(state))
     assert not balance.taken
     assert max(exposure.change for exposure in balance.exposures) < 0.003
     assert fits == [("Balancing cameras", 1, 8)]

@@ -94,13 +94,13 @@ def test_plan_growth__splits_large_long_gaussians_along_their_longest_axis():
     result = apply_plan(gaussians, growth(gaussians, [0, 0, 0, 0, 0, 1]))
     means = np.asarray(result.means)
     whole = np.asarray(gaussians.means)
-    apart = means[6] - means[5]
+    offset = means[6] - means[5]
     axes = Rotation.from_quat(np.asarray(gaussians.quats)[5], scalar_first=True).as_matrix()
     assert np.asarray(result.scales)[5:] == pytest.approx(np.tile([0.893, 2 * 0.893, 4.1 * 0.55], (2, 1)), rel=1e-5)
     assert_close(result.opacities, [0.6] * 5 + [0.36] * 2, rtol=1e-5)
     assert np.array_equal(means[:5], whole[:5])
     assert (means[5] + means[6]) / 2 == pytest.approx(whole[5], abs=1e-5)
-    assert np.abs(apart @ axes) == pytest.approx([0, 0, 2 * 1.35 * 4.1], abs=1e-4)
+    assert np.abs(offset @ axes) == pytest.approx([0, 0, 2 * 1.35 * 4.1], abs=1e-4)
     assert np.asarray(result.logit_confidence)[6] == 5
 
 

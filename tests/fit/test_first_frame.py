@@ -24,9 +24,9 @@ NO_GROWTH = DensityConfig(rounds=0)
 CONFIG = FitConfig(sh_degree=0, num_gaussians=80, first_frame_steps=8, density=NO_GROWTH)
 
 
-def fit(images, start, config, seed=0, progress=None, **given) -> FirstFrame:
-    """Fit some or all of the views; `given` are masks and the cut-offs of the renderer."""
-    return fit_first_frame(problem(images, start, **given), config, np.random.default_rng(seed), progress)
+def fit(images, start, config, seed=0, progress=None, **changes) -> FirstFrame:
+    """Fit some or all of the views; `changes` are masks and the cut-offs of the renderer."""
+    return fit_first_frame(problem(images, start, **changes), config, np.random.default_rng(seed), progress)
 
 
 @pytest.fixture(scope="module")
@@ -63,15 +63,15 @@ WHITE = [np.full((48, 64, 3), 255, np.uint8)]
 DARK = dataclasses.replace(ball(80), sh_coeffs=np.full((80, 1, 3), -1.0))
 
 
-def lengths(drawn: list[Gaussians], found: FirstFrame) -> np.ndarray:
+def lengths(drawn: list[Gaussians], first_frame: FirstFrame) -> np.ndarray:
     """Return the length of each step of the colours."""
-    colors = np.array([np.asarray(gaussians.sh_coeffs) for gaussians in [*drawn, found.gaussians]])
+    colors = np.array([np.asarray(gaussians.sh_coeffs) for gaussians in [*drawn, first_frame.gaussians]])
     return np.median(np.diff(colors, axis=0), axis=(1, 2, 3))
 
 
 def test_fit_first_frame__reports_its_steps(images):
     done = []
-    assert fit(images, ball(80), CONFIG, progress=Progress(lambda *now: done.append(now), "First frame")).steps == 8
+    assert fit(images, ball(80), CONFIG, progress=Progress(lambda *state: done.append(state), "First frame")).steps == 8
     assert done == [("First frame", step, 8) for step in range(1, 9)]
 
 
@@ -93,7 +93,7 @@ def test_fit_first_frame__moves_means_by_fractions_of_the_extent(images, drawn):
 
 @pytest.mark.slow
 def test_fit_first_frame__adds_sh_bands_at_equal_distances(images, drawn, monkeypatch):
-    monkeypatch.setattr("morgs_mi.fit.first_frame._BAND", 0.15)
+    monkeypatch.setattr("morgs_mi.fit.first_frame.BAND", 0.15)
     config = dataclasses.replace(CONFIG, sh_degree=3, first_frame_steps=20)
     result = fit(images, ball(50, sh_degree=3), config)
     assert [gaussians.sh_degree for gaussians in drawn] == 3 * [0] + 3 * [1] + 3 * [2] + 11 * [3]
@@ -150,8 +150,8 @@ def test_fit_first_frame__prunes_what_is_invisible(images):
 
 
 def test_fit_first_frame__sees_images_of_half_the_size_until_it_has_grown(images, monkeypatch):
-    monkeypatch.setattr("morgs_mi.fit.view._COARSE_WIDTH", 32)
-    monkeypatch.setattr("morgs_mi.fit.view._MIN_SIDE", 24)
+    monkeypatch.setattr("morgs_mi.fit.view.COARSE_WIDTH", 32)
+    monkeypatch.setattr("morgs_mi.fit.view.MIN_SIDE", 24)
     widths = []
     render = ActiveView.render
 
@@ -189,8 +189,8 @@ def test_fit_first_frame__does_not_see_pixels_that_are_masked(images):
         image[10:30, 20:40] = 1.0
     config = FitConfig(sh_degree=1, num_gaussians=90, first_frame_steps=12)
 
-    def fitted(given):
-        return fit(given, ball(60, 1), config, masks=masks, render=REPRODUCIBLE)
+    def fitted(changes):
+        return fit(changes, ball(60, 1), config, masks=masks, render=REPRODUCIBLE)
 
     assert values_of(fitted(spoiled).gaussians) == values_of(fitted(images).gaussians)
 

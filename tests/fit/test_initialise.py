@@ -48,24 +48,24 @@ def test_fill_points__adds_none_where_pixels_are_not_valid():
     np.testing.assert_allclose(filled_colors, 0.8)
 
 
-@pytest.mark.parametrize("known", [0, MIN_POINTS - 1, MIN_POINTS, 40, 2000])
-def test_initial_points__are_given_ones_with_random_ones_where_these_are_few(known: int):
+@pytest.mark.parametrize("count", [0, MIN_POINTS - 1, MIN_POINTS, 40, 2000])
+def test_initial_points__are_given_ones_with_random_ones_where_these_are_few(count: int):
     (points, colors), views = few_points()
-    point_cloud = np.resize(points, (known, 3)), np.resize(colors, (known, 3))
+    point_cloud = np.resize(points, (count, 3)), np.resize(colors, (count, 3))
     result, result_colors = initial_points(views, point_cloud, 1000, np.random.default_rng(1))
     assert result.shape == result_colors.shape == (1000, 3)
     random = np.isclose(result_colors, 0.2).all(axis=1)
-    expected = 1 if known < MIN_POINTS else 0.3 if known < 1000 else 0
+    expected = 1 if count < MIN_POINTS else 0.3 if count < 1000 else 0
     assert random.mean() >= expected
     assert (random.mean() > 0) == (expected > 0)
 
 
-@pytest.mark.parametrize("known", [0, 40, 2000])
-def test_initial_points__leave_the_space_before_near_planes_empty(known: int):
+@pytest.mark.parametrize("count", [0, 40, 2000])
+def test_initial_points__leave_the_space_before_near_planes_empty(count: int):
     (points, colors), views = few_points()
     views = [view._replace(camera=replace(view.camera, near=5.0)) for view in views]
     points = np.concatenate([points, points - (0, 0, 4)])
-    point_cloud = np.resize(points, (known, 3)), np.resize(colors, (known, 3))
+    point_cloud = np.resize(points, (count, 3)), np.resize(colors, (count, 3))
     chosen, _ = initial_points(views, point_cloud, 1000, np.random.default_rng(1))
     assert len(chosen) > 950
     assert not in_empty_space([view.camera for view in views], chosen).any()

@@ -23,10 +23,10 @@ EXTENT = 3.0
 PLAIN = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
 
 
-def fit(before: Gaussians, images: list[np.ndarray], config: FitConfig, motion: MotionConfig = PLAIN) -> LaterFrame:
-    active = full_active_set(before, dict(enumerate(views())), RENDER)
+def fit(previous: Gaussians, images: list[np.ndarray], config: FitConfig, motion: MotionConfig = PLAIN) -> LaterFrame:
+    active = full_active_set(previous, dict(enumerate(views())), RENDER)
     targets = {view: Target(image) for view, image in enumerate(images)}
-    problem = FrameProblem(before, active, targets, {}, None, EXTENT)
+    problem = FrameProblem(previous, active, targets, {}, None, EXTENT)
     return fit_later_frame(problem, config, motion, np.random.default_rng(0))
 
 

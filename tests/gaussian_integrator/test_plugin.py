@@ -198,7 +198,7 @@ def batch_scene(raw, film: dict, **props):
         viewmat = np.array(camera.viewmat, np.float64)
         viewmat[0, 3] += 0.1 * v
         sensors.append(replace(camera, viewmat=viewmat, name=f"view{2 - v}").sensor())
-    apart = [mi.load_dict({**sensor, "film": {**sensor["film"], **film}}) for sensor in sensors]
+    single_sensors = [mi.load_dict({**sensor, "film": {**sensor["film"], **film}}) for sensor in sensors]
     inner = {f"view{2 - v}": {k: x for k, x in sensor.items() if k != "film"} for v, sensor in enumerate(sensors)}
     whole = {**sensors[0]["film"], **film, "width": 3 * camera.width}
     scene = {
@@ -207,26 +207,26 @@ def batch_scene(raw, film: dict, **props):
         "sensor": {"type": "batch", **inner, "film": whole},
         "integrator": {"type": "gaussian_splat", "aovs": AOVS, **props},
     }
-    return mi.load_dict(scene), apart
+    return mi.load_dict(scene), single_sensors
 
 
 def test_gaussian_splat__renders_a_batch_of_sensors_beside_each_other(raw):
-    scene, apart = batch_scene(raw, {"pixel_format": "rgba"}, background=[0.1, 0.2, 0.3])
+    scene, single_sensors = batch_scene(raw, {"pixel_format": "rgba"}, background=[0.1, 0.2, 0.3])
     image = np.array(mi.render(scene))
-    expected = np.concatenate([np.array(mi.render(scene, sensor=sensor)) for sensor in apart], axis=1)
+    expected = np.concatenate([np.array(mi.render(scene, sensor=sensor)) for sensor in single_sensors], axis=1)
     np.testing.assert_array_equal(image, expected)
 
 
 @pytest.mark.slow
 def test_gaussian_splat__differentiates_a_batch_of_sensors(raw):
-    scene, apart = batch_scene(raw, {}, reproducible=True)
+    scene, single_sensors = batch_scene(raw, {}, reproducible=True)
     params = mi.traverse(scene)
     data = params["gaussians.data"]
     dr.enable_grad(data)
     dr.backward(dr.sum(dr.square(mi.render(scene, params)), axis=None))
     gradient = np.array(dr.grad(data))
     dr.set_grad(data, 0)
-    for sensor in apart:
+    for sensor in single_sensors:
         dr.backward(dr.sum(dr.square(mi.render(scene, params, sensor=sensor)), axis=None))
     assert_close(gradient, np.array(dr.grad(data)), rtol=1e-5)
 

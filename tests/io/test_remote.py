@@ -243,7 +243,7 @@ def test_mirrored__leaves_out_no_folder_that_cannot_be_listed(folder: Path, monk
     ],
 )
 def test_fetched__keeps_no_wrong_answer(server: Server, monkeypatch, name, body, kind, message) -> None:
-    monkeypatch.setattr("morgs_mi.io.remote._PATIENCE", 2)
+    monkeypatch.setattr("morgs_mi.io.remote.PATIENCE", 2)
     server.instead[name] = body
     with pytest.raises(kind, match=message):
         first_images(server.url)

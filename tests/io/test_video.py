@@ -84,7 +84,7 @@ def test_pick__decodes_from_the_start_where_time_stamps_disagree(
     wrong = replace(reader, times=np.where(np.arange(160) == 140, reader.times - 0.01, reader.times))
     assert wrong._opened_before(150)[1] == 0
     np.testing.assert_array_equal(next(wrong.pick([150])), expected)
-    monkeypatch.setattr("morgs_mi.io.video._FAR", 1000)
+    monkeypatch.setattr("morgs_mi.io.video.FAR", 1000)
     np.testing.assert_array_equal(next(reader.pick([150])), expected)
 
 

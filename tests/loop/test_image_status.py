@@ -60,7 +60,7 @@ def with_object(column: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("before", "now"),
+    ("previous", "current"),
     [
         (scene(0), scene(0)),
         (scene(0), noisy(scene(0), 12)),
@@ -70,8 +70,8 @@ def with_object(column: int) -> np.ndarray:
         (np.zeros((H, W, 3), np.uint8), scene(0)),
     ],
 )
-def test_image_status__is_empty_for_motion_noise_and_light(before: np.ndarray, now: np.ndarray) -> None:
-    assert image_status(NAMES, views(before, before, before), views(now, now, now)) == ()
+def test_image_status__is_empty_for_motion_noise_and_light(previous: np.ndarray, current: np.ndarray) -> None:
+    assert image_status(NAMES, views(previous, previous, previous), views(current, current, current)) == ()
 
 
 def test_image_status__compares_views_that_have_both_images() -> None:

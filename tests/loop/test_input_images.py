@@ -75,10 +75,10 @@ def test_copied_images__refuses_others(image, message):
         copied(image)
 
 
-def observed(images, before=None, **kwargs):
+def observed(images, history=None, **kwargs):
     config = StreamConfig(fit=FitConfig(num_gaussians=100))
     setup = prepare([CAMERA], np.zeros((0, 3)), np.zeros((0, 3)), config, **kwargs)
-    return observe_frame(setup, 0, before or ImageHistory(), images)
+    return observe_frame(setup, 0, history or ImageHistory(), images)
 
 
 def test_observe_frame__keeps_light_for_the_fit_and_shows_8_bits():

@@ -43,31 +43,31 @@ def images_of(gaussians: Gaussians) -> list[np.ndarray]:
     return [np.asarray(rasterize(gaussians, camera, ("color",)).color) for camera in cameras().values()]
 
 
-def fit(before: Gaussians, active: ActiveSet, images: list[np.ndarray], config: FitConfig) -> LaterFrame:
+def fit(previous: Gaussians, active: ActiveSet, images: list[np.ndarray], config: FitConfig) -> LaterFrame:
     targets = {view: Target(image) for view, image in enumerate(images)}
-    problem = FrameProblem(before, active, targets, {}, None, EXTENT)
+    problem = FrameProblem(previous, active, targets, {}, None, EXTENT)
     return fit_later_frame(problem, config, PLAIN, np.random.default_rng(0))
 
 
 @pytest.fixture(scope="module")
-def before() -> Gaussians:
+def previous() -> Gaussians:
     return scene()
 
 
 @pytest.fixture(scope="module")
-def after(before) -> Gaussians:
-    return scene(0.08, np.asarray(before.sh_coeffs))
+def current(previous) -> Gaussians:
+    return scene(0.08, np.asarray(previous.sh_coeffs))
 
 
-def changes(before, after) -> dict[int, np.ndarray]:
-    pairs = zip(images_of(before), images_of(after), strict=True)
+def changes(previous, current) -> dict[int, np.ndarray]:
+    pairs = zip(images_of(previous), images_of(current), strict=True)
     return {view: np.abs(b - a).max(-1) > 0.02 for view, (a, b) in enumerate(pairs)}
 
 
-def test_find_active_set__selects_moving_but_not_occluded_gaussians(before, after):
+def test_find_active_set__selects_moving_but_not_occluded_gaussians(previous, current):
     config = ActiveSetConfig(min_responsibility=0.1)  # half of one of the five views
-    active = find_active_set(before, cameras(), changes(before, after), CHANNELS, RENDER, config)
-    chosen = np.isin(np.arange(len(before)), active.indices)
+    active = find_active_set(previous, cameras(), changes(previous, current), CHANNELS, RENDER, config)
+    chosen = np.isin(np.arange(len(previous)), active.indices)
     assert chosen[HIDDEN:].mean() > 0.9  # the others are inside the ball
     assert chosen[:HIDDEN].mean() < 0.15
     assert len(active.views) == V
@@ -75,44 +75,44 @@ def test_find_active_set__selects_moving_but_not_occluded_gaussians(before, afte
     assert active.fractions["gaussians"] == chosen.mean()
 
 
-def test_find_active_set__is_empty_without_changes(before):
+def test_find_active_set__is_empty_without_changes(previous):
     nothing = {view: np.zeros((96, 128), bool) for view in range(V)}
-    active = find_active_set(before, cameras(), nothing, CHANNELS, RENDER)
+    active = find_active_set(previous, cameras(), nothing, CHANNELS, RENDER)
     assert not active.views
     assert active.fractions == {"gaussians": 0, "views": 0, "pixels": 0}
-    fitted = fit(before, active, [], FitConfig(sh_degree=0))
+    fitted = fit(previous, active, [], FitConfig(sh_degree=0))
     assert fitted.epochs == 0
-    assert np.array_equal(fitted.gaussians.means, before.means)
+    assert np.array_equal(fitted.gaussians.means, previous.means)
     assert not np.asarray(fitted.gaussians.motion).any()
 
 
-def test_find_active_set__covers_what_appears_in_front_of_a_static_wall(before, monkeypatch):
+def test_find_active_set__covers_what_appears_in_front_of_a_static_wall(previous, monkeypatch):
     """The ball is new: no Gaussian is there, and every view sees it before another part of the wall."""
-    wall = before.select(np.arange(HIDDEN))
-    active = find_active_set(wall, cameras(), changes(wall, before), CHANNELS, RENDER)
+    wall = previous.select(np.arange(HIDDEN))
+    active = find_active_set(wall, cameras(), changes(wall, previous), CHANNELS, RENDER)
     covered = []
     for view in range(V):
         region = active.views[view].region
         covered.append(region.paste(np.ones(region.shape(1)[:3]), np.zeros((96, 128))))
-    for change, drawn in zip(changes(wall, before).values(), covered, strict=True):
+    for change, drawn in zip(changes(wall, previous).values(), covered, strict=True):
         assert drawn[change].mean() > 0.9
     # With so few views, most of the wall behind is responsible all the same.
     counts = []
     for min_explained in (0.0, 1.0):
-        monkeypatch.setattr("morgs_mi.method.active_set._EXPLAINED", min_explained)
+        monkeypatch.setattr("morgs_mi.method.active_set.EXPLAINED", min_explained)
         config = ActiveSetConfig(min_responsibility=0.5)
-        active_set = find_active_set(wall, cameras(), changes(wall, before), CHANNELS, RENDER, config)
+        active_set = find_active_set(wall, cameras(), changes(wall, previous), CHANNELS, RENDER, config)
         counts.append(len(active_set.indices))
     assert counts[0] < counts[1]
 
 
-def test_find_active_set__draws_what_hardly_changed_in_some_views_only(before, after, monkeypatch):
-    changed = changes(before, after)
+def test_find_active_set__draws_what_hardly_changed_in_some_views_only(previous, current, monkeypatch):
+    changed = changes(previous, current)
 
     def drawn(quiet_views, quiet=0.9):
-        monkeypatch.setattr("morgs_mi.method.active_set._QUIET", quiet)
+        monkeypatch.setattr("morgs_mi.method.active_set.QUIET", quiet)
         config = ActiveSetConfig(quiet_views=quiet_views)
-        active_set = find_active_set(before, cameras(), changed, CHANNELS, RENDER, config)
+        active_set = find_active_set(previous, cameras(), changed, CHANNELS, RENDER, config)
         return active_set, {view: active_set.views[view].region.mask for view in range(V)}
 
     every, everywhere = drawn(V)
@@ -124,53 +124,53 @@ def test_find_active_set__draws_what_hardly_changed_in_some_views_only(before, a
     assert drawn(2, 0.0)[0].fractions == every.fractions
 
 
-def test_find_active_set__keeps_what_moved_for_one_more_frame(before):
+def test_find_active_set__keeps_what_moved_for_one_more_frame(previous):
     """Its confidence can fall in that frame."""
-    logits = np.where(np.arange(len(before)) == 7, 2.0, -2.0)
+    logits = np.where(np.arange(len(previous)) == 7, 2.0, -2.0)
     nothing = {view: np.zeros((96, 128), bool) for view in range(V)}
-    previous_gaussians = replace(before, logit_confidence=logits)
+    previous_gaussians = replace(previous, logit_confidence=logits)
     assert find_active_set(previous_gaussians, cameras(), nothing, CHANNELS, RENDER).indices.tolist() == [7]
 
 
-def test_find_active_set__takes_everything_where_most_pixels_changed(before):
+def test_find_active_set__takes_everything_where_most_pixels_changed(previous):
     half = np.zeros((96, 128), bool)
     half[:60] = True
-    active = find_active_set(before, cameras(), dict.fromkeys(range(V), half), CHANNELS, RENDER)
+    active = find_active_set(previous, cameras(), dict.fromkeys(range(V), half), CHANNELS, RENDER)
     assert active.fractions == {"gaussians": 1, "views": 1, "pixels": 1}
 
 
 @pytest.mark.parametrize("grows", [False, True])
-def test_fit_later_frame__with_the_active_set_equals_the_full_fit(before, after, grows):
+def test_fit_later_frame__with_the_active_set_equals_the_full_fit(previous, current, grows):
     """Error of the moved image, and the survivors: static Gaussians are unchanged to the bit."""
     density = DensityConfig(later_frames=grows, births=0.05, min_error=0)
     config = FitConfig(sh_degree=0, epochs=12, density=density)
-    truth = images_of(after)
-    active = find_active_set(before, cameras(), changes(before, after), CHANNELS, RENDER)
+    truth = images_of(current)
+    active = find_active_set(previous, cameras(), changes(previous, current), CHANNELS, RENDER)
     errors = {}
-    for name, some in (("whole", full_active_set(before, cameras(), RENDER)), ("active", active)):
-        fitted = fit(before, some, truth, config)
+    for name, some in (("whole", full_active_set(previous, cameras(), RENDER)), ("active", active)):
+        fitted = fit(previous, some, truth, config)
         errors[name] = np.sqrt(np.mean([(a - b) ** 2 for a, b in zip(images_of(fitted.gaussians), truth, strict=True)]))
-    start = np.sqrt(np.mean([(a - b) ** 2 for a, b in zip(images_of(before), truth, strict=True)]))
+    start = np.sqrt(np.mean([(a - b) ** 2 for a, b in zip(images_of(previous), truth, strict=True)]))
     assert errors["whole"] < 0.4 * start
     # Half a dB; it is better where the full fit disturbs what was right.
     assert errors["active"] < 1.06 * errors["whole"]
     assert np.array_equal(fitted.source[fitted.source >= 0], np.unique(fitted.source[fitted.source >= 0]))
     assert (fitted.source == -1).any() == grows
-    still = np.setdiff1d(np.arange(len(before)), active.indices)
+    still = np.setdiff1d(np.arange(len(previous)), active.indices)
     where = np.searchsorted(fitted.source[fitted.source >= 0], still)
     assert not np.asarray(fitted.gaussians.motion)[where].any()
     assert not np.asarray(fitted.gaussians.offset)[where].any()
     for attribute in ("means", "quats", "log_scales", "sh_coeffs", "logit_opacities"):
         values = np.asarray(getattr(fitted.gaussians, attribute))[where]
-        assert np.array_equal(values, np.asarray(getattr(before, attribute))[still]), attribute
+        assert np.array_equal(values, np.asarray(getattr(previous, attribute))[still]), attribute
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("density", [DensityConfig(births=0.0), DensityConfig(later_frames=False)])
-def test_fit_later_frame__ends_early_once_the_loss_stops_falling(before, density):
+def test_fit_later_frame__ends_early_once_the_loss_stops_falling(previous, density):
     """With and without density control; a tolerance of 0 switches it off."""
-    whole = full_active_set(before, cameras(), RENDER)
-    images = images_of(before)
+    whole = full_active_set(previous, cameras(), RENDER)
+    images = images_of(previous)
     config = FitConfig(sh_degree=0, epochs=12, density=density)
-    assert fit(before, whole, images, replace(config, early_stopping_tolerance=0)).epochs == 12
-    assert fit(before, whole, images, config).epochs < 12
+    assert fit(previous, whole, images, replace(config, early_stopping_tolerance=0)).epochs == 12
+    assert fit(previous, whole, images, config).epochs < 12

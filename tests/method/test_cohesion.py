@@ -76,7 +76,7 @@ def test_share_confidence__leaves_a_gaussian_unlike_its_neighbours_alone():
 def test_share_confidence__solves_its_equation(monkeypatch):
     gaussians = wall_and_object(0.3, RED)
     few = shared(gaussians, moving(0.5), 0.2)
-    monkeypatch.setattr("morgs_mi.method.cohesion._ROUNDS", 151)
+    monkeypatch.setattr("morgs_mi.method.cohesion.ROUNDS", 151)
     many = shared(gaussians, moving(0.5), 0.2)
     np.testing.assert_allclose(few, many, atol=1e-5)
     means = np.asarray(gaussians.means)

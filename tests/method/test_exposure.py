@@ -26,8 +26,8 @@ def as_bytes(colors: np.ndarray) -> np.ndarray:
     return np.rint(255 * colors.clip(0, 1)).astype(np.uint8)
 
 
-def assert_close(found: Exposure, expected: Exposure, atol: float) -> None:
-    np.testing.assert_allclose((found.gain, found.bias), (expected.gain, expected.bias), atol=atol)
+def assert_close(value: Exposure, expected: Exposure, atol: float) -> None:
+    np.testing.assert_allclose((value.gain, value.bias), (expected.gain, expected.bias), atol=atol)
 
 
 def test_fit_exposure__finds_gain_and_bias_of_each_channel():

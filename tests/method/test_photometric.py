@@ -73,7 +73,7 @@ def test_refine_start__keeps_true_motion(scene):
 
 def test_refine_start__takes_no_step_longer_than_the_limit(scene, monkeypatch):
     gaussians, views, _ = scene
-    monkeypatch.setattr("morgs_mi.method.photometric._LONGEST_PX", 0.1)
+    monkeypatch.setattr("morgs_mi.method.photometric.LONGEST_PX", 0.1)
     step = refined_from(scene, start(0.6)).displacement - start(0.6).displacement
     px = [view.camera.projection_jacobian(np.asarray(gaussians.means)) @ step[..., None] for view in views.values()]
     assert 0.05 < np.linalg.norm(px, axis=2).max() < 0.11

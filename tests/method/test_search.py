@@ -50,8 +50,8 @@ def still():
     return MotionStart(np.zeros((ROD + WALL, 3), np.float32), np.full(ROD + WALL, -2, np.float32))
 
 
-def searched(gaussians, start, views, seen, config=None):
-    return search_motion(MotionProblem(gaussians, views, seen, np.random.default_rng(0)), start, config)
+def searched(gaussians, start, views, visible, config=None):
+    return search_motion(MotionProblem(gaussians, views, visible, np.random.default_rng(0)), start, config)
 
 
 @pytest.mark.parametrize("shift", [SHIFT, -SHIFT, SHIFT * [1, 1, -2]])

@@ -23,7 +23,7 @@ def test_recorded__bounds_the_number_of_recordings(
 ) -> None:
     made = []
     freeze = dr.freeze
-    monkeypatch.setattr(kernel_recording, "_MOST_RECORDINGS", 10)
+    monkeypatch.setattr(kernel_recording, "MOST_RECORDINGS", 10)
     monkeypatch.setattr(dr, "freeze", lambda *args, **settings: made.append(freeze(*args, **settings)) or made[-1])
     function = kernel_recording.recorded(scaled, 3)
     for _ in range(2):

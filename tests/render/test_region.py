@@ -63,11 +63,11 @@ def drawn_pixels(region, mask):
     return region.paste(np.ones(region.shape(1)[:3]), np.zeros(mask.shape))[..., None]
 
 
-def assert_same_gradients(found, expected, rows=slice(None)):
+def assert_same_gradients(result, expected, rows=slice(None)):
     for name in RAW:
         scale = np.abs(expected[name]).max()
         assert scale > 0, name
-        assert_close(found[name][rows], expected[name][rows], atol=tol.SUM_ORDER_REL * scale, name=name)
+        assert_close(result[name][rows], expected[name][rows], atol=tol.SUM_ORDER_REL * scale, name=name)
 
 
 @pytest.mark.parametrize("reproducible", [False, True])

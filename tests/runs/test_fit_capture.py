@@ -590,10 +590,10 @@ def test_stream_capture__resumes_where_cameras_have_delays(tmp_path):
     assert [c.delay for c in open_stream_capture(stream, None, [0, 1]).cameras] == [0, -0.25, 0.5]
 
 
-@pytest.mark.parametrize("found", [[1, 2], {"cam1": [0.1]}, {"cam1": ["x", "y"]}, {"cam1": None}])
-def test_as_fitted__refuses_broken_distortions(tmp_path, found):
+@pytest.mark.parametrize("distortion", [[1, 2], {"cam1": [0.1]}, {"cam1": ["x", "y"]}, {"cam1": None}])
+def test_as_fitted__refuses_broken_distortions(tmp_path, distortion):
     capture = recording()
-    with StreamWriter(tmp_path / "stream.morgs", capture.cameras, 25.0, {"distortions": found}):
+    with StreamWriter(tmp_path / "stream.morgs", capture.cameras, 25.0, {"distortions": distortion}):
         pass
     with pytest.raises(ValueError, match="`distortions` must be an object with two numbers for each camera"):
         as_fitted(capture, StreamReader(tmp_path / "stream.morgs"))

@@ -13,29 +13,15 @@ from threading import Event, Thread
 import numpy as np
 
 from morgs_mi.capture.layouts.colmap import write_colmap
-from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.io.png import png_bytes
 from morgs_mi.io.video_writer import write_video
-from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.method.motion_config import MotionConfig
-from morgs_mi.render.render_config import RenderConfig
+from tests.quick import quick
 from tests.scenes import filmed, textured
 
 FPS = 20.0
 NAMES = tuple(camera.name for camera in filmed.rig())
 # Enough for a rough image, and slower than the clip.
-CONFIG = StreamConfig(
-    fit=FitConfig(
-        sh_degree=0,
-        num_gaussians=1500,
-        first_frame_steps=150,
-        confidence_steps=4,
-        epochs=2,
-        density=DensityConfig(rounds=0),
-    ),
-    motion=MotionConfig(key_views=1),
-    render=RenderConfig(reproducible=True),
-)
+CONFIG = quick(num_gaussians=1500, first_frame_steps=150, epochs=2)
 
 
 @cache

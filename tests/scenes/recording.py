@@ -13,32 +13,24 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi import RenderConfig
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.codec import container
 from morgs_mi.codec.codec_config import CodecConfig
-from morgs_mi.fit.fit_config import DensityConfig, FitConfig
-from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.fit.fit_config import DensityConfig
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.playback.visualise import write_png
 from morgs_mi.runs.fit_capture import stream_capture
+from tests.quick import quick
 from tests.scenes.cameras import look_at_cameras
 
 FRAMES = 6
 # As little as a fit can do with all that it does: births, deaths, masks, keyframes, offsets.
-CONFIG = StreamConfig(
-    fit=FitConfig(
-        sh_degree=0,
-        num_gaussians=80,
-        first_frame_steps=8,
-        confidence_steps=4,
-        epochs=2,
-        density=DensityConfig(rounds=2, births=0.05, max_gaussians=84, min_error=0),
-    ),
-    motion=MotionConfig(key_views=1, mask_interval=2),
+CONFIG = quick(
+    MotionConfig(key_views=1, mask_interval=2),
     codec=CodecConfig(keyframe_interval=2, offset=True),
-    render=RenderConfig(reproducible=True),
+    epochs=2,
+    density=DensityConfig(rounds=2, births=0.05, max_gaussians=84, min_error=0),
 )
 
 

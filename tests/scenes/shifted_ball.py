@@ -36,11 +36,11 @@ def fit_shifted(motion: MotionConfig, start: MotionStart | None = None, config: 
     return fit_later_frame(problem, config, motion, np.random.default_rng(0))
 
 
-def motion_error(found: LaterFrame) -> float:
+def motion_error(result: LaterFrame) -> float:
     """Return the mean error of the displacements, in world units."""
-    return float(np.linalg.norm(np.asarray(found.gaussians.motion) - SHIFT, axis=1).mean())
+    return float(np.linalg.norm(np.asarray(result.gaussians.motion) - SHIFT, axis=1).mean())
 
 
-def psnr_of(found: LaterFrame) -> float:
+def psnr_of(result: LaterFrame) -> float:
     """Return the mean PSNR against the shifted ball, in dB."""
-    return mean_psnr(found.gaussians, images_of(shifted_ball()))
+    return mean_psnr(result.gaussians, images_of(shifted_ball()))

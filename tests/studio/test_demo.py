@@ -12,17 +12,16 @@ import pytest
 from morgs_mi import RenderConfig, StreamLoop
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.core.files import locked_folder
-from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.studio.demo import DemoConfig, _synthesize_clip, run_demo
 from morgs_mi.studio.synth.synth_config import SynthConfig
+from tests.quick import quick
 
 SMALL = DemoConfig(
     clip=SynthConfig(cameras=6, frames=4, width=64, height=48, spp=4),
     plain_frames=3,
-    stream=StreamConfig(fit=FitConfig(sh_degree=0, num_gaussians=500, first_frame_steps=20, epochs=1)),
+    stream=quick(num_gaussians=500, first_frame_steps=20),
 )
 
 pytestmark = pytest.mark.slow

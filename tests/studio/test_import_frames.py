@@ -135,7 +135,7 @@ def test_matched_rows__finds_none_among_equal_gaussians():
 
 
 @pytest.mark.parametrize(
-    ("now", "same"),
+    ("current", "same"),
     [
         (moving(0), True),
         (moving(3), True),
@@ -147,8 +147,8 @@ def test_matched_rows__finds_none_among_equal_gaussians():
     ],
     ids=["still", "moved", "shuffled", "shifted back", "shifted on", "partly shifted", "another scene"],
 )
-def test_same_gaussians__compares_rows(now, same):
-    assert same_gaussians(moving(0), now) is same
+def test_same_gaussians__compares_rows(current, same):
+    assert same_gaussians(moving(0), current) is same
 
 
 def test_same_gaussians__accepts_equal_rows():

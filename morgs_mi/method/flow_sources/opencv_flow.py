@@ -19,7 +19,7 @@ from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FlowSource,
 
 # Side of an image in pixels below which the methods have too little to match: DIS needs patches of 8 pixels on its
 # coarsest level.
-_MIN_SIDE = 16
+MIN_SIDE = 16
 # Given None, OpenCV allocates its result; OpenCV's type stubs do not allow for it.
 _ALLOCATE: Any = None
 
@@ -103,7 +103,7 @@ def optical_flow(
     image = np.asarray(image)
     previous = np.asarray(previous)
     check_images("optical_flow()", image, previous)
-    if min(image.shape[:2]) < _MIN_SIDE:
+    if min(image.shape[:2]) < MIN_SIDE:
         return np.zeros((*image.shape[:2], 2), np.float32)
     return FLOW_METHODS[method](_bytes(image), _bytes(previous), config)
 

@@ -13,7 +13,7 @@ from morgs_mi.playback.player import channel_image, render
 from morgs_mi.playback.stream_header import render_config, stream_exposure, stream_name
 
 # Largest stream that is stored in a notebook, in bytes; the player adds a bit more than a megabyte.
-_LARGEST = 4_000_000
+LARGEST = 4_000_000
 # Width and height of the player in pixels, unless the output of the cell is narrower.
 _WIDTH = 800
 _HEIGHT = 600
@@ -33,7 +33,7 @@ def stream_html(stream: FrameSource) -> str:
         aspect = camera.width / camera.height
         style = _STYLE.format(width=min(_WIDTH, _HEIGHT * aspect), aspect=aspect)
         title = html.escape(stream_name(stream))
-        if size <= _LARGEST:
+        if size <= LARGEST:
             page = web_page(stream).decode().replace("&", "&amp;").replace('"', "&quot;")
             return _PLAYER.format(title=title, style=style, page=page)
         gaussians = next(gaussians for _, gaussians in play(stream))

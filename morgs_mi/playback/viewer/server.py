@@ -89,6 +89,10 @@ class Viewer:
         """End `run`."""
         self._server.should_exit = True
 
+    def close(self) -> None:
+        """Release the address of a page that is not served."""
+        self._socket.close()
+
     def _app(self) -> Starlette:
         routes = [
             Route("/", self._send_page),

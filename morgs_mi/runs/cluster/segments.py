@@ -174,7 +174,7 @@ class SegmentedRun:
         self._show_progress()
         if first.frame < stop:
             part = self._submitted([replace(first, stop=stop)])[0].result()
-            self._add(part if prepared is None else self._completed(part, prepared))
+            self.add_part(part if prepared is None else self._completed(part, prepared))
             first = replace(part.segment, stop=first.stop)
         self.task = replace(self.task, points=None, balance=self.recordings[0].reports[0].exposures)
         states = StreamReader(self._files(0).stream).states(stop - 1)
@@ -190,7 +190,7 @@ class SegmentedRun:
         tasks = as_completed(begun, loop=self.client.loop)
         for future in tasks:
             part = future.result()
-            self._add(part)
+            self.add_part(part)
             if part.segment.frame < part.segment.stop:
                 tasks.update(self._submitted([part.segment], part.worker))
             idle = max(1, num_workers(self.client)) - tasks.count()
@@ -239,7 +239,7 @@ class SegmentedRun:
         first = prepared.completed(part.reports[0], gaussians, frame, self.task.config)
         return replace(part, reports=(first, *part.reports[1:]))
 
-    def _add(self, part: Part) -> None:
+    def add_part(self, part: Part) -> None:
         """Add the frames of a task to the files of their segment."""
         start = part.segment.start
         if start not in self.recordings:

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from distributed import Client
 
 # Seconds after which a scheduler that does not answer counts as lost.
-_TIMEOUT = 10
+TIMEOUT = 10
 _SETTINGS = {
-    "distributed.comm.timeouts.connect": _TIMEOUT,
+    "distributed.comm.timeouts.connect": TIMEOUT,
     "distributed.admin.large-graph-warning-threshold": "1GB",  # a task has the Gaussians before it
     "distributed.worker.memory.pause": False,  # a worker that waits keeps its memory; one with too much is ended
 }
@@ -72,9 +72,9 @@ def open_client(scheduler: str | None = None, count: int | None = None) -> Itera
             stack.enter_context(address)
         problem = "none"
         try:
-            client = stack.enter_context(Client(address, timeout=_TIMEOUT, set_as_default=False))
+            client = stack.enter_context(Client(address, timeout=TIMEOUT, set_as_default=False))
             problem = "no worker"
-            client.wait_for_workers(1, timeout=_TIMEOUT)
+            client.wait_for_workers(1, timeout=TIMEOUT)
         except (OSError, ValueError):
             raise ConnectionError(
                 f"{scheduler}: expected a scheduler with workers, got {problem}; start it first."

@@ -87,7 +87,7 @@ class CalibrationResult:
 
 
 @dataclass(frozen=True)
-class _Candidate:
+class Candidate:
     """A model of COLMAP."""
 
     mapper: Mapper  # the mapper that made it
@@ -150,9 +150,9 @@ def calibrate(
     images, masks = _frames(path, config, without)
     report("Reading frames", 1, 1)
     with tempfile.TemporaryDirectory() as scratch, _quiet():
-        _match(path, images, masks, Path(scratch), config, report)
+        match_views(path, images, masks, Path(scratch), config, report)
         report("Mapping", 0, 1)
-        best = _map(path, tuple(images), Path(scratch), config.seed)
+        best = map_views(path, tuple(images), Path(scratch), config.seed)
         report("Mapping", 1, 1)
         names = tuple(check.name for check in best.checks if check.fits is not None)
         left_out = tuple(name for name in images if name not in names)
@@ -233,7 +233,7 @@ def _last_position(reader: FrameReader) -> int:
     return reader.num_held - 1 if reader.positions is None else round(reader.positions[-1])
 
 
-def _match(
+def match_views(
     path: Path,
     images: dict[str, np.ndarray],
     masks: dict[str, np.ndarray],
@@ -241,7 +241,7 @@ def _match(
     config: CalibrateConfig,
     report: Callable[[str, int, int], None],
 ) -> None:
-    """Write images, features and the matches of all pairs of views into a folder, for `_map`."""
+    """Write images, features and the matches of all pairs of views into a folder, for `map_views`."""
     pycolmap = import_pycolmap()
 
     folder = scratch / _IMAGES
@@ -280,7 +280,7 @@ def _match(
     _check_pairs(path, database)
 
 
-def _map(path: Path, names: Sequence[str], scratch: Path, seed: int) -> _Candidate:
+def map_views(path: Path, names: Sequence[str], scratch: Path, seed: int) -> Candidate:
     """Return the best model of incremental and of global mapping of the matches in a folder.
 
     If none is complete, both map the matches that agree with focal lengths found from pairs of views, too.
@@ -300,7 +300,7 @@ def _map(path: Path, names: Sequence[str], scratch: Path, seed: int) -> _Candida
     return _with_principal_points(max(candidates, key=lambda candidate: candidate.rank), names)
 
 
-def _mapped(names: Sequence[str], scratch: Path, seed: int) -> list[_Candidate]:
+def _mapped(names: Sequence[str], scratch: Path, seed: int) -> list[Candidate]:
     """Return the models of both mappers.
 
     Threads of a mapper share its random samples, which makes other models on some runs; one thread takes as long.
@@ -314,13 +314,13 @@ def _mapped(names: Sequence[str], scratch: Path, seed: int) -> list[_Candidate]:
         "global": pycolmap.global_mapping(*inputs, pycolmap.GlobalPipelineOptions(random_seed=seed, num_threads=1)),
     }
     return [
-        _Candidate(mapper, model, _checks(model, names))
+        Candidate(mapper, model, _checks(model, names))
         for mapper, models in models_by_mapper.items()
         for model in models.values()
     ]
 
 
-def _with_principal_points(candidate: _Candidate, names: Sequence[str]) -> _Candidate:
+def _with_principal_points(candidate: Candidate, names: Sequence[str]) -> Candidate:
     """Return the model with a camera and a principal point for each image, or as it is if that fits no better."""
     pycolmap = import_pycolmap()
 
@@ -337,7 +337,7 @@ def _with_principal_points(candidate: _Candidate, names: Sequence[str]) -> _Cand
     old_error, new_error = (_median_error(model) for model in (candidate.model, model))
     if not new_error < (1 - _LEAST_DECREASE) * old_error:
         return candidate
-    return _Candidate(candidate.mapper, model, _checks(model, names), principal_points=True)
+    return Candidate(candidate.mapper, model, _checks(model, names), principal_points=True)
 
 
 def _with_own_cameras(model: Any) -> Any:

@@ -70,7 +70,7 @@ class Live:
                 nonlocal is_shown
                 if not is_shown:
                     is_shown = True
-                    viewer.callback(_stop, _start_viewer(out, self.browser))
+                    viewer.callback(stop_viewer, start_viewer(out, self.browser))
 
             def on_frame(row: LiveFrame, *_: Any) -> None:
                 lines.add(row)
@@ -118,13 +118,13 @@ def _summary(out: Path, rows: Sequence[LiveFrame]) -> str:
     return f"{text}, mean latency of the others {latency:.2f} s, largest skew {1e3 * skew:.0f} ms."
 
 
-def _start_viewer(out: Path, browser: bool) -> subprocess.Popen[bytes]:
+def start_viewer(out: Path, browser: bool) -> subprocess.Popen[bytes]:
     """Start the viewer in a process of its own: in one process it would wait for the renderings of the fit."""
     opening = "--browser" if browser else "--no-browser"
     command = [sys.executable, "-m", "morgs_mi", "view", str(out), "--follow", opening, "--variant", mi.variant()]
     return subprocess.Popen(command, start_new_session=True)  # Ctrl-C is for the fit, which ends the viewer
 
 
-def _stop(process: subprocess.Popen[bytes]) -> None:
+def stop_viewer(process: subprocess.Popen[bytes]) -> None:
     process.kill()  # asked to end, it would report an interruption
     process.wait()

@@ -57,7 +57,7 @@ _TYPES = {
 }
 _LARGEST_HALF = 65504.0
 _EXTENT_SIGMAS = 3.0
-_UNSAVED_BYTES = 2**28  # of samples in memory
+UNSAVED_BYTES = 2**28  # of samples in memory
 
 
 def write_usd(
@@ -118,7 +118,7 @@ def _write_stage(
     for count, state in enumerate(selected(), start=1):
         unsaved_bytes += fields[state.first_id].put(state, axes)
         # A binary file is appended to, which bounds the memory; a text would be written again.
-        if unsaved_bytes > _UNSAVED_BYTES and path.suffix.lower() != ".usda":
+        if unsaved_bytes > UNSAVED_BYTES and path.suffix.lower() != ".usda":
             stage.Save()
             unsaved_bytes = 0
         if progress is not None:

@@ -21,7 +21,7 @@ from morgs_mi.studio.live.feed import Bundle, Shot, bundled
 _LOG = logging.getLogger(__name__)
 _POLL = 0.05  # s
 # Pause after which the numbers may begin again, s: images of several cameras are written in any order until then.
-_PAUSE = 1.0
+PAUSE = 1.0
 # Numbers per second that grow faster than this do not count images; they are times, or one is far ahead.
 _MAX_RATE = 1000
 # Suffixes of the images, whose last bytes show that the file is complete; what these bytes contain, and how many they
@@ -57,7 +57,7 @@ class FolderFeed:
     """Live images in a folder that another program fills; it has the methods of `Feed`.
 
     Images with one number are of one time, and an image that is not complete yet is not read. Newer images have larger
-    numbers. If none come, images that were written `_PAUSE` after the last bundle are newer, too: the program may count
+    numbers. If none come, images that were written `PAUSE` after the last bundle are newer, too: the program may count
     from 0 again, or one number was far ahead.
 
     Args:
@@ -87,7 +87,7 @@ class FolderFeed:
     def newest(self, after: Bundle | None = None) -> Bundle | None:
         """Wait for the newest bundle and return it; None if no camera delivers images any more."""
         start = time.monotonic()
-        pause_end = start + _PAUSE
+        pause_end = start + PAUSE
         search_time = self._return_time
         while True:
             current_time = time.monotonic()
@@ -101,7 +101,7 @@ class FolderFeed:
                     return self._arrived(bundle, self._return_time if has_paused else search_time)
             if late:
                 return self._end(after)
-            pause_end = current_time + _PAUSE if has_paused else pause_end
+            pause_end = current_time + PAUSE if has_paused else pause_end
             search_time = current_time
             time.sleep(_POLL)
 
@@ -198,17 +198,17 @@ class FolderFeed:
 
         Args:
             limit: number.
-            write_times: by camera, when an image was written, s of the file; images written up to `_PAUSE` later are of
+            write_times: by camera, when an image was written, s of the file; images written up to `PAUSE` later are of
                 the same time. Empty: no image is left out.
         """
         by_name = {}
         for name in self.names or self._cameras():
-            if files := _files(self._folder / name, limit):
+            if files := files_of_camera(self._folder / name, limit):
                 self._compare_clocks(name, files[max(files)])
                 by_name[name] = _Images(files, self._leads.get(name, 0.0))
         if not write_times:
             return by_name
-        begin = _PAUSE + max(write_time + self._leads.get(name, 0.0) for name, write_time in write_times.items())
+        begin = PAUSE + max(write_time + self._leads.get(name, 0.0) for name, write_time in write_times.items())
         by_name = {name: images.since(begin) for name, images in by_name.items()}
         return {name: images for name, images in by_name.items() if images.files}
 
@@ -257,7 +257,7 @@ def _dropped(cameras: Sequence[_Images], bundle: Bundle, last_bundle: Bundle) ->
     return min(sum(n < number for n in images.files) for images, image in pairs if image is not None)
 
 
-def _files(folder: Path, limit: int) -> dict[int, Path]:
+def files_of_camera(folder: Path, limit: int) -> dict[int, Path]:
     """Return the images in a folder, by their numbers, that are larger than `limit`."""
     files = {}
     with suppress(FileNotFoundError, NotADirectoryError):

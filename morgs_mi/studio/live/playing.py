@@ -84,7 +84,7 @@ def play(path: str | Path, clock: ClipClock, closed: Event, clip: int = 0, loop:
     try:
         while True:
             end = 0.0
-            for image, at, interval in _timed(path):
+            for image, at, interval in timed_images(path):
                 clock.wait(clip, begin + at, interval, closed)
                 if closed.is_set():
                     return
@@ -103,7 +103,7 @@ def play(path: str | Path, clock: ClipClock, closed: Event, clip: int = 0, loop:
         clock.leave(clip)
 
 
-def _timed(path: str | Path) -> Iterator[tuple[np.ndarray, float, float]]:
+def timed_images(path: str | Path) -> Iterator[tuple[np.ndarray, float, float]]:
     """Yield the images of a video, BGR, with their times from its beginning and the time between two of them, s."""
     stream = open_stream(str(path), path)
     try:

@@ -17,8 +17,8 @@ import numpy as np
 
 # Reads that may fail in succession before a source counts as ended, and the pause after each, s.
 _FAILURES = 10
-_PAUSE = 0.02
-_RETRY = 1.0  # pause before a connection is opened again, s
+PAUSE = 0.02
+RETRY = 1.0  # pause before a connection is opened again, s
 # Longest wait of FFmpeg for a connection or its next bytes, s; some streams come in parts of a few seconds.
 _SILENCE = 10.0
 # Silence after which the reader of a pipe looks whether it is to end, s, and how many bytes it copies at most.
@@ -41,7 +41,7 @@ def read_camera(
         OSError: the source cannot be opened.
     """
     yield from _until_end(source, closed, size)
-    while reconnect and "://" in str(source) and not closed.wait(_RETRY):
+    while reconnect and "://" in str(source) and not closed.wait(RETRY):
         yield None
         with suppress(OSError):
             yield from _until_end(source, closed, size)
@@ -63,7 +63,7 @@ def _until_end(source: int | str | Path, stop: Event, size: tuple[int, int] | No
                 failures = 0 if is_read else failures + 1
                 yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if is_read else None
                 if not is_read:
-                    stop.wait(_PAUSE)
+                    stop.wait(PAUSE)
         finally:
             stream.release()
 

@@ -22,7 +22,7 @@ from morgs_mi.method.flow_sources.flow_registry import FlowSource, both_directio
 from morgs_mi.studio.networks.onnx_file import OnnxNetwork, written_shapes
 
 # RAFT and similar networks halve the size three times.
-_MULTIPLE = 8
+MULTIPLE = 8
 
 
 class FlowNetwork:
@@ -80,8 +80,8 @@ class FlowNetwork:
 
     def _padded(self, image: np.ndarray, other: np.ndarray) -> np.ndarray:
         height, width = image.shape[:2]
-        down = -height % _MULTIPLE
-        right = -width % _MULTIPLE
+        down = -height % MULTIPLE
+        right = -width % MULTIPLE
         top = down // 2
         left = right // 2
         images = (

@@ -11,18 +11,14 @@ import pytest
 
 from benchmarks.reports.codec import Options, measure, quality_table
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.render.render_config import RenderConfig
 from tests.benchmarks.reports.here import client_here
+from tests.quick import quick
 
 QUICK = Options(
     captures=(),
     qualities=(4, 40),
-    stream=StreamConfig(
-        fit=FitConfig(sh_degree=0, num_gaussians=150, first_frame_steps=20, epochs=2), motion=MotionConfig(key_views=1)
-    ),
+    stream=quick(num_gaussians=150, first_frame_steps=20, epochs=2),
 )
 
 

@@ -37,7 +37,7 @@ def slow(raw: dict[str, np.ndarray], camera: Camera) -> np.ndarray:
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("pairs", [1_000_000, 50], ids=["at once", "in chunks"])
 def test_reference64__renders_like_the_reference_of_the_tests(degree, pairs, monkeypatch):
-    monkeypatch.setattr(reference64, "_PAIRS", pairs)
+    monkeypatch.setattr(reference64, "PAIRS", pairs)
     raw, camera = scene(degree)
     expected = slow(raw, camera)
     pixels = np.random.default_rng(1).permutation(np.argwhere(np.ones((13, 9))))[:80]

@@ -16,16 +16,13 @@ from morgs_mi import StreamLoop
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.render.render_config import RenderConfig
 from morgs_mi.runs.cluster.tasks import Source
 from morgs_mi.runs.cluster.workers import open_client
 from morgs_mi.studio.synth.disturbances import load_disturbances
 from tests.benchmarks.reports.here import client_here
+from tests.quick import quick
 
-TINY = StreamConfig(
-    fit=FitConfig(num_gaussians=60, first_frame_steps=3, epochs=1, dropping=0.0),
-    render=RenderConfig(reproducible=True),
-)
+TINY = quick(dropping=0.0)
 # Figures that are times, which no two fits share.
 TIMES = {"cpu_s", "seconds"}
 FIRST = {"seeds": (1,), "downscale": 1, "steps": 3, "gaussians": 60}

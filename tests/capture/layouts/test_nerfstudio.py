@@ -161,11 +161,11 @@ def test_nerfstudio__leaves_out_views_of_no_split(tmp_path: Path, caplog: pytest
 
 
 @pytest.mark.parametrize(
-    "kept", [("fl_x", "fl_y"), ("fl_x",), ("camera_angle_x",), ("camera_angle_x", "camera_angle_y")]
+    "file_names", [("fl_x", "fl_y"), ("fl_x",), ("camera_angle_x",), ("camera_angle_x", "camera_angle_y")]
 )
 @pytest.mark.parametrize("suffix", [".png", ".JPG", ".tif"])
 @pytest.mark.parametrize("named", [True, False])
-def test_nerfstudio__takes_missing_sizes_from_the_images(tmp_path: Path, kept, suffix: str, named: bool) -> None:
+def test_nerfstudio__takes_missing_sizes_from_the_images(tmp_path: Path, file_names, suffix: str, named: bool) -> None:
     angles = {"camera_angle_x": 2 * np.arctan(WIDTH / 100), "camera_angle_y": 2 * np.arctan(HEIGHT / 100)}
 
     def change(meta: dict) -> None:
@@ -173,7 +173,9 @@ def test_nerfstudio__takes_missing_sizes_from_the_images(tmp_path: Path, kept, s
         for frame in meta["frames"]:
             for key in ("fl_x", "fl_y", "cx", "cy"):
                 del frame[key]
-            frame.update({key: value for key, value in {"fl_x": 50.0, "fl_y": 50.0, **angles}.items() if key in kept})
+            frame.update(
+                {key: value for key, value in {"fl_x": 50.0, "fl_y": 50.0, **angles}.items() if key in file_names}
+            )
             if not named:
                 frame["file_path"] = "./" + frame["file_path"].removesuffix(suffix)
 

@@ -109,7 +109,7 @@ def test_flow_config__fine_width_selects_the_finest_level_of_dis():
 @pytest.mark.parametrize(("least", "is_any"), [(64, True), (65, False)])
 def test_optical_flow__is_zero_in_images_below_a_least_side(monkeypatch, least, is_any):
     previous, image, _ = moving_disc(64, 96, shift=(6, 1))
-    monkeypatch.setattr("morgs_mi.method.flow_sources.opencv_flow._MIN_SIDE", least)
+    monkeypatch.setattr("morgs_mi.method.flow_sources.opencv_flow.MIN_SIDE", least)
     assert optical_flow(image, previous).any() == is_any
 
 

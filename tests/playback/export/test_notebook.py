@@ -40,7 +40,7 @@ def test_stream_html__is_the_player_in_a_frame_without_access_to_the_notebook(tm
 def test_stream_html__of_a_large_stream_is_its_first_frame_and_the_command_for_a_page(tmp_path, monkeypatch):
     states = write_stream(tmp_path / "stream.morgs")
     stream = open_stream(tmp_path)
-    monkeypatch.setattr(notebook, "_LARGEST", 1000)
+    monkeypatch.setattr(notebook, "LARGEST", 1000)
     text = stream_html(stream)
     assert f"morgs-mi export web {stream.path} page.html" in text
     source = re.search(r"base64,([^\"]+)", text)
@@ -51,7 +51,7 @@ def test_stream_html__of_a_large_stream_is_its_first_frame_and_the_command_for_a
 
 @pytest.mark.parametrize("largest", [0, 10**9])
 def test_stream_html__of_a_stream_that_does_not_play_says_why(tmp_path, monkeypatch, largest):
-    monkeypatch.setattr(notebook, "_LARGEST", largest)
+    monkeypatch.setattr(notebook, "LARGEST", largest)
     with StreamWriter(tmp_path / "empty.morgs", rig(), 30):
         pass
     assert "expected at least one frame" in stream_html(open_stream(tmp_path / "empty.morgs"))

@@ -39,10 +39,10 @@ def convert(program: str, *files: Path) -> None:
     subprocess.run(["npx", "--yes", program, "-g", "cpu", *map(str, files)], check=True, timeout=300)
 
 
-def assert_same(before: Gaussians, after: Gaussians, atol: float) -> None:
+def assert_same(original: Gaussians, converted: Gaussians, atol: float) -> None:
     """Compare Gaussians in any order; quaternions up to their sign and length."""
     columns = []
-    for gaussians in (before, after):
+    for gaussians in (original, converted):
         raw = gaussians.numpy()
         quats = raw["quats"] / np.linalg.norm(raw["quats"], axis=1, keepdims=True)
         rotations = np.einsum("ni,nj->nij", quats, quats)

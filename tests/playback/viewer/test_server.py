@@ -350,7 +350,7 @@ def test_viewer__shows_or_refuses_hostile_streams(tmp_path, forge):
         except ValueError as error:
             wrong += [] if str(error).startswith(f"{path}: ") else [str(error)]
             continue
-        viewer._socket.close()
+        viewer.close()
         for frame in range(FRAMES):
             try:
                 viewer._exact._render(frame, "color", camera, 10.0)
@@ -432,7 +432,7 @@ def test_viewer__starts_whatever_a_header_calls_its_capture(tmp_path, capture):
 def test_view__prints_and_opens_the_link(clip, monkeypatch, capsys, args, opens):
     opened = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
-    monkeypatch.setattr(Viewer, "run", lambda viewer: viewer._socket.close())
+    monkeypatch.setattr(Viewer, "run", lambda viewer: viewer.close())
     assert cli.main(["view", str(clip[0]), *args]) == 0
     url = re.search(r"http://127\.0\.0\.1:\d+/", capsys.readouterr().out)
     assert url is not None
@@ -440,7 +440,7 @@ def test_view__prints_and_opens_the_link(clip, monkeypatch, capsys, args, opens)
 
 
 def test_view__prints_a_link_with_a_token_where_other_machines_can_reach_it(clip, monkeypatch, capsys):
-    monkeypatch.setattr(Viewer, "run", lambda viewer: viewer._socket.close())
+    monkeypatch.setattr(Viewer, "run", lambda viewer: viewer.close())
     assert cli.main(["view", str(clip[0]), "--host", "0.0.0.0", "--no-browser"]) == 0
     output = " ".join(capsys.readouterr().out.split())
     assert re.search(r"http://localhost:\d+/[\w-]{40,}/ \(Ctrl-C to stop\)", output)

@@ -69,7 +69,7 @@ def test_open_client__connects_to_a_scheduler(cluster: subprocess.Popen[str]) ->
 def test_SegmentedRun__names_a_lost_scheduler_and_is_resumed(
     capture: Capture, whole: bytes, cluster: subprocess.Popen[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("morgs_mi.runs.cluster.workers._TIMEOUT", 2)
+    monkeypatch.setattr("morgs_mi.runs.cluster.workers.TIMEOUT", 2)
     lost = when_fitted(4, cluster.kill)
     with (
         pytest.raises(

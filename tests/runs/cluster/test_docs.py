@@ -16,7 +16,7 @@ import pytest
 from benchmarks.reports import __main__ as reports
 from morgs_mi import cli
 from morgs_mi.codec.reader import StreamReader
-from tests.cli.commands import QUICK
+from tests.quick import OPTIONS
 from tests.scenes.recording import write_recording
 
 ROOT = Path(__file__).parents[3]
@@ -66,7 +66,7 @@ def test_cluster_page__commands_run(workplace: Path) -> None:
                     assert reports.main([*args[2:], *REPORT]) == 0, command
                     continue
                 assert program == "morgs-mi"
-                assert cli.main([*args, *(QUICK if args[0] == "fit" else [])]) == 0, command
+                assert cli.main([*args, *(OPTIONS if args[0] == "fit" else [])]) == 0, command
     streams = sorted(str(path.parent.relative_to("out")) for path in Path("out").rglob("stream.morgs"))
     qualities = [f"codec/capture/{quality}" for quality in (1, 1000)]
     assert streams == ["cluster", *qualities, "segments", "url"]

@@ -24,10 +24,10 @@ def fail() -> None:
     raise ValueError("fail(): expected more.")
 
 
-def threads(*about) -> tuple[int, str]:
+def threads(*tasks) -> tuple[int, str]:
     import drjit as dr
 
-    with prepared(*about):
+    with prepared(*tasks):
         return dr.thread_count(), worker_name()
 
 
@@ -85,7 +85,7 @@ def test_open_client__has_workers_that_end_with_their_parent() -> None:
     ],
 )
 def test_open_client__refuses_in_one_sentence(scheduler, count, message, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("morgs_mi.runs.cluster.workers._TIMEOUT", 1)
+    monkeypatch.setattr("morgs_mi.runs.cluster.workers.TIMEOUT", 1)
     with pytest.raises((ValueError, ConnectionError), match=message), open_client(scheduler, count):
         pass
 

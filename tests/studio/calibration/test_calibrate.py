@@ -22,12 +22,12 @@ from morgs_mi.io.video_writer import write_video
 from morgs_mi.studio.calibration.calibrate import (
     _DATABASE,
     CalibrateConfig,
-    _Candidate,
+    Candidate,
     _check,
     _frames,
-    _map,
-    _match,
     calibrate,
+    map_views,
+    match_views,
 )
 from morgs_mi.studio.calibration.checks.rig_check import CameraCheck, check_rig
 from tests.assertions import assert_close
@@ -43,9 +43,9 @@ def film(path: Path, cameras: list[Camera], suffix: str = ".mkv") -> Path:
     return path
 
 
-def aligned(found: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return `found` [n, 3] aligned to `true` by translation, rotation and scale, and the rotation."""
-    a = found - found.mean(0)
+def aligned(estimate: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return `estimate` [n, 3] aligned to `true` by translation, rotation and scale, and the rotation."""
+    a = estimate - estimate.mean(0)
     b = true - true.mean(0)
     U, _, Vt = np.linalg.svd(a.T @ b)
     R = (U @ Vt).T
@@ -79,13 +79,13 @@ def test_calibrate__finds_the_same_poses_on_every_run(tmp_path: Path) -> None:
     config = CalibrateConfig(shared_intrinsics=True)
     images, _ = _frames(tmp_path, config, ())
     (scratch := tmp_path / "scratch").mkdir()
-    _match(tmp_path, images, {}, scratch, config, lambda *_: None)
+    match_views(tmp_path, images, {}, scratch, config, lambda *_: None)
     with closing(pycolmap.Database.open(scratch / _DATABASE)) as db:
         numbered = sorted((image.image_id, Path(image.name).stem) for image in db.read_all_images())
     assert [name for _, name in numbered] == list(images), "other numbers change the world's axes by 0.1"
     poses = []
     for _ in range(3):
-        model = _map(tmp_path, tuple(images), scratch, config.seed).model
+        model = map_views(tmp_path, tuple(images), scratch, config.seed).model
         poses.append(np.array([model.image(i).cam_from_world().matrix() for i, _ in numbered]))
     assert not np.ptp(poses, axis=0).any(), "threads may find a pose from other samples"
 
@@ -152,7 +152,7 @@ def test_candidate__ranks_fitting_cameras_then_poses_then_the_error() -> None:
             self.compute_mean_reprojection_error = lambda: error
 
     def rank(error: float, *fits: bool | None) -> tuple[int, int, float]:
-        return _Candidate("global", Model(error), tuple(CameraCheck("", 0, 0.0, each) for each in fits)).rank
+        return Candidate("global", Model(error), tuple(CameraCheck("", 0, 0.0, each) for each in fits)).rank
 
     ordered = [
         rank(0.1, True, None, None),
@@ -213,9 +213,9 @@ def test_calibrate__of_a_full_disk_leaves_no_model(tmp_path: Path, monkeypatch: 
     model = pycolmap.Reconstruction(str(tmp_path / "found"))
     clips = film(tmp_path / "clips", textured.rig(4))
     checks = tuple(CameraCheck(camera.name, 60, 0.1, True) for camera in textured.rig(4))
-    monkeypatch.setattr("morgs_mi.studio.calibration.calibrate._match", lambda *_: None)
+    monkeypatch.setattr("morgs_mi.studio.calibration.calibrate.match_views", lambda *_: None)
     monkeypatch.setattr(
-        "morgs_mi.studio.calibration.calibrate._map", lambda *_: _Candidate("incremental", model, checks)
+        "morgs_mi.studio.calibration.calibrate.map_views", lambda *_: Candidate("incremental", model, checks)
     )
     size = (tmp_path / "found" / "points3D.txt").stat().st_size
     with pytest.raises(OSError, match=r"cannot write .*sparse, the partial output was removed"), files_end_at(size - 1):

@@ -157,15 +157,15 @@ def test_refine_cameras__returns_the_calibrated_cameras_without_a_gain(splat_cap
     assert "stay as calibrated" in refinement.sentence
 
 
-@pytest.mark.parametrize(("gain", "taken"), [(0.05, False), (0.2, True)])
-def test_refine_cameras__takes_cameras_with_which_withheld_pixels_gain(splat_capture, monkeypatch, gain, taken):
+@pytest.mark.parametrize(("gain", "accepted"), [(0.05, False), (0.2, True)])
+def test_refine_cameras__takes_cameras_with_which_withheld_pixels_gain(splat_capture, monkeypatch, gain, accepted):
     scores = iter((25.0, 25.0 + gain))
     monkeypatch.setattr("morgs_mi.studio.calibration.refine.mean_psnr", lambda *_: next(scores))
     refined, refinement = refine_cameras(splat_capture, LEAST)
-    assert refinement.taken is taken
-    assert (refined is splat_capture) is not taken
+    assert refinement.taken is accepted
+    assert (refined is splat_capture) is not accepted
     assert refined.cameras[0] is splat_capture.cameras[0], "the held-out view stays as calibrated"
-    assert np.array_equal(refined.points, splat_capture.points) is not taken
+    assert np.array_equal(refined.points, splat_capture.points) is not accepted
 
 
 def test_refine_cameras__compares_the_views_that_have_withheld_pixels(splat_capture, monkeypatch):
@@ -202,7 +202,7 @@ def test_refine_cameras__does_not_judge_where_refined_cameras_are_wanted(splat_c
 
 @pytest.mark.slow
 def test_matched__finds_the_cameras_by_features(textured_capture, monkeypatch):
-    monkeypatch.setattr("morgs_mi.capture.features._MAX_FEATURES", 300)
+    monkeypatch.setattr("morgs_mi.capture.features.MAX_FEATURES", 300)
     capture = replace(textured_capture, cameras=tuple(disturbed(textured_capture.cameras)))
     start, true = ([c.cameras[v] for v in capture.train_views] for c in (capture, textured_capture))
     changes, tracks, _ = _matched(capture, capture.train_views, prior_deviations(scene_extent(start), CameraPriors()))
@@ -214,7 +214,7 @@ def test_matched__finds_the_cameras_by_features(textured_capture, monkeypatch):
 
 @pytest.mark.slow
 def test_matched__finds_the_distortion_that_is_left(textured_capture, monkeypatch):
-    monkeypatch.setattr("morgs_mi.capture.features._MAX_FEATURES", 300)
+    monkeypatch.setattr("morgs_mi.capture.features.MAX_FEATURES", 300)
     terms = [(0.08 * (-1) ** v, 0.0) for v in range(len(textured_capture.cameras))]
     bent = textured_capture.with_cameras(textured_capture.cameras, terms)
     cameras = [bent.cameras[v] for v in bent.train_views]

@@ -14,7 +14,8 @@ from morgs_mi.playback.streams import open_stream
 from morgs_mi.studio.commands import live as module
 from morgs_mi.studio.commands.live import Live, LiveSettings, _Lines, _summary
 from morgs_mi.studio.live.fit_live import LiveFrame
-from tests.cli.commands import QUICK, assert_refused
+from tests.cli.commands import assert_refused
+from tests.quick import OPTIONS
 from tests.scenes import noise_capture
 
 
@@ -31,10 +32,10 @@ def test_Live__fits_videos_until_they_end(
     capture, tmp_path: Path, videos: list[Path], run, monkeypatch, caplog
 ) -> None:
     started = []
-    monkeypatch.setattr(module, "_start_viewer", lambda *args: started.append(args))
-    monkeypatch.setattr(module, "_stop", started.append)
+    monkeypatch.setattr(module, "start_viewer", lambda *args: started.append(args))
+    monkeypatch.setattr(module, "stop_viewer", started.append)
     out = tmp_path / "out"
-    status, printed, error = run("live", out, "--camera", *videos, "--calibration", capture, "--view", *QUICK)
+    status, printed, error = run("live", out, "--camera", *videos, "--calibration", capture, "--view", *OPTIONS)
     assert status == 0
     assert re.fullmatch(
         rf"{out}/stream.morgs: fitted \d+ of \d+ frames \(\d+ dropped\) in [\d.]+ s, [\d.]+ MB, [\d.]+ s for .*\.\n",
@@ -55,10 +56,10 @@ def test_Live__starts_the_viewer_at_a_provisional_first_frame(
 ) -> None:
     states = []
     monkeypatch.setattr(
-        module, "_start_viewer", lambda out, _: states.append(sorted(path.name for path in out.iterdir()))
+        module, "start_viewer", lambda out, _: states.append(sorted(path.name for path in out.iterdir()))
     )
-    monkeypatch.setattr(module, "_stop", lambda _: None)
-    args = ("--camera", *videos, "--calibration", capture, "--view", "--frames", 1, *QUICK, "--first-frame-steps", 20)
+    monkeypatch.setattr(module, "stop_viewer", lambda _: None)
+    args = ("--camera", *videos, "--calibration", capture, "--view", "--frames", 1, *OPTIONS, "--first-frame-steps", 20)
     assert run("live", tmp_path / "out", *args)[0] == 0
     assert len(states) == 1
     assert PROVISIONAL in states[0]
@@ -66,7 +67,7 @@ def test_Live__starts_the_viewer_at_a_provisional_first_frame(
 
 @pytest.mark.slow
 def test_Live__repeats_videos(capture: Path, tmp_path: Path, videos: list[Path], run, caplog) -> None:
-    args = ("--camera", *videos, "--calibration", capture, "--loop", "--seconds", 1, *QUICK)
+    args = ("--camera", *videos, "--calibration", capture, "--loop", "--seconds", 1, *OPTIONS)
     status, printed, _ = run("live", tmp_path / "out", *args)
     assert status == 0
     frames = int(re.findall(r"fitted \d+ of (\d+) frames", printed)[0])
@@ -79,7 +80,7 @@ def test_Live__ends_with_a_summary_on_ctrl_c(capture: Path, tmp_path: Path, vide
         raise KeyboardInterrupt
 
     monkeypatch.setattr(_Lines, "add", interrupt)
-    status, printed, error = run("live", tmp_path / "out", "--camera", *videos, "--calibration", capture, *QUICK)
+    status, printed, error = run("live", tmp_path / "out", "--camera", *videos, "--calibration", capture, *OPTIONS)
     assert status == 0
     assert "fitted 1 of 1 frames (0 dropped) in 0.0 s" in printed
     assert "Interrupted" not in error

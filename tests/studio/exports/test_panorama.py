@@ -74,10 +74,10 @@ def test_panorama__has_no_seam_and_is_the_same_at_all_longitudes_of_a_pole():
 
 @pytest.mark.parametrize("longitude", [0.0, 1.0, 3.0])
 def test_panorama__of_two_eyes_has_the_disparity_of_the_distance(longitude):
-    apart = 0.4
+    distance = 0.4
     width = 512
     middle = np.array([np.sin(longitude), 0, np.cos(longitude)])
-    image = panorama(ball_at(middle, 0.05), CAMERA, width, apart, samples=1)
+    image = panorama(ball_at(middle, 0.05), CAMERA, width, distance, samples=1)
     assert image.shape == (width, width, 3)
     angles = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
     disparities = []
@@ -86,7 +86,7 @@ def test_panorama__of_two_eyes_has_the_disparity_of_the_distance(longitude):
         assert weights.max() > 0.5
         disparities.append(np.angle(np.sum(weights * np.exp(1j * angles))))
     # The ray of an eye starts beside the centre: sin of the angle between both rays is (b / 2) / distance.
-    shift = np.arcsin(0.5 * apart / DISTANCE)
+    shift = np.arcsin(0.5 * distance / DISTANCE)
     assert_close(np.angle(np.exp(1j * (np.array(disparities) - longitude))), [shift, -shift], atol=1e-3)
 
 

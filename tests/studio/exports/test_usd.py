@@ -173,7 +173,7 @@ def test_write_usd__begins_a_prim_for_a_new_set_of_gaussians(tmp_path):
 
 
 def test_write_usd__saves_now_and_then(tmp_path, monkeypatch):
-    monkeypatch.setattr("morgs_mi.studio.exports.usd._UNSAVED_BYTES", 100)
+    monkeypatch.setattr("morgs_mi.studio.exports.usd.UNSAVED_BYTES", 100)
     states, stage = written(tmp_path / "a.usdc")
     for state in states:
         alive = np.isin(np.arange(42), state.ids)

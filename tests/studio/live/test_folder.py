@@ -67,15 +67,15 @@ def test_FolderFeed__waits_for_a_camera_that_begins_while_the_folders_are_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fill(tmp_path, range(1), "a", "b")
-    files_of = module._files
+    files_of = module.files_of_camera
 
-    def files_meanwhile(folder: Path, after: int) -> dict[int, Path]:
+    def files_meanwhile(folder: Path, limit: int) -> dict[int, Path]:
         if not (tmp_path / "c").exists():
             fill(tmp_path, range(1), "c")
             fill(tmp_path, range(1, 2), "a", "b", "c")
-        return files_of(folder, after)
+        return files_of(folder, limit)
 
-    monkeypatch.setattr(module, "_files", files_meanwhile)
+    monkeypatch.setattr(module, "files_of_camera", files_meanwhile)
     first = FolderFeed(tmp_path, 5).newest()
     assert first is not None
     assert len(first.images) == 3
@@ -128,7 +128,7 @@ FAR = 10**30
 
 @pytest.fixture
 def short_pause(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_PAUSE", 0.2)
+    monkeypatch.setattr(module, "PAUSE", 0.2)
 
 
 def test_FolderFeed__goes_on_after_a_number_far_ahead(tmp_path: Path, short_pause: None) -> None:

@@ -69,7 +69,7 @@ def test_play__waits_for_a_clip_that_is_decoded_slowly(monkeypatch: pytest.Monke
                 time.sleep(0.02)
             yield np.zeros((2, 2, 3), np.uint8), k / 100, 1 / 100
 
-    monkeypatch.setattr(module, "_timed", timed)
+    monkeypatch.setattr(module, "timed_images", timed)
     clock = ClipClock(2)
     ahead = []
 
@@ -105,7 +105,7 @@ def test_play__refuses_what_has_no_image(tmp_path: Path, monkeypatch: pytest.Mon
     (tmp_path / "text.mkv").write_text("no video")
     with pytest.raises(OSError, match=r"cannot open the source .*text.mkv; check"):
         next(play(tmp_path / "text.mkv", ClipClock(), Event()))
-    monkeypatch.setattr(module, "_timed", lambda _: iter(()))
+    monkeypatch.setattr(module, "timed_images", lambda _: iter(()))
     with pytest.raises(OSError, match=r"expected images in empty.mkv, found none; check"):
         next(play("empty.mkv", ClipClock(), Event(), loop=True))
 

@@ -48,8 +48,8 @@ class Missing(Connection):
 
 
 def test_read_camera__opens_a_broken_connection_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_PAUSE", 0)
-    monkeypatch.setattr(module, "_RETRY", 0)
+    monkeypatch.setattr(module, "PAUSE", 0)
+    monkeypatch.setattr(module, "RETRY", 0)
     opened = []
 
     def open_stream(source: str, *_: object) -> Connection:

@@ -18,11 +18,11 @@ from morgs_mi.studio.measures.track_scores import (
 )
 
 
-def case(errors: list[list[float]], visible: list[str], found: list[str] | None = None, query: int = 0) -> Comparison:
+def case(errors: list[list[float]], visible: list[str], tracked: list[str] | None = None, query: int = 0) -> Comparison:
     """Return tracks that are off by `errors` [P, T] in x; "1" in a row marks a frame with a visible point."""
     truth = np.zeros((*np.shape(errors), 3))
     offset = np.array(errors)[..., None] * (1, 0, 0)
-    masks = [np.array([[c == "1" for c in row] for row in rows]) for rows in (visible, found or visible)]
+    masks = [np.array([[c == "1" for c in row] for row in rows]) for rows in (visible, tracked or visible)]
     return Comparison(truth, truth + offset, *masks, np.ones(truth.shape[:2], bool), np.full(len(truth), query))
 
 

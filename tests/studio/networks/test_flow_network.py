@@ -100,7 +100,7 @@ def test_flow_network__rejects_an_output_that_is_not_flow(tmp_path):
 
 
 def test_flow_network__names_the_file_where_it_fails(network, monkeypatch):
-    monkeypatch.setattr("morgs_mi.studio.networks.flow_network._MULTIPLE", 1)
+    monkeypatch.setattr("morgs_mi.studio.networks.flow_network.MULTIPLE", 1)
     with pytest.raises(ValueError, match=r"tiny\.onnx: onnxruntime .* on image1 \[1, 3, 20, 30\], image2 .*from files"):
         FlowNetwork(network)(*image_pair(20, 30))
 
