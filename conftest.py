@@ -8,5 +8,10 @@ import pytest
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Print one line if browser tests were skipped."""
     skipped = terminalreporter.stats.get("skipped", [])
-    if any("Chromium" in str(report.longrepr) or "morgs-mi[browser]" in str(report.longrepr) for report in skipped):
-        terminalreporter.write_line("The browser tests were skipped: run tools/setup_browser.sh to install Chromium.")
+    if any(
+        "Chromium" in str(report.longrepr) or "morgs-mi[browser]" in str(report.longrepr)
+        for report in skipped
+    ):
+        terminalreporter.write_line(
+            "The browser tests were skipped: run tools/setup_browser.sh to install Chromium."
+        )

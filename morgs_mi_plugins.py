@@ -1,7 +1,8 @@
-"""The integrators of morgs_mi for Mitsuba's entry point `mitsuba`, which loads this module after each set_variant().
+"""The integrators of morgs_mi for Mitsuba's entry point `mitsuba`, which loads this module after
+each set_variant().
 
-It is light: the package is imported when the first integrator is made. LLVM must be found by Mitsuba itself, because
-`morgs_mi.core.llvm` is too late then.
+It is light: the package is imported when the first integrator is made. LLVM must be found by
+Mitsuba itself, because `morgs_mi.core.llvm` is too late then.
 """
 
 from functools import partial

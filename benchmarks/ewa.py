@@ -1,8 +1,10 @@
-"""Draw the same Gaussians by `gaussian_splat` and by Mitsuba's `volprim_rf_basic`, for the page docs/mitsuba.md.
+"""Draw the same Gaussians by `gaussian_splat` and by Mitsuba's `volprim_rf_basic`, for the page
+docs/mitsuba.md.
 
     python -m benchmarks.ewa
 
-The Gaussians are the first frame of a small synthetic clip. The picture states the PSNR between the two images.
+The Gaussians are the first frame of a small synthetic clip. The picture states the PSNR between the
+two images.
 """
 
 from __future__ import annotations
@@ -47,7 +49,9 @@ def main(options: Options) -> None:
     """Fit the Gaussians and write the picture."""
     mi.set_variant(options.variant)
     with tempfile.TemporaryDirectory() as folder:
-        clip = morgs_mi.SynthConfig(cameras=9, frames=2, width=options.width, height=3 * options.width // 4)
+        clip = morgs_mi.SynthConfig(
+            cameras=9, frames=2, width=options.width, height=3 * options.width // 4
+        )
         morgs_mi.synthesize("spheres", Path(folder, "clip"), clip)
         capture = morgs_mi.load_capture(Path(folder, "clip"))
         fit = morgs_mi.FitConfig(num_gaussians=options.gaussians, first_frame_steps=options.steps)
@@ -63,18 +67,24 @@ def write_picture(path: Path, images: dict[str, np.ndarray]) -> float:
     decibels = psnr(images["gaussian_splat"], images["volprim_rf_basic"])
     difference = np.abs(images["gaussian_splat"] - images["volprim_rf_basic"]) * _ERROR_GAIN
     panels = {**images, f"difference x {_ERROR_GAIN}, PSNR {decibels:.1f} dB": difference}
-    picture = np.concatenate([labelled(to_uint8(image), text) for text, image in panels.items()], axis=1)
+    picture = np.concatenate(
+        [labelled(to_uint8(image), text) for text, image in panels.items()], axis=1
+    )
     cv2.imwrite(str(path), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
     return decibels
 
 
-def rendered(gaussians: morgs_mi.Gaussians, camera: morgs_mi.Camera, spp: int) -> dict[str, np.ndarray]:
+def rendered(
+    gaussians: morgs_mi.Gaussians, camera: morgs_mi.Camera, spp: int
+) -> dict[str, np.ndarray]:
     """Return display-referred images [H, W, 3] of the two integrators, by their names."""
     shape = morgs_mi.ellipsoids(gaussians)
     scene = mi.load_dict({"type": "scene", "gaussians": shape, "sensor": camera.square().sensor()})
     images = {}
     for name in ("gaussian_splat", "volprim_rf_basic"):
-        image = np.array(mi.render(scene, integrator=mi.load_dict({"type": name}), spp=spp))[..., :3]
+        image = np.array(mi.render(scene, integrator=mi.load_dict({"type": name}), spp=spp))[
+            ..., :3
+        ]
         images[name] = np.clip(encode_light(image), 0, 1)
     return images
 

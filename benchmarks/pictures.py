@@ -2,7 +2,8 @@
 
     python -m benchmarks.pictures
 
-The clip of `morgs-mi demo` is made in `out/demo/capture` unless it is there. All images show one key view.
+The clip of `morgs-mi demo` is made in `out/demo/capture` unless it is there. All images show one
+key view.
 """
 
 from __future__ import annotations
@@ -54,17 +55,24 @@ def main(options: Options) -> None:
         synthesize(config.scene, options.capture, replace(config.clip, seed=config.stream.seed))
     capture = morgs_mi.load_capture(options.capture)
     loop = StreamLoop.of(capture, config.stream)
-    frames = [[frame.images[v] for v in capture.train_views] for frame in capture.frames(0, options.frame + 1)]
+    frames = [
+        [frame.images[v] for v in capture.train_views]
+        for frame in capture.frames(0, options.frame + 1)
+    ]
     for images in frames[:-1]:
         loop.push(images)
     options.out.mkdir(parents=True, exist_ok=True)
     for name, picture in draw(loop, frames[-1]).items():
         bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
-        cv2.imwrite(str(options.out / f"{name}.jpg"), bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+        cv2.imwrite(
+            str(options.out / f"{name}.jpg"), bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+        )
 
 
 def draw(loop: StreamLoop, images: Sequence[np.ndarray | None]) -> dict[str, np.ndarray]:
-    """Push the next frame and return the image [H, W, 3] of each stage in the key view that changes most, by name."""
+    """Push the next frame and return the image [H, W, 3] of each stage in the key view that changes
+    most, by name.
+    """
     setup = loop.setup
     state = loop.state
     observation = observe_frame(setup, state.frame, state.history, images)
@@ -101,7 +109,9 @@ def draw(loop: StreamLoop, images: Sequence[np.ndarray | None]) -> dict[str, np.
 
 
 def _lifted(gaussians: Gaussians, loop: StreamLoop, observation: FrameObservation) -> Gaussians:
-    """Return the Gaussians after the displacement that explains the flow of the key views best (`lift_flow`)."""
+    """Return the Gaussians after the displacement that explains the flow of the key views best
+    (`lift_flow`).
+    """
     cameras = {v: loop.setup.cameras[v] for v in observation.flows}
     views = full_active_set(gaussians, cameras, loop.setup.config.render).views
     return displaced(gaussians, lift_flow(gaussians, views, observation.flows).displacement)
@@ -112,7 +122,9 @@ def _channel(gaussians: Gaussians, camera: Camera, name: str) -> np.ndarray:
 
 
 def _changed_share(old_state: CodedFrame, new_state: CodedFrame, camera: Camera) -> np.ndarray:
-    """Return the share [H, W, 1] of each pixel that Gaussians have which the residual packet changed."""
+    """Return the share [H, W, 1] of each pixel that Gaussians have which the residual packet
+    changed.
+    """
     rows = {number: row for row, number in enumerate(old_state.ids)}
     same = [
         number in rows and np.array_equal(old_state.grid.values[rows[number]], values)

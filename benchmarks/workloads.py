@@ -1,7 +1,7 @@
 """Workloads of the speed benchmarks: workload files, and balls of Gaussians.
 
-A workload file is an .npz with `means [N,3]`, `quats [N,4]` wxyz, `scales [N,3]`, `opacities [N]`, `colors [N,3]`,
-`K [3,3]`, `viewmat [4,4]`, `width`, `height`.
+A workload file is an .npz with `means [N,3]`, `quats [N,4]` wxyz, `scales [N,3]`, `opacities [N]`,
+`colors [N,3]`, `K [3,3]`, `viewmat [4,4]`, `width`, `height`.
 """
 
 from __future__ import annotations
@@ -19,10 +19,16 @@ TARGET = (0.4, 0.5, 0.6)
 def ball(
     seed: int, count: int, width: int, height: int, median_scale: float, sh_degree: int = 0
 ) -> tuple[Gaussians, Camera]:
-    """Return Gaussians uniform in the unit ball, and a camera at distance 3 that sees 50 degrees horizontally."""
+    """Return Gaussians uniform in the unit ball, and a camera at distance 3 that sees 50 degrees
+    horizontally.
+    """
     rng = np.random.default_rng(seed)
     direction = rng.normal(size=(count, 3))
-    means = direction / np.linalg.norm(direction, axis=1, keepdims=True) * np.cbrt(rng.uniform(size=(count, 1)))
+    means = (
+        direction
+        / np.linalg.norm(direction, axis=1, keepdims=True)
+        * np.cbrt(rng.uniform(size=(count, 1)))
+    )
     sh = 0.1 * rng.normal(size=(count, (sh_degree + 1) ** 2, 3))
     sh[:, 0] = (rng.uniform(size=(count, 3)) - 0.5) / SH_C0
     scales = median_scale * np.exp(0.4 * rng.normal(size=(count, 3)))
@@ -40,7 +46,9 @@ def load(path: Path) -> tuple[Gaussians, Camera]:
 
 
 def write_bin(gaussians: Gaussians, camera: Camera, path: Path) -> None:
-    """Write Gaussians of SH degree 0 and their camera in the binary format that `Yardstick` passes on."""
+    """Write Gaussians of SH degree 0 and their camera in the binary format that `Yardstick` passes
+    on.
+    """
     raw = gaussians.numpy()
     columns = (
         raw["means"],

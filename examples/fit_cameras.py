@@ -10,7 +10,8 @@ mi.set_variant("llvm_ad_rgb")
 import morgs_mi
 
 (output,) = sys.argv[1:]
-# A path-traced clip; yours has a Camera and an image uint8 [H, W, 3] of each view, and points [P, 3] with colours.
+# A path-traced clip; yours has a Camera and an image uint8 [H, W, 3] of each view, and points
+# [P, 3] with colours.
 clip = morgs_mi.SynthConfig(cameras=6, frames=4, width=96, height=72, spp=16)
 capture = morgs_mi.load_capture(morgs_mi.synthesize("spheres", tempfile.mkdtemp() + "/clip", clip))
 views = capture.train_views
@@ -24,7 +25,8 @@ for frame in capture.frames():
 
 print(loop.gaussians)
 held_out = capture.test_views[0]
-image = morgs_mi.rasterize(loop.gaussians, capture.cameras[held_out], ("color", "motion", "confidence"))
+channels = ("color", "motion", "confidence")
+image = morgs_mi.rasterize(loop.gaussians, capture.cameras[held_out], channels)
 row = [
     frame.images[held_out],
     morgs_mi.channel_image("color", image.color),

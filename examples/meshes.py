@@ -10,7 +10,7 @@ import morgs_mi
 from morgs_mi.core.color_space import encode_light
 
 (output,) = sys.argv[1:]
-# A room: Gaussians on a sphere of radius 3 around a glossy and a diffuse ball, with a bright window.
+# A room: Gaussians on a sphere of radius 3 around two balls, with a bright window.
 count = 20_000
 directions = np.random.default_rng(0).normal(size=(count, 3))
 directions /= np.linalg.norm(directions, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Render a file of Gaussians in a Mitsuba scene: python examples/render_ply.py scene.ply render.exr."""
+"""Render a file of Gaussians in Mitsuba: python examples/render_ply.py scene.ply render.exr."""
 
 import sys
 

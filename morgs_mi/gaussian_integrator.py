@@ -2,9 +2,9 @@
 
     "integrator": {"type": "gaussian_splat", "aovs": "motion,depth"}
 
-It draws every `ellipsoids` (and `ellipsoidsmesh`) shape of a scene and reads the attributes that Mitsuba's own
-`volprim_rf_basic` reads: one scene file renders with both. N is the number of Gaussians of a shape,
-K = (degree + 1)^2:
+It draws every `ellipsoids` (and `ellipsoidsmesh`) shape of a scene and reads the attributes that
+Mitsuba's own `volprim_rf_basic` reads: one scene file renders with both. N is the number of
+Gaussians of a shape, K = (degree + 1)^2:
 
     data [N, 10]          centre, standard deviations, quaternion xyzw
     opacities [N, 1]      in [0, 1]
@@ -12,14 +12,16 @@ K = (degree + 1)^2:
     motion [N, 3]         world units per frame; only for the AOV `motion`
     confidence [N, 1]     in [0, 1]; only for the AOV `confidence`
 
-Every attribute of the table of attributes with a `channel` is rendered in the same way as `confidence`.
+Every attribute of the table of attributes with a `channel` is rendered in the same way as
+`confidence`.
 
 With an integrator for `surfaces`, the other shapes of the scene are drawn among the Gaussians:
 
     "integrator": {"type": "gaussian_splat", "surfaces": {"type": "path"}}
 
-`mi.render(scene, params)` is differentiable, in both modes, in these attributes and in the sensor's `to_world`, `x_fov`
-and `principal_point_offset_x`, `_y`; with surfaces rendered by `prb` or similar also in their materials and lights.
+`mi.render(scene, params)` is differentiable, in both modes, in these attributes and in the sensor's
+`to_world`, `x_fov` and `principal_point_offset_x`, `_y`; with surfaces rendered by `prb` or similar
+also in their materials and lights.
 
 Importing this module registers the plugin with the active variant and with every variant set later.
 """
@@ -48,13 +50,15 @@ _PLUGINS = {
 
 
 def ellipsoids(gaussians: ActivatedGaussians) -> dict[str, Any]:
-    """Return the dictionary of an `ellipsoids` shape with a copy of N Gaussians' activated attributes.
+    """Return the dictionary of an `ellipsoids` shape with a copy of N Gaussians' activated
+    attributes.
 
     Optimise the parameters of the scene: gradients do not reach `gaussians`.
 
     Example:
+        >>> integrator = {"type": "gaussian_splat"}
         >>> scene = mi.load_dict({"type": "scene", "gaussians": morgs_mi.ellipsoids(gaussians),
-        ...                       "sensor": camera.sensor(), "integrator": {"type": "gaussian_splat"}})
+        ...                       "sensor": camera.sensor(), "integrator": integrator})
         >>> image = mi.render(scene)
 
     Raises:
@@ -62,17 +66,22 @@ def ellipsoids(gaussians: ActivatedGaussians) -> dict[str, Any]:
     """
     if not hasattr(gaussians, "means") or not int(gaussians.means.shape[0]):
         raise ValueError(
-            f"ellipsoids(): `gaussians` must be at least one Gaussian, got a {type(gaussians).__name__} without any; "
-            "leave the shape out of the scene."
+            "ellipsoids(): `gaussians` must be at least one Gaussian, got a "
+            f"{type(gaussians).__name__} without any; leave the shape out of the scene."
         )
     names = ("means", "scales", "quats", *attribute_widths())
     values = {name: getattr(gaussians, name, None) for name in names}
-    values = {name: np.array(dr.detach(value)) for name, value in values.items() if value is not None}
+    values = {
+        name: np.array(dr.detach(value)) for name, value in values.items() if value is not None
+    }
     means, scales, quats = (values.pop(name) for name in names[:3])
     # Mitsuba expects unit quaternions.
     quats = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-30)
     data = np.concatenate([means, scales, np.roll(quats, -1, axis=1)], axis=1)
-    attributes = {name: from_numpy(mi.TensorXf, value.reshape(len(data), -1)) for name, value in values.items()}
+    attributes = {
+        name: from_numpy(mi.TensorXf, value.reshape(len(data), -1))
+        for name, value in values.items()
+    }
     return {"type": "ellipsoids", "data": from_numpy(mi.TensorXf, data), **attributes}
 
 
@@ -100,8 +109,8 @@ def _refusal(plugin: str, props: Any) -> Any:
 
         def render(self, *_: Any, **__: Any) -> Any:
             raise ValueError(
-                f"{plugin}: expected a variant such as 'llvm_ad_rgb' or 'cuda_ad_rgb', got {variant!r}; call "
-                "mi.set_variant() before the scene is loaded."
+                f"{plugin}: expected a variant such as 'llvm_ad_rgb' or 'cuda_ad_rgb', got "
+                f"{variant!r}; call mi.set_variant() before the scene is loaded."
             )
 
     variant = mi.variant()

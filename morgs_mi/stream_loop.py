@@ -1,8 +1,9 @@
 """The causal loop from the frames of fixed cameras to a stream of residuals.
 
-The first frame is reconstructed and written as a keyframe; every later frame is a gated residual that is guided by the
-optical flow of a few key views. The mathematics is in `method`, the optimisation in `fit`. Encoder and decoder
-cannot drift apart, because the next frame always starts from the decoded packet.
+The first frame is reconstructed and written as a keyframe; every later frame is a gated residual
+that is guided by the optical flow of a few key views. The mathematics is in `method`, the
+optimisation in `fit`. Encoder and decoder cannot drift apart, because the next frame always starts
+from the decoded packet.
 """
 
 from __future__ import annotations
@@ -54,13 +55,16 @@ _LOG = logging.getLogger(__name__)
 class StreamState:
     """State that one frame hands to the next.
 
-    It follows from the stream and the recording. An interrupted fit can therefore be resumed exactly (see `recording`).
+    It follows from the stream and the recording. An interrupted fit can therefore be resumed
+    exactly (see `recording`).
     """
 
     frame: int = 0  #: Index of the next frame.
-    coded: CodedFrame | None = None  #: State of a decoder after the last frame; None before the first.
+    #: State of a decoder after the last frame; None before the first.
+    coded: CodedFrame | None = None
     history: ImageHistory = field(default_factory=ImageHistory)  #: Images up to the last frame.
-    correction: Correction = field(default_factory=Correction)  #: Of the images to the colours of the scene.
+    #: Of the images to the colours of the scene.
+    correction: Correction = field(default_factory=Correction)
 
     @property
     def gaussians(self) -> Gaussians | None:
@@ -76,24 +80,32 @@ def step(
     progress: Report | None = None,
     on_provisional: Callable[[Packet], None] | None = None,
 ) -> tuple[StreamState, Packet, FrameReport]:
-    """Fit one frame and return (state, packet, report). The function is pure: all state is returned.
+    """Fit one frame and return (state, packet, report). The function is pure: all state is
+    returned.
 
     Args:
         setup: data that all frames share, as from `prepare`.
         state: as returned for the last frame; `StreamState()` before the first.
-        images: per training view an image [H, W, 3], RGB, or None where the view has none: uint8 in sRGB, linear light
-            as a float array or a `mi.TensorXf`, or a `mi.Bitmap`, whose flag `srgb_gamma` counts. They are copied.
-            Alternatively, the result of `observe_frame` for them.
-        progress: called with (stage, done, total): the stages of the first frame, or the steps of a later one.
+        images: per training view an image [H, W, 3], RGB, or None where the view has none: uint8 in
+            sRGB, linear light as a float array or a `mi.TensorXf`, or a `mi.Bitmap`, whose flag
+            `srgb_gamma` counts. They are copied. Alternatively, the result of `observe_frame` for
+            them.
+        progress: called with (stage, done, total): the stages of the first frame, or the steps of a
+            later one.
         on_provisional: called with provisional keyframes while the first frame is fitted.
 
     Raises:
-        ValueError: an image has another size or type than its camera, or the first frame has no image at all.
+        ValueError: an image has another size or type than its camera, or the first frame has no
+            image at all.
     """
     start = time.perf_counter()
     frame = state.frame
     frame_progress = Progress(progress, f"Frame {frame}")
-    observed = images if isinstance(images, FrameObservation) else observe_frame(setup, frame, state.history, images)
+    observed = (
+        images
+        if isinstance(images, FrameObservation)
+        else observe_frame(setup, frame, state.history, images)
+    )
     if state.coded is None:
         fitted = fitted_first_frame(setup, observed, frame_progress, on_provisional)
     else:
@@ -106,7 +118,11 @@ def step(
         losses=fitted.losses,
         num_gaussians=len(coded),
         status=_status(setup, state, observed.history.images, fitted.status),
-        missing_views=tuple(camera.name for v, camera in enumerate(setup.cameras) if v not in observed.history.images),
+        missing_views=tuple(
+            camera.name
+            for v, camera in enumerate(setup.cameras)
+            if v not in observed.history.images
+        ),
         active=fitted.active,
         validation=fitted.validation,
         steps=fitted.steps,
@@ -116,31 +132,40 @@ def step(
 
 
 def _status(setup: Setup, state: StreamState, images: Images, status: str) -> str:
-    """Return the status of a frame with the problems of its images, which are logged in the first frame."""
+    """Return the status of a frame with the problems of its images, which are logged in the first
+    frame.
+    """
     problems = image_status([camera.name for camera in setup.cameras], state.history.images, images)
     for problem in problems if state.coded is None else ():
         _LOG.warning("frame 0: %s", problem)
     return "; ".join([*([] if status == "ok" else [status]), *problems]) or "ok"
 
 
-def _fit_later_frame(setup: Setup, state: StreamState, observed: FrameObservation, progress: Progress) -> FittedFrame:
+def _fit_later_frame(
+    setup: Setup, state: StreamState, observed: FrameObservation, progress: Progress
+) -> FittedFrame:
     """Return the fit of a later frame; numbers in brackets are the paper's equations."""
     assert state.coded is not None
     config = setup.config
     motion = config.motion
     images = observed.history.images
-    rng = rng_of(config.seed, Stream.LATER_FRAMES, state.frame)  # of its own for each frame: it is no state
+    # A new generator for each frame, so that it is no state.
+    rng = rng_of(config.seed, Stream.LATER_FRAMES, state.frame)
     previous = state.coded.gaussians
-    if state.frame == 1:  # the masks of frame 0 need the flow to this frame
-        previous = with_first_confidence(setup, previous, state.history.images, observed.flows, rng)  # (9-11)
+    if state.frame == 1:
+        # The masks of frame 0 need the flow to this frame (eqs. 9-11).
+        previous = with_first_confidence(setup, previous, state.history.images, observed.flows, rng)
     observations = observe(observed.key_views, motion, config.fit.objective)
     active = _active_set(setup, previous, images, observed.changes, observations)
     corrected = state.correction.corrected({view: observed.encoded[view] for view in active.views})
     targets = {view: Target(image, setup.masks[view]) for view, image in corrected.items()}
-    initial = initial_motion(previous, active, observed.flows, targets, motion, rng)  # motion (5)
+    initial = initial_motion(previous, active, observed.flows, targets, motion, rng)  # eq. 5
     problem = FrameProblem(previous, active, targets, observations, initial, setup.extent)
-    fitted = fit_later_frame(problem, config.fit, motion, rng, progress)  # residual (6-8, 12), objective (13)
-    packet = residual_packet(state.coded, fitted.gaussians, fitted.source, setup.cameras, config.codec)  # (3)
+    # Residual (eqs. 6-8, 12) and objective (eq. 13).
+    fitted = fit_later_frame(problem, config.fit, motion, rng, progress)
+    # The next frame starts from what a decoder reads (eq. 3).
+    coder = config.codec
+    packet = residual_packet(state.coded, fitted.gaussians, fitted.source, setup.cameras, coder)
     return FittedFrame(
         packet=packet,
         correction=state.correction,
@@ -164,7 +189,9 @@ def _active_set(
     if changes is None:
         return full_active_set(gaussians, cameras, config.render)
     channels = {v: channels_of(observations.get(v, {}), config.fit.objective) for v in cameras}
-    return find_active_set(gaussians, cameras, changes, channels, config.render, config.motion.active_set)
+    return find_active_set(
+        gaussians, cameras, changes, channels, config.render, config.motion.active_set
+    )
 
 
 class StreamLoop:
@@ -174,21 +201,23 @@ class StreamLoop:
 
     Args:
         cameras: the training views.
-        points: SfM points [P, 3], world units; fewer than 20 are replaced by random ones inside the views.
+        points: SfM points [P, 3], world units; fewer than 20 are replaced by random ones inside the
+            views.
         point_colors: [P, 3], encoded: 1 is white.
         config: settings.
         masks: per view [H, W] bool of valid pixels, or None.
-        display_exposure: stops by which images in linear light are brightened where flow and changes are computed,
-            which see 8 bits; None: if any light of the first frame exceeds 1, the 99th percentile becomes 1.
+        display_exposure: stops by which images in linear light are brightened where flow and
+            changes are computed, which see 8 bits; None: if any light of the first frame exceeds 1,
+            the 99th percentile becomes 1.
 
     Example:
         >>> loop = morgs_mi.StreamLoop(cameras, points, point_colors)
-        >>> for images in frames:  # per frame one image [H, W, 3] per camera: uint8, or linear light in floats
+        >>> for images in frames:  # an image [H, W, 3] per camera: uint8, or linear light
         ...     packet, report = loop.push(images)
 
     Raises:
-        ValueError: no cameras, points that are not finite, colours of another range or shape, or a mask of
-            another shape than its view.
+        ValueError: no cameras, points that are not finite, colours of another range or shape, or a
+            mask of another shape than its view.
     """
 
     def __init__(
@@ -202,7 +231,8 @@ class StreamLoop:
     ) -> None:
         self.setup = prepare(cameras, points, point_colors, config, masks, display_exposure)
         self.state = StreamState()
-        self._next_observation: tuple[int, Future[FrameObservation]] | None = None  # of the next frame, with its index
+        # Of the next frame, with its index.
+        self._next_observation: tuple[int, Future[FrameObservation]] | None = None
 
     @classmethod
     def of(cls, capture: Recorded, config: StreamConfig | None = None) -> StreamLoop:
@@ -215,10 +245,15 @@ class StreamLoop:
         views = capture.train_views
         cameras = [capture.cameras[v] for v in views]
         masks = [capture.masks[v] for v in views]
-        return cls(cameras, capture.points, capture.point_colors, config, masks, capture.display_exposure)
+        return cls(
+            cameras, capture.points, capture.point_colors, config, masks, capture.display_exposure
+        )
 
     def __repr__(self) -> str:
-        return f"StreamLoop({len(self.setup.cameras)} cameras, frame {self.state.frame} is next, {self.gaussians})"
+        return (
+            f"StreamLoop({len(self.setup.cameras)} cameras, frame {self.state.frame} is next, "
+            f"{self.gaussians})"
+        )
 
     @property
     def gaussians(self) -> Gaussians | None:
@@ -239,20 +274,28 @@ class StreamLoop:
         Args:
             images: as for `step`.
             progress: as for `step`.
-            upcoming: images of the frame after it, if they are there already: their optical flow is computed while
-                this frame is fitted. They change nothing else.
-            recorded: images with which the next frame's images are compared, if not with `images`: for the first
-                frame, where `images` are interpolated because cameras have delays.
+            upcoming: images of the frame after it, if they are there already: their optical flow is
+                computed while this frame is fitted. They change nothing else.
+            recorded: images with which the next frame's images are compared, if not with `images`:
+                for the first frame, where `images` are interpolated because cameras have delays.
             on_provisional: as for `step`.
         """
         start = time.perf_counter()
         frame = self.state.frame
         previous = self.state.history
-        observed = self._observed_ahead(images) or observe_frame(self.setup, frame, previous, images)
-        history = observed.history if recorded is None else extended_history(self.setup, frame, previous, recorded)
+        observed = self._observed_ahead(images) or observe_frame(
+            self.setup, frame, previous, images
+        )
+        history = (
+            observed.history
+            if recorded is None
+            else extended_history(self.setup, frame, previous, recorded)
+        )
         if upcoming is not None:
             copies = [None if image is None else np.array(as_array(image)) for image in upcoming]
-            observation = in_background(partial(observe_frame, self.setup, frame + 1, history, copies))
+            observation = in_background(
+                partial(observe_frame, self.setup, frame + 1, history, copies)
+            )
             self._next_observation = frame + 1, observation
         state, packet, report = step(self.setup, self.state, observed, progress, on_provisional)
         self.state = replace(state, history=history)
@@ -267,7 +310,9 @@ class StreamLoop:
         observed = task[1].result()
         present = {v: as_array(image) for v, image in enumerate(images) if image is not None}
         same_views = present.keys() == observed.recorded.keys()
-        same = same_views and all(np.array_equal(image, observed.recorded[v]) for v, image in present.items())
+        same = same_views and all(
+            np.array_equal(image, observed.recorded[v]) for v, image in present.items()
+        )
         return observed if same else None
 
     def resume(
@@ -280,8 +325,8 @@ class StreamLoop:
 
         Args:
             coded: state of the stream after that frame.
-            frames: images of all frames up to it, as for `push`; the last frame suffices without `skip_static` and
-                `exposure`, if they have 8 bits or the display exposure is given.
+            frames: images of all frames up to it, as for `push`; the last frame suffices without
+                `skip_static` and `exposure`, if they have 8 bits or the display exposure is given.
             exposures: in the report of the first frame.
         """
         history = ImageHistory()

@@ -1,8 +1,9 @@
-"""A still life under a swinging lamp with a flickering exposure: the light changes everywhere, and few objects move.
+"""A still life under a swinging lamp with a flickering exposure: the light changes everywhere, and
+few objects move.
 
-From frame to frame every pixel becomes brighter or darker by up to a tenth in linear light, and shadows move by several
-pixels, while a few slow objects move by 1 to 4 pixels per frame at 320x240. Changes of shadow and light are not motion
-in the ground truth.
+From frame to frame every pixel becomes brighter or darker by up to a tenth in linear light, and
+shadows move by several pixels, while a few slow objects move by 1 to 4 pixels per frame at 320x240.
+Changes of shadow and light are not motion in the ground truth.
 """
 
 from __future__ import annotations
@@ -23,7 +24,10 @@ def build(seed: int = 0) -> Scene:
     plum = _paint(seed + 44, (0.48, 0.16, 0.40), (0.70, 0.52, 0.60))
     objects = {
         **room(seed),
-        "column": Object({"side": rod((1.2, 0, -0.7), (1.2, 1.1, -0.7), 0.26, stone)} | _top(1.2, 1.1, -0.7, stone)),
+        "column": Object(
+            {"side": rod((1.2, 0, -0.7), (1.2, 1.1, -0.7), 0.26, stone)}
+            | _top(1.2, 1.1, -0.7, stone)
+        ),
         "stack": Object(
             {
                 "low": box((-1.2, 0.22, -0.5), (0.42, 0.22, 0.36), slate),
@@ -36,7 +40,12 @@ def build(seed: int = 0) -> Scene:
         "slider": Object({"block": box((0, 0, 0), (0.16, 0.16, 0.16), moss)}, sliding),
     }
     lamps = lights()
-    return Scene("flicker", objects, {**lamps, "lamp": Light(lamps["lamp"].shape, swinging)}, exposure=flickering)
+    return Scene(
+        "flicker",
+        objects,
+        {**lamps, "lamp": Light(lamps["lamp"].shape, swinging)},
+        exposure=flickering,
+    )
 
 
 def turning(time: float) -> np.ndarray:
@@ -56,7 +65,7 @@ def sliding(time: float) -> np.ndarray:
 
 
 def swinging(time: float) -> np.ndarray:
-    """Return the pose of the lamp, which swings about the vertical axis through the room's centre."""
+    """Return the pose of the lamp, which swings about the vertical through the room's centre."""
     return rotate("y", 0.45 * np.sin(3.0 * time))
 
 

@@ -1,9 +1,10 @@
-"""A random scene for each seed, with its own rig and noise: it tests methods that are tuned to the other scenes.
+"""A random scene for each seed, with its own rig and noise: it tests methods that are tuned to the
+other scenes.
 
-The seed draws the objects, their motion, textures, lights, the rig and the noise. `draw_scene` draws everything but the
-colours, without Mitsuba; `build` adds walls, textures and lights. Objects never touch one another: their swept boxes
-are disjoint. The speed of an object is the speed of its fastest point in the held-out view, in pixels per frame at
-320x240 and 30 frames per second.
+The seed draws the objects, their motion, textures, lights, the rig and the noise. `draw_scene`
+draws everything but the colours, without Mitsuba; `build` adds walls, textures and lights. Objects
+never touch one another: their swept boxes are disjoint. The speed of an object is the speed of its
+fastest point in the held-out view, in pixels per frame at 320x240 and 30 frames per second.
 """
 
 from __future__ import annotations
@@ -17,7 +18,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.studio.synth.scene import Light, Object, RecordingDefaults, Rig, Scene, rotate, translate
+from morgs_mi.studio.synth.scene import (
+    Light,
+    Object,
+    RecordingDefaults,
+    Rig,
+    Scene,
+    rotate,
+    translate,
+)
 from morgs_mi.studio.synth.shapes import ball, box, disk, rod
 from morgs_mi.studio.synth.textures import lights, pattern, room, textured
 
@@ -53,7 +62,8 @@ class Solid:
         kind: the shape's name.
         points: centres of spheres that enclose it [P, 3], world units.
         margin: radius of the spheres.
-        parts: returns Mitsuba shapes by name, given a function from a texture's aspect ratio to a material.
+        parts: returns Mitsuba shapes by name, given a function from a texture's aspect ratio to a
+            material.
     """
 
     kind: str
@@ -110,7 +120,11 @@ def build(seed: int = 0) -> Scene:
     }
     objects = {name: _object(body, rng) for name, body in random_scene.bodies.items()}
     return Scene(
-        "random", walls | objects, _lights(rng, random_scene.swing), random_scene.rig, recording=random_scene.recording
+        "random",
+        walls | objects,
+        _lights(rng, random_scene.swing),
+        random_scene.rig,
+        recording=random_scene.recording,
     )
 
 
@@ -126,7 +140,9 @@ def draw_scene(seed: int) -> RandomScene:
     bodies: dict[str, Body] = {}
 
     def fits(bounds: np.ndarray) -> bool:
-        free = _inside(bounds, half_width) and not any(_touch(bounds, body.bounds) for body in bodies.values())
+        free = _inside(bounds, half_width) and not any(
+            _touch(bounds, body.bounds) for body in bodies.values()
+        )
         return free and _seen(bounds, cameras)
 
     pace = _log_uniform(rng, 3.0, 10.0)
@@ -186,10 +202,16 @@ def _place(
             continue
         if motion == "static":
             return Body(solid, motion, 0.0, _pose(place, path, 0.0, 0.0), bounds)
-        speed = rng.uniform(*THIN_SPEEDS) if thin else float(np.clip(pace * _log_uniform(rng, 0.7, 1.4), *SPEEDS))
+        speed = (
+            rng.uniform(*THIN_SPEEDS)
+            if thin
+            else float(np.clip(pace * _log_uniform(rng, 0.7, 1.4), *SPEEDS))
+        )
         rate = speed * FPS / _peak(camera, solid, place, path)
         if rate <= MAX_RATE:
-            return Body(solid, motion, speed, _pose(place, path, rng.uniform(-0.9, 0.1), rate), bounds)
+            return Body(
+                solid, motion, speed, _pose(place, path, rng.uniform(-0.9, 0.1), rate), bounds
+            )
     return None
 
 
@@ -218,7 +240,9 @@ def _plate(rng: np.random.Generator) -> Solid:
 
 
 def _block(kind: str, half: np.ndarray) -> Solid:
-    return Solid(kind, _corners(half), 0.0, lambda paint: {kind: box((0, 0, 0), half.tolist(), paint(1))})
+    return Solid(
+        kind, _corners(half), 0.0, lambda paint: {kind: box((0, 0, 0), half.tolist(), paint(1))}
+    )
 
 
 def _column(rng: np.random.Generator) -> Solid:
@@ -228,7 +252,9 @@ def _column(rng: np.random.Generator) -> Solid:
     def parts(paint: Paint) -> Shapes:
         side = paint(half / (np.pi * radius))
         end = paint(1)
-        ends = {name: disk((0, y, 0), radius, end) for name, y in (("top", half), ("bottom", -half))}
+        ends = {
+            name: disk((0, y, 0), radius, end) for name, y in (("top", half), ("bottom", -half))
+        }
         return {"side": rod((0, -half, 0), (0, half, 0), radius, side), **ends}
 
     return Solid("column", _corners(np.array([radius, half, radius])), 0.0, parts)
@@ -242,7 +268,11 @@ def _dumbbell(rng: np.random.Generator) -> Solid:
 def _cross(rng: np.random.Generator) -> Solid:
     half = rng.uniform(0.25, 0.42)
     thickness = rng.uniform(0.04, 0.09)
-    beams = {"x": (half, thickness, thickness), "y": (thickness, half, thickness), "z": (thickness, thickness, half)}
+    beams = {
+        "x": (half, thickness, thickness),
+        "y": (thickness, half, thickness),
+        "z": (thickness, thickness, half),
+    }
 
     def parts(paint: Paint) -> Shapes:
         return {axis: box((0, 0, 0), beam, paint(1)) for axis, beam in beams.items()}
@@ -262,8 +292,15 @@ def _bar(kind: str, low: float, high: float, radius: float, knob: float) -> Soli
     """Return an upright bar with a ball at either end."""
 
     def parts(paint: Paint) -> Shapes:
-        ends = {name: ball(knob, paint(1), (0, y, 0)) for name, y in (("bottom", low), ("top", high))}
-        return {"bar": rod((0, low, 0), (0, high, 0), radius, paint((high - low) / (2 * np.pi * radius))), **ends}
+        ends = {
+            name: ball(knob, paint(1), (0, y, 0)) for name, y in (("bottom", low), ("top", high))
+        }
+        return {
+            "bar": rod(
+                (0, low, 0), (0, high, 0), radius, paint((high - low) / (2 * np.pi * radius))
+            ),
+            **ends,
+        }
 
     return Solid(kind, np.array([[0, low, 0], [0, high, 0]]), knob, parts)
 
@@ -271,12 +308,21 @@ def _bar(kind: str, low: float, high: float, radius: float, knob: float) -> Soli
 def _pendulum(rng: np.random.Generator) -> Solid:
     length = rng.uniform(0.5, 1.0)
     string = rng.uniform(0.015, 0.03)
-    half = rng.uniform(0.10, 0.24) * np.ones(3) if rng.random() < 0.5 else rng.uniform(0.08, 0.22, 3)
+    half = (
+        rng.uniform(0.10, 0.24) * np.ones(3) if rng.random() < 0.5 else rng.uniform(0.08, 0.22, 3)
+    )
     round_bob = half[0] == half[1]
 
     def parts(paint: Paint) -> Shapes:
-        bob = ball(half[0], paint(1), (0, -length, 0)) if round_bob else box((0, -length, 0), half.tolist(), paint(1))
-        return {"string": rod((0, 0, 0), (0, -length, 0), string, paint(length / (2 * np.pi * string))), "bob": bob}
+        bob = (
+            ball(half[0], paint(1), (0, -length, 0))
+            if round_bob
+            else box((0, -length, 0), half.tolist(), paint(1))
+        )
+        return {
+            "string": rod((0, 0, 0), (0, -length, 0), string, paint(length / (2 * np.pi * string))),
+            "bob": bob,
+        }
 
     points = np.concatenate([np.zeros((1, 3)), _corners(half) - [0, length, 0]])
     return Solid("pendulum", points, string, parts)
@@ -298,11 +344,17 @@ def _path(rng: np.random.Generator, motion: str, solid: Solid) -> tuple[Path, bo
         return lambda s: np.broadcast_to(attitude, (*np.shape(s), 4, 4)), False
     if motion == "slide":
         # A ball rolls; others turn a little.
-        turn = np.cross(Y, direction) / solid.margin if solid.kind == "ball" else rng.uniform(-1, 1) * Y
+        turn = (
+            np.cross(Y, direction) / solid.margin
+            if solid.kind == "ball"
+            else rng.uniform(-1, 1) * Y
+        )
 
         def slide(s: Any) -> np.ndarray:
             way = reach * np.sin(s)
-            return _rigid(np.multiply.outer(way, direction), np.multiply.outer(way, turn)) @ attitude
+            return (
+                _rigid(np.multiply.outer(way, direction), np.multiply.outer(way, turn)) @ attitude
+            )
 
         return slide, free
     if motion == "spin":
@@ -325,14 +377,18 @@ def _path(rng: np.random.Generator, motion: str, solid: Solid) -> tuple[Path, bo
     return bounce, False
 
 
-def _pose(place: np.ndarray, path: Path, start: float, rate: float) -> Callable[[float], np.ndarray]:
+def _pose(
+    place: np.ndarray, path: Path, start: float, rate: float
+) -> Callable[[float], np.ndarray]:
     return lambda time: place @ path(start + rate * time)
 
 
 def _sweep(solid: Solid, path: Path) -> np.ndarray:
     """Return the corners [2, 3] of the box that a solid sweeps."""
     points = _move(path(PHASES), solid.points)
-    return np.stack([points.min(axis=(0, 1)) - solid.margin, points.max(axis=(0, 1)) + solid.margin])
+    return np.stack(
+        [points.min(axis=(0, 1)) - solid.margin, points.max(axis=(0, 1)) + solid.margin]
+    )
 
 
 def _peak(camera: Camera, solid: Solid, place: np.ndarray, path: Path) -> float:
@@ -368,7 +424,9 @@ def _move(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _rigid(shift: np.ndarray | float, turn: np.ndarray) -> np.ndarray:
-    """Return rotations about the vectors `turn` [..., 3] by their lengths in radians, then shifts, as [..., 4, 4]."""
+    """Return rotations about the vectors `turn` [..., 3] by their lengths in radians, then shifts,
+    as [..., 4, 4].
+    """
     matrix = np.broadcast_to(np.eye(4), (*turn.shape[:-1], 4, 4)).copy()
     matrix[..., :3, :3] = Rotation.from_rotvec(turn).as_matrix()
     matrix[..., :3, 3] = shift
@@ -380,12 +438,20 @@ def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 def _object(body: Body, rng: np.random.Generator) -> Object:
-    """Return a body with textures; the shapes of a static one, which has no pose, are placed in the world."""
+    """Return a body with textures; the shapes of a static one, which has no pose, are placed in the
+    world.
+    """
     import mitsuba as mi
 
     texture = _texture(rng, (2, 4, 8), (4, 24))
-    roughness = rng.uniform(0.2, 0.4) if body.solid.kind in ("ball", "box") and rng.random() < 0.25 else None
-    shapes = body.solid.parts(lambda aspect: textured(texture, roughness, (1, max(1, round(aspect)))))
+    roughness = (
+        rng.uniform(0.2, 0.4)
+        if body.solid.kind in ("ball", "box") and rng.random() < 0.25
+        else None
+    )
+    shapes = body.solid.parts(
+        lambda aspect: textured(texture, roughness, (1, max(1, round(aspect))))
+    )
     if body.motion != "static":
         return Object(shapes, body.pose)
     to_world = mi.ScalarTransform4f(body.pose(0))
@@ -400,8 +466,12 @@ def _wall(rng: np.random.Generator) -> dict[str, Any]:
     return textured(_texture(rng, (4, 8, 10, 16), (8, 60)))
 
 
-def _texture(rng: np.random.Generator, cells: tuple[int, ...], finest: tuple[float, float]) -> np.ndarray:
-    """Return a reflectance texture: fine or smooth, with or without a checker, of strong or weak contrast."""
+def _texture(
+    rng: np.random.Generator, cells: tuple[int, ...], finest: tuple[float, float]
+) -> np.ndarray:
+    """Return a reflectance texture: fine or smooth, with or without a checker, of strong or weak
+    contrast.
+    """
     hue = rng.random()
     first = _color(rng, hue)
     second = first if rng.random() < 0.4 else _color(rng, hue + rng.normal(0, 0.2))
@@ -416,7 +486,9 @@ def _color(rng: np.random.Generator, hue: float) -> tuple[float, float, float]:
 
 
 def _lights(rng: np.random.Generator, swing: float) -> dict[str, Light]:
-    """Return the lamps of `textures.lights`, turned about the vertical axis, with other strengths and tints."""
+    """Return the lamps of `textures.lights`, turned about the vertical axis, with other strengths
+    and tints.
+    """
     side = rng.uniform(-1.2, 0.4)
     rate = rng.uniform(2, 5)
     phase = rng.uniform(-0.9, 0.1)

@@ -1,7 +1,8 @@
 """Thin, fast objects: a propeller, a rope, pendulums and a baton, 4 to 9 pixels wide at 320x240.
 
-Their tips move by 8 to 12 pixels per frame, more than their width, so the regions that a tip covers in successive
-frames hardly overlap. The rope is a chain of rigid links, each hinged to the previous one.
+Their tips move by 8 to 12 pixels per frame, more than their width, so the regions that a tip covers
+in successive frames hardly overlap. The rope is a chain of rigid links, each hinged to the previous
+one.
 """
 
 from __future__ import annotations
@@ -37,33 +38,49 @@ def build(seed: int = 0) -> Scene:
     objects = {
         **room(seed),
         "mast": Object({"pole": rod((MAST[0], 0, MAST[2]), MAST, 0.04, steel)}),
-        **{f"blade{k}": Object({"blade": blade}, partial(propeller, blade=k)) for k in range(BLADES)},
+        **{
+            f"blade{k}": Object({"blade": blade}, partial(propeller, blade=k))
+            for k in range(BLADES)
+        },
         "hub": Object({"hub": ball(0.075, steel)}, propeller),
         **{
             f"link{k}": Object(
-                {"link": rod((0, 0, 0), (0, -LINK, 0), 0.026, hemp), "knot": ball(0.036, hemp)}, partial(link, index=k)
+                {"link": rod((0, 0, 0), (0, -LINK, 0), 0.026, hemp), "knot": ball(0.036, hemp)},
+                partial(link, index=k),
             )
             for k in range(LINKS)
         },
         "pendulum": _pendulum(blue, wood, pendulum),
         "far_pendulum": _pendulum(green, wood, far_pendulum),
-        "baton": Object({"stick": rod((-0.38, 0, 0), (0.38, 0, 0), 0.026, wood), **_ends(0.38, red)}, baton),
+        "baton": Object(
+            {"stick": rod((-0.38, 0, 0), (0.38, 0, 0), 0.026, wood), **_ends(0.38, red)}, baton
+        ),
     }
     return Scene("thin", objects, lights())
 
 
 def propeller(time: float, blade: int = 0) -> np.ndarray:
-    """Return the pose of a blade, which spins at 5.2 rad/s about a tilted axis; its pitch is 25 degrees."""
-    turn = rotate("y", 0.35) @ rotate("x", -0.15) @ rotate("z", 5.2 * time + 2 * np.pi * blade / BLADES)
+    """Return the pose of a blade, which spins at 5.2 rad/s about a tilted axis; its pitch is 25
+    degrees.
+    """
+    turn = (
+        rotate("y", 0.35)
+        @ rotate("x", -0.15)
+        @ rotate("z", 5.2 * time + 2 * np.pi * blade / BLADES)
+    )
     return translate(MAST[0], MAST[1] + 0.05, MAST[2] + 0.12) @ turn @ rotate("x", 0.44)
 
 
 def link(time: float, index: int) -> np.ndarray:
-    """Return the pose of a link of the rope: a travelling wave with an amplitude that grows towards the end."""
+    """Return the pose of a link of the rope: a travelling wave with an amplitude that grows towards
+    the end.
+    """
     pose = translate(*HOOK)
     for k in range(index + 1):
         wave = 4.4 * time - 0.55 * k
-        bend = rotate("z", (0.10 + 0.05 * k) * np.sin(wave)) @ rotate("x", 0.12 * np.sin(0.7 * wave))
+        bend = rotate("z", (0.10 + 0.05 * k) * np.sin(wave)) @ rotate(
+            "x", 0.12 * np.sin(0.7 * wave)
+        )
         pose = pose @ (translate(0, -LINK, 0) if k else np.eye(4)) @ bend
     return pose
 
@@ -87,7 +104,11 @@ def baton(time: float) -> np.ndarray:
 
 def _pendulum(string: dict, bob: dict, pose: Callable[[float], np.ndarray]) -> Object:
     return Object(
-        {"rod": rod((0, 0, 0), (0, -STRING, 0), 0.024, string), "bob": ball(0.07, bob, (0, -STRING, 0))}, pose
+        {
+            "rod": rod((0, 0, 0), (0, -STRING, 0), 0.024, string),
+            "bob": ball(0.07, bob, (0, -STRING, 0)),
+        },
+        pose,
     )
 
 
@@ -95,6 +116,10 @@ def _ends(half: float, material: dict) -> dict[str, dict]:
     return {name: ball(0.05, material, (x, 0, 0)) for name, x in (("left", -half), ("right", half))}
 
 
-def _paint(seed: int, first: RGB = (0.24, 0.26, 0.30), second: RGB = (0.66, 0.64, 0.58), repeat: float = 1) -> dict:
-    """Return a material for a rod `repeat` times as long as its circumference; its squares show motion along it."""
+def _paint(
+    seed: int, first: RGB = (0.24, 0.26, 0.30), second: RGB = (0.66, 0.64, 0.58), repeat: float = 1
+) -> dict:
+    """Return a material for a rod `repeat` times as long as its circumference; its squares show
+    motion along it.
+    """
     return textured(pattern(seed, first, second, 4, 8), repeat=(1, repeat))

@@ -1,4 +1,6 @@
-"""One Mitsuba variant for all tests, a capture with a stream that reproduces it exactly, and one of textured planes."""
+"""One Mitsuba variant for all tests, a capture with a stream that reproduces it exactly, and one of
+textured planes.
+"""
 
 from __future__ import annotations
 
@@ -48,20 +50,30 @@ def new_attributes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def fitted_clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a capture, its ground truth and its stream; all images are rendered from the stream."""
+    """A folder with a capture, its ground truth and its stream; all images are rendered from the
+    stream.
+    """
     folder = tmp_path_factory.mktemp("clip")
     write_colmap(folder / "capture" / "sparse", CAMERAS)
     for camera in CAMERAS:
         images = [rasterize(moved(t), camera) for t in range(FRAMES)]
-        write_video(folder / "capture" / camera.name, [to_uint8(np.array(i.color)) for i in images], 25)
+        write_video(
+            folder / "capture" / camera.name, [to_uint8(np.array(i.color)) for i in images], 25
+        )
         for t, image in enumerate(images):
             covered = np.array(image.alpha)[..., 0] > 0
             motion = covered[..., None] * np.float32([PIXELS, 0]) * (t > 0)
-            truth = GroundTruth(motion, np.float32(DISTANCE * covered), np.where(covered, 0, -1), covered)
+            truth = GroundTruth(
+                motion, np.float32(DISTANCE * covered), np.where(covered, 0, -1), covered
+            )
             save_truth(folder / "capture" / "truth", camera.name, t, truth)
     steps = np.arange(FRAMES)[:, None] * (STEP, 0, 0)
     corners = np.array([(0.0, 0, 0), (1, 0, 0), (0, 1, 0)])
-    np.savez(folder / "capture" / "truth" / "tracks.npz", points=corners[:, None] + steps, ids=np.zeros(3, np.int32))
+    np.savez(
+        folder / "capture" / "truth" / "tracks.npz",
+        points=corners[:, None] + steps,
+        ids=np.zeros(3, np.int32),
+    )
     metadata = {"capture": str(folder / "capture"), "downscale": 1, "test_view": 0}
     write_stream(folder / "stream.morgs", metadata)
     rows = [{"frame": t, "seconds": 3.0 - t} for t in range(FRAMES)]

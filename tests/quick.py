@@ -1,7 +1,7 @@
 """The quick configuration of tests that fit a stream; a test changes what it is about.
 
-It fits 80 Gaussians in eight steps and one epoch per later frame, without density control: enough for a test that asks
-what a fit writes, and not for one that asks how good it is.
+It fits 80 Gaussians in eight steps and one epoch per later frame, without density control: enough
+for a test that asks what a fit writes, and not for one that asks how good it is.
 """
 
 from __future__ import annotations
@@ -17,7 +17,12 @@ from morgs_mi.render.render_config import RenderConfig
 
 NO_DENSITY = DensityConfig(rounds=0, later_frames=False)
 FIT = FitConfig(
-    sh_degree=0, num_gaussians=80, first_frame_steps=8, confidence_steps=4, epochs=1, density=DensityConfig(rounds=0)
+    sh_degree=0,
+    num_gaussians=80,
+    first_frame_steps=8,
+    confidence_steps=4,
+    epochs=1,
+    density=DensityConfig(rounds=0),
 )
 MOTION = MotionConfig(key_views=1)
 REPRODUCIBLE = RenderConfig(reproducible=True)

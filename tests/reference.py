@@ -1,8 +1,8 @@
 """Slow float64 reference implementations of the package's mathematics.
 
-They loop over all Gaussians and pixels, without blocks, early stop or rounding tricks. All of them are analytic in
-their floating-point inputs apart from the documented cut-offs, which depend on real parts only. So `complex_step`
-returns derivatives that are exact to rounding.
+They loop over all Gaussians and pixels, without blocks, early stop or rounding tricks. All of them
+are analytic in their floating-point inputs apart from the documented cut-offs, which depend on real
+parts only. So `complex_step` returns derivatives that are exact to rounding.
 """
 
 from __future__ import annotations
@@ -15,11 +15,19 @@ from morgs_mi import Camera
 SH_C0 = 0.28209479177387814
 SH_C1 = 0.4886025119029199
 SH_C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
-SH_C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+SH_C3 = (
+    0.5900435899266435,
+    2.890611442640554,
+    0.4570457994644658,
+    0.3731763325901154,
+    1.445305721320277,
+)
 
 
 def sh_basis(d: NDArray, degree: int) -> list:
-    """Return the real spherical harmonics with 3DGS's signs, up to degree 3, of a unit direction [3]."""
+    """Return the real spherical harmonics with 3DGS's signs, up to degree 3, of a unit direction
+    [3].
+    """
     x, y, z = d
     basis = [SH_C0 + 0 * x]
     if degree > 0:
@@ -71,18 +79,22 @@ def rasterize(
     depth_limit: NDArray | None = None,
     antialiased: bool = False,
 ) -> dict[str, NDArray]:
-    """Blend raw Gaussian attributes (as `Gaussians.numpy()` returns them) over every pixel, nearest first.
+    """Blend raw Gaussian attributes (as `Gaussians.numpy()` returns them) over every pixel, nearest
+    first.
 
     With a depth limit [H, W], only what lies in front of it.
 
-    Returns all five channels [H, W, D], and `margin`: the smallest relative distance of any alpha to a cut-off.
+    Returns all five channels [H, W, D], and `margin`: the smallest relative distance of any alpha
+    to a cut-off.
     """
     means = raw["means"]
     quats = raw["quats"]
     scales = np.exp(raw["log_scales"])
     opacities = 1 / (1 + np.exp(-raw["logit_opacities"]))
     degree = int(np.sqrt(raw["sh_coeffs"].shape[1])) - 1
-    dtype = np.result_type(np.float64, *(np.asarray(v).dtype for v in raw.values()), viewmat.dtype, K.dtype)
+    dtype = np.result_type(
+        np.float64, *(np.asarray(v).dtype for v in raw.values()), viewmat.dtype, K.dtype
+    )
     R = viewmat[:3, :3]
     t = viewmat[:3, 3]
     fx = K[0, 0]
@@ -120,7 +132,9 @@ def rasterize(
         full = opacities[i] * faded * np.exp(-sigma)
         drawn = full.real >= alpha_min
         capped = full.real > alpha_max
-        margin = min(margin, np.abs(full.real / alpha_min - 1).min(), np.abs(full.real / alpha_max - 1).min())
+        margin = min(
+            margin, np.abs(full.real / alpha_min - 1).min(), np.abs(full.real / alpha_max - 1).min()
+        )
         alpha = np.where(drawn, np.where(capped, alpha_max, full), 0)
         if depth_limit is not None:
             # The joint covariance of the filtered splat and of its depth, conditioned on the pixel.
@@ -128,12 +142,16 @@ def rasterize(
             joint = M3 @ M3.T + eps2d * np.diag([1, 1, 0])
             slope = np.linalg.solve(joint[:2, :2], joint[:2, 2])
             sigma = np.sqrt(joint[2, 2] - slope @ joint[:2, 2])
-            fraction = normal_cdf((np.minimum(depth_limit, 1e6) - (z + slope[0] * dx + slope[1] * dy)) / sigma)
+            fraction = normal_cdf(
+                (np.minimum(depth_limit, 1e6) - (z + slope[0] * dx + slope[1] * dy)) / sigma
+            )
             alpha = 1 - (1 - alpha) ** fraction
 
         direction = means[i] - eye
         direction = direction / np.sqrt(np.sum(direction * direction))
-        color = 0.5 + sum(B * raw["sh_coeffs"][i, k] for k, B in enumerate(sh_basis(direction, degree)))
+        color = 0.5 + sum(
+            B * raw["sh_coeffs"][i, k] for k, B in enumerate(sh_basis(direction, degree))
+        )
         values = {"color": np.where(color.real > 0, color, 0), "depth": np.array([z])}
         if "motion" in raw:
             mx, my, mz = R @ raw["motion"][i]
@@ -141,7 +159,9 @@ def rasterize(
             if z0.real >= near:
                 values["motion"] = np.array([fx * (x / z - x0 / z0), fy * (y / z - y0 / z0)])
             else:  # to first order
-                values["motion"] = np.array([fx / z * (mx - x / z * mz), fy / z * (my - y / z * mz)])
+                values["motion"] = np.array(
+                    [fx / z * (mx - x / z * mz), fy / z * (my - y / z * mz)]
+                )
         if "logit_confidence" in raw:
             values["confidence"] = np.array([1 / (1 + np.exp(-raw["logit_confidence"][i]))])
         for name, value in values.items():
@@ -158,7 +178,9 @@ def rasterize(
 
 
 def normal_cdf(q: NDArray) -> NDArray:
-    """Return the normal distribution function by Page's approximation (1977), which the renderer has too."""
+    """Return the normal distribution function by Page's approximation (1977), which the renderer
+    has too.
+    """
     q = np.where(np.abs(q.real) < 6, q, 6 * np.sign(q.real))
     return 1 / (1 + np.exp(-2 * np.sqrt(2 / np.pi) * q * (1 + 0.044715 * q * q)))
 
@@ -171,16 +193,29 @@ def rasterize_view(
     depth_limit: NDArray | None = None,
     antialiased: bool = False,
 ) -> dict[str, NDArray]:
-    """Return `rasterize` for a camera rounded to float32, as the renderer reads it; `viewmat` replaces its pose."""
+    """Return `rasterize` for a camera rounded to float32, as the renderer reads it; `viewmat`
+    replaces its pose.
+    """
     viewmat = np.float32(camera.viewmat).astype(np.float64) if viewmat is None else viewmat
     K = np.float32(camera.K).astype(np.float64)
     return rasterize(
-        raw, K, viewmat, camera.width, camera.height, background, depth_limit=depth_limit, antialiased=antialiased
+        raw,
+        K,
+        viewmat,
+        camera.width,
+        camera.height,
+        background,
+        depth_limit=depth_limit,
+        antialiased=antialiased,
     )
 
 
-def complex_step(function, inputs: dict[str, NDArray], names: list[str], step: float = 1e-30) -> dict[str, NDArray]:
-    """Return the gradient of a real-valued `function(inputs)` with respect to `inputs[name]`, exact to rounding."""
+def complex_step(
+    function, inputs: dict[str, NDArray], names: list[str], step: float = 1e-30
+) -> dict[str, NDArray]:
+    """Return the gradient of a real-valued `function(inputs)` with respect to `inputs[name]`, exact
+    to rounding.
+    """
     grads = {}
     for name in names:
         value = inputs[name].astype(np.complex128)
@@ -193,7 +228,11 @@ def complex_step(function, inputs: dict[str, NDArray], names: list[str], step: f
     return grads
 
 
-def directional(function, inputs: dict[str, NDArray], direction: dict[str, NDArray], step: float = 1e-30):
-    """Return the derivative of `function(inputs)` along `direction`, exact to rounding; any output shape."""
+def directional(
+    function, inputs: dict[str, NDArray], direction: dict[str, NDArray], step: float = 1e-30
+):
+    """Return the derivative of `function(inputs)` along `direction`, exact to rounding; any output
+    shape.
+    """
     nudged = {k: v + 1j * step * direction[k] if k in direction else v for k, v in inputs.items()}
     return function(nudged).imag / step

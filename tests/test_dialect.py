@@ -14,7 +14,9 @@ TOOL = Path(__file__).parents[1] / "tools/check_dialect.py"
 def checked(folder: Path, source: str) -> tuple[int, str]:
     """Return the status of the check of a module, and what it prints."""
     (folder / "module.py").write_text(source, encoding="utf-8")
-    process = subprocess.run([sys.executable, TOOL, "."], cwd=folder, capture_output=True, text=True)
+    process = subprocess.run(
+        [sys.executable, TOOL, "."], cwd=folder, capture_output=True, text=True
+    )
     return process.returncode, process.stderr
 
 
@@ -38,7 +40,9 @@ def checked(folder: Path, source: str) -> tuple[int, str]:
         ('monkeypatch.setattr("package.module._LIMIT", 1)\n', 1, "a public name"),
     ],
 )
-def test_check_dialect__names_a_violation(tmp_path: Path, source: str, line: int, part: str) -> None:
+def test_check_dialect__names_a_violation(
+    tmp_path: Path, source: str, line: int, part: str
+) -> None:
     status, text = checked(tmp_path, source)
     assert status == 1
     assert text.startswith(f"module.py:{line}: ")

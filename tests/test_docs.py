@@ -20,7 +20,11 @@ PAGES = {
     for path in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"))
     if not (name := path.relative_to(ROOT).as_posix()).startswith(GENERATED)
 }
-ROWS = re.findall(r"^\| (\d+) \| [^|]+ \| (`[\w.]+`(?:, `[\w.]+`)*) \|$", PAGES["docs/architecture.md"], re.MULTILINE)
+ROWS = re.findall(
+    r"^\| (\d+) \| [^|]+ \| (`[\w.]+`(?:, `[\w.]+`)*) \|$",
+    PAGES["docs/architecture.md"],
+    re.MULTILINE,
+)
 EQUATIONS = [(number, name) for number, names in ROWS for name in re.findall(r"`([\w.]+)`", names)]
 GUIDES = {page: text for page, text in PAGES.items() if re.fullmatch(r"docs/[\w-]+\.md", page)}
 
@@ -39,7 +43,9 @@ def resolve(path: str) -> Any:
             continue
         for name in names[count:]:
             # A field without a default is no attribute of its dataclass.
-            value = None if name in getattr(value, "__dataclass_fields__", ()) else getattr(value, name)
+            value = (
+                None if name in getattr(value, "__dataclass_fields__", ()) else getattr(value, name)
+            )
         return value
     raise AttributeError(path)
 
@@ -75,13 +81,20 @@ def test_equation_table__functions_name_their_equation():
         lists = re.findall(r"\beqs?\. ((?:\d+(?:, | and |-)?)+)", inspect.getsource(resolve(name)))
         return {number for text in lists for number in re.findall(r"\d+", text)}
 
-    assert [f"{name} does not name eq. {number}" for number, name in EQUATIONS if number not in named(name)] == []
+    assert [
+        f"{name} does not name eq. {number}"
+        for number, name in EQUATIONS
+        if number not in named(name)
+    ] == []
 
 
 def test_architecture__lists_every_subpackage():
     rows = re.findall(r"^\| ((?:`\w+`(?:, )?)+) \|", PAGES["docs/architecture.md"], re.MULTILINE)
     listed = {name for row in rows for name in re.findall(r"\w+", row)}
-    modules = [*pkgutil.iter_modules(morgs_mi.__path__), *pkgutil.iter_modules(morgs_mi.studio.__path__)]
+    modules = [
+        *pkgutil.iter_modules(morgs_mi.__path__),
+        *pkgutil.iter_modules(morgs_mi.studio.__path__),
+    ]
     assert listed == {module.name for module in modules} - {"__main__"}
 
 
@@ -96,8 +109,14 @@ def test_pages__name_only_what_exists():
 def test_pages__link_only_to_what_exists():
     def missing(page: str, text: str) -> list[str]:
         targets = re.findall(r"\]\(([^)\s]+)\)", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
-        local = {target.partition("#")[0] for target in targets if not re.match(r"https?://|mailto:|#", target)}
-        return [target for target in sorted(local) if not (ROOT / page).parent.joinpath(target).exists()]
+        local = {
+            target.partition("#")[0]
+            for target in targets
+            if not re.match(r"https?://|mailto:|#", target)
+        }
+        return [
+            target for target in sorted(local) if not (ROOT / page).parent.joinpath(target).exists()
+        ]
 
     assert offenders(PAGES, missing) == {}
 
@@ -106,10 +125,17 @@ def test_pages__examples_compile():
     def broken(_: str, text: str) -> list[str]:
         # A fragment that is inserted after a line is no module; tests/test_extending.py runs it.
         text = re.sub(r"<!-- after [^\n]*-->\n```python\n.*?```", "", text, flags=re.DOTALL)
-        return [example for example in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if not compiles(example)]
+        return [
+            example
+            for example in re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+            if not compiles(example)
+        ]
 
     assert offenders(PAGES, broken) == {}
 
 
 def test_user_pages__hold_no_measurements():
-    assert offenders(GUIDES, lambda _, text: re.findall(r"[^.\n]*\d (?:dB|ms|kB)\b[^.\n]*", text)) == {}
+    assert (
+        offenders(GUIDES, lambda _, text: re.findall(r"[^.\n]*\d (?:dB|ms|kB)\b[^.\n]*", text))
+        == {}
+    )

@@ -15,7 +15,12 @@ from tests.scenes.gaussians import make_unit_scene, to_gaussians
 
 EXAMPLES = sorted((Path(__file__).parents[1] / "examples").glob("*.py"))
 # The picture of each script, in pixels.
-SIZES = {"optimise": (3 * 96, 96), "fit_cameras": (4 * 96, 72), "own_loss": (2 * 96, 72), "meshes": (240, 160)}
+SIZES = {
+    "optimise": (3 * 96, 96),
+    "fit_cameras": (4 * 96, 72),
+    "own_loss": (2 * 96, 72),
+    "meshes": (240, 160),
+}
 
 
 def run(name: str, *arguments: Path) -> np.ndarray:
@@ -30,7 +35,9 @@ def run(name: str, *arguments: Path) -> np.ndarray:
 
 def test_examples__are_short():
     assert sorted(path.stem for path in EXAMPLES) == sorted((*SIZES, "render_ply"))
-    assert [path.name for path in EXAMPLES if len(path.read_text(encoding="utf-8").splitlines()) >= 40] == []
+    assert [
+        path.name for path in EXAMPLES if len(path.read_text(encoding="utf-8").splitlines()) >= 40
+    ] == []
 
 
 @pytest.mark.slow

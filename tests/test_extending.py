@@ -1,4 +1,6 @@
-"""The worked examples of docs/extending.md run, and those that edit the package do so in the stated number of files."""
+"""The worked examples of docs/extending.md run, and those that edit the package do so in the stated
+number of files.
+"""
 
 from __future__ import annotations
 
@@ -39,13 +41,17 @@ def test_extending__example_works_within_its_number_of_files(title, tmp_path):
     (allowed,) = map(int, re.findall(r"<!-- files: (\d) -->", section))
     package = Path(morgs_mi.__file__).parent
     if allowed:
-        package = shutil.copytree(package, tmp_path / "morgs_mi", ignore=shutil.ignore_patterns("__pycache__"))
+        package = shutil.copytree(
+            package, tmp_path / "morgs_mi", ignore=shutil.ignore_patterns("__pycache__")
+        )
     blocks = BLOCK.findall(section)
     touched = {edit(tmp_path, directive, code) for directive, code in blocks if directive != "run"}
     assert len(touched) == allowed
     (example,) = (code for directive, code in blocks if directive == "run")
     script = tmp_path / "example.py"
-    script.write_text(f"{SETUP}\nassert {str(package)!r} in morgs_mi.__file__\n{example}", encoding="utf-8")
+    script.write_text(
+        f"{SETUP}\nassert {str(package)!r} in morgs_mi.__file__\n{example}", encoding="utf-8"
+    )
     done = subprocess.run(
         [sys.executable, str(script)],
         cwd=tmp_path,

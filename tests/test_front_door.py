@@ -39,7 +39,9 @@ print(*(set(sys.modules) - before))
 
 
 def test_front_door__is_lazy():
-    names = subprocess.run([sys.executable, "-c", IMPORT], capture_output=True, text=True, check=True).stdout.split()
+    names = subprocess.run(
+        [sys.executable, "-c", IMPORT], capture_output=True, text=True, check=True
+    ).stdout.split()
     assert sum(name.startswith("morgs_mi") for name in names) <= 15
     assert not {"cv2", "scipy", "pycolmap", "colour", "rich", "tyro", "OpenEXR"} & set(names)
 
@@ -56,19 +58,29 @@ def test_front_door__names_are_documented():
 
 @pytest.mark.parametrize("name", WITH_EXAMPLE)
 def test_front_door__examples_compile(name):
-    lines = re.findall(r"^\s*(?:>>>|\.\.\.) ?(.*)$", inspect.getdoc(getattr(morgs_mi, name)) or "", re.MULTILINE)
+    lines = re.findall(
+        r"^\s*(?:>>>|\.\.\.) ?(.*)$", inspect.getdoc(getattr(morgs_mi, name)) or "", re.MULTILINE
+    )
     assert lines
     assert any("morgs_mi." in line for line in lines)
     ast.parse("\n".join(lines))
 
 
 def test_front_door__has_what_readme_and_notebooks_import():
-    code = "\n".join(re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL))
+    code = "\n".join(
+        re.findall(
+            r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL
+        )
+    )
     for path in ("01_render", "02_stream"):
         cells = json.loads((ROOT / f"notebooks/{path}.ipynb").read_text(encoding="utf-8"))["cells"]
-        code += "\n" + "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+        code += "\n" + "\n".join(
+            "".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"
+        )
     lines = [line for line in code.splitlines() if not line.startswith("%")]
-    imports = [node for node in ast.walk(ast.parse("\n".join(lines))) if isinstance(node, ast.ImportFrom)]
+    imports = [
+        node for node in ast.walk(ast.parse("\n".join(lines))) if isinstance(node, ast.ImportFrom)
+    ]
     inner = [node.module for node in imports if (node.module or "").startswith("morgs_mi.")]
     assert inner == []
 
@@ -85,7 +97,9 @@ def test_front_door__reprs_are_short():
     assert repr(loop) == "StreamLoop(4 cameras, frame 0 is next, None)"
 
 
-@pytest.mark.parametrize("method", [{"flow_method": "files:none"}, {"mask_method": "sam2:a.onnx,b.onnx"}])
+@pytest.mark.parametrize(
+    "method", [{"flow_method": "files:none"}, {"mask_method": "sam2:a.onnx,b.onnx"}]
+)
 def test_stream_loop__refuses_missing_files_before_the_first_frame(method):
     config = morgs_mi.StreamConfig(motion=morgs_mi.MotionConfig(**method))
     with pytest.raises(FileNotFoundError):

@@ -19,7 +19,14 @@ from tests.quick import NO_DENSITY, quick
 from tests.scenes import surfaces
 from tests.scenes.ball import images_of, mean_psnr, opaque_ball, views
 from tests.scenes.cameras import make_camera, make_wide_camera
-from tests.scenes.gaussians import CHANNELS, RAW, make_scene, make_unit_scene, make_wide_scene, to_gaussians
+from tests.scenes.gaussians import (
+    CHANNELS,
+    RAW,
+    make_scene,
+    make_unit_scene,
+    make_wide_scene,
+    to_gaussians,
+)
 from tests.scenes.plugin import AOVS, make_mitsuba_scene
 
 pytestmark = [
@@ -52,9 +59,13 @@ def test_rasterize__agrees_between_cuda_and_llvm(n):
     def run():
         gaussians = to_gaussians(raw, grad=True)
         image = rasterize(gaussians, camera, CHANNELS)
-        solid = np.asarray(image.alpha) > 0.02  # elsewhere normalised channels divide by a small alpha
+        # Elsewhere normalised channels divide by a small alpha.
+        solid = np.asarray(image.alpha) > 0.02
         images = {name: np.asarray(dr.detach(image[name])) * solid for name in CHANNELS}
-        dr.backward(dr.sum(image.color * mi.TensorXf(weight), axis=None) + dr.sum(image.confidence, axis=None))
+        dr.backward(
+            dr.sum(image.color * mi.TensorXf(weight), axis=None)
+            + dr.sum(image.confidence, axis=None)
+        )
         return images | {f"gradient of {name}": dr.grad(getattr(gaussians, name)) for name in RAW}
 
     assert_variants_agree(run)
@@ -72,7 +83,9 @@ def test_gaussian_splat__agrees_between_cuda_and_llvm():
         dr.enable_grad([params[name] for name in names])
         image = mi.render(scene, params)
         dr.backward(dr.sum(dr.square(image[..., :4]), axis=None))
-        return {"image": dr.detach(image)[..., :4]} | {f"gradient of {name}": dr.grad(params[name]) for name in names}
+        return {"image": dr.detach(image)[..., :4]} | {
+            f"gradient of {name}": dr.grad(params[name]) for name in names
+        }
 
     assert_variants_agree(run)
 
@@ -96,7 +109,10 @@ def test_losses__agree_between_cuda_and_llvm(masked):
     mask = rng.random((37, 45)) > 0.4
 
     def run():
-        observations = {"recon": from_numpy(mi.TensorXf, image), "flow": from_numpy(mi.TensorXf, drawn)}
+        observations = {
+            "recon": from_numpy(mi.TensorXf, image),
+            "flow": from_numpy(mi.TensorXf, drawn),
+        }
         observations["mask"] = from_numpy(mi.TensorXf, image[..., :1].copy())
         dr.enable_grad(list(observations.values()))
         reliable = from_numpy(mi.TensorXf, mask.astype(np.float32))

@@ -1,6 +1,8 @@
-"""The layers of the package: a module imports only from its own subpackage and from those before it.
+"""The layers of the package: a module imports only from its own subpackage and from those before
+it.
 
-`studio` is the last one, so nothing outside of it imports it. It enters registries by the table in `core.entries`.
+`studio` is the last one, so nothing outside of it imports it. It enters registries by the table in
+`core.entries`.
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ SUBPACKAGES = (
     "cli",
     "studio",
 )
-# `import morgs_mi` collects names of all subpackages, and `python -m morgs_mi` runs the command line.
+# `import morgs_mi` collects names of all subpackages, and `python -m morgs_mi` runs the command
+# line.
 ENTRY_POINTS = {ROOT / "__init__.py", ROOT / "__main__.py"}
 MODULES = sorted(path for path in ROOT.rglob("*.py") if path not in ENTRY_POINTS)
 
@@ -62,13 +65,23 @@ def mistakes(path: Path) -> list[str]:
     place = path.relative_to(ROOT)
     if subpackage not in SUBPACKAGES:
         return [f"{place}: add {subpackage} to SUBPACKAGES, after all that it imports"]
-    names = imported_names(ast.parse(path.read_text(encoding="utf-8")), ["morgs_mi", *place.parent.parts])
+    names = imported_names(
+        ast.parse(path.read_text(encoding="utf-8")), ["morgs_mi", *place.parent.parts]
+    )
     subpackages = sorted({name[1] for name in names if name[0] == "morgs_mi" and len(name) > 1})
     successors = SUBPACKAGES[SUBPACKAGES.index(subpackage) + 1 :]
     return [
-        *(f"{place} imports from {name}, which comes after {subpackage}" for name in subpackages if name in successors),
+        *(
+            f"{place} imports from {name}, which comes after {subpackage}"
+            for name in subpackages
+            if name in successors
+        ),
         # A name imported from `morgs_mi` itself would hide its subpackage.
-        *(f"{place} imports {name} from morgs_mi itself" for name in subpackages if name not in SUBPACKAGES),
+        *(
+            f"{place} imports {name} from morgs_mi itself"
+            for name in subpackages
+            if name not in SUBPACKAGES
+        ),
     ]
 
 
@@ -77,12 +90,17 @@ def test_layers__imports_go_down():
 
 
 def test_layers__only_the_table_of_entries_names_the_studio():
-    places = [path.relative_to(ROOT) for path in MODULES if "morgs_mi.studio" in path.read_text(encoding="utf-8")]
+    places = [
+        path.relative_to(ROOT)
+        for path in MODULES
+        if "morgs_mi.studio" in path.read_text(encoding="utf-8")
+    ]
     assert [place for place in places if place.parts[0] != "studio"] == [Path("core/entries.py")]
 
 
 @pytest.mark.parametrize(
-    ("registry", "name"), [(registry, name) for registry, entries in STUDIO.items() for name in entries]
+    ("registry", "name"),
+    [(registry, name) for registry, entries in STUDIO.items() for name in entries],
 )
 def test_layers__entries_of_the_studio_exist(registry, name):
     assert studio_entry(registry, name) is not None

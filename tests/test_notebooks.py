@@ -23,7 +23,9 @@ LONG_CALLS = {
     "Tracking": "morgs_mi.track_points(stream(), [(0, 0, 0)], 0, progress=Bar('Tracking', 2))",
     "Extracting": "morgs_mi.extract_tracks(stream(), Bar('Extracting', 2))",
     "Writing": "write_web_page(stream(), out / 'page.html', progress=Bar('Writing', 2))",
-    "Exporting": "write_each(play(stream()), out / 'ply', '.ply', write_ply, [0, 1], Bar('Exporting'))",
+    "Exporting": (
+        "write_each(play(stream()), out / 'ply', '.ply', write_ply, [0, 1], Bar('Exporting'))"
+    ),
     "Importing": "import_frames([out / 'ply'], out / 'again', progress=Bar('Importing'))",
 }
 SET_UP = """
@@ -54,16 +56,25 @@ def shown(cell) -> dict[str, str]:
 
 @pytest.mark.slow
 def test_cells__show_images_streams_and_progress():
-    cells = [SET_UP, "morgs_mi.rasterize(splats(), rig()[0])", *(f"_ = {call}" for call in LONG_CALLS.values())]
-    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in [*cells, "stream()"]])
-    client = nbclient.NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(ROOT)}})
+    cells = [
+        SET_UP,
+        "morgs_mi.rasterize(splats(), rig()[0])",
+        *(f"_ = {call}" for call in LONG_CALLS.values()),
+    ]
+    notebook = nbformat.v4.new_notebook(
+        cells=[nbformat.v4.new_code_cell(cell) for cell in [*cells, "stream()"]]
+    )
+    client = nbclient.NotebookClient(
+        notebook, timeout=120, resources={"metadata": {"path": str(ROOT)}}
+    )
     client.execute()
     _, image, *bars, stream = notebook.cells
     assert base64.b64decode(shown(image)["image/png"]).startswith(b"\x89PNG")
     assert "<iframe sandbox=" in shown(stream)["text/html"]
     for title, bar in zip(LONG_CALLS, bars, strict=True):
         match = re.fullmatch(
-            r'<div>(\w+)(?:: [\w ]+)? <progress value="([\d.]+)" max="([\d.]+)".*', shown(bar)["text/html"]
+            r'<div>(\w+)(?:: [\w ]+)? <progress value="([\d.]+)" max="([\d.]+)".*',
+            shown(bar)["text/html"],
         )
         assert match is not None
         assert (match[1], float(match[2])) == (title, float(match[3]))

@@ -1,4 +1,6 @@
-"""The README is true: its examples run, its figures agree with the committed result, its commands exist."""
+"""The README is true: its examples run, its figures agree with the committed result, its commands
+exist.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,11 @@ EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 def workplace(tmp_path_factory):
     """Return a folder that holds a small capture where the demo writes its own."""
     folder = tmp_path_factory.mktemp("readme")
-    synthesize("spheres", folder / "out/demo/capture", SynthConfig(cameras=3, frames=2, width=64, height=48, spp=4))
+    synthesize(
+        "spheres",
+        folder / "out/demo/capture",
+        SynthConfig(cameras=3, frames=2, width=64, height=48, spp=4),
+    )
     return folder
 
 
@@ -36,14 +42,22 @@ def test_readme__quotes_the_committed_demo():
     report = json.loads((ROOT / "benchmarks/results/demo.json").read_text(encoding="utf-8"))
     for name, title in (("full", "ML + MO + MC"), ("plain", "residuals only")):
         row = report["comparison"][name]
-        figures = f"{row['psnr']:.2f} dB | {row['motion_error_moving']:.2f} px | {row['motion_error_still']:.2f} px"
+        figures = (
+            f"{row['psnr']:.2f} dB | {row['motion_error_moving']:.2f} px | "
+            f"{row['motion_error_still']:.2f} px"
+        )
         assert f"| {title} | {figures} |" in README
 
 
 def test_readme__quotes_the_committed_time_of_an_image():
-    rows = json.loads((ROOT / "benchmarks/results/splat_files.json").read_text(encoding="utf-8"))["rows"]
+    rows = json.loads((ROOT / "benchmarks/results/splat_files.json").read_text(encoding="utf-8"))[
+        "rows"
+    ]
     seconds = {row["gaussians"]: f"{row['image_seconds']:.1f} s" for row in rows}
-    sentence = f"takes {seconds[100_000]} with 100,000 Gaussians and {seconds[1_000_000]} with a million, on two cores"
+    sentence = (
+        f"takes {seconds[100_000]} with 100,000 Gaussians and {seconds[1_000_000]} with a million, "
+        "on two cores"
+    )
     assert sentence in " ".join(README.split())
 
 
@@ -65,7 +79,14 @@ def test_readme__cites_the_paper_as_the_other_pages_do():
     assert entry in (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
     citation = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
     (authors,) = re.findall(r"author += \{(.*)\}", entry)
-    names = [f"{first_name} {family}" for family, first_name in (name.split(", ") for name in authors.split(" and "))]
-    cited = zip(re.findall(r"family-names: (\w+)", citation), re.findall(r"given-names: (\w+)", citation), strict=True)
+    names = [
+        f"{first_name} {family}"
+        for family, first_name in (name.split(", ") for name in authors.split(" and "))
+    ]
+    cited = zip(
+        re.findall(r"family-names: (\w+)", citation),
+        re.findall(r"given-names: (\w+)", citation),
+        strict=True,
+    )
     assert names == [f"{first_name} {family}" for family, first_name in cited]
     assert all(name in " ".join(README.split()) for name in names)

@@ -14,12 +14,21 @@ import yaml
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-WORKFLOWS = {path.name: yaml.safe_load(path.read_text(encoding="utf-8")) for path in ROOT.glob(".github/**/*.yml")}
-JOBS = [(f"{name}: {job}", flow["jobs"][job]) for name, flow in WORKFLOWS.items() for job in flow.get("jobs", {})]
+WORKFLOWS = {
+    path.name: yaml.safe_load(path.read_text(encoding="utf-8"))
+    for path in ROOT.glob(".github/**/*.yml")
+}
+JOBS = [
+    (f"{name}: {job}", flow["jobs"][job])
+    for name, flow in WORKFLOWS.items()
+    for job in flow.get("jobs", {})
+]
 
 
 def check_release(root: Path, tag: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, root / "tools/check_release.py", tag], capture_output=True, text=True)
+    return subprocess.run(
+        [sys.executable, root / "tools/check_release.py", tag], capture_output=True, text=True
+    )
 
 
 @pytest.fixture
@@ -36,8 +45,13 @@ def test_check_release__compares_the_files_with_the_tag(checkout):
     pyproject = (checkout / "pyproject.toml").read_text()
     if "Source" not in PROJECT["urls"]:
         problems = check_release(checkout, f"v{version}")
-        assert (problems.returncode, "expected the addresses Source and Issues" in problems.stderr) == (1, True)
-        addresses = '[project.urls]\nSource = "https://example.org"\nIssues = "https://example.org"\n'
+        assert (
+            problems.returncode,
+            "expected the addresses Source and Issues" in problems.stderr,
+        ) == (1, True)
+        addresses = (
+            '[project.urls]\nSource = "https://example.org"\nIssues = "https://example.org"\n'
+        )
         (checkout / "pyproject.toml").write_text(pyproject.replace("[project.urls]\n", addresses))
     assert check_release(checkout, f"v{version}").returncode == 0
     wrong = check_release(checkout, "v9.9.9")
@@ -51,7 +65,11 @@ def test_project__names_its_pythons_and_dependencies_as_the_pages_do():
     assert f"now {pythons[0]} to {pythons[-1]}" in promises
     assert WORKFLOWS["ci.yml"]["jobs"]["test"]["strategy"]["matrix"]["python"] == pythons
     assert WORKFLOWS["release.yml"]["jobs"]["installed"]["strategy"]["matrix"]["python"] == pythons
-    assert all(f"`{pin}`" in promises for pin in PROJECT["dependencies"] if pin.startswith(("mitsuba", "drjit")))
+    assert all(
+        f"`{pin}`" in promises
+        for pin in PROJECT["dependencies"]
+        if pin.startswith(("mitsuba", "drjit"))
+    )
 
 
 def test_workflows__pin_their_actions():

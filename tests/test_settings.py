@@ -1,4 +1,6 @@
-"""Every setting acts: another value of any field changes the stream of a small clip. And every range is checked."""
+"""Every setting acts: another value of any field changes the stream of a small clip. And every
+range is checked.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ BASE = StreamConfig(
         first_frame_steps=30,
         confidence_steps=6,
         epochs=6,
-        density=DensityConfig(rounds=2, births=0.05, max_gaussians=150, min_error=0, split_scale=0.03),
+        density=DensityConfig(
+            rounds=2, births=0.05, max_gaussians=150, min_error=0, split_scale=0.03
+        ),
     ),
     motion=MotionConfig(key_views=2, mask_interval=2),
     codec=CodecConfig(),
@@ -57,9 +61,12 @@ ELSEWHERE: dict[str, str] = {
     "render.reproducible": "changes the order of sums only: tests/render",
     "fit.detail": "the number of Gaussians is given here: tests/fit/test_detail.py",
     "fit.first_frame_seconds": "Gaussians and steps are given here: tests/fit/test_budget.py",
-    "fit.camera_priors": "cameras are refined by the recorder: tests/studio/calibration/test_bundle.py",
-    "fit.short_fits": "no cameras are refined here: tests/studio/calibration/test_refine.py, tests/fit/test_balance.py",
-    "fit.refine_cameras": "cameras are refined by the recorder: tests/studio/calibration/test_refine.py",
+    "fit.camera_priors": "the recorder refines cameras: tests/studio/calibration/test_bundle.py",
+    "fit.short_fits": (
+        "no cameras are refined here: tests/studio/calibration/test_refine.py, "
+        "tests/fit/test_balance.py"
+    ),
+    "fit.refine_cameras": "the recorder refines cameras: tests/studio/calibration/test_refine.py",
     "fit.exposure": "the tests of the loop have cameras that differ: tests/test_stream_loop.py",
     "fit.noise_aware": "images without noise here: tests/fit/test_dropping.py",
     "motion.masks": "tests/method/test_confidence.py and tests/method/mask_refiners",
@@ -67,7 +74,7 @@ ELSEWHERE: dict[str, str] = {
     "motion.search_motion": "flow explains all parts here: tests/method/test_search.py",
     "motion.constant_velocity": "flow is lifted here: tests/fit/test_later_frame.py",
     "motion.model": "the package has no motion model: tests/fit/test_motion_stage.py",
-    "codec.keyframe_interval": "keyframes are written by the recorder: tests/runs/test_fit_capture.py",
+    "codec.keyframe_interval": "the recorder writes keyframes: tests/runs/test_fit_capture.py",
 }
 
 
@@ -84,7 +91,9 @@ def leaves(config: Any, path: str = "") -> list[str]:
 def with_value(config: Any, name: str, value: Any) -> Any:
     """Return a config with the field of a dotted name replaced."""
     head, _, rest = name.partition(".")
-    return replace(config, **{head: with_value(getattr(config, head), rest, value) if rest else value})
+    return replace(
+        config, **{head: with_value(getattr(config, head), rest, value) if rest else value}
+    )
 
 
 def value_of(config: Any, name: str) -> Any:
@@ -104,7 +113,9 @@ def other(name: str) -> Any:
 
 @pytest.fixture(scope="module")
 def clip() -> tuple[list[Camera], np.ndarray, np.ndarray, list[list[np.ndarray]]]:
-    """Five views of a bright textured square in front of a textured wall; it moves, and the light grows slowly."""
+    """Five views of a bright textured square in front of a textured wall; it moves, and the light
+    grows slowly.
+    """
     rng = np.random.default_rng(0)
     origins = [(x, y, -3) for x, y in ((-1, 0), (1, 0), (0, 0.8), (0, -0.8), (0.4, 0.4))]
     views = look_at_cameras(origins)
@@ -113,20 +124,30 @@ def clip() -> tuple[list[Camera], np.ndarray, np.ndarray, list[list[np.ndarray]]
     points = np.concatenate([wall, square])
     colors = np.concatenate([rng.uniform(0.1, 0.6, (260, 3)), rng.uniform(0.5, 1.0, (80, 3))])
     frames = [
-        [image(view, wall, square + np.array((0.06 * t, 0.02 * t, 0)), colors, rng, t) for view in views]
+        [
+            image(view, wall, square + np.array((0.06 * t, 0.02 * t, 0)), colors, rng, t)
+            for view in views
+        ]
         for t in range(4)
     ]
     return views, points, colors, frames
 
 
 def image(
-    view: Camera, wall: np.ndarray, square: np.ndarray, colors: np.ndarray, rng: np.random.Generator, t: int
+    view: Camera,
+    wall: np.ndarray,
+    square: np.ndarray,
+    colors: np.ndarray,
+    rng: np.random.Generator,
+    t: int,
 ) -> np.ndarray:
     """Draw the points as squares, the far ones first, with noise of a grey level."""
     drawn = np.full((48, 64, 3), 0.2)
     for points, part, radius in ((wall, colors[:260], 4), (square, colors[260:], 3)):
         for (x, y), color in zip(view.project(points)[0].astype(int), part, strict=True):
-            drawn[max(y - radius, 0) : max(y + radius, 0), max(x - radius, 0) : max(x + radius, 0)] = color
+            drawn[
+                max(y - radius, 0) : max(y + radius, 0), max(x - radius, 0) : max(x + radius, 0)
+            ] = color
     noisy = drawn * (1 + 0.01 * t) * 255 + rng.normal(0, 1, drawn.shape)
     return np.clip(noisy, 0, 255).astype(np.uint8)
 
@@ -144,20 +165,28 @@ def base(clip) -> bytes:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", [name for name in leaves(BASE) if not name.startswith(tuple(ELSEWHERE))])
+@pytest.mark.parametrize(
+    "name", [name for name in leaves(BASE) if not name.startswith(tuple(ELSEWHERE))]
+)
 def test_settings__every_field_acts(clip, base, name):
     assert stream(clip, with_value(BASE, name, other(name))) != base
 
 
 def bounds() -> list[tuple[Any, str, Any]]:
-    """Return a config, the name of a field, and a value beyond each of its bounds, for all settings of a fit."""
+    """Return a config, the name of a field, and a value beyond each of its bounds, for all settings
+    of a fit.
+    """
     bounds_of_fields = []
     configs = [StreamConfig()]
     for config in configs:
         configs += [value for value in vars(config).values() if is_dataclass(value)]
         for name, kind in types_of(type(config)).items():
-            bounds_of_arms = [bound for arm in arms_of(kind) for bound in getattr(arm, "__metadata__", ())]
-            bounds_of_fields += [(config, name, BEYOND[type(bound)](bound.limit)) for bound in bounds_of_arms]
+            bounds_of_arms = [
+                bound for arm in arms_of(kind) for bound in getattr(arm, "__metadata__", ())
+            ]
+            bounds_of_fields += [
+                (config, name, BEYOND[type(bound)](bound.limit)) for bound in bounds_of_arms
+            ]
     return bounds_of_fields
 
 
@@ -172,7 +201,9 @@ BEYOND = {
 
 def test_settings__every_range_is_checked():
     for config, name, value in bounds():
-        with pytest.raises(ValueError, match=rf"^{type(config).__name__}\(\): `{name}` must be ") as caught:
+        with pytest.raises(
+            ValueError, match=rf"^{type(config).__name__}\(\): `{name}` must be "
+        ) as caught:
             replace(config, **{name: value})
         assert str(caught.value).endswith(f", got {value}.")
     assert len(bounds()) > 60

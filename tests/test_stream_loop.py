@@ -46,14 +46,19 @@ SHORT = dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, first_fram
 
 
 def scene(frame: float) -> tuple[Gaussians, np.ndarray]:
-    """A textured ball that moves by SHIFT in front of a static textured wall; and the mask of the moving Gaussians.
+    """A textured ball that moves by SHIFT in front of a static textured wall; and the mask of the
+    moving Gaussians.
 
     The wall is thick: its Gaussians lie in the same order in every view.
     """
     rng = np.random.default_rng(0)
     wall = rng.uniform((-2.4, -2.0, 0.6), (2.4, 2.0, 2.0), (500, 3))
     direction = rng.normal(size=(120, 3))
-    ball = 0.5 * direction / np.linalg.norm(direction, axis=1, keepdims=True) + (-0.2, 0, -0.4) + frame * SHIFT
+    ball = (
+        0.5 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+        + (-0.2, 0, -0.4)
+        + frame * SHIFT
+    )
     moves = np.r_[np.zeros(len(wall), bool), np.ones(len(ball), bool)]
     sh = rng.uniform(-1.6, 1.6, (len(moves), 1, 3))
     return isotropic(np.concatenate([wall, ball]), np.where(moves, 0.09, 0.16), 0.95, sh), moves
@@ -65,7 +70,9 @@ def cameras() -> list[Camera]:
 
 def shown(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """Return an image of Gaussians in 8 bits."""
-    return np.uint8(np.clip(np.asarray(rasterize(gaussians, camera, ("color",)).color), 0, 1) * 255 + 0.5)
+    return np.uint8(
+        np.clip(np.asarray(rasterize(gaussians, camera, ("color",)).color), 0, 1) * 255 + 0.5
+    )
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +106,9 @@ def first(clip):
 def full(clip, first):
     loop = copy.copy(first[0])
     packets, reports = first[1:]
-    later_packets, later_reports = zip(*(loop.push(images[:4]) for images in clip[1:3]), strict=True)
+    later_packets, later_reports = zip(
+        *(loop.push(images[:4]) for images in clip[1:3]), strict=True
+    )
     return loop, (*packets, *later_packets), (*reports, *later_reports)
 
 
@@ -122,12 +131,16 @@ def test_push__motion_follows_the_truth_and_not_the_static_wall(full):
     maps = held_out(loop.gaussians)
     means = scene(1)[0].numpy()["means"]
     state = scene(2)[0]
-    truth = rasterize(dataclasses.replace(state, motion=state.numpy()["means"] - means), cameras()[4], ("motion",))
+    truth = rasterize(
+        dataclasses.replace(state, motion=state.numpy()["means"] - means), cameras()[4], ("motion",)
+    )
     truth = np.asarray(truth.motion)
     motion = np.asarray(maps.motion)
     moving = np.linalg.norm(truth, axis=-1) > 1.5
     assert 0.03 < moving.mean() < 0.4
-    assert endpoint_error(motion, truth, moving) < 0.5 * endpoint_error(np.zeros_like(truth), truth, moving)
+    assert endpoint_error(motion, truth, moving) < 0.5 * endpoint_error(
+        np.zeros_like(truth), truth, moving
+    )
     still = np.linalg.norm(truth, axis=-1) < 0.01
     assert endpoint_error(motion, truth, still) < 0.5
     assert {"recon", "flow", "offset"} <= reports[2].losses.keys()
@@ -154,14 +167,18 @@ def test_push__decoder_has_the_encoders_state_to_the_bit(full):
 
 def test_push__returns_a_keyframe_and_then_residuals(full):
     _, packets, reports = full
-    assert [p.kind for p in packets] == [PacketKind.KEYFRAME, PacketKind.RESIDUAL, PacketKind.RESIDUAL]
+    assert [p.kind for p in packets] == [
+        PacketKind.KEYFRAME,
+        PacketKind.RESIDUAL,
+        PacketKind.RESIDUAL,
+    ]
     assert [r.frame for r in reports] == [p.frame for p in packets] == [0, 1, 2]
     with pytest.raises(ValueError, match="a residual needs the frame before it"):
         decode(None, packets[1])
 
 
 def test_push__same_seed_gives_the_same_bytes_and_no_frame_looks_ahead(clip):
-    """The packets so far do not depend on later frames, to the byte where sums have a fixed order."""
+    """Packets do not depend on later frames, to the byte where sums have a fixed order."""
     density = DensityConfig(rounds=2, births=0.05, min_error=0)
     fit = dataclasses.replace(QUICK.fit, density=density, first_frame_steps=40)
     config = dataclasses.replace(QUICK, fit=fit, render=RenderConfig(reproducible=True))
@@ -173,9 +190,13 @@ def test_push__same_seed_gives_the_same_bytes_and_no_frame_looks_ahead(clip):
 
 @pytest.mark.slow
 def test_push__stream_carries_births_and_deaths(clip):
-    """Faint ones are pruned, no more are added than the limit allows, ids are never reused, and the decoder has all."""
+    """Faint ones are pruned, no more are added than the limit allows, ids are never reused, and the
+    decoder has all.
+    """
     density = DensityConfig(rounds=0, births=0.05, max_gaussians=590, min_error=0, min_opacity=0.3)
-    loop, packets, reports = run(clip, dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, density=density)))
+    loop, packets, reports = run(
+        clip, dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, density=density))
+    )
     frames = list(coded_frames(packets))
     for state, next_state, report in zip(frames, frames[1:], reports[1:], strict=False):
         births = np.setdiff1d(next_state.ids, state.ids)
@@ -190,10 +211,14 @@ def test_push__stream_carries_births_and_deaths(clip):
 
 @pytest.mark.slow
 def test_push__fits_views_at_their_own_times(clip):
-    """Two of four views are half a frame late and two half a frame early; at the instants nobody saw the ball."""
+    """Two of four views are half a frame late and two half a frame early; at the instants nobody
+    saw the ball.
+    """
     delays = (0.5, -0.5, 0.5, -0.5)
     views = [dataclasses.replace(c, delay=d) for c, d in zip(cameras()[:4], delays, strict=True)]
-    frames = [[shown(scene(t + d)[0], c) for c, d in zip(views, delays, strict=True)] for t in range(3)]
+    frames = [
+        [shown(scene(t + d)[0], c) for c, d in zip(views, delays, strict=True)] for t in range(3)
+    ]
     quality = []
     for rig, first in ((views, clip[0][:4]), (cameras()[:4], frames[0])):
         loop = StreamLoop(rig, *points_and_colors(), QUICK)
@@ -218,7 +243,9 @@ def test_push__modules_can_be_switched_off(clip):
     )
     _, _, reports = run(clip, off, frames=2)
     assert reports[1].losses.keys() == {"recon"}
-    masked = dataclasses.replace(QUICK, motion=MotionConfig(key_views=2, mask_interval=1, learn_offset=False))
+    masked = dataclasses.replace(
+        QUICK, motion=MotionConfig(key_views=2, mask_interval=1, learn_offset=False)
+    )
     _, _, reports = run(clip, masked, frames=2)
     assert reports[1].losses.keys() == {"recon", "flow", "mask"}
 
@@ -238,11 +265,21 @@ def test_push__forecasts_other_views(clip):
     ticks = []
     _, report = new_loop(SHORT).push(clip[0][:4], lambda *tick: ticks.append(tick))
     validation = report.validation
-    assert validation["sentence"].startswith(f"Views between the cameras will be {validation['quality']}")
+    assert validation["sentence"].startswith(
+        f"Views between the cameras will be {validation['quality']}"
+    )
     assert 0 < validation["training_psnr"] < 60
     steps = [tick for tick in ticks if tick[0] != "Balancing cameras"]
     assert steps == [("First frame", done, 20) for done in range(1, 21)], "there is no second fit"
-    assert {"quality", "expected_psnr", "interval", "loss", "margin", "is_outside", "rig"} < validation.keys()
+    assert {
+        "quality",
+        "expected_psnr",
+        "interval",
+        "loss",
+        "margin",
+        "is_outside",
+        "rig",
+    } < validation.keys()
 
 
 @pytest.mark.slow
@@ -268,13 +305,17 @@ def without(images, *views):
 
 @pytest.mark.slow
 def test_push__without_an_image_of_one_view(clip, first, monkeypatch):
-    """Flow on two key views out of those that have both images: not of the missing view, nor when it is back."""
+    """Flow on two key views out of those that have both images: not of the missing view, nor when
+    it is back.
+    """
     flow_views = []
     observe = observation.observe_key_views
     monkeypatch.setattr(
         observation,
         "observe_key_views",
-        lambda pairs, *more: flow_views.append({p.camera for p in pairs.values()}) or observe(pairs, *more),
+        lambda pairs, *more: (
+            flow_views.append({p.camera for p in pairs.values()}) or observe(pairs, *more)
+        ),
     )
     loop = copy.copy(first[0])
     usual = {cameras()[view].name for view in loop.setup.key_views}
@@ -293,7 +334,8 @@ def test_push__without_an_image_of_one_view(clip, first, monkeypatch):
     assert [len(views) for views in flow_views] == [2, 2, 2]
     assert all(f"cam{gone:02d}" not in views for views in flow_views[:2])
     assert flow_views[2] == usual
-    # Every frame follows the motion, from three of four views too: it shows its own instant better than the last did.
+    # Every frame follows the motion, from three of four views too: it shows its own instant better
+    # than the last did.
     assert all(score_list[t][t] > score_list[t - 1][t] + 1 for t in (1, 2, 3)), score_list
 
 
@@ -305,7 +347,8 @@ def test_push__without_any_image_nothing_moves(clip):
     packet, report = loop.push([None] * 4)
     assert report.status == "no view has an image"
     assert report.missing_views == ("cam00", "cam01", "cam02", "cam03")
-    assert report.num_bytes < 200 < len(encode_packet(first))  # the packet's frame, and nothing in it
+    # The packet's frame, and nothing in it.
+    assert report.num_bytes < 200 < len(encode_packet(first))
     for name, value in loop.gaussians.numpy().items():
         assert name == "motion" or np.array_equal(value, old_values[name]), name
     packet, report = loop.push(clip[1][:4])
@@ -337,7 +380,9 @@ def test_stream_capture__writes_a_file(clip, tmp_path):
         downscale=2,
     )
     ticks = []
-    reports = stream_capture(capture, tmp_path / "out", QUICK, progress=lambda *tick: ticks.append(tick))
+    reports = stream_capture(
+        capture, tmp_path / "out", QUICK, progress=lambda *tick: ticks.append(tick)
+    )
     path = tmp_path / "out" / "stream.morgs"
     reader = StreamReader(path)
     assert [c.name for c in reader.cameras] == [c.name for c in cameras()]
@@ -345,7 +390,11 @@ def test_stream_capture__writes_a_file(clip, tmp_path):
     assert [state.frame for state in reader.states()] == [0, 1]
     assert sum(r.num_bytes for r in reports) < path.stat().st_size
     assert ticks[-1] == ("Later frames", 1, 1)
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["capture.json", "report.json", "stream.morgs"]
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
+        "capture.json",
+        "report.json",
+        "stream.morgs",
+    ]
     settings = json.loads((tmp_path / "out" / "capture.json").read_text())
     assert settings == {"layout": "in memory", "capture": str(capture.path)}
 
@@ -359,8 +408,14 @@ def masked(masks):
     [
         (lambda clip: StreamLoop([], np.zeros((0, 3)), np.zeros((0, 3))), "at least one view"),
         (lambda clip: new_loop().push(clip[0][:3]), "one image or None for each of 4 views, got 3"),
-        (lambda clip: new_loop().push([None] * 4), "frame 0 must have an image of at least one view, got none"),
-        (lambda clip: new_loop().push([i[:50] for i in clip[0][:4]]), r"view 'cam00' must be uint8 \[72, 96, 3\]"),
+        (
+            lambda clip: new_loop().push([None] * 4),
+            "frame 0 must have an image of at least one view, got none",
+        ),
+        (
+            lambda clip: new_loop().push([i[:50] for i in clip[0][:4]]),
+            r"view 'cam00' must be uint8 \[72, 96, 3\]",
+        ),
         (lambda clip: new_loop().push([i.astype(int) for i in clip[0][:4]]), "got int64"),
         (
             lambda clip: new_loop().push([np.full(i.shape, np.nan) for i in clip[0][:4]]),
@@ -374,21 +429,39 @@ def masked(masks):
             lambda clip: StreamLoop(cameras(), np.zeros((200, 3)), np.zeros((10, 3))),
             r"`point_colors` must be \[200, 3\]",
         ),
-        (lambda clip: StreamLoop(cameras(), np.zeros((3, 4)), np.zeros((4, 3))), r"`points` must be \[P, 3\]"),
+        (
+            lambda clip: StreamLoop(cameras(), np.zeros((3, 4)), np.zeros((4, 3))),
+            r"`points` must be \[P, 3\]",
+        ),
         (
             lambda clip: StreamLoop(cameras(), np.zeros((200, 3)), np.full((200, 3), 128)),
             r"`point_colors` must be in \[0, 32\], got .* at 0; divide colours of 8 bits by 255",
         ),
         (lambda clip: masked([None]), "one mask or None for each of 4 views, got 1"),
-        (lambda clip: masked([None, np.ones((50, 96), bool), None, None]), r"view 'cam01': the mask must be bool \[72"),
+        (
+            lambda clip: masked([None, np.ones((50, 96), bool), None, None]),
+            r"view 'cam01': the mask must be bool \[72",
+        ),
         (lambda clip: masked([np.ones((72, 96), np.uint8), None, None, None]), "got uint8"),
         (lambda clip: StreamLoop(["cam00"], [], []), "`cameras` must be a .*Camera, got a str"),
-        (lambda clip: StreamLoop(cameras(), [], [], {}), "`config` must be a .*StreamConfig, got a dict"),
-        (lambda clip: new_loop().push(None), "one image or None for each of 4 views, got a NoneType"),
+        (
+            lambda clip: StreamLoop(cameras(), [], [], {}),
+            "`config` must be a .*StreamConfig, got a dict",
+        ),
+        (
+            lambda clip: new_loop().push(None),
+            "one image or None for each of 4 views, got a NoneType",
+        ),
         (lambda clip: new_loop().push(["a", None, None, None]), "got str; convert it"),
         (lambda clip: FitConfig(epochs=0), "`epochs` must be at least 1, got 0"),
-        (lambda clip: LearningRates(means=np.nan), "`means` must be a finite number, at least 0, got nan"),
-        (lambda clip: FitConfig(sh_degree=4), "`sh_degree` must be at least 0 and at most 3, got 4"),
+        (
+            lambda clip: LearningRates(means=np.nan),
+            "`means` must be a finite number, at least 0, got nan",
+        ),
+        (
+            lambda clip: FitConfig(sh_degree=4),
+            "`sh_degree` must be at least 0 and at most 3, got 4",
+        ),
         (lambda clip: MotionConfig(key_views=0), "`key_views` must be at least 1, got 0"),
     ],
 )
@@ -399,11 +472,16 @@ def test_stream_loop__refuses_bad_input(clip, call, message):
 
 @pytest.mark.slow
 def test_push__a_static_clip_costs_next_to_nothing(clip):
-    """Camera noise of 2 grey levels is no change: nothing is active, and the packets have a few bytes."""
+    """Camera noise of 2 grey levels is no change: nothing is active, and the packets have a few
+    bytes.
+    """
     rng = np.random.default_rng(0)
 
     def recorded(frame):
-        return [np.uint8(np.clip(image + rng.normal(0, 2, image.shape), 0, 255)) for image in clip[frame][:4]]
+        return [
+            np.uint8(np.clip(image + rng.normal(0, 2, image.shape), 0, 255))
+            for image in clip[frame][:4]
+        ]
 
     loop = new_loop()
     loop.push(recorded(0))
@@ -421,7 +499,7 @@ def test_push__a_static_clip_costs_next_to_nothing(clip):
 
 @pytest.mark.slow
 def test_push__skipping_static_views_costs_no_quality(clip):
-    """With and without: the held-out image is as good in the mean of three seeds, in fewer bytes."""
+    """The held-out image is as good in the mean of three seeds, in fewer bytes."""
     some = dataclasses.replace(QUICK, render=RenderConfig(reproducible=True))
     quality = np.zeros((3, 2))
     sizes = np.zeros((3, 2))
@@ -437,13 +515,16 @@ def test_push__skipping_static_views_costs_no_quality(clip):
             quality[seed, column] = psnr(np.clip(image, 0, 1), clip[2][4] / 255)
             sizes[seed, column] = sum(report.num_bytes for report in reports)
             assert (reports[-1].active["pixels"] < 1) == skip
-    # One seed differs by up to a decibel: five small views, and a first frame that is far from done.
+    # One seed differs by up to a decibel: five small views, and a first frame that is far from
+    # done.
     assert quality[:, 0].mean() > quality[:, 1].mean() - 0.3
     assert np.all(sizes[:, 0] < 0.9 * sizes[:, 1])
 
 
 def test_step__is_pure_and_complete(clip):
-    """With default settings, called twice in a row and again from the same state; the caller's images may be reused."""
+    """With default settings, called twice in a row and again from the same state; the caller's
+    images may be reused.
+    """
     config = StreamConfig(fit=dataclasses.replace(QUICK.fit, first_frame_steps=60, dropping=None))
     setup = observation.prepare(cameras()[:4], *points_and_colors(), config)
     start = stream_loop.StreamState()
@@ -477,7 +558,9 @@ def test_resume__copies_its_images_and_refuses_those_of_another_size(clip, full)
 
 
 def pushed_ahead(loop, clip, upcoming):
-    """Return the packets of all frames but the last, pushed with what `upcoming` makes of the next frame's images."""
+    """Return the packets of all frames but the last, pushed with what `upcoming` makes of the next
+    frame's images.
+    """
     packets = []
     for images, following in pairwise(clip):
         ahead = upcoming(following[:4])
@@ -498,15 +581,21 @@ def plain(clip, reproducible):
     """The packets of three frames."""
     loop = copy.copy(reproducible[0])
     packets = reproducible[1]
-    return [packet.encoded for packet in (*packets, *pushed_ahead(loop, clip[1:], lambda images: None))]
+    return [
+        packet.encoded for packet in (*packets, *pushed_ahead(loop, clip[1:], lambda images: None))
+    ]
 
 
 @pytest.mark.slow
-def test_push__observes_the_upcoming_frame_in_another_thread_and_changes_nothing(clip, plain, monkeypatch):
+def test_push__observes_the_upcoming_frame_in_another_thread_and_changes_nothing(
+    clip, plain, monkeypatch
+):
     threads = []
     observe = stream_loop.observe_frame
     monkeypatch.setattr(
-        stream_loop, "observe_frame", lambda *args: threads.append(threading.current_thread()) or observe(*args)
+        stream_loop,
+        "observe_frame",
+        lambda *args: threads.append(threading.current_thread()) or observe(*args),
     )
     loop = new_loop(dataclasses.replace(QUICK, render=RenderConfig(reproducible=True)))
     ahead = pushed_ahead(loop, clip, lambda images: [image.copy() for image in images])
@@ -518,7 +607,9 @@ def test_push__observes_the_upcoming_frame_in_another_thread_and_changes_nothing
 
 @pytest.mark.slow
 def test_push__uses_no_observation_of_other_images(clip, reproducible, plain):
-    wrong = pushed_ahead(copy.copy(reproducible[0]), clip[1:], lambda images: [image // 2 for image in images])
+    wrong = pushed_ahead(
+        copy.copy(reproducible[0]), clip[1:], lambda images: [image // 2 for image in images]
+    )
     assert [packet.encoded for packet in wrong] == plain[1:]
 
 
@@ -534,19 +625,26 @@ def test_push__refuses_upcoming_images_of_another_size_in_their_turn(clip, first
 
 EXPOSED = dataclasses.replace(
     QUICK,
-    fit=dataclasses.replace(QUICK.fit, exposure="on", short_fits=ShortFitConfig(gaussians=600, steps=60, rounds=2)),
+    fit=dataclasses.replace(
+        QUICK.fit, exposure="on", short_fits=ShortFitConfig(gaussians=600, steps=60, rounds=2)
+    ),
     render=RenderConfig(reproducible=True),
 )
 
 
 def brighter(images, gains):
     """Return the images of a frame with a gain per view."""
-    return [np.rint(np.clip(g * image, 0, 255)).astype(np.uint8) for g, image in zip(gains, images, strict=True)]
+    return [
+        np.rint(np.clip(g * image, 0, 255)).astype(np.uint8)
+        for g, image in zip(gains, images, strict=True)
+    ]
 
 
 @pytest.fixture(scope="module")
 def auto_exposed(clip):
-    """A static clip of cameras that differ, and change by up to 10 % in each frame; reports of a fit with exposures."""
+    """A static clip of cameras that differ, and change by up to 10 % in each frame; reports of a
+    fit with exposures.
+    """
     gains = [(0.9, 1.0, 0.95, 0.85), (0.9, 1.1, 0.95, 0.75), (1.0, 0.9, 0.9, 0.85)]
     frames = [brighter(clip[0][:4], each) for each in gains]
     loop = new_loop(EXPOSED)
@@ -556,7 +654,10 @@ def auto_exposed(clip):
 @pytest.mark.slow
 def test_push__reports_the_exposure_of_each_view_over_time(auto_exposed):
     gains, _, _, reports = auto_exposed
-    middle = np.array([[np.mean(e(0.4 * np.ones(3))) for e in report.exposures] for report in reports]) / 0.4
+    middle = (
+        np.array([[np.mean(e(0.4 * np.ones(3))) for e in report.exposures] for report in reports])
+        / 0.4
+    )
     np.testing.assert_allclose(middle / middle[0], gains / gains[0], atol=0.01)
     assert np.abs(np.log(middle[0])).max() > 0.02, "the cameras differ in the first frame, too"
     assert "The cameras were balanced" in reports[0].validation["exposure"]["sentence"]
@@ -565,9 +666,13 @@ def test_push__reports_the_exposure_of_each_view_over_time(auto_exposed):
 @pytest.mark.slow
 def test_push__changes_no_static_gaussian_where_only_the_exposure_changes(auto_exposed):
     _, frames, _, reports = auto_exposed
-    plain = new_loop(dataclasses.replace(EXPOSED, fit=dataclasses.replace(EXPOSED.fit, exposure="off")))
+    plain = new_loop(
+        dataclasses.replace(EXPOSED, fit=dataclasses.replace(EXPOSED.fit, exposure="off"))
+    )
     without = [plain.push(images)[1] for images in frames]
-    assert max(report.num_bytes for report in reports[1:]) < 0.1 * min(report.num_bytes for report in without[1:])
+    assert max(report.num_bytes for report in reports[1:]) < 0.1 * min(
+        report.num_bytes for report in without[1:]
+    )
     assert without[0].exposures == ()
 
 
@@ -597,7 +702,9 @@ def test_push__leaves_a_change_of_light_in_the_scene(clip):
 def test_push__has_the_same_bytes_with_exposures_where_cameras_are_equal(clip, plain, monkeypatch):
     # Their few short fits would find differences of 1 %.
     monkeypatch.setattr("morgs_mi.fit.balance.LEAST_DIFFERENCE", 0.1)
-    loop = new_loop(dataclasses.replace(EXPOSED, fit=dataclasses.replace(EXPOSED.fit, exposure="auto")))
+    loop = new_loop(
+        dataclasses.replace(EXPOSED, fit=dataclasses.replace(EXPOSED.fit, exposure="auto"))
+    )
     assert [loop.push(images[:4])[0].encoded for images in clip[:3]] == plain
 
 
@@ -660,16 +767,22 @@ def test_push__reports_a_black_first_frame_and_a_cut(clip):
 
 @pytest.mark.slow
 def test_push__light_above_white_is_fitted_and_followed():
-    """The wall of the scene shines with 1 to 20 times white; images, points and packets have encoded colours."""
+    """The wall of the scene shines with 1 to 20 times white; images, points and packets have
+    encoded colours.
+    """
 
     def shining(frame):
         gaussians, moves = scene(frame)
-        sh = gaussians.numpy()["sh_coeffs"] + np.where(moves, 0, 1.5 / SH_C0)[:, None, None].astype(np.float32)
+        sh = gaussians.numpy()["sh_coeffs"] + np.where(moves, 0, 1.5 / SH_C0)[:, None, None].astype(
+            np.float32
+        )
         return dataclasses.replace(gaussians, sh_coeffs=sh)
 
     def recorded(frame):
         views = cameras()
-        return [decode_light(np.asarray(rasterize(shining(frame), c, ("color",)).color)) for c in views]
+        return [
+            decode_light(np.asarray(rasterize(shining(frame), c, ("color",)).color)) for c in views
+        ]
 
     start = shining(0).numpy()
     colors = np.maximum(start["sh_coeffs"][:, 0] * SH_C0 + 0.5, 0)

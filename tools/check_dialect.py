@@ -1,6 +1,8 @@
-"""Check that an assignment binds one thing, that names of variables are nouns, and that tests patch public names.
+"""Check that an assignment binds one thing, that names of variables are nouns, and that tests patch
+public names.
 
-`python tools/check_dialect.py FOLDER...` prints a sentence for each violation, and exits with 1 if there is one.
+`python tools/check_dialect.py FOLDER...` prints a sentence for each violation, and exits with 1 if
+there is one.
 """
 
 from __future__ import annotations
@@ -10,12 +12,27 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-# Participles and adverbs, which do not say what a variable holds. `left` is absent: it is also a side.
+# Participles and adverbs, which do not say what a variable holds. `left` is absent: it is also a
+# side.
 NO_NOUNS = (
-    *("about", "after", "apart", "before", "found", "given", "inside", "kept", "known", "matched", "moved", "now"),
+    *(
+        "about",
+        "after",
+        "apart",
+        "before",
+        "found",
+        "given",
+        "inside",
+        "kept",
+        "known",
+        "matched",
+        "moved",
+        "now",
+    ),
     *("own", "seen", "taken", "then", "together", "used", "wanted"),
 )
-# Fields and parameters that stay, by file: other modules, scripts and files of results have these names.
+# Fields and parameters that stay, by file: other modules, scripts and files of results have these
+# names.
 EXCEPTIONS = {
     "benchmarks/reports/cameras.py": {"given"},
     "benchmarks/reports/field.py": {"found"},
@@ -38,7 +55,9 @@ EXCEPTIONS = {
 
 
 def bound_name(node: ast.expr | ast.arg) -> str:
-    """Return the name of the variable, parameter or attribute that a node binds, without underscores; or nothing."""
+    """Return the name of the variable, parameter or attribute that a node binds, without
+    underscores; or nothing.
+    """
     if isinstance(node, ast.arg):
         return node.arg.strip("_")
     if not isinstance(node, ast.Name | ast.Attribute) or not isinstance(node.ctx, ast.Store):
@@ -47,7 +66,9 @@ def bound_name(node: ast.expr | ast.arg) -> str:
 
 
 def is_parallel(node: ast.Assign) -> bool:
-    """Return whether an assignment gives several targets a value each; one that only swaps names does not count."""
+    """Return whether an assignment gives several targets a value each; one that only swaps names
+    does not count.
+    """
     places = [target for target in node.targets if isinstance(target, ast.Tuple | ast.List)]
     if not places or not isinstance(node.value, ast.Tuple | ast.List):
         return False
@@ -59,26 +80,39 @@ def is_parallel(node: ast.Assign) -> bool:
 def patches_private_name(node: ast.Call) -> bool:
     """Return whether a call is `setattr` of pytest's `monkeypatch` with a private name."""
     is_patch = isinstance(node.func, ast.Attribute) and node.func.attr == "setattr"
-    names = [arg.value for arg in node.args[:2] if isinstance(arg, ast.Constant) and isinstance(arg.value, str)]
+    names = [
+        arg.value
+        for arg in node.args[:2]
+        if isinstance(arg, ast.Constant) and isinstance(arg.value, str)
+    ]
     last_parts = [name.rpartition(".")[2] for name in names]
     return is_patch and any(name.startswith("_") and not name.endswith("__") for name in last_parts)
 
 
 def violations(tree: ast.Module, exceptions: set[str]) -> Iterator[tuple[int, str]]:
-    """Yield the line and the sentence of each violation in a module, in which some names may stay."""
+    """Yield the line and the sentence of each violation in a module; `exceptions` may stay."""
     for node in ast.walk(tree):
-        if isinstance(node, ast.expr | ast.arg) and (name := bound_name(node)) in NO_NOUNS and name not in exceptions:
+        if (
+            isinstance(node, ast.expr | ast.arg)
+            and (name := bound_name(node)) in NO_NOUNS
+            and name not in exceptions
+        ):
             yield node.lineno, f"`{name}` must be a noun; name the variable by what it holds."
         if isinstance(node, ast.Call) and patches_private_name(node):
             yield node.lineno, "expected a public name to patch, got a private one; make it public."
         if isinstance(node, ast.Assign) and is_parallel(node):
             yield node.lineno, "expected an assignment of one value, got several; give each a line."
         elif isinstance(node, ast.Assign) and len(node.targets) > 1 and node in tree.body:
-            yield node.lineno, "expected an assignment of one constant, got several; give each a line."
+            yield (
+                node.lineno,
+                "expected an assignment of one constant, got several; give each a line.",
+            )
 
 
 def check(folders: Sequence[str]) -> list[str]:
-    """Return a line for each violation in the modules of some folders, in the order of files and lines."""
+    """Return a line for each violation in the modules of some folders, in the order of files and
+    lines.
+    """
     lines = []
     for path in sorted(path for folder in folders for path in Path(folder).rglob("*.py")):
         tree = ast.parse(path.read_text(encoding="utf-8"))

@@ -1,6 +1,8 @@
-"""Check an installed package outside of a checkout: imports, data files, an image, a fit of two frames, a web page.
+"""Check an installed package outside of a checkout: imports, data files, an image, a fit of two
+frames, a web page.
 
-Run it as `python -I tools/check_installed.py`; with `--image`, only an image of a file of Gaussians is rendered.
+Run it as `python -I tools/check_installed.py`; with `--image`, only an image of a file of Gaussians
+is rendered.
 """
 
 from __future__ import annotations
@@ -18,20 +20,41 @@ QUICK = ("--num-gaussians", "300", "--first-frame-steps", "20", "--epochs", "1")
 
 def command(folder: Path, *args: str) -> str:
     """Return the output of `morgs-mi` with arguments."""
-    done = subprocess.run([sys.executable, "-I", "-m", "morgs_mi", *args], cwd=folder, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-I", "-m", "morgs_mi", *args], cwd=folder, capture_output=True, text=True
+    )
     if done.returncode:
-        raise SystemExit(f"morgs-mi {' '.join(args)}: status {done.returncode}\n{done.stdout}{done.stderr}")
+        raise SystemExit(
+            f"morgs-mi {' '.join(args)}: status {done.returncode}\n{done.stdout}{done.stderr}"
+        )
     print("morgs-mi", *args)
     return done.stdout
 
 
 def write_splats(path: Path) -> None:
     """Write Gaussians as the text of a PLY file."""
-    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2"]
+    names = [
+        "x",
+        "y",
+        "z",
+        "f_dc_0",
+        "f_dc_1",
+        "f_dc_2",
+        "opacity",
+        "scale_0",
+        "scale_1",
+        "scale_2",
+    ]
     names += [f"rot_{i}" for i in range(4)]
-    header = ["ply", "format ascii 1.0", f"element vertex {SPLATS}", *(f"property float {name}" for name in names)]
+    header = [
+        "ply",
+        "format ascii 1.0",
+        f"element vertex {SPLATS}",
+        *(f"property float {name}" for name in names),
+    ]
     rows = [
-        f"{i % 10} {i // 10 % 5} {i // 50} {i % 3 - 1} {i % 5 / 2 - 1} 0.5 2 -1 -1.5 -1 1 0 0 0" for i in range(SPLATS)
+        f"{i % 10} {i // 10 % 5} {i // 50} {i % 3 - 1} {i % 5 / 2 - 1} 0.5 2 -1 -1.5 -1 1 0 0 0"
+        for i in range(SPLATS)
     ]
     path.write_text("\n".join([*header, "end_header", *rows]) + "\n")
 
@@ -42,7 +65,9 @@ def check_files() -> None:
 
     place = Path(morgs_mi.__file__).parent
     if (place.parent / "pyproject.toml").exists():
-        raise SystemExit(f"{place}: expected an installed package, got a checkout; run this from another folder.")
+        raise SystemExit(
+            f"{place}: expected an installed package, got a checkout; run this from another folder."
+        )
     for name in ("player.html", "player.js", "NOTICE"):
         assert (resources("morgs_mi") / "playback" / "export" / "web_player" / name).is_file(), name
     scenes = {file.stem for file in files("morgs-mi") or () if file.match("morgs_mi/scenes/*.py")}

@@ -1,13 +1,16 @@
-"""Motion of anchors at several levels, after ReCon-GS (Fu et al., NeurIPS 2025) and QuARC-GS (2026).
+"""Motion of anchors at several levels, after ReCon-GS (Fu et al., NeurIPS 2025) and QuARC-GS
+(2026).
 
-The finest level has an anchor for every m Gaussians, and each further level a fraction 1/r of the anchors before it.
-So anchors are dense where Gaussians are, unlike cells of one size. Every Gaussian follows the nearest anchor a_l(i) of
-each level l, and moves by the sum of their translations t and rotations q (eq. 2 of QuARC-GS):
+The finest level has an anchor for every m Gaussians, and each further level a fraction 1/r of the
+anchors before it. So anchors are dense where Gaussians are, unlike cells of one size. Every
+Gaussian follows the nearest anchor a_l(i) of each level l, and moves by the sum of their
+translations t and rotations q (eq. 2 of QuARC-GS):
 
     d_i = sum_l t_{a_l(i)},    r_i = 1 + sum_l q_{a_l(i)}.
 
-Both are multiples of a step (its eq. 3): rounded in the forward pass, with the gradient of what is not rounded. An
-anchor that would move by less than half a step does not move at all. A step of 0 rounds nothing, as in ReCon-GS.
+Both are multiples of a step (its eq. 3): rounded in the forward pass, with the gradient of what is
+not rounded. An anchor that would move by less than half a step does not move at all. A step of 0
+rounds nothing, as in ReCon-GS.
 """
 
 from __future__ import annotations
@@ -25,7 +28,12 @@ from benchmarks.field.shared import quantised
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.z_order import equal_cells, z_order
 from morgs_mi.method.motion_config import MotionConfig
-from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, MotionModelFactory, sparse_product
+from morgs_mi.method.motion_model import (
+    MOTION_MODELS,
+    MotionModel,
+    MotionModelFactory,
+    sparse_product,
+)
 
 
 @dataclass(frozen=True)
@@ -49,7 +57,7 @@ class AnchorConfig:
 
 
 def anchored_motion(gaussians: Gaussians, extent: float, config: AnchorConfig) -> MotionModel:
-    """Return the model of N Gaussians of the previous frame; `extent` of the scene in world units."""
+    """Return the model of N Gaussians of the previous frame; `extent` of the scene, world units."""
     counts = [config.gaussians * config.ratio**level for level in range(config.levels)]
     anchors, size = anchor_matrix(np.asarray(gaussians.means), counts)
     steps = {"translation": config.translation_step * extent, "rotation": config.rotation_step}
@@ -59,7 +67,9 @@ def anchored_motion(gaussians: Gaussians, extent: float, config: AnchorConfig) -
             "rotation": dr.zeros(mi.TensorXf, (size, 4)),
         },
         {"translation": config.translation_rate * extent, "rotation": config.rotation_rate},
-        lambda p: tuple(sparse_product(anchors, quantised(p[name], step)) for name, step in steps.items()),
+        lambda p: tuple(
+            sparse_product(anchors, quantised(p[name], step)) for name, step in steps.items()
+        ),
     )
 
 
@@ -69,7 +79,8 @@ def _anchors(argument: str, config: MotionConfig) -> MotionModelFactory:
 
 
 def anchor_matrix(points: np.ndarray, counts: Sequence[int]) -> tuple[csr_array, int]:
-    """Return which anchors each of N points follows, [N, A] of 0 and 1, and the number A of anchors of all levels.
+    """Return which anchors each of N points follows, [N, A] of 0 and 1, and the number A of anchors
+    of all levels.
 
     Anchors are points at equal distances along a Z-order curve through all of them.
 
@@ -84,6 +95,10 @@ def anchor_matrix(points: np.ndarray, counts: Sequence[int]) -> tuple[csr_array,
         anchors = points[order[min(count, len(points)) // 2 :: count]]
         _, nearest = KDTree(anchors).query(points, workers=-1)
         rows = np.arange(len(points) + 1)
-        levels.append(csr_array((np.ones(len(points), np.float32), nearest, rows), (len(points), len(anchors))))
+        levels.append(
+            csr_array(
+                (np.ones(len(points), np.float32), nearest, rows), (len(points), len(anchors))
+            )
+        )
         size += len(anchors)
     return csr_array(hstack(levels, format="csr")), size

@@ -1,11 +1,13 @@
 """Hierarchical coherent motion, after HiCoM (Gao et al., NeurIPS 2024).
 
-The space of the Gaussians is divided into cubic cells, at several levels from coarse to fine. Every cell of every level
-has a translation and a rotation, and a Gaussian moves by the sum over the cells that contain it,
+The space of the Gaussians is divided into cubic cells, at several levels from coarse to fine. Every
+cell of every level has a translation and a rotation, and a Gaussian moves by the sum over the cells
+that contain it,
 
     d_i = sum_l t_l(i),    r_i = 1 + sum_l q_l(i).
 
-The coarse levels move objects, and the fine ones move the remainder. Only cells with Gaussians have parameters.
+The coarse levels move objects, and the fine ones move the remainder. Only cells with Gaussians have
+parameters.
 """
 
 from __future__ import annotations
@@ -20,7 +22,12 @@ from scipy.sparse import csr_array, hstack
 
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.method.motion_config import MotionConfig
-from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, MotionModelFactory, sparse_product
+from morgs_mi.method.motion_model import (
+    MOTION_MODELS,
+    MotionModel,
+    MotionModelFactory,
+    sparse_product,
+)
 
 
 @dataclass(frozen=True)
@@ -55,7 +62,8 @@ def _hicom(argument: str, config: MotionConfig) -> MotionModelFactory:
 
 
 def cell_matrix(points: np.ndarray, sides: Sequence[float]) -> csr_array:
-    """Return the memberships [N, C] of points [N, 3] in the cells of all levels that are not empty: 0 or 1.
+    """Return the memberships [N, C] of points [N, 3] in the cells of all levels that are not empty:
+    0 or 1.
 
     Args:
         points: world units.
@@ -63,8 +71,11 @@ def cell_matrix(points: np.ndarray, sides: Sequence[float]) -> csr_array:
     """
     levels = []
     for side in sides:
-        # A shift by half a cell keeps the origin, where captures often have their subject, inside one.
-        _, cell = np.unique(np.floor(points / side + 0.5).astype(np.int64), axis=0, return_inverse=True)
+        # A shift by half a cell keeps the origin, where captures often have their subject, inside
+        # one.
+        _, cell = np.unique(
+            np.floor(points / side + 0.5).astype(np.int64), axis=0, return_inverse=True
+        )
         rows = np.arange(len(points) + 1)
         levels.append(csr_array((np.ones(len(points), np.float32), cell.ravel(), rows)))
     return csr_array(hstack(levels, format="csr"))

@@ -1,9 +1,10 @@
 """Motion grid with its rate in the loss, after 4DGC (Hu et al., CVPR 2025).
 
-Grids at several levels have a translation and a rotation at every corner of a cell with Gaussians. A Gaussian moves by
-the sum over the levels, each interpolated between the 8 corners around its mean. The values count in steps, to which
-they are rounded (the gradient passes the rounding unchanged), and the loss contains the bits that an entropy coder
-would need for them: the values x of a level are logistic with a learned scale b,
+Grids at several levels have a translation and a rotation at every corner of a cell with Gaussians.
+A Gaussian moves by the sum over the levels, each interpolated between the 8 corners around its
+mean. The values count in steps, to which they are rounded (the gradient passes the rounding
+unchanged), and the loss contains the bits that an entropy coder would need for them: the values x
+of a level are logistic with a learned scale b,
 
     bits = -log2(S((x + 1/2) / b) - S((x - 1/2) / b)),    S the sigmoid.
 
@@ -26,7 +27,12 @@ from morgs_mi.core.attributes import sigmoid
 from morgs_mi.core.gaussians import Gaussians, repeat_each
 from morgs_mi.core.types import Float, Tensor
 from morgs_mi.method.motion_config import MotionConfig
-from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, MotionModelFactory, sparse_product
+from morgs_mi.method.motion_model import (
+    MOTION_MODELS,
+    MotionModel,
+    MotionModelFactory,
+    sparse_product,
+)
 
 # Least probability of a value, which bounds its bits.
 _LEAST = 1e-6
@@ -59,8 +65,10 @@ _SLOW = GridConfig(translation_rate=5e-4, rotation_rate=2e-3)
 
 
 def motion_grid(gaussians: Gaussians, extent: float, config: GridConfig) -> MotionModel:
-    """Return the model of N Gaussians of the previous frame; `extent` of the scene in world units."""
-    matrix, level = corner_matrix(np.asarray(gaussians.means), [side * extent for side in config.cells])
+    """Return the model of N Gaussians of the previous frame; `extent` of the scene, world units."""
+    matrix, level = corner_matrix(
+        np.asarray(gaussians.means), [side * extent for side in config.cells]
+    )
     C = len(level)
     N = len(gaussians)
     L = len(config.cells)
@@ -68,12 +76,17 @@ def motion_grid(gaussians: Gaussians, extent: float, config: GridConfig) -> Moti
     steps = {"translation": config.translation_step * extent, "rotation": config.rotation_step}
 
     def motion(p: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        return tuple(sparse_product(matrix, quantised(p[name], 1.0)) * step for name, step in steps.items())
+        return tuple(
+            sparse_product(matrix, quantised(p[name], 1.0)) * step for name, step in steps.items()
+        )
 
     def rate(p: Mapping[str, Tensor]) -> dict[str, Tensor]:
         scales = dr.exp(sparse_product(of_level, p["log_scales"]))
         of_kind = zip(steps, (scales[:, 0].array, scales[:, 1].array), strict=True)
-        total = sum(dr.sum(bits(p[name].array, repeat_each(b, int(p[name].shape[1])))) for name, b in of_kind)
+        total = sum(
+            dr.sum(bits(p[name].array, repeat_each(b, int(p[name].shape[1]))))
+            for name, b in of_kind
+        )
         return {"rate": total * (config.rate_weight / N)}
 
     return MotionModel(
@@ -109,7 +122,8 @@ def bits(x: Float, scale: Float) -> Float:
 
 
 def corner_matrix(points: np.ndarray, sides: Sequence[float]) -> tuple[csr_array, np.ndarray]:
-    """Return the weights [N, C] of the corners around points [N, 3], on all levels, and the level of each corner [C].
+    """Return the weights [N, C] of the corners around points [N, 3], on all levels, and the level
+    of each corner [C].
 
     Args:
         points: world units.
@@ -119,6 +133,8 @@ def corner_matrix(points: np.ndarray, sides: Sequence[float]) -> tuple[csr_array
     for side in sides:
         corner, weights = corners(points, side)
         _, index = np.unique(corner.reshape(-1, 3), axis=0, return_inverse=True)
-        matrices.append(csr_array((weights.ravel(), index.ravel(), np.arange(0, 8 * len(points) + 1, 8))))
+        matrices.append(
+            csr_array((weights.ravel(), index.ravel(), np.arange(0, 8 * len(points) + 1, 8)))
+        )
     levels = np.repeat(np.arange(len(sides)), [matrix.shape[1] for matrix in matrices])
     return csr_array(hstack(matrices, format="csr")), levels

@@ -9,7 +9,8 @@ from morgs_mi.core.types import Tensor
 
 
 def corners(points: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners of the cubic cells around points, and their weights in trilinear interpolation.
+    """Return the corners of the cubic cells around points, and their weights in trilinear
+    interpolation.
 
     Args:
         points: [N, 3], world units.
@@ -26,7 +27,9 @@ def corners(points: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def quantised(values: Tensor, step: float) -> Tensor:
-    """Return values rounded to multiples of a step, with the gradient of what is not rounded; 0 rounds nothing."""
+    """Return values rounded to multiples of a step, with the gradient of what is not rounded; 0
+    rounds nothing.
+    """
     if not step:
         return values
     fixed = dr.detach(values)

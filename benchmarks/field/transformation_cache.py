@@ -1,13 +1,15 @@
 """Neural transformation cache, after 3DGStream (Sun et al., CVPR 2024).
 
-A multiresolution hash grid (Mueller et al. 2022, *Instant neural graphics primitives*) encodes the mean of a Gaussian
-in the previous frame, and a small network maps the code to its displacement and its rotation,
+A multiresolution hash grid (Mueller et al. 2022, *Instant neural graphics primitives*) encodes the
+mean of a Gaussian in the previous frame, and a small network maps the code to its displacement and
+its rotation,
 
     (d_i / s, q_i) = C max(0, B max(0, A h(mu_i))),    r_i = 1 + q_i.
 
-Level l has cells of side s_l. Their corners are entries of a table of limited size by a hash of their coordinates; h
-are the entries of all levels, each interpolated between the 8 corners around the mean. The means do not change while
-the cache is fitted: h is the product of a constant sparse matrix and the tables. C starts at 0: nothing moves.
+Level l has cells of side s_l. Their corners are entries of a table of limited size by a hash of
+their coordinates; h are the entries of all levels, each interpolated between the 8 corners around
+the mean. The means do not change while the cache is fitted: h is the product of a constant sparse
+matrix and the tables. C starts at 0: nothing moves.
 """
 
 from __future__ import annotations
@@ -23,7 +25,12 @@ from benchmarks.field.shared import corners
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.method.motion_config import MotionConfig
-from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, MotionModelFactory, sparse_product
+from morgs_mi.method.motion_model import (
+    MOTION_MODELS,
+    MotionModel,
+    MotionModelFactory,
+    sparse_product,
+)
 
 # Of the hash by Mueller et al.
 _PRIMES = np.array([1, 2_654_435_761, 805_459_861], np.uint64)
@@ -87,16 +94,21 @@ def transformation_cache(
         return output[:, :3] * (config.displacement * extent), output[:, 3:]
 
     rates = dict.fromkeys(start, config.rate) | {"table": config.table_rate}
-    return MotionModel({name: from_numpy(mi.TensorXf, value) for name, value in start.items()}, rates, motion)
+    return MotionModel(
+        {name: from_numpy(mi.TensorXf, value) for name, value in start.items()}, rates, motion
+    )
 
 
 @MOTION_MODELS.register("cache")
 def _cache(argument: str, config: MotionConfig) -> MotionModelFactory:
-    return lambda gaussians, extent, rng: transformation_cache(gaussians, extent, rng, CacheConfig())
+    return lambda gaussians, extent, rng: transformation_cache(
+        gaussians, extent, rng, CacheConfig()
+    )
 
 
 def hash_matrix(points: np.ndarray, sides: list[float], table: int) -> csr_array:
-    """Return the weights of the entries of the tables at points, [N L, L T]; row n L + l reads level l of point n.
+    """Return the weights of the entries of the tables at points, [N L, L T]; row n L + l reads
+    level l of point n.
 
     Args:
         points: [N, 3], world units.

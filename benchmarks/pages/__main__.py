@@ -2,8 +2,8 @@
 
     python -m benchmarks.pages
 
-A table follows its name in a comment, `<!-- table: NAME -->`, and is replaced. A test compares the pages with the
-committed results.
+A table follows its name in a comment, `<!-- table: NAME -->`, and is replaced. A test compares the
+pages with the committed results.
 """
 
 from __future__ import annotations

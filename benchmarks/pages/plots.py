@@ -18,7 +18,9 @@ def drift() -> Figure:
     """Return the PSNR where things move over the frames of five clips, means of their fits."""
     figure = blank_figure(7, 3.2)
     axis = figure.subplots()
-    clips = grouped([fit for name in ("drift", "drift_fresh") for fit in committed(name)["fits"]], "clip")
+    clips = grouped(
+        [fit for name in ("drift", "drift_fresh") for fit in committed(name)["fits"]], "clip"
+    )
     for (name,), fits in clips.items():
         psnr = np.mean([np.array(fit["psnr_moving"], float) for fit in fits], axis=0)
         axis.plot(np.arange(1, len(psnr) + 1), psnr, label=name)
@@ -34,7 +36,9 @@ def photos_over_time() -> Figure:
     axis = figure.subplots()
     for (name,), fits in grouped(committed("real_seconds")["fits"], "set").items():
         fits = sorted(fits, key=lambda fit: fit["cpu_s"])
-        axis.plot([fit["cpu_s"] / 2 for fit in fits], [fit["held_out"] for fit in fits], "o-", label=name)
+        axis.plot(
+            [fit["cpu_s"] / 2 for fit in fits], [fit["held_out"] for fit in fits], "o-", label=name
+        )
     axis.set(xscale="log", xlabel="processor time of two cores, s", ylabel="held-out PSNR, dB")
     ticks = (30, 60, 120, 300, 600)
     axis.set_xticks(ticks, map(str, ticks))

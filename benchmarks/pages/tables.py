@@ -9,7 +9,17 @@ from typing import Any
 import numpy as np
 
 from benchmarks.pages.results import committed
-from benchmarks.reports import cameras, codec, drift, field, held_out, random_scenes, real, renderer, timing
+from benchmarks.reports import (
+    cameras,
+    codec,
+    drift,
+    field,
+    held_out,
+    random_scenes,
+    real,
+    renderer,
+    timing,
+)
 from benchmarks.reports.method_tables import best_rows
 from benchmarks.reports.plots import grouped, markdown
 from benchmarks.reports.unseen import out_of_capture
@@ -25,15 +35,29 @@ def demo() -> str:
     """Return the scores of the demo, with and without motion, offset and confidence."""
     comparison = committed("demo")["comparison"]
     rows = (
-        (title, f"{row['psnr']:.2f} dB", f"{row['motion_error_moving']:.2f} px", f"{row['motion_error_still']:.2f} px")
-        for title, row in (("default", comparison["full"]), ("residuals alone", comparison["plain"]))
+        (
+            title,
+            f"{row['psnr']:.2f} dB",
+            f"{row['motion_error_moving']:.2f} px",
+            f"{row['motion_error_still']:.2f} px",
+        )
+        for title, row in (
+            ("default", comparison["full"]),
+            ("residuals alone", comparison["plain"]),
+        )
     )
     return markdown(("", "PSNR", "motion error, moving", "still"), rows)
 
 
 def hdr() -> str:
-    """Return the error of the light that an inserted sphere receives, of fits of an HDR recording and one of 8 bits."""
-    titles = {"hdr": "HDR", "8-bit": "8 bits, as recorded", "8-bit, guessed": "8 bits, clipped light taken as 4"}
+    """Return the error of the light that an inserted sphere receives, of fits of an HDR recording
+    and one of 8 bits.
+    """
+    titles = {
+        "hdr": "HDR",
+        "8-bit": "8 bits, as recorded",
+        "8-bit, guessed": "8 bits, clipped light taken as 4",
+    }
     light = committed("hdr")["light"]
     rows = (
         (title, f"{100 * light[name]['error']:.1f} %", f"{100 * light[name]['mean']:.1f} %")
@@ -48,11 +72,21 @@ def gains() -> str:
     for clip in committed("method_report")["clips"]:
         best = {(row["preset"], row["epochs"]): row["mean"] for row in best_rows(clip)}
         for epochs in (2, 8):
-            ours, theirs, paper = (best[preset, epochs] for preset in ("default", "baseline", "paper"))
+            ours, theirs, paper = (
+                best[preset, epochs] for preset in ("default", "baseline", "paper")
+            )
             gains_in_db = (f"{ours[name] - theirs[name]:.2f}" for name in ("psnr", "psnr_moving"))
             share = ours["motion_error_moving"] / theirs["motion_error_moving"]
             over_paper = ours["psnr_moving"] - paper["psnr_moving"]
-            rows.append((f"`{clip['name']}`", f"{epochs}", *gains_in_db, f"{share:.2f}", f"{over_paper:.2f}"))
+            rows.append(
+                (
+                    f"`{clip['name']}`",
+                    f"{epochs}",
+                    *gains_in_db,
+                    f"{share:.2f}",
+                    f"{over_paper:.2f}",
+                )
+            )
     titles = "PSNR, dB", "moving, dB", "motion error, share", "moving, over `paper`, dB"
     return markdown(("clip", "epochs", *titles), rows)
 
@@ -65,10 +99,19 @@ def parts() -> str:
     for preset in ("baseline", "paper", "ml", "ml-mo", "ml-mo-mc"):
         short = best[preset, 2]
         long = best[preset, 8]
-        psnrs = (f"{scores[name]:.2f}" for scores in (short, long) for name in ("psnr", "psnr_moving"))
+        psnrs = (
+            f"{scores[name]:.2f}" for scores in (short, long) for name in ("psnr", "psnr_moving")
+        )
         iou = "-" if long["confidence_iou"] is None else f"{long['confidence_iou']:.2f}"
         rows.append((f"`{preset}`", *psnrs, f"{long['motion_error_moving']:.2f}", iou))
-    titles = "2 epochs: PSNR, dB", "moving", "8 epochs: PSNR, dB", "moving", "motion error, px", "IoU"
+    titles = (
+        "2 epochs: PSNR, dB",
+        "moving",
+        "8 epochs: PSNR, dB",
+        "moving",
+        "motion error, px",
+        "IoU",
+    )
     return markdown(("preset", *titles), rows)
 
 
@@ -84,17 +127,26 @@ def frame_times() -> str:
             scores = f"{run['seconds']:.1f}", f"{run['psnr']:.2f}", f"{run['bytes'] / 1000:.0f}"
             shares = (f"{100 * run[key]:.0f} %" for key in ("gaussians", "pixels"))
             rows.append((name, f"{epochs}", *scores, *shares))
-    return markdown(("Gaussians", "epochs", "s", "PSNR, dB", "kB", "active Gaussians", "drawn pixels"), rows)
+    return markdown(
+        ("Gaussians", "epochs", "s", "PSNR, dB", "kB", "active Gaussians", "drawn pixels"), rows
+    )
 
 
 def unseen_groups() -> str:
-    """Return coverage and width of the intervals by kind of capture, of all fits and of those with a number."""
+    """Return coverage and width of the intervals by kind of capture, of all fits and of those with
+    a number.
+    """
     rows = []
     fits = list(out_of_capture(committed("unseen")["fits"]))
-    for kind, group in [*((kind, group) for (kind,), group in grouped(fits, "kind").items()), ("all", fits)]:
+    for kind, group in [
+        *((kind, group) for (kind,), group in grouped(fits, "kind").items()),
+        ("all", fits),
+    ]:
         narrow = [row for row in group if row["width"] <= WIDEST]
         widths = f"{np.median([row['width'] for row in narrow]):.1f}"
-        shares = (f"{sum(row['within'] for row in part)} of {len(part)}" for part in (group, narrow))
+        shares = (
+            f"{sum(row['within'] for row in part)} of {len(part)}" for part in (group, narrow)
+        )
         rows.append((kind, f"{len(grouped(group, 'set'))}", *shares, widths))
     titles = "fits in the interval", "of those with a number", "median width of these, dB"
     return markdown(("kind", "captures", *titles), rows)
@@ -106,24 +158,48 @@ def splat_files() -> str:
         (
             f"{row['gaussians']:,}",
             f"{row['file_megabytes']:.0f}",
-            *(f"{row[name]:.1f}" for name in ("open_seconds", "first_image_seconds", "image_seconds", "page_seconds")),
+            *(
+                f"{row[name]:.1f}"
+                for name in ("open_seconds", "first_image_seconds", "image_seconds", "page_seconds")
+            ),
             f"{row['page_megabytes']:.0f}",
         )
         for row in committed("splat_files")["rows"]
     )
-    titles = "Gaussians", "file, MB", "open, s", "first image, s", "image, s", "web page, s", "page, MB"
+    titles = (
+        "Gaussians",
+        "file, MB",
+        "open, s",
+        "first image, s",
+        "image, s",
+        "web page, s",
+        "page, MB",
+    )
     return markdown(titles, rows, left=0)
 
 
 def plugin_step() -> str:
-    """Return the times of a step through `mi.render`, and of several cameras, by number of Gaussians."""
+    """Return the times of a step through `mi.render`, and of several cameras, by number of
+    Gaussians.
+    """
     rows = []
     for row in committed("plugin_step")["rows"]:
         times = (f"{row[name]:.0f} ms" for name in ("rasterize", "plugin", "update"))
-        ratios = (row["plugin"] / row["rasterize"], row["cameras_together"] / row["cameras_one_by_one"])
+        ratios = (
+            row["plugin"] / row["rasterize"],
+            row["cameras_together"] / row["cameras_one_by_one"],
+        )
         size = f"{row['width']}x{row['height']}"
         rows.append((f"{row['gaussians']:,}", size, *times, *(f"{ratio:.2f}" for ratio in ratios)))
-    titles = "Gaussians", "film", "`rasterize`", "`mi.render`", "`params.update()`", "ratio", "four cameras together"
+    titles = (
+        "Gaussians",
+        "film",
+        "`rasterize`",
+        "`mi.render`",
+        "`params.update()`",
+        "ratio",
+        "four cameras together",
+    )
     return markdown(titles, rows, left=0)
 
 
@@ -146,10 +222,17 @@ def workers() -> str:
     """Return wall time and efficiency by number of workers."""
     result = committed("scaling")
     rows = (
-        (f"{run['workers']}", f"{run['seconds']:.0f} s", f"{share['frames']:.2f}", f"{share['whole']:.2f}")
+        (
+            f"{run['workers']}",
+            f"{run['seconds']:.0f} s",
+            f"{share['frames']:.2f}",
+            f"{share['whole']:.2f}",
+        )
         for run, share in zip(result["runs"], result["efficiency"], strict=True)
     )
-    return markdown(("workers", "whole fit", "efficiency, later frames", "efficiency, whole fit"), rows)
+    return markdown(
+        ("workers", "whole fit", "efficiency, later frames", "efficiency, whole fit"), rows
+    )
 
 
 def steps() -> str:

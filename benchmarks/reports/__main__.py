@@ -4,8 +4,8 @@
     python -m benchmarks.reports codec CAPTURE... --out out/codec
     python -m benchmarks.reports method CAPTURE... --out out/method --workers 2
 
-`morgs-mi synth` writes captures with ground truth. The other modules of this folder are reports of their own:
-`python -m benchmarks.reports.random_scenes`.
+`morgs-mi synth` writes captures with ground truth. The other modules of this folder are reports of
+their own: `python -m benchmarks.reports.random_scenes`.
 """
 
 from __future__ import annotations

@@ -1,15 +1,16 @@
-"""Refinement of disturbed cameras: poses and focal lengths that are found again, and the quality that comes back.
+"""Refinement of disturbed cameras: poses and focal lengths that are found again, and the quality
+that comes back.
 
     python -m benchmarks.reports.cameras --seeds 3 6 7 --json out.json
 
-Each clip is `morgs-mi synth random --seed SEED`, as in `random_scenes`. Every camera is rotated by an angle about a
-random axis, displaced by as many per cent of the scene extent in a random direction, and given focal lengths that are
-1 % too long or too short; at 0 degrees, all cameras are true. The first frame is fitted with the true cameras, the
-wrong and the refined ones. The held-out view is scored as calibrated, and registered: seen from the camera that
-fits its image best.
+Each clip is `morgs-mi synth random --seed SEED`, as in `random_scenes`. Every camera is rotated by
+an angle about a random axis, displaced by as many per cent of the scene extent in a random
+direction, and given focal lengths that are 1 % too long or too short; at 0 degrees, all cameras are
+true. The first frame is fitted with the true cameras, the wrong and the refined ones. The held-out
+view is scored as calibrated, and registered: seen from the camera that fits its image best.
 
-With `--lens`, cameras are also refined that are true but for their lenses: the training views have a radial distortion
-of up to that (k1), of which the calibration knows nothing.
+With `--lens`, cameras are also refined that are true but for their lenses: the training views have
+a radial distortion of up to that (k1), of which the calibration knows nothing.
 """
 
 from __future__ import annotations
@@ -76,17 +77,28 @@ class Options(StudyOptions):
                 keys = {"seed": seed, "degrees": degrees, "disturbance": disturbance, "lens": 0.0}
                 scenes.append(Scene(keys, (source, source, degrees, disturbance)))
             if self.lens:
-                true, denied = (Source.of(load_capture(c, self.downscale)) for c in lens_clips(self, seed))
+                true, denied = (
+                    Source.of(load_capture(c, self.downscale)) for c in lens_clips(self, seed)
+                )
                 keys = {"seed": seed, "degrees": 0.0, "disturbance": 0, "lens": self.lens}
                 scenes.append(Scene(keys, (true, denied, 0.0, 0)))
-        fit = FitConfig(num_gaussians=self.gaussians, first_frame_steps=self.steps, dropping=0.0, refine_cameras="auto")
+        fit = FitConfig(
+            num_gaussians=self.gaussians,
+            first_frame_steps=self.steps,
+            dropping=0.0,
+            refine_cameras="auto",
+        )
         return Study(measure, scenes, [Variant({}, StreamConfig(fit))], self.fit_seeds)
 
     def table(self, rows: Sequence[Row]) -> str:
-        """Return the registered PSNR, its recovered share and the errors of the rotations by the error of the rig."""
+        """Return the registered PSNR, its recovered share and the errors of the rotations by the
+        error of the rig.
+        """
         groups = {
             f"poses off by {degrees:g} degrees": group
-            for (degrees,), group in sorted(grouped((row for row in rows if not row["lens"]), "degrees").items())
+            for (degrees,), group in sorted(
+                grouped((row for row in rows if not row["lens"]), "degrees").items()
+            )
         }
         groups["lenses ignored"] = [row for row in rows if row["lens"]]
         lines = []
@@ -95,7 +107,9 @@ class Options(StudyOptions):
                 continue
             psnrs = (f"{np.mean([row[rig]['registered'] for row in group]):.1f}" for rig in _RIGS)
             shares = f"{span((100 * recovered(row) for row in group), 0)} %"
-            lines.append((name, *psnrs, shares, span((row["refined"]["rotation"] for row in group), 2)))
+            lines.append(
+                (name, *psnrs, shares, span((row["refined"]["rotation"] for row in group), 2))
+            )
         titles = "true cameras, dB", "disturbed", "refined", "recovered", "rotation after, degrees"
         return markdown(("error", *titles), lines)
 
@@ -110,12 +124,18 @@ def disturbed(cameras: Sequence[Camera], degrees: float, seed: int) -> tuple[Cam
         axis, direction = rng.normal(size=(2, 3))
         rotation = np.deg2rad(degrees) * axis / np.linalg.norm(axis)
         displacement = degrees / 100 * extent * direction / np.linalg.norm(direction)
-        result.append(changed_camera(camera, np.array([*rotation, *displacement, focal * rng.choice([-1, 1]), 0, 0])))
+        result.append(
+            changed_camera(
+                camera, np.array([*rotation, *displacement, focal * rng.choice([-1, 1]), 0, 0])
+            )
+        )
     return tuple(result)
 
 
 def pose_errors(cameras: Sequence[Camera], true: Sequence[Camera]) -> dict[str, float]:
-    """Return the errors of cameras after the best common rotation, displacement and scale: degrees, extents, ratio."""
+    """Return the errors of cameras after the best common rotation, displacement and scale: degrees,
+    extents, ratio.
+    """
     centres, goals = (np.array([camera.position for camera in rig]) for rig in (cameras, true))
     centres = centres - centres.mean(axis=0)
     goals = goals - goals.mean(axis=0)
@@ -134,7 +154,9 @@ def pose_errors(cameras: Sequence[Camera], true: Sequence[Camera]) -> dict[str, 
 
 
 def scores(capture: Capture, config: StreamConfig) -> dict[str, float]:
-    """Fit the first frame; return the PSNR of the training views, and of the held-out one in both ways."""
+    """Fit the first frame; return the PSNR of the training views, and of the held-out one in both
+    ways.
+    """
     loop = new_loop(capture, config)
     images = next(capture.frames(0, 1)).images
     train = capture.train_views
@@ -178,13 +200,16 @@ def measure(
 
 
 def camera_errors(given: Capture, capture: Capture) -> dict[str, float]:
-    """Return the errors of the training cameras, and by how much their lenses shift a corner of the image, px."""
+    """Return the errors of the training cameras, and by how much their lenses shift a corner of the
+    image, px.
+    """
     truth = load_disturbances(capture.path / "truth")
     zeros = [(0.0, 0.0)] * len(capture.cameras)
     terms = given.distortions or zeros
     train = capture.train_views
     corners = [
-        _at_corner(given.cameras[v], terms[v]) - _at_corner(capture.cameras[v], (truth[capture.names[v]].distortion, 0))
+        _at_corner(given.cameras[v], terms[v])
+        - _at_corner(capture.cameras[v], (truth[capture.names[v]].distortion, 0))
         for v in train
     ]
     errors = pose_errors([given.cameras[v] for v in train], [capture.cameras[v] for v in train])
@@ -192,16 +217,23 @@ def camera_errors(given: Capture, capture: Capture) -> dict[str, float]:
 
 
 def lens_clips(options: Options, seed: int) -> tuple[Path, Path]:
-    """Return a clip through lenses with distortion, and a copy with a calibration without it for the training views."""
+    """Return a clip through lenses with distortion, and a copy with a calibration without it for
+    the training views.
+    """
     path = options.clips / f"random-{seed}-lens-{options.lens:g}"
     denied = path.with_name(f"{path.name}-denied")
     disturbances = Disturbances(distortion=options.lens)
     capture = synthetic("random", path, SynthConfig(frames=1, seed=seed, disturbances=disturbances))
     if not denied.exists():
         truth = load_disturbances(path / "truth")
-        lenses = [truth[n].lens if v in capture.test_views else Lens() for v, n in enumerate(capture.names)]
+        lenses = [
+            truth[n].lens if v in capture.test_views else Lens()
+            for v, n in enumerate(capture.names)
+        ]
         shutil.copytree(path, denied)
-        write_colmap(denied / "sparse" / "0", capture.cameras, capture.points, capture.point_colors, lenses)
+        write_colmap(
+            denied / "sparse" / "0", capture.cameras, capture.points, capture.point_colors, lenses
+        )
     return path, denied
 
 
@@ -212,7 +244,9 @@ def _at_corner(camera: Camera, terms: Sequence[float]) -> np.ndarray:
 
 
 def recovered(row: Mapping[str, Any]) -> float:
-    """Return the share of the lost PSNR of the registered view that refinement brings back; NaN of true cameras."""
+    """Return the share of the lost PSNR of the registered view that refinement brings back; NaN of
+    true cameras.
+    """
     if not row["degrees"] and not row["lens"]:
         return float("nan")
     best, worst, result = (row[name]["registered"] for name in ("true", "disturbed", "refined"))

@@ -1,4 +1,6 @@
-"""Cells of a report, which are independent fits: one after the other in this process, or side by side on workers."""
+"""Cells of a report, which are independent fits: one after the other in this process, or side by
+side on workers.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ class OnWorkers:
     """Base of the reports with fits that other processes can do."""
 
     workers: int | None = None
-    """Number of processes on this machine for the fits, which share its cores; default: this process fits alone."""
+    """Number of processes on this machine for the fits, which share its cores; default: this
+    process fits alone.
+    """
     scheduler: str | None = None
     """Dask scheduler of the workers that do the fits, such as tcp://host:8786."""
 
@@ -52,7 +56,8 @@ def run_cells(
         function: function of a module, without side effects.
         cells: its arguments for each cell, by name; workers see the files that they refer to.
         client: from `open_client`; None: this process runs one cell after the other.
-        arrived: called in this process with the name and the result of each cell, as soon as it is there.
+        arrived: called in this process with the name and the result of each cell, as soon as it is
+            there.
 
     Raises:
         OSError: a worker died several times, or the scheduler was lost.
@@ -78,7 +83,10 @@ def run_cells(
 
 
 def _run_on_worker(
-    function: Callable[..., Result], variant: str, versions: tuple[tuple[str, str], ...], args: tuple[Any, ...]
+    function: Callable[..., Result],
+    variant: str,
+    versions: tuple[tuple[str, str], ...],
+    args: tuple[Any, ...],
 ) -> tuple[Result, list[str]]:
     """Return the result of a cell, and the warnings."""
     with prepared(variant, versions) as messages:

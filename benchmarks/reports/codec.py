@@ -1,15 +1,17 @@
-"""Bytes, quality and time of the codec at several quality settings, compared with lzma over raw residuals.
+"""Bytes, quality and time of the codec at several quality settings, compared with lzma over raw
+residuals.
 
     python -m benchmarks.reports codec CAPTURE... --out out/codec --json out.json --plot out.png
 
-Each setting fits the clip again, because the next frame starts from what the codec has quantised. Fits of one setting
-differ by some hundredths of a dB; smaller differences are not significant.
+Each setting fits the clip again, because the next frame starts from what the codec has quantised.
+Fits of one setting differ by some hundredths of a dB; smaller differences are not significant.
 
-A clip of the JSON has one row per `quality`, the reference last: the PSNR of the `first` and of the `later` frames in
-dB; the bytes of the `file`, of the `first` and of a `later` frame, and of the float32 residual of a later frame, `raw`
-and with `lzma`; the median times to encode and decode a later frame, and of lzma, in ms; and the `loss` of PSNR against
-the reference in dB. Figures of later frames are means. `raw` and `lzma` lead to the same frames, so lzma benefits from
-values that were rounded to zero; in the reference stream there are none.
+A clip of the JSON has one row per `quality`, the reference last: the PSNR of the `first` and of the
+`later` frames in dB; the bytes of the `file`, of the `first` and of a `later` frame, and of the
+float32 residual of a later frame, `raw` and with `lzma`; the median times to encode and decode a
+later frame, and of lzma, in ms; and the `loss` of PSNR against the reference in dB. Figures of
+later frames are means. `raw` and `lzma` lead to the same frames, so lzma benefits from values that
+were rounded to zero; in the reference stream there are none.
 """
 
 from __future__ import annotations
@@ -72,7 +74,9 @@ class Options(Output, OnWorkers):
     """Reuse streams of an earlier report with the same settings, and continue incomplete ones."""
 
     def run(self) -> None:
-        """Fit every capture with every quality, measure the streams, print the tables, and write the figures."""
+        """Fit every capture with every quality, measure the streams, print the tables, and write
+        the figures.
+        """
         if not self.captures:
             raise ValueError("codec: `captures` must name at least one folder, got none.")
         recordings = [load_capture(path, max_frames=self.frames) for path in self.captures]
@@ -87,24 +91,38 @@ class Options(Output, OnWorkers):
 
 
 def measure(capture: Capture, options: Options, client: Client | None) -> dict[str, Any]:
-    """Fit a capture with every quality, side by side on workers, and return the figures of the streams.
+    """Fit a capture with every quality, side by side on workers, and return the figures of the
+    streams.
 
     Raises:
         ValueError: the capture has a single frame, or as `stream_capture` and `evaluate_stream`.
     """
     name = capture.path.resolve().name
     if capture.num_frames < 2:
-        raise ValueError(f"{capture.path}: expected a capture of two frames or more, got {capture.num_frames}.")
+        raise ValueError(
+            f"{capture.path}: expected a capture of two frames or more, got {capture.num_frames}."
+        )
     qualities = (*options.qualities, options.reference)
     codec = options.stream.codec
-    settings = {quality: replace(options.stream, codec=replace(codec, quality=quality)) for quality in qualities}
+    settings = {
+        quality: replace(options.stream, codec=replace(codec, quality=quality))
+        for quality in qualities
+    }
     folders = {quality: options.out / name / f"{quality:g}" for quality in qualities}
     source = Source.of(capture)
     cells = {q: (source, folders[q].resolve(), settings[q], options.resume) for q in qualities}
-    run_cells(_fit, cells, client, lambda quality, _: print(f"{name} at quality {quality:g}", flush=True))
+    run_cells(
+        _fit, cells, client, lambda quality, _: print(f"{name} at quality {quality:g}", flush=True)
+    )
     rows = []
     for quality, folder in folders.items():
-        rows.append({"quality": quality, **_evaluated(folder, capture), **_measured(folder, settings[quality])})
+        rows.append(
+            {
+                "quality": quality,
+                **_evaluated(folder, capture),
+                **_measured(folder, settings[quality]),
+            }
+        )
     best = rows[-1]["psnr"]["later"]
     return {"name": name, "rows": [{**row, "loss": best - row["psnr"]["later"]} for row in rows]}
 
@@ -123,10 +141,13 @@ def plot_codec(clips: Sequence[Row], path: Path) -> None:
         ValueError: matplotlib is not installed.
     """
     figure = blank_figure(10, 3.8 * len(clips))
-    for (left, right), clip in zip(figure.subplots(len(clips), 2, squeeze=False), clips, strict=True):
+    for (left, right), clip in zip(
+        figure.subplots(len(clips), 2, squeeze=False), clips, strict=True
+    ):
         rows = clip["rows"]
         stream_sizes, lzma_sizes = (
-            1e-3 * np.array(column) for column in zip(*((r["later"], r["lzma"]) for r in rows), strict=True)
+            1e-3 * np.array(column)
+            for column in zip(*((r["later"], r["lzma"]) for r in rows), strict=True)
         )
         psnr = [row["psnr"]["later"] for row in rows]
         times = [row["encode_ms"] for row in rows], [row["lzma_ms"] for row in rows]
@@ -139,7 +160,9 @@ def plot_codec(clips: Sequence[Row], path: Path) -> None:
             points = zip(stream_sizes, stream_values, strict=True)
             label_points(axis, points, [f"{row['quality']:g}" for row in rows], (4, -12), 8)
         left.set(ylabel="PSNR of later frames, dB", title=f"{clip['name']}: quality")
-        right.set(ylabel="ms to encode a frame", yscale="log", title=f"{clip['name']}: encoding time")
+        right.set(
+            ylabel="ms to encode a frame", yscale="log", title=f"{clip['name']}: encoding time"
+        )
         left.ticklabel_format(axis="y", useOffset=False)
         left.legend(fontsize=8)
     save_figure(figure, path)
@@ -155,7 +178,10 @@ def _evaluated(folder: Path, capture: Capture) -> dict[str, Any]:
     evaluation = evaluate_stream(folder, capture.path)
     first, *later_frames = evaluation.frames
     return {
-        "psnr": {"first": first.scores.psnr, "later": float(np.mean([row.scores.psnr for row in later_frames]))},
+        "psnr": {
+            "first": first.scores.psnr,
+            "later": float(np.mean([row.scores.psnr for row in later_frames])),
+        },
         "file": evaluation.sizes.file,
         "first": first.num_bytes,
         "later": float(np.mean([row.num_bytes for row in later_frames])),
@@ -173,7 +199,10 @@ def _measured(folder: Path, settings: StreamConfig) -> dict[str, Any]:
             rows.append(_frame(old_state, state, cameras, settings))
         old_state = state
     means = {name: float(np.mean([row[name] for row in rows])) for name in ("raw", "lzma")}
-    medians = {name: float(np.median([row[name] for row in rows])) for name in ("encode_ms", "decode_ms", "lzma_ms")}
+    medians = {
+        name: float(np.median([row[name] for row in rows]))
+        for name in ("encode_ms", "decode_ms", "lzma_ms")
+    }
     return means | medians
 
 

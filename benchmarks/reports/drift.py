@@ -1,9 +1,10 @@
-"""Drift: quality where things move, bytes and number of Gaussians from frame to frame, over many frames.
+"""Drift: quality where things move, bytes and number of Gaussians from frame to frame, over many
+frames.
 
     python -m benchmarks.reports.drift --json out.json
 
-The clips are `morgs-mi synth arm` and random scenes that no setting was chosen on. Scores are of the held-out
-view, against the exact ground truth.
+The clips are `morgs-mi synth arm` and random scenes that no setting was chosen on. Scores are of
+the held-out view, against the exact ground truth.
 """
 
 from __future__ import annotations
@@ -68,7 +69,9 @@ class Options(ClipOptions):
 
 
 def measure(source: Source, num_frames: int, config: StreamConfig) -> dict[str, Any]:
-    """Fit a clip and return its scores per later frame, and the slope of PSNR where things move, in dB a frame."""
+    """Fit a clip and return its scores per later frame, and the slope of PSNR where things move, in
+    dB a frame.
+    """
     capture = source.open()
     loop = new_loop(capture, config)
     frames = capture.partial_frames(0, num_frames)
@@ -78,7 +81,10 @@ def measure(source: Source, num_frames: int, config: StreamConfig) -> dict[str, 
     series = {name: [row[name] for row in rows] for name in rows[0]}
     moving = np.array(series["psnr_moving"])
     mask = np.isfinite(moving)
-    return {"slope_moving_db_a_frame": np.polyfit(np.flatnonzero(mask), moving[mask], 1)[0], **series}
+    return {
+        "slope_moving_db_a_frame": np.polyfit(np.flatnonzero(mask), moving[mask], 1)[0],
+        **series,
+    }
 
 
 if __name__ == "__main__":

@@ -1,10 +1,12 @@
-"""The methods of other publications beside this package's, on one renderer, one codec and one number of steps.
+"""The methods of other publications beside this package's, on one renderer, one codec and one
+number of steps.
 
     python -m benchmarks.reports.field --seeds 16 17 18 --json out.json --plot out.png
 
-Each clip is `morgs-mi synth random --seed SEED`, made in `--clips` if it is not there. Settings were chosen on seeds 0
-to 2. All methods continue from the same first frame of a clip. Image and motion scores are means over the later frames
-of the held-out view, scores of tracks are over the whole clip, all against the exact ground truth.
+Each clip is `morgs-mi synth random --seed SEED`, made in `--clips` if it is not there. Settings
+were chosen on seeds 0 to 2. All methods continue from the same first frame of a clip. Image and
+motion scores are means over the later frames of the held-out view, scores of tracks are over the
+whole clip, all against the exact ground truth.
 """
 
 from __future__ import annotations
@@ -31,11 +33,12 @@ from morgs_mi.runs.cluster.tasks import Source
 
 _FAST = {"fit": {"rates": {"means": 2e-3}}}
 _RIGID = {"rigid_weight": 0.4, "rotation_weight": 0.4, "isometry_weight": 0.2}
-# Presets and further settings by name, in the order of the tables; DEFAULT is no preset. The motion models register
-# themselves where they are imported.
+# Presets and further settings by name, in the order of the tables; DEFAULT is no preset. The motion
+# models register themselves where they are imported.
 METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "baseline": ("baseline", {}),
-    "baseline, 4x rate": ("baseline", _FAST),  # of the means, tuned like the rates of the other methods
+    # Of the means, tuned like the rates of the other methods.
+    "baseline, 4x rate": ("baseline", _FAST),
     "hicom": ("baseline", {"motion": {"model": "hicom"}}),
     "rigidity": ("rigidity", {}),
     "cache": ("baseline", {"motion": {"model": "cache"}}),
@@ -97,7 +100,11 @@ class Options(Output, OnWorkers):
             capture = random_capture(self.clips, seed, self.downscale)
             source = replace(Source.of(capture), num_frames=min(self.frames, capture.num_frames))
             for fit_seed in self.fit_seeds:
-                methods = {f"{m}/{e}": self.settings(m, e, fit_seed) for e in self.epochs for m in self.methods}
+                methods = {
+                    f"{m}/{e}": self.settings(m, e, fit_seed)
+                    for e in self.epochs
+                    for m in self.methods
+                }
                 cells[f"{seed}/{fit_seed}"] = source, methods
         return cells
 
@@ -106,7 +113,11 @@ class Options(Output, OnWorkers):
         preset, values = METHODS[method]
         config = StreamConfig() if preset == DEFAULT else apply_preset(StreamConfig(), preset)  # pyright: ignore[reportArgumentType]
         config = apply_values(config, values)
-        work = {"num_gaussians": self.num_gaussians, "first_frame_steps": self.first_frame_steps, "epochs": epochs}
+        work = {
+            "num_gaussians": self.num_gaussians,
+            "first_frame_steps": self.first_frame_steps,
+            "epochs": epochs,
+        }
         return replace(config, fit=replace(config.fit, **work), seed=seed)
 
 
@@ -115,23 +126,40 @@ def measure(source: Source, methods: Mapping[str, StreamConfig]) -> dict[str, di
     clip = Clip.read(source.open())
     loop = clip.loop(next(iter(methods.values())))
     keyframe, _ = loop.push(clip.images[0])
-    return {method: scores_of(*clip.continued(keyframe, config)) for method, config in methods.items()}
+    return {
+        method: scores_of(*clip.continued(keyframe, config)) for method, config in methods.items()
+    }
 
 
-def scores_of(found: Evaluation, reports: Sequence[FrameReport], seconds: Sequence[float]) -> dict[str, Any]:
+def scores_of(
+    found: Evaluation, reports: Sequence[FrameReport], seconds: Sequence[float]
+) -> dict[str, Any]:
     """Return the scores of a stream as JSON."""
     later_frames = found.frames[1:]
     motion = [asdict(row.motion_3d) for row in later_frames if row.motion_3d is not None]
     scores = {
-        **{name: known_mean([getattr(row.scores, name) for row in later_frames]) for name in _IMAGES},
-        **{f"motion_3d_{name}": known_mean([row[name] for row in motion]) for name in ("error", "relative_error")},
-        **{f"{row.protocol} {name}": getattr(row.moving, name) for row in found.tracking for name in _TRACKS},
+        **{
+            name: known_mean([getattr(row.scores, name) for row in later_frames])
+            for name in _IMAGES
+        },
+        **{
+            f"motion_3d_{name}": known_mean([row[name] for row in motion])
+            for name in ("error", "relative_error")
+        },
+        **{
+            f"{row.protocol} {name}": getattr(row.moving, name)
+            for row in found.tracking
+            for name in _TRACKS
+        },
         "num_bytes": known_mean([report.num_bytes for report in reports]),
         "cpu_s": known_mean(seconds),
         "steps": known_mean([report.steps for report in reports]),
     }
     figures = {name: float(f"{value:.4g}") for name, value in scores.items()}
-    series = {name: [float(f"{getattr(row.scores, name):.4g}") for row in later_frames] for name in _OVER_TIME}
+    series = {
+        name: [float(f"{getattr(row.scores, name):.4g}") for row in later_frames]
+        for name in _OVER_TIME
+    }
     return json_finite({**figures, "by_frame": series})
 
 
@@ -140,23 +168,32 @@ Cells = Mapping[str, Mapping[str, Mapping[str, Any]]]
 
 def mean_scores(cells: Cells, method: str) -> dict[str, float]:
     """Return the mean of each score of a method over the cells that have it."""
-    rows = [{name: np.nan if v is None else v for name, v in cell[method].items()} for cell in cells.values()]
+    rows = [
+        {name: np.nan if v is None else v for name, v in cell[method].items()}
+        for cell in cells.values()
+    ]
     return {name: known_mean([row[name] for row in rows]) for name in rows[0] if name != "by_frame"}
 
 
 def field_table(cells: Cells) -> str:
-    """Return the scores at the most epochs in Markdown: means over the clips, and the spread over the fits of some."""
+    """Return the scores at the most epochs in Markdown: means over the clips, and the spread over
+    the fits of some.
+    """
     names = next(iter(cells.values()))
     most = max(int(name.split("/")[1]) for name in names)
     rows = []
     for method in dict.fromkeys(name.split("/")[0] for name in names):
-        scores = [{"fit": cell.split("/")[1], **by_name[f"{method}/{most}"]} for cell, by_name in cells.items()]
+        scores = [
+            {"fit": cell.split("/")[1], **by_name[f"{method}/{most}"]}
+            for cell, by_name in cells.items()
+        ]
         rows += means_over(scores, "fit", method=f"`{method}`")
     return scores_table(rows, {"method": "method"}, COLUMNS)
 
 
 def plot_field(cells: Cells, path: Path) -> None:
-    """Plot the errors of the methods over the frames, and over the bytes of a frame; means over the cells.
+    """Plot the errors of the methods over the frames, and over the bytes of a frame; means over the
+    cells.
 
     Raises:
         OSError: the file cannot be written.
@@ -174,10 +211,17 @@ def plot_field(cells: Cells, path: Path) -> None:
             series = [cell[f"{method}/{most}"]["by_frame"][score] for cell in cells.values()]
             values = np.nanmean(np.array(series, float), axis=0)
             axis.plot(range(1, len(values) + 1), values, **style)
-            axis.set(xlabel=f"frame ({most} epochs)", ylabel=title, xticks=range(1, len(values) + 1))
+            axis.set(
+                xlabel=f"frame ({most} epochs)", ylabel=title, xticks=range(1, len(values) + 1)
+            )
         for axis, (score, title) in zip(axes[1], _PLOTTED, strict=True):
             means = [mean_scores(cells, name) for name in names if name.split("/")[0] == method]
-            axis.plot([s["num_bytes"] / 1000 for s in means], [s[score] for s in means], marker="o", **style)
+            axis.plot(
+                [s["num_bytes"] / 1000 for s in means],
+                [s[score] for s in means],
+                marker="o",
+                **style,
+            )
             axis.set(xlabel="kB per later frame (by epochs)", ylabel=title)
     for axis in axes.flat:
         axis.grid(alpha=0.3)
@@ -189,11 +233,15 @@ def main(options: Options) -> None:
     """Run the report."""
     mi.set_variant("llvm_ad_rgb")
     with options.opened() as client:
-        cells = run_cells(measure, options.cells(), client, lambda name, _: print(f"{name} is done", flush=True))
+        cells = run_cells(
+            measure, options.cells(), client, lambda name, _: print(f"{name} is done", flush=True)
+        )
     print(field_table(cells))
     if options.plot is not None:
         plot_field(cells, options.plot)
-    settings = {name: getattr(options, name) for name in ("downscale", "frames", "epochs", "num_gaussians")}
+    settings = {
+        name: getattr(options, name) for name in ("downscale", "frames", "epochs", "num_gaussians")
+    }
     options.write({**settings, "cells": cells}, unprinted=["cells"])
 
 

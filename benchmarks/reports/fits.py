@@ -1,4 +1,6 @@
-"""Shared by the reports on fits: clips of synthetic scenes, loops over a capture's views, and their fits."""
+"""Shared by the reports on fits: clips of synthetic scenes, loops over a capture's views, and their
+fits.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,11 @@ class ClipOptions(StudyOptions):
 
     def config(self, **fit: Any) -> StreamConfig:
         """Return the settings of a fit, with further ones of `FitConfig`."""
-        work = {"num_gaussians": self.gaussians, "first_frame_steps": self.steps, "epochs": self.epochs}
+        work = {
+            "num_gaussians": self.gaussians,
+            "first_frame_steps": self.steps,
+            "epochs": self.epochs,
+        }
         return StreamConfig(FitConfig(**{**work, **fit}))
 
     def clip(self, scene: str | Path, name: str, **settings: Any) -> Capture:
@@ -71,7 +77,9 @@ def synthetic(scene: str | Path, clip: Path, config: SynthConfig, downscale: flo
 
 def random_capture(clips: Path, seed: int, downscale: float = 1) -> Capture:
     """Return the random scene of a seed, which is made in the folder `clips` if it is not there."""
-    return synthetic("random", clips / f"random-{seed}", SynthConfig(frames=8, seed=seed), downscale)
+    return synthetic(
+        "random", clips / f"random-{seed}", SynthConfig(frames=8, seed=seed), downscale
+    )
 
 
 def spread_views(cameras: Sequence[Camera], count: int, among: Sequence[int]) -> tuple[int, ...]:
@@ -84,7 +92,9 @@ def spread_views(cameras: Sequence[Camera], count: int, among: Sequence[int]) ->
     return tuple(sorted(among[k] for k in selection))
 
 
-def new_loop(capture: Capture, config: StreamConfig, train: Sequence[int] | None = None) -> StreamLoop:
+def new_loop(
+    capture: Capture, config: StreamConfig, train: Sequence[int] | None = None
+) -> StreamLoop:
     """Return a loop over the views `train` of a capture, its training views if they are None."""
     train = capture.train_views if train is None else train
     cameras = [capture.cameras[v] for v in train]
@@ -107,7 +117,10 @@ class Clip:
     @classmethod
     def read(cls, capture: Capture) -> Clip:
         """Return a capture with its images decoded."""
-        return cls(capture, tuple(tuple(f.images[v] for v in capture.train_views) for f in capture.frames()))
+        return cls(
+            capture,
+            tuple(tuple(f.images[v] for v in capture.train_views) for f in capture.frames()),
+        )
 
     def loop(self, config: StreamConfig) -> StreamLoop:
         """Return a loop on the training views, before its first frame."""
@@ -115,7 +128,10 @@ class Clip:
 
     def writer(self, path: Path, config: StreamConfig) -> StreamWriter:
         """Return a writer of a new stream of this clip."""
-        metadata = {"capture": str(self.capture.path.resolve()), "downscale": self.capture.downscale}
+        metadata = {
+            "capture": str(self.capture.path.resolve()),
+            "downscale": self.capture.downscale,
+        }
         metadata |= {"test_view": list(self.capture.test_views), "config": asdict(config)}
         return StreamWriter(path, self.capture.cameras, self.capture.fps, metadata)
 

@@ -1,11 +1,13 @@
-"""Light that an inserted sphere receives from the fit of an HDR recording, and from the fit of one of 8 bits.
+"""Light that an inserted sphere receives from the fit of an HDR recording, and from the fit of one
+of 8 bits.
 
-    python -m benchmarks.reports.hdr --json benchmarks/results/hdr.json --picture docs/experiments/hdr.jpg
+    python -m benchmarks.reports.hdr --json benchmarks/results/hdr.json --picture
+    docs/experiments/hdr.jpg
 
-A room without a ceiling, with a lamp and a metal sphere that moves, is path-traced in linear light. It is recorded
-twice: as EXR files, and as PNG files, which clip the lamp and its reflections at white. Both recordings are fitted with
-the same settings. A diffuse white sphere is lit by the `light_probe` of each fit. The truth is a path-traced image of
-the room with the sphere in it.
+A room without a ceiling, with a lamp and a metal sphere that moves, is path-traced in linear light.
+It is recorded twice: as EXR files, and as PNG files, which clip the lamp and its reflections at
+white. Both recordings are fitted with the same settings. A diffuse white sphere is lit by the
+`light_probe` of each fit. The truth is a path-traced image of the room with the sphere in it.
 """
 
 from __future__ import annotations
@@ -109,13 +111,22 @@ def room(frame: int, **more: dict[str, Any]) -> Any:
                 "to_world": to().translate([0, 1, -1.6]).scale([2, 1.6, 1]),
                 "bsdf": checkered(0.55, 0.6, 0.7),
             },
-            "left": {**side, "to_world": to().translate([-1.6, 1, 0]).rotate([0, 1, 0], 90).scale([2, 1.6, 1])},
-            "right": {**side, "to_world": to().translate([1.6, 1, 0]).rotate([0, 1, 0], -90).scale([2, 1.6, 1])},
+            "left": {
+                **side,
+                "to_world": to().translate([-1.6, 1, 0]).rotate([0, 1, 0], 90).scale([2, 1.6, 1]),
+            },
+            "right": {
+                **side,
+                "to_world": to().translate([1.6, 1, 0]).rotate([0, 1, 0], -90).scale([2, 1.6, 1]),
+            },
             "lamp": {
                 "type": "sphere",
                 "center": [-0.75, 1.45, -0.7],
                 "radius": 0.16,
-                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": [34.0, 27.0, 18.0]}},
+                "emitter": {
+                    "type": "area",
+                    "radiance": {"type": "rgb", "value": [34.0, 27.0, 18.0]},
+                },
             },
             "metal": {
                 "type": "sphere",
@@ -133,7 +144,9 @@ def traced(scene: Any, camera: Camera, spp: int, seed: int) -> np.ndarray:
     integrator: Any = mi.load_dict({"type": "path", "max_depth": 6})
     render: Any = mi.render
     sensor: Any = mi.load_dict(camera.sensor())
-    return np.array(render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed))[..., :3]
+    return np.array(render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=seed))[
+        ..., :3
+    ]
 
 
 def record(options: Options) -> dict[str, Path]:
@@ -160,7 +173,9 @@ def record(options: Options) -> dict[str, Path]:
 
 
 def surface_points(cameras: list[Camera]) -> tuple[np.ndarray, np.ndarray]:
-    """Return points on the surfaces that the cameras see in the first frame, and their colours in [0, 1]."""
+    """Return points on the surfaces that the cameras see in the first frame, and their colours in
+    [0, 1].
+    """
     rng = np.random.default_rng(0)
     scene = room(0)
     points = []
@@ -183,7 +198,9 @@ def normals() -> np.ndarray:
     k = np.arange(_NORMALS) + 0.5
     y = 1 - 2 * k / _NORMALS
     angle = np.pi * (1 + np.sqrt(5)) * k
-    return np.stack([np.sqrt(1 - y * y) * np.cos(angle), y, np.sqrt(1 - y * y) * np.sin(angle)], axis=1)
+    return np.stack(
+        [np.sqrt(1 - y * y) * np.cos(angle), y, np.sqrt(1 - y * y) * np.sin(angle)], axis=1
+    )
 
 
 def received(scene: Any) -> np.ndarray:
@@ -204,7 +221,9 @@ def small_ball() -> dict[str, Any]:
 
 
 def compare(light: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-    """Return the mean absolute error of the received light, and its mean, both relative to the true mean."""
+    """Return the mean absolute error of the received light, and its mean, both relative to the true
+    mean.
+    """
     return {
         "error": round(float(np.abs(light - truth).mean() / truth.mean()), 4),
         "mean": round(float(light.mean() / truth.mean()), 4),
@@ -219,7 +238,9 @@ def main(options: Options) -> None:
     streams = {}
     for name, folder in folders.items():
         if not (options.out / f"fit-{name}" / "stream.morgs").exists():
-            stream_capture(morgs_mi.load_capture(folder), options.out / f"fit-{name}", StreamConfig(fit))
+            stream_capture(
+                morgs_mi.load_capture(folder), options.out / f"fit-{name}", StreamConfig(fit)
+            )
         streams[name] = morgs_mi.open_stream(options.out / f"fit-{name}")
     truth = received(room(0, ball=small_ball()))
     rows: dict[str, Any] = {}
@@ -229,12 +250,18 @@ def main(options: Options) -> None:
         ("8-bit, guessed", streams["8-bit"], CLIPPED),
     ):
         lamp = probe(stream, white)
-        rows[name] = compare(received(mi.load_dict({"type": "scene", "ball": small_ball(), "light": lamp})), truth)
+        rows[name] = compare(
+            received(mi.load_dict({"type": "scene", "ball": small_ball(), "light": lamp})), truth
+        )
     scores = {name: evaluate_stream(options.out / f"fit-{name}") for name in streams}
     for name, result in scores.items():
         rows[name] |= {"psnr": round(result.scores.psnr, 2), "bytes": result.sizes.file}
     rows["hdr"]["psnr_mu"] = round(scores["hdr"].scores.psnr_mu, 2)
-    settings = {key: value for key, value in asdict(options).items() if key not in ("json", "out", "picture")}
+    settings = {
+        key: value
+        for key, value in asdict(options).items()
+        if key not in ("json", "out", "picture")
+    }
     options.write({"light": rows, "options": settings})
     if options.picture is not None:
         picture = cv2.cvtColor(draw(streams, options), cv2.COLOR_RGB2BGR)
@@ -242,7 +269,9 @@ def main(options: Options) -> None:
 
 
 def probe(stream: Any, clipped: float) -> dict[str, Any]:
-    """Return the light at `PLACE` in the first frame of a stream; behind the cameras it is black, as in truth."""
+    """Return the light at `PLACE` in the first frame of a stream; behind the cameras it is black,
+    as in truth.
+    """
     return light_probe(first_gaussians(stream), PLACE, _HEIGHT, clipped=clipped)
 
 
@@ -257,11 +286,20 @@ def as_given(entries: dict[str, Any], frame: int, time: float) -> dict[str, Any]
 
 
 def draw(streams: Mapping[str, Any], options: Options) -> np.ndarray:
-    """Return the truth beside both fits: at the recordings' exposure, 4 stops darker, and with a white sphere."""
+    """Return the truth beside both fits: at the recordings' exposure, 4 stops darker, and with a
+    white sphere.
+    """
     camera = RIG.cameras(options.cameras, options.width, options.width * 3 // 4)[0]
-    lamps = {name: probe(stream, 1.0 if name == "hdr" else CLIPPED) for name, stream in streams.items()}
+    lamps = {
+        name: probe(stream, 1.0 if name == "hdr" else CLIPPED) for name, stream in streams.items()
+    }
     camera = camera.resized(2 * camera.width, 2 * camera.height)
-    ball = {"type": "sphere", "center": list(PLACE), "radius": RADIUS, "bsdf": diffuse(0.9, 0.9, 0.9)}
+    ball = {
+        "type": "sphere",
+        "center": list(PLACE),
+        "radius": RADIUS,
+        "bsdf": diffuse(0.9, 0.9, 0.9),
+    }
     rows = {"truth": (traced(room(0), camera, 256, 7), traced(room(0, ball=ball), camera, 256, 8))}
     for name, stream in streams.items():
         plain = np.asarray(morgs_mi.rasterize(first_gaussians(stream), camera).color)
@@ -269,7 +307,12 @@ def draw(streams: Mapping[str, Any], options: Options) -> np.ndarray:
         integrator = {"type": "path", "hide_emitters": True}
         entries = {"ball": ball, "light": lamps[name], "integrator": integrator}
         (_, images), *_ = render_inserted(
-            stream, camera, partial(as_given, entries), [0], ("color",), InsertConfig(128, shadows=False)
+            stream,
+            camera,
+            partial(as_given, entries),
+            [0],
+            ("color",),
+            InsertConfig(128, shadows=False),
         )
         light_images = (decode_light(image) for image in (plain, images["color"]))
         rows[f"fit of the {name} recording"] = next(light_images), next(light_images)

@@ -1,4 +1,5 @@
-"""Held-out views of recordings: the scores that `morgs-mi eval` wrote for fits at the settings of the commands.
+"""Held-out views of recordings: the scores that `morgs-mi eval` wrote for fits at the settings of
+the commands.
 
     morgs-mi fit RECORDING OUT
     morgs-mi eval OUT --json OUT/eval.json
@@ -41,7 +42,9 @@ class Options(Output):
 
 
 def scores_of(out: Path) -> dict[str, Any]:
-    """Return the scores of a fit: its settings, the first frame by view, and all frames in the mean of the views."""
+    """Return the scores of a fit: its settings, the first frame by view, and all frames in the mean
+    of the views.
+    """
     result = read_json(out / "eval.json")
     report = read_json(out / "report.json")
     stream = StreamReader(out / "stream.morgs")
@@ -75,7 +78,9 @@ def scores_of(out: Path) -> dict[str, Any]:
 
 
 def first_frames(fits: Sequence[dict[str, Any]]) -> str:
-    """Return the PSNR of each held-out view in the first frame, as recorded and with matched colours."""
+    """Return the PSNR of each held-out view in the first frame, as recorded and with matched
+    colours.
+    """
     rows = []
     for fit in fits:
         balance = "yes" if fit["is_balanced"] else "no"
@@ -84,7 +89,15 @@ def first_frames(fits: Sequence[dict[str, Any]]) -> str:
             values = [scores[key] for scores in fit["views"].values()]
             views = ", ".join(f"{value:.1f}" for value in values)
             rows.append([*fit_cells, title, views, f"{sum(values) / len(values):.2f}"])
-    titles = "recording", "training views", "Gaussians", "balanced", "colours", "held-out views, dB", "mean"
+    titles = (
+        "recording",
+        "training views",
+        "Gaussians",
+        "balanced",
+        "colours",
+        "held-out views, dB",
+        "mean",
+    )
     return markdown(titles, rows, left=1)
 
 
@@ -98,10 +111,15 @@ def later_frames(fits: Sequence[dict[str, Any]]) -> str:
         step = max(1, (len(frames) - 1) // (_ROWS - 1))
         for index in sorted({0, 1, *range(step, len(frames), step), len(frames) - 1}):
             frame = frames[index]
-            scores = (_cell(frame[key], 2) for key in ("psnr", "psnr_matched", "psnr_moving", "psnr_still"))
+            scores = (
+                _cell(frame[key], 2)
+                for key in ("psnr", "psnr_matched", "psnr_moving", "psnr_still")
+            )
             active = "" if frame["active"] is None else f"{100 * frame['active']:.0f} %"
             size = f"{frame['num_bytes'] / 1e3:.0f}"
-            rows.append((fit["recording"], f"{index}", *scores, active, size, _cell(frame["seconds"], 1)))
+            rows.append(
+                (fit["recording"], f"{index}", *scores, active, size, _cell(frame["seconds"], 1))
+            )
     titles = "PSNR, dB", "matched", "moving", "still", "active Gaussians", "kB", "s"
     return markdown(("recording", "frame", *titles), rows, left=1)
 

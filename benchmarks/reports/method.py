@@ -1,12 +1,13 @@
-"""Contribution of the method's parts: presets by epochs, and key views with and without offset, over several seeds.
+"""Contribution of the method's parts: presets by epochs, and key views with and without offset,
+over several seeds.
 
     python -m benchmarks.reports method CAPTURE... --out out/method --workers 2
 
-A *setting* is a preset, a number of epochs, a number of key views and a factor on the learning rates. It is measured
-with several seeds. Each seed has its own first frame, which depends on none of these: it is fitted once, stored as a
-keyframe, and all settings continue from it. Tuned presets are run at several rates with the first seed.
-The rate with the best mean PSNR of the held-out view over the later frames is selected, and the other seeds are run at
-that rate only.
+A *setting* is a preset, a number of epochs, a number of key views and a factor on the learning
+rates. It is measured with several seeds. Each seed has its own first frame, which depends on none
+of these: it is fitted once, stored as a keyframe, and all settings continue from it. Tuned presets
+are run at several rates with the first seed. The rate with the best mean PSNR of the held-out view
+over the later frames is selected, and the other seeds are run at that rate only.
 
 docs/experiments/method.md explains the JSON.
 """
@@ -87,7 +88,9 @@ class Options(OnWorkers):
     num_gaussians: int = 10_000
     """Number of Gaussians of the first frame; overrides stream.fit."""
     version: str | None = None
-    """Version of the method, default a digest of its sources; stored results of the same version are reused."""
+    """Version of the method, default a digest of its sources; stored results of the same version
+    are reused.
+    """
     stream: StreamConfig = field(default_factory=StreamConfig)
     """Settings of the fit; presets, epochs, key views, rates and seeds override them."""
 
@@ -95,8 +98,9 @@ class Options(OnWorkers):
         names = [name for name in (*self.presets, *self.tuned) if name not in (DEFAULT, *PRESETS)]
         if names or not self.presets or not self.epochs or self.seeds < 1:
             raise ValueError(
-                f"method: `presets` and `tuned` must be among {', '.join((DEFAULT, *PRESETS))}, with one preset, one "
-                f"number of epochs and one seed or more, got {', '.join(names) or 'none'}."
+                f"method: `presets` and `tuned` must be among {', '.join((DEFAULT, *PRESETS))}, "
+                "with one preset, one number of epochs and one seed or more, got "
+                f"{', '.join(names) or 'none'}."
             )
 
     @property
@@ -115,13 +119,14 @@ class Options(OnWorkers):
 
         Raises:
             OSError: a capture cannot be read, or a result cannot be written.
-            ValueError: there is no capture, two captures have the same name, a capture has a single frame, or a setting
-                is incompatible with a preset.
+            ValueError: there is no capture, two captures have the same name, a capture has a single
+                frame, or a setting is incompatible with a preset.
         """
         names = [Path(path).resolve().name for path in self.captures]
         if not names or len(set(names)) < len(names):
             raise ValueError(
-                f"method: `captures` must be one folder or more with distinct names, got {', '.join(names)}."
+                "method: `captures` must be one folder or more with distinct names, got "
+                f"{', '.join(names)}."
             )
         clips = []
         settings = {n: v for n, v in asdict(self).items() if n not in _WORK}
@@ -142,9 +147,13 @@ def measure(path: Path, options: Options, client: Client | None) -> dict[str, An
     """Return the results of one clip."""
     capture = load_capture(path, max_frames=options.frames)
     if capture.num_frames < 2:
-        raise ValueError(f"{capture.path}: expected a capture of two frames or more, got {capture.num_frames}.")
+        raise ValueError(
+            f"{capture.path}: expected a capture of two frames or more, got {capture.num_frames}."
+        )
     presets, key_views = variants_of(options, len(capture.train_views))
-    rows = fitted(capture, [*presets, *(v for v in key_views if v not in presets)], presets, options, client)
+    rows = fitted(
+        capture, [*presets, *(v for v in key_views if v not in presets)], presets, options, client
+    )
     camera = capture.cameras[0]
     return {
         "name": capture.path.resolve().name,
@@ -160,7 +169,9 @@ def measure(path: Path, options: Options, client: Client | None) -> dict[str, An
 
 
 def variants_of(options: Options, num_views: int) -> tuple[list[Variant], list[Variant]]:
-    """Return the settings of the presets, and those that compare numbers of key views; both may overlap."""
+    """Return the settings of the presets, and those that compare numbers of key views; both may
+    overlap.
+    """
 
     def variant(preset: str, epochs: int, key_views: int, rates: float) -> Variant:
         keys = {"preset": preset, "epochs": epochs, "key_views": key_views, "rates": rates}
@@ -181,7 +192,9 @@ def variants_of(options: Options, num_views: int) -> tuple[list[Variant], list[V
     return presets, key_views
 
 
-def settings_of(base: StreamConfig, preset: str, epochs: int, key_views: int, rates: float) -> StreamConfig:
+def settings_of(
+    base: StreamConfig, preset: str, epochs: int, key_views: int, rates: float
+) -> StreamConfig:
     """Return `base` with a setting; `rates` is a factor on all learning rates of later frames."""
     if preset != DEFAULT:
         base = apply_preset(base, preset)  # pyright: ignore[reportArgumentType]
@@ -197,28 +210,39 @@ def fitted(
     options: Options,
     client: Client | None,
 ) -> list[Row]:
-    """Return the rows of all variants with the first seed, and of the others at the best rates and all key views."""
+    """Return the rows of all variants with the first seed, and of the others at the best rates and
+    all key views.
+    """
     source = Source.of(capture)
     rows = list[Row]()
-    start = Study(first_frame, [Scene({"frame": 0}, (replace(source, num_frames=1),))], [Variant({}, options.base)])
+    start = Study(
+        first_frame,
+        [Scene({"frame": 0}, (replace(source, num_frames=1),))],
+        [Variant({}, options.base)],
+    )
     start = replace(start, seeds=range(options.seeds), version=options.version)
     firsts = {row["fit_seed"]: row["packet"] for row in start.run(client, options.out)}
     # Seed by seed: after an interruption, a report with fewer seeds is complete.
     for seed in range(options.seeds):
         if seed:
             best = [row for row in aggregate(rows, presets) if row["best"]]
-            choice = [v for v in variants if v not in presets or v.keys in [_setting(row) for row in best]]
+            choice = [
+                v for v in variants if v not in presets or v.keys in [_setting(row) for row in best]
+            ]
         else:
             choice = variants
         scenes = [Scene({}, (source, firsts[seed]))]
-        rows += Study(later_frames, scenes, choice, (seed,), version=options.version).run(client, options.out)
+        rows += Study(later_frames, scenes, choice, (seed,), version=options.version).run(
+            client, options.out
+        )
     return rows
 
 
 def aggregate(rows: Sequence[Row], variants: Sequence[Variant]) -> list[dict[str, Any]]:
     """Return one row per variant: mean and standard deviation of every score over the seeds.
 
-    `best` marks the rates of the first run with the best mean PSNR for their preset, epochs and key views.
+    `best` marks the rates of the first run with the best mean PSNR for their preset, epochs and key
+    views.
     """
     keys = [variant.keys for variant in variants]
     groups = [group for group in grouped(rows, *_SETTING).values() if _setting(group[0]) in keys]
@@ -231,13 +255,16 @@ def aggregate(rows: Sequence[Row], variants: Sequence[Variant]) -> list[dict[str
         names = [name for name in group[0] if name not in (*_SETTING, "fit_seed", "by_frame")]
         table = {name: np.array([row[name] for row in group], float) for name in names}
         series = {
-            n: np.mean([np.array(row["by_frame"][n], float) for row in group], axis=0) for n in group[0]["by_frame"]
+            n: np.mean([np.array(row["by_frame"][n], float) for row in group], axis=0)
+            for n in group[0]["by_frame"]
         }
         row = {
             **_setting(group[0]),
             "runs": len(group),
             "mean": {name: float(values.mean()) for name, values in table.items()},
-            "std": {name: float(v.std(ddof=1)) if len(v) > 1 else None for name, v in table.items()},
+            "std": {
+                name: float(v.std(ddof=1)) if len(v) > 1 else None for name, v in table.items()
+            },
             "by_frame": {name: values.tolist() for name, values in series.items()},
             "best": any(group[0] is row for row in best.values()),
         }
@@ -260,11 +287,13 @@ def later_frames(source: Source, first: str, config: StreamConfig) -> dict[str, 
     """Fit all later frames after the packet `first`, base64, and return their scores.
 
     Returns:
-        Means over the later frames in the held-out view (or all training views): ``psnr``, ``psnr_moving``,
-        ``psnr_still`` in dB, ``ssim``, ``motion_error_moving`` and ``_still`` and ``true_motion_moving`` in px,
-        ``confidence_iou``, ``motion_3d_error`` in world units, ``_relative_error`` and ``_length_ratio`` of the true
-        length, ``_angle`` in degrees, ``num_bytes``; ``mtv`` and ``mtv_input`` (x100), ``psnr_slope`` in dB per frame,
-        ``seconds``, the median of a later frame; ``by_frame``, lists of some of them. None if unknown.
+        Means over the later frames in the held-out view (or all training views): ``psnr``,
+        ``psnr_moving``, ``psnr_still`` in dB, ``ssim``, ``motion_error_moving`` and ``_still`` and
+        ``true_motion_moving`` in px, ``confidence_iou``, ``motion_3d_error`` in world units,
+        ``_relative_error`` and ``_length_ratio`` of the true length, ``_angle`` in degrees,
+        ``num_bytes``; ``mtv`` and ``mtv_input`` (x100), ``psnr_slope`` in dB per frame,
+        ``seconds``, the median of a later frame; ``by_frame``, lists of some of them. None if
+        unknown.
     """
     clip = Clip.read(source.open())
     continuation = clip.continued(decode_packet(b64decode(first)), config)
@@ -278,24 +307,35 @@ def summary(found: Evaluation, reports: Sequence[FrameReport]) -> dict[str, Any]
     return {
         **{name: known_mean([getattr(row.scores, name) for row in evaluations]) for name in _MEANS},
         "num_bytes": known_mean([row.num_bytes for row in evaluations]),
-        **{f"motion_3d_{name}": known_mean([getattr(scores, name) for scores in motion]) for name in _MOTION_3D},
+        **{
+            f"motion_3d_{name}": known_mean([getattr(scores, name) for scores in motion])
+            for name in _MOTION_3D
+        },
         "mtv": found.variation.render,
         "mtv_input": found.variation.input,
         "psnr_slope": found.psnr_slope,
         "seconds": float(np.median([report.seconds for report in reports])),
-        "by_frame": {name: [getattr(row.scores, name) for row in evaluations] for name in _BY_FRAME},
+        "by_frame": {
+            name: [getattr(row.scores, name) for row in evaluations] for name in _BY_FRAME
+        },
     }
 
 
 def flow_error(capture: Capture, config: StreamConfig) -> dict[str, float]:
-    """Return the mean error of the flow that guides the motion on the key views where the surface moves, px."""
+    """Return the mean error of the flow that guides the motion on the key views where the surface
+    moves, px.
+    """
     assert capture.truth is not None
     errors = []
     for previous, frame in pairwise(capture.frames()):
         for view in choose_key_views(capture.cameras, config.motion.key_views):
             camera = capture.cameras[view].name
-            pair = FramePair(frame.images[view], previous.images[view], camera, frame.index, capture.masks[view])
-            flow = observe_key_views({view: pair}, config.motion.flow_method, flow=config.motion.flow)[view]
+            pair = FramePair(
+                frame.images[view], previous.images[view], camera, frame.index, capture.masks[view]
+            )
+            flow = observe_key_views(
+                {view: pair}, config.motion.flow_method, flow=config.motion.flow
+            )[view]
             truth = load_truth(capture.truth, camera, frame.index)
             errors.append(np.linalg.norm(flow.motion - truth.motion, axis=-1)[truth.mask])
     return {"error": float(np.concatenate(errors).mean())}

@@ -54,13 +54,19 @@ def best_rows(clip: Row) -> list[Row]:
 def ablation_table(clip: Row, epochs: int) -> str:
     """Return the paper's Table 4 on a clip: one row per preset at a number of epochs."""
     rows = [row for row in best_rows(clip) if row["epochs"] == epochs]
-    return _table(("preset", "rates"), rows, lambda row: (f"`{row['preset']}`", f"{row['rates']:g}x"))
+    return _table(
+        ("preset", "rates"), rows, lambda row: (f"`{row['preset']}`", f"{row['rates']:g}x")
+    )
 
 
 def epochs_table(clip: Row) -> str:
     """Return quality and run time: one row per preset and number of epochs."""
     titles = ("preset", "epochs", "rates")
-    return _table(titles, best_rows(clip), lambda row: (f"`{row['preset']}`", str(row["epochs"]), f"{row['rates']:g}x"))
+    return _table(
+        titles,
+        best_rows(clip),
+        lambda row: (f"`{row['preset']}`", str(row["epochs"]), f"{row['rates']:g}x"),
+    )
 
 
 def key_views_rows(clip: Row) -> list[Row]:
@@ -71,18 +77,27 @@ def key_views_rows(clip: Row) -> list[Row]:
 def key_views_table(clip: Row) -> str:
     """Return the paper's Table 5 on a clip: motion without and with offset by key views."""
     titles = {"ml": "without offset", "ml-mo": "with offset"}
-    return _table(("", "key views"), key_views_rows(clip), lambda row: (titles[row["preset"]], str(row["key_views"])))
+    return _table(
+        ("", "key views"),
+        key_views_rows(clip),
+        lambda row: (titles[row["preset"]], str(row["key_views"])),
+    )
 
 
 def gains_table(clips: Sequence[Row]) -> str:
-    """Return the gains of the parts at the best rates: PSNR of whole and moving region, dB, and motion error, px."""
+    """Return the gains of the parts at the best rates: PSNR of whole and moving region, dB, and
+    motion error, px.
+    """
     table = []
     for clip in clips:
         rows = {(row["preset"], row["epochs"]): row["mean"] for row in best_rows(clip)}
         for epochs in sorted({epochs for _, epochs in rows}):
             cells = []
             for _, preset, without in _GAINS:
-                gains = [_score(rows, (preset, epochs), n) - _score(rows, (without, epochs), n) for n in _GAINED]
+                gains = [
+                    _score(rows, (preset, epochs), n) - _score(rows, (without, epochs), n)
+                    for n in _GAINED
+                ]
                 cells.append(" / ".join(f"{gain:+.2f}" if _known(gain) else "-" for gain in gains))
             table.append((clip["name"], str(epochs), *cells))
     return markdown(("clip", "epochs", *(title for title, *_ in _GAINS)), table, 2)
@@ -109,7 +124,8 @@ def method_page(clips: Sequence[Row], epochs: int) -> str:
 
 
 def plot_method(clips: Sequence[Row], path: Path) -> None:
-    """Plot quality over run time: a row of panels per clip, a line per preset, points labelled by epochs.
+    """Plot quality over run time: a row of panels per clip, a line per preset, points labelled by
+    epochs.
 
     Raises:
         ValueError: matplotlib is not installed.
@@ -122,35 +138,56 @@ def plot_method(clips: Sequence[Row], path: Path) -> None:
             for preset in dict.fromkeys(row["preset"] for row in rows):
                 _draw_line(axis, preset, name, [row for row in rows if row["preset"] == preset])
             if with_flow and clip["cue"] is not None:
-                axis.axhline(clip["cue"]["error"], color="k", linestyle=":", label="error of the flow")
-            axis.set(title=f"{clip['name']}: {title}", xlabel="seconds per later frame", xscale="log")
+                axis.axhline(
+                    clip["cue"]["error"], color="k", linestyle=":", label="error of the flow"
+                )
+            axis.set(
+                title=f"{clip['name']}: {title}", xlabel="seconds per later frame", xscale="log"
+            )
             axis.title.set_fontsize(10)
             axis.grid(alpha=0.3, which="both")
             axis.tick_params(axis="x", which="both", labelsize=7)
             for ticks in (axis.xaxis.set_major_formatter, axis.xaxis.set_minor_formatter):
                 ticks("{x:g}")
-    handles = {label: line for axis in grid.flat for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
-    drawing.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=8, fontsize=9)
+    handles = {
+        label: line
+        for axis in grid.flat
+        for line, label in zip(*axis.get_legend_handles_labels(), strict=True)
+    }
+    drawing.legend(
+        handles.values(), handles.keys(), loc="outside lower center", ncols=8, fontsize=9
+    )
     save_figure(drawing, path)
 
 
-def _score(rows: Mapping[tuple[str, int], Mapping[str, float]], setting: tuple[str, int], name: str) -> float:
+def _score(
+    rows: Mapping[tuple[str, int], Mapping[str, float]], setting: tuple[str, int], name: str
+) -> float:
     """Return a setting's mean, NaN if it is unknown."""
     value = rows.get(setting, {}).get(name)
     return nan if value is None else value
 
 
 def _draw_line(axis: Any, preset: str, name: str, rows: Sequence[Row]) -> None:
-    seconds, values = (np.array([row["mean"][key] for row in rows], float) for key in ("seconds", name))
+    seconds, values = (
+        np.array([row["mean"][key] for row in rows], float) for key in ("seconds", name)
+    )
     spread = np.nan_to_num(np.array([row["std"][name] for row in rows], float))
-    axis.errorbar(seconds, values, spread, fmt="o-", markersize=4, capsize=2, label=preset, alpha=0.85)
-    label_points(axis, zip(seconds, values, strict=True), [str(row["epochs"]) for row in rows], (4, 3))
+    axis.errorbar(
+        seconds, values, spread, fmt="o-", markersize=4, capsize=2, label=preset, alpha=0.85
+    )
+    label_points(
+        axis, zip(seconds, values, strict=True), [str(row["epochs"]) for row in rows], (4, 3)
+    )
 
 
 def _table(titles: Sequence[str], rows: Sequence[Row], name: Any) -> str:
     """Return a table of all scores that are known in any of the rows."""
     columns = [column for column in _COLUMNS if any(_known(row["mean"][column[1]]) for row in rows)]
-    cells = [(*name(row), *(_spread(row, key, digits, unit) for _, key, digits, unit in columns)) for row in rows]
+    cells = [
+        (*name(row), *(_spread(row, key, digits, unit) for _, key, digits, unit in columns))
+        for row in rows
+    ]
     return markdown((*titles, *(column[0] for column in columns)), cells, len(titles))
 
 
@@ -160,19 +197,24 @@ def _references(clip: Row) -> str:
     clauses = [f"The recording's own mTV is {figure(mean['mtv_input'], 3)}"]
     if clip["cue"] is not None:
         clauses.append(f"motion is {figure(mean['true_motion_moving'], 1)} px where things move")
-        clauses.append(f"the flow that guides it is off by {figure(clip['cue']['error'], 2)} px there")
+        clauses.append(
+            f"the flow that guides it is off by {figure(clip['cue']['error'], 2)} px there"
+        )
     return ", ".join(clauses) + ".\n"
 
 
 def _edges(clip: Row) -> str:
-    """Return a warning about presets with their best rate at the largest one measured, empty if there are none."""
+    """Return a warning about presets with their best rate at the largest one measured, empty if
+    there are none.
+    """
     rates_by_preset: dict[str, set[float]] = {row["preset"]: set() for row in clip["rows"]}
     for row in clip["rows"]:
         rates_by_preset[row["preset"]].add(row["rates"])
     edges = [
         row
         for row in best_rows(clip)
-        if len(rates_by_preset[row["preset"]]) > 1 and row["rates"] == max(rates_by_preset[row["preset"]])
+        if len(rates_by_preset[row["preset"]]) > 1
+        and row["rates"] == max(rates_by_preset[row["preset"]])
     ]
     names = ", ".join(f"`{row['preset']}` at {row['epochs']} epochs" for row in edges)
     return f"Larger rates than were tried may be better for {names}.\n" if names else ""
@@ -183,7 +225,8 @@ def _spread(row: Row, name: str, digits: int, unit: float) -> str:
     std = row["std"][name]
     if not _known(mean):
         return "-"
-    return figure(unit * mean, digits) + (f" ± {figure(unit * std, digits)}" if _known(std) else "")
+    deviation = f" ± {figure(unit * std, digits)}" if _known(std) else ""
+    return figure(unit * mean, digits) + deviation
 
 
 def _known(value: float | None) -> bool:

@@ -41,7 +41,11 @@ class Column(NamedTuple):
         rows = [row for row in rows if self.only is None or self.only.items() <= row.items()]
         values = [self.score(row) if callable(self.score) else row[self.score] for row in rows]
         values = [self.factor * float("nan" if value is None else value) for value in values]
-        text = plus_minus(values, self.decimals) if self.spread else figure(float(np.mean(values)), self.decimals)
+        text = (
+            plus_minus(values, self.decimals)
+            if self.spread
+            else figure(float(np.mean(values)), self.decimals)
+        )
         return text + self.unit
 
 
@@ -68,12 +72,24 @@ def scores_table(
 
 
 def means_over(rows: Sequence[Mapping[str, Any]], key: str, **about: Any) -> list[dict[str, Any]]:
-    """Return the means of the numbers of the rows that have `key` in common, as rows with the entries `about`."""
+    """Return the means of the numbers of the rows that have `key` in common, as rows with the
+    entries `about`.
+    """
     means = []
     for (value,), group in grouped(rows, key).items():
-        names = [name for name, entry in group[0].items() if isinstance(entry, Real) and name not in (key, *about)]
+        names = [
+            name
+            for name, entry in group[0].items()
+            if isinstance(entry, Real) and name not in (key, *about)
+        ]
         table = {name: np.array([row[name] for row in group], float) for name in names}
-        means.append({key: value, **about, **{name: float(np.nanmean(column)) for name, column in table.items()}})
+        means.append(
+            {
+                key: value,
+                **about,
+                **{name: float(np.nanmean(column)) for name, column in table.items()},
+            }
+        )
     return means
 
 
@@ -84,8 +100,10 @@ def markdown(titles: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1
     return "\n".join([lines[0], rule, *lines[1:]]) + "\n"
 
 
-def grouped(fits: Iterable[Mapping[str, Any]], *keys: str) -> dict[tuple[Any, ...], list[Mapping[str, Any]]]:
-    """Return the fits that have the values of `keys` in common, by these values, lists as tuples."""
+def grouped(
+    fits: Iterable[Mapping[str, Any]], *keys: str
+) -> dict[tuple[Any, ...], list[Mapping[str, Any]]]:
+    """Return the fits that share the values of `keys`, by these values, with lists as tuples."""
     groups: dict[tuple[Hashable, ...], list[Mapping[str, Any]]] = {}
     for fit in fits:
         values = (tuple(value) if isinstance(value := fit[key], list) else value for key in keys)
@@ -116,7 +134,9 @@ def blank_figure(width: float, height: float) -> Figure:
     try:
         from matplotlib.figure import Figure
     except ImportError as error:
-        raise ValueError("plot: expected matplotlib, found none; install it: pip install matplotlib.") from error
+        raise ValueError(
+            "plot: expected matplotlib, found none; install it: pip install matplotlib."
+        ) from error
     return Figure(figsize=(width, height), layout="constrained")
 
 
@@ -130,7 +150,11 @@ def save_figure(figure: Figure, path: str | Path) -> None:
 
 
 def label_points(
-    axis: Any, points: Iterable[tuple[float, float]], names: Iterable[str], shift: tuple[float, float], size: float = 7
+    axis: Any,
+    points: Iterable[tuple[float, float]],
+    names: Iterable[str],
+    shift: tuple[float, float],
+    size: float = 7,
 ) -> None:
     """Write a name beside each point, offset by `shift` typographic points."""
     for name, point in zip(names, points, strict=True):

@@ -2,8 +2,9 @@
 
     python -m benchmarks.reports.random_scenes --seeds 3 4 5 6 7 8 --json out.json
 
-Each clip is `morgs-mi synth random --seed SEED`, made in `--clips` if it is not there. Settings were chosen on seeds 0
-to 2. Scores are means over the later frames of the held-out view, against the exact ground truth.
+Each clip is `morgs-mi synth random --seed SEED`, made in `--clips` if it is not there. Settings
+were chosen on seeds 0 to 2. Scores are means over the later frames of the held-out view, against
+the exact ground truth.
 """
 
 from __future__ import annotations
@@ -53,11 +54,18 @@ class Options(StudyOptions):
         """Return the study of the clips."""
         sources = {seed: Source.of(random_capture(self.clips, seed)) for seed in self.seeds}
         scenes = [Scene({"seed": seed}, (source, self.frames)) for seed, source in sources.items()]
-        return Study(measure, scenes, [Variant({}, StreamConfig(FitConfig(epochs=self.epochs)))], self.fit_seeds)
+        return Study(
+            measure,
+            scenes,
+            [Variant({}, StreamConfig(FitConfig(epochs=self.epochs)))],
+            self.fit_seeds,
+        )
 
     def table(self, rows: Sequence[Row]) -> str:
         """Return the scores of each scene and of their means."""
-        return scores_table([*rows, *means_over(rows, "fit_seed", seed="mean")], {"seed": "seed"}, COLUMNS)
+        return scores_table(
+            [*rows, *means_over(rows, "fit_seed", seed="mean")], {"seed": "seed"}, COLUMNS
+        )
 
 
 def measure(source: Source, num_frames: int, config: StreamConfig) -> dict[str, float]:
@@ -70,8 +78,12 @@ def measure(source: Source, num_frames: int, config: StreamConfig) -> dict[str, 
     return {name: float(np.nanmean([row[name] for row in rows])) for name in rows[0]}
 
 
-def fitted_frames(loop: StreamLoop, capture: Capture, frames: Iterable[PartialFrame]) -> Iterator[dict[str, float]]:
-    """Fit frames after the first one, and yield the scores of those that the held-out view has recorded."""
+def fitted_frames(
+    loop: StreamLoop, capture: Capture, frames: Iterable[PartialFrame]
+) -> Iterator[dict[str, float]]:
+    """Fit frames after the first one, and yield the scores of those that the held-out view has
+    recorded.
+    """
     test = capture.reference_view
     for frame in frames:
         start = time.process_time()
@@ -84,7 +96,9 @@ def fitted_frames(loop: StreamLoop, capture: Capture, frames: Iterable[PartialFr
             yield {**scores, **sizes, "cpu_s": seconds, **report.active}
 
 
-def scores_of(gaussians: Gaussians, capture: Capture, view: int, frame: int, recorded: np.ndarray) -> dict[str, float]:
+def scores_of(
+    gaussians: Gaussians, capture: Capture, view: int, frame: int, recorded: np.ndarray
+) -> dict[str, float]:
     """Return the scores of a frame in one view."""
     assert capture.truth is not None
     camera = capture.cameras[view]

@@ -1,11 +1,13 @@
-"""Real images: held-out views over the time of the first frame, and from the cameras that fit their images best.
+"""Real images: held-out views over the time of the first frame, and from the cameras that fit their
+images best.
 
-    python -m benchmarks.reports.real --captures sets/fern sets/flower --json out.json
-    python -m benchmarks.reports.real --captures sets/fern sets/flower --seconds 60 120 300 --width 720 --json out.json
+    python -m benchmarks.reports.real --captures sets/fern sets/flower --json out.json python -m
+    benchmarks.reports.real --captures sets/fern sets/flower --seconds 60 120 300 --width 720 --json
+    out.json
 
-Each capture is a folder of photos with the model of `morgs-mi calibrate`, or a recording. Views 5, 13, 21 and so on are
-held out together; of six views and fewer, each one in turn. A capture with few points starts from those that
-`morgs-mi fit` finds in its training views.
+Each capture is a folder of photos with the model of `morgs-mi calibrate`, or a recording. Views 5,
+13, 21 and so on are held out together; of six views and fewer, each one in turn. A capture with few
+points starts from those that `morgs-mi fit` finds in its training views.
 """
 
 from __future__ import annotations
@@ -62,7 +64,8 @@ class Options(StudyOptions):
     seconds: tuple[int, ...] = ()
     """Times of the first frame, which plan its Gaussians and steps instead."""
     pictures: Path | None = None
-    """Folder for a picture of each set, SET.jpg: the first held-out image, recorded and rendered."""
+    """Folder for a picture of each set, SET.jpg: the first held-out image, recorded and rendered.
+    """
 
     def study(self) -> Study:
         """Return the study of the captures."""
@@ -70,21 +73,32 @@ class Options(StudyOptions):
         for path in self.captures:
             full = load_capture(path, test_view=None)
             capture = load_capture(path, max(1.0, full.cameras[0].width / self.width), None)
-            keys = {"set": path.name.partition("-")[0], "principal_points": principal_points(capture.cameras)}
+            keys = {
+                "set": path.name.partition("-")[0],
+                "principal_points": principal_points(capture.cameras),
+            }
             scenes += [
                 Scene(keys | {"test": test}, (Source.of(capture.holding_out(test)), self.pictures))
                 for test in held_out(len(full.cameras))
             ]
         settings = FitConfig(num_gaussians=self.gaussians, first_frame_steps=self.steps)
-        fits = {seconds: FitConfig(first_frame_seconds=seconds) for seconds in self.seconds} or {None: settings}
-        variants = [Variant({"seconds": seconds}, StreamConfig(fit)) for seconds, fit in fits.items()]
+        fits = {seconds: FitConfig(first_frame_seconds=seconds) for seconds in self.seconds} or {
+            None: settings
+        }
+        variants = [
+            Variant({"seconds": seconds}, StreamConfig(fit)) for seconds, fit in fits.items()
+        ]
         return Study(measure, scenes, variants, self.fit_seeds)
 
     def table(self, rows: Sequence[Row]) -> str:
         """Return the scores by set, and by the time of the first frame or by the calibration."""
         if rows[0].get("seconds"):
             return over_time_table(rows)
-        keys = {"photos": "set", "principal points": "principal_points", "held out": "held_out_views"}
+        keys = {
+            "photos": "set",
+            "principal points": "principal_points",
+            "held out": "held_out_views",
+        }
         return scores_table(rows, keys, COLUMNS, left=2)
 
 
@@ -100,12 +114,21 @@ def over_time_table(rows: Sequence[Row]) -> str:
         )
         for row in rows
     )
-    titles = "may take, s", "time of two cores, s", "Gaussians", "training views, dB", "held out", "registered"
+    titles = (
+        "may take, s",
+        "time of two cores, s",
+        "Gaussians",
+        "training views, dB",
+        "held out",
+        "registered",
+    )
     return markdown(("photos", *titles), lines)
 
 
 def principal_points(cameras: Sequence[Camera]) -> str:
-    """Return whether cameras have equal principal points, in image sizes: ``"shared"`` or ``"own"``."""
+    """Return whether cameras have equal principal points, in image sizes: ``"shared"`` or
+    ``"own"``.
+    """
     points = {(round(c.K[0, 2] / c.width, 6), round(c.K[1, 2] / c.height, 6)) for c in cameras}
     return "own" if len(points) > 1 else "shared"
 
@@ -116,7 +139,9 @@ def held_out(count: int) -> list[list[int]]:
 
 
 def measure(source: Source, pictures: Path | None, config: StreamConfig) -> dict[str, Any]:
-    """Fit the views that are not held out; return the mean PSNR of both, of the held-out ones in both ways."""
+    """Fit the views that are not held out; return the mean PSNR of both, of the held-out ones in
+    both ways.
+    """
     capture = with_points(source.open(), config.seed, Progress())
     images = next(capture.frames(0, 1)).images
     views = [View(*view) for view in zip(capture.cameras, images, capture.masks, strict=True)]
@@ -134,7 +159,9 @@ def measure(source: Source, pictures: Path | None, config: StreamConfig) -> dict
     groups = {
         "training": train,
         "held_out": test,
-        "registered": [view._replace(camera=camera) for view, camera in zip(test, cameras, strict=True)],
+        "registered": [
+            view._replace(camera=camera) for view, camera in zip(test, cameras, strict=True)
+        ],
     }
     if pictures is not None:
         _write_picture(pictures / f"{capture.path.name}.jpg", gaussians, test[0])

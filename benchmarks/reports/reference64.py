@@ -1,16 +1,18 @@
 """Reference implementation of the renderer in double precision, with which its error is measured.
 
-NumPy float64, for a list of pixels instead of a whole image. Scenes of any size can be evaluated by a sample.
-Every pixel evaluates every Gaussian: there are no lists, and no early stop. N Gaussians, P pixels; A = alpha before the
-cap, T = transmittance in front of a Gaussian, w = T alpha, values c = (colour, 1).
+NumPy float64, for a list of pixels instead of a whole image. Scenes of any size can be evaluated by
+a sample. Every pixel evaluates every Gaussian: there are no lists, and no early stop. N Gaussians,
+P pixels; A = alpha before the cap, T = transmittance in front of a Gaussian, w = T alpha, values c
+= (colour, 1).
 
-The adjoint of the blend is written by hand: with g the gradient at a pixel and S_i = sum_{j > i} w_j <g, c_j>,
+The adjoint of the blend is written by hand: with g the gradient at a pixel and S_i = sum_{j > i}
+w_j <g, c_j>,
 
     dL/dalpha_i = T_i <g, c_i> - S_i / (1 - alpha_i),
 
-and so is its chain through A = opacity exp(-sigma). The Jacobian of the projection, from eleven numbers (mean, scales,
-rotation, opacity) to a splat's nine numbers with colour, is computed by complex steps, exact to rounding: derivatives
-derived by hand might share the renderer's mistakes.
+and so is its chain through A = opacity exp(-sigma). The Jacobian of the projection, from eleven
+numbers (mean, scales, rotation, opacity) to a splat's nine numbers with colour, is computed by
+complex steps, exact to rounding: derivatives derived by hand might share the renderer's mistakes.
 """
 
 from __future__ import annotations
@@ -48,7 +50,9 @@ class Reference64:
     def render(self, pixels: np.ndarray) -> np.ndarray:
         """Return colour and alpha [P, 4] at the pixels [P, 2] (column, row)."""
         splats, values, order = self._splats()
-        return np.concatenate([w @ values[order] for _, _, w, *_ in self._blended(splats, order, pixels)])
+        return np.concatenate(
+            [w @ values[order] for _, _, w, *_ in self._blended(splats, order, pixels)]
+        )
 
     def gradients(self, pixels: np.ndarray, gradient: np.ndarray) -> dict[str, np.ndarray]:
         """Return dL/d(attribute) by name, given dL/d(colour, alpha) [P, 4] at the pixels [P, 2]."""
@@ -61,7 +65,8 @@ class Reference64:
             product = g @ values[order].T  # <g, c_i>
             inner = weights * product
             light_behind = inner[:, ::-1].cumsum(axis=1)[:, ::-1] - inner
-            to_full = np.where(free, light * product - light_behind / (1 - alpha), 0) * alpha  # dL/dA A
+            # dL/dA times A.
+            to_full = np.where(free, light * product - light_behind / (1 - alpha), 0) * alpha
             dx, dy = distance
             _, _, a, b, c, opacity = splats[order].T
             moments = (
@@ -77,15 +82,21 @@ class Reference64:
         return self._to_attributes(np.column_stack([to_splats, to_values[:, :3]]))
 
     def _splats(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return splats (mean, conic, opacity) [N, 6], values (colour, 1) [N, 4] and the drawn indices by depth."""
+        """Return splats (mean, conic, opacity) [N, 6], values (colour, 1) [N, 4] and the drawn
+        indices by depth.
+        """
         numbers, depths = _project(self._float64(), self.camera, self.config.eps2d)
         order = np.argsort(depths, kind="stable")
         visible = (depths >= self.camera.near) & (numbers[:, 5] > self.config.alpha_min)
         values = np.column_stack([numbers[:, 6:], np.ones(len(numbers))])
         return numbers[:, :6], values, order[visible[order]]
 
-    def _blended(self, splats: np.ndarray, order: np.ndarray, pixels: np.ndarray) -> Iterator[tuple]:
-        """Yield (chunk, (dx, dy), w, T, alpha, whether alpha is A) for one chunk of the pixels at a time."""
+    def _blended(
+        self, splats: np.ndarray, order: np.ndarray, pixels: np.ndarray
+    ) -> Iterator[tuple]:
+        """Yield (chunk, (dx, dy), w, T, alpha, whether alpha is A) for one chunk of the pixels at a
+        time.
+        """
         mean_x, mean_y, a, b, c, opacity = splats[order].T
         rows = max(1, PAIRS // max(len(order), 1))
         for first in range(0, len(pixels), rows):
@@ -100,7 +111,7 @@ class Reference64:
             yield chunk, (dx, dy), light * alpha, light, alpha, visible & free
 
     def _to_attributes(self, gradients: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the gradients of the attributes, given the gradients of splats and colours [N, 9]."""
+        """Return the gradients of the attributes, given those of splats and colours [N, 9]."""
         raw = self._float64()
         grads = {}
         for name in _GEOMETRY:
@@ -109,7 +120,9 @@ class Reference64:
             for k in range(columns.shape[1]):
                 trial = columns.astype(np.complex128)
                 trial[:, k] += 1j * _STEP
-                numbers, _ = _project({**raw, name: trial.reshape(raw[name].shape)}, self.camera, self.config.eps2d)
+                numbers, _ = _project(
+                    {**raw, name: trial.reshape(raw[name].shape)}, self.camera, self.config.eps2d
+                )
                 grad[:, k] = (np.imag(numbers) / _STEP * gradients).sum(axis=1)
             grads[name] = grad.reshape(raw[name].shape)
         positive = _project(raw, self.camera, self.config.eps2d)[0][:, 6:] > 0
@@ -125,8 +138,12 @@ def _pose(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     return view[:3, :3], view[:3, 3]
 
 
-def _project(raw: Mapping[str, np.ndarray], camera: Camera, eps2d: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return (mean, conic, opacity, colour) [N, 9] of every Gaussian, real or complex, and depths [N]."""
+def _project(
+    raw: Mapping[str, np.ndarray], camera: Camera, eps2d: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return (mean, conic, opacity, colour) [N, 9] of every Gaussian, real or complex, and depths
+    [N].
+    """
     R, t = _pose(camera)
     K = np.asarray(np.float32(camera.K), np.float64)
     x, y, z = (raw["means"] @ R.T + t).T
@@ -182,10 +199,17 @@ def _sh_basis(directions: np.ndarray, K: int) -> np.ndarray:
     zz = z * z
     basis = [SH_C0 + 0 * x]
     basis += [0.4886025119029199 * v for v in (-y, z, -x)]
-    basis += [1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (2 * zz - xx - yy)]
+    basis += [
+        1.0925484305920792 * x * y,
+        -1.0925484305920792 * y * z,
+        0.31539156525252005 * (2 * zz - xx - yy),
+    ]
     basis += [-1.0925484305920792 * x * z, 0.5462742152960396 * (xx - yy)]
     basis += [-0.5900435899266435 * y * (3 * xx - yy), 2.890611442640554 * x * y * z]
-    basis += [-0.4570457994644658 * y * (4 * zz - xx - yy), 0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy)]
+    basis += [
+        -0.4570457994644658 * y * (4 * zz - xx - yy),
+        0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+    ]
     basis += [-0.4570457994644658 * x * (4 * zz - xx - yy), 1.445305721320277 * z * (xx - yy)]
     basis += [-0.5900435899266435 * x * (xx - 3 * yy)]
     return np.stack(basis[:K], axis=1)

@@ -2,14 +2,16 @@
 
     python -m benchmarks.reports renderer --json out.json --plot out.png
 
-One scene, one setting changed at a time. The *exact* image has no cut-offs and no early stop. The *rounding* error
-compares with a reference that has the same `alpha_min`: only float32 and the early stop remain. Errors are
-measured on a sample of pixels: the loss of the compared gradients has random weights at these pixels and zero
-weights elsewhere. So the renderer runs unchanged while the reference stays affordable.
+One scene, one setting changed at a time. The *exact* image has no cut-offs and no early stop. The
+*rounding* error compares with a reference that has the same `alpha_min`: only float32 and the early
+stop remain. Errors are measured on a sample of pixels: the loss of the compared gradients has
+random weights at these pixels and zero weights elsewhere. So the renderer runs unchanged while the
+reference stays affordable.
 
-A row of the JSON has the changed option (`knob`), its `value`, the errors of the `image` (`max`, `rms`, `psnr` in dB)
-and of the `gradients` by attribute (`relative_l2`, `cosine`), the same as `rounding`, and the median times of rendering
-and of a whole step in ms, with the median ratio of the step to the default's in the same round.
+A row of the JSON has the changed option (`knob`), its `value`, the errors of the `image` (`max`,
+`rms`, `psnr` in dB) and of the `gradients` by attribute (`relative_l2`, `cosine`), the same as
+`rounding`, and the median times of rendering and of a whole step in ms, with the median ratio of
+the step to the default's in the same round.
 """
 
 from __future__ import annotations
@@ -70,7 +72,9 @@ class Options(Output):
         print(errors_table(rows))
         if self.plot is not None:
             plot_renderer(rows, self.plot)
-        scene = {name: value for name, value in asdict(self).items() if name not in ("json", "plot")}
+        scene = {
+            name: value for name, value in asdict(self).items() if name not in ("json", "plot")
+        }
         self.write({"scene": scene, "rows": rows}, unprinted=["rows"])
 
 
@@ -89,27 +93,35 @@ class Setting:
 
 
 def ladder() -> list[Setting]:
-    """Return the settings, one option changed at a time; each option's values include the default."""
+    """Return the settings, one option changed at a time; its values include the default."""
     default = RenderConfig()
     settings = []
     for factor, name in ((1 / 64, "1/16320"), (1 / 8, "1/2040"), (1, "1/255"), (4, "4/255")):
-        settings.append(Setting("alpha_min", name, replace(default, alpha_min=default.alpha_min * factor)))
+        settings.append(
+            Setting("alpha_min", name, replace(default, alpha_min=default.alpha_min * factor))
+        )
     for stop in (0.0, 1e-5, 1e-4, 1e-3, 1e-2):
-        settings.append(Setting("stop_transmittance", f"{stop:g}", replace(default, stop_transmittance=stop)))
+        settings.append(
+            Setting("stop_transmittance", f"{stop:g}", replace(default, stop_transmittance=stop))
+        )
     default_shape = block_shape(default)
     for shape in dict.fromkeys([(4, 4), (8, 4), (8, 8), default_shape]):
         width, height = (None, None) if shape == default_shape else shape
         config = replace(default, block_width=width, block_height=height)
         settings.append(Setting("block", f"{shape[0]}x{shape[1]}", config))
     for flag in (False, True):
-        settings.append(Setting("reproducible", str(flag).lower(), replace(default, reproducible=flag)))
+        settings.append(
+            Setting("reproducible", str(flag).lower(), replace(default, reproducible=flag))
+        )
     return settings
 
 
 def measure(options: Options) -> list[dict[str, Any]]:
     """Return one row for every setting of the ladder."""
     shape = options.width, options.height
-    gaussians, camera = ball(options.seed, options.gaussians, *shape, options.median_scale, options.sh_degree)
+    gaussians, camera = ball(
+        options.seed, options.gaussians, *shape, options.median_scale, options.sh_degree
+    )
     settings = ladder()
     rng = np.random.default_rng(options.seed)
     count = options.width * options.height
@@ -118,19 +130,28 @@ def measure(options: Options) -> list[dict[str, Any]]:
     weights = rng.normal(size=(len(pixels), 3))
 
     references: dict[float, Values] = {}
-    for alpha_min in dict.fromkeys([_EXACT_ALPHA_MIN, *(setting.config.alpha_min for setting in settings)]):
+    for alpha_min in dict.fromkeys(
+        [_EXACT_ALPHA_MIN, *(setting.config.alpha_min for setting in settings)]
+    ):
         reference = Reference64(gaussians.numpy(), camera, RenderConfig(alpha_min=alpha_min))
         gradient = np.column_stack([weights, np.zeros(len(weights))])
-        references[alpha_min] = reference.render(pixels)[:, :3], reference.gradients(pixels, gradient)
+        references[alpha_min] = (
+            reference.render(pixels)[:, :3],
+            reference.gradients(pixels, gradient),
+        )
 
     dr.enable_grad(*gaussians.items().values())
     target = np.zeros((options.height, options.width, 3), np.float32)
     target[pixels[:, 1], pixels[:, 0]] = weights
     rows = []
-    for setting, times in zip(settings, _times(gaussians, camera, settings, options.repeats), strict=True):
+    for setting, times in zip(
+        settings, _times(gaussians, camera, settings, options.repeats), strict=True
+    ):
         image, gradients = _rendered(gaussians, camera, setting.config, mi.TensorXf(target))
         result = image[pixels[:, 1], pixels[:, 0]], gradients
-        exact, same = (_errors(result, references[cut]) for cut in (_EXACT_ALPHA_MIN, setting.config.alpha_min))
+        exact, same = (
+            _errors(result, references[cut]) for cut in (_EXACT_ALPHA_MIN, setting.config.alpha_min)
+        )
         keys = {"knob": setting.knob, "value": setting.value, "default": setting.is_default}
         rows.append({**keys, **exact, "rounding": same, **times})
     return rows
@@ -141,7 +162,11 @@ def errors_table(rows: Sequence[Row]) -> str:
     lines = []
     for row in rows:
         name = f"`{row['knob']}` {row['value']}"
-        errors = (error for kind in (row, row["rounding"]) for error in (kind["image"]["rms"], worst_gradient(kind)))
+        errors = (
+            error
+            for kind in (row, row["rounding"])
+            for error in (kind["image"]["rms"], worst_gradient(kind))
+        )
         cells = (f"{row['step_ratio']:.2f}", *(f"{error:.1e}" for error in errors))
         lines.append((f"**{name}**" if row["default"] else name, *cells))
     titles = "time of a step", "image", "gradients", "image, same cut-off", "gradients"
@@ -154,7 +179,8 @@ def worst_gradient(errors: Row) -> float:
 
 
 def plot_renderer(rows: Sequence[Row], path: Path) -> None:
-    """Plot error over run time, one line per option: image and gradients, exact and at the same `alpha_min`.
+    """Plot error over run time, one line per option: image and gradients, exact and at the same
+    `alpha_min`.
 
     Raises:
         ValueError: matplotlib is not installed.
@@ -171,13 +197,23 @@ def plot_renderer(rows: Sequence[Row], path: Path) -> None:
         for knob in dict.fromkeys(row["knob"] for row in rows):
             rows_of_knob = [row for row in rows if row["knob"] == knob]
             points = [(row["step_ratio"], error(row)) for row in rows_of_knob]
-            axis.plot(*zip(*points, strict=True), _MARKS.get(knob, "o-"), label=knob, alpha=0.8, markersize=5)
+            axis.plot(
+                *zip(*points, strict=True),
+                _MARKS.get(knob, "o-"),
+                label=knob,
+                alpha=0.8,
+                markersize=5,
+            )
             # Labels would overlap if an option has no effect.
             spread = max(y for _, y in points) > 1.5 * min(y for _, y in points)
             labels = [
-                (row, point) for row, point in zip(rows_of_knob, points, strict=True) if spread and not row["default"]
+                (row, point)
+                for row, point in zip(rows_of_knob, points, strict=True)
+                if spread and not row["default"]
             ]
-            label_points(axis, [point for _, point in labels], [row["value"] for row, _ in labels], (5, 3))
+            label_points(
+                axis, [point for _, point in labels], [row["value"] for row, _ in labels], (5, 3)
+            )
         axis.plot(1, error(default), "k*", markersize=13, label="default", zorder=5)
         axis.set(
             title=title,
@@ -214,7 +250,10 @@ def _errors(result: Values, expected: Values) -> dict[str, Any]:
         length = np.linalg.norm(b)
         cosine = float(a @ b / (np.linalg.norm(a) * length))
         gradients[name] = {"relative_l2": float(np.linalg.norm(a - b) / length), "cosine": cosine}
-    return {"image": {"max": float(difference.max()), "rms": rms, "psnr": psnr}, "gradients": gradients}
+    return {
+        "image": {"max": float(difference.max()), "rms": rms, "psnr": psnr},
+        "gradients": gradients,
+    }
 
 
 def _times(
@@ -223,7 +262,9 @@ def _times(
     settings: Sequence[Setting],
     repeats: int,
 ) -> list[dict[str, float]]:
-    """Return ms forward, ms of a step and its ratio to the default: medians, measured in shuffled rounds."""
+    """Return ms forward, ms of a step and its ratio to the default: medians, measured in shuffled
+    rounds.
+    """
     target = mi.TensorXf(np.full((camera.height, camera.width, 3), 0.5, np.float32))
 
     def forward(config: RenderConfig) -> None:
@@ -263,5 +304,7 @@ def _times(
     ratios = np.median(times[:, :, 1] / times[:, default : default + 1, 1], axis=0)
     medians = np.median(times, axis=0)
     names = "forward_ms", "step_ms", "step_ratio"
-    rows = [(*medians[k], ratios[k]) for k in (configs.index(setting.config) for setting in settings)]
+    rows = [
+        (*medians[k], ratios[k]) for k in (configs.index(setting.config) for setting in settings)
+    ]
     return [{name: round(float(v), 3) for name, v in zip(names, row, strict=True)} for row in rows]

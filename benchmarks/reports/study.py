@@ -1,12 +1,15 @@
-"""Studies: fits of scenes in variants of the settings with several seeds, and the table of their scores.
+"""Studies: fits of scenes in variants of the settings with several seeds, and the table of their
+scores.
 
-A *cell* is a scene in a variant with a seed. Its *row* in the JSON has the keys of the scene and of the variant, the
-seed, and the scores that the measure returns. A report describes its study as data::
+A *cell* is a scene in a variant with a seed. Its *row* in the JSON has the keys of the scene and of
+the variant, the seed, and the scores that the measure returns. A report describes its study as
+data::
 
-    Study(measure, scenes=[Scene({"seed": 3}, (source,))], variants=[Variant({}, StreamConfig())], seeds=(0, 1, 2))
+    scenes = [Scene({"seed": 3}, (source,))]
+    Study(measure, scenes, variants=[Variant({}, StreamConfig())], seeds=(0, 1, 2))
 
-and its options (`StudyOptions`) fit the missing cells, in this process or on workers, print the table, and write the
-rows with the settings, the commit, the date, the machine and the versions.
+and its options (`StudyOptions`) fit the missing cells, in this process or on workers, print the
+table, and write the rows with the settings, the commit, the date, the machine and the versions.
 """
 
 from __future__ import annotations
@@ -70,13 +73,14 @@ class Study:
     """Fits of scenes in variants of the settings with several seeds.
 
     Attributes:
-        measure: function of a module, called with the arguments of a scene and the settings; returns the scores of a
-            cell, or several rows of them.
+        measure: function of a module, called with the arguments of a scene and the settings;
+            returns the scores of a cell, or several rows of them.
         scenes: recordings.
         variants: settings.
         seeds: seeds of the fits of each scene and variant.
         seed_key: key of the seed in the rows.
-        version: version of the method, of which stored scores are used; None: a digest of the sources.
+        version: version of the method, of which stored scores are used; None: a digest of the
+            sources.
     """
 
     measure: Callable[..., Row | Sequence[Row]]
@@ -91,11 +95,13 @@ class Study:
 
         Args:
             client: from `open_client`; None: this process fits one cell after the other.
-            store: folder of the scores of finished cells, which are not fitted again while the version of the method,
-                the settings and the files of the scene stay as they are; None: all cells are fitted.
+            store: folder of the scores of finished cells, which are not fitted again while the
+                version of the method, the settings and the files of the scene stay as they are;
+                None: all cells are fitted.
 
         Raises:
-            OSError: a worker died several times, the scheduler was lost, or a score cannot be stored.
+            OSError: a worker died several times, the scheduler was lost, or a score cannot be
+                stored.
         """
         cells = {}
         keys = {}
@@ -104,8 +110,14 @@ class Study:
             name = ", ".join(f"{key} {value}" for key, value in cell_keys.items())
             cells[name] = (*scene.args, replace(variant.config, seed=seed))
             keys[name] = cell_keys
-        files = {name: self.stored_file(store, args) for name, args in cells.items()} if store else {}
-        results_by_name = {name: json.loads(file.read_text("utf-8")) for name, file in files.items() if file.is_file()}
+        files = (
+            {name: self.stored_file(store, args) for name, args in cells.items()} if store else {}
+        )
+        results_by_name = {
+            name: json.loads(file.read_text("utf-8"))
+            for name, file in files.items()
+            if file.is_file()
+        }
 
         def arrived(name: str, result: Any) -> None:
             results_by_name[name] = json_finite(rounded(result))
@@ -113,16 +125,30 @@ class Study:
             if store:
                 write_json(files[name], results_by_name[name])
 
-        run_cells(self.measure, {n: args for n, args in cells.items() if n not in results_by_name}, client, arrived)
+        run_cells(
+            self.measure,
+            {n: args for n, args in cells.items() if n not in results_by_name},
+            client,
+            arrived,
+        )
         results = {
-            name: results_by_name[name] if isinstance(results_by_name[name], list) else [results_by_name[name]]
+            name: results_by_name[name]
+            if isinstance(results_by_name[name], list)
+            else [results_by_name[name]]
             for name in cells
         }
         return [{**keys[name], **row} for name, rows in results.items() for row in rows]
 
     def stored_file(self, store: Path, args: tuple[Any, ...]) -> Path:
-        """Return the file of a cell's scores. Its name has a digest of all that the scores depend on."""
-        files = [state for value in args if (path := getattr(value, "path", None)) for state in _files(Path(path))]
+        """Return the file of a cell's scores. Its name has a digest of all that the scores depend
+        on.
+        """
+        files = [
+            state
+            for value in args
+            if (path := getattr(value, "path", None))
+            for state in _files(Path(path))
+        ]
         name = f"{self.measure.__module__}.{self.measure.__qualname__}"
         parts = self.version or method_version(), name, args, files
         return store / f"{name}-{hashlib.sha256(repr(parts).encode()).hexdigest()[:16]}.json"
@@ -170,8 +196,12 @@ def rounded(scores: Any) -> Any:
 
 
 @cache
-def method_version(folders: tuple[Path, ...] = (Path(morgs_mi.__file__).parent, Path(__file__).parent)) -> str:
-    """Return a digest of the sources of the package and of the reports. Layout and comments do not count."""
+def method_version(
+    folders: tuple[Path, ...] = (Path(morgs_mi.__file__).parent, Path(__file__).parent),
+) -> str:
+    """Return a digest of the sources of the package and of the reports. Layout and comments do not
+    count.
+    """
     files = sorted(file for folder in folders for file in folder.rglob("*.py"))
     sources = [ast.dump(ast.parse(file.read_text(encoding="utf-8"))) for file in files]
     return hashlib.sha256("".join(sources).encode()).hexdigest()[:16]
@@ -179,5 +209,9 @@ def method_version(folders: tuple[Path, ...] = (Path(morgs_mi.__file__).parent, 
 
 def _files(folder: Path) -> list[tuple[str, int, int]]:
     """Return path, size and time of change of each file of a capture."""
-    states = ((path.relative_to(folder), path.stat()) for path in sorted(folder.rglob("*")) if path.is_file())
+    states = (
+        (path.relative_to(folder), path.stat())
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    )
     return [(str(path), state.st_size, state.st_mtime_ns) for path, state in states]

@@ -1,10 +1,12 @@
-"""Cameras that record at times of their own: how exactly offsets are found, and what rendering at these times gains.
+"""Cameras that record at times of their own: how exactly offsets are found, and what rendering at
+these times gains.
 
     python -m benchmarks.reports.timing --seeds 3 6 --json out.json
 
-Each scene is `morgs-mi synth random --seed SEED`, recorded twice: by cameras of one clock, and by cameras that are up
-to `--time-offset` frames apart. The second clip is fitted as it is and with the offsets that are found, over the same
-instants as the first. Scores are means over the later frames of the held-out view. Its clock is the reference.
+Each scene is `morgs-mi synth random --seed SEED`, recorded twice: by cameras of one clock, and by
+cameras that are up to `--time-offset` frames apart. The second clip is fitted as it is and with the
+offsets that are found, over the same instants as the first. Scores are means over the later frames
+of the held-out view. Its clock is the reference.
 """
 
 from __future__ import annotations
@@ -58,13 +60,20 @@ class Options(ClipOptions):
     """Steps of the first frame."""
 
     def study(self) -> Study:
-        """Return the study of the scenes, each recorded by both rigs; a cell has the rows of all seeds."""
+        """Return the study of the scenes, each recorded by both rigs; a cell has the rows of all
+        seeds.
+        """
         rigs = {"one-clock": Disturbances(), "apart": Disturbances(time_offset=self.time_offset)}
         scenes = []
         for seed in self.seeds:
-            clips = (self.clip("random", f"random-{seed}-{n}", disturbances=d, seed=seed) for n, d in rigs.items())
+            clips = (
+                self.clip("random", f"random-{seed}-{n}", disturbances=d, seed=seed)
+                for n, d in rigs.items()
+            )
             sources = tuple(map(Source.of, clips))
-            scenes.append(Scene({"scene": f"random {seed}"}, (*sources, self.fitted, self.fit_seeds)))
+            scenes.append(
+                Scene({"scene": f"random {seed}"}, (*sources, self.fitted, self.fit_seeds))
+            )
         return Study(measure, scenes, [Variant({}, self.config(dropping=0.0))])
 
     def table(self, rows: Sequence[Row]) -> str:
@@ -75,13 +84,23 @@ class Options(ClipOptions):
 def measure(
     clock: Source, apart: Source, num_frames: int, seeds: Sequence[int], config: StreamConfig
 ) -> list[dict[str, float]]:
-    """Return the errors of a scene's offsets, and the scores of its fits by the way in which it is read, by seed."""
+    """Return the errors of a scene's offsets, and the scores of its fits by the way in which it is
+    read, by seed.
+    """
     synchronised = clock.open()
     recording = apart.open()
     errors, offsets, reference = offset_errors(recording)
-    aligned_capture = load_capture(recording.path, reading=replace(recording.reading, offset=offsets))
-    first = int(aligned_capture.metadata()["cameras"][recording.names.index(reference)]["first_frame"])
-    fits = {"synchronised": (synchronised, first), "recorded": (recording, first), "aligned": (aligned_capture, 0)}
+    aligned_capture = load_capture(
+        recording.path, reading=replace(recording.reading, offset=offsets)
+    )
+    first = int(
+        aligned_capture.metadata()["cameras"][recording.names.index(reference)]["first_frame"]
+    )
+    fits = {
+        "synchronised": (synchronised, first),
+        "recorded": (recording, first),
+        "aligned": (aligned_capture, 0),
+    }
     rows = []
     for seed in seeds:
         row = {"fit_seed": seed, **errors}
@@ -113,7 +132,9 @@ def offset_errors(recorded: Capture) -> tuple[dict[str, float], dict[str, float]
 
 
 def scores(capture: Capture, frames: range, first: int, config: StreamConfig) -> dict[str, Any]:
-    """Return the scores of a fit of some instants, of which the first is frame `first` of the held-out clip."""
+    """Return the scores of a fit of some instants, of which the first is frame `first` of the
+    held-out clip.
+    """
     test = capture.reference_view
     loop = new_loop(capture, config)
     rows = []

@@ -1,13 +1,15 @@
-"""Forecast of views between the cameras, as `fit` prints it, on scenes that its regression has not seen.
+"""Forecast of views between the cameras, as `fit` prints it, on scenes that its regression has not
+seen.
 
-    python -m benchmarks.reports.unseen --captures sets/fern sets/flower rigs/walk4 clips/random-401 --json unseen.json
+    python -m benchmarks.reports.unseen --captures sets/fern sets/flower rigs/walk4 clips/random-401
+    --json unseen.json
 
-Each capture is a folder of photos with the model of `morgs-mi calibrate`, a recording, or a clip of `morgs-mi synth`. A
-share of the cameras, spread over the rig, is trained on in the first frame, and the others are held out; of six cameras
-and fewer, each one in turn.
+Each capture is a folder of photos with the model of `morgs-mi calibrate`, a recording, or a clip of
+`morgs-mi synth`. A share of the cameras, spread over the rig, is trained on in the first frame, and
+the others are held out; of six cameras and fewer, each one in turn.
 
-The regression of `morgs_mi.fit.unseen_views` is `regression_of` the rows of all runs, and the pages have the forecasts
-of each capture by regressions without its rows, `out_of_capture`.
+The regression of `morgs_mi.fit.unseen_views` is `regression_of` the rows of all runs, and the pages
+have the forecasts of each capture by regressions without its rows, `out_of_capture`.
 """
 
 from __future__ import annotations
@@ -80,14 +82,25 @@ class Options(StudyOptions):
             full = load_capture(path, test_view=None)
             capture = load_capture(path, max(1.0, full.cameras[0].width / self.width), None)
             for number, test in enumerate(held_out(capture, self.shares)):
-                keys = {"kind": self.kind, "set": path.name, "gaussians": self.gaussians, "fit": number}
+                keys = {
+                    "kind": self.kind,
+                    "set": path.name,
+                    "gaussians": self.gaussians,
+                    "fit": number,
+                }
                 scenes.append(Scene(keys, (Source.of(capture.holding_out(test)),)))
-        fit = FitConfig(num_gaussians=self.gaussians, first_frame_steps=self.steps, exposure=self.exposure)
+        fit = FitConfig(
+            num_gaussians=self.gaussians, first_frame_steps=self.steps, exposure=self.exposure
+        )
         return Study(measure, scenes, [Variant({}, StreamConfig(fit))], self.fit_seeds)
 
     def table(self, rows: Sequence[Row]) -> str:
-        """Return the forecasts of each capture by the regression of the package, which may have seen it."""
-        return scores_table([forecast_row(row, REGRESSION) for row in rows], {"set": "set"}, COLUMNS)
+        """Return the forecasts of each capture by the regression of the package, which may have
+        seen it.
+        """
+        return scores_table(
+            [forecast_row(row, REGRESSION) for row in rows], {"set": "set"}, COLUMNS
+        )
 
 
 def held_out(capture: Capture, shares: Sequence[float]) -> list[list[int]]:
@@ -117,17 +130,27 @@ def row_of(
     setup: Setup,
     exposures: Sequence[Exposure],
 ) -> dict[str, Any]:
-    """Return the row of a fit; held-out views are compared in the colours of the scene if it is balanced."""
+    """Return the row of a fit; held-out views are compared in the colours of the scene if it is
+    balanced.
+    """
     is_balanced = any(exposure != Exposure() for exposure in exposures)
     views = [View(*view) for view in zip(capture.cameras, images, capture.masks, strict=True)]
     train = [views[index] for index in capture.train_views]
-    test = [views[index] for index in capture.test_views[:: -(-len(capture.test_views) // _MOST_VIEWS)]]
+    test = [
+        views[index] for index in capture.test_views[:: -(-len(capture.test_views) // _MOST_VIEWS)]
+    ]
     render = setup.config.render
     if is_balanced:
         pairs = zip(train, exposures, strict=True)
         train = [view._replace(image=exposure.corrected(view.image)) for view, exposure in pairs]
-        fits = [fit_exposure(rendered(gaussians, view.camera, render), view.image / 255, view.mask) for view in test]
-        test = [view._replace(image=exposure.corrected(view.image)) for view, exposure in zip(test, fits, strict=True)]
+        fits = [
+            fit_exposure(rendered(gaussians, view.camera, render), view.image / 255, view.mask)
+            for view in test
+        ]
+        test = [
+            view._replace(image=exposure.corrected(view.image))
+            for view, exposure in zip(test, fits, strict=True)
+        ]
     rig = forecast([view.camera for view in train], setup.points)
     features = features_of(gaussians, train, setup.points, render)
     psnrs = [mean_psnr(gaussians, [view], render) for view in test]
@@ -135,7 +158,8 @@ def row_of(
 
 
 def regression_of(rows: Sequence[Row]) -> Regression:
-    """Return the regression of the loss on the features, with the interval from captures that it has not seen.
+    """Return the regression of the loss on the features, with the interval from captures that it
+    has not seen.
 
     Rigs that are too wide do not count, because `fit` prints the word alone.
     """
@@ -143,13 +167,18 @@ def regression_of(rows: Sequence[Row]) -> Regression:
     errors = []
     for (name,), group in grouped(rows, "set").items():
         others = _regression([row for row in rows if row["set"] != name])
-        ratios = [abs(_loss(row) - others.loss(row["features"])) / others.scale(row["features"]) for row in group]
+        ratios = [
+            abs(_loss(row) - others.loss(row["features"])) / others.scale(row["features"])
+            for row in group
+        ]
         errors.append(np.array(ratios))
     return _regression(rows, _conformal(errors))
 
 
 def out_of_capture(rows: Sequence[Row]) -> Iterator[dict[str, Any]]:
-    """Yield the rows of rigs that are not too wide, with forecasts by regressions without the rows of their capture."""
+    """Yield the rows of rigs that are not too wide, with forecasts by regressions without the rows
+    of their capture.
+    """
     for (name,), group in grouped(_near(rows), "set").items():
         regression = regression_of([row for row in rows if row["set"] != name])
         for row in group:
@@ -198,7 +227,8 @@ def _loss(row: Row) -> float:
 
 
 def _conformal(errors: Sequence[np.ndarray]) -> float:
-    """Return the error below which nine fits in ten of an unseen capture are, where all captures count the same.
+    """Return the error below which nine fits in ten of an unseen capture are, where all captures
+    count the same.
 
     This is rank 0.9 (m + 1) of the errors of m captures, of which each has the weight of one.
     """

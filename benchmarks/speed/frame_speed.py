@@ -2,11 +2,12 @@
 
     python -m benchmarks.speed.frame_speed --json out.json [--sizes small n3dv] [--frames 3]
 
-The scene consists of Gaussians: a wall, a floor and 40 balls, of which some move and turn. Its images are rendered from
-them, with camera noise. The loop starts from the scene at frame 0 with small errors in its colours, similar to a fit's.
-`small` is 640x480, 12 views, 50,000 Gaussians; `n3dv` 1352x1014, 20 views, 200,000 Gaussians. One more view is
-held out. Each setting is run on the same images: the default at several numbers of epochs, without skipping static
-parts, and the paper's scheme.
+The scene consists of Gaussians: a wall, a floor and 40 balls, of which some move and turn. Its
+images are rendered from them, with camera noise. The loop starts from the scene at frame 0 with
+small errors in its colours, similar to a fit's. `small` is 640x480, 12 views, 50,000 Gaussians;
+`n3dv` 1352x1014, 20 views, 200,000 Gaussians. One more view is held out. Each setting is run on the
+same images: the default at several numbers of epochs, without skipping static parts, and the
+paper's scheme.
 """
 
 from __future__ import annotations
@@ -65,7 +66,8 @@ class Options(Output):
     epochs: tuple[int, ...] = (1, 2, 4, 8)
     """Numbers of epochs of the default settings."""
     full: tuple[str, ...] = ("small",)
-    """Sizes at which the paper's scheme and a fit without skipping are also run; they take minutes."""
+    """Sizes at which the paper's scheme and a fit without skipping are also run; they take minutes.
+    """
     seed: int = 0
     """Seed of scene and noise."""
 
@@ -80,8 +82,12 @@ class Scene:
         flat = count // 3
         each = (count - 2 * (count // 3)) // 40
         wall = np.stack([rng.uniform(-3, 3, flat), rng.uniform(-2, 1, flat), np.full(flat, 1.5)], 1)
-        floor = np.stack([rng.uniform(-3, 3, flat), np.full(flat, 1.0), rng.uniform(-1.5, 1.5, flat)], 1)
-        centers = np.stack([rng.uniform(-1.8, 1.8, 40), rng.uniform(-1.2, 0.6, 40), rng.uniform(-0.8, 1.0, 40)], 1)
+        floor = np.stack(
+            [rng.uniform(-3, 3, flat), np.full(flat, 1.0), rng.uniform(-1.5, 1.5, flat)], 1
+        )
+        centers = np.stack(
+            [rng.uniform(-1.8, 1.8, 40), rng.uniform(-1.2, 0.6, 40), rng.uniform(-0.8, 1.0, 40)], 1
+        )
         self.owner = np.concatenate([np.full(2 * flat, -1), np.repeat(np.arange(40), each)])
         self.local = rng.normal(size=(40 * each, 3))
         self.local *= 0.22 / np.linalg.norm(self.local, axis=1, keepdims=True)
@@ -101,27 +107,40 @@ class Scene:
     def at(self, frame: int) -> Gaussians:
         """Return the true Gaussians of a frame."""
         angle = 0.05 * frame
-        turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+        turn = np.array(
+            [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+        )
         owner = self.owner[len(self.ground) :]
         moves = np.isin(owner, self.moving)[:, None]
-        balls = self.centers[owner] + np.where(moves, self.local @ turn.T + frame * self.direction[owner], self.local)
+        balls = self.centers[owner] + np.where(
+            moves, self.local @ turn.T + frame * self.direction[owner], self.local
+        )
         return self.gaussians(np.concatenate([self.ground, balls]))
 
     def gaussians(self, means: np.ndarray, noise: float = 0.0, seed: int = 0) -> Gaussians:
-        """Return Gaussians at the given means [N, 3], with noise of a standard deviation `noise` on the SH."""
+        """Return Gaussians at the given means [N, 3], with noise of a standard deviation `noise` on
+        the SH.
+        """
         rng = np.random.default_rng(seed)
         count = len(means)
         sh = self.sh + noise * rng.normal(size=self.sh.shape)
         quats = np.tile([1.0, 0, 0, 0], (count, 1))
         opacities = np.full(count, 0.9)
-        return Gaussians.from_activated(means, self.scales, quats, opacities, sh, logit_confidence=np.zeros(count))
+        return Gaussians.from_activated(
+            means, self.scales, quats, opacities, sh, logit_confidence=np.zeros(count)
+        )
 
     def cameras(self) -> list[Camera]:
         """Return the held-out camera and then the training cameras, on an arc in two rows."""
         angles = np.linspace(-0.5, 0.5, self.size.views)
-        places = [(5 * np.sin(a), -0.6 + 0.5 * (i % 2), -4.5 * np.cos(a)) for i, a in enumerate(angles)]
+        places = [
+            (5 * np.sin(a), -0.6 + 0.5 * (i % 2), -4.5 * np.cos(a)) for i, a in enumerate(angles)
+        ]
         size = (self.size.width, self.size.height)
-        return [Camera.look_at(p, (0, -0.2, 0.3), (0, -1, 0), 38, *size) for p in [(0.1, -0.4, -4.5), *places]]
+        return [
+            Camera.look_at(p, (0, -0.2, 0.3), (0, -1, 0), 38, *size)
+            for p in [(0.1, -0.4, -4.5), *places]
+        ]
 
     def recorded(self, num_frames: int, seed: int) -> list[list[np.ndarray]]:
         """Return the images of the first frames, with camera noise, by camera."""
@@ -141,11 +160,18 @@ def film(gaussians: Gaussians, cameras: list[Camera], rng: np.random.Generator) 
 
 def config_of(size: Size, **fit: Any) -> StreamConfig:
     """Return the settings of a fit at a size, with further ones of `FitConfig`."""
-    return StreamConfig(FitConfig(sh_degree=0, density=DensityConfig(max_gaussians=round(1.1 * size.gaussians)), **fit))
+    return StreamConfig(
+        FitConfig(
+            sh_degree=0, density=DensityConfig(max_gaussians=round(1.1 * size.gaussians)), **fit
+        )
+    )
 
 
-def measure(scene: Scene, config: StreamConfig, recorded: list[list[np.ndarray]], live: bool = True) -> dict[str, Any]:
-    """Fit the later frames but the last; return seconds, shares of what is processed, bytes, held-out PSNR.
+def measure(
+    scene: Scene, config: StreamConfig, recorded: list[list[np.ndarray]], live: bool = True
+) -> dict[str, Any]:
+    """Fit the later frames but the last; return seconds, shares of what is processed, bytes,
+    held-out PSNR.
 
     Unless they arrive `live`, the next frame is observed while one is fitted, in another thread.
     """
@@ -173,7 +199,10 @@ def measure(scene: Scene, config: StreamConfig, recorded: list[list[np.ndarray]]
 
 def settings(options: Options, name: str) -> dict[str, StreamConfig]:
     """Return the settings that are run at a size, by name."""
-    runs = {f"default, {epochs} epochs": config_of(SIZES[name], epochs=epochs) for epochs in options.epochs}
+    runs = {
+        f"default, {epochs} epochs": config_of(SIZES[name], epochs=epochs)
+        for epochs in options.epochs
+    }
     if name in options.full:
         runs["8 epochs, nothing left out"] = config_of(SIZES[name], skip_static=False)
         runs["paper, 8 epochs"] = apply_preset(config_of(SIZES[name], skip_static=False), "paper")

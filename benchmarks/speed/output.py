@@ -1,4 +1,6 @@
-"""The figures of a benchmark as JSON, with the commit, the date, the machine and the versions that they belong to."""
+"""The figures of a benchmark as JSON, with the commit, the date, the machine and the versions that
+they belong to.
+"""
 
 from __future__ import annotations
 
@@ -35,16 +37,24 @@ class Output:
             "machine": machine(),
             "versions": versions(),
         }
-        print(json.dumps({name: value for name, value in result.items() if name not in unprinted}, indent=2))
+        print(
+            json.dumps(
+                {name: value for name, value in result.items() if name not in unprinted}, indent=2
+            )
+        )
         if self.json is not None:
             write_json(self.json, result)
 
 
 def commit() -> str:
-    """Return the commit of this checkout, with -dirty if files differ from it; empty outside of a repository."""
+    """Return the commit of this checkout, with -dirty if files differ from it; empty outside of a
+    repository.
+    """
     command = ["git", "describe", "--always", "--dirty", "--exclude=*"]
     try:
-        process = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
+        process = subprocess.run(
+            command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True
+        )
     except (OSError, subprocess.CalledProcessError):
         return ""
     return process.stdout.strip()

@@ -1,9 +1,10 @@
-"""Time a step through Mitsuba's `mi.render` beside `rasterize`, and several cameras in one call beside one by one.
+"""Time a step through Mitsuba's `mi.render` beside `rasterize`, and several cameras in one call
+beside one by one.
 
     python -m benchmarks.speed.plugin_step --json plugin_step.json
 
-A ball of Gaussians with SH of degree 1. A step is an image, a quadratic loss and the gradients of all parameters of the
-shape. Medians of turns in which each kind of step is run once.
+A ball of Gaussians with SH of degree 1. A step is an image, a quadratic loss and the gradients of
+all parameters of the shape. Medians of turns in which each kind of step is run once.
 """
 
 from __future__ import annotations
@@ -62,7 +63,12 @@ def measure(count: int, width: int, height: int, turns: int) -> dict[str, Any]:
     gaussians, camera = ball(0, count, width, height, 0.4 * count ** (-1 / 3), sh_degree=1)
     shape = ellipsoids(gaussians)
     scene = mi.load_dict(
-        {"type": "scene", "gaussians": shape, "sensor": camera.sensor(), "integrator": {"type": "gaussian_splat"}}
+        {
+            "type": "scene",
+            "gaussians": shape,
+            "sensor": camera.sensor(),
+            "integrator": {"type": "gaussian_splat"},
+        }
     )
     params = mi.traverse(scene)
     names = ("gaussians.data", "gaussians.opacities", "gaussians.sh_coeffs")
@@ -86,7 +92,9 @@ def measure(count: int, width: int, height: int, turns: int) -> dict[str, Any]:
     return {"gaussians": count, "width": width, "height": height, **milliseconds(works, turns)}
 
 
-def camera_works(gaussians: Gaussians, camera: Camera, attributes: list[Any]) -> dict[str, Callable[[], Any]]:
+def camera_works(
+    gaussians: Gaussians, camera: Camera, attributes: list[Any]
+) -> dict[str, Callable[[], Any]]:
     """Return a step of several cameras in one call, and one of the same cameras one by one."""
     cameras = []
     for v in range(_CAMERAS):
@@ -99,7 +107,9 @@ def camera_works(gaussians: Gaussians, camera: Camera, attributes: list[Any]) ->
             backward(rasterize(gaussians, view, ("color",)).color, attributes)
 
     return {
-        "cameras_together": lambda: backward(rasterize(gaussians, cameras, ("color",)).color, attributes),
+        "cameras_together": lambda: backward(
+            rasterize(gaussians, cameras, ("color",)).color, attributes
+        ),
         "cameras_one_by_one": one_by_one,
     }
 

@@ -1,10 +1,11 @@
 """Time the renderer: one optimisation step on a workload, compared with baselines.
 
-    python -m benchmarks.speed.render_speed --workload W1.npz --json out.json [--yardstick BIN] [--baselines]
+    python -m benchmarks.speed.render_speed --workload W1.npz --json out.json [--yardstick BIN]
+    [--baselines]
 
-The whole step is: projection, lists, forward, L1 loss against a constant, adjoint, the projection's adjoint, and the
-gradients of all attributes in memory; the optimised step has Adam's step, too. All programs run in turn:
-background load affects them equally, so compare ratios.
+The whole step is: projection, lists, forward, L1 loss against a constant, adjoint, the projection's
+adjoint, and the gradients of all attributes in memory; the optimised step has Adam's step, too. All
+programs run in turn: background load affects them equally, so compare ratios.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ class Options:
     repeats: int = 9
     """Timed repetitions per round; medians are reported."""
     rounds: int = 3
-    """Number of rounds, in each of which the renderer, the yardstick and the baselines run in turn."""
+    """Number of rounds, in each of which the renderer, the yardstick and the baselines run in turn.
+    """
     variant: str = "llvm_ad_rgb"
     """Mitsuba variant."""
     baselines: bool = False
@@ -64,15 +66,22 @@ def figures(gaussians: Gaussians, camera: Camera, options: Options) -> dict[str,
         row |= timing.measure(others, options.repeats, patience=0.5)
         rounds.append(row)
 
-    result: dict[str, Any] = {f"{key}_ms": round(median(r[key] for r in rounds), 3) for key in rounds[0]}
+    result: dict[str, Any] = {
+        f"{key}_ms": round(median(r[key] for r in rounds), 3) for key in rounds[0]
+    }
     for key in ("yardstick_step", "volprim_step"):
         if key in rounds[0]:
             ratios = [r["step"] / r[key] for r in rounds]
             # Ratios to the slow baselines need four decimals.
-            result[f"ratio_to_{key.removesuffix('_step')}"] = round(median(ratios), 3 if key == "yardstick_step" else 4)
+            result[f"ratio_to_{key.removesuffix('_step')}"] = round(
+                median(ratios), 3 if key == "yardstick_step" else 4
+            )
             if key == "yardstick_step":
                 result["ratio_per_round"] = [round(r, 3) for r in ratios]
-    for key, share, whole in (("tenth_share", "tenth_step", "step"), ("loss_share", "loss", "forward")):
+    for key, share, whole in (
+        ("tenth_share", "tenth_step", "step"),
+        ("loss_share", "loss", "forward"),
+    ):
         if share in rounds[0]:
             result[key] = round(median(r[share] / r[whole] for r in rounds), 3)
     if left_out:

@@ -2,9 +2,9 @@
 
     python -m benchmarks.speed.scaling --json benchmarks/results/scaling.json
 
-A synthetic clip is fitted in segments with one and with two workers of one thread each. The efficiency is the
-throughput of W workers over W times the throughput of one: of the later frames, which all workers fit side by side,
-and of the whole fit.
+A synthetic clip is fitted in segments with one and with two workers of one thread each. The
+efficiency is the throughput of W workers over W times the throughput of one: of the later frames,
+which all workers fit side by side, and of the whole fit.
 """
 
 from __future__ import annotations
@@ -91,8 +91,12 @@ def measure(capture: Capture, options: Options, folder: Path) -> list[Run]:
             client.submit(os.getpid, pure=False).result()
             start = time.perf_counter() - begin
             begin = time.perf_counter()
-            reports = SegmentedRun(capture, out, client, _config(options), SegmentConfig(options.segments)).fit()
-            runs.append(_run(count, start, time.perf_counter() - begin, reports, out / "stream.morgs"))
+            reports = SegmentedRun(
+                capture, out, client, _config(options), SegmentConfig(options.segments)
+            ).fit()
+            runs.append(
+                _run(count, start, time.perf_counter() - begin, reports, out / "stream.morgs")
+            )
     return runs
 
 
@@ -110,11 +114,15 @@ def _limited_to(count: int) -> Iterator[None]:
 def _config(options: Options) -> StreamConfig:
     steps = options.first_frame_steps
     count = options.gaussians
-    fit = FitConfig(num_gaussians=count, first_frame_steps=steps, epochs=options.epochs, dropping=0.0)
+    fit = FitConfig(
+        num_gaussians=count, first_frame_steps=steps, epochs=options.epochs, dropping=0.0
+    )
     return StreamConfig(fit=fit)
 
 
-def _run(workers: int, start: float, seconds: float, reports: Sequence[FrameReport], stream: Path) -> Run:
+def _run(
+    workers: int, start: float, seconds: float, reports: Sequence[FrameReport], stream: Path
+) -> Run:
     starts = StreamReader(stream).metadata["segments"]["starts"]
     common = reports[:COMMON_FRAMES]
     frames = reports[COMMON_FRAMES:]
@@ -132,7 +140,7 @@ def _run(workers: int, start: float, seconds: float, reports: Sequence[FrameRepo
 
 
 def efficiencies(runs: list[Run]) -> list[dict[str, float]]:
-    """Return the efficiency of each number of workers: of the later frames, and of the whole fit."""
+    """Return the efficiency of each number of workers: of later frames, and of the whole fit."""
     (one,) = (run for run in runs if run.workers == 1)
     return [
         {
@@ -153,7 +161,13 @@ def main(options: Options) -> None:
         synthesize(options.scene, folder / "clip", size)
         runs = measure(load_capture(folder / "clip"), options, folder)
     settings = asdict(replace(options, json=None))
-    options.write({"options": settings, "runs": [asdict(run) for run in runs], "efficiency": efficiencies(runs)})
+    options.write(
+        {
+            "options": settings,
+            "runs": [asdict(run) for run in runs],
+            "efficiency": efficiencies(runs),
+        }
+    )
 
 
 if __name__ == "__main__":

@@ -37,8 +37,8 @@ VOLPRIM_PIXELS = 512 * 384
 def timed(work: Callable[[], Any], repeats: int, patience: float = float("inf")) -> float:
     """Return the median time of `work` in ms, synchronised, after two runs of warm-up.
 
-    If `work` returns a function, only that function is timed. After `patience` seconds, one warm-up and one timed run
-    suffice.
+    If `work` returns a function, only that function is timed. After `patience` seconds, one warm-up
+    and one timed run suffice.
     """
     times: list[float] = []
     while len(times) < repeats + 2 and (len(times) < 2 or sum(times) < 1e3 * patience):
@@ -58,9 +58,9 @@ def timed(work: Callable[[], Any], repeats: int, patience: float = float("inf"))
 def stages(gaussians: Gaussians, camera: Camera, seed: int = 1) -> dict[str, Callable[[], Any]]:
     """Return the timed stages by name.
 
-    Lists (with projection), forward (with lists), adjoint (from the image's gradient to the attributes'), the whole
-    step, the step with Adam's, the step on a tenth of the tiles, drawn at random, and the L1 + D-SSIM loss with its
-    derivative.
+    Lists (with projection), forward (with lists), adjoint (from the image's gradient to the
+    attributes'), the whole step, the step with Adam's, the step on a tenth of the tiles, drawn at
+    random, and the L1 + D-SSIM loss with its derivative.
     """
     config = RenderConfig()
     target = np.broadcast_to(np.array(TARGET, np.float32), (camera.height, camera.width, 3)).copy()
@@ -90,7 +90,9 @@ def stages(gaussians: Gaussians, camera: Camera, seed: int = 1) -> dict[str, Cal
         return grads
 
     def step(region: Region | None = None, reference: Any = full) -> Any:
-        return gradients(distance(rasterize(gaussians, camera, ("color",), region=region).color, reference))
+        return gradients(
+            distance(rasterize(gaussians, camera, ("color",), region=region).color, reference)
+        )
 
     def adjoint() -> Callable[[], Any]:
         color = rasterize(gaussians, camera, ("color",)).color
@@ -98,8 +100,12 @@ def stages(gaussians: Gaussians, camera: Camera, seed: int = 1) -> dict[str, Cal
         dr.eval(color, loss)
         return lambda: gradients(loss)
 
-    tiles = np.random.default_rng(seed).uniform(size=(-(-camera.height // 32), -(-camera.width // 32)))
-    mask = np.kron(tiles <= np.quantile(tiles, 0.1), np.ones((32, 32), bool))[: camera.height, : camera.width]
+    tiles = np.random.default_rng(seed).uniform(
+        size=(-(-camera.height // 32), -(-camera.width // 32))
+    )
+    mask = np.kron(tiles <= np.quantile(tiles, 0.1), np.ones((32, 32), bool))[
+        : camera.height, : camera.width
+    ]
 
     @cache
     def tenth() -> tuple[Region, Any]:
@@ -132,16 +138,24 @@ def stages(gaussians: Gaussians, camera: Camera, seed: int = 1) -> dict[str, Cal
         return grad
 
     works = {"lists": lists, "forward": forward, "adjoint": adjoint, "step": step}
-    return works | {"optimised_step": optimised_step, "tenth_step": lambda: step(*tenth()), "loss": loss}
+    return works | {
+        "optimised_step": optimised_step,
+        "tenth_step": lambda: step(*tenth()),
+        "loss": loss,
+    }
 
 
-def measure(works: dict[str, Callable[[], Any]], repeats: int, patience: float = float("inf")) -> dict[str, float]:
+def measure(
+    works: dict[str, Callable[[], Any]], repeats: int, patience: float = float("inf")
+) -> dict[str, float]:
     """Return the median ms of every stage."""
     return {name: timed(work, repeats, patience) for name, work in works.items()}
 
 
 def extent(gaussians: Gaussians, camera: Camera) -> dict[str, float]:
-    """Return the number of pairs of Gaussian and block, their pixels in millions, and the bytes of the lists."""
+    """Return the number of pairs of Gaussian and block, their pixels in millions, and the bytes of
+    the lists.
+    """
     config = RenderConfig()
     with dr.suspend_grad():
         region = full_view(camera.width, camera.height, config)
@@ -149,7 +163,11 @@ def extent(gaussians: Gaussians, camera: Camera) -> dict[str, float]:
         pairs = int(dr.sum(mi.UInt64(lists.count))[0])
     width, height = region.block
     size = 4 * (dr.width(lists.words) + dr.width(lists.entries))
-    return {"pairs": pairs, "listed_megapixels": round(1e-6 * pairs * width * height, 3), "list_bytes": size}
+    return {
+        "pairs": pairs,
+        "listed_megapixels": round(1e-6 * pairs * width * height, 3),
+        "list_bytes": size,
+    }
 
 
 def peak_megabytes(work: Callable[[], Any]) -> float:
@@ -163,7 +181,9 @@ def peak_megabytes(work: Callable[[], Any]) -> float:
 
 
 def error(gaussians: Gaussians, camera: Camera, seed: int) -> dict[str, float]:
-    """Return the largest and the RMS error of the colour at a sample of pixels, compared with float64."""
+    """Return the largest and the RMS error of the colour at a sample of pixels, compared with
+    float64.
+    """
     count = max(16, min(256, _REFERENCE_PAIRS // len(gaussians)))
     choice = np.random.default_rng(seed).choice(camera.width * camera.height, count, replace=False)
     pixels = np.stack([choice % camera.width, choice // camera.width], axis=1)
@@ -176,7 +196,9 @@ def error(gaussians: Gaussians, camera: Camera, seed: int) -> dict[str, float]:
 
 
 def volprim_stages(gaussians: Gaussians, camera: Camera) -> dict[str, Callable[[], Any]]:
-    """Return forward and whole step of Mitsuba's `volprim_rf_basic` on the same Gaussians, one sample per pixel."""
+    """Return forward and whole step of Mitsuba's `volprim_rf_basic` on the same Gaussians, one
+    sample per pixel.
+    """
     scene: Any = mi.load_dict(
         {
             "type": "scene",
@@ -209,13 +231,18 @@ def volprim_stages(gaussians: Gaussians, camera: Camera) -> dict[str, Callable[[
 def baselines(gaussians: Gaussians, camera: Camera) -> tuple[dict[str, Any], dict[str, str]]:
     """Return the stages of the baselines, and the reasons for which others are omitted."""
     if len(gaussians) > VOLPRIM_GAUSSIANS or camera.width * camera.height > VOLPRIM_PIXELS:
-        reason = f"a step beyond {VOLPRIM_GAUSSIANS} Gaussians or {VOLPRIM_PIXELS} pixels takes many seconds"
+        reason = (
+            f"a step beyond {VOLPRIM_GAUSSIANS} Gaussians or {VOLPRIM_PIXELS} pixels takes many "
+            "seconds"
+        )
         return {}, {"volprim": reason}
     return volprim_stages(gaussians, camera), {}
 
 
 class Yardstick:
-    """External program `BIN FILE.bin REPETITIONS THREADS` that prints the median time of its whole step."""
+    """External program `BIN FILE.bin REPETITIONS THREADS` that prints the median time of its whole
+    step.
+    """
 
     def __init__(self, program: Path) -> None:
         self.program = program.resolve()
@@ -229,5 +256,7 @@ class Yardstick:
             output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
         match = re.search(r"fwd\+bwd ms: median ([\d.]+)", output)
         if not match:
-            raise SystemExit(f"{self.program}: expected a line 'fwd+bwd ms: median ...', got {output!r}")
+            raise SystemExit(
+                f"{self.program}: expected a line 'fwd+bwd ms: median ...', got {output!r}"
+            )
         return float(match[1])

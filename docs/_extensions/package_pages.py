@@ -1,4 +1,6 @@
-"""Writes the pages that follow from the repository: api/ from the package, notebooks/ from the notebooks."""
+"""Writes the pages that follow from the repository: api/ from the package, notebooks/ from the
+notebooks.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from sphinx.pycode import ModuleAnalyzer
 
 import morgs_mi
 
-# Modules of the integrators, which can be imported once a variant is set; Mitsuba's users read their docstrings.
+# Modules of the integrators, which can be imported once a variant is set; Mitsuba's users read
+# their docstrings.
 PER_VARIANT = {"morgs_mi.surfaces.gaussian_splat", "morgs_mi.studio.light.splat_path"}
 NOTEBOOK = re.compile(r"\]\((?:\.\./)+notebooks/(\w+)\.ipynb\)")
 
@@ -35,15 +38,21 @@ def write_pages(docs: Path) -> None:
     for child in pkgutil.iter_modules(morgs_mi.__path__):
         if child.name != "__main__":
             name = f"morgs_mi.{child.name}"
-            pages[name] = "\n".join([f"# {name}\n", *(chapter(module, name) for module in modules_of(name))])
+            pages[name] = "\n".join(
+                [f"# {name}\n", *(chapter(module, name) for module in modules_of(name))]
+            )
     for old in (docs / "api").glob("morgs_mi*.md"):
         if old.stem not in pages:
             old.unlink()
     for name, text in pages.items():
         write_if_changed(docs / "api" / f"{name}.md", text.encode())
     for notebook in (docs.parent / "notebooks").glob("*.ipynb"):
-        # From the copy, docs/ is one level up, as in the repository: its pages are found without the folder's name.
-        write_if_changed(docs / "notebooks" / notebook.name, notebook.read_bytes().replace(b"](../docs/", b"](../"))
+        # From the copy, docs/ is one level up, as in the repository: its pages are found without
+        # the folder's name.
+        write_if_changed(
+            docs / "notebooks" / notebook.name,
+            notebook.read_bytes().replace(b"](../docs/", b"](../"),
+        )
 
 
 def modules_of(name: str) -> list[str]:
@@ -59,7 +68,7 @@ def chapter(module: str, page: str) -> str:
 
 
 def front_door() -> str:
-    """Return the page of the names that `import morgs_mi` brings, each linked to its description."""
+    """Return the page of the names of `import morgs_mi`, each linked to its description."""
     lines = ["# morgs_mi", "", "The names that `import morgs_mi` provides:", ""]
     for name in sorted(morgs_mi.__all__):
         path, doc = description(name)
@@ -75,12 +84,18 @@ def description(name: str) -> tuple[str, str]:
         return f"{target.__module__}.{target.__qualname__}", target.__doc__ or ""
     # A constant does not name its module: it is the one that describes it.
     packages = (module for module in sorted(sys.modules) if module.startswith("morgs_mi."))
-    module = next(m for m in packages if ("", name) in ModuleAnalyzer.for_module(m).find_attr_docs())
-    return f"{module}.{name}", "\n".join(ModuleAnalyzer.for_module(module).find_attr_docs()["", name])
+    module = next(
+        m for m in packages if ("", name) in ModuleAnalyzer.for_module(m).find_attr_docs()
+    )
+    return f"{module}.{name}", "\n".join(
+        ModuleAnalyzer.for_module(module).find_attr_docs()["", name]
+    )
 
 
 def write_if_changed(path: Path, content: bytes) -> None:
-    """Write a file unless it has this content already, so that Sphinx rereads only what has changed."""
+    """Write a file unless it has this content already, so that Sphinx rereads only what has
+    changed.
+    """
     path.parent.mkdir(exist_ok=True)
     if not path.exists() or path.read_bytes() != content:
         path.write_bytes(content)
@@ -91,10 +106,16 @@ def link_notebooks(app: Sphinx, name: str, source: list[str]) -> None:
     source[0] = NOTEBOOK.sub(r"](/notebooks/\1.ipynb)", source[0])
 
 
-def leave_internal_names(app: Sphinx, env: BuildEnvironment, node: Element, content: Element) -> Element | None:
-    """Leave a type in a signature without a link if it has no description: it is private, or a variable."""
+def leave_internal_names(
+    app: Sphinx, env: BuildEnvironment, node: Element, content: Element
+) -> Element | None:
+    """Leave a type in a signature without a link if it has no description: it is private, or a
+    variable.
+    """
     module, _, name = node.get("reftarget", "").rpartition(".")
     target = getattr(sys.modules.get(module), name, None)
-    is_described = isinstance(target, type | FunctionType) and target.__module__ == module and target.__doc__
+    is_described = (
+        isinstance(target, type | FunctionType) and target.__module__ == module and target.__doc__
+    )
     is_internal = module.startswith("morgs_mi") and (name.startswith("_") or not is_described)
     return content if is_internal else None

@@ -1,7 +1,9 @@
-"""Reads Google docstrings as plain text with `code`, indented formulas and lists, and no other markup.
+"""Reads Google docstrings as plain text with `code`, indented formulas and lists, and no other
+markup.
 
-Napoleon passes texts on as reStructuredText. There `*`, `|` and a trailing `_` in a formula are markup, a line that
-begins with "N." is a list, and the text before a colon is a type; every docstring would have to avoid that.
+Napoleon passes texts on as reStructuredText. There `*`, `|` and a trailing `_` in a formula are
+markup, a line that begins with "N." is a list, and the text before a colon is a type; every
+docstring would have to avoid that.
 """
 
 from __future__ import annotations
@@ -23,7 +25,9 @@ def setup(app: Sphinx) -> dict[str, Any]:
     return {"parallel_read_safe": True}
 
 
-def convert(app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+def convert(
+    app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]
+) -> None:
     """Replace the lines of a docstring by reStructuredText with the same content."""
     if "Fields:" in lines:  # the fields of a config have entries of their own
         del lines[lines.index("Fields:") :]
@@ -31,7 +35,11 @@ def convert(app: Sphinx, what: str, name: str, obj: object, options: object, lin
     for title, body in sections(lines):
         if title in FIELDS:
             entries = [entry(FIELDS[title], item) for item in items(body)]
-            result += [":Attributes:", *indented(entries), ""] if title == "Attributes" else [*entries, ""]
+            result += (
+                [":Attributes:", *indented(entries), ""]
+                if title == "Attributes"
+                else [*entries, ""]
+            )
         elif title.startswith("Example"):
             result += [".. rubric:: Example", "", ".. code-block:: python", "", *body, ""]
         elif title:

@@ -28,10 +28,12 @@ class CameraSource:
     undistortion: Undistortion | None  #: The pixel maps that remove the lens distortion, or None.
     #: The clip's frames that show the instants 0, 1, ... of the recording, -1 for none, int [T].
     frame_indices: np.ndarray
-    #: The share of the time to the clip's next frame that has passed at each instant [T]; None: none has.
+    #: The share of the time to the clip's next frame that has passed at each instant [T]; None:
+    #: none has.
     shares: np.ndarray | None = None
     color_correction: ColorCorrection | None = None  #: The colour correction, or None.
-    #: The mask of the recorded pixels that are neither transparent nor masked out [H, W], or None if all are.
+    #: The mask of the recorded pixels that are neither transparent nor masked out [H, W], or None
+    #: if all are.
     recorded_mask: np.ndarray | None = None
     delay: float = 0.0  #: Time from an instant to the frame that shows it, in frames of the clip.
     #: Stops by which linear light is brightened and shown in 8 bits; None: it is not shown.
@@ -40,7 +42,12 @@ class CameraSource:
 
     @classmethod
     def of(
-        cls, reader: FrameReader, lens: Lens, camera: Camera, masks: Sequence[Path], times: ClipTimes
+        cls,
+        reader: FrameReader,
+        lens: Lens,
+        camera: Camera,
+        masks: Sequence[Path],
+        times: ClipTimes,
     ) -> CameraSource:
         """Return the source of a clip.
 
@@ -58,7 +65,16 @@ class CameraSource:
         mask, notes = used_in_clip(reader, masks, camera.name)
         maps = undistortion(camera, lens)
         indices = times.frame_indices
-        return cls(reader, lens, maps, indices, times.shares, recorded_mask=mask, delay=times.delay, notes=tuple(notes))
+        return cls(
+            reader,
+            lens,
+            maps,
+            indices,
+            times.shares,
+            recorded_mask=mask,
+            delay=times.delay,
+            notes=tuple(notes),
+        )
 
     def at_instants(self) -> CameraSource:
         """Return the source without a delay: its images are interpolated instead."""
@@ -69,14 +85,22 @@ class CameraSource:
         return replace(self, frame_indices=indices, shares=positions - indices, delay=0.0)
 
     def images(self, camera: Camera, start: int, stop: int) -> Generator[ImageOrError, None, None]:
-        """Yield the processed images of the instants start..stop-1, with an error in place of a missing image."""
+        """Yield the processed images of the instants start..stop-1, with an error in place of a
+        missing image.
+        """
         if self.shares is not None:
-            yield from self._interpolated(camera, self.frame_indices[start:stop], self.shares[start:stop])
+            yield from self._interpolated(
+                camera, self.frame_indices[start:stop], self.shares[start:stop]
+            )
             return
         indices = self.frame_indices[start:stop]
         frames = self.reader.pick(indices[indices >= 0].tolist())
         for instant, index in enumerate(indices, start):
-            image = next(frames) if index >= 0 else ValueError(f"{self.reader.path}: no frame at instant {instant}.")
+            image = (
+                next(frames)
+                if index >= 0
+                else ValueError(f"{self.reader.path}: no frame at instant {instant}.")
+            )
             yield self.process(image, camera) if isinstance(image, np.ndarray) else image
 
     def _interpolated(
@@ -87,20 +111,27 @@ class CameraSource:
             first = next(frames)
             second = next(frames)
             if isinstance(first, np.ndarray) and isinstance(second, np.ndarray):
-                yield image_between(self.process(first, camera), self.process(second, camera), share)
+                yield image_between(
+                    self.process(first, camera), self.process(second, camera), share
+                )
             else:
                 yield second if isinstance(first, np.ndarray) else first
 
     def process(self, image: np.ndarray, camera: Camera) -> np.ndarray:
-        """Return a recorded image undistorted, downscaled to the size of `camera` and colour-corrected."""
+        """Return a recorded image undistorted, downscaled to the size of `camera` and
+        colour-corrected.
+        """
         if self.undistortion:
-            # The cubic filter rings less in encoded values, in which lamps are less far from their surroundings.
+            # The cubic filter rings less in encoded values, in which lamps are less far from their
+            # surroundings.
             has_light = image.dtype != np.uint8
             image = self.undistortion(encode_light(image) if has_light else image)
             image = np.maximum(decode_light(image), 0) if has_light else image
         image = _downscaled(image, camera)
         image = self.color_correction(image) if self.color_correction else image
-        return image if self.display_exposure is None else display_image(image, self.display_exposure)
+        return (
+            image if self.display_exposure is None else display_image(image, self.display_exposure)
+        )
 
     def mask(self, camera: Camera) -> np.ndarray | None:
         """Return the mask of the valid pixels of `camera` [H, W] bool, or None if all are valid."""
@@ -109,7 +140,9 @@ class CameraSource:
             valid = self.undistortion.mask
             if self.recorded_mask is not None:
                 # Other pixels must not contribute; cubic weights can also be negative.
-                valid = valid & (np.abs(self.undistortion(self.recorded_mask.astype(np.float32)) - 1) < 1e-3)
+                valid = valid & (
+                    np.abs(self.undistortion(self.recorded_mask.astype(np.float32)) - 1) < 1e-3
+                )
         if valid is None or valid.all():
             return None
         # A downscaled pixel is valid if all pixels that it averages are.
@@ -117,7 +150,8 @@ class CameraSource:
 
 
 def at_clip_size(camera: Camera, reader: FrameReader) -> Camera:
-    """Return the camera at the size of its clip, which may be a scaled version of the calibrated size.
+    """Return the camera at the size of its clip, which may be a scaled version of the calibrated
+    size.
 
     Raises:
         ValueError: the clip has another aspect ratio.
@@ -128,8 +162,9 @@ def at_clip_size(camera: Camera, reader: FrameReader) -> Camera:
     difference = abs(camera.width * reader.height - camera.height * reader.width)
     if difference > min(camera.width, camera.height):
         raise ValueError(
-            f"{reader.path}: expected {camera.width}x{camera.height}, the calibrated size of {camera.name}, or a "
-            f"scaled version of it, got {reader.width}x{reader.height}; calibrate at the recorded size."
+            f"{reader.path}: expected {camera.width}x{camera.height}, the calibrated size of "
+            f"{camera.name}, or a scaled version of it, got {reader.width}x{reader.height}; "
+            "calibrate at the recorded size."
         )
     return camera.resized(reader.width, reader.height)
 

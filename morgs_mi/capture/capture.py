@@ -1,7 +1,8 @@
 """A multi-view recording: pinhole cameras and their synchronised frames.
 
-`layouts/layout_registry.py` determines the layout of a capture folder, `layouts/clips.py` finds each camera's clip. An
-optional ``capture.json`` has settings (see `timeline.read_settings`); ``truth/`` may hold ground truth.
+`layouts/layout_registry.py` determines the layout of a capture folder, `layouts/clips.py` finds
+each camera's clip. An optional ``capture.json`` has settings (see `timeline.read_settings`);
+``truth/`` may hold ground truth.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ class Frame:
     """One instant in all views."""
 
     index: int  #: Position in the recording, from 0.
-    images: tuple[np.ndarray, ...]  #: Per camera [H, W, 3], RGB: uint8 in sRGB, or of EXR files float32 in linear light
+    #: Per camera [H, W, 3], RGB: uint8 in sRGB, or of EXR files float32 in linear light.
+    images: tuple[np.ndarray, ...]
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,8 @@ class Capture:
         fps: frames per second.
         points: [P, 3] float32, world units; P = 0 if the layout has none.
         point_colors: [P, 3] float32 in [0, 1].
-        masks: per camera [H, W] bool, true where the undistorted pixel was recorded and is used; None if all are.
+        masks: per camera [H, W] bool, true where the undistorted pixel was recorded and is used;
+            None if all are.
         test_views: indices of the cameras held out from training, in ascending order.
         truth: folder of ground truth, or None.
         downscale: the downscaling factor.
@@ -78,9 +81,10 @@ class Capture:
         reading: how clips that do not match are read.
         colors: the colour correction of the cameras, or None.
         notes: a sentence for each unexpected property of the clips, e.g. a variable frame rate.
-        distortions: per camera the radial terms k1, k2 of the distortion left in the images, which is removed as well;
-            empty if there is none.
-        display_exposure: of EXR files, stops by which a display brightens them; None: the images have 8 bits.
+        distortions: per camera the radial terms k1, k2 of the distortion left in the images, which
+            is removed as well; empty if there is none.
+        display_exposure: of EXR files, stops by which a display brightens them; None: the images
+            have 8 bits.
     """
 
     path: Path
@@ -106,7 +110,9 @@ class Capture:
 
     def __repr__(self) -> str:
         held_out = ", ".join(self.names[view] for view in self.test_views) or "none"
-        size = f"{len(self.cameras)} cameras, {self.num_frames} frames, {self.fps:g} frames per second"
+        size = (
+            f"{len(self.cameras)} cameras, {self.num_frames} frames, {self.fps:g} frames per second"
+        )
         return f"Capture('{self.path}', {self.layout}, {size}, held out: {held_out})"
 
     @property
@@ -121,7 +127,9 @@ class Capture:
 
     @property
     def reference_view(self) -> int:
-        """Index of the first held-out camera, otherwise of the first camera: the one that figures show."""
+        """Index of the first held-out camera, otherwise of the first camera: the one that figures
+        show.
+        """
         return self.test_views[0] if self.test_views else 0
 
     @property
@@ -133,35 +141,52 @@ class Capture:
         """Return the capture without downscaling, with the same points."""
         if self.downscale == 1:
             return self
-        cameras = tuple(c.resized(*size) for c, size in zip(self.cameras, self.recorded_sizes, strict=True))
-        masks = tuple(source.mask(camera) for source, camera in zip(self._sources, cameras, strict=True))
+        cameras = tuple(
+            c.resized(*size) for c, size in zip(self.cameras, self.recorded_sizes, strict=True)
+        )
+        masks = tuple(
+            source.mask(camera) for source, camera in zip(self._sources, cameras, strict=True)
+        )
         return replace(self, cameras=cameras, masks=masks, downscale=1)
 
     def displayed(self) -> Capture:
         """Return the capture with images of 8 bits: linear light as a display shows it."""
         if self.display_exposure is None:
             return self
-        sources = tuple(replace(source, display_exposure=self.display_exposure) for source in self._sources)
+        sources = tuple(
+            replace(source, display_exposure=self.display_exposure) for source in self._sources
+        )
         return replace(self, _sources=sources, display_exposure=None)
 
-    def with_cameras(self, cameras: Sequence[Camera], distortions: Sequence[Sequence[float]] = ()) -> Capture:
+    def with_cameras(
+        self, cameras: Sequence[Camera], distortions: Sequence[Sequence[float]] = ()
+    ) -> Capture:
         """Return the capture, as calibrated, with refined cameras.
 
         Args:
             cameras: one per view, of the same sizes.
-            distortions: per camera the radial terms k1, k2 of the distortion left in the images, which is removed as
-                well; empty: none.
+            distortions: per camera the radial terms k1, k2 of the distortion left in the images,
+                which is removed as well; empty: none.
         """
         rig = replace(self, cameras=tuple(cameras))
         if not np.any(distortions):
             return rig
         sources = list(self._sources)
         radial_terms = tuple((float(k1), float(k2)) for k1, k2 in distortions)
-        views = zip(self.at_recorded_size().cameras, rig.at_recorded_size().cameras, radial_terms, strict=True)
+        views = zip(
+            self.at_recorded_size().cameras,
+            rig.at_recorded_size().cameras,
+            radial_terms,
+            strict=True,
+        )
         for v, (calibrated_camera, refined, terms) in enumerate(views):
-            both = undistortion(calibrated_camera, sources[v].lens, (refined, Lens("RADIAL", terms)))
+            both = undistortion(
+                calibrated_camera, sources[v].lens, (refined, Lens("RADIAL", terms))
+            )
             sources[v] = replace(sources[v], undistortion=both)
-        masks = tuple(source.mask(camera) for source, camera in zip(sources, rig.cameras, strict=True))
+        masks = tuple(
+            source.mask(camera) for source, camera in zip(sources, rig.cameras, strict=True)
+        )
         return replace(rig, masks=masks, _sources=tuple(sources), distortions=radial_terms)
 
     def holding_out(self, views: int | str | Sequence[int | str] | None) -> Capture:
@@ -173,14 +198,22 @@ class Capture:
         return replace(self, test_views=held_out_views(self.path, views, self.names))
 
     def process(self, view: int, image: np.ndarray) -> np.ndarray:
-        """Return a recorded image of a camera undistorted, downscaled and colour-corrected, like its frames."""
+        """Return a recorded image of a camera undistorted, downscaled and colour-corrected, like
+        its frames.
+        """
         return self._sources[view].process(image, self.cameras[view])
 
     def metadata(self) -> dict[str, Any]:
-        """Return the reading of the frames in JSON types, as stored in the `capture.json` beside a stream."""
+        """Return the reading of the frames in JSON types, as stored in the `capture.json` beside a
+        stream.
+        """
         views = zip(self.cameras, self._sources, self.masks, strict=True)
         fit = self.colors
-        colors = fit and {"reference": self.names[fit.reference], "delta_e_before": fit.before, "delta_e": fit.after}
+        colors = fit and {
+            "reference": self.names[fit.reference],
+            "delta_e_before": fit.before,
+            "delta_e": fit.after,
+        }
         return {
             "capture": str(self.path),
             "layout": self.layout,
@@ -202,7 +235,9 @@ class Capture:
                     "K": camera.K.tolist(),
                     "lens": source.lens.model,
                     "distortion": list(source.lens.distortion),
-                    "undistortion": "none" if source.undistortion is None else "cubic, same intrinsics",
+                    "undistortion": "none"
+                    if source.undistortion is None
+                    else "cubic, same intrinsics",
                     "valid_share": 1.0 if mask is None else float(mask.mean()),
                     **({"delay": camera.delay} if camera.delay else {}),
                     **({"readout": camera.readout} if camera.readout else {}),
@@ -224,26 +259,43 @@ class Capture:
             yield Frame(frame.index, cast(tuple[np.ndarray, ...], frame.images))
 
     def partial_frames(self, start: int = 0, stop: int | None = None) -> Iterator[PartialFrame]:
-        """Yield frames start..stop-1 as `frames` does, with None for a missing image, which is logged."""
+        """Yield frames start..stop-1 as `frames` does, with None for a missing image, which is
+        logged.
+        """
         yield from prefetched(self._decoded(start, stop, False))
 
     def images(self, view: int, start: int = 0, stop: int | None = None) -> Iterator[ImageOrError]:
-        """Yield the images of one camera at the frames start..stop-1, with an error in place of a missing image."""
+        """Yield the images of one camera at the frames start..stop-1, with an error in place of a
+        missing image.
+        """
         stop = self.num_frames if stop is None else min(stop, self.num_frames)
         return self._sources[view].images(self.cameras[view], start, stop)
 
     def with_delays(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
-        """Return the cameras of a stream of this capture with the delays and readouts of the capture's cameras."""
+        """Return the cameras of a stream of this capture with the delays and readouts of the
+        capture's cameras.
+        """
         pairs = zip(cameras, self.cameras, strict=True)
-        return tuple(replace(camera, delay=original.delay, readout=original.readout) for camera, original in pairs)
+        return tuple(
+            replace(camera, delay=original.delay, readout=original.readout)
+            for camera, original in pairs
+        )
 
-    def _decoded(self, start: int, stop: int | None, strict: bool) -> Generator[PartialFrame, None, None]:
+    def _decoded(
+        self, start: int, stop: int | None, strict: bool
+    ) -> Generator[PartialFrame, None, None]:
         stop = self.num_frames if stop is None else min(stop, self.num_frames)
-        streams = [s.images(c, start, stop) for s, c in zip(self._sources, self.cameras, strict=True)]
+        streams = [
+            s.images(c, start, stop) for s, c in zip(self._sources, self.cameras, strict=True)
+        ]
         missing: set[str] = set()
         try:
             for index, results in enumerate(zip(*streams, strict=True), start=start):
-                errors = {n: f for n, f in zip(self.names, results, strict=True) if isinstance(f, Exception)}
+                errors = {
+                    n: f
+                    for n, f in zip(self.names, results, strict=True)
+                    if isinstance(f, Exception)
+                }
                 if strict and errors:
                     raise next(iter(errors.values()))
                 for name in errors.keys() - missing:
@@ -259,15 +311,21 @@ class Capture:
             for stream in streams:
                 stream.close()
 
-    def _at_first_instant(self, images: Sequence[np.ndarray | None]) -> tuple[np.ndarray | None, ...]:
+    def _at_first_instant(
+        self, images: Sequence[np.ndarray | None]
+    ) -> tuple[np.ndarray | None, ...]:
         """Return the images of the first frame, interpolated at its instant.
 
         The motion in the first frame is unknown, so delays cannot be rendered.
         """
         views = zip(images, self._sources, self.cameras, strict=True)
-        results = (next(s.at_instants().images(c, 0, 1)) if s.delay and i is not None else i for i, s, c in views)
+        results = (
+            next(s.at_instants().images(c, 0, 1)) if s.delay and i is not None else i
+            for i, s, c in views
+        )
         return tuple(
-            image if isinstance(result, Exception) else result for image, result in zip(images, results, strict=True)
+            image if isinstance(result, Exception) else result
+            for image, result in zip(images, results, strict=True)
         )
 
 
@@ -281,10 +339,13 @@ def load_capture(
     """Open a capture folder: read the calibration and the header of every clip.
 
     Args:
-        path: the folder, or its URL (see `io.remote`); `layouts/layout_registry.py` lists the supported layouts.
-        downscale: factor by which images are downscaled (area averages, rounded to the nearest whole size).
-        test_view: index or name of the held-out camera, several of them, or None for none; "auto" uses the value in
-            `capture.json`, then the layout's own, then 0 as N3DV does, or none with fewer than six cameras.
+        path: the folder, or its URL (see `io.remote`); `layouts/layout_registry.py` lists the
+            supported layouts.
+        downscale: factor by which images are downscaled (area averages, rounded to the nearest
+            whole size).
+        test_view: index or name of the held-out camera, several of them, or None for none; "auto"
+            uses the value in `capture.json`, then the layout's own, then 0 as N3DV does, or none
+            with fewer than six cameras.
         max_frames: number of frames to use at most, from the start.
         reading: how clips that do not match are read.
 
@@ -295,8 +356,8 @@ def load_capture(
 
     Raises:
         FileNotFoundError: the folder, the calibration or a camera's clip is missing.
-        ValueError: calibration and clips disagree (number, size, length, frame rate), a file is broken, or
-            an argument is out of range.
+        ValueError: calibration and clips disagree (number, size, length, frame rate), a file is
+            broken, or an argument is out of range.
     """
     path = mirrored(str(path)) if is_url(path) else Path(path)
     if not path.is_dir():
@@ -313,10 +374,18 @@ def load_capture(
     calibration = every.without(path, reading.without)
     readers = open_clips(calibration.clips, reading.gaps)
     recorded = [at_clip_size(c, r) for c, r in zip(calibration.cameras, readers, strict=True)]
-    if scaled_cameras := [new for old, new in zip(calibration.cameras, recorded, strict=True) if new is not old]:
+    if scaled_cameras := [
+        new for old, new in zip(calibration.cameras, recorded, strict=True) if new is not old
+    ]:
         _LOG.warning(
-            "%s: the clips of %s do not have the calibrated size (the first has %dx%d); the intrinsics are scaled.",
-            *(path, ", ".join(c.name for c in scaled_cameras), scaled_cameras[0].width, scaled_cameras[0].height),
+            "%s: the clips of %s do not have the calibrated size (the first has %dx%d); the "
+            "intrinsics are scaled.",
+            *(
+                path,
+                ", ".join(c.name for c in scaled_cameras),
+                scaled_cameras[0].width,
+                scaled_cameras[0].height,
+            ),
         )
     names = [camera.name for camera in recorded]
     common = timeline(path, names, readers, reading, max_frames, settings.get("fps"))
@@ -325,7 +394,11 @@ def load_capture(
     sources = tuple(CameraSource.of(*clip) for clip in clips)
     readouts = _readouts(path, every.names, names, settings)
     cameras = tuple(
-        replace(_resized(camera, downscale), delay=times.delay / times.rate, readout=readout / times.rate)
+        replace(
+            _resized(camera, downscale),
+            delay=times.delay / times.rate,
+            readout=readout / times.rate,
+        )
         for camera, times, readout in zip(recorded, common.clips, readouts, strict=True)
     )
     _check_downscale(downscale, cameras, recorded)
@@ -345,7 +418,11 @@ def load_capture(
         downscale=downscale,
         layout=layout.name,
         reading=reading,
-        notes=(*common.notes, *(note for source in sources for note in source.notes), *_photos(calibration.clips)),
+        notes=(
+            *common.notes,
+            *(note for source in sources for note in source.notes),
+            *_photos(calibration.clips),
+        ),
     )
     if any(reader.has_light for reader in readers):
         stops = settings.get("display_exposure")
@@ -354,7 +431,9 @@ def load_capture(
     return capture if reading.color == "none" else _color_corrected(capture, reading.color)
 
 
-def _readouts(path: Path, every: Sequence[str], names: Sequence[str], settings: dict[str, Any]) -> list[float]:
+def _readouts(
+    path: Path, every: Sequence[str], names: Sequence[str], settings: dict[str, Any]
+) -> list[float]:
     """Return the readout of each camera called `names`, out of `every`, in its clip's frames.
 
     Raises:
@@ -365,7 +444,9 @@ def _readouts(path: Path, every: Sequence[str], names: Sequence[str], settings: 
         return [readout] * len(names)
     if unknown := [name for name in readout if name not in every]:
         where = path / CAPTURE
-        raise ValueError(f"{where}: `readout` must name cameras of {', '.join(every)}, got {', '.join(unknown)}.")
+        raise ValueError(
+            f"{where}: `readout` must name cameras of {', '.join(every)}, got {', '.join(unknown)}."
+        )
     return [readout.get(name, 0.0) for name in names]
 
 
@@ -377,13 +458,15 @@ def _photos(clips: Sequence[Clip]) -> tuple[str, ...]:
     return (f"{len(files)} photos of a static scene, one per camera; a recording has {EXAMPLE}",)
 
 
-def _check_downscale(downscale: float, cameras: Sequence[Camera], recorded: Sequence[Camera]) -> None:
+def _check_downscale(
+    downscale: float, cameras: Sequence[Camera], recorded: Sequence[Camera]
+) -> None:
     if downscale > 1 and min(min(camera.width, camera.height) for camera in cameras) < MIN_SIDE:
         largest = min(min(camera.width, camera.height) for camera in recorded) / MIN_SIDE
         remedy = f"use at most {np.floor(100 * largest) / 100:g}" if largest >= 1 else "use 1"
         raise ValueError(
-            f"load_capture(): `downscale` must leave images of at least {MIN_SIDE} pixels on each side, got "
-            f"{downscale:g}; {remedy}."
+            f"load_capture(): `downscale` must leave images of at least {MIN_SIDE} pixels on each "
+            f"side, got {downscale:g}; {remedy}."
         )
 
 
@@ -392,17 +475,21 @@ def _color_corrected(capture: Capture, color: str) -> Capture:
     method, _, name = color.partition(":")
     if method != "linear" or (name and name not in capture.names):
         raise ValueError(
-            f"{capture.path}: `color` must be none, linear, or linear with a camera of {', '.join(capture.names)}, "
-            f"such as linear:{capture.names[0]}, got {color!r}."
+            f"{capture.path}: `color` must be none, linear, or linear with a camera of "
+            f"{', '.join(capture.names)}, such as linear:{capture.names[0]}, got {color!r}."
         )
     images = next(capture.displayed().partial_frames(0, 1)).images
     reference = capture.names.index(name) if name else None
     fit = fit_colors(capture.cameras, images, capture.masks, reference)
-    sources = tuple(replace(s, color_correction=fit.correction(view)) for view, s in enumerate(capture._sources))
+    sources = tuple(
+        replace(s, color_correction=fit.correction(view)) for view, s in enumerate(capture._sources)
+    )
     return replace(capture, _sources=sources, colors=fit)
 
 
 def _resized(camera: Camera, downscale: float) -> Camera:
     if downscale == 1:
         return camera
-    return camera.resized(max(1, round(camera.width / downscale)), max(1, round(camera.height / downscale)))
+    return camera.resized(
+        max(1, round(camera.width / downscale)), max(1, round(camera.height / downscale))
+    )

@@ -1,9 +1,10 @@
 """Colour correction between cameras.
 
-A correction is a matrix on (R, G, B) in linear light. It models differences of gain, white balance and cross-talk
-between sensors. Matrices are fitted to the colours of shared points: matching features that are consistent with the
-poses. The reference camera is not changed. The other cameras are corrected one by one: the next one is the camera that
-shares most points with the corrected ones.
+A correction is a matrix on (R, G, B) in linear light. It models differences of gain, white balance
+and cross-talk between sensors. Matrices are fitted to the colours of shared points: matching
+features that are consistent with the poses. The reference camera is not changed. The other cameras
+are corrected one by one: the next one is the camera that shares most points with the corrected
+ones.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ class ColorFit:
     """Colour correction of all cameras towards a reference camera."""
 
     reference: int  #: Index of the reference camera, which is not changed.
-    #: Per camera [3, 3]; None for the reference, and for a camera that shares too few points with the others.
+    #: Per camera [3, 3]; None for the reference, and for a camera that shares too few points with
+    #: the others.
     matrices: tuple[np.ndarray | None, ...]
     samples: tuple[int, ...]  #: Per camera, number of points shared with others.
     #: Per camera, mean dE2000 of its points against the other views' colours; NaN without points.
@@ -71,13 +73,16 @@ def fit_colors(
     masks: Sequence[np.ndarray | None],
     reference: int | None = None,
 ) -> ColorFit:
-    """Fit the correction that maps each view's colours of shared points to the colours in the reference view.
+    """Fit the correction that maps each view's colours of shared points to the colours in the
+    reference view.
 
     Args:
         cameras: C views.
-        images: per view an image of one instant, uint8 [H, W, 3]; None for a view that is not corrected.
+        images: per view an image of one instant, uint8 [H, W, 3]; None for a view that is not
+            corrected.
         masks: per view the mask of valid pixels [H, W], or None.
-        reference: index of the reference view; by default the one that shares most points with the others.
+        reference: index of the reference view; by default the one that shares most points with the
+            others.
     """
     features = [detect(image, mask) for image, mask in zip(images, masks, strict=True)]
     pairs, colors = matched_colors(cameras, images, features, match_views(features, cameras))
@@ -95,14 +100,20 @@ def fit_colors(
             matrices[view] = matrix = _fit(*_shared_colors(view, pairs, colors, corrected))
             corrected[view] = _corrected(colors[view], matrix)
         else:
-            _LOG.warning("%s keeps its colours: too few points in common with the others.", cameras[view].name)
+            _LOG.warning(
+                "%s keeps its colours: too few points in common with the others.",
+                cameras[view].name,
+            )
             corrected[view] = colors[view]
             counts[view] = counts[:, view] = 0  # no other view is corrected towards it
     final_colors = [corrected[view] for view in range(len(cameras))]
     return ColorFit(
         start,
         tuple(matrices),
-        tuple(sum(len(pair.features) for pair in pairs if view in pair.views) for view in range(len(cameras))),
+        tuple(
+            sum(len(pair.features) for pair in pairs if view in pair.views)
+            for view in range(len(cameras))
+        ),
         _differences(pairs, colors),
         _differences(pairs, final_colors),
     )
@@ -114,7 +125,8 @@ def matched_colors(
     features: Sequence[Features],
     matches: Sequence[Match],
 ) -> tuple[list[Match], list[np.ndarray]]:
-    """Return the well-exposed matches that fit the poses, and the linear colours [K, 3] of all features.
+    """Return the well-exposed matches that fit the poses, and the linear colours [K, 3] of all
+    features.
 
     Args:
         cameras: C views.
@@ -122,15 +134,19 @@ def matched_colors(
         features: per view, in pixels of `images`.
         matches: from `match_views`.
     """
-    colors = [np.zeros((0, 3)) if i is None else _colors_at(i, f.points) for i, f in zip(images, features, strict=True)]
+    colors = [
+        np.zeros((0, 3)) if i is None else _colors_at(i, f.points)
+        for i, f in zip(images, features, strict=True)
+    ]
     return [_reliable(match, features, cameras, colors) for match in matches], colors
 
 
 def _colors_at(image: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return the linear colours [K, 3] around points [K, 2].
 
-    Features are edges, which two views sample differently. A wider mean reduces this error (dE2000 between equal
-    cameras: 3.2 with 1 px, 2.1 with 2.6 px at a width of 320), until the mean includes the background.
+    Features are edges, which two views sample differently. A wider mean reduces this error (dE2000
+    between equal cameras: 3.2 with 1 px, 2.1 with 2.6 px at a width of 320), until the mean
+    includes the background.
     """
     light = cv2.GaussianBlur(_LINEAR[image], (0, 0), max(1.0, _BLUR * image.shape[1]))
     columns, rows = np.clip(points.astype(int), 0, (image.shape[1] - 1, image.shape[0] - 1)).T
@@ -138,7 +154,10 @@ def _colors_at(image: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _reliable(
-    match: Match, features: Sequence[Features], cameras: Sequence[Camera], colors: Sequence[np.ndarray]
+    match: Match,
+    features: Sequence[Features],
+    cameras: Sequence[Camera],
+    colors: Sequence[np.ndarray],
 ) -> Match:
     """Return the features of a match that fit the poses and are well exposed in both views."""
     good = reprojection_errors(match, features, cameras) <= _MAX_ERROR
@@ -149,7 +168,10 @@ def _reliable(
 
 
 def _shared_colors(
-    view: int, pairs: Sequence[Match], colors: Sequence[np.ndarray], corrected: dict[int, np.ndarray]
+    view: int,
+    pairs: Sequence[Match],
+    colors: Sequence[np.ndarray],
+    corrected: dict[int, np.ndarray],
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the colours [M, 3] of the same points in a view and in the views already corrected."""
     mine = []
@@ -163,7 +185,9 @@ def _shared_colors(
 
 
 def _fit(mine: np.ndarray, theirs: np.ndarray) -> np.ndarray:
-    """Return the matrix [3, 3], fitted a second time without outliers, which are highlights and wrong matches."""
+    """Return the matrix [3, 3], fitted a second time without outliers, which are highlights and
+    wrong matches.
+    """
     errors = delta_e(_corrected(mine, _least_squares(mine, theirs)), theirs)
     good = errors <= 3 * np.median(errors)
     return _least_squares(mine[good], theirs[good])
@@ -194,7 +218,9 @@ def _differences(pairs: Sequence[Match], colors: Sequence[np.ndarray]) -> tuple[
         if len(a):
             for view in pair.views:
                 differences[view].append(delta_e(a, b))
-    return tuple(float(np.mean(np.concatenate(values))) if values else float("nan") for values in differences)
+    return tuple(
+        float(np.mean(np.concatenate(values))) if values else float("nan") for values in differences
+    )
 
 
 def _encode(light: np.ndarray) -> np.ndarray:

@@ -1,7 +1,8 @@
 """Points seen in several views of one instant: features, matches and triangulation.
 
-Notation: a feature x [2] is a pixel position with pixel centres at +0.5, as in `Camera`; a match is a pair of features
-in two views. Matching does not use the poses, so poses can be checked against matches. `guided_matching` uses them.
+Notation: a feature x [2] is a pixel position with pixel centres at +0.5, as in `Camera`; a match is
+a pair of features in two views. Matching does not use the poses, so poses can be checked against
+matches. `guided_matching` uses them.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ class Features:
     points: np.ndarray  #: [K, 2] float64, pixels.
     descriptors: np.ndarray  #: [K, 128] float32 of length 1.
     colors: np.ndarray  #: [K, 3] float32 in [0, 1], colour of the pixel.
-    #: [K, 2] float64, pixels, from the centre of the described patch along its orientation to its edge.
+    #: [K, 2] float64, pixels, from the centre of the described patch along its orientation to its
+    #: edge.
     axes: np.ndarray
 
 
@@ -45,7 +47,8 @@ class Match:
 
 @dataclass(frozen=True)
 class Tracks:
-    """Features of one point each in several views: observation k is a feature of track `ids[k]` in view `views[k]`.
+    """Features of one point each in several views: observation k is a feature of track `ids[k]` in
+    view `views[k]`.
 
     Attributes:
         ids: [n] int.
@@ -67,20 +70,32 @@ class Tracks:
     def mean_colors(self) -> np.ndarray:
         """Return the mean colour of each track [P, 3]."""
         return (
-            np.stack([np.bincount(self.ids, band) for band in self.colors.T], axis=1) / np.bincount(self.ids)[:, None]
+            np.stack([np.bincount(self.ids, band) for band in self.colors.T], axis=1)
+            / np.bincount(self.ids)[:, None]
         )
 
 
 def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features:
-    """Return the SIFT features of an image uint8 [H, W, 3] where `mask` [H, W] is true; none without an image."""
-    none = Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 2)))
+    """Return the SIFT features of an image uint8 [H, W, 3] where `mask` [H, W] is true; none
+    without an image.
+    """
+    none = Features(
+        np.zeros((0, 2)),
+        np.zeros((0, 128), np.float32),
+        np.zeros((0, 3), np.float32),
+        np.zeros((0, 2)),
+    )
     if image is None:
         return none
     height, width = image.shape[:2]
     scale = min(1.0, np.sqrt(_DETECTION_PIXELS / (width * height)))
     size = (round(width * scale), round(height * scale))
     grey = cv2.cvtColor(cv2.resize(image, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
-    where = None if mask is None else cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    where = (
+        None
+        if mask is None
+        else cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    )
     # Without precise upscaling OpenCV's features are off by a quarter of a pixel.
     sift = cv2.SIFT.create(nfeatures=MAX_FEATURES, enable_precise_upscale=True)
     keypoints, descriptors = sift.detectAndCompute(grey, where)
@@ -91,23 +106,28 @@ def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features
     angles = np.deg2rad([k.angle for k in keypoints])
     sizes = np.array([k.size for k in keypoints])
     axes = 0.5 * sizes[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1) * pixel_scale
-    # RootSIFT: square roots of the normalised descriptors are easier to distinguish (Arandjelovic 2012).
+    # RootSIFT: square roots of the normalised descriptors are easier to distinguish (Arandjelovic
+    # 2012).
     descriptors = np.sqrt(descriptors / descriptors.sum(1, keepdims=True))
     columns, rows = np.clip(points.astype(int), 0, (width - 1, height - 1)).T
     return Features(points, descriptors, image[rows, columns].astype(np.float32) / 255, axes)
 
 
 def match_views(features: Sequence[Features], cameras: Sequence[Camera]) -> list[Match]:
-    """Return the matches between all pairs of up to 24 views, or of each view and its 8 nearest ones.
+    """Return the matches between all pairs of up to 24 views, or of each view and its 8 nearest
+    ones.
 
-    Only matches that are consistent with a common epipolar geometry are returned, for any such geometry.
+    Only matches that are consistent with a common epipolar geometry are returned, for any such
+    geometry.
 
     Args:
         features: per view.
         cameras: per view.
     """
     neighbours = len(cameras) if len(cameras) <= _ALL_PAIRS else _NEIGHBOURS
-    matches = (Match((i, j), _matches(features[i], features[j])) for i, j in _pairs(cameras, neighbours))
+    matches = (
+        Match((i, j), _matches(features[i], features[j])) for i, j in _pairs(cameras, neighbours)
+    )
     return [match for match in matches if len(match.features)]
 
 
@@ -145,7 +165,9 @@ def descriptor_distances(a: Features, b: Features) -> np.ndarray:
 
 
 def mutual_neighbours(distances: np.ndarray) -> np.ndarray:
-    """Return the pairs [M, 2] that are mutual nearest neighbours and pass Lowe's ratio test, from distances [K, L]."""
+    """Return the pairs [M, 2] that are mutual nearest neighbours and pass Lowe's ratio test, from
+    distances [K, L].
+    """
     forth = distances.argmin(1)
     back = distances.argmin(0)
     rows = np.arange(len(forth))
@@ -154,16 +176,20 @@ def mutual_neighbours(distances: np.ndarray) -> np.ndarray:
     return np.stack([rows, forth], axis=1)[good]
 
 
-def reprojection_errors(match: Match, features: Sequence[Features], cameras: Sequence[Camera]) -> np.ndarray:
+def reprojection_errors(
+    match: Match, features: Sequence[Features], cameras: Sequence[Camera]
+) -> np.ndarray:
     """Return the reprojection error of each match [M], px.
 
-    A match is triangulated from its two features. Its error is the mean distance of the point's projections from
-    the features; it is infinite for a point behind a camera.
+    A match is triangulated from its two features. Its error is the mean distance of the point's
+    projections from the features; it is infinite for a point behind a camera.
     """
     count = len(match.features)
     tracks = np.tile(np.arange(count), 2)
     views = np.repeat(match.views, count)
-    pixels = np.concatenate([features[v].points[match.features[:, k]] for k, v in enumerate(match.views)])
+    pixels = np.concatenate(
+        [features[v].points[match.features[:, k]] for k, v in enumerate(match.views)]
+    )
     points = intersect(tracks, views, pixels, cameras, count)
     errors = _distances(points[tracks], views, pixels, cameras)
     return errors.reshape(2, count).mean(0)
@@ -176,7 +202,8 @@ def triangulate(
     max_error: float = 2.0,
     min_angle: float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the triangulated points [P, 3] float32, world units, and their colours [P, 3] in [0, 1].
+    """Return the triangulated points [P, 3] float32, world units, and their colours [P, 3] in
+    [0, 1].
 
     Args:
         matches: from `match_views`.
@@ -186,7 +213,10 @@ def triangulate(
         min_angle: smallest accepted angle between the rays to a point, degrees.
     """
     close = [
-        replace(match, features=match.features[reprojection_errors(match, features, cameras) <= max_error])
+        replace(
+            match,
+            features=match.features[reprojection_errors(match, features, cameras) <= max_error],
+        )
         for match in matches
     ]
     tracks = join_matches(close, features)
@@ -204,13 +234,19 @@ def triangulate(
 
 
 def join_matches(matches: Sequence[Match], features: Sequence[Features]) -> Tracks:
-    """Return the tracks of features that are matched directly or through other features, all in different views."""
+    """Return the tracks of features that are matched directly or through other features, all in
+    different views.
+    """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     starts = np.concatenate([[0], np.cumsum([len(f.points) for f in features])]).astype(int)
-    edges = np.concatenate([np.zeros((0, 2), int), *(m.features + starts[list(m.views)] for m in matches)])
-    graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(starts[-1], starts[-1]))
+    edges = np.concatenate(
+        [np.zeros((0, 2), int), *(m.features + starts[list(m.views)] for m in matches)]
+    )
+    graph = coo_array(
+        (np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(starts[-1], starts[-1])
+    )
     _, track = connected_components(graph, directed=False)
     views = np.repeat(np.arange(len(features)), np.diff(starts))
     # A track is valid if it has at least two features, all in different views.
@@ -218,14 +254,18 @@ def join_matches(matches: Sequence[Match], features: Sequence[Features]) -> Trac
     distinct = np.bincount(np.unique(np.stack([track, views]), axis=1)[0], minlength=len(sizes))
     members = np.flatnonzero(((sizes >= 2) & (distinct == sizes))[track])
     _, track = np.unique(track[members], return_inverse=True)
-    pixels, colors = (np.concatenate([getattr(f, name) for f in features])[members] for name in ("points", "colors"))
+    pixels, colors = (
+        np.concatenate([getattr(f, name) for f in features])[members]
+        for name in ("points", "colors")
+    )
     return Tracks(track, views[members], pixels, colors)
 
 
 def intersect(
     track: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera], count: int
 ) -> np.ndarray:
-    """Return the points [count, 3] with the least algebraic distance to the rays of their observations.
+    """Return the points [count, 3] with the least algebraic distance to the rays of their
+    observations.
 
     Observation k is the pixel position `pixels[k]` of point `track[k]` in view `views[k]`.
     """
@@ -234,7 +274,9 @@ def intersect(
     positions = np.array([camera.position for camera in cameras])
     middle = positions.mean(0)
     scale = np.linalg.norm(positions - positions.mean(0), axis=1).max() or 1.0
-    V = np.concatenate([V[:, :, :3], ((V[:, :, :3] @ middle + V[:, :, 3]) / scale)[..., None]], axis=2)[views]
+    V = np.concatenate(
+        [V[:, :, :3], ((V[:, :, :3] @ middle + V[:, :, 3]) / scale)[..., None]], axis=2
+    )[views]
     # Image coordinates at depth 1, in each camera's own frame.
     x = np.empty_like(pixels)
     for view in np.unique(views):
@@ -249,8 +291,12 @@ def intersect(
         return solution[:, :3] / solution[:, 3:] * scale + middle
 
 
-def _distances(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the distance of each point's projection [n] from its pixel, px, infinite behind the camera."""
+def _distances(
+    points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera]
+) -> np.ndarray:
+    """Return the distance of each point's projection [n] from its pixel, px, infinite behind the
+    camera.
+    """
     projections = np.empty_like(pixels)
     depths = np.empty(len(points))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -261,8 +307,12 @@ def _distances(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, camera
     return np.where((depths > 0) & np.isfinite(error), error, np.inf)
 
 
-def _widest_angles(points: np.ndarray, track: np.ndarray, views: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """Return twice the largest angle [P] between a point's rays and their mean, degrees: the spread of its views."""
+def _widest_angles(
+    points: np.ndarray, track: np.ndarray, views: np.ndarray, cameras: Sequence[Camera]
+) -> np.ndarray:
+    """Return twice the largest angle [P] between a point's rays and their mean, degrees: the spread
+    of its views.
+    """
     positions = np.array([camera.position for camera in cameras])[views]
     with np.errstate(invalid="ignore"):
         rays = points[track] - positions

@@ -1,4 +1,6 @@
-"""Fingerprint of a recording: a digest of its first images and its points, by which a stream recognises it."""
+"""Fingerprint of a recording: a digest of its first images and its points, by which a stream
+recognises it.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,9 @@ import numpy as np
 from morgs_mi.capture.capture import Capture
 
 
-def fingerprint(capture: Capture, images: Sequence[np.ndarray | None], with_cameras: bool = False) -> str:
+def fingerprint(
+    capture: Capture, images: Sequence[np.ndarray | None], with_cameras: bool = False
+) -> str:
     """Return the digest of a recording as 16 hexadecimal digits.
 
     Args:
@@ -18,7 +22,11 @@ def fingerprint(capture: Capture, images: Sequence[np.ndarray | None], with_came
         images: of its first frame, as it was read: downscaled and colour-corrected. None: missing.
         with_cameras: whether the calibration counts, as for a fit that refines it.
     """
-    cameras = [matrix for camera in capture.cameras for matrix in (camera.K, camera.viewmat)] if with_cameras else []
+    cameras = (
+        [matrix for camera in capture.cameras for matrix in (camera.K, camera.viewmat)]
+        if with_cameras
+        else []
+    )
     digest = blake2b(digest_size=8)
     for array in (*images, capture.points, capture.point_colors, *cameras):
         digest.update(b"" if array is None else np.ascontiguousarray(array).data)

@@ -1,9 +1,9 @@
 """Matches of views that are too far apart to be matched without their poses.
 
-Only features on each other's epipolar lines are compared. A match is accepted if the patches that the two features
-describe agree. Take a patch at the triangulated point, on a plane that faces both cameras. Seen from the other camera,
-it must have about the size and the orientation of the other feature. Without this test, half of the matches at 60
-degrees are wrong.
+Only features on each other's epipolar lines are compared. A match is accepted if the patches that
+the two features describe agree. Take a patch at the triangulated point, on a plane that faces both
+cameras. Seen from the other camera, it must have about the size and the orientation of the other
+feature. Without this test, half of the matches at 60 degrees are wrong.
 """
 
 from __future__ import annotations
@@ -12,7 +12,13 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from morgs_mi.capture.features import Features, Match, descriptor_distances, intersect, mutual_neighbours
+from morgs_mi.capture.features import (
+    Features,
+    Match,
+    descriptor_distances,
+    intersect,
+    mutual_neighbours,
+)
 from morgs_mi.core.camera import Camera
 
 # Largest distance from an epipolar line, px, and between two descriptors of length 1.
@@ -37,7 +43,9 @@ def match_guided(
             continue
         distances = descriptor_distances(a, b)
         near = _line_distances(a.points, b.points, cameras[i], cameras[j]) <= _BAND
-        index_pairs = mutual_neighbours(np.where(near & (distances <= _MAX_DISTANCE), distances, 2.0))
+        index_pairs = mutual_neighbours(
+            np.where(near & (distances <= _MAX_DISTANCE), distances, 2.0)
+        )
         index_pairs = index_pairs[_patches_agree(a, b, index_pairs, cameras[i], cameras[j])]
         if len(index_pairs):
             matches.append(Match((i, j), index_pairs))
@@ -45,7 +53,9 @@ def match_guided(
 
 
 def _line_distances(x: np.ndarray, y: np.ndarray, a: Camera, b: Camera) -> np.ndarray:
-    """Return the larger distance of two pixel positions, [K, 2] and [L, 2], from each other's lines, [K, L], px."""
+    """Return the larger distance of two pixel positions, [K, 2] and [L, 2], from each other's
+    lines, [K, L], px.
+    """
     centres = np.array([a.position, b.position], np.float64)
     if np.linalg.norm(centres[1] - centres[0]) <= _ROUNDING * np.linalg.norm(centres):
         return np.full((len(x), len(y)), np.inf)  # two cameras at one position have no lines
@@ -62,7 +72,9 @@ def _line_distances(x: np.ndarray, y: np.ndarray, a: Camera, b: Camera) -> np.nd
         return np.abs(of_x @ y.T) / slopes
 
 
-def _patches_agree(a: Features, b: Features, pairs: np.ndarray, first: Camera, second: Camera) -> np.ndarray:
+def _patches_agree(
+    a: Features, b: Features, pairs: np.ndarray, first: Camera, second: Camera
+) -> np.ndarray:
     """Return whether the patches of each pair [M, 2] agree in size and orientation, [M]."""
     count = len(pairs)
     pixels = np.concatenate([a.points[pairs[:, 0]], b.points[pairs[:, 1]]])
@@ -79,10 +91,14 @@ def _patches_agree(a: Features, b: Features, pairs: np.ndarray, first: Camera, s
 
 
 def _carried(points: np.ndarray, vectors: np.ndarray, first: Camera, second: Camera) -> np.ndarray:
-    """Return image vectors at points [M, 3] as another camera sees them [M, 2], on planes that face both cameras."""
+    """Return image vectors at points [M, 3] as another camera sees them [M, 2], on planes that face
+    both cameras.
+    """
     rays = [points - camera.position for camera in (first, second)]
     normals = sum(ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
-    directions = first.unproject(first.project(points)[0] + vectors, np.ones(len(points))) - first.position
+    directions = (
+        first.unproject(first.project(points)[0] + vectors, np.ones(len(points))) - first.position
+    )
     scale = (rays[0] * normals).sum(axis=1) / (directions * normals).sum(axis=1)
     ends = first.position + scale[:, None] * directions
     return second.project(ends)[0] - second.project(points)[0]

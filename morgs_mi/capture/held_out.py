@@ -16,13 +16,18 @@ _MANY = 6
 
 
 def held_out_by(
-    path: Path, requested: TestViews, settings: dict[str, Any], every: Calibration, subset: Calibration
+    path: Path,
+    requested: TestViews,
+    settings: dict[str, Any],
+    every: Calibration,
+    subset: Calibration,
 ) -> tuple[int, ...]:
     """Return the indices of the held-out cameras among the used ones.
 
     Args:
         path: the capture folder.
-        requested: as for `load_capture`; "auto": by the settings, by the layout, or by the number of cameras.
+        requested: as for `load_capture`; "auto": by the settings, by the layout, or by the number
+            of cameras.
         settings: content of the capture's `capture.json`, whose indices count all cameras.
         every: all cameras.
         subset: the cameras that are not left out.
@@ -44,7 +49,9 @@ def held_out_by(
     return held_out_views(path, names, subset.names)
 
 
-def held_out_views(path: Path, views: int | str | Sequence[int | str] | None, names: Sequence[str]) -> tuple[int, ...]:
+def held_out_views(
+    path: Path, views: int | str | Sequence[int | str] | None, names: Sequence[str]
+) -> tuple[int, ...]:
     """Return the ascending indices of cameras that are held out.
 
     Args:
@@ -58,12 +65,15 @@ def held_out_views(path: Path, views: int | str | Sequence[int | str] | None, na
     indices = _indices(path, views, names)
     if len(indices) == len(names):
         raise ValueError(
-            f"{path}: `test_view` must leave a camera for training, got all {len(names)} cameras; name fewer of them."
+            f"{path}: `test_view` must leave a camera for training, got all {len(names)} cameras; "
+            "name fewer of them."
         )
     return indices
 
 
-def _indices(place: Path, views: int | str | Sequence[int | str] | None, names: Sequence[str]) -> tuple[int, ...]:
+def _indices(
+    place: Path, views: int | str | Sequence[int | str] | None, names: Sequence[str]
+) -> tuple[int, ...]:
     """Return the ascending indices of cameras; `place` is where they were requested."""
     if views is None:
         return ()
@@ -77,6 +87,6 @@ def _index(place: Path, view: int | str, names: Sequence[str]) -> int:
     if str(index).isdecimal() and int(index) < len(names):
         return int(index)
     raise ValueError(
-        f"{place}: `test_view` must be an index in 0..{len(names) - 1}, one of {', '.join(names)}, or none for no "
-        f"held-out camera, got {view}."
+        f"{place}: `test_view` must be an index in 0..{len(names) - 1}, one of "
+        f"{', '.join(names)}, or none for no held-out camera, got {view}."
     )

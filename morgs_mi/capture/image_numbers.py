@@ -1,7 +1,8 @@
 """Alignment of folders of images by the numbers of their images.
 
-The numbers are times: images with the same number are simultaneous. Cameras whose numbers do not overlap, such as 1000
-to 1010 and 2340 to 2350, count separately. The first images of such cameras are simultaneous.
+The numbers are times: images with the same number are simultaneous. Cameras whose numbers do not
+overlap, such as 1000 to 1010 and 2340 to 2350, count separately. The first images of such cameras
+are simultaneous.
 """
 
 from __future__ import annotations
@@ -21,16 +22,23 @@ _Numbers = Mapping[int, range]
 
 @dataclass(frozen=True)
 class ImageNumbers:
-    """Alignment of clips by the numbers of their images: the image o + r t of a clip shows instant t."""
+    """Alignment of clips by the numbers of their images: the image o + r t of a clip shows instant
+    t.
+    """
 
     offsets: np.ndarray  #: o of each clip [C].
     rates: np.ndarray  #: r of each clip [C].
-    interval: float = 1.0  #: Time between two instants, in frames of the clip with the most frames per time.
+    #: Time between two instants, in frames of the clip with the most frames per time.
+    interval: float = 1.0
     notes: tuple[str, ...] = ()  #: A sentence for each assumption.
 
 
 def align_numbers(
-    path: Path, names: Sequence[str], readers: Sequence[FrameReader], trim: bool, offset: Mapping[str, float]
+    path: Path,
+    names: Sequence[str],
+    readers: Sequence[FrameReader],
+    trim: bool,
+    offset: Mapping[str, float],
 ) -> ImageNumbers:
     """Return the alignment of the clips of the capture `path` by the numbers of their images.
 
@@ -39,16 +47,24 @@ def align_numbers(
         names: names of the cameras.
         readers: one clip per camera.
         trim: whether to use only the numbers that all cameras have which count together.
-        offset: as in `ReadConfig`; without `trim`, the images are aligned by their positions and `offset`.
+        offset: as in `ReadConfig`; without `trim`, the images are aligned by their positions and
+            `offset`.
 
     Raises:
-        ValueError: numbers of cameras that count together differ and no option resolves it, or none are common.
+        ValueError: numbers of cameras that count together differ and no option resolves it, or none
+            are common.
     """
-    numbers = {c: r.numbers for c, r in enumerate(readers) if isinstance(r, FolderReader) and r.numbers is not None}
+    numbers = {
+        c: r.numbers
+        for c, r in enumerate(readers)
+        if isinstance(r, FolderReader) and r.numbers is not None
+    }
     groups = counting_together(numbers)
     notes = _separate(names, numbers, groups)
     by_position = ImageNumbers(np.zeros(len(readers)), np.ones(len(readers)), notes=notes)
-    different = [group for group in groups if len({(numbers[c][0], numbers[c].step) for c in group}) > 1]
+    different = [
+        group for group in groups if len({(numbers[c][0], numbers[c].step) for c in group}) > 1
+    ]
     if not different:
         return by_position
     table = "; ".join(_table(names, numbers, group) for group in different)
@@ -57,18 +73,28 @@ def align_numbers(
         return ImageNumbers(by_position.offsets, by_position.rates, notes=(*notes, note))
     common = sorted(set.intersection(*(set(numbers[c]) for c in different[0])))
     if not trim or not common or len(different) > 1:
-        remedy = f"the {len(common)} common ones with --trim, " if common and len(different) == 1 else ""
-        raise ValueError(
-            f"{path}: images with the same number must be simultaneous and all cameras must have the same numbers, got "
-            f"{table}; use {remedy}all numbers with --gaps, which leaves out the cameras that lack an image, or the "
-            f"positions of the images in place of their numbers with --offset {names[different[0][0]]} 0."
+        remedy = (
+            f"the {len(common)} common ones with --trim, " if common and len(different) == 1 else ""
         )
-    note = f"Images with the same number are simultaneous: {table}. Used are {_range(common)}, which all cameras have."
+        raise ValueError(
+            f"{path}: images with the same number must be simultaneous and all cameras must have "
+            f"the same numbers, got {table}; use {remedy}all numbers with --gaps, which leaves "
+            "out the cameras that lack an image, or the positions of the images in place of "
+            f"their numbers with --offset {names[different[0][0]]} 0."
+        )
+    note = (
+        f"Images with the same number are simultaneous: {table}. Used are {_range(common)}, which "
+        "all cameras have."
+    )
     return _aligned(readers, {c: numbers[c] for c in different[0]}, common[0], (*notes, note))
 
 
-def _aligned(readers: Sequence[FrameReader], numbers: _Numbers, begin: int, notes: tuple[str, ...]) -> ImageNumbers:
-    """Return the alignment to common numbers that start with `begin`; other clips start with the first of `numbers`."""
+def _aligned(
+    readers: Sequence[FrameReader], numbers: _Numbers, begin: int, notes: tuple[str, ...]
+) -> ImageNumbers:
+    """Return the alignment to common numbers that start with `begin`; other clips start with the
+    first of `numbers`.
+    """
     step = lcm(*(clip_numbers.step for clip_numbers in numbers.values()))
     finest = min(clip_numbers.step for clip_numbers in numbers.values())
     first = min(clip_numbers[0] for clip_numbers in numbers.values())
@@ -78,12 +104,17 @@ def _aligned(readers: Sequence[FrameReader], numbers: _Numbers, begin: int, note
     return ImageNumbers(offsets, rates, step / finest, notes)
 
 
-def _separate(names: Sequence[str], numbers: _Numbers, groups: Sequence[Sequence[int]]) -> tuple[str, ...]:
+def _separate(
+    names: Sequence[str], numbers: _Numbers, groups: Sequence[Sequence[int]]
+) -> tuple[str, ...]:
     """Return a note on cameras that count separately, none if there are none or single images."""
     if len(groups) < 2 or all(len(clip_numbers) == 1 for clip_numbers in numbers.values()):
         return ()
     table = "; ".join(_table(names, numbers, group[:1]) for group in groups)
-    return (f"The numbers of the images do not overlap: {table}. Cameras with such numbers begin at the same time.",)
+    return (
+        f"The numbers of the images do not overlap: {table}. Cameras with such numbers begin at "
+        "the same time.",
+    )
 
 
 def _table(names: Sequence[str], numbers: _Numbers, group: Sequence[int]) -> str:

@@ -1,9 +1,11 @@
-"""Interpolation of images between two frames of a clip by optical flow, at the time of another camera's frame.
+"""Interpolation of images between two frames of a clip by optical flow, at the time of another
+camera's frame.
 
-A point that moves by the flow F from the first frame to the second has moved by s F at the share s of the time between
-them. So the pixel x shows the point p of the first frame with p + s F(p) = x, and the point q of the second frame with
-q + (1 - s) B(q) = x, with B the flow back. Both are found by fixed-point iteration, and their colours are averaged with
-the weights 1 - s and s. A point with unreliable flow, because the other frame does not show it, has a small weight.
+A point that moves by the flow F from the first frame to the second has moved by s F at the share s
+of the time between them. So the pixel x shows the point p of the first frame with p + s F(p) = x,
+and the point q of the second frame with q + (1 - s) B(q) = x, with B the flow back. Both are found
+by fixed-point iteration, and their colours are averaged with the weights 1 - s and s. A point with
+unreliable flow, because the other frame does not show it, has a small weight.
 """
 
 from __future__ import annotations
@@ -42,7 +44,9 @@ def image_between(first: np.ndarray, second: np.ndarray, share: float) -> np.nda
     weights = np.zeros((*first.shape[:2], 1), np.float32)
     for image, flow, back, fraction in both:
         places = _origins(flow, fraction)
-        reliable = _sampled(consistency_mask(flow, back).astype(np.float32), places, cv2.INTER_LINEAR)[..., None]
+        reliable = _sampled(
+            consistency_mask(flow, back).astype(np.float32), places, cv2.INTER_LINEAR
+        )[..., None]
         weight = np.float32(1 - fraction) * (reliable + np.float32(_LEAST_WEIGHT))
         total += weight * _sampled(image.astype(np.float32), places, cv2.INTER_CUBIC)
         weights += weight
@@ -52,8 +56,12 @@ def image_between(first: np.ndarray, second: np.ndarray, share: float) -> np.nda
 
 
 def _origins(flow: np.ndarray, share: float) -> np.ndarray:
-    """Return the points p of a frame with p + share flow(p) = x for every pixel x, in pixels [H, W, 2]."""
-    pixels = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in flow.shape[1::-1])), axis=-1)
+    """Return the points p of a frame with p + share flow(p) = x for every pixel x, in pixels
+    [H, W, 2].
+    """
+    pixels = np.stack(
+        np.meshgrid(*(np.arange(n, dtype=np.float32) for n in flow.shape[1::-1])), axis=-1
+    )
     places = pixels
     for _ in range(_ROUNDS):
         places = pixels - np.float32(share) * _sampled(flow, places, cv2.INTER_LINEAR)

@@ -1,7 +1,7 @@
 """Undistortion of COLMAP's camera models by OpenCV's pixel maps, computed once per camera.
 
-Notation: a model's parameters are its focal length(s), principal point and distortion coefficients, in
-COLMAP's order. OpenCV puts pixel centres at integers, COLMAP and `Camera` at +0.5.
+Notation: a model's parameters are its focal length(s), principal point and distortion coefficients,
+in COLMAP's order. OpenCV puts pixel centres at integers, COLMAP and `Camera` at +0.5.
 """
 
 from __future__ import annotations
@@ -32,20 +32,26 @@ class Lens:
     """Lens distortion of a COLMAP camera."""
 
     model: str = "PINHOLE"  #: COLMAP's name of the model, e.g. ``OPENCV``.
-    distortion: tuple[float, ...] = ()  #: Distortion coefficients in COLMAP's order; empty for a pinhole.
+    #: Distortion coefficients in COLMAP's order; empty for a pinhole.
+    distortion: tuple[float, ...] = ()
 
     @property
     def opencv_coefficients(self) -> np.ndarray:
-        """The coefficients in OpenCV's order: [4] for a fisheye, otherwise [8] (k1 k2 p1 p2 k3 .. k6)."""
+        """The coefficients in OpenCV's order: [4] for a fisheye, otherwise [8] (k1 k2 p1 p2 k3 ..
+        k6).
+        """
         count = 4 if self.model == "OPENCV_FISHEYE" else 8
-        return np.pad(np.array(self.distortion, dtype=np.float64), (0, count - len(self.distortion)))
+        return np.pad(
+            np.array(self.distortion, dtype=np.float64), (0, count - len(self.distortion))
+        )
 
 
 def lens_and_intrinsics(model: str, params: Sequence[float]) -> tuple[Lens, np.ndarray]:
     """Split a COLMAP camera's parameters into the lens and K [3, 3].
 
     Raises:
-        ValueError: the model is not supported, or the number of parameters does not match the model.
+        ValueError: the model is not supported, or the number of parameters does not match the
+            model.
     """
     if model not in MODELS:
         raise ValueError(
@@ -59,7 +65,10 @@ def lens_and_intrinsics(model: str, params: Sequence[float]) -> tuple[Lens, np.n
             f"got {len(params)}; write the model again."
         )
     if not bounded(params):
-        raise ValueError(f"its parameters must be finite and at most {LARGEST:g}, got {[*params]}; calibrate again.")
+        raise ValueError(
+            f"its parameters must be finite and at most {LARGEST:g}, got {[*params]}; calibrate "
+            "again."
+        )
     fx = params[0]
     fy = params[focals - 1]
     cx, cy = params[focals : focals + 2]
@@ -68,10 +77,16 @@ def lens_and_intrinsics(model: str, params: Sequence[float]) -> tuple[Lens, np.n
 
 
 def opencv_lens(coefficients: Sequence[float]) -> Lens:
-    """Return the lens with OpenCV's coefficients k1 k2 p1 p2, or k1 k2 p1 p2 k3, or k1 k2 p1 p2 k3 k4 k5 k6."""
+    """Return the lens with OpenCV's coefficients k1 k2 p1 p2, or k1 k2 p1 p2 k3, or k1 k2 p1 p2 k3
+    k4 k5 k6.
+    """
     first = tuple(map(float, coefficients[:4]))
     more = tuple(map(float, coefficients[4:]))
-    return Lens("FULL_OPENCV", (*first, *more, *(0.0,) * (4 - len(more)))) if any(more) else Lens("OPENCV", first)
+    return (
+        Lens("FULL_OPENCV", (*first, *more, *(0.0,) * (4 - len(more))))
+        if any(more)
+        else Lens("OPENCV", first)
+    )
 
 
 @dataclass(frozen=True)
@@ -79,25 +94,30 @@ class Undistortion:
     """Pixel maps that remove the distortion of one lens."""
 
     maps: tuple[np.ndarray, np.ndarray]  #: OpenCV's fixed-point maps for `cv2.remap`.
-    #: [H, W] bool, true where the undistorted pixel lies inside the recorded image and the lens model is valid.
+    #: [H, W] bool, true where the undistorted pixel lies inside the recorded image and the lens
+    #: model is valid.
     mask: np.ndarray
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Return the image [H, W, 3] of the pinhole camera with the same K."""
-        # Cubic, because linear filtering would blur: most of these lenses shift pixels by fractions of a pixel.
+        # Cubic, because linear filtering would blur: most of these lenses shift pixels by fractions
+        # of a pixel.
         return cv2.remap(image, *self.maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
-def undistortion(camera: Camera, lens: Lens, refined: tuple[Camera, Lens] | None = None) -> Undistortion | None:
+def undistortion(
+    camera: Camera, lens: Lens, refined: tuple[Camera, Lens] | None = None
+) -> Undistortion | None:
     """Return the undistortion of `lens`, or None for a lens without distortion.
 
-    The undistorted view has the same K and size as the recorded one, so a barrel-shaped image loses its
-    corners and a pincushion-shaped one has empty corners (see `Undistortion.mask`).
+    The undistorted view has the same K and size as the recorded one, so a barrel-shaped image loses
+    its corners and a pincushion-shaped one has empty corners (see `Undistortion.mask`).
 
     Args:
         camera: at the size of the recorded images.
         lens: lens of the camera.
-        refined: intrinsics of the view instead of the camera's, and the distortion that `lens` leaves in its images.
+        refined: intrinsics of the view instead of the camera's, and the distortion that `lens`
+            leaves in its images.
     """
     stages = [(camera, lens)] if any(lens.distortion) else []
     stages += [refined] if refined is not None and any(refined[1].distortion) else []
@@ -106,14 +126,22 @@ def undistortion(camera: Camera, lens: Lens, refined: tuple[Camera, Lens] | None
     x, y, mask = _maps(*stages[0])
     for stage in stages[1:]:
         columns, rows, stage_mask = _maps(*stage)
-        x, y = (cv2.remap(v, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for v in (x, y))
-        mask = stage_mask & (cv2.remap(mask.astype(np.float32), columns, rows, cv2.INTER_LINEAR) > 1 - 1e-3)
-    # Fixed point halves the memory of a rig's maps; its 1/32 px is far below the error of any calibration.
+        x, y = (
+            cv2.remap(v, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            for v in (x, y)
+        )
+        mask = stage_mask & (
+            cv2.remap(mask.astype(np.float32), columns, rows, cv2.INTER_LINEAR) > 1 - 1e-3
+        )
+    # Fixed point halves the memory of a rig's maps; its 1/32 px is far below the error of any
+    # calibration.
     return Undistortion(cv2.convertMaps(x, y, cv2.CV_16SC2), mask)
 
 
 def _maps(camera: Camera, lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the columns and rows [H, W] px at which the lens shows a pinhole camera's pixels, and the valid ones."""
+    """Return the columns and rows [H, W] px at which the lens shows a pinhole camera's pixels, and
+    the valid ones.
+    """
     K = camera.K.copy()
     K[:2, 2] -= 0.5
     size = (camera.width, camera.height)
@@ -127,8 +155,8 @@ def _maps(camera: Camera, lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarra
 def _folded(x: np.ndarray, y: np.ndarray, camera: Camera) -> np.ndarray:
     """Return the mask of pixels beyond the angle up to which the lens model is valid [H, W].
 
-    A polynomial that was fitted to the recorded rays decreases again farther out. It would mirror the inner part of
-    the image there.
+    A polynomial that was fitted to the recorded rays decreases again farther out. It would mirror
+    the inner part of the image there.
     """
     # Sampling every few pixels is accurate enough, and fast.
     step = max(1, min(x.shape) // 256)

@@ -1,4 +1,6 @@
-"""Masks of the pixels of a camera's clip that are used: opaque, and black in no image that masks them out."""
+"""Masks of the pixels of a camera's clip that are used: opaque, and black in no image that masks
+them out.
+"""
 
 from __future__ import annotations
 
@@ -12,8 +14,11 @@ from morgs_mi.io.remote import fetched
 from morgs_mi.io.video import FolderReader, FrameReader, decode_image
 
 
-def used_in_clip(reader: FrameReader, masks: Sequence[Path], name: str) -> tuple[np.ndarray | None, list[str]]:
-    """Return the mask of the pixels of a clip that are opaque and in no mask black, None if all are, and notes.
+def used_in_clip(
+    reader: FrameReader, masks: Sequence[Path], name: str
+) -> tuple[np.ndarray | None, list[str]]:
+    """Return the mask of the pixels of a clip that are opaque and in no mask black, None if all
+    are, and notes.
 
     Raises:
         FileNotFoundError: a mask is missing.
@@ -23,7 +28,10 @@ def used_in_clip(reader: FrameReader, masks: Sequence[Path], name: str) -> tuple
     mask, note = used_pixels(masks, reader.width, reader.height, name)
     both = opaque if mask is None else mask if opaque is None else mask & opaque
     if both is not None and not both.any():
-        raise ValueError(f"{masks[0]}: expected pixels that are used, got a mask of transparent ones; correct it.")
+        raise ValueError(
+            f"{masks[0]}: expected pixels that are used, got a mask of transparent ones; correct "
+            "it."
+        )
     return both, [text for text in (*notes, note) if text]
 
 
@@ -44,12 +52,20 @@ def opaque_pixels(reader: FrameReader, name: str) -> tuple[np.ndarray | None, st
     if mask.all():
         return None, ""
     if not mask.any():
-        raise ValueError(f"{reader.path}: expected opaque pixels, got an alpha channel without any; remove it.")
-    return mask, f"{name}: {100 * (1 - mask.mean()):.1f} % of its pixels are transparent and masked out."
+        raise ValueError(
+            f"{reader.path}: expected opaque pixels, got an alpha channel without any; remove it."
+        )
+    return (
+        mask,
+        f"{name}: {100 * (1 - mask.mean()):.1f} % of its pixels are transparent and masked out.",
+    )
 
 
-def used_pixels(files: Sequence[Path], width: int, height: int, name: str) -> tuple[np.ndarray | None, str]:
-    """Return the mask [H, W] of the pixels that are black in no image, None if there are none, and a note.
+def used_pixels(
+    files: Sequence[Path], width: int, height: int, name: str
+) -> tuple[np.ndarray | None, str]:
+    """Return the mask [H, W] of the pixels that are black in no image, None if there are none, and
+    a note.
 
     Args:
         files: images of one camera, of the size of its clip or scaled versions of it.
@@ -59,26 +75,40 @@ def used_pixels(files: Sequence[Path], width: int, height: int, name: str) -> tu
 
     Raises:
         FileNotFoundError: an image is missing.
-        ValueError: an image cannot be read or has another aspect ratio, or all pixels are masked out.
+        ValueError: an image cannot be read or has another aspect ratio, or all pixels are masked
+            out.
     """
     combined_mask = np.ones((height, width), bool)
     varies = False
     for file in files:
         mask = _at_size(file, _not_black(file), width, height)
-        varies = varies or (file != files[0] and not np.array_equal(combined_mask & mask, combined_mask))
+        varies = varies or (
+            file != files[0] and not np.array_equal(combined_mask & mask, combined_mask)
+        )
         combined_mask &= mask
     if combined_mask.all():
         return None, ""
     if not combined_mask.any():
-        raise ValueError(f"{files[0]}: expected pixels that are used, got a black mask of {name}; correct it.")
-    several = f": all that any of {len(files)} different masks has black" if varies else f" by {files[0].name}"
-    return combined_mask, f"{name}: {100 * (1 - combined_mask.mean()):.1f} % of its pixels are masked out{several}."
+        raise ValueError(
+            f"{files[0]}: expected pixels that are used, got a black mask of {name}; correct it."
+        )
+    several = (
+        f": all that any of {len(files)} different masks has black"
+        if varies
+        else f" by {files[0].name}"
+    )
+    return (
+        combined_mask,
+        f"{name}: {100 * (1 - combined_mask.mean()):.1f} % of its pixels are masked out{several}.",
+    )
 
 
 def _not_black(file: Path) -> np.ndarray:
     """Return the mask [H, W] of the pixels of an image that are neither black nor transparent."""
     if not file.is_file():
-        raise FileNotFoundError(f"{file}: expected a mask, found none; copy it, or drop `mask_path`.")
+        raise FileNotFoundError(
+            f"{file}: expected a mask, found none; copy it, or drop `mask_path`."
+        )
     image = _decoded(file)
     if image.ndim == 2:
         return image > 0
@@ -86,7 +116,9 @@ def _not_black(file: Path) -> np.ndarray:
 
 
 def _opaque(file: Path, shape: tuple[int, int]) -> np.ndarray:
-    """Return the mask of an image's opaque pixels [H, W]: all without an alpha channel, or if it is not readable."""
+    """Return the mask of an image's opaque pixels [H, W]: all without an alpha channel, or if it is
+    not readable.
+    """
     try:
         with fetched(file).open("rb") as stream:
             header = stream.read(26)
@@ -101,7 +133,8 @@ def _opaque(file: Path, shape: tuple[int, int]) -> np.ndarray:
 def _may_be_transparent(header: bytes) -> bool:
     """Return whether an image may have an alpha channel, from the first 26 bytes of its file."""
     if header.startswith(b"\x89PNG"):
-        return header[25:] in (b"\3", b"\4", b"\6")  # with a palette, grey and alpha, or RGB and alpha
+        # With a palette, grey and alpha, or RGB and alpha.
+        return header[25:] in (b"\3", b"\4", b"\6")
     # JPEG has none, and the alpha channel of BMP and EXR files is not a mask.
     return not header.startswith((b"\xff\xd8", b"BM", b"\x76\x2f\x31\x01"))
 
@@ -117,7 +150,9 @@ def _at_size(file: Path, mask: np.ndarray, width: int, height: int) -> np.ndarra
         return mask
     if abs(columns * height - rows * width) > min(columns, rows, width, height):
         raise ValueError(
-            f"{file}: expected a mask of {width}x{height} pixels as the clip has, or a scaled version of it, got "
-            f"{columns}x{rows}; make it again."
+            f"{file}: expected a mask of {width}x{height} pixels as the clip has, or a scaled "
+            f"version of it, got {columns}x{rows}; make it again."
         )
-    return np.greater(cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA), 1 - 1e-4)
+    return np.greater(
+        cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA), 1 - 1e-4
+    )

@@ -1,4 +1,6 @@
-"""Protection of captures against outputs in their folders: a new file may be read as a part of the capture."""
+"""Protection of captures against outputs in their folders: a new file may be read as a part of the
+capture.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ PathLike = TypeVar("PathLike", str, Path)
 
 
 def check_output(path: PathLike) -> PathLike:
-    """Return `path`, the file or folder that is about to be written, if it is outside of all captures.
+    """Return `path`, the file or folder that is about to be written, if it is outside of all
+    captures.
 
     Links are followed. A capture is a folder with a calibration.
 
@@ -22,7 +25,7 @@ def check_output(path: PathLike) -> PathLike:
     for folder in (final, *final.parents):
         if any(layout.find(folder) for layout in LAYOUTS):
             raise ValueError(
-                f"{path}: expected an output outside of captures, which stay as they were recorded, got one in the "
-                f"capture {folder}; choose another place."
+                f"{path}: expected an output outside of captures, which stay as they were "
+                f"recorded, got one in the capture {folder}; choose another place."
             )
     return path

@@ -1,7 +1,8 @@
-"""Points of a capture from its first frame: matched features, triangulated, and stereo points where cameras are close.
+"""Points of a capture from its first frame: matched features, triangulated, and stereo points where
+cameras are close.
 
-Features are found at the recorded size, and pixels refer to that size, even if the capture is downscaled. Smaller
-images have fewer and less exact features.
+Features are found at the recorded size, and pixels refer to that size, even if the capture is
+downscaled. Smaller images have fewer and less exact features.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from morgs_mi.capture.guided_matching import match_guided
 from morgs_mi.capture.stereo import stereo_points
 from morgs_mi.core.random_streams import Stream, rng_of
 
-# px. Distortion that a layout cannot represent causes errors of about a pixel, a wrong pose tens of pixels.
+# px. Distortion that a layout cannot represent causes errors of about a pixel, a wrong pose tens of
+# pixels.
 MAX_ERROR = 2.0
 # A view that matches fewer others without its pose is also matched with it, which takes longer.
 _MIN_PARTNERS = 3
@@ -33,8 +35,11 @@ class SharedFeatures:
     matches: tuple[Match, ...]  #: Per pair of cameras with matches.
 
 
-def match_capture(capture: Capture, progress: Callable[[int, int], None] | None = None) -> SharedFeatures:
-    """Return the features and matches of the first frame; takes about 0.6 s per view and 0.03 s per pair.
+def match_capture(
+    capture: Capture, progress: Callable[[int, int], None] | None = None
+) -> SharedFeatures:
+    """Return the features and matches of the first frame; takes about 0.6 s per view and 0.03 s per
+    pair.
 
     A view without an image has no features.
 
@@ -59,8 +64,8 @@ def match_capture(capture: Capture, progress: Callable[[int, int], None] | None 
 def triangulate_points(capture: Capture, shared: SharedFeatures) -> Capture:
     """Return the capture with points triangulated from its training views instead of its own.
 
-    Views with few matches are also matched by their poses. Views that share few features give few points or none, which
-    the fit reports. Held-out views are not used.
+    Views with few matches are also matched by their poses. Views that share few features give few
+    points or none, which the fit reports. Held-out views are not used.
     """
     cameras = capture.at_recorded_size().cameras
     matches = [match for match in shared.matches if not set(capture.test_views) & set(match.views)]
@@ -70,7 +75,8 @@ def triangulate_points(capture: Capture, shared: SharedFeatures) -> Capture:
 
 
 def dense_points(capture: Capture, shared: SharedFeatures, seed: int = 0) -> Capture:
-    """Return the capture with triangulated points instead of its own, and with stereo points where cameras are close.
+    """Return the capture with triangulated points instead of its own, and with stereo points where
+    cameras are close.
 
     Args:
         capture: a capture; its held-out view is not used.
@@ -98,4 +104,6 @@ def _unmatched(views: Sequence[int], matches: Sequence[Match]) -> list[tuple[int
     matched_pairs = {match.views for match in matches}
     partners = Counter(view for pair in matched_pairs for view in pair)
     few = {view for view in views if partners[view] < _MIN_PARTNERS}
-    return [pair for pair in combinations(views, 2) if pair not in matched_pairs and few & set(pair)]
+    return [
+        pair for pair in combinations(views, 2) if pair not in matched_pairs and few & set(pair)
+    ]

@@ -1,7 +1,8 @@
 """Dense points from pairs of neighbouring cameras that are close enough for stereo matching.
 
-A pair is rectified, which puts a point into the same row of both images, and matched by OpenCV's semi-global block
-matching. A point is returned if both directions of matching agree and a third camera that sees it shows its colour.
+A pair is rectified, which puts a point into the same row of both images, and matched by OpenCV's
+semi-global block matching. A point is returned if both directions of matching agree and a third
+camera that sees it shows its colour.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.rig import angles_to, scene_depths, seen_points
 
-# Images are reduced to this number of pixels: the points only initialise a fit, which is more exact.
+# Images are reduced to this number of pixels: the points only initialise a fit, which is more
+# exact.
 _PIXELS = 2e5
 # Number of nearest cameras that each is matched with, and their least and largest angle, degrees.
 _NEIGHBOURS = 2
@@ -23,8 +25,8 @@ _MIN_ANGLE = 0.5
 _MAX_ANGLE = 25.0
 # Points per pair.
 _POINTS = 4000
-# Range of searched depths, as fractions of the near and far end of the known points. With fewer than this many points,
-# the search is around the depth that the cameras look at.
+# Range of searched depths, as fractions of the near and far end of the known points. With fewer
+# than this many points, the search is around the depth that the cameras look at.
 _NEAR = 0.6
 _FAR = 1.6
 _KNOWN = 10
@@ -33,7 +35,8 @@ _BLIND = 3.0
 _MAX_DIFFERENCE = 1.0
 _MAX_COLOR = 0.08
 _BLOCK = 5
-# Least depth of a view's corners in the rectified view, for depth 1 in the camera: less is too oblique.
+# Least depth of a view's corners in the rectified view, for depth 1 in the camera: less is too
+# oblique.
 _LEAST_DEPTH = 0.2
 
 
@@ -44,7 +47,8 @@ def stereo_points(
     scene_points: np.ndarray,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return points [P, 3], world units, and their colours [P, 3] in [0, 1]; none if no cameras are close.
+    """Return points [P, 3], world units, and their colours [P, 3] in [0, 1]; none if no cameras are
+    close.
 
     Args:
         cameras: C views.
@@ -76,7 +80,11 @@ class _View:
     def of(cls, camera: Camera, image: np.ndarray, mask: np.ndarray | None) -> _View:
         scale = min(1.0, np.sqrt(_PIXELS / (camera.width * camera.height)))
         size = round(camera.width * scale), round(camera.height * scale)
-        valid = np.full(image.shape[:2], 255, np.uint8) if mask is None else np.uint8(255) * mask.astype(np.uint8)
+        valid = (
+            np.full(image.shape[:2], 255, np.uint8)
+            if mask is None
+            else np.uint8(255) * mask.astype(np.uint8)
+        )
         valid = cv2.resize(valid, size, interpolation=cv2.INTER_NEAREST)
         small_image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         return cls(camera.resized(*size), small_image, cv2.blur(small_image, (3, 3)), valid)
@@ -85,7 +93,9 @@ class _View:
 def _neighbours(cameras: Sequence[Camera], scene_points: np.ndarray) -> list[tuple[int, int]]:
     """Return the pairs of cameras that are close enough."""
     pairs = set()
-    for i, (camera, depth) in enumerate(zip(cameras, scene_depths(cameras, scene_points), strict=True)):
+    for i, (camera, depth) in enumerate(
+        zip(cameras, scene_depths(cameras, scene_points), strict=True)
+    ):
         angles = angles_to(camera, depth, cameras)
         angles[i] = np.inf
         for j in np.argsort(angles)[:_NEIGHBOURS]:
@@ -94,7 +104,9 @@ def _neighbours(cameras: Sequence[Camera], scene_points: np.ndarray) -> list[tup
     return sorted(pairs)
 
 
-def _depth_range(cameras: Sequence[Camera], view: int, scene_points: np.ndarray) -> tuple[float, float]:
+def _depth_range(
+    cameras: Sequence[Camera], view: int, scene_points: np.ndarray
+) -> tuple[float, float]:
     """Return the smallest and the largest depth in a view."""
     _, _, depths = seen_points(cameras[view], scene_points)
     if len(depths) >= _KNOWN:
@@ -119,7 +131,9 @@ class _Rectified:
 
     @classmethod
     def of(cls, a: Camera, b: Camera) -> _Rectified | None:
-        """Return the rectification of two views, None if no plane shows both, e.g. with one camera behind the other."""
+        """Return the rectification of two views, None if no plane shows both, e.g. with one camera
+        behind the other.
+        """
         right = b.position - a.position
         baseline = float(np.linalg.norm(right))
         right = right / baseline
@@ -131,21 +145,39 @@ class _Rectified:
         homographies = []
         boxes = []
         for camera in (a, b):
-            H = np.diag([focal, focal, 1]) @ axes @ camera.viewmat[:3, :3].T @ np.linalg.inv(camera.K)
-            sides = np.array([[x, y, 1] for x in (0, camera.width) for y in (0, camera.height)]) @ H.T
+            H = (
+                np.diag([focal, focal, 1])
+                @ axes
+                @ camera.viewmat[:3, :3].T
+                @ np.linalg.inv(camera.K)
+            )
+            sides = (
+                np.array([[x, y, 1] for x in (0, camera.width) for y in (0, camera.height)]) @ H.T
+            )
             if sides[:, 2].min() < _LEAST_DEPTH:
                 return None
             homographies.append(H)
-            boxes.append([(sides[:, :2] / sides[:, 2:]).min(axis=0), (sides[:, :2] / sides[:, 2:]).max(axis=0)])
+            boxes.append(
+                [
+                    (sides[:, :2] / sides[:, 2:]).min(axis=0),
+                    (sides[:, :2] / sides[:, 2:]).max(axis=0),
+                ]
+            )
         (a0, a1), (b0, b1) = boxes
         top = max(a0[1], b0[1])
         bottom = min(a1[1], b1[1])
         size = int(np.ceil(max(a1[0] - a0[0], b1[0] - b0[0]))), int(np.ceil(bottom - top))
-        transforms = [_shift(-box[0][0], -top) @ H for box, H in zip(boxes, homographies, strict=True)]
+        transforms = [
+            _shift(-box[0][0], -top) @ H for box, H in zip(boxes, homographies, strict=True)
+        ]
         return cls(axes, focal, baseline, (transforms[0], transforms[1]), (a0[0], b0[0], top), size)
 
-    def warped(self, index: int, image: np.ndarray, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
-        """Return an image of one of the views, rectified; OpenCV's pixel centres lie at whole numbers."""
+    def warped(
+        self, index: int, image: np.ndarray, interpolation: int = cv2.INTER_LINEAR
+    ) -> np.ndarray:
+        """Return an image of one of the views, rectified; OpenCV's pixel centres lie at whole
+        numbers.
+        """
         H = _shift(-0.5, -0.5) @ self.homographies[index] @ _shift(0.5, 0.5)
         return cv2.warpPerspective(image, H, self.size, flags=interpolation)
 
@@ -165,7 +197,10 @@ def _matched(a: _View, b: _View, depths: tuple[float, float]) -> np.ndarray:
         return np.zeros((0, 6))
     images, valid = (
         [rig.warped(k, image, flag) for k, image in enumerate(pair)]
-        for pair, flag in (((a.image, b.image), cv2.INTER_LINEAR), ((a.valid, b.valid), cv2.INTER_NEAREST))
+        for pair, flag in (
+            ((a.image, b.image), cv2.INTER_LINEAR),
+            ((a.valid, b.valid), cv2.INTER_NEAREST),
+        )
     )
     left, right = images
     forth = _disparity(left, right, lowest, count)
@@ -176,20 +211,32 @@ def _matched(a: _View, b: _View, depths: tuple[float, float]) -> np.ndarray:
     partner = np.clip(partner, 0, width - 1)
     agree = np.abs(forth + back[rows, partner]) <= _MAX_DIFFERENCE
     mask = (
-        agree & has_partner & (forth >= lowest) & (forth - shift > 0) & (valid[0] > 0) & (valid[1][rows, partner] > 0)
+        agree
+        & has_partner
+        & (forth >= lowest)
+        & (forth - shift > 0)
+        & (valid[0] > 0)
+        & (valid[1][rows, partner] > 0)
     )
     depth = product / (forth[mask] - shift)
     x = columns[mask] + 0.5 + rig.corners[0]
     y = rows[mask] + 0.5 + rig.corners[2]
-    points = np.stack([x * depth / rig.focal, y * depth / rig.focal, depth], axis=1) @ rig.axes + a.camera.position
+    points = (
+        np.stack([x * depth / rig.focal, y * depth / rig.focal, depth], axis=1) @ rig.axes
+        + a.camera.position
+    )
     return np.concatenate([points, left[mask] / 255.0], axis=1)
 
 
 def _disparity(left: np.ndarray, right: np.ndarray, lowest: int, count: int) -> np.ndarray:
-    """Return the disparity of each pixel of the left image [H, W], px, below `lowest` where there is none."""
+    """Return the disparity of each pixel of the left image [H, W], px, below `lowest` where there
+    is none.
+    """
     # OpenCV leaves out the columns with partners that may lie outside the image.
     pad = count + abs(lowest) + _BLOCK
-    wide = [cv2.copyMakeBorder(image, 0, 0, pad, pad, cv2.BORDER_CONSTANT) for image in (left, right)]
+    wide = [
+        cv2.copyMakeBorder(image, 0, 0, pad, pad, cv2.BORDER_CONSTANT) for image in (left, right)
+    ]
     area = 3 * _BLOCK**2
     matcher = cv2.StereoSGBM.create(
         minDisparity=lowest,
@@ -206,7 +253,9 @@ def _disparity(left: np.ndarray, right: np.ndarray, lowest: int, count: int) -> 
 
 
 def _some_confirmed(points: np.ndarray, others: Sequence[_View]) -> np.ndarray:
-    """Return the first points [at most `_POINTS`, 6] that other views confirm; all count if there are none."""
+    """Return the first points [at most `_POINTS`, 6] that other views confirm; all count if there
+    are none.
+    """
     if not others:
         return points[:_POINTS]
     parts = []
@@ -221,7 +270,9 @@ def _some_confirmed(points: np.ndarray, others: Sequence[_View]) -> np.ndarray:
 
 
 def _confirmed(points: np.ndarray, others: Sequence[_View]) -> np.ndarray:
-    """Return the mask of points with colours [P, 6] that have their colour in a valid pixel of another view."""
+    """Return the mask of points with colours [P, 6] that have their colour in a valid pixel of
+    another view.
+    """
     confirmed = np.zeros(len(points), bool)
     for view in others:
         visible, pixels, _ = seen_points(view.camera, points[:, :3])

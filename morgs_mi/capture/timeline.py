@@ -6,10 +6,10 @@ An instant t = 0, 1, ... is a frame of the recording. It is shown by frame k of 
 
 Folders of images have an o and r by the numbers of their images, too (see `image_numbers`).
 
-In a clip of variable frame rate, k is a position on its regular clock, and the nearest frame shows the instant. If o is
-not whole, the clip has no frame of the instant. With a whole r, the nearest frame is used unchanged: it is always later
-by the same time, the camera's delay (see `Camera`). Otherwise an image is interpolated between two frames (see
-`interpolation`).
+In a clip of variable frame rate, k is a position on its regular clock, and the nearest frame shows
+the instant. If o is not whole, the clip has no frame of the instant. With a whole r, the nearest
+frame is used unchanged: it is always later by the same time, the camera's delay (see `Camera`).
+Otherwise an image is interpolated between two frames (see `interpolation`).
 """
 
 from __future__ import annotations
@@ -30,7 +30,11 @@ from morgs_mi.io.video import FrameReader
 
 _LOG = logging.getLogger(__name__)
 _DEFAULT_FPS = 30.0
-_INTERVALS = {"fps": "[1e-6, 1e6]", "meters_per_unit": "[1e-12, 1e12]", "display_exposure": "[-100, 100]"}
+_INTERVALS = {
+    "fps": "[1e-6, 1e6]",
+    "meters_per_unit": "[1e-12, 1e12]",
+    "display_exposure": "[-100, 100]",
+}
 _SETTINGS = {*_INTERVALS, "test_view", "readout"}
 # Distance in frames up to which a frame shows an instant.
 _NEAR = 0.5
@@ -38,31 +42,34 @@ _NEAR = 0.5
 
 @dataclass(frozen=True)
 class ReadConfig:
-    """How a capture is read: clips that do not match, which are refused by default, and near planes."""
+    """How a capture is read: clips that do not match, which are refused by default, and near
+    planes.
+    """
 
     trim: bool = False
     """Whether to use only the instants that all clips cover, at the lowest of their frame rates."""
     offset: dict[str, float] = field(default_factory=dict)
-    """Frame of each listed camera's clip that is simultaneous with frame 0 of the others; negative for a clip that
-    started later. Instants that not all clips cover are left out, as with trim. If it is not whole, the nearest frames
-    are used, and `Camera.delay` is the rest; only the first images are interpolated between two frames."""
+    """Frame of each listed camera's clip that is simultaneous with frame 0 of the others; negative
+    for a clip that started later. Instants that not all clips cover are left out, as with trim. If
+    it is not whole, the nearest frames are used, and `Camera.delay` is the rest; only the first
+    images are interpolated between two frames."""
     gaps: bool = False
     """Whether images may be missing; a camera is left out of the frames that it lacks."""
     color: str = "none"
-    """Method that matches each camera's colours to a reference camera: linear, a matrix in linear light which is fitted
-    to points that both see, or none. linear:cam03 also names the reference camera; by default it is the one that shares
-    most points with the others."""
+    """Method that matches each camera's colours to a reference camera: linear, a matrix in linear
+    light which is fitted to points that both see, or none. linear:cam03 also names the reference
+    camera; by default it is the one that shares most points with the others."""
     without: tuple[str, ...] = ()
     """Names of the cameras that are left out."""
     near: float | None = None
-    """Depth of the cameras' near planes, world units; None: a fifth of the smallest reliable depth (see
-    `with_near_planes`)."""
+    """Depth of the cameras' near planes, world units; None: a fifth of the smallest reliable depth
+    (see `with_near_planes`)."""
 
     def __post_init__(self) -> None:
         if isinstance(self.color, str) and self.color.partition(":")[0] not in ("none", "linear"):
             raise ValueError(
-                f"ReadConfig(): `color` must be none, linear, or linear with a camera, such as linear:cam00, got "
-                f"{self.color!r}."
+                "ReadConfig(): `color` must be none, linear, or linear with a camera, such as "
+                f"linear:cam00, got {self.color!r}."
             )
 
     @property
@@ -76,7 +83,8 @@ class ClipTimes:
     """Frames of one clip that show the instants of the recording."""
 
     frame_indices: np.ndarray  #: The clip's frames in ascending order, -1 for none, int [T].
-    #: Share of the time to the next frame that has passed at each instant [T]; None: no image is interpolated.
+    #: Share of the time to the next frame that has passed at each instant [T]; None: no image is
+    #: interpolated.
     shares: np.ndarray | None
     delay: float  #: Time from an instant to the frame that shows it, in frames of the clip.
     rate: float  #: Frames of the clip per instant.
@@ -89,7 +97,8 @@ class Timeline:
     clips: tuple[ClipTimes, ...]  #: Of each camera's clip.
     fps: float  #: Instants per second.
     unchanged: bool  #: Whether instant t is frame t of every clip.
-    notes: tuple[str, ...] = ()  #: A sentence for each clip of variable frame rate, and on the numbers of images.
+    #: A sentence for each clip of variable frame rate, and on the numbers of images.
+    notes: tuple[str, ...] = ()
 
 
 def timeline(
@@ -111,11 +120,14 @@ def timeline(
         fps: actual frame rate of all clips, or None for the rates in their headers.
 
     Raises:
-        ValueError: lengths or rates differ or a rate varies and `config` does not resolve it, a clip is cut off, the
-            clips have no instant in common, or `config` names an unknown camera or has an offset that is not finite.
+        ValueError: lengths or rates differ or a rate varies and `config` does not resolve it, a
+            clip is cut off, the clips have no instant in common, or `config` names an unknown
+            camera or has an offset that is not finite.
     """
     if unknown := [name for name in config.offset if name not in names]:
-        raise ValueError(f"{path}: `offset` must name cameras of {', '.join(names)}, got {', '.join(unknown)}.")
+        raise ValueError(
+            f"{path}: `offset` must name cameras of {', '.join(names)}, got {', '.join(unknown)}."
+        )
     for name, offset in config.offset.items():
         check_number(str(path), f"offset of {name}", offset, "(-inf, inf)")
     numbers = align_numbers(path, names, readers, config.trim, config.offset)
@@ -130,15 +142,24 @@ def timeline(
         clocks = replace(exact, rates=np.ones(len(readers)))
         _check_rates(path, readers, exact, instants)
     positions = clocks.offsets[:, None] + clocks.rates[:, None] * instants
-    indices = [nearest_frames(reader, places) for reader, places in zip(readers, positions, strict=True)]
-    image_places = np.array([_positions(reader, index) for reader, index in zip(readers, indices, strict=True)])
+    indices = [
+        nearest_frames(reader, places) for reader, places in zip(readers, positions, strict=True)
+    ]
+    image_places = np.array(
+        [_positions(reader, index) for reader, index in zip(readers, indices, strict=True)]
+    )
     shares: list[np.ndarray | None] = [None] * len(readers)
     delays = [0.0] * len(readers)
     for c, (name, reader) in enumerate(zip(names, readers, strict=True)):
-        if reader.positions is not None or reader.num_frames < 2 or config.offset.get(name, 0) % 1 == 0:
+        if (
+            reader.positions is not None
+            or reader.num_frames < 2
+            or config.offset.get(name, 0) % 1 == 0
+        ):
             continue
         if clocks.rates[c] % 1 == 0:
-            delays[c] = float(np.floor(positions[c][0] + 0.5) - positions[c][0])  # the same for all of its frames
+            # The same for all of its frames.
+            delays[c] = float(np.floor(positions[c][0] + 0.5) - positions[c][0])
             indices[c] = np.rint(positions[c] + delays[c]).astype(int)
             image_places[c] = indices[c] - delays[c]
         else:
@@ -148,16 +169,22 @@ def timeline(
     if config.gaps:
         far = np.abs(image_places - positions) > _NEAR
         indices = list(np.where(far, -1, indices))
-    _warn_apart(path, (image_places - exact.offsets[:, None]) / exact.rates[:, None], indices, exact.fps)
+    _warn_apart(
+        path, (image_places - exact.offsets[:, None]) / exact.rates[:, None], indices, exact.fps
+    )
     unchanged = all(np.array_equal(index, np.arange(len(instants))) for index in indices)
     unchanged = unchanged and not any(config.offset.values())
-    notes = tuple(_note(r, k) for r, k in zip(readers, indices, strict=True) if r.positions is not None)
+    notes = tuple(
+        _note(r, k) for r, k in zip(readers, indices, strict=True) if r.positions is not None
+    )
     clips = tuple(map(ClipTimes, indices, shares, delays, clocks.rates.tolist()))
     return Timeline(clips, clocks.fps, unchanged, (*numbers.notes, *notes))
 
 
 def _warn_apart(path: Path, times: np.ndarray, indices: Sequence[np.ndarray], fps: float) -> None:
-    """Warn if images of one instant are apart; `times` [C, T] are theirs in instants, where `indices` are not -1."""
+    """Warn if images of one instant are apart; `times` [C, T] are theirs in instants, where
+    `indices` are not -1.
+    """
     times = np.where(np.stack(indices) < 0, np.nan, times)
     images = times[:, np.isfinite(times).any(0)]
     if not images.size:
@@ -169,7 +196,9 @@ def _warn_apart(path: Path, times: np.ndarray, indices: Sequence[np.ndarray], fp
 
 @dataclass(frozen=True)
 class _Clocks:
-    """Offset o and rate r of every clip [C], and the number of instants per second (see the module's docstring)."""
+    """Offset o and rate r of every clip [C], and the number of instants per second (see the
+    module's docstring).
+    """
 
     offsets: np.ndarray
     rates: np.ndarray
@@ -183,20 +212,34 @@ def _clocks(
     fps: float | None,
     numbers: ImageNumbers,
 ) -> _Clocks:
-    """Return the clocks of the clips by their offsets, their frame rates and the numbers of their images."""
+    """Return the clocks of the clips by their offsets, their frame rates and the numbers of their
+    images.
+    """
     clip_fps = [fps or reader.fps for reader in readers]
     lowest = min((rate for rate in clip_fps if rate), default=fps or _DEFAULT_FPS)
     rates = np.array([(rate or lowest) / lowest for rate in clip_fps])
-    offsets = [_position(r, config.offset.get(name, 0)) for name, r in zip(names, readers, strict=True)]
-    return _Clocks(np.array(offsets, float) + numbers.offsets * rates, rates * numbers.rates, lowest / numbers.interval)
+    offsets = [
+        _position(r, config.offset.get(name, 0)) for name, r in zip(names, readers, strict=True)
+    ]
+    return _Clocks(
+        np.array(offsets, float) + numbers.offsets * rates,
+        rates * numbers.rates,
+        lowest / numbers.interval,
+    )
 
 
-def _without_drift(clocks: _Clocks, readers: Sequence[FrameReader], max_frames: int | None) -> _Clocks:
-    """Return the clocks with a whole rate r for each clip that differs from it by less than half a frame in the end.
+def _without_drift(
+    clocks: _Clocks, readers: Sequence[FrameReader], max_frames: int | None
+) -> _Clocks:
+    """Return the clocks with a whole rate r for each clip that differs from it by less than half a
+    frame in the end.
 
-    Programs write 29.97 or 30 fps for the same camera. The distance of the frames from an instant is then constant.
+    Programs write 29.97 or 30 fps for the same camera. The distance of the frames from an instant
+    is then constant.
     """
-    periods = min(_periods(reader) / rate for reader, rate in zip(readers, clocks.rates, strict=True))
+    periods = min(
+        _periods(reader) / rate for reader, rate in zip(readers, clocks.rates, strict=True)
+    )
     whole = np.maximum(1, np.rint(clocks.rates))
     drift = np.abs(whole - clocks.rates) * (min(periods, max_frames or periods) - 1)
     return replace(clocks, rates=np.where(drift < _NEAR, whole, clocks.rates))
@@ -224,7 +267,7 @@ def _common_instants(
 
 
 def _position(reader: FrameReader, offset: float) -> float:
-    """Return the position of a frame of a clip, which may lie before its first or after its last."""
+    """Return the position of a frame of a clip, before its first or after its last one, too."""
     if reader.positions is None:
         return offset
     index = round(offset)
@@ -253,19 +296,23 @@ def _note(reader: FrameReader, indices: np.ndarray) -> str:
     frames = indices[indices >= 0]
     repeats = len(frames) - len(np.unique(frames))
     return (
-        f"{reader.path.name}: variable frame rate, {len(reader.positions)} frames in {_periods(reader)} periods "
-        f"of {1e3 / reader.fps:.1f} ms, up to {1e3 * late:.1f} ms off; each instant has the frame nearest in time: "
-        f"{repeats} repeat one, {missing} have none."
+        f"{reader.path.name}: variable frame rate, {len(reader.positions)} frames in "
+        f"{_periods(reader)} periods of {1e3 / reader.fps:.1f} ms, up to {1e3 * late:.1f} ms off; "
+        f"each instant has the frame nearest in time: {repeats} repeat one, {missing} have none."
     )
 
 
 def _periods(reader: FrameReader) -> int:
-    """Return the number of positions that a clip covers: its number of frames if their rate is constant."""
+    """Return the number of positions that a clip covers: its number of frames if their rate is
+    constant.
+    """
     return reader.num_frames if reader.positions is None else round(reader.positions[-1]) + 1
 
 
 def _usable_periods(reader: FrameReader, config: ReadConfig) -> int:
-    """Return the number of positions that can be read; a truncated clip can be trimmed but not shifted."""
+    """Return the number of positions that can be read; a truncated clip can be trimmed but not
+    shifted.
+    """
     if not config.gaps:
         if not config.trim:
             _check_complete(reader, reader.num_frames)
@@ -278,9 +325,10 @@ def _check_complete(reader: FrameReader, required: int) -> None:
     """Check that the first `required` frames of a clip can be read."""
     if required > reader.num_held:
         raise ValueError(
-            f"{reader.path}: frame {reader.num_held} of {reader.num_frames} cannot be read: the file is truncated or "
-            f"broken; copy it again, use the first {reader.num_held} frames (`max_frames`), or leave its camera out, "
-            "of the later frames (--gaps) or of all (--without)."
+            f"{reader.path}: frame {reader.num_held} of {reader.num_frames} cannot be read: the "
+            f"file is truncated or broken; copy it again, use the first {reader.num_held} frames "
+            "(`max_frames`), or leave its camera out, of the later frames (--gaps) or of all "
+            "(--without)."
         )
 
 
@@ -294,12 +342,15 @@ def _check_even(reader: FrameReader, required: int) -> None:
         assert reader.fps
         raise ValueError(
             f"{reader.path}: expected a constant frame rate, got a variable one: frame {frame} is "
-            f"{1e3 * abs(late[frame]) / reader.fps:.0f} ms {'late' if late[frame] > 0 else 'early'}; use the frames "
-            "nearest in time (--trim), leave the camera out where it has none (--gaps), or convert the clip."
+            f"{1e3 * abs(late[frame]) / reader.fps:.0f} ms "
+            f"{'late' if late[frame] > 0 else 'early'}; use the frames nearest in time (--trim), "
+            "leave the camera out where it has none (--gaps), or convert the clip."
         )
 
 
-def _num_frames(path: Path, readers: Sequence[FrameReader], max_frames: int | None, gaps: bool) -> int:
+def _num_frames(
+    path: Path, readers: Sequence[FrameReader], max_frames: int | None, gaps: bool
+) -> int:
     if gaps:
         longest = max(_periods(reader) for reader in readers)
         return min(longest, max_frames or longest)
@@ -314,30 +365,36 @@ def _num_frames(path: Path, readers: Sequence[FrameReader], max_frames: int | No
     if shortest < max(lengths):
         table = ", ".join(f"{r.path.name} {n}" for r, n in zip(readers, lengths, strict=True))
         raise ValueError(
-            f"{path}: all cameras must have the same number of frames, got {table}; use the first frames with "
-            f"`max_frames={shortest}`, the instants that all clips cover with --trim, align the clips with --offset, "
-            "or leave cameras out with --without."
+            f"{path}: all cameras must have the same number of frames, got {table}; use the first "
+            f"frames with `max_frames={shortest}`, the instants that all clips cover with --trim, "
+            "align the clips with --offset, or leave cameras out with --without."
         )
     return shortest
 
 
-def _check_rates(path: Path, readers: Sequence[FrameReader], clocks: _Clocks, instants: np.ndarray) -> None:
-    """Check that frames with the same index are simultaneous, for `instants` of clips with equal offsets."""
+def _check_rates(
+    path: Path, readers: Sequence[FrameReader], clocks: _Clocks, instants: np.ndarray
+) -> None:
+    """Check that frames with the same index are simultaneous, for `instants` of clips with equal
+    offsets.
+    """
     drift = (clocks.rates.max() - clocks.rates.min()) * (len(instants) - 1)
     if drift > _NEAR:
         table = ", ".join(f"{r.path.name} {r.fps:.6g}" for r in readers if r.fps)
         raise ValueError(
-            f"{path}: all cameras must have the same frame rate, got {table}; images of one index are up to "
-            f"{drift:.1f} frames apart; use the lowest rate with --trim, or set the true one as `fps` in capture.json."
+            f"{path}: all cameras must have the same frame rate, got {table}; images of one index "
+            f"are up to {drift:.1f} frames apart; use the lowest rate with --trim, or set the "
+            "true one as `fps` in capture.json."
         )
 
 
 def read_settings(path: Path) -> dict[str, Any]:
     """Return the settings in a capture's `capture.json`, or {} without such a file.
 
-    They are ``fps``, ``test_view``, ``meters_per_unit``, the length of a world unit in metres, and ``readout``, the
-    frames from the exposure of an image's first row to the exposure of its last row: a number for all cameras, or an
-    object with the numbers that are not 0, by the cameras' names; and ``display_exposure`` in stops, see `Capture`.
+    They are ``fps``, ``test_view``, ``meters_per_unit``, the length of a world unit in metres, and
+    ``readout``, the frames from the exposure of an image's first row to the exposure of its last
+    row: a number for all cameras, or an object with the numbers that are not 0, by the cameras'
+    names; and ``display_exposure`` in stops, see `Capture`.
 
     Raises:
         ValueError: the file is not a JSON object, or a setting is not valid.
@@ -346,7 +403,9 @@ def read_settings(path: Path) -> dict[str, Any]:
         return {}
     settings = read_json(path)
     if not isinstance(settings, dict):
-        raise ValueError(f"{path}: expected a JSON object, got {type(settings).__name__}; correct it.")
+        raise ValueError(
+            f"{path}: expected a JSON object, got {type(settings).__name__}; correct it."
+        )
     if "scene" not in settings:  # a synthetic capture describes itself
         warn_unread(path, settings.keys() - _SETTINGS)
     view = settings.get("test_view")
@@ -359,6 +418,7 @@ def read_settings(path: Path) -> dict[str, Any]:
     indices = view if isinstance(view, list) else [view]
     if view is not None and any(type(index) is not int for index in indices):
         raise ValueError(
-            f"{path}: `test_view` must be a camera's index, a list of them, or null, got {view!r}; correct it."
+            f"{path}: `test_view` must be a camera's index, a list of them, or null, got "
+            f"{view!r}; correct it."
         )
     return settings

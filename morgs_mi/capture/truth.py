@@ -1,6 +1,8 @@
-"""Ground truth of a capture: exact motion, depth and masks of its frames, and tracks of surface points.
+"""Ground truth of a capture: exact motion, depth and masks of its frames, and tracks of surface
+points.
 
-On disk: ``truth/cam00/0000.exr`` has one camera's frame, ``truth/tracks.npz`` the trajectories of the clip.
+On disk: ``truth/cam00/0000.exr`` has one camera's frame, ``truth/tracks.npz`` the trajectories of
+the clip.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ class GroundTruth:
         motion: x_t - x_{t-1} in pixels [H, W, 2]; zero in frame 0.
         depth: along the camera's z axis, world units [H, W]; 0 where there is no surface.
         ids: object id [H, W], int32; -1 where there is no surface.
-        mask: whether the surface point moved in the world since t-1 (in frame 0: until frame 1) [H, W], bool.
+        mask: whether the surface point moved in the world since t-1 (in frame 0: until frame 1)
+            [H, W], bool.
     """
 
     motion: np.ndarray
@@ -40,7 +43,8 @@ class Tracks:
     Attributes:
         points: positions at each frame [P, T, 3], world units.
         ids: object id of each point [P], int32.
-        visible: by camera name, whether the camera sees each point at each frame [P, T], bool; empty if unknown.
+        visible: by camera name, whether the camera sees each point at each frame [P, T], bool;
+            empty if unknown.
     """
 
     points: np.ndarray
@@ -78,7 +82,10 @@ def load_truth(folder: str | Path, camera: str, frame: int) -> GroundTruth:
     channels = read_exr(path)
     missing = {"motion.X", "motion.Y", "depth.Y", "id.Y", "mask.Y"} - set(channels)
     if missing:
-        raise ValueError(f"load_truth(): {path} lacks the channels {sorted(missing)}; synthesise the capture again.")
+        raise ValueError(
+            f"load_truth(): {path} lacks the channels {sorted(missing)}; synthesise the capture "
+            "again."
+        )
     return GroundTruth(
         np.stack([channels["motion.X"], channels["motion.Y"]], axis=-1),
         channels["depth.Y"],

@@ -1,10 +1,11 @@
 """Command line, the package's only argument parser.
 
-`morgs-mi synth`, `info`, `calibrate`, `fit`, `live`, `render`, `export`, `import`, `view`, `eval`, `sweep` and `demo`.
+`morgs-mi synth`, `info`, `calibrate`, `fit`, `live`, `render`, `export`, `import`, `view`, `eval`,
+`sweep` and `demo`.
 
-Results go to standard output; progress, warnings and errors to standard error. An error that the user can correct is
-one sentence and exit status 1, an interruption by Ctrl-C or SIGTERM is status 130; `--debug` adds the traceback.
-Arguments that the parser rejects give status 2.
+Results go to standard output; progress, warnings and errors to standard error. An error that the
+user can correct is one sentence and exit status 1, an interruption by Ctrl-C or SIGTERM is status
+130; `--debug` adds the traceback. Arguments that the parser rejects give status 2.
 """
 
 from __future__ import annotations
@@ -24,7 +25,14 @@ from typing import Annotated, Any, ClassVar, Literal
 import tyro
 from tyro.conf import arg
 
-from morgs_mi.cli.console import ERR, LogHandler, naming_output, print_result, print_warning, sentence_of
+from morgs_mi.cli.console import (
+    ERR,
+    LogHandler,
+    naming_output,
+    print_result,
+    print_warning,
+    sentence_of,
+)
 from morgs_mi.cli.settings import Flag, Settings
 from morgs_mi.cli.suggestion import one_command, suggesting_command
 from morgs_mi.core.entries import place_of
@@ -54,17 +62,23 @@ COMMANDS: Mapping[str, type] = {
 class Common:
     """Options of every command."""
 
-    variant: Annotated[Literal["llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb"], arg(metavar="NAME")] = "llvm_ad_rgb"
-    """Mitsuba variant: llvm_ad_rgb for any processor, cuda_ad_rgb for an NVIDIA GPU, metal_ad_rgb for a Mac's."""
+    variant: Annotated[
+        Literal["llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb"], arg(metavar="NAME")
+    ] = "llvm_ad_rgb"
+    """Mitsuba variant: llvm_ad_rgb for any processor, cuda_ad_rgb for an NVIDIA GPU, metal_ad_rgb
+    for a Mac's.
+    """
     debug: Flag = False
     """Print tracebacks and debug messages."""
 
 
 @dataclass(frozen=True)
 class Options(Common):
-    """Dynamic Gaussian splatting in Mitsuba 3: from a multi-view clip to a stream of moving Gaussians.
+    """Dynamic Gaussian splatting in Mitsuba 3: from a multi-view clip to a stream of moving
+    Gaussians.
 
-    Alone, --version prints the version, and --tyro-write-completion bash FILE writes the completion of a shell.
+    Alone, --version prints the version, and --tyro-write-completion bash FILE writes the completion
+    of a shell.
     """
 
     commands: ClassVar[Mapping[str, type]] = COMMANDS
@@ -80,7 +94,8 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
     """Parse `args` into options with a `command`, run the command, and return the exit status."""
     args = sys.argv[1:] if args is None else list(args)
     command: Any = None
-    if isinstance(sys.stdout, TextIOWrapper):  # a character that the encoding does not have is printed as a code
+    # A character that the encoding does not have is printed as a code.
+    if isinstance(sys.stdout, TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         if options_type is Options and args == ["--version"]:
@@ -100,9 +115,14 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
     except (KeyboardInterrupt, Exception) as error:
         interrupted = is_interruption(error)
         place = str(getattr(command, "capture", None) or "")
-        sentence = "Interrupted." if interrupted else sentence_of(error, _option_names(command), place)
+        sentence = (
+            "Interrupted." if interrupted else sentence_of(error, _option_names(command), place)
+        )
         command_line = shlex.join([prog, *args, *([] if "--resume" in args else ["--resume"])])
-        notes = [note.replace("`--resume`", f"`{command_line}`") for note in getattr(error, "__notes__", [])]
+        notes = [
+            note.replace("`--resume`", f"`{command_line}`")
+            for note in getattr(error, "__notes__", [])
+        ]
         print_warning(" ".join([sentence, *notes]))
         # The error may come from parsing, before `options` exist.
         if "--debug" in args:
@@ -126,7 +146,9 @@ def _parse(options_type: type[Common], prog: str, args: Sequence[str]) -> Any:
 
 
 def _drop_output() -> None:
-    """Discard what could not be written to a full or closed standard output; Python would fail again at its end."""
+    """Discard what could not be written to a full or closed standard output; Python would fail
+    again at its end.
+    """
     try:
         sys.stdout.flush()
     except OSError:
@@ -156,4 +178,6 @@ def _set_up(options: Common) -> None:
     try:
         mi.set_variant(options.variant)
     except ImportError as error:
-        raise ValueError(f"--variant {options.variant} cannot be used here ({error}); try llvm_ad_rgb.") from error
+        raise ValueError(
+            f"--variant {options.variant} cannot be used here ({error}); try llvm_ad_rgb."
+        ) from error

@@ -12,7 +12,14 @@ from typing import Any
 
 from rich.console import Console
 from rich.measure import Measurement
-from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 from rich.text import Text
 
@@ -20,7 +27,9 @@ from morgs_mi.core.progress import Report
 
 
 def printable(text: str) -> str:
-    r"""Return a text with its control characters as ``\u001b``: names in a file may hold escape sequences."""
+    r"""Return a text with its control characters as ``\u001b``: names in a file may hold escape
+    sequences.
+    """
     return "".join(c if c == "\n" or c.isprintable() else _escaped(c) for c in text)
 
 
@@ -33,7 +42,8 @@ class _Console(Console):
     """Console that prints texts and the cells of tables as they are, but no control characters."""
 
     def __init__(self, **options: Any) -> None:
-        # Rich would wrap paths and sentences at 80 columns without a terminal, and turn `:100:` into an emoji.
+        # Rich would wrap paths and sentences at 80 columns without a terminal, and turn `:100:`
+        # into an emoji.
         super().__init__(markup=False, highlight=False, emoji=False, **options)
 
     def render_str(self, text: str, **options: Any) -> Text:
@@ -69,7 +79,9 @@ def print_result(text: str) -> None:
 
 
 def print_table(table: Table) -> None:
-    """Print to standard output with complete columns, even where the terminal is narrower than the table."""
+    """Print to standard output with complete columns, even where the terminal is narrower than the
+    table.
+    """
     table_width = Measurement.get(OUT, OUT.options.update(max_width=10_000), table).maximum
     with naming_output():
         _Console(width=max(OUT.width, table_width)).print(table)
@@ -89,7 +101,8 @@ class LogHandler(logging.Handler):
 
 
 def sentence_of(error: BaseException, names: Mapping[str, str], place: str = "") -> str:
-    """Return the message of an error in one line, with the options `names`, and without the number of a system error.
+    """Return the message of an error in one line, with the options `names`, and without the number
+    of a system error.
 
     Arguments are those of `with_option_names`.
     """
@@ -98,7 +111,10 @@ def sentence_of(error: BaseException, names: Mapping[str, str], place: str = "")
         text = f"{f'{error.filename}: ' if error.filename else ''}{error.strerror.rstrip('.')}."
     text = with_option_names(" ".join(text.split()), names, place)
     if not isinstance(error, _EXPECTED):
-        text = f"Unexpected {type(error).__name__}: {text.rstrip('.')}; run the command with --debug for the traceback."
+        text = (
+            f"Unexpected {type(error).__name__}: {text.rstrip('.')}; run the command with --debug "
+            "for the traceback."
+        )
     if isinstance(error, OSError):  # it is about a file; the function is of no use to a user
         text = re.sub(r"^cannot", "Cannot", re.sub(r"^[\w.]+\(\): ", "", text))
     if isinstance(error, MemoryError):
@@ -109,9 +125,10 @@ def sentence_of(error: BaseException, names: Mapping[str, str], place: str = "")
 def with_option_names(sentence: str, names: Mapping[str, str], place: str = "") -> str:
     """Return an error message with command-line options in place of Python arguments.
 
-    ``load_capture(): `downscale` must be ...`` becomes ``--downscale must be ...``, and ```max_frames=3``` becomes
-    ``--frames 3``. A message is changed only if it starts with a function or with a file of `place` and names one of
-    the arguments; in a JSON or TOML file the same name is a key.
+    ``load_capture(): `downscale` must be ...`` becomes ``--downscale must be ...``, and
+    ```max_frames=3``` becomes ``--frames 3``. A message is changed only if it starts with a
+    function or with a file of `place` and names one of the arguments; in a JSON or TOML file the
+    same name is a key.
 
     Args:
         sentence: the message.
@@ -119,7 +136,11 @@ def with_option_names(sentence: str, names: Mapping[str, str], place: str = "") 
         place: a path from the command line that a message may start with; it stays.
     """
     function = re.match(r"[\w.]+\(\): ", sentence)
-    start = function or (re.match(rf"{re.escape(place)}(?:/.*?)?(?<!\.json)(?<!\.toml): ", sentence) if place else None)
+    start = function or (
+        re.match(rf"{re.escape(place)}(?:/.*?)?(?<!\.json)(?<!\.toml): ", sentence)
+        if place
+        else None
+    )
     if start is None:
         return sentence
     text = sentence[start.end() :]
@@ -176,7 +197,11 @@ def _line_report() -> Report:
         start, base = begin[stage]
         last = moment
         seconds = moment - start
-        estimate = f", about {_clock(seconds * (total - done) / (done - base))} left" if done > base else ""
+        estimate = (
+            f", about {_clock(seconds * (total - done) / (done - base))} left"
+            if done > base
+            else ""
+        )
         print_warning(f"{stage}: {int(done)}/{total:.0f}, {_clock(seconds)} elapsed{estimate}.")
 
     return report

@@ -31,9 +31,13 @@ class Eval:
     json: Annotated[Path | None, DisallowNone, optional("FILE.json")] = None
     """File for all results; - prints them instead of the tables."""
     figures: Annotated[Path | None, DisallowNone, optional("FOLDER")] = None
-    """Folder for slice.png (one column over time), motion.png, confidence.png, and offset.png if it is stored."""
+    """Folder for slice.png (one column over time), motion.png, confidence.png, and offset.png if it
+    is stored.
+    """
     lpips: Annotated[Path | None, DisallowNone, optional("FILE.onnx")] = None
-    """LPIPS network as ONNX with inputs in0 and in1, RGB [1, 3, H, W] from -1 to 1; the package includes none."""
+    """LPIPS network as ONNX with inputs in0 and in1, RGB [1, 3, H, W] from -1 to 1; the package
+    includes none.
+    """
 
     def run(self) -> None:
         from morgs_mi.core.entries import studio_entry
@@ -45,7 +49,9 @@ class Eval:
         for output in (self.figures, self.json):
             if output not in (None, Path("-")):
                 _check_not_of_fit(self.out, check_output(output))
-        network = None if self.lpips is None else studio_entry("image distances", "lpips")(self.lpips)
+        network = (
+            None if self.lpips is None else studio_entry("image distances", "lpips")(self.lpips)
+        )
         with progress() as report:
             frames = partial(report, "Evaluating frames")
             result = evaluate_stream(self.out, self.capture, frames, network, self.any_recording)
@@ -65,10 +71,12 @@ class Eval:
 
 
 def _check_not_of_fit(out: Path, output: Path) -> None:
-    """Raise `ValueError` if an output would replace a file that a fit has written and still needs."""
+    """Raise `ValueError` if an output would replace a file that a fit needs."""
     folder = out if out.is_dir() else out.parent
     if output.resolve() in [path.resolve() for path in (out, *(folder / name for name in FILES))]:
-        raise ValueError(f"{output}: expected a new file, got one that the fit has written; choose another name.")
+        raise ValueError(
+            f"{output}: expected a new file, got one that the fit has written; choose another name."
+        )
 
 
 def _print_evaluation(result: Evaluation) -> None:
@@ -78,4 +86,7 @@ def _print_evaluation(result: Evaluation) -> None:
     for sentence in evaluation_summary(result):
         print_result(sentence)
     if not result.complete:
-        print_warning(f"{result.stream}: the fit was not finished, its stream holds {result.num_frames} frames.")
+        print_warning(
+            f"{result.stream}: the fit was not finished, its stream holds {result.num_frames} "
+            "frames."
+        )

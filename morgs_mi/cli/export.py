@@ -23,18 +23,27 @@ if TYPE_CHECKING:
     from morgs_mi.codec.frame_source import FrameSource
 
 _PATH = (
-    f"Camera path: between (through the rig's cameras), orbit (around the scene), or a JSON file ({page('exports')})."
+    "Camera path: between (through the rig's cameras), orbit (around the scene), or a JSON file "
+    f"({page('exports')})."
 )
 
 
 @dataclass(frozen=True)
 class Ply(ExportKind):
-    """Write a PLY file per frame, in the layout of 3D Gaussian Splatting or compressed, in the capture's axes."""
+    """Write a PLY file per frame, in the layout of 3D Gaussian Splatting or compressed, in the
+    capture's axes.
+    """
 
     output: Annotated[Positional[Path | None], DisallowNone, place("FOLDER")] = None
-    """New folder for 0000.ply, ..., or FILE.ply for one frame; by default OUT/ply or OUT/compressed-ply."""
-    format: Annotated[str | None, DisallowNone, optional("NAME"), one_of(tuple(f.name for f in PLY))] = None
-    """Format: ply, or compressed.ply, PlayCanvas' layout, whose sequence SuperSplat plays. By default by the name."""
+    """New folder for 0000.ply, ..., or FILE.ply for one frame; by default OUT/ply or
+    OUT/compressed-ply.
+    """
+    format: Annotated[
+        str | None, DisallowNone, optional("NAME"), one_of(tuple(f.name for f in PLY))
+    ] = None
+    """Format: ply, or compressed.ply, PlayCanvas' layout, whose sequence SuperSplat plays. By
+    default by the name.
+    """
     frames: Annotated[str | None, DisallowNone, FRAMES] = None
 
     formats = PLY
@@ -46,7 +55,11 @@ class Ply(ExportKind):
         from morgs_mi.playback.export.clips import select_frames, write_each
         from morgs_mi.playback.export.order import by_place
 
-        clip, write = (by_place, write_compressed_ply) if chosen.name == "compressed.ply" else (play, write_ply)
+        clip, write = (
+            (by_place, write_compressed_ply)
+            if chosen.name == "compressed.ply"
+            else (play, write_ply)
+        )
         frames = select_frames(stream, self.frames)
         write_each(clip(stream), output, chosen.ending, write, frames, partial(report, "Writing"))
         return f"{len(frames)} PLY {'file' if len(frames) == 1 else 'files'}"
@@ -60,13 +73,18 @@ class Flight(ExportKind):
     """File for the video; by default OUT/PATH.mp4, e.g. OUT/orbit.mp4."""
     path: Annotated[str, arg(help=_PATH)] = "between"
     seconds: Annotated[float | None, DisallowNone, optional("FLOAT")] = None
-    """Duration in seconds; by default that of the JSON file, or that of the clip, repeated to LEAST_SECONDS."""
+    """Duration in seconds; by default that of the JSON file, or that of the clip, repeated to
+    LEAST_SECONDS.
+    """
     least_seconds: float = 5.0
-    """Least duration without SECONDS; a shorter clip is played several times, as a whole. 0: once."""
+    """Least duration without SECONDS; a shorter clip is played several times, as a whole. 0: once.
+    """
     back_and_forth: Flag = False
     """Play every second time backwards, instead of restarting at the first frame."""
     degrees: Annotated[float | None, DisallowNone, optional("FLOAT")] = None
-    """Angle of an orbit, 1 to 360; below 360 the camera swings to both sides. By default the extent of the rig."""
+    """Angle of an orbit, 1 to 360; below 360 the camera swings to both sides. By default the extent
+    of the rig.
+    """
     freeze: Annotated[int | None, DisallowNone, optional("FRAME")] = None
     """Frame at which time stands still; by default the clip plays and repeats."""
     width: Annotated[int | None, DisallowNone, optional("INT")] = None
@@ -79,7 +97,13 @@ class Flight(ExportKind):
     drawn = True
 
     def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
-        from morgs_mi.playback.export.clips import flight, frame_numbers, named_path, num_images, repeated_frames
+        from morgs_mi.playback.export.clips import (
+            flight,
+            frame_numbers,
+            named_path,
+            num_images,
+            repeated_frames,
+        )
         from morgs_mi.playback.export.frames import write_images
         from morgs_mi.playback.stream_header import stream_exposure
 
@@ -90,9 +114,13 @@ class Flight(ExportKind):
         path = path if self.width is None else path.with_width(self.width)
         path = path if self.seconds is None else path.with_duration(self.seconds)
         count = num_images(stream, path)
-        images = flight(stream, path, self.channels, repeated_frames(stream, self.freeze, self.back_and_forth))
+        images = flight(
+            stream, path, self.channels, repeated_frames(stream, self.freeze, self.back_and_forth)
+        )
         stops = stream_exposure(stream) if self.display_exposure is None else self.display_exposure
-        write_images(images, stream.fps, output, lambda done: report("Rendering", done, count), None, stops)
+        write_images(
+            images, stream.fps, output, lambda done: report("Rendering", done, count), None, stops
+        )
         return f"{path.seconds:.1f} s, {path.keys[0].width}x{path.keys[0].height}"
 
 
@@ -101,9 +129,11 @@ class Web(ExportKind):
     """Write a web page that plays the stream without a server, or a folder for a server."""
 
     output: Annotated[Positional[Path | None], DisallowNone, place("FILE.html")] = None
-    """FILE.html, or a new folder with the page, the stream and a module for three.js, for hosting; by default
-    OUT/player.html or OUT/web."""
-    format: Annotated[str | None, DisallowNone, optional("NAME"), one_of(tuple(f.name for f in WEB))] = None
+    """FILE.html, or a new folder with the page, the stream and a module for three.js, for hosting;
+    by default OUT/player.html or OUT/web."""
+    format: Annotated[
+        str | None, DisallowNone, optional("NAME"), one_of(tuple(f.name for f in WEB))
+    ] = None
     """Format: html or folder; by default by the name."""
     title: Annotated[str | None, DisallowNone, optional("TEXT")] = None
     """Title of the page; by default the name of the stream's folder or file."""

@@ -17,7 +17,9 @@ from morgs_mi.playback.export.formats import Format, destination
 if TYPE_CHECKING:
     from morgs_mi.codec.frame_source import FrameSource
 
-FRAMES = optional("FRAMES", text="Frames to write: 12, 10:20 (20 excluded) or 0:100:5; all by default.")
+FRAMES = optional(
+    "FRAMES", text="Frames to write: 12, 10:20 (20 excluded) or 0:100:5; all by default."
+)
 
 
 @dataclass(frozen=True)
@@ -34,7 +36,9 @@ class ExportKind:
     def run(self, stream: FrameSource) -> None:
         options: Mapping[str, Any] = vars(self)
         stem = Path(options.get("path", "")).stem
-        output, chosen = destination(stream.path, options["output"], self.formats, options.get("format"), stem)
+        output, chosen = destination(
+            stream.path, options["output"], self.formats, options.get("format"), stem
+        )
         with progress() as report:
             summary = self.write(stream, output, chosen, report)
         print_result(f"{output}: {summary}.")

@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress
-from morgs_mi.cli.settings import Flag, GivenReading, GivenSettings, HeldOut, Reading, Settings, held_out, optional
+from morgs_mi.cli.settings import (
+    Flag,
+    GivenReading,
+    GivenSettings,
+    HeldOut,
+    Reading,
+    Settings,
+    held_out,
+    optional,
+)
 from morgs_mi.core.documentation import page
 from morgs_mi.core.fit_names import STREAM
 from morgs_mi.core.ranges import AtLeast, check_value
@@ -29,29 +38,37 @@ _SCHEDULER = f"Dask scheduler whose workers fit them, such as tcp://host:8786 ({
 class Fit:
     """Reconstruct a capture, frame after frame, into OUT/stream.morgs.
 
-    All other settings are in a file, see --print-config and --config. The file overrides the preset; options override
-    both.
+    All other settings are in a file, see --print-config and --config. The file overrides the
+    preset; options override both.
     """
 
     capture: Annotated[
         Positional[str | None],
-        arg(help_behavior_hint="", metavar="[CAPTURE]", help=f"Folder of the capture, or its URL ({page('cluster')})."),
+        arg(
+            help_behavior_hint="",
+            metavar="[CAPTURE]",
+            help=f"Folder of the capture, or its URL ({page('cluster')}).",
+        ),
     ] = None
     out: Annotated[Positional[Path | None], arg(help_behavior_hint="")] = None
-    """Folder for stream.morgs, capture.json and report.json; an earlier stream there is replaced without --resume."""
+    """Folder for stream.morgs, capture.json and report.json; an earlier stream there is replaced
+    without --resume.
+    """
     frames: Annotated[int | None, DisallowNone, optional("INT", "(default: all)")] = None
     """Number of frames to fit, from the first one."""
     downscale: float = 1
     """Factor by which the images are reduced; 2 halves width and height."""
     test_view: HeldOut = ("auto",)
-    """Held-out cameras, by indices or names; none: all are fitted; auto: the capture's, or camera 0 of six or more."""
+    """Held-out cameras, by indices or names; none: all are fitted; auto: the capture's, or camera 0
+    of six or more.
+    """
     reading: GivenReading = field(default_factory=Reading)
     settings: GivenSettings = field(default_factory=Settings)
     resume: Flag = False
     """Continue an interrupted fit in OUT; capture and settings must be the same."""
     segments: Annotated[int | None, DisallowNone, optional("INT", "(default: 1)")] = None
-    """Number of stretches of the recording that are fitted side by side, by the extra cluster; each begins with a
-    keyframe."""
+    """Number of stretches of the recording that are fitted side by side, by the extra cluster; each
+    begins with a keyframe."""
     scheduler: Annotated[str | None, DisallowNone, optional("ADDRESS", text=_SCHEDULER)] = None
     print_config: Flag = False
     """Print all settings as TOML and exit."""
@@ -68,14 +85,18 @@ class Fit:
             return
         if self.capture is None or self.out is None:
             raise ValueError(
-                "morgs-mi fit: expected the folders CAPTURE and OUT, got fewer; give them before options with several "
-                "values, such as --test-view, and see morgs-mi fit --help."
+                "morgs-mi fit: expected the folders CAPTURE and OUT, got fewer; give them before "
+                "options with several values, such as --test-view, and see morgs-mi fit --help."
             )
         if self.segments is not None:
             check_value("fit()", "segments", self.segments, Annotated[int, AtLeast(1)])
         self.settings.check_methods(config)
         capture = load_capture(
-            self.capture, self.downscale, held_out(self.test_view), self.frames, self.reading.read_config()
+            self.capture,
+            self.downscale,
+            held_out(self.test_view),
+            self.frames,
+            self.reading.read_config(),
         )
         stream = self.out / STREAM
         if self.segments is not None or self.scheduler is not None:
@@ -94,8 +115,14 @@ class Fit:
         assert self.out is not None
         segments = SegmentConfig(self.segments or 1)
         workers = min(segments.count, cores())
-        with noting_segments(self.out), progress() as report, open_client(self.scheduler, workers) as client:
-            return SegmentedRun(capture, self.out, client, config, segments, report).fit(self.resume)
+        with (
+            noting_segments(self.out),
+            progress() as report,
+            open_client(self.scheduler, workers) as client,
+        ):
+            return SegmentedRun(capture, self.out, client, config, segments, report).fit(
+                self.resume
+            )
 
 
 def _print_summary(stream: Path, reports: Sequence[FrameReport]) -> None:
@@ -105,15 +132,16 @@ def _print_summary(stream: Path, reports: Sequence[FrameReport]) -> None:
     later_text = f", {sum(seconds) / len(seconds):.1f} s for each later one" if seconds else ""
     print_result(
         f"{stream}: {len(reports)} frames, {stream.stat().st_size / 1e6:.1f} MB, "
-        f"{first.seconds:.1f} s for the first one ({first.num_gaussians} Gaussians, {first.steps} steps){later_text}."
+        f"{first.seconds:.1f} s for the first one ({first.num_gaussians} Gaussians, {first.steps} "
+        f"steps){later_text}."
     )
     for sentence in first_frame_sentences(first.validation):
         print_result(sentence)
     if problems := [row for row in reports if row.status != "ok"]:
         row = problems[0]
         print_result(
-            f"{len(problems)} of {len(reports)} frames have a problem (status in report.json), frame {row.frame}: "
-            f"{row.status.rstrip('.')}."
+            f"{len(problems)} of {len(reports)} frames have a problem (status in report.json), "
+            f"frame {row.frame}: {row.status.rstrip('.')}."
         )
 
 
@@ -125,8 +153,8 @@ def first_frame_sentences(validation: Mapping[str, Any]) -> Iterator[str]:
     if "held_out" in refined:
         psnr = refined["held_out"]
         yield (
-            f"Held-out views have {psnr['calibrated_psnr']:.1f} dB as calibrated, {psnr['registered_psnr']:.1f} dB "
-            "registered."
+            f"Held-out views have {psnr['calibrated_psnr']:.1f} dB as calibrated, "
+            f"{psnr['registered_psnr']:.1f} dB registered."
         )
     if "exposure" in validation:
         yield validation["exposure"]["sentence"]
@@ -136,7 +164,9 @@ def first_frame_sentences(validation: Mapping[str, Any]) -> Iterator[str]:
 
 @contextmanager
 def _noting_frames(stream: Path, count: int, resume: bool) -> Iterator[None]:
-    """Add the frames that the stream holds to an interruption or a failed write, unless it is an earlier fit's."""
+    """Add the frames that the stream holds to an interruption or a failed write, unless it is an
+    earlier fit's.
+    """
     from morgs_mi.codec.reader import StreamReader
 
     begin = time.time()
@@ -146,6 +176,10 @@ def _noting_frames(stream: Path, count: int, resume: bool) -> Iterator[None]:
         with suppress(OSError, ValueError):
             if resume or stream.stat().st_mtime >= begin:
                 index = StreamReader(stream).index()
-                span = f"frames 0 to {index[-1][1]} of {count}; continue with `--resume`" if index else "no frame yet"
+                span = (
+                    f"frames 0 to {index[-1][1]} of {count}; continue with `--resume`"
+                    if index
+                    else "no frame yet"
+                )
                 error.add_note(f"{stream} holds {span}.")
         raise

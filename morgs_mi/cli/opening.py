@@ -12,19 +12,24 @@ from morgs_mi.cli.console import print_warning
 if TYPE_CHECKING:
     from morgs_mi.codec.frame_source import FrameSource
 
-_DROP = "Leave out the Gaussians of a file whose numbers are not finite or absurdly large, however many they are."
+_DROP = (
+    "Leave out the Gaussians of a file whose numbers are not finite or absurdly large, however "
+    "many they are."
+)
 DropInvalid = Annotated[bool, FlagCreatePairsOff, arg(help=_DROP, help_behavior_hint="")]
 """Option of the commands that read files of Gaussians."""
 
 
-def opened(out: Path, drop_invalid: bool, drawn: bool = True, skip_damaged: bool = False) -> FrameSource:
+def opened(
+    out: Path, drop_invalid: bool, drawn: bool = True, skip_damaged: bool = False
+) -> FrameSource:
     """Return the stream that a command reads, and print which cameras a file of Gaussians has.
 
     Args:
         out: folder of a fit, a stream file, or a file of Gaussians.
         drop_invalid: whether Gaussians with invalid numbers are left out, however many they are.
-        drawn: whether images or pages are made, which are without a few invalid Gaussians in any case; Gaussians that
-            are written for other programs are not.
+        drawn: whether images or pages are made, which are without a few invalid Gaussians in any
+            case; Gaussians that are written for other programs are not.
         skip_damaged: as for `open_stream`.
 
     Raises:

@@ -22,53 +22,70 @@ if TYPE_CHECKING:
     from morgs_mi.playback.export.paths import CameraPath
 
 _CHANNELS = (
-    "Channels to render, side by side: color, motion, confidence, depth, alpha. By default color, and for EXR files "
-    "all that the stream stores."
+    "Channels to render, side by side: color, motion, confidence, depth, alpha. By default color, "
+    "and for EXR files all that the stream stores."
 )
 _OUTPUT = (
-    "FILE.mp4; a new folder whose name ends in png, for PNG files; another new folder, for multichannel EXR files "
-    "(R, G, B in linear light, motion.X and motion.Y in pixels, confidence.Y, depth.Y); FILE.png or FILE.exr for one "
-    "image. By default OUT/CAMERA.mp4, OUT/CAMERA-png or OUT/CAMERA-exr, with the name of the camera or the path."
+    "FILE.mp4; a new folder whose name ends in png, for PNG files; another new folder, for "
+    "multichannel EXR files (R, G, B in linear light, motion.X and motion.Y in pixels, "
+    "confidence.Y, depth.Y); FILE.png or FILE.exr for one image. By default OUT/CAMERA.mp4, "
+    "OUT/CAMERA-png or OUT/CAMERA-exr, with the name of the camera or the path."
 )
 _CAMERA = (
-    "Camera of the stream, by index or name; `morgs-mi info` lists the cameras of a capture. A file of Gaussians has "
-    "front, front-right, right, back-right, back, back-left, left and front-left, or the cameras of its training. By "
-    "default, a single image is seen by the first camera; for a file, by the one with most detail in view."
+    "Camera of the stream, by index or name; `morgs-mi info` lists the cameras of a capture. A "
+    "file of Gaussians has front, front-right, right, back-right, back, back-left, left and "
+    "front-left, or the cameras of its training. By default, a single image is seen by the first "
+    "camera; for a file, by the one with most detail in view."
 )
 _PATH = (
-    "Camera path, instead of a camera: orbit (around the scene, the default), between (through the cameras), or a JSON "
-    f"file ({page('exports')}). `morgs-mi export video` has more options."
+    "Camera path, instead of a camera: orbit (around the scene, the default), between (through "
+    f"the cameras), or a JSON file ({page('exports')}). `morgs-mi export video` has more options."
 )
 _INSERT = (
-    "Mitsuba scene whose objects stand among the Gaussians: FILE.xml, or FILE.py with a function build(frame, time) "
-    "that returns the entries of a scene. Without emitters it is lit by the stream."
+    "Mitsuba scene whose objects stand among the Gaussians: FILE.xml, or FILE.py with a function "
+    "build(frame, time) that returns the entries of a scene. Without emitters it is lit by the "
+    "stream."
 )
 
 
 @dataclass(frozen=True)
 class Render:
-    """Render a stream or a file of Gaussians into a video, EXR files or PNG files, for one camera or along a path."""
+    """Render a stream or a file of Gaussians into a video, EXR files or PNG files, for one camera
+    or along a path.
+    """
 
     out: Positional[Path]
     """Folder of a fit, a stream file, or a file of Gaussians: .ply, .compressed.ply or .splat."""
     output: Annotated[
-        Positional[Path | None], DisallowNone, arg(metavar="[FILE_OR_FOLDER]", help=_OUTPUT, help_behavior_hint="")
+        Positional[Path | None],
+        DisallowNone,
+        arg(metavar="[FILE_OR_FOLDER]", help=_OUTPUT, help_behavior_hint=""),
     ] = None
     camera: Annotated[str | None, DisallowNone, optional("CAMERA", text=_CAMERA)] = None
     path: Annotated[str | None, DisallowNone, optional("PATH", text=_PATH)] = None
     degrees: Annotated[float | None, DisallowNone, optional("FLOAT")] = None
-    """Angle of an orbit, 1 to 360; by default the extent of the rig, and 60 for a file of Gaussians."""
+    """Angle of an orbit, 1 to 360; by default the extent of the rig, and 60 for a file of
+    Gaussians.
+    """
     width: Annotated[int | None, DisallowNone, optional("INT")] = None
     """Width of the images; by default that of the camera, and 2048 for equirectangular ones."""
     projection: Literal["perspective", "equirectangular"] = "perspective"
     """Projection: perspective, or equirectangular, all around the camera with a level horizon."""
     stereo: float = 0.0
-    """Distance of two eyes in world units, for equirectangular images, the left one above the right; 0: one eye."""
-    format: Annotated[str | None, DisallowNone, optional("NAME"), one_of(("mp4", "png", "exr"))] = None
+    """Distance of two eyes in world units, for equirectangular images, the left one above the
+    right; 0: one eye.
+    """
+    format: Annotated[str | None, DisallowNone, optional("NAME"), one_of(("mp4", "png", "exr"))] = (
+        None
+    )
     """Format: mp4, png or exr; by default by the name of the output."""
-    channels: Annotated[tuple[ChannelName, ...] | None, DisallowNone, optional("NAME ...", text=_CHANNELS)] = None
+    channels: Annotated[
+        tuple[ChannelName, ...] | None, DisallowNone, optional("NAME ...", text=_CHANNELS)
+    ] = None
     insert: Annotated[Path | None, DisallowNone, optional("FILE", text=_INSERT)] = None
-    at: Annotated[tuple[int, ...] | None, DisallowNone, optional("FRAME ...", "(default: all)")] = None
+    at: Annotated[tuple[int, ...] | None, DisallowNone, optional("FRAME ...", "(default: all)")] = (
+        None
+    )
     """Frames to render with an inserted scene."""
     samples: Annotated[int, arg(metavar="INT")] = 16
     """Samples per pixel of an inserted scene."""
@@ -76,8 +93,8 @@ class Render:
     """Whether an inserted scene throws shadows on the stream."""
 
     light: Literal["probe", "traced"] = "probe"
-    """Light of an inserted scene: an environment map at its middle, or rays traced through the Gaussians, for their
-    shadows and reflections."""
+    """Light of an inserted scene: an environment map at its middle, or rays traced through the
+    Gaussians, for their shadows and reflections."""
     display_exposure: DisplayExposure = None
     drop_invalid: DropInvalid = False
     skip_damaged: Flag = False
@@ -91,7 +108,11 @@ class Render:
         self._check()
         stream = opened(self.out, self.drop_invalid, skip_damaged=self.skip_damaged)
         view = find_camera(stream, 0 if self.camera is None else self.camera)
-        stem = Path(self.path or "orbit").stem if self.camera is None and self.insert is None else view.name
+        stem = (
+            Path(self.path or "orbit").stem
+            if self.camera is None and self.insert is None
+            else view.name
+        )
         output, chosen = destination(stream.path, self.output, IMAGES, self.format, stem)
         single = chosen.folder and chosen.is_file(output)
         if self.insert is not None:
@@ -104,25 +125,46 @@ class Render:
             images = self._seen(stream, path, chosen.name)
             count = num_images(stream, path)
         if single and count > 1:
-            raise ValueError(f"{output}: expected one image for one file, got {count}; name a folder.")
+            raise ValueError(
+                f"{output}: expected one image for one file, got {count}; name a folder."
+            )
         with progress() as report:
-            stops = stream_exposure(stream) if self.display_exposure is None else self.display_exposure
-            write_images(images, stream.fps, output, lambda done: report("Rendering", done, count), chosen.name, stops)
+            stops = (
+                stream_exposure(stream) if self.display_exposure is None else self.display_exposure
+            )
+            write_images(
+                images,
+                stream.fps,
+                output,
+                lambda done: report("Rendering", done, count),
+                chosen.name,
+                stops,
+            )
         print_result(f"{output}: {count} {'image' if count == 1 else 'images'}.")
 
     def _check(self) -> None:
         """Refuse options that exclude each other."""
         if self.camera is not None and self.path is not None:
-            raise ValueError(f"expected --camera or --path, got both, {self.camera} and {self.path}; leave out one.")
+            raise ValueError(
+                f"expected --camera or --path, got both, {self.camera} and {self.path}; leave out "
+                "one."
+            )
         if self.insert is None and self.at is not None:
-            raise ValueError("--at selects frames of an inserted scene, got no scene; add --insert FILE.")
+            raise ValueError(
+                "--at selects frames of an inserted scene, got no scene; add --insert FILE."
+            )
         if self.insert is not None and self.camera is None:
             raise ValueError("--insert renders for one camera, got none; add --camera CAMERA.")
         if self.projection == "perspective":
             if self.stereo:
-                raise ValueError("--stereo is for equirectangular images; add --projection equirectangular.")
+                raise ValueError(
+                    "--stereo is for equirectangular images; add --projection equirectangular."
+                )
         elif self.insert is not None or self.channels not in (None, ("color",)):
-            raise ValueError("--projection equirectangular renders the colour of a stream alone; leave out the others.")
+            raise ValueError(
+                "--projection equirectangular renders the colour of a stream alone; leave out the "
+                "others."
+            )
 
     def _seen(
         self, stream: FrameSource, view: Camera | CameraPath, format: str
@@ -152,8 +194,10 @@ class Render:
         insert = studio_entry("renderings", "insert")
         view = view if self.width is None else view.with_width(self.width)
         frames = frame_numbers(stream) if self.at is None else insert.selected(stream, self.at)
-        channels = self.channels or (insert.inserted_channels(stream) if format == "exr" else ("color",))
-        config = insert.InsertConfig(self.samples, self.shadows, self.light)
-        return insert.render_inserted(stream, view, insert.load_insert(self.insert), frames, channels, config), len(
-            frames
+        channels = self.channels or (
+            insert.inserted_channels(stream) if format == "exr" else ("color",)
         )
+        config = insert.InsertConfig(self.samples, self.shadows, self.light)
+        return insert.render_inserted(
+            stream, view, insert.load_insert(self.insert), frames, channels, config
+        ), len(frames)

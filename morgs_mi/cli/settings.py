@@ -14,7 +14,14 @@ from tyro.constructors import PrimitiveConstructorSpec
 from morgs_mi.capture.held_out import TestViews
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.documentation import page
-from morgs_mi.loop.stream_config import PresetName, StreamConfig, apply_preset, apply_values, read_config, relocated
+from morgs_mi.loop.stream_config import (
+    PresetName,
+    StreamConfig,
+    apply_preset,
+    apply_values,
+    read_config,
+    relocated,
+)
 
 # The setting of every option. All others are set in a file.
 SETTINGS = {
@@ -34,8 +41,8 @@ SETTINGS = {
 }
 
 _PRESET = (
-    "Preset: l, s (the paper's variants, 8 and 5 epochs), paper (its scheme), baseline, ml, ml-mo, ml-mo-mc (its "
-    f"ablation), or rigidity (rigid neighbours, {page('experiments/field')})."
+    "Preset: l, s (the paper's variants, 8 and 5 epochs), paper (its scheme), baseline, ml, "
+    f"ml-mo, ml-mo-mc (its ablation), or rigidity (rigid neighbours, {page('experiments/field')})."
 )
 _FLOW = f"Optical flow: a method, files:FOLDER or onnx:FILE ({page('flow')})."
 _MASKS = f"Refinement of the motion masks ({page('masks')})."
@@ -52,7 +59,9 @@ HeldOut = Annotated[tuple[str, ...], arg(metavar="CAMERA ...")]
 
 
 def held_out(names: Sequence[str]) -> TestViews:
-    """Return held-out cameras, given by name or index, or as `none` or `auto`, as `load_capture` takes them."""
+    """Return held-out cameras, given by name or index, or as `none` or `auto`, as `load_capture`
+    takes them.
+    """
     if len(names) == 1 and names[0].lower() in ("none", "auto"):
         return None if names[0].lower() == "none" else "auto"
     return tuple(names)
@@ -64,12 +73,16 @@ def optional(metavar: str, hint: str = "", text: str | None = None) -> Any:
     Args:
         metavar: name of the value.
         hint: text after the help.
-        text: the help, if it is longer than the one line that tyro reads from a field's docstring unbroken.
+        text: the help, if it is longer than the one line that tyro reads from a field's docstring
+            unbroken.
     """
     return arg(metavar=metavar, help_behavior_hint=hint, help=text)
 
 
-_EXPOSURE = "Stops by which PNG files and videos are brightened; by default the stream's, 0 for a recording of 8 bits."
+_EXPOSURE = (
+    "Stops by which PNG files and videos are brightened; by default the stream's, 0 for a "
+    "recording of 8 bits."
+)
 DisplayExposure = Annotated[float | None, DisallowNone, optional("STOPS", text=_EXPOSURE)]
 """Option of the commands that render a stream."""
 
@@ -80,12 +93,18 @@ def place(metavar: str) -> Any:
 
 
 def setting(option: str, config: StreamConfig | None = None, text: str | None = None) -> Any:
-    """Return the help of an option that is None where it is not given: the type of its setting, and the default.
+    """Return the help of an option that is None where it is not given: the type of its setting, and
+    the default.
 
-    The text of the help is the field's docstring, or `text` with the places of the pages that it cites.
+    The text of the help is the field's docstring, or `text` with the places of the pages that it
+    cites.
     """
     default = reduce(getattr, SETTINGS[option].split("."), config or StreamConfig())
-    return arg(metavar=type(default).__name__.upper(), help_behavior_hint=f"(default: {default})", help=text)
+    return arg(
+        metavar=type(default).__name__.upper(),
+        help_behavior_hint=f"(default: {default})",
+        help=text,
+    )
 
 
 def _offsets(words: list[str]) -> dict[str, float]:
@@ -98,7 +117,9 @@ def _offsets(words: list[str]) -> dict[str, float]:
     numbers = words[1::2]
     if not words or len(names) > len(numbers):
         last = f"{words[-1]!r} without one" if words else "nothing"
-        raise ValueError(f"expected pairs of a camera and a number, such as cam01 -0.5, got {last}.")
+        raise ValueError(
+            f"expected pairs of a camera and a number, such as cam01 -0.5, got {last}."
+        )
     offsets: dict[str, float] = {}
     for name, number in zip(names, numbers, strict=True):
         if name in offsets:
@@ -106,7 +127,9 @@ def _offsets(words: list[str]) -> dict[str, float]:
         try:
             offsets[name] = float(number)
         except ValueError:
-            raise ValueError(f"the offset of {name} must be a number of frames, got {number!r}.") from None
+            raise ValueError(
+                f"the offset of {name} must be a number of frames, got {number!r}."
+            ) from None
     return offsets
 
 
@@ -120,7 +143,9 @@ _OFFSETS = PrimitiveConstructorSpec(
 
 
 def one_of(names: tuple[str, ...]) -> PrimitiveConstructorSpec[Any]:
-    """Return how an option that may be missing is read, so that messages list these names, without None, in order."""
+    """Return how an option that may be missing is read, so that messages list these names, without
+    None, in order.
+    """
     return PrimitiveConstructorSpec(
         nargs=1,
         metavar="NAME",
@@ -133,19 +158,25 @@ def one_of(names: tuple[str, ...]) -> PrimitiveConstructorSpec[Any]:
 
 @dataclass(frozen=True)
 class Reading:
-    """Options that resolve differences between the clips of a capture: the fields of `ReadConfig`."""
+    """Options for differences between the clips of a capture: the fields of `ReadConfig`."""
 
     trim: Flag = False
     """Use the instants that all clips contain, at their lowest frame rate."""
-    offset: Annotated[dict[str, float], arg(help_behavior_hint=""), _OFFSETS] = field(default_factory=dict)
-    """Frame of a camera's clip, whole or not, that shows frame 0 of the others; negative if it began later."""
+    offset: Annotated[dict[str, float], arg(help_behavior_hint=""), _OFFSETS] = field(
+        default_factory=dict
+    )
+    """Frame of a camera's clip, whole or not, that shows frame 0 of the others; negative if it
+    began later.
+    """
     gaps: Flag = False
     """Continue where images are missing, without their cameras."""
     color: Annotated[str, arg(metavar="NAME")] = "none"
     """Colour correction: none, linear, or with a reference camera linear:CAMERA."""
     without: Without = ()
     """Cameras that are left out, by name."""
-    near: Annotated[float | None, optional("UNITS", f"(default: from the scene, {page('captures')})")] = None
+    near: Annotated[
+        float | None, optional("UNITS", f"(default: from the scene, {page('captures')})")
+    ] = None
     """Depth of the cameras' near planes."""
 
     def read_config(self) -> ReadConfig:
@@ -157,14 +188,18 @@ class Reading:
 class Settings:
     """Settings of a fit. Later ones override: defaults, --preset, --config, the other options."""
 
-    preset: Annotated[PresetName | None, optional("NAME", text=_PRESET), one_of(get_args(PresetName))] = None
+    preset: Annotated[
+        PresetName | None, optional("NAME", text=_PRESET), one_of(get_args(PresetName))
+    ] = None
     config: Annotated[Path | None, optional("FILE.toml")] = None
     """File with any settings, as --print-config writes it."""
     seed: Annotated[int | None, setting("seed")] = None
     """Seed of every random choice."""
     num_gaussians: Annotated[int | None, optional("INT", "(default: by detail and time)")] = None
     """Gaussians of the first frame."""
-    first_frame_steps: Annotated[int | None, optional("INT", "(default: by Gaussians and time)")] = None
+    first_frame_steps: Annotated[
+        int | None, optional("INT", "(default: by Gaussians and time)")
+    ] = None
     """Optimisation steps of the first frame."""
     first_frame_seconds: Annotated[float | None, setting("first_frame_seconds")] = None
     """Time of the first frame, which limits its Gaussians and steps."""
@@ -178,25 +213,36 @@ class Settings:
     """Precision of the stream; 2 halves all errors."""
     target_size: Annotated[int | None, setting("target_size")] = None
     """Most bytes of a later frame; 0: no limit."""
-    refine_cameras: Annotated[Estimation | None, setting("refine_cameras"), one_of(get_args(Estimation))] = None
+    refine_cameras: Annotated[
+        Estimation | None, setting("refine_cameras"), one_of(get_args(Estimation))
+    ] = None
     """Refinement of the cameras: off, on, or auto (if withheld pixels gain)."""
     exposure: Annotated[Estimation | None, setting("exposure"), one_of(get_args(Estimation))] = None
-    """Estimation of exposures and white balances: off, on, or auto (between cameras if withheld pixels gain)."""
+    """Estimation of exposures and white balances: off, on, or auto (between cameras if withheld
+    pixels gain).
+    """
     reproducible: Flag = False
     """Same bytes on every run; about half as fast."""
 
     def given(self) -> dict[str, Any]:
         """Return the settings that were given as options, by key."""
         values = {key: getattr(self, option) for option, key in SETTINGS.items()}
-        return {key: value for key, value in values.items() if value is not None and value is not False}
+        return {
+            key: value for key, value in values.items() if value is not None and value is not False
+        }
 
     def option_names(self) -> dict[str, str]:
         """Return the options that were given, by their settings' keys and names."""
-        options = {key: f"--{option.replace('_', '-')}" for option, key in SETTINGS.items() if key in self.given()}
+        options = {
+            key: f"--{option.replace('_', '-')}"
+            for option, key in SETTINGS.items()
+            if key in self.given()
+        }
         return options | {key.rpartition(".")[2]: option for key, option in options.items()}
 
     def stream_config(self, base: StreamConfig | None = None) -> StreamConfig:
-        """Return `base`, by default the default config, with the preset, the file and the given options applied.
+        """Return `base`, by default the default config, with the preset, the file and the given
+        options applied.
 
         Raises:
             FileNotFoundError: the file, or what a setting names, is missing.

@@ -17,7 +17,9 @@ from morgs_mi.cli.console import print_warning
 
 def one_command(commands: Mapping[str, type]) -> Any:
     """Return the annotation of an argument that is one of several commands, by their names."""
-    union: Any = reduce(or_, (Annotated[command, subcommand(name)] for name, command in commands.items()))
+    union: Any = reduce(
+        or_, (Annotated[command, subcommand(name)] for name, command in commands.items())
+    )
     return arg(name="", constructor=union)
 
 
@@ -34,7 +36,8 @@ def suggesting_command(options_type: type, prog: str, args: Sequence[str]) -> It
 
 
 def near_command(owner: Any, words: Sequence[str]) -> list[str]:
-    """Return the words of the command that `words` resemble; empty if none does, or if they are a command.
+    """Return the words of the command that `words` resemble; empty if none does, or if they are a
+    command.
 
     Args:
         owner: class with the mapping `commands`, or a command without one.

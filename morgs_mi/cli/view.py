@@ -14,12 +14,14 @@ from morgs_mi.cli.opening import DropInvalid, opened
 
 @dataclass(frozen=True)
 class View:
-    """View a stream or a file of Gaussians in the browser; a stream even while it is being fitted."""
+    """View a stream or a file of Gaussians in the browser; a stream even during its fit."""
 
     out: Positional[Path]
     """Folder of a fit, a stream file, or a file of Gaussians: .ply, .compressed.ply or .splat."""
     host: str = "127.0.0.1"
-    """Address of the server; the default serves this machine only, 0.0.0.0 all machines that have the link."""
+    """Address of the server; the default serves this machine only, 0.0.0.0 all machines that have
+    the link.
+    """
     port: int = 0
     """Port of the server; 0: a free one."""
     browser: bool = True
@@ -36,7 +38,9 @@ class View:
         viewer = Viewer(opened(self.out, self.drop_invalid), self.host, self.port, self.capture)
         print_result(f"{viewer.url} (Ctrl-C to stop)")
         if viewer.is_public:
-            print_result("Other machines open the same link with the address of this machine in digits.")
+            print_result(
+                "Other machines open the same link with the address of this machine in digits."
+            )
         if self.browser:
             webbrowser.open(viewer.url + ("#follow" if self.follow else ""))
         viewer.run()

@@ -14,25 +14,30 @@ from morgs_mi.core.ranges import Above, AtLeast, AtMost, check_ranges
 class CodecConfig:
     """Settings of the encoder; a decoder needs none of them.
 
-    A step is twice the tolerated error: rounding stays within it. In a later frame, a group of numbers in which
-    no change reaches a step stays unchanged, as such changes are mostly jitter of the fit. The threshold of the base
-    colour is half a step.
+    A step is twice the tolerated error: rounding stays within it. In a later frame, a group of
+    numbers in which no change reaches a step stays unchanged, as such changes are mostly jitter of
+    the fit. The threshold of the base colour is half a step.
 
     Raises:
         ValueError: a number is out of range.
     """
 
     quality: Annotated[float, Above(0)] = 1.0
-    """Divisor of the tolerated errors (see `core.attributes`): 2 doubles the precision of everything, 1000 is as
-    good as float32."""
+    """Divisor of the tolerated errors (see `core.attributes`): 2 doubles the precision of
+    everything, 1000 is as good as float32."""
     birth_precision: Annotated[float, AtLeast(1), AtMost(1024)] = 4.0
     """Factor of the precision of new Gaussians: they are written once and seen for many frames."""
     offset: bool = False
-    """Storage of the learned offset of moving Gaussians, for viewing; no other value is decoded from it."""
+    """Storage of the learned offset of moving Gaussians, for viewing; no other value is decoded
+    from it.
+    """
     target_size: Annotated[int, AtLeast(0)] = 0
-    """Bound of the bytes of a later frame, which is coded more coarsely until it fits; 0: no bound."""
+    """Bound of the bytes of a later frame, which is coded more coarsely until it fits; 0: no bound.
+    """
     keyframe_interval: Annotated[int, AtLeast(0)] = 30
-    """Frames between re-emitted keyframes, which contain the whole state and at which a reader can start; 0: never."""
+    """Frames between re-emitted keyframes, which contain the whole state and at which a reader can
+    start; 0: never.
+    """
 
     def __post_init__(self) -> None:
         check_ranges(self)

@@ -1,13 +1,15 @@
-"""The container of the stream: packets that are checked and appended one by one, and readable while they are written.
+"""The container of the stream: packets that are checked and appended one by one, and readable while
+they are written.
 
-    stream  = magic [8], version uint32, packet*
-    packet  = kind uint32, frame uint32, length uint64, crc uint32, payload [length]
-    payload = table length uint32, table (JSON: name, dtype and shape of each array), the arrays' bytes
+    stream = magic [8], version uint32, packet* packet = kind uint32, frame uint32, length uint64,
+    crc uint32, payload [length] payload = table length uint32, table (JSON: name, dtype and shape
+    of each array), the arrays' bytes
 
-All numbers are little-endian. The CRC-32 covers the packet's first 16 bytes and its payload. Packet 0 is
-the header, with a payload of JSON alone: cameras, frame rate and free metadata. A stream that was closed ends with an
-index: (kind uint32, frame uint32, offset uint64) of each packet except the header, then its own offset uint64 and a
-magic [8]. `codec.packets` defines the arrays; docs/stream-format.md specifies everything.
+All numbers are little-endian. The CRC-32 covers the packet's first 16 bytes and its payload. Packet
+0 is the header, with a payload of JSON alone: cameras, frame rate and free metadata. A stream that
+was closed ends with an index: (kind uint32, frame uint32, offset uint64) of each packet except the
+header, then its own offset uint64 and a magic [8]. `codec.packets` defines the arrays;
+docs/stream-format.md specifies everything.
 """
 
 from __future__ import annotations
@@ -54,7 +56,9 @@ class PacketKind(IntEnum):
 
 
 class TruncatedStreamError(ValueError):
-    """The stream ends inside a packet: it was truncated, or its writer has not finished that packet."""
+    """The stream ends inside a packet: it was truncated, or its writer has not finished that
+    packet.
+    """
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +67,8 @@ class Packet:
 
     kind: PacketKind  #: `KEYFRAME` (self-contained) or `RESIDUAL` (changes since the frame before).
     frame: int  #: Index of the video frame.
-    #: float32, uint32 or uint8 arrays of any shape, by name; read-only copies of those that are passed.
+    #: float32, uint32 or uint8 arrays of any shape, by name; read-only copies of those that are
+    #: passed.
     arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
     place: str = ""  #: Description of where the packet was read, for messages; empty for a new one.
 
@@ -81,17 +86,20 @@ class Packet:
         """The packet as bytes of the file; they are computed once.
 
         Raises:
-            ValueError: the kind is not `KEYFRAME` or `RESIDUAL`, the frame is not a uint32, or an array has another
-                dtype.
+            ValueError: the kind is not `KEYFRAME` or `RESIDUAL`, the frame is not a uint32, or an
+                array has another dtype.
         """
         if self.kind not in (PacketKind.KEYFRAME, PacketKind.RESIDUAL):
-            raise ValueError(f"Packet.encoded: `kind` must be KEYFRAME or RESIDUAL, got {self.kind!r}.")
+            raise ValueError(
+                f"Packet.encoded: `kind` must be KEYFRAME or RESIDUAL, got {self.kind!r}."
+            )
         if not 0 <= self.frame < 2**32:
             raise ValueError(f"Packet.encoded: `frame` must be in 0..2^32-1, got {self.frame}.")
         for name, array in self.arrays.items():
             if array.dtype.name not in _DTYPES:
                 raise ValueError(
-                    f"Packet.encoded: `{name}` must be one of {', '.join(_DTYPES)}, got {array.dtype}; convert it."
+                    f"Packet.encoded: `{name}` must be one of {', '.join(_DTYPES)}, got "
+                    f"{array.dtype}; convert it."
                 )
         table = json.dumps([[n, a.dtype.name, a.shape] for n, a in self.arrays.items()]).encode()
         arrays = (a.astype(a.dtype.newbyteorder("<")).tobytes() for a in self.arrays.values())
@@ -113,7 +121,8 @@ def encode_packet(packet: Packet) -> bytes:
 
 
 def decode_packet(data: bytes, place: str = "") -> Packet:
-    """Return the packet with the encoding `data`; `place` describes where it was read, for messages.
+    """Return the packet with the encoding `data`; `place` describes where it was read, for
+    messages.
 
     Raises:
         ValueError: the bytes are not exactly one intact keyframe or residual packet.
@@ -128,11 +137,12 @@ def decode_packet(data: bytes, place: str = "") -> Packet:
 
 
 class StreamWriter:
-    """Writer that appends packets to a new stream; a packet is handed to the system when `write` returns.
+    """Writer that appends packets to a new stream; a packet is handed to the system when `write`
+    returns.
 
     Args:
-        sink: path of the file, replacing an existing one; or a binary file object, such as a pipe or the file of a
-            socket, which is left open.
+        sink: path of the file, replacing an existing one; or a binary file object, such as a pipe
+            or the file of a socket, which is left open.
         cameras: the rig.
         fps: frames per second.
         metadata: any value that JSON can represent.
@@ -154,7 +164,8 @@ class StreamWriter:
         self._index: list[tuple[int, int, int]] | None = []
         self._file: BinaryIO
         if isinstance(sink, str | Path):
-            # Unbuffered: a buffer would write its rest again after a failed packet has been removed.
+            # Unbuffered: a buffer would write its rest again after a failed packet has been
+            # removed.
             self.path = Path(sink)
             self._owns_file = True
             self._file = open(sink, "wb", buffering=0)  # noqa: SIM115
@@ -170,12 +181,15 @@ class StreamWriter:
             raise
 
     @classmethod
-    def continued(cls, path: str | Path, index: Sequence[tuple[int, int, int]], end: int) -> StreamWriter:
+    def continued(
+        cls, path: str | Path, index: Sequence[tuple[int, int, int]], end: int
+    ) -> StreamWriter:
         """Return the writer of an interrupted stream; the file is truncated at byte `end`.
 
         Args:
             path: the file.
-            index: (kind, frame, offset) of its packets except the header, as returned by `StreamReader.check`.
+            index: (kind, frame, offset) of its packets except the header, as returned by
+                `StreamReader.check`.
             end: end of the last of them.
 
         Raises:
@@ -199,7 +213,9 @@ class StreamWriter:
             OSError: it could not be written; a file is truncated to its last complete packet.
         """
         if self._index is None:
-            raise ValueError(f"{self.path}: expected a stream that is still open, got one that was closed.")
+            raise ValueError(
+                f"{self.path}: expected a stream that is still open, got one that was closed."
+            )
         at = self.num_bytes
         size = self._append(packet.encoded)
         self._index.append((packet.kind, packet.frame, at))
@@ -211,7 +227,8 @@ class StreamWriter:
             entries = b"".join(ENTRY.pack(*entry) for entry in self._index)
             payload = entries + TRAILER.pack(self.num_bytes, INDEX_MAGIC)
             self._index = None
-            with contextlib.suppress(OSError):  # a full disk or a closed pipe; readers do not need the index
+            # A full disk or a closed pipe; readers do not need the index.
+            with contextlib.suppress(OSError):
                 self._append(_sealed(PacketKind.INDEX, 0, payload))
         if self._owns_file:
             self._file.close()
@@ -220,7 +237,10 @@ class StreamWriter:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self.close()
 
@@ -239,8 +259,9 @@ class StreamWriter:
                 raise
             raise OSError(
                 error.errno,
-                f"{self.path}: {len(data)} bytes could not be written ({error.strerror}), the file still has its "
-                f"{self.num_bytes} bytes of complete packets; free space on the disk",
+                f"{self.path}: {len(data)} bytes could not be written ({error.strerror}), the "
+                f"file still has its {self.num_bytes} bytes of complete packets; free space on "
+                "the disk",
             ) from error
         self.num_bytes += len(data)
         return len(data)
@@ -266,7 +287,9 @@ def open_packet(data: bytes) -> tuple[int, int, memoryview]:
         raise ValueError(f"its payload should have {length} bytes, got {len(payload)}")
     (stated_crc,) = _U32.unpack_from(data, HEAD.size)
     if (crc := zlib.crc32(payload, zlib.crc32(head))) != stated_crc:
-        raise ValueError(f"its CRC should be {stated_crc:08x}, got {crc:08x}: the bytes are damaged")
+        raise ValueError(
+            f"its CRC should be {stated_crc:08x}, got {crc:08x}: the bytes are damaged"
+        )
     return kind, frame, payload
 
 
@@ -292,10 +315,17 @@ def _table(rows: Any) -> list[tuple[str, str, list[int]]]:
     Raises:
         ValueError: one of them is not the name, dtype and shape of an array, or two have one name.
     """
-    if not isinstance(rows, list) or any(not isinstance(row, list) or len(row) != 3 for row in rows):
+    if not isinstance(rows, list) or any(
+        not isinstance(row, list) or len(row) != 3 for row in rows
+    ):
         raise ValueError("it must be a list of [name, dtype, shape]")
     for name, dtype, shape in rows:
-        sound = isinstance(name, str) and dtype in _DTYPES and isinstance(shape, list) and len(shape) <= _MAX_AXES
+        sound = (
+            isinstance(name, str)
+            and dtype in _DTYPES
+            and isinstance(shape, list)
+            and len(shape) <= _MAX_AXES
+        )
         if not sound or any(type(n) is not int or not 0 <= n < 2**63 for n in shape):
             raise ValueError(f"`{name!s:.60}` is declared as {dtype!s:.60} {shape!s:.60}")
     if len({name for name, *_ in rows}) < len(rows):

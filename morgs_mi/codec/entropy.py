@@ -1,13 +1,14 @@
 """Integers <-> words: adaptive entropy coding in columns.
 
-A column is an array of integers that are expected to follow one distribution. Each integer v becomes a token. Where a
-token stands for more than one value, the remaining bits are coded uniformly:
+A column is an array of integers that are expected to follow one distribution. Each integer v
+becomes a token. Where a token stands for more than one value, the remaining bits are coded
+uniformly:
 
     m = |v| below 16, else 12 + k with k = floor(log2 |v|), the rest being |v| - 2^k of k bits
     token = 0 for v = 0, 2 m - 1 for v > 0, 2 m for v < 0
 
-Tokens are coded in blocks of 16, 16, 32, 64, ...; the distribution of a block follows from the tokens of the blocks
-before it, so it is not stored. docs/stream-format.md specifies every bit.
+Tokens are coded in blocks of 16, 16, 32, 64, ...; the distribution of a block follows from the
+tokens of the blocks before it, so it is not stored. docs/stream-format.md specifies every bit.
 """
 
 from __future__ import annotations
@@ -48,7 +49,9 @@ class ColumnWriter:
         for shift, some in _halves(bits):
             half = (rest[some] >> shift) & (2**_LOW - 1)
             width = np.minimum(bits[some] - shift, _LOW)
-            self._encoder.encode(half.astype(np.int32), _MODEL.Uniform(), (1 << width).astype(np.int32))
+            self._encoder.encode(
+                half.astype(np.int32), _MODEL.Uniform(), (1 << width).astype(np.int32)
+            )
 
     def words(self) -> np.ndarray:
         """Return the words of all columns so far, uint32."""
@@ -59,7 +62,8 @@ class ColumnReader:
     """Decoder of columns, in the order in which they were encoded.
 
     Args:
-        words: uint32 with any content: damage results in wrong integers or a ValueError, never in more integers.
+        words: uint32 with any content: damage results in wrong integers or a ValueError, never in
+            more integers.
     """
 
     def __init__(self, words: np.ndarray) -> None:
@@ -87,7 +91,10 @@ class ColumnReader:
             for shift, some in _halves(bits):
                 width = np.minimum(bits[some] - shift, _LOW)
                 rest[some] |= (
-                    self._decoder.decode(_MODEL.Uniform(), (1 << width).astype(np.int32)).astype(np.int64) << shift
+                    self._decoder.decode(_MODEL.Uniform(), (1 << width).astype(np.int32)).astype(
+                        np.int64
+                    )
+                    << shift
                 )
         except AssertionError as error:  # raised by constriction where no symbol has this code
             raise ValueError(f"its code is broken ({error})") from None
@@ -96,7 +103,9 @@ class ColumnReader:
 
 
 def column_bits(values: np.ndarray) -> float:
-    """Return an estimate of the bits of a column: the entropy of its tokens plus their remaining bits."""
+    """Return an estimate of the bits of a column: the entropy of its tokens plus their remaining
+    bits.
+    """
     tokens, bits, _ = _tokens(values)
     counts = np.bincount(tokens)
     counts = counts[counts > 0]

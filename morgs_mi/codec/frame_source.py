@@ -19,9 +19,10 @@ class FrameState:
     """Gaussians of one frame."""
 
     frame: int  #: Index of the video frame.
-    ids: np.ndarray  #: uint32 [N], ascending: the number of each Gaussian from its birth to its death.
-    #: The N Gaussians; `motion` is the displacement since the frame before, zero where there is none, `offset` its
-    #: learned part, None if the packet does not contain it.
+    #: uint32 [N], ascending: the number of each Gaussian from its birth to its death.
+    ids: np.ndarray
+    #: The N Gaussians; `motion` is the displacement since the frame before, zero where there is
+    #: none, `offset` its learned part, None if the packet does not contain it.
     gaussians: Gaussians
     #: Number of ids in earlier sets since decoding began; a keyframe of a new frame begins a set.
     first_id: int = field(default=0, kw_only=True)
@@ -36,7 +37,8 @@ class FrameState:
 
 
 class FrameSource(Protocol):
-    """Frames of Gaussians with their cameras: a `StreamReader`, or a `SplatFile` with a single frame.
+    """Frames of Gaussians with their cameras: a `StreamReader`, or a `SplatFile` with a single
+    frame.
 
     Iterating yields packets, into which a file of Gaussians is coded.
 
@@ -59,7 +61,8 @@ class FrameSource(Protocol):
         ...
 
     def states(self, near: int | None = None) -> Iterator[FrameState]:
-        """Yield the state of each frame, from the first one, or from one at or before the frame `near`.
+        """Yield the state of each frame, from the first one, or from one at or before the frame
+        `near`.
 
         Raises:
             ValueError: a packet is broken, or `near` is given for a pipe.
@@ -74,7 +77,10 @@ class FrameSource(Protocol):
         """
         state = next((state for state in self.states(frame) if state.frame >= frame), None)
         if state is None or state.frame != frame:
-            raise ValueError(f"{self.path}: expected a frame of the stream, got {frame}; choose one that it contains.")
+            raise ValueError(
+                f"{self.path}: expected a frame of the stream, got {frame}; choose one that it "
+                "contains."
+            )
         return state
 
 

@@ -1,7 +1,9 @@
-"""The stream's header: cameras, frame rate and metadata as JSON, with the limits that docs/stream-format.md sets.
+"""The stream's header: cameras, frame rate and metadata as JSON, with the limits that
+docs/stream-format.md sets.
 
-JSON takes up to thirty times its bytes in memory, and a header may come from anybody: its size, its depth, and the type
-and range of every entry are checked where it is read. A writer checks its header by reading it.
+JSON takes up to thirty times its bytes in memory, and a header may come from anybody: its size, its
+depth, and the type and range of every entry are checked where it is read. A writer checks its
+header by reading it.
 """
 
 from __future__ import annotations
@@ -37,11 +39,17 @@ def header_json(cameras: Sequence[Camera], fps: float, metadata: Mapping[str, An
     Raises:
         ValueError: JSON cannot represent it, or a reader would refuse it.
     """
-    fields = {"cameras": [_camera_fields(camera) for camera in cameras], "fps": float(fps), "metadata": dict(metadata)}
+    fields = {
+        "cameras": [_camera_fields(camera) for camera in cameras],
+        "fps": float(fps),
+        "metadata": dict(metadata),
+    }
     try:
         text = json.dumps(fields, allow_nan=False)
     except (TypeError, ValueError, RecursionError) as error:
-        raise ValueError(f"StreamWriter(): `metadata` and `fps` must fit into JSON ({error}).") from None
+        raise ValueError(
+            f"StreamWriter(): `metadata` and `fps` must fit into JSON ({error})."
+        ) from None
     try:
         header_fields(text.encode())
     except ValueError as error:
@@ -67,7 +75,10 @@ def header_fields(payload: bytes | memoryview) -> tuple[tuple[Camera, ...], floa
         ValueError: an entry is missing, or has another type or range than it must have.
     """
     header = _typed(load_json(payload, _MAX_BYTES), dict, "header")
-    cameras = [camera_of_fields(fields, f"cameras[{k}]") for k, fields in enumerate(_entry(header, "cameras", list))]
+    cameras = [
+        camera_of_fields(fields, f"cameras[{k}]")
+        for k, fields in enumerate(_entry(header, "cameras", list))
+    ]
     if not cameras:
         raise ValueError("`cameras` must name at least one camera, got none")
     fps = _within(_entry(header, "fps", float), 1 / _MAX_FPS, _MAX_FPS, "fps")
@@ -82,13 +93,15 @@ def load_json(data: bytes | memoryview, most: int) -> Any:
         most: bytes that it may have.
 
     Raises:
-        ValueError: it is longer, nested too deeply or no JSON, or has numbers that are not finite or, if they are
-            integers, have more than 64 bits.
+        ValueError: it is longer, nested too deeply or no JSON, or has numbers that are not finite
+            or, if they are integers, have more than 64 bits.
     """
     if len(data) > most:
         raise ValueError(f"the JSON must have at most {most} bytes, got {len(data)}")
     try:
-        value = json.loads(str(data, "utf-8"), parse_constant=_finite, parse_float=_finite, parse_int=_short)
+        value = json.loads(
+            str(data, "utf-8"), parse_constant=_finite, parse_float=_finite, parse_int=_short
+        )
     except UnicodeDecodeError:
         raise ValueError("the JSON is broken (not UTF-8)") from None
     except json.JSONDecodeError as error:
@@ -131,11 +144,19 @@ def camera_of_fields(fields: Any, where: str) -> Camera:
     if not name.isprintable():
         raise ValueError(f"`{where}.name` must be printable, got {name!r:.60}")
     width, height = (
-        _within(_entry(fields, key, int, where), 1, _MAX_PIXELS, f"{where}.{key}") for key in ("width", "height")
+        _within(_entry(fields, key, int, where), 1, _MAX_PIXELS, f"{where}.{key}")
+        for key in ("width", "height")
     )
     _within(width * height, 1, _MAX_PIXELS, f"{where}.width * height")
     near = _within(_entry(fields, "near", float, where), 1 / LARGEST, LARGEST, f"{where}.near")
-    return Camera(_matrix(fields, "K", 3, where), _matrix(fields, "viewmat", 4, where), width, height, name, near)
+    return Camera(
+        _matrix(fields, "K", 3, where),
+        _matrix(fields, "viewmat", 4, where),
+        width,
+        height,
+        name,
+        near,
+    )
 
 
 def _matrix(fields: dict[str, Any], key: str, size: int, where: str) -> np.ndarray:
@@ -143,7 +164,9 @@ def _matrix(fields: dict[str, Any], key: str, size: int, where: str) -> np.ndarr
     what = f"{where}.{key}"
     if len(rows) != size or any(not isinstance(row, list) or len(row) != size for row in rows):
         raise ValueError(f"`{what}` must be a matrix [{size}][{size}]")
-    return np.array([[_within(_typed(x, float, what), -LARGEST, LARGEST, what) for x in row] for row in rows])
+    return np.array(
+        [[_within(_typed(x, float, what), -LARGEST, LARGEST, what) for x in row] for row in rows]
+    )
 
 
 def _entry(fields: dict[str, Any], key: str, kind: type, where: str = "") -> Any:

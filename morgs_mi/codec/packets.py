@@ -1,12 +1,14 @@
-"""Frames <-> packets: a keyframe contains all integers of a frame, a residual the changes since the frame before.
+"""Frames <-> packets: a keyframe contains all integers of a frame, a residual the changes since the
+frame before.
 
-The state of a stream is a `CodedFrame`. Encoder and decoder compute it from the same packets with the same integers, so
-the two cannot drift: after making a packet, take its `decode` as the new state, and fit the next frame to that. Each
-residual also names the state that it continues, and is refused by any other.
+The state of a stream is a `CodedFrame`. Encoder and decoder compute it from the same packets with
+the same integers, so the two cannot drift: after making a packet, take its `decode` as the new
+state, and fit the next frame to that. Each residual also names the state that it continues, and is
+refused by any other.
 
-`source` [N'] maps a frame to the frame before: the index of the same Gaussian there, -1 for a birth. Survivors come
-first in ascending order, births after them. Each Gaussian has one number in `ids` for life; births get the next free
-ones.
+`source` [N'] maps a frame to the frame before: the index of the same Gaussian there, -1 for a
+birth. Survivors come first in ascending order, births after them. Each Gaussian has one number in
+`ids` for life; births get the next free ones.
 """
 
 from __future__ import annotations
@@ -42,9 +44,9 @@ from morgs_mi.codec.residuals import Coder, offset_steps, take_change
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 
-# An entropy code stores a column of one value in almost no bytes. A small packet must not request much memory: it
-# has a word for each 16 Gaussians that it adds, or for each 16 of their integers if the state has more than 2^22. The
-# integers of a fit take about four bits each, twice as much.
+# An entropy code stores a column of one value in almost no bytes. A small packet must not request
+# much memory: it has a word for each 16 Gaussians that it adds, or for each 16 of their integers if
+# the state has more than 2^22. The integers of a fit take about four bits each, twice as much.
 _PER_WORD = 16
 _FREE_INTEGERS = 2**22
 _DTYPES = {"head": "uint32", "code": "uint32", "parent": "uint8", "offset": "uint32"}
@@ -77,9 +79,13 @@ class CodedFrame(FrameState):
 
 
 def keyframe_packet(
-    gaussians: Gaussians, frame: int, cameras: Sequence[Camera] = (), config: CodecConfig | None = None
+    gaussians: Gaussians,
+    frame: int,
+    cameras: Sequence[Camera] = (),
+    config: CodecConfig | None = None,
 ) -> Packet:
-    """Return the packet with every stored attribute of `gaussians`, which are new: their numbers start at zero.
+    """Return the packet with every stored attribute of `gaussians`, which are new: their numbers
+    start at zero.
 
     Args:
         gaussians: N Gaussians; their `motion` and `offset` are not stored.
@@ -91,18 +97,24 @@ def keyframe_packet(
         ValueError: an attribute is not finite.
     """
     grid = new_grid(split_groups(finite_fields(gaussians)), cameras, config or CodecConfig())
-    return reemitted_keyframe(CodedFrame(frame, np.arange(len(grid), dtype=np.uint32), gaussians, grid, len(grid)))
+    return reemitted_keyframe(
+        CodedFrame(frame, np.arange(len(grid), dtype=np.uint32), gaussians, grid, len(grid))
+    )
 
 
 def reemitted_keyframe(coded: CodedFrame) -> Packet:
-    """Return the keyframe that decodes to exactly `coded`: an entry point for readers, without any loss."""
+    """Return the keyframe that decodes to exactly `coded`: an entry point for readers, without any
+    loss.
+    """
     grid = coded.grid
     writer = ColumnWriter()
     writer.put(np.diff(coded.ids.astype(np.int64), prepend=-1) - 1)
     _put_grid(writer, grid)
     head = np.array([len(grid), grid.degree, grid.optional, coded.next_id], np.uint32)
     return Packet(
-        PacketKind.KEYFRAME, coded.frame, {"head": head, "code": _padded(writer.words(), len(grid), len(grid), grid)}
+        PacketKind.KEYFRAME,
+        coded.frame,
+        {"head": head, "code": _padded(writer.words(), len(grid), len(grid), grid)},
     )
 
 
@@ -113,14 +125,16 @@ def residual_packet(
     cameras: Sequence[Camera] = (),
     config: CodecConfig | None = None,
 ) -> Packet:
-    """Return the packet that leads from `previous` to `gaussians` (eq. 3); it contains changed Gaussians only.
+    """Return the packet that leads from `previous` to `gaussians` (eq. 3); it contains changed
+    Gaussians only.
 
-    A change counts from one step on, of a base colour from half a step on. With a `target_size`, the steps of the
-    changes are widened until the packet fits.
+    A change counts from one step on, of a base colour from half a step on. With a `target_size`,
+    the steps of the changes are widened until the packet fits.
 
     Args:
         previous: state of the decoder, N Gaussians.
-        gaussians: N' Gaussians of the next frame; with `config.offset`, `offset` is stored where the means change.
+        gaussians: N' Gaussians of the next frame; with `config.offset`, `offset` is stored where
+            the means change.
         source: int [N'], see above; None if there are no births and no deaths.
         cameras: cameras in which the error of births is measured.
         config: tolerated errors.
@@ -134,17 +148,25 @@ def residual_packet(
     source = _checked(np.arange(len(grid)) if source is None else source, len(grid), len(gaussians))
     fields = finite_fields(gaussians)
     survivors = source[source >= 0]
-    offset = np.zeros((len(gaussians), 3)) if gaussians.offset is None else np.asarray(gaussians.offset)
+    offset = (
+        np.zeros((len(gaussians), 3)) if gaussians.offset is None else np.asarray(gaussians.offset)
+    )
     coder = _coder(previous, fields, survivors, offset if config.offset else None)
     births = len(gaussians) - len(survivors)
     birth_grid = None
     if births:
-        birth_grid = new_grid({n: v[len(survivors) :] for n, v in split_groups(fields).items()}, cameras, config)
+        birth_grid = new_grid(
+            {n: v[len(survivors) :] for n, v in split_groups(fields).items()}, cameras, config
+        )
     coarseness = round(4 * np.log2(config.birth_precision))
     if config.target_size:
         coarseness = _fitting(coder, coarseness, config.target_size)
     codes = _codes(coder, coarseness, birth_grid)
-    while config.target_size and coarseness < _COARSEST and sum(c.nbytes for c in codes.values()) > config.target_size:
+    while (
+        config.target_size
+        and coarseness < _COARSEST
+        and sum(c.nbytes for c in codes.values()) > config.target_size
+    ):
         coarseness += 1
         codes = _codes(coder, coarseness, birth_grid)
     arrays = {"parent": previous.digest, "head": np.array([births, coarseness], np.uint32), **codes}
@@ -159,26 +181,40 @@ def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
         packet: a packet of the stream.
 
     Raises:
-        ValueError: a residual without the state that it continues, a packet that contradicts itself, or a packet
-            of a frame that is not after the frame of `previous`.
+        ValueError: a residual without the state that it continues, a packet that contradicts
+            itself, or a packet of a frame that is not after the frame of `previous`.
     """
     where = packet.place or f"packet of frame {packet.frame}"
     names = {"head", "code"} | ({"parent"} if packet.kind == PacketKind.RESIDUAL else set())
     optional = {"offset"} if packet.kind == PacketKind.RESIDUAL else set()
     if packet.arrays.keys() - optional != names:
-        raise ValueError(f"{where}: expected the arrays {sorted(names)}, got {sorted(packet.arrays)}.")
+        raise ValueError(
+            f"{where}: expected the arrays {sorted(names)}, got {sorted(packet.arrays)}."
+        )
     for name, array in packet.arrays.items():
         if array.ndim != 1 or array.dtype != _DTYPES[name]:
-            raise ValueError(f"{where}: `{name}` must be {_DTYPES[name]} [n], got {array.dtype} {list(array.shape)}.")
+            raise ValueError(
+                f"{where}: `{name}` must be {_DTYPES[name]} [n], got {array.dtype} "
+                f"{list(array.shape)}."
+            )
     try:
         if previous is not None and packet.frame <= previous.frame:
-            raise ValueError(f"its frame must be above {previous.frame}, that of the state before, got {packet.frame}")
+            raise ValueError(
+                f"its frame must be above {previous.frame}, that of the state before, got "
+                f"{packet.frame}"
+            )
         if packet.kind == PacketKind.KEYFRAME:
-            return _decoded_keyframe(packet, 0 if previous is None else previous.first_id + max(previous.next_id, 1))
+            return _decoded_keyframe(
+                packet, 0 if previous is None else previous.first_id + max(previous.next_id, 1)
+            )
         if previous is None:
-            raise ValueError("a residual needs the frame before it, got none; start from a keyframe")
+            raise ValueError(
+                "a residual needs the frame before it, got none; start from a keyframe"
+            )
         if not np.array_equal(packet.arrays["parent"], previous.digest):
-            raise ValueError(f"it does not continue the state after frame {previous.frame}; a packet is missing")
+            raise ValueError(
+                f"it does not continue the state after frame {previous.frame}; a packet is missing"
+            )
         return _decoded_residual(previous, packet)
     except ValueError as error:
         raise ValueError(f"{where}: {error}.") from None
@@ -198,8 +234,9 @@ def _decoded_keyframe(packet: Packet, first_id: int) -> CodedFrame:
     N, degree, optional, next_id = _head(packet, 4)
     if unknown_bits := optional & ~KNOWN_OPTIONAL:
         raise ValueError(
-            f"its mask of optional attributes must have no bits beyond {KNOWN_OPTIONAL:#b}, got {optional:#b} with the "
-            f"unknown {unknown_bits:#b}; read it with the release that wrote it"
+            f"its mask of optional attributes must have no bits beyond {KNOWN_OPTIONAL:#b}, got "
+            f"{optional:#b} with the unknown {unknown_bits:#b}; read it with the release that "
+            "wrote it"
         )
     _check_most(degree, 3, "its degree")
     _check_most(next_id, LIMIT - 1, "its next id")
@@ -209,7 +246,9 @@ def _decoded_keyframe(packet: Packet, first_id: int) -> CodedFrame:
     grid = _taken_grid(reader, N, degree, optional)
     if np.any(np.diff(ids, prepend=-1) < 1) or (N and ids[-1] >= next_id):
         raise ValueError("its ids do not ascend")
-    return CodedFrame(packet.frame, ids.astype(np.uint32), grid.gaussians(), grid, next_id, first_id=first_id)
+    return CodedFrame(
+        packet.frame, ids.astype(np.uint32), grid.gaussians(), grid, next_id, first_id=first_id
+    )
 
 
 def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
@@ -234,7 +273,9 @@ def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
         offset[rows] = _taken_offsets(packet.arrays["offset"], new.select(rows), coarseness)
     if births:
         new = new.concatenate(_taken_grid(reader, births, grid.degree, grid.optional))
-    ids = np.concatenate([previous.ids[survivors], previous.next_id + np.arange(births, dtype=np.uint32)])
+    ids = np.concatenate(
+        [previous.ids[survivors], previous.next_id + np.arange(births, dtype=np.uint32)]
+    )
     return replace(
         previous,
         frame=packet.frame,
@@ -246,7 +287,7 @@ def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
 
 
 def _taken_offsets(code: np.ndarray, grid: Grid, coarseness: int) -> np.ndarray:
-    """Return the offsets [M, 3] of the Gaussians whose means change, which `Coder.offsets` yields."""
+    """Return the offsets [M, 3] of the Gaussians whose means change, from `Coder.offsets`."""
     reader = ColumnReader(code)
     r = np.stack([reader.take(len(grid)) for _ in range(3)], axis=1)
     return r * offset_steps(grid, coarseness)
@@ -260,11 +301,19 @@ def _words(columns: Iterable[np.ndarray]) -> np.ndarray:
 
 
 def _put_grid(writer: ColumnWriter, grid: Grid) -> None:
-    columns = np.concatenate([grid.largest_components[:, None], grid.exponents, grid.values], axis=1, dtype=np.int64)
-    middle = np.sort(columns, axis=0)[len(grid) // 2] if len(grid) else np.zeros(columns.shape[1], np.int64)
-    middle[np.abs(columns - middle).max(0, initial=0) >= LIMIT] = 0  # the difference must not leave the limit
+    columns = np.concatenate(
+        [grid.largest_components[:, None], grid.exponents, grid.values], axis=1, dtype=np.int64
+    )
+    middle = (
+        np.sort(columns, axis=0)[len(grid) // 2]
+        if len(grid)
+        else np.zeros(columns.shape[1], np.int64)
+    )
+    # The difference must not leave the limit.
+    middle[np.abs(columns - middle).max(0, initial=0) >= LIMIT] = 0
     writer.put(middle)
-    for column in (columns - middle).T:  # small integers have a token of their own, large ones one per octave
+    # Small integers have a token of their own, large ones one per octave.
+    for column in (columns - middle).T:
         writer.put(column)
 
 
@@ -284,9 +333,14 @@ def _taken_grid(reader: ColumnReader, N: int, degree: int, optional: int) -> Gri
 
 
 def _coder(
-    previous: CodedFrame, fields: Mapping[str, np.ndarray], survivors: np.ndarray, offset: np.ndarray | None
+    previous: CodedFrame,
+    fields: Mapping[str, np.ndarray],
+    survivors: np.ndarray,
+    offset: np.ndarray | None,
 ) -> Coder:
-    """Return the coder of the changes to the next stored `fields`; survivors without any difference are skipped."""
+    """Return the coder of the changes to the next stored `fields`; survivors without any difference
+    are skipped.
+    """
     grid = previous.grid
     previous_fields = stored_fields(previous.gaussians)
     differs = np.zeros(len(survivors), bool)
@@ -295,7 +349,9 @@ def _coder(
         differs |= differences.reshape(len(survivors), prod(value.shape[1:])).any(1)
     indices = np.flatnonzero(differs)
     rows = survivors[indices]
-    change = real_values({name: value[indices] for name, value in split_groups(fields).items()}, grid.select(rows))
+    change = real_values(
+        {name: value[indices] for name, value in split_groups(fields).items()}, grid.select(rows)
+    )
     change -= grid.values[rows].T
     return Coder(grid, survivors, rows, change, offset)
 
@@ -316,7 +372,9 @@ def _codes(coder: Coder, coarseness: int, birth_grid: Grid | None) -> dict[str, 
 
 
 def _fitting(coder: Coder, low: int, target: int) -> int:
-    """Return the least coarseness from `low` at which the changes are estimated to take `target` bytes."""
+    """Return the least coarseness from `low` at which the changes are estimated to take `target`
+    bytes.
+    """
     high = _COARSEST
     while low < high:
         middle = (low + high) // 2
@@ -334,8 +392,9 @@ def _check_attributes(previous: CodedFrame, degree: int, optional: int) -> None:
     if (degree, optional) != (grid.degree, grid.optional):
         names, new_names = (list(optional_names(mask)) for mask in (grid.optional, optional))
         raise ValueError(
-            f"residual_packet(): frame {previous.frame + 1} must have SH of degree {grid.degree} and the optional "
-            f"attributes {names} as the frame before, got degree {degree} and {new_names}; write a keyframe instead."
+            f"residual_packet(): frame {previous.frame + 1} must have SH of degree {grid.degree} "
+            f"and the optional attributes {names} as the frame before, got degree {degree} and "
+            f"{new_names}; write a keyframe instead."
         )
 
 
@@ -347,8 +406,9 @@ def _checked(source: np.ndarray, N: int, next_N: int) -> np.ndarray:
     is_ordered = np.all(np.diff(survivors) > 0) and np.all(np.diff(births.astype(int)) >= 0)
     if source.shape != (next_N,) or not is_ordered or np.any(survivors >= N):
         raise ValueError(
-            f"residual_packet(): `source` must be [{next_N}] with survivors of 0..{N - 1} in ascending order, then "
-            f"-1 for each birth, got {source.shape}; sort the Gaussians in this order."
+            f"residual_packet(): `source` must be [{next_N}] with survivors of 0..{N - 1} in "
+            f"ascending order, then -1 for each birth, got {source.shape}; sort the Gaussians in "
+            "this order."
         )
     return source
 
@@ -366,16 +426,23 @@ def _check_most(number: int, most: int, what: str) -> None:
 
 
 def _padded(words: np.ndarray, births: int, total: int, grid: Grid) -> np.ndarray:
-    return np.pad(words, (0, max(0, _least_words(births, total, grid.degree, grid.optional) - len(words))))
+    return np.pad(
+        words, (0, max(0, _least_words(births, total, grid.degree, grid.optional) - len(words)))
+    )
 
 
 def _check_words(code: np.ndarray, births: int, total: int, degree: int, optional: int) -> None:
     least = _least_words(births, total, degree, optional)
     if len(code) < least:
-        raise ValueError(f"{births} new of {total} Gaussians take at least {least} words of code, got {len(code)}")
+        raise ValueError(
+            f"{births} new of {total} Gaussians take at least {least} words of code, got "
+            f"{len(code)}"
+        )
 
 
 def _least_words(births: int, total: int, degree: int, optional: int) -> int:
-    """Return the number of words that a packet has at least if it adds some Gaussians to a state with a new total."""
+    """Return the number of words that a packet has at least if it adds some Gaussians to a state
+    with a new total.
+    """
     integers = num_integers(degree, optional)
     return -(-births * (integers if total * integers > _FREE_INTEGERS else 1) // _PER_WORD)

@@ -1,21 +1,24 @@
-"""Gaussians <-> integers: every number is a multiple of a step, which stays the same for the life of its Gaussian.
+"""Gaussians <-> integers: every number is a multiple of a step, which stays the same for the life
+of its Gaussian.
 
     value = q * 2^(e / 4)        q int32, e int8: quarter octaves
 
-The columns of `values` [N, C] form groups, one per stored row of the attribute table (`core.attributes`), in its order:
+The columns of `values` [N, C] form groups, one per stored row of the attribute table
+(`core.attributes`), in its order:
 
     means            3       world units
     log_scales       3
-    quats            3       quats without their largest component, divided by it: (u, v, w) stands for
-                             (1, u, v, w) / length
+    quats            3       quats without their largest component, divided by it: (u, v, w)
+                             stands for (1, u, v, w) / length
     logit_opacities  1
     sh_dc            3
     sh_rest          3 K-3
-    any other row            optional attributes, e.g. logit_confidence with 1 column; a bit mask determines which exist
+    any other row            optional attributes, e.g. logit_confidence with 1 column; a bit mask
+                             determines which exist
 
-`exponents` [N, E] has one e per axis of log_scales and one for every other group. A decoder computes everything element
-by element in float64. IEEE 754 determines the rounding of the operations: no machine, library or number of threads can
-change a bit.
+`exponents` [N, E] has one e per axis of log_scales and one for every other group. A decoder
+computes everything element by element in float64. IEEE 754 determines the rounding of the
+operations: no machine, library or number of threads can change a bit.
 """
 
 from __future__ import annotations
@@ -44,14 +47,17 @@ KNOWN_OPTIONAL = (1 << len(_OPTIONAL)) - 1
 """Bit mask of all optional attributes that this release can decode."""
 
 _QUARTERS = np.array([1.0, 1.189207115002721, 1.4142135623730951, 1.681792830507429])  # 2^(k/4)
-_STEPS = np.ldexp(_QUARTERS[np.arange(256) & 3], np.arange(256).astype(np.int8) >> 2)  # by e mod 256
-# Values beyond these bounds make no visible difference, and one outlier must not cost the others their steps.
+# Steps by e mod 256.
+_STEPS = np.ldexp(_QUARTERS[np.arange(256) & 3], np.arange(256).astype(np.int8) >> 2)
+# Values beyond these bounds make no visible difference, and one outlier must not cost the others
+# their steps.
 _MAX_RATIO = 4096.0
 _MAX_LOGIT = 16.0
 _MAX_OPTIONAL = 6.0
 _MIN_SIZE_PX = 0.5  # smaller splats are blurred to about this size when they are drawn
 _MAX_BITS = 24  # of an integer of a new Gaussian
-_MAX_VALUE = LIMIT - 2**20  # stays within the limit when it is rounded to the coarsest change (see `packets`)
+# Stays within the limit when it is rounded to the coarsest change (see `packets`).
+_MAX_VALUE = LIMIT - 2**20
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +66,8 @@ class Grid:
 
     values: np.ndarray  #: int32 [N, C].
     exponents: np.ndarray  #: int8 [N, E].
-    largest_components: np.ndarray  #: uint8 [N], the component of each quaternion that is not stored.
+    #: uint8 [N], the component of each quaternion that is not stored.
+    largest_components: np.ndarray
     degree: int  #: Of the spherical harmonics, 0 to 3.
     optional: int  #: Bit mask of the optional attributes, see `optional_mask`.
 
@@ -97,7 +104,9 @@ class Grid:
         }
         return replace(self, **both)
 
-    def gaussians(self, motion: np.ndarray | None = None, offset: np.ndarray | None = None) -> Gaussians:
+    def gaussians(
+        self, motion: np.ndarray | None = None, offset: np.ndarray | None = None
+    ) -> Gaussians:
         """Return the Gaussians that the integers stand for.
 
         Args:
@@ -111,7 +120,11 @@ class Grid:
         quats[rows, self.largest_components] = 1 / length
         for k, ratio in enumerate((u, v, w)):
             quats[rows, k + (k >= self.largest_components)] = ratio / length
-        sh = [self.real(name).astype(np.float32) for name in ("sh_dc", "sh_rest") if name in self.columns]
+        sh = [
+            self.real(name).astype(np.float32)
+            for name in ("sh_dc", "sh_rest")
+            if name in self.columns
+        ]
         optional = {
             name: self.real(name).astype(np.float32).reshape(len(self), *_STORED[name].shape)
             for name in optional_names(self.optional)
@@ -129,7 +142,9 @@ class Grid:
 
 
 def optional_mask(names: Collection[str]) -> int:
-    """Return the bit mask of the optional attributes among `names`: bit k stands for the k-th in the table."""
+    """Return the bit mask of the optional attributes among `names`: bit k stands for the k-th in
+    the table.
+    """
     return sum(1 << bit for bit, name in enumerate(_OPTIONAL) if name in names)
 
 
@@ -145,8 +160,12 @@ def columns_of(degree: int, optional: int) -> dict[str, slice]:
 
 
 def _width(row: Attribute, degree: int) -> int:
-    """Return the number of columns of a group; -1 in a shape is the number of SH coefficients beyond the first."""
-    return 3 if row.name == "quats" else prod((degree + 1) ** 2 - 1 if n < 0 else n for n in row.shape)
+    """Return the number of columns of a group; -1 in a shape is the number of SH coefficients
+    beyond the first.
+    """
+    return (
+        3 if row.name == "quats" else prod((degree + 1) ** 2 - 1 if n < 0 else n for n in row.shape)
+    )
 
 
 def num_exponents(optional: int) -> int:
@@ -155,21 +174,30 @@ def num_exponents(optional: int) -> int:
 
 
 def num_integers(degree: int, optional: int) -> int:
-    """Return the number of integers of a Gaussian: the largest component, E exponents and C values."""
-    return 1 + num_exponents(optional) + max(at.stop for at in columns_of(degree, optional).values())
+    """Return the number of integers of a Gaussian: largest component, E exponents, C values."""
+    return (
+        1 + num_exponents(optional) + max(at.stop for at in columns_of(degree, optional).values())
+    )
 
 
 def _exponent_columns(optional: int) -> dict[str, slice]:
-    return _slices({name: 3 if name == "log_scales" else 1 for name in (*_ALWAYS, *optional_names(optional))})
+    return _slices(
+        {name: 3 if name == "log_scales" else 1 for name in (*_ALWAYS, *optional_names(optional))}
+    )
 
 
 def _slices(widths: Mapping[str, int]) -> dict[str, slice]:
     ends = np.cumsum(list(widths.values())).tolist()
-    return {name: slice(end - width, end) for (name, width), end in zip(widths.items(), ends, strict=True)}
+    return {
+        name: slice(end - width, end)
+        for (name, width), end in zip(widths.items(), ends, strict=True)
+    }
 
 
 def step_sizes(exponents: np.ndarray) -> np.ndarray:
-    """Return 2^(e / 4) as float64 for integers e of -128 to 127: one of four factors, times a power of two."""
+    """Return 2^(e / 4) as float64 for integers e of -128 to 127: one of four factors, times a power
+    of two.
+    """
     return _STEPS[exponents.astype(np.uint8)]
 
 
@@ -186,7 +214,11 @@ def bounded(values: np.ndarray, limit: int, what: str) -> np.ndarray:
 
 def stored_fields(gaussians: Gaussians) -> dict[str, np.ndarray]:
     """Return the fields [N, ...] of Gaussians that a stream stores, by name."""
-    return {name: value for name, value in gaussians.numpy().items() if name == "sh_coeffs" or name in GROUPS}
+    return {
+        name: value
+        for name, value in gaussians.numpy().items()
+        if name == "sh_coeffs" or name in GROUPS
+    }
 
 
 def split_groups(fields: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -209,35 +241,47 @@ def finite_fields(gaussians: Gaussians) -> dict[str, np.ndarray]:
         if not np.isfinite(value).all():
             row = np.argwhere(~np.isfinite(value))[0][0]
             raise ValueError(
-                f"the stream: `{name}` must be finite, that of Gaussian {row} is not; lower the learning rates."
+                f"the stream: `{name}` must be finite, that of Gaussian {row} is not; lower the "
+                "learning rates."
             )
     return fields
 
 
 def new_grid(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: CodecConfig) -> Grid:
-    """Return new Gaussians, given by their raw attributes by group, rounded to steps that are chosen here."""
+    """Return new Gaussians, given by their raw attributes by group, rounded to steps that are
+    chosen here.
+    """
     raw = {name: np.asarray(value, np.float64) for name, value in raw.items()}
     largest_components = np.abs(raw["quats"]).argmax(1).astype(np.uint8)
     degree = round((1 + raw["sh_rest"].shape[1]) ** 0.5) - 1
     exponents = _exponents(raw, cameras, config)
-    grid = Grid(np.zeros((0, 0), np.int32), exponents, largest_components, degree, optional_mask(raw))
+    grid = Grid(
+        np.zeros((0, 0), np.int32), exponents, largest_components, degree, optional_mask(raw)
+    )
     values = np.rint(real_values(raw, grid)).astype(np.int32)
     return replace(grid, values=np.ascontiguousarray(values.T))
 
 
 def _bounded_optional(name: str, values: np.ndarray) -> np.ndarray:
     """Return the values of an optional attribute, clipped where its activation saturates."""
-    return np.clip(values, -_MAX_OPTIONAL, _MAX_OPTIONAL) if BY_NAME[name].activation is SIGMOID else values
+    return (
+        np.clip(values, -_MAX_OPTIONAL, _MAX_OPTIONAL)
+        if BY_NAME[name].activation is SIGMOID
+        else values
+    )
 
 
 def real_values(raw: Mapping[str, np.ndarray], grid: Grid) -> np.ndarray:
-    """Return unrounded `Grid.values` of other raw attributes by group, float64 [C, N], with the steps of `grid`."""
+    """Return unrounded `Grid.values` of other raw attributes by group, float64 [C, N], with the
+    steps of `grid`.
+    """
     largest_components = grid.largest_components
     rows = np.arange(len(grid.largest_components))
     quats = np.asarray(raw["quats"], np.float64)
     others = np.stack([quats[rows, k + (k >= largest_components)] for k in range(3)], axis=1)
     largest = quats[rows, largest_components][:, None]
-    # The component that was the largest at birth is zero after a turn by 180 degrees; the ratio is then very large.
+    # The component that was the largest at birth is zero after a turn by 180 degrees; the ratio is
+    # then very large.
     ratios = others / np.where(np.abs(largest) < 1e-12, 1e-12, largest)
     numbers = {name: _bounded_optional(name, raw[name]) for name in optional_names(grid.optional)}
     numbers |= {name: raw[name] for name in ("means", "log_scales", "sh_dc", "sh_rest")}
@@ -245,12 +289,18 @@ def real_values(raw: Mapping[str, np.ndarray], grid: Grid) -> np.ndarray:
     numbers["logit_opacities"] = np.clip(raw["logit_opacities"], -_MAX_LOGIT, _MAX_LOGIT)
     real = np.empty((max(at.stop for at in grid.columns.values()), len(rows)))
     for name, at in grid.columns.items():
-        np.divide(numbers[name].reshape(len(rows), at.stop - at.start).T, grid.steps(name).T, out=real[at])
+        np.divide(
+            numbers[name].reshape(len(rows), at.stop - at.start).T, grid.steps(name).T, out=real[at]
+        )
     return np.clip(real, -_MAX_VALUE, _MAX_VALUE, out=real)
 
 
-def _exponents(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: CodecConfig) -> np.ndarray:
-    """Return quarter octaves int8 [N, E] of steps, which are twice the error that `config` tolerates."""
+def _exponents(
+    raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: CodecConfig
+) -> np.ndarray:
+    """Return quarter octaves int8 [N, E] of steps, which are twice the error that `config`
+    tolerates.
+    """
     ones = np.ones(len(raw["means"]))
     steps = _steps_of_groups(raw, cameras, config)
     magnitudes = _magnitudes(raw)
@@ -268,13 +318,17 @@ def _exponents(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config:
 def _steps_of_groups(
     raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: CodecConfig
 ) -> dict[str, list[tuple[float, np.ndarray]]]:
-    """Return (step of all Gaussians, factor of each one [N]) for each exponent of a group, by group."""
+    """Return (step of all Gaussians, factor of each one [N]) for each exponent of a group, by
+    group.
+    """
     precision = config.quality * config.birth_precision
     error, color = (2 * _tolerated(name) / precision for name in ("means", "sh_dc"))
     pixel = _world_per_pixel(raw["means"], cameras)
     ones = np.ones(len(pixel))
-    sizes = np.maximum(np.exp(np.minimum(raw["log_scales"], 80.0)) / pixel[:, None], _MIN_SIZE_PX)  # px
-    elongation = np.maximum(np.sqrt(sizes.max(1) ** 2 - sizes.min(1) ** 2), _MIN_SIZE_PX)  # a ball tolerates any turn
+    # In px.
+    sizes = np.maximum(np.exp(np.minimum(raw["log_scales"], 80.0)) / pixel[:, None], _MIN_SIZE_PX)
+    # A ball tolerates any turn.
+    elongation = np.maximum(np.sqrt(sizes.max(1) ** 2 - sizes.min(1) ** 2), _MIN_SIZE_PX)
     return {
         "means": [(error, pixel)],
         "log_scales": [(error, 1 / size) for size in sizes.T],
@@ -288,7 +342,8 @@ def _steps_of_groups(
 def _magnitudes(raw: Mapping[str, np.ndarray]) -> dict[str, list[np.ndarray]]:
     """Return the largest absolute values [N] for each exponent of a group, by group.
 
-    Close to a lens, and for huge splats, steps would be finer than float32, and the integers without bound.
+    Close to a lens, and for huge splats, steps would be finer than float32, and the integers
+    without bound.
     """
     return {
         "means": [np.abs(raw["means"]).max(1)],
@@ -299,7 +354,8 @@ def _magnitudes(raw: Mapping[str, np.ndarray]) -> dict[str, list[np.ndarray]]:
 
 
 def _generic_step(name: str, config: CodecConfig) -> float:
-    """Return the step. Half of it changes the activated value by the tolerated error where it is most sensitive.
+    """Return the step. Half of it changes the activated value by the tolerated error where it is
+    most sensitive.
 
     Where the slope of the activation has no bound, the error applies to the optimised value.
     """
@@ -315,7 +371,9 @@ def _tolerated(name: str) -> float:
 
 
 def _world_per_pixel(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the size of a pixel [N] at each mean, world units, in the camera that magnifies it most."""
+    """Return the size of a pixel [N] at each mean, world units, in the camera that magnifies it
+    most.
+    """
     pixel = np.full(len(means), np.inf)
     for camera in cameras:
         view = np.asarray(camera.viewmat, np.float64)

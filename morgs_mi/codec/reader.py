@@ -1,4 +1,6 @@
-"""Reader of a stream: a file, complete or still growing, or a pipe; from the start, or from near a frame."""
+"""Reader of a stream: a file, complete or still growing, or a pipe; from the start, or from near a
+frame.
+"""
 
 from __future__ import annotations
 
@@ -36,13 +38,14 @@ _Entry = tuple[int, int, int]
 class StreamReader(FrameSource):
     """Reader of a stream.
 
-    Iterating yields its packets from the first. A file may be read again, e.g. when it has grown; a pipe yields each
-    packet once, as soon as it arrives.
+    Iterating yields its packets from the first. A file may be read again, e.g. when it has grown; a
+    pipe yields each packet once, as soon as it arrives.
 
     Args:
         source: path of the file, or a binary file object, such as a pipe or the file of a socket.
-        skip_damaged: leave out damaged packets of a file, and all that follow one up to the next intact keyframe. A
-            damaged length hides the packets after it, unless the file ends with an intact index.
+        skip_damaged: leave out damaged packets of a file, and all that follow one up to the next
+            intact keyframe. A damaged length hides the packets after it, unless the file ends with
+            an intact index.
 
     Attributes:
         path: the file.
@@ -53,29 +56,38 @@ class StreamReader(FrameSource):
 
     Raises:
         FileNotFoundError: there is no such file.
-        TruncatedStreamError: the stream ends inside a packet (while iterating: after the complete ones).
-        ValueError: it is not a stream, has another version, or a packet is broken. The message names the file, the
-            packet's number and byte offset, the number of intact packets before it and the frame of the last of them;
-            or damage is to be skipped in a pipe.
+        TruncatedStreamError: the stream ends inside a packet (while iterating: after the complete
+            ones).
+        ValueError: it is not a stream, has another version, or a packet is broken. The message
+            names the file, the packet's number and byte offset, the number of intact packets before
+            it and the frame of the last of them; or damage is to be skipped in a pipe.
     """
 
     def __init__(self, source: str | Path | BinaryIO, skip_damaged: bool = False) -> None:
         self._pipe = None if isinstance(source, str | Path) else source
-        self.path = Path(source if isinstance(source, str | Path) else str(getattr(source, "name", "stream")))
+        self.path = Path(
+            source if isinstance(source, str | Path) else str(getattr(source, "name", "stream"))
+        )
         with self._opened() as file:
             preamble = _read(file, PREAMBLE.size)
             if not MAGIC.startswith(preamble[:8]):
                 raise ValueError(
-                    f"{self.path}: expected a stream that starts with {MAGIC!r}, got {preamble[:8]!r}; check the path."
+                    f"{self.path}: expected a stream that starts with {MAGIC!r}, got "
+                    f"{preamble[:8]!r}; check the path."
                 )
-            if len(preamble) == PREAMBLE.size and (version := PREAMBLE.unpack(preamble)[1]) != VERSION:
+            if (
+                len(preamble) == PREAMBLE.size
+                and (version := PREAMBLE.unpack(preamble)[1]) != VERSION
+            ):
                 raise ValueError(
                     f"{self.path}: expected format version {VERSION}, got {version}; "
                     "read it with the release that wrote it."
                 )
             data = self._packet(file, 0, len(preamble))
             if data is None:
-                raise TruncatedStreamError(self._sentence(0, len(preamble), "the header is missing"))
+                raise TruncatedStreamError(
+                    self._sentence(0, len(preamble), "the header is missing")
+                )
             with self._located(0, PREAMBLE.size):
                 kind, _, payload = open_packet(data)
                 if kind != PacketKind.HEADER:
@@ -90,7 +102,8 @@ class StreamReader(FrameSource):
     def __repr__(self) -> str:
         frames = f"{self.metadata['num_frames']} frames, " if "num_frames" in self.metadata else ""
         return (
-            f"{type(self).__name__}('{self.path}', {frames}{len(self.cameras)} cameras, {self.fps:g} frames per second)"
+            f"{type(self).__name__}('{self.path}', {frames}{len(self.cameras)} cameras, "
+            f"{self.fps:g} frames per second)"
         )
 
     def __iter__(self) -> Iterator[Packet]:
@@ -102,8 +115,9 @@ class StreamReader(FrameSource):
     def states(self, near: int | None = None) -> Iterator[CodedFrame]:
         """Decode the packets and yield the state after each frame; see `FrameSource.states`.
 
-        Near a frame, decoding starts at the last keyframe before it. Where the frame cannot be reached from there,
-        because that keyframe or the index is forged, the states from the start of the stream follow.
+        Near a frame, decoding starts at the last keyframe before it. Where the frame cannot be
+        reached from there, because that keyframe or the index is forged, the states from the start
+        of the stream follow.
         """
         has_frame = False
         if near is not None:
@@ -123,7 +137,8 @@ class StreamReader(FrameSource):
     def near(self, frame: int) -> Iterator[Packet]:
         """Yield the packets from the last keyframe before `frame` on, or from the first.
 
-        Only the residual of a frame determines its displacements, so a keyframe of `frame` itself does not count.
+        Only the residual of a frame determines its displacements, so a keyframe of `frame` itself
+        does not count.
 
         Raises:
             TruncatedStreamError: as `index`.
@@ -140,7 +155,8 @@ class StreamReader(FrameSource):
         return self._packets(number, at)
 
     def closed(self) -> bool:
-        """Return whether the file ends with its index; otherwise it is still being written, or was truncated.
+        """Return whether the file ends with its index; otherwise it is still being written, or was
+        truncated.
 
         Raises:
             TruncatedStreamError: as `index`.
@@ -149,7 +165,8 @@ class StreamReader(FrameSource):
             return self._last_index(file) is not None
 
     def index(self) -> list[_Entry]:
-        """Return (kind, frame, offset) of every complete packet except the header, from the index if there is one.
+        """Return (kind, frame, offset) of every complete packet except the header, from the index
+        if there is one.
 
         Those that are left out as damaged have no entry.
 
@@ -173,9 +190,13 @@ class StreamReader(FrameSource):
             return entries
 
     def _playable(self) -> tuple[list[_Entry], list[int]]:
-        """Return the entries of the packets that play without the damaged ones, and the frames that do not play."""
+        """Return the entries of the packets that play without the damaged ones, and the frames that
+        do not play.
+        """
         if self._pipe is not None:
-            raise ValueError(f"{self.path}: expected a file to skip damage in, got a pipe; save it first.")
+            raise ValueError(
+                f"{self.path}: expected a file to skip damage in, got a pipe; save it first."
+            )
         entries = list[_Entry]()
         frames = [-1]
         plays = False
@@ -187,7 +208,8 @@ class StreamReader(FrameSource):
                     if plays:
                         entries.append((kind, frame, offset))
                 else:
-                    # A damaged head may name any frame. A keyframe that repeats the state of a frame is not needed.
+                    # A damaged head may name any frame. A keyframe that repeats the state of a
+                    # frame is not needed.
                     frames.append(frame if frame == frames[-1] else frames[-1] + 1)
                     plays = plays and entries[-1][1] == frames[-1]
         return entries, sorted({*frames[1:]} - {frame for _, frame, _ in entries})
@@ -204,13 +226,17 @@ class StreamReader(FrameSource):
         """Return the entries of the index at the file's end, None if there is none."""
         size = file.seek(0, 2)
         if size < self._first:
-            problem = f"the header ended at byte {self._first}, now the file has {size} bytes: replaced or truncated"
+            problem = (
+                f"the header ended at byte {self._first}, now the file has {size} bytes: replaced "
+                "or truncated"
+            )
             raise TruncatedStreamError(self._sentence(0, PREAMBLE.size, problem))
         file.seek(size - TRAILER.size)
         at, magic = TRAILER.unpack(file.read(TRAILER.size))
         if magic == INDEX_MAGIC and self._first <= at < size:
             file.seek(at)
-            with contextlib.suppress(ValueError, struct.error):  # a payload that looks like an index by chance
+            # A payload that looks like an index by chance.
+            with contextlib.suppress(ValueError, struct.error):
                 kind, _, payload = open_packet(file.read(size - at))
                 entries = list(ENTRY.iter_unpack(payload[: -TRAILER.size]))
                 if kind == PacketKind.INDEX and self._plausible(entries, at):
@@ -218,13 +244,18 @@ class StreamReader(FrameSource):
         return None
 
     def _plausible(self, entries: list[_Entry], end: int) -> bool:
-        """Return whether entries name keyframes and residuals at ascending offsets of the packets before byte `end`."""
+        """Return whether entries name keyframes and residuals at ascending offsets of the packets
+        before byte `end`.
+        """
         offsets = [self._first - 1, *(offset for *_, offset in entries), end]
         kinds = {kind for kind, *_ in entries}
-        return kinds <= {PacketKind.KEYFRAME, PacketKind.RESIDUAL} and all(a < b for a, b in pairwise(offsets))
+        return kinds <= {PacketKind.KEYFRAME, PacketKind.RESIDUAL} and all(
+            a < b for a, b in pairwise(offsets)
+        )
 
     def check(self) -> tuple[list[_Entry], int]:
-        """Check every packet and return (kind, frame, offset) of all except the header, and the end of the last one.
+        """Check every packet and return (kind, frame, offset) of all except the header, and the end
+        of the last one.
 
         An index at the file's end, and a packet that is truncated there, lie after that byte.
 
@@ -232,7 +263,9 @@ class StreamReader(FrameSource):
             ValueError: it is a pipe, or a packet is broken.
         """
         if self._pipe is not None:
-            raise ValueError(f"{self.path}: expected a file that is read twice, got a pipe; save it first.")
+            raise ValueError(
+                f"{self.path}: expected a file that is read twice, got a pipe; save it first."
+            )
         entries = []
         end = self._first
         with contextlib.suppress(TruncatedStreamError):
@@ -267,9 +300,11 @@ class StreamReader(FrameSource):
                     number += 1
 
     def _checked(self, number: int, at: int) -> Iterator[tuple[int, bytes]]:
-        """Yield (offset, bytes) of every packet with a correct CRC, from packet `number` at byte `at` on.
+        """Yield (offset, bytes) of every packet with a correct CRC, from packet `number` at byte
+        `at` on.
 
-        There may be an index between packets, if a stream was closed and continued; it has no number.
+        There may be an index between packets, if a stream was closed and continued; it has no
+        number.
         """
         with self._opened() as file:
             if self._pipe is None:
@@ -284,7 +319,9 @@ class StreamReader(FrameSource):
                     number += 1
                     last = frame
 
-    def _packet(self, file: BinaryIO, number: int, at: int, last: int | None = None) -> bytes | None:
+    def _packet(
+        self, file: BinaryIO, number: int, at: int, last: int | None = None
+    ) -> bytes | None:
         """Return the bytes of the next packet, None at the stream's end."""
         head = _read(file, PAYLOAD)
         if not head:
@@ -314,14 +351,18 @@ class StreamReader(FrameSource):
     def _sentence(self, number: int, at: int, problem: str, last: int | None = None) -> str:
         """Return the message of a problem; `last` is the frame of the packet before it."""
         frames = "" if last is None else f", up to frame {last}"
-        return f"{self._place(number, at)}: {problem}; {number} packets before it are intact{frames}."
+        return (
+            f"{self._place(number, at)}: {problem}; {number} packets before it are intact{frames}."
+        )
 
     def _place(self, number: int, at: int) -> str:
         return f"{self.path}: packet {number} at byte {at}"
 
 
 def _read(file: BinaryIO, count: int) -> bytes:
-    """Return `count` bytes, or fewer at the end. Read in chunks, because a damaged length must not allocate memory."""
+    """Return `count` bytes, or fewer at the end. Read in chunks, because a damaged length must not
+    allocate memory.
+    """
     chunks = []
     while count > 0 and (chunk := file.read(min(count, _CHUNK))):
         chunks.append(chunk)

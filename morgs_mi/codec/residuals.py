@@ -1,8 +1,8 @@
 """Changes between two frames <-> columns: flags first, then the integers of the flagged groups.
 
-Each Gaussian has one flag for each of the three groups of its geometry and one for each other group, or is marked dead.
-The Gaussians that moved last and the static ones, as far as the confidence distinguishes them, are coded separately,
-because their flags and residuals differ most.
+Each Gaussian has one flag for each of the three groups of its geometry and one for each other
+group, or is marked dead. The Gaussians that moved last and the static ones, as far as the
+confidence distinguishes them, are coded separately, because their flags and residuals differ most.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from morgs_mi.codec.quantisation import GROUPS, Grid, bounded, step_sizes
 _GEOMETRY = GROUPS[:3]
 _APPEARANCE = GROUPS[3:]
 _DEAD = 8  # flags of the geometry of a Gaussian that dies; the three groups are its lower bits
-# Changes below a step are jitter of the fit, but in the base colour every bit is visible. Slightly less than a step,
-# because a decoded state is rounded to float32 and must give the packet that it was decoded from.
+# Changes below a step are jitter of the fit, but in the base colour every bit is visible. Slightly
+# less than a step, because a decoded state is rounded to float32 and must give the packet that it
+# was decoded from.
 _THRESHOLD = 0.99
 _THRESHOLD_DC = 0.5
 
@@ -32,7 +33,8 @@ class Coder:
     survivors: np.ndarray  #: Their indices in the state [S], ascending; the others die.
     rows: np.ndarray  #: Indices of the M survivors that differ.
     change: np.ndarray  #: Their differences by integer, in multiples of the grid's steps [C, M].
-    #: Offsets of the next Gaussians, survivors first [N', 3], world units; None: they are not stored.
+    #: Offsets of the next Gaussians, survivors first [N', 3], world units; None: they are not
+    #: stored.
     offset: np.ndarray | None
 
     def rounded(self, coarseness: int) -> np.ndarray:
@@ -62,20 +64,27 @@ class Coder:
                 yield from r[at].take(rows[change_masks[name][rows]], axis=1)
 
     def offsets(self, r: np.ndarray, coarseness: int) -> Iterator[np.ndarray]:
-        """Yield the columns of the offsets of the survivors with changed means; none if they are not stored."""
+        """Yield the columns of the offsets of the survivors with changed means; none if they are
+        not stored.
+        """
         if self.offset is not None:
             rows = np.flatnonzero(np.any(r[self.grid.columns["means"]], axis=0)[self.survivors])
-            real = self.offset[rows] / offset_steps(self.grid.select(self.survivors[rows]), coarseness)
+            real = self.offset[rows] / offset_steps(
+                self.grid.select(self.survivors[rows]), coarseness
+            )
             yield from np.clip(np.rint(real), 1 - LIMIT, LIMIT - 1).astype(np.int32).T
 
 
 def offset_steps(grid: Grid, coarseness: int) -> np.ndarray:
-    """Return the steps of the offsets, float64 [N, 1], world units, which are the steps of the changes of the means."""
+    """Return the steps of the offsets, float64 [N, 1], world units, which are the steps of the
+    changes of the means.
+    """
     return grid.steps("means") * _step(coarseness)
 
 
 def take_change(reader: ColumnReader, grid: Grid, coarseness: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the integers int32 [N, C] after changes in steps of a coarseness, and the mask of deaths, bool [N].
+    """Return the integers int32 [N, C] after changes in steps of a coarseness, and the mask of
+    deaths, bool [N].
 
     Raises:
         ValueError: the columns do not describe changes, or a value leaves its range.
@@ -92,12 +101,16 @@ def take_change(reader: ColumnReader, grid: Grid, coarseness: int) -> tuple[np.n
         if np.any((geometry < 0) | (geometry > _DEAD) | (appearance & ~bits != 0)):
             raise ValueError("its flags name groups that do not exist")
         dead[rows] = geometry == _DEAD
-        flags = {name: (geometry >> bit & 1) & (geometry < _DEAD) for bit, name in enumerate(_GEOMETRY)}
+        flags = {
+            name: (geometry >> bit & 1) & (geometry < _DEAD) for bit, name in enumerate(_GEOMETRY)
+        }
         flags |= {name: appearance >> bit & 1 for bit, name in enumerate(_APPEARANCE)}
         for name, at in grid.columns.items():
             change_rows = rows[flags[name] == 1]
             for column in range(at.start, at.stop):
-                new = values[change_rows, column] + np.rint(reader.take(len(change_rows)) * step).astype(np.int64)
+                new = values[change_rows, column] + np.rint(
+                    reader.take(len(change_rows)) * step
+                ).astype(np.int64)
                 values[change_rows, column] = bounded(new, LIMIT, "value")
     return values, dead
 
@@ -112,9 +125,13 @@ def _flags(change_masks: dict[str, np.ndarray], names: tuple[str, ...], N: int) 
 
 
 def _classes(grid: Grid) -> list[np.ndarray]:
-    """Return the indices of the static and of the moving Gaussians; without confidence, all count as static."""
+    """Return the indices of the static and of the moving Gaussians; without confidence, all count
+    as static.
+    """
     confidence = grid.columns.get("logit_confidence")
-    moving = np.zeros(len(grid), bool) if confidence is None else grid.values[:, confidence.start] > 0
+    moving = (
+        np.zeros(len(grid), bool) if confidence is None else grid.values[:, confidence.start] > 0
+    )
     return [np.flatnonzero(~moving), np.flatnonzero(moving)]
 
 

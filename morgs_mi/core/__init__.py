@@ -1,1 +1,3 @@
-"""Foundations of all subpackages: cameras, Gaussians, the attribute table, colour spaces, atomic files."""
+"""Foundations of all subpackages: cameras, Gaussians, the attribute table, colour spaces, atomic
+files.
+"""

@@ -1,7 +1,8 @@
 """The table of per-Gaussian attributes, from which all code that depends on an attribute derives.
 
-`Gaussians` (shapes, activations), learning rates, the residual (gates), the first frame, the stream (groups of
-integers) and the renderer (channels) read it. A new attribute is a row here and a field of `Gaussians` of that name.
+`Gaussians` (shapes, activations), learning rates, the residual (gates), the first frame, the stream
+(groups of integers) and the renderer (channels) read it. A new attribute is a row here and a field
+of `Gaussians` of that name.
 """
 
 from __future__ import annotations
@@ -28,8 +29,8 @@ class Activation:
     function: Callable[[Jit], Jit]  #: Of a Dr.Jit array or tensor.
     #: Of a NumPy array of activated values, float64; finite also where the exact one is infinite.
     inverse: Callable[[np.ndarray], np.ndarray]
-    #: Bound of its derivative, which converts a tolerated error of the activated value into one of the optimised value;
-    #: None where there is no bound.
+    #: Bound of its derivative, which converts a tolerated error of the activated value into one of
+    #: the optimised value; None where there is no bound.
     largest_slope: float | None
 
 
@@ -51,37 +52,44 @@ SIGMOID = Activation(sigmoid, _logit, 0.25)
 class Attribute:
     """One row of the table."""
 
-    name: str  #: Of the optimised tensor in `Gaussians`; the two rows of the spherical harmonics share `sh_coeffs`.
-    shape: tuple[int, ...]  #: Of one Gaussian's value; -1 where it depends on the degree of the spherical harmonics.
+    #: Of the optimised tensor in `Gaussians`; the two rows of the spherical harmonics share
+    #: `sh_coeffs`.
+    name: str
+    #: Of one Gaussian's value; -1 where it depends on the degree of the spherical harmonics.
+    shape: tuple[int, ...]
     activated_name: str  #: Of the rendered value.
     activation: Activation = IDENTITY  #: Between the two.
     required: bool = False  #: Whether every `Gaussians` has it.
-    rate: str | float | None = None  #: Field of `LearningRates`, or a learning rate; None where it is not optimised.
+    #: Field of `LearningRates`, or a learning rate; None where it is not optimised.
+    rate: str | float | None = None
     rate_in_extents: bool = False  #: Whether that rate counts in scene extents.
-    #: Of its residual with two gates: the confidence for ``motion``, none for ``appearance``; None where it has no
-    #: residual (eq. 12).
+    #: Of its residual with two gates: the confidence for ``motion``, none for ``appearance``; None
+    #: where it has no residual (eq. 12).
     gate: Literal["motion", "appearance"] | None = None
     first_frame: bool = False  #: Whether the first frame fits it.
-    #: Of the activated value that the stream tolerates with `quality` 1; on screen in px for means, scales and
-    #: rotations. None where the stream does not store it.
+    #: Of the activated value that the stream tolerates with `quality` 1; on screen in px for means,
+    #: scales and rotations. None where the stream does not store it.
     error: float | None = None
-    #: Of the renderer that blends it like a colour; None where there is none, or where the channel is not plain
-    #: blending (`color`, `motion`).
+    #: Of the renderer that blends it like a colour; None where there is none, or where the channel
+    #: is not plain blending (`color`, `motion`).
     channel: str | None = None
-    #: Value of the optimised tensor before the first frame; None where `fit.initialise` computes it, or where the
-    #: attribute is absent then.
+    #: Value of the optimised tensor before the first frame; None where `fit.initialise` computes
+    #: it, or where the attribute is absent then.
     initial: float | None = None
 
     @property
     def width(self) -> int:
-        """The numbers of one Gaussian's value; -1 where that depends on the degree of the spherical harmonics."""
+        """The numbers of one Gaussian's value; -1 where that depends on the degree of the spherical
+        harmonics.
+        """
         width = 1
         for size in self.shape:
             width = -1 if size < 0 or width < 0 else width * size
         return width
 
 
-# px, in the camera that magnifies a Gaussian most: a step of the stream, twice the error, is about a tenth of a pixel.
+# px, in the camera that magnifies a Gaussian most: a step of the stream, twice the error, is about
+# a tenth of a pixel.
 _ERROR_PX = 0.04
 # Of 1: the error of an image of 8 bits.
 _ERROR_COLOR = 1 / 255
@@ -90,7 +98,14 @@ _ERROR_COLOR = 1 / 255
 ATTRIBUTES: tuple[Attribute, ...] = (
     # The residual of the means is motion + offset, below.
     Attribute(
-        "means", (3,), "means", required=True, rate="means", rate_in_extents=True, first_frame=True, error=_ERROR_PX
+        "means",
+        (3,),
+        "means",
+        required=True,
+        rate="means",
+        rate_in_extents=True,
+        first_frame=True,
+        error=_ERROR_PX,
     ),
     Attribute(
         "log_scales",
@@ -103,7 +118,16 @@ ATTRIBUTES: tuple[Attribute, ...] = (
         first_frame=True,
         error=_ERROR_PX,
     ),
-    Attribute("quats", (4,), "quats", required=True, rate="quats", gate="motion", first_frame=True, error=_ERROR_PX),
+    Attribute(
+        "quats",
+        (4,),
+        "quats",
+        required=True,
+        rate="quats",
+        gate="motion",
+        first_frame=True,
+        error=_ERROR_PX,
+    ),
     Attribute(
         "logit_opacities",
         (),

@@ -1,7 +1,8 @@
 """The pinhole camera.
 
-Notation: x_cam = R x_world + t with `viewmat = [R t; 0 1]` (OpenCV: x right, y down, z forward), and a
-pixel is (fx x/z + cx, fy y/z + cy). Pixel centres lie at +0.5, so the image spans [0, width] x [0, height].
+Notation: x_cam = R x_world + t with `viewmat = [R t; 0 1]` (OpenCV: x right, y down, z forward),
+and a pixel is (fx x/z + cx, fy y/z + cy). Pixel centres lie at +0.5, so the image spans [0, width]
+x [0, height].
 """
 
 from __future__ import annotations
@@ -26,25 +27,27 @@ class Camera:
 
     Attributes:
         K: intrinsics [3, 3] in pixels, copied; the principal point may be off-centre.
-        viewmat: extrinsics [4, 4], world -> camera: a NumPy array, which is copied, or a Dr.Jit tensor for
-            gradients of the pose.
+        viewmat: extrinsics [4, 4], world -> camera: a NumPy array, which is copied, or a Dr.Jit
+            tensor for gradients of the pose.
         width: image width in pixels.
         height: image height in pixels.
         name: in the capture, e.g. ``cam00``.
-        near: depth in world units below which Gaussians are not rendered. The cameras of a capture have a depth that
-            follows the scene (see `with_near_planes`).
-        delay: frames by which its images are later than the instants of the recording, at the middle row. Gaussians
-            with motion are rendered where they are then.
+        near: depth in world units below which Gaussians are not rendered. The cameras of a capture
+            have a depth that follows the scene (see `with_near_planes`).
+        delay: frames by which its images are later than the instants of the recording, at the
+            middle row. Gaussians with motion are rendered where they are then.
         readout: frames between the exposures of the first and the last row; 0 for a global shutter.
 
     Example:
-        >>> camera = morgs_mi.Camera.look_at((0, -4, 1), (0, 0, 0), up=(0, 0, 1), fov_x=40, width=320, height=240)
+        >>> size = {"width": 320, "height": 240}
+        >>> camera = morgs_mi.Camera.look_at((0, -4, 1), (0, 0, 0), (0, 0, 1), fov_x=40, **size)
         >>> pixels, depths = camera.project(points)
 
     Raises:
-        ValueError: a size below 1x1, matrices of another shape or with numbers that are not finite or above 1e12, a
-            focal length or `near` that is not positive, or a `viewmat` that is no rotation and translation. Only the
-            shape of a Dr.Jit `viewmat` is checked here; `rasterize` checks that it is finite.
+        ValueError: a size below 1x1, matrices of another shape or with numbers that are not finite
+            or above 1e12, a focal length or `near` that is not positive, or a `viewmat` that is no
+            rotation and translation. Only the shape of a Dr.Jit `viewmat` is checked here;
+            `rasterize` checks that it is finite.
     """
 
     K: np.ndarray
@@ -64,24 +67,28 @@ class Camera:
             check_number(where, name, getattr(self, name), "[-1, 1]")
         K = numbers(where, "K", self.K).astype(np.float64)
         if K.shape != (3, 3):
-            raise ValueError(f"{where}: `K` must be [3, 3], got {K.shape}; pass one camera's intrinsics.")
+            raise ValueError(
+                f"{where}: `K` must be [3, 3], got {K.shape}; pass one camera's intrinsics."
+            )
         viewmat = self.viewmat
         if not isinstance(viewmat, dr.ArrayBase):
             viewmat = numbers(where, "viewmat", viewmat).astype(np.float64)
         if tuple(viewmat.shape) != (4, 4):
             raise ValueError(
-                f"{where}: `viewmat` must be [4, 4], got {tuple(viewmat.shape)}; pass one world-to-camera matrix."
+                f"{where}: `viewmat` must be [4, 4], got {tuple(viewmat.shape)}; pass one "
+                "world-to-camera matrix."
             )
         if not bounded(K) or not K[0, 0] > 0 or not K[1, 1] > 0:
             raise ValueError(
-                f"{where}: `K` must be finite with positive focal lengths, got {K.tolist()}; check the calibration."
+                f"{where}: `K` must be finite with positive focal lengths, got {K.tolist()}; "
+                "check the calibration."
             )
         if isinstance(viewmat, np.ndarray):
             viewmat = rigid(f"{where}, `viewmat`", viewmat)
         if K[0, 1] or K[1, 0] or not np.array_equal(K[2], (0, 0, 1)):
             raise ValueError(
-                f"{where}: `K` must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}; resample the images to "
-                "a camera without skew."
+                f"{where}: `K` must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}; "
+                "resample the images to a camera without skew."
             )
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "viewmat", viewmat)
@@ -89,7 +96,10 @@ class Camera:
     def __repr__(self) -> str:
         place = ", ".join(f"{x:.4g}" for x in self.position + 0.0)  # without -0
         fov = np.rad2deg(2 * np.arctan(0.5 * self.width / self.K[0, 0]))
-        return f"Camera({self.name!r}, {self.width}x{self.height}, {fov:.3g} degrees across, at ({place}))"
+        return (
+            f"Camera({self.name!r}, {self.width}x{self.height}, {fov:.3g} degrees across, at "
+            f"({place}))"
+        )
 
     @classmethod
     def look_at(
@@ -103,12 +113,14 @@ class Camera:
         name: str = "",
         near: float | None = None,
     ) -> Camera:
-        """Return the camera at `origin` [3] that looks at `target` [3]; `fov_x` in degrees across, below 180.
+        """Return the camera at `origin` [3] that looks at `target` [3]; `fov_x` in degrees across,
+        below 180.
 
         The default of `near` is 0.01, or a hundredth of the distance to `target` if that is less.
 
         Raises:
-            ValueError: `target` is at `origin` or above or below it in the direction of `up`, and as for `Camera`.
+            ValueError: `target` is at `origin` or above or below it in the direction of `up`, and
+                as for `Camera`.
         """
         where = "Camera.look_at()"
         check_size(where, width, height)
@@ -117,12 +129,19 @@ class Camera:
         for key, value in (("origin", origin), ("target", target), ("up", up)):
             vectors[key] = numbers(where, key, value).astype(np.float64)
             if vectors[key].shape != (3,):
-                raise ValueError(f"{where}: `{key}` must be [3], got {list(vectors[key].shape)}; pass x, y and z.")
+                raise ValueError(
+                    f"{where}: `{key}` must be [3], got {list(vectors[key].shape)}; pass x, y and "
+                    "z."
+                )
         forward = vectors["target"] - vectors["origin"]
         right = np.cross(forward, vectors["up"])
-        if not np.linalg.norm(right) > 1e-12 * np.linalg.norm(forward) * np.linalg.norm(vectors["up"]):
+        if not np.linalg.norm(right) > 1e-12 * np.linalg.norm(forward) * np.linalg.norm(
+            vectors["up"]
+        ):
             text = ", ".join(f"{key} {value.tolist()}" for key, value in vectors.items())
-            raise ValueError(f"{where}: `up` must not be parallel to the direction of view, got {text}; tilt it.")
+            raise ValueError(
+                f"{where}: `up` must not be parallel to the direction of view, got {text}; tilt it."
+            )
         distance = float(np.linalg.norm(forward))
         forward /= distance
         right /= np.linalg.norm(right)
@@ -132,11 +151,14 @@ class Camera:
         viewmat[:3, 3] = -R @ vectors["origin"]
         f = 0.5 * width / np.tan(np.deg2rad(0.5 * fov_x))
         K = np.array([[f, 0, 0.5 * width], [0, f, 0.5 * height], [0, 0, 1.0]])
-        return cls(K, viewmat, width, height, name, min(0.01, distance / 100) if near is None else near)
+        return cls(
+            K, viewmat, width, height, name, min(0.01, distance / 100) if near is None else near
+        )
 
     @classmethod
     def from_sensor(cls, sensor: Any) -> Camera:
-        """Return the view of a Mitsuba `perspective` sensor, without gradients: the inverse of `sensor`.
+        """Return the view of a Mitsuba `perspective` sensor, without gradients: the inverse of
+        `sensor`.
 
         It has the size of the whole film, and the sensor's id as its name.
 
@@ -146,20 +168,29 @@ class Camera:
         import mitsuba as mi
 
         if not isinstance(sensor, mi.Sensor) or sensor.class_name() != "PerspectiveCamera":
-            kind = sensor.class_name() if isinstance(sensor, mi.Sensor) else f"a {type(sensor).__name__}"
+            kind = (
+                sensor.class_name()
+                if isinstance(sensor, mi.Sensor)
+                else f"a {type(sensor).__name__}"
+            )
             raise ValueError(
-                f"Camera.from_sensor(): `sensor` must be a `perspective` sensor, got {kind}; splats are drawn only by "
-                "pinhole cameras without lens distortion."
+                f"Camera.from_sensor(): `sensor` must be a `perspective` sensor, got {kind}; "
+                "splats are drawn only by pinhole cameras without lens distortion."
             )
         params: Any = mi.traverse(sensor)
         width, height = (int(size) for size in sensor.film().size())
         names = ("x_fov", "principal_point_offset_x", "principal_point_offset_y", "near_clip")
         fov, offset_x, offset_y, near = (float(np.asarray(params[name]).item()) for name in names)
         f = 0.5 * width / np.tan(np.deg2rad(0.5 * fov))
-        # Mitsuba adds its offset to the pixel's position, so the principal point moves the other way.
-        K = np.array([[f, 0, width * (0.5 - offset_x)], [0, f, height * (0.5 - offset_y)], [0, 0, 1.0]])
+        # Mitsuba adds its offset to the pixel's position, so the principal point moves the other
+        # way.
+        K = np.array(
+            [[f, 0, width * (0.5 - offset_x)], [0, f, height * (0.5 - offset_y)], [0, 0, 1.0]]
+        )
         to_world = np.asarray(params["to_world"].matrix, float).reshape(4, 4)
-        return cls(K, _OPENCV_FROM_MITSUBA @ np.linalg.inv(to_world), width, height, sensor.id(), near)
+        return cls(
+            K, _OPENCV_FROM_MITSUBA @ np.linalg.inv(to_world), width, height, sensor.id(), near
+        )
 
     @property
     def position(self) -> np.ndarray:
@@ -182,7 +213,9 @@ class Camera:
         return (local @ self.K.T)[..., :2] / local[..., 2:], local[..., 2]
 
     def unproject(self, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
-        """Return the world points [..., 3] at pixel positions [..., 2] and depths z [...]: the inverse of `project`."""
+        """Return the world points [..., 3] at pixel positions [..., 2] and depths z [...]: the
+        inverse of `project`.
+        """
         V = np.asarray(self.viewmat, dtype=np.float64)
         K = self.K
         x = (pixels[..., 0] - K[0, 2]) / K[0, 0]
@@ -191,23 +224,31 @@ class Camera:
         return (local - V[:3, 3]) @ V[:3, :3]
 
     def rays(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the origin [3] and the unit directions [..., 3] of the rays through pixel positions [..., 2]."""
+        """Return the origin [3] and the unit directions [..., 3] of the rays through pixel
+        positions [..., 2].
+        """
         directions = self.unproject(pixels, np.ones(np.shape(pixels)[:-1])) - self.position
         return self.position, directions / np.linalg.norm(directions, axis=-1, keepdims=True)
 
     def projection_jacobian(self, points: np.ndarray) -> np.ndarray:
-        """Return d(pixel) / d(point) [N, 2, 3] at world points [N, 3]; zero for points behind the near plane."""
+        """Return d(pixel) / d(point) [N, 2, 3] at world points [N, 3]; zero for points behind the
+        near plane.
+        """
         V = np.asarray(self.viewmat, dtype=np.float64)
         x, y, z = (points @ V[:3, :3].T + V[:3, 3]).T
         inverse = np.where(z > self.near, 1 / np.maximum(z, self.near), 0)
         fx = self.K[0, 0] * inverse
         fy = self.K[1, 1] * inverse
         zero = np.zeros_like(z)
-        J = np.stack([fx, zero, -fx * x * inverse, zero, fy, -fy * y * inverse], axis=1).reshape(-1, 2, 3)
+        J = np.stack([fx, zero, -fx * x * inverse, zero, fy, -fy * y * inverse], axis=1).reshape(
+            -1, 2, 3
+        )
         return J @ V[:3, :3]
 
     def without_delays(self) -> Camera:
-        """Return the same view with images of the instants themselves: no delay and no rolling shutter."""
+        """Return the same view with images of the instants themselves: no delay and no rolling
+        shutter.
+        """
         return replace(self, delay=0.0, readout=0.0)
 
     def resized(self, width: int, height: int) -> Camera:
@@ -225,7 +266,9 @@ class Camera:
         return self.resized(width, max(1, round(width * self.height / self.width)))
 
     def square(self) -> Camera:
-        """Return the same view with equal focal lengths, to half a pixel of its height, which may be another one."""
+        """Return the same view with equal focal lengths, to half a pixel of its height, which may
+        be another one.
+        """
         return self.resized(self.width, max(1, round(self.height * self.K[0, 0] / self.K[1, 1])))
 
     def sensor(self, **film: Any) -> dict[str, Any]:
@@ -234,8 +277,8 @@ class Camera:
         Keyword arguments override entries of the film (e.g. ``rfilter``, ``pixel_format``).
 
         Raises:
-            ValueError: fx and fy differ by more than a pixel in the height of the image: Mitsuba's sensor has one
-                focal length.
+            ValueError: fx and fy differ by more than a pixel in the height of the image: Mitsuba's
+                sensor has one focal length.
         """
         import mitsuba as mi
 
@@ -245,11 +288,12 @@ class Camera:
         cy = self.K[1, 2]
         if abs(f / fy - 1) * self.height > 1:
             raise ValueError(
-                f"Camera.sensor(): `K` must have equal focal lengths, because Mitsuba's sensor has one, got {f:g} and "
-                f"{fy:g}; render `camera.square()`, of {self.square().width}x{self.square().height} pixels, and resize "
-                "the image."
+                "Camera.sensor(): `K` must have equal focal lengths, because Mitsuba's sensor "
+                f"has one, got {f:g} and {fy:g}; render `camera.square()`, of "
+                f"{self.square().width}x{self.square().height} pixels, and resize the image."
             )
-        # Mitsuba adds its offset to the pixel's position, so the principal point moves the other way.
+        # Mitsuba adds its offset to the pixel's position, so the principal point moves the other
+        # way.
         return {
             "type": "perspective",
             "to_world": mi.ScalarTransform4f(self.to_world),
@@ -278,22 +322,24 @@ def rigid(where: str, matrix: np.ndarray) -> np.ndarray:
     """
     matrix = np.asarray(matrix, dtype=np.float64)
     if matrix.shape not in ((3, 4), (4, 4)):
-        raise ValueError(f"{where}: the pose must be a matrix [4, 4], got {matrix.shape}; calibrate again.")
+        raise ValueError(
+            f"{where}: the pose must be a matrix [4, 4], got {matrix.shape}; calibrate again."
+        )
     if not bounded(matrix):
         raise ValueError(
-            f"{where}: the pose must be finite, with numbers of at most {LARGEST:g}, got {matrix.tolist()}; calibrate "
-            "again."
+            f"{where}: the pose must be finite, with numbers of at most {LARGEST:g}, got "
+            f"{matrix.tolist()}; calibrate again."
         )
     R = matrix[:3, :3]
     # Files with six digits are off by 1e-6, scaled or sheared poses by far more than 1e-3.
     if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
         raise ValueError(
-            f"{where}: the axes must be a right-handed orthonormal frame, got {R.round(4).tolist()}; "
-            "undo any scaling or mirroring of the poses."
+            f"{where}: the axes must be a right-handed orthonormal frame, got "
+            f"{R.round(4).tolist()}; undo any scaling or mirroring of the poses."
         )
     if not np.allclose(matrix[3:], (0, 0, 0, 1), atol=1e-6):
         raise ValueError(
-            f"{where}: the last row must be [0, 0, 0, 1], got {matrix[3].tolist()}; transpose the matrix if its "
-            "translation is there."
+            f"{where}: the last row must be [0, 0, 0, 1], got {matrix[3].tolist()}; transpose the "
+            "matrix if its translation is there."
         )
     return np.vstack([matrix[:3], [0, 0, 0, 1.0]])

@@ -35,7 +35,9 @@ def check_number(place: str, name: str, value: Any, interval: str) -> None:
         above = low <= x if interval[0] == "[" else low < x
         if above and (x <= high if interval[-1] == "]" else x < high):
             return
-    raise ValueError(f"{place}: `{name}` must be a number in {interval}, got {value!r}; set another value.")
+    raise ValueError(
+        f"{place}: `{name}` must be a number in {interval}, got {value!r}; set another value."
+    )
 
 
 def check_type(place: str, name: str, value: Any, kind: type) -> None:
@@ -46,7 +48,10 @@ def check_type(place: str, name: str, value: Any, kind: type) -> None:
     """
     if not isinstance(value, kind):
         expected = f"{kind.__module__}.{kind.__qualname__}"
-        raise ValueError(f"{place}: `{name}` must be a {expected}, got a {type(value).__name__}; pass another value.")
+        raise ValueError(
+            f"{place}: `{name}` must be a {expected}, got a {type(value).__name__}; pass another "
+            "value."
+        )
 
 
 def check_size(place: str, width: Any, height: Any) -> None:
@@ -57,8 +62,8 @@ def check_size(place: str, width: Any, height: Any) -> None:
     """
     if not all(isinstance(v, (int, np.integer)) and v >= 1 for v in (width, height)):
         raise ValueError(
-            f"{place}: the image size must be at least 1x1 in integers, got {width!r}x{height!r}; check width and "
-            "height."
+            f"{place}: the image size must be at least 1x1 in integers, got {width!r}x{height!r}; "
+            "check width and height."
         )
 
 
@@ -69,10 +74,14 @@ def check_mask(place: str, mask: Any, height: int, width: int) -> None:
         ValueError: it is not.
     """
     if not isinstance(mask, np.ndarray) or mask.shape != (height, width) or mask.dtype != bool:
-        kind = f"{mask.dtype} {list(mask.shape)}" if isinstance(mask, np.ndarray) else type(mask).__name__
+        kind = (
+            f"{mask.dtype} {list(mask.shape)}"
+            if isinstance(mask, np.ndarray)
+            else type(mask).__name__
+        )
         raise ValueError(
-            f"{place}: the mask must be bool [{height}, {width}] like its image, got {kind}; resize it without "
-            "interpolation, or compare it with a threshold."
+            f"{place}: the mask must be bool [{height}, {width}] like its image, got {kind}; "
+            "resize it without interpolation, or compare it with a threshold."
         )
 
 
@@ -87,13 +96,22 @@ def numbers(place: str, name: str, values: ArrayLike) -> np.ndarray:
     except (TypeError, ValueError, RuntimeError):  # for instance rows of different lengths
         array = np.array(None)
     if array.dtype.kind not in "fiub":
-        kind = f"{array.dtype} {list(array.shape)}" if isinstance(values, np.ndarray) else repr(values)[:80]
-        raise ValueError(f"{place}: `{name}` must be an array of real numbers, got {kind}; convert it to floats.")
+        kind = (
+            f"{array.dtype} {list(array.shape)}"
+            if isinstance(values, np.ndarray)
+            else repr(values)[:80]
+        )
+        raise ValueError(
+            f"{place}: `{name}` must be an array of real numbers, got {kind}; convert it to floats."
+        )
     return array
 
 
-def check_points(place: str, points: ArrayLike, colors: ArrayLike, most: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """Return points and colours as arrays [P, 3], P >= 0, if they are finite and the colours lie in [0, most].
+def check_points(
+    place: str, points: ArrayLike, colors: ArrayLike, most: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return points and colours as arrays [P, 3], P >= 0, if they are finite and the colours lie in
+    [0, most].
 
     Raises:
         ValueError: they are not.
@@ -103,14 +121,23 @@ def check_points(place: str, points: ArrayLike, colors: ArrayLike, most: float =
     if not points.size and not colors.size:
         return np.zeros((0, 3)), np.zeros((0, 3))
     if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"{place}: `points` must be [P, 3], got {list(points.shape)}; pass one row for each point.")
+        raise ValueError(
+            f"{place}: `points` must be [P, 3], got {list(points.shape)}; pass one row for each "
+            "point."
+        )
     if colors.shape != points.shape:
         raise ValueError(
-            f"{place}: `point_colors` must be {list(points.shape)} like `points`, got {list(colors.shape)}; pass one "
-            "colour for each point."
+            f"{place}: `point_colors` must be {list(points.shape)} like `points`, got "
+            f"{list(colors.shape)}; pass one colour for each point."
         )
     for name, values, good, expected, remedy in (
-        ("points", points, np.abs(points) <= LARGEST, f"finite and at most {LARGEST:g}", "remove this point"),
+        (
+            "points",
+            points,
+            np.abs(points) <= LARGEST,
+            f"finite and at most {LARGEST:g}",
+            "remove this point",
+        ),
         (
             "point_colors",
             colors,
@@ -121,5 +148,8 @@ def check_points(place: str, points: ArrayLike, colors: ArrayLike, most: float =
     ):
         if not good.all():
             row = np.flatnonzero(~good.all(axis=1))[0]
-            raise ValueError(f"{place}: `{name}` must be {expected}, got {values[row].tolist()} at {row}; {remedy}.")
+            raise ValueError(
+                f"{place}: `{name}` must be {expected}, got {values[row].tolist()} at {row}; "
+                f"{remedy}."
+            )
     return points, colors

@@ -9,9 +9,11 @@ from typing import Any
 
 
 def import_pycolmap() -> Any:
-    """Return the module pycolmap, and restore the signal handlers of Ctrl-C and SIGTERM after its import.
+    """Return the module pycolmap, and restore the signal handlers of Ctrl-C and SIGTERM after its
+    import.
 
-    The logging library of pycolmap installs a handler for SIGTERM that prints a stack trace and aborts the process.
+    The logging library of pycolmap installs a handler for SIGTERM that prints a stack trace and
+    aborts the process.
     """
     pycolmap = import_module("pycolmap")
     if threading.current_thread() is threading.main_thread():

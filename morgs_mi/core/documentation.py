@@ -21,19 +21,23 @@ CHECKOUT = Path(__file__).parents[2]
 
 
 def page(name: str) -> str:
-    """Return the path of a page in the checkout, such as docs/flow.md, or its address where there is no checkout."""
+    """Return the path of a page in the checkout, such as docs/flow.md, or its address where there
+    is no checkout.
+    """
     path = f"docs/{name}.md"
     return path if (CHECKOUT / path).is_file() else f"{DOCUMENTATION}en/latest/{name}.html"
 
 
 def with_pages(text: str) -> str:
-    """Return a text with the result of `page` in place of every path of a page, such as docs/flow.md."""
+    """Return a text with the result of `page` in place of every path of a page, such as
+    docs/flow.md.
+    """
     return re.sub(r"\bdocs/([\w/-]+)\.md\b", lambda match: page(match[1]), text)
 
 
 @cache
 def field_docs(config_type: type) -> dict[str, str]:
-    """Return the docstrings of a dataclass's fields by name; those without source code have none."""
+    """Return the docstrings of a dataclass's fields by name; none without source code."""
     docs: dict[str, str] = {}
     for base in reversed(config_type.__mro__):
         try:
@@ -42,7 +46,11 @@ def field_docs(config_type: type) -> dict[str, str]:
             continue
         body = definition.body if isinstance(definition, ast.ClassDef) else []
         for node, sibling in pairwise(body):
-            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and isinstance(sibling, ast.Expr):
+            if (
+                isinstance(node, ast.AnnAssign)
+                and isinstance(node.target, ast.Name)
+                and isinstance(sibling, ast.Expr)
+            ):
                 text = sibling.value.value if isinstance(sibling.value, ast.Constant) else None
                 if isinstance(text, str):
                     docs[node.target.id] = inspect.cleandoc(text)
@@ -50,7 +58,9 @@ def field_docs(config_type: type) -> dict[str, str]:
 
 
 def documented(config_type: type[Class]) -> type[Class]:
-    """Return a dataclass whose docstring lists its fields with defaults and docstrings, for `help()` and notebooks."""
+    """Return a dataclass whose docstring lists its fields with defaults and docstrings, for
+    `help()` and notebooks.
+    """
     config_type.__doc__ = _ListedFields(inspect.cleandoc(config_type.__doc__ or ""))  # pyright: ignore
     return config_type
 
@@ -72,7 +82,10 @@ class _ListedFields:
 @cache
 def _field_list(config_type: Any) -> str:
     docs = field_docs(config_type)
-    entries = (f"{f.name} = {_default(f)}: {' '.join(docs.get(f.name, '').split())}" for f in fields(config_type))
+    entries = (
+        f"{f.name} = {_default(f)}: {' '.join(docs.get(f.name, '').split())}"
+        for f in fields(config_type)
+    )
     lines = (textwrap.wrap(with_pages(entry), 116, break_on_hyphens=False) for entry in entries)
     return "\n".join(textwrap.indent("\n    ".join(line), "    ") for line in lines)
 
@@ -81,4 +94,8 @@ def _default(field: Field) -> str:
     """Return the default of a field as text; the name of the class for a nested config."""
     if field.default is not MISSING:
         return repr(field.default)
-    return f"{type(field.default_factory()).__name__}(...)" if field.default_factory is not MISSING else "(required)"
+    return (
+        f"{type(field.default_factory()).__name__}(...)"
+        if field.default_factory is not MISSING
+        else "(required)"
+    )

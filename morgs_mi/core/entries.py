@@ -1,7 +1,9 @@
-"""What `morgs_mi.studio` adds to the registries of the package: the only place outside of it that names the studio.
+"""What `morgs_mi.studio` adds to the registries of the package: the only place outside of it that
+names the studio.
 
-A registry is a table in the module that uses it, such as the commands of `morgs_mi.cli`. An entry is imported when it
-is used. An extension from outside this package does not need this table: it registers itself where it is imported.
+A registry is a table in the module that uses it, such as the commands of `morgs_mi.cli`. An entry
+is imported when it is used. An extension from outside this package does not need this table: it
+registers itself where it is imported.
 """
 
 from __future__ import annotations
@@ -34,7 +36,10 @@ STUDIO: Mapping[str, Mapping[str, str]] = {
         "onnx-signed": "networks.flow_network:onnx_signed",
     },
     "mask refiners": {"sam2": "networks.sam2:sam2"},
-    "measures": {"registration": "measures.registration:Registration", "tracking": "measures.tracking:Tracking"},
+    "measures": {
+        "registration": "measures.registration:Registration",
+        "tracking": "measures.tracking:Tracking",
+    },
     "image distances": {"lpips": "measures.lpips:Lpips"},
 }
 """Entries by registry and name, as MODULE or MODULE:NAME inside `morgs_mi.studio`."""

@@ -15,16 +15,29 @@ def machine() -> dict[str, Any]:
     """Return the processor, its number of threads, the system and the Mitsuba variant."""
     return {
         "processor": _processor(),
-        "threads": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "threads": len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count(),
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",
         "variant": mi.variant(),
     }
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of this package, of Python and of the libraries that the figures depend on."""
-    packages = ("morgs-mi", "mitsuba", "drjit", "numpy", "opencv-contrib-python-headless", "colour-science")
-    return {"python": platform.python_version()} | {name: metadata.version(name) for name in packages}
+    """Return the versions of this package, of Python and of the libraries that the figures depend
+    on.
+    """
+    packages = (
+        "morgs-mi",
+        "mitsuba",
+        "drjit",
+        "numpy",
+        "opencv-contrib-python-headless",
+        "colour-science",
+    )
+    return {"python": platform.python_version()} | {
+        name: metadata.version(name) for name in packages
+    }
 
 
 def _processor() -> str:

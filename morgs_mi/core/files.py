@@ -22,20 +22,26 @@ _LOCK = ".morgs-lock"
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str], place: str) -> Generator[Path, None, None]:
-    """Yield a path in the same folder for a file or folder, which is renamed to `path` when the body succeeds.
+    """Yield a path in the same folder for a file or folder, which is renamed to `path` when the
+    body succeeds.
 
-    On failure what was written is removed and `path` stays as it was. A file replaces a file; a folder replaces one
-    that existed from the start. Parent folders are not created.
+    On failure what was written is removed and `path` stays as it was. A file replaces a file; a
+    folder replaces one that existed from the start. Parent folders are not created.
 
     Raises:
         FileExistsError: `path` is a device or a pipe.
-        OSError: raised by the body or the renaming; its sentence begins with `place`, e.g. ``write_json()``.
+        OSError: raised by the body or the renaming; its sentence begins with `place`, e.g.
+            ``write_json()``.
     """
     final = Path(path).resolve()  # a rename would replace a link, and `.` has no name
-    partial, old = (final.with_name(f".{what}-{os.getpid()}-{final.name}") for what in ("partial", "old"))
+    partial, old = (
+        final.with_name(f".{what}-{os.getpid()}-{final.name}") for what in ("partial", "old")
+    )
     replaces_folder = os.path.isdir(final)  # unlike Path's, never raises
     if os.path.exists(final) and not (replaces_folder or os.path.isfile(final)):
-        raise FileExistsError(f"{place}: {path} is a device or a pipe, which would be replaced; name a file.")
+        raise FileExistsError(
+            f"{place}: {path} is a device or a pipe, which would be replaced; name a file."
+        )
     for leftover in _left_behind(final):
         _remove(leftover)
     try:
@@ -55,14 +61,17 @@ def atomic_path(path: str | os.PathLike[str], place: str) -> Generator[Path, Non
 
 @contextmanager
 def atomic_folder(path: str | os.PathLike[str], place: str) -> Generator[Path, None, None]:
-    """Create a folder and its parents under another name, which is renamed to `path` as by `atomic_path`.
+    """Create a folder and its parents under another name, which is renamed to `path` as by
+    `atomic_path`.
 
     Raises:
         FileExistsError: `path` exists.
         OSError: as `atomic_path`.
     """
     if Path(path).exists():
-        raise FileExistsError(f"{path}: expected a new folder, got one that exists; remove it first.")
+        raise FileExistsError(
+            f"{path}: expected a new folder, got one that exists; remove it first."
+        )
     with atomic_path(path, place) as partial:
         partial.mkdir(parents=True)
         yield partial
@@ -70,10 +79,12 @@ def atomic_folder(path: str | os.PathLike[str], place: str) -> Generator[Path, N
 
 @contextmanager
 def locked_folder(path: str | os.PathLike[str], place: str) -> Generator[None, None, None]:
-    """Create a folder with its parents if it is missing, and lock it against other writers while the body runs.
+    """Create a folder with its parents if it is missing, and lock it against other writers while
+    the body runs.
 
-    The lock is an empty file in the folder, which is removed at the end, as are the created folders that are still
-    empty. A killed process leaves the file, but not the lock. A file system without locks is not locked.
+    The lock is an empty file in the folder, which is removed at the end, as are the created folders
+    that are still empty. A killed process leaves the file, but not the lock. A file system without
+    locks is not locked.
 
     Raises:
         BlockingIOError: another writer has locked the folder.
@@ -92,18 +103,22 @@ def locked_folder(path: str | os.PathLike[str], place: str) -> Generator[None, N
         except OSError as error:
             raise write_error(f"{place}: cannot write into {path}", error, folder) from error
         undo.callback(os.close, lock)
-        # A writer that has just ended may have removed the file between its opening and its locking.
+        # A writer that has just ended may have removed the file between its opening and its
+        # locking.
         if not _locked(lock) or not is_same_file(file, os.fstat(lock)):
             raise BlockingIOError(
-                f"{path}: expected a folder into which nothing else is written, got one into which another process is "
-                "writing; wait until it has ended, or choose another folder."
+                f"{path}: expected a folder into which nothing else is written, got one into "
+                "which another process is writing; wait until it has ended, or choose another "
+                "folder."
             )
         undo.callback(_remove_own, file, lock)
         yield
 
 
 def is_same_file(path: str | os.PathLike[str], status: os.stat_result) -> bool:
-    """Return whether `path` still is the file that was opened: it was not removed, moved or replaced since."""
+    """Return whether `path` still is the file that was opened: it was not removed, moved or
+    replaced since.
+    """
     try:
         return os.path.samestat(os.stat(path), status)
     except OSError:
@@ -111,7 +126,8 @@ def is_same_file(path: str | os.PathLike[str], status: os.stat_result) -> bool:
 
 
 def write_json(path: str | os.PathLike[str], value: Mapping[str, Any]) -> None:
-    """Write `value` as JSON atomically, with null for floats that are not finite; missing folders are created.
+    """Write `value` as JSON atomically, with null for floats that are not finite; missing folders
+    are created.
 
     Raises:
         OSError: the file cannot be written.
@@ -136,13 +152,18 @@ def write_error(start: str, error: Exception, target: Path) -> OSError:
     reason = (getattr(error, "strerror", None) or str(error)).rstrip(".")
     if (file := getattr(error, "filename", None)) and str(file) != str(target):
         reason += f": {file}"
-    failure = OSError(f"{start}: {reason}; check that its folder is writable and the disk has room.")
-    failure.strerror = reason  # otherwise a folder's sentence would contain the sentence of a file in it
+    failure = OSError(
+        f"{start}: {reason}; check that its folder is writable and the disk has room."
+    )
+    # Otherwise a folder's sentence would contain the sentence of a file in it.
+    failure.strerror = reason
     return failure
 
 
 def _locked(file: int) -> bool:
-    """Lock an open file and return whether that succeeded; it fails if another process holds the lock."""
+    """Lock an open file and return whether that succeeded; it fails if another process holds the
+    lock.
+    """
     try:
         if fcntl is not None:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -166,11 +187,17 @@ def _remove_empty(folders: Iterable[Path]) -> None:
 
 
 def _left_behind(final: Path) -> list[Path]:
-    """Return the partial files of `final` of killed processes, one of which may have had this process's number."""
+    """Return the partial files of `final` of killed processes, one of which may have had this
+    process's number.
+    """
     process_id = str(os.getpid())
     pattern = re.compile(rf"\.partial-(\d+)-{re.escape(final.name)}")
     candidates = ((path, pattern.fullmatch(path.name)) for path in final.parent.glob(".partial-*"))
-    return [path for path, match in candidates if match and (match[1] == process_id or not _alive(int(match[1])))]
+    return [
+        path
+        for path, match in candidates
+        if match and (match[1] == process_id or not _alive(int(match[1])))
+    ]
 
 
 def _alive(process: int) -> bool:

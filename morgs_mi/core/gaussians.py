@@ -1,8 +1,8 @@
 """The `Gaussians` value.
 
-A bare name (`scales`, `opacities`, `confidence`) is activated; what the optimiser holds has the inverse of its
-activation in its name (`log_scales`, `logit_opacities`, `logit_confidence`). N is the number of Gaussians, K = (degree
-+ 1)^2 the number of spherical harmonics (SH).
+A bare name (`scales`, `opacities`, `confidence`) is activated; what the optimiser holds has the
+inverse of its activation in its name (`log_scales`, `logit_opacities`, `logit_confidence`). N is
+the number of Gaussians, K = (degree + 1)^2 the number of spherical harmonics (SH).
 """
 
 from __future__ import annotations
@@ -67,7 +67,12 @@ class ActivatedGaussians(Protocol):
 
 def displaced(gaussians: Gaussians, displacement: np.ndarray) -> Gaussians:
     """Return N Gaussians that have moved by displacements [N, 3], world units, in a frame."""
-    return replace(gaussians, means=np.asarray(gaussians.means) + displacement, motion=displacement, offset=None)
+    return replace(
+        gaussians,
+        means=np.asarray(gaussians.means) + displacement,
+        motion=displacement,
+        offset=None,
+    )
 
 
 def tensor_rows(tensor: Tensor, index: UInt32) -> list[Float]:
@@ -75,12 +80,15 @@ def tensor_rows(tensor: Tensor, index: UInt32) -> list[Float]:
 
     Args:
         tensor: D numbers in each of N rows.
-        index: UInt32 [M], none of them twice: every element is read once, and the adjoint needs no atomics.
+        index: UInt32 [M], none of them twice: every element is read once, and the adjoint needs no
+            atomics.
     """
     size = int(dr.prod(tensor.shape[1:]))
     mode = dr.ReduceMode.NoConflicts
     if size in (3, 4):  # four at a time are read as one packet
-        return list(dr.gather(mi.Vector3f if size == 3 else mi.Vector4f, tensor.array, index, mode=mode))
+        return list(
+            dr.gather(mi.Vector3f if size == 3 else mi.Vector4f, tensor.array, index, mode=mode)
+        )
     return [dr.gather(mi.Float, tensor.array, index * size + k, mode=mode) for k in range(size)]
 
 
@@ -118,18 +126,21 @@ class Gaussians:
         log_scales: logarithms of the standard deviations [N, 3].
         quats: rotations [N, 4], wxyz.
         logit_opacities: [N].
-        sh_coeffs: [N, K, 3] with K = (degree + 1)^2; colour = max(0.5 + SH(mean - camera), 0) as in 3DGS.
+        sh_coeffs: [N, K, 3] with K = (degree + 1)^2; colour = max(0.5 + SH(mean - camera), 0) as in
+            3DGS.
         motion: displacement since the last frame [N, 3] in world units, or None.
         logit_confidence: motion confidence [N] before the sigmoid, or None.
-        offset: the learned part of that displacement [N, 3], beside the part that is guided by flow (eq. 8), or None.
+        offset: the learned part of that displacement [N, 3], beside the part that is guided by flow
+            (eq. 8), or None.
 
     Example:
-        >>> gaussians = morgs_mi.Gaussians.from_activated(means, scales, quats, opacities, sh_coeffs)
+        >>> arrays = (means, scales, quats, opacities, sh_coeffs)
+        >>> gaussians = morgs_mi.Gaussians.from_activated(*arrays)
         >>> image = morgs_mi.rasterize(gaussians, camera).color
 
     Raises:
-        ValueError: a shape that does not agree with `means`, a K that is not 1, 4, 9 or 16, or other values than
-            numbers.
+        ValueError: a shape that does not agree with `means`, a K that is not 1, 4, 9 or 16, or
+            other values than numbers.
     """
 
     means: Tensor
@@ -148,7 +159,8 @@ class Gaussians:
                 object.__setattr__(self, f.name, float_tensor("Gaussians()", f.name, value))
         if len(self.means.shape) != 2:
             raise ValueError(
-                f"Gaussians(): `means` must be [N, 3], got {tuple(self.means.shape)}; pass one row for each."
+                f"Gaussians(): `means` must be [N, 3], got {tuple(self.means.shape)}; pass one "
+                "row for each."
             )
         N = len(self)
         for attribute in ATTRIBUTES:
@@ -159,14 +171,14 @@ class Gaussians:
             if value is not None and tuple(value.shape) != (N, *tail):
                 expected = ", ".join(["N", *map(str, tail)])
                 raise ValueError(
-                    f"Gaussians(): `{attribute.name}` must be [{expected}] with N={N}, got {tuple(value.shape)}; "
-                    "all attributes describe the same Gaussians."
+                    f"Gaussians(): `{attribute.name}` must be [{expected}] with N={N}, got "
+                    f"{tuple(value.shape)}; all attributes describe the same Gaussians."
                 )
         shape = tuple(self.sh_coeffs.shape)
         if len(shape) != 3 or shape[0] != N or shape[2] != 3 or shape[1] not in (1, 4, 9, 16):
             raise ValueError(
-                f"Gaussians(): `sh_coeffs` must be [N, K, 3] with N={N} and K in 1, 4, 9, 16, got {shape}; "
-                "K is (degree + 1)^2 for degree 0 to 3."
+                f"Gaussians(): `sh_coeffs` must be [N, K, 3] with N={N} and K in 1, 4, 9, 16, got "
+                f"{shape}; K is (degree + 1)^2 for degree 0 to 3."
             )
 
     def __len__(self) -> int:
@@ -176,7 +188,8 @@ class Gaussians:
         means = np.asarray(dr.detach(self.means))
         size = " x ".join(f"{side:.3g}" for side in np.ptp(means, axis=0)) if len(self) else "0"
         more = [name for name in self.items() if name in ("motion", "logit_confidence", "offset")]
-        return f"Gaussians({', '.join([f'N={len(self)}', f'SH degree {self.sh_degree}', f'box of {size}', *more])})"
+        parts = [f"N={len(self)}", f"SH degree {self.sh_degree}", f"box of {size}", *more]
+        return f"Gaussians({', '.join(parts)})"
 
     @classmethod
     def from_activated(
@@ -188,10 +201,11 @@ class Gaussians:
         sh_coeffs: ArrayLike,
         **more: ArrayLike,
     ) -> Gaussians:
-        """Return Gaussians with activated NumPy arrays: `scales` [N, 3] >= 0 and `opacities` [N] in [0, 1].
+        """Return Gaussians with activated NumPy arrays: `scales` [N, 3] >= 0 and `opacities` [N] in
+        [0, 1].
 
-        Scales are at least 1e-30, opacities are clipped to [1e-6, 1 - 1e-6]: the logarithm of 0 and the logits of 0 and
-        1 are infinite.
+        Scales are at least 1e-30, opacities are clipped to [1e-6, 1 - 1e-6]: the logarithm of 0 and
+        the logits of 0 and 1 are infinite.
 
         Raises:
             ValueError: a scale or an opacity out of these ranges, and as for `Gaussians`.
@@ -204,7 +218,8 @@ class Gaussians:
             if len(bad):
                 raise ValueError(
                     f"{place}: `{name}` must be {'at least 0' if high > 1 else 'in [0, 1]'}, got "
-                    f"{values[tuple(bad[0])]} at {bad[0].tolist()}; pass activated values, not logarithms or logits."
+                    f"{values[tuple(bad[0])]} at {bad[0].tolist()}; pass activated values, not "
+                    "logarithms or logits."
                 )
         return cls(means, EXP.inverse(scales), quats, SIGMOID.inverse(opacities), sh_coeffs, **more)
 
@@ -224,11 +239,14 @@ class Gaussians:
         return None if self.logit_confidence is None else sigmoid(self.logit_confidence)
 
     def __getattr__(self, name: str) -> Tensor | None:
-        """Return the activated value of an attribute of the table that has no property of its own, or None."""
+        """Return the activated value of an attribute of the table that has no property of its own,
+        or None.
+        """
         attribute = BY_ACTIVATED_NAME.get(name)
         if attribute is None or attribute.name == name:
             raise AttributeError(
-                f"Gaussians has no attribute {name!r}; see morgs_mi.core.attributes for those that exist."
+                f"Gaussians has no attribute {name!r}; see morgs_mi.core.attributes for those "
+                "that exist."
             )
         value = getattr(self, attribute.name)
         return None if value is None else attribute.activation.function(value)
@@ -239,7 +257,9 @@ class Gaussians:
         return round(int(self.sh_coeffs.shape[1]) ** 0.5) - 1
 
     def parameters(self) -> dict[str, Tensor]:
-        """Return the raw attributes that are present, by the names of the attribute table (SH in two parts)."""
+        """Return the raw attributes that are present, by the names of the attribute table (SH in
+        two parts).
+        """
         sh_dc, sh_rest = split_sh(self.sh_coeffs)
         values = {**self.items(), "sh_dc": sh_dc, "sh_rest": sh_rest}
         return {a.name: values[a.name] for a in ATTRIBUTES if values.get(a.name) is not None}
@@ -247,7 +267,8 @@ class Gaussians:
     def with_parameters(self, parameters: Mapping[str, Tensor]) -> Gaussians:
         """Return these Gaussians with some of their `parameters` replaced.
 
-        Where `sh_dc` is given, `sh_rest` is taken from `parameters` too; without it the degree becomes 0.
+        Where `sh_dc` is given, `sh_rest` is taken from `parameters` too; without it the degree
+        becomes 0.
         """
         values = dict(parameters)
         if "sh_dc" in values:
@@ -256,7 +277,9 @@ class Gaussians:
 
     def items(self) -> dict[str, Tensor]:
         """Return the raw attributes that are present, by the names of the fields."""
-        return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
+        return {
+            f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None
+        }
 
     def numpy(self) -> dict[str, np.ndarray]:
         """Return copies of the raw attributes that are present, as NumPy arrays."""
@@ -267,14 +290,19 @@ class Gaussians:
         return replace(self, **{name: dr.detach(value) for name, value in self.items().items()})
 
     def rows(self, name: str, index: UInt32) -> list[Float]:
-        """Return an activated attribute of the Gaussians at `index` (see `tensor_rows`): read first, then activated."""
+        """Return an activated attribute of the Gaussians at `index` (see `tensor_rows`): read
+        first, then activated.
+        """
         if name == "sh_coeffs":
             return tensor_rows(self.sh_coeffs, index)
         attribute = BY_ACTIVATED_NAME[name]
-        return [attribute.activation.function(column) for column in tensor_rows(getattr(self, attribute.name), index)]
+        return [
+            attribute.activation.function(column)
+            for column in tensor_rows(getattr(self, attribute.name), index)
+        ]
 
     def select(self, index: np.ndarray) -> Gaussians:
-        """Return the Gaussians at `index` [M] (integers, or a mask [N]); gradients are not carried."""
+        """Return the Gaussians at `index` [M] (integers, or a mask [N]), without gradients."""
         return Gaussians(**{name: value[index] for name, value in self.numpy().items()})
 
     @staticmethod
@@ -285,18 +313,26 @@ class Gaussians:
             ValueError: there are no parts, or they have different attributes.
         """
         if not parts:
-            raise ValueError("Gaussians.concatenate(): `parts` must hold at least one, got none; pass some Gaussians.")
+            raise ValueError(
+                "Gaussians.concatenate(): `parts` must hold at least one, got none; pass some "
+                "Gaussians."
+            )
         columns = [part.numpy() for part in parts]
         if any(column.keys() != columns[0].keys() for column in columns):
             raise ValueError(
                 "Gaussians.concatenate(): all parts must have the same attributes, got "
-                f"{[sorted(column) for column in columns]}; drop or add `motion`, `offset` and `logit_confidence`."
+                f"{[sorted(column) for column in columns]}; drop or add `motion`, `offset` and "
+                "`logit_confidence`."
             )
-        return Gaussians(**{k: np.concatenate([column[k] for column in columns]) for k in columns[0]})
+        return Gaussians(
+            **{k: np.concatenate([column[k] for column in columns]) for k in columns[0]}
+        )
 
 
 def split_sh(sh_coeffs: Tensor) -> tuple[Tensor, Tensor | None]:
-    """Return the constant coefficient [N, 1, 3] and the others [N, K - 1, 3], or None where there are none."""
+    """Return the constant coefficient [N, 1, 3] and the others [N, K - 1, 3], or None where there
+    are none.
+    """
     K = int(sh_coeffs.shape[1])
     return (sh_coeffs, None) if K == 1 else (sh_coeffs[:, :1], sh_coeffs[:, 1:])
 
@@ -314,5 +350,7 @@ def join_sh(sh_dc: Tensor, sh_rest: Tensor | None) -> Tensor:
     is_dc = column < 3
     mode = dr.ReduceMode.NoConflicts
     coeffs = dr.gather(mi.Float, sh_dc.array, row * 3 + column, active=is_dc, mode=mode)
-    coeffs += dr.gather(mi.Float, sh_rest.array, row * (3 * K - 3) + column - 3, active=~is_dc, mode=mode)
+    coeffs += dr.gather(
+        mi.Float, sh_rest.array, row * (3 * K - 3) + column - 3, active=~is_dc, mode=mode
+    )
     return mi.TensorXf(coeffs, (N, K, 3))

@@ -1,6 +1,7 @@
 """Gaussians in NumPy, as other programs need them: covariances, spherical harmonics, rotated axes.
 
-N Gaussians, K = (degree + 1)^2 SH coefficients; R [3, 3] is a rotation that takes column vectors, x' = R x.
+N Gaussians, K = (degree + 1)^2 SH coefficients; R [3, 3] is a rotation that takes column vectors,
+x' = R x.
 """
 
 from __future__ import annotations
@@ -16,7 +17,9 @@ from morgs_mi.core.gaussians import Gaussians
 
 
 def unit_quats(gaussians: Gaussians) -> np.ndarray:
-    """Return the rotations as unit quaternions wxyz, float64 [N, 4]; a quaternion of length 0 becomes the identity."""
+    """Return the rotations as unit quaternions wxyz, float64 [N, 4]; a quaternion of length 0
+    becomes the identity.
+    """
     quats = np.asarray(gaussians.numpy()["quats"], np.float64)
     lengths = np.linalg.norm(quats, axis=1, keepdims=True)
     return np.where(lengths > 0, quats / np.maximum(lengths, 1e-300), (1.0, 0, 0, 0))
@@ -36,20 +39,26 @@ def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
 
 
 def rotated(gaussians: Gaussians, R: np.ndarray) -> Gaussians:
-    """Return the Gaussians rotated by R [3, 3]: means, rotations, spherical harmonics, motion and offset.
+    """Return the Gaussians rotated by R [3, 3]: means, rotations, spherical harmonics, motion and
+    offset.
 
-    A colour that was seen along d is then seen along R d. A rotation maps the harmonics of one degree to
-    themselves: the new coefficients follow exactly from enough directions to make the basis invertible.
+    A colour that was seen along d is then seen along R d. A rotation maps the harmonics of one
+    degree to themselves: the new coefficients follow exactly from enough directions to make the
+    basis invertible.
     """
     R = np.asarray(R, np.float64)
     turn = Rotation.from_matrix(R)
-    quats = (turn * Rotation.from_quat(unit_quats(gaussians), scalar_first=True)).as_quat(scalar_first=True)
+    quats = (turn * Rotation.from_quat(unit_quats(gaussians), scalar_first=True)).as_quat(
+        scalar_first=True
+    )
     raw = gaussians.numpy()
     vectors = {name: raw[name] @ R.T for name in ("means", "motion", "offset") if name in raw}
     # Golden spiral: evenly spread directions, twice as many as the 16 functions of degree 3.
     z = 1 - (2 * np.arange(32) + 1) / 32
     angle = np.pi * (1 + 5**0.5) * np.arange(32)
-    directions = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
+    directions = np.stack(
+        [np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1
+    )
     degree = gaussians.sh_degree
     change = np.linalg.pinv(sh_basis(directions, degree)) @ sh_basis(directions @ R, degree)
     coeffs = np.einsum("kl,nlc->nkc", change, raw["sh_coeffs"])

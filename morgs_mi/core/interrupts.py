@@ -1,10 +1,12 @@
-"""Ctrl-C and SIGTERM: one exception for both, also where a library has turned it into another or has swallowed it.
+"""Ctrl-C and SIGTERM: one exception for both, also where a library has turned it into another or
+has swallowed it.
 
-Dr.Jit calls Python from C++, and raises a RuntimeError for whatever such a callback raises. An interruption is
-therefore looked for along the causes and contexts of an error. Its traceback refers to Dr.Jit's arrays. If a garbage
-collection in another thread freed them, the process could crash.
+Dr.Jit calls Python from C++, and raises a RuntimeError for whatever such a callback raises. An
+interruption is therefore looked for along the causes and contexts of an error. Its traceback refers
+to Dr.Jit's arrays. If a garbage collection in another thread freed them, the process could crash.
 
-This module needs the standard library only: the command line uses it before it imports anything else.
+This module needs the standard library only: the command line uses it before it imports anything
+else.
 """
 
 from __future__ import annotations
@@ -35,7 +37,8 @@ def is_interruption(error: BaseException) -> bool:
 
 @contextmanager
 def interrupts_raised() -> Iterator[None]:
-    """Raise an interruption as `KeyboardInterrupt`, whatever a library has made of it; also a decorator.
+    """Raise an interruption as `KeyboardInterrupt`, whatever a library has made of it; also a
+    decorator.
 
     The variables of the functions that were interrupted are released in this thread.
     """
@@ -52,7 +55,8 @@ def interrupts_raised() -> Iterator[None]:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise `KeyboardInterrupt` at SIGTERM as at Ctrl-C, and again where a destructor or a callback swallows it.
+    """Raise `KeyboardInterrupt` at SIGTERM as at Ctrl-C, and again where a destructor or a callback
+    swallows it.
 
     In a thread that is not the main one, signals cannot be handled, and nothing is changed.
     """
@@ -89,9 +93,9 @@ def interruptible() -> Iterator[None]:
 def begin_command() -> None:
     """Prepare a process that runs the command line; in any other process, do nothing.
 
-    Until `interruptible`, and after it, an interruption ends the process at once: a half-imported library raises
-    anything. A standard stream that is closed becomes the null device; otherwise the next file that is opened would
-    take its place, and receive what libraries print.
+    Until `interruptible`, and after it, an interruption ends the process at once: a half-imported
+    library raises anything. A standard stream that is closed becomes the null device; otherwise the
+    next file that is opened would take its place, and receive what libraries print.
     """
     if not _is_command():
         return
@@ -107,7 +111,7 @@ def begin_command() -> None:
 
 
 def _release(error: BaseException) -> None:
-    """Release the variables of the functions that an error has left, in this thread and no other."""
+    """Release the variables of the functions that an error has left, in this thread alone."""
     collects = gc.isenabled()
     gc.disable()
     for link in _chain(error):

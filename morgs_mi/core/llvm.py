@@ -1,9 +1,10 @@
 """Search for a libLLVM that Dr.Jit can use, before Dr.Jit looks for one itself.
 
-Dr.Jit compiles its CPU kernels with the LLVM that it finds when `drjit` is first imported. It refuses version 14 and
-older; 15 and 16 abort the whole process on recent CPUs (``LLVM ERROR: Cannot select: f32 = fminimum``); 17 and newer
-work. This module needs the standard library only: it can run during set-up before anything is installed.
-``python -P morgs_mi/core/llvm.py`` prints the library in use, or a sentence with exit status 1.
+Dr.Jit compiles its CPU kernels with the LLVM that it finds when `drjit` is first imported. It
+refuses version 14 and older; 15 and 16 abort the whole process on recent CPUs (``LLVM ERROR: Cannot
+select: f32 = fminimum``); 17 and newer work. This module needs the standard library only: it can
+run during set-up before anything is installed. ``python -P morgs_mi/core/llvm.py`` prints the
+library in use, or a sentence with exit status 1.
 """
 
 from __future__ import annotations
@@ -26,14 +27,17 @@ REMEDY = (
     "install one (Debian: apt-get install libllvm19; Ubuntu: the newest of libllvm17 to libllvm20; "
     f"conda: conda install -c conda-forge libllvm19) or set {VARIABLE} to its path"
 )
-# For a path that cannot be opened Dr.Jit raises an exception; with a library that it cannot use it ends the process.
+# For a path that cannot be opened Dr.Jit raises an exception; with a library that it cannot use it
+# ends the process.
 _NOWHERE = f"/nonexistent/libLLVM-{SAFE_MAJOR}-or-newer.so"
 _NAME = re.compile(r"libLLVM(?:-(\d+)[\d.]*)?\.so(?:\.(\d+)[\d.]*)?")
-_TRIAL = "import drjit as dr; from drjit.llvm import Float; dr.eval(dr.minimum(dr.arange(Float, 4), 2))"
+_TRIAL = (
+    "import drjit as dr; from drjit.llvm import Float; dr.eval(dr.minimum(dr.arange(Float, 4), 2))"
+)
 
 
 def llvm_major(path: Path) -> int | None:
-    """Return the major version in the name of a file or of a link's target; None if there is none."""
+    """Return the major version in the name of a file or of a link's target, or None."""
     for name in (path.name, path.resolve().name):
         if (match := _NAME.fullmatch(name)) and (major := match[1] or match[2]):
             return int(major)
@@ -51,7 +55,9 @@ def search_folders() -> list[Path]:
 
 
 def find_llvm(folders: Iterable[Path] | None = None) -> list[Path]:
-    """Return the libLLVM files in `folders` (default: `search_folders`), newest first, without duplicates."""
+    """Return the libLLVM files in `folders` (default: `search_folders`), newest first, without
+    duplicates.
+    """
     folders = search_folders() if folders is None else folders
     files = {path.resolve(): path for folder in folders for path in folder.glob("libLLVM*.so*")}
     libraries = [path for path in files.values() if _NAME.fullmatch(path.name)]
@@ -59,7 +65,9 @@ def find_llvm(folders: Iterable[Path] | None = None) -> list[Path]:
 
 
 def cache_folder() -> Path:
-    """Return the folder of the package's caches; it is a temporary one for a user without a home folder."""
+    """Return the folder of the package's caches; it is a temporary one for a user without a home
+    folder.
+    """
     home = os.path.expanduser("~/.cache")
     usual = tempfile.gettempdir() if home.startswith("~") else home
     return Path(os.environ.get("XDG_CACHE_HOME") or usual, "morgs_mi")
@@ -68,8 +76,8 @@ def cache_folder() -> Path:
 def works(path: Path) -> bool:
     """Return whether Dr.Jit compiles a kernel with this library, tested in a separate process.
 
-    Success is cached per file and machine in ``~/.cache/morgs_mi``; failure is not, because an update of Dr.Jit may
-    change it.
+    Success is cached per file and machine in ``~/.cache/morgs_mi``; failure is not, because an
+    update of Dr.Jit may change it.
     """
     cache = cache_folder() / "llvm.txt"
     key = f"{os.uname().nodename} {sys.executable} {path.resolve()} {path.stat().st_mtime_ns}"
@@ -88,7 +96,9 @@ def works(path: Path) -> bool:
 
 
 def usable(path: Path) -> bool:
-    """Return whether Dr.Jit can use this libLLVM, from its version, or by a test where that is inconclusive."""
+    """Return whether Dr.Jit can use this libLLVM, from its version, or by a test where that is
+    inconclusive.
+    """
     if not path.is_file():
         return False
     major = llvm_major(path)
@@ -97,8 +107,11 @@ def usable(path: Path) -> bool:
     return major >= SAFE_MAJOR
 
 
-def choose_llvm(choice: str | None = None, folders: Iterable[Path] | None = None) -> tuple[Path | None, str]:
-    """Return the library to use (None if there is none) and a sentence that describes the problem (empty if none).
+def choose_llvm(
+    choice: str | None = None, folders: Iterable[Path] | None = None
+) -> tuple[Path | None, str]:
+    """Return the library to use (None if there is none) and a sentence that describes the problem
+    (empty if none).
 
     Args:
         choice: the user's choice, which takes precedence if it is usable.
@@ -114,11 +127,17 @@ def choose_llvm(choice: str | None = None, folders: Iterable[Path] | None = None
     if best:
         return best, ""
     remark = f" (only {', '.join(map(str, libraries))}, too old for this CPU)" if libraries else ""
-    return None, f"Dr.Jit's CPU backend needs LLVM {SAFE_MAJOR} or newer and none was found{remark}: {REMEDY}."
+    return (
+        None,
+        f"Dr.Jit's CPU backend needs LLVM {SAFE_MAJOR} or newer and none was found{remark}: "
+        f"{REMEDY}.",
+    )
 
 
 def has_cuda() -> bool:
-    """Return whether an NVIDIA driver can be loaded: the variants cuda_* may then work without LLVM."""
+    """Return whether an NVIDIA driver can be loaded: the variants cuda_* may then work without
+    LLVM.
+    """
     try:
         ctypes.CDLL("libcuda.so.1")
     except OSError:
@@ -127,7 +146,8 @@ def has_cuda() -> bool:
 
 
 def ensure_llvm() -> None:
-    """Point Dr.Jit to a usable libLLVM through ``DRJIT_LIBLLVM_PATH``; Linux only, elsewhere do nothing.
+    """Point Dr.Jit to a usable libLLVM through ``DRJIT_LIBLLVM_PATH``; Linux only, elsewhere do
+    nothing.
 
     With a CUDA driver a missing LLVM is a warning, and choosing a variant ``llvm_*`` then raises
     Mitsuba's ImportError instead of ending the process.
@@ -151,8 +171,8 @@ def ensure_llvm() -> None:
         major = sys.modules["drjit"].detail.llvm_version()[0]
         if 0 < major < SAFE_MAJOR:
             warnings.warn(
-                f"Dr.Jit was imported before morgs_mi and has loaded LLVM {major}, which can abort the "
-                "process; import morgs_mi before mitsuba and drjit.",
+                f"Dr.Jit was imported before morgs_mi and has loaded LLVM {major}, which can "
+                "abort the process; import morgs_mi before mitsuba and drjit.",
                 RuntimeWarning,
                 stacklevel=3,
             )

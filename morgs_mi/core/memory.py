@@ -1,7 +1,7 @@
 """Memory that NumPy and Dr.Jit exchange, and memory that is free.
 
-Dr.Jit borrows NumPy's memory where it can, and reads it when a kernel runs: after the call that passed it, when the
-caller may have written to it. The package therefore passes copies.
+Dr.Jit borrows NumPy's memory where it can, and reads it when a kernel runs: after the call that
+passed it, when the caller may have written to it. The package therefore passes copies.
 """
 
 from __future__ import annotations
@@ -21,10 +21,12 @@ _ALIGNMENT = 64
 
 
 def from_numpy(kind: type[Jit], values: ArrayLike) -> Jit:
-    """Return numbers as a Dr.Jit tensor [...], or flattened as an array [M], copied before this returns.
+    """Return numbers as a Dr.Jit tensor [...], or flattened as an array [M], copied before this
+    returns.
 
-    Dr.Jit borrows the copy, and holds a reference to it until all kernels that read it have run. It is aligned, because
-    packets can only be read from aligned memory, and kernels are compiled for either case.
+    Dr.Jit borrows the copy, and holds a reference to it until all kernels that read it have run. It
+    is aligned, because packets can only be read from aligned memory, and kernels are compiled for
+    either case.
 
     Args:
         kind: the result's type, such as `mi.TensorXf` or `mi.UInt32`.
@@ -53,8 +55,9 @@ def float_tensor(place: str, name: str, values: ArrayLike | Tensor) -> Tensor:
         return values
     if dr.is_array_v(values):
         raise ValueError(
-            f"{place}: `{name}` must be a NumPy array or a {mi.TensorXf.__module__}.TensorXf, got a "
-            f"{type(values).__module__}.{type(values).__name__}; convert it with mi.TensorXf(array, shape)."
+            f"{place}: `{name}` must be a NumPy array or a {mi.TensorXf.__module__}.TensorXf, got "
+            f"a {type(values).__module__}.{type(values).__name__}; convert it with "
+            "mi.TensorXf(array, shape)."
         )
     return from_numpy(mi.TensorXf, numbers(place, name, values))
 
@@ -62,30 +65,36 @@ def float_tensor(place: str, name: str, values: ArrayLike | Tensor) -> Tensor:
 def refuse_freezing(place: str) -> None:
     """Raise an error while Dr.Jit records a function under `dr.freeze`.
 
-    Dr.Jit 1.5 ends the process when memory that it has borrowed from NumPy is released in a recording.
+    Dr.Jit 1.5 ends the process when memory that it has borrowed from NumPy is released in a
+    recording.
 
     Raises:
         ValueError: it does.
     """
     if dr.flag(dr.JitFlag.FreezingScope):
         raise ValueError(
-            f"{place}: expected a call outside dr.freeze, got one inside, which Dr.Jit cannot record; call it before "
-            "the frozen function and pass its result. The renderer records its own kernels."
+            f"{place}: expected a call outside dr.freeze, got one inside, which Dr.Jit cannot "
+            "record; call it before the frozen function and pass its result. The renderer "
+            "records its own kernels."
         )
 
 
 def owned_copy(values: Jit) -> Jit:
-    """Return an evaluated copy of a Dr.Jit array, aligned even if the array is borrowed from NumPy (see `from_numpy`).
+    """Return an evaluated copy of a Dr.Jit array, aligned even if the array is borrowed from NumPy
+    (see `from_numpy`).
 
     The opaque 0 prevents its removal by the optimiser.
     """
-    copy = dr.gather(type(values), values, dr.arange(mi.UInt32, dr.width(values)) + dr.opaque(mi.UInt32, 0))
+    copy = dr.gather(
+        type(values), values, dr.arange(mi.UInt32, dr.width(values)) + dr.opaque(mi.UInt32, 0)
+    )
     dr.eval(copy)
     return copy
 
 
 def check_memory(place: str, needed: float, content: str, remedy: str) -> None:
-    """Raise an error unless there is memory for what is about to be computed: Dr.Jit ends the process without it.
+    """Raise an error unless there is memory for what is about to be computed: Dr.Jit ends the
+    process without it.
 
     Args:
         place: where the error's sentence begins.
@@ -99,13 +108,15 @@ def check_memory(place: str, needed: float, content: str, remedy: str) -> None:
     free = free_memory()
     if needed > free:
         raise ValueError(
-            f"{place}: expected what fits in the {max(free, 0) / 1e9:.1f} GB of free memory, got {content}, which "
-            f"takes about {needed / 1e9:.1f} GB; {remedy}."
+            f"{place}: expected what fits in the {max(free, 0) / 1e9:.1f} GB of free memory, got "
+            f"{content}, which takes about {needed / 1e9:.1f} GB; {remedy}."
         )
 
 
 def free_memory() -> float:
-    """Return the bytes that this process may still use, by the machine, its control group and its own limit."""
+    """Return the bytes that this process may still use, by the machine, its control group and its
+    own limit.
+    """
     return min(_free_in_machine(), _free_in_group(), _free_in_limit())
 
 

@@ -15,14 +15,18 @@ Report = Callable[[str, float, float], None]
 
 _PERIOD = 0.2  # seconds between two updates
 _WIDTH = 30
-_HTML = '<div>{title} <progress value="{done}" max="{total}" style="width:20em"></progress> {text}</div>'
+_HTML = (
+    '<div>{title} <progress value="{done}" max="{total}" style="width:20em"></progress> '
+    "{text}</div>"
+)
 
 
 @dataclass(frozen=True)
 class Progress:
     """Progress of a stage of a long call; to be called with (done, total)."""
 
-    report: Report | None = None  #: Function that is called with (stage, done, total); None: nothing is reported.
+    #: Function that is called with (stage, done, total); None: nothing is reported.
+    report: Report | None = None
     stage: str = ""  #: Name of the stage.
 
     def __call__(self, done: float, total: float) -> None:
@@ -42,7 +46,8 @@ class Progress:
 class ProgressBar:
     """Progress bar, to be passed to a long call.
 
-    In a notebook it is an element of the cell's output, on a terminal a line; otherwise nothing is shown.
+    In a notebook it is an element of the cell's output, on a terminal a line; otherwise nothing is
+    shown.
 
     Args:
         title: what is done.
@@ -69,7 +74,10 @@ class ProgressBar:
         if seconds - self._shown < _PERIOD and done != total:
             return
         self._shown = seconds
-        text = f"{done:.0f}{'' if total is None else f'/{total:.0f}'}, {timedelta(seconds=round(seconds))}"
+        text = (
+            f"{done:.0f}{'' if total is None else f'/{total:.0f}'}, "
+            f"{timedelta(seconds=round(seconds))}"
+        )
         if self._is_notebook:
             self._show_html(done, total, text)
         elif sys.stderr.isatty():
@@ -94,7 +102,9 @@ class ProgressBar:
         from IPython.display import HTML, display  # type: ignore[import-not-found]
 
         value = done if total else 0
-        content = HTML(_HTML.format(title=html.escape(self._name), done=value, total=total or 1, text=text))
+        content = HTML(
+            _HTML.format(title=html.escape(self._name), done=value, total=total or 1, text=text)
+        )
         if self._output is None:
             self._output = display(content, display_id=True)
         elif self._output is not None:

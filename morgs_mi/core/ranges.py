@@ -1,7 +1,8 @@
 """Ranges of settings as a part of their types, such as ``epochs: Annotated[int, AtLeast(1)] = 8``.
 
-`check_ranges`, which a config calls in its `__post_init__`, compares all its fields with their types. An integer is one
-of at most 64 bits, as the header of a stream has no longer ones, and any number is finite.
+`check_ranges`, which a config calls in its `__post_init__`, compares all its fields with their
+types. An integer is one of at most 64 bits, as the header of a stream has no longer ones, and any
+number is finite.
 """
 
 from __future__ import annotations
@@ -66,7 +67,8 @@ class MultipleOf(_Bound):
 
 
 def check_ranges(config: Any, place: str = "") -> None:
-    """Raise an error unless every field of a dataclass has a value of its type and within its range.
+    """Raise an error unless every field of a dataclass has a value of its type and within its
+    range.
 
     Args:
         config: an instance of a dataclass.
@@ -87,19 +89,26 @@ def check_value(place: str, name: str, value: Any, kind: Any) -> None:
         place: where the error's sentence begins.
         name: of the field.
         value: of the field.
-        kind: its type: numbers, strings, booleans, None, tuples, dicts, literals, classes, and unions of them.
+        kind: its type: numbers, strings, booleans, None, tuples, dicts, literals, classes, and
+            unions of them.
 
     Raises:
         ValueError: it has not.
     """
     if not _fits(value, kind):
-        raise ValueError(f"{place}: `{name}` must be {_expected(value, kind)}, got {shortened(value)}.")
+        raise ValueError(
+            f"{place}: `{name}` must be {_expected(value, kind)}, got {shortened(value)}."
+        )
 
 
 @cache
 def types_of(config_type: type) -> dict[str, Any]:
     """Return the types of a dataclass's fields by name, with their ranges."""
-    return {n: t for n, t in get_type_hints(config_type, include_extras=True).items() if get_origin(t) is not ClassVar}
+    return {
+        n: t
+        for n, t in get_type_hints(config_type, include_extras=True).items()
+        if get_origin(t) is not ClassVar
+    }
 
 
 def arms_of(kind: Any) -> tuple[Any, ...]:
@@ -119,11 +128,19 @@ def _fits(value: Any, kind: Any) -> bool:
         return any(type(value) is type(choice) and value == choice for choice in args)
     if origin is tuple:
         kinds = args[:1] * len(value) if args[1:] == (...,) and isinstance(value, tuple) else args
-        return isinstance(value, tuple) and len(kinds) == len(value) and all(map(_fits, value, kinds))
+        return (
+            isinstance(value, tuple) and len(kinds) == len(value) and all(map(_fits, value, kinds))
+        )
     if origin is dict:
-        return isinstance(value, dict) and all(_fits(k, args[0]) and _fits(v, args[1]) for k, v in value.items())
+        return isinstance(value, dict) and all(
+            _fits(k, args[0]) and _fits(v, args[1]) for k, v in value.items()
+        )
     if kind is int:
-        return isinstance(value, Integral) and not isinstance(value, bool) and -(2**63) <= int(value) < 2**64
+        return (
+            isinstance(value, Integral)
+            and not isinstance(value, bool)
+            and -(2**63) <= int(value) < 2**64
+        )
     if kind is float:
         return isinstance(value, Real) and not isinstance(value, bool) and _is_finite(value)
     return isinstance(value, kind)
@@ -147,14 +164,18 @@ def _in_words(kind: Any) -> str:
     if origin is Literal:
         return _joined(list(map(str, args)), "or")
     if origin is tuple:
-        items = f"each {_in_words(args[0])}" if args[1:] == (...,) else ", ".join(map(_in_words, args))
+        items = (
+            f"each {_in_words(args[0])}" if args[1:] == (...,) else ", ".join(map(_in_words, args))
+        )
         return f"a list ({items})"
     name = getattr(kind, "__name__", str(kind))
     return f"a table ({name})" if is_dataclass(kind) else _WORDS.get(origin or kind, name)
 
 
 def _expected(value: Any, kind: Any) -> str:
-    """Return the expected value in words: a range alone where the type is right, such as "at least 1"."""
+    """Return the expected value in words: a range alone where the type is right, such as "at least
+    1".
+    """
     for arm in arms_of(kind):
         if get_origin(arm) is Annotated and _fits(value, get_args(arm)[0]):
             return _bounds(get_args(arm)[1:])

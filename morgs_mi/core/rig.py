@@ -1,4 +1,6 @@
-"""Geometry of a rig: its extent, what its cameras look at, and the angles and overlaps between them."""
+"""Geometry of a rig: its extent, what its cameras look at, and the angles and overlaps between
+them.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +13,9 @@ from morgs_mi.core.camera import Camera
 
 # Rows and columns of the points of each view.
 _GRID = 16
-# Depth of a near plane relative to what a camera sees. A subject may come this much closer than the scene's points, and
-# what is nearer than that is a splat that hides another camera's lens (see `docs/experiments/real.md`).
+# Depth of a near plane relative to what a camera sees. A subject may come this much closer than the
+# scene's points, and what is nearer than that is a splat that hides another camera's lens (see
+# `docs/experiments/real.md`).
 _NEAR_SHARE = 0.2
 # One per cent of the points may be wrong matches. A view with fewer points has no reliable depth.
 _RELIABLE_QUANTILE = 0.01
@@ -22,7 +25,8 @@ _IN_FRONT = 1e-30
 
 
 def scene_extent(cameras: Sequence[Camera]) -> float:
-    """Return the scene extent in world units: 1.1 times the radius of the cameras around their mean, as in 3DGS.
+    """Return the scene extent in world units: 1.1 times the radius of the cameras around their
+    mean, as in 3DGS.
 
     It is 1 for a single camera.
     """
@@ -32,7 +36,9 @@ def scene_extent(cameras: Sequence[Camera]) -> float:
 
 
 def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the mean up direction of the cameras [3], of unit length; the first camera's where they cancel out."""
+    """Return the mean up direction of the cameras [3], of unit length; the first camera's where
+    they cancel out.
+    """
     ups = np.stack([-np.asarray(camera.viewmat, np.float64)[1, :3] for camera in cameras])
     mean = ups.mean(axis=0)
     up = mean if np.linalg.norm(mean) > 0.1 else ups[0]
@@ -56,7 +62,9 @@ def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def focus_depths(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the depth of the `focus_point` in each view [V], world units; infinite where it is not in front."""
+    """Return the depth of the `focus_point` in each view [V], world units; infinite where it is not
+    in front.
+    """
     focus = np.append(focus_point(cameras), 1)
     least = 1e-3 * scene_extent(cameras)
     depths = np.array([np.asarray(camera.viewmat, float)[2] @ focus for camera in cameras])
@@ -64,23 +72,30 @@ def focus_depths(cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def seen_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return which points [P, 3] lie in a view [P], the n pixel positions [n, 2] of those, and their depths [n]."""
+    """Return which points [P, 3] lie in a view [P], the n pixel positions [n, 2] of those, and
+    their depths [n].
+    """
     with np.errstate(divide="ignore", invalid="ignore"):  # points beside the camera
         pixels, depths = camera.project(np.asarray(points, np.float64).reshape(-1, 3))
-    visible = (depths > camera.near) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+    visible = (depths > camera.near) & (
+        (pixels >= 0) & (pixels < (camera.width, camera.height))
+    ).all(axis=1)
     return visible, pixels[visible], depths[visible]
 
 
-def with_near_planes(cameras: Sequence[Camera], points: np.ndarray, near: float | None = None) -> tuple[Camera, ...]:
+def with_near_planes(
+    cameras: Sequence[Camera], points: np.ndarray, near: float | None = None
+) -> tuple[Camera, ...]:
     """Return the cameras with near planes that follow the scene.
 
-    The plane of a camera has a fifth of the smallest reliable depth of the points in its view, which is their first
-    percentile. A camera that sees fewer than 20 points has a fifth of the depth of the `focus_point`, or of the scene
-    extent if that is smaller. If the `focus_point` is not in front of it, it has a fifth of the distance to the nearest
-    other camera.
+    The plane of a camera has a fifth of the smallest reliable depth of the points in its view,
+    which is their first percentile. A camera that sees fewer than 20 points has a fifth of the
+    depth of the `focus_point`, or of the scene extent if that is smaller. If the `focus_point` is
+    not in front of it, it has a fifth of the distance to the nearest other camera.
 
     Args:
-        cameras: the rig. A camera that no rule applies to, such as a single one without points, keeps its near plane.
+        cameras: the rig. A camera that no rule applies to, such as a single one without points,
+            keeps its near plane.
         points: [P, 3] of the scene, world units, or none.
         near: depth of all near planes instead, world units.
 
@@ -106,25 +121,36 @@ def check_near_planes(where: str, cameras: Sequence[Camera], points: np.ndarray)
     depths = scene_depths([replace(camera, near=_IN_FRONT) for camera in cameras], points)
     if all(camera.near > depth for camera, depth in zip(cameras, depths, strict=True)):
         raise ValueError(
-            f"{where}: the near planes of `cameras` must be in front of the scene, got {cameras[0].near:g} world units "
-            f"where it is {depths[0]:.3g} away; pass with_near_planes(cameras, points), or cameras with a smaller "
-            "`near`."
+            f"{where}: the near planes of `cameras` must be in front of the scene, got "
+            f"{cameras[0].near:g} world units where it is {depths[0]:.3g} away; pass "
+            "with_near_planes(cameras, points), or cameras with a smaller `near`."
         )
 
 
 def _reliable_depths(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
-    """Return the smallest reliable depth of the points in each view [V], world units; NaN with too few points."""
+    """Return the smallest reliable depth of the points in each view [V], world units; NaN with too
+    few points.
+    """
     depths = [seen_points(replace(camera, near=_IN_FRONT), points)[2] for camera in cameras]
-    return np.array([np.quantile(z, _RELIABLE_QUANTILE) if len(z) >= _RELIABLE_POINTS else np.nan for z in depths])
+    return np.array(
+        [
+            np.quantile(z, _RELIABLE_QUANTILE) if len(z) >= _RELIABLE_POINTS else np.nan
+            for z in depths
+        ]
+    )
 
 
 def _rig_depths(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return a depth within which each camera shares nothing with the others, by the rig alone [V]; 0 if unknown."""
+    """Return a depth within which each camera shares nothing with the others, by the rig alone [V];
+    0 if unknown.
+    """
     positions = np.array([camera.position for camera in cameras])
     distances = np.linalg.norm(positions[:, None] - positions, axis=-1)
     np.fill_diagonal(distances, np.inf)
     focus = focus_depths(cameras)
-    depths = np.where(np.isfinite(focus), np.minimum(focus, scene_extent(cameras)), distances.min(axis=1))
+    depths = np.where(
+        np.isfinite(focus), np.minimum(focus, scene_extent(cameras)), distances.min(axis=1)
+    )
     # Cameras at one place are apart by rounding errors.
     rounding = 1e-9 * np.abs(positions).max()
     return np.where(np.isfinite(depths) & (depths > rounding), depths, 0)
@@ -146,7 +172,8 @@ def choose_key_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:
 
 
 def mean_views(cameras: Sequence[Camera], points: np.ndarray) -> float:
-    """Return the mean number of views that see a surface of the scene, by their frustums; at least 1.
+    """Return the mean number of views that see a surface of the scene, by their frustums; at least
+    1.
 
     Args:
         cameras: at least one.
@@ -162,14 +189,19 @@ def overlaps(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
         cameras: C views.
         points: [P, 3] of the scene, world units, or none.
     """
-    surfaces = [surface_of(*view) for view in zip(cameras, scene_depths(cameras, points), strict=True)]
-    return np.array([[np.mean(seen_points(other, surface)[0]) for other in cameras] for surface in surfaces])
+    surfaces = [
+        surface_of(*view) for view in zip(cameras, scene_depths(cameras, points), strict=True)
+    ]
+    return np.array(
+        [[np.mean(seen_points(other, surface)[0]) for other in cameras] for surface in surfaces]
+    )
 
 
 def scene_depths(cameras: Sequence[Camera], points: np.ndarray) -> list[float]:
     """Return the median depth of the points in each view, world units.
 
-    Without points in a view, it is the depth of the `focus_point`, or 1e6 scene extents if that is not in front.
+    Without points in a view, it is the depth of the `focus_point`, or 1e6 scene extents if that is
+    not in front.
     """
     far = 1e6 * scene_extent(cameras)
     depths = []
@@ -181,7 +213,9 @@ def scene_depths(cameras: Sequence[Camera], points: np.ndarray) -> list[float]:
 
 
 def angles_to(camera: Camera, depth: float, others: Sequence[Camera]) -> np.ndarray:
-    """Return the angles to other cameras, as seen from the point at a depth in the middle of the image, degrees."""
+    """Return the angles to other cameras, as seen from the point at a depth in the middle of the
+    image, degrees.
+    """
     middle = camera.unproject(np.array([[camera.width / 2, camera.height / 2]]), np.array([depth]))
     return np.array([angles_between(middle, camera, other)[0] for other in others])
 
@@ -196,5 +230,7 @@ def angles_between(points: np.ndarray, a: Camera, b: Camera) -> np.ndarray:
 def surface_of(camera: Camera, depth: float) -> np.ndarray:
     """Return points that are evenly spread over the image, at one depth."""
     steps = (np.arange(_GRID) + 0.5) / _GRID
-    pixels = np.stack(np.meshgrid(steps * camera.width, steps * camera.height), axis=-1).reshape(-1, 2)
+    pixels = np.stack(np.meshgrid(steps * camera.width, steps * camera.height), axis=-1).reshape(
+        -1, 2
+    )
     return camera.unproject(pixels, np.full(len(pixels), depth))

@@ -12,9 +12,11 @@ Result = TypeVar("Result")
 
 
 def map_in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """Return the results of a function for all items, in order, computed in as many threads as there are usable cores.
+    """Return the results of a function for all items, in order, computed in as many threads as
+    there are usable cores.
 
-    It pays for functions that spend their time in NumPy and OpenCV, which release the interpreter's lock.
+    It pays for functions that spend their time in NumPy and OpenCV, which release the interpreter's
+    lock.
     """
     with ThreadPoolExecutor(_usable_cores()) as pool:
         return list(pool.map(function, items))
@@ -29,5 +31,7 @@ def in_background(function: Callable[[], Result]) -> Future[Result]:
 
 
 def _usable_cores() -> int:
-    """Return the number of cores that this process may use, which ``taskset`` and containers restrict."""
+    """Return the number of cores that this process may use, which ``taskset`` and containers
+    restrict.
+    """
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,7 +1,7 @@
 """Names for Dr.Jit's types.
 
-The class of a name depends on the Mitsuba variant, which is set while the program runs. It cannot be checked
-statically: the names describe arguments and results.
+The class of a name depends on the Mitsuba variant, which is set while the program runs. It cannot
+be checked statically: the names describe arguments and results.
 """
 
 from __future__ import annotations

@@ -8,7 +8,8 @@ _CELL_BITS = 10
 
 
 def equal_cells(points: np.ndarray) -> np.ndarray:
-    """Return the inner bounds [1023, 3] of cells with equal numbers of points [N, 3] along each axis.
+    """Return the inner bounds [1023, 3] of cells with equal numbers of points [N, 3] along each
+    axis.
 
     Unlike cells of equal size, they are not widened by far points.
     """
@@ -16,7 +17,9 @@ def equal_cells(points: np.ndarray) -> np.ndarray:
 
 
 def z_order(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
-    """Return the places int64 [N] of points [N, 3] on a Z-order curve through a grid with the inner bounds `cells`."""
+    """Return the places int64 [N] of points [N, 3] on a Z-order curve through a grid with the inner
+    bounds `cells`.
+    """
     keys = np.zeros(len(points), np.int64)
     for axis in range(3):
         index = np.searchsorted(cells[:, axis], points[:, axis])

@@ -29,17 +29,20 @@ class ComparedClip:
     stream: FrameSource  #: The stream.
     recording: Capture  #: Its capture.
     packets: Mapping[int, tuple[PacketKind, int]]  #: Kind and size of each frame's packet.
-    views: Sequence[int]  #: The evaluated views: the held-out ones, or otherwise all training views.
+    #: The evaluated views: the held-out ones, or otherwise all training views.
+    views: Sequence[int]
     cameras: Sequence[Camera]  #: Of all views, with the delays of the recording.
     channels: Sequence[str]  #: Rendered channels.
     render: RenderConfig  #: Settings of the renderer, as in the fit.
 
     @classmethod
-    def of(cls, stream: FrameSource, capture: str | Path | None, any_recording: bool = False) -> ComparedClip:
+    def of(
+        cls, stream: FrameSource, capture: str | Path | None, any_recording: bool = False
+    ) -> ComparedClip:
         """Return a stream beside `capture`; None: the capture that it was fitted to.
 
-        The sizes are read from the file and not from the fit's report, because a receiver has only the file. The
-        capture must be the recording that was fitted, unless it may be any.
+        The sizes are read from the file and not from the fit's report, because a receiver has only
+        the file. The capture must be the recording that was fitted, unless it may be any.
 
         Raises:
             FileNotFoundError: the capture is missing.
@@ -64,7 +67,9 @@ class ComparedClip:
         recorded = self.recording.partial_frames(min(self.packets), max(self.packets) + 1)
         for state, frame in zip(states, recorded, strict=True):
             kind, num_bytes = self.packets[state.frame]
-            images = [None if image is None else display_image(image, stops) for image in frame.images]
+            images = [
+                None if image is None else display_image(image, stops) for image in frame.images
+            ]
             yield ComparedFrame(self, state, kind, num_bytes, images, last, frame.images)
             last = images
 
@@ -77,8 +82,10 @@ class ComparedFrame:
     state: FrameState  #: Its Gaussians.
     kind: PacketKind  #: Kind of the frame's packet.
     num_bytes: int  #: Its size.
-    images: Sequence[np.ndarray | None]  #: Recorded images of all views, as a display shows them; None: missing.
-    last: Sequence[np.ndarray | None] | None  #: Likewise of the frame before; None in the first one.
+    #: Recorded images of all views, as a display shows them; None: missing.
+    images: Sequence[np.ndarray | None]
+    #: Likewise of the frame before; None in the first one.
+    last: Sequence[np.ndarray | None] | None
     recorded: Sequence[np.ndarray | None]  #: The images as they were recorded.
 
     def views(self) -> Iterator[ComparedView]:
@@ -92,10 +99,14 @@ class ComparedFrame:
                 truth = truth_for_camera(clip.recording, camera, self.state.frame)
                 moving = self._changed(index) if truth is None else truth.mask
                 light = None if clip.recording.display_exposure is None else self.recorded[index]
-                yield ComparedView(self, index, maps, image, clip.recording.masks[index], moving, truth, light)
+                yield ComparedView(
+                    self, index, maps, image, clip.recording.masks[index], moving, truth, light
+                )
 
     def _changed(self, view: int) -> np.ndarray | None:
-        """Return the mask of pixels that changed since the last image; None without one, and beside ground truth."""
+        """Return the mask of pixels that changed since the last image; None without one, and beside
+        ground truth.
+        """
         last_image = None if self.last is None else self.last[view]
         image = self.images[view]
         if last_image is None or image is None or self.clip.recording.truth is not None:
@@ -124,4 +135,6 @@ class ComparedView:
     @property
     def rendered(self) -> np.ndarray:
         """Rendered image [H, W, 3], uint8 as a decoder shows it."""
-        return to_uint8(exposed(self.maps["color"], self.frame.clip.recording.display_exposure or 0.0))
+        return to_uint8(
+            exposed(self.maps["color"], self.frame.clip.recording.display_exposure or 0.0)
+        )

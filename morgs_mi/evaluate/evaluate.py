@@ -1,4 +1,6 @@
-"""Evaluate a stream: compare its decoded frames with the recording and with the ground truth, by a list of measures."""
+"""Evaluate a stream: compare its decoded frames with the recording and with the ground truth, by a
+list of measures.
+"""
 
 from __future__ import annotations
 
@@ -27,23 +29,25 @@ def evaluate_stream(
     lpips: ImageDistance | None = None,
     any_recording: bool = False,
 ) -> Evaluation:
-    """Decode a stream and compare it with its recording: in the held-out view, or otherwise in all training views.
+    """Decode a stream and compare it with its recording: in the held-out view, or otherwise in all
+    training views.
 
     Args:
-        out: stream file or its folder; seconds, and the forecast of other views, come from the ``report.json`` beside
-            it.
+        out: stream file or its folder; seconds, and the forecast of other views, come from the
+            ``report.json`` beside it.
         capture: recording; default is the capture that the stream was fitted to.
         progress: called with (frames done, frames in all).
         lpips: network for LPIPS; without one there is no LPIPS.
-        any_recording: whether `capture` may be another recording by the same cameras than the one that was fitted.
+        any_recording: whether `capture` may be another recording by the same cameras than the one
+            that was fitted.
 
     Returns:
         The scores of the clip, its frames and its views.
 
     Raises:
         FileNotFoundError: the stream or the capture is missing.
-        ValueError: the stream is truncated, broken or empty, the stream was fitted to another capture, the
-            network does not accept images of this size, or the true tracks are broken.
+        ValueError: the stream is truncated, broken or empty, the stream was fitted to another
+            capture, the network does not accept images of this size, or the true tracks are broken.
     """
     stream = open_stream(out)
     clip = ComparedClip.of(stream, capture, any_recording)
@@ -58,7 +62,11 @@ def evaluate_stream(
                 measure.add_view(view)
         index = frame.state.frame
         scores = _merged(measure.add_frame(frame) for measure in measures)
-        rows.append(FrameScores(index, frame.kind.name.lower(), frame.num_bytes, seconds.get(index), **scores))
+        rows.append(
+            FrameScores(
+                index, frame.kind.name.lower(), frame.num_bytes, seconds.get(index), **scores
+            )
+        )
         if progress is not None:
             progress(len(rows), len(clip.packets))
     return Evaluation(
@@ -101,14 +109,30 @@ def _of_fit(stream: Path) -> tuple[dict[int, float], dict[str, Any]]:
     report = read_json(path)
     try:
         seconds = {row["frame"]: float(row["seconds"]) for row in report["frames"]}
-        forecast = next((row["validation"] for row in report["frames"] if "sentence" in row.get("validation", {})), {})
-        psnr = float("nan") if forecast.get("expected_psnr") is None else float(forecast["expected_psnr"])
-        return seconds, {"expected": str(forecast["sentence"]), "expected_psnr": psnr} if forecast else {}
+        forecast = next(
+            (
+                row["validation"]
+                for row in report["frames"]
+                if "sentence" in row.get("validation", {})
+            ),
+            {},
+        )
+        psnr = (
+            float("nan")
+            if forecast.get("expected_psnr") is None
+            else float(forecast["expected_psnr"])
+        )
+        return seconds, {
+            "expected": str(forecast["sentence"]),
+            "expected_psnr": psnr,
+        } if forecast else {}
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{path}: expected a fit's report, got a broken one ({error!r}); remove it.") from None
+        raise ValueError(
+            f"{path}: expected a fit's report, got a broken one ({error!r}); remove it."
+        ) from None
 
 
 def _forecast(recording: Capture) -> str:
-    """Return the expected quality of views between the training cameras, empty with a single one."""
+    """Return the expected quality of views between the training cameras; empty with one camera."""
     cameras = [recording.cameras[v] for v in recording.train_views]
     return forecast(cameras, recording.points).sentence if len(cameras) > 1 else ""

@@ -1,4 +1,6 @@
-"""Figures of a stream: one column over time; motion, confidence and offset beside the truth, with legends."""
+"""Figures of a stream: one column over time; motion, confidence and offset beside the truth, with
+legends.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,13 @@ import numpy as np
 from morgs_mi.capture.capture import Capture
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import exposed
-from morgs_mi.playback.player import OFFSET_SCALE, channel_image, has_confidence, has_offset, render_stream
+from morgs_mi.playback.player import (
+    OFFSET_SCALE,
+    channel_image,
+    has_confidence,
+    has_offset,
+    render_stream,
+)
 from morgs_mi.playback.stream_header import open_stream_capture, stream_exposure, truth_for_camera
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.playback.visualise import (
@@ -40,9 +48,10 @@ def draw_stream(
 ) -> list[Path]:
     """Draw a stream's held-out view, or without one its first training view, into PNG files.
 
-    ``slice.png`` shows one column over time, recorded and rendered: the column in which the recording changes most.
-    ``motion.png`` shows up to four frames beside the truth, with a legend. So do ``confidence.png``, if confidence was
-    learned, and ``offset.png``, if the stream holds offsets; the latter stands beside the whole motion.
+    ``slice.png`` shows one column over time, recorded and rendered: the column in which the
+    recording changes most. ``motion.png`` shows up to four frames beside the truth, with a legend.
+    So do ``confidence.png``, if confidence was learned, and ``offset.png``, if the stream holds
+    offsets; the latter stands beside the whole motion.
 
     Args:
         out: stream file or its folder.
@@ -69,7 +78,8 @@ def draw_stream(
     # Nothing moves up to the first frame.
     later_frames = frames[1:] or frames
     row_frames = {
-        later_frames[i] for i in np.linspace(0, len(later_frames) - 1, min(_ROWS, len(later_frames))).astype(int)
+        later_frames[i]
+        for i in np.linspace(0, len(later_frames) - 1, min(_ROWS, len(later_frames))).astype(int)
     }
     scale = motion_scale(recording, camera)
     column, still = _busiest_column(recording, view, frames)
@@ -82,7 +92,9 @@ def draw_stream(
     with_offset = has_offset(stream)
     maps = (*(("confidence",) if with_confidence else ()), *(("offset",) if with_offset else ()))
     playback = render_stream(stream, camera, ("color", "motion", *maps))
-    for (index, images), frame in zip(playback, recording.partial_frames(frames[0], frames[-1] + 1), strict=False):
+    for (index, images), frame in zip(
+        playback, recording.partial_frames(frames[0], frames[-1] + 1), strict=False
+    ):
         # Copies: views would keep all images of a long clip in memory.
         renders.append(to_uint8(exposed(images["color"], stops))[:, column].copy())
         pixels = frame.images[view]
@@ -101,7 +113,10 @@ def draw_stream(
                 offsets.append(_row(index, to_uint8, {"motion": whole, "its offset": offset}))
         if progress is not None:
             progress(len(renders), len(frames))
-    sheets = {"slice": _slices(still, column, recorded, renders), "motion": _with_legend(motions, motion_legend(scale))}
+    sheets = {
+        "slice": _slices(still, column, recorded, renders),
+        "motion": _with_legend(motions, motion_legend(scale)),
+    }
     if confidences:
         sheets["confidence"] = _with_legend(confidences, confidence_legend())
     if offsets:
@@ -114,9 +129,15 @@ def draw_stream(
 
 
 def motion_scale(capture: Capture, camera: Camera) -> float:
-    """Return the 95th percentile of the true speed of moving pixels, px; without truth 3 % of the camera's width."""
+    """Return the 95th percentile of the true speed of moving pixels, px; without truth 3 % of the
+    camera's width.
+    """
     truths = [truth_for_camera(capture, camera, frame) for frame in range(capture.num_frames)]
-    speeds = [np.linalg.norm(truth.motion[truth.mask], axis=-1) for truth in truths[1:] if truth is not None]
+    speeds = [
+        np.linalg.norm(truth.motion[truth.mask], axis=-1)
+        for truth in truths[1:]
+        if truth is not None
+    ]
     moving = np.concatenate(speeds) if speeds else np.zeros(0)
     return float(np.percentile(moving, 95)) if moving.size else 0.03 * camera.width
 
@@ -139,7 +160,9 @@ def _busiest_column(recording: Capture, view: int, frames: Sequence[int]) -> tup
 def _slices(
     still: np.ndarray, column: int, recorded: Sequence[np.ndarray], renders: Sequence[np.ndarray]
 ) -> np.ndarray:
-    """Return an image with the column marked, beside the recorded and the rendered column over time."""
+    """Return an image with the column marked, beside the recorded and the rendered column over
+    time.
+    """
     picture = still.copy()
     picture[:, column] = _MARK
     over_time = [(recorded, "recorded, over time"), (renders, "rendered, over time")]
@@ -151,7 +174,11 @@ def _row(
     frame: int, draw: Callable[[np.ndarray], np.ndarray], maps: Mapping[str, np.ndarray | None]
 ) -> list[np.ndarray]:
     """Draw each map that is not None, labelled with its name."""
-    return [label(draw(values), f"{name}, frame {frame}") for name, values in maps.items() if values is not None]
+    return [
+        label(draw(values), f"{name}, frame {frame}")
+        for name, values in maps.items()
+        if values is not None
+    ]
 
 
 def _with_legend(rows: list[list[np.ndarray]], legend: np.ndarray) -> np.ndarray:

@@ -1,12 +1,12 @@
 """The measures of an evaluation, each of one kind of score.
 
-A measure is given the frames in order, each view by view. It returns the scores of a frame, as fields of `FrameScores`,
-and at the end the scores of the clip, as fields of `Evaluation`.
+A measure is given the frames in order, each view by view. It returns the scores of a frame, as
+fields of `FrameScores`, and at the end the scores of the clip, as fields of `Evaluation`.
 
-Every score is one number per view and frame. Frames average over views and the clip over frames; NaN stands for an
-unknown score. A name with ``_moving`` or ``_still`` is the score of a region. With ``truth/``, it is the pixels with a
-surface that moved since the last frame, in the first frame until the next. Otherwise it is the pixels in which the
-recording changed by more than its noise.
+Every score is one number per view and frame. Frames average over views and the clip over frames;
+NaN stands for an unknown score. A name with ``_moving`` or ``_still`` is the score of a region.
+With ``truth/``, it is the pixels with a surface that moved since the last frame, in the first frame
+until the next. Otherwise it is the pixels in which the recording changed by more than its noise.
 """
 
 from __future__ import annotations
@@ -39,7 +39,8 @@ from morgs_mi.method.exposure import follow_exposure
 
 REGIONS = ("", "_moving", "_still")
 IMAGE_SCORES = ("psnr", "ssim", "delta_e", "lpips")
-# Compression flickers: after a hundred frames half the pixels of a real recording have changed once.
+# Compression flickers: after a hundred frames half the pixels of a real recording have changed
+# once.
 _FALSE_ALARMS = 0.02
 
 
@@ -62,7 +63,9 @@ class ImageDistance(Protocol):
     """Perceptual distance between images, such as LPIPS."""
 
     def distance_map(self, image: np.ndarray, other: np.ndarray) -> np.ndarray:
-        """Return the distance of two images [H, W, 3] in [0, 1], pixel by pixel [H, W] or as one number."""
+        """Return the distance of two images [H, W, 3] in [0, 1], pixel by pixel [H, W] or as one
+        number.
+        """
         ...
 
 
@@ -101,7 +104,9 @@ class Variation(Measure):
 
     def __init__(self, clip: ComparedClip) -> None:
         false_alarms = _FALSE_ALARMS if clip.recording.truth is None else 0
-        self._views = {view: StillVariation(clip.recording.masks[view], false_alarms) for view in clip.views}
+        self._views = {
+            view: StillVariation(clip.recording.masks[view], false_alarms) for view in clip.views
+        }
 
     def add_view(self, view: ComparedView) -> None:
         moving = np.zeros(view.recorded.shape[:2], bool) if view.moving is None else view.moving
@@ -112,13 +117,19 @@ class Variation(Measure):
 
 
 class Motion3D(Measure):
-    """Errors in 3D of the Gaussians that exist in a frame and in the frame before, see `evaluate_motion`."""
+    """Errors in 3D of the Gaussians that exist in a frame and in the frame before, see
+    `evaluate_motion`.
+    """
 
     def __init__(self, clip: ComparedClip) -> None:
         self._cameras = clip.recording.cameras
         self._truth = clip.recording.truth
         folder = self._truth
-        self._tracks = load_tracks(folder) if folder is not None and (folder / "tracks.npz").is_file() else None
+        self._tracks = (
+            load_tracks(folder)
+            if folder is not None and (folder / "tracks.npz").is_file()
+            else None
+        )
         self._last_state: FrameState | None = None
 
     def add_frame(self, frame: ComparedFrame) -> dict[str, Any]:
@@ -142,7 +153,9 @@ class Motion3D(Measure):
         old = last_state.gaussians.numpy()["means"][last_rows].astype(float)
         new = state.gaussians.numpy()["means"][rows].astype(float)
         points = tracks.points[:, frame - 1], tracks.points[:, frame], tracks.ids
-        return evaluate_motion(old, new - old, np.asarray(last_state.gaussians.opacities)[last_rows], points, views)
+        return evaluate_motion(
+            old, new - old, np.asarray(last_state.gaussians.opacities)[last_rows], points, views
+        )
 
 
 def _image_scores(view: ComparedView, lpips: ImageDistance | None) -> dict[str, float]:
@@ -151,7 +164,10 @@ def _image_scores(view: ComparedView, lpips: ImageDistance | None) -> dict[str, 
     moving = view.moving
     whole = np.ones(rendered.shape[:2], bool) if view.valid is None else view.valid
     no_pixels = np.zeros_like(whole)
-    regions = (whole, *((no_pixels, no_pixels) if moving is None else (whole & moving, whole & ~moving)))
+    regions = (
+        whole,
+        *((no_pixels, no_pixels) if moving is None else (whole & moving, whole & ~moving)),
+    )
     a, b = unit_pair("evaluate_stream", rendered, view.recorded)
     maps = {"psnr": np.square(a - b), "delta_e": delta_e_map(a, b)}
     if min(whole.shape) >= WINDOW:
@@ -162,11 +178,17 @@ def _image_scores(view: ComparedView, lpips: ImageDistance | None) -> dict[str, 
         scores["psnr_mu"] = psnr_mu(decode_light(view.maps["color"]), view.light, view.valid)
     for name, values in maps.items():
         finish = psnr_of if name == "psnr" else float
-        scores |= {name + r: finish(mean_over(values, mask)) for r, mask in zip(REGIONS, regions, strict=True)}
+        scores |= {
+            name + r: finish(mean_over(values, mask))
+            for r, mask in zip(REGIONS, regions, strict=True)
+        }
     if lpips is not None:
         distance = lpips.distance_map(rendered, view.recorded)
         if distance.shape == whole.shape:
-            scores |= {f"lpips{r}": mean_over(distance, mask) for r, mask in zip(REGIONS, regions, strict=True)}
+            scores |= {
+                f"lpips{r}": mean_over(distance, mask)
+                for r, mask in zip(REGIONS, regions, strict=True)
+            }
         else:
             scores["lpips"] = mean_over(distance)
     return scores

@@ -18,7 +18,8 @@ C1 = 0.01**2
 C2 = 0.03**2
 # Of the mu-law, by which papers on HDR compare images.
 _MU = 5000
-# Rows of an image whose colours are compared at once; the temporaries of a whole image exceed the cache.
+# Rows of an image whose colours are compared at once; the temporaries of a whole image exceed the
+# cache.
 _ROWS = 32
 
 
@@ -38,13 +39,17 @@ def psnr(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -
 
 
 def psnr_mu(light: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Return the PSNR of tonemapped linear light, log(1 + mu x) / log(1 + mu) with mu = 5000, in dB.
+    """Return the PSNR of tonemapped linear light, log(1 + mu x) / log(1 + mu) with mu = 5000, in
+    dB.
 
-    x is relative to the brightest true value and clipped to [0, 1] (Kalantari and Ramamoorthi, TOG 2017). Arguments,
-    apart from their encoding, and errors are as for `psnr`.
+    x is relative to the brightest true value and clipped to [0, 1] (Kalantari and Ramamoorthi, TOG
+    2017). Arguments, apart from their encoding, and errors are as for `psnr`.
     """
     most = max(float(truth.max()), 1e-12)
-    tones = (np.log1p(_MU * np.clip(x.astype(np.float64) / most, 0, 1)) / np.log1p(_MU) for x in (light, truth))
+    tones = (
+        np.log1p(_MU * np.clip(x.astype(np.float64) / most, 0, 1)) / np.log1p(_MU)
+        for x in (light, truth)
+    )
     return psnr(*tones, mask=mask)
 
 
@@ -56,8 +61,8 @@ def psnr_of(error: float) -> float:
 def ssim(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Return the mean structural similarity, in [-1, 1] and 1 for equal images (Wang et al. 2004).
 
-    The window is an 11x11 Gaussian of sigma 1.5, the moments are the population's, and only windows inside
-    the image count. Channels are averaged.
+    The window is an 11x11 Gaussian of sigma 1.5, the moments are the population's, and only windows
+    inside the image count. Channels are averaged.
 
     Args:
         image: [H, W, 3] or [H, W], both sides at least 11 pixels.
@@ -72,28 +77,34 @@ def ssim(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -
 
 
 def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Return the similarity (see `ssim`) of the window around each pixel for which it fits, [H - 10, W - 10].
+    """Return the similarity (see `ssim`) of the window around each pixel for which it fits,
+    [H - 10, W - 10].
 
     Raises:
         ValueError: the sizes differ or are smaller than the window.
     """
     image, truth = unit_pair("ssim", image, truth)
     if min(image.shape[:2]) < WINDOW:
-        raise ValueError(f"ssim(): images must be at least {WINDOW}x{WINDOW} pixels, got {image.shape[:2]}.")
+        raise ValueError(
+            f"ssim(): images must be at least {WINDOW}x{WINDOW} pixels, got {image.shape[:2]}."
+        )
     x = _blur(image)
     y = _blur(truth)
     var_x = _blur(image**2) - x**2
     var_y = _blur(truth**2) - y**2
     covariance = _blur(image * truth) - x * y
-    similarity = (2 * x * y + C1) * (2 * covariance + C2) / ((x**2 + y**2 + C1) * (var_x + var_y + C2))
+    similarity = (
+        (2 * x * y + C1) * (2 * covariance + C2) / ((x**2 + y**2 + C1) * (var_x + var_y + C2))
+    )
     return similarity.reshape(*similarity.shape[:2], -1).mean(-1)
 
 
 def delta_e_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Return the colour difference CIE dE2000 per pixel [H, W], by colour-science; a value of about 1 is just visible.
+    """Return the colour difference CIE dE2000 per pixel [H, W], by colour-science; a value of about
+    1 is just visible.
 
-    Colours are decoded from sRGB and compared under its white point, D65. Values outside [0, 1] are clipped, as on
-    a display.
+    Colours are decoded from sRGB and compared under its white point, D65. Values outside [0, 1] are
+    clipped, as on a display.
 
     Args:
         image: [H, W, 3].
@@ -108,7 +119,10 @@ def delta_e_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     from colour.models import RGB_COLOURSPACE_sRGB
 
     if np.ndim(image) != 3 or np.shape(image)[2] != 3:
-        raise ValueError(f"delta_e_map(): images must be [H, W, 3], got {np.shape(image)}; give them three channels.")
+        raise ValueError(
+            f"delta_e_map(): images must be [H, W, 3], got {np.shape(image)}; give them three "
+            "channels."
+        )
     a, b = (np.clip(each, 0, 1) for each in unit_pair("delta_e_map", image, truth))
 
     def lab(colours: np.ndarray) -> np.ndarray:
@@ -148,12 +162,16 @@ def iou(mask: np.ndarray, truth: np.ndarray) -> float:
 
 
 def mean_over(values: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Return the mean of a map [h, w, ...] over `mask` [H, W], or over all pixels; NaN if there are none.
+    """Return the mean of a map [h, w, ...] over `mask` [H, W], or over all pixels; NaN if there are
+    none.
 
     A map that is smaller than the mask is centred in it, like the map of `ssim_map`.
     """
     if mask is not None:
-        rows, columns = (slice((n - m) // 2, (n - m) // 2 + m) for n, m in zip(mask.shape, values.shape, strict=False))
+        rows, columns = (
+            slice((n - m) // 2, (n - m) // 2 + m)
+            for n, m in zip(mask.shape, values.shape, strict=False)
+        )
         values = values[mask[rows, columns]]
     return float(values.mean()) if values.size else float("nan")
 
@@ -182,10 +200,13 @@ def unit_pair(
 def _check(name: str, image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None) -> None:
     if np.shape(image) != np.shape(truth):
         raise ValueError(
-            f"{name}(): both images must have one size, got {np.shape(image)} and {np.shape(truth)}; resize one first."
+            f"{name}(): both images must have one size, got {np.shape(image)} and "
+            f"{np.shape(truth)}; resize one first."
         )
     if mask is not None and (mask.shape != np.shape(image)[:2] or mask.dtype != bool):
-        raise ValueError(f"{name}(): `mask` must be bool {np.shape(image)[:2]}, got {mask.dtype} {mask.shape}.")
+        raise ValueError(
+            f"{name}(): `mask` must be bool {np.shape(image)[:2]}, got {mask.dtype} {mask.shape}."
+        )
 
 
 def _unit(image: np.ndarray) -> np.ndarray:

@@ -1,15 +1,16 @@
 """Displacements in 3D of Gaussians on moving objects, compared with the objects' true trajectories.
 
-d_i is the displacement of Gaussian i from frame t-1 to frame t, and d*_i the displacement of the surface on which it
-lay at t-1:
+d_i is the displacement of Gaussian i from frame t-1 to frame t, and d*_i the displacement of the
+surface on which it lay at t-1:
 
-1. A Gaussian lies on the surface of object k if, in some view at t-1, the pixel under its centre shows k within 1 % of
-   the centre's depth, and the same holds for no other object in any view.
-2. The motion of a rigid object is the rigid motion that best maps its tracked points from t-1 to t, exact up to
-   rounding. Another object deforms: the motion around a Gaussian is the rigid one that best maps the eight nearest
-   tracked points, and the Gaussian is excluded where they leave more than a tenth of its displacement.
-3. Gaussians are evaluated if their opacity is at least 0.1 and their d* is at least a tenth of the longest on their
-   object: the others are hardly visible or have no meaningful direction.
+1. A Gaussian lies on the surface of object k if, in some view at t-1, the pixel under its centre
+   shows k within 1 % of the centre's depth, and the same holds for no other object in any view.
+2. The motion of a rigid object is the rigid motion that best maps its tracked points from t-1 to t,
+   exact up to rounding. Another object deforms: the motion around a Gaussian is the rigid one that
+   best maps the eight nearest tracked points, and the Gaussian is excluded where they leave more
+   than a tenth of its displacement.
+3. Gaussians are evaluated if their opacity is at least 0.1 and their d* is at least a tenth of the
+   longest on their object: the others are hardly visible or have no meaningful direction.
 
 The selection does not depend on d_i, so a Gaussian that left its object counts in full.
 """
@@ -28,10 +29,12 @@ from morgs_mi.evaluate.results import Motion3DScores
 _DEPTH_TOLERANCE = 0.01
 _LEAST_OPACITY = 0.1
 _LEAST_SHARE = 0.1
-# Tolerances relative to an object's size: distance of tracked points from a rigid motion, and from one line.
+# Tolerances relative to an object's size: distance of tracked points from a rigid motion, and from
+# one line.
 _RIGID = 1e-4
 _FLAT = 1e-3
-# Tracked points around a Gaussian on a deforming object, and how much of the displacement they may leave.
+# Tracked points around a Gaussian on a deforming object, and how much of the displacement they may
+# leave.
 _NEIGHBOURS = 8
 _LEAST_AGREEMENT = 0.1
 
@@ -43,7 +46,8 @@ def evaluate_motion(
     tracks: tuple[np.ndarray, np.ndarray, np.ndarray],
     views: Sequence[tuple[Camera, GroundTruth]],
 ) -> Motion3DScores:
-    """Return the errors of one frame's displacements; the module describes which Gaussians are evaluated.
+    """Return the errors of one frame's displacements; the module describes which Gaussians are
+    evaluated.
 
     Args:
         means: centres at t-1 [N, 3], world units.
@@ -72,7 +76,8 @@ def evaluate_motion(
 
 
 def local_motion(points: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Return the displacement of points [M, 3] on a deforming object, NaN where the tracks around one disagree.
+    """Return the displacement of points [M, 3] on a deforming object, NaN where the tracks around
+    one disagree.
 
     Args:
         points: at the earlier time, world units.
@@ -87,14 +92,18 @@ def local_motion(points: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np
     center = p.mean(axis=1, keepdims=True)
     target = q.mean(axis=1, keepdims=True)
     turn = _rotation(p - center, q - target)
-    residuals = np.linalg.norm((p - center) @ turn.swapaxes(-1, -2) + target - q, axis=-1).max(axis=-1)
+    residuals = np.linalg.norm((p - center) @ turn.swapaxes(-1, -2) + target - q, axis=-1).max(
+        axis=-1
+    )
     displacements = np.einsum("mij,mj->mi", turn, points - center[:, 0]) + target[:, 0] - points
     displacements[residuals > _LEAST_AGREEMENT * np.linalg.norm(displacements, axis=-1)] = np.nan
     return displacements
 
 
 def compare_motion(motion: np.ndarray, truth: np.ndarray) -> Motion3DScores:
-    """Return the errors of displacements [M, 3] for true ones [M, 3], none of which is 0; NaN if M is 0."""
+    """Return the errors of displacements [M, 3] for true ones [M, 3], none of which is 0; NaN if M
+    is 0.
+    """
     if not len(truth):
         return Motion3DScores()
     length = np.linalg.norm(motion, axis=-1)
@@ -112,7 +121,9 @@ def compare_motion(motion: np.ndarray, truth: np.ndarray) -> Motion3DScores:
 
 
 def surface_ids(points: np.ndarray, views: Sequence[tuple[Camera, GroundTruth]]) -> np.ndarray:
-    """Return the id of the object with each point [N, 3] on its visible surface; -1 for none or several."""
+    """Return the id of the object with each point [N, 3] on its visible surface; -1 for none or
+    several.
+    """
     ids = np.full(len(points), -1, np.int64)
     several = np.zeros(len(points), bool)
     for camera, truth in views:
@@ -123,7 +134,9 @@ def surface_ids(points: np.ndarray, views: Sequence[tuple[Camera, GroundTruth]])
         front = front[visible]
         column, row = pixels[visible].astype(int).T
         pixel_ids = truth.ids[row, column]
-        on = (pixel_ids >= 0) & (np.abs(truth.depth[row, column] - depth[front]) <= _DEPTH_TOLERANCE * depth[front])
+        on = (pixel_ids >= 0) & (
+            np.abs(truth.depth[row, column] - depth[front]) <= _DEPTH_TOLERANCE * depth[front]
+        )
         front = front[on]
         pixel_ids = pixel_ids[on]
         several[front] |= (ids[front] >= 0) & (ids[front] != pixel_ids)
@@ -132,11 +145,13 @@ def surface_ids(points: np.ndarray, views: Sequence[tuple[Camera, GroundTruth]])
     return ids
 
 
-def rigid_motions(starts: np.ndarray, ends: np.ndarray, ids: np.ndarray) -> Mapping[int, tuple[np.ndarray, np.ndarray]]:
+def rigid_motions(
+    starts: np.ndarray, ends: np.ndarray, ids: np.ndarray
+) -> Mapping[int, tuple[np.ndarray, np.ndarray]]:
     """Return rotation [3, 3] and shift [3] of every moving object by its id: x -> R x + s.
 
-    Least squares over the object's points (Kabsch 1976). Excluded are objects that are static or not rigid, and those
-    with too few points or with all points on one line.
+    Least squares over the object's points (Kabsch 1976). Excluded are objects that are static or
+    not rigid, and those with too few points or with all points on one line.
 
     Args:
         starts: tracked points [P, 3].
@@ -162,7 +177,9 @@ def rigid_motions(starts: np.ndarray, ends: np.ndarray, ids: np.ndarray) -> Mapp
 
 
 def _rotation(p: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the rotations [..., 3, 3] that best map points p to q [..., P, 3], both around their means."""
+    """Return the rotations [..., 3, 3] that best map points p to q [..., P, 3], both around their
+    means.
+    """
     U, _, Vt = np.linalg.svd(q.swapaxes(-1, -2) @ p)
     U[..., :, 2] *= np.linalg.det(U @ Vt)[..., None]
     return U @ Vt

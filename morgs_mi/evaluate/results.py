@@ -1,6 +1,8 @@
-"""Results of an evaluation as frozen dataclasses; `Evaluation.as_dict` is the JSON that `morgs-mi eval` writes.
+"""Results of an evaluation as frozen dataclasses; `Evaluation.as_dict` is the JSON that `morgs-mi
+eval` writes.
 
-NaN stands for an unknown score. A name with ``_moving`` or ``_still`` is the score of a region; see `measures`.
+NaN stands for an unknown score. A name with ``_moving`` or ``_still`` is the score of a region; see
+`measures`.
 """
 
 from __future__ import annotations
@@ -13,8 +15,8 @@ import numpy as np
 
 _NAN = float("nan")
 _SECONDS = (
-    "wall time of a frame from the images in memory to its packet: flow, masks, optimisation, residual and its "
-    "decoding; without reading the recording and without writing the packet"
+    "wall time of a frame from the images in memory to its packet: flow, masks, optimisation, "
+    "residual and its decoding; without reading the recording and without writing the packet"
 )
 
 
@@ -31,7 +33,9 @@ class _Scores:
     @classmethod
     def mean(cls, scores: Sequence[Self]) -> Self:
         """Return the mean of each field over its known values."""
-        return cls(**{name: known_mean([getattr(each, name) for each in scores]) for name in cls.names()})
+        return cls(
+            **{name: known_mean([getattr(each, name) for each in scores]) for name in cls.names()}
+        )
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
@@ -46,7 +50,8 @@ class ViewScores(_Scores):
     psnr: float = _NAN  #: PSNR, dB.
     psnr_moving: float = _NAN
     psnr_still: float = _NAN
-    #: PSNR after the gain and bias per channel that make the rendered image most like the recorded one, dB.
+    #: PSNR after the gain and bias per channel that make the rendered image most like the recorded
+    #: one, dB.
     psnr_matched: float = _NAN
     psnr_mu: float = _NAN  #: PSNR of the linear light by the mu-law, dB, of HDR recordings alone.
     ssim: float = _NAN  #: SSIM, at most 1.
@@ -74,24 +79,31 @@ class Motion3DScores(_Scores):
     true_length: float = _NAN  #: Mean of |d*|, world units.
     relative_error: float = _NAN  #: `error` divided by `true_length`.
     length_ratio: float = _NAN  #: Mean of |d| divided by `true_length`.
-    angle: float = _NAN  #: Mean angle between d and d*, degrees; 90 for a Gaussian that does not move.
+    #: Mean angle between d and d*, degrees; 90 for a Gaussian that does not move.
+    angle: float = _NAN
 
 
 @dataclass(frozen=True)
 class TrackScores:
-    """Scores of 3D point tracks by one protocol (see `track_scores`); NaN where the protocol does not define one."""
+    """Scores of 3D point tracks by one protocol (see `track_scores`); NaN where the protocol does
+    not define one.
+    """
 
     num_tracks: int = 0  #: Number of tracks that are compared.
     #: AJ: Jaccard index of positions and visibility, mean over the thresholds, in [0, 1].
     average_jaccard: float = _NAN
     #: Share of the visible points that are within a threshold, mean over the thresholds, in [0, 1].
     delta_avg: float = _NAN
-    occlusion_accuracy: float = _NAN  #: OA: share of the points with the right visibility, in [0, 1].
-    #: MTE: median over the visible points of a track of the distance, mean over the tracks, world units.
+    #: OA: share of the points with the right visibility, in [0, 1].
+    occlusion_accuracy: float = _NAN
+    #: MTE: median over the visible points of a track of the distance, mean over the tracks, world
+    #: units.
     median_error: float = _NAN
     median_error_percent: float = _NAN  #: The same in percent of the scene extent.
-    survival: float = _NAN  #: Share of a track before its first failure, mean over the tracks, in [0, 1].
-    bound: float = _NAN  #: Share of the points and frames for which a Gaussian of the point is alive, in [0, 1].
+    #: Share of a track before its first failure, mean over the tracks, in [0, 1].
+    survival: float = _NAN
+    #: Share of the points and frames for which a Gaussian of the point is alive, in [0, 1].
+    bound: float = _NAN
 
 
 @dataclass(frozen=True)
@@ -176,11 +188,11 @@ class Evaluation:
     frames: tuple[FrameScores, ...]
     #: 3D point tracks against the true ones, a row per protocol; empty without true tracks.
     tracking: tuple[TrackingScores, ...] = ()
-    #: PSNR of each held-out view in the first frame, seen from the camera that fits its image best, dB, by camera name.
-    #: The scores of the frames are those as calibrated.
+    #: PSNR of each held-out view in the first frame, seen from the camera that fits its image best,
+    #: dB, by camera name. The scores of the frames are those as calibrated.
     registered: Mapping[str, float] = field(default_factory=dict)
-    #: Expected quality of views between the cameras, a sentence from the report of the fit; without one, a forecast
-    #: from the rig; empty with a single training view.
+    #: Expected quality of views between the cameras, a sentence from the report of the fit; without
+    #: one, a forecast from the rig; empty with a single training view.
     expected: str = ""
     expected_psnr: float = _NAN  #: Their PSNR as the fit forecasts it, dB; NaN where it does not.
 
@@ -198,7 +210,9 @@ class Evaluation:
     def views(self) -> dict[str, ViewScores]:
         """Means over the frames by camera name."""
         names = self.frames[0].views
-        return {name: ViewScores.mean([frame.views[name] for frame in self.frames]) for name in names}
+        return {
+            name: ViewScores.mean([frame.views[name] for frame in self.frames]) for name in names
+        }
 
     @property
     def registered_psnr(self) -> float:
@@ -221,7 +235,9 @@ class Evaluation:
         """Return the evaluation as JSON can hold it, apart from scores that are infinite or NaN."""
         means = asdict(self.scores)
         for name in ("psnr", "ssim"):
-            first, last = (getattr(frame.scores, name) for frame in (self.frames[0], self.frames[-1]))
+            first, last = (
+                getattr(frame.scores, name) for frame in (self.frames[0], self.frames[-1])
+            )
             means[name] = {"mean": means[name], "first": first, "last": last}
         views = self.views.items()
         names = ("stream", "capture", "held_out", "num_frames", "complete", "regions")
@@ -236,6 +252,9 @@ class Evaluation:
             "bytes": asdict(self.sizes),
             "mtv": asdict(self.variation),
             "playback": asdict(self.playback),
-            "views": {n: {**asdict(scores), "registered_psnr": self.registered.get(n, _NAN)} for n, scores in views},
+            "views": {
+                n: {**asdict(scores), "registered_psnr": self.registered.get(n, _NAN)}
+                for n, scores in views
+            },
             "frames": [frame.as_dict() for frame in self.frames],
         }

@@ -17,7 +17,11 @@ _FRAME = (("PSNR, dB", "psnr", 2), ("moving", "psnr_moving", 2), ("SSIM", "ssim"
 _FRAME += (("flow error", "motion_error", 2), ("moving", "motion_error_moving", 2))
 _VIEW = (("PSNR, dB", "psnr", 2), ("colours matched", "psnr_matched", 2), ("SSIM", "ssim", 4))
 _VIEW += (("flow error", "motion_error", 2), ("registered", "registered", 2))
-_SWEEP = (("first, s", "first_seconds", 1), ("later, s", "later_seconds", 2), ("bytes", "bytes_per_frame", 0))
+_SWEEP = (
+    ("first, s", "first_seconds", 1),
+    ("later, s", "later_seconds", 2),
+    ("bytes", "bytes_per_frame", 0),
+)
 _SWEEP += (("PSNR, dB", "psnr", 2), ("moving", "psnr_moving", 2))
 _SWEEP += (("flow error, moving", "motion_error_moving", 2), ("IoU", "confidence_iou", 2))
 
@@ -28,17 +32,25 @@ def figure(value: float | None, digits: int) -> str:
 
 
 def evaluation_tables(result: Evaluation) -> Iterator[Table]:
-    """Yield tables of the frames, of several views, of the regions and, with true tracks, of the point tracks."""
+    """Yield tables of the frames, of several views, of the regions and, with true tracks, of the
+    point tracks.
+    """
     frames = _table("frame by frame", "frame", *(title for title, *_ in _FRAME), "kB", "s")
     for row in result.frames:
         scores = (figure(getattr(row.scores, name), digits) for _, name, digits in _FRAME)
-        frames.add_row(str(row.frame), *scores, figure(row.num_bytes / 1e3, 1), figure(row.seconds, 1))
+        frames.add_row(
+            str(row.frame), *scores, figure(row.num_bytes / 1e3, 1), figure(row.seconds, 1)
+        )
     yield frames
     if len(result.views) > 1:
         yield _view_table(result)
-    views = ("held-out " if result.held_out else "training ") + ("views" if len(result.views) > 1 else "view")
+    views = ("held-out " if result.held_out else "training ") + (
+        "views" if len(result.views) > 1 else "view"
+    )
     names = "" if len(result.views) > 1 else " " + ", ".join(result.views)
-    regions = _table(f"{views}{names}: means, regions from {result.regions}", "", "whole", "moving", "still")
+    regions = _table(
+        f"{views}{names}: means, regions from {result.regions}", "", "whole", "moving", "still"
+    )
     mean = result.scores
     for title, name, digits in _METRICS:
         values = [getattr(mean, name + region) for region in REGIONS]
@@ -57,11 +69,15 @@ def evaluation_tables(result: Evaluation) -> Iterator[Table]:
 
 
 def sweep_table(rows: Sequence[Mapping[str, float]]) -> Table:
-    """Return the scores of fits with several numbers of epochs, without columns that are unknown."""
+    """Return the scores of fits with several numbers of epochs, without unknown columns."""
     columns = [column for column in _SWEEP if any(figure(row[column[1]], 0) != "-" for row in rows)]
-    table = _table("seconds and bytes of a frame, scores of all", "epochs", *(title for title, *_ in columns))
+    table = _table(
+        "seconds and bytes of a frame, scores of all", "epochs", *(title for title, *_ in columns)
+    )
     for row in rows:
-        table.add_row(figure(row["epochs"], 0), *(figure(row[name], digits) for _, name, digits in columns))
+        table.add_row(
+            figure(row["epochs"], 0), *(figure(row[name], digits) for _, name, digits in columns)
+        )
     return table
 
 
@@ -71,7 +87,9 @@ def _view_table(result: Evaluation) -> Table:
     rows["mean"] = {**asdict(result.scores), "registered": None}
     for name, psnr in (*result.registered.items(), ("mean", result.registered_psnr)):
         rows[name]["registered"] = psnr
-    columns = [column for column in _VIEW if any(figure(row[column[1]], 0) != "-" for row in rows.values())]
+    columns = [
+        column for column in _VIEW if any(figure(row[column[1]], 0) != "-" for row in rows.values())
+    ]
     title = "held-out views" if result.held_out else "training views"
     table = _table(f"{title}, means over the frames", "", *(title for title, *_ in columns))
     for name, row in rows.items():
@@ -88,7 +106,13 @@ def _tracking_table(result: Evaluation) -> Table:
             shares = (scores.average_jaccard, scores.delta_avg, scores.occlusion_accuracy)
             errors = figure(scores.median_error, 4), figure(scores.median_error_percent, 2)
             survival = figure(100 * scores.survival, 1)
-            table.add_row(name, str(scores.num_tracks), *(figure(100 * s, 1) for s in shares), *errors, survival)
+            table.add_row(
+                name,
+                str(scores.num_tracks),
+                *(figure(100 * s, 1) for s in shares),
+                *errors,
+                survival,
+            )
     return table
 
 
@@ -107,20 +131,22 @@ def evaluation_summary(result: Evaluation) -> Iterator[str]:
         held_out = "Held-out views" if len(result.views) > 1 else "Held-out view"
         yield (
             f"{held_out} in the first frame: {figure(first, 2)} dB as calibrated, "
-            f"{figure(result.registered_psnr, 2)} dB registered, from the camera that fits each image best."
+            f"{figure(result.registered_psnr, 2)} dB registered, from the camera that fits each "
+            "image best."
         )
         yield (
-            f"{held_out} in all frames: {figure(mean.psnr, 2)} dB as recorded, {figure(mean.psnr_matched, 2)} dB "
-            "after the gain and bias per channel that fit best."
+            f"{held_out} in all frames: {figure(mean.psnr, 2)} dB as recorded, "
+            f"{figure(mean.psnr_matched, 2)} dB after the gain and bias per channel that fit best."
         )
     elif result.expected:
         yield result.expected
     motion = result.motion_3d
     if motion is not None and motion.num_gaussians:
         yield (
-            f"3D motion of {motion.num_gaussians:.0f} Gaussians on moving objects: error {motion.error:.4f} of "
-            f"{motion.true_length:.4f} units ({100 * motion.relative_error:.0f} %), angle "
-            f"{motion.angle:.1f} degrees, length ratio {motion.length_ratio:.2f}."
+            f"3D motion of {motion.num_gaussians:.0f} Gaussians on moving objects: error "
+            f"{motion.error:.4f} of {motion.true_length:.4f} units "
+            f"({100 * motion.relative_error:.0f} %), angle {motion.angle:.1f} degrees, length "
+            f"ratio {motion.length_ratio:.2f}."
         )
     if mean.confidence_iou == mean.confidence_iou:
         yield f"Confidence over the true mask: IoU {mean.confidence_iou:.2f}."
@@ -129,9 +155,10 @@ def evaluation_summary(result: Evaluation) -> Iterator[str]:
         f"{figure(sizes.per_residual / 1e3, 1)} kB per residual."
     )
     yield (
-        f"Time: {figure(seconds.first, 1)} s for the first frame, {figure(seconds.per_later_frame, 1)} s per "
-        f"later one, from images to packet; played at {figure(play.fps, 0)} frames per second "
-        f"({figure(play.decode_ms, 1)} ms to decode, {figure(play.render_ms, 1)} ms to render)."
+        f"Time: {figure(seconds.first, 1)} s for the first frame, "
+        f"{figure(seconds.per_later_frame, 1)} s per later one, from images to packet; played at "
+        f"{figure(play.fps, 0)} frames per second ({figure(play.decode_ms, 1)} ms to decode, "
+        f"{figure(play.render_ms, 1)} ms to render)."
     )
 
 

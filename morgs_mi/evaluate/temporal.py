@@ -21,14 +21,15 @@ _GREY_LEVEL = 1 / 255
 class StillVariation:
     """Masked total variation of a view (mTV): 100 mean |I_t - I_{t-1}| over the static pixels.
 
-    One mask serves the whole clip, as in the paper: pixels in which nothing moves in any frame. A frozen view has a
-    variation of 0 and the recording's own variation is its noise, so both are reported. A mask computed from the
-    recording itself favours the recording slightly: it selects the pixels that change least there.
+    One mask serves the whole clip, as in the paper: pixels in which nothing moves in any frame. A
+    frozen view has a variation of 0 and the recording's own variation is its noise, so both are
+    reported. A mask computed from the recording itself favours the recording slightly: it selects
+    the pixels that change least there.
 
     Args:
         valid: valid pixels [H, W], bool; None for all.
-        false_alarms: share of the frames in which a pixel may be marked as moving and still count as static: 0 for
-            true masks, more for masks computed from a noisy recording.
+        false_alarms: share of the frames in which a pixel may be marked as moving and still count
+            as static: 0 for true masks, more for masks computed from a noisy recording.
     """
 
     def __init__(self, valid: np.ndarray | None = None, false_alarms: float = 0) -> None:
@@ -40,36 +41,48 @@ class StillVariation:
         self._motion_counts = np.zeros((1, 1), int)
 
     def add(self, image: np.ndarray, recorded: np.ndarray, moving: np.ndarray) -> None:
-        """Add the next frame: rendered and recorded image [H, W, 3], and the mask of moving pixels [H, W] bool."""
+        """Add the next frame: rendered and recorded image [H, W, 3], and the mask of moving pixels
+        [H, W] bool.
+        """
         pair = unit_pair("StillVariation.add", image, recorded, moving)
         self._motion_counts = self._motion_counts + moving
         self._frames += 1
         if self._last is not None:
-            changes = [np.abs(new - old).mean(-1) for new, old in zip(pair, self._last, strict=True)]
-            self._sums = [a + b for a, b in zip(self._sums, changes, strict=True)] if self._sums else changes
+            changes = [
+                np.abs(new - old).mean(-1) for new, old in zip(pair, self._last, strict=True)
+            ]
+            self._sums = (
+                [a + b for a, b in zip(self._sums, changes, strict=True)] if self._sums else changes
+            )
         self._last = pair
 
     def result(self) -> VariationScores:
-        """Return the mTV of I and of I', and the mask's share of the view; NaN without two frames or a static pixel."""
+        """Return the mTV of I and of I', and the mask's share of the view; NaN without two frames
+        or a static pixel.
+        """
         if self._frames < 2:
             return VariationScores()
         valid = np.ones(self._motion_counts.shape, bool) if self._valid is None else self._valid
         still = (self._motion_counts <= self._false_alarms * self._frames) & valid
-        render, recorded = (100 * mean_over(total, still) / (self._frames - 1) for total in self._sums)
+        render, recorded = (
+            100 * mean_over(total, still) / (self._frames - 1) for total in self._sums
+        )
         return VariationScores(render, recorded, float(still.sum() / max(valid.sum(), 1)))
 
 
-# Not `morgs_mi.method.change.change_mask`, with which the fit selects its work. The score ignores a change of the whole
-# image's brightness (it subtracts the median), accepts any noise level, and marks changes above four standard
-# deviations; the fit must react to such a brightness change, assumes static noise of at most a grey level, and marks
-# changes above five. Sharing one definition would change the regions of all published scores.
+# Not `morgs_mi.method.change.change_mask`, with which the fit selects its work. The score ignores a
+# change of the whole image's brightness (it subtracts the median), accepts any noise level, and
+# marks changes above four standard deviations; the fit must react to such a brightness change,
+# assumes static noise of at most a grey level, and marks changes above five. Sharing one definition
+# would change the regions of all published scores.
 def recorded_change(last_image: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """Return the mask of pixels [H, W] in which a recording changes by more than its noise; it replaces a true mask.
+    """Return the mask of pixels [H, W] in which a recording changes by more than its noise; it
+    replaces a true mask.
 
-    Changes of brightness are averaged over 5x5 pixels. The noise is estimated from their median absolute deviation
-    over the image, which is robust as long as most of the image is static. A change above four of its standard
-    deviations, and above one grey level, is marked. The inside of a uniform moving surface does not change and is not
-    marked; a moving shadow is.
+    Changes of brightness are averaged over 5x5 pixels. The noise is estimated from their median
+    absolute deviation over the image, which is robust as long as most of the image is static. A
+    change above four of its standard deviations, and above one grey level, is marked. The inside of
+    a uniform moving surface does not change and is not marked; a moving shadow is.
 
     Args:
         last_image: I'_{t-1} [H, W, 3].

@@ -1,9 +1,10 @@
-"""Balance of the cameras: their exposures in the first frame, from renderings of Gaussians that they share.
+"""Balance of the cameras: their exposures in the first frame, from renderings of Gaussians that
+they share.
 
-Rounds of a short fit of Gaussians and of the closed form of `method.exposure`, view by view, take turns. The Gaussians
-have no view-dependent colours, which would hide wrong exposures. Where the cameras are alike, the first round shows it
-and is the last. Otherwise a fit from the same start to the recorded images is compared in withheld pixels, blocks of
-every view that no fit has seen.
+Rounds of a short fit of Gaussians and of the closed form of `method.exposure`, view by view, take
+turns. The Gaussians have no view-dependent colours, which would hide wrong exposures. Where the
+cameras are alike, the first round shows it and is the last. Otherwise a fit from the same start to
+the recorded images is compared in withheld pixels, blocks of every view that no fit has seen.
 """
 
 from __future__ import annotations
@@ -25,10 +26,12 @@ from morgs_mi.method.exposure import Exposure, centred, fit_exposure
 
 # Fits that are compared: to the images as recorded and to the balanced ones.
 _COMPARED = 2
-# Difference of tones, of 1, below which `auto` takes cameras as alike. The first round measures up to 0.002 on
-# path-traced cameras without differences, 0.003 and 0.009 on real ones, and 0.16 and more on rigs that `info` warns of.
+# Difference of tones, of 1, below which `auto` takes cameras as alike. The first round measures up
+# to 0.002 on path-traced cameras without differences, 0.003 and 0.009 on real ones, and 0.16 and
+# more on rigs that `info` warns of.
 LEAST_DIFFERENCE = 0.01
-# Steps of the first frame per step of a short fit, at least: the balance must not cost more than it.
+# Steps of the first frame per step of a short fit, at least: the balance must not cost more than
+# it.
 _LEAST_SHARE = 4
 
 
@@ -46,10 +49,16 @@ class Balance:
     @property
     def sentence(self) -> str:
         """Sentence on the change of the cameras and its reason."""
-        change = f"exposures differ by up to {100 * max(exposure.change for exposure in self.exposures):.1f} % of white"
+        change = (
+            "exposures differ by up to "
+            f"{100 * max(exposure.change for exposure in self.exposures):.1f} % of white"
+        )
         if np.isnan(self.recorded_psnr):
             return f"The cameras {'were balanced' if self.taken else 'stay as recorded'}: {change}."
-        scores = f"withheld pixels have {self.balanced_psnr:.2f} dB instead of {self.recorded_psnr:.2f} dB"
+        scores = (
+            f"withheld pixels have {self.balanced_psnr:.2f} dB instead of {self.recorded_psnr:.2f} "
+            "dB"
+        )
         if self.taken:
             return f"The cameras were balanced: {change}, and {scores}."
         return f"The cameras stay as recorded: balanced ones are no clear gain, {scores}."
@@ -71,7 +80,8 @@ def balance_config(config: FitConfig) -> FitConfig:
 def balance_cameras(
     problem: FirstFrameProblem, config: FitConfig, seed: int, progress: Progress | None = None
 ) -> Balance:
-    """Return the exposures with which the cameras agree, and whether withheld pixels show that they are better.
+    """Return the exposures with which the cameras agree, and whether withheld pixels show that they
+    are better.
 
     Args:
         problem: the data of the first frame, with a start as for `balance_config`.
@@ -91,7 +101,9 @@ def balance_cameras(
             return Balance(tuple(exposures.values()), False)
     if config.exposure == "on":
         return Balance(tuple(exposures.values()), True)
-    recorded_psnr, balanced_psnr = (fits.withheld_psnr(candidate) for candidate in (as_recorded, exposures))
+    recorded_psnr, balanced_psnr = (
+        fits.withheld_psnr(candidate) for candidate in (as_recorded, exposures)
+    )
     is_gain = balanced_psnr >= recorded_psnr + LEAST_GAIN
     return Balance(tuple(exposures.values()), is_gain, recorded_psnr, balanced_psnr)
 
@@ -103,7 +115,9 @@ class _ShortFits:
         steps: number of steps of a fit from the start.
     """
 
-    def __init__(self, problem: FirstFrameProblem, config: FitConfig, seed: int, progress: Progress) -> None:
+    def __init__(
+        self, problem: FirstFrameProblem, config: FitConfig, seed: int, progress: Progress
+    ) -> None:
         rng = rng_of(seed, Stream.WITHHELD_BLOCKS)
         self._visible, self._withheld = withheld_blocks(problem.views, config.short_fits.width, rng)
         self._problem = problem
@@ -116,7 +130,10 @@ class _ShortFits:
 
     def fit(self, start: Gaussians, exposures: Mapping[int, Exposure], steps: int) -> Gaussians:
         """Return Gaussians after some steps, from a start."""
-        views = [view._replace(image=exposures[v].corrected(view.image)) for v, view in enumerate(self._visible)]
+        views = [
+            view._replace(image=exposures[v].corrected(view.image))
+            for v, view in enumerate(self._visible)
+        ]
         problem = replace(self._problem, start=start, views=tuple(views))
         config = replace(self._config, first_frame_steps=steps)
         gaussians = fit_first_frame(problem, config, rng_of(self._seed, Stream.BALANCE)).gaussians
@@ -125,10 +142,14 @@ class _ShortFits:
         return gaussians
 
     def exposures_of(self, gaussians: Gaussians) -> dict[int, Exposure]:
-        """Return the exposure of each camera relative to the Gaussians, without what most have in common."""
+        """Return the exposure of each camera relative to the Gaussians, without what most have in
+        common.
+        """
         return centred(
             {
-                v: fit_exposure(rendered(gaussians, camera, self._problem.render), unit_values(image), mask)
+                v: fit_exposure(
+                    rendered(gaussians, camera, self._problem.render), unit_values(image), mask
+                )
                 for v, (camera, image, mask) in enumerate(self._visible)
             }
         )

@@ -1,16 +1,18 @@
-"""The plan of the first frame: as many Gaussians and steps as its images ask for and its time allows.
+"""The plan of the first frame: as many Gaussians and steps as its images ask for and its time
+allows.
 
-The images ask for a number of Gaussians (see `detail`), and these for a number of steps (`FitConfig.planned_steps`).
-Where that would take longer than `FitConfig.first_frame_seconds`, the most Gaussians are chosen whose own number of
-steps fits the time. An eighth of those that the images ask for is the least, because pixels take time as well: from
-there on, the steps are reduced. Numbers that are given stay as they are.
+The images ask for a number of Gaussians (see `detail`), and these for a number of steps
+(`FitConfig.planned_steps`). Where that would take longer than `FitConfig.first_frame_seconds`, the
+most Gaussians are chosen whose own number of steps fits the time. An eighth of those that the
+images ask for is the least, because pixels take time as well: from there on, the steps are reduced.
+Numbers that are given stay as they are.
 
 The time of a step is modelled as
 
     a number of Gaussians + b number of pixels
 
-with the factors of a reference machine, two cores of a server. The same command therefore gives the same plan on every
-machine, and on a busy one.
+with the factors of a reference machine, two cores of a server. The same command therefore gives the
+same plan on every machine, and on a busy one.
 """
 
 from __future__ import annotations
@@ -42,12 +44,17 @@ class Plan:
     """Gaussians and steps of a first frame."""
 
     config: FitConfig  #: Settings with both numbers.
-    seconds: float | None = None  #: Time of the first frame on the reference machine; None if both numbers were given.
+    #: Time of the first frame on the reference machine; None if both numbers were given.
+    seconds: float | None = None
 
     @property
     def stage(self) -> str:
         """Name of the stage in which the first frame is fitted, with its time."""
-        return "First frame" if self.seconds is None else f"First frame, about {max(self.seconds, 1):.0f} s"
+        return (
+            "First frame"
+            if self.seconds is None
+            else f"First frame, about {max(self.seconds, 1):.0f} s"
+        )
 
 
 def plan_first_frame(views: Sequence[View], points: np.ndarray, config: FitConfig) -> Plan:
@@ -67,7 +74,9 @@ def plan_first_frame(views: Sequence[View], points: np.ndarray, config: FitConfi
     half_pixels = _pixels(half_sized(views))
 
     def seconds(plan: FitConfig) -> float:
-        """Return the time of a plan. A round of density control is a step in every view, at half the size."""
+        """Return the time of a plan. A round of density control is a step in every view, at half
+        the size.
+        """
         late_seconds = _step_seconds(plan.planned_gaussians, pixels)
         if not plan.density.rounds:
             return plan.planned_steps * late_seconds
@@ -79,11 +88,15 @@ def plan_first_frame(views: Sequence[View], points: np.ndarray, config: FitConfi
         most = full_plan.planned_gaussians
         least = min(max(config.detail.least_gaussians, most // _LEAST_SHARE), most)
         counts = range(least + 1, most + 1)
-        too_many = bisect_left(counts, True, key=lambda count: seconds(replace(full_plan, num_gaussians=count)) > limit)
+        too_many = bisect_left(
+            counts, True, key=lambda count: seconds(replace(full_plan, num_gaussians=count)) > limit
+        )
         plan = replace(full_plan, num_gaussians=least + too_many)
     if config.first_frame_steps is None:
         affordable = int(plan.planned_steps * limit / seconds(plan))
-        plan = replace(plan, first_frame_steps=max(_LEAST_STEPS, min(plan.planned_steps, affordable)))
+        plan = replace(
+            plan, first_frame_steps=max(_LEAST_STEPS, min(plan.planned_steps, affordable))
+        )
     return Plan(plan, seconds(plan))
 
 

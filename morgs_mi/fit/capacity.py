@@ -22,7 +22,8 @@ _STEP = 16
 
 
 def check_capacity(place: str, cameras: Sequence[Camera], config: FitConfig) -> None:
-    """Raise an error unless there is memory for the numbers of Gaussians and of steps that a config gives.
+    """Raise an error unless there is memory for the numbers of Gaussians and of steps that a config
+    gives.
 
     Args:
         place: where the error's sentence begins.
@@ -33,7 +34,9 @@ def check_capacity(place: str, cameras: Sequence[Camera], config: FitConfig) -> 
         ValueError: there is not.
     """
     K = (config.sh_degree + 1) ** 2
-    floats = sum(3 * (K - 1) if attribute.width < 0 else attribute.width for attribute in ATTRIBUTES)
+    floats = sum(
+        3 * (K - 1) if attribute.width < 0 else attribute.width for attribute in ATTRIBUTES
+    )
     sizes = {
         "num_gaussians": _FLOAT * (_ARRAYS * floats + _PROJECTED),
         "first_frame_steps": _STEP,
@@ -43,4 +46,6 @@ def check_capacity(place: str, cameras: Sequence[Camera], config: FitConfig) -> 
         check_memory(place, size * count, f"`{name}={count}`", "set a smaller number")
     pixels = sum(camera.width * camera.height for camera in cameras)
     views = f"{len(cameras)} views with {pixels} pixels"
-    check_memory(place, _PIXEL * pixels, views, "fit smaller images (`downscale`), or fewer cameras")
+    check_memory(
+        place, _PIXEL * pixels, views, "fit smaller images (`downscale`), or fewer cameras"
+    )

@@ -1,14 +1,17 @@
-"""Density control: cloning, splitting, adding and pruning Gaussians, and resizing the optimiser's state.
+"""Density control: cloning, splitting, adding and pruning Gaussians, and resizing the optimiser's
+state.
 
-N Gaussians become M. `parent` [M] is the index among the N of the Gaussian that each one is or was made from; `source`
-[M] is the same for survivors, which come first in ascending order, and -1 for births, which come last.
+N Gaussians become M. `parent` [M] is the index among the N of the Gaussian that each one is or was
+made from; `source` [M] is the same for survivors, which come first in ascending order, and -1 for
+births, which come last.
 
-In the first frame, `plan_growth` (Kerbl et al. 2023): a small parent is cloned, and both get the opacity
-1 - sqrt(1 - o), with which they cover as much as the parent (Bulo et al. 2024). A large parent is split into two: a
-long one along its longest axis (arXiv 2508.12313), another one into two smaller ones. In a later frame,
-`plan_additions` (Sun et al. 2024): parents stay unchanged, because their tracks must not jump and the few remaining
-steps could not repair them; births are small and faint, and gain opacity or are pruned. Births that are not from splits
-along an axis are drawn from the density of their parents.
+In the first frame, `plan_growth` (Kerbl et al. 2023): a small parent is cloned, and both get the
+opacity 1 - sqrt(1 - o), with which they cover as much as the parent (Bulo et al. 2024). A large
+parent is split into two: a long one along its longest axis (arXiv 2508.12313), another one into two
+smaller ones. In a later frame, `plan_additions` (Sun et al. 2024): parents stay unchanged, because
+their tracks must not jump and the few remaining steps could not repair them; births are small and
+faint, and gain opacity or are pruned. Births that are not from splits along an axis are drawn from
+the density of their parents.
 
 Parents are the Gaussians with the largest densification scores (see `method.attribution`).
 """
@@ -33,12 +36,13 @@ from morgs_mi.fit.optimise import replace_parameter
 _MAX_OPACITY = 1 - 1e-6
 # Opacity of a birth in a later frame: low, because unnecessary births are then pruned soon.
 _BIRTH_OPACITY = 0.1
-# Logarithm of the factor by which both parts of a large Gaussian that is not long, and a birth in a later frame, are
-# smaller than their parent (3DGS).
+# Logarithm of the factor by which both parts of a large Gaussian that is not long, and a birth in a
+# later frame, are smaller than their parent (3DGS).
 _LOG_SHRINK = -float(np.log(1.6))
 # Least ratio of the longest scale to the second one of a long Gaussian.
 _LONG = 2.0
-# Distance of the two parts of a split Gaussian from its mean, in scales along its longest axis (arXiv 2508.12313).
+# Distance of the two parts of a split Gaussian from its mean, in scales along its longest axis
+# (arXiv 2508.12313).
 _SPLIT_SHIFT = 1.35
 # Factor on the scale of both parts along the longest axis (arXiv 2508.12313).
 _SPLIT_LONGEST = 0.55
@@ -81,7 +85,8 @@ def plan_growth(
 ) -> DensityPlan:
     """Return the plan of a round in the first frame: which Gaussians are pruned, cloned and split.
 
-    Gaussians in the empty space before the cameras are pruned; a birth there takes the mean of its parent instead.
+    Gaussians in the empty space before the cameras are pruned; a birth there takes the mean of its
+    parent instead.
 
     Args:
         gaussians: N Gaussians.
@@ -93,7 +98,9 @@ def plan_growth(
         cameras: the training cameras.
     """
     means = np.asarray(gaussians.means)
-    visible = (np.asarray(gaussians.opacities) >= config.min_opacity) & ~in_empty_space(cameras, means)
+    visible = (np.asarray(gaussians.opacities) >= config.min_opacity) & ~in_empty_space(
+        cameras, means
+    )
     survivors, parents = _select(visible, scores, room, 0)
     parent = np.concatenate([survivors, parents])
     is_parent = np.isin(parent, parents)
@@ -125,7 +132,9 @@ def _halve(plan: DensityPlan, is_halved: np.ndarray, quats: np.ndarray, scales: 
     is_longest = np.eye(3, dtype=bool)[scales.argmax(axis=1)]
     side = np.where(plan.source < 0, _SPLIT_SHIFT, -_SPLIT_SHIFT)[:, None]
     plan.edits["means"][is_halved] = _rotated(quats, side * is_longest * scales)[is_halved]
-    plan.edits["log_scales"][is_halved] = np.log(np.where(is_longest, _SPLIT_LONGEST, _SPLIT_OTHERS))[is_halved]
+    plan.edits["log_scales"][is_halved] = np.log(
+        np.where(is_longest, _SPLIT_LONGEST, _SPLIT_OTHERS)
+    )[is_halved]
 
 
 def plan_additions(
@@ -135,7 +144,8 @@ def plan_additions(
     rng: np.random.Generator,
     num_static: int = 0,
 ) -> DensityPlan:
-    """Return the plan of a round in a later frame: which Gaussians are pruned, and where small faint ones are added.
+    """Return the plan of a round in a later frame: which Gaussians are pruned, and where small
+    faint ones are added.
 
     Args:
         gaussians: N active Gaussians.
@@ -154,11 +164,14 @@ def plan_additions(
     return _plan(gaussians, survivors, parents, np.where(is_birth, _LOG_SHRINK, 0), fainter, rng)
 
 
-def _select(visible: np.ndarray, scores: np.ndarray, room: Room, min_error: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices of the survivors, and the indices of the parents: survivors with the largest error.
+def _select(
+    visible: np.ndarray, scores: np.ndarray, room: Room, min_error: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the indices of the survivors, and the indices of the parents: survivors with the
+    largest error.
 
-    Gaussians that are not `visible` [N] are pruned. At the limit, others are not: a later frame draws a part of the
-    pixels, in which it cannot see what a Gaussian contributes elsewhere.
+    Gaussians that are not `visible` [N] are pruned. At the limit, others are not: a later frame
+    draws a part of the pixels, in which it cannot see what a Gaussian contributes elsewhere.
     """
     # Without any Gaussian, the scene could not recover.
     survivors = np.flatnonzero(visible) if visible.any() else np.arange(len(visible))
@@ -175,13 +188,23 @@ def _plan(
     logit_opacity: np.ndarray,
     rng: np.random.Generator,
 ) -> DensityPlan:
-    """Return the plan that adds `log_scale` and `logit_opacity` [M] and draws the means of the births."""
+    """Return the plan that adds `log_scale` and `logit_opacity` [M] and draws the means of the
+    births.
+    """
     parent = np.concatenate([survivors, parents])
     source = np.concatenate([survivors, np.full(len(parents), -1)])
     shift = np.zeros((len(parent), 3))
-    shift[len(survivors) :] = _draw(np.asarray(gaussians.quats)[parents], np.asarray(gaussians.scales)[parents], rng)
-    edits = {"means": shift, "log_scales": np.repeat(log_scale[:, None], 3, axis=1), "logit_opacities": logit_opacity}
-    return DensityPlan(parent, source, {name: edit.astype(np.float32) for name, edit in edits.items()})
+    shift[len(survivors) :] = _draw(
+        np.asarray(gaussians.quats)[parents], np.asarray(gaussians.scales)[parents], rng
+    )
+    edits = {
+        "means": shift,
+        "log_scales": np.repeat(log_scale[:, None], 3, axis=1),
+        "logit_opacities": logit_opacity,
+    }
+    return DensityPlan(
+        parent, source, {name: edit.astype(np.float32) for name, edit in edits.items()}
+    )
 
 
 def _draw(quats: np.ndarray, scales: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -209,8 +232,11 @@ def apply_plan(gaussians: Gaussians, plan: DensityPlan) -> Gaussians:
     return replace(parents, **{name: columns[name] + edit for name, edit in plan.edits.items()})
 
 
-def resize_optimizer(optimizer: Adam, plan: DensityPlan, edits: Mapping[str, np.ndarray] | None = None) -> None:
-    """Replace an optimiser's parameters [N, ...] and moments by the rows of a plan [M, ...]; moments of births are 0.
+def resize_optimizer(
+    optimizer: Adam, plan: DensityPlan, edits: Mapping[str, np.ndarray] | None = None
+) -> None:
+    """Replace an optimiser's parameters [N, ...] and moments by the rows of a plan [M, ...];
+    moments of births are 0.
 
     Args:
         optimizer: holds tensors of N rows; its learning rates and its count of steps stay.
@@ -226,4 +252,6 @@ def resize_optimizer(optimizer: Adam, plan: DensityPlan, edits: Mapping[str, np.
 
     for name in list(optimizer):
         value = np.asarray(dr.detach(optimizer[name]))[plan.parent]
-        replace_parameter(optimizer, name, value + edits[name] if edits and name in edits else value, carry)
+        replace_parameter(
+            optimizer, name, value + edits[name] if edits and name in edits else value, carry
+        )

@@ -1,9 +1,9 @@
 """The number of Gaussians of the first frame, from the detail of its images.
 
-An image is averaged over blocks of 2x2 pixels, again and again. A value that differs from the mean of its block by more
-than a threshold and the noise is a detail. Flat areas and noise have none, edges have some at every level. Details
-that several views see are counted once: the number of details of all views is divided by the mean number of views that
-see a point.
+An image is averaged over blocks of 2x2 pixels, again and again. A value that differs from the mean
+of its block by more than a threshold and the noise is a detail. Flat areas and noise have none,
+edges have some at every level. Details that several views see are counted once: the number of
+details of all views is divided by the mean number of views that see a point.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ _NOISE = 3.5
 
 
 def with_num_gaussians(config: FitConfig, views: Sequence[View], points: np.ndarray) -> FitConfig:
-    """Return the settings of a first frame with a number of Gaussians, which follows from the views if none is given.
+    """Return the settings of a first frame with a number of Gaussians, which follows from the views
+    if none is given.
 
     Args:
         config: settings of the fit.
@@ -41,7 +42,9 @@ def with_num_gaussians(config: FitConfig, views: Sequence[View], points: np.ndar
     how = config.detail
     details = sum(count_details(view.image, view.mask) for view in views)
     count = how.per_detail * details / mean_views([view.camera for view in views], points)
-    return replace(config, num_gaussians=int(np.clip(round(count), how.least_gaussians, how.most_gaussians)))
+    return replace(
+        config, num_gaussians=int(np.clip(round(count), how.least_gaussians, how.most_gaussians))
+    )
 
 
 def count_details(image: np.ndarray, mask: np.ndarray | None) -> float:
@@ -59,7 +62,9 @@ def count_details(image: np.ndarray, mask: np.ndarray | None) -> float:
         height, width = (size // 2 for size in values.shape[:2])
         values = values[: 2 * height, : 2 * width]
         valid = valid[: 2 * height, : 2 * width]
-        means, fractions = (cv2.resize(v, (width, height), interpolation=cv2.INTER_AREA) for v in (values, valid))
+        means, fractions = (
+            cv2.resize(v, (width, height), interpolation=cv2.INTER_AREA) for v in (values, valid)
+        )
         differences = np.abs(values - means.repeat(2, axis=0).repeat(2, axis=1)).max(axis=-1)
         is_complete = (fractions == 1).repeat(2, axis=0).repeat(2, axis=1)
         count += np.count_nonzero((differences > max(_THRESHOLD, noise)) & is_complete)

@@ -1,8 +1,9 @@
 """Random dropping of Gaussians, which improves novel views (DropGaussian, Park et al. 2025).
 
-Where training views are few or noisy, Gaussians overfit them together: one compensates for another in a single view. In
-every step of the first frame, each Gaussian is left out with probability p, and the opacities of the others are scaled
-by 1 / (1 - p). p follows from the number of views, their noise and the angles between them.
+Where training views are few or noisy, Gaussians overfit them together: one compensates for another
+in a single view. In every step of the first frame, each Gaussian is left out with probability p,
+and the opacities of the others are scaled by 1 / (1 - p). p follows from the number of views, their
+noise and the angles between them.
 """
 
 from __future__ import annotations
@@ -44,13 +45,17 @@ def dropped(gaussians: Gaussians, probability: float, rng: np.random.Generator) 
     if not probability:
         return gaussians
     is_kept = from_numpy(mi.UInt32, rng.random(len(gaussians), np.float32) >= probability) != 0
-    opacity = dr.minimum(sigmoid(gaussians.logit_opacities.array) * dr.opaque(mi.Float, 1 / (1 - probability)), _MOST)
+    opacity = dr.minimum(
+        sigmoid(gaussians.logit_opacities.array) * dr.opaque(mi.Float, 1 / (1 - probability)), _MOST
+    )
     logits = dr.select(is_kept, dr.log(opacity) - dr.log(1 - opacity), _INVISIBLE)
     return replace(gaussians, logit_opacities=mi.TensorXf(logits))
 
 
 def default_dropping(problem: FirstFrameProblem) -> float:
-    """Return the probability of dropping of a first frame: above 0 for few views that are noisy or far apart."""
+    """Return the probability of dropping of a first frame: above 0 for few views that are noisy or
+    far apart.
+    """
     if len(problem.views) >= _MANY_VIEWS:
         return 0.0
     far = len(problem.views) > 1 and forecast(problem.cameras, problem.points).reach >= _FAR
@@ -58,10 +63,13 @@ def default_dropping(problem: FirstFrameProblem) -> float:
 
 
 def adapted_to_images(config: FitConfig, problem: FirstFrameProblem) -> FitConfig:
-    """Return the settings of the first frame with what follows from its images: dropping, and the loss of noisy ones.
+    """Return the settings of the first frame with what follows from its images: dropping, and the
+    loss of noisy ones.
 
     Noisy images are fitted by L1 alone if `noise_aware`. A dropping that is given stays.
     """
     if config.noise_aware and is_noisy(problem.images):
         config = replace(config, objective=replace(config.objective, dssim_weight=0.0))
-    return replace(config, dropping=default_dropping(problem)) if config.dropping is None else config
+    return (
+        replace(config, dropping=default_dropping(problem)) if config.dropping is None else config
+    )

@@ -12,7 +12,8 @@ from morgs_mi.core.camera import Camera
 def in_empty_space(cameras: Sequence[Camera], means: np.ndarray) -> np.ndarray:
     """Return the mask of means [N] that lie in the view of a camera, nearer than its near plane.
 
-    This camera does not render them, so that nothing moves them away. In front of other cameras they are fog.
+    This camera does not render them, so that nothing moves them away. In front of other cameras
+    they are fog.
 
     Args:
         cameras: the training cameras.

@@ -60,11 +60,12 @@ def fit_first_frame(
     progress: Progress | None = None,
     on_round: Callable[[Gaussians], None] | None = None,
 ) -> FirstFrame:
-    """Fit Gaussians to the images of one instant by L_recon (eq. 2); the confidence stays unchanged.
+    """Fit Gaussians to the images of one instant by L_recon (eq. 2); the confidence stays
+    unchanged.
 
-    As in 3DGS, the bands of the spherical harmonics are added one after the other. Between a tenth and a half of the
-    planned steps, rounds of density control (see `density`) let the Gaussians grow to `num_gaussians`, if so many are
-    needed.
+    As in 3DGS, the bands of the spherical harmonics are added one after the other. Between a tenth
+    and a half of the planned steps, rounds of density control (see `density`) let the Gaussians
+    grow to `num_gaussians`, if so many are needed.
 
     Args:
         problem: views and initial Gaussians.
@@ -86,10 +87,14 @@ def fit_first_frame(
 
 
 class _Fit:
-    """Optimiser of the first frame, and the events of its schedule: SH bands and rounds of density control."""
+    """Optimiser of the first frame, and its events: SH bands and rounds of density control."""
 
     def __init__(
-        self, problem: FirstFrameProblem, config: FitConfig, rng: np.random.Generator, progress: Progress | None
+        self,
+        problem: FirstFrameProblem,
+        config: FitConfig,
+        rng: np.random.Generator,
+        progress: Progress | None,
     ) -> None:
         self._problem = problem
         self._config = config
@@ -98,7 +103,10 @@ class _Fit:
         self._base = problem.start
         self._optimizer = adam(_start(problem.start))
         self._rates = config.first_frame_rates.by_parameter(problem.extent)
-        self._bands = [int(band * config.planned_steps * BAND + 1e-9) for band in range(1, problem.start.sh_degree + 1)]
+        self._bands = [
+            int(band * config.planned_steps * BAND + 1e-9)
+            for band in range(1, problem.start.sh_degree + 1)
+        ]
         self._rounds = density_rounds(config)
         self._look_at(problem.halved() if self._rounds else problem)
 
@@ -116,7 +124,7 @@ class _Fit:
         return step in self._rounds
 
     def prepare(self, step: int) -> None:
-        """Add the SH bands, do the round of density control, and enlarge the images, as is due before a step."""
+        """Do what is due before a step: an SH band, a round of density control, larger images."""
         for _ in range(self._bands.count(step)):
             _add_band(self._optimizer, self._base)
         if self._rounds and step == self._rounds[-1]:
@@ -125,7 +133,7 @@ class _Fit:
             self._grow(len(self._rounds) - self._rounds.index(step))
 
     def run(self, views: Iterable[int], first: int, steps: int) -> dict[str, float]:
-        """Make the steps of some views, from step `first` of `steps`, and return the losses by name."""
+        """Make the steps of some views, from step `first` of `steps`; return the losses by name."""
         progress = self._progress
         stretch = Steps(
             views,
@@ -142,18 +150,23 @@ class _Fit:
         self._targets = [view.target for view in problem.views]
 
     def _losses_at(self, values: Mapping[str, Tensor], view: int) -> dict[str, Tensor]:
-        gaussians = dropped(self._base.with_parameters(values), self._config.dropping or 0.0, self._rng)
+        gaussians = self._base.with_parameters(values)
+        gaussians = dropped(gaussians, self._config.dropping or 0.0, self._rng)
         image = self._views[view].render(gaussians, ("color",))
-        return {"recon": recon_loss(image.color, self._targets[view], self._config.objective.dssim_weight)}
+        weight = self._config.objective.dssim_weight
+        return {"recon": recon_loss(image.color, self._targets[view], weight)}
 
     def _grow(self, rounds: int) -> None:
         """Add and prune Gaussians by density control; `rounds` are left, with this one."""
         gaussians = self.gaussians
         config = self._config
-        room = Room(-(-max(config.planned_gaussians - len(gaussians), 0) // rounds), config.planned_gaussians)
+        planned = config.planned_gaussians
+        room = Room(-(-max(planned - len(gaussians), 0) // rounds), planned)
         scores = densification_scores(gaussians, self._views, self._targets)
         problem = self._problem
-        plan = plan_growth(gaussians, scores, room, problem.extent, config.density, self._rng, problem.cameras)
+        plan = plan_growth(
+            gaussians, scores, room, problem.extent, config.density, self._rng, problem.cameras
+        )
         resize_optimizer(self._optimizer, plan, plan.edits)
         self._base = self._base.select(plan.parent)
 
@@ -165,9 +178,11 @@ def density_rounds(config: FitConfig) -> list[int]:
 
 
 def _start(gaussians: Gaussians) -> dict[str, Tensor]:
-    """Return the parameters at the start: those that the first frame fits, without the higher SH bands."""
+    """Return the parameters that the first frame fits at the start: without higher SH bands."""
     parameters = gaussians.parameters()
-    names = [a.name for a in ATTRIBUTES if a.first_frame and a.name in parameters and a.name != "sh_rest"]
+    names = [
+        a.name for a in ATTRIBUTES if a.first_frame and a.name in parameters and a.name != "sh_rest"
+    ]
     return {name: parameters[name] for name in names}
 
 
@@ -181,7 +196,10 @@ def _add_band(optimizer: Adam, base: Gaussians) -> None:
     width = (round((coefficients.shape[1] + 1) ** 0.5) + 1) ** 2 - 1
     value = np.concatenate([coefficients, rest[:, coefficients.shape[1] : width]], axis=1)
     replace_parameter(
-        optimizer, "sh_rest", value, lambda moment: np.pad(moment, [(0, 0), (0, width - coefficients.shape[1]), (0, 0)])
+        optimizer,
+        "sh_rest",
+        value,
+        lambda moment: np.pad(moment, [(0, 0), (0, width - coefficients.shape[1]), (0, 0)]),
     )
 
 
@@ -193,7 +211,8 @@ def fit_confidence(
     render: RenderConfig,
     rng: np.random.Generator,
 ) -> tuple[Gaussians, dict[str, float]]:
-    """Learn the confidence alone from motion masks on key views (eq. 11); all other attributes are frozen.
+    """Learn the confidence alone from motion masks on key views (eq. 11); all other attributes are
+    frozen.
 
     Args:
         gaussians: N Gaussians with a confidence.
@@ -211,7 +230,9 @@ def fit_confidence(
 
     def losses_at(values: Mapping[str, Tensor], k: int) -> dict[str, Tensor]:
         trial = replace(gaussians, logit_confidence=values["logit_confidence"])
-        image = rasterize(trial, cameras[views[k]], ("confidence",), detach_weights=("confidence",), config=render)
+        image = rasterize(
+            trial, cameras[views[k]], ("confidence",), detach_weights=("confidence",), config=render
+        )
         return {"mask": mask_loss(image.confidence, targets[views[k]])}
 
     rates = {"logit_confidence": config.first_frame_rates.confidence}

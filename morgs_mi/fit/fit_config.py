@@ -25,8 +25,9 @@ _GAUSSIANS_PER_STEP = 25
 class LearningRates:
     """Adam's learning rate of every parameter, per step.
 
-    The defaults are for a later frame. They were chosen on the clip `spheres`, held-out view, from 1x to
-    8x the rates of 3DGS (Kerbl et al. 2023): 3DGS takes thousands of steps where a frame here has under a hundred.
+    The defaults are for a later frame. They were chosen on the clip `spheres`, held-out view, from
+    1x to 8x the rates of 3DGS (Kerbl et al. 2023): 3DGS takes thousands of steps where a frame here
+    has under a hundred.
     """
 
     means: Annotated[float, AtLeast(0)] = 5e-4
@@ -48,11 +49,17 @@ class LearningRates:
         check_ranges(self)
 
     def by_parameter(self, extent: float) -> dict[str, float]:
-        """Return the learning rate of every parameter of the attribute table by its name; `extent` in world units."""
+        """Return the learning rate of every parameter of the attribute table by its name; `extent`
+        in world units.
+        """
         rates = {}
         for attribute in ATTRIBUTES:
             if attribute.rate is not None:
-                rate = getattr(self, attribute.rate) if isinstance(attribute.rate, str) else attribute.rate
+                rate = (
+                    getattr(self, attribute.rate)
+                    if isinstance(attribute.rate, str)
+                    else attribute.rate
+                )
                 rates[attribute.name] = rate * extent if attribute.rate_in_extents else rate
         return rates
 
@@ -63,8 +70,8 @@ class DensityConfig:
     """Settings of density control (see `density`), with thresholds from the literature."""
 
     rounds: Annotated[int, AtLeast(0)] = 6
-    """Rounds of density control in the first frame; 0: none. With them, the first frame starts from half of its
-    Gaussians and grows to all."""
+    """Rounds of density control in the first frame; 0: none. With them, the first frame starts from
+    half of its Gaussians and grows to all."""
     later_frames: bool = True
     """One round of density control in every later frame."""
     births: Annotated[float, AtLeast(0)] = 0.02
@@ -72,9 +79,12 @@ class DensityConfig:
     max_gaussians: Annotated[int, AtLeast(1)] = 60_000
     """Number of Gaussians beyond which a later frame adds none unless others are pruned."""
     split_scale: Annotated[float, AtLeast(0)] = 0.01
-    """Scale, in scene extents, above which the first frame splits a Gaussian instead of cloning it."""
+    """Scale, in scene extents, above which the first frame splits a Gaussian instead of cloning it.
+    """
     min_error: Annotated[float, AtLeast(0)] = 0.1
-    """Attributed error, in pixels of full contrast, below which a later frame does not densify a Gaussian."""
+    """Attributed error, in pixels of full contrast, below which a later frame does not densify a
+    Gaussian.
+    """
     min_opacity: Annotated[float, Above(0), Below(1)] = 0.005
     """Opacity below which a Gaussian is pruned."""
 
@@ -92,14 +102,15 @@ class DetailConfig:
     least_gaussians: Annotated[int, AtLeast(1)] = 4_000
     """Least number of Gaussians."""
     most_gaussians: Annotated[int, AtLeast(1)] = 250_000
-    """Largest number of Gaussians, for memory, the time of later frames and the size of the stream."""
+    """Largest number of Gaussians, for memory, the time of later frames and the size of the stream.
+    """
 
     def __post_init__(self) -> None:
         check_ranges(self)
         if self.least_gaussians > self.most_gaussians:
             raise ValueError(
-                f"DetailConfig(): `least_gaussians` must be 1 to `most_gaussians` = {self.most_gaussians}, got "
-                f"{self.least_gaussians}."
+                "DetailConfig(): `least_gaussians` must be 1 to `most_gaussians` = "
+                f"{self.most_gaussians}, got {self.least_gaussians}."
             )
 
 
@@ -115,10 +126,12 @@ class CameraPriors:
     focal: Annotated[float, Above(0)] = 0.01
     """Focal lengths, relative."""
     principal_point: Annotated[float, Above(0)] = 2e-4
-    """Principal point along each axis, in image widths. It follows the calibration closely, because its displacement is
-    nearly indistinguishable from a rotation."""
+    """Principal point along each axis, in image widths. It follows the calibration closely, because
+    its displacement is nearly indistinguishable from a rotation."""
     distortion: Annotated[float, Above(0)] = 0.1
-    """First term of radial distortion that the calibrated lens leaves; the second has a fifth of this deviation."""
+    """First term of radial distortion that the calibrated lens leaves; the second has a fifth of
+    this deviation.
+    """
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -127,7 +140,9 @@ class CameraPriors:
 @documented
 @dataclass(frozen=True)
 class ShortFitConfig:
-    """Settings of the short fits with which cameras are refined and balanced, and the results are compared."""
+    """Settings of the short fits with which cameras are refined and balanced, and the results are
+    compared.
+    """
 
     gaussians: Annotated[int, AtLeast(4)] = 4000
     """Number of Gaussians."""
@@ -150,38 +165,44 @@ class FitConfig:
     sh_degree: Annotated[int, AtLeast(0), AtMost(3)] = 1
     """Degree of the spherical harmonics, 0 to 3; 0 is enough where no surface is glossy."""
     num_gaussians: Annotated[int, AtLeast(1)] | None = None
-    """Number of Gaussians of the first frame; None: from the detail of its images and its time (see `budget`). It
-    starts from `first_count`."""
+    """Number of Gaussians of the first frame; None: from the detail of its images and its time (see
+    `budget`). It starts from `first_count`."""
     detail: DetailConfig = field(default_factory=DetailConfig)
     """Number of Gaussians where none is given."""
     first_frame_steps: Annotated[int, AtLeast(1)] | None = None
-    """Steps of the first frame, one view each; None: from its Gaussians and its time (see `budget`)."""
+    """Steps of the first frame, one view each; None: from its Gaussians and its time (see
+    `budget`).
+    """
     first_frame_seconds: Annotated[float, Above(0)] = 120.0
-    """Time that the first frame may take on two cores of a server: it limits those numbers of Gaussians and of steps
-    that are not given."""
+    """Time that the first frame may take on two cores of a server: it limits those numbers of
+    Gaussians and of steps that are not given."""
     dropping: Annotated[float, AtLeast(0), Below(1)] | None = None
-    """Probability with which each step of the first frame leaves a Gaussian out (see `dropping`); None: from the noise
-    of the images and the angles between the views."""
+    """Probability with which each step of the first frame leaves a Gaussian out (see `dropping`);
+    None: from the noise of the images and the angles between the views."""
     noise_aware: bool = True
     """Fit the first frame to noisy images by L1 alone: SSIM makes the fit follow their noise."""
     refine_cameras: Literal["off", "auto", "on"] = "off"
-    """Refine poses and intrinsics on the first frame: off, auto (taken if withheld pixels show that they are better) or
-    on (always taken)."""
+    """Refine poses and intrinsics on the first frame: off, auto (taken if withheld pixels show that
+    they are better) or on (always taken)."""
     camera_priors: CameraPriors = field(default_factory=CameraPriors)
     """Errors that the calibration may have."""
     exposure: Literal["off", "auto", "on"] = "auto"
-    """Estimate gain and bias of each camera and frame: off, auto (differences between the cameras are taken if withheld
-    pixels show that they are real) or on (always taken)."""
+    """Estimate gain and bias of each camera and frame: off, auto (differences between the cameras
+    are taken if withheld pixels show that they are real) or on (always taken)."""
     short_fits: ShortFitConfig = field(default_factory=ShortFitConfig)
     """Fits for the refinement of the cameras and for their exposures."""
     confidence_steps: Annotated[int, AtLeast(0)] = 40
     """Steps that learn the confidence of the first frame from the masks of its key views."""
     epochs: Annotated[int, AtLeast(1)] = 8
-    """Most passes over all training views for every later frame; the paper's small variant takes 5."""
+    """Most passes over all training views for every later frame; the paper's small variant takes 5.
+    """
     skip_static: bool = True
-    """Skip the Gaussians, blocks of pixels and views that cannot have changed (see `active_set`)."""
+    """Skip the Gaussians, blocks of pixels and views that cannot have changed (see `active_set`).
+    """
     early_stopping_tolerance: Annotated[float, AtLeast(0)] = 1e-6
-    """Relative decrease of the objective over two epochs below which a later frame ends early; 0: never."""
+    """Relative decrease of the objective over two epochs below which a later frame ends early; 0:
+    never.
+    """
     objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
     """Weights of the losses."""
     density: DensityConfig = field(default_factory=DensityConfig)
@@ -191,9 +212,13 @@ class FitConfig:
     decay_means_rate: bool = True
     """Let the learning rate of the means decay within a later frame."""
     first_frame_rates: LearningRates = field(
-        default_factory=lambda: LearningRates(means=2e-3, scales=0.02, quats=0.02, opacities=0.2, confidence=0.2)
+        default_factory=lambda: LearningRates(
+            means=2e-3, scales=0.02, quats=0.02, opacities=0.2, confidence=0.2
+        )
     )
-    """Learning rates at the start of the first frame. The confidence is fitted alone, at a constant rate."""
+    """Learning rates at the start of the first frame. The confidence is fitted alone, at a constant
+    rate.
+    """
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -201,22 +226,29 @@ class FitConfig:
     def rates_at(self, epoch: int) -> LearningRates:
         """Return the learning rates of an epoch of a later frame, counted from 0.
 
-        The rate of the means is constant in the first two epochs and then falls like 1 / (epoch + 1): a mean that has
-        nearly arrived does not leave again. All others are larger by (8 / epochs)^1/2: fewer steps have to go as far.
+        The rate of the means is constant in the first two epochs and then falls like 1 / (epoch +
+        1): a mean that has nearly arrived does not leave again. All others are larger by (8 /
+        epochs)^1/2: fewer steps have to go as far.
         """
         means = min(1.0, _CONSTANT_EPOCHS / (epoch + 1)) if self.decay_means_rate else 1.0
         others = (_USUAL_EPOCHS / self.epochs) ** 0.5
-        rates = {n: (means if n == "means" else others) * rate for n, rate in asdict(self.rates).items()}
+        rates = {
+            n: (means if n == "means" else others) * rate for n, rate in asdict(self.rates).items()
+        }
         return LearningRates(**rates)
 
     @property
     def momentum(self) -> float:
-        """Adam's momentum in a later frame: 0.9 in 8 epochs, and gradients fade in the same share of fewer steps."""
+        """Adam's momentum in a later frame: 0.9 in 8 epochs, and gradients fade in the same share
+        of fewer steps.
+        """
         return 0.9 ** max(_USUAL_EPOCHS / self.epochs, 1)
 
     @property
     def planned_steps(self) -> int:
-        """Number of steps of the first frame: where none is given, one per 25 Gaussians, at least 1200."""
+        """Number of steps of the first frame: where none is given, one per 25 Gaussians, at least
+        1200.
+        """
         if self.first_frame_steps is not None:
             return self.first_frame_steps
         return max(_LEAST_STEPS, round(self.planned_gaussians / _GAUSSIANS_PER_STEP))

@@ -1,4 +1,6 @@
-"""Forecast of views between the cameras, from the angles between neighbouring cameras and their overlap alone."""
+"""Forecast of views between the cameras, from the angles between neighbouring cameras and their
+overlap alone.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +19,8 @@ from morgs_mi.core.rig import (
 )
 
 _WORDS = ("good", "fair", "poor")
-# Limits of good and of fair views between the cameras (`docs/experiments/first-frame.md`). Loss against the training
-# views, dB.
+# Limits of good and of fair views between the cameras (`docs/experiments/first-frame.md`). Loss
+# against the training views, dB.
 _LOSSES = (4.0, 8.0)
 # PSNR, dB.
 _LEAST_PSNR = (22.0, 16.0)
@@ -35,7 +37,8 @@ class Forecast:
     cameras: int  #: Number of cameras.
     spacing: float  #: Mean angle from a camera to its nearest one, seen from the scene, degrees.
     overlap: float  #: Mean share of a camera's image that its nearest one sees as well.
-    #: Mean angle from a camera to the nearest one that sees the same point, degrees, 90 where there is none.
+    #: Mean angle from a camera to the nearest one that sees the same point, degrees, 90 where there
+    #: is none.
     reach: float
 
     @property
@@ -56,7 +59,8 @@ class Forecast:
 
 
 def quality_of(psnr: float, loss: float) -> str:
-    """Return the quality of views between the cameras: the worse that their PSNR and their loss allow.
+    """Return the quality of views between the cameras: the worse that their PSNR and their loss
+    allow.
 
     Args:
         psnr: of these views, dB.
@@ -72,10 +76,13 @@ def forecast(cameras: Sequence[Camera], points: np.ndarray) -> Forecast:
 
     Args:
         cameras: the training cameras, at least two.
-        points: [P, 3] of the scene, world units; without any, `focus_point` of the cameras replaces them.
+        points: [P, 3] of the scene, world units; without any, `focus_point` of the cameras replaces
+            them.
     """
     measures = []
-    for view, (camera, depth) in enumerate(zip(cameras, scene_depths(cameras, points), strict=True)):
+    for view, (camera, depth) in enumerate(
+        zip(cameras, scene_depths(cameras, points), strict=True)
+    ):
         others = [*cameras[:view], *cameras[view + 1 :]]
         angles = angles_to(camera, depth, others)
         surface = surface_of(camera, depth)

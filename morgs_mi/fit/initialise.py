@@ -32,8 +32,11 @@ _NEIGHBOURS = 3
 _SPREAD = 0.1
 
 
-def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int, opacity: float = 0.3) -> Gaussians:
-    """Return a round Gaussian on every point, as large as the distance to its three nearest neighbours (as in 3DGS).
+def from_points(
+    points: np.ndarray, colors: np.ndarray, sh_degree: int, opacity: float = 0.3
+) -> Gaussians:
+    """Return a round Gaussian on every point, as large as the distance to its three nearest
+    neighbours (as in 3DGS).
 
     Args:
         points: [P, 3], world units.
@@ -44,12 +47,14 @@ def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int, opacity:
     Raises:
         ValueError: no points, points that are not finite, or colours of another shape or range.
     """
-    points, colors = (v.astype(np.float64) for v in check_points("from_points()", points, colors, BRIGHTEST))
+    points, colors = (
+        v.astype(np.float64) for v in check_points("from_points()", points, colors, BRIGHTEST)
+    )
     n = len(points)
     if not n:
         raise ValueError(
-            "from_points(): `points` must be [P, 3] with P > 0, got none; give a capture with SfM points, or seed some "
-            "with seed_points()."
+            "from_points(): `points` must be [P, 3] with P > 0, got none; give a capture with SfM "
+            "points, or seed some with seed_points()."
         )
     neighbours = min(4, n)
     distance = KDTree(points).query(points, k=neighbours)[0].reshape(n, neighbours)[:, 1:]
@@ -68,12 +73,15 @@ def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int, opacity:
     )
 
 
-def initial_points(views: Sequence[View], points: Points, count: int, rng: np.random.Generator) -> Points:
+def initial_points(
+    views: Sequence[View], points: Points, count: int, rng: np.random.Generator
+) -> Points:
     """Return the points that Gaussians start from, at most [count, 3], and their colours.
 
-    Fewer than `MIN_POINTS` given ones are replaced by random points inside the views; where there are few, random ones
-    are added where the views show none. Points in the empty space before the cameras are left out. Given points get the
-    colours of HDR views, because their own do not exceed white.
+    Fewer than `MIN_POINTS` given ones are replaced by random points inside the views; where there
+    are few, random ones are added where the views show none. Points in the empty space before the
+    cameras are left out. Given points get the colours of HDR views, because their own do not exceed
+    white.
 
     Args:
         views: V views, at least one.
@@ -99,7 +107,9 @@ def _outside_empty_space(cameras: Sequence[Camera], points: Points) -> Points:
 
 
 def _in_light(points: Points, views: Sequence[View]) -> Points:
-    """Return the points with their median colours in HDR views; their own where no such view shows them."""
+    """Return the points with their median colours in HDR views; their own where no such view shows
+    them.
+    """
     positions, own_colors = points
     hdr_views = [view for view in views if np.isinf(view.white)]
     if not hdr_views or not len(positions):
@@ -116,7 +126,9 @@ def _in_light(points: Points, views: Sequence[View]) -> Points:
 
 
 def resample_points(points: Points, count: int, rng: np.random.Generator) -> Points:
-    """Return `count` points [count, 3] and colours: a random subset, or with points added between near neighbours."""
+    """Return `count` points [count, 3] and colours: a random subset, or with points added between
+    near neighbours.
+    """
     positions, colors = points
     if len(positions) >= count:
         rows = np.sort(rng.choice(len(positions), count, replace=False))
@@ -134,9 +146,10 @@ def resample_points(points: Points, count: int, rng: np.random.Generator) -> Poi
 def seed_points(views: Sequence[View], count: int, rng: np.random.Generator) -> Points:
     """Return random points [count, 3] inside the views, and their colours [count, 3].
 
-    Each view with valid pixels gets the same number of points: random ones of these pixels at random depths, uniform in
-    1 / depth between a third and three times the distance of the `focus_point`, in their colours. Where the
-    focus point is not in front of the camera, as with parallel axes, the distance is ten scene extents.
+    Each view with valid pixels gets the same number of points: random ones of these pixels at
+    random depths, uniform in 1 / depth between a third and three times the distance of the
+    `focus_point`, in their colours. Where the focus point is not in front of the camera, as with
+    parallel axes, the distance is ten scene extents.
 
     Args:
         views: V views.
@@ -146,7 +159,11 @@ def seed_points(views: Sequence[View], count: int, rng: np.random.Generator) -> 
     cameras = [view.camera for view in views]
     depths = focus_depths(cameras)
     depths[np.isinf(depths)] = _PARALLEL * scene_extent(cameras)
-    pairs = [pair for pair in zip(views, depths, strict=True) if pair[0].mask is None or pair[0].mask.any()]
+    pairs = [
+        pair
+        for pair in zip(views, depths, strict=True)
+        if pair[0].mask is None or pair[0].mask.any()
+    ]
     points = [np.zeros((0, 3))]
     colors = [np.zeros((0, 3))]
     for index, ((camera, image, mask), depth) in enumerate(pairs):
@@ -162,11 +179,15 @@ def seed_points(views: Sequence[View], count: int, rng: np.random.Generator) -> 
     return np.concatenate(points), np.concatenate(colors)
 
 
-def fill_points(points: Points, views: Sequence[View], count: int, rng: np.random.Generator) -> Points:
-    """Return points [count, 3] and their colours: the given ones, resampled, and random ones where views show none.
+def fill_points(
+    points: Points, views: Sequence[View], count: int, rng: np.random.Generator
+) -> Points:
+    """Return points [count, 3] and their colours: the given ones, resampled, and random ones where
+    views show none.
 
-    A view is divided into cells. Those that show no point get random pixels, at the mean depth of the nearest points
-    in the image, which is far better than a random depth (see `docs/experiments/first-frame.md`).
+    A view is divided into cells. Those that show no point get random pixels, at the mean depth of
+    the nearest points in the image, which is far better than a random depth (see
+    `docs/experiments/first-frame.md`).
 
     Args:
         points: P points and their colours.
@@ -180,7 +201,9 @@ def fill_points(points: Points, views: Sequence[View], count: int, rng: np.rando
         _, point_pixels, depths = seen_points(camera, points[0])
         if not len(point_pixels):
             continue
-        pixels = rng.uniform(0, (camera.width, camera.height), (_share(count, index, len(views)), 2))
+        pixels = rng.uniform(
+            0, (camera.width, camera.height), (_share(count, index, len(views)), 2)
+        )
         columns, rows = pixels.astype(int).T
         is_free = ~_shown_cells(camera, point_pixels)[_cells_of(camera, pixels)]
         if mask is not None:
@@ -190,7 +213,11 @@ def fill_points(points: Points, views: Sequence[View], count: int, rng: np.rando
         distance, near = (np.reshape(values, (-1, k)) for values in nearest)
         weights = 1 / (distance + 1e-3)
         depth = weights.sum(axis=1) / (weights / depths[near]).sum(axis=1)
-        new_points.append(camera.unproject(pixels[is_free], depth * rng.uniform(1 - _SPREAD, 1 + _SPREAD, len(depth))))
+        new_points.append(
+            camera.unproject(
+                pixels[is_free], depth * rng.uniform(1 - _SPREAD, 1 + _SPREAD, len(depth))
+            )
+        )
         new_colors.append(unit_values(image[rows[is_free], columns[is_free]]))
     positions, colors = resample_points(points, count - sum(map(len, new_points)), rng)
     return np.concatenate([positions, *new_points]), np.concatenate([colors, *new_colors])

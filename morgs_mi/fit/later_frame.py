@@ -28,8 +28,9 @@ from morgs_mi.method.rigidity import find_neighbours
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 
-# The round of density control is due when the loss hardly falls, and at this fraction of the epochs at the latest: the
-# residual has shown by then where Gaussians are missing, and enough steps are left to fit the births.
+# The round of density control is due when the loss hardly falls, and at this fraction of the epochs
+# at the latest: the residual has shown by then where Gaussians are missing, and enough steps are
+# left to fit the births.
 _DENSITY_ROUND = 0.625
 
 
@@ -40,8 +41,10 @@ class FrameProblem:
     previous: Gaussians  #: N Gaussians of the previous frame, detached.
     active: ActiveSet  #: The active Gaussians and views.
     targets: Mapping[int, Target]  #: Images of the active views, by view index.
-    observations: Mapping[int, Mapping[str, np.ndarray]]  #: Of the key views, arrays [H, W, ...] by name, by view index
-    #: Start of motion and confidence of the M active Gaussians; None: no motion, confidence as before.
+    #: Of the key views, arrays [H, W, ...] by name, by view index.
+    observations: Mapping[int, Mapping[str, np.ndarray]]
+    #: Start of motion and confidence of the M active Gaussians; None: no motion, confidence as
+    #: before.
     start: MotionStart | None
     extent: float  #: Of the scene in world units.
 
@@ -50,8 +53,10 @@ class FrameProblem:
 class LaterFrame:
     """Result of fitting one later frame."""
 
-    gaussians: Gaussians  #: M Gaussians, with the `motion` that moved them and the learned `offset` that is part of it.
-    #: int [M], index of each Gaussian in the previous frame, ascending; -1 for births, which come last.
+    #: M Gaussians, with the `motion` that moved them and the learned `offset` that is part of it.
+    gaussians: Gaussians
+    #: int [M], index of each Gaussian in the previous frame, ascending; -1 for births, which come
+    #: last.
     source: np.ndarray
     losses: dict[str, float]  #: Means over the last epoch, by the names of the terms.
     epochs: int  #: Number of epochs that were run.
@@ -95,8 +100,8 @@ class Epoch:
 
     first: int  #: Number of the first step.
     stop: int  #: Number of the step after the last one.
-    #: Number of the step from which densification scores are collected: the first steps of an epoch still correct what
-    #: the last ones show.
+    #: Number of the step from which densification scores are collected: the first steps of an epoch
+    #: still correct what the last ones show.
     first_score: int
 
     @classmethod
@@ -107,7 +112,8 @@ class Epoch:
 
 
 class _Fit:
-    """Optimiser of a later frame's residual: the stage of a motion model, epochs, and a round of density control.
+    """Optimiser of a later frame's residual: the stage of a motion model, epochs, and a round of
+    density control.
 
     Attributes:
         source: as in `LaterFrame`, among the active Gaussians.
@@ -149,13 +155,13 @@ class _Fit:
 
     @property
     def has_converged(self) -> bool:
-        """Whether the objective (eq. 13) hardly decreased over the last two epochs: a single one may overshoot."""
+        """Whether the objective (eq. 13) hardly decreased over two epochs: one may overshoot."""
         tolerance = self._config.early_stopping_tolerance
         values = self._objectives
         return tolerance > 0 and len(values) > 2 and values[-1] > (1 - tolerance) * values[-3]
 
     def start(self) -> int:
-        """Fit the motion model, if there is one, start the residual, and return the number of epochs that this took."""
+        """Fit the motion model, if there is one, and start the residual; return the epochs used."""
         problem = self._problem
         motion = self._motion
         start = self._problem.start
@@ -167,7 +173,8 @@ class _Fit:
             weight = self._config.objective.dssim_weight
             steps = self._begin(Epoch.after(self.steps, len(self._views), epochs))
             start, self.losses = fit_motion(shared, model, start, steps, weight)
-        self._optimizer = adam(residual_parameters(self._base, motion, start), self._config.momentum)
+        parameters = residual_parameters(self._base, motion, start)
+        self._optimizer = adam(parameters, self._config.momentum)
         return epochs
 
     def run_epoch(self, epoch: int) -> None:
@@ -180,7 +187,7 @@ class _Fit:
 
     @property
     def can_densify(self) -> bool:
-        """Whether the round of density control is still to come, and an epoch has shown where Gaussians are missing."""
+        """Whether a round of density control is due, and an epoch has shown where it is needed."""
         return self._attribution is not None
 
     def densify(self) -> None:
@@ -191,7 +198,8 @@ class _Fit:
         scores = self._attribution.scores()
         num_static = len(problem.previous) - len(problem.active.indices)
         plan = plan_additions(self.gaussians, scores, density, self._rng, num_static)
-        # A birth has the motion of its parent: it starts from the parent's past and shares the residual.
+        # A birth has the motion of its parent: it starts from the parent's past and shares the
+        # residual.
         self._base = apply_plan(self._base, plan)
         self.source = plan.source
         self._neighbours = self._neighbour_observation()
@@ -205,7 +213,8 @@ class _Fit:
         if self._densifies:
             self._attribution = Attribution(len(self.source), epoch.first_score - epoch.first)
         views = self._order[epoch.first : epoch.stop]
-        return Steps(views, epoch.first, on_step=self._report_step, observer=self._attribution, last=len(self._views))
+        count = len(self._views)
+        return Steps(views, epoch.first, None, self._report_step, self._attribution, last=count)
 
     def _report_step(self, step: int) -> None:
         self._progress(step, len(self._order))
@@ -227,7 +236,9 @@ class _Fit:
             self._attribution.observe(image, problem.targets[index], view.region)
         num_pixels = view.camera.width * view.camera.height
         num_gaussians = problem.active.num_gaussians
-        prediction = Prediction(image, parameters, view.region, num_pixels, num_gaussians, problem.extent, gaussians)
+        prediction = Prediction(
+            image, parameters, view.region, num_pixels, num_gaussians, problem.extent, gaussians
+        )
         return losses_of(prediction, observations, objective)
 
     def _neighbour_observation(self) -> Observations:
@@ -242,7 +253,8 @@ class _Fit:
 def _on_active_views(problem: FrameProblem) -> dict[int, Observations]:
     """Return the observations of each active view as tensors on its region, its target included."""
     return {
-        v: {"target": problem.targets[v]} | {n: _tensor(a, view) for n, a in problem.observations.get(v, {}).items()}
+        v: {"target": problem.targets[v]}
+        | {n: _tensor(a, view) for n, a in problem.observations.get(v, {}).items()}
         for v, view in problem.active.views.items()
     }
 
@@ -254,13 +266,16 @@ def _tensor(array: np.ndarray, view: ActiveView) -> Tensor:
 def _merge(
     previous: Gaussians, active: ActiveSet, gaussians: Gaussians, source: np.ndarray
 ) -> tuple[Gaussians, np.ndarray]:
-    """Return the fitted Gaussians among the static ones, in the order of the previous frame, and their `source`."""
+    """Return the fitted and the static Gaussians in the previous frame's order, and `source`."""
     if len(active.indices) == len(previous):
         return gaussians, source
     is_static = np.ones(len(previous), bool)
     is_static[active.indices] = False
     static = np.flatnonzero(is_static)
-    previous_index = np.concatenate([static, np.where(source < 0, len(previous), active.indices[source])])
+    previous_index = np.concatenate(
+        [static, np.where(source < 0, len(previous), active.indices[source])]
+    )
     order = np.argsort(previous_index, kind="stable")  # births come last
     all_gaussians = Gaussians.concatenate([with_zero_motion(previous.select(static)), gaussians])
-    return all_gaussians.select(order), np.where(previous_index < len(previous), previous_index, -1)[order]
+    merged_source = np.where(previous_index < len(previous), previous_index, -1)
+    return all_gaussians.select(order), merged_source[order]

@@ -20,20 +20,25 @@ _FINAL_RATE = 0.1
 
 
 def fit_motion(
-    problem: MotionProblem, model: MotionModel, start: MotionStart | None, steps: Steps, dssim_weight: float
+    problem: MotionProblem,
+    model: MotionModel,
+    start: MotionStart | None,
+    steps: Steps,
+    dssim_weight: float,
 ) -> tuple[MotionStart, dict[str, float]]:
     """Fit a motion model to the images by L_recon and the model's own losses.
 
     Args:
         problem: N Gaussians, the active views and their images.
         model: of their motion.
-        start: displacement from which it starts, and colour from which the residual starts; None: none.
+        start: displacement from which it starts, and colour from which the residual starts; None:
+            none.
         steps: the steps, from the first one of the frame.
         dssim_weight: lambda of eq. 2.
 
     Returns:
-        The start of the residual, with the confidence of `start` or of the previous frame, and the losses by name,
-        means over the last round of views.
+        The start of the residual, with the confidence of `start` or of the previous frame, and the
+        losses by name, means over the last round of views.
     """
     gaussians = problem.gaussians
     start = start or MotionStart.without_motion(problem.gaussians)

@@ -1,8 +1,9 @@
 """Noise of images.
 
-The difference of two Laplacians is zero on gradients and edges, and has unit gain for noise (Immerkaer 1996). Fine
-texture passes it, too. But a mean over 2x2 pixels halves white noise, while natural texture, which has contrast in
-every octave, keeps its strength: with s and s' the responses at the full and at half the size,
+The difference of two Laplacians is zero on gradients and edges, and has unit gain for noise
+(Immerkaer 1996). Fine texture passes it, too. But a mean over 2x2 pixels halves white noise, while
+natural texture, which has contrast in every octave, keeps its strength: with s and s' the responses
+at the full and at half the size,
 
     n^2 = 4/3 (s^2 - s'^2) ,    0 where that is negative,
 
@@ -26,12 +27,13 @@ _NOISY = 0.015
 
 
 def is_noisy(images: Sequence[np.ndarray]) -> bool:
-    """Return whether images [H, W, 3], uint8 or encoded floats, have much white noise in the mean."""
+    """Return whether images [H, W, 3], uint8 or encoded floats, have much white noise."""
     return bool(np.mean([white_noise_of(image) for image in images]) >= _NOISY)
 
 
 def noise_of(image: np.ndarray) -> float:
-    """Return the standard deviation of noise and fine texture in most of an image [H, W, 3], relative to white.
+    """Return the standard deviation of noise and fine texture in most of an image [H, W, 3],
+    relative to white.
 
     Args:
         image: uint8 or encoded floats.
@@ -41,7 +43,9 @@ def noise_of(image: np.ndarray) -> float:
 
 
 def white_noise_of(image: np.ndarray) -> float:
-    """Return the standard deviation of the white noise of an image [H, W, 3], uint8 or floats, relative to white."""
+    """Return the standard deviation of the white noise of an image [H, W, 3], uint8 or floats,
+    relative to white.
+    """
     height, width = (size // 2 for size in image.shape[:2])
     if not (height and width):
         return 0.0

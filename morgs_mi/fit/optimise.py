@@ -1,4 +1,4 @@
-"""The optimisation loop: Adam on a dict of parameters, with a dict of losses and a dict of weights."""
+"""The optimisation loop: Adam on a dict of parameters, with dicts of losses and weights."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ def adam(parameters: Mapping[str, Tensor], momentum: float = 0.9) -> Adam:
         parameters: the tensors.
         momentum: decay of the mean of the gradients from step to step (beta_1).
     """
-    # Gradients of means over a million pixels are tiny: Adam's usual epsilon of 1e-8 would dominate them.
+    # Gradients of means over a million pixels are tiny: Adam's usual epsilon of 1e-8 would dominate
+    # them.
     return Adam(lr=1.0, params=dict(parameters), beta_1=momentum, epsilon=1e-15)
 
 
@@ -34,8 +35,11 @@ def values_of(optimizer: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name: dr.detach(optimizer[name]) for name in optimizer}
 
 
-def replace_parameter(optimizer: Adam, name: str, value: np.ndarray, carry: Callable[[np.ndarray], np.ndarray]) -> None:
-    """Give a parameter another value and shape, and Adam's two moments with it, which an assignment would reset.
+def replace_parameter(
+    optimizer: Adam, name: str, value: np.ndarray, carry: Callable[[np.ndarray], np.ndarray]
+) -> None:
+    """Give a parameter another value and shape, and Adam's two moments with it, which an assignment
+    would reset.
 
     Args:
         optimizer: its learning rates and its count of steps stay.
@@ -56,7 +60,9 @@ class Observer(Protocol):
     """Reads further gradients from the backward pass of every step, without a pass of its own."""
 
     def term(self) -> Tensor | None:
-        """Return a term of value 0, which joins the losses of the step in its backward pass; None: no term."""
+        """Return a term of value 0, which joins the losses of the step in its backward pass; None:
+        no term.
+        """
         ...
 
     def collect(self) -> None:
@@ -83,7 +89,8 @@ def optimise(
     steps: Steps,
     weights: Mapping[str, float] | None = None,
 ) -> dict[str, float]:
-    """Minimise the weighted sum of losses by one Adam step per view; the optimiser holds the parameters.
+    """Minimise the weighted sum of losses by one Adam step per view; the optimiser holds the
+    parameters.
 
     Args:
         optimizer: as from `adam`.
@@ -116,7 +123,8 @@ def optimise(
         if steps.on_step is not None:
             steps.on_step(step + 1)
     final = {
-        name: float(np.mean([np.asarray(v).item() for v in losses[-steps.last :]])) for name, losses in history.items()
+        name: float(np.mean([np.asarray(v).item() for v in losses[-steps.last :]]))
+        for name, losses in history.items()
     }
     broken_losses = [name for name, value in final.items() if not np.isfinite(value)]
     if broken_losses:
@@ -137,6 +145,8 @@ def _backward(total: Tensor, observer: Observer | None) -> None:
 
 
 def view_order(num_views: int, steps: int, rng: np.random.Generator) -> list[int]:
-    """Return the views of `steps` steps in random order: each is drawn once before any is drawn again."""
+    """Return the views of `steps` steps in random order: each is drawn once before any is drawn
+    again.
+    """
     epochs = -(-steps // num_views)
     return np.concatenate([rng.permutation(num_views) for _ in range(epochs)])[:steps].tolist()

@@ -1,4 +1,6 @@
-"""The problem of the first frame: the views of one instant, and the Gaussians that a fit to them starts from."""
+"""The problem of the first frame: the views of one instant, and the Gaussians that a fit to them
+starts from.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from morgs_mi.render.render_config import RenderConfig
 
 # Least scene extent, relative to the median depth: of means that move by fractions of the extent.
 _DEPTH = 1 / 6
-# Opacity of the Gaussians at the start: most can become opaque or vanish within the steps of a first frame.
+# Opacity of the Gaussians at the start: most can become opaque or vanish within the steps of a
+# first frame.
 _OPACITY = 0.3
 
 
@@ -28,7 +31,8 @@ class FirstFrameProblem:
     start: Gaussians  #: Initial Gaussians.
     views: tuple[View, ...]  #: V views of one instant.
     points: np.ndarray  #: [P, 3] of the scene, world units, or none.
-    extent: float  #: Of the scene in world units, at least a sixth of its depth: cameras close together see far.
+    #: Of the scene in world units, at least a sixth of its depth: cameras close together see far.
+    extent: float
     render: RenderConfig  #: Cut-offs.
 
     @classmethod
@@ -40,7 +44,8 @@ class FirstFrameProblem:
         render: RenderConfig,
         rng: np.random.Generator,
     ) -> FirstFrameProblem:
-        """Return the problem with Gaussians at the points, and at random points where the views show none.
+        """Return the problem with Gaussians at the points, and at random points where the views
+        show none.
 
         Args:
             views: V views, at least one.
@@ -52,7 +57,9 @@ class FirstFrameProblem:
         start_points = initial_points(views, points, config.first_count, rng)
         start = from_points(*start_points, config.sh_degree, _OPACITY)
         cameras = [view.camera for view in views]
-        extent = max(scene_extent(cameras), _DEPTH * float(np.median(scene_depths(cameras, start_points[0]))))
+        extent = max(
+            scene_extent(cameras), _DEPTH * float(np.median(scene_depths(cameras, start_points[0])))
+        )
         return cls(start, tuple(views), points[0], extent, render)
 
     @property

@@ -1,18 +1,19 @@
 """Forecast of views between the cameras of a fitted first frame, without a second fit.
 
-Novel views have a lower PSNR than training views. The mean difference, the loss in dB, is modelled as a linear function
-of two features that need no further image: the PSNR of the training views, and their
+Novel views have a lower PSNR than training views. The mean difference, the loss in dB, is modelled
+as a linear function of two features that need no further image: the PSNR of the training views, and
+their
 
     disagreement    10 log10(1 + d / e) ,
 
-where e is the mean square error of the training views. d compares each of them with its nearest other cameras: a
-pixel's point, at the rendered depth, has a colour in each of their images, and the least square difference from the
-rendered colour counts. A surface at a wrong depth shows colours that no other camera has recorded there, however well
-the Gaussians fit the view itself.
+where e is the mean square error of the training views. d compares each of them with its nearest
+other cameras: a pixel's point, at the rendered depth, has a colour in each of their images, and the
+least square difference from the rendered colour counts. A surface at a wrong depth shows colours
+that no other camera has recorded there, however well the Gaussians fit the view itself.
 
-The coefficients are a ridge regression on the held-out views of photos, rigs and synthetic clips. The interval is
-conformal: nine tenths of the scaled errors on captures that the regression has not seen are smaller
-(`benchmarks/reports/unseen.py`, `docs/experiments/real.md`).
+The coefficients are a ridge regression on the held-out views of photos, rigs and synthetic clips.
+The interval is conformal: nine tenths of the scaled errors on captures that the regression has not
+seen are smaller (`benchmarks/reports/unseen.py`, `docs/experiments/real.md`).
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ from morgs_mi.render.render_config import RenderConfig
 WIDEST = 6.0
 """Width of an interval in dB beyond which only the word is certain."""
 WIDEST_REACH = 20.0
-"""`Forecast.reach` in degrees beyond which the regression has no rigs: neighbours show something else."""
+"""`Forecast.reach` in degrees beyond which the regression has no rigs: neighbours show something
+else.
+"""
 
 # Nearest cameras whose images a view is compared with.
 _NEAREST = 4
@@ -50,7 +53,9 @@ _OUTSIDE = 2.0
 
 @dataclass(frozen=True)
 class Regression:
-    """Loss of views between the cameras, from the features of a fit: disagreement and training PSNR, both in dB."""
+    """Loss of views between the cameras, from the features of a fit: disagreement and training
+    PSNR, both in dB.
+    """
 
     intercept: float  #: Loss where both features are 0, dB.
     slopes: tuple[float, float]  #: dB per dB of each feature.
@@ -99,24 +104,32 @@ class UnseenViews:
 
     @property
     def expected_psnr(self) -> float | None:
-        """Expected mean PSNR of views between the cameras, dB; None where only the word is certain."""
+        """Expected mean PSNR of views between the cameras, dB; None if only the word is certain."""
         is_uncertain = self._is_wide or 2 * self.margin > WIDEST
         return None if is_uncertain else self.training_psnr - self.loss
 
     @property
     def interval(self) -> tuple[float, float] | None:
-        """PSNR between which the mean is nine times in ten, dB; None where only the word is certain."""
+        """PSNR between which the mean is nine times in ten, dB; None where only the word is
+        certain.
+        """
         psnr = self.expected_psnr
         return None if psnr is None else (psnr - self.margin, psnr + self.margin)
 
     @property
     def quality(self) -> str:
-        """Quality to expect of views between the cameras: good, fair or poor; by the angles alone if they are wide."""
-        return self.rig.quality if self._is_wide else quality_of(self.training_psnr - self.loss, self.loss)
+        """Quality to expect of views between the cameras: good, fair or poor; by the angles alone
+        if they are wide.
+        """
+        return (
+            self.rig.quality
+            if self._is_wide
+            else quality_of(self.training_psnr - self.loss, self.loss)
+        )
 
     @property
     def _is_wide(self) -> bool:
-        """Whether the regression has no rigs like this one, because neighbours show something else."""
+        """Whether the regression has no rigs like this one: neighbours show something else."""
         return self.rig.reach > WIDEST_REACH
 
     @property
@@ -124,18 +137,29 @@ class UnseenViews:
         """Sentence on the expected quality of views between the cameras."""
         if self.interval is None:
             bound = f"They have at most {self.training_psnr:.0f} dB."
-            return f"Views between the cameras will be {self.quality}: {self.rig.description}. {bound}"
+            return (
+                f"Views between the cameras will be {self.quality}: {self.rig.description}. {bound}"
+            )
         low, high = self.interval
-        wider = ", a wider range than usual because few measured captures are like this one" if self.is_outside else ""
+        wider = (
+            ", a wider range than usual because few measured captures are like this one"
+            if self.is_outside
+            else ""
+        )
         return (
-            f"Views between the cameras will be {self.quality}: {self.expected_psnr:.0f} dB in the mean, nine times in "
-            f"ten between {low:.0f} and {high:.0f}{wider}; {self.rig.description}."
+            f"Views between the cameras will be {self.quality}: {self.expected_psnr:.0f} dB in "
+            f"the mean, nine times in ten between {low:.0f} and {high:.0f}{wider}; "
+            f"{self.rig.description}."
         )
 
     @property
     def entries(self) -> dict[str, Any]:
         """Entries of the first frame's report: the attributes and the properties."""
-        figures = {"quality": self.quality, "expected_psnr": self.expected_psnr, "interval": self.interval}
+        figures = {
+            "quality": self.quality,
+            "expected_psnr": self.expected_psnr,
+            "interval": self.interval,
+        }
         return {"sentence": self.sentence, **figures, **asdict(self)}
 
 
@@ -175,12 +199,17 @@ def features_of(
         angles = angles_to(cameras[index], depths[index], cameras)
         angles[index] = np.inf
         nearest = angles.argsort(kind="stable")[: min(_NEAREST, len(views) - 1)]
-        squares.append(_disagreement(gaussians, views[index], [views[other] for other in nearest], render))
+        squares.append(
+            _disagreement(gaussians, views[index], [views[other] for other in nearest], render)
+        )
     return float(10 * np.log10(1 + np.mean(squares) * 10 ** (psnr / 10))), psnr
 
 
-def _disagreement(gaussians: Gaussians, view: View, others: Sequence[View], render: RenderConfig) -> float:
-    """Return the mean of the least square difference of a pixel from what others recorded of its point.
+def _disagreement(
+    gaussians: Gaussians, view: View, others: Sequence[View], render: RenderConfig
+) -> float:
+    """Return the mean of the least square difference of a pixel from what others recorded of its
+    point.
 
     A pixel whose point none of them has recorded does not count; 1 where all are such.
     """
@@ -196,12 +225,16 @@ def _disagreement(gaussians: Gaussians, view: View, others: Sequence[View], rend
 
 
 def _squares(color: np.ndarray, points: np.ndarray, is_drawn: np.ndarray, view: View) -> np.ndarray:
-    """Return the square differences [H, W] of colours from a view of their points [H, W, 3]; infinite outside it."""
+    """Return the square differences [H, W] of colours from a view of their points [H, W, 3];
+    infinite outside it.
+    """
     camera = view.camera
     with np.errstate(divide="ignore", invalid="ignore"):  # points beside the camera
         pixels, depths = camera.project(points)
     visible = (
-        is_drawn & (depths > camera.near) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=-1)
+        is_drawn
+        & (depths > camera.near)
+        & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=-1)
     )
     pixels = np.where(visible[..., None], pixels, 0)
     if view.mask is not None:

@@ -16,7 +16,9 @@ from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
 
 LEAST_GAIN = 0.1
-"""Increase of the PSNR of withheld pixels from which a change of the cameras is taken, dB: less is chance."""
+"""Increase of the PSNR of withheld pixels from which a change of the cameras is taken, dB: less is
+chance.
+"""
 
 MIN_SIDE = 32  # px, of a reduced image
 # Least width of views of half the size, px.
@@ -31,7 +33,8 @@ class View(NamedTuple):
     """A camera and its image."""
 
     camera: Camera  #: The camera.
-    image: np.ndarray  #: [H, W, 3], encoded: uint8, or float32 with values above 1 of an HDR recording.
+    #: [H, W, 3], encoded: uint8, or float32 with values above 1 of an HDR recording.
+    image: np.ndarray
     mask: np.ndarray | None = None  #: Valid pixels [H, W] bool, or None if all are.
 
     @property
@@ -65,8 +68,11 @@ def half_sized(views: Sequence[View]) -> list[View]:
     return [view.reduced(max(view.camera.width // 2, COARSE_WIDTH)) for view in views]
 
 
-def withheld_blocks(views: Sequence[View], width: int, rng: np.random.Generator) -> tuple[list[View], list[View]]:
-    """Return the reduced views without withheld blocks of pixels, and with these alone, which may be none in a view.
+def withheld_blocks(
+    views: Sequence[View], width: int, rng: np.random.Generator
+) -> tuple[list[View], list[View]]:
+    """Return the reduced views without withheld blocks of pixels, and with these alone, which may
+    be none in a view.
 
     Args:
         views: V views.
@@ -94,9 +100,13 @@ def squared_errors(gaussians: Gaussians, views: Sequence[View], render: RenderCo
     return np.array(errors)
 
 
-def rendered(gaussians: Gaussians, camera: Camera, render: RenderConfig, white: float = 1.0) -> np.ndarray:
+def rendered(
+    gaussians: Gaussians, camera: Camera, render: RenderConfig, white: float = 1.0
+) -> np.ndarray:
     """Return the encoded image of a camera [H, W, 3], clipped to [0, white]."""
-    return np.clip(np.asarray(rasterize(gaussians, camera, ("color",), config=render).color), 0, white)
+    return np.clip(
+        np.asarray(rasterize(gaussians, camera, ("color",), config=render).color), 0, white
+    )
 
 
 def decibels(squares: np.ndarray) -> np.ndarray:

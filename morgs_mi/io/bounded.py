@@ -1,8 +1,8 @@
 """Readers with memory bounded by the size of the file, whatever its header claims.
 
-A file may make its reader use 10 times its size plus 200 MB. The allowance is for small files that decode to large
-data without being broken, such as an image of one colour. Only regular files are read: a pipe in a folder would keep
-its reader waiting, and a device may have no end.
+A file may make its reader use 10 times its size plus 200 MB. The allowance is for small files that
+decode to large data without being broken, such as an image of one colour. Only regular files are
+read: a pipe in a folder would keep its reader waiting, and a device may have no end.
 
 Text is UTF-8, or UTF-16 or UTF-32 as shells of Windows write it, with or without a byte order mark.
 """
@@ -27,21 +27,32 @@ _FACTOR = 10
 _ALLOWANCE = 200_000_000
 # Errors of NumPy and zipfile for broken files. NumPy parses headers as Python.
 _BROKEN = (
-    *(ValueError, TypeError, EOFError, KeyError, MemoryError, RuntimeError, OverflowError, zipfile.BadZipFile),
+    *(
+        ValueError,
+        TypeError,
+        EOFError,
+        KeyError,
+        MemoryError,
+        RuntimeError,
+        OverflowError,
+        zipfile.BadZipFile,
+    ),
     *(zlib.error, SyntaxError, tokenize.TokenError),
 )
-# At most, in bytes: an empty dict or list as the value of a list, and a number or a short key with its reference.
+# At most, in bytes: an empty dict or list as the value of a list, and a number or a short key with
+# its reference.
 _DICT_BYTES = 240
 _LIST_BYTES = 64
 _VALUE_BYTES = 40
 # A text in JSON, which may lack its end.
 _TEXT = re.compile(r'"(?:[^"\\]|\\.)*+"?', re.DOTALL)
-# Size of a TOML file, bytes that its parser takes for a table, and parts of a key: memory and time grow with the square
-# of their number.
+# Size of a TOML file, bytes that its parser takes for a table, and parts of a key: memory and time
+# grow with the square of their number.
 MAX_TOML = 1_000_000
 _TABLE_BYTES = 1000
 _MAX_PARTS = 32
-# A comment or a string of a TOML file, which may lack its end. Every branch consumes what it has searched.
+# A comment or a string of a TOML file, which may lack its end. Every branch consumes what it has
+# searched.
 _COMMENT = r"#[^\n]*+"
 _STRING = (
     r'"""(?:[^"\\]|\\.|"(?!""))*+(?:"{3,5})?'
@@ -50,7 +61,8 @@ _STRING = (
     r"|'[^'\n]*+'?"
 )
 _TOKEN = re.compile(f"(?P<comment>{_COMMENT})|(?:{_STRING})", re.DOTALL)
-# A key or a number with its parts, and the character that shows that it is a key: of a value or of a table.
+# A key or a number with its parts, and the character that shows that it is a key: of a value or of
+# a table.
 _WORD = re.compile(r"([^\s.=,\[\]{}]++(?:[ \t]*+\.[ \t]*+[^\s.=,\[\]{}]++)*+)[ \t]*+([=\]]?)")
 
 
@@ -60,7 +72,8 @@ def check_claim(path: str | Path, claimed: int, content: str) -> None:
     Args:
         path: the file.
         claimed: bytes that the decoded content takes.
-        content: claimed content of the file, for the message, e.g. ``an image of 20000x20000 pixels``.
+        content: claimed content of the file, for the message, e.g. ``an image of 20000x20000
+            pixels``.
 
     Raises:
         ValueError: it takes more.
@@ -68,8 +81,8 @@ def check_claim(path: str | Path, claimed: int, content: str) -> None:
     size = Path(path).stat().st_size
     if claimed > _FACTOR * size + _ALLOWANCE:
         raise ValueError(
-            f"{path}: expected content that fits its {size} bytes, got a claim of {content}, which takes "
-            f"{claimed / 1e6:.0f} MB; the file is broken, create it again."
+            f"{path}: expected content that fits its {size} bytes, got a claim of {content}, "
+            f"which takes {claimed / 1e6:.0f} MB; the file is broken, create it again."
         )
 
 
@@ -95,13 +108,16 @@ def read_bytes(path: str | Path, most: int | None = None) -> bytes:
     path = regular(path)
     if most is not None and path.stat().st_size > most:
         raise ValueError(
-            f"{path}: expected at most {most} bytes, got {path.stat().st_size}; leave out what is not needed."
+            f"{path}: expected at most {most} bytes, got {path.stat().st_size}; leave out what is "
+            "not needed."
         )
     return path.read_bytes()
 
 
 def encoding_of(start: bytes) -> str:
-    """Return the encoding of a text that begins with these bytes, of which the first two are of ASCII."""
+    """Return the encoding of a text that begins with these bytes, of which the first two are of
+    ASCII.
+    """
     return json.detect_encoding(start[:4])
 
 
@@ -116,7 +132,9 @@ def read_text(path: str | Path, most: int | None = None) -> str:
     try:
         return data.decode(encoding_of(data))
     except UnicodeError as error:
-        raise ValueError(f"{path}: expected text in UTF-8, got other bytes ({error}); save it as UTF-8.") from None
+        raise ValueError(
+            f"{path}: expected text in UTF-8, got other bytes ({error}); save it as UTF-8."
+        ) from None
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
@@ -136,7 +154,9 @@ def read_toml(path: str | Path) -> dict[str, Any]:
             raise ValueError(f"a key has more than {_MAX_PARTS} parts")
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: expected TOML, got a broken file ({error}); write it again.") from None
+        raise ValueError(
+            f"{path}: expected TOML, got a broken file ({error}); write it again."
+        ) from None
 
 
 def read_json(path: str | Path) -> Any:
@@ -144,7 +164,8 @@ def read_json(path: str | Path) -> Any:
 
     Raises:
         OSError: there is no such file, or it cannot be read.
-        ValueError: it is no regular file, is broken, nested too deeply, or has too many tiny values.
+        ValueError: it is no regular file, is broken, nested too deeply, or has too many tiny
+            values.
     """
     text = read_text(path)
     claim, values = _json_claim(text)
@@ -154,7 +175,9 @@ def read_json(path: str | Path) -> Any:
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: expected JSON, got a broken file ({error}); write it again.") from None
+        raise ValueError(
+            f"{path}: expected JSON, got a broken file ({error}); write it again."
+        ) from None
 
 
 def _json_claim(text: str) -> tuple[int, int]:
@@ -164,7 +187,8 @@ def _json_claim(text: str) -> tuple[int, int]:
 
 
 def read_array(path: str | Path, name: str | None = None) -> np.ndarray:
-    """Return the array in a NumPy file, or the array `name` in an archive (.npz); it is not writable.
+    """Return the array in a NumPy file, or the array `name` in an archive (.npz); it is not
+    writable.
 
     Raises:
         ValueError: the file is broken, claims more numbers than it holds, or holds Python objects.
@@ -173,7 +197,11 @@ def read_array(path: str | Path, name: str | None = None) -> np.ndarray:
         data = read_bytes(path) if name is None else _member(path, f"{name}.npy")
         stream = BytesIO(data)
         version = np.lib.format.read_magic(stream)
-        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        read_header = (
+            np.lib.format.read_array_header_1_0
+            if version == (1, 0)
+            else np.lib.format.read_array_header_2_0
+        )
         shape, in_columns, dtype = read_header(stream)
         # NumPy would execute what such a file contains.
         if dtype.hasobject:
@@ -186,7 +214,9 @@ def read_array(path: str | Path, name: str | None = None) -> np.ndarray:
         return flat.reshape(shape, order="F" if in_columns else "C")
     except _BROKEN as error:
         what = "a NumPy array" if name is None else f"an array `{name}` in a NumPy archive"
-        raise ValueError(f"{path}: expected {what}, got a broken file ({error}); export it again.") from None
+        raise ValueError(
+            f"{path}: expected {what}, got a broken file ({error}); export it again."
+        ) from None
 
 
 def array_names(path: str | Path) -> list[str]:
@@ -199,7 +229,9 @@ def array_names(path: str | Path) -> list[str]:
         with zipfile.ZipFile(regular(path)) as archive:
             return [name.removesuffix(".npy") for name in archive.namelist()]
     except _BROKEN as error:
-        raise ValueError(f"{path}: expected a NumPy archive, got a broken file ({error}); export it again.") from None
+        raise ValueError(
+            f"{path}: expected a NumPy archive, got a broken file ({error}); export it again."
+        ) from None
 
 
 def _member(path: str | Path, name: str) -> bytes:

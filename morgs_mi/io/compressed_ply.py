@@ -1,16 +1,22 @@
-"""Gaussians as PLY files in PlayCanvas' compressed layout, which SuperSplat and splat-transform read.
+"""Gaussians as PLY files in PlayCanvas' compressed layout, which SuperSplat and splat-transform
+read.
 
-A file has up to three elements, little-endian. Chunk c has the bounds of Gaussians 256 c to 256 c + 255:
+A file has up to three elements, little-endian. Chunk c has the bounds of Gaussians 256 c to 256 c +
+255:
 
-    chunk     float   min_x .. max_z, min_scale_x .. max_scale_z (natural logarithms), min_r .. max_b (0.5 + SH)
-    vertex    uint    packed_position, packed_scale   11, 10 and 11 bits of x, y, z, between the bounds of the chunk
-                      packed_rotation                 2 bits: index of the largest component of wxyz; 10 for each other
-                      packed_color                    8 for each of r, g, b, between the bounds, and for the opacity
+    chunk     float   min_x .. max_z, min_scale_x .. max_scale_z (natural logarithms),
+                      min_r .. max_b (0.5 + SH)
+    vertex    uint    packed_position, packed_scale   11, 10 and 11 bits of x, y, z, between the
+                                                      bounds of the chunk
+                      packed_rotation                 2 bits: index of the largest component of
+                                                      wxyz; 10 for each other
+                      packed_color                    8 for each of r, g, b, between the bounds, and
+                                                      for the opacity
     sh        uchar   f_rest_0 .. as in an uncompressed PLY, -4 to 4
 
-A number of b bits stands for k / (2^b - 1) of its range. The components of a quaternion lie between -sqrt(1/2) and
-sqrt(1/2), the opacity between 0 and 1. A byte k of `sh` stands for (k + 0.5) / 256 of its range, but 0 and 255 stand
-for its ends.
+A number of b bits stands for k / (2^b - 1) of its range. The components of a quaternion lie between
+-sqrt(1/2) and sqrt(1/2), the opacity between 0 and 1. A byte k of `sh` stands for (k + 0.5) / 256
+of its range, but 0 and 255 stand for its ends.
 """
 
 from __future__ import annotations
@@ -32,7 +38,10 @@ from morgs_mi.io.ply import read_elements
 _CHUNK = 256
 _BOUNDS = {
     "position": (("min_x", "min_y", "min_z"), ("max_x", "max_y", "max_z")),
-    "scale": (("min_scale_x", "min_scale_y", "min_scale_z"), ("max_scale_x", "max_scale_y", "max_scale_z")),
+    "scale": (
+        ("min_scale_x", "min_scale_y", "min_scale_z"),
+        ("max_scale_x", "max_scale_y", "max_scale_z"),
+    ),
     "color": (("min_r", "min_g", "min_b"), ("max_r", "max_g", "max_b")),
 }
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -48,9 +57,10 @@ _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
     """Write Gaussians as a compressed PLY file in their order, atomically.
 
-    The precision of the positions depends on the extent of each 256 successive Gaussians, so they should be ordered by
-    place (see `morgs_mi.playback.export.order.by_place`). Logarithms of scales beyond -20 to 20 and SH coefficients of
-    degree 1 to 3 beyond -4 to 4 are clipped. Motion and confidence are not written.
+    The precision of the positions depends on the extent of each 256 successive Gaussians, so they
+    should be ordered by place (see `morgs_mi.playback.export.order.by_place`). Logarithms of scales
+    beyond -20 to 20 and SH coefficients of degree 1 to 3 beyond -4 to 4 are clipped. Motion and
+    confidence are not written.
 
     Raises:
         OSError: the file cannot be written.
@@ -62,7 +72,10 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
         "scale": np.clip(raw["log_scales"], -_MOST_LOG_SCALE, _MOST_LOG_SCALE),
         "color": 0.5 + SH_C0 * raw["sh_coeffs"][:, 0],
     }
-    chunks = np.empty(-(-N // _CHUNK), [(name, "<f4") for ends in _BOUNDS.values() for names in ends for name in names])
+    chunks = np.empty(
+        -(-N // _CHUNK),
+        [(name, "<f4") for ends in _BOUNDS.values() for names in ends for name in names],
+    )
     fractions = {}
     for key, value in values.items():
         low, high, fractions[key] = _within_chunks(value.astype(np.float32))
@@ -74,7 +87,9 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
     vertices["packed_position"] = _packed(fractions["position"], _XYZ_BITS)
     vertices["packed_rotation"] = _packed_rotations(unit_quats(gaussians))
     vertices["packed_scale"] = _packed(fractions["scale"], _XYZ_BITS)
-    vertices["packed_color"] = _packed(np.concatenate([fractions["color"], opacities], axis=1), _COLOR_BITS)
+    vertices["packed_color"] = _packed(
+        np.concatenate([fractions["color"], opacities], axis=1), _COLOR_BITS
+    )
     elements = [PlyElement.describe(chunks, "chunk"), PlyElement.describe(vertices, "vertex")]
     if K > 1:
         rest = raw["sh_coeffs"][:, 1:].transpose(0, 2, 1).reshape(N, 3 * (K - 1))
@@ -92,11 +107,13 @@ def read_compressed_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussian
 
     Args:
         path: the file.
-        most_invalid: share of Gaussians with invalid numbers that are left out with a warning; 0: none.
+        most_invalid: share of Gaussians with invalid numbers that are left out with a warning; 0:
+            none.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is not a PLY file, is truncated, lacks a property, or has more invalid Gaussians.
+        ValueError: it is not a PLY file, is truncated, lacks a property, or has more invalid
+            Gaussians.
     """
     elements = read_elements(path, ("chunk", "vertex"), ("sh",))
     chunks = elements["chunk"]
@@ -107,27 +124,35 @@ def read_compressed_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussian
     num_chunks = len(next(iter(chunks.values()), ()))
     if num_chunks != -(-N // _CHUNK):
         raise ValueError(
-            f"{path}: expected {-(-N // _CHUNK)} chunks of {_CHUNK} for {N} Gaussians, got {num_chunks}; the file is "
-            "broken, export it again."
+            f"{path}: expected {-(-N // _CHUNK)} chunks of {_CHUNK} for {N} Gaussians, got "
+            f"{num_chunks}; the file is broken, export it again."
         )
     degree = {0: 0, 9: 1, 24: 2, 45: 3}.get(len(rest))
     if degree is None or any(len(column) != N for column in rest.values()):
         raise ValueError(
-            f"{path}: expected {N} rows of f_rest_0 to f_rest_8, 23 or 44 (SH of degree 1 to 3) or none, got "
-            f"{len(next(iter(rest.values()), ()))} rows of {len(rest)} properties; the file is broken, export it again."
+            f"{path}: expected {N} rows of f_rest_0 to f_rest_8, 23 or 44 (SH of degree 1 to 3) "
+            f"or none, got {len(next(iter(rest.values()), ()))} rows of {len(rest)} properties; "
+            "the file is broken, export it again."
         )
     names = [f"f_rest_{i}" for i in range(len(rest))]
     _check_columns(path, "sh", rest, names, "u1")
     position, scale = (
-        _between(path, chunks, key, _unpacked(vertices[f"packed_{key}"], _XYZ_BITS)) for key in ("position", "scale")
+        _between(path, chunks, key, _unpacked(vertices[f"packed_{key}"], _XYZ_BITS))
+        for key in ("position", "scale")
     )
     color = _unpacked(vertices["packed_color"], _COLOR_BITS)
     base = color[:, :3] if "min_r" not in chunks else _between(path, chunks, "color", color[:, :3])
     coeffs = np.empty((N, (degree + 1) ** 2, 3), np.float32)
     coeffs[:, 0] = (base - 0.5) / SH_C0
     if degree:
-        steps = np.stack([rest[name] for name in names], axis=1).reshape(N, 3, len(names) // 3).transpose(0, 2, 1)
-        coeffs[:, 1:] = (np.where(steps == 0, 0, np.where(steps == 255, 256, steps + 0.5)) / 128 - 1) * _SH_RANGE
+        steps = (
+            np.stack([rest[name] for name in names], axis=1)
+            .reshape(N, 3, len(names) // 3)
+            .transpose(0, 2, 1)
+        )
+        coeffs[:, 1:] = (
+            np.where(steps == 0, 0, np.where(steps == 255, 256, steps + 0.5)) / 128 - 1
+        ) * _SH_RANGE
     quats = _unpacked_rotations(vertices["packed_rotation"])
     with np.errstate(over="ignore"):  # infinite, and therefore invalid
         gaussians = Gaussians.from_activated(position, np.exp(scale), quats, color[:, 3], coeffs)
@@ -135,44 +160,63 @@ def read_compressed_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussian
 
 
 def _within_chunks(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the bounds of the chunks [chunks, 3], twice, and the values [N, 3] as fractions between them."""
+    """Return the bounds of the chunks [chunks, 3], twice, and the values [N, 3] as fractions
+    between them.
+    """
     starts = np.arange(0, len(values), _CHUNK)
     if not len(starts):
         return values, values, values
     low, high = (bound.reduceat(values, starts, axis=0) for bound in (np.minimum, np.maximum))
-    first, last = (np.repeat(bound, _CHUNK, axis=0)[: len(values)].astype(np.float64) for bound in (low, high))
+    first, last = (
+        np.repeat(bound, _CHUNK, axis=0)[: len(values)].astype(np.float64) for bound in (low, high)
+    )
     return low, high, (values - first) / np.where(last > first, last - first, 1)
 
 
-def _between(path: str | Path, chunks: dict[str, np.ndarray], key: str, fractions: np.ndarray) -> np.ndarray:
-    """Return the values [N, 3] at fractions between the bounds of their chunks, the inverse of `_within_chunks`."""
+def _between(
+    path: str | Path, chunks: dict[str, np.ndarray], key: str, fractions: np.ndarray
+) -> np.ndarray:
+    """Return the values [N, 3] at fractions between the bounds of their chunks, the inverse of
+    `_within_chunks`.
+    """
     names = [name for ends in _BOUNDS[key] for name in ends]
     _check_columns(path, "chunk", chunks, names, "<f4")
     low, high = (
-        np.stack([np.asarray(chunks[name], np.float64) for name in ends], axis=1).repeat(_CHUNK, axis=0)
+        np.stack([np.asarray(chunks[name], np.float64) for name in ends], axis=1).repeat(
+            _CHUNK, axis=0
+        )
         for ends in _BOUNDS[key]
     )
     N = len(fractions)
-    with np.errstate(invalid="ignore"):  # NaN where a bound is infinite: the Gaussians of the chunk are invalid
+    # NaN where a bound is infinite: the Gaussians of the chunk are invalid.
+    with np.errstate(invalid="ignore"):
         return low[:N] * (1 - fractions) + high[:N] * fractions
 
 
 def _check_columns(
     path: str | Path, element: str, columns: dict[str, np.ndarray], names: Sequence[str], dtype: str
 ) -> None:
-    if faults := [name for name in names if name not in columns or columns[name].dtype.newbyteorder("<") != dtype]:
+    if faults := [
+        name
+        for name in names
+        if name not in columns or columns[name].dtype.newbyteorder("<") != dtype
+    ]:
         raise ValueError(
-            f"{path}: expected a compressed PLY, got an element {element} without {', '.join(faults)} as "
-            f"{np.dtype(dtype).name}; export it again."
+            f"{path}: expected a compressed PLY, got an element {element} without "
+            f"{', '.join(faults)} as {np.dtype(dtype).name}; export it again."
         )
 
 
 def _packed(fractions: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
-    """Return fractions [N, k] rounded to integers of these numbers of bits, the first one in the highest bits."""
+    """Return fractions [N, k] rounded to integers of these numbers of bits, the first one in the
+    highest bits.
+    """
     words = np.zeros(len(fractions), np.uint32)
     for column, count in zip(fractions.T, bits, strict=True):
         most = 2**count - 1
-        words = words << np.uint32(count) | np.floor(np.clip(column, 0, 1) * most + 0.5).astype(np.uint32)
+        words = words << np.uint32(count) | np.floor(np.clip(column, 0, 1) * most + 0.5).astype(
+            np.uint32
+        )
     return words
 
 
@@ -188,11 +232,15 @@ def _unpacked(words: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
 
 
 def _packed_rotations(quats: np.ndarray) -> np.ndarray:
-    """Return unit quaternions [N, 4] as integers; q and -q, which are the same rotation, become the same one."""
+    """Return unit quaternions [N, 4] as integers; q and -q, which are the same rotation, become the
+    same one.
+    """
     largest = np.abs(quats).argmax(axis=1)
     signs = np.where(np.take_along_axis(quats, largest[:, None], axis=1) < 0, -1, 1)
     others = np.take_along_axis(quats * signs, _OTHERS[largest], axis=1)
-    return largest.astype(np.uint32) << np.uint32(30) | _packed(others * np.sqrt(0.5) + 0.5, _ROTATION_BITS)
+    return largest.astype(np.uint32) << np.uint32(30) | _packed(
+        others * np.sqrt(0.5) + 0.5, _ROTATION_BITS
+    )
 
 
 def _unpacked_rotations(words: np.ndarray) -> np.ndarray:

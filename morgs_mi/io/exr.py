@@ -1,4 +1,6 @@
-"""EXR files: float32 channels with the names of the renderer's AOVs (`motion.X`, ...), and images in linear light."""
+"""EXR files: float32 channels with the names of the renderer's AOVs (`motion.X`, ...), and images
+in linear light.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,10 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
     """
     shapes = {name: np.shape(channel) for name, channel in channels.items()}
     if len(set(shapes.values())) != 1 or any(len(shape) != 2 for shape in shapes.values()):
-        raise ValueError(f"write_exr(): `channels` must share one shape [H, W], got {shapes}; pass one image each.")
+        raise ValueError(
+            f"write_exr(): `channels` must share one shape [H, W], got {shapes}; pass one image "
+            "each."
+        )
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     pixels = {name: np.ascontiguousarray(channel, np.float32) for name, channel in channels.items()}
     with atomic_path(path, "write_exr()") as partial:
@@ -52,10 +57,11 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
 
 
 def read_light(path: str | Path) -> np.ndarray:
-    """Return the image of an EXR file [H, W, 3], float32 in linear light with Rec. 709 primaries, not negative.
+    """Return the image of an EXR file [H, W, 3], float32 in linear light with Rec. 709 primaries,
+    not negative.
 
-    Its channels are R, G, B, or Y alone. Other primaries, which the attribute `chromaticities` names, are converted by
-    colour-science, with Bradford's adaptation to another white.
+    Its channels are R, G, B, or Y alone. Other primaries, which the attribute `chromaticities`
+    names, are converted by colour-science, with Bradford's adaptation to another white.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -65,7 +71,9 @@ def read_light(path: str | Path) -> np.ndarray:
     channels, primaries = _read(path)
     names = "RGB" if {"R", "G", "B"} <= channels.keys() else "YYY"
     if not set(names) <= channels.keys():
-        raise ValueError(f"{path}: expected the channels R, G, B, or Y, got {', '.join(channels)}; rename them.")
+        raise ValueError(
+            f"{path}: expected the channels R, G, B, or Y, got {', '.join(channels)}; rename them."
+        )
     light = np.stack([channels[name] for name in names], axis=-1)
     if np.abs(np.subtract(primaries, _REC_709)).max() > _SAME:
         light = light @ _to_rec_709(primaries).T
@@ -73,29 +81,41 @@ def read_light(path: str | Path) -> np.ndarray:
 
 
 def _to_rec_709(primaries: Sequence[float]) -> np.ndarray:
-    """Return the matrix [3, 3] that converts linear RGB from primaries in the form of `_REC_709` to Rec. 709."""
+    """Return the matrix [3, 3] that converts linear RGB from primaries in the form of `_REC_709` to
+    Rec. 709.
+    """
     # The import takes a second, for which other images should not wait.
     from colour import RGB_Colourspace, matrix_RGB_to_RGB
 
-    spaces = (RGB_Colourspace("", np.reshape(xy[:6], (3, 2)), np.array(xy[6:])) for xy in (primaries, _REC_709))
+    spaces = (
+        RGB_Colourspace("", np.reshape(xy[:6], (3, 2)), np.array(xy[6:]))
+        for xy in (primaries, _REC_709)
+    )
     return matrix_RGB_to_RGB(*spaces, chromatic_adaptation_transform="Bradford").astype(np.float32)
 
 
 def _read(path: str | Path) -> tuple[dict[str, np.ndarray], Sequence[float]]:
-    """Return the channels of an EXR file by name, and the primaries and the white, see `_REC_709`."""
+    """Return the channels of an EXR file by name, and its primaries and white, see `_REC_709`."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"read_exr(): there is no file {path}; check the path.")
     try:
         _check_size(path)
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = {name: np.asarray(channel.pixels, np.float32) for name, channel in file.channels().items()}
+            channels = {
+                name: np.asarray(channel.pixels, np.float32)
+                for name, channel in file.channels().items()
+            }
             return channels, file.header().get("chromaticities", _REC_709)
     except (RuntimeError, ValueError, KeyError, struct.error) as error:
-        raise OSError(f"read_exr(): cannot read {path}: {error}; the file may be truncated.") from error
+        raise OSError(
+            f"read_exr(): cannot read {path}: {error}; the file may be truncated."
+        ) from error
 
 
 def _check_size(path: str | Path) -> None:
-    """Check the sizes in the headers of all parts, which OpenEXR allocates even where it reads the headers alone."""
+    """Check the sizes in the headers of all parts, which OpenEXR allocates even where it reads the
+    headers alone.
+    """
     with Path(path).open("rb") as file:
         magic, version = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
         if magic != _MAGIC:
@@ -107,11 +127,15 @@ def _check_size(path: str | Path) -> None:
     sizes = []
     for part in parts:
         left, top, right, bottom = struct.unpack("<4i", part[b"dataWindow"])
-        sizes.append((max(0, right - left + 1), max(0, bottom - top + 1), _count_channels(part[b"channels"])))
+        sizes.append(
+            (max(0, right - left + 1), max(0, bottom - top + 1), _count_channels(part[b"channels"]))
+        )
         if part.get(b"type", b"").startswith(b"deep"):
             raise ValueError("it has deep pixels, which are not supported")
     numbers = sum(width * height * channels for width, height, channels in sizes)
-    check_claim(path, 4 * numbers, " and ".join(f"{w}x{h} pixels of {n} channels" for w, h, n in sizes))
+    check_claim(
+        path, 4 * numbers, " and ".join(f"{w}x{h} pixels of {n} channels" for w, h, n in sizes)
+    )
 
 
 def _header(file: BinaryIO) -> dict[bytes, bytes]:

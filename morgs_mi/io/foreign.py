@@ -1,4 +1,5 @@
-"""Files of Gaussians in other formats than those that are read, recognised by their names and their first bytes.
+"""Files of Gaussians in other formats than those that are read, recognised by their names and their
+first bytes.
 
 The first bytes of a file decide before its name, because files are renamed.
 """
@@ -9,7 +10,10 @@ import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
-_CONVERTERS = "convert it to .ply with SuperSplat (superspl.at/editor) or splat-transform (@playcanvas/splat-transform)"
+_CONVERTERS = (
+    "convert it to .ply with SuperSplat (superspl.at/editor) or splat-transform "
+    "(@playcanvas/splat-transform)"
+)
 _EXPORT = "export it as .ply in the layout of 3D Gaussian Splatting from the program that wrote it"
 _HEAD = 4096
 
@@ -27,7 +31,9 @@ _SPZ = _Format("SPZ (Niantic's compressed format)", (".spz",))
 _SOG = _Format("SOG (PlayCanvas' compressed format)", (".sog", ".sogs", "meta.json"))
 _GLTF = _Format("glTF (KHR_gaussian_splatting)", (".glb", ".gltf"), _EXPORT)
 _USD = _Format("OpenUSD", (".usd", ".usda", ".usdc", ".usdz"), _EXPORT)
-_ARCHIVE = _Format("an archive", (".zip", ".7z", ".tar", ".gz", ".tgz"), "unpack it, and name the .ply in it")
+_ARCHIVE = _Format(
+    "an archive", (".zip", ".7z", ".tar", ".gz", ".tgz"), "unpack it, and name the .ply in it"
+)
 _NUMPY = _Format("an archive of NumPy", (".npz", ".npy"), _EXPORT)
 _CHECKPOINT = _Format("a checkpoint of a training", (".pt", ".pth", ".ckpt"), _EXPORT)
 _PLY = _Format("PLY", (), "rename it to .ply")
@@ -55,13 +61,15 @@ def refuse_foreign(path: str | Path) -> None:
     kind = _format(Path(path))
     if kind is not None:
         raise ValueError(
-            f"{path}: expected Gaussians as .ply, .compressed.ply or .splat, got {kind.name}, which is not read; "
-            f"{kind.remedy}."
+            f"{path}: expected Gaussians as .ply, .compressed.ply or .splat, got {kind.name}, "
+            f"which is not read; {kind.remedy}."
         )
 
 
 def _format(path: Path) -> _Format | None:
-    """Return the format of a file that is not read, by its first bytes or else by its name; None: no such format."""
+    """Return the format of a file that is not read, by its first bytes or else by its name; None:
+    no such format.
+    """
     head = b""
     if path.is_file():
         with path.open("rb") as file:

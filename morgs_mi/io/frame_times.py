@@ -1,6 +1,7 @@
 """Headers of video files, and the times of the frames that they show.
 
-The number of frames in a header, and the packets of a file, include frames that its edit list hides.
+The number of frames in a header, and the packets of a file, include frames that its edit list
+hides.
 """
 
 from __future__ import annotations
@@ -33,16 +34,18 @@ class VideoHeader:
 
     width: int  #: Of the first frame, in pixels.
     height: int  #: Of the first frame, in pixels.
-    num_frames: int  #: Number of frames that the file shows if it is complete, 0 if it does not state it.
+    #: Number of frames that the file shows if it is complete, 0 if it does not state it.
+    num_frames: int
     num_held: int  #: Number of these frames in the file.
     fps: float  #: Frames per second, 0 if it does not state them.
-    #: Times of the frames in the file on the clock of OpenCV's decoder, ascending, s [num_held]; None if it does not
-    #: store them.
+    #: Times of the frames in the file on the clock of OpenCV's decoder, ascending, s [num_held];
+    #: None if it does not store them.
     times: np.ndarray | None
 
 
 def read_header(path: Path) -> VideoHeader:
-    """Return the header of a video; its first frame is decoded, and the packets of the others are read.
+    """Return the header of a video; its first frame is decoded, and the packets of the others are
+    read.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -57,8 +60,9 @@ def read_header(path: Path) -> VideoHeader:
         ok, first = stream.read()
         if not ok:
             raise ValueError(
-                f"{path}: expected a video, got {path.stat().st_size} bytes of which OpenCV cannot decode one frame: "
-                "the file is truncated or no video; copy or convert it again."
+                f"{path}: expected a video, got {path.stat().st_size} bytes of which OpenCV "
+                "cannot decode one frame: the file is truncated or no video; copy or convert it "
+                "again."
             )
         num_frames = int(stream.get(cv2.CAP_PROP_FRAME_COUNT))
         frames_before = int(stream.get(cv2.CAP_PROP_PTS))
@@ -74,12 +78,15 @@ def read_header(path: Path) -> VideoHeader:
     elif has_times:
         num_frames -= len(packets) - len(times)
     if movie is None and has_times:
-        num_frames -= frames_before  # the header has the end of the file, also where the sound begins first
+        # The header has the end of the file, also where the sound begins first.
+        num_frames -= frames_before
     height, width = first.shape[:2]
     if has_times and (np.diff(times) > 0).all():
         return VideoHeader(width, height, num_frames, len(times), fps, times)
     # The decoder skips packets without a time.
-    return VideoHeader(width, height, num_frames, min(len(times), num_frames or len(times)), fps, None)
+    return VideoHeader(
+        width, height, num_frames, min(len(times), num_frames or len(times)), fps, None
+    )
 
 
 def seconds(stream: cv2.VideoCapture) -> float:
@@ -88,7 +95,9 @@ def seconds(stream: cv2.VideoCapture) -> float:
 
 
 def clock(times: np.ndarray) -> tuple[np.ndarray, float] | None:
-    """Return the positions of frames on a regular clock and its rate, None if the rate of the frames is constant."""
+    """Return the positions of frames on a regular clock and its rate, None if the rate of the
+    frames is constant.
+    """
     steps = np.diff(times)
     if len(steps) < 2:
         return None
@@ -109,7 +118,8 @@ def true_rate(fps: float, frames: float, duration: float) -> float:
         frames: number of frame periods between the first and the last frame.
         duration: time between the two, s.
     """
-    # A header may have a rounded rate or a mean over pauses, and the time of a frame may be rounded.
+    # A header may have a rounded rate or a mean over pauses, and the time of a frame may be
+    # rounded.
     difference = abs(fps * duration - frames)
     return fps if not duration or difference <= _JITTER + _ROUNDING * fps else frames / duration
 
@@ -117,8 +127,9 @@ def true_rate(fps: float, frames: float, duration: float) -> float:
 def packet_times(path: Path) -> np.ndarray:
     """Return the times of the packets in a video file, s.
 
-    The packets are read but not decoded, 0.2 ms each at 1080x1920. They are in the order of decoding, which differs
-    from the order of presentation where frames are predicted from later ones.
+    The packets are read but not decoded, 0.2 ms each at 1080x1920. They are in the order of
+    decoding, which differs from the order of presentation where frames are predicted from later
+    ones.
     """
     stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
     times = []
@@ -128,7 +139,9 @@ def packet_times(path: Path) -> np.ndarray:
     return np.array(times)
 
 
-def _shown(path: Path, stream: cv2.VideoCapture, movie: Movie | None, packets: np.ndarray) -> np.ndarray:
+def _shown(
+    path: Path, stream: cv2.VideoCapture, movie: Movie | None, packets: np.ndarray
+) -> np.ndarray:
     """Return the times of the frames that a video shows, ascending, s.
 
     Args:
@@ -157,10 +170,11 @@ def _shown(path: Path, stream: cv2.VideoCapture, movie: Movie | None, packets: n
 
 
 def _clock_difference(stream: cv2.VideoCapture, packets: np.ndarray) -> float:
-    """Return the time of a video's first packet for its decoder minus its time among the packets, s.
+    """Return the time of a video's first packet for its decoder minus its time among the packets,
+    s.
 
-    OpenCV sets the first packet to the time 0 where packets are read without a decoder, and the first frame that is
-    shown where they are decoded.
+    OpenCV sets the first packet to the time 0 where packets are read without a decoder, and the
+    first frame that is shown where they are decoded.
     """
     stream.set(cv2.CAP_PROP_POS_FRAMES, 0)
     stream.set(cv2.CAP_PROP_FORMAT, -1)
@@ -168,7 +182,7 @@ def _clock_difference(stream: cv2.VideoCapture, packets: np.ndarray) -> float:
 
 
 def _decoded_times(path: Path, begin: float) -> np.ndarray:
-    """Return the times of the frames of a video after about `begin`, s, all of which are decoded."""
+    """Return the times of the frames of a video after about `begin`, s; all are decoded."""
     stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if begin > 0:
         stream.set(cv2.CAP_PROP_POS_MSEC, 1000 * begin)

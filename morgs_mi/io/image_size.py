@@ -9,13 +9,16 @@ import numpy as np
 # Bytes of a JPEG file in which its size is searched.
 _MAX_HEADER = 1_000_000
 
-# Tags of the width and the height of a TIFF image, and the formats of the numbers that store them, by type.
+# Tags of the width and the height of a TIFF image, and the formats of the numbers that store them,
+# by type.
 _TIFF_SIZE = {256: 0, 257: 1}
 _TIFF_TYPES = {3: "H", 4: "I", 16: "Q"}
 
 
 def image_size(data: np.ndarray) -> tuple[int, int]:
-    """Return the width and height in the bytes of an image file, uint8 [N]; 0, 0 of another file or a broken header."""
+    """Return the width and height in the bytes of an image file, uint8 [N]; 0, 0 of another file or
+    a broken header.
+    """
     content = data.data
     start = bytes(content[:4])
     for magic, read in _FORMATS.items():
@@ -74,7 +77,9 @@ def _tiff(data: memoryview) -> tuple[int, int]:
     for at in range(entries, min(entries + length * count, len(data)), length):
         tag, kind = struct.unpack_from(order + "HH", data, at)
         if tag in _TIFF_SIZE and kind in _TIFF_TYPES:
-            (size[_TIFF_SIZE[tag]],) = struct.unpack_from(order + _TIFF_TYPES[kind], data, at + value)
+            (size[_TIFF_SIZE[tag]],) = struct.unpack_from(
+                order + _TIFF_TYPES[kind], data, at + value
+            )
     return size[0], size[1]
 
 

@@ -26,7 +26,8 @@ _MOST_NAMED = 3
 def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float) -> Gaussians:
     """Return the Gaussians of a file without the invalid ones, with a warning that names them.
 
-    An invalid Gaussian has NaN, infinity or a number above 1e12 in an attribute. A rotation of length 0 is none.
+    An invalid Gaussian has NaN, infinity or a number above 1e12 in an attribute. A rotation of
+    length 0 is none.
 
     Args:
         path: the file.
@@ -41,12 +42,18 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
     zero = np.flatnonzero(~raw["quats"].any(axis=1))
     if len(zero):
         _log.warning(
-            "%s: %d of %d Gaussians have a rotation of 0 and are not rotated: %s.", path, len(zero), N, _few(zero)
+            "%s: %d of %d Gaussians have a rotation of 0 and are not rotated: %s.",
+            path,
+            len(zero),
+            N,
+            _few(zero),
         )
     limits = {name: np.log(LARGEST) if name == "log_scales" else LARGEST for name in raw}
     # Small sizes have negative logarithms without a bound.
     valid = {
-        name: ((values <= limits[name]) & (values >= -LARGEST)).all(axis=tuple(range(1, values.ndim)))
+        name: ((values <= limits[name]) & (values >= -LARGEST)).all(
+            axis=tuple(range(1, values.ndim))
+        )
         for name, values in raw.items()
     }
     every = np.all([*valid.values()], axis=0)
@@ -54,12 +61,15 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
     if not count:
         return gaussians
     details = "; ".join(
-        f"{_WORDS.get(name, name)} of {_few(np.flatnonzero(~rows))}" for name, rows in valid.items() if not rows.all()
+        f"{_WORDS.get(name, name)} of {_few(np.flatnonzero(~rows))}"
+        for name, rows in valid.items()
+        if not rows.all()
     )
     if count > most_invalid * N:
         raise ValueError(
-            f"{path}: expected finite numbers of at most {LARGEST:g}, others in {count} of {N} Gaussians ({details}); "
-            "leave them out with --drop-invalid, in Python with `most_invalid=1`, or export the file again."
+            f"{path}: expected finite numbers of at most {LARGEST:g}, others in {count} of {N} "
+            f"Gaussians ({details}); leave them out with --drop-invalid, in Python with "
+            "`most_invalid=1`, or export the file again."
         )
     _log.warning(
         "%s: %d of %d Gaussians are left out, whose numbers are not finite or above %g: %s.",

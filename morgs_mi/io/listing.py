@@ -1,4 +1,6 @@
-"""Content of folders, without the files that operating systems and file servers add, and kinds of files."""
+"""Content of folders, without the files that operating systems and file servers add, and kinds of
+files.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,8 @@ VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".mov", ".webm")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
 EXR_SUFFIX = ".exr"
 
-# In lower case: of macOS and its archives, Windows (thumbnails, settings, bins), Synology, and ext4.
+# In lower case: of macOS and its archives, Windows (thumbnails, settings, bins), Synology, and
+# ext4.
 _ADDED = {
     *(".ds_store", "__macosx", "icon\r", ".spotlight-v100", ".trashes", ".fseventsd"),
     *("thumbs.db", "ehthumbs.db", "desktop.ini", "$recycle.bin", "system volume information"),
@@ -27,7 +30,8 @@ def is_listed(name: str) -> bool:
 
 
 def listed(folder: str | Path) -> list[Path]:
-    """Return the files and folders in a folder that are neither hidden nor added by a system, by name.
+    """Return the files and folders in a folder that are neither hidden nor added by a system, by
+    name.
 
     Raises:
         OSError: there is no such folder, or it cannot be read.
@@ -36,7 +40,8 @@ def listed(folder: str | Path) -> list[Path]:
 
 
 def images_in(folder: str | Path) -> list[Path]:
-    """Return the images in a folder by name: those of 8 bits, or EXR files where there is no other image.
+    """Return the images in a folder by name: those of 8 bits, or EXR files where there is no other
+    image.
 
     Renderers write depth and normals as EXR files beside their images.
 

@@ -1,8 +1,9 @@
-"""Cameras of a training run of 3D Gaussian Splatting, from the `cameras.json` in the folder of its model.
+"""Cameras of a training run of 3D Gaussian Splatting, from the `cameras.json` in the folder of its
+model.
 
-A model has `cameras.json` and `point_cloud/iteration_30000/point_cloud.ply`. The file is a list of objects with
-`img_name`, `width`, `height`, `position` [3], `rotation` [3][3] (camera to world, x right, y down, z forward), `fx` and
-`fy` in pixels; the principal point is the middle of the image.
+A model has `cameras.json` and `point_cloud/iteration_30000/point_cloud.ply`. The file is a list of
+objects with `img_name`, `width`, `height`, `position` [3], `rotation` [3][3] (camera to world, x
+right, y down, z forward), `fx` and `fy` in pixels; the principal point is the middle of the image.
 """
 
 from __future__ import annotations
@@ -24,10 +25,11 @@ _MOST = 48
 
 
 def model_cameras(path: Path) -> tuple[Path | None, tuple[Camera, ...]]:
-    """Return the `cameras.json` that may belong to a file of Gaussians, and its cameras; None and none without one.
+    """Return the `cameras.json` that may belong to a file of Gaussians, and its cameras; None and
+    none without one.
 
-    The file is beside the Gaussians or in one of the two folders above. At most 48 cameras are returned. Nothing in it
-    names the Gaussians: it may be of another scene.
+    The file is beside the Gaussians or in one of the two folders above. At most 48 cameras are
+    returned. Nothing in it names the Gaussians: it may be of another scene.
 
     Raises:
         ValueError: an entry is broken.
@@ -36,9 +38,15 @@ def model_cameras(path: Path) -> tuple[Path | None, tuple[Camera, ...]]:
     for file in (folder / _FILE for folder in folders):
         if file.is_file():
             rows = read_json(file)
-            if isinstance(rows, list) and rows and all(isinstance(row, dict) and row.keys() >= _KEYS for row in rows):
+            if (
+                isinstance(rows, list)
+                and rows
+                and all(isinstance(row, dict) and row.keys() >= _KEYS for row in rows)
+            ):
                 warn_unread(file, {key for row in rows for key in row} - _KEYS - _HARMLESS)
-                return file, tuple(_camera(file, i, rows[i]) for i in range(0, len(rows), -(-len(rows) // _MOST)))
+                return file, tuple(
+                    _camera(file, i, rows[i]) for i in range(0, len(rows), -(-len(rows) // _MOST))
+                )
     return None, ()
 
 
@@ -53,4 +61,6 @@ def _camera(file: Path, index: int, row: dict[str, Any]) -> Camera:
         K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
         return Camera(K, viewmat, round(width), round(height), str(row.get("img_name", index)))
     except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{file}: entry {index}: expected a camera, got a broken one: {error}") from None
+        raise ValueError(
+            f"{file}: entry {index}: expected a camera, got a broken one: {error}"
+        ) from None

@@ -1,6 +1,8 @@
-"""Structure of MP4 and QuickTime files: nested boxes, and the edit list, which states the part of a clip that is shown.
+"""Structure of MP4 and QuickTime files: nested boxes, and the edit list, which states the part of a
+clip that is shown.
 
-Programs that cut a clip without encoding it again leave the frames in the file and hide them by an edit list.
+Programs that cut a clip without encoding it again leave the frames in the file and hide them by an
+edit list.
 """
 
 from __future__ import annotations
@@ -23,7 +25,8 @@ class Movie:
     """An MP4 or QuickTime file."""
 
     complete: bool  #: Whether the file is as long as its boxes state.
-    parts: tuple[float, ...]  #: Lengths of the parts of the video that are shown in succession, s; 0: up to its end.
+    #: Lengths of the parts of the video that are shown in succession, s; 0: up to its end.
+    parts: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,11 @@ def _parts(file: BinaryIO, movie: _Box) -> tuple[float, ...]:
         if handler is None or _bytes(file, handler, 12)[8:] != b"vide":
             continue
         edits = _first(file, track, b"edts", b"elst")
-        return () if header is None or edits is None else _durations(file, edits, _time_scale(file, header))
+        return (
+            ()
+            if header is None or edits is None
+            else _durations(file, edits, _time_scale(file, header))
+        )
     return ()
 
 
@@ -64,9 +71,15 @@ def _durations(file: BinaryIO, edits: _Box, per_second: int) -> tuple[float, ...
     data = _bytes(file, edits, _MAX_EDITS)
     # An entry has the length of the part, its start in the track, -1 for a pause, and its speed.
     width = 8 if data[:1] == b"\1" else 4
-    entries = [data[at : at + 2 * width] for at in range(8, len(data) - 2 * width - 3, 2 * width + 4)]
-    visible_entries = [entry for entry in entries if int.from_bytes(entry[width:], "big", signed=True) >= 0]
-    return tuple(int.from_bytes(entry[:width], "big") / max(per_second, 1) for entry in visible_entries)
+    entries = [
+        data[at : at + 2 * width] for at in range(8, len(data) - 2 * width - 3, 2 * width + 4)
+    ]
+    visible_entries = [
+        entry for entry in entries if int.from_bytes(entry[width:], "big", signed=True) >= 0
+    ]
+    return tuple(
+        int.from_bytes(entry[:width], "big") / max(per_second, 1) for entry in visible_entries
+    )
 
 
 def _time_scale(file: BinaryIO, header: _Box) -> int:
@@ -85,7 +98,7 @@ def _first(file: BinaryIO, box: _Box | None, *kinds: bytes) -> _Box | None:
 
 
 def _boxes(file: BinaryIO, start: int, stop: int) -> Iterator[_Box]:
-    """Yield the boxes side by side in a range of a file; the last one may state an end behind it."""
+    """Yield the boxes side by side in a range of a file; the last one may end behind it."""
     while start + 8 <= stop:
         file.seek(start)
         head = file.read(16)

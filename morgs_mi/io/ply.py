@@ -1,8 +1,10 @@
-"""Gaussians as PLY files in the layout of 3D Gaussian Splatting, which the field's viewers and trainers read.
+"""Gaussians as PLY files in the layout of 3D Gaussian Splatting, which the field's viewers and
+trainers read.
 
-One vertex per Gaussian with float properties: ``x y z``, ``nx ny nz`` (zeros), ``f_dc_0..2``, ``f_rest_0..3(K-1)-1``
-channel by channel (all of red, then green, then blue), ``opacity`` (logit), ``scale_0..2`` (natural logarithms of the
-standard deviations), ``rot_0..3`` (w, x, y, z). World axes stay as they are; the layout does not prescribe any.
+One vertex per Gaussian with float properties: ``x y z``, ``nx ny nz`` (zeros), ``f_dc_0..2``,
+``f_rest_0..3(K-1)-1`` channel by channel (all of red, then green, then blue), ``opacity`` (logit),
+``scale_0..2`` (natural logarithms of the standard deviations), ``rot_0..3`` (w, x, y, z). World
+axes stay as they are; the layout does not prescribe any.
 
 Mitsuba's shape `ellipsoids` reads this layout, and one with further attributes, see `mitsuba_ply`.
 """
@@ -49,7 +51,9 @@ _NORMAL = ("nx", "ny", "nz")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 
 
-def write_ply(path: str | Path, gaussians: Gaussians, layout: Literal["3dgs", "mitsuba"] = "3dgs") -> None:
+def write_ply(
+    path: str | Path, gaussians: Gaussians, layout: Literal["3dgs", "mitsuba"] = "3dgs"
+) -> None:
     """Write Gaussians as a binary PLY file, atomically.
 
     Quaternions are normalised.
@@ -57,8 +61,9 @@ def write_ply(path: str | Path, gaussians: Gaussians, layout: Literal["3dgs", "m
     Args:
         path: the file.
         gaussians: N Gaussians.
-        layout: ``3dgs``, the layout of 3D Gaussian Splatting, which has no motion and no confidence; or ``mitsuba``,
-            with all attributes for the shape `ellipsoids`, which tools other than Mitsuba and this package do not read.
+        layout: ``3dgs``, the layout of 3D Gaussian Splatting, which has no motion and no
+            confidence; or ``mitsuba``, with all attributes for the shape `ellipsoids`, which tools
+            other than Mitsuba and this package do not read.
 
     Raises:
         ValueError: another layout.
@@ -73,7 +78,8 @@ def write_ply(path: str | Path, gaussians: Gaussians, layout: Literal["3dgs", "m
         _NORMAL: np.zeros_like(raw["means"]),
         **(mitsuba_columns(gaussians) if layout == "mitsuba" else _columns(raw)),
         _SCALE: raw["log_scales"],
-        _ROTATION: np.where(lengths > 0, raw["quats"] / np.maximum(lengths, 1e-30), (1, 0, 0, 0)),  # zero: no rotation
+        # A zero quaternion is no rotation.
+        _ROTATION: np.where(lengths > 0, raw["quats"] / np.maximum(lengths, 1e-30), (1, 0, 0, 0)),
     }
     names = [name for names in columns for name in names]
     table = np.concatenate([*columns.values()], axis=1, dtype=np.float32, casting="same_kind")
@@ -83,48 +89,59 @@ def write_ply(path: str | Path, gaussians: Gaussians, layout: Literal["3dgs", "m
 
 
 def _columns(raw: dict[str, np.ndarray]) -> dict[tuple[str, ...], np.ndarray]:
-    """Return colours and opacities as columns [N, names] by their names, in the order of the layout."""
+    """Return colours and opacities as columns [N, names] by their names, in the order of the
+    layout.
+    """
     N, K = raw["sh_coeffs"].shape[:2]
     rest = raw["sh_coeffs"][:, 1:].transpose(0, 2, 1).reshape(N, 3 * (K - 1))
-    return {_DC: raw["sh_coeffs"][:, 0], _rest(K): rest, ("opacity",): raw["logit_opacities"][:, None]}
+    return {
+        _DC: raw["sh_coeffs"][:, 0],
+        _rest(K): rest,
+        ("opacity",): raw["logit_opacities"][:, None],
+    }
 
 
 def read_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
-    """Return the Gaussians in a PLY file of this package or of another tool: binary or text, SH of degree 0 to 3.
+    """Return the Gaussians in a PLY file of this package or of another tool: binary or text, SH of
+    degree 0 to 3.
 
-    Normals and other harmless properties are ignored; without ``f_rest_*`` the degree is 0. Infinite logits of the
-    opacities 0 and 1 and infinite logarithms of sizes of 0 are replaced by finite ones, as in `from_activated`.
-    `ply_kinds` lists the kinds of Gaussians of other methods that are read. All attributes of the layout ``mitsuba`` of
-    `write_ply` are read.
+    Normals and other harmless properties are ignored; without ``f_rest_*`` the degree is 0.
+    Infinite logits of the opacities 0 and 1 and infinite logarithms of sizes of 0 are replaced by
+    finite ones, as in `from_activated`. `ply_kinds` lists the kinds of Gaussians of other methods
+    that are read. All attributes of the layout ``mitsuba`` of `write_ply` are read.
 
     Args:
         path: the file.
-        most_invalid: share of Gaussians with invalid numbers that are left out with a warning; 0: none.
+        most_invalid: share of Gaussians with invalid numbers that are left out with a warning; 0:
+            none.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is not a PLY file, is truncated, lacks a property, holds another kind of Gaussians, or has more
-            invalid ones.
+        ValueError: it is not a PLY file, is truncated, lacks a property, holds another kind of
+            Gaussians, or has more invalid ones.
     """
     vertices = read_vertices(path)
     if "packed_position" in vertices:
         raise ValueError(
-            f"{path}: expected an uncompressed PLY, got PlayCanvas' compressed one; read it with `read_splats`."
+            f"{path}: expected an uncompressed PLY, got PlayCanvas' compressed one; read it with "
+            "`read_splats`."
         )
     vertices, more = from_mitsuba(vertices)
     vertices = as_3dgs(path, vertices)
-    missing = [name for name in (*_MEAN, *_DC, "opacity", *_SCALE, *_ROTATION) if name not in vertices]
+    missing = [
+        name for name in (*_MEAN, *_DC, "opacity", *_SCALE, *_ROTATION) if name not in vertices
+    ]
     if missing:
         raise ValueError(
-            f"{path}: expected Gaussians in the layout of 3D Gaussian Splatting, got vertices without "
-            f"{', '.join(missing)}, as of a mesh or a point cloud; export the Gaussians."
+            f"{path}: expected Gaussians in the layout of 3D Gaussian Splatting, got vertices "
+            f"without {', '.join(missing)}, as of a mesh or a point cloud; export the Gaussians."
         )
     count = sum(name.startswith("f_rest_") for name in vertices)
     degree = {0: 0, 9: 1, 24: 2, 45: 3}.get(count)
     if degree is None or not vertices.keys() >= {*_rest((degree + 1) ** 2)}:
         raise ValueError(
-            f"{path}: expected f_rest_0 to f_rest_8, 23 or 44 (SH of degree 1 to 3) or none, got {count} of them; "
-            "export the Gaussians with SH of degree 3 or less."
+            f"{path}: expected f_rest_0 to f_rest_8, 23 or 44 (SH of degree 1 to 3) or none, got "
+            f"{count} of them; export the Gaussians with SH of degree 3 or less."
         )
     N = len(vertices["x"])
     K = (degree + 1) ** 2
@@ -140,13 +157,19 @@ def read_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
     coeffs[:, 0] = columns(_DC)
     coeffs[:, 1:] = columns(_rest(K)).reshape(N, 3, K - 1).transpose(0, 2, 1)
     gaussians = Gaussians(
-        columns(_MEAN), columns(_SCALE), columns(_ROTATION), columns(("opacity",))[:, 0], coeffs, **more
+        columns(_MEAN),
+        columns(_SCALE),
+        columns(_ROTATION),
+        columns(("opacity",))[:, 0],
+        coeffs,
+        **more,
     )
     return without_invalid(path, gaussians, most_invalid)
 
 
 def read_vertices(path: str | Path) -> dict[str, np.ndarray]:
-    """Return the properties of the vertices in a PLY file, binary or text, by name, each [N] in its stored type.
+    """Return the properties of the vertices in a PLY file, binary or text, by name, each [N] in its
+    stored type.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -158,19 +181,23 @@ def read_vertices(path: str | Path) -> dict[str, np.ndarray]:
 def read_elements(
     path: str | Path, required: Sequence[str], optional: Sequence[str] = ()
 ) -> dict[str, dict[str, np.ndarray]]:
-    """Return the properties of elements of a PLY file, by the names of element and property, each [rows].
+    """Return the properties of elements of a PLY file, by the names of element and property, each
+    [rows].
 
-    Written by hand because plyfile allocates what the header claims, and Python objects for lists. Elements after the
-    last one of these are not read; that one and those before it must have no lists.
+    Written by hand because plyfile allocates what the header claims, and Python objects for lists.
+    Elements after the last one of these are not read; that one and those before it must have no
+    lists.
 
     Args:
         path: the file, binary or text.
         required: names of elements.
-        optional: names of elements that are left out of the result where the file does not have them.
+        optional: names of elements that are left out of the result where the file does not have
+            them.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is not a PLY file, lacks an element, or has fewer rows than its header claims.
+        ValueError: it is not a PLY file, lacks an element, or has fewer rows than its header
+            claims.
     """
     path = Path(path)
     if not path.is_file():
@@ -178,7 +205,9 @@ def read_elements(
     try:
         with path.open("rb") as file:
             order, elements = _read_header(file)
-            element_names = {element.name for element in elements}.intersection((*required, *optional))
+            element_names = {element.name for element in elements}.intersection(
+                (*required, *optional)
+            )
             if missing_names := [name for name in required if name not in element_names]:
                 raise ValueError(f"it has no element {missing_names[0]}")
             properties: dict[str, dict[str, np.ndarray]] = {}
@@ -188,9 +217,14 @@ def read_elements(
                 dtype = element.dtype(order)
                 num_bytes = path.stat().st_size - file.tell()
                 # A number in a text takes a digit and a separator.
-                size = element.count * (dtype.itemsize if order else 2 * len(element.properties)) - (not order)
+                size = element.count * (
+                    dtype.itemsize if order else 2 * len(element.properties)
+                ) - (not order)
                 if element.count < 0 or size > num_bytes:
-                    raise ValueError(f"{element.count} {element.name} need at least {size} bytes, {num_bytes} follow")
+                    raise ValueError(
+                        f"{element.count} {element.name} need at least {size} bytes, {num_bytes} "
+                        "follow"
+                    )
                 if element.name in element_names:
                     properties[element.name] = _read_rows(file, element, dtype, text=not order)
                 elif order:
@@ -199,12 +233,16 @@ def read_elements(
                     next(islice(file, element.count, element.count), None)
             return properties
     except (ValueError, KeyError, IndexError, OverflowError) as error:
-        raise ValueError(f"{path}: expected a complete PLY file, got one that cannot be read: {error}.") from error
+        raise ValueError(
+            f"{path}: expected a complete PLY file, got one that cannot be read: {error}."
+        ) from error
 
 
 @dataclass
 class _Element:
-    """An element of a PLY file: its name, its number of rows, and the lines of its properties, split into words."""
+    """An element of a PLY file: its name, its number of rows, and the lines of its properties,
+    split into words.
+    """
 
     name: str
     count: int
@@ -213,7 +251,10 @@ class _Element:
     def dtype(self, order: str) -> np.dtype:
         """Return the type of a row in the byte order `order`."""
         if any(words[1] == "list" for words in self.properties):
-            raise ValueError(f"the element {self.name} has lists before the end of what is read, write it without them")
+            raise ValueError(
+                f"the element {self.name} has lists before the end of what is read, write it "
+                "without them"
+            )
         return np.dtype([(words[2], order + _TYPES[words[1]]) for words in self.properties])
 
 
@@ -239,7 +280,9 @@ def _read_header(file: BinaryIO) -> tuple[str, list[_Element]]:
     raise ValueError("its header does not end")
 
 
-def _read_rows(file: BinaryIO, element: _Element, dtype: np.dtype, text: bool) -> dict[str, np.ndarray]:
+def _read_rows(
+    file: BinaryIO, element: _Element, dtype: np.dtype, text: bool
+) -> dict[str, np.ndarray]:
     if not text:
         table = np.fromfile(file, dtype, element.count)
     elif element.count == 0:

@@ -4,7 +4,7 @@
 |---|---|---|
 | discs of 2D Gaussian Splatting | `scale_0` and `scale_1` alone | with a third axis of size 0 |
 | Mip-Splatting, Gaussian Opacity Fields | `filter_3D` | with the filter in sizes and opacities |
-| several instants (Spacetime Gaussians, 4DGS and others) | properties of time or motion that vary | refused |
+| several instants (Spacetime Gaussians, 4DGS, ...) | varying time or motion | refused |
 | anchors of Scaffold-GS | `f_offset_*`, `f_anchor_feat_*` | refused |
 
 Properties that are neither read nor known to be harmless are named in a warning.
@@ -25,8 +25,9 @@ Vertices = dict[str, np.ndarray]
 
 # Instants and durations; all of a file's Gaussians may be of one instant.
 _TIME = re.compile(
-    r"t|time|times|timestamp|instant|frame|frame_?(id|index|idx|number)|t_\w+|time_\w+|mu_?t|cov_t.*|scale_?t\w*|sigma_?t"
-    r"|trbf_\w+|duration|life(time|span)|(start|end|birth|death)_?(time|frame)"
+    r"t|time|times|timestamp|instant|frame|frame_?(id|index|idx|number)|t_\w+|time_\w+|mu_?t"
+    r"|cov_t.*|scale_?t\w*|sigma_?t|trbf_\w+|duration|life(time|span)"
+    r"|(start|end|birth|death)_?(time|frame)"
 )
 # Changes over time; they may be 0 everywhere.
 _MOTION = re.compile(r"(motion|omega|velocity|vel|speed|flow|deform\w*|v|acc\w*)_?(\d+|[xyz])")
@@ -35,8 +36,9 @@ _FOURTH = re.compile(r"scale_3|rot_[4-7]|rot_[lr]_\d")
 _ANCHOR = re.compile(r"f_offset_\d+|f_anchor_feat_\d+")
 _READ = re.compile(r"[xyz]|f_dc_[0-2]|f_rest_\d+|opacity|scale_[0-2]|rot_[0-3]|filter_3D")
 _HARMLESS = re.compile(
-    r"n[xyz]|normal_?[xyz]|red|green|blue|alpha|[rgba]|(diffuse_)?(red|green|blue)|label\w*|\w*_?id|index|segment\w*"
-    r"|cluster\w*|class\w*|instance\w*|semantic\w*|object\w*|category|selected|state|error|uncertainty|confidence"
+    r"n[xyz]|normal_?[xyz]|red|green|blue|alpha|[rgba]|(diffuse_)?(red|green|blue)|label\w*"
+    r"|\w*_?id|index|segment\w*|cluster\w*|class\w*|instance\w*|semantic\w*|object\w*|category"
+    r"|selected|state|error|uncertainty|confidence"
 )
 _GAUSSIAN = {"f_dc_0", "opacity", "scale_0", "rot_0"}
 # Folders and what their files have that is not read: a sequence has a file for every frame.
@@ -59,27 +61,37 @@ def as_3dgs(path: str | Path, vertices: Vertices) -> Vertices:
     _refuse_instants(path, vertices)
     if anchors := _matching(names, _ANCHOR):
         raise ValueError(
-            f"{path}: expected Gaussians, got anchors of Scaffold-GS ({_listed(anchors)}), of which a network makes "
-            "the Gaussians of a view; export Gaussians with the program that trained them."
+            f"{path}: expected Gaussians, got anchors of Scaffold-GS ({_listed(anchors)}), of "
+            "which a network makes the Gaussians of a view; export Gaussians with the program "
+            "that trained them."
         )
     if integers := [name for name in _matching(names, _READ) if vertices[name].dtype.kind != "f"]:
         raise ValueError(
-            f"{path}: expected Gaussians with floats, got integers in {_listed(integers)}, which stand for entries of "
-            "a codebook; export the Gaussians uncompressed."
+            f"{path}: expected Gaussians with floats, got integers in {_listed(integers)}, which "
+            "stand for entries of a codebook; export the Gaussians uncompressed."
         )
     _name_unread(Path(path), names)
     return _with_third_axis(path, _with_filter(vertices))
 
 
 def _refuse_instants(path: str | Path, vertices: Vertices) -> None:
-    """Raise an error if the Gaussians of several instants are in one file: all of them are never in one image."""
-    time_names = [name for name, values in vertices.items() if _TIME.fullmatch(name) and (values != values[:1]).any()]
-    moving = [name for name, values in vertices.items() if _MOTION.fullmatch(name) and (values != 0).any()]
+    """Raise an error if the Gaussians of several instants are in one file: all of them are never in
+    one image.
+    """
+    time_names = [
+        name
+        for name, values in vertices.items()
+        if _TIME.fullmatch(name) and (values != values[:1]).any()
+    ]
+    moving = [
+        name for name, values in vertices.items() if _MOTION.fullmatch(name) and (values != 0).any()
+    ]
     if evidence := [*time_names, *moving, *_matching(vertices, _FOURTH)]:
         raise ValueError(
-            f"{path}: expected the Gaussians of one instant, got several instants, as of Spacetime Gaussians or 4D "
-            f"Gaussian Splatting ({_listed(evidence)}); export a .ply of each instant with the program that trained "
-            "them, which `morgs-mi import` turns into a stream."
+            f"{path}: expected the Gaussians of one instant, got several instants, as of "
+            f"Spacetime Gaussians or 4D Gaussian Splatting ({_listed(evidence)}); export a .ply "
+            "of each instant with the program that trained them, which `morgs-mi import` turns "
+            "into a stream."
         )
 
 
@@ -90,18 +102,21 @@ def _with_third_axis(path: str | Path, vertices: Vertices) -> Vertices:
         return vertices
     if axes != ["scale_0", "scale_1"]:
         raise ValueError(
-            f"{path}: expected Gaussians with three axes, or discs of 2D Gaussian Splatting with two, got "
-            f"{_listed(axes)} alone; export Gaussians with scale_0 to scale_2."
+            f"{path}: expected Gaussians with three axes, or discs of 2D Gaussian Splatting with "
+            f"two, got {_listed(axes)} alone; export Gaussians with scale_0 to scale_2."
         )
     _log.warning(
-        "%s: it has discs of 2D Gaussian Splatting (no scale_2); they are drawn with a third axis of size 0.",
+        "%s: it has discs of 2D Gaussian Splatting (no scale_2); they are drawn with a third axis "
+        "of size 0.",
         path,
     )
     return {**vertices, "scale_2": np.full(len(vertices["scale_0"]), -np.inf, np.float32)}
 
 
 def _with_filter(vertices: Vertices) -> Vertices:
-    """Return Gaussians with their 3D smoothing filter in sizes and opacities (Mip-Splatting, Yu et al. 2024, eq. 9)."""
+    """Return Gaussians with their 3D smoothing filter in sizes and opacities (Mip-Splatting, Yu et
+    al. 2024, eq. 9).
+    """
     names = ("scale_0", "scale_1", "scale_2", "opacity")
     if not vertices.keys() >= {*names, "filter_3D"}:
         return vertices
@@ -134,4 +149,6 @@ def _name_unread(path: Path, names: Iterable[str]) -> None:
 def _listed(names: Iterable[str]) -> str:
     """Return names in order, the first few of many."""
     ordered_names = sorted(names)
-    return ", ".join(ordered_names[:6]) + (f" and {len(ordered_names) - 6} more" if len(ordered_names) > 6 else "")
+    return ", ".join(ordered_names[:6]) + (
+        f" and {len(ordered_names) - 6} more" if len(ordered_names) > 6 else ""
+    )

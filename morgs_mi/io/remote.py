@@ -1,9 +1,10 @@
 """Captures at URLs, such as ``s3://bucket/capture``, read through fsspec.
 
-A capture is mirrored in a folder of ``~/.cache/morgs_mi/captures``. Calibrations are fetched when it is opened. Videos
-and images are empty files there until they are read: a process fetches only the files that it decodes. The name of the
-folder depends on names, sizes and versions of the remote files (time, ETag or checksum): a capture that has changed is
-fetched again, and one without versions at every opening. Ground truth is not fetched.
+A capture is mirrored in a folder of ``~/.cache/morgs_mi/captures``. Calibrations are fetched when
+it is opened. Videos and images are empty files there until they are read: a process fetches only
+the files that it decodes. The name of the folder depends on names, sizes and versions of the remote
+files (time, ETag or checksum): a capture that has changed is fetched again, and one without
+versions at every opening. Ground truth is not fetched.
 """
 
 from __future__ import annotations
@@ -25,9 +26,11 @@ from morgs_mi.core.files import write_json
 from morgs_mi.core.llvm import cache_folder
 from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, VIDEO_SUFFIXES, is_listed
 
-# Entries of fsspec's listings that change with a file, by file system. A size alone does not prove that it is the same.
+# Entries of fsspec's listings that change with a file, by file system. A size alone does not prove
+# that it is the same.
 _VERSION = (
-    *("mtime", "created", "LastModified", "ETag", "etag", "last_modified", "md5Hash", "generation"),  # disks and clouds
+    # Disks and clouds.
+    *("mtime", "created", "LastModified", "ETag", "etag", "last_modified", "md5Hash", "generation"),
     *("Last-Modified", "Content-MD5", "Digest"),  # http
     *("modify", "modificationTime", "date_time", "sha"),  # ftp, webhdfs, archives, GitHub
 )
@@ -57,7 +60,10 @@ def mirrored(url: str) -> Path:
     base = root.rstrip("/")
     with _failures(url):
         system.invalidate_cache()
-        files = {path.removeprefix(base).lstrip("/"): entry for path, entry in _listing(system, base).items()}
+        files = {
+            path.removeprefix(base).lstrip("/"): entry
+            for path, entry in _listing(system, base).items()
+        }
     # A name with a query is a link of a server's listing, by which it is sorted.
     files = {name: files[name] for name in sorted(files) if name and "?" not in name}
     if not files:
@@ -66,7 +72,13 @@ def mirrored(url: str) -> Path:
         raise ValueError(f"{url}: expected files in the folder, got {outside}; rename it.")
     if not all(map(_versions, files.values())):
         with _failures(url), ThreadPoolExecutor(_REQUESTS) as requests:
-            files = dict(zip(files, requests.map(lambda name: system.info(f"{base}/{name}"), files), strict=True))
+            files = dict(
+                zip(
+                    files,
+                    requests.map(lambda name: system.info(f"{base}/{name}"), files),
+                    strict=True,
+                )
+            )
     folder = _folder(url, files) / base.rpartition("/")[2]
     sizes = {name: entry.get("size") for name, entry in files.items()}
     for name, size in sizes.items():
@@ -104,7 +116,9 @@ def _cache() -> Path:
 
 
 def _listing(system: Any, base: str) -> dict[str, Mapping[str, Any]]:
-    """Return the files below a folder by path; fsspec's `find` would leave out folders that it cannot list."""
+    """Return the files below a folder by path; fsspec's `find` would leave out folders that it
+    cannot list.
+    """
     entries = {}
     folders = [base]
     for folder in folders:  # which grows
@@ -120,7 +134,9 @@ def _listing(system: Any, base: str) -> dict[str, Mapping[str, Any]]:
 
 
 def _folder(url: str, files: Mapping[str, Mapping[str, Any]]) -> Path:
-    """Return the folder of these versions of files; a new one, until the process ends, if one has no version."""
+    """Return the folder of these versions of files; a new one, until the process ends, if one has
+    no version.
+    """
     has_versions = all(map(_versions, files.values()))
     versions = [(name, entry.get("size"), _versions(entry)) for name, entry in files.items()]
     content = repr((url, versions)) if has_versions else uuid.uuid4().hex
@@ -131,7 +147,9 @@ def _folder(url: str, files: Mapping[str, Mapping[str, Any]]) -> Path:
 
 
 def _versions(entry: Mapping[str, Any]) -> list[str]:
-    """Return the values of `_VERSION` in an entry of a listing, which change with its file; empty without any."""
+    """Return the values of `_VERSION` in an entry of a listing, which change with its file; empty
+    without any.
+    """
     return [f"{key} {entry[key]}" for key in _VERSION if entry.get(key)]
 
 
@@ -152,14 +170,18 @@ def _file_system(url: str) -> tuple[Any, str]:
     try:
         from fsspec.core import url_to_fs
     except ImportError:
-        raise ValueError(f"{url}: reading it needs the package fsspec; pip install 'morgs-mi[cluster]'.") from None
+        raise ValueError(
+            f"{url}: reading it needs the package fsspec; pip install 'morgs-mi[cluster]'."
+        ) from None
     try:
         with _failures(url):
             return url_to_fs(url, **_options(url))
     except ImportError as error:
         raise ValueError(f"{url}: reading it needs another package: {error}.") from None
     except ValueError as error:
-        raise ValueError(f"{url}: expected a URL that fsspec can open, got an error: {error}.") from None
+        raise ValueError(
+            f"{url}: expected a URL that fsspec can open, got an error: {error}."
+        ) from None
 
 
 def _options(url: str) -> dict[str, Any]:
@@ -172,7 +194,9 @@ def _options(url: str) -> dict[str, Any]:
 
 
 def _fetch(system: Any, url: str, remote: str, file: Path, size: int | None) -> None:
-    """Copy a remote file of `size` bytes, None if unknown; several processes may fetch the same one."""
+    """Copy a remote file of `size` bytes, None if unknown; several processes may fetch the same
+    one.
+    """
     partial = file.with_name(f".{file.name}-{os.getpid()}-{threading.get_ident()}")
     place = remote if is_url(remote) else f"{url}: {remote}"
     try:
@@ -185,14 +209,22 @@ def _fetch(system: Any, url: str, remote: str, file: Path, size: int | None) -> 
 
 
 def _check_content(place: str, file: Path, size: int | None) -> None:
-    """Raise `ConnectionError` if a fetched file has another size, or is a page of HTML, such as one to log in."""
+    """Raise `ConnectionError` if a fetched file has another size, or is a page of HTML, such as one
+    to log in.
+    """
     with file.open("rb") as stream:
         head = stream.read(512).lower()
     got = file.stat().st_size
     if any(mark in head for mark in _PAGE):
-        raise ConnectionError(f"{place}: expected a file, got a page of HTML; check the URL, or log in, and try again.")
+        raise ConnectionError(
+            f"{place}: expected a file, got a page of HTML; check the URL, or log in, and try "
+            "again."
+        )
     if size is not None and got != size:
-        raise ConnectionError(f"{place}: expected {size} bytes, got {got}; it has changed or was cut short, try again.")
+        raise ConnectionError(
+            f"{place}: expected {size} bytes, got {got}; it has changed or was cut short, try "
+            "again."
+        )
 
 
 @contextmanager
@@ -201,13 +233,19 @@ def _failures(place: str) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError:
-        raise FileNotFoundError(f"{place}: expected a file or a folder, found none; check the URL.") from None
+        raise FileNotFoundError(
+            f"{place}: expected a file or a folder, found none; check the URL."
+        ) from None
     except PermissionError as error:
-        raise PermissionError(f"{place}: expected to be allowed to read it, got {error}; check the rights.") from None
+        raise PermissionError(
+            f"{place}: expected to be allowed to read it, got {error}; check the rights."
+        ) from None
     except TimeoutError:
         message = f"{place}: expected an answer, got none in time; check the connection, try again."
         raise ConnectionError(message) from None
     except (ImportError, ValueError):
         raise
     except Exception as error:  # the libraries of the protocols have errors of their own
-        raise ConnectionError(f"{place}: expected to read it, got {str(error) or type(error).__name__}.") from None
+        raise ConnectionError(
+            f"{place}: expected to read it, got {str(error) or type(error).__name__}."
+        ) from None

@@ -1,7 +1,9 @@
-"""Gaussians in the files of other tools: PLY in the layout of 3D Gaussian Splatting, compressed PLY, and `.splat`.
+"""Gaussians in the files of other tools: PLY in the layout of 3D Gaussian Splatting, compressed
+PLY, and `.splat`.
 
-A `.splat` file has 32 bytes per Gaussian and nothing else: centre and standard deviations as float32 [3] each, colour
-and opacity as uint8 [4] of 0 to 1, and the quaternion wxyz as uint8 [4] of -1 to 1, where 128 is zero.
+A `.splat` file has 32 bytes per Gaussian and nothing else: centre and standard deviations as
+float32 [3] each, colour and opacity as uint8 [4] of 0 to 1, and the quaternion wxyz as uint8 [4] of
+-1 to 1, where 128 is zero.
 """
 
 from __future__ import annotations
@@ -21,7 +23,13 @@ SUFFIXES = (".compressed.ply", ".ply", ".splat")
 """Ends of the names of files that `read_splats` reads."""
 
 _RECORD = np.dtype(
-    [("means", "<f4", 3), ("scales", "<f4", 3), ("color", "u1", 3), ("opacity", "u1"), ("quats", "u1", 4)]
+    [
+        ("means", "<f4", 3),
+        ("scales", "<f4", 3),
+        ("color", "u1", 3),
+        ("opacity", "u1"),
+        ("quats", "u1", 4),
+    ]
 )
 
 
@@ -32,24 +40,29 @@ def suffix_of(path: str | Path) -> str | None:
 
 
 def read_splats(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
-    """Return the Gaussians in a file. Its name determines its format; a `.ply` may also be compressed.
+    """Return the Gaussians in a file. Its name determines its format; a `.ply` may also be
+    compressed.
 
     Args:
         path: the file.
-        most_invalid: share of Gaussians that are left out with a warning because a number of theirs is not finite, or a
-            centre, size or coefficient is above 1e12; 0: none.
+        most_invalid: share of Gaussians that are left out with a warning because a number of theirs
+            is not finite, or a centre, size or coefficient is above 1e12; 0: none.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file has another format, is broken or truncated, or has more invalid Gaussians.
+        ValueError: the file has another format, is broken or truncated, or has more invalid
+            Gaussians.
     """
     if not Path(path).is_file():
-        raise FileNotFoundError(f"{path}: expected a file with Gaussians, found none; check the path.")
+        raise FileNotFoundError(
+            f"{path}: expected a file with Gaussians, found none; check the path."
+        )
     refuse_foreign(path)
     suffix = suffix_of(path)
     if suffix is None:
         raise ValueError(
-            f"{path}: expected a file whose name ends in {', '.join(SUFFIXES)}, got {Path(path).suffix!r}; convert it."
+            f"{path}: expected a file whose name ends in {', '.join(SUFFIXES)}, got "
+            f"{Path(path).suffix!r}; convert it."
         )
     if suffix == ".splat":
         return _read_splat(Path(path), most_invalid)
@@ -66,12 +79,14 @@ def _read_splat(path: Path, most_invalid: float) -> Gaussians:
     size = path.stat().st_size
     if size % _RECORD.itemsize:
         raise ValueError(
-            f"{path}: expected {_RECORD.itemsize} bytes for each Gaussian, got {size} bytes, which is no multiple; the "
-            "file is truncated or no .splat, export it again."
+            f"{path}: expected {_RECORD.itemsize} bytes for each Gaussian, got {size} bytes, "
+            "which is no multiple; the file is truncated or no .splat, export it again."
         )
     records = np.fromfile(path, _RECORD)
     scales = np.where(records["scales"] >= 0, records["scales"], np.nan)
     quats = (records["quats"] - 128.0) / 128
     colors = (records["color"] / 255 - 0.5) / SH_C0
-    gaussians = Gaussians.from_activated(records["means"], scales, quats, records["opacity"] / 255, colors[:, None])
+    gaussians = Gaussians.from_activated(
+        records["means"], scales, quats, records["opacity"] / 255, colors[:, None]
+    )
     return without_invalid(path, gaussians, most_invalid)

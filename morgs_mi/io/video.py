@@ -1,10 +1,11 @@
 """Readers of video files and of folders of images.
 
-A frame is an RGB array [H, W, 3]: uint8 in sRGB, or of an EXR file float32 in linear light. `VideoReader` and
-`FolderReader` have the same members.
+A frame is an RGB array [H, W, 3]: uint8 in sRGB, or of an EXR file float32 in linear light.
+`VideoReader` and `FolderReader` have the same members.
 
-Many cameras, above all in phones, record at a variable frame rate: they delay or leave out frames. The container
-stores the time of each frame, so the reader knows where on a regular clock the frames lie.
+Many cameras, above all in phones, record at a variable frame rate: they delay or leave out frames.
+The container stores the time of each frame, so the reader knows where on a regular clock the frames
+lie.
 """
 
 from __future__ import annotations
@@ -28,8 +29,9 @@ from morgs_mi.io.remote import fetched
 
 # Bytes of memory that a pixel takes, in BGR and RGB.
 _BYTES_PER_PIXEL = 6
-# First frame that is worth a search, and the frames before it at which the search aims: those shown right after a
-# keyframe may refer to frames before it, and a file may be indexed by the times of decoding.
+# First frame that is worth a search, and the frames before it at which the search aims: those shown
+# right after a keyframe may refer to frames before it, and a file may be indexed by the times of
+# decoding.
 FAR = 100
 _BEFORE = 32
 # Frames that a clip may pause; the instants of the pause are listed.
@@ -38,12 +40,15 @@ _MAX_PAUSE = 1_000_000
 
 def natural_key(name: str) -> list[str | int]:
     """Return a sorting key that places cam_2 before cam_10."""
-    # split() with a group alternates text and digits, so keys compare text with text and int with int.
+    # split() with a group alternates text and digits, so keys compare text with text and int with
+    # int.
     return [int(piece) if i % 2 else piece for i, piece in enumerate(re.split(r"([0-9]+)", name))]
 
 
 def numbering_gap(names: Sequence[str]) -> int | None:
-    """Return the index of the first name with a last number that does not continue the sequence, or None."""
+    """Return the index of the first name with a last number that does not continue the sequence, or
+    None.
+    """
     numbers = [int((re.findall(r"[0-9]+", name) or ["-1"])[-1]) for name in names]
     steps = np.diff(numbers)
     if len(names) < 2 or (min(numbers) >= 0 and steps.min() >= 1 and steps.min() == steps.max()):
@@ -55,7 +60,8 @@ def numbering_gap(names: Sequence[str]) -> int | None:
 class VideoReader:
     """Reader of a video file.
 
-    Each call of `frames` or `pick` decodes from the start, or far from there from the last keyframe before, see `pick`.
+    Each call of `frames` or `pick` decodes from the start, or far from there from the last keyframe
+    before, see `pick`.
     """
 
     path: Path  #: The file.
@@ -64,8 +70,9 @@ class VideoReader:
     width: int  #: In pixels.
     height: int  #: In pixels.
     num_held: int  #: Number of frames in the file; less than `num_frames` if it was truncated.
-    #: Times of the frames in the file, in frames of a regular clock of rate `fps`, which shows position k at the time
-    #: of frame k of a clip of constant rate [num_held]; None at a constant rate.
+    #: Times of the frames in the file, in frames of a regular clock of rate `fps`, which shows
+    #: position k at the time of frame k of a clip of constant rate [num_held]; None at a constant
+    #: rate.
     positions: np.ndarray | None = field(default=None, compare=False)
     #: Times of the frames in the file, ascending, s [num_held]; None if it does not store them.
     times: np.ndarray | None = field(default=None, compare=False, repr=False)
@@ -94,15 +101,25 @@ class VideoReader:
                 periods = float(positions[-1] - positions[0])
                 if positions[-1] > 10 * num_held + _MAX_PAUSE:
                     raise ValueError(
-                        f"{path}: expected {num_held} frames at about {rate:.3g} per second, got time stamps that span "
-                        f"{times[-1]:.3g} s; they are broken, convert the clip."
+                        f"{path}: expected {num_held} frames at about {rate:.3g} per second, got "
+                        f"time stamps that span {times[-1]:.3g} s; they are broken, convert the "
+                        "clip."
                     )
-                # Where the number is not stored, it is the duration times the mean rate; a clip of this length is
-                # complete.
+                # Where the number is not stored, it is the duration times the mean rate; a clip of
+                # this length is complete.
                 if fps > 0 and num_frames / fps <= times[-1] + 1.5 / rate:
                     num_frames = num_held
             fps = true_rate(fps, periods, float(times[-1] - times[0]))
-        return cls(path, num_frames, fps if fps > 0 else None, header.width, header.height, num_held, positions, times)
+        return cls(
+            path,
+            num_frames,
+            fps if fps > 0 else None,
+            header.width,
+            header.height,
+            num_held,
+            positions,
+            times,
+        )
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
         """Yield frames start..stop-1, by default up to `num_frames`.
@@ -110,14 +127,18 @@ class VideoReader:
         Raises:
             ValueError: a frame before `stop` cannot be decoded.
         """
-        return _raising(self.pick(range(start, self.num_frames if stop is None else min(stop, self.num_frames))))
+        return _raising(
+            self.pick(range(start, self.num_frames if stop is None else min(stop, self.num_frames)))
+        )
 
     def pick(self, indices: Sequence[int]) -> Generator[ImageOrError, None, None]:
-        """Yield the frames of ascending `indices`, with an error in place of each that cannot be decoded.
+        """Yield the frames of ascending `indices`, with an error in place of each that cannot be
+        decoded.
 
-        The frames between are decoded too. Those before the first are skipped if the time stamps of the frames that are
-        decoded instead prove which ones they are. The pixels are the same as after decoding from the start,
-        except in streams that refresh their images gradually instead of with keyframes.
+        The frames between are decoded too. Those before the first are skipped if the time stamps of
+        the frames that are decoded instead prove which ones they are. The pixels are the same as
+        after decoding from the start, except in streams that refresh their images gradually instead
+        of with keyframes.
         """
         stream, done = self._opened_before(indices[0]) if len(indices) else (self._opened(), 0)
         ok = True
@@ -127,7 +148,11 @@ class VideoReader:
                     ok = stream.grab()
                     done += ok
                 frame = stream.retrieve()[1] if ok else None
-                yield self._missing(index if ok else done) if frame is None else cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
+                yield (
+                    self._missing(index if ok else done)
+                    if frame is None
+                    else cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
+                )
         finally:
             stream.release()
 
@@ -135,7 +160,9 @@ class VideoReader:
         return cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
 
     def _opened_before(self, index: int) -> tuple[cv2.VideoCapture, int]:
-        """Return the decoder of the file, and the number of frames that it has passed: none, or all up to `index`."""
+        """Return the decoder of the file, and the number of frames that it has passed: none, or all
+        up to `index`.
+        """
         if self.times is None or not FAR <= index < len(self.times):
             return self._opened(), 0
         stream = self._opened()
@@ -153,17 +180,19 @@ class VideoReader:
 
     def _missing(self, index: int) -> ValueError:
         if index >= self.num_frames:
-            return ValueError(f"{self.path}: it has ended after {self.num_frames} frames; record longer.")
+            return ValueError(
+                f"{self.path}: it has ended after {self.num_frames} frames; record longer."
+            )
         return ValueError(
-            f"{self.path}: frame {index} of {self.num_frames} cannot be decoded: the file is truncated or broken; copy "
-            f"it again or use the first {index} frames (`max_frames`)."
+            f"{self.path}: frame {index} of {self.num_frames} cannot be decoded: the file is "
+            f"truncated or broken; copy it again or use the first {index} frames (`max_frames`)."
         )
 
 
 @dataclass(frozen=True)
 class FolderReader:
-    """Reader of a folder of numbered images, e.g. ``0000.png``, with the members of `VideoReader`, `fps` and
-    `positions` being None.
+    """Reader of a folder of numbered images, e.g. ``0000.png``, with the members of `VideoReader`,
+    `fps` and `positions` being None.
 
     The images may also be a list of files in any folders; `path` is then the folder of the first.
     """
@@ -179,7 +208,8 @@ class FolderReader:
 
     @classmethod
     def open(cls, path: str | Path) -> FolderReader:
-        """Return the reader of a folder's images in the order of their numbers; the first is decoded.
+        """Return the reader of a folder's images in the order of their numbers; the first is
+        decoded.
 
         Raises:
             FileNotFoundError: the folder or the images are missing.
@@ -189,24 +219,32 @@ class FolderReader:
         files = _images(path)
         if gap := numbering_gap([f.stem for f in files]):
             raise ValueError(
-                f"{path}: the images must be numbered without gaps, got {files[gap - 1].name} followed by "
-                f"{files[gap].name}; extract the frames again, or go on without the missing ones (--gaps)."
+                f"{path}: the images must be numbered without gaps, got {files[gap - 1].name} "
+                f"followed by {files[gap].name}; extract the frames again, or go on without the "
+                "missing ones (--gaps)."
             )
         return replace(cls.of_files(files), numbers=_numbers(files))
 
     @classmethod
     def of_files(cls, files: Sequence[Path], gaps: bool = False) -> FolderReader:
-        """Return the reader of the images `files`; the first is decoded, with `gaps` the first that is readable.
+        """Return the reader of the images `files`; the first is decoded, with `gaps` the first that
+        is readable.
 
         Raises:
             FileNotFoundError: a file is missing.
             ValueError: there are none, or the first cannot be decoded.
         """
         if not files:
-            raise ValueError("FolderReader.of_files(): expected at least one image, got none; list the frames.")
+            raise ValueError(
+                "FolderReader.of_files(): expected at least one image, got none; list the frames."
+            )
         if not gaps and (missing := next((f for f in files if not f.is_file()), None)):
             raise _no_image(missing)
-        readable = (f for f in files if not isinstance(_image_or_error(f), Exception)) if gaps else iter(files)
+        readable = (
+            (f for f in files if not isinstance(_image_or_error(f), Exception))
+            if gaps
+            else iter(files)
+        )
         first = _read_image(next(readable, files[0]))
         return cls(files[0].parent, tuple(files), first.shape[1], first.shape[0])
 
@@ -231,16 +269,21 @@ class FolderReader:
         return _raising(self.pick(range(self.num_frames)[start:stop]))
 
     def pick(self, indices: Sequence[int]) -> Generator[ImageOrError, None, None]:
-        """Yield the frames `indices`, with an error in place of each that is missing, broken or of another size."""
+        """Yield the frames `indices`, with an error in place of each that is missing, broken or of
+        another size.
+        """
         for index in indices:
             if index >= self.num_frames:
-                yield ValueError(f"{self.path}: it has ended after {self.num_frames} images; record longer.")
+                yield ValueError(
+                    f"{self.path}: it has ended after {self.num_frames} images; record longer."
+                )
                 continue
             frame = _image_or_error(self.files[index])
             if isinstance(frame, np.ndarray) and frame.shape[:2] != (self.height, self.width):
                 frame = ValueError(
-                    f"{self.files[index]}: expected {self.width}x{self.height} as in {self.files[0].name}, got "
-                    f"{frame.shape[1]}x{frame.shape[0]}; extract the frames again."
+                    f"{self.files[index]}: expected {self.width}x{self.height} as in "
+                    f"{self.files[0].name}, got {frame.shape[1]}x{frame.shape[0]}; extract the "
+                    "frames again."
                 )
             yield frame
 
@@ -255,17 +298,21 @@ ImageOrError = np.ndarray | ValueError | FileNotFoundError
 def open_clips(clips: Sequence[Clip], gaps: bool = False) -> list[FrameReader]:
     """Return one reader per camera; with `gaps`, images may be missing or broken.
 
-    Folders that count together (see `counting_together`) are then aligned by the numbers of their images: a number
-    that only others have is a missing image.
+    Folders that count together (see `counting_together`) are then aligned by the numbers of their
+    images: a number that only others have is a missing image.
 
     Raises:
         FileNotFoundError: a clip is missing, or one of its images.
         ValueError: as `VideoReader.open` and `FolderReader.open`.
     """
     folders = [clip for clip in clips if gaps and isinstance(clip, Path) and clip.is_dir()]
-    folder_files = {folder: {image_number(file): file for file in _images(folder)} for folder in folders}
+    folder_files = {
+        folder: {image_number(file): file for file in _images(folder)} for folder in folders
+    }
     readers: dict[Clip, FrameReader] = {}
-    for group in counting_together({folder: sorted(files) for folder, files in folder_files.items()}):
+    for group in counting_together(
+        {folder: sorted(files) for folder, files in folder_files.items()}
+    ):
         numbers = _instants([folder_files[folder] for folder in group])
         for folder in group:
             files = folder_files[folder]
@@ -275,7 +322,8 @@ def open_clips(clips: Sequence[Clip], gaps: bool = False) -> list[FrameReader]:
 
 
 def _instants(group: Sequence[Mapping[int, Path]]) -> range:
-    """Return the numbers of the instants of folders that count together, given by their images by number.
+    """Return the numbers of the instants of folders that count together, given by their images by
+    number.
 
     Raises:
         ValueError: there are far more than images.
@@ -293,7 +341,8 @@ def _instants(group: Sequence[Mapping[int, Path]]) -> range:
 
 
 def open_frames(path: str | Path | tuple[Path, ...], gaps: bool = False) -> FrameReader:
-    """Return the reader of a video file, a folder of images or a list of images; raises the errors of their `open`.
+    """Return the reader of a video file, a folder of images or a list of images; raises the errors
+    of their `open`.
 
     With `gaps`, images of a list may be missing or broken.
     """
@@ -316,7 +365,8 @@ def _images(path: Path) -> list[Path]:
     files = sorted(images_in(path), key=lambda f: natural_key(f.stem))
     if not files:
         raise FileNotFoundError(
-            f"{path}: expected images ({', '.join((*IMAGE_SUFFIXES, EXR_SUFFIX))}), found none; extract the frames."
+            f"{path}: expected images ({', '.join((*IMAGE_SUFFIXES, EXR_SUFFIX))}), found none; "
+            "extract the frames."
         )
     return files
 
@@ -338,19 +388,25 @@ def image_number(file: Path) -> int:
     """
     numbers = re.findall(r"[0-9]+", file.stem)
     if not numbers:
-        raise ValueError(f"{file}: expected an image whose name ends in a number, got none; extract the frames again.")
+        raise ValueError(
+            f"{file}: expected an image whose name ends in a number, got none; extract the frames "
+            "again."
+        )
     return int(numbers[-1])
 
 
 def _missing_name(folder: Path, files: Mapping[int, Path], number: int) -> Path:
     """Return the path that a missing image would have."""
     other = next(iter(files.values()))
-    return folder / re.sub(r"[0-9]+(?=[^0-9]*\.)", lambda old: str(number).zfill(len(old[0])), other.name, count=1)
+    return folder / re.sub(
+        r"[0-9]+(?=[^0-9]*\.)", lambda old: str(number).zfill(len(old[0])), other.name, count=1
+    )
 
 
 def _no_image(file: Path) -> FileNotFoundError:
     return FileNotFoundError(
-        f"{file}: expected an image, found none; extract the frames again, or go on without it (--gaps)."
+        f"{file}: expected an image, found none; extract the frames again, or go on without it "
+        "(--gaps)."
     )
 
 
@@ -389,5 +445,7 @@ def decode_image(file: Path, data: np.ndarray, mode: int) -> np.ndarray:
     check_claim(file, _BYTES_PER_PIXEL * width * height, f"{width}x{height} pixels")
     image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
     if image is None:
-        raise ValueError(f"{file}: expected an image, got {len(data)} bytes that cannot be decoded.")
+        raise ValueError(
+            f"{file}: expected an image, got {len(data)} bytes that cannot be decoded."
+        )
     return image

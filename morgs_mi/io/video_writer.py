@@ -14,8 +14,11 @@ PLAYABLE = "vp09"
 """Codec of videos in .mp4 that browsers and players open: VP9, which OpenCV's wheels have."""
 
 
-def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float, codec: str = "FFV1") -> None:
-    """Write RGB uint8 frames [H, W, 3] as a video, or as a folder of PNGs where `path` has no suffix.
+def write_video(
+    path: str | Path, frames: Iterable[np.ndarray], fps: float, codec: str = "FFV1"
+) -> None:
+    """Write RGB uint8 frames [H, W, 3] as a video, or as a folder of PNGs where `path` has no
+    suffix.
 
     The file gets its name only after all of it could be read back, so it is never incomplete.
 
@@ -23,14 +26,15 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float, code
         path: ``.mp4``, ``.mkv``, ``.avi``, ... or a folder that does not exist yet.
         frames: at least one, all of one even width and height (any size in a folder).
         fps: frames per second; not stored in a folder.
-        codec: OpenCV's four-character code. ``FFV1`` is lossless, in .mp4 too, but no browser plays it, unlike
-            `PLAYABLE`. On a path-traced box at 304x224, 4:2:0 chroma alone allows 42.4 dB; ``vp09`` reaches 39.2 dB at
-            37 ms a frame, ``mp4v`` 37.6 dB at 0.6 ms. OpenCV has no setting of the quality (opencv issue 24570), and
-            its wheels have no ``avc1``.
+        codec: OpenCV's four-character code. ``FFV1`` is lossless, in .mp4 too, but no browser plays
+            it, unlike `PLAYABLE`. On a path-traced box at 304x224, 4:2:0 chroma alone allows 42.4
+            dB; ``vp09`` reaches 39.2 dB at 37 ms a frame, ``mp4v`` 37.6 dB at 0.6 ms. OpenCV has no
+            setting of the quality (opencv issue 24570), and its wheels have no ``avc1``.
 
     Raises:
         ValueError: there are no frames, or a frame is not as described.
-        OSError: the encoder is missing, the folder exists, or the written frames cannot be read back.
+        OSError: the encoder is missing, the folder exists, or the written frames cannot be read
+            back.
     """
     path = Path(path)
     if path.suffix:
@@ -45,7 +49,9 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float, code
             (folder / f"{i:04d}.png").write_bytes(png.tobytes())
 
 
-def _write_file(partial: Path, path: Path, frames: Iterable[np.ndarray], fps: float, codec: str) -> None:
+def _write_file(
+    partial: Path, path: Path, frames: Iterable[np.ndarray], fps: float, codec: str
+) -> None:
     count = 0
     encoder = None
     try:
@@ -54,14 +60,22 @@ def _write_file(partial: Path, path: Path, frames: Iterable[np.ndarray], fps: fl
                 height, width = frame.shape[:2]
                 if width % 2 or height % 2:
                     raise ValueError(
-                        f"write_video({path}): the width and height must be even, because OpenCV drops an odd "
-                        f"column or row, got {width}x{height}; crop, or write a folder of PNGs."
+                        f"write_video({path}): the width and height must be even, because OpenCV "
+                        f"drops an odd column or row, got {width}x{height}; crop, or write a "
+                        "folder of PNGs."
                     )
                 encoder = cv2.VideoWriter(
-                    str(partial), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), fps, (width, height)
+                    str(partial),
+                    cv2.CAP_FFMPEG,
+                    cv2.VideoWriter.fourcc(*codec),
+                    fps,
+                    (width, height),
                 )
                 if not encoder.isOpened():
-                    raise OSError(f"OpenCV could not open it with the encoder {codec!r}; try the codec FFV1 or mp4v")
+                    raise OSError(
+                        f"OpenCV could not open it with the encoder {codec!r}; try the codec FFV1 "
+                        "or mp4v"
+                    )
             encoder.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
             count += 1
     finally:
@@ -81,11 +95,18 @@ def _checked(path: Path, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
     shape = None
     for i, frame in enumerate(frames):
         shape = frame.shape if shape is None else shape
-        if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or frame.shape != shape:
+        if (
+            frame.dtype != np.uint8
+            or frame.ndim != 3
+            or frame.shape[2] != 3
+            or frame.shape != shape
+        ):
             raise ValueError(
                 f"write_video({path}): frame {i} must be uint8 [H, W, 3] of the first frame's size "
                 f"{shape[:2]}, got {frame.dtype} {frame.shape}; convert it first."
             )
         yield frame
     if shape is None:
-        raise ValueError(f"write_video({path}): at least one frame was expected, got none; pass frames.")
+        raise ValueError(
+            f"write_video({path}): at least one frame was expected, got none; pass frames."
+        )

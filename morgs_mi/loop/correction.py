@@ -24,15 +24,25 @@ class Correction:
 
     def corrected(self, images: Images) -> dict[int, np.ndarray]:
         """Return images, by view index, in the colours of the scene."""
-        return {v: self.exposures[v].corrected(image) if self.exposures else image for v, image in images.items()}
+        return {
+            v: self.exposures[v].corrected(image) if self.exposures else image
+            for v, image in images.items()
+        }
 
     def followed_by(self, relative: Mapping[int, Exposure]) -> tuple[Exposure, ...]:
-        """Return the exposures of a frame, with those relative to the view's first image by view index."""
-        return tuple(relative.get(v, Exposure()).after(first) for v, first in enumerate(self.exposures))
+        """Return the exposures of a frame, with those relative to the view's first image by view
+        index.
+        """
+        return tuple(
+            relative.get(v, Exposure()).after(first) for v, first in enumerate(self.exposures)
+        )
 
 
-def estimate_correction(setup: Setup, images: Images, progress: Progress) -> tuple[Correction, dict[str, Any]]:
-    """Return the correction by the balance of the cameras, and its entry of the first frame's report.
+def estimate_correction(
+    setup: Setup, images: Images, progress: Progress
+) -> tuple[Correction, dict[str, Any]]:
+    """Return the correction by the balance of the cameras, and its entry of the first frame's
+    report.
 
     Args:
         setup: data that all frames share.
@@ -47,12 +57,16 @@ def estimate_correction(setup: Setup, images: Images, progress: Progress) -> tup
         return identity, {}
     start_rng = rng_of(config.seed, Stream.BALANCED_POINTS)
     views = views_of(setup, images)
-    problem = FirstFrameProblem.of(views, setup.cloud, balance_config(config.fit), config.render, start_rng)
+    problem = FirstFrameProblem.of(
+        views, setup.cloud, balance_config(config.fit), config.render, start_rng
+    )
     balance = balance_cameras(problem, config.fit, config.seed, progress)
     if not balance.taken:
         return identity, _entry(balance)
     exposures = dict(zip(images, balance.exposures, strict=True))
-    return Correction(tuple(exposures.get(v, Exposure()) for v in range(len(setup.cameras)))), _entry(balance)
+    return Correction(
+        tuple(exposures.get(v, Exposure()) for v in range(len(setup.cameras)))
+    ), _entry(balance)
 
 
 def _entry(balance: Balance) -> dict[str, Any]:

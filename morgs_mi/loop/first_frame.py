@@ -53,7 +53,9 @@ def fitted_first_frame(
     def packed(gaussians: Gaussians) -> Packet:
         return keyframe_packet(gaussians, 0, setup.cameras, config.codec)
 
-    on_round = None if on_provisional is None else lambda gaussians: on_provisional(packed(gaussians))
+    on_round = (
+        None if on_provisional is None else lambda gaussians: on_provisional(packed(gaussians))
+    )
     fitted = fit_first_frame(problem, fit_config, rng, progress.of(plan.stage), on_round)
     forecast = unseen_views(problem, fitted.gaussians).entries if len(views) > 1 else {}
     return FittedFrame(
@@ -70,7 +72,10 @@ def _start_status(setup: Setup, config: FitConfig) -> str:
     """Return a status about the points that the first frame starts from."""
     if (count := len(setup.points)) >= MIN_POINTS:
         return "ok"
-    status = f"the capture has {count} points, too few: seeded {config.first_count} random ones inside the views"
+    status = (
+        f"the capture has {count} points, too few: seeded {config.first_count} random ones inside "
+        "the views"
+    )
     _LOG.warning("frame 0: %s", status)
     return status
 
@@ -82,7 +87,8 @@ def with_first_confidence(
     flows: Mapping[int, FlowObservation],
     rng: np.random.Generator,
 ) -> Gaussians:
-    """Return the Gaussians of the first frame with a confidence learned from the masks of that frame (eqs. 9 to 11).
+    """Return the Gaussians of the first frame with a confidence learned from the masks of that
+    frame (eqs. 9 to 11).
 
     Args:
         setup: data that all frames share.
@@ -96,7 +102,11 @@ def with_first_confidence(
     if not flows or not motion.learn_confidence:
         return gaussians
     masks = {
-        v: motion_mask(images[v], flow.forward_flow, flow.forward_reliable, motion.mask_method, motion.masks)
+        v: motion_mask(
+            images[v], flow.forward_flow, flow.forward_reliable, motion.mask_method, motion.masks
+        )
         for v, flow in flows.items()
     }
-    return fit_confidence(gaussians, dict(enumerate(setup.cameras)), masks, config.fit, config.render, rng)[0]
+    return fit_confidence(
+        gaussians, dict(enumerate(setup.cameras)), masks, config.fit, config.render, rng
+    )[0]

@@ -23,8 +23,8 @@ class FrameReport:
         status: "ok", or a sentence about a problem and how it was handled.
         missing_views: names of the views without an image.
         active: fractions that took part, by name: gaussians, views, pixels, epochs.
-        validation: of the first frame, a `sentence` on views between the cameras, with the fields of `UnseenViews`
-            (see `fit.unseen_views`); empty with a single view.
+        validation: of the first frame, a `sentence` on views between the cameras, with the fields
+            of `UnseenViews` (see `fit.unseen_views`); empty with a single view.
         steps: number of optimisation steps.
         exposures: gain and bias of each view; empty if they are not estimated.
     """
@@ -48,7 +48,9 @@ class FrameReport:
 
 @dataclass(frozen=True)
 class FittedFrame:
-    """Result of the fit of a frame: its packet, entries of its `FrameReport`, and the correction of its images."""
+    """Result of the fit of a frame: its packet, entries of its `FrameReport`, and the correction of
+    its images.
+    """
 
     packet: Packet
     correction: Correction

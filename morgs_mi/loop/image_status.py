@@ -1,4 +1,4 @@
-"""Problems that the images of a frame alone show: views of one colour, and a cut to another scene."""
+"""Problems that the images of a frame show: views of one colour, and a cut to another scene."""
 
 from __future__ import annotations
 
@@ -7,16 +7,19 @@ from collections.abc import Mapping, Sequence
 import cv2
 import numpy as np
 
-# px: thumbnails of this width keep the layout of a scene, without noise and the motion between two frames.
+# px: thumbnails of this width keep the layout of a scene, without noise and the motion between two
+# frames.
 _WIDTH = 16
 # Standard deviation of the thumbnail of an image of one colour, in grey levels.
 _PLAIN = 2.0
 # Mean of a black image, in grey levels.
 _BLACK = 16.0
-# Correlation of the thumbnails of successive frames; it is 0.95 and more in recordings, and 0.7 and less at cuts.
+# Correlation of the thumbnails of successive frames; it is 0.95 and more in recordings, and 0.7 and
+# less at cuts.
 _SAME_SCENE = 0.8
-# Share of a thumbnail that changes by more than some grey levels: a few percent in recordings, half of it at cuts. A
-# bright object alone, in fast motion before a dull scene, changes the correlation and less of the thumbnail.
+# Share of a thumbnail that changes by more than some grey levels: a few percent in recordings, half
+# of it at cuts. A bright object alone, in fast motion before a dull scene, changes the correlation
+# and less of the thumbnail.
 _LEAST_CHANGED = 0.4
 _CHANGE = 8.0
 
@@ -28,23 +31,28 @@ def image_status(
 
     Args:
         names: of the views.
-        previous: images of the frame before, uint8 [H, W, 3], by view index; empty for the first frame.
+        previous: images of the frame before, uint8 [H, W, 3], by view index; empty for the first
+            frame.
         images: of this frame, likewise.
     """
     thumbnails = {v: _thumbnail(image) for v, image in images.items()}
     plain = [v for v, image in thumbnails.items() if image.std((0, 1)).max() < _PLAIN]
-    pairs = {v: (_thumbnail(previous[v]), thumbnails[v]) for v in thumbnails.keys() & previous.keys()}
+    pairs = {
+        v: (_thumbnail(previous[v]), thumbnails[v]) for v in thumbnails.keys() & previous.keys()
+    }
     cuts = [v for v, pair in pairs.items() if v not in plain and _is_cut(*pair)]
     return (*_plain_status(names, thumbnails, plain), *_cut_status(names, len(thumbnails), cuts))
 
 
-def _plain_status(names: Sequence[str], images: Mapping[int, np.ndarray], plain: Sequence[int]) -> tuple[str, ...]:
+def _plain_status(
+    names: Sequence[str], images: Mapping[int, np.ndarray], plain: Sequence[int]
+) -> tuple[str, ...]:
     if not plain:
         return ()
     color = "black" if max(images[v].mean() for v in plain) < _BLACK else "of one colour"
     return (
-        f"{_list(names, plain)}: the image is {color}; cut such frames off the recording, or leave the camera out "
-        "(--without)",
+        f"{_list(names, plain)}: the image is {color}; cut such frames off the recording, or "
+        "leave the camera out (--without)",
     )
 
 
@@ -53,12 +61,12 @@ def _cut_status(names: Sequence[str], count: int, views: Sequence[int]) -> tuple
         return ()
     if 2 * len(views) >= count:
         return (
-            "the images show another scene than in the frame before; end the fit before this frame (--frames), and fit "
-            "the rest as another recording",
+            "the images show another scene than in the frame before; end the fit before this "
+            "frame (--frames), and fit the rest as another recording",
         )
     return (
-        f"{_list(names, views)}: the image shows something else than in the frame before; if the camera was moved, or "
-        "its clip has a cut, leave it out (--without)",
+        f"{_list(names, views)}: the image shows something else than in the frame before; if the "
+        "camera was moved, or its clip has a cut, leave it out (--without)",
     )
 
 
@@ -73,7 +81,9 @@ def _thumbnail(image: np.ndarray) -> np.ndarray:
 
 
 def _is_cut(a: np.ndarray, b: np.ndarray) -> bool:
-    """Return whether two thumbnails show different scenes; another exposure, or light after black, is no cut."""
+    """Return whether two thumbnails show different scenes; another exposure, or light after black,
+    is no cut.
+    """
     if a.std((0, 1)).max() < _PLAIN:
         return False
     a = a - a.mean((0, 1))

@@ -1,4 +1,4 @@
-"""The images that a caller gives to the loop, as arrays: uint8 in sRGB, or float32 in linear light."""
+"""Images that a caller gives to the loop, as arrays: uint8 in sRGB, or float32 in linear light."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import positive_light
 
 Given: TypeAlias = Any
-"""An image [H, W, 3]: a uint8 array in sRGB; linear light as a float array or a `mi.TensorXf`; or a `mi.Bitmap`, whose
-flag `srgb_gamma` counts."""
+"""An image [H, W, 3]: a uint8 array in sRGB; linear light as a float array or a `mi.TensorXf`; or a
+`mi.Bitmap`, whose flag `srgb_gamma` counts."""
 
 
 def as_array(image: Any) -> Any:
-    """Return a copy of a bitmap or a tensor as an array: uint8 if it is in sRGB of 8 bits, else linear float32.
+    """Return a copy of a bitmap or a tensor as an array: uint8 if it is in sRGB of 8 bits, else
+    linear float32.
 
     Any other value is returned as it is.
     """
@@ -29,20 +30,29 @@ def as_array(image: Any) -> Any:
     return np.array(dr.detach(image)) if dr.is_tensor_v(image) else image
 
 
-def copied_images(cameras: Sequence[Camera], images: Sequence[Given | None], frame: int) -> dict[int, np.ndarray]:
-    """Return copies of the images of those views that have one, by view index, negative light set to 0.
+def copied_images(
+    cameras: Sequence[Camera], images: Sequence[Given | None], frame: int
+) -> dict[int, np.ndarray]:
+    """Return copies of the images of those views that have one, by view index, negative light set
+    to 0.
 
     Raises:
-        ValueError: their number is not that of the cameras, an image has another size or type than its camera, or light
-            that is not finite, or the first frame has no image at all.
+        ValueError: their number is not that of the cameras, an image has another size or type than
+            its camera, or light that is not finite, or the first frame has no image at all.
     """
-    count = len(images) if isinstance(images, (Sequence, np.ndarray)) else f"a {type(images).__name__}"
+    count = (
+        len(images) if isinstance(images, (Sequence, np.ndarray)) else f"a {type(images).__name__}"
+    )
     if count != len(cameras):
         raise ValueError(
-            f"step(): frame {frame} must have one image or None for each of {len(cameras)} views, got {count}."
+            f"step(): frame {frame} must have one image or None for each of {len(cameras)} views, "
+            f"got {count}."
         )
     if not frame and all(image is None for image in images):
-        raise ValueError("step(): frame 0 must have an image of at least one view, got none; begin with one that has.")
+        raise ValueError(
+            "step(): frame 0 must have an image of at least one view, got none; begin with one "
+            "that has."
+        )
     views = enumerate(zip(cameras, images, strict=True))
     return {
         view: _copy(image, camera, f"step(): frame {frame} of view {camera.name or view!r}")
@@ -59,5 +69,11 @@ def _copy(image: Given, camera: Camera, place: str) -> np.ndarray:
         return array.copy()
     if is_image and array.dtype.kind == "f":
         return positive_light(array, place)
-    kind = f"{array.dtype} {list(array.shape)}" if isinstance(array, np.ndarray) else type(array).__name__
-    raise ValueError(f"{place} must be uint8 {list(shape)}, or linear light in floats, got {kind}; convert it.")
+    kind = (
+        f"{array.dtype} {list(array.shape)}"
+        if isinstance(array, np.ndarray)
+        else type(array).__name__
+    )
+    raise ValueError(
+        f"{place} must be uint8 {list(shape)}, or linear light in floats, got {kind}; convert it."
+    )

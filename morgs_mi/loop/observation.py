@@ -1,7 +1,7 @@
 """Input of the loop: the rig, and the observations of a frame that follow from its images alone.
 
-Changes and optical flow do not depend on the Gaussians. They can be computed for the next frame while this one is
-fitted.
+Changes and optical flow do not depend on the Gaussians. They can be computed for the next frame
+while this one is fitted.
 """
 
 from __future__ import annotations
@@ -70,13 +70,16 @@ class Recorded(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class ImageHistory:
-    """Images up to a frame, with the exposure of each view's first image if exposures are estimated."""
+    """Images up to a frame, with the exposure of each view's first image if exposures are
+    estimated.
+    """
 
     #: Of that frame as a display shows them, uint8, by view index, of the views that have one.
     images: Images = field(default_factory=dict)
     #: Images that the next frame is compared with to detect changes, by view index.
     references: Images = field(default_factory=dict)
-    #: Of that frame relative to the view's first image, by view index; empty if they are not estimated.
+    #: Of that frame relative to the view's first image, by view index; empty if they are not
+    #: estimated.
     exposures: Mapping[int, Exposure] = field(default_factory=dict)
     #: Stops by which linear light is brightened for them; None before the first frame.
     display_exposure: float | None = None
@@ -89,10 +92,11 @@ class FrameObservation:
     history: ImageHistory  #: The images, with those before.
     #: Masks of changed pixels [H, W], by view index; None: all pixels may have changed.
     changes: Mapping[int, np.ndarray] | None
-    flows: Mapping[int, FlowObservation]  #: Optical flow of the key views that changed, by view index.
+    #: Optical flow of the key views that changed, by view index.
+    flows: Mapping[int, FlowObservation]
     key_views: Mapping[int, KeyView]  #: These views for the terms of the objective, by view index.
-    #: Images that the fit compares, encoded, by view index: `history.images` where uint8 was given, otherwise float32
-    #: with values above 1.
+    #: Images that the fit compares, encoded, by view index: `history.images` where uint8 was given,
+    #: otherwise float32 with values above 1.
     encoded: Images
     recorded: Images  #: The images as they were given, by view index.
 
@@ -108,8 +112,8 @@ class Setup:
     key_views: tuple[int, ...]  #: Indices of the views with optical flow and masks.
     extent: float  #: Of the scene, world units.
     config: StreamConfig  #: Settings.
-    #: Stops by which linear light is brightened where flow and changes are computed; None: the first frame determines
-    #: it, see `display_stops`.
+    #: Stops by which linear light is brightened where flow and changes are computed; None: the
+    #: first frame determines it, see `display_stops`.
     display_exposure: float | None = None
 
     @property
@@ -131,19 +135,24 @@ def prepare(
     check_type("StreamLoop()", "config", config, StreamConfig)
     if not isinstance(cameras, Sequence) or not cameras:
         kind = f"a {type(cameras).__name__}" if cameras else "none"
-        raise ValueError(f"StreamLoop(): `cameras` must be a sequence of at least one view, got {kind}; pass a list.")
+        raise ValueError(
+            f"StreamLoop(): `cameras` must be a sequence of at least one view, got {kind}; pass a "
+            "list."
+        )
     for camera in cameras:
         check_type("StreamLoop()", "cameras", camera, Camera)
     points, point_colors = check_points("StreamLoop()", points, point_colors, BRIGHTEST)
     masks = (None,) * len(cameras) if masks is None else masks
     if len(masks) != len(cameras):
         raise ValueError(
-            f"StreamLoop(): `masks` must have one mask or None for each of {len(cameras)} views, got {len(masks)}; "
-            "pass None where all pixels are valid."
+            f"StreamLoop(): `masks` must have one mask or None for each of {len(cameras)} views, "
+            f"got {len(masks)}; pass None where all pixels are valid."
         )
     for view, (camera, mask) in enumerate(zip(cameras, masks, strict=True)):
         if mask is not None:
-            check_mask(f"StreamLoop(): view {camera.name or view!r}", mask, camera.height, camera.width)
+            check_mask(
+                f"StreamLoop(): view {camera.name or view!r}", mask, camera.height, camera.width
+            )
     check_near_planes("StreamLoop()", cameras, points)
     check_capacity("StreamLoop()", cameras, config.fit)
     # A file that they name and that is missing is reported now, not at the second frame.
@@ -164,34 +173,43 @@ def views_of(setup: Setup, images: Images) -> list[View]:
     return [View(setup.cameras[v], image, setup.masks[v]) for v, image in images.items()]
 
 
-def observe_frame(setup: Setup, frame: int, history: ImageHistory, images: Sequence[Given | None]) -> FrameObservation:
+def observe_frame(
+    setup: Setup, frame: int, history: ImageHistory, images: Sequence[Given | None]
+) -> FrameObservation:
     """Return the observations of a frame: changes, flow (eq. 4) and masks (eqs. 9, 10).
 
     Args:
         setup: data that all frames share.
         frame: its index.
         history: images up to the frame before; `ImageHistory()` for the first.
-        images: per training view uint8 [H, W, 3], RGB, or linear light (see `Given`), or None where the view has no
-            image. They are copied.
+        images: per training view uint8 [H, W, 3], RGB, or linear light (see `Given`), or None where
+            the view has no image. They are copied.
 
     Raises:
-        ValueError: an image has another size or type than its camera, or the first frame has no image at all.
+        ValueError: an image has another size or type than its camera, or the first frame has no
+            image at all.
     """
     recorded = copied_images(setup.cameras, images, frame)
     new_history, changes = _extended(setup, history, recorded)
     flows, key_views = _flows(setup, frame, history.images, new_history.images, changes)
-    return FrameObservation(new_history, changes, flows, key_views, _encoded(recorded, new_history), recorded)
+    return FrameObservation(
+        new_history, changes, flows, key_views, _encoded(recorded, new_history), recorded
+    )
 
 
-def extended_history(setup: Setup, frame: int, history: ImageHistory, images: Sequence[Given | None]) -> ImageHistory:
-    """Return the images up to a frame, without flow; arguments and errors as for `observe_frame`."""
+def extended_history(
+    setup: Setup, frame: int, history: ImageHistory, images: Sequence[Given | None]
+) -> ImageHistory:
+    """Return the images up to a frame, without flow; arguments and errors of `observe_frame`."""
     return _extended(setup, history, copied_images(setup.cameras, images, frame))[0]
 
 
 def _extended(
     setup: Setup, history: ImageHistory, recorded: Images
 ) -> tuple[ImageHistory, dict[int, np.ndarray] | None]:
-    """Return the images up to a frame with these, and the masks of its changes; None: all may have changed."""
+    """Return the images up to a frame with these, and the masks of its changes; None: all may have
+    changed.
+    """
     skip = setup.config.fit.skip_static
     follow = setup.config.fit.exposure != "off"
     stops = history.display_exposure if setup.display_exposure is None else setup.display_exposure
@@ -201,11 +219,17 @@ def _extended(
         return ImageHistory(display_images, display_exposure=stops), None
     references = history.references
     exposures = _exposures(setup, history, display_images) if follow else {}
-    images = {v: exposures[v].corrected(image) if v in exposures else image for v, image in display_images.items()}
-    changes = {v: np.zeros(image.shape[:2], bool) for v, image in images.items()}  # where it is the view's first image
+    images = {
+        v: exposures[v].corrected(image) if v in exposures else image
+        for v, image in display_images.items()
+    }
+    # Where it is the view's first image.
+    changes = {v: np.zeros(image.shape[:2], bool) for v, image in images.items()}
     views = sorted(images.keys() & references.keys())
     config = setup.config.motion.change
-    masks = map_in_threads(lambda v: change_mask(references[v], images[v], setup.masks[v], config), views)
+    masks = map_in_threads(
+        lambda v: change_mask(references[v], images[v], setup.masks[v], config), views
+    )
     changes |= dict(zip(views, masks, strict=True))
     new_references = {v: update_reference(references[v], images[v], changes[v]) for v in views}
     new_history = ImageHistory(images, {**references, **images, **new_references}, exposures, stops)
@@ -223,22 +247,37 @@ def _encoded(recorded: Images, history: ImageHistory) -> dict[int, np.ndarray]:
 
 
 def _exposures(setup: Setup, history: ImageHistory, recorded: Images) -> dict[int, Exposure]:
-    """Return the exposures relative to the views' first images, without the change of light that all views show."""
+    """Return the exposures relative to the views' first images, without the change of light that
+    all views show.
+    """
     views = sorted(recorded.keys() & history.references.keys())
     view_exposures = map_in_threads(
-        lambda v: follow_exposure(history.references[v], recorded[v], setup.masks[v], history.exposures.get(v)),
+        lambda v: follow_exposure(
+            history.references[v], recorded[v], setup.masks[v], history.exposures.get(v)
+        ),
         views,
     )
     light = common_change(view_exposures)
-    exposures = {v: exposure.without(light) for v, exposure in zip(views, view_exposures, strict=True)}
-    exposures = {v: exposure if exposure.change > LEAST_CHANGE else Exposure() for v, exposure in exposures.items()}
+    exposures = {
+        v: exposure.without(light) for v, exposure in zip(views, view_exposures, strict=True)
+    }
+    exposures = {
+        v: exposure if exposure.change > LEAST_CHANGE else Exposure()
+        for v, exposure in exposures.items()
+    }
     return {**history.exposures, **exposures}
 
 
 def _flows(
-    setup: Setup, frame: int, previous: Images, images: Images, changes: Mapping[int, np.ndarray] | None
+    setup: Setup,
+    frame: int,
+    previous: Images,
+    images: Images,
+    changes: Mapping[int, np.ndarray] | None,
 ) -> tuple[dict[int, FlowObservation], dict[int, KeyView]]:
-    """Return the optical flow of the key views that changed, with masks in every n-th frame, where a term uses it."""
+    """Return the optical flow of the key views that changed, with masks in every n-th frame, where
+    a term uses it.
+    """
     motion = setup.config.motion
     with_masks = motion.learn_confidence and frame % motion.mask_interval == 0
     if not (motion.learn_motion or with_masks or (motion.learn_confidence and frame == 1)):
@@ -259,11 +298,14 @@ def _flows(
 
 
 def _frame_key_views(setup: Setup, previous: Images, images: Images) -> tuple[int, ...]:
-    """Return the key views of a frame: the key views of the setup, or others if some of them lack an image."""
+    """Return the key views of a frame: the key views of the setup, or others if some of them lack
+    an image.
+    """
     common_views = sorted(previous.keys() & images.keys())
     key_views = tuple(v for v in setup.key_views if v in common_views)
     if len(key_views) == len(setup.key_views) or not common_views:
         return key_views
     return tuple(
-        common_views[k] for k in choose_key_views([setup.cameras[v] for v in common_views], len(setup.key_views))
+        common_views[k]
+        for k in choose_key_views([setup.cameras[v] for v in common_views], len(setup.key_views))
     )

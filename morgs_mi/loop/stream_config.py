@@ -3,16 +3,18 @@
 Presets:
 
     l, s                              8 and 5 passes over the views for every later frame
-    baseline, ml, ml-mo, ml-mo-mc     rows of the ablation: residuals only; with motion; with offset; with confidence
-    paper                             all three modules; motion starts from zero instead of the lifted flow, one gate,
-                                      constant learning rates
+    baseline, ml, ml-mo, ml-mo-mc     rows of the ablation: residuals only; with motion; with
+                                      offset; with confidence
+    paper                             all three modules; motion starts from zero instead of the
+                                      lifted flow, one gate, constant learning rates
     rigidity                          the baseline with the rigid neighbours of Dynamic 3D Gaussians
                                       (docs/experiments/field.md)
 
-The number of key views (2, 4, 8 or 12 in the paper) is `MotionConfig.key_views` and belongs to no preset.
+The number of key views (2, 4, 8 or 12 in the paper) is `MotionConfig.key_views` and belongs to no
+preset.
 
-A key such as ``fit.density.rounds`` names a setting. In a TOML file it is ``rounds`` in the table ``[fit.density]``.
-TOML has no null: the string ``"none"`` stands for None.
+A key such as ``fit.density.rounds`` names a setting. In a TOML file it is ``rounds`` in the table
+``[fit.density]``. TOML has no null: the string ``"none"`` stands for None.
 """
 
 from __future__ import annotations
@@ -96,7 +98,14 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
             "objective": {"rigid_weight": 0.4, "rotation_weight": 0.4, "isometry_weight": 0.2},
             "density": {"later_frames": False},
             "decay_means_rate": False,
-            "rates": {"means": 4e-3, "quats": 0.02, "scales": 0.0, "opacities": 0.0, "sh_dc": 0.0, "sh_rest": 0.0},
+            "rates": {
+                "means": 4e-3,
+                "quats": 0.02,
+                "scales": 0.0,
+                "opacities": 0.0,
+                "sh_dc": 0.0,
+                "sh_rest": 0.0,
+            },
         },
         "motion": {"constant_velocity": True, **_modules(False, False, False)},
     },
@@ -110,16 +119,22 @@ def apply_preset(config: StreamConfig, name: PresetName) -> StreamConfig:
         ValueError: `name` is not a preset.
     """
     if name not in PRESETS:
-        raise ValueError(f"apply_preset(): `name` must be one of {', '.join(PRESETS)}, got {name!r}.")
+        raise ValueError(
+            f"apply_preset(): `name` must be one of {', '.join(PRESETS)}, got {name!r}."
+        )
     return apply_values(config, PRESETS[name], "apply_preset()")
 
 
-def apply_values(config: Config, values: Mapping[str, Any], source: str = "apply_values()") -> Config:
+def apply_values(
+    config: Config, values: Mapping[str, Any], source: str = "apply_values()"
+) -> Config:
     """Return a config with some of its settings replaced.
 
     Args:
-        config: a frozen dataclass of numbers, strings, booleans, tuples, None and further such dataclasses.
-        values: new values by field name; a mapping for a nested dataclass, which replaces only the fields it names.
+        config: a frozen dataclass of numbers, strings, booleans, tuples, None and further such
+            dataclasses.
+        values: new values by field name; a mapping for a nested dataclass, which replaces only the
+            fields it names.
         source: where the values come from, for messages: a file or a function.
 
     Raises:
@@ -129,7 +144,8 @@ def apply_values(config: Config, values: Mapping[str, Any], source: str = "apply
 
 
 def read_config(path: str | Path) -> dict[str, Any]:
-    """Return the settings that a TOML file gives, as `apply_values` takes them; they are not checked yet.
+    """Return the settings that a TOML file gives, as `apply_values` takes them; they are not
+    checked yet.
 
     Raises:
         FileNotFoundError: the file is missing.
@@ -139,31 +155,40 @@ def read_config(path: str | Path) -> dict[str, Any]:
         return read_toml(path)
     except FileNotFoundError:
         raise FileNotFoundError(
-            f"{path}: expected a TOML file with settings, found none; write one with `morgs-mi fit --print-config`."
+            f"{path}: expected a TOML file with settings, found none; write one with `morgs-mi "
+            "fit --print-config`."
         ) from None
 
 
 def config_toml(config: Any) -> str:
     """Return a config as TOML: every setting with its docstring as a comment.
 
-    `apply_values`, given the values that `read_config` returns for this text, makes any config of the same type equal.
+    `apply_values`, given the values that `read_config` returns for this text, makes any config of
+    the same type equal.
 
     Raises:
         TypeError: a value has no TOML form here, see `apply_values`.
         ValueError: an optional string is "none", which would be read as None.
     """
-    return "\n".join((f'# The string "{_NONE}" stands for no value.', "", *_table(config, ""))) + "\n"
+    return (
+        "\n".join((f'# The string "{_NONE}" stands for no value.', "", *_table(config, ""))) + "\n"
+    )
 
 
 def relocated(error: ValueError, source: str, prefix: str, names: list[str]) -> ValueError:
-    """Return an error of a config's check with `source` as the place and full keys in place of field names.
+    """Return an error of a config's check with `source` as the place and full keys in place of
+    field names.
 
-    ``FitConfig(): `epochs` must be ...`` becomes ``FILE.toml: `fit.epochs` must be ...``. An error that names none of
-    the fields is returned as it is.
+    ``FitConfig(): `epochs` must be ...`` becomes ``FILE.toml: `fit.epochs` must be ...``. An error
+    that names none of the fields is returned as it is.
     """
     text = re.sub(r"^[\w.]+\(\): ", "", str(error))
     keyed_text = re.sub(r"`(\w+)`", lambda m: f"`{prefix}{m[1]}`" if m[1] in names else m[0], text)
-    return ValueError(f"{source}: {keyed_text}") if any(f"`{name}`" in text for name in names) else error
+    return (
+        ValueError(f"{source}: {keyed_text}")
+        if any(f"`{name}`" in text for name in names)
+        else error
+    )
 
 
 def _replaced(config: Any, values: Mapping[str, Any], source: str, prefix: str) -> Any:
@@ -175,10 +200,15 @@ def _replaced(config: Any, values: Mapping[str, Any], source: str, prefix: str) 
         if name not in kinds:
             near = " or ".join(f"`{prefix}{n}`" for n in get_close_matches(name, kinds, 1) or kinds)
             raise ValueError(f"{source}: `{key}` is unknown, expected {near}.")
-        nested = next((arm for arm in arms_of(kinds[name]) if is_dataclass(arm) and isinstance(arm, type)), None)
+        nested = next(
+            (arm for arm in arms_of(kinds[name]) if is_dataclass(arm) and isinstance(arm, type)),
+            None,
+        )
         if nested and isinstance(value, Mapping):
             current = getattr(config, name)
-            changes[name] = _replaced(nested() if current is None else current, value, source, f"{key}.")
+            changes[name] = _replaced(
+                nested() if current is None else current, value, source, f"{key}."
+            )
         else:
             changes[name] = _converted(value, kinds[name])
             check_value(source, key, changes[name], kinds[name])
@@ -189,7 +219,9 @@ def _replaced(config: Any, values: Mapping[str, Any], source: str, prefix: str) 
 
 
 def _converted(value: Any, kind: Any) -> Any:
-    """Return a TOML value as a field's type has it: tuples for lists, floats for integers, None for "none"."""
+    """Return a TOML value as a field's type has it: tuples for lists, floats for integers, None for
+    "none".
+    """
     arms = [get_args(arm)[0] if get_origin(arm) is Annotated else arm for arm in arms_of(kind)]
     if NoneType in arms and value in (None, _NONE):
         return None
@@ -217,7 +249,9 @@ def _table(config: Any, key: str) -> Iterator[str]:
         if name in nested:
             continue
         if value == _NONE and NoneType in arms_of(kinds[name]):
-            raise ValueError(f"config_toml(): `{name}` must not be the string 'none', which stands for None.")
+            raise ValueError(
+                f"config_toml(): `{name}` must not be the string 'none', which stands for None."
+            )
         yield from _comment(docs.get(name, ""))
         yield f"{name} = {_toml(value)}"
     for name, value in nested.items():
@@ -231,7 +265,10 @@ def _table(config: Any, key: str) -> Iterator[str]:
 def _comment(text: str) -> list[str]:
     """Return a docstring as lines of comment."""
     lines = textwrap.wrap(
-        with_pages(" ".join(text.split())), _COMMENT_WIDTH, break_long_words=False, break_on_hyphens=False
+        with_pages(" ".join(text.split())),
+        _COMMENT_WIDTH,
+        break_long_words=False,
+        break_on_hyphens=False,
     )
     return [f"# {line}" for line in lines]
 
@@ -249,4 +286,7 @@ def _toml(value: Any) -> str:
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, tuple):
         return f"[{', '.join(map(_toml, value))}]"
-    raise TypeError(f"config_toml(): expected numbers, strings, booleans, tuples or None, got {shortened(value)}.")
+    raise TypeError(
+        "config_toml(): expected numbers, strings, booleans, tuples or None, got "
+        f"{shortened(value)}."
+    )

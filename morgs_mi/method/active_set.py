@@ -1,14 +1,16 @@
-"""The active set of a frame: the Gaussians that may change, and the pixels of the views where they are visible.
+"""The active set of a frame: the Gaussians that may change, and the pixels of the views where they
+are visible.
 
-A Gaussian is active if its responsibility for the changes of all views and its overlap with them exceed thresholds (see
-`responsibility`), or if it moved in the previous frame, because its confidence must be able to fall. A view is rendered
-where an active Gaussian is visible or the image changed. Active Gaussians that hardly changed are rendered only in some
-views, spread over the rig, which suffice to hold them in place. All other Gaussians are static splats.
+A Gaussian is active if its responsibility for the changes of all views and its overlap with them
+exceed thresholds (see `responsibility`), or if it moved in the previous frame, because its
+confidence must be able to fall. A view is rendered where an active Gaussian is visible or the image
+changed. Active Gaussians that hardly changed are rendered only in some views, spread over the rig,
+which suffice to hold them in place. All other Gaussians are static splats.
 
-An object that appears in front of a static background hides a different part of it in each view, and no Gaussian is
-responsible. If active Gaussians cover less than half of a connected change, the Gaussians that lie in it by more than
-half are active. If more than half of all pixels changed, all Gaussians are active: leaving out the others would cost
-more than it saves.
+An object that appears in front of a static background hides a different part of it in each view,
+and no Gaussian is responsible. If active Gaussians cover less than half of a connected change, the
+Gaussians that lie in it by more than half are active. If more than half of all pixels changed, all
+Gaussians are active: leaving out the others would cost more than it saves.
 """
 
 from __future__ import annotations
@@ -35,12 +37,14 @@ from morgs_mi.render.render_config import RenderConfig
 
 # Fraction of a connected change that active Gaussians must cover to explain it.
 EXPLAINED = 0.5
-# Fraction of a block's pixels above which it belongs to a connected change: fewer are noise, or the rim of one.
+# Fraction of a block's pixels above which it belongs to a connected change: fewer are noise, or the
+# rim of one.
 _CHANGED = 0.25
-# Fraction of all pixels above which all Gaussians are active: leaving out the others would cost more than it saves.
+# Fraction of all pixels above which all Gaussians are active: leaving out the others would cost
+# more than it saves.
 _MOST_CHANGED = 0.5
-# Half side of the box, as a fraction of the Gaussian's extent: two standard deviations of an opaque one. Its
-# extent reaches the alpha cut-off at three and a third.
+# Half side of the box, as a fraction of the Gaussian's extent: two standard deviations of an opaque
+# one. Its extent reaches the alpha cut-off at three and a third.
 _CORE = 0.6
 # Responsibility below which an active Gaussian is rendered in `quiet_views` only.
 QUIET = 0.2
@@ -54,10 +58,13 @@ class ActiveSetConfig:
     min_responsibility: Annotated[float, AtLeast(0)] = 0.05
     """Responsibility above which a Gaussian is active."""
     min_overlap: Annotated[float, AtLeast(0)] = 0.35
-    """Overlap above which a Gaussian is active: walls behind moving objects have less, and what moves has more."""
+    """Overlap above which a Gaussian is active: walls behind moving objects have less, and what
+    moves has more.
+    """
     min_weight: Annotated[float, AtLeast(0)] = 0.2
-    """Blend weight in changed blocks, summed over all views in px, below which a Gaussian counts as hidden. One inside
-    an object that moves is nearly hidden: it would stay behind, and be uncovered later."""
+    """Blend weight in changed blocks, summed over all views in px, below which a Gaussian counts as
+    hidden. One inside an object that moves is nearly hidden: it would stay behind, and be uncovered
+    later."""
     quiet_views: Annotated[int, AtLeast(1)] = 12
     """Number of views in which active Gaussians that hardly change are rendered."""
 
@@ -80,7 +87,9 @@ class ActiveSet:
 
     @property
     def fractions(self) -> dict[str, float]:
-        """Fractions of the Gaussians, of the views and of all their pixels that are active, from 0 to 1."""
+        """Fractions of the Gaussians, of the views and of all their pixels that are active, from 0
+        to 1.
+        """
         pixels = sum(view.pixel_fraction for view in self.views.values())
         return {
             "gaussians": len(self.indices) / max(self.num_gaussians, 1),
@@ -89,7 +98,9 @@ class ActiveSet:
         }
 
 
-def full_active_set(gaussians: Gaussians, cameras: Mapping[int, Camera], render: RenderConfig) -> ActiveSet:
+def full_active_set(
+    gaussians: Gaussians, cameras: Mapping[int, Camera], render: RenderConfig
+) -> ActiveSet:
     """Return the active set of all Gaussians and of all pixels of the cameras, by view index."""
     views = {view: ActiveView(camera, render) for view, camera in cameras.items()}
     return ActiveSet(np.arange(len(gaussians)), len(gaussians), views, len(cameras))
@@ -117,7 +128,9 @@ def find_active_set(
     if sum(c.mean() for c in changes.values()) > _MOST_CHANGED * len(cameras):
         return full_active_set(gaussians, cameras, render)
     changed_views = {
-        v: ChangedView(ActiveView(camera, render), changes[v], boxes_around(gaussians, camera, render, _CORE))
+        v: ChangedView(
+            ActiveView(camera, render), changes[v], boxes_around(gaussians, camera, render, _CORE)
+        )
         for v, camera in cameras.items()
     }
     shares = responsibility(gaussians, changed_views.values(), config.min_weight)
@@ -136,7 +149,9 @@ def find_active_set(
     blocks_by_view = _drawn(active, shares > QUIET, changed_views, config)
     static = with_zero_motion(gaussians.select(~active))
     views = {
-        v: make_active_view(cameras[v], Region.of(changed_views[v].view.grid, blocks), static, channels[v], render)
+        v: make_active_view(
+            cameras[v], Region.of(changed_views[v].view.grid, blocks), static, channels[v], render
+        )
         for v, blocks in blocks_by_view.items()
         if blocks.any()
     }
@@ -150,17 +165,31 @@ def with_zero_motion(gaussians: Gaussians) -> Gaussians:
 
 
 def _drawn(
-    active: np.ndarray, changing: np.ndarray, views: Mapping[int, ChangedView], config: ActiveSetConfig
+    active: np.ndarray,
+    changing: np.ndarray,
+    views: Mapping[int, ChangedView],
+    config: ActiveSetConfig,
 ) -> dict[int, np.ndarray]:
-    """Return the drawn blocks [rows, columns], by view index: changes, and boxes of active Gaussians [N]."""
+    """Return the drawn blocks [rows, columns], by view index: changes, and boxes of active
+    Gaussians [N].
+    """
     indices = list(views)
-    some = {indices[k] for k in choose_key_views([entry.view.camera for entry in views.values()], config.quiet_views)}
+    some = {
+        indices[k]
+        for k in choose_key_views(
+            [entry.view.camera for entry in views.values()], config.quiet_views
+        )
+    }
     selections = {v: active if v in some else active & changing for v in views}
-    return {v: entry.boxes.union(selections[v], entry.view.grid) | (entry.counts > 0) for v, entry in views.items()}
+    return {
+        v: entry.boxes.union(selections[v], entry.view.grid) | (entry.counts > 0)
+        for v, entry in views.items()
+    }
 
 
 def _unexplained(counts: np.ndarray, covered: np.ndarray, block: tuple[int, int]) -> np.ndarray:
-    """Return the blocks of the connected changes that others cover by less than half, bool [rows, columns].
+    """Return the blocks of the connected changes that others cover by less than half, bool
+    [rows, columns].
 
     Args:
         counts: changed pixels of each block.
@@ -172,7 +201,10 @@ def _unexplained(counts: np.ndarray, covered: np.ndarray, block: tuple[int, int]
         return np.zeros_like(changes)
     count, components = cv2.connectedComponents(changes.astype(np.uint8))
     labels = np.asarray(components, np.int32)
-    area, covered_area = (np.bincount(labels[blocks], counts[blocks], count) for blocks in (changes, changes & covered))
+    area, covered_area = (
+        np.bincount(labels[blocks], counts[blocks], count)
+        for blocks in (changes, changes & covered)
+    )
     missing = covered_area < EXPLAINED * area
     missing[0] = False
     return missing[labels]

@@ -1,10 +1,11 @@
 """Attribution of the rendering error to Gaussians, by their blend weights.
 
-With the error e(x) of a rendered view, E_i = sum_x w_i(x) e(x) is the error attributed to Gaussian i there (Bulo et al.
-2024), in pixels of full contrast. Its densification score is the largest one over the views.
+With the error e(x) of a rendered view, E_i = sum_x w_i(x) e(x) is the error attributed to Gaussian
+i there (Bulo et al. 2024), in pixels of full contrast. Its densification score is the largest one
+over the views.
 
-It is the gradient of sum_x f(x) e(x) for a feature that is blended like a colour and is 0 everywhere: the adjoint of a
-step gives it along with the gradients of its losses.
+It is the gradient of sum_x f(x) e(x) for a feature that is blended like a colour and is 0
+everywhere: the adjoint of a step gives it along with the gradients of its losses.
 """
 
 from __future__ import annotations
@@ -23,13 +24,14 @@ from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.rasterize import Image
 from morgs_mi.render.region import Region
 
-# Error that counts as noise, in typical errors of the image: normal noise, independent in three colours, exceeds 3 at
-# 3 of 10,000 pixels.
+# Error that counts as noise, in typical errors of the image: normal noise, independent in three
+# colours, exceeds 3 at 3 of 10,000 pixels.
 NOISE = 3.0
 
 
 class Attribution:
-    """Densification scores of N Gaussians from the steps of an optimisation that it observes, without a pass of their own.
+    """Densification scores of N Gaussians from the steps of an optimisation that it observes,
+    without a pass of their own.
 
     Args:
         count: N.
@@ -44,7 +46,9 @@ class Attribution:
         self._largest = dr.zeros(mi.Float, count)
 
     def features(self) -> Tensor | None:
-        """Return the features [N, 1] to render in the next step, with detached weights; None: the step does not count."""
+        """Return the features [N, 1] to render in the next step, with detached weights; None: the
+        step does not count.
+        """
         if self._skip > 0:
             return None
         self._probe = probe = dr.zeros(mi.TensorXf, (self._count, 1))
@@ -68,7 +72,9 @@ class Attribution:
         self._term = dr.sum(image.features * mi.TensorXf(error, image.features.shape), axis=None)
 
     def term(self) -> Tensor | None:
-        """Return the sum over the image of feature times error, which is 0: the gradients of the features are E."""
+        """Return the sum over the image of feature times error, which is 0: the gradients of the
+        features are E.
+        """
         return self._term
 
     def collect(self) -> None:
@@ -86,13 +92,17 @@ class Attribution:
 
 
 def _typical(error: Float) -> Float:
-    """Return about the median of errors >= 0 that are not 0: the mean of those below twice the mean."""
+    """Return about the median of errors >= 0 that are not 0: the mean of those below twice the
+    mean.
+    """
     mean = dr.sum(error) / dr.maximum(mi.Float(dr.count(error > 0)), 1)
     small = (error > 0) & (error < 2 * mean)
     return dr.sum(dr.select(small, error, 0)) / dr.maximum(mi.Float(dr.count(small)), 1)
 
 
-def densification_scores(gaussians: Gaussians, views: Sequence[ActiveView], targets: Sequence[Target]) -> np.ndarray:
+def densification_scores(
+    gaussians: Gaussians, views: Sequence[ActiveView], targets: Sequence[Target]
+) -> np.ndarray:
     """Render every view and return the densification scores [N] of the Gaussians.
 
     Args:
@@ -103,5 +113,7 @@ def densification_scores(gaussians: Gaussians, views: Sequence[ActiveView], targ
     gaussians = gaussians.detached()
     scores = np.zeros(len(gaussians), np.float32)
     for view, target in zip(views, targets, strict=True):
-        scores = np.maximum(scores, KeyImages({0: view}, {0: target}).sums(gaussians, ("error",))["error"][0])
+        scores = np.maximum(
+            scores, KeyImages({0: view}, {0: target}).sums(gaussians, ("error",))["error"][0]
+        )
     return scores

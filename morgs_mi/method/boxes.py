@@ -33,7 +33,8 @@ class Boxes:
     def within(self, table: UInt32, grid: BlockGrid, factor: int = 1) -> Float:
         """Return the number of pixels [N] of each box in some blocks of the view.
 
-        The number of pixels before a corner is linear within a block, along x and y: it is interpolated.
+        The number of pixels before a corner is linear within a block, along x and y: it is
+        interpolated.
 
         Args:
             table: the `summed_area` of these blocks.
@@ -50,7 +51,10 @@ class Boxes:
             j = dr.minimum(mi.UInt32(down), dr.opaque(mi.UInt32, rows - 1))
             place = j * dr.opaque(mi.UInt32, columns + 1) + i
             pitch = dr.opaque(mi.UInt32, columns + 1)
-            a, b, c, d = (mi.Float(dr.gather(mi.UInt32, table, place + step)) for step in (0, 1, pitch, pitch + 1))
+            a, b, c, d = (
+                mi.Float(dr.gather(mi.UInt32, table, place + step))
+                for step in (0, 1, pitch, pitch + 1)
+            )
             u = dr.minimum(across - mi.Float(i), 1)
             v = dr.minimum(down - mi.Float(j), 1)
             return dr.lerp(dr.lerp(a, b, u), dr.lerp(c, d, u), v)
@@ -62,7 +66,8 @@ class Boxes:
     def union(self, selection: np.ndarray, grid: BlockGrid) -> np.ndarray:
         """Return the blocks, bool [rows, columns], that any box of a `selection` [N] touches."""
         x0, y0, x1, y1 = (
-            np.asarray(v)[selection].astype(np.int64) for v in (self.left, self.top, self.right, self.bottom)
+            np.asarray(v)[selection].astype(np.int64)
+            for v in (self.left, self.top, self.right, self.bottom)
         )
         some = (x1 > x0) & (y1 > y0)
         width, height = grid.block
@@ -71,7 +76,9 @@ class Boxes:
         x1 = -(-x1[some] // width)
         y1 = -(-y1[some] // height)
         rows, columns = (size + 1 for size in grid.shape)
-        corners = np.concatenate([y0 * columns + x0, y1 * columns + x1, y0 * columns + x1, y1 * columns + x0])
+        corners = np.concatenate(
+            [y0 * columns + x0, y1 * columns + x1, y0 * columns + x1, y1 * columns + x0]
+        )
         signs = np.repeat([1.0, -1.0], 2 * len(x0))
         steps = np.bincount(corners, signs, rows * columns).reshape(rows, columns)
         return (steps.cumsum(0).cumsum(1) > 0.5)[:-1, :-1]

@@ -1,18 +1,19 @@
 """Detection of the pixels of a fixed camera that changed by more than noise.
 
-Brightness and two differences of colours are compared, the latter at half the resolution, as video stores them. Each is
-averaged over a window, which removes noise and preserves visible changes. The threshold follows from the larger of two
-estimates of the noise, which is normal in both:
+Brightness and two differences of colours are compared, the latter at half the resolution, as video
+stores them. Each is averaged over a window, which removes noise and preserves visible changes. The
+threshold follows from the larger of two estimates of the noise, which is normal in both:
 
-- of the whole image: the median absolute deviation of the averaged change, at most a grey level. It holds while most of
-  the image is static.
-- of the surroundings, e.g. in penumbrae of a path tracer: the median absolute deviation of mixed differences,
-  (a - b) - (c - d) of 2 x 2 pixels, to which motion and shadows hardly contribute.
+- of the whole image: the median absolute deviation of the averaged change, at most a grey level. It
+  holds while most of the image is static.
+- of the surroundings, e.g. in penumbrae of a path tracer: the median absolute deviation of mixed
+  differences, (a - b) - (c - d) of 2 x 2 pixels, to which motion and shadows hardly contribute.
 
-The noise of JPEG and of video codecs is not normal: whole blocks of 8 x 8 pixels, and of 16 x 16 pixels in colour,
-change by one step at a time, which no average over a window removes. A connected change therefore counts only if it
-exceeds a second, larger threshold somewhere, as in the hysteresis of Canny (1986). A faint change that does not is
-compared with the same reference again, so it counts once it has grown.
+The noise of JPEG and of video codecs is not normal: whole blocks of 8 x 8 pixels, and of 16 x 16
+pixels in colour, change by one step at a time, which no average over a window removes. A connected
+change therefore counts only if it exceeds a second, larger threshold somewhere, as in the
+hysteresis of Canny (1986). A faint change that does not is compared with the same reference again,
+so it counts once it has grown.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from morgs_mi.core.ranges import AtLeast, check_ranges
 _GREY_LEVEL = 1 / 255
 # Standard deviations of normal noise in a median absolute deviation.
 _NORMAL = 1.4826
-# px: 5 x 5 groups of pixels, that far apart, are a sample of the noise that thin moving parts do not dominate.
+# px: 5 x 5 groups of pixels, that far apart, are a sample of the noise that thin moving parts do
+# not dominate.
 _NOISE_STEP = 4
 # Side of the window over which changes of brightness are averaged, in px.
 _WINDOW = 5
@@ -48,19 +50,24 @@ class ChangeConfig:
     """Settings of the change detection."""
 
     sigmas: Annotated[float, AtLeast(0)] = 5.0
-    """Threshold in standard deviations of the noise: normal noise exceeds 5 at less than one of 1.4 million pixels."""
+    """Threshold in standard deviations of the noise: normal noise exceeds 5 at less than one of 1.4
+    million pixels.
+    """
     min_change: Annotated[float, AtLeast(0)] = _GREY_LEVEL
     """Least threshold and bound of the noise of the whole image, of 1: a grey level."""
     min_peak: Annotated[float, AtLeast(0)] = 4 * _GREY_LEVEL
-    """Change that a connected change must exceed in one of its pixels, of 1: four grey levels; 0: none. Blocks of
-    compressed video change by less."""
+    """Change that a connected change must exceed in one of its pixels, of 1: four grey levels; 0:
+    none. Blocks of compressed video change by less."""
 
     def __post_init__(self) -> None:
         check_ranges(self)
 
 
 def change_mask(
-    reference: np.ndarray, image: np.ndarray, valid: np.ndarray | None = None, config: ChangeConfig | None = None
+    reference: np.ndarray,
+    image: np.ndarray,
+    valid: np.ndarray | None = None,
+    config: ChangeConfig | None = None,
 ) -> np.ndarray:
     """Return the mask of changed pixels [H, W], bool.
 
@@ -80,15 +87,20 @@ def change_mask(
         unit = 1.0
     # Integers as long as possible: these images are large.
     levels = _levels(cv2.transform(difference, _SUM) * np.float32(unit / 3), 1, config)
-    half = cv2.resize(difference, (max(W // 2, 1), max(H // 2, 1)), interpolation=cv2.INTER_AREA).astype(np.float32)
+    half = cv2.resize(
+        difference, (max(W // 2, 1), max(H // 2, 1)), interpolation=cv2.INTER_AREA
+    ).astype(np.float32)
     for channel in cv2.split(cv2.transform(half, unit * _COLORS)):
-        pixel_levels = cv2.resize(_levels(channel, 2, config), (W, H), interpolation=cv2.INTER_NEAREST)
+        pixel_levels = cv2.resize(
+            _levels(channel, 2, config), (W, H), interpolation=cv2.INTER_NEAREST
+        )
         levels = np.maximum(levels, pixel_levels)
     return _with_peaks(levels if valid is None else levels * valid)
 
 
 def _levels(change: np.ndarray, scale: int, config: ChangeConfig) -> np.ndarray:
-    """Return 1 where a change [H, W], of 1, exceeds its noise on average, 2 where also `min_peak`, else 0, uint8.
+    """Return 1 where a change [H, W], of 1, exceeds its noise on average, 2 where also `min_peak`,
+    else 0, uint8.
 
     Args:
         change: at 1 / scale of the resolution.
@@ -99,7 +111,9 @@ def _levels(change: np.ndarray, scale: int, config: ChangeConfig) -> np.ndarray:
     # Zero padding: reflection would double the noise at the border.
     average = cv2.blur(change, (window, window), borderType=cv2.BORDER_CONSTANT)
     sample = average.ravel()[:: max(1, average.size // 20_000)]
-    everywhere = min(_NORMAL * float(np.median(np.abs(sample - np.median(sample)))), config.min_change)
+    everywhere = min(
+        _NORMAL * float(np.median(np.abs(sample - np.median(sample)))), config.min_change
+    )
     noise = np.maximum(_noise_of_surroundings(change, _NOISE_STEP // scale) / window, everywhere)
     threshold = np.maximum(config.sigmas * noise, config.min_change).astype(np.float32)
     size = np.abs(average)
@@ -118,7 +132,9 @@ def _with_peaks(levels: np.ndarray) -> np.ndarray:
 
 
 def _noise_of_surroundings(change: np.ndarray, step: int) -> np.ndarray:
-    """Return the standard deviation of the noise of single pixels at one group of 2 x 2 pixels in `step` x `step`."""
+    """Return the standard deviation of the noise of single pixels at one group of 2 x 2 pixels in
+    `step` x `step`.
+    """
     height, width = change.shape
     change = change[: height // step * step, : width // step * step]
     if not change.size:
@@ -144,7 +160,8 @@ def moving_region(change: np.ndarray) -> np.ndarray:
 
 
 def update_reference(reference: np.ndarray, image: np.ndarray, change: np.ndarray) -> np.ndarray:
-    """Return the image that the next frame is compared with: the reference, replaced where the image changed.
+    """Return the image that the next frame is compared with: the reference, replaced where the
+    image changed.
 
     So a slow change is detected once it has added up.
 
@@ -157,9 +174,11 @@ def update_reference(reference: np.ndarray, image: np.ndarray, change: np.ndarra
 
 
 def box_around(mask: np.ndarray) -> tuple[slice, slice] | None:
-    """Return rows and columns of the smallest box around a mask [H, W], enlarged by half its size on all sides.
+    """Return rows and columns of the smallest box around a mask [H, W], enlarged by half its size
+    on all sides.
 
-    The static surroundings of a motion are needed to separate it from noise. None where the mask is empty.
+    The static surroundings of a motion are needed to separate it from noise. None where the mask is
+    empty.
     """
     if not mask.any():
         return None

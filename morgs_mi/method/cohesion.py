@@ -1,16 +1,20 @@
 """Cohesion: neighbours of similar colour are parts of one object, and move or stand still together.
 
-Flow is unreliable evidence of motion. It is zero inside an object with weak texture, it bleeds onto the background
-beside the object, and shadows have flow, too. But objects are mostly separate from their surroundings in space or in
-colour. So the logit u_i of the confidence of each active Gaussian is replaced by z_i, an approximate solution of
+Flow is unreliable evidence of motion. It is zero inside an object with weak texture, it bleeds onto
+the background beside the object, and shadows have flow, too. But objects are mostly separate from
+their surroundings in space or in colour. So the logit u_i of the confidence of each active Gaussian
+is replaced by z_i, an approximate solution of
 
-    z_i = (u_i + lambda sum_j a_ij z_j) / (1 + lambda sum_j a_ij),    a_ij = o_j exp(-|c_i - c_j|^2 / (2 s^2)),
+    z_i = (u_i + lambda sum_j a_ij z_j) / (1 + lambda sum_j a_ij),
+    a_ij = o_j exp(-|c_i - c_j|^2 / (2 s^2)),
 
-over its nearest neighbours j, where o is opacity and c is chromaticity, which shadows hardly change. All other
-Gaussians stand still. (A random walk on the graph of neighbours; Grady 2006 segments images so.)
+over its nearest neighbours j, where o is opacity and c is chromaticity, which shadows hardly
+change. All other Gaussians stand still. (A random walk on the graph of neighbours; Grady 2006
+segments images so.)
 
-A Gaussian that resembles none of its neighbours follows its own evidence, and one that is transparent does not pull
-others along: such Gaussians gather over many frames, and all of them seem to stand still.
+A Gaussian that resembles none of its neighbours follows its own evidence, and one that is
+transparent does not pull others along: such Gaussians gather over many frames, and all of them seem
+to stand still.
 """
 
 from __future__ import annotations
@@ -28,7 +32,8 @@ _LEAST_COLOR = 0.02
 _NEIGHBOURS = 12
 # Difference of chromaticity s at which the affinity has fallen to 0.61.
 _CHROMA_SCALE = 0.03
-# Rounds of averaging (Jacobi's method). With more of them, and a larger weight, evidence spreads farther.
+# Rounds of averaging (Jacobi's method). With more of them, and a larger weight, evidence spreads
+# farther.
 ROUNDS = 150
 
 
@@ -56,7 +61,9 @@ def share_confidence(
         return logit
     chroma = _chromaticity(gaussians)
     opacity = np.asarray(gaussians.opacities)
-    affinity = np.exp(-np.sum((chroma[indices][:, None] - chroma[near]) ** 2, axis=2) / (2 * _CHROMA_SCALE**2))
+    affinity = np.exp(
+        -np.sum((chroma[indices][:, None] - chroma[near]) ** 2, axis=2) / (2 * _CHROMA_SCALE**2)
+    )
     affinity = weight * (opacity[near] * affinity).astype(np.float32)
     starts = np.arange(0, near.size + 1, near.shape[1])
     weights = csr_array((affinity.ravel(), near.ravel(), starts), (len(indices), len(gaussians)))

@@ -17,13 +17,18 @@ _NOISE = 0.2
 
 
 def motion_floor(width: int, config: MaskConfig | None = None) -> float:
-    """Return the speed in pixels, in an image of `width` pixels, below which nothing counts as moving."""
+    """Return the speed in pixels, in an image of `width` pixels, below which nothing counts as
+    moving.
+    """
     config = config or MaskConfig()
     return max(config.floor * width / _FLOOR_WIDTH, _NOISE)
 
 
-def flow_threshold(motion: np.ndarray, reliable: np.ndarray | None = None, config: MaskConfig | None = None) -> float:
-    """Return the speed in pixels above which a pixel moves: max(floor, median + 4 MAD) of the speeds.
+def flow_threshold(
+    motion: np.ndarray, reliable: np.ndarray | None = None, config: MaskConfig | None = None
+) -> float:
+    """Return the speed in pixels above which a pixel moves: max(floor, median + 4 MAD) of the
+    speeds.
 
     The median assumes that less than half of the image moves. Only reliable pixels count.
 
@@ -37,11 +42,16 @@ def flow_threshold(motion: np.ndarray, reliable: np.ndarray | None = None, confi
     speed = speed[reliable] if reliable is not None and reliable.any() else speed.ravel()
     median = np.median(speed)
     spread = np.median(np.abs(speed - median))
-    return float(max(motion_floor(motion.shape[1], config), median + config.threshold_mads * spread))
+    return float(
+        max(motion_floor(motion.shape[1], config), median + config.threshold_mads * spread)
+    )
 
 
-def flow_mask(motion: np.ndarray, reliable: np.ndarray | None = None, config: MaskConfig | None = None) -> np.ndarray:
-    """Return the mask of moving pixels [H, W] bool: the motion exceeds its `flow_threshold` (eq. 9).
+def flow_mask(
+    motion: np.ndarray, reliable: np.ndarray | None = None, config: MaskConfig | None = None
+) -> np.ndarray:
+    """Return the mask of moving pixels [H, W] bool: the motion exceeds its `flow_threshold`
+    (eq. 9).
 
     Args:
         motion: [H, W, 2] in pixels, of either sign.
@@ -54,7 +64,9 @@ def flow_mask(motion: np.ndarray, reliable: np.ndarray | None = None, config: Ma
     if motion.ndim != 3 or motion.shape[2] != 2:
         raise ValueError(f"flow_mask(): `motion` must be [H, W, 2], got {motion.shape}.")
     if reliable is not None and reliable.shape != motion.shape[:2]:
-        raise ValueError(f"flow_mask(): `reliable` must be {motion.shape[:2]}, got {reliable.shape}.")
+        raise ValueError(
+            f"flow_mask(): `reliable` must be {motion.shape[:2]}, got {reliable.shape}."
+        )
     moving = np.linalg.norm(motion, axis=-1) > flow_threshold(motion, reliable, config)
     return moving if reliable is None else moving & reliable
 

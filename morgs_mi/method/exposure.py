@@ -1,11 +1,14 @@
-"""Exposure and white balance of each camera and frame: a gain and a bias per channel. Beyond the paper.
+"""Exposure and white balance of each camera and frame: a gain and a bias per channel. Beyond the
+paper.
 
-A camera shows the display-referred colours x of the scene as y = gain x + bias. As sRGB is 1.055 l^(1/2.4) - 0.055 of
-the light l, a factor on the light is such a map, except in the darkest tones. It is solved in closed form by least
-squares with a prior, weighted against outliers: motion, highlights, and errors of a rendering.
+A camera shows the display-referred colours x of the scene as y = gain x + bias. As sRGB is 1.055
+l^(1/2.4) - 0.055 of the light l, a factor on the light is such a map, except in the darkest tones.
+It is solved in closed form by least squares with a prior, weighted against outliers: motion,
+highlights, and errors of a rendering.
 
-Between cameras, x is a rendering of Gaussians that all cameras share (see `fit.balance`). Over time, x is the
-reference image of the same camera. Static pixels then do not change with the exposure.
+Between cameras, x is a rendering of Gaussians that all cameras share (see `fit.balance`). Over
+time, x is the reference image of the same camera. Static pixels then do not change with the
+exposure.
 """
 
 from __future__ import annotations
@@ -17,11 +20,13 @@ import cv2
 import numpy as np
 
 LEAST_CHANGE = 3e-3
-"""Change of tones over time, of 1, below which an image is not corrected: it is an error of the measurement."""
+"""Change of tones over time, of 1, below which an image is not corrected: it is an error of the
+measurement.
+"""
 
-# Weights of the priors of gain and bias, relative to all pixels. The first acts where nearly all pixels are dark. The
-# second, for the bias beyond the bias of a factor on the light, acts where images have little contrast: a gain explains
-# a change there.
+# Weights of the priors of gain and bias, relative to all pixels. The first acts where nearly all
+# pixels are dark. The second, for the bias beyond the bias of a factor on the light, acts where
+# images have little contrast: a gain explains a change there.
 _WEIGHTS = (1e-4, 0.02)
 # Values, of 1, that are neither nearly black nor nearly white.
 _DARK = 0.03
@@ -36,7 +41,9 @@ _MIN_PIXELS = 30
 _MAX_LOG_GAIN = np.log(4)
 # Normal standard deviations in a median absolute deviation.
 _NORMAL = 1.4826
-_WIDTH = 96  # px, of the thumbnails on which changes over time are measured: means of pixels have less noise
+# Width of the thumbnails on which changes over time are measured, px: means of pixels have less
+# noise.
+_WIDTH = 96
 # sRGB is 1.055 l^(1/2.4) - 0.055: a gain g of the light's root comes with the bias 0.055 (g - 1).
 _TOE = 0.055
 _TONES = np.array([0.1, 0.5, 0.9])[:, None]
@@ -46,7 +53,9 @@ _MIDDLE_TONES = np.repeat([[0.2], [0.6]], 3, axis=1)
 
 @dataclass(frozen=True)
 class Exposure:
-    """Exposure and white balance of an image: recorded = gain * scene + bias, display-referred in [0, 1]."""
+    """Exposure and white balance of an image: recorded = gain * scene + bias, display-referred in
+    [0, 1].
+    """
 
     gain: tuple[float, ...] = (1.0, 1.0, 1.0)  #: Of R, G and B.
     bias: tuple[float, ...] = (0.0, 0.0, 0.0)  #: Of R, G and B.
@@ -56,7 +65,9 @@ class Exposure:
         return colors * np.array(self.gain) + np.array(self.bias)
 
     def corrected(self, image: np.ndarray) -> np.ndarray:
-        """Return the image [H, W, 3], uint8 or encoded floats, in the scene's colours; clipped values stay lost."""
+        """Return the image [H, W, 3], uint8 or encoded floats, in the scene's colours; clipped
+        values stay lost.
+        """
         if self == Exposure():
             return image
         if image.dtype != np.uint8:
@@ -101,22 +112,34 @@ def fit_exposure(
         weights: of the priors of gain and bias, relative to all pixels.
 
     Returns:
-        The exposure, or the prior where it is not determined: with few well-exposed pixels, and for images that do not
-        show the same.
+        The exposure, or the prior where it is not determined: with few well-exposed pixels, and for
+        images that do not show the same.
     """
     prior = prior or Exposure()
-    good = ((recorded > _DARK) & (recorded < _BRIGHT) & (scene > _DARK) & (scene < _BRIGHT)).all(axis=-1)
+    good = ((recorded > _DARK) & (recorded < _BRIGHT) & (scene > _DARK) & (scene < _BRIGHT)).all(
+        axis=-1
+    )
     good = good if mask is None else good & mask
     if good.sum() < _MIN_PIXELS:
         return prior
-    channels = zip(scene[good].T.astype(float), recorded[good].T.astype(float), prior.gain, prior.bias, strict=True)
+    channels = zip(
+        scene[good].T.astype(float),
+        recorded[good].T.astype(float),
+        prior.gain,
+        prior.bias,
+        strict=True,
+    )
     gains, biases = zip(*(_line(x, y, line, weights) for x, y, *line in channels), strict=True)
     plausible = min(gains) > 0 and np.abs(np.log(gains)).max() < _MAX_LOG_GAIN
     return _exposure(np.array(gains), np.array(biases)) if plausible else prior
 
 
-def _line(x: np.ndarray, y: np.ndarray, prior: Sequence[float], weights: tuple[float, float]) -> tuple[float, float]:
-    """Return slope and intercept of y over x [P] by reweighted least squares (Geman and McClure 1987)."""
+def _line(
+    x: np.ndarray, y: np.ndarray, prior: Sequence[float], weights: tuple[float, float]
+) -> tuple[float, float]:
+    """Return slope and intercept of y over x [P] by reweighted least squares (Geman and McClure
+    1987).
+    """
     # The change of the gain, and of the bias beyond the bias of a factor on the light.
     rows = np.stack([x + _TOE, np.ones_like(x)])
     rest = y - prior[0] * x - prior[1]
@@ -137,18 +160,22 @@ def _line(x: np.ndarray, y: np.ndarray, prior: Sequence[float], weights: tuple[f
 def centred(exposures: Mapping[int, Exposure]) -> dict[int, Exposure]:
     """Return the exposures of all cameras relative to the one that most of them agree on.
 
-    Which of them are right is unknown: all could be brighter and the scene darker. The reference shows a dark and a
-    bright tone as their medians over the cameras. A few dark cameras would move a mean away from all others, and the
-    rendering of a view between those with it.
+    Which of them are right is unknown: all could be brighter and the scene darker. The reference
+    shows a dark and a bright tone as their medians over the cameras. A few dark cameras would move
+    a mean away from all others, and the rendering of a view between those with it.
     """
-    dark, bright = (np.median([exposure(tone) for exposure in exposures.values()], axis=0) for tone in _MIDDLE_TONES)
+    dark, bright = (
+        np.median([exposure(tone) for exposure in exposures.values()], axis=0)
+        for tone in _MIDDLE_TONES
+    )
     gain = (bright - dark) / (_MIDDLE_TONES[1] - _MIDDLE_TONES[0])
     reference = _exposure(gain, dark - gain * _MIDDLE_TONES[0])
     return {view: exposure.without(reference) for view, exposure in exposures.items()}
 
 
 def common_change(exposures: Sequence[Exposure]) -> Exposure:
-    """Return the change that all cameras show, due to the scene's light, or no change if they differ too much.
+    """Return the change that all cameras show, due to the scene's light, or no change if they
+    differ too much.
 
     The cameras' common change is their median, if most are nearer to it than half of its size.
     """
@@ -177,15 +204,24 @@ def follow_exposure(
     height, width = image.shape[:2]
     size = (min(width, _WIDTH), max(1, round(height * min(1, _WIDTH / width))))
     small_reference, small_image = (
-        cv2.resize(x.astype(np.float32) / 255, size, interpolation=cv2.INTER_AREA) for x in (reference, image)
+        cv2.resize(x.astype(np.float32) / 255, size, interpolation=cv2.INTER_AREA)
+        for x in (reference, image)
     )
-    small = None if mask is None else cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
+    small = (
+        None
+        if mask is None
+        else cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
+    )
     return fit_exposure(small_reference, small_image, small, last)
 
 
 def _straightened(encoded: np.ndarray) -> np.ndarray:
-    """Return encoded values, with sRGB's root of the light also above white, where the curve is logarithmic."""
-    return np.where(encoded > 1, (1 + _TOE) * np.exp((np.maximum(encoded, 1) - 1) / (1 + _TOE)) - _TOE, encoded)
+    """Return encoded values, with sRGB's root of the light also above white, where the curve is
+    logarithmic.
+    """
+    return np.where(
+        encoded > 1, (1 + _TOE) * np.exp((np.maximum(encoded, 1) - 1) / (1 + _TOE)) - _TOE, encoded
+    )
 
 
 def _bent(root: np.ndarray) -> np.ndarray:

@@ -1,4 +1,6 @@
-"""Optical flow of the key views (eq. 4), checked forward and backward, and the motion masks that follow from it."""
+"""Optical flow of the key views (eq. 4), checked forward and backward, and the motion masks that
+follow from it.
+"""
 
 from __future__ import annotations
 
@@ -19,11 +21,14 @@ from morgs_mi.method.mask_refiners.mask_config import MaskConfig
 class FlowObservation:
     """Optical flow of one key view at one frame."""
 
-    motion: np.ndarray  #: x_t - x_{t-1} [H, W, 2] in px on frame t's grid: the negative of the flow to frame t - 1.
+    #: x_t - x_{t-1} [H, W, 2] in px on frame t's grid: the negative of the flow to frame t - 1.
+    motion: np.ndarray
     reliable: np.ndarray  #: [H, W] bool, where forward and backward flow agree.
-    forward_flow: np.ndarray  #: x_t - x_{t-1} [H, W, 2] in px on frame t - 1's grid: the flow to frame t.
+    #: x_t - x_{t-1} [H, W, 2] in px on frame t - 1's grid: the flow to frame t.
+    forward_flow: np.ndarray
     forward_reliable: np.ndarray  #: [H, W] bool, likewise.
-    mask: np.ndarray | None = None  #: Motion mask [H, W] bool (eq. 10), or None if it was not requested.
+    #: Motion mask [H, W] bool (eq. 10), or None if it was not requested.
+    mask: np.ndarray | None = None
 
 
 def observe_key_views(
@@ -49,8 +54,15 @@ def observe_key_views(
     source = flow_source(method, flow)
     flows = map_in_threads(lambda pair: _checked_flow(source, pair, flow), pairs.values())
     observations = {}
-    for (view, pair), (backward, forward, reliable, forward_reliable) in zip(pairs.items(), flows, strict=True):
-        mask = motion_mask(pair.image, -backward, reliable, mask_method, masks) if mask_method else None  # eqs. 9, 10
+    for (view, pair), (backward, forward, reliable, forward_reliable) in zip(
+        pairs.items(), flows, strict=True
+    ):
+        # Eqs. 9 and 10.
+        mask = (
+            motion_mask(pair.image, -backward, reliable, mask_method, masks)
+            if mask_method
+            else None
+        )
         observations[view] = FlowObservation(-backward, reliable, forward, forward_reliable, mask)
     return observations
 
@@ -81,4 +93,8 @@ def _reliable(
     if pair.box is not None:
         valid = np.zeros(reliable.shape, bool)
         valid[pair.box] = True if pair.valid is None else pair.valid[pair.box]
-    return (reliable, forward_reliable) if valid is None else (reliable & valid, forward_reliable & valid)
+    return (
+        (reliable, forward_reliable)
+        if valid is None
+        else (reliable & valid, forward_reliable & valid)
+    )

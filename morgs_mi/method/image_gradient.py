@@ -1,4 +1,6 @@
-"""Derivatives of images, and their products per Gaussian: the sums of Lucas and Kanade's method (IJCAI 1981)."""
+"""Derivatives of images, and their products per Gaussian: the sums of Lucas and Kanade's method
+(IJCAI 1981).
+"""
 
 from __future__ import annotations
 
@@ -11,13 +13,17 @@ from morgs_mi.render.view_group import backproject
 
 
 def blurred(image: np.ndarray, blur: float) -> np.ndarray:
-    """Return an image [H, W, C] after a Gaussian filter of standard deviation `blur` in pixels; 0: as it is."""
+    """Return an image [H, W, C] after a Gaussian filter of standard deviation `blur` in pixels; 0:
+    as it is.
+    """
     return cv2.GaussianBlur(image, (0, 0), blur) if blur else image
 
 
 def image_gradient(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of a float32 image [H, W, C] along x and y, per px, by Sobel's filter."""
-    x, y = (cv2.Sobel(image, cv2.CV_32F, *order, ksize=3, scale=1 / 8) for order in ((1, 0), (0, 1)))
+    """Return the derivatives of a float32 image [H, W, C] by x and y, per px (Sobel's filter)."""
+    x, y = (
+        cv2.Sobel(image, cv2.CV_32F, *order, ksize=3, scale=1 / 8) for order in ((1, 0), (0, 1))
+    )
     return np.asarray(x), np.asarray(y)
 
 
@@ -28,7 +34,8 @@ def gradient_products(
     gradient: tuple[np.ndarray, np.ndarray],
     weight: np.ndarray | float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sums of w g g^T [N, 2, 2] and of w e g [N, 2] over the pixels and colours of a view, per Gaussian.
+    """Return the sums of w g g^T [N, 2, 2] and of w e g [N, 2] over the pixels and colours of a
+    view, per Gaussian.
 
     Args:
         gaussians: N Gaussians; their blend weights weight the pixels.
@@ -38,6 +45,8 @@ def gradient_products(
         weight: w [H, W], a further weight of the pixels.
     """
     x, y = gradient
-    sums = [weight * np.sum(a * b, axis=-1) for a, b in ((x, x), (x, y), (y, y), (error, x), (error, y))]
+    sums = [
+        weight * np.sum(a * b, axis=-1) for a, b in ((x, x), (x, y), (y, y), (error, x), (error, y))
+    ]
     sums = backproject(gaussians, view, np.stack(sums, axis=-1)).astype(np.float64)
     return sums[:, [0, 1, 1, 2]].reshape(-1, 2, 2), sums[:, 3:]

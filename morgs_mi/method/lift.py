@@ -1,7 +1,8 @@
-"""Lifted flow: the optical flow of the key views as one 3D displacement per Gaussian, in closed form.
+"""Lifted flow: the optical flow of the key views as one 3D displacement per Gaussian, in closed
+form.
 
-Beyond the paper. With the blend weights w fixed, the flow loss (eq. 7) is linear in the motion. On frame t-1's grid,
-with frame t-1's Gaussians and the flow u from t-1 to t, each key view v gives
+Beyond the paper. With the blend weights w fixed, the flow loss (eq. 7) is linear in the motion. On
+frame t-1's grid, with frame t-1's Gaussians and the flow u from t-1 to t, each key view v gives
 
     W_iv = sum_x w_i(x),    u_iv = sum_x w_i(x) u(x) / W_iv,
 
@@ -9,20 +10,22 @@ and with J_v the Jacobian of its projection at the mean, the displacement d_i of
 
     (sum_v k_iv W_iv J_v' J_v + lambda I) d_i = sum_v k_iv W_iv J_v' u_iv .
 
-Adam moves a mean by at most its learning rate per step; starting from d_i, large motion is no longer rate-limited.
-(TrackerSplat, 2026, solves similar normal equations for 2D affine maps of point tracks and triangulates these.)
+Adam moves a mean by at most its learning rate per step; starting from d_i, large motion is no
+longer rate-limited. (TrackerSplat, 2026, solves similar normal equations for 2D affine maps of
+point tracks and triangulates these.)
 
-Flow bleeds over the edges of moving objects, in each view onto another part of the static background. So a view's
-weight follows its agreement with the others, k_iv = 1 / (1 + |u_iv - J_v d_i|^2 / s_iv^2) with s_iv = 0.2 px + |J_v
-d_i| / 5, by iteratively reweighted least squares (Cauchy's cost r(e) = log(1 + |e|^2 / s^2)). There and below, |e|^2
-is the mean over the Gaussian's pixels, that is, the squared length plus the variance of the flow: on a rigid part the
-flow hardly varies; where it bleeds, it falls off. Motion is separated from noise by how much better it explains the
-flow than no motion does,
+Flow bleeds over the edges of moving objects, in each view onto another part of the static
+background. So a view's weight follows its agreement with the others, k_iv = 1 / (1 + |u_iv - J_v
+d_i|^2 / s_iv^2) with s_iv = 0.2 px + |J_v d_i| / 5, by iteratively reweighted least squares
+(Cauchy's cost r(e) = log(1 + |e|^2 / s^2)). There and below, |e|^2 is the mean over the Gaussian's
+pixels, that is, the squared length plus the variance of the flow: on a rigid part the flow hardly
+varies; where it bleeds, it falls off. Motion is separated from noise by how much better it explains
+the flow than no motion does,
 
     e_i = sum_v a_iv (r(u_iv) - r(u_iv - J_v d_i)) / sum_v a_iv,    a_iv = W_iv / (W_iv + 1),
 
-the mean over the key views that see the Gaussian: it moves if e_i > 0.5 and its motion exceeds the noise of the flow in
-some view.
+the mean over the key views that see the Gaussian: it moves if e_i > 0.5 and its motion exceeds the
+noise of the flow in some view.
 """
 
 from __future__ import annotations
@@ -48,8 +51,8 @@ from morgs_mi.render.view_group import ViewGroup
 
 # Numbers of a pixel that are summed per Gaussian.
 _FLOW_MAPS = 4
-# Weight of the prior that nothing moves, in fully covered pixels without motion: a Gaussian that is hardly visible
-# stays in place.
+# Weight of the prior that nothing moves, in fully covered pixels without motion: a Gaussian that is
+# hardly visible stays in place.
 _PRIOR_PIXELS = 0.3
 # Growth of s with the motion, as a fraction of it: flow errors grow with the motion.
 _NOISE_FRACTION = 0.2
@@ -67,11 +70,14 @@ class LiftConfig:
     """Settings of the lifted flow."""
 
     noise_px: Annotated[float, Above(0)] = 0.2
-    """Scale s of the robust cost for a Gaussian that does not move, in px: the noise of the flow."""
+    """Scale s of the robust cost for a Gaussian that does not move, in px: the noise of the flow.
+    """
     min_evidence: float = 0.5
     """Evidence e_i above which a Gaussian moves."""
     max_logit: Annotated[float, AtLeast(0)] = 2.0
-    """Bound of the logit of the confidence: from 0.12 to 0.88, soft enough for the images to correct it."""
+    """Bound of the logit of the confidence: from 0.12 to 0.88, soft enough for the images to
+    correct it.
+    """
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -93,9 +99,13 @@ class _LiftView:
         return np.einsum("nij,nj->ni", self.jacobian, d)
 
     def cost(self, d: np.ndarray, motion: np.ndarray) -> np.ndarray:
-        """Return r(u - J d) [N] (see the module), with the scale s that belongs to a motion [N, 2] in px."""
+        """Return r(u - J d) [N] (see the module), with the scale s that belongs to a motion [N, 2]
+        in px.
+        """
         scale = self.noise_px + _NOISE_FRACTION * np.linalg.norm(motion, axis=1)
-        return np.log1p((np.sum((self.flow - self.project(d)) ** 2, axis=1) + self.variance) / scale**2)
+        return np.log1p(
+            (np.sum((self.flow - self.project(d)) ** 2, axis=1) + self.variance) / scale**2
+        )
 
 
 def lift_flow(
@@ -105,12 +115,14 @@ def lift_flow(
     config: LiftConfig | None = None,
     masks: MaskConfig | None = None,
 ) -> MotionStart:
-    """Return the displacements that explain the flow of the key views best, and the confidence that follows from it.
+    """Return the displacements that explain the flow of the key views best, and the confidence that
+    follows from it.
 
     Args:
         gaussians: N Gaussians of frame t - 1.
         views: active views, by view index.
-        observations: flow of the key views, by view index; those without an active view are not used.
+        observations: flow of the key views, by view index; those without an active view are not
+            used.
         config: settings.
         masks: settings of the motion masks; their floor is the noise of the flow.
     """
@@ -119,7 +131,9 @@ def lift_flow(
     top = config.max_logit
     indices = sorted(observations.keys() & views.keys())
     if not indices:
-        return MotionStart(np.zeros((len(means), 3), np.float32), np.full(len(means), -top, np.float32))
+        return MotionStart(
+            np.zeros((len(means), 3), np.float32), np.full(len(means), -top, np.float32)
+        )
     group = ViewGroup([views[v] for v in indices])
     flow = group.crop([observations[v].forward_flow for v in indices])
     maps = _flow_maps(flow, group.crop([observations[v].forward_reliable for v in indices]))
@@ -141,8 +155,12 @@ def lift_flow(
         total += a
         moves |= np.linalg.norm(motion, axis=1) > view.floor
     evidence = gain / total
-    logit = np.where(moves, np.clip(_CONFIDENCE_SLOPE * (evidence - config.min_evidence), -top, top), -top)
-    return MotionStart(np.where(logit[:, None] > 0, d, 0).astype(np.float32), logit.astype(np.float32))
+    logit = np.where(
+        moves, np.clip(_CONFIDENCE_SLOPE * (evidence - config.min_evidence), -top, top), -top
+    )
+    return MotionStart(
+        np.where(logit[:, None] > 0, d, 0).astype(np.float32), logit.astype(np.float32)
+    )
 
 
 def _flow_maps(flow: np.ndarray, reliable: np.ndarray) -> np.ndarray:
@@ -154,7 +172,9 @@ def _flow_maps(flow: np.ndarray, reliable: np.ndarray) -> np.ndarray:
     return maps * reliable[..., None]
 
 
-def _lift_view(sums: np.ndarray, means: np.ndarray, camera: Camera, floor: float, noise_px: float) -> _LiftView:
+def _lift_view(
+    sums: np.ndarray, means: np.ndarray, camera: Camera, floor: float, noise_px: float
+) -> _LiftView:
     """Return the flow of a view at every Gaussian, from the sums of `_flow_maps` [N, 4]."""
     average = sums[:, :3] / np.maximum(sums[:, 3:], 1e-6)
     variance = np.maximum(average[:, 2] - np.sum(average[:, :2] ** 2, axis=1), 0)

@@ -1,4 +1,4 @@
-"""Registry of implementations, one of which a setting selects by a string: NAME or NAME:ARGUMENT."""
+"""Registry of implementations; a setting selects one by a string: NAME or NAME:ARGUMENT."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ Config = TypeVar("Config")
 class Registry(Generic[Made, Config]):
     """Factories by name.
 
-    A factory takes the argument of the string (empty for a NAME alone) and a config, and returns the implementation.
+    A factory takes the argument of the string (empty for a NAME alone) and a config, and returns
+    the implementation.
 
     Args:
         place: the public function that looks names up, for error messages.
@@ -32,7 +33,8 @@ class Registry(Generic[Made, Config]):
 
         Args:
             name: the name that selects it.
-            argument: placeholder of the argument in messages, e.g. ``FOLDER``; empty: the name takes no argument.
+            argument: placeholder of the argument in messages, e.g. ``FOLDER``; empty: the name
+                takes no argument.
 
         Raises:
             ValueError: the name is empty, has a colon or is taken.
@@ -40,7 +42,10 @@ class Registry(Generic[Made, Config]):
         if not name or ":" in name:
             raise ValueError(f"register(): `name` must be a name without a colon, got {name!r}.")
         if name in self._factories:
-            raise ValueError(f"register(): `name` must be new, got {name!r}, which is registered already; rename one.")
+            raise ValueError(
+                f"register(): `name` must be new, got {name!r}, which is registered already; "
+                "rename one."
+            )
 
         def add(factory: Callable[[str, Config], Made]) -> Callable[[str, Config], Made]:
             self._factories[name] = factory
@@ -49,7 +54,9 @@ class Registry(Generic[Made, Config]):
 
         return add
 
-    def register_entry(self, name: str, argument: str, entry: Callable[[], Callable[[str, Config], Made]]) -> None:
+    def register_entry(
+        self, name: str, argument: str, entry: Callable[[], Callable[[str, Config], Made]]
+    ) -> None:
         """Register a factory that is imported when it is used.
 
         Args:
@@ -66,8 +73,11 @@ class Registry(Generic[Made, Config]):
 
     @property
     def usages(self) -> tuple[str, ...]:
-        """Values of the setting: the names that take no argument, then NAME:ARGUMENT of the others."""
-        return (*self.names, *(f"{name}:{argument}" for name, argument in self._arguments.items() if argument))
+        """Values of the setting: names without an argument, then NAME:ARGUMENT of the others."""
+        return (
+            *self.names,
+            *(f"{name}:{argument}" for name, argument in self._arguments.items() if argument),
+        )
 
     def make(self, text: str, config: Config) -> Made:
         """Return the implementation that `text` selects.
@@ -93,4 +103,6 @@ class Registry(Generic[Made, Config]):
         takes_argument = bool(self._arguments.get(name))
         if name not in self._factories or not (takes_argument == bool(colon) == bool(argument)):
             usages = ", ".join(self.usages) or "the registered names, of which there are none"
-            raise ValueError(f"{place or self._place}: `{self._setting}` must be one of {usages}, got {text!r}.")
+            raise ValueError(
+                f"{place or self._place}: `{self._setting}` must be one of {usages}, got {text!r}."
+            )

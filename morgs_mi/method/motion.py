@@ -1,6 +1,8 @@
-"""The start of each Gaussian's motion (eq. 5), in stages: lifted flow, proposals, search, refinement.
+"""The start of each Gaussian's motion (eq. 5), in stages: lifted flow, proposals, search,
+refinement.
 
-A `Stage` returns a better start from the one before. `STAGES` lists them in their order; settings switch them off.
+A `Stage` returns a better start from the one before. `STAGES` lists them in their order; settings
+switch them off.
 """
 
 from __future__ import annotations
@@ -29,13 +31,16 @@ class Stage:
     """One stage of the start of the motion."""
 
     acts: Callable[[MotionConfig], bool]  #: Whether it is on, by the settings.
-    run: Callable[[MotionProblem, MotionStart, MotionConfig], MotionStart]  #: (problem, start, settings) -> start.
+    #: (problem, start, settings) -> start.
+    run: Callable[[MotionProblem, MotionStart, MotionConfig], MotionStart]
 
 
 STAGES: tuple[Stage, ...] = (
     Stage(
         lambda config: config.lift_flow,
-        lambda p, start, config: lift_flow(p.gaussians, p.views, p.flows, config.lift, config.masks),
+        lambda p, start, config: lift_flow(
+            p.gaussians, p.views, p.flows, config.lift, config.masks
+        ),
     ),
     Stage(
         lambda config: config.propagate_motion,
@@ -51,7 +56,8 @@ STAGES: tuple[Stage, ...] = (
     ),
 )
 
-# Logit that a confidence loses per frame without evidence of motion: where something moved, more is to correct.
+# Logit that a confidence loses per frame without evidence of motion: where something moved, more is
+# to correct.
 _CONFIDENCE_DECAY = 0.3
 
 
@@ -86,7 +92,9 @@ def initial_motion(
     for stage in STAGES:
         if stage.acts(config):
             start = stage.run(problem, start, config)
-    neighbours = problem.neighbours if gaussians is previous else NeighbourIndex(np.asarray(previous.means))
+    neighbours = (
+        problem.neighbours if gaussians is previous else NeighbourIndex(np.asarray(previous.means))
+    )
     logit = _carried_confidence(start, gaussians)
     shared = share_confidence(
         previous, active.indices, logit, -config.lift.max_logit, config.cohesion_weight, neighbours
@@ -97,11 +105,17 @@ def initial_motion(
 def _constant_velocity(gaussians: Gaussians) -> MotionStart:
     """Return the motion into the previous frame as the start, with the confidence as it is."""
     start = MotionStart.without_motion(gaussians)
-    return start if gaussians.motion is None else replace(start, displacement=np.asarray(gaussians.motion))
+    return (
+        start
+        if gaussians.motion is None
+        else replace(start, displacement=np.asarray(gaussians.motion))
+    )
 
 
 def _carried_confidence(start: MotionStart, gaussians: Gaussians) -> np.ndarray:
-    """Return the logits [M] of the previous frame, slightly lowered, or the start's logits where these are higher."""
+    """Return the logits [M] of the previous frame, slightly lowered, or the start's logits where
+    these are higher.
+    """
     if gaussians.logit_confidence is None:
         return start.logit_confidence
     last_logit = np.asarray(gaussians.logit_confidence)

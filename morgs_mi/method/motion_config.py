@@ -36,7 +36,9 @@ class MotionConfig:
     learn_confidence: bool = True
     """MC: a learned confidence gates the residuals (eq. 12)."""
     two_gates: bool = True
-    """Gate means and rotations only, and let appearance change freely; False: one gate for all, as in the paper."""
+    """Gate means and rotations only, and let appearance change freely; False: one gate for all, as
+    in the paper.
+    """
     lift_flow: bool = True
     """Start each Gaussian's motion from lifted flow; False: from zero, as in the paper."""
     constant_velocity: bool = False
@@ -46,12 +48,17 @@ class MotionConfig:
     search_motion: bool = True
     """Search for parts that neither flow nor proposals explain; needs `lift_flow`."""
     refine_start: bool = True
-    """Refine the start of motion and colour by the images of the key views; needs `lift_flow` and `two_gates`."""
+    """Refine the start of motion and colour by the images of the key views; needs `lift_flow` and
+    `two_gates`.
+    """
     lift_confidence: bool = True
-    """Raise each Gaussian's confidence to the confidence of lifted flow; False: carry it over, as in the paper."""
+    """Raise each Gaussian's confidence to the confidence of lifted flow; False: carry it over, as
+    in the paper.
+    """
     flow_method: str = "dis"
-    """Source of optical flow: a method of OpenCV (see docs/flow.md), files:FOLDER, or onnx:FILE for a network
-    (onnx-unit:FILE or onnx-signed:FILE if it takes values from 0 or -1 to 1 instead of bytes)."""
+    """Source of optical flow: a method of OpenCV (see docs/flow.md), files:FOLDER, or onnx:FILE for
+    a network (onnx-unit:FILE or onnx-signed:FILE if it takes values from 0 or -1 to 1 instead of
+    bytes)."""
     mask_method: str = "grabcut"
     """Refinement of flow masks to objects: none, grabcut, superpixels+grabcut, or
     sam2:ENCODER.onnx,DECODER.onnx (see docs/masks.md)."""
@@ -60,10 +67,12 @@ class MotionConfig:
     mask_interval: Annotated[int, AtLeast(1)] = 5
     """Frames from one supervision of the confidence by masks to the next."""
     cohesion_weight: Annotated[float, AtLeast(0)] = 50.0
-    """Weight of an opaque neighbour of the same colour against the evidence of motion of a Gaussian alone (see
-    `cohesion`); 0: no cohesion."""
+    """Weight of an opaque neighbour of the same colour against the evidence of motion of a Gaussian
+    alone (see `cohesion`); 0: no cohesion."""
     model: str = "none"
-    """Motion that Gaussians share, fitted before the residual: none, or a registered model (see docs/extending.md)."""
+    """Motion that Gaussians share, fitted before the residual: none, or a registered model (see
+    docs/extending.md).
+    """
     model_share: Annotated[float, AtLeast(0), AtMost(1)] = 0.5
     """Fraction of a later frame's epochs that fit this model, at least one epoch."""
     flow: FlowConfig = field(default_factory=FlowConfig)

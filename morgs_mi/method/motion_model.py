@@ -1,15 +1,17 @@
-"""Motion models: a few parameters that move all Gaussians, fitted before each Gaussian has a residual of its own.
+"""Motion models: a few parameters that move all Gaussians, fitted before each Gaussian has a
+residual of its own.
 
-3DGStream, HiCoM and 4DGC fit a later frame in two stages: first a motion that Gaussians share, then the remaining
-change. A model is the first stage. It maps its parameters to a displacement d of every Gaussian and to a rotation r, a
-quaternion,
+3DGStream, HiCoM and 4DGC fit a later frame in two stages: first a motion that Gaussians share, then
+the remaining change. A model is the first stage. It maps its parameters to a displacement d of
+every Gaussian and to a rotation r, a quaternion,
 
     mu' = mu + d,    q' = r q    (Hamilton product),
 
-and the residual (eq. 12) starts from there. `fit.motion_stage` fits it. The spherical harmonics are not rotated.
+and the residual (eq. 12) starts from there. `fit.motion_stage` fits it. The spherical harmonics are
+not rotated.
 
-The setting `motion.model` selects a model of `MOTION_MODELS`. The package has none; models of other publications are in
-benchmarks/field, and docs/extending.md describes how to register one.
+The setting `motion.model` selects a model of `MOTION_MODELS`. The package has none; models of other
+publications are in benchmarks/field, and docs/extending.md describes how to register one.
 """
 
 from __future__ import annotations
@@ -38,16 +40,20 @@ class MotionModel:
 
     parameters: Mapping[str, Tensor]  #: Tensors at their start, by name, for which nothing moves.
     rates: Mapping[str, float]  #: Adam's learning rate of each, by name.
-    #: Parameters -> (displacements [N, 3] in world units, rotations [N, 4] minus the identity, wxyz).
+    #: Parameters -> (displacements [N, 3] in world units, rotations [N, 4] minus the identity,
+    #: wxyz).
     motion: Callable[[Mapping[str, Tensor]], tuple[Tensor, Tensor]]
     #: Parameters -> weighted losses in addition to L_recon, by name.
     losses: Callable[[Mapping[str, Tensor]], dict[str, Tensor]] = lambda parameters: {}
 
 
-# (N Gaussians of the previous frame, extent of the scene in world units, random generator) -> model.
+# (N Gaussians of the previous frame, extent of the scene in world units, random generator) ->
+# model.
 MotionModelFactory = Callable[[Gaussians, float, np.random.Generator], MotionModel]
 
-MOTION_MODELS: Registry[MotionModelFactory | None, MotionConfig] = Registry("motion_model()", "model")
+MOTION_MODELS: Registry[MotionModelFactory | None, MotionConfig] = Registry(
+    "motion_model()", "model"
+)
 
 
 @MOTION_MODELS.register("none")
@@ -88,7 +94,8 @@ def quaternion_product(r: Jit, q: Jit) -> Jit:
 def sparse_product(matrix: csr_array, x: Tensor) -> Tensor:
     """Return W x [N, K] of a constant matrix W [N, C] and a tensor x [C, K], differentiable in x.
 
-    A gather's adjoint would add atomically, in no fixed order; this one is a product with the transpose.
+    A gather's adjoint would add atomically, in no fixed order; this one is a product with the
+    transpose.
     """
     return dr.custom(_SparseProduct, x, matrix)
 

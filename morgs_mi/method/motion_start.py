@@ -22,14 +22,18 @@ from morgs_mi.render.active_view import ActiveView
 class MotionStart:
     """Start of the motion, of the confidence, of the colour and of the rotation of N Gaussians."""
 
-    displacement: np.ndarray  #: d [N, 3] since the previous frame, world units; 0 for a Gaussian that does not move.
+    #: D [N, 3] since the previous frame, world units; 0 for a Gaussian that does not move.
+    displacement: np.ndarray
     logit_confidence: np.ndarray  #: Logit of the confidence that it moves [N].
-    color_change: np.ndarray | None = None  #: Change of the constant SH coefficients [N, 3]; None: none.
+    #: Change of the constant SH coefficients [N, 3]; None: none.
+    color_change: np.ndarray | None = None
     rotation: np.ndarray | None = None  #: Change of the quaternions [N, 4]; None: none.
 
     @classmethod
     def without_motion(cls, gaussians: Gaussians) -> MotionStart:
-        """Return the start of N Gaussians that stay in place, with their confidence; its logit is 0 without one."""
+        """Return the start of N Gaussians that stay in place, with their confidence; its logit is 0
+        without one.
+        """
         logit = gaussians.logit_confidence
         confidence = np.zeros(len(gaussians)) if logit is None else logit
         return cls(np.zeros((len(gaussians), 3), np.float32), np.array(confidence, np.float32))
@@ -39,11 +43,13 @@ class MotionStart:
 class MotionProblem:
     """N Gaussians of the previous frame, and images of this one that show their motion."""
 
-    gaussians: Gaussians  #: N Gaussians of the previous frame, detached; `motion` is their displacement into that frame
+    #: N Gaussians of the previous frame, detached; `motion` is their displacement into that frame.
+    gaussians: Gaussians
     views: Mapping[int, ActiveView]  #: Active views, by view index.
     targets: Mapping[int, Target]  #: Images of these views, by view index.
     rng: np.random.Generator  #: Draws the neighbours that proposals come from.
-    flows: Mapping[int, FlowObservation] = field(default_factory=dict)  #: Optical flow of the views, by view index.
+    #: Optical flow of the views, by view index.
+    flows: Mapping[int, FlowObservation] = field(default_factory=dict)
     _last: dict[str, Any] = field(default_factory=dict)
 
     @cached_property
@@ -57,14 +63,19 @@ class MotionProblem:
         return KeyImages(self.views, self.targets)
 
     def sums_at(self, displacement: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the sums of all maps of a sweep, with the Gaussians displaced by d [N, 3]; kept until d is another."""
+        """Return the sums of all maps of a sweep, with the Gaussians displaced by d [N, 3]; kept
+        until d is another.
+        """
         if self._last.get("displacement") is not displacement:
             sums = self.images.sums(displaced(self.gaussians, displacement), [*MAPS])
             self._last.update(displacement=displacement, sums=sums)
         return self._last["sums"]
 
-    def images_around(self, selection: np.ndarray, displacements: Sequence[np.ndarray]) -> KeyImages | None:
-        """Return the images in the blocks that some Gaussians reach, in place or displaced; None if there are none.
+    def images_around(
+        self, selection: np.ndarray, displacements: Sequence[np.ndarray]
+    ) -> KeyImages | None:
+        """Return the images in the blocks that some Gaussians reach, in place or displaced; None if
+        there are none.
 
         Args:
             selection: which Gaussians, bool [N].
@@ -76,6 +87,8 @@ class MotionProblem:
         all_rows = np.ones(len(some), bool)
         for index, view in self.views.items():
             boxes = [boxes_around(place, view.camera, view.config, 1.0) for place in places]
-            narrow_views[index] = view.narrowed(np.any([box.union(all_rows, view.grid) for box in boxes], axis=0))
+            narrow_views[index] = view.narrowed(
+                np.any([box.union(all_rows, view.grid) for box in boxes], axis=0)
+            )
         views = {index: view for index, view in narrow_views.items() if view is not None}
         return KeyImages(views, self.targets) if views else None

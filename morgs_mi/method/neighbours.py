@@ -24,7 +24,9 @@ class NeighbourIndex:
         return KDTree(self.points)
 
     def nearest(self, count: int) -> np.ndarray:
-        """Return the indices of the nearest other points of each point, [N, min(count, N - 1)], the nearest first."""
+        """Return the indices of the nearest other points of each point, [N, min(count, N - 1)], the
+        nearest first.
+        """
         if count not in self._of_all:
             self._of_all[count] = self.nearest_of(np.arange(len(self.points)), count)
         return self._of_all[count]
@@ -33,4 +35,5 @@ class NeighbourIndex:
         """Return the same of the chosen points, int [M]: [M, min(count, N - 1)]."""
         count = min(count, len(self.points) - 1)
         _, near = self._tree.query(self.points[rows], count + 1, workers=-1)
-        return np.asarray(near).reshape(len(rows), count + 1)[:, 1:]  # the first is the point itself
+        # The first is the point itself.
+        return np.asarray(near).reshape(len(rows), count + 1)[:, 1:]

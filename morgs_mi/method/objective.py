@@ -1,11 +1,13 @@
 """The objective (eq. 13) as data: L = L_recon + sum of lambda L over further terms.
 
-A `Term` declares its weight, the channels that must be rendered for it, and the observations that it compares them
-with. Which channels a view renders, which static splats it needs and which losses a report lists follow from `TERMS`.
+A `Term` declares its weight, the channels that must be rendered for it, and the observations that
+it compares them with. Which channels a view renders, which static splats it needs and which losses
+a report lists follow from `TERMS`.
 
-An observation is an array of one view at one frame, by name. `target` exists in all views, and so do `neighbours`, the
-Gaussians of the previous frame, where a term compares them. The others exist in key views, where the observer of a term
-returns them. A term acts in the views that have all its observations.
+An observation is an array of one view at one frame, by name. `target` exists in all views, and so
+do `neighbours`, the Gaussians of the previous frame, where a term compares them. The others exist
+in key views, where the observer of a term returns them. A term acts in the views that have all its
+observations.
 
 `loss_term` registers further terms, which `ObjectiveConfig.terms` selects.
 """
@@ -69,7 +71,9 @@ class ObjectiveConfig:
             _weight(text.partition(":")[2])
         names = [text.partition(":")[0] for text in self.terms]
         if len(names) > len({*names}):
-            raise ValueError(f"ObjectiveConfig(): `terms` must name each term once, got {self.terms}.")
+            raise ValueError(
+                f"ObjectiveConfig(): `terms` must name each term once, got {self.terms}."
+            )
 
     @property
     def is_rigid(self) -> bool:
@@ -112,18 +116,27 @@ class Term:
     channels: tuple[str, ...] = ()  #: That must be rendered.
     observations: tuple[str, ...] = ()  #: That must exist.
     parameters: tuple[str, ...] = ()  #: Of the residual that must exist.
-    #: (key view, settings of the motion, settings) -> observations [H, W, ...] by name; None: they exist without it.
+    #: (key view, settings of the motion, settings) -> observations [H, W, ...] by name; None: they
+    #: exist without it.
     observer: Observer | None = None
 
 
-def _observe_motion(view: KeyView, motion: MotionConfig, config: ObjectiveConfig) -> dict[str, np.ndarray]:
+def _observe_motion(
+    view: KeyView, motion: MotionConfig, config: ObjectiveConfig
+) -> dict[str, np.ndarray]:
     """Return the motion by optical flow [H, W, 2] in px, and where it is reliable [H, W]."""
-    return {"motion": view.flow.motion, "reliable": view.flow.reliable} if motion.learn_motion else {}
+    return (
+        {"motion": view.flow.motion, "reliable": view.flow.reliable} if motion.learn_motion else {}
+    )
 
 
-def _observe_mask(view: KeyView, motion: MotionConfig, config: ObjectiveConfig) -> dict[str, np.ndarray]:
+def _observe_mask(
+    view: KeyView, motion: MotionConfig, config: ObjectiveConfig
+) -> dict[str, np.ndarray]:
     """Return the motion mask [H, W], in frames that have one."""
-    return {"mask": view.flow.mask} if motion.learn_confidence and view.flow.mask is not None else {}
+    return (
+        {"mask": view.flow.mask} if motion.learn_confidence and view.flow.mask is not None else {}
+    )
 
 
 TERMS: tuple[Term, ...] = (
@@ -137,7 +150,9 @@ TERMS: tuple[Term, ...] = (
     Term(  # eq. 7
         "flow",
         lambda config: config.flow_weight,
-        lambda p, o, config: flow_loss(p.image["guided_motion"], o["motion"], o["reliable"], p.num_pixels),
+        lambda p, o, config: flow_loss(
+            p.image["guided_motion"], o["motion"], o["reliable"], p.num_pixels
+        ),
         channels=("guided_motion",),
         observations=("motion", "reliable"),
         observer=_observe_motion,
@@ -163,7 +178,11 @@ TERMS: tuple[Term, ...] = (
             lambda p, o, config, loss=loss: loss(p.gaussians, o["neighbours"]),
             observations=("neighbours",),
         )
-        for name, loss in (("rigid", rigid_loss), ("rotation", rotation_loss), ("isometry", isometry_loss))
+        for name, loss in (
+            ("rigid", rigid_loss),
+            ("rotation", rotation_loss),
+            ("isometry", isometry_loss),
+        )
     ),
 )
 
@@ -183,7 +202,8 @@ def loss_term(
     Example:
         >>> @morgs_mi.loss_term("speed", parameters=("motion",))
         ... def speed_loss(prediction, observations, config):
-        ...     return dr.mean(dr.abs(prediction.parameters["motion"]), axis=None) / prediction.extent
+        ...     motion = prediction.parameters["motion"]
+        ...     return dr.mean(dr.abs(motion), axis=None) / prediction.extent
         >>> objective = morgs_mi.ObjectiveConfig(terms=("speed:0.1",))
 
     Args:
@@ -197,11 +217,16 @@ def loss_term(
         ValueError: the name is taken, empty, or has a colon.
     """
     if name in (term.name for term in TERMS):
-        raise ValueError(f"loss_term(): `name` must be new, got {name!r}, which the objective has already; rename it.")
+        raise ValueError(
+            f"loss_term(): `name` must be new, got {name!r}, which the objective has already; "
+            "rename it."
+        )
 
     def add(loss: Loss) -> Loss:
         def term(weight: str, config: ObjectiveConfig) -> Term:
-            return Term(name, lambda _: _weight(weight), loss, channels, observations, parameters, observer)
+            return Term(
+                name, lambda _: _weight(weight), loss, channels, observations, parameters, observer
+            )
 
         LOSS_TERMS.register(name, "WEIGHT")(term)
         return loss
@@ -237,7 +262,9 @@ def observe(
     return observations
 
 
-def active_terms(observations: Observations, parameters: Mapping[str, Tensor], config: ObjectiveConfig) -> list[Term]:
+def active_terms(
+    observations: Observations, parameters: Mapping[str, Tensor], config: ObjectiveConfig
+) -> list[Term]:
     """Return the terms that act in a view with these observations."""
 
     def acts(term: Term) -> bool:
@@ -248,12 +275,14 @@ def active_terms(observations: Observations, parameters: Mapping[str, Tensor], c
 
 
 def channels_of(observations: Observations, config: ObjectiveConfig) -> tuple[str, ...]:
-    """Return the channels to render in a view with these observations in addition to its `target`."""
+    """Return the channels to render in a view with these observations beside its `target`."""
     terms = active_terms({"target": None, **observations}, {}, config)
     return tuple(dict.fromkeys(channel for term in terms for channel in term.channels))
 
 
-def losses_of(prediction: Prediction, observations: Observations, config: ObjectiveConfig) -> dict[str, Tensor]:
+def losses_of(
+    prediction: Prediction, observations: Observations, config: ObjectiveConfig
+) -> dict[str, Tensor]:
     """Return the losses of one view, by the names of the terms."""
     terms = active_terms(observations, prediction.parameters, config)
     return {term.name: term.loss(prediction, observations, config) for term in terms}

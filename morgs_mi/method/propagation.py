@@ -1,15 +1,16 @@
 """Motion proposals from the previous frame and from neighbours, where lifted flow fails.
 
-Flow fails where parts are thin and fast, or look alike. But motion mostly continues, and neighbours share it. So each
-Gaussian gets further proposals, as pixels do in PatchMatch (Barnes et al. 2009): first its own motion of the previous
-frame, then, in each round, the motion of a random one of its nearest moving neighbours. All Gaussians try their
-proposals at once and are rendered in the key views. With the attributed error E_iv and the coverage W_iv there (see
-`method.attribution`), the error of a Gaussian is
+Flow fails where parts are thin and fast, or look alike. But motion mostly continues, and neighbours
+share it. So each Gaussian gets further proposals, as pixels do in PatchMatch (Barnes et al. 2009):
+first its own motion of the previous frame, then, in each round, the motion of a random one of its
+nearest moving neighbours. All Gaussians try their proposals at once and are rendered in the key
+views. With the attributed error E_iv and the coverage W_iv there (see `method.attribution`), the
+error of a Gaussian is
 
     (0.01 px + sum_v E_iv) / (1 px + sum_v W_iv) .
 
-A Gaussian accepts a proposal that clearly lowers its error. Only the surroundings of Gaussians that may move are
-rendered.
+A Gaussian accepts a proposal that clearly lowers its error. Only the surroundings of Gaussians that
+may move are rendered.
 """
 
 from __future__ import annotations
@@ -24,11 +25,12 @@ from morgs_mi.method.sweep import relative_error
 _ROUNDS = 2
 # Nearest Gaussians that a proposal is drawn from.
 _NEIGHBOURS = 8
-# Ratio of the new error to the old one up to which a Gaussian accepts a proposal, if it moves otherwise and if not.
-# Others move at the same time: a smaller gain is chance.
+# Ratio of the new error to the old one up to which a Gaussian accepts a proposal, if it moves
+# otherwise and if not. Others move at the same time: a smaller gain is chance.
 _ERROR_RATIO = 0.9
 _ERROR_RATIO_STATIC = 0.8
-# Logit of the confidence of a Gaussian that accepted a motion: 0.57, as some accept a wrong one by chance.
+# Logit of the confidence of a Gaussian that accepted a motion: 0.57, as some accept a wrong one by
+# chance.
 _LOGIT = 0.3
 
 
@@ -46,7 +48,9 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
         return start
     near = problem.neighbours.nearest(_NEIGHBOURS)
     rounds = _ROUNDS if near.size else 0
-    images = problem.images_around(_reached(near, np.any([d, last_motion], axis=(0, 2)), rounds), (d, last_motion))
+    images = problem.images_around(
+        _reached(near, np.any([d, last_motion], axis=(0, 2)), rounds), (d, last_motion)
+    )
     if images is None:
         return start
 
@@ -56,7 +60,9 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
     error = error_of(d)
     continues = np.any(last_motion, axis=1, keepdims=True)
     for k in range(1 + rounds):
-        proposal = d[_moving_neighbour(near, d, problem.rng)] if k else np.where(continues, last_motion, d)
+        proposal = (
+            d[_moving_neighbour(near, d, problem.rng)] if k else np.where(continues, last_motion, d)
+        )
         differs = np.any(proposal != d, axis=1)
         if not differs.any():
             continue
@@ -71,7 +77,9 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
 
 
 def _previous_motion(gaussians: Gaussians) -> np.ndarray:
-    """Return the motion [N, 3] into the previous frame of those that moved then with confidence, 0 for the others."""
+    """Return the motion [N, 3] into the previous frame of those that moved then with confidence, 0
+    for the others.
+    """
     if gaussians.motion is None:
         return np.zeros((len(gaussians), 3), np.float32)
     motion = np.asarray(gaussians.motion)
@@ -88,6 +96,6 @@ def _reached(near: np.ndarray, moving: np.ndarray, rounds: int) -> np.ndarray:
 
 
 def _moving_neighbour(near: np.ndarray, d: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the index of a random neighbour of each Gaussian [N]; of a moving one if there is any."""
+    """Return the index of a random neighbour of each Gaussian [N], a moving one if there is any."""
     draw = np.any(d, axis=1)[near] + rng.random(near.shape, np.float32)
     return near[np.arange(len(near)), draw.argmax(axis=1)]

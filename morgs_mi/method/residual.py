@@ -1,13 +1,14 @@
 """The gated residual: the change from one frame to the next (eqs. 3, 8 and 12).
 
-    A_t = A_{t-1} + m R_t,        R of the means = motion + offset,        m = sigmoid(logit_confidence)
+    A_t = A_{t-1} + m R_t,    R of the means = motion + offset,    m = sigmoid(logit_confidence)
 
-With two gates, m gates only the attributes of motion (means and rotations); colour, opacity and size are free, because
-shadows and light change where nothing moves and uncovered background has to be filled. The paper has one gate for all
-attributes. Which attribute belongs to which gate is a column of the attribute table (`core.attributes`).
+With two gates, m gates only the attributes of motion (means and rotations); colour, opacity and
+size are free, because shadows and light change where nothing moves and uncovered background has to
+be filled. The paper has one gate for all attributes. Which attribute belongs to which gate is a
+column of the attribute table (`core.attributes`).
 
-The parameters are a dict of raw tensors. All are zero at the start of a frame except the confidence, which carries
-over.
+The parameters are a dict of raw tensors. All are zero at the start of a frame except the
+confidence, which carries over.
 """
 
 from __future__ import annotations
@@ -45,14 +46,16 @@ def residual_parameters(
     """
     shapes = {**previous.parameters(), "motion": previous.means, "offset": previous.means}
     names = [n for n in _RESIDUALS if n in shapes and (n != "offset" or config.learn_offset)]
-    parameters: dict[str, Tensor] = {name: dr.zeros(mi.TensorXf, tuple(shapes[name].shape)) for name in names}
+    parameters: dict[str, Tensor] = {
+        name: dr.zeros(mi.TensorXf, tuple(shapes[name].shape)) for name in names
+    }
     displacement, rotation = (None, None) if start is None else (start.displacement, start.rotation)
     if config.learn_confidence:
         logit = previous.logit_confidence
         if logit is None:
             raise ValueError(
-                "residual_parameters(): `previous` must have a confidence with `learn_confidence`, got none; set "
-                "`logit_confidence`, or switch the module off."
+                "residual_parameters(): `previous` must have a confidence with "
+                "`learn_confidence`, got none; set `logit_confidence`, or switch the module off."
             )
         if start is not None and config.lift_confidence:
             logit = from_numpy(mi.TensorXf, start.logit_confidence)
@@ -70,10 +73,13 @@ def residual_parameters(
     return parameters
 
 
-def apply_residual(previous: Gaussians, parameters: Mapping[str, Tensor], config: MotionConfig) -> Gaussians:
+def apply_residual(
+    previous: Gaussians, parameters: Mapping[str, Tensor], config: MotionConfig
+) -> Gaussians:
     """Return A_{t-1} + m R_t (eq. 12); its `motion` is the displacement of the means.
 
-    The displacement is the sum of the flow-guided motion and the learned offset (eq. 8), which is `offset`.
+    The displacement is the sum of the flow-guided motion and the learned offset (eq. 8), which is
+    `offset`.
 
     Args:
         previous: N Gaussians of the previous frame.
@@ -91,12 +97,22 @@ def apply_residual(previous: Gaussians, parameters: Mapping[str, Tensor], config
         return mi.TensorXf(repeat_each(gate, width) * change.array, tuple(change.shape))
 
     motion = gated("motion")
-    offset = gated("offset") if "offset" in parameters else dr.zeros(mi.TensorXf, tuple(motion.shape))
+    offset = (
+        gated("offset") if "offset" in parameters else dr.zeros(mi.TensorXf, tuple(motion.shape))
+    )
     attributes = previous.parameters()
     others = [
-        name for name in parameters if name in attributes and name not in ("motion", "offset", "logit_confidence")
+        name
+        for name in parameters
+        if name in attributes and name not in ("motion", "offset", "logit_confidence")
     ]
     values = {name: attributes[name] + gated(name) for name in others}
     displacement = motion + offset
-    values |= {"means": attributes["means"] + displacement, "motion": displacement, "offset": offset}
-    return previous.with_parameters(values if logit is None else {**values, "logit_confidence": logit})
+    values |= {
+        "means": attributes["means"] + displacement,
+        "motion": displacement,
+        "offset": offset,
+    }
+    return previous.with_parameters(
+        values if logit is None else {**values, "logit_confidence": logit}
+    )

@@ -1,19 +1,23 @@
-"""Responsibility and overlap of a Gaussian: how much of its visible surface changed, and in how many of the views.
+"""Responsibility and overlap of a Gaussian: how much of its visible surface changed, and in how
+many of the views.
 
 With the change mask c_v of view v and the blend weights w_iv(x) of frame t-1's Gaussians,
 
     r_i = sum_v sum_x w_iv c_v / sum_v sum_x w_iv .
 
-A hidden Gaussian has no weight and is not responsible; one that something passes in front of in two of twenty views is
-hardly so. Rendering all views to learn the denominator would cost more than the rest of a frame. So only the blocks R_v
-of pixels with changes are rendered, and a Gaussian counts as equally visible elsewhere: with its boxes b_iv,
+A hidden Gaussian has no weight and is not responsible; one that something passes in front of in two
+of twenty views is hardly so. Rendering all views to learn the denominator would cost more than the
+rest of a frame. So only the blocks R_v of pixels with changes are rendered, and a Gaussian counts
+as equally visible elsewhere: with its boxes b_iv,
 
     r_i = (sum_v sum_{R_v} w_iv c_v / sum_v sum_{R_v} w_iv) (sum_v |b_iv and R_v| / sum_v |b_iv|) .
 
-Large views are rendered at a fraction of their resolution, where c_v is the changed share of a pixel.
+Large views are rendered at a fraction of their resolution, where c_v is the changed share of a
+pixel.
 
-A wall behind moving objects changes at their edges, in those views in which they are in front of it. What moves itself
-lies within the changes of all views V_i in which it is, hidden or not. The overlap is the mean over these views,
+A wall behind moving objects changes at their edges, in those views in which they are in front of
+it. What moves itself lies within the changes of all views V_i in which it is, hidden or not. The
+overlap is the mean over these views,
 
     o_i = 1/|V_i| sum_{v in V_i} |b_iv and R_v| / |b_iv| .
 """
@@ -54,12 +58,14 @@ class ChangedView:
 def responsibility(
     gaussians: Gaussians, views: Iterable[ChangedView], min_weight: float, width: int = 640
 ) -> np.ndarray:
-    """Return the responsibility r [N] of each Gaussian for the changes, from 0 to 1; 0 for hidden ones.
+    """Return the responsibility r [N] of each Gaussian for the changes, from 0 to 1; 0 for hidden
+    ones.
 
     Args:
         gaussians: N Gaussians of the previous frame, detached.
         views: V views with the boxes of these Gaussians.
-        min_weight: blend weight summed over all changed blocks, in px, below which a Gaussian counts as hidden.
+        min_weight: blend weight summed over all changed blocks, in px, below which a Gaussian
+            counts as hidden.
         width: views are reduced by the largest whole factor that leaves this width, in px.
     """
     near = dr.zeros(mi.Float, len(gaussians))
@@ -76,24 +82,32 @@ def responsibility(
         factors.append(max(view.camera.width // width, 1))
         shares.append(_reduced(changed_view.change, factors[-1]))
         region = Region(shares[-1] > 0, view.config)
-        active_views.append(ActiveView(view.camera.resized(*shares[-1].shape[::-1]), view.config, region))
+        active_views.append(
+            ActiveView(view.camera.resized(*shares[-1].shape[::-1]), view.config, region)
+        )
         near += boxes.within(region.block_table, region.grid, factors[-1])
     if not active_views:
         return np.zeros(len(gaussians), np.float32)
     group = ViewGroup(active_views)
     change = group.crop(shares)
     blocks = [region.num_blocks for region in group.regions]
-    area_of = np.repeat(np.square(factors), blocks)[:, None, None]  # px of the view per reduced pixel
-    maps = from_numpy(mi.Float, np.stack([area_of * change, np.broadcast_to(area_of, change.shape)], axis=-1))
+    # px of the view per reduced pixel.
+    area_of = np.repeat(np.square(factors), blocks)[:, None, None]
+    maps = from_numpy(
+        mi.Float, np.stack([area_of * change, np.broadcast_to(area_of, change.shape)], axis=-1)
+    )
     change_weight, weight = group.draw(gaussians).totals(maps, 2).T
     visible = weight > min_weight
-    # At least 1: the box of a Gaussian beside the view may be empty, although it reaches into the view.
+    # At least 1: the box of a Gaussian beside the view may be empty, although it reaches into the
+    # view.
     area_ratio = np.maximum(np.asarray(area / dr.maximum(near, 1)), 1)
     return np.where(visible, change_weight / np.where(visible, weight * area_ratio, 1), 0)
 
 
 def overlap(count: int, views: Iterable[ChangedView]) -> np.ndarray:
-    """Return the overlap o [N] of `count` Gaussians with the changes, from 0 to 1; 0 for one that is in no view."""
+    """Return the overlap o [N] of `count` Gaussians with the changes, from 0 to 1; 0 for one that
+    is in no view.
+    """
     shares = np.zeros(count)
     counts = np.zeros_like(shares)
     for changed_view in views:
@@ -101,11 +115,15 @@ def overlap(count: int, views: Iterable[ChangedView]) -> np.ndarray:
         counts += area > 0
         if changed_view.change.any():
             table = from_numpy(mi.UInt32, summed_area(changed_view.counts > 0))
-            shares += np.asarray(changed_view.boxes.within(table, changed_view.view.grid)) / np.maximum(area, 1)
+            shares += np.asarray(
+                changed_view.boxes.within(table, changed_view.view.grid)
+            ) / np.maximum(area, 1)
     return shares / np.maximum(counts, 1)
 
 
 def _reduced(mask: np.ndarray, factor: int) -> np.ndarray:
-    """Return the covered share of the pixels of a mask [H, W] at 1 / factor of its resolution, float32."""
+    """Return the covered share of the pixels of a mask [H, W] at 1 / factor of its resolution,
+    float32.
+    """
     height, width = (max(size // factor, 1) for size in mask.shape)
     return cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)

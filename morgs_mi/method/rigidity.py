@@ -1,7 +1,8 @@
-"""Local rigidity, after Dynamic 3D Gaussians (Luiten et al., 3DV 2024): neighbours move like parts of one body.
+"""Local rigidity, after Dynamic 3D Gaussians (Luiten et al., 3DV 2024): neighbours move like parts
+of one body.
 
-For a Gaussian i and each of its k nearest neighbours j, with r_i the rotation of i since the previous frame and e_ij =
-mu_j - mu_i then, e'_ij now,
+For a Gaussian i and each of its k nearest neighbours j, with r_i the rotation of i since the
+previous frame and e_ij = mu_j - mu_i then, e'_ij now,
 
     rigid     w_ij |e'_ij - r_i(e_ij)|        j keeps its place in the coordinate system of i,
     rotation  w_ij |r_j - r_i|                both turn alike (quaternions),
@@ -48,7 +49,8 @@ class Neighbours:
 def find_neighbours(
     gaussians: Gaussians, extent: float, count: int = _NEIGHBOURS, reach: float = _REACH
 ) -> Neighbours | None:
-    """Return the pairs of neighbours among N Gaussians of the previous frame, None if there is only one Gaussian.
+    """Return the pairs of neighbours among N Gaussians of the previous frame, None if there is only
+    one Gaussian.
 
     Args:
         gaussians: the N Gaussians.
@@ -64,7 +66,8 @@ def find_neighbours(
     pairs = np.arange(near.size)
     ones = np.ones(near.size, np.float32)
     first, second = (
-        csr_array((ones, (pairs, of)), (near.size, N)) for of in (np.repeat(np.arange(N), k), near.ravel())
+        csr_array((ones, (pairs, of)), (near.size, N))
+        for of in (np.repeat(np.arange(N), k), near.ravel())
     )
     edges = (means[near] - means[:, None]).reshape(-1, 3) / extent
     weights = np.exp(-np.sum(edges**2, axis=1) / reach**2) / len(edges)
@@ -91,16 +94,21 @@ def rigid_loss(gaussians: Gaussians, neighbours: Neighbours) -> Tensor:
     e = neighbours.edges
     u = mi.Vector3f(r.y, r.z, r.w)
     t = 2 * dr.cross(u, e)
-    return _mean(_length(_edges(gaussians, neighbours) - (e + r.x * t + dr.cross(u, t))), neighbours)
+    return _mean(
+        _length(_edges(gaussians, neighbours) - (e + r.x * t + dr.cross(u, t))), neighbours
+    )
 
 
 def rotation_loss(gaussians: Gaussians, neighbours: Neighbours) -> Tensor:
     """Return the mean of w_ij |r_j - r_i| over all pairs, a scalar tensor; see `rigid_loss`."""
-    return _mean(_length(_columns(sparse_product(neighbours.difference, _turns(gaussians, neighbours)), 4)), neighbours)
+    return _mean(
+        _length(_columns(sparse_product(neighbours.difference, _turns(gaussians, neighbours)), 4)),
+        neighbours,
+    )
 
 
 def isometry_loss(gaussians: Gaussians, neighbours: Neighbours) -> Tensor:
-    """Return the mean of w_ij ||e'_ij| - |e_ij|| over all pairs, a scalar tensor; see `rigid_loss`."""
+    """Return the mean of w_ij ||e'_ij| - |e_ij|| over all pairs, a scalar; see `rigid_loss`."""
     change = _length(_edges(gaussians, neighbours)) - _length(neighbours.edges)
     return _mean(dr.abs(change), neighbours)
 

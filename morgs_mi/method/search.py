@@ -1,14 +1,15 @@
 """Coarse search: the motion of parts that neither flow nor motion proposals explain.
 
-Beyond the paper. Flow cannot follow a thin part that moves farther than it is wide, and no neighbour has its motion.
-It appears as connected Gaussians with colours that their pixels no longer have. Such a part is searched for as a whole.
-With the rendering I_{t-1} of the previous Gaussians in a key view v, and the blend weight m_v of the part there, a
-displacement d of the part costs
+Beyond the paper. Flow cannot follow a thin part that moves farther than it is wide, and no
+neighbour has its motion. It appears as connected Gaussians with colours that their pixels no longer
+have. Such a part is searched for as a whole. With the rendering I_{t-1} of the previous Gaussians
+in a key view v, and the blend weight m_v of the part there, a displacement d of the part costs
 
     C(d) = sum_v sum_x m_v(x) |I_t(x + s_v(d)) - I_{t-1}(x)|^2,    s_v(d) its projected shift in px.
 
-Masked template matching gives the inner sums for all shifts of a view at once; the sum over the views is then looked up
-on a grid of displacements in 3D. The best one is accepted if the image with the displaced part is closer to the target.
+Masked template matching gives the inner sums for all shifts of a view at once; the sum over the
+views is then looked up on a grid of displacements in 3D. The best one is accepted if the image with
+the displaced part is closer to the target.
 """
 
 from __future__ import annotations
@@ -34,15 +35,17 @@ from morgs_mi.method.neighbours import NeighbourIndex
 from morgs_mi.render.view_group import ViewGroup
 
 _GRID = 16  # steps of the grid from 0 to its end, in each direction of each axis
-# Error of a Gaussian, in medians of all active ones, or in grey levels if the median is less, above which it is not
-# explained.
+# Error of a Gaussian, in medians of all active ones, or in grey levels if the median is less, above
+# which it is not explained.
 _UNEXPLAINED = 3.0
-# Nearest Gaussians that it forms a part with if they are not explained either, and the fewest Gaussians of a part.
+# Nearest Gaussians that it forms a part with if they are not explained either, and the fewest
+# Gaussians of a part.
 _NEIGHBOURS = 8
 _MIN_SIZE = 4
 # Cost of a displacement, relative to no displacement, up to which it is tested.
 _COST_RATIO = 0.3
-# Error of the images around a part, relative to the error without the displacement, up to which it is accepted.
+# Error of the images around a part, relative to the error without the displacement, up to which it
+# is accepted.
 _ERROR_RATIO = 0.8
 # Logit of the confidence of a Gaussian that was found, see `propagation`.
 _LOGIT = 0.3
@@ -62,8 +65,11 @@ class SearchConfig:
         check_ranges(self)
 
 
-def search_motion(problem: MotionProblem, start: MotionStart, config: SearchConfig | None = None) -> MotionStart:
-    """Return a start of the motion in which parts that were not explained move to where they are found.
+def search_motion(
+    problem: MotionProblem, start: MotionStart, config: SearchConfig | None = None
+) -> MotionStart:
+    """Return a start of the motion in which parts that were not explained move to where they are
+    found.
 
     If nothing is found, it is `start` itself.
 
@@ -83,7 +89,9 @@ def search_motion(problem: MotionProblem, start: MotionStart, config: SearchConf
         images = problem.images_around(part, [displacement, proposal])
         if images is None:
             continue
-        old_error, new_error = (images.total_error(displaced(problem.gaussians, at)) for at in (displacement, proposal))
+        old_error, new_error = (
+            images.total_error(displaced(problem.gaussians, at)) for at in (displacement, proposal)
+        )
         if new_error < _ERROR_RATIO * old_error:
             displacement = proposal
             logit = np.where(part, np.maximum(logit, _LOGIT), logit)
@@ -92,8 +100,12 @@ def search_motion(problem: MotionProblem, start: MotionStart, config: SearchConf
     return replace(start, displacement=displacement, logit_confidence=logit.astype(np.float32))
 
 
-def _unexplained_parts(problem: MotionProblem, displacement: np.ndarray, count: int) -> list[np.ndarray]:
-    """Return the `count` parts with the largest errors that are not explained, or fewer, each as a mask [N]."""
+def _unexplained_parts(
+    problem: MotionProblem, displacement: np.ndarray, count: int
+) -> list[np.ndarray]:
+    """Return the `count` parts with the largest errors that are not explained, or fewer, each as a
+    mask [N].
+    """
     sums = problem.sums_at(displacement)
     error_sums = sums["error"].sum(0)
     weight = sums["weight"].sum(0)
@@ -129,17 +141,27 @@ def _find(
         if images is None:
             continue
         factor = _reduction(images.group, config.reach)
-        renderings = [images.rendered(gaussians, factor) for gaussians in (previous, _brighter(previous, few))]
+        renderings = [
+            images.rendered(gaussians, factor) for gaussians in (previous, _brighter(previous, few))
+        ]
         matched_views = [
-            _MatchedView(view.camera, color, _reduced(problem.targets[v].image(), factor), 1 / factor)
+            _MatchedView(
+                view.camera, color, _reduced(problem.targets[v].image(), factor), 1 / factor
+            )
             for (v, view), color in zip(images.views.items(), renderings[0], strict=True)
         ]
         # The weight of a part is the increase of a pixel if the part is brighter by 1.
-        weights = [np.clip(brighter - color, 0, 1) for color, brighter in zip(*renderings, strict=True)]
+        weights = [
+            np.clip(brighter - color, 0, 1) for color, brighter in zip(*renderings, strict=True)
+        ]
         for k, part in enumerate(few):
             pairs = zip(matched_views, weights, strict=True)
-            surfaces = [view.cost_surface(weight[..., k]) for view, weight in pairs if weight[..., k].any()]
-            d = _best_displacement(np.asarray(previous.means)[part].mean(axis=0), surfaces, config.reach)
+            surfaces = [
+                view.cost_surface(weight[..., k]) for view, weight in pairs if weight[..., k].any()
+            ]
+            d = _best_displacement(
+                np.asarray(previous.means)[part].mean(axis=0), surfaces, config.reach
+            )
             if d.any():
                 displaced_parts.append((part, d))
     return displaced_parts
@@ -153,8 +175,12 @@ def _brighter(gaussians: Gaussians, parts: Sequence[np.ndarray]) -> Gaussians:
     return replace(gaussians, sh_coeffs=sh_coeffs)
 
 
-def _best_displacement(center: np.ndarray, surfaces: Sequence[_CostSurface], reach: float) -> np.ndarray:
-    """Return the displacement d [3] that costs a part around `center` least; 0 if it hardly saves anything."""
+def _best_displacement(
+    center: np.ndarray, surfaces: Sequence[_CostSurface], reach: float
+) -> np.ndarray:
+    """Return the displacement d [3] that costs a part around `center` least; 0 if it hardly saves
+    anything.
+    """
     if not surfaces:
         return np.zeros(3)
 
@@ -162,8 +188,15 @@ def _best_displacement(center: np.ndarray, surfaces: Sequence[_CostSurface], rea
         return np.sum([surface.at(center, d) for surface in surfaces], axis=0)
 
     camera = surfaces[0].camera
-    unit = reach * camera.width / _GRID / np.linalg.norm(camera.projection_jacobian(center[None])[0, 0])
-    coarse = np.stack(np.meshgrid(*[np.arange(-_GRID, _GRID + 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    unit = (
+        reach
+        * camera.width
+        / _GRID
+        / np.linalg.norm(camera.projection_jacobian(center[None])[0, 0])
+    )
+    coarse = np.stack(
+        np.meshgrid(*[np.arange(-_GRID, _GRID + 1)] * 3, indexing="ij"), axis=-1
+    ).reshape(-1, 3)
     fine = coarse[np.abs(coarse).max(axis=1) <= 4] / 4
     d = np.zeros(3)
     for grid in (coarse, fine):
@@ -190,7 +223,9 @@ class _CostSurface:
 
 @dataclass(frozen=True, eq=False)
 class _MatchedView:
-    """A view in which parts are looked for, with images reduced to 2 px or more per step of the grid."""
+    """A view in which parts are looked for, with images reduced to 2 px or more per step of the
+    grid.
+    """
 
     camera: Camera  # the view
     rendering: np.ndarray  # rendering of the previous Gaussians around the parts, reduced [h, w, 3]
@@ -199,21 +234,30 @@ class _MatchedView:
 
     def cost_surface(self, weight: np.ndarray) -> _CostSurface:
         """Match the pixels of a part with the weight m [h, w], not all 0."""
-        margin = 4 * _GRID  # in reduced pixels: twice the grid along an axis, as its corners are farther
+        # In reduced pixels: twice the grid along an axis, as its corners are farther.
+        margin = 4 * _GRID
         rows, columns = np.nonzero(weight > 0.01 * weight.max())
         box = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
-        surroundings = cv2.copyMakeBorder(self.target, margin, margin, margin, margin, cv2.BORDER_REPLICATE)
-        surroundings = surroundings[box[0].start : box[0].stop + 2 * margin, box[1].start : box[1].stop + 2 * margin]
+        surroundings = cv2.copyMakeBorder(
+            self.target, margin, margin, margin, margin, cv2.BORDER_REPLICATE
+        )
+        surroundings = surroundings[
+            box[0].start : box[0].stop + 2 * margin, box[1].start : box[1].stop + 2 * margin
+        ]
         mask = np.repeat(np.sqrt(weight[box])[..., None], 3, axis=2)  # squared by OpenCV
         cost = cv2.matchTemplate(surroundings, self.rendering[box], cv2.TM_SQDIFF, mask=mask)
         return _CostSurface(np.maximum(cost, 0) / self.scale**2, self.camera, self.scale)
 
 
 def _reduction(group: ViewGroup, reach: float) -> int:
-    """Return the factor by which the images of views are reduced: it leaves 2 px per step of the grid, if any does."""
+    """Return the factor by which the images of views are reduced: it leaves 2 px per step of the
+    grid, if any does.
+    """
     widest = max(view.camera.width for view in group.views)
     block = gcd(*group.region.block)
-    return next(f for f in (4, 2, 1) if f == 1 or (2 * _GRID * f <= reach * widest and block % f == 0))
+    return next(
+        f for f in (4, 2, 1) if f == 1 or (2 * _GRID * f <= reach * widest and block % f == 0)
+    )
 
 
 def _reduced(image: np.ndarray, factor: int) -> np.ndarray:
@@ -221,4 +265,6 @@ def _reduced(image: np.ndarray, factor: int) -> np.ndarray:
     height = image.shape[0] // factor
     width = image.shape[1] // factor
     whole = image[: height * factor, : width * factor]
-    return whole if factor == 1 else cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
+    return (
+        whole if factor == 1 else cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
+    )

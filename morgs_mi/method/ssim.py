@@ -1,18 +1,22 @@
 """L_recon (eq. 2) and its derivative in two traced passes.
 
-L_recon is (1 - lambda) L1 + lambda (1 - SSIM). SSIM (Wang et al. 2004) has the 11x11 Gaussian window of sigma 1.5 and
-takes pixels outside the image as black. With x the image, y its target and M the mean over a window,
+L_recon is (1 - lambda) L1 + lambda (1 - SSIM). SSIM (Wang et al. 2004) has the 11x11 Gaussian
+window of sigma 1.5 and takes pixels outside the image as black. With x the image, y its target and
+M the mean over a window,
 
-    SSIM = (2 Mx My + C1) (2 (Mxy - Mx My) + C2) / ((Mx^2 + My^2 + C1) (Mxx - Mx^2 + Myy - My^2 + C2)).
+    SSIM = (2 Mx My + C1) (2 (Mxy - Mx My) + C2) / ((Mx^2 + My^2 + C1) (Mxx - Mx^2 + Myy - My^2 +
+    C2)).
 
-Two traced passes, over a whole view or a region of it: the first computes SSIM's derivatives D by Mx, Mxx and Mxy at
-every window, the second propagates them back through the window, which is its own transpose:
+Two traced passes, over a whole view or a region of it: the first computes SSIM's derivatives D by
+Mx, Mxx and Mxy at every window, the second propagates them back through the window, which is its
+own transpose:
 
     dL/dx = (1 - lambda) sign(x - y) - lambda (M D_x + 2 x M D_xx + y M D_xy).
 
-My and Myy come from a pass of their own, once per target and region. In all three, a SIMD lane walks down a run of rows
-of a strip (see `ssim_layout`). It blurs each row horizontally and adds it to the 11 windows that contain the row: every
-number is read once, and no blurred row is written to memory.
+My and Myy come from a pass of their own, once per target and region. In all three, a SIMD lane
+walks down a run of rows of a strip (see `ssim_layout`). It blurs each row horizontally and adds it
+to the 11 windows that contain the row: every number is read once, and no blurred row is written to
+memory.
 """
 
 from __future__ import annotations
@@ -68,11 +72,13 @@ class Target:
     """A target image. Its terms of SSIM are computed once for each region on which it is compared.
 
     Args:
-        image: [H, W, 3], RGB, encoded: uint8, or floats, of which 1 is white and HDR images have larger ones.
+        image: [H, W, 3], RGB, encoded: uint8, or floats, of which 1 is white and HDR images have
+            larger ones.
         mask: [H, W] bool; pixels that are False do not count. None: all pixels count.
 
     Raises:
-        ValueError: an image of another shape or type, or that is not finite, or a mask of another shape or type.
+        ValueError: an image of another shape or type, or that is not finite, or a mask of another
+            shape or type.
     """
 
     def __init__(self, image: np.ndarray, mask: np.ndarray | None = None) -> None:
@@ -94,7 +100,9 @@ class Target:
 
     def _planes(self, image: np.ndarray) -> Float:
         if image.dtype == np.uint8:  # a quarter of the memory to copy
-            pixels = mi.Float(from_numpy(sys.modules[mi.Float.__module__].UInt8, image)) / dr.opaque(mi.Float, 255)
+            pixels = mi.Float(
+                from_numpy(sys.modules[mi.Float.__module__].UInt8, image)
+            ) / dr.opaque(mi.Float, 255)
             dr.eval(pixels)
         else:
             pixels = from_numpy(mi.Float, image)
@@ -103,7 +111,9 @@ class Target:
         return planes
 
     def image(self) -> np.ndarray:
-        """Return the target [H, W, 3], float32 with white at 1; black where masked. It is read-only."""
+        """Return the target [H, W, 3], float32 with white at 1; black where masked. It is
+        read-only.
+        """
         if self._image is None:
             self._image = np.asarray(self.planes.image(self.pixels)).reshape(self.shape)
             self._image.flags.writeable = False
@@ -117,20 +127,28 @@ class Target:
         return np.asarray(self.minus(dr.detach(image).array, region)).reshape(region.shape(3))
 
     def minus(self, image: Float, region: Region | None) -> Float:
-        """Return the target minus an image, both flat on a region or the whole view; 0 where masked."""
+        """Return the target minus an image, both flat on a region or the whole view; 0 where
+        masked.
+        """
         pixels, weight = self.on(region)
         return pixels - (image if weight is None else image * weight)
 
     def on(self, region: Region | None) -> tuple[Float, Float | None]:
-        """Return the target on a region, flat, 0 outside the view, and the weights of its numbers; None: 1."""
+        """Return the target on a region, flat, 0 outside the view, and the weights of its numbers;
+        None: 1.
+        """
         if region is None or region.whole:
-            return self.planes.image(self.pixels), None if self.weight is None else self.planes.image(self.weight)
+            return self.planes.image(
+                self.pixels
+            ), None if self.weight is None else self.planes.image(self.weight)
         places, valid = self.places_on(region)
         weight = None if self.weight is None else dr.gather(mi.Float, self.weight, places)
         return dr.gather(mi.Float, self.pixels, places, active=valid), weight
 
     def gradient_on(self, region: Region) -> tuple[Float, Float]:
-        """Return the derivatives of the target along x and y on a region, flat, per px, by Sobel's filter."""
+        """Return the derivatives of the target along x and y on a region, flat, per px, by Sobel's
+        filter.
+        """
         return self.planes.gradient_on(self.pixels, region)
 
     def places_on(self, region: Region) -> tuple[UInt32, Bool]:
@@ -140,16 +158,22 @@ class Target:
         return self._places[region]
 
     def windows_on(self, region: Region | None) -> _Windows:
-        """Return the windows that contain the pixels of a region, or all windows of the view for None."""
+        """Return the windows that contain the pixels of a region, or all windows of the view for
+        None.
+        """
         if region not in self._windows:
             windows, pixels = (self.planes.runs(region, reach) for reach in (RADIUS, 0))
             height = dr.opaque(mi.Int32, self.planes.height)
-            (mean, variance), _ = recorded(_statistics_pass, self.planes.size)(windows.lanes, height, self.pixels)
+            (mean, variance), _ = recorded(_statistics_pass, self.planes.size)(
+                windows.lanes, height, self.pixels
+            )
             self._windows[region] = _Windows(windows, pixels, mean, variance)
         return self._windows[region]
 
     def set_surroundings(self, image: Tensor) -> None:
-        """Store a rendered image [H, W, 3] as the surroundings of the regions that are compared from now on."""
+        """Store a rendered image [H, W, 3] as the surroundings of the regions that are compared
+        from now on.
+        """
         self.surroundings = self.masked(self.planes.of(owned_copy(dr.detach(image).array)))
         dr.eval(self.surroundings)
 
@@ -157,21 +181,32 @@ class Target:
         """Return planes, or their numbers at `places`, set to 0 where the mask is False."""
         if self.weight is None:
             return values
-        return values * (self.weight if places is None else dr.gather(mi.Float, self.weight, places))
+        return values * (
+            self.weight if places is None else dr.gather(mi.Float, self.weight, places)
+        )
 
 
 def _check_image(image: np.ndarray) -> None:
-    if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or not image.size:
+    if (
+        not isinstance(image, np.ndarray)
+        or image.ndim != 3
+        or image.shape[2] != 3
+        or not image.size
+    ):
         kind = list(image.shape) if isinstance(image, np.ndarray) else type(image).__name__
         raise ValueError(f"Target(): `image` must be [H, W, 3], got {kind}; pass one RGB image.")
     if image.dtype == np.uint8:
         return
     low, high = (image.min(), image.max()) if image.dtype.kind == "f" else (np.nan, np.nan)
     if not (low >= -_MARGIN and high <= BRIGHTEST):
-        kind = f"{image.dtype} from {low:g} to {high:g}" if image.dtype.kind == "f" else str(image.dtype)
+        kind = (
+            f"{image.dtype} from {low:g} to {high:g}"
+            if image.dtype.kind == "f"
+            else str(image.dtype)
+        )
         raise ValueError(
-            f"Target(): `image` must be uint8, or floats from 0 to {BRIGHTEST:g} with white at 1, got {kind}; divide "
-            "8-bit values by 255."
+            f"Target(): `image` must be uint8, or floats from 0 to {BRIGHTEST:g} with white at 1, "
+            f"got {kind}; divide 8-bit values by 255."
         )
 
 
@@ -197,7 +232,8 @@ class _Recon(dr.CustomOp):
 class WholeView(_Recon):
     def eval(self, x: Float, target: Target, weight: float) -> Float:
         planes = target.planes
-        image = target.masked(planes.of(x * dr.opaque(mi.Float, 1)))  # in memory allocated by Dr.Jit
+        # In memory allocated by Dr.Jit.
+        image = target.masked(planes.of(x * dr.opaque(mi.Float, 1)))
         gradient, loss = _passes(image, target, weight, target.windows_on(None))
         return self.finish(planes.image(target.masked(gradient)), loss)
 
@@ -208,9 +244,13 @@ class OnRegion(_Recon):
             target.surroundings = target.pixels + 0
         image = target.surroundings
         places, valid = target.places_on(region)
-        dr.scatter(image, target.masked(x, places), places, active=valid, mode=dr.ReduceMode.NoConflicts)
+        dr.scatter(
+            image, target.masked(x, places), places, active=valid, mode=dr.ReduceMode.NoConflicts
+        )
         gradient, loss = _passes(image, target, weight, target.windows_on(region))
-        return self.finish(target.masked(dr.gather(mi.Float, gradient, places, active=valid), places), loss)
+        return self.finish(
+            target.masked(dr.gather(mi.Float, gradient, places, active=valid), places), loss
+        )
 
 
 def _passes(image: Float, target: Target, weight: float, on: _Windows) -> tuple[Float, Float]:
@@ -227,7 +267,9 @@ def _passes(image: Float, target: Target, weight: float, on: _Windows) -> tuple[
     return gradient, scale * ((1 - weight) * dr.sum(error) + weight * structure)
 
 
-def _statistics_pass(size: int, lanes: Lanes, height: Int32, target: Float) -> tuple[list[Float], Float]:
+def _statistics_pass(
+    size: int, lanes: Lanes, height: Int32, target: Float
+) -> tuple[list[Float], Float]:
     """Return the planes of M y and M yy - (M y)^2, and the sum of M y over each run."""
 
     def moments(read: _Read) -> list[list[Float]]:
@@ -242,9 +284,17 @@ def _statistics_pass(size: int, lanes: Lanes, height: Int32, target: Float) -> t
 
 
 def _similarity_pass(
-    size: int, lanes: Lanes, height: Int32, image: Float, target: Float, mean: Float, variance: Float
+    size: int,
+    lanes: Lanes,
+    height: Int32,
+    image: Float,
+    target: Float,
+    mean: Float,
+    variance: Float,
 ) -> tuple[list[Float], Float]:
-    """Return the planes of SSIM's derivatives by M x, M xx and M xy, and the sum of SSIM over each run."""
+    """Return the planes of SSIM's derivatives by M x, M xx and M xy, and the sum of SSIM over each
+    run.
+    """
 
     def products(read: _Read) -> list[list[Float]]:
         x = read(image)
@@ -252,14 +302,18 @@ def _similarity_pass(
         return [x, [v * v for v in x], [v * w for v, w in zip(x, y, strict=True)]]
 
     def similarity(read: _Read, means: list[list[Float]]) -> tuple[list[list[Float]], list[Float]]:
-        terms = [_similarity(*values) for values in zip(*means, read(mean), read(variance), strict=True)]
+        terms = [
+            _similarity(*values) for values in zip(*means, read(mean), read(variance), strict=True)
+        ]
         ssim, *derivatives = map(list, zip(*terms, strict=True))
         return derivatives, ssim
 
     return _walk(size, lanes, height, products, similarity, 3, 3)
 
 
-def _similarity(mx: Float, xx: Float, xy: Float, my: Float, variance: Float) -> tuple[Float, Float, Float, Float]:
+def _similarity(
+    mx: Float, xx: Float, xy: Float, my: Float, variance: Float
+) -> tuple[Float, Float, Float, Float]:
     """Return SSIM of a window and its derivatives by M x, M xx and M xy."""
     a1 = dr.fma(2 * mx, my, _C1)
     a2 = dr.fma(2.0, dr.fma(-mx, my, xy), _C2)
@@ -311,14 +365,16 @@ def _walk(
     inputs: int,
     outputs: int,
 ) -> tuple[list[Float], Float]:
-    """Walk down the runs with a window: blur the rows that `across` returns, and write those that `finish` returns.
+    """Walk down the runs with a window: blur the rows that `across` returns, and write those that
+    `finish` returns.
 
     Args:
         size: size of the planes.
         lanes: the runs.
         height: height of the image.
         across: read -> rows of numbers, wider than a strip by 5 on both sides.
-        finish: (read, these rows blurred, of a strip) -> (rows of a strip to write, row of a strip to sum).
+        finish: (read, these rows blurred, of a strip) -> (rows of a strip to write, row of a strip
+            to sum).
         inputs: number of rows to blur.
         outputs: number of rows to write.
 
@@ -346,7 +402,8 @@ def _walk(
         return packet(sums)
 
     def body(row, end, first, places, columns, height, windows, total, targets):
-        # Two rows per turn: the windows are read and written half as often. Window k ends k rows further down.
+        # Two rows per turn: the windows are read and written half as often. Window k ends k rows
+        # further down.
         a = blurred(row, height, places)
         b = blurred(row + 1, height, places)
         w = _TAPS
@@ -364,15 +421,34 @@ def _walk(
                 return list(read_packet(plane, center, ready))
 
             sums = list(done[k])
-            planes, numbers = finish(narrow, [sums[STRIP * c : STRIP * (c + 1)] for c in range(inputs)])
+            planes, numbers = finish(
+                narrow, [sums[STRIP * c : STRIP * (c + 1)] for c in range(inputs)]
+            )
             for target, values in zip(targets, planes, strict=True):
-                write_packet(target, [dr.select(t, v, 0) for t, v in zip(masks, values, strict=True)], center, ready)
+                write_packet(
+                    target,
+                    [dr.select(t, v, 0) for t, v in zip(masks, values, strict=True)],
+                    center,
+                    ready,
+                )
             for t, v in zip(masks, numbers, strict=True):
                 total = total + dr.select(t & ready, v, 0)
         return row + 2, end, first, places, columns, height, windows, total, targets
 
     windows = [packet([mi.Float(0) for _ in range(inputs * STRIP)]) for _ in range(2 * RADIUS)]
     end = on_aligned_stack(lanes.end)
-    state = (lanes.first - RADIUS, end, lanes.first, lanes.places, lanes.columns, height, windows, mi.Float(0), targets)
-    *_, total, targets = dr.while_loop(state, lambda row, end, *_: row < end + RADIUS, body, label="window")
+    state = (
+        lanes.first - RADIUS,
+        end,
+        lanes.first,
+        lanes.places,
+        lanes.columns,
+        height,
+        windows,
+        mi.Float(0),
+        targets,
+    )
+    *_, total, targets = dr.while_loop(
+        state, lambda row, end, *_: row < end + RADIUS, body, label="window"
+    )
     return targets, total

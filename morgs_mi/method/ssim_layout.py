@@ -1,8 +1,9 @@
 """Memory layout of images as planes, and the runs of rows over which a separable window walks.
 
-A strip is 8 pixels wide, a column 16 strips. The three components of an image [H, W, 3] are stored one after the other,
-each column by column, and a column row by row: 16 SIMD lanes that walk down 16 neighbouring strips read one contiguous
-section of memory. Two strips of zeros lie on either side of an image: derivatives of windows there are 0, and are read.
+A strip is 8 pixels wide, a column 16 strips. The three components of an image [H, W, 3] are stored
+one after the other, each column by column, and a column row by row: 16 SIMD lanes that walk down 16
+neighbouring strips read one contiguous section of memory. Two strips of zeros lie on either side of
+an image: derivatives of windows there are 0, and are read.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ _LONGEST = 64
 class Lanes:
     """Runs of rows of strips, in all three planes, one for each SIMD lane."""
 
-    #: Places of row 0 of the strip to the left, of the strip, and of the one to the right, in strips.
+    #: Places of row 0 of the strip to the left, of the strip, and of the one to the right, in
+    #: strips.
     places: tuple[UInt32, UInt32, UInt32]
     first: Int32  #: First row.
     end: Int32  #: Row past the last.
@@ -39,7 +41,7 @@ class Lanes:
 
 @dataclass(frozen=True)
 class Runs:
-    """The lanes over which a window walks, and the number of the image's numbers that they cover."""
+    """Lanes over which a window walks, and how many numbers of the image they cover."""
 
     lanes: Lanes
     num_pixels: int
@@ -56,13 +58,17 @@ class Planes:
         self.size = 3 * self.num_columns * height * COLUMN * STRIP
 
     def of(self, image: Float) -> Float:
-        """Return the planes of a flat image [H * W * 3] in memory allocated by Dr.Jit (see `memory.owned_copy`)."""
+        """Return the planes of a flat image [H * W * 3] in memory allocated by Dr.Jit (see
+        `memory.owned_copy`).
+        """
         if self.width % STRIP == 0:
             target = dr.empty(mi.Float, self.size)
             strip, y, places = self._strips(self.num_columns * COLUMN)
             strip = strip - _SPARE
             strips = dr.opaque(mi.UInt32, self.num_strips)
-            reads = [read_packet(image, 3 * (y * strips + strip) + k, strip < strips) for k in range(3)]
+            reads = [
+                read_packet(image, 3 * (y * strips + strip) + k, strip < strips) for k in range(3)
+            ]
             values = [v for read in reads for v in read]
             for component, place in enumerate(places):
                 write_packet(target, values[component::3], place)
@@ -96,18 +102,32 @@ class Planes:
         return dr.gather(mi.Float, planes, place)
 
     def _strips(self, count: int, first: int = 0) -> tuple[UInt32, UInt32, list[UInt32]]:
-        """Return (strip, row) of `count` strips of every row, and the place of strip `first` + strip in each plane."""
+        """Return (strip, row) of `count` strips of every row, and the place of strip `first` +
+        strip in each plane.
+        """
         lane = dr.arange(mi.UInt32, self.height * count)
         y = quotient(lane, count)
         strip = lane - y * dr.opaque(mi.UInt32, count)
         x = (strip + first) * STRIP - _SPARE * STRIP
-        return strip, y, [self._place(mi.UInt32(component), y, x) // STRIP for component in range(3)]
+        return (
+            strip,
+            y,
+            [self._place(mi.UInt32(component), y, x) // STRIP for component in range(3)],
+        )
 
     def _place(self, component: UInt32, y: UInt32, x: UInt32) -> UInt32:
-        return _place(component, y, x, dr.opaque(mi.UInt32, self.height), dr.opaque(mi.UInt32, self.num_columns))
+        return _place(
+            component,
+            y,
+            x,
+            dr.opaque(mi.UInt32, self.height),
+            dr.opaque(mi.UInt32, self.num_columns),
+        )
 
     def places_on(self, region: Region) -> tuple[UInt32, Bool]:
-        """Return the places of the numbers of a flat image on a region, and the mask of those in the view."""
+        """Return the places of the numbers of a flat image on a region, and the mask of those in
+        the view.
+        """
         component, x, y = self._pixels_of(region)
         valid = (x < dr.opaque(mi.UInt32, self.width)) & (y < dr.opaque(mi.UInt32, self.height))
         places = dr.select(valid, self._place(component, y, x), 0)
@@ -115,14 +135,23 @@ class Planes:
         return places, valid
 
     def gradient_on(self, planes: Float, region: Region) -> tuple[Float, Float]:
-        """Return the derivatives of an image in `planes` along x and y on a region, flat, per px, by Sobel's filter."""
+        """Return the derivatives of an image in `planes` along x and y on a region, flat, per px,
+        by Sobel's filter.
+        """
         component, x, y = self._pixels_of(region)
         xs, ys = (
-            [dr.minimum(dr.maximum(mi.Int32(v) + step, 0), dr.opaque(mi.Int32, size - 1)) for step in (-1, 0, 1)]
+            [
+                dr.minimum(dr.maximum(mi.Int32(v) + step, 0), dr.opaque(mi.Int32, size - 1))
+                for step in (-1, 0, 1)
+            ]
             for v, size in ((x, self.width), (y, self.height))
         )
         near = [
-            [dr.gather(mi.Float, planes, self._place(component, mi.UInt32(b), mi.UInt32(a))) for a in xs] for b in ys
+            [
+                dr.gather(mi.Float, planes, self._place(component, mi.UInt32(b), mi.UInt32(a)))
+                for a in xs
+            ]
+            for b in ys
         ]
         along_x, along_y = (
             sum(w * (rows[k][2] - rows[k][0]) for k, w in enumerate((0.125, 0.25, 0.125)))
@@ -143,7 +172,9 @@ class Planes:
         return lane - 3 * pixel, x, y
 
     def runs(self, region: Region | None, reach: int) -> Runs:
-        """Return the runs that cover a region, or the whole view, and `reach` <= 8 pixels around it."""
+        """Return the runs that cover a region, or the whole view, and `reach` <= 8 pixels around
+        it.
+        """
         cells = np.ones((self.height, self.num_strips), bool)
         if region is not None:
             mask = np.pad(region.mask, ((0, 0), (0, self.num_strips * STRIP - self.width)))
@@ -159,7 +190,10 @@ class Planes:
         columns = np.clip(self.width - (strip - 1) * STRIP, 0, STRIP) * (strip > 0)
         component = np.repeat(np.arange(3), len(strip))
         x = np.tile(strip - 1, 3) * STRIP
-        places = (_place(component, 0, x + k * STRIP, self.height, self.num_columns) // STRIP for k in (-1, 0, 1))
+        places = (
+            _place(component, 0, x + k * STRIP, self.height, self.num_columns) // STRIP
+            for k in (-1, 0, 1)
+        )
         lanes = Lanes(
             tuple(from_numpy(mi.UInt32, place) for place in places),  # pyright: ignore[reportArgumentType]
             from_numpy(mi.Int32, np.tile(first, 3)),
@@ -174,13 +208,17 @@ def read_packet(values: Float, place: UInt32, active: Bool | bool = True) -> Jit
     return dr.gather(packet_type(), values, place, active=active, shape=(STRIP, dr.width(place)))
 
 
-def write_packet(target: Float, values: list[Float], place: UInt32, active: Bool | bool = True) -> None:
+def write_packet(
+    target: Float, values: list[Float], place: UInt32, active: Bool | bool = True
+) -> None:
     """Write 8 floats to 8 `place`, which differs between lanes."""
     dr.scatter(target, packet_type()(values), place, active=active, mode=dr.ReduceMode.NoConflicts)
 
 
 def packet_type() -> type[Jit]:
-    """Return Dr.Jit's dynamic array of float arrays, which is read and written in packets of its size."""
+    """Return Dr.Jit's dynamic array of float arrays, which is read and written in packets of its
+    size.
+    """
     return sys.modules[mi.Float.__module__].ArrayXf
 
 
@@ -192,13 +230,17 @@ def _place(component: Jit, y: Jit, x: Jit, height: Jit, num_columns: Jit) -> Jit
 
 
 def _cell_runs(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (line, first, end) of all runs of set cells in the lines of [L, M], none longer than `_LONGEST`."""
+    """Return (line, first, end) of all runs of set cells in the lines of [L, M], none longer than
+    `_LONGEST`.
+    """
     edges = np.diff(np.pad(cells, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     line, first = np.nonzero(edges == 1)
     end = np.nonzero(edges == -1)[1]
     parts = -(-(end - first) // _LONGEST)
     index = np.repeat(np.arange(len(line)), parts)
-    first = first[index] + _LONGEST * (np.arange(len(index)) - np.repeat(parts.cumsum() - parts, parts))
+    first = first[index] + _LONGEST * (
+        np.arange(len(index)) - np.repeat(parts.cumsum() - parts, parts)
+    )
     end = np.minimum(end[index], first + _LONGEST)
     line = line[index]
     # The lanes of a packet are neighbours in one column.

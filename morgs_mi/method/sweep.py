@@ -1,7 +1,9 @@
-"""One sweep over the key views: the sums over each Gaussian's pixels that the start of a frame is found from.
+"""One sweep over the key views: the sums over each Gaussian's pixels that the start of a frame is
+found from.
 
-With the blend weights w_i of Gaussian i in view v, the error e = target - image and the target's gradient g, one
-rendering and one back-projection of all views together give the sums sum_x w_i(x) m(x) of the maps
+With the blend weights w_i of Gaussian i in view v, the error e = target - image and the target's
+gradient g, one rendering and one back-projection of all views together give the sums sum_x w_i(x)
+m(x) of the maps
 
     weight 1,   error |e|,   color e,   normal g g',   right e g
 
@@ -33,18 +35,21 @@ MAPS: dict[str, _Map] = {
     "normal": lambda e, x, y: [_dot(x, x), _dot(x, y), _dot(y, y)],
     "right": lambda e, x, y: [_dot(e, x), _dot(e, y)],
 }
-"""Name of a map -> its numbers at a pixel, from e and the derivatives of the target along x and y, three colours each.
+"""Name of a map -> its numbers at a pixel, from e and the derivatives of the target along x and y,
+three colours each.
 """
 
 
-# Error, in pixels of full contrast, and covered pixels, that are added to every Gaussian's: one that is hardly visible
-# has little of either.
+# Error, in pixels of full contrast, and covered pixels, that are added to every Gaussian's: one
+# that is hardly visible has little of either.
 _FLOOR_PX = 0.01
 _FLOOR_WEIGHT = 1.0
 
 
 def relative_error(sums: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the mean error of each Gaussian's pixels [N], of 1, from the sums of ``error`` and ``weight`` [V, N]."""
+    """Return the mean error of each Gaussian's pixels [N], of 1, from the sums of ``error`` and
+    ``weight`` [V, N].
+    """
     return (sums["error"].sum(0) + _FLOOR_PX) / (sums["weight"].sum(0) + _FLOOR_WEIGHT)
 
 
@@ -62,7 +67,8 @@ class KeyImages:
         self.group = ViewGroup([*views.values()])
 
     def sums(self, gaussians: Gaussians, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """Return the sums of some `MAPS` per view and Gaussian, float32 [V, N, ...] by name; one number has no axis.
+        """Return the sums of some `MAPS` per view and Gaussian, float32 [V, N, ...] by name; one
+        number has no axis.
 
         Args:
             gaussians: N Gaussians, detached.
@@ -72,10 +78,13 @@ class KeyImages:
         image, sizes = self._maps(drawing, names)
         ends = np.cumsum(sizes)
         parts = np.split(drawing.sums(image, int(ends[-1])), ends[:-1], axis=-1)
-        return {name: v[..., 0] if v.shape[-1] == 1 else v for name, v in zip(names, parts, strict=True)}
+        return {
+            name: v[..., 0] if v.shape[-1] == 1 else v for name, v in zip(names, parts, strict=True)
+        }
 
     def rendered(self, gaussians: Gaussians, factor: int = 1) -> list[np.ndarray]:
-        """Return the image of Gaussians in each view [H // factor, W // factor, 3]; 0 where the view is not drawn.
+        """Return the image of Gaussians in each view [H // factor, W // factor, 3]; 0 where the
+        view is not drawn.
 
         Args:
             gaussians: N Gaussians, detached.
@@ -83,9 +92,14 @@ class KeyImages:
         """
         color = np.asarray(self.group.draw(gaussians).color).reshape(self.group.region.shape(3))
         A, height, width, _ = color.shape
-        color = color.reshape(A, height // factor, factor, width // factor, factor, 3).mean(axis=(2, 4))
+        color = color.reshape(A, height // factor, factor, width // factor, factor, 3).mean(
+            axis=(2, 4)
+        )
         parts = zip(self.group.regions, self.group.split(color), strict=True)
-        return [region.uncropped(part)[: region.height // factor, : region.width // factor] for region, part in parts]
+        return [
+            region.uncropped(part)[: region.height // factor, : region.width // factor]
+            for region, part in parts
+        ]
 
     def total_error(self, gaussians: Gaussians) -> float:
         """Return the error |e| of Gaussians, summed over all drawn pixels."""
@@ -93,13 +107,18 @@ class KeyImages:
             return float(dr.sum(dr.abs(self._difference(self.group.draw(gaussians))))[0]) / 3
 
     def _maps(self, drawing: Drawing, names: Sequence[str]) -> tuple[Float, list[int]]:
-        """Return the numbers of some maps at every pixel, flat, and how many numbers each map has."""
+        """Return the numbers of some maps at every pixel, flat, and how many each map has."""
         with dr.suspend_grad():
             error = self._difference(drawing)
             dr.eval(error)
-            images = [error, *(self._gradient if {"normal", "right"} & set(names) else (error, error))]
+            images = [
+                error,
+                *(self._gradient if {"normal", "right"} & set(names) else (error, error)),
+            ]
             lane = dr.arange(mi.UInt32, self.group.region.num_pixels)
-            pixel = [[dr.gather(mi.Float, image, 3 * lane + c) for c in range(3)] for image in images]
+            pixel = [
+                [dr.gather(mi.Float, image, 3 * lane + c) for c in range(3)] for image in images
+            ]
             columns = [MAPS[name](*pixel) for name in names]
             sizes = [len(column) for column in columns]
             count = sum(sizes)
@@ -117,12 +136,18 @@ class KeyImages:
     @cached_property
     def _pixels(self) -> tuple[Float, Float | None]:
         """The targets on the group, and the weights of their numbers; None: 1."""
-        target_numbers = [target.on(region) for target, region in zip(self._targets, self.group.regions, strict=True)]
+        target_numbers = [
+            target.on(region)
+            for target, region in zip(self._targets, self.group.regions, strict=True)
+        ]
         pixels, weights = ([*column] for column in zip(*target_numbers, strict=True))
         if all(weight is None for weight in weights):
             return _end_to_end(pixels), None
         pairs = zip(weights, pixels, strict=True)
-        full_weights = [dr.full(mi.Float, 1, dr.width(part)) if weight is None else weight for weight, part in pairs]
+        full_weights = [
+            dr.full(mi.Float, 1, dr.width(part)) if weight is None else weight
+            for weight, part in pairs
+        ]
         return _end_to_end(pixels), _end_to_end(full_weights)
 
     @cached_property

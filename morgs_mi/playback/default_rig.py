@@ -1,8 +1,9 @@
 """Cameras for Gaussians without a recording: a ring around them, from their extent.
 
-Gaussians of other tools have no cameras, and do not state which direction is up. Their extent along each axis is that
-of the middle 90 % of the centres, weighted by opacity: floaters and a far background do not count. Captured scenes have
-a side from which they were seen: there the images have the most detail.
+Gaussians of other tools have no cameras, and do not state which direction is up. Their extent along
+each axis is that of the middle 90 % of the centres, weighted by opacity: floaters and a far
+background do not count. Captured scenes have a side from which they were seen: there the images
+have the most detail.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.render.rasterize import rasterize
 
 Axes = Literal["y-down", "y-up", "z-up"]
-"""Direction that is up, by axis. Files in the layout of 3D Gaussian Splatting mostly have COLMAP's axes, y down."""
+"""Direction that is up, by axis. Files in the layout of 3D Gaussian Splatting mostly have COLMAP's
+axes, y down.
+"""
 DEFAULT_RIG = "default_rig"
 """Entry of a stream's metadata that is true where its cameras are made up, not recorded."""
 
@@ -42,19 +45,24 @@ _LEAST_EXTENT = 1e-6  # of the distance from the origin
 
 
 def default_rig(frames: Sequence[Gaussians], axes: Axes = "y-down") -> tuple[Camera, ...]:
-    """Return eight cameras on a circle around nearly all Gaussians in these frames, which look at their middle.
+    """Return eight cameras on a circle around nearly all Gaussians in these frames, which look at
+    their middle.
 
-    `front` looks along the forward axis of the convention. The first one is where the first frame with Gaussians has
-    the most detail; the others follow counterclockwise, seen from above.
+    `front` looks along the forward axis of the convention. The first one is where the first frame
+    with Gaussians has the most detail; the others follow counterclockwise, seen from above.
 
     Raises:
         ValueError: there is no Gaussian in any of the frames, or `axes` is unknown.
     """
     if axes not in _DIRECTIONS:
-        raise ValueError(f"default_rig(): `axes` must be one of {', '.join(_DIRECTIONS)}, got {axes!r}; choose one.")
+        raise ValueError(
+            f"default_rig(): `axes` must be one of {', '.join(_DIRECTIONS)}, got {axes!r}; choose "
+            "one."
+        )
     up, forward = _DIRECTIONS[axes]
     low, high, size = _extent(frames)
-    # A single Gaussian has no extent but its own, and one without extent is at least larger than rounding errors.
+    # A single Gaussian has no extent but its own, and one without extent is at least larger than
+    # rounding errors.
     least = _LEAST_EXTENT * (1 + np.abs((low, high)).max())
     half = np.maximum(_MARGIN * 0.5 * (high - low) + 3 * size, least)
     tall = np.abs(up) @ half
@@ -64,7 +72,9 @@ def default_rig(frames: Sequence[Gaussians], axes: Axes = "y-down") -> tuple[Cam
     # The first camera sees the box; the others keep its distance from the middle.
     distance = deep + max(wide, tall * _WIDTH / _HEIGHT) / tangent
     center = (low + high) / 2
-    arms = Rotation.from_rotvec(np.linspace(0, 2 * np.pi, len(_NAMES), endpoint=False)[:, None] * up).apply(-forward)
+    arms = Rotation.from_rotvec(
+        np.linspace(0, 2 * np.pi, len(_NAMES), endpoint=False)[:, None] * up
+    ).apply(-forward)
     ring = tuple(
         Camera.look_at(center + distance * arm, center, up, _FOV_X, _WIDTH, _HEIGHT, name)
         for name, arm in zip(_NAMES, arms, strict=True)
@@ -88,15 +98,23 @@ def _detail(gaussians: Gaussians, camera: Camera) -> float:
 
 
 def _extent(frames: Sequence[Gaussians]) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the corners [3] of the box around most of the opacity in all frames, and the median size of a Gaussian."""
+    """Return the corners [3] of the box around most of the opacity in all frames, and the median
+    size of a Gaussian.
+    """
     raw = [gaussians.numpy() for gaussians in frames]
     means = np.concatenate([values["means"] for values in raw]).astype(np.float64)
     sizes = np.concatenate([values["log_scales"].max(axis=1, initial=-69) for values in raw])
-    opacities = 0.5 + 0.5 * np.tanh(0.5 * np.concatenate([values["logit_opacities"] for values in raw], dtype=float))
+    opacities = 0.5 + 0.5 * np.tanh(
+        0.5 * np.concatenate([values["logit_opacities"] for values in raw], dtype=float)
+    )
     if not len(means):
-        raise ValueError("expected at least one Gaussian, got none; leave out files that are empty.")
+        raise ValueError(
+            "expected at least one Gaussian, got none; leave out files that are empty."
+        )
     percents = (_PERCENT_OUTSIDE, 100 - _PERCENT_OUTSIDE)
     weights = opacities + 1e-9
-    corners = [np.percentile(axis, percents, weights=weights, method="inverted_cdf") for axis in means.T]
+    corners = [
+        np.percentile(axis, percents, weights=weights, method="inverted_cdf") for axis in means.T
+    ]
     low, high = np.array(corners).T
     return low, high, float(np.exp(np.median(sizes)))

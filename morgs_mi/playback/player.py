@@ -1,7 +1,8 @@
 """Playback of a stream: rendered frames, the images of their channels, and the playback speed.
 
-The Gaussians of frame t store their displacement since frame t-1. The motion map rendered from them lies on frame t's
-pixel grid and holds x_t - x_{t-1}, like the ground truth. Keyframes store no displacement.
+The Gaussians of frame t store their displacement since frame t-1. The motion map rendered from them
+lies on frame t's pixel grid and holds x_t - x_{t-1}, like the ground truth. Keyframes store no
+displacement.
 """
 
 from __future__ import annotations
@@ -20,7 +21,13 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.types import Tensor
 from morgs_mi.playback.stream_header import metadata_entry, render_config
-from morgs_mi.playback.visualise import confidence_image, depth_image, grey_image, motion_image, to_uint8
+from morgs_mi.playback.visualise import (
+    confidence_image,
+    depth_image,
+    grey_image,
+    motion_image,
+    to_uint8,
+)
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
 
@@ -29,9 +36,13 @@ _ATTRIBUTE_CHANNELS = {row.channel: row.name for row in ATTRIBUTES if row.channe
 CHANNELS = ("color", "motion", *_ATTRIBUTE_CHANNELS, "offset", "depth", "alpha")
 """All channels that can be shown: the renderer's, and the learned offset."""
 MOTION_SCALE = 0.03
-"""Speed at which the colour of motion is fully saturated, as a fraction of the image width per frame."""
+"""Speed at which the colour of motion is fully saturated, as a fraction of the image width per
+frame.
+"""
 OFFSET_SCALE = 0.1
-"""The same for the learned offset, as a fraction of that speed: the offset is the smaller part of the motion."""
+"""The same for the learned offset, as a fraction of that speed: the offset is the smaller part of
+the motion.
+"""
 _MOST_TIMED_FRAMES = 30
 
 
@@ -46,11 +57,12 @@ def render_stream(
         channels: out of `CHANNELS`; None for `available_channels`.
 
     Yields:
-        (frame, images): per channel a float32 array [H, W, C], colour display-referred, motion and offset in pixels,
-        depth in world units.
+        (frame, images): per channel a float32 array [H, W, C], colour display-referred, motion and
+        offset in pixels, depth in world units.
 
     Raises:
-        ValueError: an unknown channel, a channel that the stream does not store, or a broken packet.
+        ValueError: an unknown channel, a channel that the stream does not store, or a broken
+            packet.
     """
     config = render_config(stream)
     for frame, gaussians in play(stream):
@@ -65,11 +77,13 @@ def has_confidence(stream: FrameSource) -> bool:
     """
     learns_confidence = metadata_entry(stream, "config.motion.learn_confidence", True, bool)
     first_frames = islice(play(stream), 1)
-    return learns_confidence and any(gaussians.logit_confidence is not None for _, gaussians in first_frames)
+    return learns_confidence and any(
+        gaussians.logit_confidence is not None for _, gaussians in first_frames
+    )
 
 
 def has_offset(packets: Iterable[Packet]) -> bool:
-    """Return whether the residuals of a stream store the learned offset, which is off by default."""
+    """Return whether the residuals of a stream store the learned offset (off by default)."""
     residuals = (packet for packet in packets if packet.kind == PacketKind.RESIDUAL)
     return any("offset" in packet.arrays for packet in islice(residuals, 1))
 
@@ -80,8 +94,8 @@ def channel_image(name: str, image: np.ndarray, motion_scale: float | None = Non
     Args:
         name: one of `CHANNELS`.
         image: values of the channel [H, W, C].
-        motion_scale: speed of full saturation in pixels, `OFFSET_SCALE` times that for an offset. The default is
-            `MOTION_SCALE`, which is the same for all frames of a clip.
+        motion_scale: speed of full saturation in pixels, `OFFSET_SCALE` times that for an offset.
+            The default is `MOTION_SCALE`, which is the same for all frames of a clip.
     """
     if name in ("motion", "offset"):
         scale = motion_scale or MOTION_SCALE * image.shape[1]
@@ -91,13 +105,15 @@ def channel_image(name: str, image: np.ndarray, motion_scale: float | None = Non
 
 
 def playback_speed(stream: FrameSource, camera: Camera) -> dict[str, float]:
-    """Return the speed at which this machine plays a stream: decode a frame, render its colour, copy it to the host.
+    """Return the speed at which this machine plays a stream: decode a frame, render its colour,
+    copy it to the host.
 
-    At most the first 30 frames are measured. The first one compiles kernels and is excluded if there are others.
+    At most the first 30 frames are measured. The first one compiles kernels and is excluded if
+    there are others.
 
     Returns:
-        ``fps``, frames per second at the size of `camera`, and the medians ``decode_ms`` and ``render_ms`` from which
-        it is computed; NaN for a stream without frames.
+        ``fps``, frames per second at the size of `camera`, and the medians ``decode_ms`` and
+        ``render_ms`` from which it is computed; NaN for a stream without frames.
 
     Raises:
         ValueError: a broken packet.
@@ -117,19 +133,31 @@ def playback_speed(stream: FrameSource, camera: Camera) -> dict[str, float]:
         to_uint8(render(gaussians, camera, ("color",), config)["color"])
         times.append((end_of_decoding - start, time.perf_counter() - start_of_render))
     decode, draw = np.median(times[1:] or times or [(np.nan, np.nan)], axis=0)
-    return {"fps": float(1 / (decode + draw)), "decode_ms": float(1e3 * decode), "render_ms": float(1e3 * draw)}
+    return {
+        "fps": float(1 / (decode + draw)),
+        "decode_ms": float(1e3 * decode),
+        "render_ms": float(1e3 * draw),
+    }
 
 
 def available_channels(gaussians: Gaussians) -> tuple[str, ...]:
-    """Return the channels of a stream's Gaussians: color, motion, depth, and channels of their attributes."""
-    attributes = (name for name, attribute in _ATTRIBUTE_CHANNELS.items() if getattr(gaussians, attribute) is not None)
+    """Return the channels of a stream's Gaussians: color, motion, depth, and channels of their
+    attributes.
+    """
+    attributes = (
+        name
+        for name, attribute in _ATTRIBUTE_CHANNELS.items()
+        if getattr(gaussians, attribute) is not None
+    )
     return ("color", "motion", "depth", *attributes)
 
 
 def render(
     gaussians: Gaussians, camera: Camera, channels: Sequence[str], config: RenderConfig
 ) -> dict[str, np.ndarray]:
-    """Return rendered channels as float32 arrays [H, W, C] by name; the offset is zero where none is stored."""
+    """Return rendered channels as float32 arrays [H, W, C] by name; the offset is zero where none
+    is stored.
+    """
     names = [name for name in channels if name != "offset"]
     images: dict[str, Tensor] = {}
     if names:
@@ -137,5 +165,7 @@ def render(
         images = {name: image[name] for name in names}
     if "offset" in channels:
         offset = np.zeros((len(gaussians), 3)) if gaussians.offset is None else gaussians.offset
-        images["offset"] = rasterize(replace(gaussians, motion=offset), camera, ("motion",), config=config).motion
+        images["offset"] = rasterize(
+            replace(gaussians, motion=offset), camera, ("motion",), config=config
+        ).motion
     return {name: np.array(images[name]) for name in channels}

@@ -23,14 +23,16 @@ def as_fitted(capture: Capture, stream: FrameSource) -> Capture:
         terms = np.full((1, 1), np.nan)
     if terms.shape[1:] != (2,) or not np.isfinite(terms).all():
         raise ValueError(
-            f"{stream.path}: packet 0: `distortions` must be an object with two numbers for each camera; fit the "
-            "capture again."
+            f"{stream.path}: packet 0: `distortions` must be an object with two numbers for each "
+            "camera; fit the capture again."
         )
     return capture.with_cameras(capture.with_delays(stream.cameras), terms.tolist())
 
 
 def about_lenses(capture: Capture) -> dict[str, Any]:
-    """Return the entries of a stream's header that `as_fitted` reads, none where no distortion was refined."""
+    """Return the entries of a stream's header that `as_fitted` reads, none where no distortion was
+    refined.
+    """
     pairs = zip(capture.names, capture.distortions, strict=bool(capture.distortions))
     distortions = {name: list(terms) for name, terms in pairs if any(terms)}
     return {"distortions": distortions} if distortions else {}

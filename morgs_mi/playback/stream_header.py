@@ -1,4 +1,4 @@
-"""What the header of a stream states: its name, cameras, settings, and the capture that was fitted."""
+"""What the header of a stream states: name, cameras, settings, and the fitted capture."""
 
 from __future__ import annotations
 
@@ -40,7 +40,8 @@ _JSON_TYPES = {
 def stream_name(stream: FrameSource) -> str:
     """Return the name of a stream: the name of its folder or file, without `.morgs`.
 
-    Bytes of the name that are not UTF-8 are replaced, because pages and messages to a browser cannot contain them.
+    Bytes of the name that are not UTF-8 are replaced, because pages and messages to a browser
+    cannot contain them.
     """
     path = stream.path.resolve()
     name = path.parent.name if path.name == STREAM else path.stem
@@ -58,16 +59,17 @@ def find_camera(stream: FrameSource, camera: int | str) -> Camera:
     if str(index).isdecimal() and int(index) < len(names):
         return stream.cameras[int(index)]
     raise ValueError(
-        f"{stream.path}: the camera must be an index in 0..{len(names) - 1} or one of {', '.join(names)}, "
-        f"got {camera!r}."
+        f"{stream.path}: the camera must be an index in 0..{len(names) - 1} or one of "
+        f"{', '.join(names)}, got {camera!r}."
     )
 
 
 def truth_for_camera(capture: Capture, camera: Camera, frame: int) -> GroundTruth | None:
-    """Return the ground truth of a frame on the pixel grid of `camera`, or None if the capture has none.
+    """Return the ground truth of a frame on the pixel grid of `camera`, or None if the capture has
+    none.
 
-    It is resampled by the nearest neighbour: averages across an outline would be motions of no surface. Motion is in
-    pixels of `camera`.
+    It is resampled by the nearest neighbour: averages across an outline would be motions of no
+    surface. Motion is in pixels of `camera`.
     """
     if capture.truth is None or not (capture.truth / camera.name / f"{frame:04d}.exr").is_file():
         return None
@@ -75,8 +77,12 @@ def truth_for_camera(capture: Capture, camera: Camera, frame: int) -> GroundTrut
     H, W = truth.mask.shape
     rows = ((np.arange(camera.height) + 0.5) * H / camera.height).astype(int)[:, None]
     columns = ((np.arange(camera.width) + 0.5) * W / camera.width).astype(int)
-    motion = truth.motion[rows, columns] * np.array([camera.width / W, camera.height / H], np.float32)
-    return GroundTruth(motion, truth.depth[rows, columns], truth.ids[rows, columns], truth.mask[rows, columns])
+    motion = truth.motion[rows, columns] * np.array(
+        [camera.width / W, camera.height / H], np.float32
+    )
+    return GroundTruth(
+        motion, truth.depth[rows, columns], truth.ids[rows, columns], truth.mask[rows, columns]
+    )
 
 
 def render_config(stream: FrameSource) -> RenderConfig:
@@ -90,7 +96,8 @@ def render_config(stream: FrameSource) -> RenderConfig:
 
 
 def stream_exposure(stream: FrameSource) -> float:
-    """Return the stops by which a display brightens a stream, 0 for the stream of a recording of 8 bits.
+    """Return the stops by which a display brightens a stream, 0 for the stream of a recording of 8
+    bits.
 
     Raises:
         ValueError: the header has another value than a number from -100 to 100.
@@ -102,7 +109,8 @@ def stream_exposure(stream: FrameSource) -> float:
 
 
 def num_frames(stream: FrameSource) -> int:
-    """Return the number of frames of the capture that was fitted, zero if the stream's header does not state it.
+    """Return the number of frames of the capture that was fitted, zero if the stream's header does
+    not state it.
 
     Raises:
         ValueError: the header states something else.
@@ -131,7 +139,9 @@ def metadata_entry(stream: FrameSource, key: str, default: Any, *kinds: type) ->
         value = value[name] if isinstance(value, dict) else None
     if type(value) not in kinds:
         names = " or ".join(_JSON_TYPES[kind] for kind in kinds)
-        raise ValueError(f"{_place(stream, key)} must be {names}, got {shortened(value)}; fit the capture again.")
+        raise ValueError(
+            f"{_place(stream, key)} must be {names}, got {shortened(value)}; fit the capture again."
+        )
     return value
 
 
@@ -140,41 +150,52 @@ def _place(stream: FrameSource, key: str) -> str:
 
 
 def open_stream_capture(
-    stream: FrameSource, capture: str | Path | None, frames: Sequence[int], any_recording: bool = False
+    stream: FrameSource,
+    capture: str | Path | None,
+    frames: Sequence[int],
+    any_recording: bool = False,
 ) -> Capture:
     """Open the capture to which a stream was fitted, with the settings of the fit.
 
     Args:
         stream: the file.
-        capture: folder of the capture; default: the fit's, which the ``capture.json`` beside the stream names.
+        capture: folder of the capture; default: the fit's, which the ``capture.json`` beside the
+            stream names.
         frames: indices of the stream's frames.
         any_recording: whether the capture may be another recording by the same cameras.
 
     Raises:
         FileNotFoundError: the capture is missing.
-        ValueError: no capture is named, the header's metadata do not state how it was read, the capture is not the one
-            that was fitted, or there are no frames.
+        ValueError: no capture is named, the header's metadata do not state how it was read, the
+            capture is not the one that was fitted, or there are no frames.
     """
     path = capture or fitted_capture(stream)
-    reading = apply_values(ReadConfig(), metadata_entry(stream, "reading", {}, dict), _place(stream, "reading"))
+    reading = apply_values(
+        ReadConfig(), metadata_entry(stream, "reading", {}, dict), _place(stream, "reading")
+    )
     downscale = metadata_entry(stream, "downscale", 1, int, float)
     test_view = metadata_entry(stream, "test_view", "auto", list, int, str, NoneType)
     if not frames:
-        raise ValueError(f"{stream.path}: expected at least one frame, got a header alone; fit the capture again.")
-    recording = load_capture(path, downscale, "auto" if test_view == "auto" else None, frames[-1] + 1, reading)
+        raise ValueError(
+            f"{stream.path}: expected at least one frame, got a header alone; fit the capture "
+            "again."
+        )
+    recording = load_capture(
+        path, downscale, "auto" if test_view == "auto" else None, frames[-1] + 1, reading
+    )
     sizes = _sizes(stream.cameras)
     recorded_sizes = _sizes(recording.cameras)
     if recorded_sizes != sizes:
         raise ValueError(
-            f"{path}: expected the cameras that {stream.path} was fitted to, {sizes}, got {recorded_sizes}; "
-            "pass that capture (--capture)."
+            f"{path}: expected the cameras that {stream.path} was fitted to, {sizes}, got "
+            f"{recorded_sizes}; pass that capture (--capture)."
         )
     if test_view != "auto":
         recording = recording.holding_out(test_view)
     if frames != list(range(frames[0], frames[-1] + 1)) or recording.num_frames <= frames[-1]:
         raise ValueError(
-            f"{stream.path}: expected consecutive frames out of the {recording.num_frames} of {path}, got {frames}; "
-            "pass the capture that was fitted (--capture)."
+            f"{stream.path}: expected consecutive frames out of the {recording.num_frames} of "
+            f"{path}, got {frames}; pass the capture that was fitted (--capture)."
         )
     if not any_recording:
         _check_recording(stream, recording)
@@ -185,20 +206,27 @@ def open_stream_capture(
 
 
 def _check_recording(stream: FrameSource, recording: Capture) -> None:
-    """Raise `ValueError` if a recording has not the fingerprint in a stream's header; imported streams have none."""
+    """Raise `ValueError` if a recording has not the fingerprint in a stream's header; imported
+    streams have none.
+    """
     stream_fingerprint = metadata_entry(stream, "fingerprint", None, str, NoneType)
     if stream_fingerprint is None:
         return
     refines = metadata_entry(stream, "config.fit.refine_cameras", "off", str) != "off"
-    if fingerprint(recording, next(recording.partial_frames(0, 1)).images, refines) != stream_fingerprint:
+    if (
+        fingerprint(recording, next(recording.partial_frames(0, 1)).images, refines)
+        != stream_fingerprint
+    ):
         raise ValueError(
-            f"{recording.path}: expected the recording that {stream.path} was fitted to, got other images in its first "
-            "frame, or other points; pass that capture (--capture), or compare with any recording (--any-recording)."
+            f"{recording.path}: expected the recording that {stream.path} was fitted to, got "
+            "other images in its first frame, or other points; pass that capture (--capture), or "
+            "compare with any recording (--any-recording)."
         )
 
 
 def fitted_capture(stream: FrameSource) -> str:
-    """Return the path of a stream's capture, which is in the `capture.json` beside it; in the header of older streams.
+    """Return the path of a stream's capture, which is in the `capture.json` beside it; in the
+    header of older streams.
 
     Raises:
         FileNotFoundError: it is not there any more.
@@ -207,12 +235,17 @@ def fitted_capture(stream: FrameSource) -> str:
     capture_file = None
     with suppress(OSError, ValueError):
         capture_file = read_json(stream.path.with_name(CAPTURE))
-    entries = [fields.get("capture") for fields in (stream.metadata, capture_file) if isinstance(fields, dict)]
+    entries = [
+        fields.get("capture")
+        for fields in (stream.metadata, capture_file)
+        if isinstance(fields, dict)
+    ]
     paths = [path for path in entries if isinstance(path, str)]
     remedy = "name its folder with --capture"
     if not paths:
         raise ValueError(
-            f"{stream.path}: expected the path of its capture in the capture.json beside it, found none; {remedy}."
+            f"{stream.path}: expected the path of its capture in the capture.json beside it, "
+            f"found none; {remedy}."
         )
     if folder := next((path for path in paths if Path(path).is_dir()), None):
         return folder

@@ -23,7 +23,9 @@ from morgs_mi.playback.export.notebook import stream_html
 from morgs_mi.playback.trained_cameras import trained_cameras
 
 DRAWN = 0.5
-"""Share of invalid Gaussians up to which a file is drawn without them: beyond, the file as a whole is broken."""
+"""Share of invalid Gaussians up to which a file is drawn without them: beyond, the file as a whole
+is broken.
+"""
 
 _LOG = logging.getLogger(__name__)
 
@@ -36,7 +38,8 @@ class PlayableStream(StreamReader):
 
 
 class SplatFile(FrameSource):
-    """File with the Gaussians of one frame, of any tool; they are rounded only where it is coded into a packet.
+    """File with the Gaussians of one frame, of any tool; they are rounded only where it is coded
+    into a packet.
 
     Its cameras are the training cameras, if it has any (see `trained_cameras`), or a `default_rig`.
 
@@ -79,7 +82,8 @@ class SplatFile(FrameSource):
 
 
 def stream_path(out: str | Path) -> Path:
-    """Return the path of a stream file or of a file with Gaussians; in the folder of a fit, of its ``stream.morgs``.
+    """Return the path of a stream file or of a file with Gaussians; in the folder of a fit, of its
+    ``stream.morgs``.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -91,12 +95,15 @@ def stream_path(out: str | Path) -> Path:
             refuse_foreign(path / "meta.json")
         if frames := [file.name for file in listed(path) if suffix_of(file)]:
             raise ValueError(
-                f"{path}: got a folder with {len(frames)} files of Gaussians, not a stream; name one of them, such "
-                f"as {path / frames[0]}, or turn all into a stream with `morgs-mi import`."
+                f"{path}: got a folder with {len(frames)} files of Gaussians, not a stream; name "
+                f"one of them, such as {path / frames[0]}, or turn all into a stream with "
+                "`morgs-mi import`."
             )
     path = path / STREAM if path.is_dir() else path
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a stream, found none; check the path or fit a capture first.")
+        raise FileNotFoundError(
+            f"{path}: expected a stream, found none; check the path or fit a capture first."
+        )
     with path.open("rb") as file:
         content = file.read(len(MAGIC))
     if content != MAGIC:
@@ -104,18 +111,22 @@ def stream_path(out: str | Path) -> Path:
     return path
 
 
-def open_stream(out: str | Path, most_invalid: float = DRAWN, skip_damaged: bool = False) -> PlayableStream | SplatFile:
-    """Open a stream file, the ``stream.morgs`` in the folder of a fit, or a file with Gaussians as one frame.
+def open_stream(
+    out: str | Path, most_invalid: float = DRAWN, skip_damaged: bool = False
+) -> PlayableStream | SplatFile:
+    """Open a stream file, the ``stream.morgs`` in the folder of a fit, or a file with Gaussians as
+    one frame.
 
-    Files with Gaussians are ``.ply`` files in the layout of 3D Gaussian Splatting, ``.compressed.ply`` and ``.splat``.
-    A warning is logged for a provisional first frame, which a fit that was killed leaves behind.
+    Files with Gaussians are ``.ply`` files in the layout of 3D Gaussian Splatting,
+    ``.compressed.ply`` and ``.splat``. A warning is logged for a provisional first frame, which a
+    fit that was killed leaves behind.
 
     Args:
         out: the file or folder.
-        most_invalid: share of Gaussians of such a file that may have numbers that are not finite or above 1e12; they
-            are left out with a warning. 0: none.
-        skip_damaged: leave out the damaged frames of a stream, and those up to the next intact keyframe, with a warning
-            that names them.
+        most_invalid: share of Gaussians of such a file that may have numbers that are not finite or
+            above 1e12; they are left out with a warning. 0: none.
+        skip_damaged: leave out the damaged frames of a stream, and those up to the next intact
+            keyframe, with a warning that names them.
 
     Example:
         >>> stream = morgs_mi.open_stream("out/arm_fit")
@@ -124,13 +135,14 @@ def open_stream(out: str | Path, most_invalid: float = DRAWN, skip_damaged: bool
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is not a stream, or its header is broken or missing; or it has no Gaussians, or more
-            invalid ones.
+        ValueError: the file is not a stream, or its header is broken or missing; or it has no
+            Gaussians, or more invalid ones.
     """
     path = stream_path(out)
     if path.name == PROVISIONAL:
         _LOG.warning(
-            "%s: a provisional first frame of a fit that is still running or was killed; its Gaussians are not final.",
+            "%s: a provisional first frame of a fit that is still running or was killed; its "
+            "Gaussians are not final.",
             path,
         )
     if suffix_of(path):
@@ -142,17 +154,27 @@ def open_stream(out: str | Path, most_invalid: float = DRAWN, skip_damaged: bool
 
 
 def _warn_of_damage(stream: StreamReader) -> None:
-    """Log the frames that a reader leaves out as damaged, and the end of a stream that was not closed."""
+    """Log the frames that a reader leaves out as damaged, and the end of a stream that was not
+    closed.
+    """
     problems = []
     if stream.skipped:
         problems.append(f"the damaged frames {_spans(stream.skipped)} are skipped")
     if not stream.closed():
-        problems.append(f"it ends after {len(stream.index())} packets without an index, and may lack later frames")
+        problems.append(
+            f"it ends after {len(stream.index())} packets without an index, and may lack later "
+            "frames"
+        )
     if problems:
         _LOG.warning("%s: %s.", stream.path, "; ".join(problems))
 
 
 def _spans(numbers: Sequence[int]) -> str:
     """Return ascending numbers as text, such as ``0 to 3, 7``."""
-    spans = [[n for _, n in span] for _, span in groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])]
-    return ", ".join(f"{span[0]} to {span[-1]}" if len(span) > 1 else f"{span[0]}" for span in spans)
+    spans = [
+        [n for _, n in span]
+        for _, span in groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])
+    ]
+    return ", ".join(
+        f"{span[0]} to {span[-1]}" if len(span) > 1 else f"{span[0]}" for span in spans
+    )

@@ -1,7 +1,7 @@
 """The training cameras of a file of Gaussians, if they see the Gaussians.
 
-Nothing in a `cameras.json` names its Gaussians. It may be of another scene in the same folder, or of the same scene
-before it was moved or scaled.
+Nothing in a `cameras.json` names its Gaussians. It may be of another scene in the same folder, or
+of the same scene before it was moved or scaled.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ def trained_cameras(path: Path, gaussians: Gaussians) -> tuple[Path | None, tupl
     share = visible.any(axis=0) @ weights
     if share < _LEAST_SEEN:
         _log.warning(
-            "%s: its cameras see %.1f %% of the Gaussians of %s and are not used, as they seem to be of another scene; "
-            "the cameras are a ring around the Gaussians instead.",
+            "%s: its cameras see %.1f %% of the Gaussians of %s and are not used, as they seem to "
+            "be of another scene; the cameras are a ring around the Gaussians instead.",
             file,
             100 * share,
             path.name,
@@ -65,7 +65,8 @@ def trained_cameras(path: Path, gaussians: Gaussians) -> tuple[Path | None, tupl
     if not sees.all():
         names = [camera.name for camera, good in zip(cameras, sees, strict=True) if not good]
         _log.warning(
-            "%s: %d of %d cameras are left out, because they see next to nothing of the Gaussians of %s: %s.",
+            "%s: %d of %d cameras are left out, because they see next to nothing of the Gaussians "
+            "of %s: %s.",
             file,
             len(names),
             len(cameras),
@@ -76,11 +77,13 @@ def trained_cameras(path: Path, gaussians: Gaussians) -> tuple[Path | None, tupl
 
 
 def _seen(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """Return which of N Gaussians a camera sees, bool [N]: none where they are a dot in its image."""
+    """Return which of N Gaussians a camera sees, bool [N]: none that are a dot in its image."""
     raw = gaussians.numpy()
     with np.errstate(all="ignore"):
         pixels, depths = camera.project(raw["means"].astype(np.float64))
-        visible = (depths > camera.near) & ((pixels > 0) & (pixels < [camera.width, camera.height])).all(axis=1)
+        visible = (depths > camera.near) & (
+            (pixels > 0) & (pixels < [camera.width, camera.height])
+        ).all(axis=1)
         radii = camera.K[0, 0] * np.exp(raw["log_scales"].max(axis=1, initial=-69)) / depths
     if not visible.any():
         return visible

@@ -1,4 +1,5 @@
-"""Visualisation: images of motion, confidence and depth, legends, labels, contact sheets, PNG files.
+"""Visualisation: images of motion, confidence and depth, legends, labels, contact sheets, PNG
+files.
 
 All images that are returned are uint8 RGB [H, W, 3].
 """
@@ -23,7 +24,8 @@ UNDEFINED = (128, 128, 128)
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:
-    """Return a display-referred image [H, W, 3], [H, W, 1] or [H, W] as a uint8 RGB copy; floats are in [0, 1].
+    """Return a display-referred image [H, W, 3], [H, W, 1] or [H, W] as a uint8 RGB copy; floats
+    are in [0, 1].
 
     Values that are not finite become black.
 
@@ -34,9 +36,13 @@ def to_uint8(image: np.ndarray) -> np.ndarray:
     if image.ndim == 2:
         image = image[..., None]
     if image.ndim != 3 or image.shape[2] not in (1, 3):
-        raise ValueError(f"to_uint8(): `image` must be [H, W], [H, W, 1] or [H, W, 3], got {image.shape}.")
+        raise ValueError(
+            f"to_uint8(): `image` must be [H, W], [H, W, 1] or [H, W, 3], got {image.shape}."
+        )
     if image.dtype != np.uint8:
-        image = (np.clip(np.nan_to_num(image, posinf=0, neginf=0), 0, 1) * 255 + 0.5).astype(np.uint8)
+        image = (np.clip(np.nan_to_num(image, posinf=0, neginf=0), 0, 1) * 255 + 0.5).astype(
+            np.uint8
+        )
     return np.broadcast_to(image, (*image.shape[:2], 3)).copy()
 
 
@@ -46,11 +52,12 @@ def grey_image(values: np.ndarray) -> np.ndarray:
 
 
 def motion_image(motion: np.ndarray, scale_px: float) -> np.ndarray:
-    """Return motion as colours: the hue is the direction, the saturation is the speed, white is no motion.
+    """Return motion as colours: the hue is the direction, the saturation is the speed, white is no
+    motion.
 
-    Right is red, and the hue increases clockwise on the screen: down is yellow-green, left is cyan, up is violet.
-    Speeds of `scale_px` or more are fully saturated; images with the same scale are comparable. Values that are not
-    finite are grey.
+    Right is red, and the hue increases clockwise on the screen: down is yellow-green, left is cyan,
+    up is violet. Speeds of `scale_px` or more are fully saturated; images with the same scale are
+    comparable. Values that are not finite are grey.
 
     Args:
         motion: [H, W, 2] in pixels, x to the right and y down.
@@ -75,7 +82,9 @@ def motion_image(motion: np.ndarray, scale_px: float) -> np.ndarray:
 
 
 def motion_legend(scale_px: float, size: int = 96) -> np.ndarray:
-    """Return the legend [size, size, 3] of `motion_image`: a disc of its colours with the speed at the rim."""
+    """Return the legend [size, size, 3] of `motion_image`: a disc of its colours with the speed at
+    the rim.
+    """
     axis = np.linspace(-scale_px, scale_px, size, dtype=np.float32)
     motion = np.stack(np.meshgrid(axis, axis), -1)
     motion[np.hypot(*np.moveaxis(motion, -1, 0)) > scale_px] = 0
@@ -83,12 +92,16 @@ def motion_legend(scale_px: float, size: int = 96) -> np.ndarray:
 
 
 def confidence_image(confidence: np.ndarray) -> np.ndarray:
-    """Return [H, W] or [H, W, 1] in [0, 1] as colours: dark violet is static, bright yellow is moving."""
+    """Return [H, W] or [H, W, 1] in [0, 1] as colours: dark violet is static, bright yellow is
+    moving.
+    """
     return _apply_colour_map(np.asarray(confidence, np.float64), cv2.COLORMAP_INFERNO)
 
 
 def confidence_legend(size: int = 96) -> np.ndarray:
-    """Return the legend [size, size, 3] of `confidence_image`: a bar from 1 at the top to 0 at the bottom."""
+    """Return the legend [size, size, 3] of `confidence_image`: a bar from 1 at the top to 0 at the
+    bottom.
+    """
     ramp = np.repeat(np.linspace(1, 0, size)[:, None], size // 3, axis=1)
     image = np.full((size, size, 3), BACKGROUND, np.uint8)
     image[:, : ramp.shape[1]] = confidence_image(ramp)
@@ -99,10 +112,11 @@ def confidence_legend(size: int = 96) -> np.ndarray:
 
 
 def time_slice(columns: Sequence[np.ndarray], least_width: int = 320) -> np.ndarray:
-    """Return the same image column [H, 3] of every frame side by side, with time to the right [H, W, 3].
+    """Return the same image column [H, 3] of every frame side by side, with time to the right
+    [H, W, 3].
 
-    Static surfaces appear as horizontal streaks, noise as roughness. The columns of a short clip are repeated to a
-    width of at least `least_width` pixels.
+    Static surfaces appear as horizontal streaks, noise as roughness. The columns of a short clip
+    are repeated to a width of at least `least_width` pixels.
 
     Raises:
         ValueError: there is no column.
@@ -112,7 +126,9 @@ def time_slice(columns: Sequence[np.ndarray], least_width: int = 320) -> np.ndar
     return np.repeat(to_uint8(np.stack(columns, axis=1)), -(-least_width // len(columns)), axis=1)
 
 
-def depth_image(depth: np.ndarray, near: float | None = None, far: float | None = None) -> np.ndarray:
+def depth_image(
+    depth: np.ndarray, near: float | None = None, far: float | None = None
+) -> np.ndarray:
     """Return depth [H, W] or [H, W, 1] as colours, red near and blue far, linear in 1 / depth.
 
     Args:
@@ -135,7 +151,9 @@ def depth_image(depth: np.ndarray, near: float | None = None, far: float | None 
 
 
 def depth_range(depth: np.ndarray) -> tuple[float, float]:
-    """Return the 1st and the 99th percentile of the depths that are positive and finite; (1, 1) if there is none."""
+    """Return the 1st and the 99th percentile of the depths that are positive and finite; (1, 1) if
+    there is none.
+    """
     values = depth[np.isfinite(depth) & (depth > 0)]
     low, high = np.percentile(values, (1, 99)) if values.size else (1.0, 1.0)
     return float(low), float(high)
@@ -173,7 +191,8 @@ def contact_sheet(rows: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
 
 
 def write_png(path: str | os.PathLike[str], image: np.ndarray) -> None:
-    """Write an image (see `to_uint8`) as PNG; the file is written atomically, missing folders are created.
+    """Write an image (see `to_uint8`) as PNG; the file is written atomically, missing folders are
+    created.
 
     Raises:
         OSError: the file cannot be written; the message names it and the cause.

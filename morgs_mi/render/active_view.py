@@ -1,4 +1,6 @@
-"""Active views: a camera, the blocks of pixels that are drawn, and the static splats behind the active Gaussians."""
+"""Active views: a camera, the blocks of pixels that are drawn, and the static splats behind the
+active Gaussians.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ class ActiveView:
     camera: Camera  #: The view.
     config: RenderConfig = field(default_factory=RenderConfig)  #: Cut-offs and block shape.
     region: Region | None = None  #: The blocks of pixels that are drawn; None: the whole view.
-    static_splats: Splats | None = None  #: Further splats that are drawn there and get no gradients; None: none.
+    #: Further splats that are drawn there and get no gradients; None: none.
+    static_splats: Splats | None = None
 
     def render(
         self,
@@ -34,7 +37,9 @@ class ActiveView:
         detach_weights: Sequence[str] = (),
         features: Tensor | None = None,
     ) -> Image:
-        """Return the image of Gaussians in this view, see `rasterize`; static splats have features of 0."""
+        """Return the image of Gaussians in this view, see `rasterize`; static splats have features
+        of 0.
+        """
         return rasterize(
             gaussians,
             self.camera,
@@ -56,7 +61,9 @@ class ActiveView:
         return BlockGrid.of(self.camera.width, self.camera.height, self.config)
 
     def narrowed(self, blocks: np.ndarray) -> ActiveView | None:
-        """Return the view restricted to some of its drawn blocks, bool [rows, columns]; None if there are none."""
+        """Return the view restricted to some of its drawn blocks, bool [rows, columns]; None if
+        there are none.
+        """
         blocks = blocks if self.region is None else blocks & self.region.drawn
         return replace(self, region=Region.of(self.grid, blocks)) if blocks.any() else None
 
@@ -66,15 +73,22 @@ class ActiveView:
         if self.region is None:
             return 1.0
         width, height = self.region.block
-        return min(1.0, self.region.num_blocks * width * height / (self.camera.width * self.camera.height))
+        return min(
+            1.0, self.region.num_blocks * width * height / (self.camera.width * self.camera.height)
+        )
 
 
 def make_active_view(
-    camera: Camera, region: Region, static: ActivatedGaussians, channels: Sequence[str], config: RenderConfig
+    camera: Camera,
+    region: Region,
+    static: ActivatedGaussians,
+    channels: Sequence[str],
+    config: RenderConfig,
 ) -> ActiveView:
     """Return the active view of a region.
 
-    The static Gaussians are projected here, once, and not again when active Gaussians are rendered with them.
+    The static Gaussians are projected here, once, and not again when active Gaussians are rendered
+    with them.
 
     Args:
         camera: the view.

@@ -14,7 +14,9 @@ def _backend() -> dr.JitBackend:
 
 
 def block_shape(config: RenderConfig) -> tuple[int, int]:
-    """Return (width, height) in pixels of one lane's block: 8x4 on a CPU, 4x4 on a GPU, unless `config` sets it."""
+    """Return (width, height) in pixels of one lane's block: 8x4 on a CPU, 4x4 on a GPU, unless
+    `config` sets it.
+    """
     default_width = 8 if _backend() == dr.JitBackend.LLVM else 4
     return config.block_width or default_width, config.block_height or 4
 
@@ -32,7 +34,8 @@ def stable_order(keys: UInt32, buckets: int) -> UInt32:
 def add_mode() -> dr.ReduceMode:
     """Return the mode of scatter-additions to one record per Gaussian.
 
-    On few CPU cores, one copy of the target per thread is 1.8 times faster than atomics (`Direct`) on two threads.
+    On few CPU cores, one copy of the target per thread is 1.8 times faster than atomics (`Direct`)
+    on two threads.
     """
     return dr.ReduceMode.Expand if _backend() == dr.JitBackend.LLVM else dr.ReduceMode.Auto
 
@@ -40,8 +43,9 @@ def add_mode() -> dr.ReduceMode:
 def on_aligned_stack(value: UInt32 | Int32) -> UInt32 | Int32:
     """Return an integer unchanged, in a way that aligns the stack of the kernel that computes it.
 
-    LLVM aligns a kernel's stack only for variables that require it, and adds its own spilled packets later: they
-    straddle cache lines, and the step takes 3 to 6 % longer. An array that is indexed at run time requires alignment.
+    LLVM aligns a kernel's stack only for variables that require it, and adds its own spilled
+    packets later: they straddle cache lines, and the step takes 3 to 6 % longer. An array that is
+    indexed at run time requires alignment.
     """
     if _backend() != dr.JitBackend.LLVM:
         return value

@@ -1,10 +1,11 @@
 """Depth-ordered lists of the Gaussians that touch each block of pixels.
 
-The lists have two levels. Coarse: every Gaussian is entered into the tiles (4 x 8 blocks) that its extent touches. One
-counting sort by tile, applied in depth order, gives the list of each tile. Fine: each entry of a tile's list is tested
-exactly against the tile's 32 blocks, one bit each. 32 entries by 32 blocks of bits are transposed in registers: every
-block has its own string of bits over its tile's list. The blending loops walk the set bits. A block's list is never
-written out, and a pair of Gaussian and block costs one bit.
+The lists have two levels. Coarse: every Gaussian is entered into the tiles (4 x 8 blocks) that its
+extent touches. One counting sort by tile, applied in depth order, gives the list of each tile.
+Fine: each entry of a tile's list is tested exactly against the tile's 32 blocks, one bit each. 32
+entries by 32 blocks of bits are transposed in registers: every block has its own string of bits
+over its tile's list. The blending loops walk the set bits. A block's list is never written out, and
+a pair of Gaussian and block costs one bit.
 
 The *rank* of a Gaussian is its place in depth order. Equal depths are in the order of the input.
 """
@@ -32,8 +33,10 @@ _TEST_SLACK = 1e-3
 class BlockLists:
     """Depth-ordered lists, one per block of pixels, as bits over the entries of its tile."""
 
-    records: Float  #: (geometry, blended columns) of each rank, see `Splats.geometry` and `pack_records`.
-    words: UInt32  #: Bit k of a block's i-th word is set if the block draws entry `first` + 32 i + k.
+    #: (geometry, blended columns) of each rank, see `Splats.geometry` and `pack_records`.
+    records: Float
+    #: Bit k of a block's i-th word is set if the block draws entry `first` + 32 i + k.
+    words: UInt32
     entries: UInt32  #: Ranks, tile by tile.
     begin: UInt32  #: Place of each block's first word [A]; the next ones follow at steps of 32.
     end: UInt32  #: Place past its last word [A].
@@ -45,7 +48,11 @@ class BlockLists:
 
 
 def build_lists(
-    splats: Splats, columns: list[Float], region: Region, config: RenderConfig, limits: Float | None = None
+    splats: Splats,
+    columns: list[Float],
+    region: Region,
+    config: RenderConfig,
+    limits: Float | None = None,
 ) -> BlockLists:
     """List the splats (N > 0) that may touch each block of a region, nearest first.
 
@@ -54,7 +61,8 @@ def build_lists(
         columns: the blended values, floats [N].
         region: the blocks.
         config: cut-offs.
-        limits: depth limit of every pixel of the view [H W], which the splats' profiles are compared with.
+        limits: depth limit of every pixel of the view [H W], which the splats' profiles are
+            compared with.
     """
     N = len(splats)
     depths = dr.select(splats.valid, splats.depths, dr.inf)
@@ -66,7 +74,9 @@ def build_lists(
     tiles = _tile_lists([dr.gather(mi.UInt32, v, by_rank) for v in rectangles], region)
 
     records = pack_records([*splats.geometry, *columns], by_rank)
-    geometry = fetch_record(records, tiles.entries, len(splats.geometry), dr.width(records) // (4 * N))
+    geometry = fetch_record(
+        records, tiles.entries, len(splats.geometry), dr.width(records) // (4 * N)
+    )
     farthest = None if limits is None else _farthest_limits(limits, region)
     words, first_word, end_word = _block_bits(geometry, tiles, region, config, farthest)
     begin = dr.gather(mi.UInt32, first_word, region.tile) * 32 + region.bit
@@ -74,10 +84,13 @@ def build_lists(
     first = dr.gather(mi.UInt32, tiles.first, region.tile)
     count = _set_bits(words, begin, end)
     dr.eval(begin, end, first, count)
-    # Neighbours stay together if their lengths differ by less than an eighth: they draw the same splats and stop alike.
+    # Neighbours stay together if their lengths differ by less than an eighth: they draw the same
+    # splats and stop alike.
     bucket = mi.UInt32(6 * dr.log2(mi.Float(count) + 1))
     order = dr.detail.block_mkperm(255 - bucket, dr.width(count), 256)  # pyright: ignore[reportArgumentType]
-    return BlockLists(records, words, tiles.entries, begin, end, first, count, order, rank_of, by_rank)
+    return BlockLists(
+        records, words, tiles.entries, begin, end, first, count, order, rank_of, by_rank
+    )
 
 
 def touches(splats: Splats, region: Region) -> Bool:
@@ -85,8 +98,11 @@ def touches(splats: Splats, region: Region) -> Bool:
     return splats.valid & (_cells_within(region.block_table, region, splats, (1, 1))[1] > 0)
 
 
-def next_entry(place: UInt32, word: UInt32, base: UInt32, end: UInt32, words: UInt32) -> tuple[UInt32, UInt32, UInt32]:
-    """Advance to a word with a set bit and return (place of the word after it, word, entry of the word's bit 0).
+def next_entry(
+    place: UInt32, word: UInt32, base: UInt32, end: UInt32, words: UInt32
+) -> tuple[UInt32, UInt32, UInt32]:
+    """Advance to a word with a set bit and return (place of the word after it, word, entry of the
+    word's bit 0).
 
     The word is 0 where none is left.
     """
@@ -96,13 +112,17 @@ def next_entry(place: UInt32, word: UInt32, base: UInt32, end: UInt32, words: UI
 
     state = (place, word, base, end, words)
     result = dr.while_loop(
-        state, lambda place, word, base, end, _: (word == 0) & (place < end), step, label="next word"
+        state,
+        lambda place, word, base, end, _: (word == 0) & (place < end),
+        step,
+        label="next word",
     )
     return result[:3]
 
 
 def pack_records(columns: list[Float], order: UInt32) -> Float:
-    """Return the columns [N] interleaved to one record per Gaussian, in the given order, padded to 4 floats.
+    """Return the columns [N] interleaved to one record per Gaussian, in the given order, padded to
+    4 floats.
 
     Records are read in packets of 4 floats, one cache line or less for each Gaussian.
     """
@@ -119,8 +139,12 @@ def pack_records(columns: list[Float], order: UInt32) -> Float:
     return records
 
 
-def fetch_record(records: Float, rank: UInt32, length: int, packets: int | None = None) -> list[Float]:
-    """Return the first `length` floats of the record at `rank`, which has `packets`, by default as many as needed."""
+def fetch_record(
+    records: Float, rank: UInt32, length: int, packets: int | None = None
+) -> list[Float]:
+    """Return the first `length` floats of the record at `rank`, which has `packets`, by default as
+    many as needed.
+    """
     count = -(-length // 4)
     reads = (dr.gather(mi.Vector4f, records, rank * (packets or count) + j) for j in range(count))
     return [v for packet in reads for v in packet][:length]
@@ -128,7 +152,9 @@ def fetch_record(records: Float, rank: UInt32, length: int, packets: int | None 
 
 @dataclass(frozen=True)
 class _Tiles:
-    """The coarse lists: ranks by tile and depth, the slot of each entry's tile, first and end entry of each slot."""
+    """The coarse lists: ranks by tile and depth, the slot of each entry's tile, first and end entry
+    of each slot.
+    """
 
     entries: UInt32
     slots: UInt32
@@ -139,7 +165,8 @@ class _Tiles:
 def _cells_within(
     table: UInt32, region: Region, splats: Splats, cell: tuple[int, int]
 ) -> tuple[tuple[UInt32, UInt32, UInt32, UInt32], UInt32]:
-    """Return the rectangle (x0, y0, x1, y1) of cells that each splat's extent touches, and its number of set cells.
+    """Return the rectangle (x0, y0, x1, y1) of cells that each splat's extent touches, and its
+    number of set cells.
 
     Args:
         table: summed areas of the cells.
@@ -174,7 +201,9 @@ def _cells_within(
 
 
 def _tile_rectangles(splats: Splats, region: Region) -> tuple[UInt32, UInt32, UInt32, UInt32]:
-    """Return each splat's first tile (x, y), its tiles across, and the number of its tiles in the region."""
+    """Return each splat's first tile (x, y), its tiles across, and the number of its tiles in the
+    region.
+    """
     (x0, y0, x1, _), counts = _cells_within(region.tile_table, region, splats, (ACROSS, DOWN))
     return x0, y0, x1 - x0, dr.select(splats.valid, counts, 0)
 
@@ -186,8 +215,9 @@ def _tile_lists(rectangles: list[UInt32], region: Region) -> _Tiles:
     slots = region.num_tiles
     if N * slots >= 2**32 and (entries := dr.sum(mi.Float64(counts))[0]) >= 2**32:
         raise ValueError(
-            f"rasterize(): the lists must have fewer than 2^32 entries, got {entries:.3g} for {N} Gaussians in "
-            f"{slots} tiles; make the Gaussians smaller or fewer, or render the image in several regions."
+            f"rasterize(): the lists must have fewer than 2^32 entries, got {entries:.3g} for {N} "
+            f"Gaussians in {slots} tiles; make the Gaussians smaller or fewer, or render the "
+            "image in several regions."
         )
     end = dr.cumsum(counts)
     total = int(end[-1])  # the one number that must reach the host: the size of the lists
@@ -220,7 +250,9 @@ def _tile_lists(rectangles: list[UInt32], region: Region) -> _Tiles:
         slot_at,
         rank_at,
     )
-    *_, slot_at, rank_at = dr.while_loop(state, lambda place, end, *_: place < end, enter, label="tile entries")
+    *_, slot_at, rank_at = dr.while_loop(
+        state, lambda place, end, *_: place < end, enter, label="tile entries"
+    )
     dr.eval(slot_at, rank_at)
 
     perm, slot_at, first, end = sorted_buckets(slot_at, slots)
@@ -230,7 +262,9 @@ def _tile_lists(rectangles: list[UInt32], region: Region) -> _Tiles:
 
 
 def sorted_buckets(keys: UInt32, buckets: int) -> tuple[UInt32, UInt32, UInt32, UInt32]:
-    """Return (permutation that sorts `keys` stably, sorted keys, first place of each bucket, end of each bucket)."""
+    """Return (permutation that sorts `keys` stably, sorted keys, first place of each bucket, end of
+    each bucket).
+    """
     total = dr.width(keys)
     perm = stable_order(keys, buckets)
     sorted_keys = dr.gather(mi.UInt32, keys, perm)
@@ -248,12 +282,17 @@ def sorted_buckets(keys: UInt32, buckets: int) -> tuple[UInt32, UInt32, UInt32, 
 
 
 def _block_bits(
-    geometry: list[Float], tiles: _Tiles, region: Region, config: RenderConfig, farthest_limits: Float | None
+    geometry: list[Float],
+    tiles: _Tiles,
+    region: Region,
+    config: RenderConfig,
+    farthest_limits: Float | None,
 ) -> tuple[UInt32, UInt32, UInt32]:
-    """Return (words, first word of each tile, end word of each tile) for the geometry of the entries.
+    """Return (words, first word of each tile, end word of each tile) for the geometry of the
+    entries.
 
-    Bit k of word 32 w + b is set if block b of the tile is touched by entry 32 w + k, both counted from the tile's
-    first.
+    Bit k of word 32 w + b is set if block b of the tile is touched by entry 32 w + k, both counted
+    from the tile's first.
     """
     bw, bh = region.block
     num_tiles = region.num_tiles
@@ -292,7 +331,10 @@ def _block_bits(
         if farthest_limits is not None:
             row = dr.minimum(gy * y0, gy * y1)
             farthest = dr.gather(mi.Vector4f, farthest_limits, slot * DOWN + j)
-            ahead = [(limit - z - row) * r_sigma > -FARTHEST_CUT for limit, z in zip(farthest, nearest, strict=True)]
+            ahead = [
+                (limit - z - row) * r_sigma > -FARTHEST_CUT
+                for limit, z in zip(farthest, nearest, strict=True)
+            ]
         y = _clipped(0, y0, y1)
         by = b * y
         v = c * y
@@ -309,12 +351,14 @@ def _block_bits(
             mask |= dr.select(touches, mi.UInt32(1 << (j * ACROSS + i)), mi.UInt32(0))
 
     if farthest_limits is not None:
-        # A depth limit may cut the entries that would hide later ones: no entry is omitted for its transmittance.
+        # A depth limit may cut the entries that would hide later ones: no entry is omitted for its
+        # transmittance.
         dr.eval(mask)
         return _transposed_words(mask, tiles, first_word, end_word, num_words)
 
-    # Over the tile, u^2 + v^2 is largest at a corner: a lower bound of alpha, hence an upper bound of the transmittance
-    # behind an entry. Entries below the stop in all blocks are not listed; they would not have been blended.
+    # Over the tile, u^2 + v^2 is largest at a corner: a lower bound of alpha, hence an upper bound
+    # of the transmittance behind an entry. Entries below the stop in all blocks are not listed;
+    # they would not have been blended.
     def distance(x: Float, y: Float) -> Float:
         u = dr.fma(a, x, b * y)
         v = c * y
@@ -327,14 +371,18 @@ def _block_bits(
     log2_transmitted = dr.log2(1 - dr.minimum(alpha, config.alpha_max))
     dr.eval(mask, log2_transmitted)
     behind = dr.prefix_sum(mi.Float64(log2_transmitted))
-    log2_transmittance = behind - dr.gather(mi.Float64, behind, dr.gather(mi.UInt32, tiles.first, slot))
+    log2_transmittance = behind - dr.gather(
+        mi.Float64, behind, dr.gather(mi.UInt32, tiles.first, slot)
+    )
     # Half an octave exceeds the rounding error of the blend; a stop at 0 omits nothing.
-    mask = dr.select(log2_transmittance < log2(max(config.stop_transmittance, 1e-38)) - 0.5, 0, mask)
+    mask = dr.select(
+        log2_transmittance < log2(max(config.stop_transmittance, 1e-38)) - 0.5, 0, mask
+    )
     return _transposed_words(mask, tiles, first_word, end_word, num_words)
 
 
 def _farthest_limits(limits: Float, region: Region) -> Float:
-    """Return the largest depth limit in each block of the region's tiles [tiles * ACROSS * DOWN]."""
+    """Return the largest depth limit in each block of a region's tiles [tiles ACROSS DOWN]."""
     lane = dr.arange(mi.UInt32, region.width * region.height)
     row = quotient(lane, region.width)
     column = lane - row * dr.opaque(mi.UInt32, region.width)
@@ -345,7 +393,9 @@ def _farthest_limits(limits: Float, region: Region) -> Float:
     slot = tile if region.whole else dr.gather(mi.UInt32, region.slot_of, tile)
     farthest = dr.full(mi.Float, -dr.inf, region.num_tiles * ACROSS * DOWN)
     bit = y % DOWN * ACROSS + x % ACROSS
-    dr.scatter_reduce(dr.ReduceOp.Max, farthest, limits, slot * (ACROSS * DOWN) + bit, active=slot != NO_SLOT)
+    dr.scatter_reduce(
+        dr.ReduceOp.Max, farthest, limits, slot * (ACROSS * DOWN) + bit, active=slot != NO_SLOT
+    )
     dr.eval(farthest)
     return farthest
 
@@ -353,11 +403,15 @@ def _farthest_limits(limits: Float, region: Region) -> Float:
 def _transposed_words(
     mask: UInt32, tiles: _Tiles, first_word: UInt32, end_word: UInt32, num_words: int
 ) -> tuple[UInt32, UInt32, UInt32]:
-    """Return (words, first word of each tile, end word of each tile) of the blocks' bits of every entry."""
+    """Return (words, first word of each tile, end word of each tile) of the blocks' bits of every
+    entry.
+    """
     slot = tiles.slots
     place = dr.gather(mi.UInt32, first_word, slot) * 32 + dr.arange(mi.UInt32, dr.width(slot))
     masks = dr.zeros(mi.UInt32, num_words * 32)
-    dr.scatter(masks, mask, place - dr.gather(mi.UInt32, tiles.first, slot), mode=dr.ReduceMode.NoConflicts)
+    dr.scatter(
+        masks, mask, place - dr.gather(mi.UInt32, tiles.first, slot), mode=dr.ReduceMode.NoConflicts
+    )
     dr.eval(masks)
     word = dr.arange(mi.UInt32, num_words) * 32
     rows = _transposed([dr.gather(mi.UInt32, masks, word + k) for k in range(32)])
@@ -369,13 +423,17 @@ def _transposed_words(
 
 
 def _clipped(value: Float | int, low: Float, high: Float) -> Float:
-    """Return `value` clipped to [low, high]: two instructions, where `dr.clip` takes six to handle NaN."""
+    """Return `value` clipped to [low, high]: two instructions, where `dr.clip` takes six to handle
+    NaN.
+    """
     value = dr.select(value < low, low, value)
     return dr.select(value > high, high, value)
 
 
 def _transposed(rows: list[UInt32]) -> list[UInt32]:
-    """Return 32 words of 32 bits transposed: swap off-diagonal squares of 16, 8, ... 1 bits (Hacker's Delight, 7-3)."""
+    """Return 32 words of 32 bits transposed: swap off-diagonal squares of 16, 8, ... 1 bits
+    (Hacker's Delight, 7-3).
+    """
     rows = list(rows)
     size = 16
     mask = 0x0000FFFF

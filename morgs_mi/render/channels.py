@@ -1,8 +1,9 @@
 """The renderer's channels.
 
-`color`, `depth`, `motion` and `guided_motion` have a rule of their own. Every attribute with a `channel` in the table
-of attributes is a further channel, blended like a colour. `alpha` is blended with every call that needs it. A shape of
-a Mitsuba scene has the attributes that the channels require.
+`color`, `depth`, `motion` and `guided_motion` have a rule of their own. Every attribute with a
+`channel` in the table of attributes is a further channel, blended like a colour. `alpha` is blended
+with every call that needs it. A shape of a Mitsuba scene has the attributes that the channels
+require.
 """
 
 from __future__ import annotations
@@ -17,29 +18,46 @@ NORMALISED = ("depth", "motion", "guided_motion")
 
 def attribute_channels() -> dict[str, Attribute]:
     """Return the attributes that are blended like a colour, by the names of their channels."""
-    return {attribute.channel: attribute for attribute in BY_ACTIVATED_NAME.values() if attribute.channel}
+    return {
+        attribute.channel: attribute
+        for attribute in BY_ACTIVATED_NAME.values()
+        if attribute.channel
+    }
 
 
 def channel_sizes() -> dict[str, int]:
-    """Return the number of floats that each channel blends, by name, without `alpha` and `features`."""
-    return {**_OWN_RULE, **{name: attribute.width for name, attribute in attribute_channels().items()}}
+    """Return the number of floats that each channel blends, by name, without `alpha` and
+    `features`.
+    """
+    return {
+        **_OWN_RULE,
+        **{name: attribute.width for name, attribute in attribute_channels().items()},
+    }
 
 
 def exr_names(channel: str) -> tuple[str, ...]:
-    """Return the EXR names of a channel's floats: NAME.Y for one, NAME.X, NAME.Y, NAME.Z for 2 or 3."""
+    """Return the EXR names of a channel's floats: NAME.Y for one, NAME.X, NAME.Y, NAME.Z for 2 or
+    3.
+    """
     size = channel_sizes()[channel]
     suffixes = "Y" if size == 1 else "XYZ"[:size] if size <= 3 else [str(k) for k in range(size)]
     return tuple(f"{channel}.{suffix}" for suffix in suffixes)
 
 
 def aov_attributes() -> dict[str, str | None]:
-    """Return the shape attribute that each AOV requires, by the name of the AOV; None: no attribute."""
-    names = {channel: attribute.activated_name for channel, attribute in attribute_channels().items()}
+    """Return the shape attribute that each AOV requires, by the name of the AOV; None: no
+    attribute.
+    """
+    names = {
+        channel: attribute.activated_name for channel, attribute in attribute_channels().items()
+    }
     return {"motion": "motion", **names, "depth": None}
 
 
 def attribute_widths() -> dict[str, tuple[int, ...]]:
-    """Return the admissible numbers of floats per Gaussian of every shape attribute beside `data`, by name."""
+    """Return the admissible numbers of floats per Gaussian of every shape attribute beside `data`,
+    by name.
+    """
     names = [name for name in aov_attributes().values() if name]
     return {
         "opacities": (1,),

@@ -43,9 +43,9 @@ def blend(
         limits: depth limit of every pixel [H W] if the layout has them.
 
     Returns:
-        The image of each channel on the region, flat; and, if the layout has it, alpha, twice: one for output, one to
-        divide by, because forward mode clears the gradients of an array that is used further. Differentiable in
-        `geometry` and `channels` by `dr.backward` and `dr.forward`.
+        The image of each channel on the region, flat; and, if the layout has it, alpha, twice: one
+        for output, one to divide by, because forward mode clears the gradients of an array that is
+        used further. Differentiable in `geometry` and `channels` by `dr.backward` and `dr.forward`.
     """
     columns = [column for channel in channels for column in channel]
     return dr.custom(_Blend, [*geometry, *columns], region, lists, layout, limits)
@@ -53,13 +53,21 @@ def blend(
 
 class _Blend(dr.CustomOp):
     def eval(
-        self, values: list[Float], region: Region, lists: BlockLists, layout: Layout, limits: Float | None
+        self,
+        values: list[Float],
+        region: Region,
+        lists: BlockLists,
+        layout: Layout,
+        limits: Float | None,
     ) -> list[Float]:
-        # The lists' records contain the values already: they are arguments only to be differentiated.
+        # The lists' records contain the values already: they are arguments only to be
+        # differentiated.
         self.region = region
         self.lists = lists
         self.layout = layout
-        self.blocks = Blocks.of(region, lists, None if limits is None else on_region(limits, region))
+        self.blocks = Blocks.of(
+            region, lists, None if limits is None else on_region(limits, region)
+        )
         self.images = _run(primal, layout, self.blocks, lists.records, self._allocated())
         return self._outputs(self.images)
 
@@ -73,34 +81,47 @@ class _Blend(dr.CustomOp):
     def forward(self) -> None:
         grads = [dr.zeros(mi.Float, 1) + g for g in cast(list[Float], self.grad_in("values"))]
         tangents = pack_records(grads, self.lists.by_rank)
-        images = _run(tangent, self.layout, self.blocks, self.lists.records, tangents, self._allocated())
+        images = _run(
+            tangent, self.layout, self.blocks, self.lists.records, tangents, self._allocated()
+        )
         self.set_grad_out(self._outputs(images))
 
     def _allocated(self) -> list[Float]:
-        """Return memory for the images: a frozen function cannot allocate arrays of a size that it computes."""
+        """Return memory for the images: a frozen function cannot allocate arrays of a size that it
+        computes.
+        """
         return [dr.empty(mi.Float, self.region.num_pixels * size) for size in self.layout.sizes]
 
     def _outputs(self, images: list[Float]) -> list[Float]:
         """Return the images without the padding to whole blocks, and alpha twice."""
-        outputs = [_cropped(v, self.region, size) for v, size in zip(images, self.layout.sizes, strict=True)]
+        outputs = [
+            _cropped(v, self.region, size)
+            for v, size in zip(images, self.layout.sizes, strict=True)
+        ]
         return [*outputs, outputs[-1] + 0] if self.layout.alpha else outputs
 
     def _image_grads(self, grads: list[Float]) -> list[Float]:
-        """Return the gradients of the images from the gradients of the outputs: the transpose of `_outputs`."""
+        """Return the gradients of the images from the gradients of the outputs: the transpose of
+        `_outputs`.
+        """
         if self.layout.alpha:
             *grads, alpha, coverage = grads
             grads = [*grads, alpha + coverage]
-        return [padded(v, self.region, size) for v, size in zip(grads, self.layout.sizes, strict=True)]
+        return [
+            padded(v, self.region, size) for v, size in zip(grads, self.layout.sizes, strict=True)
+        ]
 
     def name(self) -> str:
         return "morgs_mi.blend"
 
 
-def weighted_sums(images: list[Float], region: Region, lists: BlockLists, layout: Layout) -> list[Float]:
+def weighted_sums(
+    images: list[Float], region: Region, lists: BlockLists, layout: Layout
+) -> list[Float]:
     """Return the sums of images' pixels, weighted by each splat's blend weights.
 
-    They are the gradients of the columns if the images are the gradients of the blended image. A layout with detached
-    channels does not need the blended image itself.
+    They are the gradients of the columns if the images are the gradients of the blended image. A
+    layout with detached channels does not need the blended image itself.
 
     Args:
         images: flat image of each channel on the region.
@@ -117,7 +138,9 @@ def weighted_sums(images: list[Float], region: Region, lists: BlockLists, layout
 def _gradients(
     blocks: Blocks, lists: BlockLists, layout: Layout, images: list[Float], grads: list[Float]
 ) -> list[Float]:
-    """Return the gradients of the geometry (if the layout reaches it) and the columns, from the images' gradients."""
+    """Return the gradients of the geometry (if the layout reaches it) and the columns, from the
+    images' gradients.
+    """
     N = dr.width(lists.by_rank)
     arrays = (blocks, lists.records, images, grads)
     stride = 4 * record_packets(layout)
@@ -133,7 +156,9 @@ def _gradients(
         sums = _run(adjoint, layout, _rounded_up(N), *arrays)
     lane = lists.rank_of * stride
     start = 0 if layout.reaches_weights else layout.geometry
-    return [dr.gather(mi.Float, sums, lane + k) for k in range(start, layout.geometry + layout.columns)]
+    return [
+        dr.gather(mi.Float, sums, lane + k) for k in range(start, layout.geometry + layout.columns)
+    ]
 
 
 def _run(loop: Callable[..., Any], *arguments: Any) -> Any:
@@ -147,16 +172,21 @@ def _cropped(image: Float, region: Region, size: int) -> Float:
         return image
     lane = dr.arange(mi.UInt32, region.width * region.height * size)
     row = quotient(lane, region.width * size)
-    return dr.gather(mi.Float, image, lane + row * dr.opaque(mi.UInt32, (region.row - region.width) * size))
+    return dr.gather(
+        mi.Float, image, lane + row * dr.opaque(mi.UInt32, (region.row - region.width) * size)
+    )
 
 
 def padded(image: Float, region: Region, size: int) -> Float:
-    """Return a flat image padded to whole blocks, or zeros for a literal 0: the transpose of `_cropped`."""
+    """Return a flat image padded to whole blocks, or zeros for a literal 0: the transpose of
+    `_cropped`.
+    """
     total = region.num_pixels * size
     if dr.width(image) != dr.prod(region.shape(size)):
         return dr.opaque(mi.Float, 0, total)
     if not region.whole or region.row == region.width:
-        # In memory allocated by Dr.Jit (see `memory.owned_copy`); a product fuses with the kernel of the gradient.
+        # In memory allocated by Dr.Jit (see `memory.owned_copy`); a product fuses with the kernel
+        # of the gradient.
         return image * dr.opaque(mi.Float, 1)
     lane = dr.arange(mi.UInt32, total)
     row = quotient(lane, region.row * size)
@@ -166,7 +196,9 @@ def padded(image: Float, region: Region, size: int) -> Float:
 
 
 def _summed_by_rank(pairs: Float, N: int, layout: Layout) -> Float:
-    """Return the sums of the records of all pairs of each rank, one lane per rank, in the order of the blocks."""
+    """Return the sums of the records of all pairs of each rank, one lane per rank, in the order of
+    the blocks.
+    """
     packets = pair_packets(layout)
     place = layout.geometry + layout.columns
     lane = dr.arange(mi.UInt32, dr.width(pairs) // (4 * packets)) * (4 * packets)
@@ -189,6 +221,8 @@ def _summed_by_rank(pairs: Float, N: int, layout: Layout) -> Float:
 
 
 def _rounded_up(n: int) -> int:
-    """Return n rounded up to a quarter octave: each target size of a scatter-reduction compiles its own kernel."""
+    """Return n rounded up to a quarter octave: each target size of a scatter-reduction compiles its
+    own kernel.
+    """
     step = max(1024, 1 << max(n.bit_length() - 3, 0))
     return -(-n // step) * step

@@ -1,12 +1,14 @@
 """The part of a splat in front of a depth limit, and its derivatives by hand.
 
-Along the ray of a pixel, a Gaussian is also a Gaussian in depth, with mean z + gx dx + gy dy and standard deviation
-sigma (see `projection`). Up to the limit the ray has passed the fraction Phi of its optical depth -log(1 - alpha), and
+Along the ray of a pixel, a Gaussian is also a Gaussian in depth, with mean z + gx dx + gy dy and
+standard deviation sigma (see `projection`). Up to the limit the ray has passed the fraction Phi of
+its optical depth -log(1 - alpha), and
 
     q = (limit - depth) / sigma        alpha' = 1 - (1 - alpha)^Phi(q)
 
-takes the place of alpha: the transmittance of the 1D integral. Phi is the distribution function of the normal
-distribution, approximated to 2e-4 by 1 / (1 + exp(-2 y)) with y = sqrt(2 / pi) q (1 + 0.044715 q^2) (Page 1977).
+takes the place of alpha: the transmittance of the 1D integral. Phi is the distribution function of
+the normal distribution, approximated to 2e-4 by 1 / (1 + exp(-2 y)) with y = sqrt(2 / pi) q (1 +
+0.044715 q^2) (Page 1977).
 """
 
 from __future__ import annotations
@@ -49,7 +51,9 @@ class Cut:
         limits: depth limit of every pixel, row by row.
     """
 
-    def __init__(self, profile: list[Float], dx: list[Float], dy: list[Float], limits: list[Float]) -> None:
+    def __init__(
+        self, profile: list[Float], dx: list[Float], dy: list[Float], limits: list[Float]
+    ) -> None:
         z, gx, gy, self.r_sigma = profile
         self.gx = gx
         self.gy = gy
@@ -73,7 +77,8 @@ class Cut:
         transmittance = exp2(fraction * log_transmittance)
         slope = fraction * (1 - fraction) * (_SLOPE * _LN2) * dr.fma(3 * _CUBIC, qq, 1)
         return CutAlpha(
-            # All or nothing without rounding where the limit is far away; a Gaussian that is not drawn stays so.
+            # All or nothing without rounding where the limit is far away; a Gaussian that is not
+            # drawn stays so.
             dr.select(near & (alpha > 0), 1 - transmittance, dr.select(behind > 0, alpha, 0)),
             fraction * transmittance * dr.rcp(1 - alpha),
             dr.select(near, -_LN2 * transmittance * log_transmittance * slope, 0),
@@ -85,19 +90,27 @@ class Cut:
         j, i = divmod(k, len(self.dx))
         d = d_alpha * cut.by_q
         one, column, row, behind = self.sums
-        self.sums = [one + d, dr.fma(d, float(i), column), dr.fma(d, float(j), row), dr.fma(d, cut.behind, behind)]
+        self.sums = [
+            one + d,
+            dr.fma(d, float(i), column),
+            dr.fma(d, float(j), row),
+            dr.fma(d, cut.behind, behind),
+        ]
 
     def gradients(self) -> tuple[list[Float], list[Float]]:
         """Return the gradients of (mean_x, mean_y) and of the profile."""
         one, column, row, behind = self.sums
         dz = -self.r_sigma * one
         slopes = [
-            -self.r_sigma * dr.fma(one, first, total) for first, total in ((self.dx[0], column), (self.dy[0], row))
+            -self.r_sigma * dr.fma(one, first, total)
+            for first, total in ((self.dx[0], column), (self.dy[0], row))
         ]
         return [-self.gx * dz, -self.gy * dz], [dz, *slopes, behind]
 
     def tangent(self, k: int, cut: CutAlpha, mean: list[Float], profile: list[Float]) -> Float:
-        """Return the change of alpha' at pixel k along tangents of (mean_x, mean_y) and the profile."""
+        """Return the change of alpha' at pixel k along tangents of (mean_x, mean_y) and the
+        profile.
+        """
         j, i = divmod(k, len(self.dx))
         tz, t_gx, t_gy, t_r = profile
         change = tz + t_gx * self.dx[i] + t_gy * self.dy[j] - self.gx * mean[0] - self.gy * mean[1]

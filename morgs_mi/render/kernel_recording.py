@@ -1,9 +1,10 @@
-"""Recordings of traced functions (`dr.freeze`): tracing a long loop again costs several ms per call.
+"""Recordings of traced functions (`dr.freeze`): tracing a long loop again costs several ms per
+call.
 
-In Dr.Jit 1.5 recordings are not thread-safe. A recording is replayed into its own memory: two simultaneous replays end
-the process. While Dr.Jit inspects the arguments, it holds a lock that `dr.backward` in another thread waits for, and
-waits for one that `dr.backward` holds: a deadlock. Therefore all recordings, and all derivatives that the package
-computes, hold `render_lock`.
+In Dr.Jit 1.5 recordings are not thread-safe. A recording is replayed into its own memory: two
+simultaneous replays end the process. While Dr.Jit inspects the arguments, it holds a lock that
+`dr.backward` in another thread waits for, and waits for one that `dr.backward` holds: a deadlock.
+Therefore all recordings, and all derivatives that the package computes, hold `render_lock`.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ MOST_RECORDINGS = 500
 render_lock = RLock()
 """Lock of the renderer, which a thread may take more than once.
 
-`rasterize` and all functions that fit Gaussians take it. Hold it around `dr.backward` and `dr.forward` if another
-thread renders at the same time.
+`rasterize` and all functions that fit Gaussians take it. Hold it around `dr.backward` and
+`dr.forward` if another thread renders at the same time.
 """
 
 
@@ -48,16 +49,18 @@ def with_render_lock(function: Callable[P, R]) -> Callable[P, R]:
 def recorded(function: Callable[..., Jit], *static: Any) -> Callable[..., Jit]:
     """Return a recording of `function` with its first arguments fixed to `static`.
 
-    The other arguments are Dr.Jit arrays, or dataclasses of them. There is one recording per variant and `static`.
-    Arguments that are not arrays must be in `static`: Dr.Jit 1.5 distinguishes other arguments by a hash in which two
-    booleans can cancel. Sizes inside a recording are its arguments' sizes, or static: `dr.empty` and similar
-    functions need a static size.
+    The other arguments are Dr.Jit arrays, or dataclasses of them. There is one recording per
+    variant and `static`. Arguments that are not arrays must be in `static`: Dr.Jit 1.5
+    distinguishes other arguments by a hash in which two booleans can cancel. Sizes inside a
+    recording are its arguments' sizes, or static: `dr.empty` and similar functions need a static
+    size.
     """
 
     def call(*arguments: Any) -> Jit:
         classes = tuple(type(a) if is_dataclass(a) else None for a in arguments)
-        # Dr.Jit holds its own lock while it inspects the arguments. For a dataclass that runs Python code, in which
-        # another thread can get the interpreter's lock and then wait for Dr.Jit's: a deadlock.
+        # Dr.Jit holds its own lock while it inspects the arguments. For a dataclass that runs
+        # Python code, in which another thread can get the interpreter's lock and then wait for
+        # Dr.Jit's: a deadlock.
         plain = [vars(a) if c else a for a, c in zip(arguments, classes, strict=True)]
         with render_lock, _garbage_collection_off():
             return _recording(function, mi.variant(), static, classes)(*plain)
@@ -67,16 +70,24 @@ def recorded(function: Callable[..., Jit], *static: Any) -> Callable[..., Jit]:
 
 @cache
 def _recording(
-    function: Callable[..., Jit], variant: str, static: tuple[Any, ...], classes: tuple[type | None, ...]
+    function: Callable[..., Jit],
+    variant: str,
+    static: tuple[Any, ...],
+    classes: tuple[type | None, ...],
 ) -> Callable[..., Jit]:
-    # Dr.Jit also inspects the variables of a closure; what is in a `partial` it compares by identity.
+    # Dr.Jit also inspects the variables of a closure; what is in a `partial` it compares by
+    # identity.
     rebuilt = partial(_rebuilt, function, static, classes)
-    # A long fit meets new combinations of sizes again and again; the least used recordings are evicted.
+    # A long fit meets new combinations of sizes again and again; the least used recordings are
+    # evicted.
     return dr.freeze(lambda *plain: rebuilt(plain), limit=MOST_RECORDINGS, warn_after=2**31 - 1)
 
 
 def _rebuilt(
-    function: Callable[..., Jit], static: tuple[Any, ...], classes: tuple[type | None, ...], plain: tuple[Any, ...]
+    function: Callable[..., Jit],
+    static: tuple[Any, ...],
+    classes: tuple[type | None, ...],
+    plain: tuple[Any, ...],
 ) -> Jit:
     """Return the result of `function` for arguments with their dataclasses converted to dicts."""
     return function(*static, *(c(**a) if c else a for a, c in zip(plain, classes, strict=True)))

@@ -1,24 +1,25 @@
 """Front-to-back blending of the block lists (eq. 1), and its two derivatives, by hand.
 
-Each SIMD lane owns a block of pixels and walks its own list once; the pixels of the block are unrolled.
-For Gaussian i at one pixel, with values c_i and transmittance T:
+Each SIMD lane owns a block of pixels and walks its own list once; the pixels of the block are
+unrolled. For Gaussian i at one pixel, with values c_i and transmittance T:
 
     p = log2(opacity) - u^2 - v^2        alpha = 2^p, 0 below alpha_min, at most alpha_max
     w = T alpha                          C += w c_i        T <- T - w
 
-The adjoint walks the same list in the same direction. With g the gradient of the pixel, it needs one more number
-per pixel, the suffix S = <g, C_final> - sum_j<=i w_j <g, c_j>, and
+The adjoint walks the same list in the same direction. With g the gradient of the pixel, it needs
+one more number per pixel, the suffix S = <g, C_final> - sum_j<=i w_j <g, c_j>, and
 
     dL/dp = ln(2) (w <g, c_i> - alpha S / (1 - alpha)).
 
-A channel is *attached* if its gradient reaches the weights w (geometry and opacity), detached if it reaches
-only the blended value itself. Alpha is blended as one more channel of ones.
+A channel is *attached* if its gradient reaches the weights w (geometry and opacity), detached if it
+reaches only the blended value itself. Alpha is blended as one more channel of ones.
 
-With depth limits, alpha' takes the place of alpha (see `cut`), and a record contains the splat's shape, followed by the
-four numbers of its profile. The limits are constants: they get no derivative.
+With depth limits, alpha' takes the place of alpha (see `cut`), and a record contains the splat's
+shape, followed by the four numbers of its profile. The limits are constants: they get no
+derivative.
 
-Every channel has its own image, rows of blocks times its columns (see `region`). A row of a block is a run of packets
-of 4 floats.
+Every channel has its own image, rows of blocks times its columns (see `region`). A row of a block
+is a run of packets of 4 floats.
 """
 
 from __future__ import annotations
@@ -98,7 +99,8 @@ def record_packets(layout: Layout) -> int:
 
 @dataclass(frozen=True)
 class Blocks:
-    """The arrays of a region and its lists that the loops read, see `Region` and `BlockLists`; one entry per block.
+    """The arrays of a region and its lists that the loops read, see `Region` and `BlockLists`; one
+    entry per block.
 
     `limits` is an image on the region, the depth limit of every pixel, or None.
     """
@@ -120,11 +122,22 @@ class Blocks:
     def of(region: Region, lists: BlockLists, limits: Float | None = None) -> Blocks:
         """Return the arrays of a region, its lists and its depth limits."""
         geometry = (region.x, region.y, region.place, region.rows, region.pitch)
-        return Blocks(*geometry, lists.words, lists.entries, lists.begin, lists.end, lists.first, lists.order, limits)
+        return Blocks(
+            *geometry,
+            lists.words,
+            lists.entries,
+            lists.begin,
+            lists.end,
+            lists.first,
+            lists.order,
+            limits,
+        )
 
 
 class _Block:
-    """The lanes' blocks: their pixels, their section of the lists, and the shape in which they are unrolled."""
+    """The lanes' blocks: their pixels, their section of the lists, and the shape in which they are
+    unrolled.
+    """
 
     def __init__(self, layout: Layout, blocks: Blocks) -> None:
         config = layout.config
@@ -138,35 +151,47 @@ class _Block:
         self.rows = dr.gather(mi.UInt32, blocks.rows, order)
         self.pitch = dr.gather(mi.UInt32, blocks.pitch, mi.UInt32(0))
         # Centre of the first pixel.
-        self.x, self.y = (mi.Float(dr.gather(mi.UInt32, v, order)) + 0.5 for v in (blocks.x, blocks.y))
+        self.x, self.y = (
+            mi.Float(dr.gather(mi.UInt32, v, order)) + 0.5 for v in (blocks.x, blocks.y)
+        )
         begin = dr.gather(mi.UInt32, blocks.begin, order)
         first = dr.gather(mi.UInt32, blocks.first, order)
         # One depth limit per pixel, row by row; none without depth limits.
-        self.limits = [] if blocks.limits is None else [v for (v,) in _load_image(self, 1, blocks.limits)]
+        self.limits = (
+            [] if blocks.limits is None else [v for (v,) in _load_image(self, 1, blocks.limits)]
+        )
         self.end = on_aligned_stack(dr.gather(mi.UInt32, blocks.end, order))
         # One word before the block's first, as `next_entry` expects.
         self.walk = next_entry(begin, mi.UInt32(0), first - 32, self.end, blocks.words)
 
     def continues(self, walk: tuple[UInt32, UInt32, UInt32], T: list[Float]) -> Bool:
-        """Return whether a lane continues: entries are left, and its most transparent pixel is above the stop."""
+        """Return whether a lane continues: entries are left, and its most transparent pixel is
+        above the stop.
+        """
         while len(T) > 1:
             pairs = zip(T[::2], T[1::2], strict=False)
             T = [dr.select(a > b, a, b) for a, b in pairs] + T[len(T) & ~1 :]
         return (walk[1] != 0) & (T[0] >= self.stop)
 
     def packets(self, size: int) -> list[tuple[UInt32, Bool]]:
-        """Return (place, in the image) of all packets of 4 in an image of `size` floats per pixel, row by row."""
+        """Return (place, in the image) of all packets of 4 in an image of `size` floats per pixel,
+        row by row.
+        """
         run = self.width * size // 4
         starts = [((self.place + j * self.pitch) * size, self.rows > j) for j in range(self.height)]
         return [(start + k, valid) for start, valid in starts for k in range(run)]
 
     def offsets(self, x: Float, y: Float, geometry: list[Float]) -> tuple[list[Float], list[Float]]:
-        """Return the offsets dx [width] and dy [height] of the block's columns and rows from the mean."""
+        """Return the offsets dx [width] and dy [height] of the block's columns and rows from the
+        mean.
+        """
         dx = x - geometry[0]
         dy = y - geometry[1]
         return [dx + i for i in range(self.width)], [dy + j for j in range(self.height)]
 
-    def powers(self, dx: list[Float], dy: list[Float], geometry: list[Float]) -> list[tuple[Float, Float]]:
+    def powers(
+        self, dx: list[Float], dy: list[Float], geometry: list[Float]
+    ) -> list[tuple[Float, Float]]:
         """Return (p, u) of every pixel, row by row."""
         _, _, a, b, c, log2_opacity = geometry[:_SHAPE]
         ax = [a * x for x in dx]
@@ -218,13 +243,19 @@ def _store(
 
 def _load(block: _Block, layout: Layout, images: list[Float]) -> list[list[Float]]:
     """Return every pixel's columns, and alpha if it is an output; zeros outside the image."""
-    channels = (_load_image(block, size, image) for image, size in zip(images, layout.sizes, strict=True))
-    return [[value for values in pixel for value in values] for pixel in zip(*channels, strict=True)]
+    channels = (
+        _load_image(block, size, image) for image, size in zip(images, layout.sizes, strict=True)
+    )
+    return [
+        [value for values in pixel for value in values] for pixel in zip(*channels, strict=True)
+    ]
 
 
 def _load_image(block: _Block, size: int, image: Float) -> list[list[Float]]:
     """Return the `size` floats of every pixel in an image."""
-    packets = (dr.gather(mi.Vector4f, image, place, active=valid) for place, valid in block.packets(size))
+    packets = (
+        dr.gather(mi.Vector4f, image, place, active=valid) for place, valid in block.packets(size)
+    )
     values = [value for packet in packets for value in packet]
     return [values[k : k + size] for k in range(0, len(values), size)]
 
@@ -253,7 +284,9 @@ def primal(layout: Layout, blocks: Blocks, records: Float, images: list[Float]) 
             alpha, _ = block.alpha(p)
             w = (cut.alpha(k, alpha).alpha if cut else alpha) * T[k]
             T_next.append(T[k] - w)
-            sums_next.append([dr.fma(w, c, total) for c, total in zip(values, sums[k], strict=True)])
+            sums_next.append(
+                [dr.fma(w, c, total) for c, total in zip(values, sums[k], strict=True)]
+            )
         return walk, end, x, y, limits, T_next, sums_next, records, words, entries
 
     T = _floats(block.area, 1.0)
@@ -274,9 +307,15 @@ def primal(layout: Layout, blocks: Blocks, records: Float, images: list[Float]) 
 
 
 def adjoint(
-    layout: Layout, ranks: int, blocks: Blocks, records: Float, images: list[Float], image_grads: list[Float]
+    layout: Layout,
+    ranks: int,
+    blocks: Blocks,
+    records: Float,
+    images: list[Float],
+    image_grads: list[Float],
 ) -> Float:
-    """Return dL/d(record) of `ranks` ranks, one record each: the geometry's floats, the columns, padding.
+    """Return dL/d(record) of `ranks` ranks, one record each: the geometry's floats, the columns,
+    padding.
 
     Args:
         layout: description of the blend.
@@ -308,9 +347,11 @@ def adjoint_of_pairs(
     first_pair: UInt32,
     pairs: Float,
 ) -> Float:
-    """Write dL/d(record) of every pair of block and Gaussian, followed by the rank, to a section of `pairs`.
+    """Write dL/d(record) of every pair of block and Gaussian, followed by the rank, to a section of
+    `pairs`.
 
-    `first_pair` [A] is the first pair of each block's section. Nothing depends on the order of execution.
+    `first_pair` [A] is the first pair of each block's section. Nothing depends on the order of
+    execution.
     """
     packets = pair_packets(layout)
 
@@ -365,7 +406,9 @@ def _adjoint(
             alpha, full = block.alpha(p)
             part = cut.alpha(k, alpha) if cut else None
             w = (part.alpha if part else alpha) * T[k]
-            value_grads = [dr.fma(w, g_c, total) for g_c, total in zip(g[k], value_grads, strict=False)]
+            value_grads = [
+                dr.fma(w, g_c, total) for g_c, total in zip(g[k], value_grads, strict=False)
+            ]
             T_next.append(T[k] - w)
             if geometric:
                 gc = _inner(g[k], values, layout, None)
@@ -391,7 +434,10 @@ def _adjoint(
     walk = (block.walk, pair, block.end, block.x, block.y, block.limits)
     state = (*walk, T, suffix, gradients, records, blocks.words, blocks.entries, target)
     *_, target = dr.while_loop(
-        state, lambda walk, pair, end, x, y, limits, T, *_: block.continues(walk, T), body, label="blend (adjoint)"
+        state,
+        lambda walk, pair, end, x, y, limits, T, *_: block.continues(walk, T),
+        body,
+        label="blend (adjoint)",
     )
     return target
 
@@ -408,7 +454,9 @@ def _inner(g: list[Float], values: list[Float], layout: Layout, alpha: Float | N
 
 
 class _Moments:
-    """Sums over a block of d times 1, u, u dx, u dy, dy, dy^2; rows first: a pixel costs four additions."""
+    """Sums over a block of d times 1, u, u dx, u dy, dy, dy^2; rows first: a pixel costs four
+    additions.
+    """
 
     def __init__(self, block: _Block) -> None:
         self.width = block.width
@@ -430,7 +478,9 @@ class _Moments:
             self.duj = dr.fma(self.row_du, float(j), self.duj)
 
     def gradients(self, x0: Float, y0: Float, geometry: list[Float]) -> list[Float]:
-        """Return the gradients of (mean_x, mean_y, a, b, c, log2_opacity); (x0, y0) is the first pixel's offset."""
+        """Return the gradients of (mean_x, mean_y, a, b, c, log2_opacity); (x0, y0) is the first
+        pixel's offset.
+        """
         _, _, a, b, c, _ = geometry[:_SHAPE]
         du_dx = dr.fma(self.du, x0, self.dui)
         du_dy = dr.fma(self.du, y0, self.duj)
@@ -452,8 +502,12 @@ class _Moments:
 # --------------------------------------------------------------------------------------------------
 
 
-def tangent(layout: Layout, blocks: Blocks, records: Float, tangents: Float, images: list[Float]) -> list[Float]:
-    """Write the directional derivative along the records' tangents to `images`, which are overwritten."""
+def tangent(
+    layout: Layout, blocks: Blocks, records: Float, tangents: Float, images: list[Float]
+) -> list[Float]:
+    """Write the directional derivative along the records' tangents to `images`, which are
+    overwritten.
+    """
     block = _Block(layout, blocks)
     G = layout.geometry
     C = layout.columns
@@ -490,10 +544,25 @@ def tangent(layout: Layout, blocks: Blocks, records: Float, tangents: Float, ima
             dsums_next.append(
                 [
                     dr.fma(w, tangent[G + i], dr.fma(tw, values[i], total) if attached else total)
-                    for i, (total, attached) in enumerate(zip(dsums[k], layout.attached, strict=True))
+                    for i, (total, attached) in enumerate(
+                        zip(dsums[k], layout.attached, strict=True)
+                    )
                 ]
             )
-        return walk, end, x, y, limits, T_next, dT_next, dsums_next, records, tangents, words, entries
+        return (
+            walk,
+            end,
+            x,
+            y,
+            limits,
+            T_next,
+            dT_next,
+            dsums_next,
+            records,
+            tangents,
+            words,
+            entries,
+        )
 
     dsums = [_floats(C) for _ in range(block.area)]
     T = _floats(block.area, 1.0)
@@ -501,6 +570,11 @@ def tangent(layout: Layout, blocks: Blocks, records: Float, tangents: Float, ima
     walk = (block.walk, block.end, block.x, block.y, block.limits)
     state = (*walk, T, dT, dsums, records, tangents, blocks.words, blocks.entries)
     _, _, _, _, _, _, dT, dsums, *_ = dr.while_loop(
-        state, lambda walk, end, x, y, limits, T, *_: block.continues(walk, T), body, label="blend (tangent)"
+        state,
+        lambda walk, end, x, y, limits, T, *_: block.continues(walk, T),
+        body,
+        label="blend (tangent)",
     )
-    return _store(block, layout, dsums, [-t if layout.alpha_attached else mi.Float(0) for t in dT], images)
+    return _store(
+        block, layout, dsums, [-t if layout.alpha_attached else mi.Float(0) for t in dT], images
+    )

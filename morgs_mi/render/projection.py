@@ -9,13 +9,15 @@ A pixel at offset d = (dx, dy) from the splat's centre gets alpha = 2^p with
 where [a b; 0 c] is the Cholesky factor of the conic times log2(e) / 2. In this form p never exceeds
 log2(opacity), however thin the needle, and the only exponential in the pixel loop is 2^p.
 
-In screen coordinates and depth, the Gaussian has the covariance [UU' + eps2d I, U w'; w U', w w'] where w is the last
-row of R Q diag(s). Along the ray of a pixel it is a Gaussian in depth, with mean z + gx dx + gy dy where (gx, gy) =
-w U' (U U' + eps2d I)^-1, and a variance that is the same for all pixels: the ratio of the two determinants.
+In screen coordinates and depth, the Gaussian has the covariance [UU' + eps2d I, U w'; w U', w w']
+where w is the last row of R Q diag(s). Along the ray of a pixel it is a Gaussian in depth, with
+mean z + gx dx + gy dy where (gx, gy) = w U' (U U' + eps2d I)^-1, and a variance that is the same
+for all pixels: the ratio of the two determinants.
 
-No intermediate value overflows: U is computed in units of the splat's own size, and a Gaussian that the camera cannot
-see is projected from a substitute position, because 0 * inf would reach a gradient. x is summed in double precision:
-for scenes far from the origin, and cameras far from the scene, single precision would lose the digits that cancel.
+No intermediate value overflows: U is computed in units of the splat's own size, and a Gaussian that
+the camera cannot see is projected from a substitute position, because 0 * inf would reach a
+gradient. x is summed in double precision: for scenes far from the origin, and cameras far from the
+scene, single precision would lose the digits that cancel.
 """
 
 from __future__ import annotations
@@ -55,15 +57,18 @@ class Splats:
     shape: tuple[Float, ...]
     channels: dict[str, tuple[Float, ...]]  #: Blended values, by channel name.
     depths: Float  #: Camera-space z in world units, detached.
-    #: (half width, half height) in px of the region where alpha >= alpha_min, detached; 0 if culled.
+    #: (half width, half height) in px of the region where alpha >= alpha_min, detached; 0 if
+    #: culled.
     extent: tuple[Float, Float]
     valid: Bool  #: False where culled: behind the near plane, too faint, or not finite.
-    #: False where an attribute, or a value computed from it, is not finite, or a blended one is above 1e18.
+    #: False where an attribute, or a value computed from it, is not finite, or a blended one is
+    #: above 1e18.
     finite: Bool
-    #: (z, gx, gy, 1 / sigma), the Gaussian in depth along the ray of a pixel (see module docstring), world units,
-    #: differentiable; empty if no depth limit cuts the splats.
+    #: (z, gx, gy, 1 / sigma), the Gaussian in depth along the ray of a pixel (see module
+    #: docstring), world units, differentiable; empty if no depth limit cuts the splats.
     profile: tuple[Float, ...] = ()
-    #: Index of the view that each splat belongs to, in a region of several views; None: there is one view.
+    #: Index of the view that each splat belongs to, in a region of several views; None: there is
+    #: one view.
     view: UInt32 | None = None
 
     def __len__(self) -> int:
@@ -71,16 +76,26 @@ class Splats:
 
     @property
     def geometry(self) -> tuple[Float, ...]:
-        """The differentiable numbers that determine a splat's alpha at a pixel: `shape` and `profile`."""
+        """The differentiable numbers that determine a splat's alpha at a pixel: `shape` and
+        `profile`.
+        """
         return self.shape + self.profile
 
     def concatenated_with(self, other: Splats) -> Splats:
-        """Return these splats followed by the others, which are 0 in the channels that they lack."""
+        """Return these splats, then the others, which are 0 in the channels that they lack."""
 
         def columns_of(splats: Splats) -> tuple[Any, ...]:
-            columns = tuple(splats.channels.get(n) or _zeros(v, len(splats)) for n, v in self.channels.items())
+            columns = tuple(
+                splats.channels.get(n) or _zeros(v, len(splats)) for n, v in self.channels.items()
+            )
             bounds = splats.depths, splats.extent, splats.valid, splats.finite
-            return splats.shape, columns, *bounds, splats.profile, () if splats.view is None else splats.view
+            return (
+                splats.shape,
+                columns,
+                *bounds,
+                splats.profile,
+                () if splats.view is None else splats.view,
+            )
 
         shape, columns, *bounds, profile, view = concatenated(columns_of(self), columns_of(other))
         channels = dict(zip(self.channels, columns, strict=True))
@@ -109,8 +124,12 @@ class Views:
 
 
 def concatenated(a: Jit, b: Jit) -> Jit:
-    """Return two arrays, or tuples of arrays, end to end; `dr.concat` would compile a kernel for every length."""
-    return _joined(a, b, dr.opaque(mi.UInt32, dr.width(a)), dr.arange(mi.UInt32, dr.width(a) + dr.width(b)))
+    """Return two arrays, or tuples of arrays, end to end; `dr.concat` would compile a kernel for
+    every length.
+    """
+    return _joined(
+        a, b, dr.opaque(mi.UInt32, dr.width(a)), dr.arange(mi.UInt32, dr.width(a) + dr.width(b))
+    )
 
 
 def _joined(a: Jit, b: Jit, count: UInt32, lane: UInt32) -> Jit:
@@ -135,8 +154,10 @@ def project(
 
     Args:
         gaussians: N Gaussians with activated attributes.
-        camera: the view; a Dr.Jit `viewmat` receives gradients. Or several views, without gradients.
-        channels: names of `channel_sizes()`, ``features``, or ``profile``: the splats get a `profile`.
+        camera: the view; a Dr.Jit `viewmat` receives gradients. Or several views, without
+            gradients.
+        channels: names of `channel_sizes()`, ``features``, or ``profile``: the splats get a
+            `profile`.
         config: cut-offs.
         rows: indices of the Gaussians [M], in one view without repetition; None: all N, in order.
         features: tensor [N, F] that the channel ``features`` blends.
@@ -159,7 +180,10 @@ def project(
         _, y, z = _transformed(world, pose)
         row = dr.fma(fy, y / dr.maximum(z, near), cy)
         late = dr.fma(readout, dr.clip(row / height, 0, 1) - 0.5, delay)  # frames after the instant
-        world = [v + mi.Float64(late * d) for v, d in zip(world, gaussians.rows("motion", rows), strict=True)]
+        world = [
+            v + mi.Float64(late * d)
+            for v, d in zip(world, gaussians.rows("motion", rows), strict=True)
+        ]
     x, y, z = _transformed(world, pose)
     probe = dr.detach(x + y + z)
     front = dr.detach((z >= near) & (dr.maximum(dr.maximum(dr.abs(x), dr.abs(y)), z) < FARTHEST))
@@ -170,13 +194,16 @@ def project(
     mean_x = dr.fma(fx, x * rz, cx)
     mean_y = dr.fma(fy, y * rz, cy)
 
-    u0, u1, w, r_focal, r_scale = _screen_axes(x * rz, y * rz, fx * rz, fy * rz, R, quats, scales, limits)
+    u0, u1, w, r_focal, r_scale = _screen_axes(
+        x * rz, y * rz, fx * rz, fy * rz, R, quats, scales, limits
+    )
     r_size = r_focal * r_scale
     eps = dr.maximum(config.eps2d * dr.square(r_size), _THINNEST**2)
     xx = dr.dot(u0, u0)
     yy = dr.dot(u1, u1)
     xy = dr.dot(u0, u1)
-    # Lagrange's identity: det(U U' + eps I) without the cancellation that xx yy - xy^2 has for needles.
+    # Lagrange's identity: det(U U' + eps I) without the cancellation that xx yy - xy^2 has for
+    # needles.
     det_exact = dr.squared_norm(dr.cross(u0, u1))
     det = det_exact + eps * (xx + yy) + eps * eps
     xx = xx + eps
@@ -191,22 +218,34 @@ def project(
     if config.antialiased:
         log2_opacity += 0.5 * dr.log2(dr.maximum(det_exact / det, _FAINTEST**2))
     shape = (mean_x, mean_y, a, b, c, log2_opacity)
-    line = _depth_profile(z, (u0, u1, w), (xx, xy, yy), det, eps, r_focal, r_scale) if "profile" in channels else ()
+    line = (
+        _depth_profile(z, (u0, u1, w), (xx, xy, yy), det, eps, r_focal, r_scale)
+        if "profile" in channels
+        else ()
+    )
 
     blended: dict[str, tuple[Float, ...]] = {}
     largest = mi.Float(0)
     attributes = attribute_channels()
     for name in channels:
         if name == "color":
-            direction = dr.select(front, mi.Vector3f(*(mi.Float(v - e) for v, e in zip(world, eye, strict=True))), 1)
+            direction = dr.select(
+                front, mi.Vector3f(*(mi.Float(v - e) for v, e in zip(world, eye, strict=True))), 1
+            )
             coeffs = gaussians.rows("sh_coeffs", rows)
             largest = _largest(largest, coeffs)
             blended[name] = _colors(direction, coeffs)
         elif name == "depth":
             blended[name] = (z,)
         elif name in ("motion", "guided_motion"):
-            motion = gaussians.rows("motion", rows) if name == "motion" else _guided_motion(gaussians, rows)
-            blended[name] = _screen_motion(motion, (x * rz, y * rz, z), (fx, fy), near, R, config.first_order_motion)
+            motion = (
+                gaussians.rows("motion", rows)
+                if name == "motion"
+                else _guided_motion(gaussians, rows)
+            )
+            blended[name] = _screen_motion(
+                motion, (x * rz, y * rz, z), (fx, fy), near, R, config.first_order_motion
+            )
         elif name == "features":
             blended[name] = tuple(tensor_rows(features, rows))
         elif name in attributes:
@@ -217,8 +256,12 @@ def project(
     xx = dr.detach(xx)
     yy = dr.detach(yy)
     # Not finite where any of these values is not.
-    probe += sum(dr.detach(v) for v in (*shape, *line, *(v for values in blended.values() for v in values)))
-    largest = _largest(largest, [v for name, values in blended.items() if name != "depth" for v in values])
+    probe += sum(
+        dr.detach(v) for v in (*shape, *line, *(v for values in blended.values() for v in values))
+    )
+    largest = _largest(
+        largest, [v for name, values in blended.items() if name != "depth" for v in values]
+    )
     finite = dr.isfinite(probe) & (largest <= FARTHEST)  # pyright: ignore
     valid = front & (reach > 0) & finite  # pyright: ignore[reportOperatorIssue]
     extent = (dr.sqrt(reach * xx) / s, dr.sqrt(reach * yy) / s)
@@ -235,7 +278,10 @@ def _largest(bound: Float, values: Sequence[Float]) -> Float:
 
 def _transformed(world: list[Float], pose: list[list[Float]]) -> tuple[Float, Float, Float]:
     """Return points in camera space, in single precision."""
-    x, y, z = (mi.Float(dr.fma(a, world[0], dr.fma(b, world[1], dr.fma(c, world[2], t)))) for a, b, c, t in pose)
+    x, y, z = (
+        mi.Float(dr.fma(a, world[0], dr.fma(b, world[1], dr.fma(c, world[2], t))))
+        for a, b, c, t in pose
+    )
     return x, y, z
 
 
@@ -248,9 +294,11 @@ def _guided_motion(gaussians: ActivatedGaussians, rows: UInt32) -> list[Float]:
 
 
 def _pose(camera: Camera | Views) -> tuple[list[list[Float]], list[list[Float]], list[Float]]:
-    """Return R [3][3] in single, and [R t] [3][4] and the camera's centre -R't [3] in double precision.
+    """Return R [3][3] in single, and [R t] [3][4] and the camera's centre -R't [3] in double
+    precision.
 
-    All are Dr.Jit floats, of width 1 for one camera, and attached to the gradient of a Dr.Jit `viewmat`.
+    All are Dr.Jit floats, of width 1 for one camera, and attached to the gradient of a Dr.Jit
+    `viewmat`.
     """
     if isinstance(camera, Views):
         memory = from_numpy(mi.Float64, np.stack([np.asarray(c.viewmat) for c in camera.cameras]))
@@ -268,7 +316,8 @@ def _pose(camera: Camera | Views) -> tuple[list[list[Float]], list[list[Float]],
 
 
 def _intrinsics(camera: Camera | Views) -> list[Float]:
-    """Return fx, fy, cx, cy, near, the bounds (low, high) of x/z and of y/z, and delay, readout and height.
+    """Return fx, fy, cx, cy, near, the bounds (low, high) of x/z and of y/z, and delay, readout and
+    height.
 
     They are read from memory: with Python numbers, every camera would compile its own kernels.
     """
@@ -300,14 +349,27 @@ def _numbers_of(camera: Camera) -> list[float]:
         c = K[axis, 2]
         margin = 0.15 * size / f  # 30 % of the half view on every side
         bounds += [-c / f - margin, (size - c) / f + margin]
-    return [K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.near, *bounds, camera.delay, camera.readout, camera.height]
+    return [
+        K[0, 0],
+        K[1, 1],
+        K[0, 2],
+        K[1, 2],
+        camera.near,
+        *bounds,
+        camera.delay,
+        camera.readout,
+        camera.height,
+    ]
 
 
 def _rotation(quats: Jit) -> list[Jit]:
-    """Return the columns of the rotation matrix of wxyz quaternions of any length; length 0 is the identity."""
+    """Return the columns of the rotation matrix of wxyz quaternions of any length; length 0 is the
+    identity.
+    """
     largest = dr.max(dr.abs(dr.detach(quats)))
     zero = largest < 1e-30
-    # Scaling prevents over- and underflow of the squares. A product with 0 preserves NaN, which a selection would not.
+    # Scaling prevents over- and underflow of the squares. A product with 0 preserves NaN, which a
+    # selection would not.
     scaled_quats = quats * dr.select(zero, 0, dr.rcp(dr.minimum(largest, 1e30)))
     w, x, y, z = dr.normalize(scaled_quats + mi.Vector4f(dr.select(zero, 1, 0), 0, 0, 0))
     return [
@@ -318,14 +380,24 @@ def _rotation(quats: Jit) -> list[Jit]:
 
 
 def _screen_axes(
-    tan_x: Float, tan_y: Float, jx: Float, jy: Float, R: list[list[Float]], quats: Jit, scales: Jit, limits: list[Float]
+    tan_x: Float,
+    tan_y: Float,
+    jx: Float,
+    jy: Float,
+    R: list[list[Float]],
+    quats: Jit,
+    scales: Jit,
+    limits: list[Float],
 ) -> tuple[Jit, Jit, Jit, Float, Float]:
-    """Return the rows of U = J R Q diag(s) and w = R_z Q diag(s), three vectors [3], and their units.
+    """Return the rows of U = J R Q diag(s) and w = R_z Q diag(s), three vectors [3], and their
+    units.
 
-    U is in units of the splat's size on the screen, at least one pixel and of the order of the largest entry of U; w in
-    units of its size in the world. The units are returned as world units per px and 1 / world units.
+    U is in units of the splat's size on the screen, at least one pixel and of the order of the
+    largest entry of U; w in units of its size in the world. The units are returned as world units
+    per px and 1 / world units.
     """
-    # Outside the view the linearisation diverges: its point is clamped to 1.3 times the half view, as in 3DGS.
+    # Outside the view the linearisation diverges: its point is clamped to 1.3 times the half view,
+    # as in 3DGS.
     lo_x, hi_x, lo_y, hi_y = limits
     tan_x = dr.clip(tan_x, lo_x, hi_x)
     tan_y = dr.clip(tan_y, lo_y, hi_y)
@@ -338,7 +410,9 @@ def _screen_axes(
     J1 = mi.Vector3f(*(jy * (R[1][k] - tan_y * R[2][k]) for k in range(3)))
     Q = _rotation(quats)
     z_axis = mi.Vector3f(*R[2])
-    u0, u1, w = (mi.Vector3f(*(dr.dot(J, Q[k]) * scales[k] for k in range(3))) for J in (J0, J1, z_axis))
+    u0, u1, w = (
+        mi.Vector3f(*(dr.dot(J, Q[k]) * scales[k] for k in range(3))) for J in (J0, J1, z_axis)
+    )
     return u0, u1, w, r_focal, r_scale
 
 
@@ -351,16 +425,19 @@ def _depth_profile(
     r_focal: Float,
     r_scale: Float,
 ) -> tuple[Float, Float, Float, Float]:
-    """Return the depth z + gx dx + gy dy and the inverse standard deviation along rays, as (z, gx, gy, 1 / sigma).
+    """Return the depth z + gx dx + gy dy and the inverse standard deviation along rays, as (z, gx,
+    gy, 1 / sigma).
 
-    The response along the ray is largest at that depth, in the affine approximation (RaDe-GS, Zhang et al. 2024).
+    The response along the ray is largest at that depth, in the affine approximation (RaDe-GS, Zhang
+    et al. 2024).
     """
     u0, u1, w = rows
     xx, xy, yy = covariance
     zx = dr.dot(u0, w)
     zy = dr.dot(u1, w)
     slope = r_focal / det
-    # The determinant with the third row and column, as a sum of squares: differences would cancel for thin Gaussians.
+    # The determinant with the third row and column, as a sum of squares: differences would cancel
+    # for thin Gaussians.
     across = dr.cross(u0, u1)
     minors = dr.squared_norm(dr.cross(u0, w)) + dr.squared_norm(dr.cross(u1, w))
     det3 = dr.square(dr.dot(across, w)) + eps * minors + eps * eps * dr.squared_norm(w)
@@ -369,7 +446,9 @@ def _depth_profile(
 
 
 def _colors(direction: Jit, coeffs: list[Float]) -> tuple[Float, ...]:
-    """Return max(0.5 + SH(direction), 0) per colour component (3DGS's convention) of 3 K coefficients."""
+    """Return max(0.5 + SH(direction), 0) per colour component (3DGS's convention) of 3 K
+    coefficients.
+    """
     basis = dr.sh_eval(dr.normalize(direction), int(sqrt(len(coeffs) // 3)) - 1)
     sums: list[Float] = [sum(B * coeffs[3 * k + c] for k, B in enumerate(basis)) for c in range(3)]
     return tuple(dr.maximum(total + 0.5, 0) for total in sums)
@@ -383,10 +462,11 @@ def _screen_motion(
     R: list[list[Float]],
     first_order: bool,
 ) -> tuple[Float, Float]:
-    """Return the displacement pi(x) - pi(x - v) in px, where v = R motion: fx (vx - x/z vz) / (z - vz), likewise for y.
+    """Return the displacement pi(x) - pi(x - v) in px, where v = R motion: fx (vx - x/z vz) / (z -
+    vz), likewise for y.
 
-    With z instead of z - vz it is J v, the first-order projection (eq. 6). It is returned on request, and where x - v
-    is behind the near plane.
+    With z instead of z - vz it is J v, the first-order projection (eq. 6). It is returned on
+    request, and where x - v is behind the near plane.
 
     Args:
         motion: displacement in the world since the last frame.

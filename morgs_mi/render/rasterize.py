@@ -28,7 +28,8 @@ from morgs_mi.render.projection import FARTHEST, Splats, project
 from morgs_mi.render.region import Region, full_view
 from morgs_mi.render.render_config import RenderConfig
 
-# Beside the channels color, depth, motion and confidence, a record then takes seven packets of 4 floats.
+# Beside the channels color, depth, motion and confidence, a record then takes seven packets of 4
+# floats.
 _MOST_FEATURES = 12
 # Pixels from which the free memory is compared with what an image takes, and bytes of a pixel.
 _LARGE = 2**22
@@ -39,15 +40,16 @@ _PIXEL_BYTES = 60
 class Image:
     """Tensors of one view, one per requested channel; H rows, W columns.
 
-    ``image["color"]`` is `image.color`, and so on for every channel. For a sequence of V cameras, all tensors are
-    [V, H, W, C] instead of [H, W, C].
-    On a region all tensors are [A, block_height, block_width, C] instead of [H, W, C], and 0 outside the view.
+    ``image["color"]`` is `image.color`, and so on for every channel. For a sequence of V cameras,
+    all tensors are [V, H, W, C] instead of [H, W, C]. On a region all tensors are [A, block_height,
+    block_width, C] instead of [H, W, C], and 0 outside the view.
 
     Attributes:
         color: display-referred colour [H, W, 3].
         alpha: 1 - transmittance [H, W, 1].
         depth: expected camera-space z [H, W, 1], world units; 0 where nothing is drawn.
-        motion: displacement since the previous frame [H, W, 2], px, x_t - x_{t-1} (eq. 6); 0 where nothing is drawn.
+        motion: displacement since the previous frame [H, W, 2], px, x_t - x_{t-1} (eq. 6); 0 where
+            nothing is drawn.
         confidence: blended motion confidence [H, W, 1].
         features: blended features [H, W, F].
         others: blended channels of further attributes, by name.
@@ -69,24 +71,39 @@ class Image:
         """
         tensors = self._tensors()
         if channel not in tensors:
-            raise KeyError(f"Image: expected a channel out of {', '.join(tensors)}, got {channel!r}; render it.")
+            raise KeyError(
+                f"Image: expected a channel out of {', '.join(tensors)}, got {channel!r}; render "
+                "it."
+            )
         return tensors[channel]
 
     def _repr_png_(self) -> bytes | None:
-        """Return the colour as a PNG file, which notebooks show; None without a colour, or on a region."""
+        """Return the colour as a PNG file, which notebooks show; None without a colour, or on a
+        region.
+        """
         if self.color is None or len(self.color.shape) != 3:
             return None
-        return png_bytes(np.rint(255 * np.clip(np.nan_to_num(np.array(dr.detach(self.color))), 0, 1)).astype(np.uint8))
+        return png_bytes(
+            np.rint(255 * np.clip(np.nan_to_num(np.array(dr.detach(self.color))), 0, 1)).astype(
+                np.uint8
+            )
+        )
 
     def _tensors(self) -> dict[str, Tensor]:
         tensors = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "others"}
-        return {name: tensor for name, tensor in {**tensors, **self.others}.items() if tensor is not None}
+        return {
+            name: tensor
+            for name, tensor in {**tensors, **self.others}.items()
+            if tensor is not None
+        }
 
     @staticmethod
     def _of(tensors: Mapping[str, Tensor]) -> Image:
         names = [f.name for f in fields(Image)]
         others = {name: tensor for name, tensor in tensors.items() if name not in names}
-        return Image(**{name: tensor for name, tensor in tensors.items() if name in names}, others=others)
+        return Image(
+            **{name: tensor for name, tensor in tensors.items() if name in names}, others=others
+        )
 
 
 @with_render_lock
@@ -104,52 +121,63 @@ def rasterize(
 ) -> Image:
     """Render Gaussians by depth-ordered alpha blending (eq. 1), differentiably.
 
-    `dr.backward` and `dr.forward` give the derivatives with respect to every attribute of `gaussians`, and
-    to the pose if `camera.viewmat` is a Dr.Jit tensor. Channels that are not requested are neither traced nor computed.
+    `dr.backward` and `dr.forward` give the derivatives with respect to every attribute of
+    `gaussians`, and to the pose if `camera.viewmat` is a Dr.Jit tensor. Channels that are not
+    requested are neither traced nor computed.
 
     Args:
         gaussians: N Gaussians, usually a `Gaussians`, or any object with its activated attributes.
         camera: the view; or V >= 1 views of the same size, which are drawn together.
-        channels: out of ``color``, ``alpha``, ``depth``, ``motion``, ``guided_motion`` (motion without the learned
-            offset), and the channels of the table of attributes (``confidence``). Colour and the channels of attributes
-            are sums weighted by T alpha; depth and motion are divided by the sum of those weights.
-        background: display-referred colour [3] behind all Gaussians; None: black. A Dr.Jit array gets gradients.
-        detach_weights: channels with a gradient that reaches only the blended values, not opacity and geometry.
-        region: the blocks of pixels to draw; None: the whole view. Gaussians that touch none of its blocks are only
-            projected.
-        features: [N, F], further values to blend like a colour, returned as `Image.features`; F is at most 12.
-        static_splats: further splats of this view that are drawn and get no gradients; they must have the channels.
+        channels: out of ``color``, ``alpha``, ``depth``, ``motion``, ``guided_motion`` (motion
+            without the learned offset), and the channels of the table of attributes
+            (``confidence``). Colour and the channels of attributes are sums weighted by T alpha;
+            depth and motion are divided by the sum of those weights.
+        background: display-referred colour [3] behind all Gaussians; None: black. A Dr.Jit array
+            gets gradients.
+        detach_weights: channels with a gradient that reaches only the blended values, not opacity
+            and geometry.
+        region: the blocks of pixels to draw; None: the whole view. Gaussians that touch none of its
+            blocks are only projected.
+        features: [N, F], further values to blend like a colour, returned as `Image.features`; F is
+            at most 12.
+        static_splats: further splats of this view that are drawn and get no gradients; they must
+            have the channels.
         config: cut-offs and block shape.
-        depth_limit: [H, W], the camera-space z of every pixel at which an opaque surface ends its ray, world units; inf
-            where there is none. A Gaussian around that depth is drawn in part: by the fraction of its optical depth
-            that the ray has passed. The limit gets no gradient. None: no limit, and no cost.
+        depth_limit: [H, W], the camera-space z of every pixel at which an opaque surface ends its
+            ray, world units; inf where there is none. A Gaussian around that depth is drawn in
+            part: by the fraction of its optical depth that the ray has passed. The limit gets no
+            gradient. None: no limit, and no cost.
 
     Example:
         >>> image = morgs_mi.rasterize(gaussians, camera, channels=("color", "depth"))
         >>> dr.backward(dr.mean(dr.square(image.color - target), axis=None))
 
     Returns:
-        An `Image` with one tensor per requested channel. On a region, the drawn pixels and their gradients equal
-        the full computation's.
+        An `Image` with one tensor per requested channel. On a region, the drawn pixels and their
+        gradients equal the full computation's.
 
     Raises:
-        ValueError: an image that does not fit in memory, cameras of different sizes, or several with a region, static
-            splats or a depth limit, an unknown channel, a channel with a missing attribute, NaN or
-            infinite attributes or poses, values above 1e18 to blend, a region of another view or block shape,
-            `static_splats` together with a depth limit, a depth limit with gradients enabled, or a call inside a
-            function under `dr.freeze`.
+        ValueError: an image that does not fit in memory, cameras of different sizes, or several
+            with a region, static splats or a depth limit, an unknown channel, a channel with a
+            missing attribute, NaN or infinite attributes or poses, values above 1e18 to blend, a
+            region of another view or block shape, `static_splats` together with a depth limit, a
+            depth limit with gradients enabled, or a call inside a function under `dr.freeze`.
 
-    Equal depths are blended in the order of the input. A quaternion of length 0 is the identity. Gaussians nearer than
-    the camera's near plane or beyond 1e18 units, and those that overflow float32 once projected, are not drawn.
-    There is no antialiasing beyond `eps2d`, and lens distortion is not removed.
+    Equal depths are blended in the order of the input. A quaternion of length 0 is the identity.
+    Gaussians nearer than the camera's near plane or beyond 1e18 units, and those that overflow
+    float32 once projected, are not drawn. There is no antialiasing beyond `eps2d`, and lens
+    distortion is not removed.
 
-    Threads may share Gaussians; they render one after the other. Where one thread renders while another one computes
-    derivatives, hold `render_lock` around `dr.backward` and `dr.forward`: Dr.Jit 1.5 can deadlock otherwise.
+    Threads may share Gaussians; they render one after the other. Where one thread renders while
+    another one computes derivatives, hold `render_lock` around `dr.backward` and `dr.forward`:
+    Dr.Jit 1.5 can deadlock otherwise.
     """
     refuse_freezing("rasterize()")
     config = RenderConfig() if config is None else config
     cameras = tuple(camera) if isinstance(camera, Sequence) else (camera,)
-    _check_types(gaussians, cameras, config, {"channels": channels, "detach_weights": detach_weights})
+    _check_types(
+        gaussians, cameras, config, {"channels": channels, "detach_weights": detach_weights}
+    )
     for name, value, kind in (("region", region, Region), ("static_splats", static_splats, Splats)):
         if value is not None:
             check_type("rasterize()", name, value, kind)
@@ -167,14 +195,20 @@ def rasterize(
         region = full_view(view.width, view.height, config, len(cameras))
     else:
         _check_region(region, view, config)
-    stack = (len(cameras), view.height, view.width) if isinstance(camera, Sequence) else region.shape(0)[:-1]
+    stack = (
+        (len(cameras), view.height, view.width)
+        if isinstance(camera, Sequence)
+        else region.shape(0)[:-1]
+    )
     blended = tuple(c for c in channels if c != "alpha")
     if dr.prod(gaussians.means.shape[:1]) == 0:
         return _empty(channels, sizes, background, region, stack)
     cut = limits is not None
     projected = (*blended, "profile") if cut else blended
     if static_splats is not None:
-        splats = project(gaussians, view, projected, config, features=features).concatenated_with(static_splats)
+        splats = project(gaussians, view, projected, config, features=features).concatenated_with(
+            static_splats
+        )
     elif region.whole:
         splats = _project_views(gaussians, cameras, projected, features, config)
     else:
@@ -185,17 +219,23 @@ def rasterize(
     _check_finite(splats.finite, gaussians, cameras, features)
     values = [splats.channels[name] for name in blended]
     with dr.suspend_grad():
-        lists = build_lists(splats, [column for columns in values for column in columns], region, config, limits)
+        lists = build_lists(
+            splats, [column for columns in values for column in columns], region, config, limits
+        )
     layout = _layout(channels, sizes, background, detach_weights, config, cut)
     outputs = blend(splats.geometry, values, region, lists, layout, limits)
     images = dict(zip((*blended, "alpha", "coverage"), outputs, strict=False))
     coverage = images.pop("coverage", None)
     for name in blended:
         if name in NORMALISED or (name == "color" and background is not None):
-            weight = repeat_each(dr.detach(coverage) if name in detach_weights else coverage, sizes[name])
+            weight = repeat_each(
+                dr.detach(coverage) if name in detach_weights else coverage, sizes[name]
+            )
             finish = _normalised if name in NORMALISED else _over(background)
             images[name] = finish(images[name], weight)
-    return Image._of({name: _tensor(images[name], region, (*stack, sizes[name])) for name in channels})
+    return Image._of(
+        {name: _tensor(images[name], region, (*stack, sizes[name])) for name in channels}
+    )
 
 
 def _normalised(values: Float, weight: Float) -> Float:
@@ -215,7 +255,11 @@ def _over(background: Sequence[float] | Jit) -> Callable[[Float, Float], Float]:
 
     def composited(values: Float, weight: Float) -> Float:
         component = dr.arange(mi.UInt32, dr.width(weight)) % 3
-        return dr.fma(1 - weight, dr.select(component == 0, red, dr.select(component == 1, green, blue)), values)
+        return dr.fma(
+            1 - weight,
+            dr.select(component == 0, red, dr.select(component == 1, green, blue)),
+            values,
+        )
 
     return composited
 
@@ -227,13 +271,21 @@ def _project_views(
     features: Tensor | None,
     config: RenderConfig,
 ) -> Splats:
-    """Project the Gaussians into every view; one after the other, so that the views share a kernel."""
+    """Project the Gaussians into every view, one by one, so that the views share a kernel."""
     parts = [project(gaussians, camera, channels, config, features=features) for camera in cameras]
     if len(parts) == 1:
         return parts[0]
     for v, part in enumerate(parts):
         parts[v] = replace(part, view=dr.full(mi.UInt32, v, len(part)))
-        dr.eval(part.geometry, part.channels, part.depths, part.extent, part.valid, part.finite, parts[v].view)
+        dr.eval(
+            part.geometry,
+            part.channels,
+            part.depths,
+            part.extent,
+            part.valid,
+            part.finite,
+            parts[v].view,
+        )
     while len(parts) > 1:
         pairs = zip(parts[::2], parts[1::2], strict=False)
         parts = [a.concatenated_with(b) for a, b in pairs] + parts[len(parts) & ~1 :]
@@ -267,14 +319,23 @@ def _layout(
     cut: bool,
 ) -> Layout:
     """Return the layout of the blend: its channels, and where their gradients go."""
-    # Alpha itself, the channels that are divided by it, and the colour that is composited over the background.
+    # Alpha itself, the channels that are divided by it, and the colour that is composited over the
+    # background.
     read_alpha = [
         name
         for name in channels
         if name == "alpha" or name in NORMALISED or (name == "color" and background is not None)
     ]
-    blended = tuple(Channel(sizes[name], name not in detach_weights) for name in channels if name != "alpha")
-    return Layout(blended, bool(read_alpha), any(name not in detach_weights for name in read_alpha), config, cut)
+    blended = tuple(
+        Channel(sizes[name], name not in detach_weights) for name in channels if name != "alpha"
+    )
+    return Layout(
+        blended,
+        bool(read_alpha),
+        any(name not in detach_weights for name in read_alpha),
+        config,
+        cut,
+    )
 
 
 def _tensor(values: Float, region: Region, shape: tuple[int, ...]) -> Tensor:
@@ -304,9 +365,10 @@ def _check_region(region: Region, camera: Camera, config: RenderConfig) -> None:
     shape = (region.width, region.height, *region.block)
     if shape != (camera.width, camera.height, *block):
         raise ValueError(
-            f"rasterize(): `region` must be of a {camera.width}x{camera.height} view with {block[0]}x{block[1]} blocks "
-            f"like the camera's and the config's, got {shape[0]}x{shape[1]} with {shape[2]}x{shape[3]}; build it for "
-            "this camera with this config."
+            f"rasterize(): `region` must be of a {camera.width}x{camera.height} view with "
+            f"{block[0]}x{block[1]} blocks like the camera's and the config's, got "
+            f"{shape[0]}x{shape[1]} with {shape[2]}x{shape[3]}; build it for this camera with "
+            "this config."
         )
 
 
@@ -315,8 +377,8 @@ def _check_alone(arguments: Mapping[str, object]) -> None:
     for name, value in arguments.items():
         if value is not None:
             raise ValueError(
-                f"rasterize(): `{name}` must be None with a sequence of cameras, got a {type(value).__name__}; render "
-                "one camera at a time."
+                f"rasterize(): `{name}` must be None with a sequence of cameras, got a "
+                f"{type(value).__name__}; render one camera at a time."
             )
 
 
@@ -327,21 +389,30 @@ def _check_types(
     names: Mapping[str, Sequence[str]],
 ) -> None:
     if not hasattr(gaussians, "means"):
-        raise ValueError(f"rasterize(): `gaussians` must be Gaussians, got a {type(gaussians).__name__}; pass some.")
+        raise ValueError(
+            f"rasterize(): `gaussians` must be Gaussians, got a {type(gaussians).__name__}; pass "
+            "some."
+        )
     if not cameras:
-        raise ValueError("rasterize(): `camera` must be one or more cameras, got an empty sequence; pass one.")
+        raise ValueError(
+            "rasterize(): `camera` must be one or more cameras, got an empty sequence; pass one."
+        )
     for camera in cameras:
         check_type("rasterize()", "camera", camera, Camera)
     sizes = list(dict.fromkeys((camera.width, camera.height) for camera in cameras))
     if len(sizes) > 1:
         sizes_text = " and ".join(f"{width}x{height}" for width, height in sizes[:2])
         raise ValueError(
-            f"rasterize(): `camera` must be cameras of the same size, got {sizes_text}; render one camera at a time."
+            f"rasterize(): `camera` must be cameras of the same size, got {sizes_text}; render "
+            "one camera at a time."
         )
     check_type("rasterize()", "config", config, RenderConfig)
     for name, sequence in names.items():
         if isinstance(sequence, str) or not isinstance(sequence, Sequence):
-            raise ValueError(f"rasterize(): `{name}` must be a sequence of names, got {sequence!r}; pass a tuple.")
+            raise ValueError(
+                f"rasterize(): `{name}` must be a sequence of names, got {sequence!r}; pass a "
+                "tuple."
+            )
 
 
 def _check(
@@ -361,23 +432,24 @@ def _check(
     for name in (*channels, *detach_weights):
         if name not in choices and not (name == "features" and name not in channels):
             raise ValueError(
-                f"rasterize(): `channels` must be out of {', '.join(choices)}, got {name!r}; use one of these, or pass "
-                "other values as `features`."
+                f"rasterize(): `channels` must be out of {', '.join(choices)}, got {name!r}; use "
+                "one of these, or pass other values as `features`."
             )
     motions = dict.fromkeys(("motion", "guided_motion"), BY_ACTIVATED_NAME["motion"])
     for name, attribute in {**motions, **attributes}.items():
         if name in channels and getattr(gaussians, attribute.activated_name, None) is None:
             raise ValueError(
-                f"rasterize(): channel {name!r} requires Gaussians with `{attribute.name}`, got none; set it or remove "
-                "the channel."
+                f"rasterize(): channel {name!r} requires Gaussians with `{attribute.name}`, got "
+                "none; set it or remove the channel."
             )
     behind = np.asarray(dr.detach(background)).ravel() if dr.is_array_v(background) else background
     if behind is not None and not (
-        np.shape(behind) == (3,) and (np.abs(numbers("rasterize()", "background", behind)) <= FARTHEST).all()
+        np.shape(behind) == (3,)
+        and (np.abs(numbers("rasterize()", "background", behind)) <= FARTHEST).all()
     ):
         raise ValueError(
-            f"rasterize(): `background` must be three finite numbers of at most 1e18, got {background!r}; "
-            "pass a colour or None."
+            "rasterize(): `background` must be three finite numbers of at most 1e18, got "
+            f"{background!r}; pass a colour or None."
         )
     V = len(cameras)
     W = cameras[0].width
@@ -386,45 +458,55 @@ def _check(
     if pixels > 2**28:
         size = f"{W}x{H}" if V == 1 else f"{V} times {W}x{H}"
         raise ValueError(
-            f"rasterize(): the image must have at most 2^28 pixels, got {size}; render it in tiles, one camera each."
+            f"rasterize(): the image must have at most 2^28 pixels, got {size}; render it in "
+            "tiles, one camera each."
         )
     if pixels >= _LARGE:
         size = f"an image of {W}x{H} pixels" if V == 1 else f"{V} images of {W}x{H} pixels"
-        check_memory("rasterize()", _PIXEL_BYTES * pixels, size, "render a smaller one, or tiles, one camera each")
+        check_memory(
+            "rasterize()",
+            _PIXEL_BYTES * pixels,
+            size,
+            "render a smaller one, or tiles, one camera each",
+        )
 
 
-def _checked_features(features: Tensor | np.ndarray, gaussians: ActivatedGaussians) -> tuple[Tensor, int]:
+def _checked_features(
+    features: Tensor | np.ndarray, gaussians: ActivatedGaussians
+) -> tuple[Tensor, int]:
     """Return the features as a tensor [N, F], and F."""
     features = float_tensor("rasterize()", "features", features)
     shape = tuple(features.shape)
     N = int(gaussians.means.shape[0])
     if len(shape) != 2 or shape[0] != N or not 1 <= shape[1] <= _MOST_FEATURES:
         raise ValueError(
-            f"rasterize(): `features` must be [N, F] with N={N} and F from 1 to {_MOST_FEATURES}, got {list(shape)}; "
-            "blend more in several calls."
+            f"rasterize(): `features` must be [N, F] with N={N} and F from 1 to {_MOST_FEATURES}, "
+            f"got {list(shape)}; blend more in several calls."
         )
     return features, shape[1]
 
 
-def _checked_limits(depth_limit: Tensor | np.ndarray, camera: Camera, static_splats: Splats | None) -> Float:
+def _checked_limits(
+    depth_limit: Tensor | np.ndarray, camera: Camera, static_splats: Splats | None
+) -> Float:
     """Return the depth limits [H W], finite: a limit at infinity is one beyond all Gaussians."""
     limits: Tensor = float_tensor("rasterize()", "depth_limit", depth_limit)
     expected = (camera.height, camera.width)
     if tuple(limits.shape) != expected or dr.any(dr.isnan(limits.array)):
         problem = list(limits.shape) if tuple(limits.shape) != expected else "NaN"
         raise ValueError(
-            f"rasterize(): `depth_limit` must be one depth per pixel, {list(expected)}, got {problem}; use inf where "
-            "there is no surface."
+            f"rasterize(): `depth_limit` must be one depth per pixel, {list(expected)}, got "
+            f"{problem}; use inf where there is no surface."
         )
     if static_splats is not None:
         raise ValueError(
-            "rasterize(): `depth_limit` must be None where `static_splats` are given, got both; their depth along a "
-            "ray is not stored."
+            "rasterize(): `depth_limit` must be None where `static_splats` are given, got both; "
+            "their depth along a ray is not stored."
         )
     if dr.grad_enabled(limits):
         raise ValueError(
-            "rasterize(): `depth_limit` must not be attached to a gradient graph, because it gets no gradient, got "
-            "one with gradients enabled; pass dr.detach(depth_limit)."
+            "rasterize(): `depth_limit` must not be attached to a gradient graph, because it gets "
+            "no gradient, got one with gradients enabled; pass dr.detach(depth_limit)."
         )
     return dr.clip(limits.array, -FARTHEST, FARTHEST)
 
@@ -432,13 +514,19 @@ def _checked_limits(depth_limit: Tensor | np.ndarray, camera: Camera, static_spl
 def _check_finite(
     finite: Bool, gaussians: ActivatedGaussians, cameras: Sequence[Camera], features: Tensor | None
 ) -> None:
-    """Raise an error if a projected Gaussian is not finite because its attributes, or the pose, are not.
+    """Raise an error if a projected Gaussian is not finite because its attributes, or the pose, are
+    not.
 
-    Values that are blended must also be at most 1e18, beyond which their squares and gradients overflow.
+    Values that are blended must also be at most 1e18, beyond which their squares and gradients
+    overflow.
     """
     if dr.all(finite):
         return
-    blend_names = ["sh_coeffs", "motion", *(attribute.activated_name for attribute in attribute_channels().values())]
+    blend_names = [
+        "sh_coeffs",
+        "motion",
+        *(attribute.activated_name for attribute in attribute_channels().values()),
+    ]
     names = ["means", "scales", "quats", "opacities", *blend_names]
     poses = [("camera.viewmat", camera.viewmat) for camera in cameras]
     attributes = [(name, getattr(gaussians, name, None)) for name in names]
@@ -457,6 +545,7 @@ def _check_finite(
                 else "remove these Gaussians or lower the learning rate"
             )
             raise ValueError(
-                f"rasterize(): `{name}` must be {'at most 1e18' if np.isfinite(worst) else 'finite'}, got {worst:g} at "
+                f"rasterize(): `{name}` must be "
+                f"{'at most 1e18' if np.isfinite(worst) else 'finite'}, got {worst:g} at "
                 f"[{index}] ({len(bad)} such values); {remedy}."
             )

@@ -1,7 +1,8 @@
 """Regions: the blocks of pixels that are drawn, all or some of the blocks of a view.
 
-A block is `block_width` x `block_height` pixels and belongs to one SIMD lane; a tile is 4 x 8 blocks. An image of a
-whole view is stored row by row, padded to whole blocks on the right; an image of a region, block by block.
+A block is `block_width` x `block_height` pixels and belongs to one SIMD lane; a tile is 4 x 8
+blocks. An image of a whole view is stored row by row, padded to whole blocks on the right; an image
+of a region, block by block.
 """
 
 from __future__ import annotations
@@ -40,7 +41,9 @@ class BlockGrid:
 
     @classmethod
     def of(cls, width: int, height: int, config: RenderConfig) -> BlockGrid:
-        """Return the blocks of a view of that size, in pixels, with the block shape of a configuration."""
+        """Return the blocks of a view of that size, in pixels, with the block shape of a
+        configuration.
+        """
         return cls(width, height, block_shape(config))
 
     @property
@@ -56,7 +59,8 @@ class BlockGrid:
 
     def covering(self, mask: np.ndarray) -> np.ndarray:
         """Return the blocks with a pixel of a mask [H, W], bool [rows, columns]."""
-        # Several pixels of a row as one integer: NumPy reduces a few small groups of booleans 50 times more slowly.
+        # Several pixels of a row as one integer: NumPy reduces a few small groups of booleans 50
+        # times more slowly.
         word = gcd(self.block[0], 8)
         pixels = self._padded(mask).reshape(self.shape[0], self.block[1], -1)
         rows = np.bitwise_or.reduce(pixels.view(f"u{word}"), axis=1)
@@ -67,7 +71,9 @@ class BlockGrid:
         rows, columns = self.shape
         width, height = self.block
         pixels = self._padded(mask).view(np.uint8)
-        shares = cv2.resize(pixels.astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
+        shares = cv2.resize(
+            pixels.astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA
+        )
         return np.rint(shares * (width * height)).astype(np.int32)
 
     def _padded(self, mask: np.ndarray) -> np.ndarray:
@@ -104,10 +110,12 @@ class Region:
     def __init__(self, mask: np.ndarray, config: RenderConfig | None = None) -> None:
         check_type("Region()", "mask", mask, np.ndarray)
         if mask.ndim != 2 or mask.dtype != bool or not mask.any():
-            description = f"{mask.dtype} {mask.shape}" if mask.ndim != 2 or mask.dtype != bool else "none"
+            description = (
+                f"{mask.dtype} {mask.shape}" if mask.ndim != 2 or mask.dtype != bool else "none"
+            )
             raise ValueError(
-                f"Region(): `mask` must be bool [H, W] with at least one pixel set, got {description}; "
-                "skip a view in which nothing is drawn."
+                "Region(): `mask` must be bool [H, W] with at least one pixel set, got "
+                f"{description}; skip a view in which nothing is drawn."
             )
         grid = BlockGrid.of(mask.shape[1], mask.shape[0], config or RenderConfig())
         self._build(grid, grid.covering(mask))
@@ -126,7 +134,8 @@ class Region:
         region._build(grid, blocks, whole, views)
         return region
 
-    # Per block: slot of its tile, its bit there, its first pixel (x, y), that pixel's packet in memory, its rows.
+    # Per block: slot of its tile, its bit there, its first pixel (x, y), that pixel's packet in
+    # memory, its rows.
     tile: UInt32
     bit: UInt32
     x: UInt32
@@ -144,7 +153,9 @@ class Region:
     weights: Float | None  # per pixel: 1 in the view, 0 outside; None: all pixels are in the view
     _blocks: tuple[np.ndarray, np.ndarray]  # per block: its row and column in the grid
 
-    def _build(self, grid: BlockGrid, blocks: np.ndarray, whole: bool = False, views: int = 1) -> None:
+    def _build(
+        self, grid: BlockGrid, blocks: np.ndarray, whole: bool = False, views: int = 1
+    ) -> None:
         self.grid = grid
         self.width = grid.width
         self.block = grid.block
@@ -156,7 +167,9 @@ class Region:
         self.weights = None if mask is None or mask.all() else from_numpy(mi.Float, mask)
 
     def _lay_out(self, blocks: np.ndarray) -> None:
-        """Number the blocks of a grid bool [rows, columns]; a second view begins after `down` rows of tiles."""
+        """Number the blocks of a grid bool [rows, columns]; a second view begins after `down` rows
+        of tiles.
+        """
         bw, bh = self.block
         W = self.width
         whole = self.whole
@@ -215,20 +228,22 @@ class Region:
     def inside(self) -> np.ndarray:
         """Return the mask of the pixels that lie in the view, bool [A, block_height, block_width].
 
-        If the size of the view is not a multiple of the block, pixels of the last blocks lie outside the view.
+        If the size of the view is not a multiple of the block, pixels of the last blocks lie
+        outside the view.
         """
         return self.crop(np.ones((self.height, self.width), bool))
 
     def crop(self, image: np.ndarray) -> np.ndarray:
-        """Return this region's pixels [A, block_height, block_width, ...] of an image [H, W, ...], 0 outside it.
+        """Return this region's pixels [A, block_height, block_width, ...] of an image [H, W, ...],
+        0 outside it.
 
         Raises:
             ValueError: the image has another size than the view.
         """
         if image.shape[:2] != (self.height, self.width):
             raise ValueError(
-                f"Region.crop(): `image` must be [{self.height}, {self.width}, ...], got {list(image.shape)}; resize "
-                "it to the view."
+                f"Region.crop(): `image` must be [{self.height}, {self.width}, ...], got "
+                f"{list(image.shape)}; resize it to the view."
             )
         row, column = self._blocks
         width, height = self.block
@@ -236,7 +251,8 @@ class Region:
         columns = image.shape[1] // width
         (down, across, *rest) = image.strides
         shape = (rows, height, columns, width, *image.shape[2:])
-        # A view of the blocks that lie in the image as a whole: a copy of large images would take most of the time.
+        # A view of the blocks that lie in the image as a whole: a copy of large images would take
+        # most of the time.
         blocks = as_strided(image, shape, (height * down, down, width * across, across, *rest))
         is_whole = (row < rows) & (column < columns)
         if is_whole.all():
@@ -251,7 +267,9 @@ class Region:
         return pixels
 
     def uncropped(self, values: np.ndarray) -> np.ndarray:
-        """Return an image in whole blocks from this region's values [A, height, width, ...], 0 in all other blocks."""
+        """Return an image in whole blocks from this region's values [A, height, width, ...], 0 in
+        all other blocks.
+        """
         row, column = self._blocks
         (_, height, width, *rest) = values.shape
         rows, columns = self.drawn.shape
@@ -270,7 +288,9 @@ class Region:
         return blocks.reshape(rows * height, columns * width, *rest)[: self.height, : self.width]
 
     def _in_blocks(self, image: np.ndarray) -> np.ndarray:
-        """Return an image [H, W, ...] as [rows, block_height, columns, block_width, ...], padded by zeros."""
+        """Return an image [H, W, ...] as [rows, block_height, columns, block_width, ...], padded by
+        zeros.
+        """
         rows, columns = self.drawn.shape
         width, height = self.block
         missing = [(0, rows * height - image.shape[0]), (0, columns * width - image.shape[1])]
@@ -280,9 +300,11 @@ class Region:
 
 
 def joined(regions: Sequence[Region]) -> Region:
-    """Return the blocks of regions of several views as one region, of the views one below the other.
+    """Return the blocks of regions of several views as one region, of the views one below the
+    other.
 
-    Its images are the regions' images, one after the other. Blocks keep the pixel coordinates of their view.
+    Its images are the regions' images, one after the other. Blocks keep the pixel coordinates of
+    their view.
     """
     region = Region.__new__(Region)
     region.block = regions[0].block
@@ -302,20 +324,23 @@ def joined(regions: Sequence[Region]) -> Region:
 
 
 def summed_area(grid: np.ndarray) -> np.ndarray:
-    """Return the number of set cells left of and above every corner of a grid [R, C], flat [(R + 1) (C + 1)]."""
+    """Return the number of set cells left of and above every corner of a grid [R, C], flat
+    [(R + 1) (C + 1)].
+    """
     return np.pad(grid, ((1, 0), (1, 0))).cumsum(0).cumsum(1).ravel()
 
 
 def quotient(lane: UInt32, divisor: int) -> UInt32:
     """Return lane // divisor without the divisor as a literal in the kernel.
 
-    Adding half a step before the product rounds down correctly: it exceeds the rounding error of a double.
+    Adding half a step before the product rounds down correctly: it exceeds the rounding error of a
+    double.
     """
     return mi.UInt32((mi.Float64(lane) + 0.5) * dr.opaque(mi.Float64, 1 / divisor))
 
 
 def on_region(values: Float, region: Region) -> Float:
-    """Return an image [H W] of one float per pixel as an image on the region, 0 outside the view."""
+    """Return an image [H W] of one float per pixel on the region, 0 outside the view."""
     lane = dr.arange(mi.UInt32, region.num_pixels)
     if region.whole:
         row = quotient(lane, region.row)
@@ -334,11 +359,15 @@ def on_region(values: Float, region: Region) -> Float:
 
 
 def full_view(width: int, height: int, config: RenderConfig, views: int = 1) -> Region:
-    """Return the region of all blocks of equal views, one below the other; its images are [views * H, W, C]."""
+    """Return the region of all blocks of equal views, one below the other; its images are
+    [views * H, W, C].
+    """
     return _whole_view(width, height, block_shape(config), views, mi.variant())
 
 
 @lru_cache(maxsize=8)
-def _whole_view(width: int, height: int, block: tuple[int, int], views: int, variant: str) -> Region:
+def _whole_view(
+    width: int, height: int, block: tuple[int, int], views: int, variant: str
+) -> Region:
     grid = BlockGrid(width, height, block)
     return Region.of(grid, grid.covering(np.ones((height, width), bool)), whole=True, views=views)

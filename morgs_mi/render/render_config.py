@@ -15,31 +15,38 @@ class RenderConfig:
     """Settings of the rasteriser. The defaults match 3DGS, because its models depend on them."""
 
     eps2d: Annotated[float, AtLeast(0), AtMost(1e18)] = 0.3  # beyond, float32 overflows
-    """Low-pass filter in px^2, added to the projected covariance; it prevents splats from falling between pixels."""
+    """Low-pass filter in px^2, added to the projected covariance; it prevents splats from falling
+    between pixels.
+    """
     antialiased: bool = False
-    """Reduce the opacity by what the low-pass filter adds to a splat's area, sqrt(det S / det (S + eps2d I)) (Yu et al.
-    2024): small splats fade instead of growing. For models that were trained so."""
+    """Reduce the opacity by what the low-pass filter adds to a splat's area, sqrt(det S / det (S +
+    eps2d I)) (Yu et al. 2024): small splats fade instead of growing. For models that were trained
+    so."""
     alpha_min: Annotated[float, Above(0)] = 1.0 / 255.0
     """Alpha below which a Gaussian is skipped at a pixel: it cannot change an 8-bit image."""
     alpha_max: Annotated[float, Above(0), Below(1)] = 0.99
     """Upper limit of alpha; it bounds 1 / (1 - alpha) in the adjoint."""
     stop_transmittance: Annotated[float, AtLeast(0), Below(1)] = 1e-4
-    """Transmittance of its most transparent pixel below which a block ends; bounds the error of the colour."""
+    """Transmittance of its most transparent pixel below which a block ends; bounds the error of the
+    colour.
+    """
     first_order_motion: bool = False
-    """Draw motion to first order, J(mean) * motion, as in the MoRGS paper (eq. 6), instead of the difference of two
-    projections. The relative difference is motion in depth / depth."""
+    """Draw motion to first order, J(mean) * motion, as in the MoRGS paper (eq. 6), instead of the
+    difference of two projections. The relative difference is motion in depth / depth."""
     block_width: Annotated[int, AtLeast(4), AtMost(16), MultipleOf(4)] | None = None
-    """Width in pixels of the block of one SIMD lane; pixels are read and written in packets of 4. None: 8 on the CPU, 4
-    on the GPU."""
+    """Width in pixels of the block of one SIMD lane; pixels are read and written in packets of 4.
+    None: 8 on the CPU, 4 on the GPU."""
     block_height: Annotated[int, AtLeast(1), AtMost(16)] | None = None
     """Height in pixels of that block, 1 to 16; None: 4."""
     reproducible: bool = False
-    """Sum gradients in a fixed order: the same bytes on every run and any number of threads. A step takes 1.9 to 2.4
-    times as long (20k and 100k Gaussians, two cores), and 48 bytes for every pair of Gaussian and block."""
+    """Sum gradients in a fixed order: the same bytes on every run and any number of threads. A step
+    takes 1.9 to 2.4 times as long (20k and 100k Gaussians, two cores), and 48 bytes for every pair
+    of Gaussian and block."""
 
     def __post_init__(self) -> None:
         check_ranges(self)
         if self.alpha_min >= self.alpha_max:
             raise ValueError(
-                f"RenderConfig(): `alpha_min` must be below `alpha_max` = {self.alpha_max}, got {self.alpha_min}."
+                f"RenderConfig(): `alpha_min` must be below `alpha_max` = {self.alpha_max}, got "
+                f"{self.alpha_min}."
             )

@@ -1,7 +1,8 @@
 """Several active views that are drawn by the same launches, without gradients.
 
-A pass over a few small views takes longer to prepare than to compute. So all views share one region: a lane projects
-one Gaussian into one view, the lists of all blocks are built together, and one loop walks them all.
+A pass over a few small views takes longer to prepare than to compute. So all views share one
+region: a lane projects one Gaussian into one view, the lists of all blocks are built together, and
+one loop walks them all.
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ from morgs_mi.render.render_config import RenderConfig
 class ViewGroup:
     """Active views that are drawn together.
 
-    Images of the group are [A, block_height, block_width, C], the drawn blocks of all views, one view after the other.
+    Images of the group are [A, block_height, block_width, C], the drawn blocks of all views, one
+    view after the other.
 
     Args:
         views: V >= 1 views with the same cut-offs and block shape.
@@ -54,7 +56,9 @@ class ViewGroup:
 
     def crop(self, images: Sequence[np.ndarray]) -> np.ndarray:
         """Return an image of the group from one image [H, W, ...] per view."""
-        return np.concatenate([region.crop(image) for region, image in zip(self.regions, images, strict=True)])
+        return np.concatenate(
+            [region.crop(image) for region, image in zip(self.regions, images, strict=True)]
+        )
 
     def split(self, image: np.ndarray) -> list[np.ndarray]:
         """Return the image of each view on its region from an image of the group."""
@@ -75,7 +79,9 @@ class ViewGroup:
             lane = dr.arange(mi.UInt32, N * V)
             view = quotient(lane, N)
             row = lane - view * dr.opaque(mi.UInt32, N)
-            lanes = dr.compress(touches(project(gaussians, Views(cameras, view), (), self.config, row), self.region))
+            lanes = dr.compress(
+                touches(project(gaussians, Views(cameras, view), (), self.config, row), self.region)
+            )
             splats = self._static
             if dr.width(lanes):
                 view = quotient(lanes, N)
@@ -93,8 +99,12 @@ class ViewGroup:
         splats: Splats | None = None
         for index, view in enumerate(self.views):
             if view.static_splats is not None:
-                view_splats = replace(view.static_splats, view=dr.full(mi.UInt32, index, len(view.static_splats)))
-                view_splats = replace(view_splats, channels={"color": view_splats.channels["color"]})
+                view_splats = replace(
+                    view.static_splats, view=dr.full(mi.UInt32, index, len(view.static_splats))
+                )
+                view_splats = replace(
+                    view_splats, channels={"color": view_splats.channels["color"]}
+                )
                 splats = view_splats if splats is None else splats.concatenated_with(view_splats)
         if splats is None:
             return None
@@ -107,28 +117,33 @@ class Drawing:
     """Gaussians in the views of a group."""
 
     group: ViewGroup  #: The views.
-    #: The projected Gaussians that touch the group's blocks, with the static splats after them, and the lists of the
-    #: blocks; None if there are no splats.
+    #: The projected Gaussians that touch the group's blocks, with the static splats after them, and
+    #: the lists of the blocks; None if there are no splats.
     drawn: tuple[Splats, BlockLists] | None
     lanes: UInt32  #: (view * N + Gaussian) of the splats that are not static, ascending.
     count: int  #: N.
 
     @cached_property
     def color(self) -> Float:
-        """Colour of the group's pixels, flat [A * block_height * block_width * 3]; 0 outside the views."""
+        """Colour of the group's pixels, flat [A * block_height * block_width * 3]; 0 outside the
+        views.
+        """
         if self.drawn is None:
             return dr.zeros(mi.Float, 3 * self.group.region.num_pixels)
         splats, lists = self.drawn
         layout = Layout((Channel(3, True),), False, False, self.group.config)
         with dr.suspend_grad():
-            (image,) = blend(splats.geometry, [splats.channels["color"]], self.group.region, lists, layout)
+            (image,) = blend(
+                splats.geometry, [splats.channels["color"]], self.group.region, lists, layout
+            )
             if self.group.region.weights is not None:
                 image = image * repeat_each(self.group.region.weights, 3)
             dr.eval(image)
         return image
 
     def sums(self, image: Float, channels: int) -> np.ndarray:
-        """Return the sums of an image's pixels by blend weight, per view and Gaussian, float32 [V, N, C].
+        """Return the sums of an image's pixels by blend weight, per view and Gaussian, float32
+        [V, N, C].
 
         Args:
             image: flat image of the group [A * block_height * block_width * C].
@@ -137,11 +152,15 @@ class Drawing:
         sums = np.zeros((len(self.group.views) * self.count, channels), np.float32)
         lanes = np.asarray(self.lanes)
         if len(lanes):
-            sums[lanes] = np.stack([np.asarray(channel_sums) for channel_sums in self._sums(image, channels)], axis=1)
+            sums[lanes] = np.stack(
+                [np.asarray(channel_sums) for channel_sums in self._sums(image, channels)], axis=1
+            )
         return sums.reshape(-1, self.count, channels)
 
     def totals(self, image: Float, channels: int) -> np.ndarray:
-        """Return the sums of an image's pixels by blend weight over all views, float32 [N, C]; see `sums`."""
+        """Return the sums of an image's pixels by blend weight over all views, float32 [N, C]; see
+        `sums`.
+        """
         if not dr.width(self.lanes):
             return np.zeros((self.count, channels), np.float32)
         view = quotient(self.lanes, self.count)
@@ -161,7 +180,9 @@ class Drawing:
             columns = [dr.zeros(mi.Float, len(splats)) for _ in range(channels)]
             records = pack_records([*splats.geometry, *columns], lists.by_rank)
             layout = Layout((Channel(channels, False),), False, False, self.group.config)
-            grads = weighted_sums([image], self.group.region, replace(lists, records=records), layout)
+            grads = weighted_sums(
+                [image], self.group.region, replace(lists, records=records), layout
+            )
             place = dr.arange(mi.UInt32, dr.width(self.lanes))  # static splats come after
             lane_sums = [dr.gather(mi.Float, grad, place) for grad in grads]
             dr.eval(lane_sums)
@@ -169,9 +190,11 @@ class Drawing:
 
 
 def backproject(gaussians: ActivatedGaussians, view: ActiveView, image: np.ndarray) -> np.ndarray:
-    """Return sum_x w_i(x) image(x) for every Gaussian i, with the weights w_i = T_i alpha_i of eq. 1.
+    """Return sum_x w_i(x) image(x) for every Gaussian i, with the weights w_i = T_i alpha_i of
+    eq. 1.
 
-    This is the transpose of blending: the renderer's channel adjoint with the image in place of a gradient.
+    This is the transpose of blending: the renderer's channel adjoint with the image in place of a
+    gradient.
 
     Args:
         gaussians: N > 0 Gaussians.
@@ -186,11 +209,15 @@ def backproject(gaussians: ActivatedGaussians, view: ActiveView, image: np.ndarr
     """
     group = ViewGroup([view])
     C = (np.shape(image) or (0,))[-1]
-    size = (view.camera.height, view.camera.width) if view.region is None else group.region.shape(0)[:-1]
+    size = (
+        (view.camera.height, view.camera.width)
+        if view.region is None
+        else group.region.shape(0)[:-1]
+    )
     if not C or image.shape != (*size, C):
         raise ValueError(
-            f"backproject(): `image` must be [{', '.join(map(str, size))}, C] with C > 0, got {list(np.shape(image))}; "
-            "resize it to the camera, or crop it to the region."
+            f"backproject(): `image` must be [{', '.join(map(str, size))}, C] with C > 0, got "
+            f"{list(np.shape(image))}; resize it to the camera, or crop it to the region."
         )
     blocks = group.crop([image]) if view.region is None else image
     return group.draw(gaussians).sums(from_numpy(mi.Float, blocks), C)[0]

@@ -1,1 +1,3 @@
-"""Whole jobs: fits of captures, live fits, segments on several machines, imports, the demonstration."""
+"""Whole jobs: fits of captures, live fits, segments on several machines, imports, the
+demonstration.
+"""

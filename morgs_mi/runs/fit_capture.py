@@ -42,37 +42,47 @@ def stream_capture(
     resume: bool = False,
     progress: Report | None = None,
 ) -> list[FrameReport]:
-    """Fit a whole capture and write OUT/stream.morgs packet by packet, and OUT/report.json with every frame.
+    """Fit a whole capture and write OUT/stream.morgs packet by packet, and OUT/report.json with
+    every frame.
 
-    OUT/capture.json has the capture's path and describes how it was read. Points are triangulated where a capture has
-    too few. OUT is locked meanwhile.
+    OUT/capture.json has the capture's path and describes how it was read. Points are triangulated
+    where a capture has too few. OUT is locked meanwhile.
 
     Args:
-        capture: cameras and frames; the test view is not trained on, but is part of the stream's header.
-        out: folder, made if missing. The files of an earlier fit stay there until the first frame replaces them.
+        capture: cameras and frames; the test view is not trained on, but is part of the stream's
+            header.
+        out: folder, made if missing. The files of an earlier fit stay there until the first frame
+            replaces them.
         config: settings.
-        resume: continue after the last complete packet of the stream in `out`, if there is one. With
-            `RenderConfig(reproducible=True)` the stream has the same bytes as without an interruption.
+        resume: continue after the last complete packet of the stream in `out`, if there is one.
+            With `RenderConfig(reproducible=True)` the stream has the same bytes as without an
+            interruption.
         progress: called with (stage, done, total): matching views, the first frame, later frames.
 
     Returns:
         The reports of all frames, including those before an interruption.
 
     Raises:
-        OSError: the disk is full or not writable, another fit writes into OUT, or the stream was removed, moved or
+        OSError: the disk is full or not writable, another fit writes into OUT, or the stream was
+            removed, moved or
         replaced meanwhile; the stream is complete up to the last frame.
-        ValueError: as `StreamLoop`; OUT lies in a capture; or the stream to resume is damaged, or belongs to another
+        ValueError: as `StreamLoop`; OUT lies in a capture; or the stream to resume is damaged, or
+            belongs to another
         capture or other settings; or images, Gaussians or steps that do not fit in memory.
     """
     out = Path(out)
     config = config or StreamConfig()
     check_outputs(out)
-    check_capacity("stream_capture()", [capture.cameras[view] for view in capture.train_views], config.fit)
+    check_capacity(
+        "stream_capture()", [capture.cameras[view] for view in capture.train_views], config.fit
+    )
     with locked_folder(out, "stream_capture()"):
         return _stream(capture, out, config, resume, Progress(progress))
 
 
-def _stream(capture: Capture, out: Path, config: StreamConfig, resume: bool, progress: Progress) -> list[FrameReport]:
+def _stream(
+    capture: Capture, out: Path, config: StreamConfig, resume: bool, progress: Progress
+) -> list[FrameReport]:
     """Fit a capture into a locked folder."""
     frames = capture.partial_frames()
     files = FitFiles.of(out)
@@ -82,7 +92,11 @@ def _stream(capture: Capture, out: Path, config: StreamConfig, resume: bool, pro
     if earlier is None:
         prepared = Prepared.of(capture, config, progress)
         loop = StreamLoop.of(prepared.capture, config)
-        frames = chain((first,), frames) if prepared.refinement is None else prepared.capture.partial_frames()
+        frames = (
+            chain((first,), frames)
+            if prepared.refinement is None
+            else prepared.capture.partial_frames()
+        )
     else:
         prepared = Prepared(as_fitted(capture, earlier.stream))
         loop = StreamLoop.of(prepared.capture, config)
@@ -91,13 +105,19 @@ def _stream(capture: Capture, out: Path, config: StreamConfig, resume: bool, pro
     train = capture.train_views
     with Recording(files, prepared.capture, metadata | prepared.metadata, earlier) as recording:
         for frame, upcoming in with_next(frames):
-            stage = progress.of("Later frames").part(frame.index - 1, last) if frame.index else progress
+            stage = (
+                progress.of("Later frames").part(frame.index - 1, last) if frame.index else progress
+            )
             packet, report = push_frame(loop, frame, train, stage.report, upcoming, recording.show)
-            recording.push(packet, prepared.completed(report, loop.gaussians, frame, config), loop.state.coded)
+            recording.push(
+                packet, prepared.completed(report, loop.gaussians, frame, config), loop.state.coded
+            )
     return recording.reports
 
 
-def _resumed(loop: StreamLoop, capture: Capture, earlier: Interrupted, progress: Progress) -> Iterator[PartialFrame]:
+def _resumed(
+    loop: StreamLoop, capture: Capture, earlier: Interrupted, progress: Progress
+) -> Iterator[PartialFrame]:
     """Let a loop continue after an interrupted fit, and return the frames that follow."""
     fit = loop.setup.config.fit
     last_frame = earlier.coded.frame
@@ -107,7 +127,9 @@ def _resumed(loop: StreamLoop, capture: Capture, earlier: Interrupted, progress:
     frames = capture.partial_frames(start)
     count = last_frame + 1 - start
     past = _counted(islice(frames, count), progress.of("Reading the fitted frames"), count)
-    loop.resume(earlier.coded, (frame.comparable(train) for frame in past), earlier.reports[0].exposures)
+    loop.resume(
+        earlier.coded, (frame.comparable(train) for frame in past), earlier.reports[0].exposures
+    )
     return frames
 
 
@@ -117,7 +139,7 @@ class Refinement(Protocol):
     def validation(
         self, capture: Capture, gaussians: Gaussians, frame: PartialFrame, config: StreamConfig
     ) -> dict[str, Any]:
-        """Return the changes of the cameras and what they gain, for the report of the first frame."""
+        """Return the changes of the cameras and their gain, for the report of the first frame."""
         ...
 
 
@@ -125,12 +147,15 @@ class Refinement(Protocol):
 class Prepared:
     """A capture that is ready to be fitted."""
 
-    capture: Capture  #: With enough points, and with refined cameras where the settings ask for them.
+    #: With enough points, and with refined cameras where the settings ask for them.
+    capture: Capture
     refinement: Refinement | None = None  #: Of the cameras; None if they are the calibration's.
 
     @classmethod
     def of(cls, capture: Capture, config: StreamConfig, progress: Progress) -> Prepared:
-        """Return a capture with triangulated points where it has few, and with refined cameras where asked for."""
+        """Return a capture with triangulated points where it has few, and with refined cameras
+        where asked for.
+        """
         capture = with_points(capture, config.seed, progress)
         if config.fit.refine_cameras == "off":
             return cls(capture)
@@ -144,7 +169,11 @@ class Prepared:
         return about_lenses(self.capture)
 
     def completed(
-        self, report: FrameReport, gaussians: Gaussians | None, frame: PartialFrame, config: StreamConfig
+        self,
+        report: FrameReport,
+        gaussians: Gaussians | None,
+        frame: PartialFrame,
+        config: StreamConfig,
     ) -> FrameReport:
         """Return the report of a frame; the first one includes the findings about the cameras.
 
@@ -161,7 +190,9 @@ class Prepared:
 
 
 def with_points(capture: Capture, seed: int, progress: Progress) -> Capture:
-    """Return a capture with the points of `dense_points` if it has few and they are more; see `stream_capture`."""
+    """Return a capture with the points of `dense_points` if it has few and they are more; see
+    `stream_capture`.
+    """
     if len(capture.points) >= _FEW_POINTS:
         return capture
     shared = match_capture(capture, progress.of("Matching views"))
@@ -177,17 +208,23 @@ def push_frame(
     upcoming: PartialFrame | None = None,
     on_provisional: Callable[[Packet], None] | None = None,
 ) -> tuple[Packet, FrameReport]:
-    """Fit the next frame of a loop on the views `train`; the report's status names the images that are missing."""
+    """Fit the next frame of a loop on the views `train`; the report's status names the images that
+    are missing.
+    """
     images, ahead = (None if f is None else [f.images[v] for v in train] for f in (frame, upcoming))
     assert images is not None
     recorded = None if frame.recorded is None else frame.comparable(train)
     packet, report = loop.push(images, progress, ahead, recorded, on_provisional)
-    status = "; ".join([*([report.status] if report.status != "ok" else []), *frame.problems]) or "ok"
+    status = (
+        "; ".join([*([report.status] if report.status != "ok" else []), *frame.problems]) or "ok"
+    )
     return packet, replace(report, status=status)
 
 
 def with_next(frames: Iterable[PartialFrame]) -> Iterator[tuple[PartialFrame, PartialFrame | None]]:
-    """Yield each frame with the one after it, which is None for the last; raise what reading that one raised after."""
+    """Yield each frame with the one after it, which is None for the last; raise what reading that
+    one raised after.
+    """
     frames = iter(frames)
     frame = next(frames, None)
     while frame is not None:
@@ -203,7 +240,9 @@ def with_next(frames: Iterable[PartialFrame]) -> Iterator[tuple[PartialFrame, Pa
         frame = upcoming
 
 
-def _counted(frames: Iterable[PartialFrame], progress: Progress, count: int) -> Iterator[PartialFrame]:
+def _counted(
+    frames: Iterable[PartialFrame], progress: Progress, count: int
+) -> Iterator[PartialFrame]:
     """Yield frames and report how many were there before."""
     for done, frame in enumerate(frames):
         progress(done, count)

@@ -1,13 +1,15 @@
 """The files of a fit: its stream, its report, and what an interrupted fit continues from.
 
-A fit may be killed at any instruction. The stream then holds complete packets and perhaps a part of the next one. A
-frame's row is written to the report before its packets are written to the stream, so every packet has a row. Nothing
-else is stored, because the state of the loop follows from the stream and the recording (see `StreamState`).
+A fit may be killed at any instruction. The stream then holds complete packets and perhaps a part of
+the next one. A frame's row is written to the report before its packets are written to the stream,
+so every packet has a row. Nothing else is stored, because the state of the loop follows from the
+stream and the recording (see `StreamState`).
 
-A fit into a folder that has a stream writes hidden files beside it until its first frame is there. They then replace
-the earlier stream, its description and its report together.
+A fit into a folder that has a stream writes hidden files beside it until its first frame is there.
+They then replace the earlier stream, its description and its report together.
 
-A stream is made to be shared, so its header has no paths. The path of the capture is in the `capture.json` beside it.
+A stream is made to be shared, so its header has no paths. The path of the capture is in the
+`capture.json` beside it.
 """
 
 from __future__ import annotations
@@ -28,7 +30,13 @@ import mitsuba as mi
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.capture.fingerprint import fingerprint
 from morgs_mi.capture.outputs import check_output
-from morgs_mi.codec.container import Packet, PacketKind, StreamWriter, TruncatedStreamError, header_json
+from morgs_mi.codec.container import (
+    Packet,
+    PacketKind,
+    StreamWriter,
+    TruncatedStreamError,
+    header_json,
+)
 from morgs_mi.codec.packets import CodedFrame, decode, reemitted_keyframe
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.color_space import TRANSFER
@@ -51,7 +59,9 @@ Finished = Callable[[Sequence[Entry], int], tuple[Sequence[Entry], int]]
 
 
 class FitFiles(NamedTuple):
-    """Stream and report of a fit, and the description of its capture; None: there is none, as in a segment."""
+    """Stream and report of a fit, and the description of its capture; None: there is none, as in a
+    segment.
+    """
 
     stream: Path
     report: Path
@@ -65,7 +75,9 @@ class FitFiles(NamedTuple):
     @property
     def next(self) -> FitFiles:
         """Hidden files that are to replace these."""
-        return FitFiles(*(path.with_name(f".next-{path.name}") for path in self if path is not None))
+        return FitFiles(
+            *(path.with_name(f".next-{path.name}") for path in self if path is not None)
+        )
 
     @classmethod
     def of(cls, out: Path) -> FitFiles:
@@ -82,7 +94,8 @@ class FitFiles(NamedTuple):
         self.settle()
 
     def settle(self) -> None:
-        """Finish a replacement that was cut off, or remove the `next` files of one that had not begun.
+        """Finish a replacement that was cut off, or remove the `next` files of one that had not
+        begun.
 
         The stream is replaced first and removed last, which distinguishes the two.
 
@@ -123,7 +136,11 @@ class Recording:
     """
 
     def __init__(
-        self, files: FitFiles, capture: Capture, metadata: Mapping[str, Any], earlier: Interrupted | None = None
+        self,
+        files: FitFiles,
+        capture: Capture,
+        metadata: Mapping[str, Any],
+        earlier: Interrupted | None = None,
     ) -> None:
         self._files = files
         self._metadata = metadata
@@ -136,7 +153,9 @@ class Recording:
         has_predecessor = earlier is None and files.stream.exists()
         self._written_files = files.next if has_predecessor else files
         if earlier is None:
-            self._writer = StreamWriter(self._written_files.stream, capture.cameras, capture.fps, metadata)
+            self._writer = StreamWriter(
+                self._written_files.stream, capture.cameras, capture.fps, metadata
+            )
         else:
             self.reports += earlier.reports
             self._writer = StreamWriter.continued(files.stream, earlier.index, earlier.end)
@@ -159,27 +178,33 @@ class Recording:
             self._check_in_place()
 
     def show(self, keyframe: Packet) -> None:
-        """Write a provisional first frame beside the stream, which viewers show until the stream has its first frame.
+        """Write a provisional first frame beside the stream, which viewers show until the stream
+        has its first frame.
 
-        If it cannot be written, e.g. because the disk has room for the result alone, a warning is logged, and it and
-        later ones are skipped.
+        If it cannot be written, e.g. because the disk has room for the result alone, a warning is
+        logged, and it and later ones are skipped.
         """
         if not self._shows_provisional:
             return
         try:
             with (
                 atomic_path(self._files.provisional, "Recording.show()") as partial,
-                StreamWriter(partial, self._capture.cameras, self._capture.fps, self._metadata) as writer,
+                StreamWriter(
+                    partial, self._capture.cameras, self._capture.fps, self._metadata
+                ) as writer,
             ):
                 writer.write(keyframe)
         except OSError:
             self._shows_provisional = False
             _LOG.warning(
-                "%s: a provisional first frame cannot be written, perhaps for lack of room; the fit goes on without it",
+                "%s: a provisional first frame cannot be written, perhaps for lack of room; the "
+                "fit goes on without it",
                 self._files.provisional,
             )
 
-    def push(self, packet: Packet, report: FrameReport, coded: CodedFrame | None, **entries: Any) -> None:
+    def push(
+        self, packet: Packet, report: FrameReport, coded: CodedFrame | None, **entries: Any
+    ) -> None:
         """Add a frame, and the keyframe that is due after it.
 
         Args:
@@ -189,12 +214,14 @@ class Recording:
             entries: further entries of the report.
 
         Raises:
-            OSError: the disk is full or not writable, or the stream was removed, moved or replaced; the stream is
-                complete up to the last frame.
+            OSError: the disk is full or not writable, or the stream was removed, moved or replaced;
+                the stream is complete up to the last frame.
         """
         self.extend([packet, *due_keyframe(coded, self._interval)], [report], **entries)
 
-    def extend(self, packets: Iterable[Packet], reports: Iterable[FrameReport], **entries: Any) -> None:
+    def extend(
+        self, packets: Iterable[Packet], reports: Iterable[FrameReport], **entries: Any
+    ) -> None:
         """Add frames with all their packets; see `push`."""
         self._check_in_place()
         reports = [*self.reports, *reports]
@@ -215,8 +242,8 @@ class Recording:
         if not is_same_file(path, self._written):
             kind = "another file" if path.exists() else "none"
             raise FileNotFoundError(
-                f"{path}: expected the stream that is being written, found {kind}: it was removed, moved or replaced; "
-                "start again, or resume it where it is now."
+                f"{path}: expected the stream that is being written, found {kind}: it was "
+                "removed, moved or replaced; start again, or resume it where it is now."
             )
 
 
@@ -250,7 +277,8 @@ def interrupted_fit(
         first: frame of the first row of the report.
 
     Raises:
-        ValueError: the stream or the report is damaged, or belongs to another capture or other settings.
+        ValueError: the stream or the report is damaged, or belongs to another capture or other
+            settings.
     """
     files.settle()
     try:
@@ -274,7 +302,13 @@ def interrupted_fit(
     assert coded is not None
     assert last is not None
     return Interrupted(
-        stream, index, end, coded, previous_state, last, read_reports(files.report, range(first, frame + 1))
+        stream,
+        index,
+        end,
+        coded,
+        previous_state,
+        last,
+        read_reports(files.report, range(first, frame + 1)),
     )
 
 
@@ -285,7 +319,11 @@ def restart_of(previous_state: CodedFrame | None, last: Packet) -> tuple[bytes, 
         previous_state: state before the frame; None if its packet is a keyframe.
         last: packet of the frame.
     """
-    return (last.encoded,) if previous_state is None else (reemitted_keyframe(previous_state).encoded, last.encoded)
+    return (
+        (last.encoded,)
+        if previous_state is None
+        else (reemitted_keyframe(previous_state).encoded, last.encoded)
+    )
 
 
 def check_same_fit(stream: StreamReader, capture: Capture, metadata: Mapping[str, Any]) -> None:
@@ -296,7 +334,9 @@ def check_same_fit(stream: StreamReader, capture: Capture, metadata: Mapping[str
     """
     # Streams of earlier versions have paths in their headers.
     excluded_names = ("capture", "distortions")
-    recorded = _without_folders({name: value for name, value in stream.metadata.items() if name not in excluded_names})
+    recorded = _without_folders(
+        {name: value for name, value in stream.metadata.items() if name not in excluded_names}
+    )
     # Refined cameras differ from the calibrated ones, which are part of the fingerprint then.
     refined = metadata["config"]["fit"]["refine_cameras"] != "off"
     cameras = stream.cameras if refined else capture.cameras
@@ -308,12 +348,15 @@ def check_same_fit(stream: StreamReader, capture: Capture, metadata: Mapping[str
         name, old_value, new_value = difference
         raise ValueError(
             f"{stream.path}: expected to resume a fit with {name} = {shortened(old_value)}, got "
-            f"{shortened(new_value)}; give the same capture and settings, or start again without --resume."
+            f"{shortened(new_value)}; give the same capture and settings, or start again without "
+            "--resume."
         )
 
 
 def stream_metadata(capture: Capture, first: PartialFrame, config: StreamConfig) -> dict[str, Any]:
-    """Return the entries of the stream's header about the fit; they must agree for a fit to be resumed."""
+    """Return the entries of the stream's header about the fit; they must agree for a fit to be
+    resumed.
+    """
     train = capture.train_views
     key_views = choose_key_views([capture.cameras[v] for v in train], config.motion.key_views)
     metadata = {
@@ -339,10 +382,20 @@ def _given(items: Sequence[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _without_folders(metadata: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a header's metadata with methods such as ``onnx:FILE`` that have the names of their files alone."""
+    """Return a header's metadata with methods such as ``onnx:FILE`` that have the names of their
+    files alone.
+    """
     match metadata:
-        case {"config": {"motion": {"flow_method": str(flow), "mask_method": str(masks)} as motion} as config}:
-            motion = {**motion, "flow_method": _without_folder(flow), "mask_method": _without_folder(masks)}
+        case {
+            "config": {
+                "motion": {"flow_method": str(flow), "mask_method": str(masks)} as motion
+            } as config
+        }:
+            motion = {
+                **motion,
+                "flow_method": _without_folder(flow),
+                "mask_method": _without_folder(masks),
+            }
             return {**metadata, "config": {**config, "motion": motion}}
     return dict(metadata)
 
@@ -353,7 +406,9 @@ def _without_folder(method: str) -> str:
 
 
 def described_capture(capture: Capture, earlier: Path | None) -> dict[str, Any]:
-    """Return the content of `capture.json`: an earlier fit's if there is one, with the capture's present path."""
+    """Return the content of `capture.json`: an earlier fit's if there is one, with the capture's
+    present path.
+    """
     description = None
     if earlier is not None:
         with suppress(OSError, ValueError):
@@ -365,9 +420,14 @@ def described_capture(capture: Capture, earlier: Path | None) -> dict[str, Any]:
 
 
 def _difference(old: Any, new: Any, name: str = "") -> tuple[str, Any, Any] | None:
-    """Return (name, old, new) of the first entry in which two JSON values differ, None if they are equal."""
+    """Return (name, old, new) of the first entry in which two JSON values differ, None if they are
+    equal.
+    """
     if isinstance(old, dict) and isinstance(new, dict):
-        pairs = (_difference(old.get(key), new.get(key), f"{name}.{key}".lstrip(".")) for key in {**old, **new})
+        pairs = (
+            _difference(old.get(key), new.get(key), f"{name}.{key}".lstrip("."))
+            for key in {**old, **new}
+        )
         return next(filter(None, pairs), None)
     return None if old == new else (name, old, new)
 
@@ -380,15 +440,25 @@ def read_reports(path: Path, frames: range) -> list[FrameReport]:
         reports = [_report(row) for row in document["frames"][: len(frames)]]
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         description = f"a broken one ({error})" if path.exists() else "none"
-        raise ValueError(f"{path}: expected the report of the fit, got {description}; {remedy}.") from None
+        raise ValueError(
+            f"{path}: expected the report of the fit, got {description}; {remedy}."
+        ) from None
     if [report.frame for report in reports] != list(frames):
-        raise ValueError(f"{path}: expected the rows of {len(frames)} frames, got {len(reports)}; {remedy}.")
+        raise ValueError(
+            f"{path}: expected the rows of {len(frames)} frames, got {len(reports)}; {remedy}."
+        )
     return reports
 
 
 def _report(row: Mapping[str, Any]) -> FrameReport:
-    exposures = tuple(Exposure(tuple(e["gain"]), tuple(e["bias"])) for e in row.get("exposures", ()))
-    values = {"seconds": float(row["seconds"]), "missing_views": tuple(row["missing_views"]), "exposures": exposures}
+    exposures = tuple(
+        Exposure(tuple(e["gain"]), tuple(e["bias"])) for e in row.get("exposures", ())
+    )
+    values = {
+        "seconds": float(row["seconds"]),
+        "missing_views": tuple(row["missing_views"]),
+        "exposures": exposures,
+    }
     return FrameReport(**{**row, **values})
 
 

@@ -1,4 +1,6 @@
-"""The demonstration: synthesise a clip, fit it with and without learned motion, evaluate both fits and draw images."""
+"""The demonstration: synthesise a clip, fit it with and without learned motion, evaluate both fits
+and draw images.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,14 @@ from morgs_mi.runs.fit_files import FitFiles, Recording, read_reports, stream_me
 from morgs_mi.studio.synth.synth_config import SynthConfig
 from morgs_mi.studio.synth.synthesize import synthesize
 
-_COMPARED = ("psnr", "ssim", "motion_error", "motion_error_moving", "motion_error_still", "true_motion_moving")
+_COMPARED = (
+    "psnr",
+    "ssim",
+    "motion_error",
+    "motion_error_moving",
+    "motion_error_still",
+    "true_motion_moving",
+)
 # Factor on the error images: errors of a tenth are visible, typical ones are smaller.
 _ERROR_GAIN = 4
 # Shortest duration of the video in seconds; a short clip is played more slowly.
@@ -50,9 +59,13 @@ class DemoConfig:
     clip: SynthConfig = field(default_factory=lambda: SynthConfig(cameras=10, frames=10, spp=16))
     """The path-traced clip, with the seed of the fit."""
     plain_frames: int = 5
-    """Number of frames of the second fit, without learned motion, offset and confidence, for comparison."""
+    """Number of frames of the second fit, without learned motion, offset and confidence, for
+    comparison.
+    """
     stream: StreamConfig = field(
-        default_factory=lambda: StreamConfig(fit=FitConfig(num_gaussians=20_000, first_frame_steps=750))
+        default_factory=lambda: StreamConfig(
+            fit=FitConfig(num_gaussians=20_000, first_frame_steps=750)
+        )
     )
     """The fit, with a shortened, smaller first frame; its seed is also the clip's."""
 
@@ -85,11 +98,14 @@ class DemoReport:
         }
 
 
-def run_demo(out: str | Path, config: DemoConfig | None = None, progress: Report | None = None) -> DemoReport:
+def run_demo(
+    out: str | Path, config: DemoConfig | None = None, progress: Report | None = None
+) -> DemoReport:
     """Synthesise a clip, fit it, and write images and results of its held-out view into `out`.
 
-    The folder contains ``capture/`` (reused if it has the same settings), ``stream/``, ``stream_plain/``,
-    ``side_by_side.mp4`` (truth, render, motion, confidence), ``contact_sheet.png`` and ``report.json``.
+    The folder contains ``capture/`` (reused if it has the same settings), ``stream/``,
+    ``stream_plain/``, ``side_by_side.mp4`` (truth, render, motion, confidence),
+    ``contact_sheet.png`` and ``report.json``.
 
     Args:
         out: the folder.
@@ -98,8 +114,8 @@ def run_demo(out: str | Path, config: DemoConfig | None = None, progress: Report
 
     Raises:
         ValueError: a setting is out of range, or `out` lies in a capture.
-        OSError: a file cannot be written, another process writes into the folder, or ``capture`` exists and is not a
-            synthetic capture.
+        OSError: a file cannot be written, another process writes into the folder, or ``capture``
+            exists and is not a synthetic capture.
     """
     root = check_output(Path(out))
     with locked_folder(root, "run_demo()"):
@@ -116,25 +132,39 @@ def _run(root: Path, config: DemoConfig, report_stage: Report | None) -> DemoRep
         seconds[name] = time.perf_counter() - start
         return result
 
-    def fit(capture: Capture, folder: str, settings: StreamConfig, progress: Progress, resume: bool = False) -> None:
+    def fit(
+        capture: Capture,
+        folder: str,
+        settings: StreamConfig,
+        progress: Progress,
+        resume: bool = False,
+    ) -> None:
         def report(stage: str, done: float, total: float) -> None:
             progress.of(f"{progress.stage}: {stage.lower()}")(done, total)
 
         stream_capture(capture, root / folder, settings, resume, report)
 
     def fit_plain(progress: Progress) -> None:
-        capture = load_capture(root / "capture", max_frames=min(config.plain_frames, config.clip.frames))
+        capture = load_capture(
+            root / "capture", max_frames=min(config.plain_frames, config.clip.frames)
+        )
         _begin_with_first_frame(root / "stream_plain", root / "stream", capture, plain)
         fit(capture, "stream_plain", plain, progress, resume=True)
 
-    run_step("Path-tracing the clip", lambda report: _synthesize_clip(root / "capture", config, report))
+    run_step(
+        "Path-tracing the clip", lambda report: _synthesize_clip(root / "capture", config, report)
+    )
     switches = {"learn_motion": False, "learn_offset": False, "learn_confidence": False}
     plain = replace(config.stream, motion=replace(config.stream.motion, **switches))
-    run_step("Fitting", lambda report: fit(load_capture(root / "capture"), "stream", config.stream, report))
+    run_step(
+        "Fitting",
+        lambda report: fit(load_capture(root / "capture"), "stream", config.stream, report),
+    )
     run_step("Fitting without ML, MO, MC", fit_plain)
     results = {
         name: run_step(
-            f"Evaluating {folder}", lambda report, folder=folder: evaluate_stream(root / folder, progress=report)
+            f"Evaluating {folder}",
+            lambda report, folder=folder: evaluate_stream(root / folder, progress=report),
         )
         for name, folder in (("full", "stream"), ("plain", "stream_plain"))
     }
@@ -143,13 +173,19 @@ def _run(root: Path, config: DemoConfig, report_stage: Report | None) -> DemoRep
     seconds["total"] = sum(seconds.values())
     full = results["full"]
     plain_result = results["plain"]
-    report = DemoReport(config, full, plain_result, frames, comparison, seconds, machine(), versions())
+    report = DemoReport(
+        config, full, plain_result, frames, comparison, seconds, machine(), versions()
+    )
     write_json(root / REPORT, report.as_dict())
     return report
 
 
-def _synthesize_clip(folder: Path, config: DemoConfig, report: Callable[[float, float], None]) -> None:
-    """Path-trace the clip unless `folder` has it already; captures are written atomically, so it is complete."""
+def _synthesize_clip(
+    folder: Path, config: DemoConfig, report: Callable[[float, float], None]
+) -> None:
+    """Path-trace the clip unless `folder` has it already; captures are written atomically, so it is
+    complete.
+    """
     clip = replace(config.clip, seed=config.stream.seed)
     settings = {"scene": config.scene, **clip.as_dict()}
     set_values = {name: value for name, value in settings.items() if value is not None}
@@ -157,14 +193,19 @@ def _synthesize_clip(folder: Path, config: DemoConfig, report: Callable[[float, 
         metadata = read_json(folder / CAPTURE)
     except (OSError, ValueError):
         metadata = None
-    if isinstance(metadata, dict) and all(metadata.get(name) == value for name, value in set_values.items()):
+    if isinstance(metadata, dict) and all(
+        metadata.get(name) == value for name, value in set_values.items()
+    ):
         report(1, 1)
         return
     synthesize(config.scene, folder, clip, overwrite=True, progress=report)
 
 
-def _begin_with_first_frame(out: Path, source: Path, capture: Capture, config: StreamConfig) -> None:
-    """Begin a fit with the first frame of another fit: it has no motion, so the settings of the motion change nothing.
+def _begin_with_first_frame(
+    out: Path, source: Path, capture: Capture, config: StreamConfig
+) -> None:
+    """Begin a fit with the first frame of another fit: it has no motion, so the settings of the
+    motion change nothing.
 
     Args:
         out: folder of the fit, which `stream_capture` resumes.
@@ -181,13 +222,21 @@ def _begin_with_first_frame(out: Path, source: Path, capture: Capture, config: S
         recording.extend([next(iter(stream))], read_reports(FitFiles.of(source).report, range(1)))
 
 
-def _compare(results: Mapping[str, Evaluation]) -> tuple[list[int], dict[str, dict[str, float | None]]]:
-    """Return the frames that both fits have, without the first, which has no motion, and mean scores over them."""
+def _compare(
+    results: Mapping[str, Evaluation],
+) -> tuple[list[int], dict[str, dict[str, float | None]]]:
+    """Return the frames that both fits have, without the first, which has no motion, and mean
+    scores over them.
+    """
     count = min(result.num_frames for result in results.values())
     rows = {name: result.frames[1:count] for name, result in results.items()}
 
     def mean(name: str, score: str) -> float | None:
-        return float(np.mean([getattr(row.scores, score) for row in rows[name]])) if rows[name] else None
+        return (
+            float(np.mean([getattr(row.scores, score) for row in rows[name]]))
+            if rows[name]
+            else None
+        )
 
     means = {name: {score: mean(name, score) for score in _COMPARED} for name in rows}
     return [row.frame for row in rows["full"]], means
@@ -213,20 +262,38 @@ def _draw(out: Path, capture: Capture, report: Callable[[float, float], None]) -
     report(2, 2)
 
 
-def _panels(capture: Capture, stream: Path, scale: float, note: str = "") -> list[dict[str, np.ndarray]]:
-    """Return the labelled images of every frame of the held-out view by name; `note` is appended to the labels."""
+def _panels(
+    capture: Capture, stream: Path, scale: float, note: str = ""
+) -> list[dict[str, np.ndarray]]:
+    """Return the labelled images of every frame of the held-out view by name; `note` is appended to
+    the labels.
+    """
     reader = open_stream(stream)
     view = capture.reference_view
     camera = reader.cameras[view]
     frames = []
-    for frame, (index, images) in zip(capture.frames(), render_stream(reader, camera), strict=False):
+    for frame, (index, images) in zip(
+        capture.frames(), render_stream(reader, camera), strict=False
+    ):
         truth = truth_for_camera(capture, camera, index)
         picture = channel_image("color", images["color"])
         error = np.abs(picture.astype(float) - frame.images[view]) * _ERROR_GAIN / 255
-        panels = {"truth": frame.images[view], "render": picture, "error": channel_image("color", error)}
+        panels = {
+            "truth": frame.images[view],
+            "render": picture,
+            "error": channel_image("color", error),
+        }
         if truth is not None:
             panels["true motion"] = channel_image("motion", truth.motion, scale)
-        panels |= {n: channel_image(n, images[n], scale) for n in ("motion", "confidence") if n in images}
-        labels = {"truth": f"truth, frame {index}", "error": f"error x{_ERROR_GAIN}", "true motion": "true motion"}
-        frames.append({name: label(panel, labels.get(name, name + note)) for name, panel in panels.items()})
+        panels |= {
+            n: channel_image(n, images[n], scale) for n in ("motion", "confidence") if n in images
+        }
+        labels = {
+            "truth": f"truth, frame {index}",
+            "error": f"error x{_ERROR_GAIN}",
+            "true motion": "true motion",
+        }
+        frames.append(
+            {name: label(panel, labels.get(name, name + note)) for name, panel in panels.items()}
+        )
     return frames

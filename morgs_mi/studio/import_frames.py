@@ -1,13 +1,15 @@
 """Frames of other tools as a stream: one file with Gaussians per frame, without a capture.
 
-Files do not name their Gaussians, so identities follow from the order of the rows. If a frame has as many as the frame
-before, and nearly every row resembles the same row there more than the next one, the rows are taken for the same
-Gaussians. Otherwise rows may have been removed and added: each row is matched with the most similar one of the frame
-before, and the longest sequence of matches in the order of both frames survives. If that is most of the Gaussians, the
-frame becomes a residual, and the survivors keep their ids; otherwise it becomes a keyframe with a new set of Gaussians.
+Files do not name their Gaussians, so identities follow from the order of the rows. If a frame has
+as many as the frame before, and nearly every row resembles the same row there more than the next
+one, the rows are taken for the same Gaussians. Otherwise rows may have been removed and added: each
+row is matched with the most similar one of the frame before, and the longest sequence of matches in
+the order of both frames survives. If that is most of the Gaussians, the frame becomes a residual,
+and the survivors keep their ids; otherwise it becomes a keyframe with a new set of Gaussians.
 
-The header of a stream has at least one camera, on whose screen the codec measures its errors and with which players
-begin. An imported stream has a ring of them, which sees the Gaussians of several frames.
+The header of a stream has at least one camera, on whose screen the codec measures its errors and
+with which players begin. An imported stream has a ring of them, which sees the Gaussians of several
+frames.
 """
 
 from __future__ import annotations
@@ -35,9 +37,11 @@ from morgs_mi.playback.default_rig import DEFAULT_RIG, Axes, default_rig
 from morgs_mi.runs.fit_files import due_keyframe
 
 _FRAMES_IN_VIEW = 3  # first, middle and last
-# With rows of other Gaussians the share is about a half; with the same ones, only near-duplicates reduce it.
+# With rows of other Gaussians the share is about a half; with the same ones, only near-duplicates
+# reduce it.
 _LEAST_SHARE = 0.95
-# Share of the smaller frame that survives at least. Of n matches in random order, about 2 sqrt(n) are a sequence.
+# Share of the smaller frame that survives at least. Of n matches in random order, about 2 sqrt(n)
+# are a sequence.
 _LEAST_SURVIVORS = 0.8
 
 
@@ -60,19 +64,22 @@ def import_frames(
     progress: Callable[[int, int], None] | None = None,
     most_invalid: float = 0.0,
 ) -> Imported:
-    """Write files with Gaussians, one per frame, as a stream, and return a summary; the stream is written atomically.
+    """Write files with Gaussians, one per frame, as a stream, and return a summary; the stream is
+    written atomically.
 
-    One frame is in memory at a time. Motion is the displacement since the frame before, zero in keyframes; confidence
-    and offset are not stored.
+    One frame is in memory at a time. Motion is the displacement since the frame before, zero in
+    keyframes; confidence and offset are not stored.
 
     Args:
         sources: one folder, or the files in the order of the frames, see `find_frames`.
-        out: new file with a name that ends in ``.morgs``, or a folder for ``stream.morgs``; folders are created.
+        out: new file with a name that ends in ``.morgs``, or a folder for ``stream.morgs``; folders
+            are created.
         fps: frames per second.
         config: precision of the stream.
         axes: direction that is up.
         progress: called with (frames done, number of frames).
-        most_invalid: share of a frame's Gaussians with invalid numbers that are left out with a warning; 0: none.
+        most_invalid: share of a frame's Gaussians with invalid numbers that are left out with a
+            warning; 0: none.
 
     Raises:
         FileNotFoundError: a file or the folder is missing.
@@ -85,7 +92,9 @@ def import_frames(
     paths = find_frames(sources)
     path = Path(out) if Path(out).suffix.lower() == ".morgs" else Path(out) / STREAM
     if path.exists():
-        raise FileExistsError(f"{path}: expected a new stream, got a file that exists; remove it, or name another.")
+        raise FileExistsError(
+            f"{path}: expected a new stream, got a file that exists; remove it, or name another."
+        )
     in_view = np.unique(np.linspace(0, len(paths) - 1, _FRAMES_IN_VIEW).astype(int))
     try:
         cameras = default_rig([read_splats(paths[t], most_invalid) for t in in_view], axes)
@@ -98,21 +107,34 @@ def import_frames(
     order = np.zeros(0, np.int64)
     keyframes = 0
     metadata = {"num_frames": len(paths), DEFAULT_RIG: True, "config": {"codec": asdict(config)}}
-    with atomic_path(path, "import_frames()") as partial, StreamWriter(partial, cameras, fps, metadata) as writer:
+    with (
+        atomic_path(path, "import_frames()") as partial,
+        StreamWriter(partial, cameras, fps, metadata) as writer,
+    ):
         for frame, source in enumerate(paths):
             gaussians = read_splats(source, most_invalid)
-            rows = None if state is None else matched_rows(state.gaussians.select(np.argsort(order)), gaussians)
+            rows = (
+                None
+                if state is None
+                else matched_rows(state.gaussians.select(np.argsort(order)), gaussians)
+            )
             if state is None or rows is None:
                 order = np.arange(len(gaussians))
                 packet = keyframe_packet(gaussians, frame, cameras, config)
             else:
-                rows = np.where(rows < 0, -1, np.argsort(order)[rows])  # of the state, where births are last
+                # Of the state, where births are last.
+                rows = np.where(rows < 0, -1, np.argsort(order)[rows])
                 order = np.argsort(np.where(rows < 0, len(state), rows), kind="stable")
-                packet = residual_packet(state, gaussians.select(order), rows[order], cameras, config)
+                packet = residual_packet(
+                    state, gaussians.select(order), rows[order], cameras, config
+                )
             state = decode(state, packet)
             is_keyframe = packet.kind == PacketKind.KEYFRAME
             keyframes += is_keyframe
-            for each in (packet, *([] if is_keyframe else due_keyframe(state, config.keyframe_interval))):
+            for each in (
+                packet,
+                *([] if is_keyframe else due_keyframe(state, config.keyframe_interval)),
+            ):
                 writer.write(each)
             if progress is not None:
                 progress(frame + 1, len(paths))
@@ -123,8 +145,8 @@ def find_frames(sources: Sequence[str | Path]) -> list[Path]:
     """Return the files of the frames in their order.
 
     Args:
-        sources: one folder, whose files with the suffixes of `SUFFIXES` are ordered by the numbers in their names; or
-            files, which stay in the given order.
+        sources: one folder, whose files with the suffixes of `SUFFIXES` are ordered by the numbers
+            in their names; or files, which stay in the given order.
 
     Raises:
         FileNotFoundError: the folder or a file is missing.
@@ -133,7 +155,9 @@ def find_frames(sources: Sequence[str | Path]) -> list[Path]:
     paths = [Path(source) for source in sources]
     for path in paths:
         if not path.exists():
-            raise FileNotFoundError(f"{path}: expected frames ({', '.join(SUFFIXES)}), found none; check the path.")
+            raise FileNotFoundError(
+                f"{path}: expected frames ({', '.join(SUFFIXES)}), found none; check the path."
+            )
     if len(paths) == 1 and paths[0].is_dir():
         folder = paths[0]
         files = (path for path in listed(folder) if path.is_file() and suffix_of(path))
@@ -142,27 +166,33 @@ def find_frames(sources: Sequence[str | Path]) -> list[Path]:
             for file in listed(folder):
                 refuse_foreign(file)
             raise ValueError(
-                f"{folder}: expected files whose names end in {', '.join(SUFFIXES)}, got none; convert the frames."
+                f"{folder}: expected files whose names end in {', '.join(SUFFIXES)}, got none; "
+                "convert the frames."
             )
     if not paths:
-        raise ValueError("import_frames(): `sources` must be a folder or at least one file, got none.")
+        raise ValueError(
+            "import_frames(): `sources` must be a folder or at least one file, got none."
+        )
     first = {suffix_of(path): path for path in reversed(paths)}
     if None in first:
         refuse_foreign(first[None])
         raise ValueError(
-            f"{first[None]}: expected one folder, or files whose names end in {', '.join(SUFFIXES)}, got another; "
-            "convert it, or leave it out."
+            f"{first[None]}: expected one folder, or files whose names end in "
+            f"{', '.join(SUFFIXES)}, got another; convert it, or leave it out."
         )
     if len(first) > 1:
         names = " and ".join(path.name for path in first.values())
         raise ValueError(
-            f"{paths[0].parent}: expected frames of one format, got {names}; name the files of one of them."
+            f"{paths[0].parent}: expected frames of one format, got {names}; name the files of "
+            "one of them."
         )
     return paths
 
 
 def same_gaussians(before: Gaussians, now: Gaussians) -> bool:
-    """Return whether the rows of two frames are the same Gaussians, by centre, size, opacity and base colour."""
+    """Return whether the rows of two frames are the same Gaussians, by centre, size, opacity and
+    base colour.
+    """
     if len(before) != len(now) or before.sh_degree != now.sh_degree or not len(now):
         return False
     old, new = _scaled_features(before, now)
@@ -172,7 +202,8 @@ def same_gaussians(before: Gaussians, now: Gaussians) -> bool:
 
 
 def matched_rows(before: Gaussians, now: Gaussians) -> np.ndarray | None:
-    """Return the row in the frame before of each Gaussian, -1 for births; None if the frames have other Gaussians.
+    """Return the row in the frame before of each Gaussian, -1 for births; None if the frames have
+    other Gaussians.
 
     Args:
         before: N Gaussians.
@@ -197,8 +228,11 @@ def matched_rows(before: Gaussians, now: Gaussians) -> np.ndarray | None:
         return None
     rows = np.full(len(now), -1)
     rows[survivors] = nearest[survivors]
-    # Between two survivors with as many rows between them in both frames, those are the same ones, too.
-    ends = np.concatenate([[[-1, -1]], np.stack([survivors, nearest[survivors]], axis=1), [[len(now), len(before)]]])
+    # Between two survivors with as many rows between them in both frames, those are the same ones,
+    # too.
+    ends = np.concatenate(
+        [[[-1, -1]], np.stack([survivors, nearest[survivors]], axis=1), [[len(now), len(before)]]]
+    )
     gap, gap_before = np.diff(ends, axis=0).T
     for k in np.flatnonzero((gap == gap_before) & (gap > 1)):
         row, row_before = ends[k] + 1
@@ -206,8 +240,12 @@ def matched_rows(before: Gaussians, now: Gaussians) -> np.ndarray | None:
     return rows
 
 
-def _scaled_features(old_gaussians: Gaussians, new_gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
-    """Return the features of two frames in units of their spread in the first, without those that are equal there."""
+def _scaled_features(
+    old_gaussians: Gaussians, new_gaussians: Gaussians
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the features of two frames in units of their spread in the first, without those that
+    are equal there.
+    """
     old = _features(old_gaussians)
     new = _features(new_gaussians)
     spread = old.std(axis=0)
@@ -238,5 +276,7 @@ def _features(gaussians: Gaussians) -> np.ndarray:
     # Opacities of 0 and 1 have logits far from all others.
     opacities = np.clip(raw["logit_opacities"], -5, 5)[:, None]
     return np.concatenate(
-        [raw["means"], raw["log_scales"], opacities, raw["sh_coeffs"][:, 0]], axis=1, dtype=np.float64
+        [raw["means"], raw["log_scales"], opacities, raw["sh_coeffs"][:, 0]],
+        axis=1,
+        dtype=np.float64,
     )

@@ -1,4 +1,6 @@
-"""Error against run time of a capture: fits with several numbers of epochs and several seeds, and their scores."""
+"""Error against run time of a capture: fits with several numbers of epochs and several seeds, and
+their scores.
+"""
 
 from __future__ import annotations
 
@@ -49,10 +51,12 @@ def sweep(
 ) -> list[Scores]:
     """Fit and evaluate a capture with each number of epochs and each of the seeds 0, 1, ....
 
-    Kernels are compiled before the first fit. OUT/epochs4-seed0 etc. have the streams, OUT/sweep.json the scores.
+    Kernels are compiled before the first fit. OUT/epochs4-seed0 etc. have the streams,
+    OUT/sweep.json the scores.
 
     Returns:
-        The number of epochs, seed, seconds, bytes and mean scores of each fit, by name; NaN where they are unknown.
+        The number of epochs, seed, seconds, bytes and mean scores of each fit, by name; NaN where
+        they are unknown.
 
     Raises:
         ValueError: a number is below 1, or as `stream_capture`.
@@ -68,9 +72,15 @@ def sweep(
     for count, seed in ladder:
         stage(len(rows), len(ladder))
         folder = Path(out) / f"epochs{count}-seed{seed}"
-        stream_capture(capture, folder, replace(config, fit=replace(config.fit, epochs=count), seed=seed))
-        rows.append({"epochs": count, "seed": seed, **_scores(evaluate_stream(folder, capture.path))})
-        write_json(Path(out) / "sweep.json", {"rows": rows, "machine": machine(), "versions": versions()})
+        stream_capture(
+            capture, folder, replace(config, fit=replace(config.fit, epochs=count), seed=seed)
+        )
+        rows.append(
+            {"epochs": count, "seed": seed, **_scores(evaluate_stream(folder, capture.path))}
+        )
+        write_json(
+            Path(out) / "sweep.json", {"rows": rows, "machine": machine(), "versions": versions()}
+        )
     stage(len(rows), len(ladder))
     return rows
 
@@ -92,12 +102,19 @@ def _scores(result: Evaluation) -> Scores:
 
 def mean_scores(rows: Sequence[Scores]) -> list[Scores]:
     """Return the means over the seeds, for each number of epochs."""
-    same = {epochs: [row for row in rows if row["epochs"] == epochs] for epochs in {row["epochs"]: 0 for row in rows}}
-    return [{name: known_mean([row[name] for row in group]) for name in group[0]} for group in same.values()]
+    same = {
+        epochs: [row for row in rows if row["epochs"] == epochs]
+        for epochs in {row["epochs"]: 0 for row in rows}
+    }
+    return [
+        {name: known_mean([row[name] for row in group]) for name in group[0]}
+        for group in same.values()
+    ]
 
 
 def write_sweep_plot(path: Path, rows: Sequence[Scores]) -> None:
-    """Plot scores and sizes over the seconds of a later frame: a dot for each fit, a line through the means.
+    """Plot scores and sizes over the seconds of a later frame: a dot for each fit, a line through
+    the means.
 
     Raises:
         ValueError: as `check_plot`.
@@ -111,7 +128,9 @@ def write_sweep_plot(path: Path, rows: Sequence[Scores]) -> None:
     figure = Figure(figsize=(3.6 * len(panels), 3.2), layout="constrained")
     for axes, name in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
         axes.plot([row["later_seconds"] for row in means], [row[name] for row in means])
-        axes.plot([row["later_seconds"] for row in rows], [row[name] for row in rows], "o", markersize=4)
+        axes.plot(
+            [row["later_seconds"] for row in rows], [row[name] for row in rows], "o", markersize=4
+        )
         for row in means:
             place = (row["later_seconds"], row[name])
             axes.annotate(f"{row['epochs']:.0f}", place, xytext=(4, 4), textcoords="offset points")

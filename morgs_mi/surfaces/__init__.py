@@ -1,1 +1,3 @@
-"""Surfaces among Gaussians: the other shapes of a Mitsuba scene, their light, shadows and reflections."""
+"""Surfaces among Gaussians: the other shapes of a Mitsuba scene, their light, shadows and
+reflections.
+"""

@@ -1,12 +1,14 @@
 """Splats and surfaces in one image.
 
-Per pixel, a fraction f is covered by surfaces at depth z, with radiance L there and E elsewhere. C(z) and T(z) are the
-blended colour of the splats in front of z and the transmittance that remains; at z = inf, of all splats:
+Per pixel, a fraction f is covered by surfaces at depth z, with radiance L there and E elsewhere.
+C(z) and T(z) are the blended colour of the splats in front of z and the transmittance that remains;
+at z = inf, of all splats:
 
     f dec(C(z) + T(z) enc(L)) + (1 - f) dec(C(inf) + T(inf) enc(E))
 
-`enc` encodes linear light like the colours of the splats (sRGB, or not at all) and `dec` decodes it: a surface is
-blended like one more splat, and the two parts of a pixel are averaged in linear light, as a film does.
+`enc` encodes linear light like the colours of the splats (sRGB, or not at all) and `dec` decodes
+it: a surface is blended like one more splat, and the two parts of a pixel are averaged in linear
+light, as a film does.
 """
 
 from __future__ import annotations
@@ -38,15 +40,18 @@ def composite(
     view: SurfaceView,
     config: RenderConfig | None = None,
 ) -> Columns:
-    """Return the channels of splats and surfaces, differentiable in both, each a list of floats [P].
+    """Return the channels of splats and surfaces, differentiable in both, each a list of floats
+    [P].
 
-    Colour is linear light. Alpha is 1 where a surface or the environment is seen. Depth is the expected depth of splats
-    and surfaces together. Motion and the channels of attributes belong to the splats in front of the surfaces.
+    Colour is linear light. Alpha is 1 where a surface or the environment is seen. Depth is the
+    expected depth of splats and surfaces together. Motion and the channels of attributes belong to
+    the splats in front of the surfaces.
 
     Args:
         gaussians: N Gaussians.
         channels: as for `rasterize`.
-        background: colour [3] behind all splats where no surface and no environment is seen, encoded like the splats.
+        background: colour [3] behind all splats where no surface and no environment is seen,
+            encoded like the splats.
         view: the surfaces on P pixels of a camera's image.
         config: settings of the rasteriser.
     """
@@ -67,7 +72,8 @@ def composite(
     for k in range(3):
         L = view.image[:, :, k].array
         E = behind[k]
-        # Rays of its own find the coverage. Without splats, the two parts add up to L whatever it is.
+        # Rays of its own find the coverage. Without splats, the two parts add up to L whatever it
+        # is.
         surface = dr.maximum(L - (1 - f) * E, 0) / dr.select(has_surface, f, 1)
         rest = dr.maximum(L - f * surface, 0) / dr.select(f < 1, 1 - f, 1)
         beyond = encode(rest) + ground[k]
@@ -75,12 +81,17 @@ def composite(
         outer_color = decode(dr.fma(t_whole, beyond, whole["color"][k]))
         color.append(dr.fma(f, inner_color - outer_color, outer_color))
 
-    splats = {name: [dr.lerp(b, a, f) for a, b in zip(front[name], whole[name], strict=True)] for name in channels}
+    splats = {
+        name: [dr.lerp(b, a, f) for a, b in zip(front[name], whole[name], strict=True)]
+        for name in channels
+    }
     (alpha,) = splats["alpha"]
     if "depth" in channels:
         (depth,) = splats["depth"]
         weight = alpha + f * t_front
-        splats["depth"] = _ratio([depth + f * t_front * dr.select(has_surface, view.depth, 0)], weight)
+        splats["depth"] = _ratio(
+            [depth + f * t_front * dr.select(has_surface, view.depth, 0)], weight
+        )
     if "motion" in channels:
         splats["motion"] = _ratio(splats["motion"], alpha)
     opaque = mi.Float(1) if has_environment else dr.fma(f, t_whole, 1 - t_whole)
@@ -88,9 +99,13 @@ def composite(
 
 
 def _in_front(
-    gaussians: ActivatedGaussians, channels: tuple[str, ...], view: SurfaceView, config: RenderConfig | None
+    gaussians: ActivatedGaussians,
+    channels: tuple[str, ...],
+    view: SurfaceView,
+    config: RenderConfig | None,
 ) -> Columns | None:
-    """Return the blended sums of the splats in front of the surfaces [P], 0 where there are none; None: nowhere.
+    """Return the blended sums of the splats in front of the surfaces [P], 0 where there are none;
+    None: nowhere.
 
     Only the blocks of pixels in which a surface is seen are drawn.
     """
@@ -103,13 +118,18 @@ def _in_front(
     pixel = dr.arange(mi.UInt32, width * height)
     row = pixel // dr.opaque(mi.UInt32, width)
     limit = dr.full(mi.Float, dr.inf, mask.size)
-    place = dr.fma(row + y, dr.opaque(mi.UInt32, camera.width), pixel - row * dr.opaque(mi.UInt32, width) + x)
+    place = dr.fma(
+        row + y, dr.opaque(mi.UInt32, camera.width), pixel - row * dr.opaque(mi.UInt32, width) + x
+    )
     dr.scatter(limit, view.depth, place, mode=dr.ReduceMode.Permute)
     region = Region(mask)
     depth_limit = mi.TensorXf(limit, mask.shape)
-    part = rasterize(gaussians, camera, channels, region=region, config=config, depth_limit=depth_limit)
+    part = rasterize(
+        gaussians, camera, channels, region=region, config=config, depth_limit=depth_limit
+    )
     index_image = region.paste(
-        np.arange(int(np.prod(region.shape(1)))).reshape(region.shape(1)[:3]), np.zeros(mask.shape, int)
+        np.arange(int(np.prod(region.shape(1)))).reshape(region.shape(1)[:3]),
+        np.zeros(mask.shape, int),
     )
     index = from_numpy(mi.UInt32, index_image[y : y + height, x : x + width])
     has_surface = view.coverage > 0
@@ -117,20 +137,28 @@ def _in_front(
     def on_crop(image: Tensor) -> list[Float]:
         size = image.shape[-1]
         mode = dr.ReduceMode.NoConflicts
-        return [dr.gather(mi.Float, image.array, index * size + k, active=has_surface, mode=mode) for k in range(size)]
+        return [
+            dr.gather(mi.Float, image.array, index * size + k, active=has_surface, mode=mode)
+            for k in range(size)
+        ]
 
     return _blended(part, channels, on_crop)
 
 
-def _blended(image: Image, channels: tuple[str, ...], columns: Callable[[Tensor], list[Float]]) -> Columns:
+def _blended(
+    image: Image, channels: tuple[str, ...], columns: Callable[[Tensor], list[Float]]
+) -> Columns:
     """Return the columns of every channel as sums weighted by T alpha."""
     values = {name: columns(image[name]) for name in channels}
     (alpha,) = values["alpha"]
-    return {name: [v * alpha for v in value] if name in NORMALISED else value for name, value in values.items()}
+    return {
+        name: [v * alpha for v in value] if name in NORMALISED else value
+        for name, value in values.items()
+    }
 
 
 def cropped(image: Tensor, crop: Crop) -> list[Float]:
-    """Return the columns [P] of an image [H, W, C] on the pixels of a crop (x, y, width, height)."""
+    """Return the columns [P] of an image [H, W, C] on a crop (x, y, width, height)."""
     x, y, width, height = crop
     return [image[y : y + height, x : x + width, k].array for k in range(image.shape[2])]
 

@@ -29,7 +29,14 @@ from morgs_mi.surfaces.surface_view import SampledPixels, SurfaceView
 _log = logging.getLogger(__name__)
 
 # Settings of the rasteriser that are properties of the plugin.
-_SETTINGS = ("eps2d", "alpha_min", "stop_transmittance", "antialiased", "first_order_motion", "reproducible")
+_SETTINGS = (
+    "eps2d",
+    "alpha_min",
+    "stop_transmittance",
+    "antialiased",
+    "first_order_motion",
+    "reproducible",
+)
 
 
 class _SceneGaussians:
@@ -52,29 +59,38 @@ class _SceneGaussians:
 
 
 def _scene_gaussians(scene: Any, attributes: list[str], with_surfaces: bool) -> _SceneGaussians:
-    """Return the Gaussians of all shapes, padded with zeros to the largest number of SH coefficients."""
+    """Return the Gaussians of all shapes, padded with zeros to the largest number of SH
+    coefficients.
+    """
     shapes = [shape for shape in scene.shapes() if shape.is_ellipsoids()]
     for shape in scene.shapes():
         if not (with_surfaces or shape.is_ellipsoids()):
             raise ValueError(
-                f"gaussian_splat: expected `ellipsoids` shapes only, got {shape.class_name()} {shape.id()!r}; "
-                "remove it from the scene, or set `surfaces` to an integrator that renders it, such as `path`."
+                f"gaussian_splat: expected `ellipsoids` shapes only, got {shape.class_name()} "
+                f"{shape.id()!r}; remove it from the scene, or set `surfaces` to an integrator "
+                "that renders it, such as `path`."
             )
     if not shapes:
-        raise ValueError("gaussian_splat: expected a scene with an `ellipsoids` shape, got none; add one.")
+        raise ValueError(
+            "gaussian_splat: expected a scene with an `ellipsoids` shape, got none; add one."
+        )
     parts = [_shape_gaussians(shape, attributes) for shape in shapes]
     K = max(part["sh_coeffs"].shape[1] for part in parts)
     for part in parts:
         N, present, _ = part["sh_coeffs"].shape
         if present < K:
-            part["sh_coeffs"] = dr.concat([part["sh_coeffs"], dr.zeros(mi.TensorXf, (N, K - present, 3))], axis=1)
+            part["sh_coeffs"] = dr.concat(
+                [part["sh_coeffs"], dr.zeros(mi.TensorXf, (N, K - present, 3))], axis=1
+            )
     if len(parts) == 1:
         return _SceneGaussians(parts[0])
-    return _SceneGaussians({name: dr.concat([part[name] for part in parts], axis=0) for name in parts[0]})
+    return _SceneGaussians(
+        {name: dr.concat([part[name] for part in parts], axis=0) for name in parts[0]}
+    )
 
 
 def _shape_gaussians(shape: Any, attributes: list[str]) -> dict[str, Tensor]:
-    """Return one shape's attributes by the rasteriser's names, attached to the shape's parameters."""
+    """Return a shape's attributes by the rasteriser's names, attached to its parameters."""
     params: Any = mi.traverse(shape)
     data = mi.TensorXf(params["data"], (dr.width(params["data"]) // 10, 10))
     N = data.shape[0]
@@ -87,9 +103,9 @@ def _shape_gaussians(shape: Any, attributes: list[str]) -> dict[str, Tensor]:
             expected = " or ".join(map(str, widths))
             content = f"{size} values" if name in params else f"only {sorted(params.keys())}"
             raise ValueError(
-                f"gaussian_splat: the {shape.class_name()} {shape.id()!r} must have `{name}` [N, {expected}] with "
-                f"N={N}, got {content}; set it where the shape is defined, or write its file by "
-                "morgs_mi.write_ply(path, gaussians, layout='mitsuba')."
+                f"gaussian_splat: the {shape.class_name()} {shape.id()!r} must have `{name}` [N, "
+                f"{expected}] with N={N}, got {content}; set it where the shape is defined, or "
+                "write its file by morgs_mi.write_ply(path, gaussians, layout='mitsuba')."
             )
         tail = (size // N // 3, 3) if name == "sh_coeffs" else BY_ACTIVATED_NAME[name].shape
         part[name] = mi.TensorXf(params[name], (N, *tail))
@@ -97,13 +113,17 @@ def _shape_gaussians(shape: Any, attributes: list[str]) -> dict[str, Tensor]:
 
 
 class _ForwardPass(NamedTuple):
-    """A rendering with gradients: its inputs, which must not have changed for the backward pass, and the image."""
+    """A rendering with gradients: its inputs, which must not have changed for the backward pass,
+    and the image.
+    """
 
     inputs: list[Any]
     image: Any
 
     def fits(self, inputs: list[Any]) -> bool:
-        """Return whether the inputs are the same numbers and the same Dr.Jit variables as those of the image."""
+        """Return whether the inputs are the same numbers and the same Dr.Jit variables as those of
+        the image.
+        """
         return [_identity(leaf) for leaf in inputs] == [_identity(leaf) for leaf in self.inputs]
 
 
@@ -116,29 +136,41 @@ def _leaves(value: Any) -> list[Any]:
     value = getattr(value, "matrix", value)  # of a transform
     if not (dr.is_array_v(value) and dr.is_jit_v(value)):
         return [str(value)]
-    return [leaf for part in value for leaf in _leaves(part)] if dr.depth_v(value) > 1 else [type(value)(value)]
+    return (
+        [leaf for part in value for leaf in _leaves(part)]
+        if dr.depth_v(value) > 1
+        else [type(value)(value)]
+    )
 
 
 def _views(sensor: Any) -> list[Any]:
-    """Return the sensors of a `batch`, which are beside each other on its film, or the sensor itself."""
+    """Return the sensors of a `batch`, which are beside each other on its film, or the sensor
+    itself.
+    """
     if sensor.class_name() != "BatchSensor":
         return [sensor]
     parts: Any = mi.traverse(sensor).hierarchy
-    return [part for part, (parent, _) in parts.items() if isinstance(part, mi.Sensor) and parent is sensor]
+    return [
+        part
+        for part, (parent, _) in parts.items()
+        if isinstance(part, mi.Sensor) and parent is sensor
+    ]
 
 
 def _sensor_camera(sensor: Any, border: int) -> Camera:
     """Return the camera of the sensor's whole film with a margin of `border` pixels."""
     if sensor.class_name() != "PerspectiveCamera":
         raise ValueError(
-            f"gaussian_splat: expected a `perspective` sensor or a `batch` of them, got {sensor.class_name()}; splats "
-            "are drawn only by pinhole cameras without lens distortion."
+            "gaussian_splat: expected a `perspective` sensor or a `batch` of them, got "
+            f"{sensor.class_name()}; splats are drawn only by pinhole cameras without lens "
+            "distortion."
         )
     view = Camera.from_sensor(sensor)
     params: Any = mi.traverse(sensor)
     W = view.width
     H = view.height
-    # Numbers of the view, which take no kernel of their own; Dr.Jit arrays only for their gradients.
+    # Numbers of the view, which take no kernel of their own; Dr.Jit arrays only for their
+    # gradients.
     K = view.K.copy()
     K[:2, 2] += border
     f = 0.5 * W / dr.tan(dr.deg2rad(0.5 * params["x_fov"]))
@@ -167,8 +199,8 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
 
      * - srgb_primitives
        - |bool|
-       - Whether the SH coefficients give sRGB-encoded colours, which reach the film as linear light after
-         blending. (Default: True)
+       - Whether the SH coefficients give sRGB-encoded colours, which reach the film as linear
+         light after blending. (Default: True)
 
      * - background
        - |rgb|, |exposed|, |differentiable|
@@ -176,9 +208,10 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
 
      * - aovs
        - |string|
-       - Further channels, a comma-separated list of `motion` (`motion.X`, `motion.Y`: displacement since the
-         last frame, px), `depth` (`depth.Y`: expected z, world units) and the channels of attributes such as
-         `confidence` (`confidence.Y`). Channels that are not listed are not computed. (Default: none)
+       - Further channels, a comma-separated list of `motion` (`motion.X`, `motion.Y`:
+         displacement since the last frame, px), `depth` (`depth.Y`: expected z, world units) and
+         the channels of attributes such as `confidence` (`confidence.Y`). Channels that are not
+         listed are not computed. (Default: none)
 
      * - eps2d, alpha_min, stop_transmittance
        - |float|
@@ -186,7 +219,8 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
 
      * - antialiased
        - |bool|
-       - Whether small splats fade instead of growing, for models that were trained so. (Default: False)
+       - Whether small splats fade instead of growing, for models that were trained so.
+         (Default: False)
 
      * - first_order_motion
        - |bool|
@@ -198,23 +232,25 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
 
      * - surfaces
        - |integrator|
-       - Integrator for the other shapes of the scene, which are blended among the splats. (Default: none, and other
-         shapes are refused)
+       - Integrator for the other shapes of the scene, which are blended among the splats.
+         (Default: none, and other shapes are refused)
 
-    The film's size, crop, border, reconstruction filter and pixel format are honoured; every pixel gets one
-    sample at its centre. Therefore `spp`, the seeds and the sampler have no effect. Emitters (with a warning), the
-    sensor's far plane and shutter, and the shapes' `extent` are ignored. A crop saves no time.
-    Sensors of a `batch` share their launches.
+    The film's size, crop, border, reconstruction filter and pixel format are honoured; every pixel
+    gets one sample at its centre. Therefore `spp`, the seeds and the sampler have no effect.
+    Emitters (with a warning), the sensor's far plane and shutter, and the shapes' `extent` are
+    ignored. A crop saves no time. Sensors of a `batch` share their launches.
 
-    A rendering with gradients is kept for the backward pass until the next one; if neither the Gaussians nor the sensor
-    have changed, the backward pass does not render again.
+    A rendering with gradients is kept for the backward pass until the next one; if neither the
+    Gaussians nor the sensor have changed, the backward pass does not render again.
 
-    With `surfaces`, that integrator renders the other shapes with `spp` samples; their mean is the pixel's sample.
-    A pixel's splats end at the mean depth of the surfaces in it, and are blended twice if they cover it in part.
-    Surfaces get no light or shadow from splats, and splats get none from surfaces; see docs/surfaces.md for both.
-    The surfaces have no derivatives with respect to the sensor.
+    With `surfaces`, that integrator renders the other shapes with `spp` samples; their mean is the
+    pixel's sample. A pixel's splats end at the mean depth of the surfaces in it, and are blended
+    twice if they cover it in part. Surfaces get no light or shadow from splats, and splats get none
+    from surfaces; see docs/surfaces.md for both. The surfaces have no derivatives with respect to
+    the sensor.
 
-    Integrators around it, such as `aov` and `moment`, are refused: they need the colour of single rays.
+    Integrators around it, such as `aov` and `moment`, are refused: they need the colour of single
+    rays.
     """
 
     def __init__(self, props: Any) -> None:
@@ -222,19 +258,24 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         self.srgb_primitives = bool(props.get("srgb_primitives", True))
         self.config = _render_config(props)
         background = props.get("background", None)
-        self.background = None if background is None else mi.Color3f(np.broadcast_to(np.array(background, float), 3))
+        self.background = (
+            None
+            if background is None
+            else mi.Color3f(np.broadcast_to(np.array(background, float), 3))
+        )
         names = (name.strip() for name in props.get("aovs", "").split(","))
         self.aovs = list(dict.fromkeys(name for name in names if name))
         self.surfaces = props.get("surfaces", None)
         if not (self.surfaces is None or isinstance(self.surfaces, mi.Integrator)):
             raise ValueError(
-                f"gaussian_splat: `surfaces` must be an integrator, got {self.surfaces!r}; pass one such as "
-                "{'type': 'path'}."
+                f"gaussian_splat: `surfaces` must be an integrator, got {self.surfaces!r}; pass "
+                "one such as {'type': 'path'}."
             )
         if self.surfaces is not None and not mi.is_rgb:
             raise ValueError(
-                f"gaussian_splat: with `surfaces`, expected a variant such as 'llvm_ad_rgb', got {mi.variant()!r}; "
-                "call mi.set_variant() before the scene is loaded, because Gaussians have RGB colours."
+                "gaussian_splat: with `surfaces`, expected a variant such as 'llvm_ad_rgb', got "
+                f"{mi.variant()!r}; call mi.set_variant() before the scene is loaded, because "
+                "Gaussians have RGB colours."
             )
         self.warnings: set[str] = set()
         self.forward_pass: _ForwardPass | None = None
@@ -242,7 +283,8 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         for name in self.aovs:
             if name not in names:
                 raise ValueError(
-                    f"gaussian_splat: `aovs` must be out of {', '.join(names)}, got {name!r}; separate them by commas."
+                    f"gaussian_splat: `aovs` must be out of {', '.join(names)}, got {name!r}; "
+                    "separate them by commas."
                 )
 
     def traverse(self, callback: Any) -> None:
@@ -256,17 +298,25 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
             ValueError: always.
         """
         raise ValueError(
-            "gaussian_splat: expected to be the scene's integrator, got an integrator around it, such as `aov` or "
-            "`moment`, which needs the colour of single rays; list further channels in `aovs`, such as 'depth'."
+            "gaussian_splat: expected to be the scene's integrator, got an integrator around it, "
+            "such as `aov` or `moment`, which needs the colour of single rays; list further "
+            "channels in `aovs`, such as 'depth'."
         )
 
     def aov_names(self) -> list[str]:
         return [channel for name in self.aovs for channel in exr_names(name)]
 
     def render(
-        self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
+        self,
+        scene: Any,
+        sensor: Any = 0,
+        seed: Any = 0,
+        spp: int = 0,
+        develop: bool = True,
+        evaluate: bool = True,
     ) -> Any:
-        refuse_freezing("gaussian_splat")  # before any memory is released, which would end the process
+        # Before any memory is released, which would end the process.
+        refuse_freezing("gaussian_splat")
         self.forward_pass = None
         with dr.resume_grad():
             inputs = self._inputs(scene, sensor)
@@ -283,7 +333,9 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
             dr.sync_thread()
         return image
 
-    def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
+    def render_forward(
+        self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
+    ) -> Any:
         with dr.resume_grad():
             film, surfaces = self._expose(scene, sensor, seed, spp)
             image = film.develop()
@@ -319,21 +371,26 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         values = [value for table in tables for _, value in table]
         return [leaf for value in [*values, self.background] for leaf in _leaves(value)]
 
-    def _expose(self, scene: Any, sensor: Any, seed: Any, spp: int) -> tuple[Any, SurfaceView | None]:
-        """Render the scene to the sensor's film and return the film, and the surfaces if there are any."""
+    def _expose(
+        self, scene: Any, sensor: Any, seed: Any, spp: int
+    ) -> tuple[Any, SurfaceView | None]:
+        """Render the scene to the sensor's film and return the film, and the surfaces if there are
+        any.
+        """
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         film = sensor.film()
         if mi.has_flag(film.flags(), mi.FilmFlags.Special):
             raise ValueError(
-                f"gaussian_splat: expected an `hdrfilm`, got {film.class_name()}; replace it, because only RGB is "
-                "drawn."
+                f"gaussian_splat: expected an `hdrfilm`, got {film.class_name()}; replace it, "
+                "because only RGB is drawn."
             )
         border = film.rfilter().border_size() if film.sample_border() else 0
         views = _views(sensor)
         if len(views) > 1 and (border or self.surfaces is not None):
             reason = "`sample_border` in its film" if border else "`surfaces`"
             raise ValueError(
-                f"gaussian_splat: expected a `batch` sensor without {reason}; render its sensors one by one."
+                f"gaussian_splat: expected a `batch` sensor without {reason}; render its sensors "
+                "one by one."
             )
         cameras = [_sensor_camera(view, border) for view in views]
         has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
@@ -341,7 +398,8 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         attributes = ["opacities", "sh_coeffs", *(name for name in required if name)]
         gaussians = _scene_gaussians(scene, attributes, self.surfaces is not None)
         channels = ("color", *(["alpha"] if has_alpha else []), *self.aovs)
-        # Cropped after rendering: the projection's linearisation depends on the extent of the whole view.
+        # Cropped after rendering: the projection's linearisation depends on the extent of the whole
+        # view.
         x0, y0 = film.crop_offset()
         w, h = film.crop_size() + 2 * border
         crop = (int(x0), int(y0), int(w), int(h))
@@ -350,7 +408,9 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         surfaces = None
         if self.surfaces is not None:
             pixels = SampledPixels(cameras[0], crop, sensor, seed, spp)
-            surfaces = SurfaceView.of(scene, self.surfaces, pixels, gaussians, self.srgb_primitives, self.config)
+            surfaces = SurfaceView.of(
+                scene, self.surfaces, pixels, gaussians, self.srgb_primitives, self.config
+            )
         if surfaces is None:
             columns = self._splats(gaussians, cameras, channels, crop)
         else:
@@ -368,15 +428,23 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         return film, surfaces
 
     def _splats(
-        self, gaussians: Any, cameras: list[Camera], channels: tuple[str, ...], crop: tuple[int, int, int, int]
+        self,
+        gaussians: Any,
+        cameras: list[Camera],
+        channels: tuple[str, ...],
+        crop: tuple[int, int, int, int],
     ) -> dict[str, list[Float]]:
-        """Return the channels of a scene without surfaces, colour in linear light; several views beside each other."""
+        """Return the channels of a scene without surfaces, colour in linear light; several views
+        beside each other.
+        """
         camera = cameras if len(cameras) > 1 else cameras[0]
         image = rasterize(gaussians, camera, channels, self.background, config=self.config)
         images: dict[str, Any] = {name: image[name] for name in channels}
         if len(cameras) > 1:
             count = range(len(cameras))
-            images = {name: dr.concat([stack[v] for v in count], axis=1) for name, stack in images.items()}
+            images = {
+                name: dr.concat([stack[v] for v in count], axis=1) for name, stack in images.items()
+            }
         columns = {name: cropped(value, crop) for name, value in images.items()}
         if self.srgb_primitives:
             columns["color"] = [decode_traced(value) for value in columns["color"]]
@@ -385,13 +453,16 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
     def _warn(self, scene: Any, gaussians: _SceneGaussians) -> None:
         """Log what the image leaves out, once."""
         if scene.emitters() and self.surfaces is None:
-            self._warn_once("gaussian_splat ignores the scene's emitters; set its `background` colour instead.")
+            self._warn_once(
+                "gaussian_splat ignores the scene's emitters; set its `background` colour instead."
+            )
         opacities = dr.detach(gaussians.opacities.array)
         outside: Any = dr.count((opacities < 0) | (opacities > 1))
         if count := int(outside[0]):
             self._warn_once(
-                f"gaussian_splat: `opacities` must be in [0, 1], got {count} values outside: those below 0 are "
-                "not drawn and get no gradient, those above 1 are cut off at full coverage; clamp them after each step."
+                f"gaussian_splat: `opacities` must be in [0, 1], got {count} values outside: "
+                "those below 0 are not drawn and get no gradient, those above 1 are cut off at "
+                "full coverage; clamp them after each step."
             )
 
     def _warn_once(self, sentence: str) -> None:

@@ -1,19 +1,19 @@
 """Gaussians along arbitrary rays: colour and transmittance of segments that no rasteriser can draw.
 
-In the coordinates x' = diag(1 / s) R' (x - mean) of a Gaussian, a ray o + t d passes the centre at the distance
-p = |o' x d'| / |d'|, nearest at t* = -o'.d' / |d'|^2. The response is largest there,
+In the coordinates x' = diag(1 / s) R' (x - mean) of a Gaussian, a ray o + t d passes the centre at
+the distance p = |o' x d'| / |d'|, nearest at t* = -o'.d' / |d'|^2. The response is largest there,
 
     alpha = opacity exp(-p^2 / 2),
 
-and along the ray it is a Gaussian with mean t* and standard deviation 1 / |d'|. A segment [0, end] has the fraction
-f = Phi(|d'| (end - t*)) - Phi(-|d'| t*) of the optical depth, and 1 - (1 - alpha)^f takes the place of alpha. It is
-the response of the rasteriser without the affine approximation and the low-pass filter. Colours are blended in the
-order of t*.
+and along the ray it is a Gaussian with mean t* and standard deviation 1 / |d'|. A segment [0, end]
+has the fraction f = Phi(|d'| (end - t*)) - Phi(-|d'| t*) of the optical depth, and 1 - (1 -
+alpha)^f takes the place of alpha. It is the response of the rasteriser without the affine
+approximation and the low-pass filter. Colours are blended in the order of t*.
 
-The Gaussians are the leaves of a complete binary tree of boxes: node n has the children 2 n and 2 n + 1. All nodes of a
-level are split along the same axis: the order in which a ray meets the children depends only on the signs of its
-direction. Flipping bits of n by those signs gives an order from front to back, in which the next node follows from n
-without a stack.
+The Gaussians are the leaves of a complete binary tree of boxes: node n has the children 2 n and 2 n
++ 1. All nodes of a level are split along the same axis: the order in which a ray meets the children
+depends only on the signs of its direction. Flipping bits of n by those signs gives an order from
+front to back, in which the next node follows from n without a stack.
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ class _Tree:
     """Boxes of a complete binary tree with 2^depth leaves."""
 
     depth: UInt32  # depth of the leaves; the root has depth 0
-    flips: tuple[UInt32, UInt32, UInt32]  # for each axis, the bits of a leaf's number that choose a side along it
+    # For each axis, the bits of a leaf's number that choose a side along it.
+    flips: tuple[UInt32, UInt32, UInt32]
     boxes: Float  # lower and upper corner of every node, from 1, in rows of eight floats
 
     @staticmethod
@@ -66,7 +67,9 @@ class _Tree:
             order = order.reshape(1 << level, -1)
             axis = _longest_axis(places[order])
             flips[axis] |= 1 << (depth - 1 - level)
-            order = np.take_along_axis(order, places[order, axis].argpartition(order.shape[1] // 2 - 1, axis=1), axis=1)
+            order = np.take_along_axis(
+                order, places[order, axis].argpartition(order.shape[1] // 2 - 1, axis=1), axis=1
+            )
         order = np.minimum(order.ravel(), N)
         # Rounding must not make a box smaller.
         halves = halves * (1 + 1e-5) + 1e-6 * np.abs(centers)
@@ -91,7 +94,8 @@ class _Tree:
         visit: Callable[[tuple[Jit, ...], UInt32, Bool], tuple[Jit, ...]],
         span: Callable[[tuple[Jit, ...]], tuple[Float, Float]],
     ) -> tuple[Jit, ...]:
-        """Visit the leaves with boxes that meet a part of each ray, roughly front to back, and return the last state.
+        """Visit the leaves with boxes that meet a part of each ray, roughly front to back, and
+        return the last state.
 
         Args:
             ray: rays [M].
@@ -128,7 +132,9 @@ class _Tree:
             return dr.select(node == 1, 0, node), level, state
 
         start = dr.select(active, mi.UInt32(1), 0)
-        return dr.while_loop((start, mi.UInt32(0), state), lambda node, *_: node != 0, step, label="tree")[2]
+        return dr.while_loop(
+            (start, mi.UInt32(0), state), lambda node, *_: node != 0, step, label="tree"
+        )[2]
 
 
 class SplatRays:
@@ -153,7 +159,10 @@ class SplatRays:
                 f"{type(gaussians).__name__} without any; pass some."
             )
         self._config = config or RenderConfig()
-        values = {name: _finite(gaussians, name) for name in ("means", "scales", "quats", "opacities", "sh_coeffs")}
+        values = {
+            name: _finite(gaussians, name)
+            for name in ("means", "scales", "quats", "opacities", "sh_coeffs")
+        }
         means, scales, quats, opacities, coeffs = values.values()
         scales = np.maximum(scales, np.maximum(_THINNEST * scales.max(1, keepdims=True), 1e-30))
         quats = np.where(np.linalg.norm(quats, axis=1, keepdims=True) > 0, quats, [1, 0, 0, 0])
@@ -193,7 +202,8 @@ class SplatRays:
             return self._tree.walk(ray, mi.Bool(active), (mi.Float(1),), visit, span)[0]
 
     def trace(self, ray: Any, active: Bool = True) -> tuple[Any, Float]:
-        """Return the colour, weighted as in `rasterize`, and the transmittance of the Gaussians along rays [M].
+        """Return the colour, weighted as in `rasterize`, and the transmittance of the Gaussians
+        along rays [M].
 
         View-dependent colours are evaluated in the ray's direction.
 
@@ -212,26 +222,41 @@ class SplatRays:
                 queue = ([*depths, mi.Float(dr.inf)], [*rows, mi.UInt32(0)], count)
                 return color, transmittance * (1 - alpha), queue, (depth, row)
 
-            def advance(active: Bool, color: Any, transmittance: Float, last: Any) -> tuple[Any, ...]:
+            def advance(
+                active: Bool, color: Any, transmittance: Float, last: Any
+            ) -> tuple[Any, ...]:
                 nearest = self._nearest(ray, active, last)
                 color, transmittance, nearest, last = dr.while_loop(
                     (color, transmittance, nearest, last),
-                    lambda color, transmittance, nearest, last: (nearest[0][0] < dr.inf) & self._open(transmittance),
+                    lambda color, transmittance, nearest, last: (
+                        (nearest[0][0] < dr.inf) & self._open(transmittance)
+                    ),
                     blend,
                     label="blend",
                 )
                 # Where fewer were found than can be sorted, none is left.
-                return active & self._open(transmittance) & (nearest[2] >= _SORTED), color, transmittance, last
+                return (
+                    active & self._open(transmittance) & (nearest[2] >= _SORTED),
+                    color,
+                    transmittance,
+                    last,
+                )
 
             state = (mi.Bool(active), mi.Color3f(0), mi.Float(1), (mi.Float(-dr.inf), mi.UInt32(0)))
-            _, color, transmittance, _ = dr.while_loop(state, lambda active, *_: active, advance, label="trace")
+            _, color, transmittance, _ = dr.while_loop(
+                state, lambda active, *_: active, advance, label="trace"
+            )
             return color, transmittance
 
     def _open(self, transmittance: Float) -> Bool:
         return transmittance >= self._config.stop_transmittance
 
-    def _nearest(self, ray: Any, active: Bool, last: tuple[Float, UInt32]) -> tuple[list[Float], list[UInt32], UInt32]:
-        """Return depths and rows of the next Gaussians after `last`, ordered by both, and how many were found."""
+    def _nearest(
+        self, ray: Any, active: Bool, last: tuple[Float, UInt32]
+    ) -> tuple[list[Float], list[UInt32], UInt32]:
+        """Return depths and rows of the next Gaussians after `last`, ordered by both, and how many
+        were found.
+        """
 
         def visit(state: tuple[Jit, ...], row: UInt32, active: Bool) -> tuple[Jit, ...]:
             depths, rows, count = state
@@ -251,14 +276,17 @@ class SplatRays:
             return depths, rows, count + dr.select(hit, mi.UInt32(1), 0)
 
         def span(state: tuple[Jit, ...]) -> tuple[Float, Float]:
-            # The largest response of a Gaussian that reaches into the segment may be beyond either end.
+            # The largest response of a Gaussian that reaches into the segment may be beyond either
+            # end.
             return dr.clip(last[0], 0, ray.maxt), dr.clip(state[0][-1], 0, ray.maxt)
 
         start = ([mi.Float(dr.inf)] * _SORTED, [mi.UInt32(0)] * _SORTED, mi.UInt32(0))
         return self._tree.walk(ray, active, start, visit, span)
 
     def _response(self, ray: Any, row: UInt32) -> tuple[Float, Float]:
-        """Return the depth of a Gaussian's largest response along rays, and its alpha on the segment."""
+        """Return the depth of a Gaussian's largest response along rays, and its alpha on the
+        segment.
+        """
         x, y, z, more = (dr.gather(mi.Vector4f, self._rows, 4 * row + k) for k in range(4))
         offset = ray.o - mi.Point3f(x.w, y.w, z.w)
         W = [mi.Vector3f(v.x, v.y, v.z) for v in (x, y, z)]
@@ -268,8 +296,12 @@ class SplatRays:
         r_sigma = dr.sqrt(dd)
         # The distance as a cross product: a difference of squares would cancel for thin Gaussians.
         alpha = more.x * dr.exp(-0.5 * dr.squared_norm(dr.cross(o, d)) / dd)
-        alpha = dr.select(alpha >= self._config.alpha_min, dr.minimum(alpha, self._config.alpha_max), 0)
-        segment_share = _phi(r_sigma * (dr.minimum(ray.maxt, FARTHEST) - depth)) - _phi(-r_sigma * depth)
+        alpha = dr.select(
+            alpha >= self._config.alpha_min, dr.minimum(alpha, self._config.alpha_max), 0
+        )
+        segment_share = _phi(r_sigma * (dr.minimum(ray.maxt, FARTHEST) - depth)) - _phi(
+            -r_sigma * depth
+        )
         return depth, 1 - dr.exp2(segment_share * dr.log2(1 - alpha))
 
     def _color(self, basis: list[Float], row: UInt32) -> Any:
@@ -290,14 +322,16 @@ def _finite(gaussians: ActivatedGaussians, name: str) -> np.ndarray:
     if len(bad):
         expected = "finite and at most 1e18" if name == "sh_coeffs" else "finite"
         raise ValueError(
-            f"SplatRays(): `{name}` must be {expected}, got {values[tuple(bad[0])]} at {bad[0].tolist()} ({len(bad)} "
-            "such values); remove these Gaussians."
+            f"SplatRays(): `{name}` must be {expected}, got {values[tuple(bad[0])]} at "
+            f"{bad[0].tolist()} ({len(bad)} such values); remove these Gaussians."
         )
     return values
 
 
 def _longest_axis(points: np.ndarray) -> int:
-    """Return the axis along which groups of points [G, M, 3] extend most; points at infinity are left out."""
+    """Return the axis along which groups of points [G, M, 3] extend most; points at infinity are
+    left out.
+    """
     finite = np.isfinite(points)
     extent = np.where(finite, points, -np.inf).max(1) - np.where(finite, points, np.inf).min(1)
     return int(np.where(finite.any(1), extent, 0).mean(0).argmax())
@@ -314,5 +348,7 @@ def _phi(q: Float) -> Float:
 
 
 def _opaque(value: int) -> UInt32:
-    """Return a number that is not a literal of the kernel, which would otherwise be compiled for every scene."""
+    """Return a number that is not a literal of the kernel, which would otherwise be compiled for
+    every scene.
+    """
     return dr.opaque(mi.UInt32, value)

@@ -1,7 +1,8 @@
-"""The surfaces of a Mitsuba scene as one camera sees them, rendered by one of Mitsuba's own integrators.
+"""The surfaces of a Mitsuba scene as one camera sees them, rendered by one of Mitsuba's own
+integrators.
 
-The scene's shapes other than Gaussians are put into a second scene, which shares the objects: gradients of a nested
-integrator such as `prb` reach the parameters of the whole scene.
+The scene's shapes other than Gaussians are put into a second scene, which shares the objects:
+gradients of a nested integrator such as `prb` reach the parameters of the whole scene.
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ _FIRST = (1, 5, 6)
 _OTHERS = (0, 2, 3, 4, 7, 8)
 
 
-def rays_for(integrator: Any, gaussians: ActivatedGaussians, config: RenderConfig | None = None) -> SplatRays | None:
+def rays_for(
+    integrator: Any, gaussians: ActivatedGaussians, config: RenderConfig | None = None
+) -> SplatRays | None:
     """Return N Gaussians prepared for a `splat_path`; None for other integrators."""
     return SplatRays(gaussians, config) if hasattr(integrator, "splats") else None
 
@@ -57,7 +60,8 @@ def traced(integrator: Any, splats: SplatRays | None, srgb: bool) -> Iterator[No
 
 
 def surface_scene(scene: Any) -> Any:
-    """Return a scene of the surfaces and emitters of `scene`, or None if it has neither surfaces nor an environment.
+    """Return a scene of the surfaces and emitters of `scene`, or None if it has neither surfaces
+    nor an environment.
 
     It shares the shapes, emitters and materials with `scene`, and is built for their current state.
 
@@ -69,32 +73,38 @@ def surface_scene(scene: Any) -> Any:
         return None
     if not scene.emitters():
         raise ValueError(
-            "gaussian_splat: expected an emitter that lights the surfaces, got none; add one to the scene, such as an "
-            "`envmap` of morgs_mi.light_probe()."
+            "gaussian_splat: expected an emitter that lights the surfaces, got none; add one to "
+            "the scene, such as an `envmap` of morgs_mi.light_probe()."
         )
     for shape in surfaces:
         if shape.is_medium_transition():
             raise ValueError(
-                f"gaussian_splat: expected surfaces, got {shape.class_name()} {shape.id()!r}, the boundary of a "
-                "medium; remove the medium, because splats have no place in the order of a volume's light."
+                f"gaussian_splat: expected surfaces, got {shape.class_name()} {shape.id()!r}, the "
+                "boundary of a medium; remove the medium, because splats have no place in the "
+                "order of a volume's light."
             )
         if shape.bsdf() is None:
             raise ValueError(
-                f"gaussian_splat: the {shape.class_name()} {shape.id()!r} must have a BSDF, got none; set `bsdf` "
-                "where the shape is defined."
+                f"gaussian_splat: the {shape.class_name()} {shape.id()!r} must have a BSDF, got "
+                "none; set `bsdf` where the shape is defined."
             )
     return shared_scene([*surfaces, *lights(scene)], scene)
 
 
 def lights(scene: Any) -> list[Any]:
     """Return the emitters of a scene, without the emitters on its surfaces."""
-    return [emitter for emitter in scene.emitters() if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)]
+    return [
+        emitter
+        for emitter in scene.emitters()
+        if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)
+    ]
 
 
 def shared_scene(parts: list[Any], whole: Any) -> Any:
     """Return a scene of some shapes and emitters of a whole scene, which does not change.
 
-    A new scene names its parts, and sets the extent of an environment to its own; both are set back.
+    A new scene names its parts, and sets the extent of an environment to its own; both are set
+    back.
     """
     names = [part.id() for part in parts]
     scene = mi.load_dict({"type": "scene", **{f"part{i}": part for i, part in enumerate(parts)}})
@@ -106,7 +116,9 @@ def shared_scene(parts: list[Any], whole: Any) -> Any:
 
 
 def _attached(thing: Any) -> list[str]:
-    """Return the names of the parameters of a scene or shape that are attached to the gradient graph."""
+    """Return the names of the parameters of a scene or shape that are attached to the gradient
+    graph.
+    """
     params: Any = mi.traverse(thing)
     return [key for key in params.keys() if dr.grad_enabled(params[key])]  # noqa: SIM118
 
@@ -115,8 +127,8 @@ def _attached(thing: Any) -> list[str]:
 def _detached(shapes: list[Any]) -> Iterator[None]:
     """Detach the parameters of shapes inside the context.
 
-    Calls of Mitsuba's virtual functions are traced for all shapes that exist, of any scene. In forward mode `prb` would
-    depend on shapes that its scene does not have, and fail.
+    Calls of Mitsuba's virtual functions are traced for all shapes that exist, of any scene. In
+    forward mode `prb` would depend on shapes that its scene does not have, and fail.
     """
     attached = []
     for shape in shapes:
@@ -147,7 +159,12 @@ class SampledPixels:
         params: Any = mi.traverse(self.template)
         more = {"far_clip": float(params["far_clip"]), "sampler": self.template.sampler()}
         return mi.load_dict(
-            {**self.camera.sensor(pixel_format="rgba", **dict(zip(names, self.crop, strict=True))), **more}
+            {
+                **self.camera.sensor(
+                    pixel_format="rgba", **dict(zip(names, self.crop, strict=True))
+                ),
+                **more,
+            }
         )
 
     def samples(self) -> int:
@@ -166,12 +183,14 @@ class SurfaceView:
     integrator: Any  #: Renders them.
     pixels: SampledPixels  #: The pixels and their samples.
     sensor: Any  #: The camera, with a film of those pixels.
-    #: Radiance and alpha of the nested integrator [h, w, 4], in linear light, a leaf of the gradient graph.
+    #: Radiance and alpha of the nested integrator [h, w, 4], in linear light, a leaf of the
+    #: gradient graph.
     image: Tensor
     coverage: Float  #: Fraction of each pixel in which a surface is seen [P], in [0, 1].
-    depth: Float  #: Mean camera-space z of what is seen there [P], world units; inf where there is no surface.
-    #: Radiance of the environment at the pixels' centres, `mi.Color3f` [P], a leaf of the gradient graph; None if there
-    #: is none, or the integrator hides it.
+    #: Mean camera-space z of what is seen there [P], world units; inf where there is no surface.
+    depth: Float
+    #: Radiance of the environment at the pixels' centres, `mi.Color3f` [P], a leaf of the gradient
+    #: graph; None if there is none, or the integrator hides it.
     behind: Any
     #: The Gaussians, for an integrator that traces rays through them; None for other integrators.
     splats: SplatRays | None
@@ -186,7 +205,8 @@ class SurfaceView:
         srgb: bool,
         config: RenderConfig | None = None,
     ) -> SurfaceView | None:
-        """Render the surfaces of a scene, or return None if it has neither surfaces nor an environment.
+        """Render the surfaces of a scene, or return None if it has neither surfaces nor an
+        environment.
 
         Args:
             whole: scene of Gaussians and surfaces.
@@ -206,36 +226,51 @@ class SurfaceView:
         sensor = pixels.sensor()
         rays = rays_for(integrator, splats, config)
         with dr.suspend_grad(), traced(integrator, rays, srgb):
-            image = mi.TensorXf(integrator.render(scene, sensor, seed=pixels.seed, spp=pixels.samples()))
+            image = mi.TensorXf(
+                integrator.render(scene, sensor, seed=pixels.seed, spp=pixels.samples())
+            )
             coverage, depth = coverage_and_depth(scene, sensor, pixels.camera, pixels.crop)
-            has_environment = scene.environment() is not None and not getattr(integrator, "hide_emitters", False)
+            has_environment = scene.environment() is not None and not getattr(
+                integrator, "hide_emitters", False
+            )
             behind = _environment(scene, sensor) if has_environment else None
         dr.enable_grad(image, behind)
-        return SurfaceView(scene, gaussians, integrator, pixels, sensor, image, coverage, depth, behind, rays, srgb)
+        return SurfaceView(
+            scene, gaussians, integrator, pixels, sensor, image, coverage, depth, behind, rays, srgb
+        )
 
     def forward(self, params: Any) -> None:
-        """Set the tangents of `image` and `behind` from the tangents of the surfaces' parameters."""
+        """Set the tangents of `image` and `behind` from those of the surfaces' parameters."""
         if not self._differentiates():
             return
         with _detached(self.gaussians), traced(self.integrator, self.splats, self.srgb):
-            tangent = self.integrator.render_forward(self.scene, params, self.sensor, **self._samples(self.pixels.seed))
+            tangent = self.integrator.render_forward(
+                self.scene, params, self.sensor, **self._samples(self.pixels.seed)
+            )
         dr.set_grad(self.image, tangent)
-        if self.behind is not None and dr.grad_enabled(values := _environment(self.scene, self.sensor)):
+        if self.behind is not None and dr.grad_enabled(
+            values := _environment(self.scene, self.sensor)
+        ):
             dr.set_grad(self.behind, dr.forward_to(values))
 
     def backward(self, params: Any) -> None:
-        """Propagate the gradients of `image` and `behind` to the surfaces' parameters, adding to their gradients.
+        """Propagate the gradients of `image` and `behind` to the surfaces' parameters, adding to
+        their gradients.
 
-        Its samples differ from the samples of `image`: where an image is no linear function of the radiance, the
-        product of two noisy factors would be biased.
+        Its samples differ from the samples of `image`: where an image is no linear function of the
+        radiance, the product of two noisy factors would be biased.
         """
         if not self._differentiates():
             return
         seed, _ = mi.sample_tea_32(self.pixels.seed, 1)
         grad = dr.grad(self.image)
         with traced(self.integrator, self.splats, self.srgb):
-            self.integrator.render_backward(self.scene, params, grad, self.sensor, **self._samples(seed))
-        if self.behind is not None and dr.grad_enabled(values := _environment(self.scene, self.sensor)):
+            self.integrator.render_backward(
+                self.scene, params, grad, self.sensor, **self._samples(seed)
+            )
+        if self.behind is not None and dr.grad_enabled(
+            values := _environment(self.scene, self.sensor)
+        ):
             # `values` may be a parameter itself: its gradient is added to.
             dr.backward(dr.sum(dr.dot(values, dr.grad(self.behind))))
 
@@ -246,14 +281,15 @@ class SurfaceView:
         moving = [key for key in attached if params.flags(key) & mi.ParamFlags.Discontinuous]
         if moving:
             _log.warning(
-                "gaussian_splat: gradients of the surfaces' positions lack what changes with their silhouettes and "
-                "depth; do not optimise `%s` with it.",
+                "gaussian_splat: gradients of the surfaces' positions lack what changes with "
+                "their silhouettes and depth; do not optimise `%s` with it.",
                 "`, `".join(moving),
             )
         if self.splats is not None and any(_attached(shape) for shape in self.gaussians):
             _log.warning(
-                "splat_path: gradients of the Gaussians are those of the splats that the camera sees; they lack what "
-                "the Gaussians send to the surfaces and take from their light."
+                "splat_path: gradients of the Gaussians are those of the splats that the camera "
+                "sees; they lack what the Gaussians send to the surfaces and take from their "
+                "light."
             )
         return bool(attached)
 
@@ -266,10 +302,14 @@ class SurfaceView:
         return np.array(self.coverage > 0).reshape(self.image.shape[:2])
 
 
-def coverage_and_depth(scene: Any, sensor: Any, camera: Camera, crop: tuple[int, int, int, int]) -> tuple[Float, Float]:
-    """Return the coverage and the mean depth z of surfaces in every pixel [P], by rays through a regular grid.
+def coverage_and_depth(
+    scene: Any, sensor: Any, camera: Camera, crop: tuple[int, int, int, int]
+) -> tuple[Float, Float]:
+    """Return the coverage and the mean depth z of surfaces in every pixel [P], by rays through a
+    regular grid.
 
-    Three rays, one in each row and column of the grid, decide where all are cast: where they or the next pixels differ.
+    Three rays, one in each row and column of the grid, decide where all are cast: where they or the
+    next pixels differ.
 
     Args:
         scene: the surfaces.
@@ -285,12 +325,16 @@ def coverage_and_depth(scene: Any, sensor: Any, camera: Camera, crop: tuple[int,
     lane: UInt32 = dr.arange(mi.UInt32, across * down)
     columns: UInt32 = dr.opaque(mi.UInt32, across)
     row = lane // columns
-    pixel = (row + int(first[1])) * dr.opaque(mi.UInt32, crop[2]) + lane - row * columns + int(first[0])
+    pixel = (
+        (row + int(first[1])) * dr.opaque(mi.UInt32, crop[2]) + lane - row * columns + int(first[0])
+    )
     params: Any = mi.traverse(sensor)
     to_camera = params["to_world"].inverse()
 
     def cast(pixel: UInt32, grid: tuple[int, ...]) -> tuple[Float, Float]:
-        """Return the number of hits of some rays of the grid in pixels, and the sum of their depths."""
+        """Return the number of hits of some rays of the grid in pixels, and the sum of their
+        depths.
+        """
         cells = mi.UInt32(grid)
         end = dr.opaque(mi.UInt32, len(grid))
 
@@ -309,7 +353,11 @@ def coverage_and_depth(scene: Any, sensor: Any, camera: Camera, crop: tuple[int,
     rays = dr.full(mi.Float, len(_FIRST), across * down)
     dr.eval(count, total, rays)
     column = lane - row * columns
-    neighbours = ((lane - 1, column > 0), (lane + 1, column + 1 < columns), (lane - columns, row > 0))
+    neighbours = (
+        (lane - 1, column > 0),
+        (lane + 1, column + 1 < columns),
+        (lane - columns, row > 0),
+    )
     neighbours = (*neighbours, (lane + columns, lane + columns < across * down))
     is_mixed: Bool = (count > 0) & (count < len(_FIRST))
     for place, valid in neighbours:
@@ -322,17 +370,25 @@ def coverage_and_depth(scene: Any, sensor: Any, camera: Camera, crop: tuple[int,
         for target, values in ((count, more), (total, deeper), (rays, mi.Float(_GRID**2))):
             dr.scatter(target, values, edge, mode=dr.ReduceMode.Permute)
     dr.scatter(coverage, count / rays, pixel, mode=dr.ReduceMode.Permute)
-    dr.scatter(depth, dr.select(count > 0, total / count, dr.inf), pixel, mode=dr.ReduceMode.Permute)
+    dr.scatter(
+        depth, dr.select(count > 0, total / count, dr.inf), pixel, mode=dr.ReduceMode.Permute
+    )
     dr.eval(coverage, depth)
     return coverage, depth
 
 
-def _rectangle(box: Any, camera: Camera, crop: tuple[int, int, int, int]) -> tuple[np.ndarray, list[int]]:
-    """Return the first pixel (x, y) of a crop that a bounding box may reach, and how many from there, (x, y)."""
+def _rectangle(
+    box: Any, camera: Camera, crop: tuple[int, int, int, int]
+) -> tuple[np.ndarray, list[int]]:
+    """Return the first pixel (x, y) of a crop that a bounding box may reach, and how many from
+    there, (x, y).
+    """
     if not box.valid():  # no surface
         return np.zeros(2, int), [0, 0]
     ends = np.stack([np.ravel(box.min), np.ravel(box.max)])
-    corners = np.array([[ends[i, 0], ends[j, 1], ends[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    corners = np.array(
+        [[ends[i, 0], ends[j, 1], ends[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    )
     pixels, depth = camera.project(corners)
     low = np.zeros(2)
     high = np.array(crop[2:])
@@ -355,7 +411,9 @@ def _environment(scene: Any, sensor: Any) -> Any:
 
 
 def _rays(sensor: Any, pixel: UInt32, offset: Any) -> Any:
-    """Return rays through the positions `offset` [0, 1]^2 of pixels of a sensor's film, numbered row by row."""
+    """Return rays through the positions `offset` [0, 1]^2 of pixels of a sensor's film, numbered
+    row by row.
+    """
     width, height = (dr.opaque(mi.UInt32, int(size)) for size in sensor.film().crop_size())
     row = pixel // width
     position = (mi.Vector2f(pixel - row * width, row) + offset) / mi.Vector2f(width, height)

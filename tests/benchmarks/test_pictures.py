@@ -18,12 +18,18 @@ PAGE = Path(__file__).parents[2] / "docs/how-it-works.md"
 def test_draw__returns_every_picture_of_the_page():
     capture = recording()
     loop = StreamLoop.of(capture, CONFIG)
-    *others, last = [frame.images for frame in capture.partial_frames(0, CONFIG.motion.mask_interval + 1)]
+    *others, last = [
+        frame.images for frame in capture.partial_frames(0, CONFIG.motion.mask_interval + 1)
+    ]
     for images in others:
         loop.push(images)
     pictures = draw(loop, last)
-    assert set(pictures) == set(re.findall(r"\(how-it-works/(\w+)\.jpg\)", PAGE.read_text(encoding="utf-8")))
-    assert {(picture.shape, picture.dtype.name) for picture in pictures.values()} == {((24, 32, 3), "uint8")}
+    assert set(pictures) == set(
+        re.findall(r"\(how-it-works/(\w+)\.jpg\)", PAGE.read_text(encoding="utf-8"))
+    )
+    assert {(picture.shape, picture.dtype.name) for picture in pictures.values()} == {
+        ((24, 32, 3), "uint8")
+    }
     assert pictures["flow"].std() > 0
 
 

@@ -19,7 +19,8 @@ from tests.scenes import captures as layouts
 Damage = Callable[[Path], object]
 
 
-# ---- damage to clips -------------------------------------------------------------------------------------
+# ---- damage to clips
+# -------------------------------------------------------------------------------------
 
 
 def missing(name: str) -> Damage:
@@ -62,7 +63,8 @@ def shorter(name: str, i: int) -> Damage:
     return lambda path: write_video(path / name, layouts.frames(i, layouts.COUNT - 1), layouts.FPS)
 
 
-# ---- damage to calibrations ------------------------------------------------------------------------------
+# ---- damage to calibrations
+# ------------------------------------------------------------------------------
 
 
 def rows(change: Callable[[np.ndarray], np.ndarray | None]) -> Damage:
@@ -149,20 +151,56 @@ def none(path: Path) -> None:
 NAN = float("nan")
 # By kind of damage: the damage, the message, and options of `fit`.
 POSES_BOUNDS = {
-    "no file": (missing("poses_bounds.npy"), "expected a calibration .*poses_bounds.npy.* run `morgs-mi calibrate`"),
+    "no file": (
+        missing("poses_bounds.npy"),
+        "expected a calibration .*poses_bounds.npy.* run `morgs-mi calibrate`",
+    ),
     "pipe": (pipe("poses_bounds.npy"), "expected a calibration"),
-    "pipe beside": (pipe("capture.json"), "capture.json: expected a file, got a folder, a pipe or a device; remove it"),
-    "no clip": (missing("cam02.mkv"), r"expected one row per camera, got 3 rows for 2 videos \(cam00, cam11\)"),
-    "fewer rows": (rows(lambda values: values[:2]), r"got 2 rows for 3 videos \(cam00, cam02, cam11\)"),
-    "other columns": (rows(lambda values: values[:, :15]), r"expected a float array \[C, 17\], got float64 \(3, 15\)"),
-    "broken file": (truncated("poses_bounds.npy"), "poses_bounds.npy: expected a NumPy array, got a broken file"),
+    "pipe beside": (
+        pipe("capture.json"),
+        "capture.json: expected a file, got a folder, a pipe or a device; remove it",
+    ),
+    "no clip": (
+        missing("cam02.mkv"),
+        r"expected one row per camera, got 3 rows for 2 videos \(cam00, cam11\)",
+    ),
+    "fewer rows": (
+        rows(lambda values: values[:2]),
+        r"got 2 rows for 3 videos \(cam00, cam02, cam11\)",
+    ),
+    "other columns": (
+        rows(lambda values: values[:, :15]),
+        r"expected a float array \[C, 17\], got float64 \(3, 15\)",
+    ),
+    "broken file": (
+        truncated("poses_bounds.npy"),
+        "poses_bounds.npy: expected a NumPy array, got a broken file",
+    ),
     "NaN pose": (entry(1, 3, NAN), r"row 1 \(cam02\): the pose must be finite"),
-    "no rotation": (entry(2, slice(0, 2), 0.5), r"row 2 \(cam11\), columns .*: the axes must be a right-handed"),
+    "no rotation": (
+        entry(2, slice(0, 2), 0.5),
+        r"row 2 \(cam11\), columns .*: the axes must be a right-handed",
+    ),
     "no focal length": (entry(0, 14, 0), r"row 0 \(cam00\): .* positive focal lengths"),
-    "truncated clip": (truncated("cam11.mkv"), r"cam11.mkv: frame \d of 4 cannot be read: the file is truncated"),
-    "shorter clip": (shorter("cam11.mkv", 2), "the same number of frames, got cam00.mkv 4, cam02.mkv 4, cam11.mkv 3"),
-    "faster clip": (faster("cam11.mkv", 2), "frame rate, got cam00.mkv 25, cam02.mkv 25, cam11.mkv 50; .* --trim"),
-    "unknown offset": (none, "--offset must name cameras of cam00, cam02, cam11, got cam01", "--offset", "cam01", "2"),
+    "truncated clip": (
+        truncated("cam11.mkv"),
+        r"cam11.mkv: frame \d of 4 cannot be read: the file is truncated",
+    ),
+    "shorter clip": (
+        shorter("cam11.mkv", 2),
+        "the same number of frames, got cam00.mkv 4, cam02.mkv 4, cam11.mkv 3",
+    ),
+    "faster clip": (
+        faster("cam11.mkv", 2),
+        "frame rate, got cam00.mkv 25, cam02.mkv 25, cam11.mkv 50; .* --trim",
+    ),
+    "unknown offset": (
+        none,
+        "--offset must name cameras of cam00, cam02, cam11, got cam01",
+        "--offset",
+        "cam01",
+        "2",
+    ),
     "far offset": (
         none,
         "no instant in common, cam00 0.00 to 0.16 s, cam02 -0.36 to -0.20",
@@ -170,15 +208,23 @@ POSES_BOUNDS = {
     ),
     "unknown reference": (
         none,
-        "--color must be none, linear, .* with a camera of cam00, cam02, cam11, .*got 'linear:cam01'",
+        "--color must be none, linear, .* with a camera of cam00, cam02, cam11, .*got "
+        "'linear:cam01'",
         *("--color", "linear:cam01"),
     ),
-    "gaps and no clip": (empty("cam00.mkv"), "cam00.mkv: expected a video, got an empty file", "--gaps"),
+    "gaps and no clip": (
+        empty("cam00.mkv"),
+        "cam00.mkv: expected a video, got an empty file",
+        "--gaps",
+    ),
     "empty clip": (empty("cam00.mkv"), "cam00.mkv: expected a video, got an empty file"),
     "clip of no frames": (headers_only("cam00.mkv"), "cam00.mkv: .* cannot decode one frame"),
 }
 BY_FRAME = {
-    "no image": (missing("frame000002/cam_2.png"), "frame000002/cam_2.png: expected an image, found none"),
+    "no image": (
+        missing("frame000002/cam_2.png"),
+        "frame000002/cam_2.png: expected an image, found none",
+    ),
     "pipe": (pipe("frame000002/cam_2.png"), "frame000002/cam_2.png: expected an image, found none"),
     "no camera": (missing("frame000000/cam_10.png"), "got 3 rows for 4 videos"),
     "no image at all": (
@@ -188,23 +234,45 @@ BY_FRAME = {
     ),
     "no frame": (
         lambda path: (path / "frame000001").rename(path / "frame000007"),
-        "the folders of the frames must be numbered without gaps, got frame000000 followed by frame000002",
+        "the folders of the frames must be numbered without gaps, got frame000000 followed by "
+        "frame000002",
     ),
-    "truncated image": (empty("frame000000/cam_0.png"), "frame000000/cam_0.png: expected an image, got 0 bytes"),
+    "truncated image": (
+        empty("frame000000/cam_0.png"),
+        "frame000000/cam_0.png: expected an image, got 0 bytes",
+    ),
 }
 COLMAP = {
     "no file": (missing("sparse/0/images.txt"), "images.txt is missing; export the whole model"),
-    "pipe": (pipe("sparse/0/images.txt"), "images.txt: expected a file, got a folder, a pipe or a device; remove it"),
-    "other clips": (renamed, r"clips named after its cameras cam1.png, cam2.png, cam10.png, found left0, left1, left2"),
-    "fewer parameters": (replace("sparse/0/cameras.txt", " 34.0 20.0\n", "\n"), "PINHOLE takes 4 parameters, got 2"),
-    "no such camera": (replace("sparse/0/cameras.txt", "\n2 ", "\n7 "), "refers to camera 2, cameras.txt has"),
-    "unknown model": (replace("sparse/0/cameras.txt", "PINHOLE", "FOV"), "camera model must be one of .* got FOV"),
+    "pipe": (
+        pipe("sparse/0/images.txt"),
+        "images.txt: expected a file, got a folder, a pipe or a device; remove it",
+    ),
+    "other clips": (
+        renamed,
+        r"clips named after its cameras cam1.png, cam2.png, cam10.png, found left0, left1, left2",
+    ),
+    "fewer parameters": (
+        replace("sparse/0/cameras.txt", " 34.0 20.0\n", "\n"),
+        "PINHOLE takes 4 parameters, got 2",
+    ),
+    "no such camera": (
+        replace("sparse/0/cameras.txt", "\n2 ", "\n7 "),
+        "refers to camera 2, cameras.txt has",
+    ),
+    "unknown model": (
+        replace("sparse/0/cameras.txt", "PINHOLE", "FOV"),
+        "camera model must be one of .* got FOV",
+    ),
     "NaN pose": (quaternion("1 nan 0 0"), "image 'cam1.png': .* must be finite"),
     "huge place": (
         replace("sparse/0/images.txt", " 1 cam1.png", "e308 1 cam1.png"),
         "images.txt, image 'cam1.png': .* the pose must be finite, with numbers of at most",
     ),
-    "infinite rate": (lambda path: (path / "capture.json").write_text('{"fps": 1e999}'), "capture.json: `fps` must be"),
+    "infinite rate": (
+        lambda path: (path / "capture.json").write_text('{"fps": 1e999}'),
+        "capture.json: `fps` must be",
+    ),
     "long rate": (
         lambda path: (path / "capture.json").write_text('{"fps": 1' + 400 * "0" + "}"),
         "capture.json: `fps` must be a number in .1e-6, 1e6., got 1000",
@@ -217,8 +285,14 @@ NERFSTUDIO = {
         renamed,
         r"named after its cameras ./images/cam1.png, .*, found left0, left1, left2; name the clips",
     ),
-    "no frames": (transforms(lambda m: m.update(frames=[])), "expected an object with a list of `frames`, got none"),
-    "broken file": (truncated("transforms.json"), "transforms.json: expected JSON, got a broken file"),
+    "no frames": (
+        transforms(lambda m: m.update(frames=[])),
+        "expected an object with a list of `frames`, got none",
+    ),
+    "broken file": (
+        truncated("transforms.json"),
+        "transforms.json: expected JSON, got a broken file",
+    ),
     "unnamed": (
         transforms(lambda m: m["frames"][1].pop("file_path")),
         "frame 1: `file_path` must name a file, got None",
@@ -227,22 +301,49 @@ NERFSTUDIO = {
         transforms(lambda m: m.update(w="62")),
         "frame 0 .*: `w` must be a finite number .*, here or .* got '62'",
     ),
-    "no focal length": (transforms(lambda m: m["frames"][2].pop("fl_x")), "frame 2 .*cam10.png.: `fl_x` must be a fin"),
+    "no focal length": (
+        transforms(lambda m: m["frames"][2].pop("fl_x")),
+        "frame 2 .*cam10.png.: `fl_x` must be a fin",
+    ),
     "word": (transforms(lambda m: m.update(k1="no")), "`k1` must be a finite number .* got 'no'"),
-    "unknown model": (transforms(lambda m: m.update(camera_model="EQUIRECTANGULAR")), "got 'EQUIRECTANGULAR'; undist"),
-    "long number": (transforms(lambda m: m.update(k1=10**400)), "`k1` must be a finite number .* got 1000"),
+    "unknown model": (
+        transforms(lambda m: m.update(camera_model="EQUIRECTANGULAR")),
+        "got 'EQUIRECTANGULAR'; undist",
+    ),
+    "long number": (
+        transforms(lambda m: m.update(k1=10**400)),
+        "`k1` must be a finite number .* got 1000",
+    ),
     "long pose": (
         transforms(lambda m: m["frames"][0]["transform_matrix"][0].__setitem__(0, 10**400)),
         "the pose must be a matrix",
     ),
-    "huge distortion": (transforms(lambda m: m.update(k1=1e300)), "transforms.json.*`k1` must be .* got 1e.300"),
-    "large size": (transforms(lambda m: m.update(w=1e11, h=1e10)), "expected 1.*, the calibrated size of cam1"),
-    "k4": (transforms(lambda m: m.update(k4=0.1)), "`k4` must be 0 in a perspective camera, got 0.1"),
+    "huge distortion": (
+        transforms(lambda m: m.update(k1=1e300)),
+        "transforms.json.*`k1` must be .* got 1e.300",
+    ),
+    "large size": (
+        transforms(lambda m: m.update(w=1e11, h=1e10)),
+        "expected 1.*, the calibrated size of cam1",
+    ),
+    "k4": (
+        transforms(lambda m: m.update(k4=0.1)),
+        "`k4` must be 0 in a perspective camera, got 0.1",
+    ),
     "NaN pose": (transforms(pose(1, NAN)), "frame 1 .*cam2.png.: the pose must be finite"),
-    "no rotation": (transforms(pose(0, 1.5)), "frame 0 .*cam1.png.: the axes must be a right-handed orthonormal frame"),
+    "no rotation": (
+        transforms(pose(0, 1.5)),
+        "frame 0 .*cam1.png.: the axes must be a right-handed orthonormal frame",
+    ),
     "mirrored": (transforms(pose(0, -1)), "frame 0 .*cam1.png.: the axes must be a right-handed"),
-    "no pose": (transforms(lambda m: m["frames"][0].pop("transform_matrix")), "the pose must be a matrix"),
-    "no points": (transforms(lambda m: m.update(ply_file_path="a.ply")), "a.ply: expected the points' PLY file, found"),
+    "no pose": (
+        transforms(lambda m: m["frames"][0].pop("transform_matrix")),
+        "the pose must be a matrix",
+    ),
+    "no points": (
+        transforms(lambda m: m.update(ply_file_path="a.ply")),
+        "a.ply: expected the points' PLY file, found",
+    ),
     "moving camera": (
         transforms(lambda m: m["frames"][1].update(file_path="cam1/0001.png")),
         "cameras must not move, but './images/cam1.png' and 'cam1/0001.png', both of cam1",
@@ -251,32 +352,64 @@ NERFSTUDIO = {
 DYNAMIC3DGS = {
     "no file": (missing("train_meta.json"), "expected a calibration .*train_meta.json"),
     "no image": (missing("ims/10/000002.png"), "ims/10/000002.png: expected an image, found none"),
-    "broken file": (truncated("train_meta.json"), "train_meta.json: expected JSON, got a broken file"),
+    "broken file": (
+        truncated("train_meta.json"),
+        "train_meta.json: expected JSON, got a broken file",
+    ),
     "no key": (meta(lambda m: m.pop("w2c")), "train_meta.json: expected the keys .*, w2c missing"),
-    "fewer poses": (meta(lambda m: m["w2c"].pop()), "as many cameras in every frame .* w2c 3 frames of 3 to 3 cameras"),
+    "fewer poses": (
+        meta(lambda m: m["w2c"].pop()),
+        "as many cameras in every frame .* w2c 3 frames of 3 to 3 cameras",
+    ),
     "fewer cameras": (
         meta(lambda m: m["k"][1].pop()),
         "as many cameras in every frame .* k 4 frames of 2 to 3 cameras",
     ),
     "no frames": (meta(lambda m: m.update(fn=[])), "must be lists of frames of cameras"),
-    "other camera": (meta(lambda m: m["cam_id"][1].__setitem__(0, 7)), "frame 1: `cam_id` must name each camera of"),
-    "NaN pose": (meta(lambda m: m["w2c"][1][0][0].__setitem__(0, NAN)), "frame 1: the pose must be finite"),
+    "other camera": (
+        meta(lambda m: m["cam_id"][1].__setitem__(0, 7)),
+        "frame 1: `cam_id` must name each camera of",
+    ),
+    "NaN pose": (
+        meta(lambda m: m["w2c"][1][0][0].__setitem__(0, NAN)),
+        "frame 1: the pose must be finite",
+    ),
     "no rotation": (meta(stretch), "camera 1: the axes must be a right-handed orthonormal frame"),
-    "moving camera": (meta(moving), "camera 10: the pose in frame 2 must equal that in frame 0, as moving cam"),
-    "long pose": (meta(lambda m: m["w2c"][1][0][0].__setitem__(0, 10**400)), r"`w2c` \[4, 4\] in every frame"),
-    "long size": (meta(lambda m: m.update(w=10**400)), "expected 1000.*, the calibrated size of 1, or a"),
+    "moving camera": (
+        meta(moving),
+        "camera 10: the pose in frame 2 must equal that in frame 0, as moving cam",
+    ),
+    "long pose": (
+        meta(lambda m: m["w2c"][1][0][0].__setitem__(0, 10**400)),
+        r"`w2c` \[4, 4\] in every frame",
+    ),
+    "long size": (
+        meta(lambda m: m.update(w=10**400)),
+        "expected 1000.*, the calibrated size of 1, or a",
+    ),
     "no size": (meta(lambda m: m.update(w=0)), "`w` and `h` must be positive whole numbers"),
     "broken points": (truncated("init_pt_cld.npz"), "init_pt_cld.npz: expected an array `data`"),
-    "truncated image": (empty("ims/1/000000.png"), "ims/1/000000.png: expected an image, got 0 bytes"),
+    "truncated image": (
+        empty("ims/1/000000.png"),
+        "ims/1/000000.png: expected an image, got 0 bytes",
+    ),
 }
 ANIPOSE = {
-    "broken file": (truncated("calibration.toml"), "calibration.toml: expected TOML, got a broken file"),
+    "broken file": (
+        truncated("calibration.toml"),
+        "calibration.toml: expected TOML, got a broken file",
+    ),
     "pipe": (pipe("calibration.toml"), "expected a calibration"),
     "long key": (
-        lambda path: (path / "calibration.toml").write_text("matrix=1\nrotation=1\nx." + "a." * 20_000 + "b=1\n"),
+        lambda path: (path / "calibration.toml").write_text(
+            "matrix=1\nrotation=1\nx." + "a." * 20_000 + "b=1\n"
+        ),
         r"calibration.toml: expected TOML, got a broken file \(a key has more than 32 parts\)",
     ),
-    "other clips": (renamed, "named after its cameras camA, camB, camC, found left0, left1, left2; name the clips"),
+    "other clips": (
+        renamed,
+        "named after its cameras camA, camB, camC, found left0, left1, left2; name the clips",
+    ),
     "no pose": (
         replace("calibration.toml", "translation", "translate"),
         r"\[cam_0\]: `translation` must be .* got none",
@@ -291,39 +424,67 @@ ANIPOSE = {
     ),
     "three coefficients": (
         replace("calibration.toml", "distortions = [0.0, 0.0, ", "distortions = ["),
-        r"\[cam_0\]: `distortions` must be finite numbers \[4\] or \[5\] or \[8\] of at most 1e\+12, got",
+        r"\[cam_0\]: `distortions` must be finite numbers \[4\] or \[5\] or \[8\] of at most "
+        r"1e\+12, got",
     ),
     "huge distortion": (
         replace("calibration.toml", "distortions = [0.0", "distortions = [1e300"),
-        r"calibration.toml, table \[cam_0\]: `distortions` must be finite numbers .* of at most 1e\+12, got",
+        r"calibration.toml, table \[cam_0\]: `distortions` must be finite numbers .* of at most "
+        r"1e\+12, got",
     ),
     "no size": (
         replace("calibration.toml", "size", "sizes"),
         r"\[cam_0\]: `size` must be finite numbers \[2\] .*, got none",
     ),
-    "half a pixel": (replace("calibration.toml", "size = [62.0", "size = [62.5"), "`size` must be whole pixels"),
-    "name": (replace("calibration.toml", '"camA"', "[]"), r"\[cam_0\]: `name` must be a text, got \[\]"),
-    "negative focal length": (replace("calibration.toml", "matrix = [[", "matrix = [[-"), "positive focal lengths"),
-    "skew": (replace("calibration.toml", ", 0.0, ", ", 0.1, "), r"\[cam_0\]: .* resample the images"),
+    "half a pixel": (
+        replace("calibration.toml", "size = [62.0", "size = [62.5"),
+        "`size` must be whole pixels",
+    ),
+    "name": (
+        replace("calibration.toml", '"camA"', "[]"),
+        r"\[cam_0\]: `name` must be a text, got \[\]",
+    ),
+    "negative focal length": (
+        replace("calibration.toml", "matrix = [[", "matrix = [[-"),
+        "positive focal lengths",
+    ),
+    "skew": (
+        replace("calibration.toml", ", 0.0, ", ", 0.1, "),
+        r"\[cam_0\]: .* resample the images",
+    ),
 }
 QUALISYS = {
     "broken file": (truncated("rig.qca.txt"), "rig.qca.txt: expected XML, got a broken file"),
-    "no cameras": (replace("rig.qca.txt", "<cameras>", "<cameras/><!--"), "expected XML, got a broken file"),
-    "pipe": (pipe("rig.qca.txt"), "rig.qca.txt: expected a file, got a folder, a pipe or a device; remove it"),
+    "no cameras": (
+        replace("rig.qca.txt", "<cameras>", "<cameras/><!--"),
+        "expected XML, got a broken file",
+    ),
+    "pipe": (
+        pipe("rig.qca.txt"),
+        "rig.qca.txt: expected a file, got a folder, a pipe or a device; remove it",
+    ),
     "document type in UTF-16": (
-        lambda path: (path / "rig.qca.txt").write_text("<!DOCTYPE a [<!ENTITY b 'c'>]><a>&b;</a>", encoding="utf-16"),
+        lambda path: (path / "rig.qca.txt").write_text(
+            "<!DOCTYPE a [<!ENTITY b 'c'>]><a>&b;</a>", encoding="utf-16"
+        ),
         "declares a document type",
     ),
     "many elements": (
         lambda path: (path / "rig.qca.txt").write_text("<a>" + "<b/>" * 2_000_000 + "</a>"),
         "got a claim of 2000002 elements and attributes",
     ),
-    "document type": (replace("rig.qca.txt", "<calibration>", "<!DOCTYPE a><calibration>"), "declares a document type"),
+    "document type": (
+        replace("rig.qca.txt", "<calibration>", "<!DOCTYPE a><calibration>"),
+        "declares a document type",
+    ),
     "no transform": (
         replace("rig.qca.txt", "transform", "moved"),
         "'26580': expected an element `transform`, found none",
     ),
-    "no attribute": (replace("rig.qca.txt", " y=", " why="), "`y` of `transform` must be a finite number .*, got none"),
+    "no attribute": (
+        replace("rig.qca.txt", " y=", " why="),
+        "`y` of `transform` must be a finite number .*, got none",
+    ),
     "word": (
         replace("rig.qca.txt", 'r11="', 'r11="none'),
         "`r11` of `transform` must be a finite number .* got 'n",
@@ -332,8 +493,14 @@ QUALISYS = {
         replace("rig.qca.txt", ' x="', ' x="1e300'),
         "`x` of `transform` must be a finite number of at most",
     ),
-    "no rotation": (replace("rig.qca.txt", 'r11="', 'r11="3'), "'26580': the axes must be a right-handed"),
-    "no serial": (replace("rig.qca.txt", 'serial="26580"', ""), "every `camera` must have a `serial`, got one without"),
+    "no rotation": (
+        replace("rig.qca.txt", 'r11="', 'r11="3'),
+        "'26580': the axes must be a right-handed",
+    ),
+    "no serial": (
+        replace("rig.qca.txt", 'serial="26580"', ""),
+        "every `camera` must have a `serial`, got one without",
+    ),
     "no image": (replace("rig.qca.txt", 'right="71"', 'right="8"'), "'26580': .* at least 1x1"),
     "two files": (
         lambda path: (path / "old.qca.txt").write_text((path / "rig.qca.txt").read_text()),
@@ -353,7 +520,9 @@ LAYOUTS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_fit_command__reports_a_broken_capture_in_one_line_and_writes_nothing(tmp_path: Path, capsys, layout) -> None:
+def test_fit_command__reports_a_broken_capture_in_one_line_and_writes_nothing(
+    tmp_path: Path, capsys, layout
+) -> None:
     build, table = LAYOUTS[layout]
     whole = build(tmp_path / "whole")
     mistakes = []
@@ -363,7 +532,16 @@ def test_fit_command__reports_a_broken_capture_in_one_line_and_writes_nothing(tm
         damage(path)
         old_files = sorted(folder.rglob("*"))
         status = cli.main(["fit", str(path), str(folder / "out"), *options])
-        lines = [line for line in capsys.readouterr().err.splitlines() if line.strip() and "━" not in line]
-        if status != 1 or len(lines) != 1 or not re.search(message, lines[0]) or sorted(folder.rglob("*")) != old_files:
+        lines = [
+            line
+            for line in capsys.readouterr().err.splitlines()
+            if line.strip() and "━" not in line
+        ]
+        if (
+            status != 1
+            or len(lines) != 1
+            or not re.search(message, lines[0])
+            or sorted(folder.rglob("*")) != old_files
+        ):
             mistakes.append((kind, status, lines))
     assert mistakes == []

@@ -41,7 +41,12 @@ def colmap(path: Path, names: tuple[str, ...] = ("cam01", "cam02"), **kwargs) ->
 def test_load_capture__reads_n3dv(tmp_path: Path) -> None:
     capture = load_capture(n3dv(tmp_path))
     assert capture.names == ("cam00", "cam01", "cam02")
-    assert (capture.num_frames, capture.fps, capture.test_views, capture.truth) == (COUNT, FPS, (), None)
+    assert (capture.num_frames, capture.fps, capture.test_views, capture.truth) == (
+        COUNT,
+        FPS,
+        (),
+        None,
+    )
     assert capture.points.shape == capture.point_colors.shape == (0, 3)
     assert capture.masks == (None,) * 3
     assert_close(capture.cameras[1].viewmat, make_camera(1, "cam01").viewmat, atol=1e-12)
@@ -68,7 +73,9 @@ def test_load_capture__prefers_the_colmap_model_and_orders_it_by_number(tmp_path
     points = np.arange(6.0).reshape(2, 3)
     names = ("cam10", "cam2", "cam1")  # a model lists its images in any order
     colmap(tmp_path, names, points=points, point_colors=points / 5)
-    write_poses_bounds(tmp_path / "poses_bounds.npy", [make_camera(7, n) for n in names], [[1, 9]] * 3)
+    write_poses_bounds(
+        tmp_path / "poses_bounds.npy", [make_camera(7, n) for n in names], [[1, 9]] * 3
+    )
     capture = load_capture(tmp_path)
     assert capture.names == ("cam1", "cam2", "cam10")
     assert [image[0, 0, 0] for image in next(capture.frames()).images] == [2, 1, 0]
@@ -80,7 +87,9 @@ def test_load_capture__prefers_the_colmap_model_and_orders_it_by_number(tmp_path
 
 @pytest.mark.usefixtures("small_images")
 @pytest.mark.parametrize("downscale", [2, 3, 4.5])
-def test_load_capture__downscaling_moves_projections_with_the_pixels(tmp_path: Path, downscale: float) -> None:
+def test_load_capture__downscaling_moves_projections_with_the_pixels(
+    tmp_path: Path, downscale: float
+) -> None:
     full = make_camera(0, "cam01", shift=3.0)
     write_colmap(tmp_path / "sparse", [full])
     point = np.array([0.03, 0.05, 0.02])
@@ -124,7 +133,9 @@ def test_load_capture__prefers_lossless_frames(tmp_path: Path) -> None:
 
 def test_load_capture__reads_frame_folders_named_in_the_model(tmp_path: Path) -> None:
     names = ("cam01", "cam02")
-    write_colmap(tmp_path / "sparse", [make_camera(i, f"{n}/0000.png") for i, n in enumerate(names)])
+    write_colmap(
+        tmp_path / "sparse", [make_camera(i, f"{n}/0000.png") for i, n in enumerate(names)]
+    )
     for i, name in enumerate(names):
         write_video(tmp_path / name, frames(i), FPS)
     (tmp_path / "capture.json").write_text('{"fps": 24}')
@@ -177,15 +188,23 @@ def test_load_capture__leaves_cameras_out(tmp_path: Path, without: list[str]) ->
     (test_view,) = capture.test_views
     assert capture.names[test_view] == "cam04", "the setting counts all cameras"
     assert {c.name: c.readout for c in capture.cameras if c.readout} == {"cam05": 0.2}
-    assert [image[0, 0, 0] for image in next(capture.frames()).images] == [names.index(name) for name in remainder]
-    assert load_capture(path, test_view=2, reading=ReadConfig(without=tuple(without))).test_views == (2,)
+    assert [image[0, 0, 0] for image in next(capture.frames()).images] == [
+        names.index(name) for name in remainder
+    ]
+    assert load_capture(
+        path, test_view=2, reading=ReadConfig(without=tuple(without))
+    ).test_views == (2,)
 
 
-def test_load_capture__holds_out_another_view_without_the_one_of_the_settings(tmp_path: Path) -> None:
+def test_load_capture__holds_out_another_view_without_the_one_of_the_settings(
+    tmp_path: Path,
+) -> None:
     path = n3dv(tmp_path, tuple(f"cam{i:02}" for i in range(8)))
     (path / "capture.json").write_text('{"test_view": 4}')
     assert load_capture(path, reading=ReadConfig(without=("cam04",))).test_views == (0,)
-    assert load_capture(path, reading=ReadConfig(without=("cam04", "cam06", "cam07"))).test_views == ()
+    assert (
+        load_capture(path, reading=ReadConfig(without=("cam04", "cam06", "cam07"))).test_views == ()
+    )
 
 
 @pytest.mark.parametrize(
@@ -240,9 +259,13 @@ def test_with_cameras__reads_as_if_the_calibration_had_the_lens(tmp_path: Path) 
     capture = load_capture(path)
     assert capture.with_cameras(capture.cameras).distortions == ()
     cameras = [square(camera) for camera in capture.cameras]
-    recording = replace(capture, cameras=tuple(cameras)).with_cameras(cameras, [terms] * len(cameras))
+    recording = replace(capture, cameras=tuple(cameras)).with_cameras(
+        cameras, [terms] * len(cameras)
+    )
     points = np.zeros((1, 3))
-    write_colmap(path / "sparse" / "0", cameras, points, points, [Lens("RADIAL", terms)] * len(cameras))
+    write_colmap(
+        path / "sparse" / "0", cameras, points, points, [Lens("RADIAL", terms)] * len(cameras)
+    )
     expected = load_capture(path)
     for images in zip(*(next(c.frames(0, 1)).images for c in (expected, recording)), strict=True):
         assert np.array_equal(*images)
@@ -265,7 +288,8 @@ def square(camera: Camera) -> Camera:
         (
             other_size,
             ValueError,
-            "cam02.mp4: expected 62x46, the calibrated size of cam02, or a scaled version of it, got 60x46",
+            "cam02.mp4: expected 62x46, the calibrated size of cam02, or a scaled version of it, "
+            "got 60x46",
         ),
         (
             two_images_of_a_camera,
@@ -275,14 +299,21 @@ def square(camera: Camera) -> Camera:
         (
             bad_settings,
             ValueError,
-            "capture.json: `test_view` must be a camera's index, a list of them, or null, got 'cam01'",
+            "capture.json: `test_view` must be a camera's index, a list of them, or null, got "
+            "'cam01'",
         ),
         (bad_readout, ValueError, r"capture.json: `readout` must be a number in \[-1, 1\], got 2"),
-        (readout_of_another, ValueError, "capture.json: `readout` must name cameras of cam01, cam02, .*got cam07"),
+        (
+            readout_of_another,
+            ValueError,
+            "capture.json: `readout` must name cameras of cam01, cam02, .*got cam07",
+        ),
         (broken_settings, ValueError, "capture.json: expected JSON"),
     ],
 )
-def test_load_capture__refuses_broken_captures(tmp_path: Path, damage, error: type[Exception], message: str) -> None:
+def test_load_capture__refuses_broken_captures(
+    tmp_path: Path, damage, error: type[Exception], message: str
+) -> None:
     path = colmap(tmp_path / "capture")
     damage(path)
     with pytest.raises(error, match=message):
@@ -301,8 +332,14 @@ def test_load_capture__refuses_broken_captures(tmp_path: Path, damage, error: ty
         ({"downscale": float("nan")}, "`downscale` must be at least 1, got nan"),
         ({"max_frames": 0}, "`max_frames` must be at least 1, got 0"),
         ({"test_view": 2}, r"`test_view` must be an index in 0..1, one of .*, or none .* got 2"),
-        ({"test_view": ["cam01", 7]}, r"`test_view` must be an index in 0..1, one of .*, or none .* got 7"),
-        ({"test_view": [0, "cam02"]}, "`test_view` must leave a camera for training, got all 2 cameras"),
+        (
+            {"test_view": ["cam01", 7]},
+            r"`test_view` must be an index in 0..1, one of .*, or none .* got 7",
+        ),
+        (
+            {"test_view": [0, "cam02"]},
+            "`test_view` must leave a camera for training, got all 2 cameras",
+        ),
         ({"test_view": -1}, r"`test_view` must be an index in 0..1, one of .*, or none .* got -1"),
     ],
 )
@@ -320,7 +357,9 @@ def test_load_capture__accepts_the_largest_downscale(tmp_path: Path) -> None:
 @pytest.mark.parametrize("colors", [[[0, 0, 300]], [[-1, 0, 0]]])
 def test_load_capture__refuses_point_colours_out_of_range(tmp_path: Path, colors: list) -> None:
     path = colmap(tmp_path, points=np.zeros((1, 3)))
-    (row,) = (line for line in (path / "sparse/0/points3D.txt").read_text().splitlines() if line[0] != "#")
+    (row,) = (
+        line for line in (path / "sparse/0/points3D.txt").read_text().splitlines() if line[0] != "#"
+    )
     fields = [*row.split()[:4], *map(str, colors[0]), "0.5"]
     (path / "sparse/0/points3D.txt").write_text(" ".join(fields) + "\n")
     with pytest.raises(ValueError, match=r"`point_colors` must be in \[0, 1\], got .*; divide"):
@@ -334,7 +373,8 @@ def test_load_capture__does_not_clip_the_colours_of_a_point_cloud(tmp_path: Path
         load_capture(path)
 
 
-# ---- images with other channels --------------------------------------------------------------------------
+# ---- images with other channels
+# --------------------------------------------------------------------------
 
 
 def transparent(t: int = 0, kind: type = np.uint8) -> np.ndarray:
@@ -359,11 +399,15 @@ def test_load_capture__masks_transparent_pixels(tmp_path: Path, kind: type) -> N
     capture = load_capture(with_images(tmp_path, [transparent(kind=kind)] * 3))
     assert capture.masks[0] is not None
     np.testing.assert_array_equal(capture.masks[0], transparent()[..., 3] == 255)
-    assert capture.notes == (f"cam01: {1100 / WIDTH:.1f} % of its pixels are transparent and masked out.",)
+    assert capture.notes == (
+        f"cam01: {1100 / WIDTH:.1f} % of its pixels are transparent and masked out.",
+    )
     assert capture.metadata()["cameras"][0]["valid_share"] == pytest.approx(1 - 11 / WIDTH)
 
 
-def test_load_capture__masks_what_transparent_pixels_contribute_to(tmp_path: Path, small_images: None) -> None:
+def test_load_capture__masks_what_transparent_pixels_contribute_to(
+    tmp_path: Path, small_images: None
+) -> None:
     lens = Lens("SIMPLE_RADIAL", (0.05,))
     images = [transparent()] * 2
     images[0][images[0][..., 3] < 255, :3] = 0
@@ -378,7 +422,9 @@ def test_load_capture__masks_what_transparent_pixels_contribute_to(tmp_path: Pat
 def test_load_capture__ignores_an_alpha_channel_that_changes(tmp_path: Path) -> None:
     capture = load_capture(with_images(tmp_path, [transparent(t) for t in range(3)]))
     assert capture.masks == (None,)
-    assert capture.notes == ("cam01: the alpha channel of its images changes over time and is ignored.",)
+    assert capture.notes == (
+        "cam01: the alpha channel of its images changes over time and is ignored.",
+    )
 
 
 def test_load_capture__does_not_mask_opaque_images(tmp_path: Path) -> None:
@@ -389,7 +435,10 @@ def test_load_capture__does_not_mask_opaque_images(tmp_path: Path) -> None:
 
 def test_load_capture__refuses_images_without_opaque_pixels(tmp_path: Path) -> None:
     path = with_images(tmp_path, [np.zeros((HEIGHT, WIDTH, 4), np.uint8)])
-    with pytest.raises(ValueError, match=r"cam01: expected opaque pixels, got an alpha channel without any; remove it"):
+    with pytest.raises(
+        ValueError,
+        match=r"cam01: expected opaque pixels, got an alpha channel without any; remove it",
+    ):
         load_capture(path)
 
 
@@ -403,7 +452,8 @@ def test_load_capture__reads_grey_and_16_bit_images(tmp_path: Path, image: np.nd
     assert (next(capture.frames()).images[0] == 200).all()
 
 
-# ---- photos ----------------------------------------------------------------------------------------------
+# ---- photos
+# ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("place", ["", "images", "photos"])
@@ -411,21 +461,32 @@ def test_load_capture__reads_photos_as_cameras_of_one_frame(tmp_path: Path, plac
     names = ("IMG_2", "IMG_3", "IMG_10")
     write_colmap(tmp_path / "sparse/0", rig(names))
     for i, name in enumerate(names):
-        for folder in (tmp_path / place, tmp_path / "images_2"):  # the latter as Nerfstudio's downscaled copies
+        # The latter as Nerfstudio's downscaled copies.
+        for folder in (tmp_path / place, tmp_path / "images_2"):
             folder.mkdir(exist_ok=True)
             cv2.imwrite(str(folder / f"{name}.png"), frames(i)[0][..., ::-1])
     capture = load_capture(tmp_path)
     assert (capture.names, capture.num_frames) == (names, 1)
     assert [image[0, 0, 0] for image in next(capture.frames()).images] == [0, 1, 2]
     (note,) = capture.notes
-    assert "3 photos of a static scene, one per camera; a recording has one folder per camera: cam01/0000.png" in note
+    assert (
+        "3 photos of a static scene, one per camera; a recording has one folder per camera: "
+        "cam01/0000.png" in note
+    )
 
 
 def test_load_capture__describes_the_folders_that_photos_lack(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"found none; .*, or make one folder per camera: cam01/0000"):
+    with pytest.raises(
+        FileNotFoundError, match=r"found none; .*, or make one folder per camera: cam01/0000"
+    ):
         load_capture(tmp_path)
     cv2.imwrite(str(tmp_path / "IMG_1.png"), frames(0)[0])
-    with pytest.raises(FileNotFoundError, match=r"run `morgs-mi calibrate`.* The 1 photos .* one folder per camera: c"):
+    with pytest.raises(
+        FileNotFoundError,
+        match=r"run `morgs-mi calibrate`.* The 1 photos .* one folder per camera: c",
+    ):
         load_capture(tmp_path)
-    with pytest.raises(ValueError, match=r"at least two cameras, found IMG_1; .* one folder per camera: cam01/"):
+    with pytest.raises(
+        ValueError, match=r"at least two cameras, found IMG_1; .* one folder per camera: cam01/"
+    ):
         calibrate(tmp_path)

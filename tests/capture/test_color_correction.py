@@ -42,7 +42,9 @@ def through(sensor: np.ndarray, image: np.ndarray, gain: float = 1.0) -> np.ndar
 
 @pytest.fixture(scope="module")
 def views():
-    """Four views of textured planes: cameras, true images, and images recorded by the sensors with slight noise."""
+    """Four views of textured planes: cameras, true images, and images recorded by the sensors with
+    slight noise.
+    """
     cameras = textured.rig(4)
     planes = textured.textures()
     rng = np.random.default_rng(0)
@@ -56,7 +58,9 @@ def views():
 
 
 def error(a: np.ndarray, b: np.ndarray) -> float:
-    return float(delta_e(linear(a[::4, ::4].reshape(-1, 3)), linear(b[::4, ::4].reshape(-1, 3))).mean())
+    return float(
+        delta_e(linear(a[::4, ::4].reshape(-1, 3)), linear(b[::4, ::4].reshape(-1, 3))).mean()
+    )
 
 
 def corrected(fit: ColorFit, view: int, image: np.ndarray) -> np.ndarray:
@@ -69,7 +73,10 @@ def test_fit_colors__removes_differences_between_sensors(views) -> None:
     fit = fit_colors(cameras, recorded, [None] * 4, 0)
     assert (fit.reference, fit.matrices[0]) == (0, None)
     assert min(fit.samples) > 100
-    assert all(new_error < 0.5 * old_error for old_error, new_error in zip(fit.before, fit.after, strict=True))
+    assert all(
+        new_error < 0.5 * old_error
+        for old_error, new_error in zip(fit.before, fit.after, strict=True)
+    )
     for view in (1, 2, 3):
         old_error = error(recorded[view], true[view])
         new_error = error(corrected(fit, view, recorded[view]), true[view])
@@ -84,7 +91,10 @@ def test_fit_colors__leaves_matching_cameras_unchanged(views) -> None:
     fit = fit_colors(cameras, true, [None] * 4)
     for view in range(4):
         assert error(corrected(fit, view, true[view]), true[view]) < 0.5
-    assert all(new_error <= old_error + 0.1 for old_error, new_error in zip(fit.before, fit.after, strict=True))
+    assert all(
+        new_error <= old_error + 0.1
+        for old_error, new_error in zip(fit.before, fit.after, strict=True)
+    )
 
 
 def test_fit_colors__leaves_a_camera_without_shared_points_unchanged(views, caplog) -> None:
@@ -118,18 +128,25 @@ def test_load_capture__corrects_colors_and_reports_it(recording: Path, views, ca
         assert all(error(frame.images[view], true[view]) < 2 for view in (1, 2, 3))
     metadata = capture.metadata()["colors"]
     assert metadata["reference"] == "cam0"
-    assert all(a < 0.5 * b for b, a in zip(metadata["delta_e_before"], metadata["delta_e"], strict=True))
+    assert all(
+        a < 0.5 * b for b, a in zip(metadata["delta_e_before"], metadata["delta_e"], strict=True)
+    )
     assert cli.main(["info", str(recording), "--color", "linear", "--no-check"]) == 0
     assert "dE2000 before -> after: cam0 " in capsys.readouterr().out
 
 
 def test_load_capture__refuses_an_unknown_reference_camera(recording: Path) -> None:
-    message = "`color` must be none, linear, .*with a camera of cam0, cam1, cam2, cam3, .*got 'linear:cam9'"
+    message = (
+        "`color` must be none, linear, .*with a camera of cam0, cam1, cam2, cam3, .*got "
+        "'linear:cam9'"
+    )
     with pytest.raises(ValueError, match=message):
         load_capture(recording, reading=ReadConfig(color="linear:cam9"))
 
 
 @pytest.mark.parametrize("color", ["cubic", "cubic:cam0", ""])
 def test_read_config__refuses_an_unknown_method(color: str) -> None:
-    with pytest.raises(ValueError, match=rf"ReadConfig\(\): `color` must be none, linear, .* got '{color}'"):
+    with pytest.raises(
+        ValueError, match=rf"ReadConfig\(\): `color` must be none, linear, .* got '{color}'"
+    ):
         ReadConfig(color=color)

@@ -18,9 +18,9 @@ TRANSFORMS, META = re.findall(r"```json\n(.*?)```", TEXT, re.DOTALL)
 
 def test_captures_page__nerfstudio_example_is_read_as_described(tmp_path: Path) -> None:
     (tmp_path / "transforms.json").write_text(TRANSFORMS)
-    PlyData([PlyElement.describe(np.array([(1, 2, 3)], [(a, "f4") for a in "xyz"]), "vertex")]).write(
-        str(tmp_path / "points.ply")
-    )
+    PlyData(
+        [PlyElement.describe(np.array([(1, 2, 3)], [(a, "f4") for a in "xyz"]), "vertex")]
+    ).write(str(tmp_path / "points.ply"))
     write_video(tmp_path / "cam01", [np.zeros((720, 1280, 3), np.uint8)], 30)
     capture = load_capture(tmp_path)
     camera = capture.cameras[0]

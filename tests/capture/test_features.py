@@ -1,11 +1,19 @@
-"""Features and matches: their places, the points behind them, and matches without a common geometry."""
+"""Features and matches: their places, the points behind them, and matches without a common
+geometry.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
-from morgs_mi.capture.features import Features, detect, match_views, reprojection_errors, triangulate
+from morgs_mi.capture.features import (
+    Features,
+    detect,
+    match_views,
+    reprojection_errors,
+    triangulate,
+)
 from morgs_mi.capture.points import SharedFeatures
 from morgs_mi.core.camera import Camera
 from tests.assertions import assert_close
@@ -20,7 +28,10 @@ def test_match_views__returns_none_for_matches_without_a_common_geometry():
     points = rng.uniform(0, 96, (count, 2)).round(1)
     places = points + rng.normal(0, 3, (count, 2))
     descriptors = np.eye(count, 128, dtype=np.float32)
-    features = [Features(p, descriptors, np.zeros((count, 3), np.float32), places - points) for p in (points, places)]
+    features = [
+        Features(p, descriptors, np.zeros((count, 3), np.float32), places - points)
+        for p in (points, places)
+    ]
     camera = Camera.look_at((0, 0, -3), (0, 0, 0), (0, -1, 0), 60, 96, 72)
     assert match_views(features, [camera, camera]) == []
 
@@ -29,7 +40,9 @@ def test_reprojection_errors__are_bounded_by_epipolar_distances(
     textured_capture: Capture, textured_features: SharedFeatures
 ) -> None:
     """No point can be nearer to both features than half their distance to the epipolar lines."""
-    turned_cameras = with_cameras(textured_capture, lambda i, c: turned(c, 4) if i == 2 else c).cameras
+    turned_cameras = with_cameras(
+        textured_capture, lambda i, c: turned(c, 4) if i == 2 else c
+    ).cameras
     match = next(m for m in textured_features.matches if m.views == (1, 2))
     errors = reprojection_errors(match, textured_features.features, turned_cameras)
     a, b = (turned_cameras[v] for v in match.views)
@@ -38,7 +51,9 @@ def test_reprojection_errors__are_bounded_by_epipolar_distances(
     E = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ relative[:3, :3]
     F = np.linalg.inv(b.K).T @ E @ np.linalg.inv(a.K)
     left, right = (
-        np.column_stack([textured_features.features[v].points[match.features[:, k]], np.ones(len(errors))])
+        np.column_stack(
+            [textured_features.features[v].points[match.features[:, k]], np.ones(len(errors))]
+        )
         for k, v in enumerate(match.views)
     )
     lines = left @ F.T
@@ -70,11 +85,16 @@ def test_detect__respects_the_mask(textured_capture: Capture) -> None:
     assert detect(image, mask).points[:, 0].min() > 158
 
 
-def test_triangulate__finds_points_on_the_planes(textured_capture: Capture, textured_features: SharedFeatures) -> None:
-    points, colors = triangulate(textured_features.matches, textured_features.features, textured_capture.cameras)
+def test_triangulate__finds_points_on_the_planes(
+    textured_capture: Capture, textured_features: SharedFeatures
+) -> None:
+    points, colors = triangulate(
+        textured_features.matches, textured_features.features, textured_capture.cameras
+    )
     assert points.dtype == colors.dtype == np.float32
     assert len(points) > 1000
-    # 0.1 px at 4 units, 277 px focal length and a base of 0.5 is 1 cm; a few points at occlusion edges are wrong.
+    # 0.1 px at 4 units, 277 px focal length and a base of 0.5 is 1 cm; a few points at occlusion
+    # edges are wrong.
     distance = textured.distance_to_planes(points)
     assert np.percentile(distance, 90) < 0.05
     assert np.percentile(distance, 98) < 0.3
@@ -93,7 +113,10 @@ def test_triangulate__leaves_out_points_with_a_small_angle(
     counts = [
         len(
             triangulate(
-                textured_features.matches, textured_features.features, textured_capture.cameras, min_angle=angle
+                textured_features.matches,
+                textured_features.features,
+                textured_capture.cameras,
+                min_angle=angle,
             )[0]
         )
         for angle in (1, 20, 60)

@@ -13,7 +13,9 @@ from morgs_mi.capture.points import SharedFeatures
 from tests.scenes.textured import turned
 
 
-def test_match_guided__finds_true_matches(textured_capture: Capture, textured_features: SharedFeatures) -> None:
+def test_match_guided__finds_true_matches(
+    textured_capture: Capture, textured_features: SharedFeatures
+) -> None:
     features = textured_features.features
     cameras = textured_capture.cameras
     (match,) = match_guided(features, cameras, [(0, 4)])
@@ -32,7 +34,9 @@ def test_match_guided__finds_next_to_nothing_with_wrong_poses(
     cameras = textured_capture.cameras
     (true,) = match_guided(features, cameras, [(0, 4)])
     wrong = [turned(camera, 90) if view == 4 else camera for view, camera in enumerate(cameras)]
-    assert sum(len(m.features) for m in match_guided(features, wrong, [(0, 4)])) < 0.05 * len(true.features)
+    assert sum(len(m.features) for m in match_guided(features, wrong, [(0, 4)])) < 0.05 * len(
+        true.features
+    )
     assert match_guided(features, [cameras[0]] * 6, [(0, 4)]) == []
 
 
@@ -44,4 +48,6 @@ def test_match_guided__rejects_patches_of_another_size_or_orientation(
     (true,) = match_guided(features, cameras, [(0, 4)])
     for axes in (2 * features[4].axes, features[4].axes[:, ::-1] * (-1, 1)):
         features[4] = replace(textured_features.features[4], axes=axes)
-        assert sum(len(m.features) for m in match_guided(features, cameras, [(0, 4)])) < 0.05 * len(true.features)
+        assert sum(len(m.features) for m in match_guided(features, cameras, [(0, 4)])) < 0.05 * len(
+            true.features
+        )

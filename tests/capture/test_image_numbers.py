@@ -21,7 +21,7 @@ GAPS = ReadConfig(gaps=True)
 
 
 def capture_of(path: Path, **cameras: Iterable[int]) -> Path:
-    """Write folders of images with the numbers of each camera; an image has its number as colour."""
+    """Write folders of images with the numbers of each camera; the colour is the number."""
     layouts.n3dv(path, tuple(cameras), lambda *_: None)
     for name, numbers in cameras.items():
         (path / name).mkdir()
@@ -33,7 +33,10 @@ def capture_of(path: Path, **cameras: Iterable[int]) -> Path:
 
 def colors(capture: Capture) -> list[list[int | None]]:
     frames = capture.partial_frames()
-    return [[None if image is None else int(image[0, 0, 0]) for image in frame.images] for frame in frames]
+    return [
+        [None if image is None else int(image[0, 0, 0]) for image in frame.images]
+        for frame in frames
+    ]
 
 
 DIFFERENT = [
@@ -70,7 +73,10 @@ def test_align_numbers__are_refused_without_an_option_and_replaced_by_offsets(
     path = capture_of(tmp_path / "c", a=a, b=b)
     with pytest.raises(
         ValueError,
-        match=rf"got a 0 to .*, b {b[0]} to .*; use the {len(common)} common .*--trim, .*--gaps.*--offset a 0",
+        match=(
+            rf"got a 0 to .*, b {b[0]} to .*; use the {len(common)} common .*--trim, "
+            r".*--gaps.*--offset a 0"
+        ),
     ):
         load_capture(path)
     capture = load_capture(path, reading=ReadConfig(offset={"a": 0}))
@@ -81,12 +87,16 @@ def test_align_numbers__are_refused_without_an_option_and_replaced_by_offsets(
 def test_align_numbers__without_a_common_one_are_refused(tmp_path: Path) -> None:
     path = capture_of(tmp_path / "c", a=range(0, 6, 2), b=range(1, 7, 2))
     for reading in (ReadConfig(), TRIM):
-        with pytest.raises(ValueError, match=r"got a 0 to 4 by 2, b 1 to 5 by 2; use all numbers with --gaps"):
+        with pytest.raises(
+            ValueError, match=r"got a 0 to 4 by 2, b 1 to 5 by 2; use all numbers with --gaps"
+        ):
             load_capture(path, reading=reading)
 
 
 @pytest.mark.parametrize("reading", [ReadConfig(), TRIM, GAPS])
-def test_align_numbers__that_do_not_overlap_count_separately(tmp_path: Path, caplog, reading: ReadConfig) -> None:
+def test_align_numbers__that_do_not_overlap_count_separately(
+    tmp_path: Path, caplog, reading: ReadConfig
+) -> None:
     path = capture_of(tmp_path / "c", a=range(100, 105), b=range(40, 45), c=range(40, 45))
     with caplog.at_level(logging.WARNING):
         capture = load_capture(path, reading=reading)
@@ -96,7 +106,11 @@ def test_align_numbers__that_do_not_overlap_count_separately(tmp_path: Path, cap
 
 
 def test_align_numbers__says_nothing_on_equal_numbers_and_photos(tmp_path: Path) -> None:
-    for cameras in ({"a": range(3, 6), "b": range(3, 6)}, {"a": [1], "b": [2]}, {"a": [4], "b": [4]}):
+    for cameras in (
+        {"a": range(3, 6), "b": range(3, 6)},
+        {"a": [1], "b": [2]},
+        {"a": [4], "b": [4]},
+    ):
         capture = load_capture(capture_of(tmp_path / str(cameras["a"]), **cameras))
         assert not any("numbers" in note for note in capture.notes)
     (tmp_path / "d").mkdir()
@@ -109,7 +123,9 @@ def test_align_numbers__says_nothing_on_equal_numbers_and_photos(tmp_path: Path)
 def test_align_numbers__shifts_videos_beside_them(tmp_path: Path) -> None:
     """A video begins with the first number."""
     path = capture_of(tmp_path / "c", a=range(6), b=range(2, 8))
-    layouts.write_poses_bounds(path / "poses_bounds.npy", layouts.rig(("a", "b", "v")), np.array([[1, 9]] * 3))
+    layouts.write_poses_bounds(
+        path / "poses_bounds.npy", layouts.rig(("a", "b", "v")), np.array([[1, 9]] * 3)
+    )
     images = [np.full((layouts.HEIGHT, layouts.WIDTH, 3), t, np.uint8) for t in range(8)]
     write_video(path / "v.mkv", images, 30)
     assert colors(load_capture(path, reading=TRIM)) == [[t, t, t] for t in range(2, 6)]

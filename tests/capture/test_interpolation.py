@@ -27,7 +27,9 @@ def moving_square(position: float) -> np.ndarray:
     opaque = np.zeros((HEIGHT, WIDTH))
     opaque[20:52, 30:62] = 1
     shift = np.float32([[1, 0, position], [0, 1, 0]])
-    square, opaque = (cv2.warpAffine(a, shift, (WIDTH, HEIGHT), flags=cv2.INTER_CUBIC) for a in (square, opaque))
+    square, opaque = (
+        cv2.warpAffine(a, shift, (WIDTH, HEIGHT), flags=cv2.INTER_CUBIC) for a in (square, opaque)
+    )
     opaque = opaque.clip(0, 1)[..., None]
     return np.clip(background * (1 - opaque) + square * opaque, 0, 255).astype(np.uint8)
 
@@ -41,7 +43,10 @@ def test_image_between__shows_things_where_they_have_moved_to(share: float) -> N
     blended = (1 - share) * first + share * second
     assert image.dtype == np.uint8
     window = slice(24, 48), slice(38, 58)
-    assert psnr(image[window] / 255, expected[window] / 255) > psnr(blended[window] / 255, expected[window] / 255) + 10
+    assert (
+        psnr(image[window] / 255, expected[window] / 255)
+        > psnr(blended[window] / 255, expected[window] / 255) + 10
+    )
     assert psnr(image / 255, expected / 255) > psnr(blended / 255, expected / 255) + 2
 
 

@@ -34,7 +34,9 @@ def dots(centres: np.ndarray) -> np.ndarray:
 
 
 def project(model: str, lens: Lens, points: np.ndarray) -> np.ndarray:
-    """Return the positions [N, 2] of points in the frame of `camera`, seen through the lens, with centres at +0.5."""
+    """Return the positions [N, 2] of points in the frame of `camera`, seen through the lens, with
+    centres at +0.5.
+    """
     K = camera().K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
     zero = np.zeros(3)
     through = cv2.fisheye.projectPoints if model == "OPENCV_FISHEYE" else cv2.projectPoints
@@ -76,9 +78,15 @@ def test_undistortion__removes_what_a_refined_lens_leaves(model: str) -> None:
     x, y = ((expected - refined.K[:2, 2]) / refined.K[[0, 1], [0, 1]]).T
     square = x**2 + y**2
     # Where the refined lens, and then the calibrated one, shows the points.
-    rays = np.stack([x, y], axis=1) * (1 + remainder[0] * square + remainder[1] * square**2)[:, None]
-    positions = (rays * refined.K[[0, 1], [0, 1]] + refined.K[:2, 2] - cam.K[:2, 2]) / cam.K[[0, 1], [0, 1]]
-    distorted = project(model, lens, np.concatenate([positions, np.ones((len(positions), 1))], axis=1))
+    rays = (
+        np.stack([x, y], axis=1) * (1 + remainder[0] * square + remainder[1] * square**2)[:, None]
+    )
+    positions = (rays * refined.K[[0, 1], [0, 1]] + refined.K[:2, 2] - cam.K[:2, 2]) / cam.K[
+        [0, 1], [0, 1]
+    ]
+    distorted = project(
+        model, lens, np.concatenate([positions, np.ones((len(positions), 1))], axis=1)
+    )
     lens_map = undistortion(cam, lens, (refined, Lens("RADIAL", remainder)))
     assert lens_map is not None
     assert_centred(lens_map(dots(distorted)).astype(float)[..., 0], expected)
@@ -101,15 +109,21 @@ def test_undistortion__masks_the_empty_corners_of_a_pincushion() -> None:
     assert barrel.mask.all()
 
 
-@pytest.mark.parametrize(("model", "fold"), [("SIMPLE_RADIAL", (3 * 0.5) ** -0.5), ("OPENCV_FISHEYE", None)])
+@pytest.mark.parametrize(
+    ("model", "fold"), [("SIMPLE_RADIAL", (3 * 0.5) ** -0.5), ("OPENCV_FISHEYE", None)]
+)
 def test_undistortion__mask_ends_where_the_polynomial_folds(model: str, fold: float | None) -> None:
-    """R (1 - 0.5 r^2) decreases beyond r = 0.816; theta (1 - 0.5 theta^2) beyond that angle, of tangent 1.066."""
+    """R (1 - 0.5 r^2) decreases beyond r = 0.816; theta (1 - 0.5 theta^2) beyond that angle, of
+    tangent 1.066.
+    """
     radius = fold or np.tan((3 * 0.5) ** -0.5)
     cam = camera(focal=60.0)
     lens_map = undistortion(cam, Lens(model, (-0.5,)))
     assert lens_map is not None
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    x, y, _ = np.moveaxis(cam.unproject(np.stack([columns, rows], -1), np.ones((HEIGHT, WIDTH))), -1, 0)
+    x, y, _ = np.moveaxis(
+        cam.unproject(np.stack([columns, rows], -1), np.ones((HEIGHT, WIDTH))), -1, 0
+    )
     r = np.hypot(x, y)
     assert r.max() > 1.2 * radius
     pixel = 1.5 / cam.K[0, 0]
@@ -124,7 +138,9 @@ def test_undistortion__mask_ends_where_the_polynomial_folds(model: str, fold: fl
         ("OPENCV", (1, 2, 3, 4), "OPENCV takes 8 parameters, got 4"),
     ],
 )
-def test_lens_and_intrinsics__refuse_bad_input(model: str, params: tuple[float, ...], message: str) -> None:
+def test_lens_and_intrinsics__refuse_bad_input(
+    model: str, params: tuple[float, ...], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         lens_and_intrinsics(model, params)
 
@@ -138,7 +154,9 @@ def test_lens_and_intrinsics__refuse_bad_input(model: str, params: tuple[float, 
         ((1, 2, 3, 4, 5, 6, 7, 8), "FULL_OPENCV", (1, 2, 3, 4, 5, 6, 7, 8)),
     ],
 )
-def test_opencv_lens__keeps_the_order_of_opencv(coefficients: tuple, model: str, distortion: tuple) -> None:
+def test_opencv_lens__keeps_the_order_of_opencv(
+    coefficients: tuple, model: str, distortion: tuple
+) -> None:
     lens = opencv_lens(coefficients)
     assert (lens.model, lens.distortion) == (model, distortion)
     np.testing.assert_array_equal(lens.opencv_coefficients[: len(coefficients)], coefficients)

@@ -25,7 +25,11 @@ NAMES = ("cam01", "cam02")
 
 
 def light(camera: int, frame: int) -> np.ndarray:
-    image = np.random.default_rng([camera, frame]).uniform(0, 0.5, (HEIGHT, WIDTH, 3)).astype(np.float32)
+    image = (
+        np.random.default_rng([camera, frame])
+        .uniform(0, 0.5, (HEIGHT, WIDTH, 3))
+        .astype(np.float32)
+    )
     image[: HEIGHT // 4] *= 16
     return image
 
@@ -36,7 +40,9 @@ def recorded(path: Path, **kwargs) -> Path:
         (path / name).mkdir(parents=True)
         for frame in range(2):
             image = light(camera, frame)
-            write_exr(path / name / f"{frame:04d}.exr", {c: image[..., k] for k, c in enumerate("RGB")})
+            write_exr(
+                path / name / f"{frame:04d}.exr", {c: image[..., k] for k, c in enumerate("RGB")}
+            )
     return path
 
 
@@ -61,7 +67,9 @@ def test_load_capture__prefers_images_of_8_bits_to_exr_files_beside_them(tmp_pat
     recorded(tmp_path)
     for name in NAMES:
         for frame in range(2):
-            write_png(tmp_path / name / f"{frame:04d}.png", np.full((HEIGHT, WIDTH, 3), 9, np.uint8))
+            write_png(
+                tmp_path / name / f"{frame:04d}.png", np.full((HEIGHT, WIDTH, 3), 9, np.uint8)
+            )
     capture = load_capture(tmp_path)
     assert capture.display_exposure is None
     assert next(capture.frames()).images[0].dtype == np.uint8
@@ -69,7 +77,9 @@ def test_load_capture__prefers_images_of_8_bits_to_exr_files_beside_them(tmp_pat
 
 def test_process__averages_light_when_it_downscales(tmp_path: Path) -> None:
     capture = load_capture(recorded(tmp_path))
-    smaller = replace(capture, cameras=tuple(c.resized(WIDTH // 2, HEIGHT // 2) for c in capture.cameras))
+    smaller = replace(
+        capture, cameras=tuple(c.resized(WIDTH // 2, HEIGHT // 2) for c in capture.cameras)
+    )
     blocks = light(0, 0).reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean((1, 3))
     np.testing.assert_allclose(next(smaller.frames()).images[0], blocks, rtol=1e-5)
 

@@ -1,4 +1,6 @@
-"""A held-out camera that stands in a dark ball, as cameras on the wall of a dome do in the views of the others."""
+"""A held-out camera that stands in a dark ball, as cameras on the wall of a dome do in the views of
+the others.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,7 @@ def dome() -> list[Camera]:
 
 
 def scene() -> tuple[np.ndarray, np.ndarray]:
-    """Return points and colours of a bright cube in the middle and of a dark ball around camera 0."""
+    """Return points and colours of a bright cube in the middle and a dark ball around camera 0."""
     rng = np.random.default_rng(0)
     cube = rng.uniform(-0.8, 0.8, (400, 3))
     ball = rng.normal(size=(60, 3))
@@ -50,12 +52,16 @@ def splats() -> Gaussians:
 
 
 def image(camera: Camera, gaussians: Gaussians) -> np.ndarray:
-    return to_uint8(np.asarray(rasterize(gaussians, camera, ("color",), background=(0.5, 0.5, 0.5)).color))
+    return to_uint8(
+        np.asarray(rasterize(gaussians, camera, ("color",), background=(0.5, 0.5, 0.5)).color)
+    )
 
 
 @pytest.fixture
 def capture(tmp_path: Path) -> Path:
-    """A capture whose camera 0, held out, has photographed the scene without the ball around itself."""
+    """A capture whose camera 0, held out, has photographed the scene without the ball around
+    itself.
+    """
     path = tmp_path / "capture"
     write_colmap(path / "sparse" / "0", dome(), *scene())
     for index, camera in enumerate(dome()):
@@ -73,11 +79,15 @@ def test_load_capture__near_plane_is_behind_a_splat_around_a_held_out_camera(cap
     camera = load_capture(capture).cameras[0]
     shown, true = (image(camera, s) for s in (splats(), splats().select(np.arange(400))))
     assert np.array_equal(shown, true)
-    assert image(replace(camera, near=0.01), splats()).max() < 60, "the test has no splat around the camera"
+    assert image(replace(camera, near=0.01), splats()).max() < 60, (
+        "the test has no splat around the camera"
+    )
 
 
 @pytest.mark.slow
-def test_load_capture__near_plane_shows_a_held_out_camera_past_a_splat_around_it(capture: Path, tmp_path: Path) -> None:
+def test_load_capture__near_plane_shows_a_held_out_camera_past_a_splat_around_it(
+    capture: Path, tmp_path: Path
+) -> None:
     with_rule = held_out_psnr(capture, tmp_path / "rule", ReadConfig())
     without = held_out_psnr(capture, tmp_path / "constant", ReadConfig(near=0.01))
     assert without < 12
@@ -85,7 +95,9 @@ def test_load_capture__near_plane_shows_a_held_out_camera_past_a_splat_around_it
 
 
 @pytest.mark.slow
-def test_load_capture__takes_a_given_near_plane_and_the_stream_stores_it(capture: Path, tmp_path: Path) -> None:
+def test_load_capture__takes_a_given_near_plane_and_the_stream_stores_it(
+    capture: Path, tmp_path: Path
+) -> None:
     stream_capture(load_capture(capture, reading=ReadConfig(near=0.3)), tmp_path / "out", quick())
     assert {camera.near for camera in open_stream(tmp_path / "out").cameras} == {0.3}
 
@@ -98,6 +110,8 @@ def test_capture__keeps_near_planes_at_the_recorded_size(capture: Path) -> None:
 
 
 @pytest.mark.parametrize("near", [0.0, -1.0, float("nan"), float("inf")])
-def test_load_capture__refuses_a_near_plane_that_is_not_positive(capture: Path, near: float) -> None:
+def test_load_capture__refuses_a_near_plane_that_is_not_positive(
+    capture: Path, near: float
+) -> None:
     with pytest.raises(ValueError, match="`near` must"):
         load_capture(capture, reading=ReadConfig(near=near))

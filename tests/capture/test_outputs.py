@@ -7,15 +7,33 @@ from pathlib import Path
 import pytest
 
 from morgs_mi.capture.outputs import check_output
-from tests.scenes.captures import anipose, colmap, dynamic3dgs, meet_room, n3dv, nerfstudio, qualisys
+from tests.scenes.captures import (
+    anipose,
+    colmap,
+    dynamic3dgs,
+    meet_room,
+    n3dv,
+    nerfstudio,
+    qualisys,
+)
 
 
-@pytest.mark.parametrize("build", [colmap, nerfstudio, dynamic3dgs, n3dv, meet_room, anipose, qualisys])
+@pytest.mark.parametrize(
+    "build", [colmap, nerfstudio, dynamic3dgs, n3dv, meet_room, anipose, qualisys]
+)
 def test_check_output__refuses_captures_of_every_layout(tmp_path: Path, build) -> None:
     capture = build(tmp_path / "clip")
     (tmp_path / "link").symlink_to(capture)
-    for path in (capture, capture / "new", tmp_path / "link" / "a" / "b.mp4", f"{capture}/../clip/c"):
-        with pytest.raises(ValueError, match=f"expected an output outside of captures, .* in the capture {capture};"):
+    for path in (
+        capture,
+        capture / "new",
+        tmp_path / "link" / "a" / "b.mp4",
+        f"{capture}/../clip/c",
+    ):
+        with pytest.raises(
+            ValueError,
+            match=f"expected an output outside of captures, .* in the capture {capture};",
+        ):
             check_output(path)
 
 

@@ -48,7 +48,9 @@ def test_stereo_points__are_the_same_every_time(views, points_and_colors) -> Non
 def test_stereo_points__leaves_out_pixels_that_are_not_valid(views) -> None:
     cameras, images = views
     halves = [np.arange(camera.width) < camera.width // 2 for camera in cameras]
-    masks = [np.tile(of_row, (camera.height, 1)) for of_row, camera in zip(halves, cameras, strict=True)]
+    masks = [
+        np.tile(of_row, (camera.height, 1)) for of_row, camera in zip(halves, cameras, strict=True)
+    ]
     points, _ = stereo_points(cameras, images, masks, NO_POINTS, np.random.default_rng(0))
     assert len(points) > 1000
     # Valid pixels of the third view confirm what the other two have in common.
@@ -62,7 +64,9 @@ def test_stereo_points__finds_none_if_one_camera_is_before_the_other(views) -> N
         pose = np.eye(4)
         pose[:3, 3] = shift
         ahead = replace(camera, viewmat=pose @ camera.viewmat)
-        points, _ = stereo_points([camera, ahead], [image, image], [None] * 2, NO_POINTS, np.random.default_rng(0))
+        points, _ = stereo_points(
+            [camera, ahead], [image, image], [None] * 2, NO_POINTS, np.random.default_rng(0)
+        )
         assert len(points) == 0
 
 
@@ -70,5 +74,7 @@ def test_stereo_points__finds_none_between_distant_cameras(textured_capture: Cap
     cameras = textured_capture.cameras
     images = next(textured_capture.frames()).images
     ends = [cameras[0], cameras[5]], [images[0], images[5]]
-    points, colors = stereo_points(ends[0], ends[1], [None] * 2, NO_POINTS, np.random.default_rng(0))
+    points, colors = stereo_points(
+        ends[0], ends[1], [None] * 2, NO_POINTS, np.random.default_rng(0)
+    )
     assert points.shape == colors.shape == (0, 3)

@@ -17,7 +17,9 @@ from tests.scenes import captures as layouts
 
 
 def capture_of(path: Path, clips: dict[str, tuple[int, float]]) -> Path:
-    """Write clips given by number of frames and frame rate; frame t of camera i is filled with (i, t, 0)."""
+    """Write clips given by number of frames and frame rate; frame t of camera i is filled with (i,
+    t, 0).
+    """
     layouts.n3dv(path, tuple(clips), lambda *_: None)
     for i, (name, (count, fps)) in enumerate(clips.items()):
         write_video(path / f"{name}.mkv", layouts.frames(i, count), fps)
@@ -27,7 +29,10 @@ def capture_of(path: Path, clips: dict[str, tuple[int, float]]) -> Path:
 def frame_numbers(capture: Capture) -> list[list[int | None]]:
     """Return per instant the frame of each clip, None for a missing image."""
     frames = capture.partial_frames()
-    return [[None if image is None else int(image[0, 0, 1]) for image in frame.images] for frame in frames]
+    return [
+        [None if image is None else int(image[0, 0, 1]) for image in frame.images]
+        for frame in frames
+    ]
 
 
 @pytest.mark.parametrize(
@@ -70,7 +75,8 @@ def brightening(path: Path, fps: dict[str, float]) -> Path:
 def test_timeline__gives_clips_whose_offset_is_not_whole_a_delay(tmp_path: Path) -> None:
     path = brightening(tmp_path / "c", {"a": 25, "b": 25})
     capture = load_capture(path, reading=ReadConfig(offset={"b": -1.25}))
-    # At frames 2, 3 and 4 of a, b would show its frames 0.75, 1.75 and 2.75. Only the first image is interpolated.
+    # At frames 2, 3 and 4 of a, b would show its frames 0.75, 1.75 and 2.75. Only the first image
+    # is interpolated.
     assert frame_numbers(capture) == [[80, 30], [120, 80], [160, 120]]
     assert [camera.delay for camera in capture.cameras] == [0, 0.25]
     first, second = list(capture.partial_frames())[:2]
@@ -126,8 +132,12 @@ RATES = {"a": (300, 30.0), "b": (300, 29.7), "c": (300, 29.97)}
 
 
 def moments(capture: Capture, clips: dict[str, tuple[int, float]]) -> np.ndarray:
-    """Return the times of the images of each instant [T, C] in s; the clips of `capture_of` begin together."""
-    numbers = np.array([[int(image[0, 0, 1]) for image in frame.images] for frame in capture.frames()])
+    """Return the times of the images of each instant [T, C] in s; the clips of `capture_of` begin
+    together.
+    """
+    numbers = np.array(
+        [[int(image[0, 0, 1]) for image in frame.images] for frame in capture.frames()]
+    )
     # The colour of a frame is its number modulo 256.
     numbers += 256 * np.cumsum(np.diff(numbers, axis=0, prepend=0) < 0, axis=0)
     return numbers / [fps for _, fps in clips.values()]
@@ -136,7 +146,9 @@ def moments(capture: Capture, clips: dict[str, tuple[int, float]]) -> np.ndarray
 @pytest.mark.parametrize(
     "config", [ReadConfig(trim=True), ReadConfig(offset={"b": 0}), ReadConfig(trim=True, gaps=True)]
 )
-def test_timeline__uses_rates_that_are_less_than_a_percent_apart(tmp_path: Path, caplog, config: ReadConfig) -> None:
+def test_timeline__uses_rates_that_are_less_than_a_percent_apart(
+    tmp_path: Path, caplog, config: ReadConfig
+) -> None:
     path = capture_of(tmp_path / "c", RATES)
     with caplog.at_level(logging.WARNING):
         capture = load_capture(path, reading=config)
@@ -145,12 +157,14 @@ def test_timeline__uses_rates_that_are_less_than_a_percent_apart(tmp_path: Path,
     np.testing.assert_allclose(times[:, 1], np.arange(len(times)) / 29.7, atol=1e-3)
     spread = np.ptp(times, axis=1).max()
     assert spread < 1 / 29.7
-    assert f"images of one instant are up to {1e3 * apart:.0f}"[:-1] in caplog.text
+    assert f"images of one instant are up to {1e3 * spread:.0f}"[:-1] in caplog.text
 
 
 def test_timeline__refuses_rates_that_drift_more_than_half_a_frame(tmp_path: Path, caplog) -> None:
     path = capture_of(tmp_path / "c", RATES)
-    with pytest.raises(ValueError, match=r"same frame rate, got a.mkv 30, .* up to 3.0 frames apart; .*--trim"):
+    with pytest.raises(
+        ValueError, match=r"same frame rate, got a.mkv 30, .* up to 3.0 frames apart; .*--trim"
+    ):
         load_capture(path)
     with caplog.at_level(logging.WARNING):
         capture = load_capture(path, max_frames=30)
@@ -179,7 +193,8 @@ def test_timeline__keeps_truth_only_for_unshifted_clips(tmp_path: Path) -> None:
         (
             {"a": (4, 25), "b": (6, 25)},
             ReadConfig(),
-            r"same number of frames, got a.mkv 4, b.mkv 6; .*`max_frames=4`, .* --trim, .* --offset",
+            r"same number of frames, got a.mkv 4, b.mkv 6; .*`max_frames=4`, .* --trim, .* "
+            r"--offset",
         ),
         (
             {"a": (4, 25), "b": (4, 25)},
@@ -188,13 +203,17 @@ def test_timeline__keeps_truth_only_for_unshifted_clips(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_timeline__refuses_clips_that_do_not_match(tmp_path: Path, clips, config, message: str) -> None:
+def test_timeline__refuses_clips_that_do_not_match(
+    tmp_path: Path, clips, config, message: str
+) -> None:
     path = capture_of(tmp_path / "c", clips)
     with pytest.raises(ValueError, match=message):
         load_capture(path, reading=config)
 
 
-def test_timeline__truncated_clip_can_be_trimmed_or_left_out_but_not_shifted(tmp_path: Path) -> None:
+def test_timeline__truncated_clip_can_be_trimmed_or_left_out_but_not_shifted(
+    tmp_path: Path,
+) -> None:
     path = capture_of(tmp_path / "c", {"a": (6, 25), "b": (6, 25)})
     data = (path / "b.mkv").read_bytes()
     (path / "b.mkv").write_bytes(data[: len(data) * 2 // 3])
@@ -203,22 +222,29 @@ def test_timeline__truncated_clip_can_be_trimmed_or_left_out_but_not_shifted(tmp
             load_capture(path, reading=config)
     held = load_capture(path, reading=ReadConfig(trim=True)).num_frames
     assert 0 < held < 6
-    assert frame_numbers(load_capture(path, reading=ReadConfig(trim=True))) == [[t, t] for t in range(held)]
+    assert frame_numbers(load_capture(path, reading=ReadConfig(trim=True))) == [
+        [t, t] for t in range(held)
+    ]
     expected = [[t, t if t < held else None] for t in range(6)]
     assert frame_numbers(load_capture(path, reading=ReadConfig(gaps=True))) == expected
 
 
-# Clips at 20 fps, the second with two frames that come 0.1 s late, the third with jitter within half a frame.
+# Clips at 20 fps, the second with two frames that come 0.1 s late, the third with jitter within
+# half a frame.
 REGULAR = [50 * t for t in range(7)]
 LATE = [0, 50, 100, 250, 300]
 JITTER = [0, 60, 95, 140, 200, 255, 300]
 
 
 def timed(path: Path, **times: list[int]) -> Path:
-    """Write clips given by the times of their frames in milliseconds; frame t of camera i is filled with (i, t, 0)."""
+    """Write clips given by the times of their frames in milliseconds; frame t of camera i is filled
+    with (i, t, 0).
+    """
     layouts.n3dv(path, tuple(times), lambda *_: None)
     for i, (name, milliseconds) in enumerate(times.items()):
-        layouts.write_timed_video(path / f"{name}.mp4", layouts.frames(i, len(milliseconds)), milliseconds)
+        layouts.write_timed_video(
+            path / f"{name}.mp4", layouts.frames(i, len(milliseconds)), milliseconds
+        )
     return path
 
 
@@ -226,7 +252,11 @@ def timed(path: Path, **times: list[int]) -> Path:
     ("times", "config", "instants"),
     [
         # The nearest frame is shown at each instant.
-        ({"a": REGULAR, "b": LATE}, ReadConfig(trim=True), [[0, 0], [1, 1], [2, 2], [3, 2], [4, 3], [5, 3], [6, 4]]),
+        (
+            {"a": REGULAR, "b": LATE},
+            ReadConfig(trim=True),
+            [[0, 0], [1, 1], [2, 2], [3, 2], [4, 3], [5, 3], [6, 4]],
+        ),
         # Its camera is left out where the nearest frame is more than half a frame away.
         (
             {"a": REGULAR, "b": LATE},
@@ -234,7 +264,11 @@ def timed(path: Path, **times: list[int]) -> Path:
             [[0, 0], [1, 1], [2, 2], [3, None], [4, None], [5, 3], [6, 4]],
         ),
         # Frame 1 of b is simultaneous with frame 0 of a; then frame 3 of b.
-        ({"a": REGULAR, "b": LATE}, ReadConfig(offset={"b": 1}), [[0, 1], [1, 2], [2, 2], [3, 3], [4, 3], [5, 4]]),
+        (
+            {"a": REGULAR, "b": LATE},
+            ReadConfig(offset={"b": 1}),
+            [[0, 1], [1, 2], [2, 2], [3, 3], [4, 3], [5, 4]],
+        ),
         ({"a": REGULAR[:2], "b": LATE}, ReadConfig(offset={"b": 3}), [[0, 3], [1, 4]]),
         # a has twice the rate: the instants are b's.
         (
@@ -246,7 +280,9 @@ def timed(path: Path, **times: list[int]) -> Path:
         ({"a": REGULAR, "b": JITTER}, ReadConfig(trim=True), [[t, t] for t in range(7)]),
     ],
 )
-def test_timeline__synchronises_variable_frame_rates_by_time(tmp_path: Path, times, config, instants) -> None:
+def test_timeline__synchronises_variable_frame_rates_by_time(
+    tmp_path: Path, times, config, instants
+) -> None:
     capture = load_capture(timed(tmp_path / "c", **times), reading=config)
     assert capture.fps == pytest.approx(20, rel=0.01)
     assert frame_numbers(capture) == instants
@@ -255,7 +291,10 @@ def test_timeline__synchronises_variable_frame_rates_by_time(tmp_path: Path, tim
 
 def test_timeline__refuses_a_variable_frame_rate_by_default(tmp_path: Path) -> None:
     path = timed(tmp_path / "c", a=REGULAR[:5], b=LATE)
-    with pytest.raises(ValueError, match=r"b.mp4: expected a constant frame rate, .* frame 3 is 100 ms late; .*--trim"):
+    with pytest.raises(
+        ValueError,
+        match=r"b.mp4: expected a constant frame rate, .* frame 3 is 100 ms late; .*--trim",
+    ):
         load_capture(path)
     assert load_capture(path, max_frames=3).num_frames == 3
 
@@ -263,18 +302,21 @@ def test_timeline__refuses_a_variable_frame_rate_by_default(tmp_path: Path) -> N
 def test_timeline__reports_how_irregular_a_clip_is_and_what_was_done(tmp_path: Path) -> None:
     path = timed(tmp_path / "c", a=REGULAR, b=LATE)
     assert load_capture(path, reading=ReadConfig(trim=True)).notes == (
-        "b.mp4: variable frame rate, 5 frames in 7 periods of 50.0 ms, up to 0.0 ms off; each instant has the frame "
-        "nearest in time: 2 repeat one, 0 have none.",
+        "b.mp4: variable frame rate, 5 frames in 7 periods of 50.0 ms, up to 0.0 ms off; each "
+        "instant has the frame nearest in time: 2 repeat one, 0 have none.",
     )
     capture = load_capture(path, reading=ReadConfig(gaps=True))
     assert "0 repeat one, 2 have none" in capture.metadata()["notes"][0]
     problems = [frame.problems for frame in capture.partial_frames(3, 4)]
     assert problems == [(f"b: {path / 'b.mp4'}: no frame at instant 3.",)]
-    regular = timed(tmp_path / "d", a=REGULAR, b=[50 * t + t % 2 for t in range(7)])  # rounded, as in Matroska
+    # Rounded, as in Matroska.
+    regular = timed(tmp_path / "d", a=REGULAR, b=[50 * t + t % 2 for t in range(7)])
     assert load_capture(regular).notes == ()
 
 
-def test_info_command__reports_a_variable_frame_rate(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_info_command__reports_a_variable_frame_rate(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
     path = timed(tmp_path / "c", a=REGULAR, b=LATE)
     assert cli.main(["info", str(path), "--no-check", "--trim"]) == 0
     assert "b.mp4: variable frame rate, 5 frames in 7 periods" in capsys.readouterr().out
@@ -314,15 +356,22 @@ def test_partial_frames__leave_out_missing_images_in_frame_folders(tmp_path: Pat
     (path / "frame000002/cam_2.png").unlink()
     capture = load_capture(path, reading=ReadConfig(gaps=True))
     assert frame_numbers(capture) == [[0, 0, 0], [1, 1, 1], [2, None, 2], [3, 3, 3]]
-    with pytest.raises(FileNotFoundError, match=r"frame000002/cam_2.png: expected an image, found none; .* \(--gaps\)"):
+    with pytest.raises(
+        FileNotFoundError,
+        match=r"frame000002/cam_2.png: expected an image, found none; .* \(--gaps\)",
+    ):
         load_capture(path)
 
 
 @pytest.mark.parametrize("number", ["9000000000", "9" * 60])
-def test_open_clips__refuses_numbers_that_span_more_than_the_images(tmp_path: Path, number: str) -> None:
+def test_open_clips__refuses_numbers_that_span_more_than_the_images(
+    tmp_path: Path, number: str
+) -> None:
     path = images(tmp_path / "c")
     (path / "cam_2" / "0003.png").rename(path / "cam_2" / f"{number}.png")
-    with pytest.raises(ValueError, match=rf"cam_2/{number}.png: expected images numbered without .* after number 3"):
+    with pytest.raises(
+        ValueError, match=rf"cam_2/{number}.png: expected images numbered without .* after number 3"
+    ):
         load_capture(path, reading=ReadConfig(gaps=True))
 
 

@@ -1,4 +1,6 @@
-"""The page for users of other tools: its commands run on a small recording in the folder of each of them."""
+"""The page for users of other tools: its commands run on a small recording in the folder of each of
+them.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ FRAMES = 2
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory) -> Capture:
     folder = tmp_path_factory.mktemp("recording") / "spheres"
-    synthesize("spheres", folder, SynthConfig(cameras=CAMERAS, frames=FRAMES, width=320, height=240, spp=8))
+    synthesize(
+        "spheres", folder, SynthConfig(cameras=CAMERAS, frames=FRAMES, width=320, height=240, spp=8)
+    )
     return load_capture(folder)
 
 
@@ -41,7 +45,9 @@ def write_images(recording: Capture, name: str) -> None:
     """Write the images under names with {camera}, {frame} and {number}, which counts from 1."""
     for frame in recording.frames():
         for camera, image in zip(recording.names, frame.images, strict=True):
-            write_png(Path(name.format(camera=camera, frame=frame.index, number=frame.index + 1)), image)
+            write_png(
+                Path(name.format(camera=camera, frame=frame.index, number=frame.index + 1)), image
+            )
 
 
 def dynerf(recording: Capture) -> None:
@@ -53,7 +59,10 @@ def dynerf(recording: Capture) -> None:
 def multipleview(recording: Capture) -> None:
     write_images(recording, "multipleview/SCENE/{camera}/frame_{number:05d}.png")
     # As 4DGaussians' script names them: in no particular order.
-    other = [Camera(c.K, c.viewmat, c.width, c.height, f"image{i + 1}") for i, c in enumerate(recording.cameras[::-1])]
+    other = [
+        Camera(c.K, c.viewmat, c.width, c.height, f"image{i + 1}")
+        for i, c in enumerate(recording.cameras[::-1])
+    ]
     write_colmap("multipleview/SCENE/sparse_", other, recording.points)
 
 
@@ -71,14 +80,18 @@ def dynamic3dgs(recording: Capture) -> None:
 
     Path("dynamic3dgs/SCENE/train_meta.json").write_text(meta(list(recording.cameras[1:])))
     Path("dynamic3dgs/SCENE/test_meta.json").write_text(meta(list(recording.cameras[:1])))
-    points = np.concatenate([recording.points, recording.point_colors, np.ones((len(recording.points), 1))], axis=1)
+    points = np.concatenate(
+        [recording.points, recording.point_colors, np.ones((len(recording.points), 1))], axis=1
+    )
     np.savez("dynamic3dgs/SCENE/init_pt_cld.npz", data=points)
 
 
 def stream3dgs(recording: Capture) -> None:
     write_images(recording, "3dgstream/SCENE/frame{frame:06d}/images/{camera}.png")
     for frame in range(FRAMES):
-        write_colmap(f"3dgstream/SCENE/frame{frame:06d}/sparse/0", recording.cameras, recording.points)
+        write_colmap(
+            f"3dgstream/SCENE/frame{frame:06d}/sparse/0", recording.cameras, recording.points
+        )
 
 
 def nerfstudio(recording: Capture) -> None:
@@ -88,7 +101,9 @@ def nerfstudio(recording: Capture) -> None:
         for folder in ("images", "images_2"):
             write_png(Path(f"nerfstudio/SCENE/{folder}/frame_{i:05d}.png"), image)
         pose = np.linalg.inv(np.asarray(camera.viewmat)) @ np.diag([1, -1, -1, 1])
-        entries.append({"file_path": f"images/frame_{i:05d}.png", "transform_matrix": pose.tolist()})
+        entries.append(
+            {"file_path": f"images/frame_{i:05d}.png", "transform_matrix": pose.tolist()}
+        )
     (fx, _, cx), (_, fy, cy), _ = recording.cameras[0].K.tolist()
     intrinsics = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": 320, "h": 240}
     meta = {"camera_model": "OPENCV", **intrinsics, "frames": entries}
@@ -106,7 +121,9 @@ def vggt(recording: Capture) -> None:
 
 
 @pytest.mark.slow
-def test_coming_from__commands_run_on_the_folders_of_the_tools(recording, tmp_path, run, monkeypatch):
+def test_coming_from__commands_run_on_the_folders_of_the_tools(
+    recording, tmp_path, run, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     for write in (dynerf, multipleview, dynamic3dgs, stream3dgs, nerfstudio, vggt):
         write(recording)
@@ -125,7 +142,9 @@ def test_coming_from__commands_run_on_the_folders_of_the_tools(recording, tmp_pa
         if rest[0] == "fit":
             frames[rest[2]] = len(json.loads(Path(rest[2], "report.json").read_text())["frames"])
     assert [frames.pop(f"out/{name}") for name in ("nerfstudio", "vggt")] == [1, 1]
-    assert frames == {f"out/{name}": FRAMES for name in ("dynerf", "multipleview", "dynamic3dgs", "3dgstream")}
+    assert frames == {
+        f"out/{name}": FRAMES for name in ("dynerf", "multipleview", "dynamic3dgs", "3dgstream")
+    }
     assert "Views between the cameras" in outputs["info"]
 
 

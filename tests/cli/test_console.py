@@ -1,4 +1,6 @@
-"""Console output: progress and tables without a terminal, and error messages in the words of the command line."""
+"""Console output: progress and tables without a terminal, and error messages in the words of the
+command line.
+"""
 
 from __future__ import annotations
 
@@ -56,18 +58,25 @@ def test_progress__estimates_the_time_left_from_the_pace_of_the_stage_alone(
     ]
 
 
-def test_progress__prints_nothing_without_a_terminal_for_short_work(capsys: pytest.CaptureFixture[str]) -> None:
+def test_progress__prints_nothing_without_a_terminal_for_short_work(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     with progress() as report:
         report("Rendering", 1, 2)
     assert capsys.readouterr().err == ""
 
 
-def test_print_table__is_as_wide_as_its_content_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+def test_print_table__is_as_wide_as_its_content_without_a_terminal(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     table = Table("camera", "x" * 60)
     table.add_row("a_camera_with_a_name_of_50_characters_or_a_few_more", "y" * 70)
     print_table(table)
     text = capsys.readouterr().out
-    assert all(word in text for word in ("a_camera_with_a_name_of_50_characters_or_a_few_more", "x" * 60, "y" * 70))
+    assert all(
+        word in text
+        for word in ("a_camera_with_a_name_of_50_characters_or_a_few_more", "x" * 60, "y" * 70)
+    )
     assert len(text.splitlines()) == 5
 
 
@@ -93,22 +102,33 @@ def test_printable__changes_no_text_and_no_toml() -> None:
 
 
 def test_LogHandler__prints_one_line_with_the_level(capsys: pytest.CaptureFixture[str]) -> None:
-    LogHandler().emit(logging.LogRecord("name", logging.WARNING, "", 0, "%s: [left out]", ("cam1" * 40,), None))
+    LogHandler().emit(
+        logging.LogRecord("name", logging.WARNING, "", 0, "%s: [left out]", ("cam1" * 40,), None)
+    )
     assert capsys.readouterr().err == f"Warning: {'cam1' * 40}: [left out]\n"
 
 
 @pytest.mark.parametrize(
     ("error", "sentence"),
     [
-        (FileNotFoundError(2, "No such file or directory", "a/b"), "a/b: No such file or directory."),
+        (
+            FileNotFoundError(2, "No such file or directory", "a/b"),
+            "a/b: No such file or directory.",
+        ),
         (OSError(28, "No space left on device"), "No space left on device."),
         (OSError(28, "s.morgs: 9 bytes; free space"), "s.morgs: 9 bytes; free space."),
         (OSError("write_png(): cannot write a.png: full."), "Cannot write a.png: full."),
-        (FileExistsError("f(): out is not empty; set `overwrite`."), "out is not empty; set --overwrite."),
+        (
+            FileExistsError("f(): out is not empty; set `overwrite`."),
+            "out is not empty; set --overwrite.",
+        ),
         (ValueError("f(): `b` must\nbe 1."), "f(): `b` must be 1."),
         (MemoryError(), "Out of memory; process smaller images, or fewer frames or Gaussians."),
         (MemoryError("Unable to allocate 9 GiB."), "Unable to allocate 9 GiB."),
-        (AttributeError("no a."), "Unexpected AttributeError: no a; run the command with --debug for the traceback."),
+        (
+            AttributeError("no a."),
+            "Unexpected AttributeError: no a; run the command with --debug for the traceback.",
+        ),
     ],
 )
 def test_sentence_of__has_no_number_and_no_function(error: Exception, sentence: str) -> None:

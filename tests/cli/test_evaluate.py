@@ -33,14 +33,20 @@ def test_eval__refuses_another_recording_by_the_same_cameras(tmp_path: Path, run
         write_png(image, 255 - cv2.imread(str(image))[..., ::-1])
     for figures in ((), ("--figures", tmp_path / "figures")):
         result = run("eval", out, "--capture", other, *figures)
-        assert_refused(result, f"{other}: expected the recording that {out}/stream.morgs was fitted to", "--any-recor")
+        assert_refused(
+            result,
+            f"{other}: expected the recording that {out}/stream.morgs was fitted to",
+            "--any-recor",
+        )
     assert not (tmp_path / "figures").exists()
     assert run("eval", out, "--capture", other, "--any-recording")[0] == 0
     shutil.rmtree(other)
     assert run("eval", out, "--capture", clip.rename(tmp_path / "moved"))[0] == 0
 
 
-def test_eval__says_that_a_first_frame_is_provisional(tmp_path: Path, run, caplog: pytest.LogCaptureFixture) -> None:
+def test_eval__says_that_a_first_frame_is_provisional(
+    tmp_path: Path, run, caplog: pytest.LogCaptureFixture
+) -> None:
     clip = write_recording(tmp_path / "clip", 1)
     out = tmp_path / "out"
     assert run("fit", clip, out, *OPTIONS)[0] == 0
@@ -57,8 +63,14 @@ def test_eval__says_that_a_first_frame_is_provisional(tmp_path: Path, run, caplo
     [
         ("[" * 100_000, "expected JSON, got a broken file"),
         ("[]", "expected a fit's report, got a broken one"),
-        ('{"frames": [{"frame": 0, "seconds": 1, "validation": 5}]}', "expected a fit's report, got a broken one"),
-        (f'{{"frames": [{{"frame": 0, "seconds": {10**400}}}]}}', "expected a fit's report, got a broken one"),
+        (
+            '{"frames": [{"frame": 0, "seconds": 1, "validation": 5}]}',
+            "expected a fit's report, got a broken one",
+        ),
+        (
+            f'{{"frames": [{{"frame": 0, "seconds": {10**400}}}]}}',
+            "expected a fit's report, got a broken one",
+        ),
     ],
 )
 def test_eval__reports_a_hostile_report_in_one_sentence(
@@ -66,4 +78,6 @@ def test_eval__reports_a_hostile_report_in_one_sentence(
 ) -> None:
     shutil.copy(fitted_clip / "stream.morgs", tmp_path)
     (tmp_path / "report.json").write_text(text)
-    assert_refused(run("eval", tmp_path, "--capture", fitted_clip / "capture"), f"report.json: {message}")
+    assert_refused(
+        run("eval", tmp_path, "--capture", fitted_clip / "capture"), f"report.json: {message}"
+    )

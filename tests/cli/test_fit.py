@@ -51,7 +51,9 @@ def test_fit__continues_without_a_camera_whose_clip_is_cut_off_meanwhile(
 
 
 @pytest.mark.slow
-def test_fit__reports_what_to_expect_of_views_between_the_cameras(capture: Path, tmp_path: Path, run) -> None:
+def test_fit__reports_what_to_expect_of_views_between_the_cameras(
+    capture: Path, tmp_path: Path, run
+) -> None:
     code, output, _ = run("fit", capture, tmp_path / "out", *OPTIONS, "--test-view", "none")
     (first, *_) = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
     assert code == 0
@@ -64,7 +66,10 @@ def test_fit__balances_cameras_of_other_exposure(tmp_path: Path, run) -> None:
     camera = textured.rig(shift=7)[2]
     planes = textured.textures()
     write_video(path / "cam2.mkv", [brighter(textured.render(camera, planes), 1.25)], 30)
-    sentence = r"cam2 is 2[3-6] % brighter than the other cameras: .*; fit corrects it \(not with --exposure off\)\."
+    sentence = (
+        r"cam2 is 2[3-6] % brighter than the other cameras: .*; fit corrects it \(not with "
+        r"--exposure off\)\."
+    )
     for options in ((), ("--deep",)):
         assert len(re.findall(sentence, run("info", path, *options)[1])) == 1
     (tmp_path / "a.toml").write_text("[fit.short_fits]\ngaussians = 40\nsteps = 2\nrounds = 1\n")
@@ -119,7 +124,10 @@ def test_fit__leaves_a_stream_marked_as_unfinished_when_interrupted(
     [
         (["--frames", "0"], ("--frames must be at least 1, got 0",)),
         (["--downscale", "0.5"], ("--downscale must be at least 1, got 0.5",)),
-        (["--test-view", "3"], ("--test-view must be an index in 0..2, one of cam0, cam1, cam2, or none", "got 3")),
+        (
+            ["--test-view", "3"],
+            ("--test-view must be an index in 0..2, one of cam0, cam1, cam2, or none", "got 3"),
+        ),
         (["--offset", "cam9", "1"], ("--offset must name cameras of cam0, cam1, cam2, got cam9",)),
         (["--num-gaussians", "0"], ("--num-gaussians must be at least 1, got 0",)),
         (["--seed", "-1"], ("--seed must be at least 0, got -1",)),
@@ -132,11 +140,17 @@ def test_fit__leaves_a_stream_marked_as_unfinished_when_interrupted(
         (["--flow", "none"], ("--flow must be one of dis,", "got 'none'")),
         (["--flow", "files:nowhere"], ("nowhere",)),
         (["--masks", "some"], ("--masks must be one of none,", "got 'some'")),
-        (["--config", "nowhere.toml"], ("nowhere.toml: expected a TOML file with settings, found none",)),
+        (
+            ["--config", "nowhere.toml"],
+            ("nowhere.toml: expected a TOML file with settings, found none",),
+        ),
         (["--config", "[fit"], ("bad.toml: expected TOML, got a broken file",)),
         (["--config", "[fit]\na = " + "[" * 5000], ("bad.toml: expected TOML, got a broken file",)),
         (["--config", "[fit]\na = " + "9" * 5000], ("bad.toml: expected TOML, got a broken file",)),
-        (["--config", "[fit]\nepoch = 1"], ("bad.toml: `fit.epoch` is unknown, expected `fit.epochs`",)),
+        (
+            ["--config", "[fit]\nepoch = 1"],
+            ("bad.toml: `fit.epoch` is unknown, expected `fit.epochs`",),
+        ),
         (
             ["--config", "[fit]\nepochs = 'many'"],
             ("bad.toml: `fit.epochs` must be a whole number below 2^64, at least 1, got 'many'",),
@@ -149,14 +163,28 @@ def test_fit__leaves_a_stream_marked_as_unfinished_when_interrupted(
             ["--config", "[render]\nblock_width = 17"],
             ("bad.toml: `render.block_width` must be at least 4, at most 16",),
         ),
-        (["--config", "[motion]\nflow_method = 'no'"], ("bad.toml: `motion.flow_method` must be one of dis,",)),
-        (["--config", "[motion]\nmask_method = 'no'"], ("bad.toml: `motion.mask_method` must be one of none,",)),
+        (
+            ["--config", "[motion]\nflow_method = 'no'"],
+            ("bad.toml: `motion.flow_method` must be one of dis,",),
+        ),
+        (
+            ["--config", "[motion]\nmask_method = 'no'"],
+            ("bad.toml: `motion.mask_method` must be one of none,",),
+        ),
         (["--config", "[motion]\nmodel = 'no'"], ("bad.toml: `motion.model` must be one of none",)),
-        (["--variant", "cuda_ad_rgb"], ("--variant cuda_ad_rgb cannot be used here", "llvm_ad_rgb")),
-        (["--variant", "metal_ad_rgb"], ("--variant metal_ad_rgb cannot be used here", "llvm_ad_rgb")),
+        (
+            ["--variant", "cuda_ad_rgb"],
+            ("--variant cuda_ad_rgb cannot be used here", "llvm_ad_rgb"),
+        ),
+        (
+            ["--variant", "metal_ad_rgb"],
+            ("--variant metal_ad_rgb cannot be used here", "llvm_ad_rgb"),
+        ),
     ],
 )
-def test_fit__rejects_bad_input_in_one_sentence(capture: Path, tmp_path: Path, run, args, parts) -> None:
+def test_fit__rejects_bad_input_in_one_sentence(
+    capture: Path, tmp_path: Path, run, args, parts
+) -> None:
     if "cuda_ad_rgb" in args and Path("/dev/nvidiactl").exists():
         pytest.skip("this machine has a GPU")
     option, value, *more = args
@@ -182,7 +210,9 @@ def test_fit__asks_for_its_folders(folders: tuple[str, ...], run) -> None:
         (["--fit.epochs", "1"], "--fit.epochs"),
     ],
 )
-def test_fit__rejects_arguments_that_cannot_be_parsed(capture: Path, tmp_path: Path, capsys, args, part) -> None:
+def test_fit__rejects_arguments_that_cannot_be_parsed(
+    capture: Path, tmp_path: Path, capsys, args, part
+) -> None:
     with pytest.raises(SystemExit) as stop:
         cli.main(["fit", str(capture), str(tmp_path / "out"), *args])
     assert stop.value.code == 2
@@ -194,7 +224,14 @@ def test_fit__rejects_arguments_that_cannot_be_parsed(capture: Path, tmp_path: P
 
 @pytest.mark.parametrize(
     ("view", "test_views"),
-    [(("cam1",), (1,)), (("2",), (2,)), (("cam2", "0"), (0, 2)), (("none",), ()), (("None",), ()), (("auto",), ())],
+    [
+        (("cam1",), (1,)),
+        (("2",), (2,)),
+        (("cam2", "0"), (0, 2)),
+        (("none",), ()),
+        (("None",), ()),
+        (("auto",), ()),
+    ],
 )
 def test_fit__takes_the_held_out_camera_by_index_or_name(
     capture: Path,
@@ -204,10 +241,15 @@ def test_fit__takes_the_held_out_camera_by_index_or_name(
     view: tuple[str, ...],
     test_views: tuple[int, ...],
 ) -> None:
-    assert fitted_capture(monkeypatch, run, capture, tmp_path, "--test-view", *view).test_views == test_views
+    assert (
+        fitted_capture(monkeypatch, run, capture, tmp_path, "--test-view", *view).test_views
+        == test_views
+    )
 
 
-def fitted_capture(monkeypatch: pytest.MonkeyPatch, run, capture: Path, out: Path, *args: object) -> Capture:
+def fitted_capture(
+    monkeypatch: pytest.MonkeyPatch, run, capture: Path, out: Path, *args: object
+) -> Capture:
     """Return the capture that `morgs-mi fit` passes on."""
     passed: list[Capture] = []
 
@@ -220,18 +262,28 @@ def fitted_capture(monkeypatch: pytest.MonkeyPatch, run, capture: Path, out: Pat
     return passed[0]
 
 
-def test_fit__refuses_to_leave_fewer_than_32_pixels(tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fit__refuses_to_leave_fewer_than_32_pixels(
+    tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     clip = colmap(tmp_path / "clip")  # 62x46
     assert_refused(
         run("fit", clip, tmp_path / "out", "--downscale", 1.5),
-        "--downscale must leave images of at least 32 pixels on each side, got 1.5; use at most 1.43.",
+        "--downscale must leave images of at least 32 pixels on each side, got 1.5; use at most "
+        "1.43.",
     )
-    assert fitted_capture(monkeypatch, run, clip, tmp_path / "out", "--downscale", 1.43).cameras[0].height == 32
+    assert (
+        fitted_capture(monkeypatch, run, clip, tmp_path / "out", "--downscale", 1.43)
+        .cameras[0]
+        .height
+        == 32
+    )
 
 
 @pytest.fixture
 def heeds_interrupts() -> Iterator[None]:
-    """Python's handler of SIGINT, which a shell ignores for the processes that it starts in the background."""
+    """Python's handler of SIGINT, which a shell ignores for the processes that it starts in the
+    background.
+    """
     handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, handler)
@@ -240,13 +292,21 @@ def heeds_interrupts() -> Iterator[None]:
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_fit__names_what_stands_and_how_to_go_on_when_interrupted(
-    capture: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch, number: signal.Signals, heeds_interrupts: None
+    capture: Path,
+    tmp_path: Path,
+    run,
+    monkeypatch: pytest.MonkeyPatch,
+    number: signal.Signals,
+    heeds_interrupts: None,
 ) -> None:
     before_frame_2(monkeypatch, lambda: signal.raise_signal(number))
     args = ["fit", str(capture), str(tmp_path / "my out"), *OPTIONS]
     status, _, error = run(*args)
     again = shlex.join(["morgs-mi", *args, "--resume"])
-    stands = f"Interrupted. {tmp_path / 'my out'}/stream.morgs holds frames 0 to 1 of 3; continue with `{again}`."
+    stands = (
+        f"Interrupted. {tmp_path / 'my out'}/stream.morgs holds frames 0 to 1 of 3; continue with "
+        f"`{again}`."
+    )
     assert status == 130
     assert error.splitlines()[-1] == stands  # after lines of progress, on a slow machine
 
@@ -260,12 +320,16 @@ def test_fit__is_interrupted_whatever_a_library_makes_of_ctrl_c(
         try:
             raise KeyboardInterrupt
         except KeyboardInterrupt as error:
-            raise RuntimeError("drjit: an exception in a callback") from error if raised_in == "a callback" else None
+            raise RuntimeError("drjit: an exception in a callback") from (
+                error if raised_in == "a callback" else None
+            )
 
     before_frame_2(monkeypatch, library)
     status, _, error = run("fit", capture, tmp_path / "out", *OPTIONS)
     assert status == 130
-    assert error.splitlines()[-1].startswith(f"Interrupted. {tmp_path / 'out'}/stream.morgs holds frames 0 to 1 of 3; ")
+    assert error.splitlines()[-1].startswith(
+        f"Interrupted. {tmp_path / 'out'}/stream.morgs holds frames 0 to 1 of 3; "
+    )
 
 
 def test_fit__does_not_offer_to_resume_a_stream_of_an_earlier_fit(
@@ -280,7 +344,9 @@ def test_fit__does_not_offer_to_resume_a_stream_of_an_earlier_fit(
     assert len(StreamReader(tmp_path / "out" / "stream.morgs").index()) == 2
 
 
-def test_fit__reports_progress_before_the_first_frame(capture: Path, tmp_path: Path, run, monkeypatch) -> None:
+def test_fit__reports_progress_before_the_first_frame(
+    capture: Path, tmp_path: Path, run, monkeypatch
+) -> None:
     write_colmap(capture / "sparse" / "0", rig(), np.zeros((0, 3)), np.zeros((0, 3)))
     clock = iter(range(0, 10**9, 40))
     monkeypatch.setattr("morgs_mi.cli.console.time.monotonic", lambda: float(next(clock)))
@@ -293,7 +359,9 @@ def test_fit__reports_progress_before_the_first_frame(capture: Path, tmp_path: P
 
 @pytest.mark.slow
 def test_fit__ends_with_a_whole_packet_on_a_full_disk(capture: Path, tmp_path: Path) -> None:
-    """The second packet does not fit: the file ends with the first and still has the intended number of frames."""
+    """The second packet does not fit: the file ends with the first and still has the intended
+    number of frames.
+    """
     script = (
         "import resource, sys; from morgs_mi.codec import container; from morgs_mi import cli\n"
         "write = container.StreamWriter.write\n"
@@ -307,7 +375,13 @@ def test_fit__ends_with_a_whole_packet_on_a_full_disk(capture: Path, tmp_path: P
     args = [sys.executable, "-c", script, "fit", str(capture), str(tmp_path / "out"), *OPTIONS]
     result = subprocess.run(args, capture_output=True, text=True, check=False)
     assert result.returncode == 1
-    assert_one_sentence(result.stderr, "stream.morgs", "could not be written", "free space on the disk. ", "--resume`.")
+    assert_one_sentence(
+        result.stderr,
+        "stream.morgs",
+        "could not be written",
+        "free space on the disk. ",
+        "--resume`.",
+    )
     assert "Errno" not in result.stderr
     reader = StreamReader(tmp_path / "out" / "stream.morgs")
     assert len(list(reader)) == 1
@@ -323,7 +397,10 @@ def test_fit__prints_the_first_problem_of_its_frames(tmp_path: Path, run) -> Non
     (first, second) = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
     assert (status, second["status"]) == (0, "ok")
     assert "the image is black; cut such frames off" in first["status"]
-    assert f"1 of 2 frames have a problem (status in report.json), frame 0: {first['status']}." in output
+    assert (
+        f"1 of 2 frames have a problem (status in report.json), frame 0: {first['status']}."
+        in output
+    )
 
 
 def test_fit__resumes_a_stream_to_the_same_bytes(capture: Path, tmp_path: Path, run) -> None:
@@ -336,7 +413,11 @@ def test_fit__resumes_a_stream_to_the_same_bytes(capture: Path, tmp_path: Path, 
     assert status == 0
     assert f"stream.morgs: {FRAMES} frames" in output
     assert (out / "stream.morgs").read_bytes() == whole
-    assert_refused(run(*fit, "--resume", "--seed", 1), "stream.morgs: expected to resume", "config.seed = 0, got 1")
+    assert_refused(
+        run(*fit, "--resume", "--seed", 1),
+        "stream.morgs: expected to resume",
+        "config.seed = 0, got 1",
+    )
 
 
 @pytest.mark.slow
@@ -353,11 +434,17 @@ def test_fit__fits_segments_side_by_side(
     assert "stream.morgs: 4 frames" in output
     assert not any(record.name.startswith("distributed") for record in caplog.records)
     assert len({frame for _, frame, _ in StreamReader(out / "stream.morgs").index()}) == 4
-    assert_refused(run("fit", clip, out, *OPTIONS, "--segments", 3), "--segments must be 1 to 2 for 4 frames", "got 3")
+    assert_refused(
+        run("fit", clip, out, *OPTIONS, "--segments", 3),
+        "--segments must be 1 to 2 for 4 frames",
+        "got 3",
+    )
 
 
 @pytest.mark.slow
-def test_fit__names_what_segments_stand_when_interrupted(tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fit__names_what_segments_stand_when_interrupted(
+    tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("distributed", reason="comes with the extra `cluster`")
     clip = write_recording(tmp_path / "clip", 4)
     out = tmp_path / "out"
@@ -372,4 +459,7 @@ def test_fit__names_what_segments_stand_when_interrupted(tmp_path: Path, run, mo
     status, _, error = run(*args)
     again = shlex.join(["morgs-mi", *args, "--resume"])
     assert status == 130
-    assert error.splitlines()[-1] == f"Interrupted. {out / 'segments'} holds 2 frames; continue with `{again}`."
+    assert (
+        error.splitlines()[-1]
+        == f"Interrupted. {out / 'segments'} holds 2 frames; continue with `{again}`."
+    )

@@ -1,4 +1,6 @@
-"""`morgs-mi`: from a scene to an evaluation, help, and what all commands refuse with one sentence each."""
+"""`morgs-mi`: from a scene to an evaluation, help, and what all commands refuse with one sentence
+each.
+"""
 
 from __future__ import annotations
 
@@ -47,8 +49,12 @@ def test_main__names_what_is_broken_in_a_capture(capture: Path, tmp_path: Path, 
 @pytest.mark.slow
 def test_main__leaves_cameras_out(capture: Path, tmp_path: Path, run) -> None:
     lengthen_clip(capture)
-    assert_refused(run("info", capture), "morgs-mi fit --frames 3,", "leave cameras out with --without.")
-    assert_refused(run("fit", capture, tmp_path / "out", *OPTIONS), "use the first frames with --frames 3,")
+    assert_refused(
+        run("info", capture), "morgs-mi fit --frames 3,", "leave cameras out with --without."
+    )
+    assert_refused(
+        run("fit", capture, tmp_path / "out", *OPTIONS), "use the first frames with --frames 3,"
+    )
     (capture / "cam2.mkv").write_bytes(b"")
     status, out, _ = run("info", capture, "--without", "cam2")
     assert (status, "cam2" in out, "3 frames" in out) == (0, False, True)
@@ -61,12 +67,16 @@ def test_main__leaves_cameras_out(capture: Path, tmp_path: Path, run) -> None:
         assert_refused(run(*args, "--without", "cam7", "cam2"), refused)
 
 
-def test_main__leaves_out_a_camera_without_a_clip(capture: Path, tmp_path: Path, run, caplog) -> None:
+def test_main__leaves_out_a_camera_without_a_clip(
+    capture: Path, tmp_path: Path, run, caplog
+) -> None:
     (capture / "cam1.mkv").unlink()
     status, out, _ = run("info", capture)
     assert (status, "cam1" in out) == (0, False)
     assert run("fit", capture, tmp_path / "out", *OPTIONS)[0] == 0
-    assert [m.endswith("sparse/0: no clip is named after cam1.png: left out.") for m in caplog.messages] == [True] * 2
+    assert [
+        m.endswith("sparse/0: no clip is named after cam1.png: left out.") for m in caplog.messages
+    ] == [True] * 2
 
 
 @pytest.mark.parametrize(
@@ -74,13 +84,28 @@ def test_main__leaves_out_a_camera_without_a_clip(capture: Path, tmp_path: Path,
     [
         (("synth", "spheres", "OUT", "--cameras", 1), ("--cameras must be at least 2, got 1",)),
         (("synth", "spheres", "OUT", "--frames", 0), ("--frames must be at least 1, got 0",)),
-        (("synth", "spheres", "OUT", "--width", 3), ("--width must be at least 2 and a multiple of 2, got 3",)),
-        (("synth", "spheres", "OUT", "--fps", 1e9), ("--fps must be a number in (0, 1000], got 1000000000.0",)),
-        (("synth", "spheres", "OUT", "--spp", 9_000_000_000), ("--spp must be a number in [1, 1e6], got 9000000000",)),
-        (("synth", "spheres", "OUT", "--noise", 2), ("--noise must be at least 0 and below 1, got 2",)),
+        (
+            ("synth", "spheres", "OUT", "--width", 3),
+            ("--width must be at least 2 and a multiple of 2, got 3",),
+        ),
+        (
+            ("synth", "spheres", "OUT", "--fps", 1e9),
+            ("--fps must be a number in (0, 1000], got 1000000000.0",),
+        ),
+        (
+            ("synth", "spheres", "OUT", "--spp", 9_000_000_000),
+            ("--spp must be a number in [1, 1e6], got 9000000000",),
+        ),
+        (
+            ("synth", "spheres", "OUT", "--noise", 2),
+            ("--noise must be at least 0 and below 1, got 2",),
+        ),
         (("demo", "OUT", "--cameras", 1), ("--cameras must be at least 2, got 1",)),
         (("demo", "OUT", "--seed", -1), ("--seed must be at least 0, got -1",)),
-        (("demo", "OUT", "--config", "nowhere.toml"), ("nowhere.toml: expected a TOML file with settings",)),
+        (
+            ("demo", "OUT", "--config", "nowhere.toml"),
+            ("nowhere.toml: expected a TOML file with settings",),
+        ),
     ],
 )
 def test_main__names_options_not_arguments(tmp_path: Path, run, args, parts) -> None:
@@ -95,7 +120,9 @@ COMMANDS = ("synth", "info", "calibrate", "fit", "render", "import", "view", "ev
 EXPORTS = ("ply", "gltf", "usd", "video", "tracks", "web")
 
 
-@pytest.mark.parametrize("command", [*((name,) for name in COMMANDS), *(("export", name) for name in EXPORTS)])
+@pytest.mark.parametrize(
+    "command", [*((name,) for name in COMMANDS), *(("export", name) for name in EXPORTS)]
+)
 def test_main__has_at_most_30_options_per_command(command: tuple[str, ...], capsys) -> None:
     with pytest.raises(SystemExit) as stop:
         cli.main([*command, "--help"])
@@ -111,13 +138,17 @@ def test_main__has_at_most_30_options_per_command(command: tuple[str, ...], caps
 
 
 def test_main__runs_as_a_module() -> None:
-    result = subprocess.run([sys.executable, "-m", "morgs_mi", "fit"], capture_output=True, text=True, check=False)
+    result = subprocess.run(
+        [sys.executable, "-m", "morgs_mi", "fit"], capture_output=True, text=True, check=False
+    )
     assert (result.returncode, result.stdout) == (1, "")
     assert_one_sentence(result.stderr, "expected the folders CAPTURE and OUT")
 
 
 @pytest.mark.slow
-def test_main__names_an_output_that_cannot_be_written(capture: Path, stream: Path, tmp_path: Path, run) -> None:
+def test_main__names_an_output_that_cannot_be_written(
+    capture: Path, stream: Path, tmp_path: Path, run
+) -> None:
     (tmp_path / "file").write_text("")
     size = ("--cameras", 2, "--frames", 1, "--width", 16, "--height", 16)
     for folder in (tmp_path / "file", Path("/sys")):  # /sys accepts no new files, even from root
@@ -135,7 +166,10 @@ def test_main__names_an_output_that_cannot_be_written(capture: Path, stream: Pat
             status, _, error = run(*args)
             assert status == 1
             assert_one_sentence(
-                error.splitlines()[-1], "Cannot write ", str(folder), "check that its folder is writable"
+                error.splitlines()[-1],
+                "Cannot write ",
+                str(folder),
+                "check that its folder is writable",
             )
             assert "Errno" not in error
     for args in (("fit", capture, tmp_path / "file", *OPTIONS), ("demo", tmp_path / "file")):
@@ -143,7 +177,9 @@ def test_main__names_an_output_that_cannot_be_written(capture: Path, stream: Pat
 
 
 @pytest.mark.slow
-def test_main__writes_nothing_into_a_capture(capture: Path, stream: Path, tmp_path: Path, run) -> None:
+def test_main__writes_nothing_into_a_capture(
+    capture: Path, stream: Path, tmp_path: Path, run
+) -> None:
     (capture / "capture.json").write_text('{"fps": 25}')
     place = tmp_path / "link"
     place.symlink_to(capture)
@@ -169,21 +205,32 @@ def test_main__writes_nothing_into_a_capture(capture: Path, stream: Path, tmp_pa
         ("info", capture, "--plot", place / "cam0.png"),
     ):
         assert_refused(
-            run(*args), "expected an output outside of captures, which stay as they were recorded, got one in"
+            run(*args),
+            "expected an output outside of captures, which stay as they were recorded, got one in",
         )
-    assert_refused(run("synth", "spheres", capture, "--overwrite"), f"{capture} is not a synthetic capture")
+    assert_refused(
+        run("synth", "spheres", capture, "--overwrite"), f"{capture} is not a synthetic capture"
+    )
     assert tree(capture) == old_tree
 
 
 def tree(path: Path) -> dict[str, bytes | None]:
     """Return the content of every file below `path` by its name, None for folders."""
-    return {str(p.relative_to(path)): p.read_bytes() if p.is_file() else None for p in sorted(path.rglob("*"))}
+    return {
+        str(p.relative_to(path)): p.read_bytes() if p.is_file() else None
+        for p in sorted(path.rglob("*"))
+    }
 
 
-def test_main__reports_a_full_standard_output_in_one_sentence(run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_main__reports_a_full_standard_output_in_one_sentence(
+    run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with open("/dev/full", "w") as full:
         monkeypatch.setattr(sys, "stdout", full)
-        assert run("fit", "--print-config")[::2] == (1, "standard output: No space left on device.\n")
+        assert run("fit", "--print-config")[::2] == (
+            1,
+            "standard output: No space left on device.\n",
+        )
 
 
 @pytest.mark.slow
@@ -198,7 +245,9 @@ def test_main__prints_any_path_to_an_ascii_or_a_closed_standard_output(
     result = subprocess.run(command, capture_output=True, cwd=tmp_path, check=False)
     assert (result.returncode, result.stderr) == (0, b"")
     assert (rb"\u64ae\u5f71" if args[0] == "info" else rb"\u51fa\u529b") in result.stdout
-    closed = subprocess.run(command, stderr=-1, preexec_fn=lambda: os.close(1), cwd=tmp_path, check=False)
+    closed = subprocess.run(
+        command, stderr=-1, preexec_fn=lambda: os.close(1), cwd=tmp_path, check=False
+    )
     assert (closed.returncode, closed.stderr) == (0, b"")
 
 
@@ -210,7 +259,9 @@ def test_main__prints_its_help_to_an_ascii_standard_output(monkeypatch: pytest.M
         assert subprocess.run(command, capture_output=True, check=False).returncode == 0
 
 
-def test_main__is_interrupted_while_the_variant_is_set(capture: Path, run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_main__is_interrupted_while_the_variant_is_set(
+    capture: Path, run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def interrupted(*_: object) -> None:
         try:
             raise KeyboardInterrupt
@@ -226,7 +277,11 @@ def test_main__reports_an_unexpected_error_in_one_sentence(capture: Path, run, m
         raise AttributeError("'NoneType' object has no attribute 'a'")
 
     monkeypatch.setattr("morgs_mi.studio.commands.info.load_capture", fail)
-    assert_refused(run("info", capture), "Unexpected AttributeError: 'NoneType' object has no attribute 'a'", "--debug")
+    assert_refused(
+        run("info", capture),
+        "Unexpected AttributeError: 'NoneType' object has no attribute 'a'",
+        "--debug",
+    )
 
 
 @pytest.mark.parametrize(
@@ -234,11 +289,16 @@ def test_main__reports_an_unexpected_error_in_one_sentence(capture: Path, run, m
     [
         (lambda data: b"", ("the header is missing",)),
         (lambda data: b"not a stream", ("expected a stream that starts with",)),
-        (lambda data: data[:-75], ("truncated or still written", "packet 2", "2 packets before it are intact")),
+        (
+            lambda data: data[:-75],
+            ("truncated or still written", "packet 2", "2 packets before it are intact"),
+        ),
         (lambda data: data[:-5] + b"\1" * 5, ("the bytes are damaged",)),
     ],
 )
-def test_main__names_what_is_broken_in_a_stream(stream: Path, tmp_path: Path, run, damage, parts) -> None:
+def test_main__names_what_is_broken_in_a_stream(
+    stream: Path, tmp_path: Path, run, damage, parts
+) -> None:
     stream.write_bytes(damage(stream.read_bytes()))
     outputs = [tmp_path / "a.mp4", tmp_path / "exr", tmp_path / "png"]
     commands = [("render", stream, output, "--camera", 0) for output in outputs]
@@ -248,12 +308,17 @@ def test_main__names_what_is_broken_in_a_stream(stream: Path, tmp_path: Path, ru
 
 
 def test_main__names_a_missing_or_empty_stream(stream: Path, tmp_path: Path, run) -> None:
-    assert_refused(run("render", tmp_path, "--camera", 0), "stream.morgs: expected a stream, found none")
+    assert_refused(
+        run("render", tmp_path, "--camera", 0), "stream.morgs: expected a stream, found none"
+    )
     assert_refused(run("eval", stream), "expected the path of its capture", "--capture")
     with StreamWriter(stream, rig(), 25):
         pass
     for output in (tmp_path / "a.mp4", tmp_path / "exr"):
-        assert_refused(run("render", stream, output, "--camera", 0), "at least one frame was expected, got none")
+        assert_refused(
+            run("render", stream, output, "--camera", 0),
+            "at least one frame was expected, got none",
+        )
         assert not output.exists()
 
 
@@ -287,7 +352,11 @@ def test_main__goes_from_a_scene_to_an_evaluation(tmp_path: Path, run) -> None:
     status, output, _ = run("eval", out, *more)
     assert status == 0
     assert "held-out view cam00" in output
-    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"slice.png", "motion.png", "confidence.png"}
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {
+        "slice.png",
+        "motion.png",
+        "confidence.png",
+    }
     assert 0 < result["motion_3d"]["num_gaussians"] <= 600
     status, _, error = run("eval", out, "--lpips", tmp_path / "none.onnx")
     assert (status, "expected an ONNX file, found none" in error) == (1, True)

@@ -1,4 +1,6 @@
-"""The commands of the README and of the pages run as they stand there, on small clips with few steps."""
+"""The commands of the README and of the pages run as they stand there, on small clips with few
+steps.
+"""
 
 from __future__ import annotations
 
@@ -34,15 +36,23 @@ LEFT_OUT = ("morgs-mi view", "morgs-mi --tyro-write-completion")
 
 def commands(page: str) -> list[str]:
     """Return the commands of a page, without comments."""
-    lines = re.findall(r"^    (morgs-mi .*)$", (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE)
+    lines = re.findall(
+        r"^    (morgs-mi .*)$", (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE
+    )
     return [line.partition("#")[0].strip() for line in lines if not line.startswith(LEFT_OUT)]
 
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with what stands for the names in capitals: a capture, its first images, and the clips alone."""
+    """A folder with what stands for the names in capitals: a capture, its first images, and the
+    clips alone.
+    """
     folder = tmp_path_factory.mktemp("recordings")
-    synthesize("spheres", folder / "CAPTURE", SynthConfig(cameras=7, frames=6, width=320, height=240, spp=8))
+    synthesize(
+        "spheres",
+        folder / "CAPTURE",
+        SynthConfig(cameras=7, frames=6, width=320, height=240, spp=8),
+    )
     (folder / "FOLDER").mkdir()
     capture = load_capture(folder / "CAPTURE")
     for name, image in zip(capture.names, next(capture.frames(0, 1)).images, strict=True):
@@ -55,14 +65,18 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES)
-def test_commands__of_a_page_run_to_the_end(page: str, recordings: Path, tmp_path: Path, run, monkeypatch) -> None:
+def test_commands__of_a_page_run_to_the_end(
+    page: str, recordings: Path, tmp_path: Path, run, monkeypatch
+) -> None:
     shutil.copytree(recordings, tmp_path / "there")
     monkeypatch.chdir(tmp_path / "there")
     cameras = " ".join(str(clip) for clip in sorted(Path("CAPTURE").glob("*.mp4")))
     lines = commands(page)
     assert lines, f"{page} has no commands"
     for command in lines:
-        short_command = command.replace("--camera 0 1 2 3", f"--camera {cameras}").replace(" > settings.toml", "")
+        short_command = command.replace("--camera 0 1 2 3", f"--camera {cameras}").replace(
+            " > settings.toml", ""
+        )
         if short_command.startswith("morgs-mi import frames"):
             assert run("export", "ply", "out/arm_fit", "frames")[0] == 0
         if "--refine-cameras" in command:

@@ -1,4 +1,6 @@
-"""The commands for N3DV and Meet Room of the documentation, on short clips with the names and files of these."""
+"""The commands for N3DV and Meet Room of the documentation, on short clips with the names and files
+of these.
+"""
 
 from __future__ import annotations
 
@@ -20,9 +22,13 @@ SMALLER = "--num-gaussians 5000 --first-frame-steps 400 --epochs 1"
 
 
 def stand_in(path: Path, width: int, height: int, number: str) -> None:
-    """Write videos with camera numbers in this format, and `poses_bounds.npy`, as these recordings have them."""
+    """Write videos with camera numbers in this format, and `poses_bounds.npy`, as these recordings
+    have them.
+    """
     synthesize(
-        "random", path, SynthConfig(cameras=8, frames=FRAMES, width=width, height=height, seed=3, lossless=False)
+        "random",
+        path,
+        SynthConfig(cameras=8, frames=FRAMES, width=width, height=height, seed=3, lossless=False),
     )
     for extra in ("sparse", "truth"):
         shutil.rmtree(path / extra)

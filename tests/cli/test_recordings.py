@@ -1,4 +1,5 @@
-"""Real recordings at the default settings. They are not in the repository: a variable names the folder that holds them.
+"""Real recordings at the default settings. They are not in the repository: a variable names the
+folder that holds them.
 
 MORGS_MI_RECORDINGS=FOLDER pytest -m slow tests/cli/test_recordings.py
 """
@@ -17,9 +18,13 @@ FRAMES = 3
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not CAPTURES, reason="needs recordings: set MORGS_MI_RECORDINGS to their folder")
+@pytest.mark.skipif(
+    not CAPTURES, reason="needs recordings: set MORGS_MI_RECORDINGS to their folder"
+)
 @pytest.mark.parametrize("capture", CAPTURES, ids=lambda path: path.name)
-def test_recording__is_fitted_evaluated_and_exported_by_default(capture: Path, tmp_path: Path, run) -> None:
+def test_recording__is_fitted_evaluated_and_exported_by_default(
+    capture: Path, tmp_path: Path, run
+) -> None:
     out = tmp_path / "out"
     for command in (
         ("info", capture),

@@ -29,16 +29,27 @@ from tests.scenes.noise_capture import rig
         ),
         (
             ["a.gif", "--camera", "0"],
-            ("must be FILE.mp4, a folder ending in exr, FILE.exr for one frame, a folder ending in png or FILE.png",),
+            (
+                "must be FILE.mp4, a folder ending in exr, FILE.exr for one frame, a folder "
+                "ending in png or FILE.png",
+            ),
         ),
         (["a.mp4", "--camera", "0", "--format", "png", "--at", "1"], ("--at selects frames",)),
         (["png", "--camera", "0", "--format", "mp4"], ("the output must be FILE.mp4, got 'png'",)),
         (["--camera", "0", "--insert", "no.xml"], ("no.xml", "expected a scene to insert")),
-        (["a.png", "--camera", "0"], ("a.png: expected one image for one file, got 2; name a folder.",)),
-        (["--camera", "0", "--at", "1"], ("--at selects frames of an inserted scene", "add --insert FILE")),
+        (
+            ["a.png", "--camera", "0"],
+            ("a.png: expected one image for one file, got 2; name a folder.",),
+        ),
+        (
+            ["--camera", "0", "--at", "1"],
+            ("--at selects frames of an inserted scene", "add --insert FILE"),
+        ),
     ],
 )
-def test_render__rejects_bad_input_in_one_sentence(stream: Path, tmp_path: Path, run, args, parts) -> None:
+def test_render__rejects_bad_input_in_one_sentence(
+    stream: Path, tmp_path: Path, run, args, parts
+) -> None:
     assert_refused(run("render", stream, *args), *parts)
     assert list(tmp_path.iterdir()) == [stream]
 
@@ -52,7 +63,9 @@ def test_render__draws_a_stream_without_gaussians_black(tmp_path: Path, run) -> 
 
 
 def test_render__inserts_a_scene_into_some_frames(stream: Path, tmp_path: Path, run) -> None:
-    (tmp_path / "ball.py").write_text('def build(frame, time):\n    return {"ball": {"type": "sphere"}}\n')
+    (tmp_path / "ball.py").write_text(
+        'def build(frame, time):\n    return {"ball": {"type": "sphere"}}\n'
+    )
     args = ("--camera", 0, "--insert", tmp_path / "ball.py", "--at", 1, "--samples", 1)
     assert run("render", stream, tmp_path / "exr", *args)[0] == 0
     assert [path.name for path in (tmp_path / "exr").iterdir()] == ["0001.exr"]
@@ -60,8 +73,11 @@ def test_render__inserts_a_scene_into_some_frames(stream: Path, tmp_path: Path, 
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "exr", "png"])
-def test_render__removes_its_output_on_a_full_disk(stream: Path, tmp_path: Path, run, name: str) -> None:
-    run("render", stream, tmp_path / f"warm-{name}", "--camera", 0)  # compiled kernels are cached on disk too
+def test_render__removes_its_output_on_a_full_disk(
+    stream: Path, tmp_path: Path, run, name: str
+) -> None:
+    # Compiled kernels are cached on disk too.
+    run("render", stream, tmp_path / f"warm-{name}", "--camera", 0)
     with files_end_at(200):
         status, _, error = run("render", stream, tmp_path / name, "--camera", 0)
     assert status == 1
@@ -87,7 +103,9 @@ def test_render__skips_damaged_frames_when_asked(tmp_path: Path, run, caplog) ->
     data[offset + 40] ^= 1
     path.write_bytes(data)
     render = ("render", path, tmp_path / "png", "--camera", 0, "--width", 32)
-    assert_refused(run(*render), f"packet 2 at byte {offset}: ", "the bytes are damaged", "up to frame 0")
+    assert_refused(
+        run(*render), f"packet 2 at byte {offset}: ", "the bytes are damaged", "up to frame 0"
+    )
     assert run(*render, "--skip-damaged")[0] == 0
     assert sorted(image.name for image in (tmp_path / "png").iterdir()) == [
         "0000.png",
@@ -96,7 +114,14 @@ def test_render__skips_damaged_frames_when_asked(tmp_path: Path, run, caplog) ->
     assert caplog.messages == [f"{path}: the damaged frames 1 to 2 are skipped."]
 
 
-def test_render__warns_of_the_end_of_a_stream_that_was_not_closed(stream: Path, tmp_path: Path, run, caplog) -> None:
+def test_render__warns_of_the_end_of_a_stream_that_was_not_closed(
+    stream: Path, tmp_path: Path, run, caplog
+) -> None:
     stream.write_bytes(stream.read_bytes()[: StreamReader(stream).index()[1][2] + 30])
-    assert run("render", stream, tmp_path / "png", "--camera", 0, "--width", 32, "--skip-damaged")[0] == 0
-    assert caplog.messages == [f"{stream}: it ends after 1 packets without an index, and may lack later frames."]
+    assert (
+        run("render", stream, tmp_path / "png", "--camera", 0, "--width", 32, "--skip-damaged")[0]
+        == 0
+    )
+    assert caplog.messages == [
+        f"{stream}: it ends after 1 packets without an index, and may lack later frames."
+    ]

@@ -42,10 +42,13 @@ def printed_config(run, *args: object) -> StreamConfig:
         (("--config", "FILE", "--target-size", "0"), "codec.target_size", 0),
     ],
 )
-def test_fit__overrides_defaults_by_preset_by_file_by_options(tmp_path: Path, run, args, key, expected) -> None:
+def test_fit__overrides_defaults_by_preset_by_file_by_options(
+    tmp_path: Path, run, args, key, expected
+) -> None:
     file = tmp_path / "a.toml"
     file.write_text(
-        "[fit]\nepochs = 3\n[motion]\nflow_method = 'files:nowhere'\n[codec]\nquality = 2.5\ntarget_size = 9\n"
+        "[fit]\nepochs = 3\n[motion]\nflow_method = 'files:nowhere'\n[codec]\nquality = "
+        "2.5\ntarget_size = 9\n"
         "[render]\nreproducible = true\nblock_width = 4\n"
     )
     config = printed_config(run, *(file if arg == "FILE" else arg for arg in args))
@@ -58,7 +61,18 @@ def test_fit__overrides_defaults_by_preset_by_file_by_options(tmp_path: Path, ru
         (),
         ("--preset", "paper"),
         (
-            *("--seed", 3, "--num-gaussians", 7, "--first-frame-steps", 5, "--first-frame-seconds", 9.5, "--epochs", 4),
+            *(
+                "--seed",
+                3,
+                "--num-gaussians",
+                7,
+                "--first-frame-steps",
+                5,
+                "--first-frame-seconds",
+                9.5,
+                "--epochs",
+                4,
+            ),
             *(
                 "--sh-degree",
                 2,
@@ -75,7 +89,9 @@ def test_fit__overrides_defaults_by_preset_by_file_by_options(tmp_path: Path, ru
         ),
     ],
 )
-def test_fit__prints_a_config_that_it_reads_back(tmp_path: Path, run, args: tuple[object, ...]) -> None:
+def test_fit__prints_a_config_that_it_reads_back(
+    tmp_path: Path, run, args: tuple[object, ...]
+) -> None:
     config = printed_config(run, *args)
     (tmp_path / "a.toml").write_text(config_toml(config))
     assert printed_config(run, "--config", tmp_path / "a.toml") == config
@@ -86,20 +102,26 @@ def test_fit__prints_a_config_that_it_reads_back(tmp_path: Path, run, args: tupl
 
 def flattened(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     pairs = [
-        flattened(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+        flattened(value, f"{prefix}{name}.")
+        if isinstance(value, dict)
+        else {f"{prefix}{name}": value}
         for name, value in values.items()
     ]
     return {key: value for part in pairs for key, value in part.items()}
 
 
 @pytest.mark.parametrize(("command", "config"), [("fit", StreamConfig()), ("live", LIVE_STREAM)])
-def test_help__shows_the_defaults_of_the_options(command: str, config: StreamConfig, capsys) -> None:
+def test_help__shows_the_defaults_of_the_options(
+    command: str, config: StreamConfig, capsys
+) -> None:
     with pytest.raises(SystemExit):
         cli.main([command, "--help"])
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     for option, key in SETTINGS.items():
         default = reduce(getattr, key.split("."), config)
-        shown = "" if default is None or default is False else rf" (?:(?!--).)*\(default: {default}\)"
+        shown = (
+            "" if default is None or default is False else rf" (?:(?!--).)*\(default: {default}\)"
+        )
         assert re.search(rf"--{option.replace('_', '-')}{shown}", text), option
 
 
@@ -118,13 +140,18 @@ def test_Reading__has_the_fields_of_the_config() -> None:
     ("words", "sentence"),
     [
         (["cam01", "abc"], "the offset of cam01 must be a number of frames, got 'abc'."),
-        (["cam01"], "expected pairs of a camera and a number, such as cam01 -0.5, got 'cam01' without one."),
+        (
+            ["cam01"],
+            "expected pairs of a camera and a number, such as cam01 -0.5, got 'cam01' without one.",
+        ),
         (["cam01", "1", "cam02"], "got 'cam02' without one."),
         (["cam01", "1", "cam01", "2"], "expected each camera once, got cam01 twice."),
         ([], "expected pairs of a camera and a number, such as cam01 -0.5, got nothing."),
     ],
 )
-def test_offset__refuses_what_is_no_pair(words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_offset__refuses_what_is_no_pair(
+    words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit):
         cli.main(["info", "capture", "--offset", *words])
     captured = capsys.readouterr()
@@ -132,7 +159,9 @@ def test_offset__refuses_what_is_no_pair(words: list[str], sentence: str, capsys
 
 
 @pytest.mark.parametrize("option", ["--preset", "--refine-cameras", "--exposure"])
-def test_fit__lists_the_choices_of_an_option_without_none(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_fit__lists_the_choices_of_an_option_without_none(
+    option: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit):
         cli.main(["fit", "capture", "out", option, "maybe"])
     captured = capsys.readouterr()

@@ -1,4 +1,4 @@
-"""`morgs-mi --version`, the completion of a shell, and the command that a mistyped one resembles."""
+"""`morgs-mi --version`, completion of a shell, and the command that a mistyped one resembles."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ def test_main__prints_the_version(run) -> None:
     assert run("--version") == (0, f"morgs-mi {version('morgs-mi')}\n", "")
 
 
-def test_main__names_standard_output_if_the_version_does_not_fit(run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_main__names_standard_output_if_the_version_does_not_fit(
+    run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with open("/dev/full", "w") as full:
         monkeypatch.setattr("sys.stdout", full)
         assert run("--version")[::2] == (1, "standard output: No space left on device.\n")
@@ -66,4 +68,6 @@ def test_fit__lists_all_presets_in_its_help(capsys) -> None:
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     start = text.index("--preset NAME")
     shown = text[start : text.index("--config", start)]
-    assert [name for name in get_args(PresetName) if name not in shown.replace(",", " ").split()] == []
+    assert [
+        name for name in get_args(PresetName) if name not in shown.replace(",", " ").split()
+    ] == []

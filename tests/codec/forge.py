@@ -1,4 +1,6 @@
-"""Damaged and forged streams, made from a short clip with a random generator. Forged packets have the right CRC."""
+"""Damaged and forged streams, made from a short clip with a random generator. Forged packets have
+the right CRC.
+"""
 
 from __future__ import annotations
 
@@ -18,25 +20,99 @@ from tests.scenes.coded_clip import CAMERAS, cloud
 from tests.scenes.short_clip import Clip, Piece, sealed
 
 HOSTILE_TEXT = (
-    *("NaN", "-Infinity", "1e999", "-1e999", "1e308", "1e-320", "0", "-1", "1.5", "true", "null", '""', "[]", "{}"),
-    *("2147483648", "4294967295", "9223372036854775807", "18446744073709551616", "1" + 400 * "0", "[[1,2],[3]]"),
-    *('"\\ud800"', '"\\u0000"', '"\\u001b[2J"', '"../../x"', '"auto"', '{"a":{"a":{"a":1}}}', "[null]", '["x","y"]'),
-    *("[" * 200 + "]" * 200, "[" * 50_000, '{"a":' * 200 + "1" + "}" * 200, '"', "{", "[1,,2]", "\xff"),
+    *(
+        "NaN",
+        "-Infinity",
+        "1e999",
+        "-1e999",
+        "1e308",
+        "1e-320",
+        "0",
+        "-1",
+        "1.5",
+        "true",
+        "null",
+        '""',
+        "[]",
+        "{}",
+    ),
+    *(
+        "2147483648",
+        "4294967295",
+        "9223372036854775807",
+        "18446744073709551616",
+        "1" + 400 * "0",
+        "[[1,2],[3]]",
+    ),
+    *(
+        '"\\ud800"',
+        '"\\u0000"',
+        '"\\u001b[2J"',
+        '"../../x"',
+        '"auto"',
+        '{"a":{"a":{"a":1}}}',
+        "[null]",
+        '["x","y"]',
+    ),
+    *(
+        "[" * 200 + "]" * 200,
+        "[" * 50_000,
+        '{"a":' * 200 + "1" + "}" * 200,
+        '"',
+        "{",
+        "[1,,2]",
+        "\xff",
+    ),
 )
-HOSTILE_NUMBERS = (0, 1, 2, 3, 4, 5, 7, 16, 80, 81, 255, 2**16, 2**20, 2**24, 2**30 - 1, 2**30, 2**31, 2**32 - 1)
+HOSTILE_NUMBERS = (
+    0,
+    1,
+    2,
+    3,
+    4,
+    5,
+    7,
+    16,
+    80,
+    81,
+    255,
+    2**16,
+    2**20,
+    2**24,
+    2**30 - 1,
+    2**30,
+    2**31,
+    2**32 - 1,
+)
 NAMES = ("head", "code", "parent", "offset", "", "x")
-DTYPES = ("uint8", "uint32", "float32", "float64", "int8", "object", "O", "<U9", "f4,f4", "M8[s]", ">u4", "void", "")
+DTYPES = (
+    "uint8",
+    "uint32",
+    "float32",
+    "float64",
+    "int8",
+    "object",
+    "O",
+    "<U9",
+    "f4,f4",
+    "M8[s]",
+    ">u4",
+    "void",
+    "",
+)
 
 
 class Forgery(NamedTuple):
-    """A forged stream: its bytes, and the frame of the only packet that differs, None if more than that differ."""
+    """A forged stream: its bytes, and the frame of the only packet that differs, None if more than
+    that differ.
+    """
 
     data: bytes
     frame: int | None
 
 
 def damaged(clip: Clip, rng: np.random.Generator) -> bytes:
-    """Return the stream truncated, with one or several flipped bits, or with an overwritten range."""
+    """Return the stream truncated, with flipped bits, or with an overwritten range."""
     data = clip.data
     spoilt = bytearray(data)
     kind = rng.integers(4)
@@ -47,7 +123,9 @@ def damaged(clip: Clip, rng: np.random.Generator) -> bytes:
         length = rng.integers(1, 200)
         size = len(spoilt[start : start + length])
         spoilt[start : start + length] = bytes(size) if rng.random() < 0.5 else rng.bytes(size)
-    for at in rng.choice(8 * len(data), 1 if kind == 1 else rng.integers(2, 9) if kind == 2 else 0, replace=False):
+    for at in rng.choice(
+        8 * len(data), 1 if kind == 1 else rng.integers(2, 9) if kind == 2 else 0, replace=False
+    ):
         spoilt[at // 8] ^= 1 << at % 8
     return bytes(spoilt)
 
@@ -57,14 +135,18 @@ def with_forged_bytes(clip: Clip, rng: np.random.Generator) -> Forgery:
     piece = clip.pieces[rng.integers(2, len(clip.pieces))]
     spoilt = bytearray(clip.data[piece.start + PAYLOAD : piece.stop])
     # Half of them among the numbers that determine the sizes of arrays.
-    for at in rng.integers(0, len(spoilt) if rng.random() < 0.5 else min(120, len(spoilt)), rng.integers(1, 4)):
+    for at in rng.integers(
+        0, len(spoilt) if rng.random() < 0.5 else min(120, len(spoilt)), rng.integers(1, 4)
+    ):
         spoilt[at] = rng.integers(256)
     packet = sealed(bytes(spoilt), piece.kind, piece.frame)
     return Forgery(clip.data[: piece.start] + packet + clip.data[piece.stop :], piece.frame)
 
 
 def with_forged_packets(clip: Clip, rng: np.random.Generator) -> Forgery:
-    """Change numbers, tables, codes, kinds, frames and the order of packets; half of the time the parents fit again."""
+    """Change numbers, tables, codes, kinds, frames and the order of packets; half of the time the
+    parents fit again.
+    """
     packets = [Draft.of(clip, piece) for piece in clip.pieces[2:]]
     changes = (_table, _head, _head, _code, _code, _number, _order, _index)
     for _ in range(rng.integers(1, 4)):
@@ -91,12 +173,16 @@ def with_forged_header(clip: Clip, rng: np.random.Generator) -> Forgery:
     for mark in marks:
         text = text.replace(f'"{mark}"', _any(HOSTILE_TEXT, rng))
     return Forgery(
-        clip.data[: PREAMBLE.size] + sealed(text.encode("latin1"), 0) + clip.data[clip.pieces[1].stop :], None
+        clip.data[: PREAMBLE.size]
+        + sealed(text.encode("latin1"), 0)
+        + clip.data[clip.pieces[1].stop :],
+        None,
     )
 
 
 def forged_streams(clip: Clip) -> tuple[bytes, bytes]:
-    """Return the stream with another keyframe of frame 3, and with an index that has no keyframe as its second entry.
+    """Return the stream with another keyframe of frame 3, and with an index that has no keyframe as
+    its second entry.
 
     Both play from the start as the clip does.
     """
@@ -114,8 +200,12 @@ def forged_streams(clip: Clip) -> tuple[bytes, bytes]:
 
 def _nodes(value: Any) -> list[Any]:
     """Return all objects and lists in a JSON value."""
-    children = value.values() if isinstance(value, dict) else value if isinstance(value, list) else None
-    return [] if children is None else [value, *(node for child in children for node in _nodes(child))]
+    children = (
+        value.values() if isinstance(value, dict) else value if isinstance(value, list) else None
+    )
+    return (
+        [] if children is None else [value, *(node for child in children for node in _nodes(child))]
+    )
 
 
 def _any(choices: Sequence[Any], rng: np.random.Generator) -> Any:
@@ -153,7 +243,9 @@ class Draft:
     def sealed(self) -> bytes:
         table = (self.table or json.dumps(self.rows())).encode("latin1")
         arrays = b"".join(array.tobytes() for array in self.arrays.values())
-        return sealed(self.index or struct.pack("<I", len(table)) + table + arrays, self.kind, self.frame)
+        return sealed(
+            self.index or struct.pack("<I", len(table)) + table + arrays, self.kind, self.frame
+        )
 
 
 def _with_arrays(packets: list[Draft], rng: np.random.Generator) -> Draft:
@@ -171,7 +263,10 @@ def _table(packets: list[Draft], rng: np.random.Generator) -> None:
     elif choice == 1:
         row[place] = "MARK"
     else:
-        shapes = [rng.choice(HOSTILE_NUMBERS, rng.integers(0, 4)).tolist(), [1] * 10 ** rng.integers(1, 5) + row[2]]
+        shapes = [
+            rng.choice(HOSTILE_NUMBERS, rng.integers(0, 4)).tolist(),
+            [1] * 10 ** rng.integers(1, 5) + row[2],
+        ]
         row[place] = _any((NAMES, DTYPES, shapes)[place], rng)
     packet.table = json.dumps(table).replace('"MARK"', _any(HOSTILE_TEXT, rng))
 
@@ -224,11 +319,16 @@ def _index(packets: list[Draft], rng: np.random.Generator) -> None:
         for _ in range(rng.integers(6))
     )
     end = struct.pack("<Q8s", rng.integers(6000), b"MORGSIDX")
-    packets[:] = [*(packet for packet in packets if not packet.index), Draft(3, 0, index=entries + end)]
+    packets[:] = [
+        *(packet for packet in packets if not packet.index),
+        Draft(3, 0, index=entries + end),
+    ]
 
 
 def _continue(packets: list[Draft]) -> None:
-    """Replace the parents of residuals by the digests of the states before, as far as they can be decoded."""
+    """Replace the parents of residuals by the digests of the states before, as far as they can be
+    decoded.
+    """
     state = None
     for packet in packets:
         if state is not None and "parent" in packet.arrays:

@@ -1,8 +1,10 @@
-"""Program that reads damaged and forged streams until a time is over, with little memory and little time for each.
+"""Program that reads damaged and forged streams until a time is over, with little memory and little
+time for each.
 
-`python -m tests.codec.fuzz SECONDS [FUZZER ...]` prints the number of streams and of refusals by kind as JSON. It needs
-a process of its own: a limit on the address space may end any thread of any library, at once and without an exception
-(glibc exits with status 127 where it has no memory for the thread-local data of a library).
+`python -m tests.codec.fuzz SECONDS [FUZZER ...]` prints the number of streams and of refusals by
+kind as JSON. It needs a process of its own: a limit on the address space may end any thread of any
+library, at once and without an exception (glibc exits with status 127 where it has no memory for
+the thread-local data of a library).
 """
 
 from __future__ import annotations
@@ -28,18 +30,24 @@ from morgs_mi.codec.packets import CodedFrame, coded_frames
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.playback.player import has_confidence, has_offset
 from morgs_mi.playback.stream_header import num_frames, open_stream_capture, render_config
-from tests.codec.forge import Forgery, damaged, with_forged_bytes, with_forged_header, with_forged_packets
+from tests.codec.forge import (
+    Forgery,
+    damaged,
+    with_forged_bytes,
+    with_forged_header,
+    with_forged_packets,
+)
 from tests.scenes.short_clip import FRAMES, Clip, short_clip
 
-# What a stream of a few kB may take: far less than a damaged length or count may request. A thread of a library that
-# starts meanwhile reserves 64 MiB for its heap and 8 MiB for its stack (glibc).
+# What a stream of a few kB may take: far less than a damaged length or count may request. A thread
+# of a library that starts meanwhile reserves 64 MiB for its heap and 8 MiB for its stack (glibc).
 MEMORY_BYTES = 200 * 10**6
 THREAD_BYTES = 72 * 2**20
 THREADS = 4
 CASE_SECONDS = 30
 PLACE = re.compile(
-    r"packet \d+ at byte \d+: |expected a stream that starts with|expected format version|`.*` of the header|"
-    r"expected the path of its capture"
+    r"packet \d+ at byte \d+: |expected a stream that starts with|expected format version|`.*` of "
+    r"the header|expected the path of its capture"
 )
 
 
@@ -51,11 +59,15 @@ class Refusals(Counter[str]):
         sentence = str(error)
         assert sentence.startswith(f"{path}: "), sentence
         assert PLACE.search(sentence), sentence
-        problem = re.split(r"packet \d+(?: at byte \d+)?: ", sentence.removeprefix(f"{path}: "), maxsplit=1)[-1]
+        problem = re.split(
+            r"packet \d+(?: at byte \d+)?: ", sentence.removeprefix(f"{path}: "), maxsplit=1
+        )[-1]
         problem = re.split(r",? got |; \d+ packets before", problem)[0].rstrip(".")
         self[
             re.sub(
-                r"`[^`]*`|'[^']*'|\[.*\]|\[.*$", "...", re.sub(r"\b\d[\d.]*(e[+-]?\d+)?\b|\b[\da-f]{8}\b", "N", problem)
+                r"`[^`]*`|'[^']*'|\[.*\]|\[.*$",
+                "...",
+                re.sub(r"\b\d[\d.]*(e[+-]?\d+)?\b|\b[\da-f]{8}\b", "N", problem),
             )
         ] += 1
 
@@ -71,8 +83,13 @@ def check_damage(clip: Clip, path: Path, rng: np.random.Generator, refusals: Ref
 
 def check_intact_frames(clip: Clip, data: bytes, path: Path) -> None:
     """Check the frames of a file that differs from the clip by damage without a right CRC."""
-    intact = [data[piece.start : piece.stop] == clip.data[piece.start : piece.stop] for piece in clip.pieces]
-    intact = [same and piece.stop <= len(data) for same, piece in zip(intact, clip.pieces, strict=True)]
+    intact = [
+        data[piece.start : piece.stop] == clip.data[piece.start : piece.stop]
+        for piece in clip.pieces
+    ]
+    intact = [
+        same and piece.stop <= len(data) for same, piece in zip(intact, clip.pieces, strict=True)
+    ]
     first = intact.index(False)  # the first damaged piece
     played, error = play(path)
     if clip.pieces[first].start == len(data) and first > 1:
@@ -80,11 +97,14 @@ def check_intact_frames(clip: Clip, data: bytes, path: Path) -> None:
         assert not StreamReader(path).closed()
     elif first:  # the sentence names the place, except for the preamble
         assert f"packet {max(first - 1, 0)} at byte {clip.pieces[first].start}: " in str(error)
-    assert [state.frame for state in played] == sorted({p.frame for p in clip.pieces[2:first] if p.kind < 3})
+    assert [state.frame for state in played] == sorted(
+        {p.frame for p in clip.pieces[2:first] if p.kind < 3}
+    )
     assert not any(differs(state, clip) for state in played)
     if not (intact[0] and intact[1]):
         return
-    # A reader that skips damage plays what plays before it, and finds what is behind it by an intact index.
+    # A reader that skips damage plays what plays before it, and finds what is behind it by an
+    # intact index.
     stream = StreamReader(path, skip_damaged=True)
     states = list(coded_frames(stream))
     frames = [state.frame for state in states]
@@ -94,8 +114,16 @@ def check_intact_frames(clip: Clip, data: bytes, path: Path) -> None:
         assert frames == playable(clip, intact)
         assert stream.skipped == sorted({*range(FRAMES)} - {*frames})
         for piece in clip.pieces[first + 1 : -1]:
-            behind = [p for p in clip.pieces[first:] if p.start >= piece.start and p.frame <= piece.frame + 1]
-            if piece.kind == 1 and piece.frame + 1 < FRAMES and all(intact[clip.pieces.index(p)] for p in behind):
+            behind = [
+                p
+                for p in clip.pieces[first:]
+                if p.start >= piece.start and p.frame <= piece.frame + 1
+            ]
+            if (
+                piece.kind == 1
+                and piece.frame + 1 < FRAMES
+                and all(intact[clip.pieces.index(p)] for p in behind)
+            ):
                 assert not differs(StreamReader(path).seek(piece.frame + 1), clip)
 
 
@@ -110,7 +138,9 @@ def playable(clip: Clip, intact: list[bool]) -> list[int]:
 
 
 def check_bytes(clip: Clip, path: Path, rng: np.random.Generator, refusals: Refusals) -> None:
-    """Check that a forged packet affects its own frame at most: the next residual refuses another state."""
+    """Check that a forged packet affects its own frame at most: the next residual refuses another
+    state.
+    """
     data, frame = with_forged_bytes(clip, rng)
     path.write_bytes(data)
     assert {state.frame for state in play(path)[0] if differs(state, clip)} <= {frame}
@@ -130,7 +160,9 @@ def check_forged(
 
 
 def check_readers(path: Path, refusals: Refusals) -> None:
-    """Check that a file plays and can be sought, also without its damage, or is refused by sentences with the place."""
+    """Check that a file plays and can be sought, also without its damage, or is refused by
+    sentences with the place.
+    """
     played, error = play(path)
     if error is not None:
         refusals.add(path, error)
@@ -161,8 +193,8 @@ def check_readers(path: Path, refusals: Refusals) -> None:
 def check_seek(stream: StreamReader, played: list[CodedFrame]) -> None:
     """Check that frames that play can be sought: one in the middle and the last.
 
-    A reader that starts at a keyframe has nothing to compare it with: what it finds may differ from what plays, where
-    that keyframe is forged.
+    A reader that starts at a keyframe has nothing to compare it with: what it finds may differ from
+    what plays, where that keyframe is forged.
     """
     digests = {state.frame: state.digest for state in played}
     for state in (*played[len(played) // 2 : -1][:1], *played[-1:]):
@@ -234,12 +266,15 @@ def main(seconds: str, *names: str) -> None:
     clip = short_clip()
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "s").write_bytes(clip.data)
-        check_readers(Path(folder) / "s", Refusals())  # what is loaded and cached once does not count
+        # What is loaded and cached once does not count.
+        check_readers(Path(folder) / "s", Refusals())
     limit_memory()
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     results = {name: run(name, clip, float(seconds)) for name in names or FUZZERS}
     grown = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory)
-    print(json.dumps({"seconds": float(seconds), "memory_bytes": grown, "fuzzers": results}, indent=1))
+    print(
+        json.dumps({"seconds": float(seconds), "memory_bytes": grown, "fuzzers": results}, indent=1)
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""Program that adds an attribute to the table and streams it; `test_quantisation` runs it in a process of its own."""
+"""Program that adds an attribute to the table and streams it; `test_quantisation` runs it in a
+process of its own.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +53,8 @@ def check_round_trip(confidence: bool) -> None:
     state = decode(None, packet)
     assert state.grid.values.shape == (50, 10 + 12 + confidence + 2)
     assert state.grid.exponents.shape == (50, 8 + confidence + 1)
-    # Twice the error, over four times the precision of a birth and the largest slope, rounded down to quarter octaves.
+    # Twice the error, over four times the precision of a birth and the largest slope, rounded down
+    # to quarter octaves.
     steps = state.grid.steps(ROW.name)
     assert np.all(steps == 2.0 ** (np.floor(4 * np.log2(2 * 0.01 / 4 / 0.25)) / 4))
     assert error(state.gaussians, first) <= 0.01 / 4
@@ -61,7 +64,9 @@ def check_round_trip(confidence: bool) -> None:
     relabelled = rng.random(48) < 0.5
     survivors = jittered(state.gaussians, rng).select(alive)
     labels = state.gaussians.numpy()[ROW.name][alive] + 0.5 * relabelled[:, None]
-    target = gaussians.Gaussians.concatenate([replace(survivors, logit_labels=labels), labelled(3, 2)])
+    target = gaussians.Gaussians.concatenate(
+        [replace(survivors, logit_labels=labels), labelled(3, 2)]
+    )
     new_state = decode(state, residual_packet(state, target, np.r_[alive, -1, -1, -1], CAMERAS))
     assert new_state.ids.tolist() == list(range(2, 53))
     integers = (new_state.grid.values[:48], state.grid.values[alive])

@@ -1,4 +1,6 @@
-"""A reference decoder written from docs/stream-format.md alone: slow, simple, and without the package's code."""
+"""A reference decoder written from docs/stream-format.md alone: slow, simple, and without the
+package's code.
+"""
 
 from __future__ import annotations
 
@@ -59,9 +61,14 @@ class RangeCode:
             end = 2 * end
         ks = [(token + 1) // 2 - 12 if token > 30 else 0 for token in tokens]
         rest = [self.bits(min(k, 16)) if k else 0 for k in ks]
-        rest = [low | self.bits(k - 16) << 16 if k > 16 else low for low, k in zip(rest, ks, strict=True)]
+        rest = [
+            low | self.bits(k - 16) << 16 if k > 16 else low
+            for low, k in zip(rest, ks, strict=True)
+        ]
         sizes = [2**k + r if k else (t + 1) // 2 for t, k, r in zip(tokens, ks, rest, strict=True)]
-        return np.array([v if t % 2 else -v for t, v in zip(tokens, sizes, strict=True)], dtype=np.int64)
+        return np.array(
+            [v if t % 2 else -v for t, v in zip(tokens, sizes, strict=True)], dtype=np.int64
+        )
 
 
 def packets(data):
@@ -81,7 +88,9 @@ def arrays(payload):
     values = {}
     for name, dtype, shape in json.loads(payload[4:at]):
         count = math.prod(shape)
-        values[name] = np.frombuffer(payload, np.dtype(dtype).newbyteorder("<"), count, at).reshape(shape)
+        values[name] = np.frombuffer(payload, np.dtype(dtype).newbyteorder("<"), count, at).reshape(
+            shape
+        )
         at += values[name].nbytes
     assert at == len(payload)
     return values
@@ -107,12 +116,18 @@ def keyframe(payload):
     code = RangeCode(values["code"])
     ids = np.cumsum(code.column(N) + 1) - 1
     state = {"ids": ids, "degree": degree, "confidence": confidence, "next_id": next_id}
-    state["largest_components"], state["exponents"], state["values"] = born(code, N, degree, confidence)
+    state["largest_components"], state["exponents"], state["values"] = born(
+        code, N, degree, confidence
+    )
     return state
 
 
 def digest(state):
-    arrays = [state["ids"].astype("<u4"), state["largest_components"].astype("u1"), state["exponents"].astype("i1")]
+    arrays = [
+        state["ids"].astype("<u4"),
+        state["largest_components"].astype("u1"),
+        state["exponents"].astype("i1"),
+    ]
     arrays += [state["values"].astype("<i4"), np.array([state["next_id"], state["degree"]], "<u4")]
     return hashlib.blake2b(b"".join(array.tobytes() for array in arrays), digest_size=8).digest()
 
@@ -137,7 +152,9 @@ def residual(state, payload):
             changed = members[flags == 1]
             for column in columns:
                 r = code.column(len(changed))
-                values[changed, column] += np.rint(r * F[coarseness % 4] * 2.0 ** (coarseness // 4)).astype(np.int64)
+                values[changed, column] += np.rint(
+                    r * F[coarseness % 4] * 2.0 ** (coarseness // 4)
+                ).astype(np.int64)
     new = {
         **state,
         **{name: state[name][~dead] for name in ("ids", "largest_components", "exponents")},
@@ -179,7 +196,12 @@ def numbers(state):
         length = math.sqrt(((1 + u * u) + v * v) + w * w)
         quats[i] = np.insert([u / length, v / length, w / length], int(largest), 1 / length)
     end = 10 + 3 * (state["degree"] + 1) ** 2
-    values = {"means": real[:, :3], "log_scales": real[:, 3:6], "quats": quats, "logit_opacities": real[:, 9]}
+    values = {
+        "means": real[:, :3],
+        "log_scales": real[:, 3:6],
+        "quats": quats,
+        "logit_opacities": real[:, 9],
+    }
     values["sh_coeffs"] = real[:, 10:end].reshape(len(real), -1, 3)
     if state["confidence"]:
         values["logit_confidence"] = real[:, end]

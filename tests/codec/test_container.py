@@ -29,7 +29,11 @@ PACKETS = [
         0,
         {"means": RNG.normal(size=(4, 3)).astype(np.float32), "ids": np.arange(4, dtype=np.uint32)},
     ),
-    Packet(PacketKind.RESIDUAL, 1, {"empty": np.zeros((0, 3), np.float32), "code": np.arange(7, dtype=np.uint8)}),
+    Packet(
+        PacketKind.RESIDUAL,
+        1,
+        {"empty": np.zeros((0, 3), np.float32), "code": np.arange(7, dtype=np.uint8)},
+    ),
     Packet(PacketKind.RESIDUAL, 2**32 - 1, {"scalar": np.array(np.nan, np.float32)}),
     Packet(PacketKind.RESIDUAL, 3),
 ]
@@ -52,7 +56,11 @@ def write(path: Path, packets: list[Packet] = PACKETS) -> list[int]:
 
 
 def assert_equal(got: Packet, expected: Packet) -> None:
-    assert (got.kind, got.frame, list(got.arrays)) == (expected.kind, expected.frame, list(expected.arrays))
+    assert (got.kind, got.frame, list(got.arrays)) == (
+        expected.kind,
+        expected.frame,
+        list(expected.arrays),
+    )
     for name, array in expected.arrays.items():
         assert got.arrays[name].dtype == array.dtype
         np.testing.assert_array_equal(got.arrays[name], array)
@@ -98,7 +106,11 @@ def test_packet__is_encoded_once_and_does_not_change() -> None:
 
 def test_decode_packet__restores_arrays_of_any_memory_order() -> None:
     array = RNG.normal(size=(3, 5)).astype(np.float32)
-    arrays = {"fortran": np.asfortranarray(array), "slice": array[::2, 1:], "swapped": array.astype(">f4")}
+    arrays = {
+        "fortran": np.asfortranarray(array),
+        "slice": array[::2, 1:],
+        "swapped": array.astype(">f4"),
+    }
     got = decode_packet(encode_packet(Packet(PacketKind.RESIDUAL, 0, arrays))).arrays
     for name, expected in arrays.items():
         np.testing.assert_array_equal(got[name], expected)
@@ -125,7 +137,9 @@ def test_stream_reader__detects_every_truncation_inside_a_packet(tmp_path: Path)
         if length in ends:
             got.extend(StreamReader(path))
         else:
-            with pytest.raises(TruncatedStreamError, match=rf"s: packet {intact} at byte \d+: .*; {intact} packets"):
+            with pytest.raises(
+                TruncatedStreamError, match=rf"s: packet {intact} at byte \d+: .*; {intact} packets"
+            ):
                 got.extend(StreamReader(path))
         assert len(got) == max(intact - 1, 0)
 
@@ -166,18 +180,33 @@ def with_table(table: bytes, rest: bytes = b"") -> bytes:
         (with_table(b'[["a", "uint8", 1]]', bytes(1)), "`a` is declared as uint8 1"),
         (with_table(b'[["a", "uint8", [true]]]', bytes(1)), r"`a` is declared as uint8 \[True\]"),
         (with_table(b'[["a", "uint8", [1.0]]]', bytes(1)), r"`a` is declared as uint8 \[1.0\]"),
-        (with_table(b'[["a", "uint8", [1,1,1,1,1,1,1,1,1]]]', bytes(1)), r"`a` is declared as uint8 \[1, 1"),
-        (with_table(b'[["a", "uint8", [1]], ["a", "uint8", [1]]]', bytes(2)), "two arrays have one name"),
+        (
+            with_table(b'[["a", "uint8", [1,1,1,1,1,1,1,1,1]]]', bytes(1)),
+            r"`a` is declared as uint8 \[1, 1",
+        ),
+        (
+            with_table(b'[["a", "uint8", [1]], ["a", "uint8", [1]]]', bytes(2)),
+            "two arrays have one name",
+        ),
         (with_table(b'[["a", "uint8", [NaN]]]'), "numbers must be finite, got NaN"),
-        (with_table(b'[["a", "uint8", [' + b"1," * 33_000 + b"1]]]"), "must have at most 65536 bytes, got 66021"),
+        (
+            with_table(b'[["a", "uint8", [' + b"1," * 33_000 + b"1]]]"),
+            "must have at most 65536 bytes, got 66021",
+        ),
         (with_table(b'[["a", "object", [1]]]', bytes(8)), "`a` is declared as object"),
         (with_table(b'[["a", "uint8", [-1]]]', bytes(8)), r"`a` is declared as uint8 \[-1\]"),
         (
             with_table(b'[["a", "float32", [1000000000000]]]', bytes(8)),
             "would end at byte 4000000000039 of 47",
         ),
-        (with_table(b'[["a", "uint8", [0, 10000000000000000000000]]]'), "integers must have at most 64 bits"),
-        (with_table(b'[["a", "uint8", [10000000000000000000000]]]'), "integers must have at most 64 bits"),
+        (
+            with_table(b'[["a", "uint8", [0, 10000000000000000000000]]]'),
+            "integers must have at most 64 bits",
+        ),
+        (
+            with_table(b'[["a", "uint8", [10000000000000000000000]]]'),
+            "integers must have at most 64 bits",
+        ),
         (with_table(b'[["a", "uint8", [7]]]', bytes(8)), "describes 32 bytes of 33"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
@@ -192,7 +221,10 @@ def test_decode_packet__refuses_inconsistent_packets(data: bytes, message: str) 
     [
         (Packet(PacketKind.HEADER, 0), "`kind` must be KEYFRAME or RESIDUAL"),
         (Packet(PacketKind.RESIDUAL, -1), r"`frame` must be in 0..2\^32-1, got -1"),
-        (Packet(PacketKind.RESIDUAL, 0, {"a": np.zeros(3)}), "`a` must be one of float32, .* got float64"),
+        (
+            Packet(PacketKind.RESIDUAL, 0, {"a": np.zeros(3)}),
+            "`a` must be one of float32, .* got float64",
+        ),
         (Packet(PacketKind.RESIDUAL, 0, {"a": np.array([None])}), "got object"),
     ],
 )
@@ -216,10 +248,15 @@ def test_stream_reader__refuses_files_that_are_not_streams(tmp_path: Path) -> No
         StreamReader(path)
     preamble = struct.pack("<8sI", b"MORGS-MI", 2)
     path.write_bytes(preamble + sealed(b"{}", kind=1))
-    with pytest.raises(ValueError, match="packet 0 at byte 12: the first packet must be the header, got kind 1"):
+    with pytest.raises(
+        ValueError, match="packet 0 at byte 12: the first packet must be the header, got kind 1"
+    ):
         StreamReader(path)
     path.write_bytes(preamble + sealed(b"{}", kind=0))
-    with pytest.raises(ValueError, match="packet 0 at byte 12: `cameras` is missing; 0 packets before it are intact"):
+    with pytest.raises(
+        ValueError,
+        match="packet 0 at byte 12: `cameras` is missing; 0 packets before it are intact",
+    ):
         StreamReader(path)
     with pytest.raises(FileNotFoundError):
         StreamReader(tmp_path / "none")
@@ -239,25 +276,33 @@ def test_stream_reader__walks_from_packet_to_packet_where_the_index_is_implausib
     ends = write(tmp_path / "s")
     packed = b"".join(struct.pack("<IIQ", *entry) for entry in entries)
     data = (tmp_path / "s").read_bytes()[: ends[-1]]
-    (tmp_path / "s").write_bytes(data + sealed(packed + struct.pack("<Q8s", len(data), b"MORGSIDX"), 3))
+    (tmp_path / "s").write_bytes(
+        data + sealed(packed + struct.pack("<Q8s", len(data), b"MORGSIDX"), 3)
+    )
     reader = StreamReader(tmp_path / "s")
     assert [at for *_, at in reader.index()] == ends[:-1]
     assert len(list(reader.near(3))) == len(PACKETS)
 
 
 @pytest.mark.parametrize("length", [0, 5, 15, 16, 40])
-def test_stream_reader__reports_a_file_that_became_shorter_than_its_header(tmp_path: Path, length: int) -> None:
+def test_stream_reader__reports_a_file_that_became_shorter_than_its_header(
+    tmp_path: Path, length: int
+) -> None:
     path = tmp_path / "s"
     write(path)
     reader = StreamReader(path)
     path.write_bytes(path.read_bytes()[:length])
-    sentence = rf"s: packet 0 at byte 12: the header ended at byte \d+, now the file has {length} bytes: "
+    sentence = (
+        rf"s: packet 0 at byte 12: the header ended at byte \d+, now the file has {length} bytes: "
+    )
     for call in (reader.index, reader.closed, lambda: reader.near(1)):
         with pytest.raises(TruncatedStreamError, match=sentence):
             call()
 
 
-def test_stream_writer__leaves_complete_packets_on_a_full_disk_and_stays_usable(tmp_path: Path) -> None:
+def test_stream_writer__leaves_complete_packets_on_a_full_disk_and_stays_usable(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "s"
     # A limit on the file size makes a write fail in its middle, as a full disk does.
     program = f"""
@@ -275,7 +320,9 @@ with StreamWriter({str(path)!r}, CAMERAS, 30) as stream:
     resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY,) * 2)
     stream.write(Packet(PacketKind.RESIDUAL, 2))
 """
-    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    result = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
     assert f"{path}: 2" in result.stdout
     assert "bytes of complete packets; free space on the disk" in result.stdout
     assert [packet.frame for packet in StreamReader(path)] == [0, 2]

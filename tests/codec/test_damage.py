@@ -1,4 +1,6 @@
-"""Damaged and forged streams: all damage is reported, every undamaged frame plays, and no damaged number is trusted."""
+"""Damaged and forged streams: all damage is reported, every undamaged frame plays, and no damaged
+number is trusted.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ def fuzz(seconds: float, *names: str) -> None:
     """Run fuzzers in a process of their own and check that it ends well."""
     single = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
     command = [sys.executable, "-m", "tests.codec.fuzz", str(seconds), *names]
-    result = subprocess.run(command, capture_output=True, text=True, env=os.environ | single, check=False)
+    result = subprocess.run(
+        command, capture_output=True, text=True, env=os.environ | single, check=False
+    )
     assert result.returncode == 0, f"status {result.returncode}\n{result.stderr[-5000:]}"
     counts = json.loads(result.stdout)["fuzzers"]
     assert all(counts[name]["streams"] > 0 for name in names)
@@ -70,7 +74,8 @@ def test_stream_reader__names_packet_byte_and_frame_of_damage(clip: Clip, tmp_pa
     (tmp_path / "s").write_bytes(flipped(clip, 2))
     place = f"s: packet 3 at byte {clip.pieces[4].start}: its CRC should be "
     with pytest.raises(
-        ValueError, match=f"{place}.*: the bytes are damaged; 3 packets before it are intact, up to frame 1"
+        ValueError,
+        match=f"{place}.*: the bytes are damaged; 3 packets before it are intact, up to frame 1",
     ):
         list(coded_frames(StreamReader(tmp_path / "s")))
 
@@ -100,12 +105,16 @@ def test_stream_reader__continues_at_the_next_intact_keyframe(
         assert not differs(stream.seek(state.frame), clip)
 
 
-def test_stream_reader__skips_the_rest_behind_a_damaged_length_without_an_index(clip: Clip, tmp_path: Path) -> None:
+def test_stream_reader__skips_the_rest_behind_a_damaged_length_without_an_index(
+    clip: Clip, tmp_path: Path
+) -> None:
     damaged = clip.pieces[4]
     data = bytearray(clip.data)
     data[damaged.start + 8] ^= 1  # the lowest byte of its length
     (tmp_path / "s").write_bytes(data)
-    assert StreamReader(tmp_path / "s", skip_damaged=True).skipped == [2], "the index leads to the others"
+    assert StreamReader(tmp_path / "s", skip_damaged=True).skipped == [2], (
+        "the index leads to the others"
+    )
     (tmp_path / "s").write_bytes(data[: clip.pieces[-1].start])
     stream = StreamReader(tmp_path / "s", skip_damaged=True)
     assert [state.frame for state in coded_frames(stream)] == [0, 1]
@@ -121,11 +130,15 @@ def test_stream_reader__skips_nothing_of_an_intact_stream(clip: Clip, tmp_path: 
 
 
 def test_stream_reader__skips_no_damage_in_a_pipe(clip: Clip) -> None:
-    with pytest.raises(ValueError, match="expected a file to skip damage in, got a pipe; save it first"):
+    with pytest.raises(
+        ValueError, match="expected a file to skip damage in, got a pipe; save it first"
+    ):
         StreamReader(io.BytesIO(clip.data), skip_damaged=True)
 
 
-def test_seek__plays_from_the_start_where_a_keyframe_or_the_index_is_forged(clip: Clip, tmp_path: Path) -> None:
+def test_seek__plays_from_the_start_where_a_keyframe_or_the_index_is_forged(
+    clip: Clip, tmp_path: Path
+) -> None:
     for data in forged_streams(clip):
         (tmp_path / "s").write_bytes(data)
         stream = StreamReader(tmp_path / "s")
@@ -136,7 +149,9 @@ def test_seek__plays_from_the_start_where_a_keyframe_or_the_index_is_forged(clip
 def constant(N: int, degree: int) -> CodedFrame:
     """Return N equal Gaussians, which an entropy code stores in almost no bytes."""
     C = 10 + 3 * (degree + 1) ** 2
-    grid = Grid(np.zeros((N, C), np.int32), np.zeros((N, 8), np.int8), np.zeros(N, np.uint8), degree, 0)
+    grid = Grid(
+        np.zeros((N, C), np.int32), np.zeros((N, 8), np.int8), np.zeros(N, np.uint8), degree, 0
+    )
     return CodedFrame(0, np.arange(N, dtype=np.uint32), cloud(1), grid, N)
 
 
@@ -147,7 +162,9 @@ def test_reemitted_keyframe__is_padded_to_the_words_that_its_integers_need() -> 
     packet = reemitted_keyframe(constant(free + 1, 3))
     assert len(packet.arrays["code"]) == -(-(free + 1) * 67 // 16)
     short = {**packet.arrays, "code": packet.arrays["code"][:-1]}
-    with pytest.raises(ValueError, match=r"62602 new of 62602 Gaussians take at least \d+ words of code, got \d+"):
+    with pytest.raises(
+        ValueError, match=r"62602 new of 62602 Gaussians take at least \d+ words of code, got \d+"
+    ):
         decode(None, Packet(packet.kind, 0, short))
     assert len(decode(None, packet)) == free + 1
 
@@ -155,7 +172,9 @@ def test_reemitted_keyframe__is_padded_to_the_words_that_its_integers_need() -> 
 def test_decode__refuses_a_count_before_it_allocates(tmp_path: Path) -> None:
     """A keyframe of 1 MB could request 4 million Gaussians of 67 integers."""
     code = np.zeros(2**18, np.uint32)
-    packet = Packet(PacketKind.KEYFRAME, 0, {"head": np.array([2**22, 3, 0, 2**22], np.uint32), "code": code})
+    packet = Packet(
+        PacketKind.KEYFRAME, 0, {"head": np.array([2**22, 3, 0, 2**22], np.uint32), "code": code}
+    )
     tracemalloc.start()
     with pytest.raises(ValueError, match="words of code"):
         decode(None, packet)

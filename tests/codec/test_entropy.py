@@ -16,7 +16,9 @@ COLUMNS = {
     "constant": np.zeros(5000, np.int64),
     "narrow": np.rint(RNG.laplace(0, 0.6, 5000)).astype(np.int64),
     "wide": np.rint(RNG.laplace(3, 400, 5000)).astype(np.int64),
-    "limits": np.array([LIMIT - 1, 1 - LIMIT, 15, -15, 16, -16, 2**16 - 1, 2**16, 2**17 - 1, -(2**17)]),
+    "limits": np.array(
+        [LIMIT - 1, 1 - LIMIT, 15, -15, 16, -16, 2**16 - 1, 2**16, 2**17 - 1, -(2**17)]
+    ),
     "any": RNG.integers(1 - LIMIT, LIMIT, 300),
 }
 
@@ -40,7 +42,8 @@ def test_column_writer__is_close_to_the_entropy(scale: float) -> None:
     _, counts = np.unique(values, return_counts=True)
     entropy = -(counts * np.log2(counts / counts.sum())).sum()
     size = 32 * len(coded(values))
-    # Learning the distribution costs about ten bits per distinct token, and octaves are modelled as uniform.
+    # Learning the distribution costs about ten bits per distinct token, and octaves are modelled as
+    # uniform.
     assert entropy < size < 1.035 * entropy + 300
     assert size == pytest.approx(column_bits(values), rel=0.02, abs=100)
 
@@ -53,7 +56,9 @@ def test_column_reader__returns_wrong_numbers_or_raises_on_damage() -> None:
     words = coded(*COLUMNS.values())
     for _ in range(100):
         damaged = words.copy()
-        damaged[RNG.integers(len(words), size=3)] ^= np.uint32(1) << RNG.integers(32, size=3).astype(np.uint32)
+        damaged[RNG.integers(len(words), size=3)] ^= np.uint32(1) << RNG.integers(
+            32, size=3
+        ).astype(np.uint32)
         reader = ColumnReader(damaged)
         with contextlib.suppress(ValueError):
             sizes = [len(reader.take(len(column))) for column in COLUMNS.values()]

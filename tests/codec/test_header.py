@@ -76,7 +76,9 @@ def test_header_fields__refuse_other_types_and_ranges(path: str, text: str, mess
         ("viewmat.2.1", "[1]", "viewmat` must be a number, got a list"),
     ],
 )
-def test_header_fields__refuse_other_types_and_ranges_of_a_camera(path: str, text: str, message: str) -> None:
+def test_header_fields__refuse_other_types_and_ranges_of_a_camera(
+    path: str, text: str, message: str
+) -> None:
     with pytest.raises(ValueError, match=re.escape(f"`cameras[0].{message}")):
         header_fields(with_entry(f"cameras.0.{path}", text))
 
@@ -98,7 +100,11 @@ def test_header_fields__refuse_other_json(data: bytes, message: str) -> None:
 def test_load_json__accepts_what_is_within_its_limits() -> None:
     deep = b"[" * 32 + b"]" * 32
     assert load_json(deep, len(deep)) == json.loads(deep)
-    assert load_json(b"[18446744073709551615, -9223372036854775808, 1e308]", 99) == [2**64 - 1, -(2**63), 1e308]
+    assert load_json(b"[18446744073709551615, -9223372036854775808, 1e308]", 99) == [
+        2**64 - 1,
+        -(2**63),
+        1e308,
+    ]
 
 
 @pytest.mark.parametrize(
@@ -106,10 +112,16 @@ def test_load_json__accepts_what_is_within_its_limits() -> None:
     [
         ([], 25, "a reader would refuse the header: `cameras` must name at least one"),
         (CAMERAS, 0, "a reader would refuse the header: `fps` must lie between"),
-        ([Camera(CAMERAS[0].K, CAMERAS[0].viewmat, 2**14, 2**14)], 25, r"a reader would refuse .* `cameras\[0\].width"),
+        (
+            [Camera(CAMERAS[0].K, CAMERAS[0].viewmat, 2**14, 2**14)],
+            25,
+            r"a reader would refuse .* `cameras\[0\].width",
+        ),
     ],
 )
-def test_stream_writer__refuses_a_header_that_a_reader_would_refuse(tmp_path, cameras, fps, message: str) -> None:
+def test_stream_writer__refuses_a_header_that_a_reader_would_refuse(
+    tmp_path, cameras, fps, message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         StreamWriter(tmp_path / "s", cameras, fps)
     assert not (tmp_path / "s").exists()

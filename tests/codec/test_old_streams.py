@@ -1,7 +1,8 @@
 """Streams of earlier releases: this one decodes them to the same numbers, or names their version.
 
-`streams/` has a small stream for each version that this release reads, as the release that defined it wrote it: births,
-a death, offsets, confidences and a re-emitted keyframe. Never write them again.
+`streams/` has a small stream for each version that this release reads, as the release that defined
+it wrote it: births, a death, offsets, confidences and a re-emitted keyframe. Never write them
+again.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ PROMISES = (Path(__file__).parents[2] / "docs" / "promises.md").read_text(encodi
 
 
 def summary(path: Path) -> list[dict[str, Any]]:
-    """Return the number of Gaussians and hashes of the integers and of the decoded numbers of each frame."""
+    """Return the number of Gaussians and hashes of the integers and of the decoded numbers of each
+    frame.
+    """
     return [
         {
             "frame": coded.frame,
@@ -43,7 +46,10 @@ def summary(path: Path) -> list[dict[str, Any]]:
 def test_old_streams__decode_to_the_same_numbers(path):
     expected = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
     assert summary(path) == expected
-    assert StreamReader(path).seek(expected[-1]["frame"]).digest.tobytes().hex() == expected[-1]["integers"]
+    assert (
+        StreamReader(path).seek(expected[-1]["frame"]).digest.tobytes().hex()
+        == expected[-1]["integers"]
+    )
 
 
 def test_old_streams__are_those_that_the_page_of_promises_lists():
@@ -59,5 +65,8 @@ def test_old_streams__of_other_versions_are_named(tmp_path, version):
     data = bytearray((STREAMS / "version2.morgs").read_bytes())
     data[8:12] = version.to_bytes(4, "little")
     (tmp_path / "other.morgs").write_bytes(data)
-    with pytest.raises(ValueError, match=f"expected format version {VERSION}, got {version}; read it with the release"):
+    with pytest.raises(
+        ValueError,
+        match=f"expected format version {VERSION}, got {version}; read it with the release",
+    ):
         StreamReader(tmp_path / "other.morgs")

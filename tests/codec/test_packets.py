@@ -25,7 +25,9 @@ from tests.scenes.coded_clip import CAMERAS, cloud, encoded_clip, jittered, writ
 
 
 @pytest.mark.parametrize("config", [None, CodecConfig(offset=True)], ids=["", "offset"])
-def test_decode__equals_a_decoder_from_the_specification(tmp_path: Path, config: CodecConfig | None) -> None:
+def test_decode__equals_a_decoder_from_the_specification(
+    tmp_path: Path, config: CodecConfig | None
+) -> None:
     packets, states = encoded_clip(6, config)
     write(tmp_path / "s", packets, states, every=3)
     plain = list(plain_decoder.states((tmp_path / "s").read_bytes()))
@@ -56,14 +58,18 @@ def test_residual_packet__stores_offsets_of_moving_gaussians_and_changes_nothing
             assert np.array_equal(packet.arrays[name], array)
     rng = np.random.default_rng(3)
     state = states[-1]
-    next_gaussians = replace(jittered(state.gaussians, rng), offset=rng.normal(0, 0.02, (len(state), 3)))
+    next_gaussians = replace(
+        jittered(state.gaussians, rng), offset=rng.normal(0, 0.02, (len(state), 3))
+    )
     values = decode(
         state, residual_packet(state, next_gaussians, None, CAMERAS, CodecConfig(offset=True))
     ).gaussians.numpy()
     mask = values["motion"].any(1)
     assert 0.2 < mask.mean() < 0.6
     # The step of a moved mean is four times the step of its birth.
-    error = np.abs(values["offset"] - next_gaussians.numpy()["offset"])[mask] / (4 * state.grid.steps("means")[mask])
+    error = np.abs(values["offset"] - next_gaussians.numpy()["offset"])[mask] / (
+        4 * state.grid.steps("means")[mask]
+    )
     assert 0.45 < error.max() <= 0.5 + 1e-4
     assert not values["offset"][~mask].any()
 
@@ -74,7 +80,9 @@ def test_residual_packet__of_a_decoded_state_reproduces_it() -> None:
     for old, new in pairwise(states):
         source = np.searchsorted(old.ids, new.ids)
         survivors = np.flatnonzero(new.ids < old.next_id)  # births would choose new steps
-        result = decode(old, residual_packet(old, new.gaussians.select(survivors), source[survivors], CAMERAS))
+        result = decode(
+            old, residual_packet(old, new.gaussians.select(survivors), source[survivors], CAMERAS)
+        )
         assert np.array_equal(result.grid.values, new.grid.values[survivors])
 
 
@@ -84,7 +92,9 @@ def test_decode__ids_follow_a_gaussian_from_birth_to_death() -> None:
     marked = Gaussians.concatenate([state.gaussians.select(np.array([0, 2, 5])), single_at(7.0)])
     state = decode(state, residual_packet(state, marked, np.array([0, 2, 5, -1]), CAMERAS))
     assert state.ids.tolist() == [0, 2, 5, 6]
-    again = Gaussians.concatenate([state.gaussians.select(np.array([1, 2])), single_at(8.0), single_at(9.0)])
+    again = Gaussians.concatenate(
+        [state.gaussians.select(np.array([1, 2])), single_at(8.0), single_at(9.0)]
+    )
     state = decode(state, residual_packet(state, again, np.array([1, 2, -1, -1]), CAMERAS))
     assert (state.ids.tolist(), state.next_id) == ([2, 5, 7, 8], 9)
     assert_close(state.gaussians.numpy()["means"][2:, 0], [8, 9], atol=0.01)
@@ -98,7 +108,9 @@ def single_at(x: float) -> Gaussians:
 
 
 @pytest.mark.parametrize(("degree", "confidence"), [(0, False), (0, True), (2, False), (3, True)])
-def test_decode__round_trips_every_degree_with_and_without_confidence(degree: int, confidence: bool) -> None:
+def test_decode__round_trips_every_degree_with_and_without_confidence(
+    degree: int, confidence: bool
+) -> None:
     state = decode(None, keyframe_packet(cloud(20, degree, confidence), 3, CAMERAS))
     target = jittered(state.gaussians, np.random.default_rng(0))
     result = decode(state, residual_packet(state, target, None, CAMERAS))
@@ -116,7 +128,9 @@ def test_residual_packet__removes_all_gaussians() -> None:
 
 def test_decode__names_a_missing_packet() -> None:
     packets, states = encoded_clip(4)
-    with pytest.raises(ValueError, match="packet of frame 3: it does not continue the state after frame 1"):
+    with pytest.raises(
+        ValueError, match="packet of frame 3: it does not continue the state after frame 1"
+    ):
         decode(states[1], packets[3])
     with pytest.raises(ValueError, match="packet of frame 1: a residual needs the frame before it"):
         decode(None, packets[1])
@@ -133,24 +147,63 @@ def with_array(packet: Packet, name: str, array: np.ndarray) -> Packet:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda key, _: with_head(key, 2**32 - 1, 1, 1, 60), r"take at least \d+ words of code, got"),
+        (
+            lambda key, _: with_head(key, 2**32 - 1, 1, 1, 60),
+            r"take at least \d+ words of code, got",
+        ),
         (lambda key, _: with_head(key, 60, 4, 1, 60), "its degree must be at most 3, got 4"),
-        (lambda key, _: with_head(key, 60, 1, 5, 60), "must have no bits beyond 0b1, got 0b101 with the unknown 0b100"),
+        (
+            lambda key, _: with_head(key, 60, 1, 5, 60),
+            "must have no bits beyond 0b1, got 0b101 with the unknown 0b100",
+        ),
         (lambda key, _: with_head(key, 60, 1, 1, 5), "its ids do not ascend"),
-        (lambda key, _: with_head(key, 60, 1, 1, 2**30), "its next id must be at most 1073741823, got 1073741824"),
+        (
+            lambda key, _: with_head(key, 60, 1, 1, 2**30),
+            "its next id must be at most 1073741823, got 1073741824",
+        ),
         (lambda key, _: with_head(key, 60), "its head must have 4 numbers"),
-        (lambda _, residual: with_head(residual, 2**29, 8), r"take at least \d+ words of code, got"),
-        (lambda _, residual: with_head(residual, 2**31, 8), "its next id must be at most 1073741823"),
-        (lambda _, residual: with_head(residual, 0, 81), "its coarseness must be at most 80, got 81"),
+        (
+            lambda _, residual: with_head(residual, 2**29, 8),
+            r"take at least \d+ words of code, got",
+        ),
+        (
+            lambda _, residual: with_head(residual, 2**31, 8),
+            "its next id must be at most 1073741823",
+        ),
+        (
+            lambda _, residual: with_head(residual, 0, 81),
+            "its coarseness must be at most 80, got 81",
+        ),
         (lambda key, _: Packet(key.kind, 0, {"head": key.arrays["head"]}), "expected the arrays"),
         (lambda key, _: with_array(key, "offset", key.arrays["code"]), "expected the arrays"),
-        (lambda key, _: with_array(key, "head", np.full(4, np.inf, np.float32)), r"`head` must be uint32 \[n\], got f"),
-        (lambda key, _: with_array(key, "code", np.zeros(99, np.float32)), r"`code` must be uint32 \[n\], got float32"),
-        (lambda key, _: with_array(key, "code", key.arrays["code"][None]), r"`code` must be uint32 \[n\], got uint32"),
-        (lambda _, residual: with_array(residual, "parent", np.zeros(8, np.uint32)), r"`parent` must be uint8 \[n\]"),
-        (lambda _, residual: with_array(residual, "offset", np.zeros(8, np.uint8)), r"`offset` must be uint32 \[n\]"),
-        (lambda _, residual: with_array(residual, "offset", np.full(60, 2**32 - 1, "u4")), "its code is broken"),
-        (lambda _, residual: replace(residual, frame=0), "its frame must be above 0, that of the state before, got 0"),
+        (
+            lambda key, _: with_array(key, "head", np.full(4, np.inf, np.float32)),
+            r"`head` must be uint32 \[n\], got f",
+        ),
+        (
+            lambda key, _: with_array(key, "code", np.zeros(99, np.float32)),
+            r"`code` must be uint32 \[n\], got float32",
+        ),
+        (
+            lambda key, _: with_array(key, "code", key.arrays["code"][None]),
+            r"`code` must be uint32 \[n\], got uint32",
+        ),
+        (
+            lambda _, residual: with_array(residual, "parent", np.zeros(8, np.uint32)),
+            r"`parent` must be uint8 \[n\]",
+        ),
+        (
+            lambda _, residual: with_array(residual, "offset", np.zeros(8, np.uint8)),
+            r"`offset` must be uint32 \[n\]",
+        ),
+        (
+            lambda _, residual: with_array(residual, "offset", np.full(60, 2**32 - 1, "u4")),
+            "its code is broken",
+        ),
+        (
+            lambda _, residual: replace(residual, frame=0),
+            "its frame must be above 0, that of the state before, got 0",
+        ),
     ],
 )
 def test_decode__refuses_packets_that_contradict_themselves(change, message: str) -> None:
@@ -174,7 +227,10 @@ def test_decode__refuses_scrambled_code_or_the_packet_after_it() -> None:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda s: keyframe_packet(replace(cloud(3), means=np.full((3, 3), np.nan)), 0), "`means` must be finite"),
+        (
+            lambda s: keyframe_packet(replace(cloud(3), means=np.full((3, 3), np.nan)), 0),
+            "`means` must be finite",
+        ),
         (lambda s: residual_packet(s, cloud(4)), "`source` must be"),
         (lambda s: residual_packet(s, cloud(3), np.array([0, -1, 1])), "`source` must be"),
         (lambda s: residual_packet(s, cloud(3), np.array([1, 0, -1])), "`source` must be"),
@@ -195,9 +251,16 @@ def test_packets__refuse_bad_input(call, message: str) -> None:
 
 
 def test_lasting_ids__continue_after_those_of_the_set_before() -> None:
-    """A re-emitted keyframe repeats a set; a keyframe of the next frame starts another one with ids from 0."""
+    """A re-emitted keyframe repeats a set; a keyframe of the next frame starts another one with ids
+    from 0.
+    """
     first = keyframe_packet(cloud(3), 0)
     state = decode(None, first)
-    packets = [first, reemitted_keyframe(state), residual_packet(state, cloud(3)), keyframe_packet(cloud(2), 2)]
+    packets = [
+        first,
+        reemitted_keyframe(state),
+        residual_packet(state, cloud(3)),
+        keyframe_packet(cloud(2), 2),
+    ]
     ids = [(coded.frame, coded.lasting_ids.tolist()) for coded in coded_frames(packets)]
     assert ids == [(0, [0, 1, 2]), (1, [0, 1, 2]), (2, [3, 4])]

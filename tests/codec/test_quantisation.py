@@ -23,16 +23,24 @@ from tests.scenes.coded_clip import CAMERAS, cloud, encoded_clip, history, jitte
 
 
 def test_residual_packet__errors_stay_within_the_tolerance() -> None:
-    """The error is at most half a step for a new Gaussian, a step for a moved one, half a step for its base colour."""
+    """The error is at most half a step for a new Gaussian, a step for a moved one, half a step for
+    its base colour.
+    """
     config = CodecConfig(birth_precision=2)
     start = cloud(400)
     state = decode(None, keyframe_packet(start, 0, CAMERAS, config))
     target = jittered(start, np.random.default_rng(1))
     new_state = decode(state, residual_packet(state, target, None, CAMERAS, config))
-    for true, result, error, color_error in ((start, state, 0.5, 0.5), (target, new_state, 2.0, 1.0)):
+    for true, result, error, color_error in (
+        (start, state, 0.5, 0.5),
+        (target, new_state, 2.0, 1.0),
+    ):
         for camera in CAMERAS:
             view = camera.viewmat
-            a, b = (g.numpy()["means"].astype(float) @ view[:3, :3].T + view[:3, 3] for g in (true, result.gaussians))
+            a, b = (
+                g.numpy()["means"].astype(float) @ view[:3, :3].T + view[:3, 3]
+                for g in (true, result.gaussians)
+            )
             # At most, the errors of three coordinates add up.
             pixels = camera.K[0, 0] * np.abs(a - b)[:, :2] / a[:, 2:]
             assert pixels.max() < error * BY_NAME["means"].error * np.sqrt(3)
@@ -60,7 +68,10 @@ def test_codec_config__more_quality_takes_more_bytes_and_has_smaller_errors() ->
         packet = residual_packet(state, changed_gaussians, None, CAMERAS, config)
         sizes.append(len(encode_packet(packet)))
         errors.append(
-            np.abs(decode(state, packet).gaussians.numpy()["means"] - changed_gaussians.numpy()["means"]).max()
+            np.abs(
+                decode(state, packet).gaussians.numpy()["means"]
+                - changed_gaussians.numpy()["means"]
+            ).max()
         )
     assert sizes == sorted(sizes)
     assert errors == sorted(errors, reverse=True)
@@ -72,7 +83,9 @@ def test_codec_config__more_quality_takes_more_bytes_and_has_smaller_errors() ->
 def test_residual_packet__stays_below_its_target_size_and_comes_near_it(target: int) -> None:
     state = decode(None, keyframe_packet(cloud(1500), 0, CAMERAS))
     changed_gaussians = jittered(state.gaussians, np.random.default_rng(1), share=1)
-    packet = residual_packet(state, changed_gaussians, None, CAMERAS, CodecConfig(target_size=target))
+    packet = residual_packet(
+        state, changed_gaussians, None, CAMERAS, CodecConfig(target_size=target)
+    )
     # The coarseness has steps of 2^(1/4), up to a fifth of the bytes where few numbers are left.
     assert 0.75 * target < packet.arrays["code"].nbytes <= target
     assert len(decode(state, packet)) == 1500
@@ -94,14 +107,20 @@ def test_residual_packet__stores_changes_of_a_step_and_colours_of_half_a_step() 
 def test_residual_packet__counts_offsets_towards_the_target_size() -> None:
     state = decode(None, keyframe_packet(cloud(1500), 0, CAMERAS))
     rng = np.random.default_rng(1)
-    changed_gaussians = replace(jittered(state.gaussians, rng, share=1), offset=rng.normal(0, 0.02, (1500, 3)))
-    arrays = residual_packet(state, changed_gaussians, None, CAMERAS, CodecConfig(target_size=8000, offset=True)).arrays
+    changed_gaussians = replace(
+        jittered(state.gaussians, rng, share=1), offset=rng.normal(0, 0.02, (1500, 3))
+    )
+    arrays = residual_packet(
+        state, changed_gaussians, None, CAMERAS, CodecConfig(target_size=8000, offset=True)
+    ).arrays
     assert arrays["offset"].nbytes > 400
     assert 0.75 * 8000 < arrays["code"].nbytes + arrays["offset"].nbytes <= 8000
 
 
 def test_grid__stores_the_attribute_of_a_new_row_of_the_table() -> None:
-    """One more row with an `error` and a field of that name; streams without the attribute stay the same."""
+    """One more row with an `error` and a field of that name; streams without the attribute stay the
+    same.
+    """
     command = [sys.executable, "-m", "tests.codec.new_row"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
@@ -121,7 +140,9 @@ def test_residual_packet__follows_a_turn_of_any_angle() -> None:
 
 
 def test_keyframe_packet__codes_extremes_as_exactly_as_float32() -> None:
-    """Close to a lens steps are tiny, and large, distant or bright Gaussians would need unbounded integers."""
+    """Close to a lens steps are tiny, and large, distant or bright Gaussians would need unbounded
+    integers.
+    """
     raw = cloud(40).numpy()
     raw["means"][:8] = CAMERAS[0].position + 1.001 * CAMERAS[0].near * CAMERAS[0].viewmat[2, :3]
     raw["log_scales"][:4] = 12, -30, 0
@@ -130,9 +151,12 @@ def test_keyframe_packet__codes_extremes_as_exactly_as_float32() -> None:
     extreme = Gaussians(**raw)
     first = decode(None, keyframe_packet(extreme, 0, CAMERAS))
     for name in ("means", "log_scales", "sh_coeffs"):
-        exact, code = (np.asarray(getattr(g, name)).astype(np.float64) for g in (extreme, first.gaussians))
+        exact, code = (
+            np.asarray(getattr(g, name)).astype(np.float64) for g in (extreme, first.gaussians)
+        )
         largest = np.abs(exact).reshape(40, -1).max(1).reshape(40, *[1] * (exact.ndim - 1))
-        usual = 2 * np.abs(code[16:] - exact[16:]).max()  # of the other Gaussians; twice, because steps come in octaves
+        # Of the other Gaussians; twice, because steps come in octaves.
+        usual = 2 * np.abs(code[16:] - exact[16:]).max()
         assert np.all(np.abs(code - exact) <= np.maximum(2.0**-23 * largest, usual)), name
 
     # A Gaussian that is born close and small and flies off stops at the limit of its integers.

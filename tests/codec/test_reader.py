@@ -88,7 +88,10 @@ def test_stream_reader__reports_a_lost_connection_after_complete_frames() -> Non
     got = []
     with (
         source,
-        pytest.raises(TruncatedStreamError, match=r"packet 2 at byte .*: truncated or still written; 2 packets"),
+        pytest.raises(
+            TruncatedStreamError,
+            match=r"packet 2 at byte .*: truncated or still written; 2 packets",
+        ),
     ):
         got.extend(coded_frames(StreamReader(source)))
     assert_same(got[0], states[0])
@@ -109,7 +112,9 @@ def test_stream_reader__refuses_to_seek_in_a_pipe() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("frames", [60, pytest.param(300, marks=pytest.mark.long)])
-def test_coded_frames__equal_the_encoders_states_on_one_thread_and_on_many(tmp_path: Path, frames: int) -> None:
+def test_coded_frames__equal_the_encoders_states_on_one_thread_and_on_many(
+    tmp_path: Path, frames: int
+) -> None:
     packets, states = encoded_clip(frames, degree=0)
     write(tmp_path / "s", packets, states, every=50)
     program = f"""
@@ -123,7 +128,9 @@ print(history(coded_frames(StreamReader({str(tmp_path / "s")!r}))))
 """
     single = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
     command = [sys.executable, "-c", program]
-    result = subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ | single)
+    result = subprocess.run(
+        command, capture_output=True, text=True, check=True, env=os.environ | single
+    )
     expected = history(states)
     assert result.stdout.strip() == expected
     assert history(coded_frames(StreamReader(tmp_path / "s"))) == expected
@@ -134,12 +141,17 @@ def test_coded_frames__name_file_packet_and_byte(tmp_path: Path) -> None:
     packets, states = encoded_clip(4)
     write(tmp_path / "s", [packets[0], packets[2], packets[3]], [states[0], states[2], states[3]])
     at = StreamReader(tmp_path / "s").index()[1][2]
-    with pytest.raises(ValueError, match=f"s: packet 2 at byte {at}: it does not continue the state after frame 0; "):
+    with pytest.raises(
+        ValueError,
+        match=f"s: packet 2 at byte {at}: it does not continue the state after frame 0; ",
+    ):
         list(coded_frames(StreamReader(tmp_path / "s")))
 
 
 def test_coded_frames__refuse_frames_that_do_not_ascend(tmp_path: Path) -> None:
     packets, states = encoded_clip(4)
     write(tmp_path / "s", [*packets, packets[0]], [*states, states[0]])
-    with pytest.raises(ValueError, match=r"s: packet 5 at byte \d+: its frame must be above 3, .* got 0"):
+    with pytest.raises(
+        ValueError, match=r"s: packet 5 at byte \d+: its frame must be above 3, .* got 0"
+    ):
         list(coded_frames(StreamReader(tmp_path / "s")))

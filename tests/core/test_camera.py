@@ -12,7 +12,9 @@ from morgs_mi.core.camera import Camera
 from tests.assertions import assert_close
 
 
-@pytest.fixture(params=[(0.0, 0.0), (9.0, -6.0), (-5.5, 7.25)], ids=["centred", "right_up", "left_down"])
+@pytest.fixture(
+    params=[(0.0, 0.0), (9.0, -6.0), (-5.5, 7.25)], ids=["centred", "right_up", "left_down"]
+)
 def camera(request) -> Camera:
     camera = Camera.look_at((0.3, 0.5, 4), (0, 0, 0), (0, 1, 0), 40, 64, 48, "cam00")
     K = camera.K.copy()
@@ -32,7 +34,8 @@ def test_project__agrees_with_the_mitsuba_sensor(camera):
     image = np.array(mi.render(scene, integrator=mi.load_dict({"type": "direct"}), spp=64))[..., 0]
     y, x = np.mgrid[:48, :64] + 0.5
     centre = np.array([(image * x).sum(), (image * y).sum()]) / image.sum()
-    # A ball's image is an ellipse; its middle is not quite the image of the ball's centre; noise is 0.02 px.
+    # A ball's image is an ellipse; its middle is not quite the image of the ball's centre; noise is
+    # 0.02 px.
     assert_close(centre, camera.project(point)[0], atol=0.1)
 
 
@@ -55,7 +58,10 @@ def test_from_sensor__inverts_sensor(camera):
 
 
 def test_from_sensor__refuses_other_sensors(camera):
-    with pytest.raises(ValueError, match=r"Camera\.from_sensor\(\): .* got ThinLensCamera; splats are drawn only by"):
+    with pytest.raises(
+        ValueError,
+        match=r"Camera\.from_sensor\(\): .* got ThinLensCamera; splats are drawn only by",
+    ):
         Camera.from_sensor(mi.load_dict({"type": "thinlens", "aperture_radius": 0.1}))
     with pytest.raises(ValueError, match="got a dict"):
         Camera.from_sensor(camera.sensor())
@@ -66,7 +72,10 @@ def test_sensor__refuses_two_focal_lengths(camera, ratio):
     K = np.diag([1, ratio, 1]) @ camera.K
     K[1, 2] = camera.K[1, 2]
     view = replace(camera, K=K, width=640, height=480)
-    with pytest.raises(ValueError, match=r"Camera\.sensor\(\): `K` must have equal focal lengths.*camera\.square\(\)"):
+    with pytest.raises(
+        ValueError,
+        match=r"Camera\.sensor\(\): `K` must have equal focal lengths.*camera\.square\(\)",
+    ):
         view.sensor()
     square = view.square()
     mi.load_dict(square.sensor())
@@ -139,12 +148,21 @@ def test_camera__copies_its_matrices():
         ({"viewmat": None}, "`viewmat` must be an array of real numbers, got None"),
         ({"viewmat": VIEWMAT[:3]}, r"`viewmat` must be \[4, 4\]"),
         ({"viewmat": VIEWMAT * np.nan}, r"Camera\(\), `viewmat`: the pose must be finite"),
-        ({"viewmat": np.diag([1, 1, 1, 1e308])}, "the pose must be finite, with numbers of at most 1e\\+12"),
+        (
+            {"viewmat": np.diag([1, 1, 1, 1e308])},
+            "the pose must be finite, with numbers of at most 1e\\+12",
+        ),
         ({"viewmat": np.zeros((4, 4))}, "the axes must be a right-handed orthonormal frame, got"),
-        ({"viewmat": np.diag([0.0, 0, 0, 1])}, "the axes must be a right-handed orthonormal frame, got"),
+        (
+            {"viewmat": np.diag([0.0, 0, 0, 1])},
+            "the axes must be a right-handed orthonormal frame, got",
+        ),
         ({"viewmat": np.diag([2.0, 2, 2, 1]) @ VIEWMAT}, "undo any scaling or mirroring"),
         ({"viewmat": np.diag([-1.0, 1, 1, 1]) @ VIEWMAT}, "undo any scaling or mirroring"),
-        ({"viewmat": np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 2, 3, 1]])}, "transpose the matrix if"),
+        (
+            {"viewmat": np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 2, 3, 1]])},
+            "transpose the matrix if",
+        ),
         ({"K": K * 1e13}, "`K` must be finite with positive focal lengths"),
         ({"viewmat": VIEWMAT * 1j}, "got complex128"),
     ],
@@ -164,7 +182,14 @@ def test_camera__refuses_bad_input(change, message):
     ],
 )
 def test_look_at__refuses_bad_input(change, message):
-    view = {"origin": (0, -3, 0), "target": (0, 0, 0), "up": (0, 0, 1), "fov_x": 40, "width": 8, "height": 8}
+    view = {
+        "origin": (0, -3, 0),
+        "target": (0, 0, 0),
+        "up": (0, 0, 1),
+        "fov_x": 40,
+        "width": 8,
+        "height": 8,
+    }
     with pytest.raises(ValueError, match=message):
         Camera.look_at(**{**view, **change})
 
@@ -173,7 +198,9 @@ def test_look_at__refuses_bad_input(change, message):
 def test_look_at__has_a_near_plane_before_its_target(distance: float, near: float) -> None:
     camera = Camera.look_at((0, 0, -distance), (0, 0, 0), (0, -1, 0), 40, 32, 24)
     assert camera.near == pytest.approx(near)
-    assert Camera.look_at((0, 0, -distance), (0, 0, 0), (0, -1, 0), 40, 32, 24, near=0.5).near == 0.5
+    assert (
+        Camera.look_at((0, 0, -distance), (0, 0, 0), (0, -1, 0), 40, 32, 24, near=0.5).near == 0.5
+    )
 
 
 def test_repr__has_name_size_and_place():

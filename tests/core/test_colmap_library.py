@@ -21,5 +21,7 @@ with interruptible():
 
 
 def test_import_pycolmap__keeps_the_handler_of_sigterm():
-    result = subprocess.run([sys.executable, "-c", SCRIPT], capture_output=True, text=True, timeout=120)
+    result = subprocess.run(
+        [sys.executable, "-c", SCRIPT], capture_output=True, text=True, timeout=120
+    )
     assert (result.returncode, result.stdout, result.stderr) == (0, "interrupted\n", "")

@@ -25,7 +25,9 @@ def test_encode_light__is_srgb_up_to_white_and_logarithmic_above():
     x = np.linspace(0, 1, 4097).astype(np.float32)
     srgb = np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 0) ** (1 / 2.4) - 0.055)
     np.testing.assert_array_equal(encode_light(x), srgb)
-    np.testing.assert_allclose(encode_light(np.array([100.0, 1e20])), [1 + A * np.log(100), 1 + A * np.log(1e20)])
+    np.testing.assert_allclose(
+        encode_light(np.array([100.0, 1e20])), [1 + A * np.log(100), 1 + A * np.log(1e20)]
+    )
     assert abs(encode_light(np.array(100.0)) - 3.02) < 0.01
 
 
@@ -47,7 +49,9 @@ def test_encode_light__keeps_nan_and_the_sign_of_negative_values():
     assert encode_light(np.array(np.inf)) == np.inf
 
 
-@pytest.mark.parametrize(("traced", "curve"), [(encode_traced, encode_light), (decode_traced, decode_light)])
+@pytest.mark.parametrize(
+    ("traced", "curve"), [(encode_traced, encode_light), (decode_traced, decode_light)]
+)
 def test_encode_traced__agrees_with_numpy_in_value_and_slope(traced, curve):
     x = np.float32([-0.1, 0, 0.001, 0.2, 0.99, 1.01, 3, 15])
     values = mi.Float(x)

@@ -47,7 +47,11 @@ class Plant(Stem):
 
 
 def test_field_docs__returns_docstrings_by_field() -> None:
-    docs = {"number": "Length\nin px.", "name": "Name, see docs/flow.md.", "roots": "Number of roots."}
+    docs = {
+        "number": "Length\nin px.",
+        "name": "Name, see docs/flow.md.",
+        "roots": "Number of roots.",
+    }
     assert field_docs(Plant) == docs
     assert field_docs(int) == {}
     without_source: dict[str, Any] = {"__name__": "builtins"}
@@ -69,7 +73,9 @@ Fields:
     assert Plant.__doc__ == inspect.getdoc(Plant) == Plant(roots=1).__doc__ == expected
 
 
-@pytest.mark.parametrize("config_type", [StreamConfig, FitConfig, MotionConfig, type(FitConfig().density)])
+@pytest.mark.parametrize(
+    "config_type", [StreamConfig, FitConfig, MotionConfig, type(FitConfig().density)]
+)
 def test_documented__lists_every_setting(config_type: type) -> None:
     text = inspect.getdoc(config_type) or ""
     for setting in fields(config_type):
@@ -80,24 +86,41 @@ def test_page__is_a_path_in_the_checkout() -> None:
     assert page("flow") == "docs/flow.md"
 
 
-def test_page__is_an_address_without_a_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_page__is_an_address_without_a_checkout(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(documentation, "CHECKOUT", tmp_path)
-    assert page("experiments/field") == "https://morgs-mi.readthedocs.io/en/latest/experiments/field.html"
-    assert with_pages("a, see docs/flow.md.") == "a, see https://morgs-mi.readthedocs.io/en/latest/flow.html."
+    assert (
+        page("experiments/field")
+        == "https://morgs-mi.readthedocs.io/en/latest/experiments/field.html"
+    )
+    assert (
+        with_pages("a, see docs/flow.md.")
+        == "a, see https://morgs-mi.readthedocs.io/en/latest/flow.html."
+    )
     assert with_pages("mydocs/flow.md, docs/flow.toml") == "mydocs/flow.md, docs/flow.toml"
 
 
 def messages(path: Path) -> list[str]:
     """Return the texts of a module but its docstrings, which are help in the commands alone."""
     nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
-    hidden = {id(node.value) for node in nodes if isinstance(node, ast.Expr) and path.parent.name != "cli"}
+    hidden = {
+        id(node.value) for node in nodes if isinstance(node, ast.Expr) and path.parent.name != "cli"
+    }
     texts = [node for node in nodes if isinstance(node, ast.Constant) and id(node) not in hidden]
     return [node.value for node in texts if isinstance(node.value, str)]
 
 
 @pytest.mark.slow
-def test_page__gives_every_page_that_a_message_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    named = {str(path): text for path in SOURCES for text in messages(path) if re.search(r"docs/[\w/-]+\.md", text)}
+def test_page__gives_every_page_that_a_message_names(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    named = {
+        str(path): text
+        for path in SOURCES
+        for text in messages(path)
+        if re.search(r"docs/[\w/-]+\.md", text)
+    }
     assert named == {}
     monkeypatch.setattr(documentation, "CHECKOUT", tmp_path)
     assert "docs/" not in config_toml(StreamConfig())

@@ -15,8 +15,13 @@ from tests.scenes.full_disk import files_end_at
 
 
 def tree(path: Path) -> dict[str, str | None]:
-    """Return the text of every file below `path` by its name, hidden ones too, and None for folders."""
-    return {str(p.relative_to(path)): p.read_text() if p.is_file() else None for p in sorted(path.rglob("*"))}
+    """Return the text of every file below `path` by its name, hidden ones too, and None for
+    folders.
+    """
+    return {
+        str(p.relative_to(path)): p.read_text() if p.is_file() else None
+        for p in sorted(path.rglob("*"))
+    }
 
 
 def write(partial: Path, kind: str, text: str = "new") -> None:
@@ -28,20 +33,28 @@ def write(partial: Path, kind: str, text: str = "new") -> None:
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
 @pytest.mark.parametrize("old", [False, True])
-def test_atomic_path__appears_at_the_end_and_replaces_the_old(tmp_path: Path, kind: str, old: bool) -> None:
+def test_atomic_path__appears_at_the_end_and_replaces_the_old(
+    tmp_path: Path, kind: str, old: bool
+) -> None:
     if old:
         write(tmp_path / "x", kind, "old")
     old_tree = tree(tmp_path)
     with atomic_path(tmp_path / "x", "test()") as partial:
         write(partial, kind)
-        assert {name: text for name, text in tree(tmp_path).items() if not name.startswith(".")} == old_tree
+        assert {
+            name: text for name, text in tree(tmp_path).items() if not name.startswith(".")
+        } == old_tree
     assert tree(tmp_path) == ({"x": "new"} if kind == "file" else {"x": None, "x/a": "new"})
 
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
 @pytest.mark.parametrize("old", [False, True])
-@pytest.mark.parametrize("error", [ValueError("bad"), KeyboardInterrupt("stop"), OSError(28, "No space left")])
-def test_atomic_path__is_unchanged_after_an_error_in_the_body(tmp_path: Path, kind: str, old: bool, error) -> None:
+@pytest.mark.parametrize(
+    "error", [ValueError("bad"), KeyboardInterrupt("stop"), OSError(28, "No space left")]
+)
+def test_atomic_path__is_unchanged_after_an_error_in_the_body(
+    tmp_path: Path, kind: str, old: bool, error
+) -> None:
     if old:
         write(tmp_path / "x", kind, "old")
     old_tree = tree(tmp_path)
@@ -103,7 +116,10 @@ def test_atomic_path__restores_the_old_folder_after_a_failed_swap(
         raise OSError(5, "Input/output error")
 
     monkeypatch.setattr(Path, "replace", failing)
-    with pytest.raises(OSError, match="Input/output error"), atomic_path(tmp_path / "x", "test()") as partial:
+    with (
+        pytest.raises(OSError, match="Input/output error"),
+        atomic_path(tmp_path / "x", "test()") as partial,
+    ):
         write(partial, "folder")
     assert tree(tmp_path) == old_tree
 
@@ -129,10 +145,14 @@ def test_write_json__follows_a_link(tmp_path: Path) -> None:
     assert (tmp_path / "x.json").read_text() == "{}\n"
 
 
-def test_atomic_folder__replaces_nothing_not_even_a_folder_created_meanwhile(tmp_path: Path) -> None:
+def test_atomic_folder__replaces_nothing_not_even_a_folder_created_meanwhile(
+    tmp_path: Path,
+) -> None:
     write(tmp_path / "x", "folder", "old")
     with (
-        pytest.raises(FileExistsError, match="x: expected a new folder, got one that exists; remove it first"),
+        pytest.raises(
+            FileExistsError, match="x: expected a new folder, got one that exists; remove it first"
+        ),
         atomic_folder(tmp_path / "x", "test()"),
     ):
         pass
@@ -152,8 +172,13 @@ def test_atomic_folder__reports_a_failed_file_in_one_sentence(tmp_path: Path) ->
 
 
 def test_write_json__writes_null_for_infinity_and_nan(tmp_path: Path) -> None:
-    write_json(tmp_path / "new" / "a.json", {"psnr": [float("inf"), 1.0], "deep": {"nan": float("nan")}})
-    assert json.loads((tmp_path / "new" / "a.json").read_text()) == {"psnr": [None, 1.0], "deep": {"nan": None}}
+    write_json(
+        tmp_path / "new" / "a.json", {"psnr": [float("inf"), 1.0], "deep": {"nan": float("nan")}}
+    )
+    assert json.loads((tmp_path / "new" / "a.json").read_text()) == {
+        "psnr": [None, 1.0],
+        "deep": {"nan": None},
+    }
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match=r"cannot write .*b.json"):
         write_json(tmp_path / "file" / "b.json", {})
@@ -164,7 +189,9 @@ def test_locked_folder__refuses_a_second_writer_until_the_first_has_ended(tmp_pa
     (tmp_path / "link").symlink_to(out)
     with locked_folder(out, "test()"):
         for same in (out, tmp_path / "link"):
-            with pytest.raises(BlockingIOError, match=f"{same}: .* another process is writing; wait"):
+            with pytest.raises(
+                BlockingIOError, match=f"{same}: .* another process is writing; wait"
+            ):
                 locked_folder(same, "test()").__enter__()
         (out / "a").write_text("whole")
     with locked_folder(out, "test()"):
@@ -177,7 +204,9 @@ def test_locked_folder__is_free_after_its_writer_was_killed(tmp_path: Path) -> N
         "import os, sys; from morgs_mi.core.files import locked_folder\n"
         "with locked_folder(sys.argv[1], 'test()'): os.kill(os.getpid(), 9)\n"
     )
-    assert subprocess.run([sys.executable, "-c", script, str(tmp_path)], check=False).returncode == -9
+    assert (
+        subprocess.run([sys.executable, "-c", script, str(tmp_path)], check=False).returncode == -9
+    )
     assert len(tree(tmp_path)) == 1
     with locked_folder(tmp_path, "test()"):
         pass
@@ -202,7 +231,9 @@ def test_locked_folder__leaves_no_empty_folder_and_no_foreign_lock(tmp_path: Pat
         ("/sys/out", r"^test\(\): cannot write into /sys/out: [^:\[]*; check"),
     ],
 )
-def test_locked_folder__reports_a_folder_that_cannot_be_written(tmp_path: Path, folder: str, sentence: str) -> None:
+def test_locked_folder__reports_a_folder_that_cannot_be_written(
+    tmp_path: Path, folder: str, sentence: str
+) -> None:
     """/sys accepts no new files, even from root."""
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match=sentence):

@@ -1,4 +1,4 @@
-"""The Gaussians value: parameters of the attribute table, and the parts of the spherical harmonics."""
+"""Gaussians: parameters of the attribute table, and the parts of the spherical harmonics."""
 
 from __future__ import annotations
 
@@ -58,9 +58,17 @@ def test_gaussians__refuse_shapes_that_disagree_and_unknown_attributes():
 
 
 def test_gaussians__are_not_changed_by_later_writes_to_their_arrays():
-    """One buffer per attribute is refilled for each of five frames, so large that kernels run while it is written."""
+    """One buffer per attribute is refilled for each of five frames, so large that kernels run while
+    it is written.
+    """
     N = 200_000
-    shapes = {"means": (3,), "log_scales": (3,), "quats": (4,), "logit_opacities": (), "sh_coeffs": (1, 3)}
+    shapes = {
+        "means": (3,),
+        "log_scales": (3,),
+        "quats": (4,),
+        "logit_opacities": (),
+        "sh_coeffs": (1, 3),
+    }
     buffers = {name: np.zeros((N, *shape), np.float32) for name, shape in shapes.items()}
     frames = []
     for frame in range(5):
@@ -68,7 +76,9 @@ def test_gaussians__are_not_changed_by_later_writes_to_their_arrays():
             buffer[:] = frame
         frames.append(Gaussians(**buffers))
     for name in shapes:
-        assert [np.unique(np.asarray(getattr(g, name))).tolist() for g in frames] == [[k] for k in range(5)], name
+        assert [np.unique(np.asarray(getattr(g, name))).tolist() for g in frames] == [
+            [k] for k in range(5)
+        ], name
 
 
 def test_numpy__returns_copies():
@@ -77,7 +87,9 @@ def test_numpy__returns_copies():
     assert not (np.asarray(gaussians.means) == 7).any()
 
 
-@pytest.mark.parametrize(("name", "value"), [("scales", -1), ("opacities", -0.1), ("opacities", 1.5)])
+@pytest.mark.parametrize(
+    ("name", "value"), [("scales", -1), ("opacities", -0.1), ("opacities", 1.5)]
+)
 def test_from_activated__refuses_values_that_are_not_activated(name, value):
     values = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh_coeffs": (1, 3)}
     values = {name: np.full((2, *shape), 0.5) for name, shape in values.items()}
@@ -88,6 +100,10 @@ def test_from_activated__refuses_values_that_are_not_activated(name, value):
 
 def test_repr__has_number_degree_and_size():
     raw = {**make_scene(2, n=3), "means": np.array([[0, 0, 0], [2, 1, 0], [1, 0.5, -0.25]])}
-    gaussians = to_gaussians({name: value for name, value in raw.items() if name != "logit_confidence"})
+    gaussians = to_gaussians(
+        {name: value for name, value in raw.items() if name != "logit_confidence"}
+    )
     assert repr(gaussians) == "Gaussians(N=3, SH degree 2, box of 2 x 1 x 0.25, motion)"
-    assert repr(gaussians.select(np.zeros(3, bool))) == "Gaussians(N=0, SH degree 2, box of 0, motion)"
+    assert (
+        repr(gaussians.select(np.zeros(3, bool))) == "Gaussians(N=0, SH degree 2, box of 0, motion)"
+    )

@@ -1,4 +1,6 @@
-"""Covariances, spherical harmonics and rotated axes, against the float64 reference and the renderer."""
+"""Covariances, spherical harmonics and rotated axes, against the float64 reference and the
+renderer.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ def cloud(N: int = 30, degree: int = 3) -> Gaussians:
 def test_covariances__agree_with_the_reference():
     raw = cloud().numpy()
     matrices = covariances(cloud())
-    for log_scale, quat, covariance in zip(raw["log_scales"], raw["quats"].astype(float), matrices, strict=True):
+    for log_scale, quat, covariance in zip(
+        raw["log_scales"], raw["quats"].astype(float), matrices, strict=True
+    ):
         M = reference.rotation(quat) * np.exp(log_scale)
         np.testing.assert_allclose(covariance, M @ M.T, rtol=1e-6, atol=1e-9)
 
@@ -60,5 +64,6 @@ def test_rotated__looks_the_same_to_a_rotated_camera(degree):
     vectors = replace(gaussians, offset=gaussians.motion)
     np.testing.assert_array_equal(rotated(vectors, R).offset, rotated(vectors, R).motion)
     for name in channels:
-        # A rotation rounds every attribute once in float32; nearly equal depths do not swap on these seeds.
+        # A rotation rounds every attribute once in float32; nearly equal depths do not swap on
+        # these seeds.
         assert_close(getattr(b, name), getattr(a, name), atol=2e-4, name=name)

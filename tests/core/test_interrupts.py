@@ -1,4 +1,6 @@
-"""Interruptions: found in what libraries make of them, raised again where they are swallowed, without memory left."""
+"""Interruptions: found in what libraries make of them, raised again where they are swallowed,
+without memory left.
+"""
 
 from __future__ import annotations
 
@@ -78,7 +80,9 @@ def test_interrupts_raised__leaves_other_errors_as_they_are() -> None:
 
 @pytest.fixture
 def heeds_interrupts() -> Iterator[None]:
-    """Python's handler of SIGINT, which a shell ignores for the processes that it starts in the background."""
+    """Python's handler of SIGINT, which a shell ignores for the processes that it starts in the
+    background.
+    """
     handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, handler)
@@ -100,7 +104,9 @@ def in_a_destructor() -> None:
 
 
 @pytest.mark.parametrize("interrupt", [plainly, in_a_destructor])
-def test_interruptible__raises_once_for_each_signal(heeds_interrupts: None, interrupt: Callable[[], None]) -> None:
+def test_interruptible__raises_once_for_each_signal(
+    heeds_interrupts: None, interrupt: Callable[[], None]
+) -> None:
     handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
 
     def wait() -> None:
@@ -145,19 +151,29 @@ sys.exit(main())
 @pytest.mark.parametrize("module", ["numpy", "drjit", "tyro"])
 def test_begin_command__ends_quietly_while_libraries_are_imported(module: str, number: str) -> None:
     script = STARTING.format(module=module, number=number)
-    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    result = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False
+    )
     assert (result.returncode, result.stdout, result.stderr) == (130, "", "Interrupted.\n")
 
 
 @pytest.mark.parametrize("closed", [0, 1, 2])
 def test_begin_command__replaces_a_closed_standard_stream(closed: int) -> None:
     """Otherwise the next file that is opened would be the standard stream of libraries."""
-    script = "import os, sys; sys.argv = ['morgs-mi']; import morgs_mi; sys.exit(os.fstat({0}).st_rdev != {1})"
+    script = (
+        "import os, sys; sys.argv = ['morgs-mi']; import morgs_mi; sys.exit(os.fstat({0}).st_rdev "
+        "!= {1})"
+    )
     null = os.stat(os.devnull).st_rdev
     args = [sys.executable, "-c", script.format(closed, null)]
     assert subprocess.run(args, preexec_fn=lambda: os.close(closed), check=False).returncode == 0
 
 
 def test_begin_command__changes_nothing_in_other_programs() -> None:
-    script = "import signal; import morgs_mi; print(signal.getsignal(signal.SIGTERM) == signal.SIG_DFL)"
-    assert subprocess.run([sys.executable, "-c", script], capture_output=True, check=True).stdout == b"True\n"
+    script = (
+        "import signal; import morgs_mi; print(signal.getsignal(signal.SIGTERM) == signal.SIG_DFL)"
+    )
+    assert (
+        subprocess.run([sys.executable, "-c", script], capture_output=True, check=True).stdout
+        == b"True\n"
+    )

@@ -1,4 +1,6 @@
-"""The choice of libLLVM: the user's if it is usable, otherwise the newest; an error message instead of a crash."""
+"""The choice of libLLVM: the user's if it is usable, otherwise the newest; an error message instead
+of a crash.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,9 @@ import pytest
 
 from morgs_mi.core import llvm
 
-linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the search is for Linux only")
+linux = pytest.mark.skipif(
+    not sys.platform.startswith("linux"), reason="the search is for Linux only"
+)
 pytestmark = linux
 
 
@@ -56,7 +60,9 @@ def test_llvm_major__follows_links(libraries, tmp_path):
 
 
 def test_find_llvm__returns_the_newest_first(libraries):
-    folders = libraries("libLLVM-9.so.1", "libLLVM-15.so.1", "libLLVM.so.22.1", "libLLVM.so.19.1", "libLLVMx.so")
+    folders = libraries(
+        "libLLVM-9.so.1", "libLLVM-15.so.1", "libLLVM.so.22.1", "libLLVM.so.19.1", "libLLVMx.so"
+    )
     assert [llvm.llvm_major(path) for path in llvm.find_llvm(folders)] == [22, 19, 15, 9]
     assert llvm.choose_llvm(folders=folders) == (folders[0] / "libLLVM.so.22.1", "")
 
@@ -103,12 +109,20 @@ def test_find_llvm__takes_less_than_30_ms():
 
 def test_ensure_llvm__replaces_an_unusable_library_on_import(tmp_path):
     """A library that Dr.Jit cannot use is replaced, with a warning, before Dr.Jit loads it."""
-    bad = next((p for p in llvm.find_llvm() if (llvm.llvm_major(p) or 99) < 17), tmp_path / "libLLVM-15.so.1")
+    bad = next(
+        (p for p in llvm.find_llvm() if (llvm.llvm_major(p) or 99) < 17),
+        tmp_path / "libLLVM-15.so.1",
+    )
     if llvm.usable(bad):
         pytest.skip(f"{bad} works on this CPU")
-    code = "import morgs_mi; import drjit as dr; from drjit.llvm import Float; print(dr.minimum(Float(1, 3), 2))"
+    code = (
+        "import morgs_mi; import drjit as dr; from drjit.llvm import Float; "
+        "print(dr.minimum(Float(1, 3), 2))"
+    )
     environment = llvm.os.environ | {llvm.VARIABLE: str(bad)}
-    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    run = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True
+    )
     assert run.returncode == 0, run.stderr
     assert run.stdout.strip() == "[1, 2]"
     assert "RuntimeWarning" in run.stderr

@@ -65,14 +65,19 @@ from morgs_mi.core.memory import free_memory
 resource.setrlimit(resource.RLIMIT_AS, (4_000_000_000, resource.RLIM_INFINITY))
 print(free_memory())
 """
-    output = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    output = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    ).stdout
     assert 0 < float(output.splitlines()[-1]) < 4e9
 
 
 def test_check_memory__names_what_is_needed_and_free(monkeypatch):
     monkeypatch.setattr("morgs_mi.core.memory.free_memory", lambda: 2e9)
     check_memory("f()", 1.9e9, "an image", "make it smaller")
-    with pytest.raises(ValueError, match=r"^f\(\): expected what fits in the 2\.0 GB of free .*, got an image, which"):
+    with pytest.raises(
+        ValueError,
+        match=r"^f\(\): expected what fits in the 2\.0 GB of free .*, got an image, which",
+    ):
         check_memory("f()", 2.1e9, "an image", "make it smaller")
 
 
@@ -99,11 +104,26 @@ DOORS = {
 def test_check_memory__is_called_before_work_begins(door, monkeypatch):
     call, content = DOORS[door]
     monkeypatch.setattr("morgs_mi.core.memory.free_memory", lambda: 8e9)
-    with pytest.raises(ValueError, match=rf"\(\): expected what fits in the 8\.0 GB of free .*, got {content}, "):
+    with pytest.raises(
+        ValueError, match=rf"\(\): expected what fits in the 8\.0 GB of free .*, got {content}, "
+    ):
         call()
 
 
 def test_synthesize__refuses_images_that_do_not_fit_in_memory(tmp_path, capsys):
-    assert cli.main(["synth", "spheres", str(tmp_path / "a"), "--width", "1000000000", "--height", "1000000"]) == 1
+    assert (
+        cli.main(
+            [
+                "synth",
+                "spheres",
+                str(tmp_path / "a"),
+                "--width",
+                "1000000000",
+                "--height",
+                "1000000",
+            ]
+        )
+        == 1
+    )
     assert "got images of 1000000000x1000000 pixels" in capsys.readouterr().err
     assert not (tmp_path / "a").exists()

@@ -41,7 +41,13 @@ class Config:
         {},
         {"count": 1, "width": 4, "share": 1, "opacity": 0, "seed": -(2**63), "number": -1e308},
         {"count": np.int64(3), "share": np.float32(0.5), "opacity": None, "seed": 2**64 - 1},
-        {"mode": "auto", "blurs": (), "size": (2, 3), "offset": (("a", 1), ("b", 0.5)), "name": "none"},
+        {
+            "mode": "auto",
+            "blurs": (),
+            "size": (2, 3),
+            "offset": (("a", 1), ("b", 0.5)),
+            "name": "none",
+        },
     ],
 )
 def test_check_ranges__accepts_values_within_their_ranges(values: dict[str, Any]):
@@ -56,7 +62,11 @@ def test_check_ranges__accepts_values_within_their_ranges(values: dict[str, Any]
         ("count", True, "a whole number below 2^64, at least 1, got True."),
         ("count", None, "a whole number below 2^64, at least 1, got None."),
         ("width", 6, "at least 4 and a multiple of 4, got 6."),
-        ("width", 8.0, "a whole number below 2^64, at least 4 and a multiple of 4 or none, got 8.0."),
+        (
+            "width",
+            8.0,
+            "a whole number below 2^64, at least 4 and a multiple of 4 or none, got 8.0.",
+        ),
         ("share", 0, "above 0 and at most 1, got 0."),
         ("share", 1.5, "above 0 and at most 1, got 1.5."),
         ("share", nan, "a finite number, above 0 and at most 1, got nan."),
@@ -69,10 +79,16 @@ def test_check_ranges__accepts_values_within_their_ranges(values: dict[str, Any]
         ("name", None, "a string, got None."),
         ("mode", "yes", "off, auto or on, got 'yes'."),
         ("blurs", (3, -1), "a list (each a finite number, above 0), got (3, -1)."),
-        ("size", (1,), "a list (a whole number below 2^64, a whole number below 2^64) or none, got (1,)."),
+        (
+            "size",
+            (1,),
+            "a list (a whole number below 2^64, a whole number below 2^64) or none, got (1,).",
+        ),
     ],
 )
-def test_check_ranges__names_the_field_its_range_and_the_value(name: str, value: object, expected: str):
+def test_check_ranges__names_the_field_its_range_and_the_value(
+    name: str, value: object, expected: str
+):
     with pytest.raises(ValueError, match=r"^Config\(\): ") as caught:
         Config(**{name: value})
     assert str(caught.value).startswith(f"Config(): `{name}` must be {expected}")

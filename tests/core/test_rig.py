@@ -83,6 +83,8 @@ def test_check_near_planes__refuses_planes_behind_the_scene(points: np.ndarray) 
     cameras = look_at_cameras(arc((-0.3, 0.3), 3.0))
     check_near_planes("here", cameras, points)
     hidden = [replace(camera, near=5.0) for camera in cameras]
-    with pytest.raises(ValueError, match=r"here: the near planes .* got 5 world units where it is .* away"):
+    with pytest.raises(
+        ValueError, match=r"here: the near planes .* got 5 world units where it is .* away"
+    ):
         check_near_planes("here", hidden, points)
     check_near_planes("here", with_near_planes(hidden, points), points)

@@ -27,14 +27,26 @@ from morgs_mi.io.video_writer import write_video
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.studio.measures.lpips import Lpips
 from tests.evaluate.tiny_onnx import squared_difference
-from tests.scenes.moving_splats import CAMERAS, EXACT, FRAMES, HEIGHT, PIXELS, STEP, WIDTH, moved, write_stream
+from tests.scenes.moving_splats import (
+    CAMERAS,
+    EXACT,
+    FRAMES,
+    HEIGHT,
+    PIXELS,
+    STEP,
+    WIDTH,
+    moved,
+    write_stream,
+)
 
 
 def test_evaluate_stream__finds_no_error_in_the_stream_of_the_recording(fitted_clip: Path) -> None:
     result = evaluate_stream(fitted_clip)
     assert result.held_out
     assert list(result.views) == ["cam0"]
-    assert [row.scores.psnr for row in (result, result.frames[0], result.frames[-1])] == [np.inf] * 3
+    assert [row.scores.psnr for row in (result, result.frames[0], result.frames[-1])] == [
+        np.inf
+    ] * 3
     assert result.scores.ssim == pytest.approx(1)
     # Residuals of float32 coordinates near 1 store a displacement of 0.05 to 1e-7: 1e-6 px.
     assert result.scores.motion_error == pytest.approx(0, abs=1e-5)
@@ -54,18 +66,25 @@ def test_evaluate_stream__reports_the_bytes_of_the_file(fitted_clip: Path) -> No
     assert result.sizes.per_residual == np.mean(packets[1:])
 
 
-def test_evaluate_stream__uses_all_training_views_without_a_held_out_view(fitted_clip: Path, tmp_path: Path) -> None:
+def test_evaluate_stream__uses_all_training_views_without_a_held_out_view(
+    fitted_clip: Path, tmp_path: Path
+) -> None:
     write_stream(tmp_path / "s.morgs", {"test_view": None})
     with pytest.raises(ValueError, match="expected the path of its capture"):
         evaluate_stream(tmp_path / "s.morgs")
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
     assert not result.held_out
-    assert {name: scores.psnr for name, scores in result.views.items()} == {"cam0": np.inf, "cam1": np.inf}
+    assert {name: scores.psnr for name, scores in result.views.items()} == {
+        "cam0": np.inf,
+        "cam1": np.inf,
+    }
     assert result.frames[0].seconds is None
 
 
-def test_evaluate_stream__reports_a_wrong_motion_in_the_moving_region(fitted_clip: Path, tmp_path: Path) -> None:
-    """A keyframe has no motion, hence no motion error. The error of zero motion is the true motion."""
+def test_evaluate_stream__reports_a_wrong_motion_in_the_moving_region(
+    fitted_clip: Path, tmp_path: Path
+) -> None:
+    """A keyframe has no motion error. The error of zero motion is the true motion."""
     state = decode(None, keyframe_packet(moved(1), 0, CAMERAS, EXACT))
     with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25, {"test_view": 0}) as writer:
         writer.write(reemitted_keyframe(state))
@@ -81,12 +100,16 @@ def test_evaluate_stream__reports_a_wrong_motion_in_the_moving_region(fitted_cli
 def test_evaluate_stream__compares_3d_motion_of_gaussians_in_both_frames_only(
     fitted_clip: Path, tmp_path: Path
 ) -> None:
-    """The first splat is removed and one with a wrong motion is added: the motion of the others is still exact."""
+    """The first splat is removed and one with a wrong motion is added: the motion of the others is
+    still exact.
+    """
     state = decode(None, keyframe_packet(moved(0), 0, CAMERAS, EXACT))
     moved_gaussians = moved(1).select([1, 2, 3, 4, 0])
     with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25, {"test_view": 0}) as writer:
         writer.write(reemitted_keyframe(state))
-        writer.write(residual_packet(state, moved_gaussians, np.array([1, 2, 3, 4, -1]), CAMERAS, EXACT))
+        writer.write(
+            residual_packet(state, moved_gaussians, np.array([1, 2, 3, 4, -1]), CAMERAS, EXACT)
+        )
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture").motion_3d
     assert result is not None
     assert 0 < result.num_gaussians <= 4
@@ -94,7 +117,9 @@ def test_evaluate_stream__compares_3d_motion_of_gaussians_in_both_frames_only(
 
 
 @pytest.mark.usefixtures("small_images")
-def test_evaluate_stream__uses_the_size_of_a_downscaled_fit(fitted_clip: Path, tmp_path: Path) -> None:
+def test_evaluate_stream__uses_the_size_of_a_downscaled_fit(
+    fitted_clip: Path, tmp_path: Path
+) -> None:
     small = load_capture(fitted_clip / "capture", downscale=1.7)
     with StreamWriter(
         tmp_path / "s.morgs", small.cameras, 25, {"test_view": 0, "downscale": small.downscale}
@@ -104,8 +129,13 @@ def test_evaluate_stream__uses_the_size_of_a_downscaled_fit(fitted_clip: Path, t
     assert evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture").scores.psnr > 20
 
 
-def test_evaluate_stream__scores_the_held_out_view_registered_too(fitted_clip: Path, tmp_path: Path) -> None:
-    turned = np.array([[1, 0, 0.01, 0], [0, 1, 0, 0], [-0.01, 0, 1, 0], [0, 0, 0, 1]]) @ CAMERAS[0].viewmat
+def test_evaluate_stream__scores_the_held_out_view_registered_too(
+    fitted_clip: Path, tmp_path: Path
+) -> None:
+    turned = (
+        np.array([[1, 0, 0.01, 0], [0, 1, 0, 0], [-0.01, 0, 1, 0], [0, 0, 0, 1]])
+        @ CAMERAS[0].viewmat
+    )
     cameras = [replace(CAMERAS[0], viewmat=turned), CAMERAS[1]]
     with StreamWriter(tmp_path / "s.morgs", cameras, 25, {"test_view": 0}) as writer:
         writer.write(keyframe_packet(moved(0), 0, cameras, EXACT))
@@ -120,7 +150,10 @@ def test_evaluate_stream__repeats_the_forecast_of_the_fit_without_a_held_out_vie
 ) -> None:
     write_stream(tmp_path / "stream.morgs", {"test_view": test_view})
     validation = {"sentence": "Views between the cameras will be fine.", "expected_psnr": 33.5}
-    rows = [{"frame": 0, "seconds": 1.0, "validation": validation}, {"frame": 1, "seconds": 1.0, "validation": {}}]
+    rows = [
+        {"frame": 0, "seconds": 1.0, "validation": validation},
+        {"frame": 1, "seconds": 1.0, "validation": {}},
+    ]
     (tmp_path / "report.json").write_text(json.dumps({"frames": rows}))
     result = evaluate_stream(tmp_path, fitted_clip / "capture")
     assert (result.expected, result.expected_psnr) == tuple(validation.values())
@@ -128,25 +161,35 @@ def test_evaluate_stream__repeats_the_forecast_of_the_fit_without_a_held_out_vie
     assert (result.expected in evaluation_summary(result)) == (test_view is None)
 
 
-def test_evaluate_stream__forecasts_other_views_without_a_report(fitted_clip: Path, tmp_path: Path) -> None:
+def test_evaluate_stream__forecasts_other_views_without_a_report(
+    fitted_clip: Path, tmp_path: Path
+) -> None:
     write_stream(tmp_path / "s.morgs", {"test_view": None})
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
-    assert result.expected == forecast(CAMERAS, load_capture(fitted_clip / "capture").points).sentence
+    assert (
+        result.expected == forecast(CAMERAS, load_capture(fitted_clip / "capture").points).sentence
+    )
     assert np.isnan(result.expected_psnr)
 
 
-def test_evaluate_stream__expects_nothing_of_other_views_from_a_single_camera(fitted_clip: Path) -> None:
+def test_evaluate_stream__expects_nothing_of_other_views_from_a_single_camera(
+    fitted_clip: Path,
+) -> None:
     assert evaluate_stream(fitted_clip).expected == ""
 
 
-def test_evaluate_stream__scores_the_held_out_view_with_matched_colours_too(fitted_clip: Path, tmp_path: Path) -> None:
+def test_evaluate_stream__scores_the_held_out_view_with_matched_colours_too(
+    fitted_clip: Path, tmp_path: Path
+) -> None:
     bright = moved(0).sh_coeffs + 0.5 / SH_C0
     darker = replace(moved(0), sh_coeffs=0.9 * bright - 0.5 / SH_C0)
     with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25, {"test_view": 0}) as writer:
         writer.write(keyframe_packet(darker, 0, CAMERAS, EXACT))
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
     assert result.scores.psnr_matched > result.scores.psnr + 10
-    assert f"{result.scores.psnr_matched:.2f} dB after the gain and bias" in " ".join(evaluation_summary(result))
+    assert f"{result.scores.psnr_matched:.2f} dB after the gain and bias" in " ".join(
+        evaluation_summary(result)
+    )
 
 
 def test_evaluate_stream__reports_every_score_by_region(fitted_clip: Path) -> None:
@@ -162,7 +205,9 @@ def test_evaluate_stream__reports_every_score_by_region(fitted_clip: Path) -> No
     assert np.isnan(result.psnr_slope), "there is no line through infinite values"
 
 
-def test_evaluate_stream__reports_the_3d_motion_of_splats_on_a_moving_object(fitted_clip: Path) -> None:
+def test_evaluate_stream__reports_the_3d_motion_of_splats_on_a_moving_object(
+    fitted_clip: Path,
+) -> None:
     motion = evaluate_stream(fitted_clip).motion_3d
     assert motion is not None
     # Some of the five may lie behind pixels that none of them covers enough.
@@ -174,8 +219,12 @@ def test_evaluate_stream__reports_the_3d_motion_of_splats_on_a_moving_object(fit
     assert motion.angle == pytest.approx(0, abs=1e-2)
 
 
-def test_evaluate_stream__reports_the_overlap_of_confidence_and_true_mask(fitted_clip: Path, tmp_path: Path) -> None:
-    """The clip's confidence of 0.5 is never above the threshold; a confidence of 1 is rendered as the alpha."""
+def test_evaluate_stream__reports_the_overlap_of_confidence_and_true_mask(
+    fitted_clip: Path, tmp_path: Path
+) -> None:
+    """The clip's confidence of 0.5 is never above the threshold; a confidence of 1 is rendered as
+    the alpha.
+    """
     assert evaluate_stream(fitted_clip).scores.confidence_iou == 0
     write_stream(tmp_path / "s.morgs", {"test_view": 0}, logit=20)
     alphas = [np.array(rasterize(moved(t), CAMERAS[0]).alpha) for t in range(1, FRAMES)]
@@ -185,8 +234,12 @@ def test_evaluate_stream__reports_the_overlap_of_confidence_and_true_mask(fitted
     assert overlap > 0
 
 
-def test_evaluate_stream__uses_the_recorded_change_as_regions_without_truth(fitted_clip: Path, tmp_path: Path) -> None:
-    shutil.copytree(fitted_clip / "capture", tmp_path / "capture", ignore=shutil.ignore_patterns("truth"))
+def test_evaluate_stream__uses_the_recorded_change_as_regions_without_truth(
+    fitted_clip: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(
+        fitted_clip / "capture", tmp_path / "capture", ignore=shutil.ignore_patterns("truth")
+    )
     result = evaluate_stream(fitted_clip, tmp_path / "capture")
     assert result.regions == "recorded change"
     assert result.scores.psnr_moving == result.scores.psnr_still == np.inf
@@ -196,11 +249,14 @@ def test_evaluate_stream__uses_the_recorded_change_as_regions_without_truth(fitt
     assert np.isnan(result.scores.confidence_iou)
 
 
-def test_evaluate_stream__reports_lpips_if_a_network_is_given(fitted_clip: Path, tmp_path: Path) -> None:
+def test_evaluate_stream__reports_lpips_if_a_network_is_given(
+    fitted_clip: Path, tmp_path: Path
+) -> None:
     write_stream(tmp_path / "s.morgs", {"test_view": 0}, shift=1)
     network = squared_difference(tmp_path / "net.onnx", HEIGHT, WIDTH)
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture", lpips=Lpips(network))
-    # The network's distance is the squared error on a scale twice as wide; the mean over frames is a mean of errors.
+    # The network's distance is the squared error on a scale twice as wide; the mean over frames is
+    # a mean of errors.
     errors = [4 * 10 ** (-row.scores.psnr_moving / 10) for row in result.frames]
     assert result.scores.lpips_moving == pytest.approx(np.mean(errors), rel=1e-5)
     single = squared_difference(tmp_path / "single.onnx", HEIGHT, WIDTH, spatial=False)
@@ -209,14 +265,18 @@ def test_evaluate_stream__reports_lpips_if_a_network_is_given(fitted_clip: Path,
     assert np.isnan(result.scores.lpips_moving)
 
 
-def test_evaluate_stream__reports_drift_as_the_slope_of_psnr(fitted_clip: Path, tmp_path: Path) -> None:
+def test_evaluate_stream__reports_drift_as_the_slope_of_psnr(
+    fitted_clip: Path, tmp_path: Path
+) -> None:
     write_stream(tmp_path / "s.morgs", {"test_view": 0}, shift=1)
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
     first, _, last = (row.scores.psnr for row in result.frames)
     assert result.psnr_slope == pytest.approx((last - first) / 2)
 
 
-def test_evaluation__as_dict_holds_the_scores_under_the_keys_of_the_json(fitted_clip: Path, tmp_path: Path) -> None:
+def test_evaluation__as_dict_holds_the_scores_under_the_keys_of_the_json(
+    fitted_clip: Path, tmp_path: Path
+) -> None:
     write_stream(tmp_path / "s.morgs", {"test_view": 0}, shift=1)
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
     report = result.as_dict()
@@ -224,7 +284,11 @@ def test_evaluation__as_dict_holds_the_scores_under_the_keys_of_the_json(fitted_
     scores = {name + region for name in IMAGE_SCORES for region in REGIONS}
     assert scores <= row.keys()
     assert scores <= report.keys()
-    ends = {"mean": result.scores.psnr, "first": report["frames"][0]["psnr"], "last": report["frames"][-1]["psnr"]}
+    ends = {
+        "mean": result.scores.psnr,
+        "first": report["frames"][0]["psnr"],
+        "last": report["frames"][-1]["psnr"],
+    }
     assert report["psnr"] == ends
     assert report["ssim"].keys() == ends.keys()
     assert (report["num_frames"], report["complete"], report["held_out"]) == (FRAMES, True, True)
@@ -233,7 +297,10 @@ def test_evaluation__as_dict_holds_the_scores_under_the_keys_of_the_json(fitted_
         ("bytes", {"file", "overhead", "per_frame", "per_keyframe", "per_residual"}),
         ("mtv", {"render", "input", "still_share"}),
         ("playback", {"fps", "decode_ms", "render_ms"}),
-        ("motion_3d", {"num_gaussians", "error", "true_length", "relative_error", "length_ratio", "angle"}),
+        (
+            "motion_3d",
+            {"num_gaussians", "error", "true_length", "relative_error", "length_ratio", "angle"},
+        ),
     ):
         assert report[name].keys() == keys, name
     assert {"frame", "kind", "num_bytes", "seconds", "motion_3d", "views"} <= row.keys()
@@ -247,7 +314,9 @@ def test_known_mean__ignores_nan() -> None:
     assert np.isnan(known_mean([]))
 
 
-def test_evaluate_stream__refuses_a_stream_of_another_capture(fitted_clip: Path, tmp_path: Path) -> None:
+def test_evaluate_stream__refuses_a_stream_of_another_capture(
+    fitted_clip: Path, tmp_path: Path
+) -> None:
     write_colmap(tmp_path / "sparse", CAMERAS[:1])
     write_video(tmp_path / "cam0", [np.zeros((HEIGHT, WIDTH, 3), np.uint8)] * FRAMES, 25)
     with pytest.raises(ValueError, match=r"expected the cameras that .* was fitted to"):
@@ -270,7 +339,9 @@ def test_evaluate_stream__compares_the_light_of_an_hdr_recording(tmp_path: Path)
             planes = {name: light[..., k] for k, name in enumerate("RGB")}
             write_exr(tmp_path / "capture" / camera.name / f"{t:04d}.exr", planes)
     metadata = {"capture": str(tmp_path / "capture"), "test_view": 0}
-    write_stream(tmp_path / "s.morgs", metadata | {"transfer": {"name": TRANSFER, "display_exposure": -1}})
+    write_stream(
+        tmp_path / "s.morgs", metadata | {"transfer": {"name": TRANSFER, "display_exposure": -1}}
+    )
     scores = evaluate_stream(tmp_path / "s.morgs").scores
     color = np.array(rasterize(moved(0), CAMERAS[0]).color)
     light, truth = (gain * decode_light(color) for gain in (1, 2))

@@ -32,26 +32,38 @@ def test_draw_stream__writes_every_figure(fitted_clip: Path, tmp_path: Path) -> 
     rendered = slices[:, -321:]
     np.testing.assert_array_equal(recorded[20:], rendered[20:])
     # Two frames after the first: truth, rendering, and a legend beside the first row.
-    assert motion.shape == confidence.shape == (LEGEND + GAP + HEIGHT, 2 * (WIDTH + GAP) + LEGEND, 3)
+    assert (
+        motion.shape == confidence.shape == (LEGEND + GAP + HEIGHT, 2 * (WIDTH + GAP) + LEGEND, 3)
+    )
     mask = confidence[LEGEND + GAP + 15 :, :WIDTH].max(-1) > 128
-    true, picture = (motion[LEGEND + GAP + 15 :, x : x + WIDTH][mask[: HEIGHT - 15]] for x in (0, WIDTH + GAP))
+    true, picture = (
+        motion[LEGEND + GAP + 15 :, x : x + WIDTH][mask[: HEIGHT - 15]] for x in (0, WIDTH + GAP)
+    )
     assert_close(picture, true, atol=2)
 
 
-def test_draw_stream__draws_the_stream_alone_without_truth(fitted_clip: Path, tmp_path: Path) -> None:
-    shutil.copytree(fitted_clip / "capture", tmp_path / "capture", ignore=shutil.ignore_patterns("truth"))
+def test_draw_stream__draws_the_stream_alone_without_truth(
+    fitted_clip: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(
+        fitted_clip / "capture", tmp_path / "capture", ignore=shutil.ignore_patterns("truth")
+    )
     paths = draw_stream(fitted_clip, tmp_path, tmp_path / "capture")
     assert cv2.imread(str(paths[1])).shape == (LEGEND + GAP + HEIGHT, WIDTH + GAP + LEGEND, 3)
 
 
-def test_draw_stream__draws_offsets_beside_the_whole_motion(fitted_clip: Path, tmp_path: Path) -> None:
+def test_draw_stream__draws_offsets_beside_the_whole_motion(
+    fitted_clip: Path, tmp_path: Path
+) -> None:
     write_stream(tmp_path / "s.morgs", open_stream(fitted_clip).metadata, offset=0.05)
     path = draw_stream(tmp_path / "s.morgs", tmp_path)[-1]
     assert path.name == "offset.png"
     sheet = cv2.imread(str(path))[..., ::-1].astype(int)
     # Two frames after the first: motion, its offset and both legends beside the first row.
     assert sheet.shape == (LEGEND + GAP + HEIGHT, 2 * (WIDTH + GAP) + 2 * LEGEND + GAP, 3)
-    motion, offset = (sheet[LEGEND + GAP + 15 :, x : x + WIDTH][: HEIGHT - 15] for x in (0, WIDTH + GAP))
+    motion, offset = (
+        sheet[LEGEND + GAP + 15 :, x : x + WIDTH][: HEIGHT - 15] for x in (0, WIDTH + GAP)
+    )
     mask = motion[..., 1] < 128  # red: to the right, at full saturation
     assert mask.any()
     # A twentieth of it at a tenth of the scale is half saturated.
@@ -61,8 +73,12 @@ def test_draw_stream__draws_offsets_beside_the_whole_motion(fitted_clip: Path, t
 def test_motion_scale__is_that_of_the_truth(fitted_clip: Path, tmp_path: Path) -> None:
     capture = load_capture(fitted_clip / "capture")
     assert motion_scale(capture, capture.cameras[0]) == pytest.approx(PIXELS)
-    shutil.copytree(fitted_clip / "capture", tmp_path / "capture", ignore=shutil.ignore_patterns("truth"))
-    assert motion_scale(load_capture(tmp_path / "capture"), capture.cameras[0]) == pytest.approx(0.03 * WIDTH)
+    shutil.copytree(
+        fitted_clip / "capture", tmp_path / "capture", ignore=shutil.ignore_patterns("truth")
+    )
+    assert motion_scale(load_capture(tmp_path / "capture"), capture.cameras[0]) == pytest.approx(
+        0.03 * WIDTH
+    )
 
 
 def test_draw_stream__refuses_a_stream_without_a_frame(fitted_clip: Path, tmp_path: Path) -> None:

@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morgs_mi.evaluate.metrics import delta_e_map, endpoint_error, iou, mean_over, psnr, psnr_mu, ssim, ssim_map
+from morgs_mi.evaluate.metrics import (
+    delta_e_map,
+    endpoint_error,
+    iou,
+    mean_over,
+    psnr,
+    psnr_mu,
+    ssim,
+    ssim_map,
+)
 
 rng = np.random.default_rng(0)
 TRUTH = rng.random((24, 31, 3))
@@ -26,7 +35,9 @@ def ssim_by_windows(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
         vx = (w * (x - mx) ** 2).sum()
         vy = (w * (y - my) ** 2).sum()
         cov = (w * (x - mx) * (y - my)).sum()
-        out[r, c] = (2 * mx * my + 1e-4) * (2 * cov + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))
+        out[r, c] = (
+            (2 * mx * my + 1e-4) * (2 * cov + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))
+        )
     return out
 
 

@@ -10,7 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from morgs_mi.capture.truth import GroundTruth
 from morgs_mi.core.camera import Camera
-from morgs_mi.evaluate.motion3d import compare_motion, evaluate_motion, local_motion, rigid_motions, surface_ids
+from morgs_mi.evaluate.motion3d import (
+    compare_motion,
+    evaluate_motion,
+    local_motion,
+    rigid_motions,
+    surface_ids,
+)
 from tests.assertions import assert_close
 
 rng = np.random.default_rng(0)
@@ -22,15 +28,22 @@ SHIFT = np.array([0.05, 0, -0.02])
 
 
 def plane(depth: float, left: int, right: int) -> GroundTruth:
-    """Ground truth of a wall: object `left` in the left half of the image, `right` in the right half."""
+    """Ground truth of a wall: object `left` in the left half of the image, `right` in the right
+    half.
+    """
     ids = np.where(np.arange(WIDTH) < WIDTH // 2, left, right) + np.zeros((HEIGHT, 1), int)
     return GroundTruth(
-        np.zeros((HEIGHT, WIDTH, 2)), np.full((HEIGHT, WIDTH), depth), ids, np.zeros((HEIGHT, WIDTH), bool)
+        np.zeros((HEIGHT, WIDTH, 2)),
+        np.full((HEIGHT, WIDTH), depth),
+        ids,
+        np.zeros((HEIGHT, WIDTH), bool),
     )
 
 
 def test_surface_ids__assigns_points_on_a_visible_surface_to_its_object():
-    points = np.array([(-0.5, 0, 0), (0.5, 0, 0.03), (-0.5, 0, -0.1), (0.5, 0, 0.1), (9, 0, 0), (0, 0, -9)])
+    points = np.array(
+        [(-0.5, 0, 0), (0.5, 0, 0.03), (-0.5, 0, -0.1), (0.5, 0, 0.1), (9, 0, 0), (0, 0, -9)]
+    )
     # On, on within 1 % of the depth of 4, in front, behind, outside the image, behind the camera.
     assert surface_ids(points, [(FRONT, plane(4, 3, 5))]).tolist() == [3, 5, -1, -1, -1, -1]
     assert surface_ids(points, []).tolist() == [-1] * 6
@@ -38,8 +51,14 @@ def test_surface_ids__assigns_points_on_a_visible_surface_to_its_object():
 
 def test_surface_ids__excludes_points_on_which_views_disagree_and_combines_the_others():
     points = np.array([(-0.5, 0, 0.0), (0.5, 0, 0.0)])
-    assert surface_ids(points, [(FRONT, plane(4, 3, 5)), (FRONT, plane(4, 3, 6))]).tolist() == [3, -1]
-    assert surface_ids(points, [(FRONT, plane(4, -1, 5)), (FRONT, plane(4, 3, 5))]).tolist() == [3, 5]
+    assert surface_ids(points, [(FRONT, plane(4, 3, 5)), (FRONT, plane(4, 3, 6))]).tolist() == [
+        3,
+        -1,
+    ]
+    assert surface_ids(points, [(FRONT, plane(4, -1, 5)), (FRONT, plane(4, 3, 5))]).tolist() == [
+        3,
+        5,
+    ]
 
 
 def test_rigid_motions__are_recovered_from_tracks():
@@ -87,14 +106,17 @@ def test_evaluate_motion__selects_opaque_gaussians_on_a_moving_object_off_its_ax
     """The left half of the wall turns about the axis through (-1, 0, 0) along the view."""
     turn = Rotation.from_rotvec([0, 0, 0.2]).as_matrix()
     centre = np.array([-1.0, 0, 0])
-    tracked = np.array([(-1.6, 0, 0), (-0.4, 0, 0), (-1, 0.6, 0), (0.5, 0, 0), (0.6, 0, 0), (0.5, 0.1, 0)])
+    tracked = np.array(
+        [(-1.6, 0, 0), (-0.4, 0, 0), (-1, 0.6, 0), (0.5, 0, 0), (0.6, 0, 0), (0.5, 0.1, 0)]
+    )
     ids = np.array([3, 3, 3, 5, 5, 5])
     moved_points = np.where(ids[:, None] == 3, (tracked - centre) @ turn.T + centre, tracked)
     means = np.array([(-0.6, 0, 0), (-1.01, 0, 0), (-0.6, 0.2, 0), (0.5, 0, 0), (-0.6, 0, 1)])
     true = (means - centre) @ turn.T + centre - means
     opacities = np.array([0.9, 0.9, 0.05, 0.9, 0.9])
     views = [(FRONT, plane(4, 3, 5))]
-    # Only the first is evaluated: on the axis, too transparent, on the static half, off the surface.
+    # Only the first is evaluated: on the axis, too transparent, on the static half, off the
+    # surface.
     score = evaluate_motion(means, 1.5 * true, opacities, (tracked, moved_points, ids), views)
     assert score.num_gaussians == 1
     assert score.true_length == pytest.approx(2 * 0.4 * np.sin(0.1))
@@ -107,7 +129,9 @@ def bent(points: np.ndarray, curvature: float) -> np.ndarray:
     x, y, z = np.moveaxis(points, -1, 0)
     angle = x * curvature
     radius = 1 / curvature
-    return np.stack([(radius - z) * np.sin(angle), y, radius - (radius - z) * np.cos(angle)], axis=-1)
+    return np.stack(
+        [(radius - z) * np.sin(angle), y, radius - (radius - z) * np.cos(angle)], axis=-1
+    )
 
 
 def test_local_motion__of_a_bending_wall():
@@ -116,7 +140,10 @@ def test_local_motion__of_a_bending_wall():
     new_positions = bent(tracked, 0.3)
     true = bent(points, 0.3) - bent(points, 0.2)
     motion = local_motion(bent(points, 0.2), positions, new_positions)
-    moves = np.linalg.norm(true, axis=-1) > 0.1 * np.linalg.norm(new_positions - positions, axis=-1).max()
+    moves = (
+        np.linalg.norm(true, axis=-1)
+        > 0.1 * np.linalg.norm(new_positions - positions, axis=-1).max()
+    )
     mask = moves & np.isfinite(motion[:, 0])
     assert mask.sum() > 0.9 * moves.sum()
     error = np.linalg.norm(motion - true, axis=-1)[mask] / np.linalg.norm(true, axis=-1)[mask]
@@ -125,7 +152,9 @@ def test_local_motion__of_a_bending_wall():
 
 
 def test_local_motion__excludes_points_between_parts_that_move_apart():
-    tracked = rng.uniform(0.2, 1, (400, 3)) * (1, 1, 0) * np.where(np.arange(400) % 2, 1, -1)[:, None]
+    tracked = (
+        rng.uniform(0.2, 1, (400, 3)) * (1, 1, 0) * np.where(np.arange(400) % 2, 1, -1)[:, None]
+    )
     new_positions = tracked + np.sign(tracked[:, :1]) * [0, 0, 0.1]
     motion = local_motion(np.array([(0.6, 0.6, 0.0), (0.0, 0.0, 0.0)]), tracked, new_positions)
     assert_close(motion[0], [0, 0, 0.1], atol=1e-12)
@@ -138,6 +167,8 @@ def test_evaluate_motion__evaluates_gaussians_on_a_deforming_object():
     means = np.array([(-1.0, -0.5, 0), (-1.2, -0.2, 0)])
     true = 0.02 * means**2 @ [[0, 0, 1], [0, 0, 0], [0, 0, 0]]
     views = [(FRONT, plane(4, 3, -1))]
-    score = evaluate_motion(means, true, np.full(2, 0.9), (tracked, new_positions, np.full(600, 3)), views)
+    score = evaluate_motion(
+        means, true, np.full(2, 0.9), (tracked, new_positions, np.full(600, 3)), views
+    )
     assert score.num_gaussians == 2
     assert score.relative_error < 0.02

@@ -34,16 +34,20 @@ def test_evaluation_tables__fit_eighty_columns(result: Evaluation) -> None:
     assert max(map(len, lines)) <= 80
     rows = {line.split("  ")[0].strip(): line.split()[-3:] for line in lines}
     assert rows["PSNR, dB"] == [
-        figure(v, 2) for v in (result.scores.psnr, result.scores.psnr_moving, result.scores.psnr_still)
+        figure(v, 2)
+        for v in (result.scores.psnr, result.scores.psnr_moving, result.scores.psnr_still)
     ]
     assert rows["dE2000"] == [
-        figure(v, 2) for v in (result.scores.delta_e, result.scores.delta_e_moving, result.scores.delta_e_still)
+        figure(v, 2)
+        for v in (result.scores.delta_e, result.scores.delta_e_moving, result.scores.delta_e_still)
     ]
     assert "LPIPS" not in rows, "no network was given"
     assert any(line.endswith(figure(result.variation.input, 3)) for line in lines)
 
 
-def test_evaluation_tables__have_a_row_for_each_of_several_views(fitted_clip: Path, tmp_path: Path) -> None:
+def test_evaluation_tables__have_a_row_for_each_of_several_views(
+    fitted_clip: Path, tmp_path: Path
+) -> None:
     write_stream(tmp_path / "s.morgs", {"test_view": None}, shift=1)
     several = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
     registered = dict.fromkeys(several.views, 30.0) | {"cam1": 32.0}
@@ -54,7 +58,13 @@ def test_evaluation_tables__have_a_row_for_each_of_several_views(fitted_clip: Pa
         *((n, s, registered[n]) for n, s in several.views.items()),
         ("mean", several.scores, 31),
     ):
-        expected = (scores.psnr, 2), (scores.psnr_matched, 2), (scores.ssim, 4), (scores.motion_error, 2), (psnr, 2)
+        expected = (
+            (scores.psnr, 2),
+            (scores.psnr_matched, 2),
+            (scores.ssim, 4),
+            (scores.motion_error, 2),
+            (psnr, 2),
+        )
         assert rows[name] == [figure(*value) for value in expected]
 
 

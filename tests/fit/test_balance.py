@@ -32,7 +32,10 @@ def scene() -> Gaussians:
     """A textured wall; all Gaussians are seen by all cameras."""
     rng = np.random.default_rng(0)
     return isotropic(
-        rng.uniform((-2.4, -2.0, 0.6), (2.4, 2.0, 1.2), (400, 3)), 0.16, 0.95, rng.uniform(-1.0, 1.0, (400, 1, 3))
+        rng.uniform((-2.4, -2.0, 0.6), (2.4, 2.0, 1.2), (400, 3)),
+        0.16,
+        0.95,
+        rng.uniform(-1.0, 1.0, (400, 1, 3)),
     )
 
 
@@ -43,7 +46,8 @@ def exposed(colors: np.ndarray, gain: float) -> np.ndarray:
 def images(cameras: list[Camera], gains: np.ndarray) -> list[np.ndarray]:
     rendered = [np.asarray(rasterize(scene(), camera, ("color",)).color) for camera in cameras]
     return [
-        np.rint(255 * exposed(image.clip(0, 1), g)).astype(np.uint8) for g, image in zip(gains, rendered, strict=True)
+        np.rint(255 * exposed(image.clip(0, 1), g)).astype(np.uint8)
+        for g, image in zip(gains, rendered, strict=True)
     ]
 
 
@@ -59,7 +63,9 @@ def test_balance_cameras__finds_the_exposures_and_takes_them():
     balance = balanced(GAINS)
     for exposure, gain in zip(balance.exposures, GAINS, strict=True):
         # A tenth of the largest change of a tone, 0.075, is left.
-        np.testing.assert_allclose(exposure(TONES), np.repeat(exposed(TONES, gain), 3, axis=1), atol=0.007)
+        np.testing.assert_allclose(
+            exposure(TONES), np.repeat(exposed(TONES, gain), 3, axis=1), atol=0.007
+        )
     assert balance.taken
     assert balance.balanced_psnr > balance.recorded_psnr + 5
     assert "The cameras were balanced" in balance.sentence
@@ -81,7 +87,10 @@ def test_balance_cameras__judges_by_withheld_pixels(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr("morgs_mi.fit.balance.mean_psnr", lambda *_: next(scores))
     balance = balanced(GAINS)
     assert not balance.taken
-    assert "balanced ones are no clear gain, withheld pixels have 25.05 dB instead of 25.00 dB" in balance.sentence
+    assert (
+        "balanced ones are no clear gain, withheld pixels have 25.05 dB instead of 25.00 dB"
+        in balance.sentence
+    )
 
 
 def test_balance_config__takes_at_most_a_quarter_of_the_steps_of_the_first_frame():
@@ -99,4 +108,6 @@ def test_balance_cameras__does_not_judge_where_balanced_cameras_are_wanted():
 
 def test_balance__sentence_names_the_largest_change():
     balance = Balance((Exposure((1.1, 1, 1)), Exposure()), True)
-    assert balance.sentence == "The cameras were balanced: exposures differ by up to 9.0 % of white."
+    assert (
+        balance.sentence == "The cameras were balanced: exposures differ by up to 9.0 % of white."
+    )

@@ -19,8 +19,12 @@ CONFIG = FitConfig(sh_degree=0, detail=DETAIL, dropping=0.0, density=DensityConf
 
 
 def planned(seconds: float, config: FitConfig = CONFIG) -> Plan:
-    views_of_ball = [View(*view) for view in zip(views(), bytes_of(images_of(opaque_ball())), strict=True)]
-    return plan_first_frame(views_of_ball, np.zeros((0, 3)), replace(config, first_frame_seconds=seconds))
+    views_of_ball = [
+        View(*view) for view in zip(views(), bytes_of(images_of(opaque_ball())), strict=True)
+    ]
+    return plan_first_frame(
+        views_of_ball, np.zeros((0, 3)), replace(config, first_frame_seconds=seconds)
+    )
 
 
 def numbers(plan: Plan) -> tuple[int, int]:
@@ -43,7 +47,7 @@ def test_plan_first_frame__has_fewer_gaussians_and_steps_in_less_time():
 
 
 def test_plan_first_frame__takes_more_time_at_the_size_of_the_last_steps():
-    """Up to the last round of density control, images have half the size, and Gaussians are fewer."""
+    """Up to the last round of density control, images are half as large, Gaussians fewer."""
     rounds = planned(1000, replace(CONFIG, density=DensityConfig(rounds=6))).seconds
     assert 0.8 * planned(1000).seconds < rounds < planned(1000).seconds
 

@@ -1,4 +1,6 @@
-"""Density control: which Gaussians are added and pruned, their order, and the state of the optimiser."""
+"""Density control: which Gaussians are added and pruned, their order, and the state of the
+optimiser.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from morgs_mi import Camera, Gaussians, rasterize
-from morgs_mi.fit.density import DensityPlan, Room, apply_plan, plan_additions, plan_growth, resize_optimizer
+from morgs_mi.fit.density import (
+    DensityPlan,
+    Room,
+    apply_plan,
+    plan_additions,
+    plan_growth,
+    resize_optimizer,
+)
 from morgs_mi.fit.fit_config import DensityConfig
 from morgs_mi.fit.optimise import adam, values_of
 from morgs_mi.method.attribution import densification_scores
@@ -38,7 +47,13 @@ def cloud(n=6, opacity=0.6, scale=0.05, shape=(1, 2, 3)):
 def growth(gaussians, error, cameras=()):
     n = len(gaussians)
     return plan_growth(
-        gaussians, np.asarray(error, float), Room(n, 2 * n), 10.0, CONFIG, np.random.default_rng(1), cameras
+        gaussians,
+        np.asarray(error, float),
+        Room(n, 2 * n),
+        10.0,
+        CONFIG,
+        np.random.default_rng(1),
+        cameras,
     )
 
 
@@ -54,9 +69,14 @@ def test_plan_additions__survivors_come_first_and_births_last():
     assert plan.parent.tolist() == [0, 2, 3, 5, 2, 5]  # the survivors with the largest error
 
 
-@pytest.mark.parametrize(("births", "limit", "expected"), [(0, 100, 6), (0.5, 100, 9), (1, 100, 12), (1, 8, 8)])
+@pytest.mark.parametrize(
+    ("births", "limit", "expected"), [(0, 100, 6), (0.5, 100, 9), (1, 100, 12), (1, 8, 8)]
+)
 def test_plan_additions__births_stay_within_budget_and_limit(births, limit, expected):
-    assert len(additions(cloud(), np.arange(1, 7), births=births, max_gaussians=limit).source) == expected
+    assert (
+        len(additions(cloud(), np.arange(1, 7), births=births, max_gaussians=limit).source)
+        == expected
+    )
 
 
 @pytest.mark.parametrize(("limit", "births"), [(3, 0), (6, 0), (7, 1)])
@@ -84,7 +104,9 @@ def test_plan_growth__clones_small_gaussians_with_the_same_coverage():
 def test_plan_growth__splits_large_round_gaussians_and_keeps_means():
     gaussians = cloud(scale=1.0, shape=(1, 2, 3.9))
     result = apply_plan(gaussians, growth(gaussians, [0, 0, 0, 0, 0, 1]))
-    assert np.asarray(result.scales)[5:] == pytest.approx(np.tile([1, 2, 3.9], (2, 1)) / 1.6, rel=1e-5)
+    assert np.asarray(result.scales)[5:] == pytest.approx(
+        np.tile([1, 2, 3.9], (2, 1)) / 1.6, rel=1e-5
+    )
     assert_close(result.opacities, np.full(7, 0.6), rtol=1e-5)
     assert np.array_equal(np.asarray(result.means)[:6], np.asarray(gaussians.means))
 
@@ -96,7 +118,9 @@ def test_plan_growth__splits_large_long_gaussians_along_their_longest_axis():
     whole = np.asarray(gaussians.means)
     offset = means[6] - means[5]
     axes = Rotation.from_quat(np.asarray(gaussians.quats)[5], scalar_first=True).as_matrix()
-    assert np.asarray(result.scales)[5:] == pytest.approx(np.tile([0.893, 2 * 0.893, 4.1 * 0.55], (2, 1)), rel=1e-5)
+    assert np.asarray(result.scales)[5:] == pytest.approx(
+        np.tile([0.893, 2 * 0.893, 4.1 * 0.55], (2, 1)), rel=1e-5
+    )
     assert_close(result.opacities, [0.6] * 5 + [0.36] * 2, rtol=1e-5)
     assert np.array_equal(means[:5], whole[:5])
     assert (means[5] + means[6]) / 2 == pytest.approx(whole[5], abs=1e-5)
@@ -200,4 +224,7 @@ def test_densification_scores__attribute_the_error_to_the_wrong_gaussian():
     assert scores[[0, 1, 2]].max() < 0.01 * scores[4]
     hidden = np.ones((48, 64), bool)
     hidden[:, 32:] = False
-    assert densification_scores(wrong, [ActiveView(camera)], [Target(image, hidden)]).max() < 0.01 * scores[4]
+    assert (
+        densification_scores(wrong, [ActiveView(camera)], [Target(image, hidden)]).max()
+        < 0.01 * scores[4]
+    )

@@ -17,11 +17,17 @@ CONFIG = DetailConfig(per_detail=1.0, least_gaussians=10, most_gaussians=10**6)
 POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))
 
 
-def texture(width: int = 64, height: int = 48, cell: int = 4, amplitude: float = 80, noise: float = 0) -> np.ndarray:
+def texture(
+    width: int = 64, height: int = 48, cell: int = 4, amplitude: float = 80, noise: float = 0
+) -> np.ndarray:
     """Return cells of random brightness with noise; both in 8-bit units."""
     rng = np.random.default_rng(1)
     cells = rng.uniform(-amplitude, amplitude, (height // cell, width // cell, 1))
-    image = 128 + cells.repeat(cell, axis=0).repeat(cell, axis=1) + rng.normal(0, noise, (height, width, 3))
+    image = (
+        128
+        + cells.repeat(cell, axis=0).repeat(cell, axis=1)
+        + rng.normal(0, noise, (height, width, 3))
+    )
     return np.clip(image + 0.5, 0, 255).astype(np.uint8)
 
 
@@ -45,7 +51,9 @@ def test_count_details__counts_valid_pixels_only():
     assert count_details(image, mask) == pytest.approx(count_details(image, None) / 2, rel=0.1)
 
 
-def count(cameras, image: np.ndarray, points: np.ndarray, config: DetailConfig = CONFIG) -> int | None:
+def count(
+    cameras, image: np.ndarray, points: np.ndarray, config: DetailConfig = CONFIG
+) -> int | None:
     """Return the number of Gaussians of views that all show one image."""
     return with_num_gaussians(
         FitConfig(detail=config), [View(camera, image) for camera in cameras], points

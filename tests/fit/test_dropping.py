@@ -62,7 +62,9 @@ def test_default_dropping__is_for_few_views_that_are_noisy_or_far_apart():
         cameras = look_at_cameras(arc(np.deg2rad(degrees) * np.arange(len(noisy)), 3.5), 40)
         images = [np.uint8(np.clip(image + 0.5, 0, 255)) for image in noisy]
         views = tuple(map(View, cameras, images))
-        return default_dropping(FirstFrameProblem(GAUSSIANS, views, np.zeros((0, 3)), 3.0, RenderConfig()))
+        return default_dropping(
+            FirstFrameProblem(GAUSSIANS, views, np.zeros((0, 3)), 3.0, RenderConfig())
+        )
 
     assert [dropping(noise, 8) for noise in (0.0, 0.008, 0.02)] == [0, 0, 0.2]
     assert [dropping(0.0, degrees) for degrees in (8, 40)] == [0, 0.2]
@@ -70,8 +72,12 @@ def test_default_dropping__is_for_few_views_that_are_noisy_or_far_apart():
 
 
 @pytest.mark.parametrize("views", [1, 2, 4])
-@pytest.mark.parametrize(("noise", "dropping", "dssim_weight"), [(0.0, 0.0, 0.2), (0.008, 0.0, 0.2), (0.05, 0.2, 0.0)])
-def test_adapted_to_images__follows_the_noise(views: int, noise: float, dropping: float, dssim_weight: float):
+@pytest.mark.parametrize(
+    ("noise", "dropping", "dssim_weight"), [(0.0, 0.0, 0.2), (0.008, 0.0, 0.2), (0.05, 0.2, 0.0)]
+)
+def test_adapted_to_images__follows_the_noise(
+    views: int, noise: float, dropping: float, dssim_weight: float
+):
     config = FitConfig(sh_degree=0)
     adapted = adapted_to_images(config, problem(bytes_of(GREY[:views], noise)))
     objective = replace(config.objective, dssim_weight=dssim_weight)

@@ -1,4 +1,6 @@
-"""The first frame: schedule of steps, SH bands, growth and learning rates; losses, masks, and the confidence."""
+"""The first frame: schedule of steps, SH bands, growth and learning rates; losses, masks, and the
+confidence.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ CONFIG = FitConfig(sh_degree=0, num_gaussians=80, first_frame_steps=8, density=N
 
 def fit(images, start, config, seed=0, progress=None, **changes) -> FirstFrame:
     """Fit some or all of the views; `changes` are masks and the cut-offs of the renderer."""
-    return fit_first_frame(problem(images, start, **changes), config, np.random.default_rng(seed), progress)
+    return fit_first_frame(
+        problem(images, start, **changes), config, np.random.default_rng(seed), progress
+    )
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +45,8 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Gaussians]:
     render = ActiveView.render
 
     def spy(view, gaussians, *channels, **more):
-        if dr.grad_enabled(gaussians.sh_coeffs):  # rounds of density control render without gradients
+        # Rounds of density control render without gradients.
+        if dr.grad_enabled(gaussians.sh_coeffs):
             steps.append(gaussians.detached())
         return render(view, gaussians, *channels, **more)
 
@@ -53,9 +58,11 @@ def values_of(gaussians: Gaussians) -> dict[str, bytes]:
     return {name: value.tobytes() for name, value in gaussians.numpy().items()}
 
 
-# ---- learning rates --------------------------------------------------------------------------------------
+# ---- learning rates
+# --------------------------------------------------------------------------------------
 
-# L1 of white images and of colours that stay dark: their gradient is constant, so Adam's steps are as long as the rate.
+# L1 of white images and of colours that stay dark: their gradient is constant, so Adam's steps are
+# as long as the rate.
 COLOR_ALONE = LearningRates(means=0, scales=0, quats=0, opacities=0, sh_dc=0.05, sh_rest=0)
 L1 = ObjectiveConfig(dssim_weight=0.0)
 SCHEDULED = dataclasses.replace(CONFIG, first_frame_rates=COLOR_ALONE, objective=L1)
@@ -65,13 +72,23 @@ DARK = dataclasses.replace(ball(80), sh_coeffs=np.full((80, 1, 3), -1.0))
 
 def lengths(drawn: list[Gaussians], first_frame: FirstFrame) -> np.ndarray:
     """Return the length of each step of the colours."""
-    colors = np.array([np.asarray(gaussians.sh_coeffs) for gaussians in [*drawn, first_frame.gaussians]])
+    colors = np.array(
+        [np.asarray(gaussians.sh_coeffs) for gaussians in [*drawn, first_frame.gaussians]]
+    )
     return np.median(np.diff(colors, axis=0), axis=(1, 2, 3))
 
 
 def test_fit_first_frame__reports_its_steps(images):
     done = []
-    assert fit(images, ball(80), CONFIG, progress=Progress(lambda *state: done.append(state), "First frame")).steps == 8
+    assert (
+        fit(
+            images,
+            ball(80),
+            CONFIG,
+            progress=Progress(lambda *state: done.append(state), "First frame"),
+        ).steps
+        == 8
+    )
     assert done == [("First frame", step, 8) for step in range(1, 9)]
 
 
@@ -82,13 +99,16 @@ def test_fit_first_frame__lets_the_rates_fall_to_the_final_one(drawn):
 
 def test_fit_first_frame__moves_means_by_fractions_of_the_extent(images, drawn):
     rates = dataclasses.replace(CONFIG.first_frame_rates, means=1e-3)
-    result = fit(images, ball(80), dataclasses.replace(CONFIG, first_frame_steps=1, first_frame_rates=rates))
+    result = fit(
+        images, ball(80), dataclasses.replace(CONFIG, first_frame_steps=1, first_frame_rates=rates)
+    )
     shift = np.abs(np.asarray(result.gaussians.means) - np.asarray(drawn[0].means))
     # The extent is 3. The first step of Adam has the length of the rate where there is a gradient.
     assert np.median(shift) == pytest.approx(3e-3, rel=1e-3)
 
 
-# ---- bands of the spherical harmonics --------------------------------------------------------------------
+# ---- bands of the spherical harmonics
+# --------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -107,7 +127,8 @@ def test_fit_first_frame__has_all_sh_bands_after_one_step(images):
     assert result.gaussians.sh_degree == 3
 
 
-# ---- growth ----------------------------------------------------------------------------------------------
+# ---- growth
+# ----------------------------------------------------------------------------------------------
 
 
 def test_density_rounds__lie_between_a_tenth_and_a_half():
@@ -117,10 +138,16 @@ def test_density_rounds__lie_between_a_tenth_and_a_half():
 
 
 def test_fit_first_frame__grows_in_the_rounds_alone_and_to_the_number_that_is_given(images, drawn):
-    config = FitConfig(sh_degree=0, first_frame_steps=20, num_gaussians=100, density=DensityConfig(rounds=3))
+    config = FitConfig(
+        sh_degree=0, first_frame_steps=20, num_gaussians=100, density=DensityConfig(rounds=3)
+    )
     result = fit(images, ball(60), config)
     counts = [len(gaussians) for gaussians in drawn]
-    assert [step for step, (a, b) in enumerate(pairwise(counts), 1) if a != b] == density_rounds(config) == [2, 6, 10]
+    assert (
+        [step for step, (a, b) in enumerate(pairwise(counts), 1) if a != b]
+        == density_rounds(config)
+        == [2, 6, 10]
+    )
     assert counts == sorted(counts)
     assert (counts[0], len(result.gaussians)) == (60, 100)
 
@@ -169,12 +196,15 @@ def test_fit_first_frame__sees_images_of_half_the_size_until_it_has_grown(images
     assert widths == 8 * [64]
 
 
-# ---- images, masks and losses ----------------------------------------------------------------------------
+# ---- images, masks and losses
+# ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2])
 def test_fit_first_frame__reports_l1_where_dssim_has_no_weight(images, weight):
-    config = dataclasses.replace(CONFIG, first_frame_steps=1, objective=ObjectiveConfig(dssim_weight=weight))
+    config = dataclasses.replace(
+        CONFIG, first_frame_steps=1, objective=ObjectiveConfig(dssim_weight=weight)
+    )
     loss = fit(images[:1], ball(80), config).losses["recon"]
     l1 = np.abs(rendered(ball(80), views()[0], RenderConfig()) - images[0]).mean()
     assert (loss == pytest.approx(l1, rel=1e-4)) == (weight == 0)
@@ -204,11 +234,15 @@ def test_fit_first_frame__fits_views_of_different_sizes(images):
         mixed, dataclasses.replace(CONFIG, first_frame_steps=60), np.random.default_rng(0)
     ).gaussians
     for view in mixed.views:
-        errors = [np.abs(rendered(g, view.camera, RenderConfig()) - view.image).mean() for g in (ball(80), result)]
+        errors = [
+            np.abs(rendered(g, view.camera, RenderConfig()) - view.image).mean()
+            for g in (ball(80), result)
+        ]
         assert errors[1] < 0.5 * errors[0]
 
 
-# ---- dropping, and what does not change ------------------------------------------------------------------
+# ---- dropping, and what does not change
+# ------------------------------------------------------------------
 
 
 def test_fit_first_frame__leaves_gaussians_out_of_its_steps_but_not_of_the_result(images, drawn):
@@ -221,7 +255,9 @@ def test_fit_first_frame__leaves_gaussians_out_of_its_steps_but_not_of_the_resul
 
 def test_fit_first_frame__keeps_the_confidence(images):
     confidence = np.linspace(-2, 2, 80)
-    gaussians = fit(images, dataclasses.replace(ball(80), logit_confidence=confidence), CONFIG).gaussians
+    gaussians = fit(
+        images, dataclasses.replace(ball(80), logit_confidence=confidence), CONFIG
+    ).gaussians
     assert_close(gaussians.logit_confidence, np.float32(confidence))
 
 
@@ -229,13 +265,15 @@ def test_fit_first_frame__keeps_the_confidence(images):
 def test_fit_first_frame__is_the_same_for_a_seed_and_another_for_another(images):
     config = FitConfig(sh_degree=1, num_gaussians=90, first_frame_steps=12, dropping=0.2)
     first, second, other = (
-        values_of(fit(images, ball(60, 1), config, seed, render=REPRODUCIBLE).gaussians) for seed in (5, 5, 6)
+        values_of(fit(images, ball(60, 1), config, seed, render=REPRODUCIBLE).gaussians)
+        for seed in (5, 5, 6)
     )
     assert first == second
     assert first != other
 
 
-# ---- the confidence --------------------------------------------------------------------------------------
+# ---- the confidence
+# --------------------------------------------------------------------------------------
 
 
 def learned(steps: int, masks: dict[int, np.ndarray]) -> tuple[Gaussians, dict[str, float]]:

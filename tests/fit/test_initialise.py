@@ -16,7 +16,9 @@ from tests.scenes.cameras import arc, look_at_cameras
 
 
 def few_points():
-    """Return 40 points of a wall at z = 2 that fill the right half of the views, with their colours, and the views."""
+    """Return 40 points of a wall at z = 2 that fill the right half of the views, with their
+    colours, and the views.
+    """
     rng = np.random.default_rng(0)
     cameras = look_at_cameras(arc((-0.2, 0.0, 0.2), 3), 60)
     points = np.stack([rng.uniform(0.2, 2, 40), rng.uniform(-2, 2, 40), np.full(40, 2.0)], axis=1)
@@ -79,7 +81,9 @@ def moved(camera: Camera, shift: np.ndarray) -> Camera:
 
 
 def parallel_cameras() -> list[Camera]:
-    return [c for x in (-1.0, 0.0, 1.0) for c in look_at_cameras([(x, 0, -4)], 40, target=(x, 0, 0))]
+    return [
+        c for x in (-1.0, 0.0, 1.0) for c in look_at_cameras([(x, 0, -4)], 40, target=(x, 0, 0))
+    ]
 
 
 @pytest.mark.parametrize(
@@ -100,7 +104,9 @@ def test_focus_point__is_where_converging_cameras_look():
 
 def test_seed_points__are_far_before_parallel_cameras():
     cameras = parallel_cameras()
-    points, _ = seed_points([grey_view(camera) for camera in cameras], 300, np.random.default_rng(0))
+    points, _ = seed_points(
+        [grey_view(camera) for camera in cameras], 300, np.random.default_rng(0)
+    )
     depths = cameras[0].project(points)[1] / scene_extent(cameras)
     assert 3 < depths.min() < 4
     assert 20 < depths.max() < 31
@@ -134,7 +140,9 @@ def test_seen_points__leaves_out_points_behind_and_beside_the_camera():
 
 
 def test_in_light__points_get_the_median_colours_of_hdr_views():
-    """The points of a recording have colours of 8 bits; a view in which something hides a point does not matter."""
+    """The points of a recording have colours of 8 bits; a view in which something hides a point
+    does not matter.
+    """
     cameras = look_at_cameras([(x, 0, -4) for x in (-0.5, 0, 0.5)], 60, 40, 30)
     images = [np.full((30, 40, 3), light, np.float32) for light in (2.5, 2.6, 0.1)]
     masks = [None, np.ones((30, 40), bool), None]
@@ -144,4 +152,7 @@ def test_in_light__points_get_the_median_colours_of_hdr_views():
     points = np.concatenate([cube, outside]), np.full((31, 3), 0.75)
     expected = np.repeat([2.5, 0.75], (30, 1))[:, None] * np.ones(3)
     np.testing.assert_allclose(_in_light(points, views)[1], expected)
-    assert _in_light(points, [View(camera, np.zeros((30, 40, 3), np.uint8)) for camera in cameras]) is points
+    assert (
+        _in_light(points, [View(camera, np.zeros((30, 40, 3), np.uint8)) for camera in cameras])
+        is points
+    )

@@ -23,7 +23,9 @@ EXTENT = 3.0
 PLAIN = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
 
 
-def fit(previous: Gaussians, images: list[np.ndarray], config: FitConfig, motion: MotionConfig = PLAIN) -> LaterFrame:
+def fit(
+    previous: Gaussians, images: list[np.ndarray], config: FitConfig, motion: MotionConfig = PLAIN
+) -> LaterFrame:
     active = full_active_set(previous, dict(enumerate(views())), RENDER)
     targets = {view: Target(image) for view, image in enumerate(images)}
     problem = FrameProblem(previous, active, targets, {}, None, EXTENT)
@@ -31,7 +33,9 @@ def fit(previous: Gaussians, images: list[np.ndarray], config: FitConfig, motion
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("motion", [PLAIN, MotionConfig(learn_motion=False)], ids=["plain", "gated"])
+@pytest.mark.parametrize(
+    "motion", [PLAIN, MotionConfig(learn_motion=False)], ids=["plain", "gated"]
+)
 def test_fit_later_frame__reports_births_and_survivors(motion):
     """Half of the ball is new: births help, survivors stay in order, births come last."""
     truth = opaque_ball()
@@ -52,7 +56,9 @@ def test_fit_later_frame__reports_births_and_survivors(motion):
         assert np.isfinite(losses["recon"])
         raw = gaussians.numpy()
         moves = raw["means"][: len(survivors)] - start.numpy()["means"][survivors]
-        assert raw["motion"][: len(survivors)] == pytest.approx(moves, abs=1e-6), "the whole displacement"
+        assert raw["motion"][: len(survivors)] == pytest.approx(moves, abs=1e-6), (
+            "the whole displacement"
+        )
         assert raw["offset"].any() == motion.learn_offset
         results[births] = mean_psnr(gaussians, images)
     assert results[0.3] > results[0.0] + 0.05  # dB; runs differ by 1e-5
@@ -60,7 +66,11 @@ def test_fit_later_frame__reports_births_and_survivors(motion):
 
 def test_fit_later_frame__keeps_all_without_density_control():
     truth = opaque_ball()
-    fitted = fit(truth, images_of(truth), FitConfig(sh_degree=0, epochs=1, density=DensityConfig(later_frames=False)))
+    fitted = fit(
+        truth,
+        images_of(truth),
+        FitConfig(sh_degree=0, epochs=1, density=DensityConfig(later_frames=False)),
+    )
     assert isinstance(fitted.gaussians, Gaussians)
     assert np.array_equal(fitted.source, np.arange(400))
 
@@ -84,11 +94,15 @@ def test_fit_later_frame__rigid_neighbours_move_alike():
     usual = FitConfig(sh_degree=0, epochs=8, density=DensityConfig(later_frames=False))
     preset = apply_preset(StreamConfig(fit=usual), "rigidity").fit
     results = [fit(start, images_of(truth), config) for config in (usual, preset)]
-    free, rigid = (np.linalg.norm(np.asarray(r.gaussians.motion) - shift, axis=1).mean() for r in results)
+    free, rigid = (
+        np.linalg.norm(np.asarray(r.gaussians.motion) - shift, axis=1).mean() for r in results
+    )
     assert rigid < 0.5 * free
     assert results[1].losses.keys() == {"recon", "rigid", "rotation", "isometry"}
     for name in ("log_scales", "logit_opacities", "sh_coeffs"):
-        assert np.array_equal(getattr(results[1].gaussians, name), getattr(start, name)), "the preset moves alone"
+        assert np.array_equal(getattr(results[1].gaussians, name), getattr(start, name)), (
+            "the preset moves alone"
+        )
 
 
 def test_fit_later_frame__compares_the_neighbours_of_births_with_their_parents():
@@ -111,6 +125,8 @@ def test_initial_motion__continues_with_constant_velocity():
     rng = np.random.default_rng(0)
     active = full_active_set(previous_gaussians, dict(enumerate(views())), RENDER)
     assert initial_motion(previous_gaussians, active, {}, {}, PLAIN, rng) is None
-    start = initial_motion(previous_gaussians, active, {}, {}, replace(PLAIN, constant_velocity=True), rng)
+    start = initial_motion(
+        previous_gaussians, active, {}, {}, replace(PLAIN, constant_velocity=True), rng
+    )
     assert start is not None
     assert np.array_equal(start.displacement, np.full((400, 3), 0.1, np.float32))

@@ -11,7 +11,12 @@ from scipy.sparse import csr_array
 
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.method.motion_config import MotionConfig
-from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, MotionModelFactory, sparse_product
+from morgs_mi.method.motion_model import (
+    MOTION_MODELS,
+    MotionModel,
+    MotionModelFactory,
+    sparse_product,
+)
 from morgs_mi.method.motion_start import MotionStart
 from tests.scenes.ball import opaque_ball
 from tests.scenes.shifted_ball import FIT, PLAIN, SHIFT, fit_shifted, motion_error, psnr_of
@@ -26,7 +31,10 @@ def _one_shift(argument: str, config: MotionConfig) -> MotionModelFactory:
         return MotionModel(
             {"shift": dr.zeros(mi.TensorXf, (1, 3))},
             {"shift": 2e-3 * extent},
-            lambda p: (sparse_product(everyone, p["shift"]), dr.zeros(mi.TensorXf, (len(gaussians), 4))),
+            lambda p: (
+                sparse_product(everyone, p["shift"]),
+                dr.zeros(mi.TensorXf, (len(gaussians), 4)),
+            ),
             lambda p: {"length": 1e-4 * dr.sum(dr.abs(p["shift"].array))},
         )
 
@@ -36,7 +44,9 @@ def _one_shift(argument: str, config: MotionConfig) -> MotionModelFactory:
 MODEL = replace(PLAIN, model="test-shift")
 
 
-def fit(config: FitConfig = FIT, start: MotionStart | None = None, share: float = MODEL.model_share):
+def fit(
+    config: FitConfig = FIT, start: MotionStart | None = None, share: float = MODEL.model_share
+):
     return fit_shifted(replace(MODEL, model_share=share), start, config)
 
 
@@ -65,5 +75,8 @@ def test_fit_later_frame__fits_the_model_alone_in_a_single_epoch():
 def test_fit_later_frame__shares_its_epochs_with_the_model():
     some, all_of_it = (fit(replace(FIT, epochs=4), share=share) for share in (0.25, 1.0))
     assert some.epochs == all_of_it.epochs == 4
-    assert np.abs(np.asarray(some.gaussians.log_scales) - np.asarray(opaque_ball().log_scales)).max() > 0
+    assert (
+        np.abs(np.asarray(some.gaussians.log_scales) - np.asarray(opaque_ball().log_scales)).max()
+        > 0
+    )
     assert np.array_equal(all_of_it.gaussians.log_scales, opaque_ball().log_scales)

@@ -14,9 +14,13 @@ def bytes_of(values: np.ndarray) -> np.ndarray:
 
 
 def foliage(seed: int = 0, size: int = 128) -> np.ndarray:
-    """Return a texture [S, S, 3] in [0, 1] with equal contrast in every octave, as in nature, seen by a lens."""
+    """Return a texture [S, S, 3] in [0, 1] with equal contrast in every octave, as in nature, seen
+    by a lens.
+    """
     frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(size), np.fft.rfftfreq(size), indexing="ij"))
-    spectrum = np.fft.rfft2(np.random.default_rng(seed).normal(size=(size, size))) / np.maximum(frequency, 1 / size)
+    spectrum = np.fft.rfft2(np.random.default_rng(seed).normal(size=(size, size))) / np.maximum(
+        frequency, 1 / size
+    )
     values = cv2.GaussianBlur(np.fft.irfft2(spectrum, s=(size, size)), None, 0.7)
     return (0.5 + 0.12 * values / values.std()).repeat(3).reshape(size, size, 3)
 
@@ -25,7 +29,9 @@ def foliage(seed: int = 0, size: int = 128) -> np.ndarray:
 def test_white_noise_of__finds_white_noise(noise):
     rng = np.random.default_rng(1)
     ramp = np.linspace(0.3, 0.7, 128)[:, None, None] * np.ones((128, 96, 3))
-    assert white_noise_of(bytes_of(ramp + rng.normal(0, noise, ramp.shape))) == pytest.approx(noise, rel=0.06)
+    assert white_noise_of(bytes_of(ramp + rng.normal(0, noise, ramp.shape))) == pytest.approx(
+        noise, rel=0.06
+    )
 
 
 def test_white_noise_of__takes_texture_for_none():

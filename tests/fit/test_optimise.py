@@ -13,7 +13,10 @@ from tests.assertions import assert_close
 
 def bowl(values, view):
     x = values["x"]
-    return {"near": dr.sum(dr.square(x - 1.0), axis=None), "far": dr.sum(dr.square(x - 3.0), axis=None)}
+    return {
+        "near": dr.sum(dr.square(x - 1.0), axis=None),
+        "far": dr.sum(dr.square(x - 3.0), axis=None),
+    }
 
 
 @pytest.mark.parametrize("decay", [None, lambda step: 0.1 ** (step / 200)])
@@ -60,7 +63,10 @@ def test_optimise__names_losses_that_are_not_finite():
     start = {"x": mi.TensorXf(np.zeros(1, np.float32))}
     with pytest.raises(FloatingPointError, match="recon are not finite after 3 steps"):
         optimise(
-            adam(start), {"x": 1.0}, lambda v, _: {"recon": dr.log(dr.sum(v["x"], axis=None) - 100)}, Steps([0] * 3)
+            adam(start),
+            {"x": 1.0},
+            lambda v, _: {"recon": dr.log(dr.sum(v["x"], axis=None) - 100)},
+            Steps([0] * 3),
         )
 
 
@@ -85,7 +91,12 @@ def test_replace_parameter__keeps_moments():
         optimise(optimizer, {"x": 0.1}, bowl, Steps([0] * 4))
         if widens:
             value = np.asarray(values_of(optimizer)["x"])
-            replace_parameter(optimizer, "x", np.pad(value, [(0, 0), (0, 2)]), lambda m: np.pad(m, [(0, 0), (0, 2)]))
+            replace_parameter(
+                optimizer,
+                "x",
+                np.pad(value, [(0, 0), (0, 2)]),
+                lambda m: np.pad(m, [(0, 0), (0, 2)]),
+            )
         optimise(optimizer, {"x": 0.1}, bowl, Steps([0] * 4, 4))
         ends.append(np.asarray(values_of(optimizer)["x"]))
     assert np.array_equal(ends[0][:, 0], ends[1][:, 0])

@@ -21,14 +21,22 @@ LARGE = look_at_cameras([(0, 0, -4)], 40, 160, 120)[0]
 
 def large_view(mask: np.ndarray | None = None) -> View:
     """Return a view of 160x120 pixels, all of them white in even columns."""
-    return View(LARGE, np.uint8(255 * np.tile(np.arange(160) % 2, (120, 1)))[..., None].repeat(3, axis=2), mask)
+    return View(
+        LARGE,
+        np.uint8(255 * np.tile(np.arange(160) % 2, (120, 1)))[..., None].repeat(3, axis=2),
+        mask,
+    )
 
 
 def test_first_frame_problem__starts_from_the_points_with_the_settings_of_the_fit():
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (300, 3)), np.full((300, 3), 0.25)
     config = FitConfig(sh_degree=2, num_gaussians=100, density=DensityConfig(rounds=1))
-    views_of_ball = [View(*view) for view in zip(views(), bytes_of(images_of(opaque_ball())), strict=True)]
-    result = FirstFrameProblem.of(views_of_ball, points, config, RenderConfig(), np.random.default_rng(0))
+    views_of_ball = [
+        View(*view) for view in zip(views(), bytes_of(images_of(opaque_ball())), strict=True)
+    ]
+    result = FirstFrameProblem.of(
+        views_of_ball, points, config, RenderConfig(), np.random.default_rng(0)
+    )
     assert (len(result.start), result.start.sh_degree) == (50, 2)  # half, as it grows to all
     np.testing.assert_allclose(result.start.opacities, 0.3, rtol=1e-6)
     assert result.points is points[0]
@@ -48,7 +56,9 @@ def test_first_frame_problem__psnr_is_the_mean_over_its_views():
     shown = [rendered(ball(80), camera, RenderConfig()) for camera in views()]
     expected = np.mean([psnr(a, image / 255) for a, image in zip(shown, images, strict=True)])
     assert problem(images).psnr(ball(80)) == pytest.approx(expected, abs=1e-4)
-    assert problem(images).only([1]).psnr(ball(80)) == pytest.approx(psnr(shown[1], images[1] / 255), abs=1e-4)
+    assert problem(images).only([1]).psnr(ball(80)) == pytest.approx(
+        psnr(shown[1], images[1] / 255), abs=1e-4
+    )
 
 
 def test_first_frame_problem__psnr_does_not_count_masked_pixels():
@@ -61,9 +71,12 @@ def test_first_frame_problem__psnr_does_not_count_masked_pixels():
 
 
 @pytest.mark.parametrize(
-    ("width", "size"), [(160, (160, 120)), (81, (160, 120)), (80, (80, 60)), (50, (53, 40)), (10, (160, 120))]
+    ("width", "size"),
+    [(160, (160, 120)), (81, (160, 120)), (80, (80, 60)), (50, (53, 40)), (10, (160, 120))],
 )
-def test_view__is_reduced_by_a_whole_factor_to_no_less_than_a_width(width: int, size: tuple[int, int]):
+def test_view__is_reduced_by_a_whole_factor_to_no_less_than_a_width(
+    width: int, size: tuple[int, int]
+):
     # A reduced image has 32 pixels at least on each side.
     camera, image, mask = large_view().reduced(width)
     assert (camera.width, camera.height) == size == image.shape[1::-1]
@@ -101,10 +114,14 @@ def test_first_frame_problem__has_an_extent_of_a_sixth_of_the_depth_at_least():
 
     def extent(spread: float) -> float:
         cameras = look_at_cameras([(x, 0, -12) for x in (-spread, spread)], 40)
-        black_views = [View(camera, np.zeros((camera.height, camera.width, 3), np.uint8)) for camera in cameras]
+        black_views = [
+            View(camera, np.zeros((camera.height, camera.width, 3), np.uint8)) for camera in cameras
+        ]
         config = FitConfig(num_gaussians=50)
         cloud = points, np.full_like(points, 0.5)
-        return FirstFrameProblem.of(black_views, cloud, config, RenderConfig(), np.random.default_rng(0)).extent
+        return FirstFrameProblem.of(
+            black_views, cloud, config, RenderConfig(), np.random.default_rng(0)
+        ).extent
 
     assert extent(0.1) == pytest.approx(12 / 6, rel=0.1)
     assert extent(5.0) == pytest.approx(1.1 * 5.0)

@@ -54,7 +54,9 @@ def test_features_of__ignores_masked_pixels():
 def test_features_of__counts_views_that_share_nothing_as_wrong():
     away = look_at_cameras([(0, 0, -4)], 40, target=(0, 0, -8))[0]
     cameras = [views()[0], away]
-    assert squares(opaque_ball(), cameras=cameras, images=IMAGES[:2], masks=(None, None)) == pytest.approx(1)
+    assert squares(
+        opaque_ball(), cameras=cameras, images=IMAGES[:2], masks=(None, None)
+    ) == pytest.approx(1)
 
 
 def test_Regression__widens_the_interval_outside_its_data():
@@ -71,9 +73,27 @@ def test_Regression__widens_the_interval_outside_its_data():
 @pytest.mark.parametrize(
     ("training_psnr", "loss", "margin", "is_outside", "sentence"),
     [
-        (23.9, 2.0, 1.8, False, "fair: 22 dB in the mean, nine times in ten between 20 and 24; 8 cameras"),
-        (34.0, 2.0, 1.4, False, "good: 32 dB in the mean, nine times in ten between 31 and 33; 8 cameras"),
-        (34.0, 9.0, 2.9, False, "poor: 25 dB in the mean, nine times in ten between 22 and 28; 8 cameras"),
+        (
+            23.9,
+            2.0,
+            1.8,
+            False,
+            "fair: 22 dB in the mean, nine times in ten between 20 and 24; 8 cameras",
+        ),
+        (
+            34.0,
+            2.0,
+            1.4,
+            False,
+            "good: 32 dB in the mean, nine times in ten between 31 and 33; 8 cameras",
+        ),
+        (
+            34.0,
+            9.0,
+            2.9,
+            False,
+            "poor: 25 dB in the mean, nine times in ten between 22 and 28; 8 cameras",
+        ),
         (
             34.0,
             2.0,
@@ -81,10 +101,18 @@ def test_Regression__widens_the_interval_outside_its_data():
             True,
             "good: 32 dB in the mean, nine times in ten between 30 and 34, a wider range",
         ),
-        (34.0, 5.0, 3.1, False, "fair: 8 cameras, 8 degrees apart, neighbours share 90 % of what they see. They have"),
+        (
+            34.0,
+            5.0,
+            3.1,
+            False,
+            "fair: 8 cameras, 8 degrees apart, neighbours share 90 % of what they see. They have",
+        ),
     ],
 )
-def test_sentence__has_a_number_where_the_interval_is_narrow(training_psnr, loss, margin, is_outside, sentence):
+def test_sentence__has_a_number_where_the_interval_is_narrow(
+    training_psnr, loss, margin, is_outside, sentence
+):
     forecast = UnseenViews(RIG, training_psnr, loss, margin, is_outside)
     assert forecast.sentence.startswith(f"Views between the cameras will be {sentence}")
     assert (forecast.expected_psnr is None) == (forecast.interval is None) == (2 * margin > 6)

@@ -17,5 +17,8 @@ def to_linear(color):
 def expected_image(raw, viewmat=None):
     """Return the reference image of an rgba film with all AOVs."""
     image = rasterize_view(raw, make_sensor_camera(), viewmat=viewmat)
-    parts = [to_linear(image["color"]), *(image[name] for name in ("alpha", "motion", "confidence", "depth"))]
+    parts = [
+        to_linear(image["color"]),
+        *(image[name] for name in ("alpha", "motion", "confidence", "depth")),
+    ]
     return np.concatenate(parts, axis=2)

@@ -29,11 +29,17 @@ ACTIVATED = {
 
 
 def parameter_gradients(gradient, raw):
-    """Return the gradient with respect to Mitsuba's parameters from the one with respect to raw attributes."""
-    gradient = {name: g * ACTIVATED[name](raw) if name in ACTIVATED else g for name, g in gradient.items()}
+    """Return the gradient with respect to Mitsuba's parameters from the one with respect to raw
+    attributes.
+    """
+    gradient = {
+        name: g * ACTIVATED[name](raw) if name in ACTIVATED else g for name, g in gradient.items()
+    }
     quats = np.roll(gradient["quats"], -1, axis=1)
     return {
-        "gaussians.data": np.concatenate([gradient["means"], gradient["log_scales"], quats], axis=1).ravel(),
+        "gaussians.data": np.concatenate(
+            [gradient["means"], gradient["log_scales"], quats], axis=1
+        ).ravel(),
         "gaussians.opacities": gradient["logit_opacities"],
         "gaussians.sh_coeffs": gradient["sh_coeffs"].ravel(),
         "gaussians.motion": gradient["motion"].ravel(),
@@ -43,7 +49,9 @@ def parameter_gradients(gradient, raw):
 
 @pytest.fixture(scope="module")
 def weight(raw):
-    """A random linear loss on all channels, where normalised channels do not divide by a small alpha."""
+    """A random linear loss on all channels, where normalised channels do not divide by a small
+    alpha.
+    """
     solid = rasterize_view(raw, make_sensor_camera())["alpha"] > 0.02
     return np.float32(np.random.default_rng(1).normal(size=(*solid.shape[:2], 8)) * solid)
 
@@ -51,11 +59,15 @@ def weight(raw):
 @pytest.fixture(scope="module")
 def gradients(raw, weight):
     """The loss's gradient by Mitsuba's parameters, exact to rounding."""
-    expected = reference.complex_step(lambda values: np.sum(expected_image(values) * weight), raw, list(raw))
+    expected = reference.complex_step(
+        lambda values: np.sum(expected_image(values) * weight), raw, list(raw)
+    )
     return parameter_gradients(expected, raw)
 
 
-def test_gaussian_splat__backward_agrees_with_the_reference_for_every_parameter(raw, weight, gradients):
+def test_gaussian_splat__backward_agrees_with_the_reference_for_every_parameter(
+    raw, weight, gradients
+):
     scene = make_mitsuba_scene(to_gaussians(raw), {"pixel_format": "rgba"}, aovs=AOVS)
     params = mi.traverse(scene)
     dr.enable_grad([params[name] for name in gradients])
@@ -98,23 +110,29 @@ def test_gaussian_splat__backward_agrees_with_central_differences(raw):
             losses.append(np.sum(np.asarray(mi.render(scene), np.float64) ** 2))
         params[name] = mi.Float(start)
         slope = (losses[0] - losses[1]) / 2e-3
-        assert slope == pytest.approx(np.vdot(gradient, direction), rel=tol.CENTRAL_DIFFERENCE_REL), name
+        assert slope == pytest.approx(
+            np.vdot(gradient, direction), rel=tol.CENTRAL_DIFFERENCE_REL
+        ), name
 
 
 def test_gaussian_splat__gradient_of_the_sensors_pose(raw):
-    """The camera moves to its left by t: to_world = M T(t), and viewmat moves points to the right."""
+    """The camera moves to its left by t: to_world = M T(t); viewmat moves points to the right."""
     scene = make_mitsuba_scene(to_gaussians(raw))
     params = mi.traverse(scene)
     t = mi.Float(0)
     dr.enable_grad(t)
-    params["sensor.to_world"] = params["sensor.to_world"] @ mi.AffineTransform4f().translate([t, 0, 0])
+    params["sensor.to_world"] = params["sensor.to_world"] @ mi.AffineTransform4f().translate(
+        [t, 0, 0]
+    )
     params.update()
     dr.backward(dr.sum(dr.square(mi.render(scene, params)), axis=None))
     right = np.zeros((4, 4))
     right[0, 3] = 1
     viewmat = np.float32(make_sensor_camera().viewmat).astype(np.float64)
     expected = reference.directional(
-        lambda v: np.sum(expected_image(raw, v["viewmat"])[..., :3] ** 2), {"viewmat": viewmat}, {"viewmat": right}
+        lambda v: np.sum(expected_image(raw, v["viewmat"])[..., :3] ** 2),
+        {"viewmat": viewmat},
+        {"viewmat": right},
     )
     assert dr.grad(t)[0] == pytest.approx(expected, rel=10 * tol.GRADIENT_REL)
 
@@ -129,7 +147,9 @@ def test_gaussian_splat__differentiates_filter_and_crop(raw):
         "crop_width": 11,
         "crop_height": 12,
     }
-    scene = make_mitsuba_scene(to_gaussians(raw), {**film, "pixel_format": "luminance_alpha"}, aovs=AOVS)
+    scene = make_mitsuba_scene(
+        to_gaussians(raw), {**film, "pixel_format": "luminance_alpha"}, aovs=AOVS
+    )
     params = mi.traverse(scene)
     data = params["gaussians.data"]
     rng = np.random.default_rng(5)
@@ -141,12 +161,16 @@ def test_gaussian_splat__differentiates_filter_and_crop(raw):
     forward = np.vdot(np.asarray(dr.grad(image), np.float64), g)
     dr.set_grad(data, 0)
     dr.backward(dr.sum(mi.render(scene, params) * mi.TensorXf(g), axis=None))
-    assert np.vdot(np.asarray(dr.grad(data), np.float64), v) == pytest.approx(forward, rel=tol.DUALITY_REL)
+    assert np.vdot(np.asarray(dr.grad(data), np.float64), v) == pytest.approx(
+        forward, rel=tol.DUALITY_REL
+    )
 
 
 # Change of K by a parameter of the sensor, for a film of W x H pixels.
 INTRINSICS = {
-    "x_fov": lambda K, W, H: np.diag([1, 1, 0]) * -0.5 * np.deg2rad(1) * (K[0, 0] ** 2 / (W / 2) + W / 2),
+    "x_fov": lambda K, W, H: (
+        np.diag([1, 1, 0]) * -0.5 * np.deg2rad(1) * (K[0, 0] ** 2 / (W / 2) + W / 2)
+    ),
     "principal_point_offset_x": lambda K, W, H: np.array([[0, 0, -W], [0, 0, 0], [0, 0, 0]]),
     "principal_point_offset_y": lambda K, W, H: np.array([[0, 0, 0], [0, 0, -H], [0, 0, 0]]),
 }
@@ -183,7 +207,9 @@ def test_gaussian_splat__has_the_gradients_of_rasterize_to_the_bit(raw):
     scene = make_mitsuba_scene(to_gaussians(raw), film, srgb_primitives=False, reproducible=True)
     params = mi.traverse(scene)
     camera = make_sensor_camera()
-    weight = mi.TensorXf(np.float32(np.random.default_rng(8).normal(size=(camera.height, camera.width, 3))))
+    weight = mi.TensorXf(
+        np.float32(np.random.default_rng(8).normal(size=(camera.height, camera.width, 3)))
+    )
     names = ("gaussians.data", "gaussians.opacities", "gaussians.sh_coeffs")
 
     def gradients(image) -> list[np.ndarray]:
@@ -195,10 +221,14 @@ def test_gaussian_splat__has_the_gradients_of_rasterize_to_the_bit(raw):
 
     dr.enable_grad([params[name] for name in names])
     shape = scene.shapes()[0]
-    splats = gaussian_splat._SceneGaussians(gaussian_splat._shape_gaussians(shape, ["opacities", "sh_coeffs"]))
+    splats = gaussian_splat._SceneGaussians(
+        gaussian_splat._shape_gaussians(shape, ["opacities", "sh_coeffs"])
+    )
     camera = gaussian_splat._sensor_camera(scene.sensors()[0], border=0)
     plugin = gradients(mi.render(scene, params))
-    direct = gradients(rasterize(splats, camera, ("color",), config=RenderConfig(reproducible=True)).color)
+    direct = gradients(
+        rasterize(splats, camera, ("color",), config=RenderConfig(reproducible=True)).color
+    )
     for name, by_plugin, by_rasterize in zip(names, plugin, direct, strict=True):
         np.testing.assert_array_equal(by_plugin, by_rasterize, err_msg=name)
 
@@ -209,7 +239,9 @@ def counting_renders(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     # A change of the variant imports the module again.
     module = import_module("morgs_mi.surfaces.gaussian_splat")
     draw = module.rasterize
-    monkeypatch.setattr(module, "rasterize", lambda *args, **kwargs: calls.append(1) or draw(*args, **kwargs))
+    monkeypatch.setattr(
+        module, "rasterize", lambda *args, **kwargs: calls.append(1) or draw(*args, **kwargs)
+    )
     return calls
 
 
@@ -233,7 +265,9 @@ def test_gaussian_splat__backward_uses_the_rendering_of_the_same_parameters(raw,
 
 
 def test_gaussian_splat__backward_renders_what_has_changed_since(raw):
-    """A sensor that moved between the two passes is used as it is, like Mitsuba's own integrators use it."""
+    """A sensor that moved between the two passes is used as it is, like Mitsuba's own integrators
+    use it.
+    """
 
     def gradient(zoom: str) -> np.ndarray:
         scene = make_mitsuba_scene(to_gaussians(raw), reproducible=True)
@@ -263,4 +297,8 @@ def test_gaussian_splat__gradient_of_the_background(raw):
     weight = np.float32(np.random.default_rng(7).normal(size=(*image.shape[:2], 3)))
     dr.backward(dr.sum(image[:, :, :3] * mi.TensorXf(weight), axis=None))
     transmitted = 1 - rasterize_view(raw, make_sensor_camera())["alpha"]
-    assert_close(np.array(dr.grad(background)).ravel(), (transmitted * weight).sum((0, 1)), rtol=tol.GRADIENT_REL)
+    assert_close(
+        np.array(dr.grad(background)).ravel(),
+        (transmitted * weight).sum((0, 1)),
+        rtol=tol.GRADIENT_REL,
+    )

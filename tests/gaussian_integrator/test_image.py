@@ -40,10 +40,18 @@ def test_gaussian_splat__image_is_the_rasterisers_in_linear_light(raw, srgb_prim
 )
 def test_gaussian_splat__has_the_settings_of_the_rasteriser(raw, settings):
     gaussians = to_gaussians(raw)
-    image = np.asarray(mi.render(make_mitsuba_scene(gaussians, srgb_primitives=False, aovs="motion", **settings)))
-    by_default = np.asarray(mi.render(make_mitsuba_scene(gaussians, srgb_primitives=False, aovs="motion")))
-    expected = rasterize(gaussians, make_sensor_camera(), ("color", "motion"), config=RenderConfig(**settings))
-    assert_close(image, np.concatenate([expected.color, expected.motion], axis=2), atol=tol.IMAGE_ABS)
+    image = np.asarray(
+        mi.render(make_mitsuba_scene(gaussians, srgb_primitives=False, aovs="motion", **settings))
+    )
+    by_default = np.asarray(
+        mi.render(make_mitsuba_scene(gaussians, srgb_primitives=False, aovs="motion"))
+    )
+    expected = rasterize(
+        gaussians, make_sensor_camera(), ("color", "motion"), config=RenderConfig(**settings)
+    )
+    assert_close(
+        image, np.concatenate([expected.color, expected.motion], axis=2), atol=tol.IMAGE_ABS
+    )
     assert np.abs(image - by_default).max() > 1e-3
 
 
@@ -64,7 +72,9 @@ def test_gaussian_splat__writes_aovs_in_the_requested_order(raw):
     expected = np.concatenate([np.asarray(image.depth), np.asarray(image.motion)], axis=2)
     # The sensor's angles and inverse pose are rounded.
     solid = np.asarray(rasterize(to_gaussians(raw), make_sensor_camera()).alpha) > 0.02
-    assert_close(np.asarray(mi.render(scene))[..., 3:], expected, atol=5 * tol.IMAGE_ABS, where=solid)
+    assert_close(
+        np.asarray(mi.render(scene))[..., 3:], expected, atol=5 * tol.IMAGE_ABS, where=solid
+    )
 
 
 def test_gaussian_splat__supports_pixel_formats(raw):
@@ -88,7 +98,13 @@ def test_gaussian_splat__supports_a_field_of_view_along_any_axis(raw, axis):
     W = camera.width
     H = camera.height
     f = camera.K[0, 0]
-    extent = {"x": W, "y": H, "diagonal": np.hypot(W, H), "smaller": min(W, H), "larger": max(W, H)}[axis]
+    extent = {
+        "x": W,
+        "y": H,
+        "diagonal": np.hypot(W, H),
+        "smaller": min(W, H),
+        "larger": max(W, H),
+    }[axis]
     sensor = {"fov_axis": axis, "fov": float(np.rad2deg(2 * np.arctan(0.5 * extent / f)))}
     image = mi.render(make_mitsuba_scene(to_gaussians(raw), sensor=sensor))
     expected = mi.render(make_mitsuba_scene(to_gaussians(raw)))
@@ -96,8 +112,13 @@ def test_gaussian_splat__supports_a_field_of_view_along_any_axis(raw, axis):
 
 
 def test_gaussian_splat__composites_over_the_background(raw):
-    scene = make_mitsuba_scene(to_gaussians(raw), background={"type": "rgb", "value": [0.2, 0.5, 0.9]})
-    color = np.asarray(rasterize(to_gaussians(raw), make_sensor_camera(), background=(0.2, 0.5, 0.9)).color, np.float64)
+    scene = make_mitsuba_scene(
+        to_gaussians(raw), background={"type": "rgb", "value": [0.2, 0.5, 0.9]}
+    )
+    color = np.asarray(
+        rasterize(to_gaussians(raw), make_sensor_camera(), background=(0.2, 0.5, 0.9)).color,
+        np.float64,
+    )
     assert_close(mi.render(scene), to_linear(color), atol=tol.IMAGE_ABS)
 
 
@@ -119,7 +140,8 @@ def test_gaussian_splat__reconstruction_filter_weights_the_pixel_centres(raw, sa
         return values
 
     expected = (blur(samples) / blur(np.ones_like(samples)))[b : b + 8, b : b + 10]
-    # The border enlarges the view, and with it the region where splats are linearised at their own centre.
+    # The border enlarges the view, and with it the region where splats are linearised at their own
+    # centre.
     assert_close(image, expected, atol=1e-3 if sample_border else tol.IMAGE_ABS)
 
 
@@ -127,19 +149,32 @@ def test_gaussian_splat__reconstruction_filter_weights_the_pixel_centres(raw, sa
 def test_gaussian_splat__renders_shapes_of_several_degrees_as_one_cloud():
     raw = make_unit_scene(degree=2)
     raw["sh_coeffs"][4:, 1:] = 0
-    parts = [to_gaussians({k: v[s] for k, v in raw.items()}) for s in (slice(0, 4), slice(4, 7), slice(7, None))]
+    parts = [
+        to_gaussians({k: v[s] for k, v in raw.items()})
+        for s in (slice(0, 4), slice(4, 7), slice(7, None))
+    ]
     parts[1] = replace(parts[1], sh_coeffs=parts[1].sh_coeffs[:, :1])
     parts[2] = replace(parts[2], sh_coeffs=parts[2].sh_coeffs[:, :4])
     scene = {f"shape{i}": ellipsoids(part) for i, part in enumerate(parts)}
     scene["shape1"]["type"] = "ellipsoidsmesh"
     integrator = {"type": "gaussian_splat", "aovs": AOVS}
-    scene = mi.load_dict({"type": "scene", "sensor": make_sensor_camera().sensor(), "integrator": integrator, **scene})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": make_sensor_camera().sensor(),
+            "integrator": integrator,
+            **scene,
+        }
+    )
     one = make_mitsuba_scene(to_gaussians(raw), aovs=AOVS)
     assert_close(mi.render(scene), mi.render(one), atol=tol.IMAGE_ABS)
 
     params = mi.traverse(scene)
     expected = mi.traverse(one)
-    for p, keys in ((params, ["shape0.data", "shape1.data", "shape2.data"]), (expected, ["gaussians.data"])):
+    for p, keys in (
+        (params, ["shape0.data", "shape1.data", "shape2.data"]),
+        (expected, ["gaussians.data"]),
+    ):
         dr.enable_grad([p[key] for key in keys])
     for s, p in ((scene, params), (one, expected)):
         dr.backward(dr.sum(dr.square(mi.render(s, p)[..., :3]), axis=None))
@@ -148,18 +183,26 @@ def test_gaussian_splat__renders_shapes_of_several_degrees_as_one_cloud():
 
 
 def test_gaussian_splat__agrees_with_mitsubas_own_integrator():
-    """Ray tracing has no low-pass filter, no linearised projection and orders by entry: similar, not equal."""
+    """Ray tracing has no low-pass filter, no linearised projection and orders by entry: similar,
+    not equal.
+    """
     rng = np.random.default_rng(3)
     quats = rng.normal(size=(20, 4))
     sh_coeffs = rng.normal(size=(20, 4, 3)) * 0.4
     gaussians = Gaussians.from_activated(
-        rng.uniform(-1, 1, (20, 3)), rng.uniform(0.08, 0.2, (20, 3)), quats, rng.uniform(0.3, 0.8, 20), sh_coeffs
+        rng.uniform(-1, 1, (20, 3)),
+        rng.uniform(0.08, 0.2, (20, 3)),
+        quats,
+        rng.uniform(0.3, 0.8, 20),
+        sh_coeffs,
     )
     camera = Camera.look_at((0.3, -0.4, -3.0), (0, 0, 0), (0, -1, 0), 45.0, 96, 72)
     shape = {**ellipsoids(gaussians), "extent": 3.5}
     scene = mi.load_dict({"type": "scene", "gaussians": shape, "sensor": camera.sensor()})
     splatted = np.asarray(mi.render(scene, integrator=mi.load_dict({"type": "gaussian_splat"})))
-    traced = np.asarray(mi.render(scene, integrator=mi.load_dict({"type": "volprim_rf_basic"}), spp=16))
+    traced = np.asarray(
+        mi.render(scene, integrator=mi.load_dict({"type": "volprim_rf_basic"}), spp=16)
+    )
     psnr = -10 * np.log10(np.mean((splatted - traced) ** 2))
     assert psnr > 45  # 51 dB, of which Mitsuba's cut-off at `extent` standard deviations costs one
 
@@ -170,11 +213,21 @@ def test_gaussian_splat__renders_a_new_attribute_of_the_table(raw):
     normals = np.float32(np.random.default_rng(6).normal(size=(len(raw["means"]), 3)))
     gaussians = ExtendedGaussians(**raw, logit_roughness=raw["logit_confidence"], normals=normals)
     scene = make_mitsuba_scene(gaussians, aovs="roughness,confidence,normal")
-    assert scene.integrator().aov_names() == ["roughness.Y", "confidence.Y", "normal.X", "normal.Y", "normal.Z"]
+    assert scene.integrator().aov_names() == [
+        "roughness.Y",
+        "confidence.Y",
+        "normal.X",
+        "normal.Y",
+        "normal.Z",
+    ]
     image = np.asarray(mi.render(scene))
     assert np.abs(image[..., 3]).max() > 0
     assert_close(image[..., 3], image[..., 4])
-    assert_close(image[..., 5:], rasterize(gaussians, make_sensor_camera(), ("normal",))["normal"], atol=tol.IMAGE_ABS)
+    assert_close(
+        image[..., 5:],
+        rasterize(gaussians, make_sensor_camera(), ("normal",))["normal"],
+        atol=tol.IMAGE_ABS,
+    )
     integrator = mi.load_dict({"type": "gaussian_splat", "aovs": "roughness"})
     bare = make_mitsuba_scene(to_gaussians(raw))
     with pytest.raises(ValueError, match=r"must have `roughness` \[N, 1\] with N=10, got only"):

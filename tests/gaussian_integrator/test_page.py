@@ -20,7 +20,7 @@ FILES = dict(re.findall(r"<!-- file ([^ ]+) -->\n```\w+\n(.*?)```", TEXT, re.DOT
 
 
 def rows(title: str) -> set[str]:
-    """Return the names in the first column of the table whose header begins with a column `title`."""
+    """Return the names in the first column of the table whose first column is `title`."""
     (table,) = re.findall(rf"^\| {title} \|.*\n((?:\|.*\n)+)", TEXT, re.MULTILINE)
     return set(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE))
 
@@ -34,7 +34,9 @@ def test_mitsuba_page__blocks_run(tmp_path, monkeypatch):
         exec(compile(block, "docs/mitsuba.md", "exec"), space)
         if "image = mi.render" in block:
             assert np.array(space["image"]).shape == (32, 48, 7)
-            assert np.ptp(np.array(space["image"]), axis=(0, 1)).min() > 0.01, "every channel shows something"
+            assert np.ptp(np.array(space["image"]), axis=(0, 1)).min() > 0.01, (
+                "every channel shows something"
+            )
     assert space["both"].shape == (32, 96, 7)
     space["test_gradient_of_data"]()
     assert not dr.grad_enabled(mi.Float(0))
@@ -43,7 +45,9 @@ def test_mitsuba_page__blocks_run(tmp_path, monkeypatch):
 def test_mitsuba_page__lists_all_properties():
     docstring = gaussian_splat.GaussianSplatIntegrator.__doc__
     properties = {
-        name for names in re.findall(r"^ +\* - ([\w, ]+)$", docstring, re.MULTILINE) for name in names.split(", ")
+        name
+        for names in re.findall(r"^ +\* - ([\w, ]+)$", docstring, re.MULTILINE)
+        for name in names.split(", ")
     }
     assert rows(r"parameter \| type") == properties
 
@@ -52,7 +56,9 @@ def test_mitsuba_page__lists_all_channels():
     assert rows(r"`aovs` \| channels") == {*aov_attributes()}
     for channel in aov_attributes():
         assert all(f"`{name}`" in TEXT for name in exr_names(channel))
-    assert all(f"`SHAPE.{name}`" in TEXT for name in aov_attributes().values() if name in BY_ACTIVATED_NAME)
+    assert all(
+        f"`SHAPE.{name}`" in TEXT for name in aov_attributes().values() if name in BY_ACTIVATED_NAME
+    )
 
 
 @pytest.mark.parametrize("name", ["eps2d", "alpha_min", "stop_transmittance"])

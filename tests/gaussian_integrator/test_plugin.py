@@ -44,24 +44,35 @@ def test_gaussian_splat__reads_props_of_an_xml_scene(raw):
     integrator = mi.load_string(text)
     np.testing.assert_allclose(np.array(integrator.background).ravel(), [0.1, 0.2, 0.3], rtol=1e-6)
     image = np.asarray(mi.render(make_mitsuba_scene(to_gaussians(raw)), integrator=integrator))
-    expected = np.asarray(rasterize(to_gaussians(raw), make_sensor_camera(), background=(0.1, 0.2, 0.3)).color)
+    expected = np.asarray(
+        rasterize(to_gaussians(raw), make_sensor_camera(), background=(0.1, 0.2, 0.3)).color
+    )
     assert_close(image[..., :3], expected, atol=tol.IMAGE_ABS)
 
 
 def test_gaussian_splat__ignores_emitters_with_one_warning(raw, caplog):
     shape = ellipsoids(to_gaussians(raw))
     sensor = make_sensor_camera().sensor()
-    scene = {"type": "scene", "gaussians": shape, "sensor": sensor, "integrator": {"type": "gaussian_splat"}}
+    scene = {
+        "type": "scene",
+        "gaussians": shape,
+        "sensor": sensor,
+        "integrator": {"type": "gaussian_splat"},
+    }
     dark = mi.load_dict(scene)
     lit = mi.load_dict({**scene, "sky": {"type": "constant"}})
     with caplog.at_level(logging.WARNING):
         images = [np.asarray(mi.render(s)) for s in (dark, lit, lit)]
     np.testing.assert_array_equal(images[0], images[1])
-    assert [r.getMessage().split(";")[0] for r in caplog.records] == ["gaussian_splat ignores the scene's emitters"]
+    assert [r.getMessage().split(";")[0] for r in caplog.records] == [
+        "gaussian_splat ignores the scene's emitters"
+    ]
 
 
 def test_gaussian_splat__stays_registered_when_variants_are_switched():
-    """Importing before any variant is set works; a variant without derivatives is refused in one sentence."""
+    """Importing before any variant is set works; a variant without derivatives is refused in one
+    sentence.
+    """
     script = r"""
 import morgs_mi, mitsuba as mi
 for variant in ("scalar_rgb", "llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
@@ -71,14 +82,17 @@ for variant in ("scalar_rgb", "llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
         print("\n>", variant, integrator.aov_names())
         continue
     try:
-        mi.render(mi.load_dict({"type": "scene", "integrator": integrator, "sensor": {"type": "perspective"}}))
+        sensor = {"type": "perspective"}
+        mi.render(mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor}))
     except ValueError as error:
         print("\n>", error)
 """
-    output = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    output = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    ).stdout
     assert [line for line in output.splitlines() if line.startswith(">")] == [
-        "> gaussian_splat: expected a variant such as 'llvm_ad_rgb' or 'cuda_ad_rgb', got 'scalar_rgb'; call "
-        "mi.set_variant() before the scene is loaded.",
+        "> gaussian_splat: expected a variant such as 'llvm_ad_rgb' or 'cuda_ad_rgb', got "
+        "'scalar_rgb'; call mi.set_variant() before the scene is loaded.",
         "> llvm_ad_rgb ['depth.Y']",
         "> llvm_ad_mono ['depth.Y']",
         "> llvm_ad_rgb ['depth.Y']",
@@ -114,7 +128,9 @@ def test_gaussian_splat__renders_a_shape_after_density_control(raw):
     for name in ("data", "opacities", "sh_coeffs", "motion", "confidence"):
         params[f"gaussians.{name}"] = shape[name].array
     params.update()
-    expected = to_linear(np.asarray(rasterize(to_gaussians(half), make_sensor_camera()).color, np.float64))
+    expected = to_linear(
+        np.asarray(rasterize(to_gaussians(half), make_sensor_camera()).color, np.float64)
+    )
     assert_close(mi.render(scene), expected, atol=tol.IMAGE_ABS)
 
 
@@ -128,23 +144,48 @@ def ones(*shape):
 
 
 BAD_SCENES = {
-    "no shape": (lambda: {"gaussians": None}, {}, "expected a scene with an `ellipsoids` shape, got none"),
-    "mesh": (lambda: {"wall": {"type": "rectangle"}}, {}, "expected `ellipsoids` shapes only, got Rectangle 'wall'"),
-    "no opacities": (lambda: with_shape(opacities=None), {}, r"'gaussians' must have `opacities` \[N, 1\] with N=10"),
-    "no sh": (lambda: with_shape(sh_coeffs=None), {}, r"must have `sh_coeffs` \[N, 3 or 12 or 27 or 48\]"),
+    "no shape": (
+        lambda: {"gaussians": None},
+        {},
+        "expected a scene with an `ellipsoids` shape, got none",
+    ),
+    "mesh": (
+        lambda: {"wall": {"type": "rectangle"}},
+        {},
+        "expected `ellipsoids` shapes only, got Rectangle 'wall'",
+    ),
+    "no opacities": (
+        lambda: with_shape(opacities=None),
+        {},
+        r"'gaussians' must have `opacities` \[N, 1\] with N=10",
+    ),
+    "no sh": (
+        lambda: with_shape(sh_coeffs=None),
+        {},
+        r"must have `sh_coeffs` \[N, 3 or 12 or 27 or 48\]",
+    ),
     "odd sh": (lambda: with_shape(sh_coeffs=ones(10, 6)), {}, r"with N=10, got 60 values"),
     "no motion": (
         lambda: with_shape(motion=None),
         {"aovs": "motion"},
-        r"`motion` \[N, 3\] with N=10, got only \['.*write_ply\(path, gaussians, layout='mitsuba'\)",
+        r"`motion` \[N, 3\] with N=10, got only \['.*write_ply\(path, gaussians, "
+        r"layout='mitsuba'\)",
     ),
-    "nan": (lambda: with_shape(opacities=ones(10, 1) * dr.nan), {}, r"`opacities` must be finite, got nan at \[0\]"),
+    "nan": (
+        lambda: with_shape(opacities=ones(10, 1) * dr.nan),
+        {},
+        r"`opacities` must be finite, got nan at \[0\]",
+    ),
     "thin lens": (
         lambda: {"sensor": {"type": "thinlens", "aperture_radius": 0.1}},
         {},
         "expected a `perspective` sensor or a `batch` of them, got ThinLens",
     ),
-    "orthographic": (lambda: {"sensor": {"type": "orthographic"}}, {}, "a `batch` of them, got OrthographicCamera"),
+    "orthographic": (
+        lambda: {"sensor": {"type": "orthographic"}},
+        {},
+        "a `batch` of them, got OrthographicCamera",
+    ),
 }
 
 
@@ -164,7 +205,13 @@ def test_gaussian_splat__refuses_bad_scenes(case):
 
 def test_gaussian_splat__warns_once_about_opacities_outside_the_unit_interval(caplog):
     opacities = mi.TensorXf(np.float32([-1, 2, -0.1, *[0.5] * 7])[:, None])
-    scene = mi.load_dict({"type": "scene", "sensor": make_sensor_camera().sensor(), **with_shape(opacities=opacities)})
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": make_sensor_camera().sensor(),
+            **with_shape(opacities=opacities),
+        }
+    )
     integrator = mi.load_dict({"type": "gaussian_splat"})
     with caplog.at_level(logging.WARNING):
         for _ in range(2):
@@ -178,7 +225,8 @@ def test_gaussian_splat__is_refused_under_freeze(raw):
     image = mi.render(scene)
     dr.eval(image)
     frozen = dr.freeze(lambda image: image + mi.render(scene))
-    # Dr.Jit ends the process if memory of NumPy that other tests have left is collected in a recording.
+    # Dr.Jit ends the process if memory of NumPy that other tests have left is collected in a
+    # recording.
     gc.collect()
     gc.disable()
     try:
@@ -186,20 +234,30 @@ def test_gaussian_splat__is_refused_under_freeze(raw):
             frozen(image)
     finally:
         gc.enable()
-    causes = [str(error.value.__cause__), str(error.value.__cause__ and error.value.__cause__.__cause__)]
+    causes = [
+        str(error.value.__cause__),
+        str(error.value.__cause__ and error.value.__cause__.__cause__),
+    ]
     assert any("gaussian_splat: expected a call outside dr.freeze" in cause for cause in causes)
 
 
 def batch_scene(raw, film: dict, **props):
-    """Return a scene of a `batch` of three cameras, and the same sensors, each with a film of its own."""
+    """Return a scene of a `batch` of three cameras, and the same sensors, each with a film of its
+    own.
+    """
     camera = make_sensor_camera()
     sensors = []
     for v in range(3):
         viewmat = np.array(camera.viewmat, np.float64)
         viewmat[0, 3] += 0.1 * v
         sensors.append(replace(camera, viewmat=viewmat, name=f"view{2 - v}").sensor())
-    single_sensors = [mi.load_dict({**sensor, "film": {**sensor["film"], **film}}) for sensor in sensors]
-    inner = {f"view{2 - v}": {k: x for k, x in sensor.items() if k != "film"} for v, sensor in enumerate(sensors)}
+    single_sensors = [
+        mi.load_dict({**sensor, "film": {**sensor["film"], **film}}) for sensor in sensors
+    ]
+    inner = {
+        f"view{2 - v}": {k: x for k, x in sensor.items() if k != "film"}
+        for v, sensor in enumerate(sensors)
+    }
     whole = {**sensors[0]["film"], **film, "width": 3 * camera.width}
     scene = {
         "type": "scene",
@@ -213,7 +271,9 @@ def batch_scene(raw, film: dict, **props):
 def test_gaussian_splat__renders_a_batch_of_sensors_beside_each_other(raw):
     scene, single_sensors = batch_scene(raw, {"pixel_format": "rgba"}, background=[0.1, 0.2, 0.3])
     image = np.array(mi.render(scene))
-    expected = np.concatenate([np.array(mi.render(scene, sensor=sensor)) for sensor in single_sensors], axis=1)
+    expected = np.concatenate(
+        [np.array(mi.render(scene, sensor=sensor)) for sensor in single_sensors], axis=1
+    )
     np.testing.assert_array_equal(image, expected)
 
 
@@ -240,7 +300,9 @@ def test_gaussian_splat__refuses_a_batch_with_a_border(raw):
 def test_gaussian_splat__refuses_films_other_than_rgb():
     mi.set_variant("llvm_ad_spectral")
     film = {"type": "specfilm", "band": {"type": "spectrum", "value": [(400, 0.5), (700, 0.5)]}}
-    scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective", "film": film}, **with_shape()})
+    scene = mi.load_dict(
+        {"type": "scene", "sensor": {"type": "perspective", "film": film}, **with_shape()}
+    )
     with pytest.raises(ValueError, match="expected an `hdrfilm`, got SpecFilm"):
         mi.load_dict({"type": "gaussian_splat"}).render(scene)
 
@@ -261,14 +323,18 @@ def test_gaussian_splat__refuses_bad_props_when_the_scene_is_loaded(props, messa
 
 
 @pytest.mark.parametrize(
-    "outer", [{"type": "aov", "aovs": "dd:depth"}, {"type": "moment"}], ids=lambda outer: outer["type"]
+    "outer",
+    [{"type": "aov", "aovs": "dd:depth"}, {"type": "moment"}],
+    ids=lambda outer: outer["type"],
 )
 def test_gaussian_splat__refuses_an_integrator_around_it(outer):
     scene = {"type": "scene", "sensor": make_sensor_camera().sensor(), **with_shape()}
     scene = mi.load_dict({**scene, "integrator": {**outer, "inner": {"type": "gaussian_splat"}}})
     with pytest.raises(RuntimeError) as error:
         mi.render(scene)
-    assert "expected to be the scene's integrator, got an integrator around it" in str(error.value.__cause__)
+    assert "expected to be the scene's integrator, got an integrator around it" in str(
+        error.value.__cause__
+    )
 
 
 @pytest.mark.slow
@@ -278,14 +344,17 @@ def test_gaussian_splat__names_variants_that_it_does_not_work_in():
 import morgs_mi, mitsuba as mi
 for variant in ("llvm_ad_mono", "llvm_ad_spectral"):
     mi.set_variant(variant)
-    for plugin in ({"type": "splat_path"}, {"type": "gaussian_splat", "surfaces": {"type": "path"}}):
+    splats = {"type": "gaussian_splat", "surfaces": {"type": "path"}}
+    for plugin in ({"type": "splat_path"}, splats):
         try:
             mi.load_dict(plugin)
             print("\n>", plugin)
         except RuntimeError as error:
             print("\n>", "expected a variant such as 'llvm_ad_rgb'" in str(error))
 """
-    output = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    output = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    ).stdout
     assert [line for line in output.splitlines() if line.startswith(">")] == 4 * ["> True"]
 
 
@@ -298,14 +367,20 @@ SCENE_FILE = """<scene version="3.0.0">
     <integrator type="gaussian_splat"/>
     <shape type="ellipsoids"><string name="filename" value="gaussians.ply"/></shape>
     <sensor type="perspective">
-        <transform name="to_world"><lookat origin="0, 0, -3" target="0, 0, 0" up="0, 1, 0"/></transform>
-        <film type="hdrfilm"><integer name="width" value="32"/><integer name="height" value="16"/></film>
+        <transform name="to_world">
+            <lookat origin="0, 0, -3" target="0, 0, 0" up="0, 1, 0"/>
+        </transform>
+        <film type="hdrfilm">
+            <integer name="width" value="32"/><integer name="height" value="16"/>
+        </film>
     </sensor>
 </scene>"""
 
 
 @pytest.mark.parametrize("shape", ["ellipsoids", "ellipsoidsmesh"])
-def test_gaussian_splat__renders_the_same_channels_from_a_file_as_from_a_dictionary(tmp_path, raw, shape):
+def test_gaussian_splat__renders_the_same_channels_from_a_file_as_from_a_dictionary(
+    tmp_path, raw, shape
+):
     expected = np.asarray(mi.render(make_mitsuba_scene(to_gaussians(raw), aovs=AOVS)))
     write_ply(tmp_path / "gaussians.ply", to_gaussians(raw), layout="mitsuba")
     text = SCENE_FILE.replace(
@@ -322,7 +397,9 @@ def test_gaussian_splat__renders_the_same_channels_from_a_file_as_from_a_diction
 
 @pytest.mark.slow
 def test_gaussian_splat__renders_a_scene_file_as_the_page_describes(tmp_path, raw):
-    """The command `mitsuba` does not find the plugin; the Python command in docs/mitsuba.md renders the same file."""
+    """The command `mitsuba` does not find the plugin; the Python command in docs/mitsuba.md renders
+    the same file.
+    """
     write_ply(tmp_path / "gaussians.ply", to_gaussians(raw))
     (tmp_path / "scene.xml").write_text(SCENE_FILE)
     page = (Path(__file__).parents[2] / "docs/mitsuba.md").read_text(encoding="utf-8")

@@ -63,7 +63,13 @@ def ply(header: str, body: bytes = b"") -> bytes:
 
 def png(width: int, height: int) -> bytes:
     header = struct.pack(">4sIIBBBBB", b"IHDR", width, height, 8, 2, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header)) + bytes(99)
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + struct.pack(">I", 13)
+        + header
+        + struct.pack(">I", zlib.crc32(header))
+        + bytes(99)
+    )
 
 
 def jpeg(width: int, height: int) -> bytes:
@@ -83,41 +89,129 @@ def large_exr(path: Path) -> None:
 BINARY = "format binary_little_endian 1.0\n"
 LARGE = "element vertex 99999999999\nproperty float x\n"
 CASES = {
-    "npy of many rows": (read_array, npy("(1000000000000, 17)"), r"claims float64 \(1000000000000, 17\), but 48 bytes"),
+    "npy of many rows": (
+        read_array,
+        npy("(1000000000000, 17)"),
+        r"claims float64 \(1000000000000, 17\), but 48 bytes",
+    ),
     "npy of an overflow": (read_array, npy("(9223372036854775807, 17)"), "its header claims"),
     "npy of negative size": (read_array, npy("(-2, -3)"), r"its header claims float64 \(-2, -3\)"),
-    "npy of a truth value": (read_array, npy("(True,)"), "expected a NumPy array, got a broken file"),
-    "npy of objects": (read_array, npy("(1,)", "'|O'", b"cos\nsystem\n."), "it holds Python objects, not numbers"),
-    "npy of no bytes": (read_array, npy("(3,)", "'|V0'"), "expected a NumPy array, got a broken file"),
+    "npy of a truth value": (
+        read_array,
+        npy("(True,)"),
+        "expected a NumPy array, got a broken file",
+    ),
+    "npy of objects": (
+        read_array,
+        npy("(1,)", "'|O'", b"cos\nsystem\n."),
+        "it holds Python objects, not numbers",
+    ),
+    "npy of no bytes": (
+        read_array,
+        npy("(3,)", "'|V0'"),
+        "expected a NumPy array, got a broken file",
+    ),
     "npy of code": (read_array, npy("().__class__"), "expected a NumPy array, got a broken file"),
-    "npy of an open bracket": (read_array, npy_header("("), "expected a NumPy array, got a broken file"),
-    "npy of bad indentation": (read_array, npy_header("\n  (\n )\n 1"), "expected a NumPy array, got a broken file"),
-    "npy of no type": (read_array, npy("(6,)", "'<,4'"), "expected a NumPy array, got a broken file"),
-    "npy of no bytes and many": (read_array, npy(f"({10**30},)", "'|V0'"), "expected a NumPy array, got a broken file"),
-    "npz in place of npy": (read_array, npz(npy("(6,)")), "expected a NumPy array, got a broken file"),
+    "npy of an open bracket": (
+        read_array,
+        npy_header("("),
+        "expected a NumPy array, got a broken file",
+    ),
+    "npy of bad indentation": (
+        read_array,
+        npy_header("\n  (\n )\n 1"),
+        "expected a NumPy array, got a broken file",
+    ),
+    "npy of no type": (
+        read_array,
+        npy("(6,)", "'<,4'"),
+        "expected a NumPy array, got a broken file",
+    ),
+    "npy of no bytes and many": (
+        read_array,
+        npy(f"({10**30},)", "'|V0'"),
+        "expected a NumPy array, got a broken file",
+    ),
+    "npz in place of npy": (
+        read_array,
+        npz(npy("(6,)")),
+        "expected a NumPy array, got a broken file",
+    ),
     "npz of many rows": (
         archived,
         npz(npy("(1000000000, 7)")),
         r"an array `data` in .* claims float64 \(1000000000, 7",
     ),
     "npz bomb": (archived, npz(bytes(250_000_000)), "got a claim of 250000000 bytes of data.npy"),
-    "npz of another name": (archived, npz(npy("(6,)"), "a.npy"), "expected an array `data` in a NumPy archive"),
+    "npz of another name": (
+        archived,
+        npz(npy("(6,)"), "a.npy"),
+        "expected an array `data` in a NumPy archive",
+    ),
     "deep JSON": (read_json, b"[" * 100_000, "expected JSON, got a broken file"),
-    "JSON of empty lists": (read_json, b"[" + b"[]," * 3_000_000 + b"0]", "got a claim of 6000001 values"),
+    "JSON of empty lists": (
+        read_json,
+        b"[" + b"[]," * 3_000_000 + b"0]",
+        "got a claim of 6000001 values",
+    ),
     "JSON of long number": (read_json, b"9" * 5000, "expected JSON, got a broken file"),
-    "TOML of a long key": (read_toml, b"x." + b"a." * 20_000 + b"b = 1", r"broken file \(a key has more than 32 parts"),
-    "TOML of a long table": (read_toml, b"[a" + b" .\t'b'" * 99 + b"]", r"broken file \(a key has more than 32 parts"),
-    "TOML of signs": (read_toml, b'"#".' * 20_000 + b"b = 1", r"broken file \(a key has more than 32 parts"),
-    "TOML of equals signs": (read_toml, b"'='." * 20_000 + b"b = 1", r"broken file \(a key has more than 32 parts"),
-    "TOML of escapes": (read_toml, rb'"\"".' * 20_000 + b"b = 1", r"broken file \(a key has more than 32 parts"),
-    "TOML of a long inline key": (read_toml, b"x = {" + b"'{'." * 99 + b"b = 1}", "a key has more than 32 parts"),
+    "TOML of a long key": (
+        read_toml,
+        b"x." + b"a." * 20_000 + b"b = 1",
+        r"broken file \(a key has more than 32 parts",
+    ),
+    "TOML of a long table": (
+        read_toml,
+        b"[a" + b" .\t'b'" * 99 + b"]",
+        r"broken file \(a key has more than 32 parts",
+    ),
+    "TOML of signs": (
+        read_toml,
+        b'"#".' * 20_000 + b"b = 1",
+        r"broken file \(a key has more than 32 parts",
+    ),
+    "TOML of equals signs": (
+        read_toml,
+        b"'='." * 20_000 + b"b = 1",
+        r"broken file \(a key has more than 32 parts",
+    ),
+    "TOML of escapes": (
+        read_toml,
+        rb'"\"".' * 20_000 + b"b = 1",
+        r"broken file \(a key has more than 32 parts",
+    ),
+    "TOML of a long inline key": (
+        read_toml,
+        b"x = {" + b"'{'." * 99 + b"b = 1}",
+        "a key has more than 32 parts",
+    ),
     "TOML of a key alone": (read_toml, b"a." * 400_000, "a key has more than 32 parts"),
-    "TOML of open strings": (read_toml, b'a = """' + b'\\"""' * 100_000, "expected TOML, got a broken file"),
-    "TOML in Latin-1": (read_toml, "a = 'é'".encode("latin-1"), "expected text in UTF-8, got other bytes"),
-    "JSON in Latin-1": (read_json, '"é"'.encode("latin-1"), "expected text in UTF-8, got other bytes"),
-    "npy of more numbers": (read_array, npy("(5,)"), r"its header claims float64 \(5,\), but 48 bytes follow"),
+    "TOML of open strings": (
+        read_toml,
+        b'a = """' + b'\\"""' * 100_000,
+        "expected TOML, got a broken file",
+    ),
+    "TOML in Latin-1": (
+        read_toml,
+        "a = 'é'".encode("latin-1"),
+        "expected text in UTF-8, got other bytes",
+    ),
+    "JSON in Latin-1": (
+        read_json,
+        '"é"'.encode("latin-1"),
+        "expected text in UTF-8, got other bytes",
+    ),
+    "npy of more numbers": (
+        read_array,
+        npy("(5,)"),
+        r"its header claims float64 \(5,\), but 48 bytes follow",
+    ),
     "TOML of many tables": (read_toml, b"[a.b.c]\n" * 90_000, "got a claim of 270000 tables"),
-    "TOML of many rows": (read_toml, b"x = [" + b"1," * MAX_TOML + b"]", "expected at most 1000000 bytes, got 2000006"),
+    "TOML of many rows": (
+        read_toml,
+        b"x = [" + b"1," * MAX_TOML + b"]",
+        "expected at most 1000000 bytes, got 2000006",
+    ),
     "deep TOML": (read_toml, b"x = " + b"[" * 5000, "expected TOML, got a broken file"),
     "PLY of many vertices": (
         read_vertices,
@@ -129,7 +223,11 @@ CASES = {
         ply("format ascii 1.0\n" + LARGE, b"1\n"),
         "at least .* 2 follow",
     ),
-    "PLY of negative size": (read_vertices, ply(BINARY + LARGE.replace("9", "-9", 1)), "-99999999999 vertex"),
+    "PLY of negative size": (
+        read_vertices,
+        ply(BINARY + LARGE.replace("9", "-9", 1)),
+        "-99999999999 vertex",
+    ),
     "PLY of empty lists": (
         read_vertices,
         ply(BINARY + "element face 3000000\nproperty list uchar int i\n" + LARGE, bytes(3_000_000)),
@@ -137,26 +235,52 @@ CASES = {
     ),
     "compressed PLY of many vertices": (
         read_splats,
-        ply(BINARY + "element chunk 1\nproperty float min_x\n" + LARGE.replace(" x", " packed_position"), bytes(4)),
+        ply(
+            BINARY
+            + "element chunk 1\nproperty float min_x\n"
+            + LARGE.replace(" x", " packed_position"),
+            bytes(4),
+        ),
         "99999999999 vertex need at least 399999999996 bytes, 0 follow",
     ),
     "compressed PLY of empty rows": (
         read_splats,
-        ply(BINARY + "element chunk 99999999999\nelement vertex 1\nproperty uint packed_position\n", bytes(4)),
+        ply(
+            BINARY + "element chunk 99999999999\nelement vertex 1\nproperty uint packed_position\n",
+            bytes(4),
+        ),
         "expected a compressed PLY",
     ),
     "PLY of one line": (read_vertices, b"ply\n" + b"a" * 1_000_000, "expected a complete PLY file"),
-    "PLY without an element": (read_vertices, ply(BINARY + "property float x\n"), "expected a complete PLY file"),
-    "PLY of a word": (read_vertices, ply(BINARY + "element vertex many\n"), "expected a complete PLY file"),
+    "PLY without an element": (
+        read_vertices,
+        ply(BINARY + "property float x\n"),
+        "expected a complete PLY file",
+    ),
+    "PLY of a word": (
+        read_vertices,
+        ply(BINARY + "element vertex many\n"),
+        "expected a complete PLY file",
+    ),
     "EXR of many pixels": (read_exr, large_exr, "got a claim of 40000x40000 pixels of 1 channels"),
-    "PNG of many pixels": (image, png(30000, 30000), "0.png: expected content .* got a claim of 30000x30000 pixels"),
-    "JPEG of many pixels": (image, jpeg(30000, 30000), "0.png: expected content .* got a claim of 30000x30000 pixels"),
+    "PNG of many pixels": (
+        image,
+        png(30000, 30000),
+        "0.png: expected content .* got a claim of 30000x30000 pixels",
+    ),
+    "JPEG of many pixels": (
+        image,
+        jpeg(30000, 30000),
+        "0.png: expected content .* got a claim of 30000x30000 pixels",
+    ),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("read", "content", "message"), CASES.values(), ids=CASES)
-def test_readers__refuse_a_hostile_file_in_one_sentence(tmp_path: Path, read, content, message: str) -> None:
+def test_readers__refuse_a_hostile_file_in_one_sentence(
+    tmp_path: Path, read, content, message: str
+) -> None:
     path = tmp_path / ("0.ply" if read is read_splats else "0.png")
     content(path) if callable(content) else path.write_bytes(content)
     with pytest.raises((ValueError, OSError), match=message) as caught:
@@ -168,7 +292,9 @@ def test_readers__refuse_a_hostile_file_in_one_sentence(tmp_path: Path, read, co
 def test_readers__refuse_pipes_and_folders(tmp_path: Path, read) -> None:
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", tmp_path):
-        with pytest.raises(ValueError, match=f"^{path}: expected a.*got a folder, a pipe or a device"):
+        with pytest.raises(
+            ValueError, match=f"^{path}: expected a.*got a folder, a pipe or a device"
+        ):
             read(path)
 
 
@@ -176,7 +302,10 @@ def test_readers__refuse_pipes_and_folders(tmp_path: Path, read) -> None:
 def test_read_toml__counts_keys_and_not_texts(tmp_path: Path) -> None:
     """Dots and brackets in comments and texts, and the points of numbers, take nothing."""
     dots = "a." * 100_000
-    text = f"# {dots} \"'\n# it's [[\nx = {[0.5] * 20_000}\na.b.c.d = '{dots}'\n\"{dots[:99]}\".'{dots[:99]}' = 1\n"
+    text = (
+        f"# {dots} \"'\n# it's [[\nx = {[0.5] * 20_000}\na.b.c.d = "
+        f"'{dots}'\n\"{dots[:99]}\".'{dots[:99]}' = 1\n"
+    )
     (tmp_path / "a.toml").write_text(text)
     content = {"x": [0.5] * 20_000, "a": {"b": {"c": {"d": dots}}}, dots[:99]: {dots[:99]: 1}}
     assert read_toml(tmp_path / "a.toml") == content
@@ -188,7 +317,9 @@ def test_read_json__does_not_count_the_punctuation_of_texts(tmp_path: Path) -> N
     assert read_json(tmp_path / "a.json") == [text]
 
 
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32"])
+@pytest.mark.parametrize(
+    "encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32"]
+)
 def test_readers__read_every_encoding_of_unicode(tmp_path: Path, encoding: str) -> None:
     (tmp_path / "a").write_bytes('a = "é"\r\n[b]\r\n'.encode(encoding))
     assert read_toml(tmp_path / "a") == {"a": "é", "b": {}}

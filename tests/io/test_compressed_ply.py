@@ -1,4 +1,6 @@
-"""Compressed PLY: errors within the steps of the layout, bits of the layout, and messages for broken files."""
+"""Compressed PLY: errors within the steps of the layout, bits of the layout, and messages for
+broken files.
+"""
 
 from __future__ import annotations
 
@@ -26,12 +28,20 @@ def test_read_compressed_ply__returns_what_was_written_up_to_the_steps(tmp_path,
     new = result.numpy()
     extent = np.ptp(old["means"], axis=0).max()
     assert_close(new["means"], old["means"], atol=0.51 * extent / 1023)
-    assert_close(new["log_scales"], old["log_scales"], atol=0.51 * np.ptp(old["log_scales"], axis=0).max() / 1023)
+    assert_close(
+        new["log_scales"],
+        old["log_scales"],
+        atol=0.51 * np.ptp(old["log_scales"], axis=0).max() / 1023,
+    )
     assert_close(np.asarray(result.opacities), np.asarray(gaussians.opacities), atol=0.51 / 255)
     units = old["quats"] / np.linalg.norm(old["quats"], axis=1, keepdims=True)
     # The largest component follows from three with steps of sqrt(2) / 1023 and is at least a half.
     assert_close(np.abs((units * new["quats"]).sum(axis=1)), 1, atol=1e-5)
-    assert_close(new["sh_coeffs"][:, 0], old["sh_coeffs"][:, 0], atol=0.51 * np.ptp(old["sh_coeffs"][:, 0]) / 255)
+    assert_close(
+        new["sh_coeffs"][:, 0],
+        old["sh_coeffs"][:, 0],
+        atol=0.51 * np.ptp(old["sh_coeffs"][:, 0]) / 255,
+    )
     assert_close(new["sh_coeffs"][:, 1:], old["sh_coeffs"][:, 1:], atol=4.01 / 256)
 
 
@@ -47,30 +57,43 @@ def test_write_compressed_ply__has_the_bits_of_the_layout(tmp_path):
     write_compressed_ply(tmp_path / "g.compressed.ply", gaussians)
     file = PlyData.read(tmp_path / "g.compressed.ply")
     assert [element.name for element in file.elements] == ["chunk", "vertex"]
-    assert [file["chunk"][name][0] for name in ("min_z", "max_z", "min_scale_y", "max_scale_x")] == [0, 4, -3, -1]
+    assert [
+        file["chunk"][name][0] for name in ("min_z", "max_z", "min_scale_y", "max_scale_x")
+    ] == [0, 4, -3, -1]
     vertices = file["vertex"]
     assert vertices["packed_position"].tolist() == [0, 2**32 - 1, 1024 << 21 | 512 << 11 | 512]
     assert vertices["packed_scale"].tolist() == [0, 2**32 - 1, 1024 << 21 | 2047]
     zero = 512  # round(1023 / 2) upwards
     half = 512 + 362  # sqrt(1/2) / 2 of 1023 beyond it
     rotations = vertices["packed_rotation"].tolist()
-    assert rotations[:2] == [zero << 20 | zero << 10 | zero, 2 << 30 | zero << 20 | zero << 10 | zero]
+    assert rotations[:2] == [
+        zero << 20 | zero << 10 | zero,
+        2 << 30 | zero << 20 | zero << 10 | zero,
+    ]
     low = 1023 - half
-    assert [rotations[2] >> 30, *(rotations[2] >> shift & 1023 for shift in (20, 10, 0))] == pytest.approx(
-        [3, low, low, low], abs=1
-    )
+    assert [
+        rotations[2] >> 30,
+        *(rotations[2] >> shift & 1023 for shift in (20, 10, 0)),
+    ] == pytest.approx([3, low, low, low], abs=1)
     assert [color & 255 for color in vertices["packed_color"].tolist()] == [0, 128, 255]
     assert [color >> 24 for color in vertices["packed_color"].tolist()] == [0, 255, 153]
     assert [color >> 8 & 255 for color in vertices["packed_color"].tolist()] == [0, 0, 0]
 
 
 def test_write_compressed_ply__has_bounds_for_each_256(tmp_path):
-    means = np.repeat(np.arange(3.0), 256)[:600, None] * np.ones(3) * 1000 + np.random.default_rng(0).random((600, 3))
+    means = np.repeat(np.arange(3.0), 256)[:600, None] * np.ones(3) * 1000 + np.random.default_rng(
+        0
+    ).random((600, 3))
     many = splats(600)
     gaussians = Gaussians(
-        means, *(many.numpy()[name] for name in ("log_scales", "quats", "logit_opacities", "sh_coeffs"))
+        means,
+        *(many.numpy()[name] for name in ("log_scales", "quats", "logit_opacities", "sh_coeffs")),
     )
-    assert_close(round_trip(tmp_path / "g.compressed.ply", gaussians).numpy()["means"], means, atol=0.6 / 1023)
+    assert_close(
+        round_trip(tmp_path / "g.compressed.ply", gaussians).numpy()["means"],
+        means,
+        atol=0.6 / 1023,
+    )
 
 
 def test_write_compressed_ply__writes_a_file_of_no_gaussians(tmp_path):
@@ -99,11 +122,26 @@ def infinite(tables) -> None:
     ("change", "message"),
     [
         (lambda t: t.pop("chunk"), "expected a complete PLY file.*it has no element chunk"),
-        (lambda t: t.update(chunk=t["chunk"][:1]), "expected 2 chunks of 256 for 300 Gaussians, got 1"),
-        (lambda t: t.update(sh=t["sh"][:9]), "expected 300 rows of f_rest_0 .* got 9 rows of 9 properties"),
-        (lambda t: renamed(t, "sh", "f_rest_8", "f_rest_9"), "an element sh without f_rest_8 as uint8"),
-        (lambda t: renamed(t, "vertex", "packed_scale", "scale"), "an element vertex without packed_scale as uint32"),
-        (lambda t: renamed(t, "chunk", "max_scale_x", "x"), "an element chunk without max_scale_x as float32"),
+        (
+            lambda t: t.update(chunk=t["chunk"][:1]),
+            "expected 2 chunks of 256 for 300 Gaussians, got 1",
+        ),
+        (
+            lambda t: t.update(sh=t["sh"][:9]),
+            "expected 300 rows of f_rest_0 .* got 9 rows of 9 properties",
+        ),
+        (
+            lambda t: renamed(t, "sh", "f_rest_8", "f_rest_9"),
+            "an element sh without f_rest_8 as uint8",
+        ),
+        (
+            lambda t: renamed(t, "vertex", "packed_scale", "scale"),
+            "an element vertex without packed_scale as uint32",
+        ),
+        (
+            lambda t: renamed(t, "chunk", "max_scale_x", "x"),
+            "an element chunk without max_scale_x as float32",
+        ),
         (infinite, "others in 256 of 300 Gaussians .centre of 0, 1, 2 and 253 more."),
     ],
 )

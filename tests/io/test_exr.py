@@ -11,7 +11,10 @@ from morgs_mi.io.exr import read_exr, read_light, write_exr
 
 def test_read_exr__inverts_write_exr_exactly(tmp_path):
     rng = np.random.default_rng(0)
-    channels = {name: rng.normal(size=(5, 7)).astype(np.float32) for name in ("motion.X", "motion.Y", "depth.Y")}
+    channels = {
+        name: rng.normal(size=(5, 7)).astype(np.float32)
+        for name in ("motion.X", "motion.Y", "depth.Y")
+    }
     write_exr(tmp_path / "a.exr", channels)
     back = read_exr(tmp_path / "a.exr")
     assert back.keys() == channels.keys()
@@ -65,7 +68,9 @@ LIGHT = np.random.default_rng(0).uniform(0, 20, (4, 5, 3)).astype(np.float32)
 
 
 def test_read_light__returns_what_was_written(tmp_path):
-    write_exr(tmp_path / "a.exr", {**channels_of(LIGHT), "A": LIGHT[..., 0], "depth.Y": LIGHT[..., 1]})
+    write_exr(
+        tmp_path / "a.exr", {**channels_of(LIGHT), "A": LIGHT[..., 0], "depth.Y": LIGHT[..., 1]}
+    )
     np.testing.assert_array_equal(read_light(tmp_path / "a.exr"), LIGHT)
     write_exr(tmp_path / "grey.exr", {"Y": LIGHT[..., 0]})
     np.testing.assert_array_equal(read_light(tmp_path / "grey.exr"), LIGHT[..., [0, 0, 0]])
@@ -73,17 +78,25 @@ def test_read_light__returns_what_was_written(tmp_path):
 
 def test_read_light__converts_other_primaries(tmp_path):
     """By the matrices of ITU-R BT.2087 from Rec. 2020, in which Rec. 709's colours fit."""
-    to_2020 = np.array([[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]])
+    to_2020 = np.array(
+        [[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]]
+    )
     primaries = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
     header = {"type": OpenEXR.scanlineimage, "chromaticities": primaries}
-    OpenEXR.File(header, channels_of((LIGHT @ to_2020.T).astype(np.float32))).write(str(tmp_path / "a.exr"))
+    OpenEXR.File(header, channels_of((LIGHT @ to_2020.T).astype(np.float32))).write(
+        str(tmp_path / "a.exr")
+    )
     np.testing.assert_allclose(read_light(tmp_path / "a.exr"), LIGHT, atol=0.01)
 
 
 def test_read_light__refuses_other_channels_and_infinity(tmp_path):
     write_exr(tmp_path / "a.exr", {"depth.Y": LIGHT[..., 0]})
-    with pytest.raises(ValueError, match=r"expected the channels R, G, B, or Y, got depth\.Y; rename"):
+    with pytest.raises(
+        ValueError, match=r"expected the channels R, G, B, or Y, got depth\.Y; rename"
+    ):
         read_light(tmp_path / "a.exr")
     write_exr(tmp_path / "a.exr", channels_of(LIGHT + np.inf))
-    with pytest.raises(ValueError, match=r"a\.exr: its image must be finite .* replace such pixels"):
+    with pytest.raises(
+        ValueError, match=r"a\.exr: its image must be finite .* replace such pixels"
+    ):
         read_light(tmp_path / "a.exr")

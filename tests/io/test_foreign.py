@@ -1,4 +1,6 @@
-"""Formats of Gaussians that are not read: recognised by content and by name, and named with what converts them."""
+"""Formats of Gaussians that are not read: recognised by content and by name, and named with what
+converts them.
+"""
 
 from __future__ import annotations
 
@@ -52,22 +54,31 @@ def test_refuse_foreign__names_format_and_remedy_at_every_door(tmp_path, name):
     content, kind, remedy = FILES[name]
     (tmp_path / name).write_bytes(content)
     for door in (open_stream, read_splats, lambda path: import_frames([path], tmp_path / "out")):
-        with pytest.raises(ValueError, match=rf"{name}: expected Gaussians as \.ply.*, got {kind}.*{remedy}"):
+        with pytest.raises(
+            ValueError, match=rf"{name}: expected Gaussians as \.ply.*, got {kind}.*{remedy}"
+        ):
             door(tmp_path / name)
 
 
 @pytest.mark.parametrize(
-    "command", [("render",), ("export", "ply"), ("export", "web"), ("view", "--no-browser")], ids=" ".join
+    "command",
+    [("render",), ("export", "ply"), ("export", "web"), ("view", "--no-browser")],
+    ids=" ".join,
 )
 def test_commands__name_a_compressed_format(tmp_path, capsys, command):
     (tmp_path / "a.spz").write_bytes(SPZ)
     assert cli.main([*command, str(tmp_path / "a.spz")]) == 1
-    assert "got SPZ (Niantic's compressed format), which is not read; convert it to .ply" in capsys.readouterr().err
+    assert (
+        "got SPZ (Niantic's compressed format), which is not read; convert it to .ply"
+        in capsys.readouterr().err
+    )
 
 
 def test_open_stream__names_what_to_do_with_a_folder_of_gaussians(tmp_path):
     (tmp_path / "1.ply").touch()
-    with pytest.raises(ValueError, match=r"got a folder with 1 files of Gaussians.*1\.ply, or turn all .*import"):
+    with pytest.raises(
+        ValueError, match=r"got a folder with 1 files of Gaussians.*1\.ply, or turn all .*import"
+    ):
         open_stream(tmp_path)
     (tmp_path / "meta.json").write_text("{}")
     with pytest.raises(ValueError, match="got SOG"):

@@ -49,12 +49,15 @@ def test_video_reader__has_the_shown_frames_of_hevc_with_sound(name: str) -> Non
     reader = VideoReader.open(CLIPS / name)
     levels = np.array([image.mean() for image in reader.frames()])
     assert reader.num_frames == len(levels) == 19
-    np.testing.assert_allclose(levels, 98 + 8 * np.arange(19), atol=4)  # half a step: lossy compression
+    # Half a step: lossy compression.
+    np.testing.assert_allclose(levels, 98 + 8 * np.arange(19), atol=4)
 
 
 @pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize("file", ["a.mp4 mp4v", "a.mp4 mpg2", "a.mov mpg2", "a.mp4 vp09"])
-def test_video_reader__has_the_frames_that_the_edit_list_shows(tmp_path: Path, file: str, part: str) -> None:
+def test_video_reader__has_the_frames_that_the_edit_list_shows(
+    tmp_path: Path, file: str, part: str
+) -> None:
     """With frames that refer to later ones in mpg2; live plays the same frames."""
     name, codec = file.split()
     parts, frames = PARTS[part]
@@ -75,7 +78,11 @@ def test_play__shows_the_frames_of_the_reader(tmp_path: Path) -> None:
     write_video(tmp_path / "a.mp4", clip(20), 100, "mpg2")
     show_parts(tmp_path / "a.mp4", [(0.05, 0.08)])
     played = [number(image) for image in play(tmp_path / "a.mp4", ClipClock(), Event())]
-    assert played == [number(image) for image in VideoReader.open(tmp_path / "a.mp4").frames()] == list(range(5, 13))
+    assert (
+        played
+        == [number(image) for image in VideoReader.open(tmp_path / "a.mp4").frames()]
+        == list(range(5, 13))
+    )
 
 
 def test_video_reader__has_the_positions_of_shown_frames_at_a_variable_rate(tmp_path: Path) -> None:
@@ -105,7 +112,13 @@ def test_read_movie__reads_parts_and_notices_a_truncated_file(tmp_path: Path) ->
 
 @pytest.mark.parametrize("length", [0, 7, 8, 20, 60])
 def test_read_movie__survives_broken_boxes(tmp_path: Path, length: int) -> None:
-    boxes = b"\0\0\0\x40ftypisom" + b"\0\0\0\x09moov" + b"\xff\xff\xff\xfftrak" + b"\0\0\0\1mdia" + bytes(80)
+    boxes = (
+        b"\0\0\0\x40ftypisom"
+        + b"\0\0\0\x09moov"
+        + b"\xff\xff\xff\xfftrak"
+        + b"\0\0\0\1mdia"
+        + bytes(80)
+    )
     (tmp_path / "a.mp4").write_bytes(boxes[:length])
     movie = read_movie(tmp_path / "a.mp4")
     assert movie is None or movie.parts == ()

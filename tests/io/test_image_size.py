@@ -13,7 +13,9 @@ from morgs_mi.io.image_size import image_size
 from morgs_mi.io.video import FolderReader
 
 RGB = np.random.default_rng(0).integers(0, 256, (37, 53, 3)).astype(np.uint8)
-RGBA = np.dstack([RGB, np.where(np.arange(53) < 20, 0, 255).astype(np.uint8) + np.zeros((37, 1), np.uint8)])
+RGBA = np.dstack(
+    [RGB, np.where(np.arange(53) < 20, 0, 255).astype(np.uint8) + np.zeros((37, 1), np.uint8)]
+)
 FILES = {
     "png": (".png", RGB, ()),
     "jpeg": (".jpg", RGB, ()),
@@ -27,7 +29,9 @@ FILES = {
 
 
 @pytest.mark.parametrize(("suffix", "image", "options"), FILES.values(), ids=FILES)
-def test_image_size__reads_the_header_of_every_format(suffix: str, image: np.ndarray, options) -> None:
+def test_image_size__reads_the_header_of_every_format(
+    suffix: str, image: np.ndarray, options
+) -> None:
     data = cv2.imencode(suffix, image, options)[1]
     assert image_size(data) == (53, 37)
     for length in range(0, len(data), 11):
@@ -50,7 +54,9 @@ def test_folder_reader__reads_every_format_and_upper_case(tmp_path: Path, suffix
 
 
 @pytest.mark.parametrize("suffix", [".tif", ".webp", ".png"])
-def test_folder_reader__masks_transparent_pixels_of_every_format(tmp_path: Path, suffix: str) -> None:
+def test_folder_reader__masks_transparent_pixels_of_every_format(
+    tmp_path: Path, suffix: str
+) -> None:
     file = tmp_path / f"0{suffix}"
     file.write_bytes(cv2.imencode(suffix, RGBA)[1].tobytes())
     mask, note = opaque_pixels(FolderReader.of_files([file]), "cam")

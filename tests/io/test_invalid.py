@@ -35,7 +35,10 @@ def broken(name: str, value: float, rows: list[int]) -> Gaussians:
 @pytest.mark.parametrize("name", KINDS)
 def test_without_invalid__names_the_attribute_the_count_and_the_first(name, value):
     gaussians = broken(name, value, [3, 5, 8, 9, 30])
-    message = rf"f.ply: expected .* in 5 of 40 Gaussians \({KINDS[name]} of 3, 5, 8 and 2 more\); leave them out"
+    message = (
+        rf"f.ply: expected .* in 5 of 40 Gaussians \({KINDS[name]} of 3, 5, 8 and 2 more\); leave "
+        r"them out"
+    )
     with pytest.raises(ValueError, match=message):
         without_invalid("f.ply", gaussians, 0.1)
 

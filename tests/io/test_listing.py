@@ -6,7 +6,15 @@ from pathlib import Path
 
 from morgs_mi.io.listing import is_added, listed
 
-ADDED = ("._cam01.mp4", ".DS_Store", "Thumbs.db", "desktop.ini", "__MACOSX", "@eaDir", "$RECYCLE.BIN")
+ADDED = (
+    "._cam01.mp4",
+    ".DS_Store",
+    "Thumbs.db",
+    "desktop.ini",
+    "__MACOSX",
+    "@eaDir",
+    "$RECYCLE.BIN",
+)
 
 
 def test_listed__leaves_out_what_systems_add_and_hidden_files(tmp_path: Path) -> None:

@@ -15,7 +15,14 @@ from morgs_mi.io.model_cameras import model_cameras
 def test_model_cameras__names_keys_that_it_does_not_understand_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    row = {"id": 0, "img_name": "a", "width": 62, "height": 46, "position": [0, 0, 0], "rotation": np.eye(3).tolist()}
+    row = {
+        "id": 0,
+        "img_name": "a",
+        "width": 62,
+        "height": 46,
+        "position": [0, 0, 0],
+        "rotation": np.eye(3).tolist(),
+    }
     rows = [row | {"fx": 50, "fy": 50, "k1": 0.1}, row | {"fx": 50, "fy": 50, "cx": 3}]
     (tmp_path / "cameras.json").write_bytes(json.dumps(rows).encode("utf-8-sig"))
     with caplog.at_level(logging.WARNING):

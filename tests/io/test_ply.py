@@ -23,7 +23,9 @@ LAYOUT = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
 def random_gaussians(n: int = 20, degree: int = 3) -> Gaussians:
     """Return Gaussians with the attributes of a PLY file."""
     raw = make_unit_scene(degree, n)
-    return to_gaussians({name: raw[name] for name in RAW if name not in ("motion", "logit_confidence")})
+    return to_gaussians(
+        {name: raw[name] for name in RAW if name not in ("motion", "logit_confidence")}
+    )
 
 
 def table(gaussians: Gaussians) -> np.ndarray:
@@ -32,8 +34,14 @@ def table(gaussians: Gaussians) -> np.ndarray:
     columns = {"x": raw["means"][:, 0], "y": raw["means"][:, 1], "z": raw["means"][:, 2]}
     columns |= {f"f_dc_{c}": raw["sh_coeffs"][:, 0, c] for c in range(3)}
     bands = raw["sh_coeffs"].shape[1] - 1
-    columns |= {f"f_rest_{c * bands + k}": raw["sh_coeffs"][:, 1 + k, c] for c in range(3) for k in range(bands)}
-    columns |= {"opacity": raw["logit_opacities"]} | {f"scale_{i}": raw["log_scales"][:, i] for i in range(3)}
+    columns |= {
+        f"f_rest_{c * bands + k}": raw["sh_coeffs"][:, 1 + k, c]
+        for c in range(3)
+        for k in range(bands)
+    }
+    columns |= {"opacity": raw["logit_opacities"]} | {
+        f"scale_{i}": raw["log_scales"][:, i] for i in range(3)
+    }
     columns |= {f"rot_{i}": raw["quats"][:, i] for i in range(4)}
     records = np.empty(len(gaussians), [(name, "f4") for name in columns])
     for name, column in columns.items():
@@ -43,7 +51,9 @@ def table(gaussians: Gaussians) -> np.ndarray:
 
 def assert_same(a: Gaussians, b: Gaussians, **tolerance: float) -> None:
     for name, value in a.numpy().items():
-        np.testing.assert_allclose(b.numpy()[name], value, err_msg=name, **({"rtol": 0} | tolerance))
+        np.testing.assert_allclose(
+            b.numpy()[name], value, err_msg=name, **({"rtol": 0} | tolerance)
+        )
 
 
 @pytest.mark.parametrize("degree", range(4))
@@ -56,7 +66,9 @@ def test_read_ply__inverts_write_ply(tmp_path, degree):
 
 @pytest.mark.parametrize("degree", range(4))
 def test_read_ply__inverts_write_ply_with_all_attributes(tmp_path, degree):
-    gaussians = replace(to_gaussians(make_unit_scene(degree)), offset=np.arange(30.0).reshape(10, 3))
+    gaussians = replace(
+        to_gaussians(make_unit_scene(degree)), offset=np.arange(30.0).reshape(10, 3)
+    )
     write_ply(tmp_path / "g.ply", gaussians, layout="mitsuba")
     copy = read_ply(tmp_path / "g.ply")
     assert copy.items().keys() == gaussians.items().keys()
@@ -67,7 +79,9 @@ def test_read_ply__inverts_write_ply_with_all_attributes(tmp_path, degree):
 def test_write_ply__stores_the_attributes_of_mitsuba(tmp_path):
     gaussians = to_gaussians(make_unit_scene(1, 2))
     write_ply(tmp_path / "g.ply", gaussians, layout="mitsuba")
-    attributes = dict(mi.traverse(mi.load_dict({"type": "ellipsoids", "filename": str(tmp_path / "g.ply")})))
+    attributes = dict(
+        mi.traverse(mi.load_dict({"type": "ellipsoids", "filename": str(tmp_path / "g.ply")}))
+    )
     for name, value in ellipsoids(gaussians).items():
         if name != "type":
             assert_close(attributes[name], np.ravel(value), atol=2e-6)  # of the unit quaternions
@@ -102,7 +116,12 @@ def test_write_ply__has_the_bytes_of_the_layout(tmp_path):
     head, body = (tmp_path / "g.ply").read_bytes().split(b"end_header\n")
     lines = head.decode().splitlines()
     assert lines[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 2"]
-    names = [*LAYOUT, *(f"f_rest_{i}" for i in range(9)), "opacity", *(f"scale_{i}" for i in range(3))]
+    names = [
+        *LAYOUT,
+        *(f"f_rest_{i}" for i in range(9)),
+        "opacity",
+        *(f"scale_{i}" for i in range(3)),
+    ]
     names += [f"rot_{i}" for i in range(4)]
     assert lines[3:] == [f"property float {name}" for name in names]
     first = dict(zip(names, struct.unpack_from(f"<{len(names)}f", body), strict=True))
@@ -118,21 +137,25 @@ def test_write_ply__has_the_bytes_of_the_layout(tmp_path):
 
 @pytest.mark.parametrize("degree", range(4))
 @pytest.mark.parametrize(
-    "form", [{"text": True}, {"byte_order": ">"}, {"byte_order": "<"}], ids=["text", "big", "little"]
+    "form",
+    [{"text": True}, {"byte_order": ">"}, {"byte_order": "<"}],
+    ids=["text", "big", "little"],
 )
 def test_read_ply__accepts_files_of_other_tools(tmp_path, degree, form):
     gaussians = random_gaussians(degree=degree)
     records = table(gaussians)
-    # No normals, properties in another order and of other types, unknown properties, and a second element.
+    # No normals, properties in another order and of other types, unknown properties, and a second
+    # element.
     extra = [("label", "u1"), *reversed(records.dtype.descr), ("time", "f8")]
     vertices = np.zeros(len(records), extra)
     for name in records.dtype.names:
         vertices[name] = records[name]
     camera = PlyElement.describe(np.zeros(1, [("focal", "f4")]), "camera")
-    PlyData([camera, PlyElement.describe(vertices, "vertex")], comments=["by another tool"], **form).write(
-        str(tmp_path / "g.ply")
-    )
-    assert_same(gaussians, read_ply(tmp_path / "g.ply"), rtol=1e-6 if "text" in form else 0)  # 9 digits may be fewer
+    PlyData(
+        [camera, PlyElement.describe(vertices, "vertex")], comments=["by another tool"], **form
+    ).write(str(tmp_path / "g.ply"))
+    # 9 digits may be fewer.
+    assert_same(gaussians, read_ply(tmp_path / "g.ply"), rtol=1e-6 if "text" in form else 0)
 
 
 def test_read_ply__bounds_the_infinite_numbers_of_opaque_and_flat_gaussians(tmp_path):
@@ -148,13 +171,16 @@ def test_read_ply__bounds_the_infinite_numbers_of_opaque_and_flat_gaussians(tmp_
 
 def test_write_ply__writes_no_rotation_for_a_zero_quaternion(tmp_path):
     write_ply(
-        tmp_path / "g.ply", Gaussians(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 4)), [0], np.zeros((1, 1, 3)))
+        tmp_path / "g.ply",
+        Gaussians(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 4)), [0], np.zeros((1, 1, 3))),
     )
     assert read_ply(tmp_path / "g.ply").numpy()["quats"].tolist() == [[1, 0, 0, 0]]
 
 
 def without(*names):
-    return lambda records: repack_fields(records[[name for name in records.dtype.names if name not in names]])
+    return lambda records: repack_fields(
+        records[[name for name in records.dtype.names if name not in names]]
+    )
 
 
 def with_nan(records):
@@ -165,13 +191,20 @@ def with_nan(records):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (without("rot_3", "opacity"), "without opacity, rot_3, as of a mesh or a point cloud; export the Gaussians"),
+        (
+            without("rot_3", "opacity"),
+            "without opacity, rot_3, as of a mesh or a point cloud; export the Gaussians",
+        ),
         (without("f_rest_4"), "expected f_rest_0 to f_rest_8, 23 or 44 .* got 44 of them"),
         (
             with_nan,
-            r"expected finite numbers of at most 1e\+12, others in 1 of 20 Gaussians \(size of 3\); leave them out",
+            r"expected finite numbers of at most 1e\+12, others in 1 of 20 Gaussians \(size of "
+            r"3\); leave them out",
         ),
-        (lambda _: np.zeros(4, [("packed_position", "u4")]), "PlayCanvas' compressed one; read it with `read_splats`"),
+        (
+            lambda _: np.zeros(4, [("packed_position", "u4")]),
+            "PlayCanvas' compressed one; read it with `read_splats`",
+        ),
     ],
 )
 def test_read_ply__refuses_files_that_it_cannot_read(tmp_path, change, message):

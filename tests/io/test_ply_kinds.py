@@ -40,12 +40,19 @@ def columns(*names: str) -> dict[str, np.ndarray]:
 def test_read_ply__draws_discs_with_a_thin_third_axis(tmp_path, caplog):
     gaussians = read_ply(write(tmp_path / "a.ply", without=("scale_2",)))
     expected = random_gaussians(N, degree=1)
-    np.testing.assert_array_equal(gaussians.numpy()["log_scales"][:, :2], expected.numpy()["log_scales"][:, :2])
+    np.testing.assert_array_equal(
+        gaussians.numpy()["log_scales"][:, :2], expected.numpy()["log_scales"][:, :2]
+    )
     assert np.exp(gaussians.numpy()["log_scales"][:, 2]).max() < 1e-20
     assert "a.ply: it has discs of 2D Gaussian Splatting" in caplog.text
 
 
-SPACETIME = {"trbf_center", "trbf_scale", *(f"motion_{i}" for i in range(9)), *(f"omega_{i}" for i in range(4))}
+SPACETIME = {
+    "trbf_center",
+    "trbf_scale",
+    *(f"motion_{i}" for i in range(9)),
+    *(f"omega_{i}" for i in range(4)),
+}
 INSTANTS = {
     "spacetime gaussians": columns(*SPACETIME),
     "4dgs": columns("t", "scale_t", "rot_r_0", "rot_r_1", "rot_r_2", "rot_r_3"),
@@ -64,12 +71,15 @@ INSTANTS = {
 def test_read_ply__refuses_several_instants(tmp_path, kind):
     path = write(tmp_path / "a.ply", **INSTANTS[kind])
     with pytest.raises(
-        ValueError, match=r"a\.ply: expected the Gaussians of one instant, got several instants.*import"
+        ValueError,
+        match=r"a\.ply: expected the Gaussians of one instant, got several instants.*import",
     ):
         read_ply(path)
 
 
-@pytest.mark.parametrize("more", [{"time": same(3)}, {"frame": np.full(N, 7, "i4")}, {"motion_0": same()}])
+@pytest.mark.parametrize(
+    "more", [{"time": same(3)}, {"frame": np.full(N, 7, "i4")}, {"motion_0": same()}]
+)
 def test_read_ply__reads_gaussians_of_one_instant(tmp_path, more):
     assert len(read_ply(write(tmp_path / "a.ply", **more))) == N
 
@@ -77,7 +87,11 @@ def test_read_ply__reads_gaussians_of_one_instant(tmp_path, more):
 @pytest.mark.parametrize(
     ("without", "more", "message"),
     [
-        (("f_dc_0",), columns("f_offset_0", "f_anchor_feat_0"), "got anchors of Scaffold-GS .f_anchor_feat_0, f_off"),
+        (
+            ("f_dc_0",),
+            columns("f_offset_0", "f_anchor_feat_0"),
+            "got anchors of Scaffold-GS .f_anchor_feat_0, f_off",
+        ),
         (("scale_1", "scale_2"), {}, "expected Gaussians with three axes, .* got scale_0 alone"),
         (("scale_0",), {}, "with two, got scale_1, scale_2 alone"),
         (
@@ -85,7 +99,11 @@ def test_read_ply__reads_gaussians_of_one_instant(tmp_path, more):
             {"scale_0": np.zeros(N, "u1")},
             "got integers in scale_0, which stand for entries of a codebook",
         ),
-        ((), columns(*(f"f_rest_{i}" for i in range(72))), "got 72 of them; export the Gaussians with SH of degree 3"),
+        (
+            (),
+            columns(*(f"f_rest_{i}" for i in range(72))),
+            "got 72 of them; export the Gaussians with SH of degree 3",
+        ),
         (("f_rest_8",), {}, "got 8 of them"),
     ],
 )
@@ -108,9 +126,15 @@ def test_read_ply__puts_the_filter_of_mip_splatting_into_sizes_and_opacities(tmp
 
 def test_read_ply__names_what_may_change_the_image_once_in_a_folder(tmp_path, caplog):
     for name in ("a.ply", "b.ply"):
-        read_ply(write(tmp_path / name, **columns("nx", "label", "object_id", "red", "beta", "sg_axis_0")))
+        read_ply(
+            write(
+                tmp_path / name, **columns("nx", "label", "object_id", "red", "beta", "sg_axis_0")
+            )
+        )
     (message,) = [record.getMessage() for record in caplog.records]
-    assert message.endswith("a.ply: it is drawn without beta, sg_axis_0, which may change the image.")
+    assert message.endswith(
+        "a.ply: it is drawn without beta, sg_axis_0, which may change the image."
+    )
 
 
 def test_read_ply__names_a_deformation_network_beside_the_gaussians(tmp_path, caplog):

@@ -109,5 +109,7 @@ def test_prefetched__lets_the_interpreter_end_while_an_item_is_produced() -> Non
         "next(frames)\n"
         "raise SystemExit(3)\n"
     )
-    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    result = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False
+    )
     assert (result.returncode, result.stderr) == (3, "")

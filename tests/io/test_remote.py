@@ -43,7 +43,11 @@ def folder(tmp_path: Path) -> Iterator[Path]:
 def test_load_capture__reads_a_url_like_a_folder(folder: Path) -> None:
     local = load_capture(folder)
     remote = load_capture(URL)
-    assert (remote.names, remote.num_frames, remote.path.name) == (local.names, local.num_frames, "clip")
+    assert (remote.names, remote.num_frames, remote.path.name) == (
+        local.names,
+        local.num_frames,
+        "clip",
+    )
     np.testing.assert_array_equal(remote.points, local.points)
     for ours, theirs in zip(remote.frames(), local.frames(), strict=True):
         np.testing.assert_array_equal(ours.images, theirs.images)
@@ -100,14 +104,28 @@ class Silent(Refusing):
 @pytest.mark.parametrize(
     ("url", "kind", "message"),
     [
-        ("nothing://a/b", ValueError, r"nothing://a/b: expected a URL that fsspec can open, .*not known: nothing"),
+        (
+            "nothing://a/b",
+            ValueError,
+            r"nothing://a/b: expected a URL that fsspec can open, .*not known: nothing",
+        ),
         ("s3://a/b", ValueError, r"s3://a/b: reading it needs another package: Install s3fs"),
-        ("memory://none", FileNotFoundError, r"memory://none: expected a file or a folder, found none"),
-        ("refusing://a", PermissionError, r"refusing://a: expected to be allowed to read it, got Access Denied"),
+        (
+            "memory://none",
+            FileNotFoundError,
+            r"memory://none: expected a file or a folder, found none",
+        ),
+        (
+            "refusing://a",
+            PermissionError,
+            r"refusing://a: expected to be allowed to read it, got Access Denied",
+        ),
         ("silent://a", ConnectionError, r"silent://a: expected an answer, got none in time"),
     ],
 )
-def test_mirrored__refuses_in_one_sentence(url, kind, message, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mirrored__refuses_in_one_sentence(
+    url, kind, message, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for system in (Refusing, Silent):
         fsspec.register_implementation(system.protocol, system, clobber=True)
     monkeypatch.setitem(sys.modules, "s3fs", None)
@@ -117,20 +135,28 @@ def test_mirrored__refuses_in_one_sentence(url, kind, message, monkeypatch: pyte
 
 def test_mirrored__names_the_extra_that_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "fsspec.core", None)
-    with pytest.raises(ValueError, match=r"memory://a: reading it needs the package fsspec; pip .*morgs-mi\[cluster\]"):
+    with pytest.raises(
+        ValueError,
+        match=r"memory://a: reading it needs the package fsspec; pip .*morgs-mi\[cluster\]",
+    ):
         mirrored("memory://a")
 
 
 def test_fetched__names_a_file_that_has_gone(folder: Path) -> None:
     capture = load_capture(URL)
     fsspec.filesystem("memory").rm("/bucket/clip/cam1/0002.png")
-    with pytest.raises(FileNotFoundError, match=r"memory://bucket/clip: /bucket/clip/cam1/0002\.png: expected a file"):
+    with pytest.raises(
+        FileNotFoundError,
+        match=r"memory://bucket/clip: /bucket/clip/cam1/0002\.png: expected a file",
+    ):
         list(capture.frames(2, 3))
 
 
 def test_fit__names_an_unknown_protocol(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["fit", "nothing://a/b", str(tmp_path / "out")]) == 1
-    assert "nothing://a/b: expected a URL that fsspec can open" in " ".join(capsys.readouterr().err.split())
+    assert "nothing://a/b: expected a URL that fsspec can open" in " ".join(
+        capsys.readouterr().err.split()
+    )
 
 
 class Server(ThreadingHTTPServer):
@@ -138,7 +164,8 @@ class Server(ThreadingHTTPServer):
 
     Attributes:
         versions: header fields of every file that has its time, e.g. ``ETag``.
-        instead: body that is sent once in place of a file, by the end of its path; None: it is never finished.
+        instead: body that is sent once in place of a file, by the end of its path; None: it is
+            never finished.
         fetched: paths of the requested bodies.
     """
 
@@ -200,7 +227,9 @@ def first_images(url: str) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("versions", [("Last-Modified",), ("ETag",), ("ETag", "Last-Modified"), ()])
-def test_mirrored__reuses_http_files_only_while_their_versions_are_equal(server: Server, tmp_path, versions) -> None:
+def test_mirrored__reuses_http_files_only_while_their_versions_are_equal(
+    server: Server, tmp_path, versions
+) -> None:
     server.versions = versions
     focal_length = load_capture(server.url).cameras[0].K[0, 0]
     server.fetched.clear()
@@ -209,7 +238,8 @@ def test_mirrored__reuses_http_files_only_while_their_versions_are_equal(server:
     file = tmp_path / "clip" / "sparse" / "0" / "cameras.txt"
     text = file.read_text()
     old = f" {focal_length:g}"[:2]
-    file.write_text(text.replace(f"PINHOLE 32 24{old}", "PINHOLE 32 24 9"))  # as many bytes as before
+    # As many bytes as before.
+    file.write_text(text.replace(f"PINHOLE 32 24{old}", "PINHOLE 32 24 9"))
     os.utime(file, (1e9, 1e9))
     assert load_capture(server.url).cameras[0].K[0, 0] > 90
 
@@ -217,7 +247,9 @@ def test_mirrored__reuses_http_files_only_while_their_versions_are_equal(server:
 PAGE = b"<!DOCTYPE html><html><body>Log in"
 
 
-def test_mirrored__leaves_out_no_folder_that_cannot_be_listed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mirrored__leaves_out_no_folder_that_cannot_be_listed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     system = type(fsspec.filesystem("memory"))
     whole = system.ls
 
@@ -228,7 +260,9 @@ def test_mirrored__leaves_out_no_folder_that_cannot_be_listed(folder: Path, monk
 
     with monkeypatch.context() as stalled:
         stalled.setattr(system, "ls", ls)
-        with pytest.raises(ConnectionError, match="memory://bucket/clip: expected an answer, got none in time"):
+        with pytest.raises(
+            ConnectionError, match="memory://bucket/clip: expected an answer, got none in time"
+        ):
             mirrored(URL)
 
 
@@ -236,13 +270,30 @@ def test_mirrored__leaves_out_no_folder_that_cannot_be_listed(folder: Path, monk
 @pytest.mark.parametrize(
     ("name", "body", "kind", "message"),
     [
-        ("0000.png", PAGE, ConnectionError, "expected a file, got a page of HTML; check the URL, or log in"),
+        (
+            "0000.png",
+            PAGE,
+            ConnectionError,
+            "expected a file, got a page of HTML; check the URL, or log in",
+        ),
         ("cameras.txt", PAGE, ConnectionError, "cameras.txt: expected a file, got a page of HTML"),
-        ("cameras.txt", b"# Camera list\n", ConnectionError, r"expected \d+ bytes, got 14; it has changed or was cut"),
-        ("0000.png", None, ConnectionError, "0000.png: expected an answer, got none in time; check the connection"),
+        (
+            "cameras.txt",
+            b"# Camera list\n",
+            ConnectionError,
+            r"expected \d+ bytes, got 14; it has changed or was cut",
+        ),
+        (
+            "0000.png",
+            None,
+            ConnectionError,
+            "0000.png: expected an answer, got none in time; check the connection",
+        ),
     ],
 )
-def test_fetched__keeps_no_wrong_answer(server: Server, monkeypatch, name, body, kind, message) -> None:
+def test_fetched__keeps_no_wrong_answer(
+    server: Server, monkeypatch, name, body, kind, message
+) -> None:
     monkeypatch.setattr("morgs_mi.io.remote.PATIENCE", 2)
     server.instead[name] = body
     with pytest.raises(kind, match=message):

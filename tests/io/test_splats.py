@@ -37,7 +37,9 @@ def test_read_splats__recognises_a_compressed_ply(tmp_path, name):
 
 def test_read_splats__reads_an_uncompressed_ply(tmp_path):
     write_ply(tmp_path / "a.ply", splats())
-    np.testing.assert_array_equal(read_splats(tmp_path / "a.ply").numpy()["means"], splats().numpy()["means"])
+    np.testing.assert_array_equal(
+        read_splats(tmp_path / "a.ply").numpy()["means"], splats().numpy()["means"]
+    )
 
 
 @pytest.mark.parametrize(
@@ -49,7 +51,11 @@ def test_read_splats__reads_an_uncompressed_ply(tmp_path):
             RECORD.pack(*(0,) * 14) + RECORD.pack(np.nan, *(0,) * 13),
             "others in 1 of 2 Gaussians .centre of 1.",
         ),
-        ("a.splat", RECORD.pack(*(0,) * 3, -1, *(0,) * 10), "others in 1 of 1 Gaussians .size of 0."),
+        (
+            "a.splat",
+            RECORD.pack(*(0,) * 3, -1, *(0,) * 10),
+            "others in 1 of 1 Gaussians .size of 0.",
+        ),
         ("a.ply", b"", "expected a complete PLY file"),
         ("a.xyz", b"", r"name ends in .compressed.ply, .ply, .splat, got '.xyz'"),
     ],
@@ -62,5 +68,7 @@ def test_read_splats__names_what_is_broken(tmp_path, name, content, message):
 
 
 def test_read_splats__names_a_missing_file(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"a\.splat: expected a file with Gaussians, found none"):
+    with pytest.raises(
+        FileNotFoundError, match=r"a\.splat: expected a file with Gaussians, found none"
+    ):
         read_splats(tmp_path / "a.splat")

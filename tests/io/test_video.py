@@ -21,12 +21,17 @@ COUNT = 6
 
 
 def clip(height: int = HEIGHT, width: int = WIDTH, count: int = COUNT) -> list[np.ndarray]:
-    return list(np.random.default_rng(0).integers(0, 256, (count, height, width, 3), dtype=np.uint8))
+    return list(
+        np.random.default_rng(0).integers(0, 256, (count, height, width, 3), dtype=np.uint8)
+    )
 
 
 def smooth_clip() -> list[np.ndarray]:
     y, x = np.mgrid[:HEIGHT, :WIDTH]
-    return [np.stack([120 + 80 * np.sin((x + t) / 9), 100 + 2 * y, 90 + x], -1).astype(np.uint8) for t in range(COUNT)]
+    return [
+        np.stack([120 + 80 * np.sin((x + t) / 9), 100 + 2 * y, 90 + x], -1).astype(np.uint8)
+        for t in range(COUNT)
+    ]
 
 
 @pytest.mark.parametrize("name", ["cam.mp4", "cam.mkv", "cam"])
@@ -41,7 +46,9 @@ def test_write_video__is_lossless_by_default(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("codec", ["mp4v", PLAYABLE])
-def test_write_video__lossy_codecs_preserve_the_rgb_order_and_most_of_the_image(tmp_path: Path, codec: str) -> None:
+def test_write_video__lossy_codecs_preserve_the_rgb_order_and_most_of_the_image(
+    tmp_path: Path, codec: str
+) -> None:
     write_video(tmp_path / "cam.mp4", smooth_clip(), 30, codec)
     got = np.array(list(VideoReader.open(tmp_path / "cam.mp4").frames()), float)
     # 4:2:0 chroma and the encoders' default rates; a swap of red and blue would give 13 dB.
@@ -54,20 +61,30 @@ def test_natural_key__sorts_names_by_their_numbers() -> None:
 
 
 def long_video(path: Path, codec: str, count: int = 160) -> Path:
-    """Write a clip in which every frame differs; with the codec mpg2 it has frames that refer to later ones."""
+    """Write a clip in which every frame differs; with the codec mpg2 it has frames that refer to
+    later ones.
+    """
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     red = (np.uint8(120 + 80 * np.sin((x + 3 * t) / 9)) for t in range(count))
-    write_video(path, (np.stack([r, 100 + 2 * y, 90 + x], -1).astype(np.uint8) for r in red), 29.97, codec)
+    write_video(
+        path, (np.stack([r, 100 + 2 * y, 90 + x], -1).astype(np.uint8) for r in red), 29.97, codec
+    )
     return path
 
 
-@pytest.mark.parametrize("name", ["a.mp4 mpg2", "a.mkv mpg2", "a.mp4 vp09", "a.mp4 mp4v", "a.mkv FFV1", "a.avi mpg2"])
-def test_pick__searches_the_frames_that_decoding_from_the_start_reaches(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(
+    "name", ["a.mp4 mpg2", "a.mkv mpg2", "a.mp4 vp09", "a.mp4 mp4v", "a.mkv FFV1", "a.avi mpg2"]
+)
+def test_pick__searches_the_frames_that_decoding_from_the_start_reaches(
+    tmp_path: Path, name: str
+) -> None:
     file, codec = name.split()
     reader = VideoReader.open(long_video(tmp_path / file, codec))
     whole = list(reader.frames())
     for start in (*range(98, 125, 2), 159):
-        np.testing.assert_array_equal(list(reader.frames(start, start + 3)), whole[start : start + 3])
+        np.testing.assert_array_equal(
+            list(reader.frames(start, start + 3)), whole[start : start + 3]
+        )
     near, far = (reader._opened_before(index) for index in (99, 150))
     assert [done for _, done in (near, far)] == [0, 0 if file.endswith("avi") else 151]
     late = list(reader.pick([155, 158, 160]))
@@ -81,7 +98,9 @@ def test_pick__decodes_from_the_start_where_time_stamps_disagree(
     reader = VideoReader.open(long_video(tmp_path / "a.mkv", "mpg2"))
     (expected,) = reader.pick([150])
     assert reader.times is not None
-    wrong = replace(reader, times=np.where(np.arange(160) == 140, reader.times - 0.01, reader.times))
+    wrong = replace(
+        reader, times=np.where(np.arange(160) == 140, reader.times - 0.01, reader.times)
+    )
     assert wrong._opened_before(150)[1] == 0
     np.testing.assert_array_equal(next(wrong.pick([150])), expected)
     monkeypatch.setattr("morgs_mi.io.video.FAR", 1000)
@@ -99,12 +118,16 @@ def truncated(path: Path, length: int) -> Path:
     return path
 
 
-def test_video_reader__yields_the_frames_of_a_truncated_video_and_then_names_the_missing_one(tmp_path: Path) -> None:
+def test_video_reader__yields_the_frames_of_a_truncated_video_and_then_names_the_missing_one(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "cam.mkv"
     write_video(path, clip(), 30)
     reader = VideoReader.open(truncated(path, path.stat().st_size // 2))
     frames = []
-    with pytest.raises(ValueError, match=rf"cam.mkv: frame \d of {COUNT} cannot be decoded.*max_frames"):
+    with pytest.raises(
+        ValueError, match=rf"cam.mkv: frame \d of {COUNT} cannot be decoded.*max_frames"
+    ):
         frames.extend(reader.frames())
     assert 0 < len(frames) < COUNT
     np.testing.assert_array_equal(frames, clip()[: len(frames)])
@@ -140,7 +163,11 @@ def make_bad(tmp_path: Path, case: str) -> Path:
     [
         ("missing", FileNotFoundError, "cam7.mp4: expected a video file, found none"),
         ("empty", ValueError, "cam.mp4: expected a video, got an empty file"),
-        ("truncated", ValueError, r"cam.mp4: expected a video, got \d+ bytes .* truncated or no video"),
+        (
+            "truncated",
+            ValueError,
+            r"cam.mp4: expected a video, got \d+ bytes .* truncated or no video",
+        ),
         ("text", ValueError, "cam.mp4: expected a video, got 8 bytes"),
         ("no images", FileNotFoundError, r"cam: expected images \(.png"),
         ("gap", ValueError, "numbered without gaps, got 0001.png followed by 0003.png"),
@@ -148,7 +175,9 @@ def make_bad(tmp_path: Path, case: str) -> Path:
         ("size", ValueError, "0003.png: expected 48x32 as in 0000.png, got 8x8"),
     ],
 )
-def test_open_frames__refuses_bad_input(tmp_path: Path, case: str, error: type[Exception], message: str) -> None:
+def test_open_frames__refuses_bad_input(
+    tmp_path: Path, case: str, error: type[Exception], message: str
+) -> None:
     with pytest.raises(error, match=message):
         list(open_frames(make_bad(tmp_path, case)).frames())
 
@@ -176,9 +205,13 @@ def test_video_reader__has_the_positions_of_a_variable_frame_rate(tmp_path: Path
     np.testing.assert_array_equal(list(reader.frames()), clip())
 
 
-@pytest.mark.parametrize(("name", "codec"), [("cam.mp4", "mp4v"), ("cam.mkv", "FFV1"), ("cam.avi", "MJPG")])
+@pytest.mark.parametrize(
+    ("name", "codec"), [("cam.mp4", "mp4v"), ("cam.mkv", "FFV1"), ("cam.avi", "MJPG")]
+)
 @pytest.mark.parametrize("fps", [24000 / 1001, 29.97, 240])
-def test_video_reader__recognises_a_constant_frame_rate(tmp_path: Path, name: str, codec: str, fps: float) -> None:
+def test_video_reader__recognises_a_constant_frame_rate(
+    tmp_path: Path, name: str, codec: str, fps: float
+) -> None:
     write_video(tmp_path / name, clip(count=30), fps, codec)
     reader = VideoReader.open(tmp_path / name)
     assert (reader.num_frames, reader.positions) == (30, None)
@@ -187,7 +220,9 @@ def test_video_reader__recognises_a_constant_frame_rate(tmp_path: Path, name: st
 
 def test_video_reader__refuses_time_stamps_of_years(tmp_path: Path) -> None:
     write_timed_video(tmp_path / "cam.mp4", clip(), [0, 33, 67, 100, 133, 200_000_000])
-    with pytest.raises(ValueError, match=r"cam.mp4: expected 6 frames at about 30.* that span 2e\+05 s; .*convert"):
+    with pytest.raises(
+        ValueError, match=r"cam.mp4: expected 6 frames at about 30.* that span 2e\+05 s; .*convert"
+    ):
         VideoReader.open(tmp_path / "cam.mp4")
 
 
@@ -196,7 +231,9 @@ def test_folder_reader__ignores_the_rotation_of_exif(tmp_path: Path) -> None:
     # One entry, orientation (0x112) 6: rotated by 90 degrees.
     tiff = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
     exif = b"Exif\0\0" + tiff
-    (tmp_path / "0.jpg").write_bytes(jpeg[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + jpeg[2:])
+    (tmp_path / "0.jpg").write_bytes(
+        jpeg[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + jpeg[2:]
+    )
     assert cv2.imread(str(tmp_path / "0.jpg")).shape == (32, 16, 3), "OpenCV rotates it by default"
     assert next(open_frames(tmp_path).frames()).shape == (16, 32, 3)
 
@@ -212,7 +249,13 @@ def interrupted():
         ("cam.mp4", [], "FFV1", ValueError, "at least one frame was expected"),
         ("cam", [], "FFV1", ValueError, "at least one frame was expected"),
         ("cam.mp4", clip(31), "FFV1", ValueError, "must be even.*got 48x31"),
-        ("cam.mp4", [clip()[0].astype(float)], "FFV1", ValueError, r"frame 0 must be uint8 .* got float64"),
+        (
+            "cam.mp4",
+            [clip()[0].astype(float)],
+            "FFV1",
+            ValueError,
+            r"frame 0 must be uint8 .* got float64",
+        ),
         (
             "cam.mp4",
             [clip()[0], clip(30)[0]],
@@ -224,7 +267,9 @@ def interrupted():
         ("cam.mp4", interrupted(), "FFV1", KeyboardInterrupt, "Ctrl-C"),
     ],
 )
-def test_write_video__leaves_nothing_on_failure(tmp_path: Path, name, frames, codec, error, message) -> None:
+def test_write_video__leaves_nothing_on_failure(
+    tmp_path: Path, name, frames, codec, error, message
+) -> None:
     with pytest.raises(error, match=message):
         write_video(tmp_path / name, frames, 30, codec)
     assert not list(tmp_path.iterdir())
@@ -253,7 +298,9 @@ try:
 except OSError as error:
     print("OSError:", error)
 """
-    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    result = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
     assert result.stdout.startswith("OSError:")
     assert name in result.stdout
     assert not list(tmp_path.iterdir())

@@ -19,7 +19,9 @@ def scene(seed: int) -> np.ndarray:
 
 
 def noisy(image: np.ndarray, sigma: float, seed: int = 0) -> np.ndarray:
-    return np.uint8(np.clip(image + np.random.default_rng(seed).normal(0, sigma, image.shape), 0, 255))
+    return np.uint8(
+        np.clip(image + np.random.default_rng(seed).normal(0, sigma, image.shape), 0, 255)
+    )
 
 
 def views(*images: np.ndarray) -> dict[int, np.ndarray]:
@@ -47,7 +49,9 @@ def test_image_status__names_views_of_one_colour(image: np.ndarray, words: str) 
 
 def test_image_status__names_a_cut_of_all_views_or_of_one() -> None:
     (problem,) = image_status(NAMES, RIG, views(scene(3), scene(4), scene(5)))
-    assert problem.startswith("the images show another scene than in the frame before; end the fit before this frame")
+    assert problem.startswith(
+        "the images show another scene than in the frame before; end the fit before this frame"
+    )
     (problem,) = image_status(NAMES, RIG, {**RIG, 2: scene(6)})
     assert problem.startswith("c: the image shows something else than in the frame before")
 
@@ -70,8 +74,13 @@ def with_object(column: int) -> np.ndarray:
         (np.zeros((H, W, 3), np.uint8), scene(0)),
     ],
 )
-def test_image_status__is_empty_for_motion_noise_and_light(previous: np.ndarray, current: np.ndarray) -> None:
-    assert image_status(NAMES, views(previous, previous, previous), views(current, current, current)) == ()
+def test_image_status__is_empty_for_motion_noise_and_light(
+    previous: np.ndarray, current: np.ndarray
+) -> None:
+    assert (
+        image_status(NAMES, views(previous, previous, previous), views(current, current, current))
+        == ()
+    )
 
 
 def test_image_status__compares_views_that_have_both_images() -> None:

@@ -65,7 +65,11 @@ def test_copied_images__warns_once_of_negative_light(caplog):
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        (LIGHT[:4], r"must be uint8 \[5, 6, 3\], or linear light in floats, got float32 \[4, 6, 3\]; convert it"),
+        (
+            LIGHT[:4],
+            r"must be uint8 \[5, 6, 3\], or linear light in floats, got float32 \[4, 6, 3\]; "
+            r"convert it",
+        ),
         (LIGHT + np.inf, "must be finite and at most 1e"),
         (GREY.astype(int), r"got int64 \[5, 6, 3\]"),
     ],

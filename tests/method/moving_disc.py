@@ -13,7 +13,12 @@ def texture(height: int, width: int, seed: int) -> np.ndarray:
     """Return a random texture [H, W, 3] in [0, 1] with detail of 2 to 8 pixels."""
     rng = np.random.default_rng(seed)
     octaves = [
-        cv2.resize(rng.random((height // s + 4, width // s + 4, 3)), (width, height), interpolation=cv2.INTER_CUBIC) * s
+        cv2.resize(
+            rng.random((height // s + 4, width // s + 4, 3)),
+            (width, height),
+            interpolation=cv2.INTER_CUBIC,
+        )
+        * s
         for s in (2, 4, 8)
     ]
     return np.clip(sum(octaves) / 14, 0, 1)
@@ -22,7 +27,9 @@ def texture(height: int, width: int, seed: int) -> np.ndarray:
 def moving_disc(
     height: int, width: int, shift: tuple[int, int], noise: float = 0.0, seed: int = 0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return I_{t-1}, I_t [H, W, 3] and the disc's mask [H, W] in frame t; `shift` is (x, y) in pixels."""
+    """Return I_{t-1}, I_t [H, W, 3] and the disc's mask [H, W] in frame t; `shift` is (x, y) in
+    pixels.
+    """
     rng = np.random.default_rng(seed)
     background = texture(height, width, 1)
     disc = texture(height, width, 2) * (1.0, 0.6, 0.4)
@@ -35,6 +42,8 @@ def moving_disc(
     return frames[0], frames[1], mask
 
 
-def observed(image: np.ndarray, previous: np.ndarray, mask_method: str | None = None) -> FlowObservation:
+def observed(
+    image: np.ndarray, previous: np.ndarray, mask_method: str | None = None
+) -> FlowObservation:
     """Return the flow observation of two images of one camera."""
     return observe_key_views({0: FramePair(image, previous)}, "dis", mask_method)[0]

@@ -1,4 +1,6 @@
-"""The active set: which Gaussians all views select, and that a frame fitted with it equals one fitted in full."""
+"""The active set: which Gaussians all views select, and that a frame fitted with it equals one
+fitted in full.
+"""
 
 from __future__ import annotations
 
@@ -40,10 +42,14 @@ def scene(shift=0.0, colors=None) -> Gaussians:
 
 
 def images_of(gaussians: Gaussians) -> list[np.ndarray]:
-    return [np.asarray(rasterize(gaussians, camera, ("color",)).color) for camera in cameras().values()]
+    return [
+        np.asarray(rasterize(gaussians, camera, ("color",)).color) for camera in cameras().values()
+    ]
 
 
-def fit(previous: Gaussians, active: ActiveSet, images: list[np.ndarray], config: FitConfig) -> LaterFrame:
+def fit(
+    previous: Gaussians, active: ActiveSet, images: list[np.ndarray], config: FitConfig
+) -> LaterFrame:
     targets = {view: Target(image) for view, image in enumerate(images)}
     problem = FrameProblem(previous, active, targets, {}, None, EXTENT)
     return fit_later_frame(problem, config, PLAIN, np.random.default_rng(0))
@@ -66,7 +72,9 @@ def changes(previous, current) -> dict[int, np.ndarray]:
 
 def test_find_active_set__selects_moving_but_not_occluded_gaussians(previous, current):
     config = ActiveSetConfig(min_responsibility=0.1)  # half of one of the five views
-    active = find_active_set(previous, cameras(), changes(previous, current), CHANNELS, RENDER, config)
+    active = find_active_set(
+        previous, cameras(), changes(previous, current), CHANNELS, RENDER, config
+    )
     chosen = np.isin(np.arange(len(previous)), active.indices)
     assert chosen[HIDDEN:].mean() > 0.9  # the others are inside the ball
     assert chosen[:HIDDEN].mean() < 0.15
@@ -87,7 +95,9 @@ def test_find_active_set__is_empty_without_changes(previous):
 
 
 def test_find_active_set__covers_what_appears_in_front_of_a_static_wall(previous, monkeypatch):
-    """The ball is new: no Gaussian is there, and every view sees it before another part of the wall."""
+    """The ball is new: no Gaussian is there, and every view sees it before another part of the
+    wall.
+    """
     wall = previous.select(np.arange(HIDDEN))
     active = find_active_set(wall, cameras(), changes(wall, previous), CHANNELS, RENDER)
     covered = []
@@ -101,12 +111,16 @@ def test_find_active_set__covers_what_appears_in_front_of_a_static_wall(previous
     for min_explained in (0.0, 1.0):
         monkeypatch.setattr("morgs_mi.method.active_set.EXPLAINED", min_explained)
         config = ActiveSetConfig(min_responsibility=0.5)
-        active_set = find_active_set(wall, cameras(), changes(wall, previous), CHANNELS, RENDER, config)
+        active_set = find_active_set(
+            wall, cameras(), changes(wall, previous), CHANNELS, RENDER, config
+        )
         counts.append(len(active_set.indices))
     assert counts[0] < counts[1]
 
 
-def test_find_active_set__draws_what_hardly_changed_in_some_views_only(previous, current, monkeypatch):
+def test_find_active_set__draws_what_hardly_changed_in_some_views_only(
+    previous, current, monkeypatch
+):
     changed = changes(previous, current)
 
     def drawn(quiet_views, quiet=0.9):
@@ -129,7 +143,9 @@ def test_find_active_set__keeps_what_moved_for_one_more_frame(previous):
     logits = np.where(np.arange(len(previous)) == 7, 2.0, -2.0)
     nothing = {view: np.zeros((96, 128), bool) for view in range(V)}
     previous_gaussians = replace(previous, logit_confidence=logits)
-    assert find_active_set(previous_gaussians, cameras(), nothing, CHANNELS, RENDER).indices.tolist() == [7]
+    assert find_active_set(
+        previous_gaussians, cameras(), nothing, CHANNELS, RENDER
+    ).indices.tolist() == [7]
 
 
 def test_find_active_set__takes_everything_where_most_pixels_changed(previous):
@@ -149,12 +165,18 @@ def test_fit_later_frame__with_the_active_set_equals_the_full_fit(previous, curr
     errors = {}
     for name, some in (("whole", full_active_set(previous, cameras(), RENDER)), ("active", active)):
         fitted = fit(previous, some, truth, config)
-        errors[name] = np.sqrt(np.mean([(a - b) ** 2 for a, b in zip(images_of(fitted.gaussians), truth, strict=True)]))
-    start = np.sqrt(np.mean([(a - b) ** 2 for a, b in zip(images_of(previous), truth, strict=True)]))
+        errors[name] = np.sqrt(
+            np.mean([(a - b) ** 2 for a, b in zip(images_of(fitted.gaussians), truth, strict=True)])
+        )
+    start = np.sqrt(
+        np.mean([(a - b) ** 2 for a, b in zip(images_of(previous), truth, strict=True)])
+    )
     assert errors["whole"] < 0.4 * start
     # Half a dB; it is better where the full fit disturbs what was right.
     assert errors["active"] < 1.06 * errors["whole"]
-    assert np.array_equal(fitted.source[fitted.source >= 0], np.unique(fitted.source[fitted.source >= 0]))
+    assert np.array_equal(
+        fitted.source[fitted.source >= 0], np.unique(fitted.source[fitted.source >= 0])
+    )
     assert (fitted.source == -1).any() == grows
     still = np.setdiff1d(np.arange(len(previous)), active.indices)
     where = np.searchsorted(fitted.source[fitted.source >= 0], still)

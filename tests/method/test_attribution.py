@@ -28,8 +28,13 @@ def scene():
     cameras = look_at_cameras([(x, 0.3, -3) for x in (-0.8, 0.8)], 45, 80, 60)
     part = np.zeros((60, 80), bool)
     part[20:50, 10:60] = True
-    static = isotropic(random_sheet(rng, 40, 1.2, 0.3), 0.06, 0.8, rng.uniform(-1.5, 1.5, (40, 1, 3)))
-    views = [ActiveView(cameras[0]), make_active_view(cameras[1], Region(part), static, ("color",), RenderConfig())]
+    static = isotropic(
+        random_sheet(rng, 40, 1.2, 0.3), 0.06, 0.8, rng.uniform(-1.5, 1.5, (40, 1, 3))
+    )
+    views = [
+        ActiveView(cameras[0]),
+        make_active_view(cameras[1], Region(part), static, ("color",), RenderConfig()),
+    ]
     images = [cv2.GaussianBlur(rng.random((60, 80, 3), np.float32), (0, 0), 2) for _ in views]
     return wall, views, [Target(images[0]), Target(images[1], rng.random((60, 80)) > 0.3)]
 
@@ -61,7 +66,9 @@ def test_attribution__ignores_noise():
     rng = np.random.default_rng(1)
     wall = isotropic(random_sheet(rng, N, 1.2, 0.6), 0.06, 0.8, rng.uniform(-1.5, 1.5, (N, 1, 3)))
     view = ActiveView(look_at_cameras([(0, 0.3, -3)], 45, 80, 60)[0])
-    image = np.asarray(view.render(wall).color) + rng.normal(0, 0.02, (60, 80, 3)).astype(np.float32)
+    image = np.asarray(view.render(wall).color) + rng.normal(0, 0.02, (60, 80, 3)).astype(
+        np.float32
+    )
     image[20:30, 30:40] += 0.5
     scores = scores_of(wall, [view], [Target(np.clip(image, 0, 1))])[0]
     pixels, _ = view.camera.project(np.asarray(wall.means))

@@ -19,16 +19,22 @@ def boxes() -> Boxes:
     rng = np.random.default_rng(0)
     means = rng.uniform(-2, 2, (50, 3)) * (1, 1, 0.3)
     means[7] = (0, 0, -9)  # behind the camera
-    return boxes_around(isotropic(means, 0.1, 0.9, np.zeros((50, 1, 3))), CAMERA, RenderConfig(), 0.6)
+    return boxes_around(
+        isotropic(means, 0.1, 0.9, np.zeros((50, 1, 3))), CAMERA, RenderConfig(), 0.6
+    )
 
 
 def slices(boxes: Boxes) -> list[tuple[slice, slice]]:
-    corners = (np.asarray(side).astype(int) for side in (boxes.left, boxes.top, boxes.right, boxes.bottom))
+    corners = (
+        np.asarray(side).astype(int) for side in (boxes.left, boxes.top, boxes.right, boxes.bottom)
+    )
     return [(slice(y0, y1), slice(x0, x1)) for x0, y0, x1, y1 in zip(*corners, strict=True)]
 
 
 def test_boxes__area_counts_pixels(boxes):
-    np.testing.assert_array_equal(boxes.area, [np.ones((48, 64))[box].sum() for box in slices(boxes)])
+    np.testing.assert_array_equal(
+        boxes.area, [np.ones((48, 64))[box].sum() for box in slices(boxes)]
+    )
     assert np.asarray(boxes.area)[7] == 0
 
 
@@ -48,4 +54,6 @@ def test_within__counts_pixels_in_the_blocks_of_a_reduced_view(boxes, factor):
     blocks = region.mask.repeat(factor, 0).repeat(factor, 1)
     expected = [blocks[box].sum() for box in slices(boxes)]
     assert 0 < np.mean(expected) < np.asarray(boxes.area).mean()
-    np.testing.assert_allclose(boxes.within(region.block_table, region.grid, factor), expected, atol=0.05)
+    np.testing.assert_allclose(
+        boxes.within(region.block_table, region.grid, factor), expected, atol=0.05
+    )

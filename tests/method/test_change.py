@@ -6,7 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.method.change import ChangeConfig, box_around, change_mask, moving_region, update_reference
+from morgs_mi.method.change import (
+    ChangeConfig,
+    box_around,
+    change_mask,
+    moving_region,
+    update_reference,
+)
 from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FramePair
 
@@ -16,7 +22,9 @@ NOISE = 3.0
 
 
 def noisy_image(rng, level=0.0, disc=None, noise=NOISE):
-    """Return a textured image with camera noise in grey levels, and perhaps a disc that is 40 levels brighter."""
+    """Return a textured image with camera noise in grey levels, and perhaps a disc that is 40
+    levels brighter.
+    """
     y, x = np.mgrid[:H, :W]
     image = 120 + 60 * np.sin(x / 7)[..., None] * np.cos(y / 9)[..., None] * np.ones(3) + level
     if disc is not None:
@@ -47,7 +55,9 @@ def test_change_mask__covers_a_change_of_light():
 
 def test_change_mask__covers_an_image_without_static_pixels():
     rng = np.random.default_rng(5)
-    noise = cv2.resize(rng.integers(0, 255, (15, 20, 3), np.uint8), (W, H), interpolation=cv2.INTER_NEAREST)
+    noise = cv2.resize(
+        rng.integers(0, 255, (15, 20, 3), np.uint8), (W, H), interpolation=cv2.INTER_NEAREST
+    )
     assert change_mask(noise, np.roll(noise, 8, axis=1)).mean() > 0.8
 
 
@@ -55,7 +65,10 @@ def test_change_mask__ignores_noise_that_is_larger_in_some_places():
     """As in a penumbra of a path tracer: 20 grey levels in a part of the image, 3 elsewhere."""
     rng = np.random.default_rng(6)
     noise = np.where((np.mgrid[:H, :W][1] > 100)[..., None], 20, NOISE)
-    image, next_image = (np.clip(128 + rng.normal(0, 1, (H, W, 3)) * noise, 0, 255).astype(np.uint8) for _ in range(2))
+    image, next_image = (
+        np.clip(128 + rng.normal(0, 1, (H, W, 3)) * noise, 0, 255).astype(np.uint8)
+        for _ in range(2)
+    )
     assert change_mask(image, next_image).mean() < 0.005
 
 
@@ -83,7 +96,9 @@ def test_change_mask__ignores_blocks_of_compressed_video(size: int, step: tuple[
     image = noisy_image(rng, noise=1)
     next_image = noisy_image(rng, noise=1)
     flips = rng.random((-(-H // size), -(-W // size))) < 0.1
-    next_image += (np.kron(flips, np.ones((size, size)))[:H, :W, None] * step).astype(np.int8).view(np.uint8)
+    next_image += (
+        (np.kron(flips, np.ones((size, size)))[:H, :W, None] * step).astype(np.int8).view(np.uint8)
+    )
     assert not change_mask(image, next_image).any()
     assert change_mask(image, next_image, config=ChangeConfig(min_peak=0)).mean() > 0.02
 
@@ -112,7 +127,9 @@ def test_moving_region__includes_what_changes_enclose():
 
 
 def test_update_reference__detects_slow_changes_once_they_add_up():
-    """A quarter of a grey level per frame is never detected between two frames, but against the reference."""
+    """A quarter of a grey level per frame is never detected between two frames, but against the
+    reference.
+    """
     rng = np.random.default_rng(3)
     reference = noisy_image(rng)
     last = noisy_image(rng)
@@ -125,7 +142,8 @@ def test_update_reference__detects_slow_changes_once_they_add_up():
         reference = update_reference(reference, image, change)
         last = image
     assert max(waited[:4]) < 0.01
-    # 15 grey levels in all. Five standard deviations are 2.5, and the noise lets some pixels pass earlier.
+    # 15 grey levels in all. Five standard deviations are 2.5, and the noise lets some pixels pass
+    # earlier.
     assert 5 < sum(waited) < 20  # of 59 frames
     # The reference is never far behind.
     assert abs(float(np.mean(reference.astype(float) - last))) < 8
@@ -144,12 +162,17 @@ def test_observe_key_views__flow_in_a_box_equals_that_of_the_whole_image(with_ma
     rng = np.random.default_rng(4)
     image = noisy_image(rng)
     next_image = noisy_image(rng)
-    patch = cv2.resize(rng.integers(0, 255, (8, 8, 3), np.uint8), (32, 32), interpolation=cv2.INTER_CUBIC)
+    patch = cv2.resize(
+        rng.integers(0, 255, (8, 8, 3), np.uint8), (32, 32), interpolation=cv2.INTER_CUBIC
+    )
     image[34:66, 54:86] = patch
     next_image[34:66, 58:90] = patch
     box = box_around(change_mask(image, next_image))
     masks = "grabcut" if with_masks else None
-    observations = [observe_key_views({0: FramePair(next_image, image, box=b)}, "dis", masks)[0] for b in (None, box)]
+    observations = [
+        observe_key_views({0: FramePair(next_image, image, box=b)}, "dis", masks)[0]
+        for b in (None, box)
+    ]
     whole, part = (observation.motion[40:60, 64:84] for observation in observations)
     assert np.median(whole, axis=(0, 1)) == pytest.approx((4, 0), abs=0.2)
     assert np.median(np.linalg.norm(whole - part, axis=-1)) < 0.2
@@ -164,7 +187,9 @@ def test_observe_key_views__what_has_not_changed_has_not_moved():
     """Flow bleeds over the edges of a patch that moves by 6 px before a plain wall."""
     rng = np.random.default_rng(9)
     image, next_image = np.full((2, H, W, 3), 120, np.uint8)
-    patch = cv2.resize(rng.integers(0, 255, (8, 8, 3), np.uint8), (32, 32), interpolation=cv2.INTER_CUBIC)
+    patch = cv2.resize(
+        rng.integers(0, 255, (8, 8, 3), np.uint8), (32, 32), interpolation=cv2.INTER_CUBIC
+    )
     image[34:66, 54:86] = patch
     next_image[34:66, 60:92] = patch
     region = moving_region(change_mask(image, next_image))
@@ -177,4 +202,6 @@ def test_observe_key_views__what_has_not_changed_has_not_moved():
     assert not observation.motion[~region].any()
     assert not observation.forward_flow[~region].any()
     assert observation.reliable[~region].all()
-    assert np.median(observation.motion[40:60, 66:86], axis=(0, 1)) == pytest.approx((6, 0), abs=0.2)
+    assert np.median(observation.motion[40:60, 66:86], axis=(0, 1)) == pytest.approx(
+        (6, 0), abs=0.2
+    )

@@ -22,12 +22,17 @@ def wall_and_object(height, color, brightness=1.0):
     """Return Gaussians of a wall, and of a patch at some height above it."""
     rng = np.random.default_rng(0)
     means = np.concatenate([random_sheet(rng, 600, 1.0, 0.0), random_sheet(rng, 100, 0.3, height)])
-    colors = np.where(WALL[:, None], GREY, color) * np.where(rng.random(700) < 0.5, brightness, 1)[:, None]
+    colors = (
+        np.where(WALL[:, None], GREY, color)
+        * np.where(rng.random(700) < 0.5, brightness, 1)[:, None]
+    )
     return isotropic(means, 0.05, 0.9, ((colors - 0.5) / SH_C0)[:, None])
 
 
 def moving(share, seed=1):
-    """Return logits of 700 Gaussians: a share of the object's moves for sure, and everything else stands still."""
+    """Return logits of 700 Gaussians: a share of the object's moves for sure, and everything else
+    stands still.
+    """
     rng = np.random.default_rng(seed)
     return np.where(~WALL & (rng.random(700) < share), 2.0, STILL).astype(np.float32)
 
@@ -69,7 +74,9 @@ def test_share_confidence__leaves_a_gaussian_unlike_its_neighbours_alone():
     red = isotropic([[0, 0, 0]], 0.05, 0.9, ((np.array([RED]) - 0.5) / SH_C0)[:, None])
     logit = np.full(701, STILL, np.float32)
     logit[-1] = 2.0
-    confidence = share_confidence(Gaussians.concatenate([wall, red]), np.arange(701), logit, STILL, WEIGHT)
+    confidence = share_confidence(
+        Gaussians.concatenate([wall, red]), np.arange(701), logit, STILL, WEIGHT
+    )
     assert confidence[-1] > 1.9
 
 

@@ -31,7 +31,8 @@ def test_motion_mask__is_empty_for_a_static_pair_under_camera_noise(method, size
 def test_motion_mask__finds_a_moving_disc(method, shift):
     previous, image, disc = moving_disc(240, 320, shift, CAMERA_NOISE)
     mask = observed(image, previous, method).mask
-    # DIS spreads motion by up to half a patch, 4 px: the bound is a disc of 48 px radius grown by that much.
+    # DIS spreads motion by up to half a patch, 4 px: the bound is a disc of 48 px radius grown by
+    # that much.
     assert overlap(mask, disc) > (48 / 52) ** 2 - 0.1
     assert mask[disc].mean() > 0.95
 
@@ -46,9 +47,15 @@ def test_motion_mask__passes_its_config_to_threshold_and_refiner():
     previous, image, _ = moving_disc(120, 160, (3, 2), CAMERA_NOISE)
     motion = observed(image, previous).motion
     for config in (MaskConfig(floor=20), MaskConfig(superpixel_share=0.2)):
-        expected = mask_refiner("superpixels+grabcut", config)(image, flow_mask(motion, config=config))
-        np.testing.assert_array_equal(motion_mask(image, motion, method="superpixels+grabcut", config=config), expected)
-        assert not np.array_equal(expected, motion_mask(image, motion, method="superpixels+grabcut"))
+        expected = mask_refiner("superpixels+grabcut", config)(
+            image, flow_mask(motion, config=config)
+        )
+        np.testing.assert_array_equal(
+            motion_mask(image, motion, method="superpixels+grabcut", config=config), expected
+        )
+        assert not np.array_equal(
+            expected, motion_mask(image, motion, method="superpixels+grabcut")
+        )
 
 
 def test_observe_key_views__masks_are_those_of_the_configured_method():
@@ -68,7 +75,9 @@ def test_flow_threshold__follows_width_and_noise():
     noisy = np.random.default_rng(0).normal(0, 1, (100, 100, 2))
     # Rayleigh: median 1.18, MAD 0.45; 1 % of it lies above 3.
     assert flow_threshold(noisy) == pytest.approx(1.18 + 4 * 0.45, rel=0.05)
-    assert flow_threshold(noisy, config=MaskConfig(threshold_mads=2)) == pytest.approx(1.18 + 2 * 0.45, rel=0.05)
+    assert flow_threshold(noisy, config=MaskConfig(threshold_mads=2)) == pytest.approx(
+        1.18 + 2 * 0.45, rel=0.05
+    )
 
 
 @pytest.mark.parametrize(

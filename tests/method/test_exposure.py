@@ -1,4 +1,6 @@
-"""Exposures in closed form: gains and biases, outliers, priors, and what all cameras have in common."""
+"""Exposures in closed form: gains and biases, outliers, priors, and what all cameras have in
+common.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +60,9 @@ def test_fit_exposure__is_the_prior_of_images_that_do_not_show_the_same():
 def test_fit_exposure__explains_a_change_by_a_factor_on_the_light_where_images_have_no_contrast():
     dull = encode_light(np.random.default_rng(0).uniform(0.2, 0.21, (40, 40, 3)))
     exposure = fit_exposure(dull, encode_light(1.1 * decode_light(dull)))
-    np.testing.assert_allclose(exposure(scene()), encode_light(1.1 * decode_light(scene())), atol=0.003)
+    np.testing.assert_allclose(
+        exposure(scene()), encode_light(1.1 * decode_light(scene())), atol=0.003
+    )
 
 
 def test_fit_exposure__ignores_masked_pixels():
@@ -87,10 +91,14 @@ def test_centred__leaves_differences_between_cameras():
     truth = {0: WARM, 3: Exposure((1.3, 1.2, 1.1), (0.1, 0.1, 0.0))}
     exposures = centred(truth)
     middle = np.full(3, 0.4)
-    np.testing.assert_allclose(np.mean([e(middle) for e in exposures.values()], axis=0), middle, atol=0.01)
+    np.testing.assert_allclose(
+        np.mean([e(middle) for e in exposures.values()], axis=0), middle, atol=0.01
+    )
     # The map from one camera's image to another's is the same.
     colors = scene()
-    np.testing.assert_allclose(exposures[3](exposures[0].inverse(colors)), truth[3](truth[0].inverse(colors)))
+    np.testing.assert_allclose(
+        exposures[3](exposures[0].inverse(colors)), truth[3](truth[0].inverse(colors))
+    )
 
 
 def test_centred__is_not_moved_by_a_few_dark_cameras():
@@ -102,7 +110,9 @@ def test_centred__is_not_moved_by_a_few_dark_cameras():
 
 def test_common_change__is_that_of_most_cameras():
     dimmed = Exposure((0.8,) * 3, (0.0,) * 3)
-    assert_close(common_change([dimmed, dimmed, Exposure((0.81,) * 3), WARM]), Exposure((0.805,) * 3), 0.01)
+    assert_close(
+        common_change([dimmed, dimmed, Exposure((0.81,) * 3), WARM]), Exposure((0.805,) * 3), 0.01
+    )
 
 
 def test_common_change__is_none_where_cameras_differ():

@@ -1,4 +1,4 @@
-"""Lifted flow: exact flow gives the true displacement; noise and one wrong view do not change it."""
+"""Lifted flow: exact flow gives the true displacement, also with noise or one wrong view."""
 
 from __future__ import annotations
 
@@ -39,7 +39,9 @@ def uniform_flow(camera, shift):
 
 
 def lifted_from(gaussians, flows):
-    return lift_flow(gaussians, {view: ActiveView(camera) for view, camera in enumerate(rig())}, flows)
+    return lift_flow(
+        gaussians, {view: ActiveView(camera) for view, camera in enumerate(rig())}, flows
+    )
 
 
 def test_lift_flow__recovers_a_translation():
@@ -55,7 +57,10 @@ def test_lift_flow__recovers_a_translation():
 def test_lift_flow__gives_no_motion_without_observations():
     flow_of_view = uniform_flow(rig()[0], SHIFT)
     nowhere = np.zeros_like(flow_of_view.forward_reliable)
-    for flows in ({}, {0: FlowObservation(flow_of_view.motion, nowhere, flow_of_view.forward_flow, nowhere)}):
+    for flows in (
+        {},
+        {0: FlowObservation(flow_of_view.motion, nowhere, flow_of_view.forward_flow, nowhere)},
+    ):
         lifted = lifted_from(cloud(), flows)
         assert np.abs(lifted.displacement).max() == 0
         assert (lifted.logit_confidence < -1).all()
@@ -66,7 +71,9 @@ def test_lift_flow__gives_no_motion_for_noise():
     rng = np.random.default_rng(0)
     flows = {}
     for view, camera in enumerate(rig()):
-        flow = cv2.resize(rng.normal(0, 0.1, (6, 8, 2)), (camera.width, camera.height)).astype(np.float32)
+        flow = cv2.resize(rng.normal(0, 0.1, (6, 8, 2)), (camera.width, camera.height)).astype(
+            np.float32
+        )
         everywhere = np.ones((camera.height, camera.width), bool)
         flows[view] = FlowObservation(flow, everywhere, flow, everywhere)
     lifted = lifted_from(cloud(), flows)
@@ -75,7 +82,9 @@ def test_lift_flow__gives_no_motion_for_noise():
 
 
 def test_lift_flow__is_robust_to_one_wrong_view():
-    """Flow bleeds in one of four views: the result follows the three others, with and without motion."""
+    """Flow bleeds in one of four views: the result follows the three others, with and without
+    motion.
+    """
     cameras = rig()
     for truth in (np.zeros(3), SHIFT):
         flows = {view: uniform_flow(camera, truth) for view, camera in enumerate(cameras)}
@@ -85,7 +94,11 @@ def test_lift_flow__is_robust_to_one_wrong_view():
         error = np.linalg.norm(np.median(lifted.displacement, axis=0) - truth)
         # Without the rounds of reweighting it is 0.6 to 0.7 of the motion.
         assert error < 0.15 * np.linalg.norm(SHIFT)
-        assert (lifted.logit_confidence > 0).mean() > 0.95 if truth.any() else (lifted.logit_confidence < 0).all()
+        assert (
+            (lifted.logit_confidence > 0).mean() > 0.95
+            if truth.any()
+            else (lifted.logit_confidence < 0).all()
+        )
 
 
 def test_choose_key_views__are_spread_and_distinct():
@@ -97,12 +110,16 @@ def test_choose_key_views__are_spread_and_distinct():
 
 
 def test_lift_flow__counts_flow_that_varies_within_a_gaussian_as_weak_evidence():
-    """The same mean flow everywhere, uniform or alternating from column to column as far as it bleeds."""
+    """The same mean flow everywhere, uniform or alternating from column to column as far as it
+    bleeds.
+    """
     flows = {view: uniform_flow(camera, SHIFT) for view, camera in enumerate(rig())}
     varying = {}
     for view, observation in flows.items():
         spread = np.where(np.arange(observation.forward_flow.shape[1]) % 2, 0, 2)[None, :, None]
-        varying[view] = replace(observation, forward_flow=observation.forward_flow * spread.astype(np.float32))
+        varying[view] = replace(
+            observation, forward_flow=observation.forward_flow * spread.astype(np.float32)
+        )
     rigid, bleeding = (lifted_from(cloud(), each).logit_confidence for each in (flows, varying))
     assert np.median(rigid) > 1.9
     assert np.median(bleeding) < np.median(rigid) - 1

@@ -1,4 +1,6 @@
-"""The losses against float64 reference implementations, and their derivatives against central differences."""
+"""The losses against float64 reference implementations, and their derivatives against central
+differences.
+"""
 
 from __future__ import annotations
 
@@ -78,7 +80,9 @@ def test_recon_loss__gradient_agrees_with_central_differences(images, weight):
         v = rng.normal(size=SIZE) * (np.abs(image - target) > 2e-3)
         h = 1e-4
         up, down = (slow_recon(image + s * h * v, target, weight) for s in (1, -1))
-        assert np.vdot(grad, v) == pytest.approx((up - down) / (2 * h), rel=tol.LOSS_GRADIENT_REL, abs=1e-6)
+        assert np.vdot(grad, v) == pytest.approx(
+            (up - down) / (2 * h), rel=tol.LOSS_GRADIENT_REL, abs=1e-6
+        )
 
 
 def test_recon_loss__ignores_masked_pixels(images):
@@ -92,7 +96,7 @@ def test_recon_loss__ignores_masked_pixels(images):
 
 
 def test_recon_loss__dssim_agrees_with_the_metric_away_from_the_border():
-    """The metric excludes the border, the loss pads it: on images that are black there both agree."""
+    """The metric excludes the border, the loss pads it: both agree where it is black."""
     rng = np.random.default_rng(2)
     a, b = (np.zeros((48, 48, 3), np.float32) for _ in range(2))
     for image in (a, b):
@@ -125,7 +129,11 @@ def test_flow_loss__is_the_mean_endpoint_error():
 def test_flow_loss__has_a_finite_gradient_where_both_agree():
     x = mi.TensorXf(np.ones((4, 4, 2), np.float32))
     dr.enable_grad(x)
-    dr.backward(flow_loss(x, mi.TensorXf(np.ones((4, 4, 2), np.float32)), mi.TensorXf(np.ones((4, 4), np.float32))))
+    dr.backward(
+        flow_loss(
+            x, mi.TensorXf(np.ones((4, 4, 2), np.float32)), mi.TensorXf(np.ones((4, 4), np.float32))
+        )
+    )
     assert np.asarray(dr.grad(x)).max() == 0
 
 
@@ -139,13 +147,17 @@ def test_mask_loss__is_the_mean_absolute_difference():
 
 def test_offset_loss__is_the_mean_l1_norm_in_scene_extents():
     offset = np.random.default_rng(4).normal(size=(7, 3)).astype(np.float32)
-    assert item(offset_loss(mi.TensorXf(offset), 2.0)) == pytest.approx(np.abs(offset).sum(1).mean() / 2, rel=1e-5)
+    assert item(offset_loss(mi.TensorXf(offset), 2.0)) == pytest.approx(
+        np.abs(offset).sum(1).mean() / 2, rel=1e-5
+    )
 
 
 @pytest.mark.parametrize("width", [64, 77])
 @pytest.mark.parametrize("masked", [False, True])
 def test_recon_loss__gradient_on_a_region_agrees_with_the_full_view(width, masked):
-    """If only a region has changed, its derivative is the full view's, and the value changes by the same amount."""
+    """If only a region has changed, its derivative is the full view's, and the value changes by the
+    same amount.
+    """
     height = 150
     rng = np.random.default_rng(4)
     y, x = np.mgrid[:height, :width]
@@ -153,7 +165,10 @@ def test_recon_loss__gradient_on_a_region_agrees_with_the_full_view(width, maske
     drawn[0, 0] = drawn[-1, -1] = drawn[70, 5] = True
     region = Region(drawn)
     truth, old_image = (np.float32(rng.uniform(size=(height, width, 3))) for _ in range(2))
-    changed = region.crop(old_image) + np.float32(rng.normal(size=region.shape(3))) * region.inside()[..., None] * 0.1
+    changed = (
+        region.crop(old_image)
+        + np.float32(rng.normal(size=region.shape(3))) * region.inside()[..., None] * 0.1
+    )
     new_image = region.paste(changed, old_image)
     target = Target(truth, rng.uniform(size=drawn.shape) < 0.8 if masked else None)
     target.set_surroundings(mi.TensorXf(old_image))
@@ -201,7 +216,11 @@ def test_target__is_its_own_surroundings_by_default():
     default = Target(truth)
     target.set_surroundings(mi.TensorXf(truth))
     image = mi.TensorXf(region.crop(truth) + 0.1)
-    assert item(recon_loss(image, default, region=region)) == item(recon_loss(image, target, region=region)) > 0
+    assert (
+        item(recon_loss(image, default, region=region))
+        == item(recon_loss(image, target, region=region))
+        > 0
+    )
 
 
 def test_recon_loss__refuses_an_image_of_another_size(images):
@@ -211,7 +230,9 @@ def test_recon_loss__refuses_an_image_of_another_size(images):
     region = Region(mask)
     with pytest.raises(ValueError, match=r"`image` must be \[1, 4, 8, 3\]"):
         recon_loss(mi.TensorXf(image), Target(target), region=region)
-    with pytest.raises(ValueError, match="`region` must be of a 23x19 view like its target, got 40x32"):
+    with pytest.raises(
+        ValueError, match="`region` must be of a 23x19 view like its target, got 40x32"
+    ):
         recon_loss(mi.TensorXf(region.crop(image)), Target(images[1]), region=region)
 
 
@@ -220,7 +241,9 @@ def test_recon_loss__compiles_its_kernels_once_for_all_sizes():
 
     def step(height, width):
         # An array of NumPy may not be aligned, which needs a kernel of its own.
-        image = from_numpy(mi.TensorXf, rng.uniform(size=(height, width, 3))) * dr.opaque(mi.Float, 1)
+        image = from_numpy(mi.TensorXf, rng.uniform(size=(height, width, 3))) * dr.opaque(
+            mi.Float, 1
+        )
         dr.eval(image)
         dr.enable_grad(image)
         dr.backward(recon_loss(image, Target(np.asarray(image))))
@@ -231,7 +254,9 @@ def test_recon_loss__compiles_its_kernels_once_for_all_sizes():
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
         step(90, 72)
-        compiled = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT and not k["cache_hit"]]
+        compiled = [
+            k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT and not k["cache_hit"]
+        ]
     assert not compiled, [k["operation_count"] for k in compiled]
 
 
@@ -242,17 +267,41 @@ def tensor(*shape):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: flow_loss(tensor(4, 5, 2), tensor(2, 2, 2), tensor(4, 5)), r"`target` must be \[4, 5, 2\]"),
-        (lambda: flow_loss(tensor(4, 5, 2), tensor(4, 5, 2), tensor(5, 4)), r"`reliable` must be \[4, 5\]"),
-        (lambda: flow_loss(np.ones((4, 5, 2)), tensor(4, 5, 2), tensor(4, 5)), "`motion` must be a .*TensorXf"),
+        (
+            lambda: flow_loss(tensor(4, 5, 2), tensor(2, 2, 2), tensor(4, 5)),
+            r"`target` must be \[4, 5, 2\]",
+        ),
+        (
+            lambda: flow_loss(tensor(4, 5, 2), tensor(4, 5, 2), tensor(5, 4)),
+            r"`reliable` must be \[4, 5\]",
+        ),
+        (
+            lambda: flow_loss(np.ones((4, 5, 2)), tensor(4, 5, 2), tensor(4, 5)),
+            "`motion` must be a .*TensorXf",
+        ),
         (lambda: mask_loss(tensor(4, 5, 1), tensor(1, 1)), r"`mask` must be \[4, 5\]"),
         (lambda: offset_loss(tensor(4, 2), 1.0), r"`offset` must be \[4, 3\]"),
-        (lambda: offset_loss(tensor(4, 3), np.nan), r"`extent` must be a number in \(0, inf\), got nan"),
-        (lambda: recon_loss(tensor(4, 5, 3), Target(np.ones((4, 5, 3))), np.nan), "`dssim_weight` must be a number"),
+        (
+            lambda: offset_loss(tensor(4, 3), np.nan),
+            r"`extent` must be a number in \(0, inf\), got nan",
+        ),
+        (
+            lambda: recon_loss(tensor(4, 5, 3), Target(np.ones((4, 5, 3))), np.nan),
+            "`dssim_weight` must be a number",
+        ),
         (lambda: Target(np.ones((4, 5))), r"`image` must be \[H, W, 3\], got \[4, 5\]"),
-        (lambda: Target(np.full((4, 5, 3), 255.0)), r"floats from 0 to 32 with white at 1, got float64 from 255"),
-        (lambda: Target(np.full((4, 5, 3), np.nan)), r"floats from 0 to 32 with white at 1, got float64 from nan"),
-        (lambda: Target(np.ones((4, 5, 3)), np.ones((5, 4), bool)), r"mask must be bool \[4, 5\] like its image"),
+        (
+            lambda: Target(np.full((4, 5, 3), 255.0)),
+            r"floats from 0 to 32 with white at 1, got float64 from 255",
+        ),
+        (
+            lambda: Target(np.full((4, 5, 3), np.nan)),
+            r"floats from 0 to 32 with white at 1, got float64 from nan",
+        ),
+        (
+            lambda: Target(np.ones((4, 5, 3)), np.ones((5, 4), bool)),
+            r"mask must be bool \[4, 5\] like its image",
+        ),
         (lambda: Target(np.ones((4, 5, 3)), np.ones((4, 5))), "got float64"),
     ],
 )
@@ -268,4 +317,10 @@ def test_target__is_not_changed_by_later_writes_to_its_image():
         image[:] = frame / 4
         targets.append(Target(image))
     black = mi.TensorXf(np.zeros_like(image))
-    assert [float(target.difference(black)[0, 0, 0]) for target in targets] == [0, 0.25, 0.5, 0.75, 1]
+    assert [float(target.difference(black)[0, 0, 0]) for target in targets] == [
+        0,
+        0.25,
+        0.5,
+        0.75,
+        1,
+    ]

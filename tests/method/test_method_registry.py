@@ -37,7 +37,9 @@ def test_registry__lists_names_without_argument_first(registry):
 
 @pytest.mark.parametrize("text", ["flat", "", "file", "file:", "round:", "round:3", ":3"])
 def test_registry__rejects_other_strings_with_the_known_ones(registry, text):
-    with pytest.raises(ValueError, match=rf"^paint\(\): `brush` must be one of round, file:PATH, got '{text}'\.$"):
+    with pytest.raises(
+        ValueError, match=rf"^paint\(\): `brush` must be one of round, file:PATH, got '{text}'\.$"
+    ):
         registry.make(text, 3)
 
 
@@ -51,10 +53,18 @@ def test_registry__rejects_bad_and_taken_names(registry, name, message):
 
 @pytest.mark.parametrize(
     ("setting", "value"),
-    [("flow_method", "diss"), ("flow_method", "files"), ("flow_method", ""), ("mask_method", "sam"), ("model", "mesh")],
+    [
+        ("flow_method", "diss"),
+        ("flow_method", "files"),
+        ("flow_method", ""),
+        ("mask_method", "sam"),
+        ("model", "mesh"),
+    ],
 )
 def test_motion_config__refuses_names_that_are_not_registered(setting, value):
-    with pytest.raises(ValueError, match=rf"^MotionConfig\(\): `{setting}` must be one of .*, got '{value}'\.$"):
+    with pytest.raises(
+        ValueError, match=rf"^MotionConfig\(\): `{setting}` must be one of .*, got '{value}'\.$"
+    ):
         morgs_mi.MotionConfig(**{setting: value})
 
 
@@ -80,7 +90,8 @@ from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.mask_refiners.mask_registry import mask_refiner
 mask = np.zeros((9, 9), bool)
 mask[4, 4] = True
-assert mask_refiner(MotionConfig(mask_method="dilate:1").mask_method)(np.zeros((9, 9, 3)), mask).sum() == 5
+refiner = mask_refiner(MotionConfig(mask_method="dilate:1").mask_method)
+assert refiner(np.zeros((9, 9, 3)), mask).sum() == 5
 assert "onnxruntime" not in sys.modules  # imported by the refiner that needs it
 """
 
@@ -94,11 +105,22 @@ assert "onnxruntime" not in sys.modules  # imported by the refiner that needs it
     ],
 )
 def test_registry__finds_a_new_module_of_its_package(tmp_path, page, module, program):
-    shutil.copytree(Path(morgs_mi.__file__).parent, tmp_path / "morgs_mi", ignore=shutil.ignore_patterns("__pycache__"))
-    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / page).read_text(encoding="utf-8"), re.DOTALL)
+    shutil.copytree(
+        Path(morgs_mi.__file__).parent,
+        tmp_path / "morgs_mi",
+        ignore=shutil.ignore_patterns("__pycache__"),
+    )
+    (example,) = re.findall(
+        r"```python\n(.*?)```", (ROOT / "docs" / page).read_text(encoding="utf-8"), re.DOTALL
+    )
     (tmp_path / "morgs_mi/method" / module).write_text(example, encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
     result = subprocess.run(
-        [sys.executable, "-c", program], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert result.returncode == 0, result.stderr

@@ -24,13 +24,23 @@ SHIFT = np.float32([0.06, -0.03, 0.02])
 def start(config: MotionConfig):
     """Return the start of a ball that goes on moving by `SHIFT`, without any flow."""
     ball = opaque_ball()
-    previous_gaussians = replace(ball, motion=np.tile(SHIFT, (len(ball), 1)), logit_confidence=np.ones(len(ball)))
+    previous_gaussians = replace(
+        ball, motion=np.tile(SHIFT, (len(ball), 1)), logit_confidence=np.ones(len(ball))
+    )
     moved_gaussians = replace(ball, means=mi.TensorXf(np.asarray(ball.means) + SHIFT))
     active = full_active_set(previous_gaussians, dict(enumerate(views())), RenderConfig())
-    targets = {v: Target(np.asarray(view.render(moved_gaussians).color)) for v, view in active.views.items()}
-    flow = np.zeros((*targets[0].image().shape[:2], 2), np.float32), np.ones(targets[0].image().shape[:2], bool)
+    targets = {
+        v: Target(np.asarray(view.render(moved_gaussians).color))
+        for v, view in active.views.items()
+    }
+    flow = (
+        np.zeros((*targets[0].image().shape[:2], 2), np.float32),
+        np.ones(targets[0].image().shape[:2], bool),
+    )
     flows = {v: FlowObservation(*flow, *flow) for v in active.views}
-    return initial_motion(previous_gaussians, active, flows, targets, config, np.random.default_rng(0))
+    return initial_motion(
+        previous_gaussians, active, flows, targets, config, np.random.default_rng(0)
+    )
 
 
 def test_initial_motion__runs_the_stages_that_are_on():

@@ -25,7 +25,9 @@ def tensor(*shape: int) -> mi.TensorXf:
 
 def test_motion_model__is_the_one_that_the_setting_selects():
     assert motion_model(MotionConfig()) is None
-    with pytest.raises(ValueError, match=r"MotionConfig\(\): `model` must be one of none.*, got 'mesh'\."):
+    with pytest.raises(
+        ValueError, match=r"MotionConfig\(\): `model` must be one of none.*, got 'mesh'\."
+    ):
         motion_model(MotionConfig(model="mesh"))
 
 
@@ -44,7 +46,9 @@ def test_sparse_product__has_an_adjoint_in_both_modes():
     dr.enable_grad(x)
     tangent = tensor(5, 3)
     dr.set_grad(x, tangent)
-    assert_close(dr.forward_to(sparse_product(MATRIX, x)), MATRIX.toarray() @ np.asarray(tangent), atol=1e-6)
+    assert_close(
+        dr.forward_to(sparse_product(MATRIX, x)), MATRIX.toarray() @ np.asarray(tangent), atol=1e-6
+    )
 
 
 def test_moved__shifts_means_and_turns_rotations():
@@ -54,14 +58,18 @@ def test_moved__shifts_means_and_turns_rotations():
     quats = turns.as_quat(scalar_first=True) - (1, 0, 0, 0)
     result = moved(gaussians, shift, mi.TensorXf(quats.astype(np.float32)))
     assert_close(result.means, np.asarray(gaussians.means) + np.asarray(shift), atol=1e-6)
-    rotations, new_rotations = (Rotation.from_quat(unit_quats(g), scalar_first=True) for g in (gaussians, result))
+    rotations, new_rotations = (
+        Rotation.from_quat(unit_quats(g), scalar_first=True) for g in (gaussians, result)
+    )
     assert_close(new_rotations.as_matrix(), (turns * rotations).as_matrix(), atol=1e-5)
 
 
 def test_moved__without_motion_changes_no_bit():
     gaussians = to_gaussians(make_scene())
     result = moved(gaussians, dr.zeros(mi.TensorXf, (10, 3)), dr.zeros(mi.TensorXf, (10, 4)))
-    assert all(np.array_equal(result.numpy()[name], value) for name, value in gaussians.numpy().items())
+    assert all(
+        np.array_equal(result.numpy()[name], value) for name, value in gaussians.numpy().items()
+    )
 
 
 def test_moved__gradients_agree_with_central_differences():
@@ -71,11 +79,16 @@ def test_moved__gradients_agree_with_central_differences():
     direction = np.asarray(tensor(10, 4))
 
     def value(rotation):
-        return dr.sum(weight * moved(gaussians, dr.zeros(mi.TensorXf, (10, 3)), rotation).quats, axis=None)
+        return dr.sum(
+            weight * moved(gaussians, dr.zeros(mi.TensorXf, (10, 3)), rotation).quats, axis=None
+        )
 
     dr.enable_grad(rotation)
     dr.backward(value(rotation))
     derivative = np.vdot(np.asarray(dr.grad(rotation)), direction)
     at = np.asarray(dr.detach(rotation))
-    ends = [np.asarray(value(mi.TensorXf(np.asarray(at + h * direction, np.float32)))).item() for h in (0.5, -0.5)]
+    ends = [
+        np.asarray(value(mi.TensorXf(np.asarray(at + h * direction, np.float32)))).item()
+        for h in (0.5, -0.5)
+    ]
     assert abs(derivative - (ends[0] - ends[1])) < 1e-4 * abs(derivative)  # linear in the rotation

@@ -40,7 +40,8 @@ def key_view(mask: bool) -> KeyView:
     flow = np.ones((H, W, 2), np.float32)
     everywhere = np.ones((H, W), bool)
     return KeyView(
-        FramePair(image, image), FlowObservation(flow, everywhere, flow, everywhere, everywhere if mask else None)
+        FramePair(image, image),
+        FlowObservation(flow, everywhere, flow, everywhere, everywhere if mask else None),
     )
 
 
@@ -76,10 +77,21 @@ def test_losses_of__every_term_acts_where_its_inputs_exist_and_has_a_gradient():
     image = Image(color=tensor(H, W, 3), confidence=tensor(H, W, 1), others=guided)
     previous_gaussians = to_gaussians(make_scene())
     moved_gaussians = replace(to_gaussians(make_scene()), means=tensor(10, 3), quats=tensor(10, 4))
-    inputs = {"recon": image.color, "flow": image["guided_motion"], "mask": image.confidence, "offset": tensor(5, 3)}
-    inputs |= {"rigid": moved_gaussians.means, "rotation": moved_gaussians.quats, "isometry": moved_gaussians.means}
+    inputs = {
+        "recon": image.color,
+        "flow": image["guided_motion"],
+        "mask": image.confidence,
+        "offset": tensor(5, 3),
+    }
+    inputs |= {
+        "rigid": moved_gaussians.means,
+        "rotation": moved_gaussians.quats,
+        "isometry": moved_gaussians.means,
+    }
     assert list(inputs) == NAMES, "a new term needs an input here"
-    prediction = Prediction(image, {"offset": inputs["offset"]}, None, H * W, 10, 2.0, moved_gaussians)
+    prediction = Prediction(
+        image, {"offset": inputs["offset"]}, None, H * W, 10, 2.0, moved_gaussians
+    )
     observations = {
         "target": Target(np.zeros((H, W, 3), np.float32)),
         "motion": mi.TensorXf(np.zeros((H, W, 2), np.float32)),
@@ -87,9 +99,18 @@ def test_losses_of__every_term_acts_where_its_inputs_exist_and_has_a_gradient():
         "mask": mi.TensorXf(np.zeros((H, W), np.float32)),
         "neighbours": find_neighbours(previous_gaussians, 2.0),
     }
-    assert losses_of(prediction, {"target": observations["target"]}, ObjectiveConfig()).keys() == {"recon", "offset"}
-    assert losses_of(prediction, observations, ObjectiveConfig()).keys() == {*NAMES[:4]}, "the others are off"
-    losses = losses_of(prediction, observations, ObjectiveConfig(rigid_weight=1, rotation_weight=1, isometry_weight=1))
+    assert losses_of(prediction, {"target": observations["target"]}, ObjectiveConfig()).keys() == {
+        "recon",
+        "offset",
+    }
+    assert losses_of(prediction, observations, ObjectiveConfig()).keys() == {*NAMES[:4]}, (
+        "the others are off"
+    )
+    losses = losses_of(
+        prediction,
+        observations,
+        ObjectiveConfig(rigid_weight=1, rotation_weight=1, isometry_weight=1),
+    )
     assert list(losses) == NAMES
     for name, loss in losses.items():
         dr.backward(loss, flags=dr.ADFlag.ClearVertices)
@@ -135,7 +156,9 @@ def test_loss_term__acts_where_its_observation_exists(registry):
     assert channels_of({}, config) == ("color",)
     assert weights_of(config)["height"] == 2.5
 
-    prediction = Prediction(Image(depth=mi.TensorXf(np.full((H, W, 1), 3.0))), {}, None, H * W, 1, 1.0, None)
+    prediction = Prediction(
+        Image(depth=mi.TensorXf(np.full((H, W, 1), 3.0))), {}, None, H * W, 1, 1.0, None
+    )
     losses = losses_of(prediction, {"height": mi.TensorXf(observations["height"])}, config)
     assert losses.keys() == {"height"}
     assert np.asarray(losses["height"]).item() == 4 * H * W
@@ -159,12 +182,15 @@ def test_objective_config__refuses_terms(registry, terms, message):
 
 
 def test_objective_config__refuses_terms_where_none_is_registered(registry):
-    with pytest.raises(ValueError, match="`terms` must be one of the registered names, of which there are none"):
+    with pytest.raises(
+        ValueError, match="`terms` must be one of the registered names, of which there are none"
+    ):
         ObjectiveConfig(terms=("speed:1",))
 
 
 @pytest.mark.parametrize(
-    ("name", "message"), [("flow", "which the objective has already"), ("speed", "registered"), ("a:b", "colon")]
+    ("name", "message"),
+    [("flow", "which the objective has already"), ("speed", "registered"), ("a:b", "colon")],
 )
 def test_loss_term__refuses_names(registry, name, message):
     loss_term("speed")(lambda p, o, config: 0)

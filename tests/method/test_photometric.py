@@ -1,4 +1,6 @@
-"""Photometric refinement: displacements of a fraction of a pixel and colours, from the images alone."""
+"""Photometric refinement: displacements of a fraction of a pixel and colours, from the images
+alone.
+"""
 
 from __future__ import annotations
 
@@ -25,9 +27,15 @@ def scene():
     """A bright clump that moves by SHIFT in front of a dark static wall, in two views."""
     rng = np.random.default_rng(0)
     means = np.concatenate([rng.normal(0, 0.15, (MOVING, 3)), random_sheet(rng, STATIC, 1.2, 0.6)])
-    colors = np.concatenate([rng.uniform(0.2, 1.5, (MOVING, 1, 3)), rng.uniform(-1.5, -1, (STATIC, 1, 3))])
+    colors = np.concatenate(
+        [rng.uniform(0.2, 1.5, (MOVING, 1, 3)), rng.uniform(-1.5, -1, (STATIC, 1, 3))]
+    )
     gaussians = isotropic(means, 0.05, 0.9, colors)
-    views = dict(enumerate(map(ActiveView, look_at_cameras([(x, 0.3, -3) for x in (-0.8, 0.8)], 45, 128, 96))))
+    views = dict(
+        enumerate(
+            map(ActiveView, look_at_cameras([(x, 0.3, -3) for x in (-0.8, 0.8)], 45, 128, 96))
+        )
+    )
     return gaussians, views, targets(moved(gaussians), views)
 
 
@@ -75,19 +83,26 @@ def test_refine_start__takes_no_step_longer_than_the_limit(scene, monkeypatch):
     gaussians, views, _ = scene
     monkeypatch.setattr("morgs_mi.method.photometric.LONGEST_PX", 0.1)
     step = refined_from(scene, start(0.6)).displacement - start(0.6).displacement
-    px = [view.camera.projection_jacobian(np.asarray(gaussians.means)) @ step[..., None] for view in views.values()]
+    px = [
+        view.camera.projection_jacobian(np.asarray(gaussians.means)) @ step[..., None]
+        for view in views.values()
+    ]
     assert 0.05 < np.linalg.norm(px, axis=2).max() < 0.11
 
 
 def test_refine_start__does_nothing_without_motion_or_views(scene):
     assert refined_from(scene, start(0.0)).displacement.any() == 0
-    assert np.array_equal(refined_from((scene[0], {}, {}), start(0.6)).displacement, start(0.6).displacement)
+    assert np.array_equal(
+        refined_from((scene[0], {}, {}), start(0.6)).displacement, start(0.6).displacement
+    )
 
 
 def color_change(gaussians, views, targets):
     """Return the change of colour of Gaussians that do not move."""
     still = MotionStart.without_motion(gaussians)
-    return refine_start(MotionProblem(gaussians, views, targets, np.random.default_rng(0)), still).color_change
+    return refine_start(
+        MotionProblem(gaussians, views, targets, np.random.default_rng(0)), still
+    ).color_change
 
 
 def test_refine_start__follows_a_change_of_light(scene):
@@ -96,10 +111,15 @@ def test_refine_start__follows_a_change_of_light(scene):
     bright_targets = targets(brighter, views)
     followed = with_colors(gaussians, color_change(gaussians, views, bright_targets)[:, None])
     differences = [
-        np.abs(bright_targets[v].difference(view.render(followed).color)).mean() for v, view in views.items()
+        np.abs(bright_targets[v].difference(view.render(followed).color)).mean()
+        for v, view in views.items()
     ]
-    there = [np.abs(bright_targets[v].difference(view.render(gaussians).color)).mean() for v, view in views.items()]
-    assert max(differences) < 0.5 * min(there)  # the rest is at the border, and from the weight of ten pixels
+    there = [
+        np.abs(bright_targets[v].difference(view.render(gaussians).color)).mean()
+        for v, view in views.items()
+    ]
+    # The rest is at the border, and from the weight of ten pixels.
+    assert max(differences) < 0.5 * min(there)
 
 
 def test_refine_start__trusts_few_pixels_less(scene):
@@ -107,7 +127,9 @@ def test_refine_start__trusts_few_pixels_less(scene):
 
     def followed(sizes):
         smaller = replace(gaussians, log_scales=np.asarray(gaussians.log_scales) + np.log(sizes))
-        return np.median(color_change(smaller, views, targets(with_colors(smaller, 0.1 / SH_C0), views)))
+        return np.median(
+            color_change(smaller, views, targets(with_colors(smaller, 0.1 / SH_C0), views))
+        )
 
     assert followed(0.2) < 0.3 * followed(1.0)
 

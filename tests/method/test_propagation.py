@@ -20,14 +20,16 @@ SHIFT = np.float32([0.25, -0.1, 0.0])
 
 @pytest.fixture(scope="module")
 def scene():
-    """A bright clump of 60 in front of a dark wall; the clump moves by SHIFT, the wall is static."""
+    """A bright clump of 60 in front of a dark wall; the clump moves by SHIFT."""
     rng = np.random.default_rng(0)
     wall = random_sheet(rng, 400, 1.2, 0.6)
     means = np.concatenate([rng.normal(0, 0.12, (60, 3)), wall])
     colors = np.concatenate([rng.uniform(0.5, 1.5, (60, 1, 3)), rng.uniform(-1.5, -1, (400, 1, 3))])
     gaussians = isotropic(means, 0.05, 0.9, colors)
     moves = np.arange(460) < 60
-    target = replace(gaussians, means=mi.TensorXf(np.asarray(gaussians.means) + SHIFT * moves[:, None]))
+    target = replace(
+        gaussians, means=mi.TensorXf(np.asarray(gaussians.means) + SHIFT * moves[:, None])
+    )
     cameras = look_at_cameras([(x, 0.3, -3) for x in (-0.8, 0.8)], 45)
     views = {view: ActiveView(camera) for view, camera in enumerate(cameras)}
     targets = {v: Target(np.asarray(view.render(target).color)) for v, view in views.items()}
@@ -40,14 +42,22 @@ def still(n):
 
 def start(scene, lifted, motion=None):
     gaussians, _, views, targets = scene
-    start_gaussians = gaussians if motion is None else replace(gaussians, motion=mi.TensorXf(motion.astype(np.float32)))
-    return propagate_motion(MotionProblem(start_gaussians, views, targets, np.random.default_rng(0)), lifted)
+    start_gaussians = (
+        gaussians
+        if motion is None
+        else replace(gaussians, motion=mi.TensorXf(motion.astype(np.float32)))
+    )
+    return propagate_motion(
+        MotionProblem(start_gaussians, views, targets, np.random.default_rng(0)), lifted
+    )
 
 
 def found(lift, moves):
-    """Fractions of the moving Gaussians that move by SHIFT, and of the static ones that do not move.
+    """Fractions of the moving Gaussians that move by SHIFT, and of the static ones that do not
+    move.
 
-    Measured, all are 1 but for one of the 60, which is hardly visible; the bounds below allow for two.
+    Measured, all are 1 but for one of the 60, which is hardly visible; the bounds below allow for
+    two.
     """
     right = np.linalg.norm(lift.displacement - SHIFT * moves[:, None], axis=1) < 0.05
     return right[moves].mean(), right[~moves].mean()
@@ -74,7 +84,9 @@ def test_propagate_motion__ends_motion_that_has_stopped(scene):
 def test_propagate_motion__spreads_to_neighbours(scene):
     moves = scene[1]
     mask = moves & (np.arange(460) % 3 == 0)
-    lift = MotionStart((SHIFT * mask[:, None]).astype(np.float32), np.where(mask, 2, -2).astype(np.float32))
+    lift = MotionStart(
+        (SHIFT * mask[:, None]).astype(np.float32), np.where(mask, 2, -2).astype(np.float32)
+    )
     hit, static = found(start(scene, lift), moves)
     assert hit > 0.96  # a third to begin with
     assert static > 0.99
@@ -82,7 +94,9 @@ def test_propagate_motion__spreads_to_neighbours(scene):
 
 def test_propagate_motion__keeps_true_motion(scene):
     moves = scene[1]
-    lift = MotionStart((SHIFT * moves[:, None]).astype(np.float32), np.where(moves, 2, -2).astype(np.float32))
+    lift = MotionStart(
+        (SHIFT * moves[:, None]).astype(np.float32), np.where(moves, 2, -2).astype(np.float32)
+    )
     result = start(scene, lift, -SHIFT * moves[:, None])
     assert found(result, moves)[0] > 0.96
 
@@ -98,10 +112,15 @@ def test_propagate_motion__does_nothing_without_motion_or_views(scene):
 def test_propagate_motion__does_nothing_where_no_view_shows_what_may_move(scene):
     gaussians, moves, views, targets = scene
     outside = replace(
-        gaussians, means=np.asarray(gaussians.means) - np.float32([0, 0, 50]), motion=SHIFT * moves[:, None]
+        gaussians,
+        means=np.asarray(gaussians.means) - np.float32([0, 0, 50]),
+        motion=SHIFT * moves[:, None],
     )
     lifted = still(460)
-    assert propagate_motion(MotionProblem(outside, views, targets, np.random.default_rng(0)), lifted) is lifted
+    assert (
+        propagate_motion(MotionProblem(outside, views, targets, np.random.default_rng(0)), lifted)
+        is lifted
+    )
 
 
 def test_propagate_motion__leaves_a_single_gaussian_without_neighbours_as_it_is(scene):

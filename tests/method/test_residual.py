@@ -21,7 +21,10 @@ OFF = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=Fals
 def random_parameters(previous, config, seed=0):
     rng = np.random.default_rng(seed)
     start = residual_parameters(previous, config)
-    return {k: mi.TensorXf(rng.normal(0, 0.1, tuple(v.shape)).astype(np.float32)) for k, v in start.items()}
+    return {
+        k: mi.TensorXf(rng.normal(0, 0.1, tuple(v.shape)).astype(np.float32))
+        for k, v in start.items()
+    }
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
@@ -53,8 +56,14 @@ def test_apply_residual__gate_scales_every_attribute(degree, two_gates):
     assert_close(current["quats"] - old_values["quats"], m[:, None] * R["quats"], atol=1e-6)
     change = current["sh_coeffs"] - old_values["sh_coeffs"]
     m = np.ones_like(m) if two_gates else m
-    assert_close(current["log_scales"] - old_values["log_scales"], m[:, None] * R["log_scales"], atol=1e-6)
-    assert_close(current["logit_opacities"] - old_values["logit_opacities"], m * R["logit_opacities"], atol=1e-6)
+    assert_close(
+        current["log_scales"] - old_values["log_scales"], m[:, None] * R["log_scales"], atol=1e-6
+    )
+    assert_close(
+        current["logit_opacities"] - old_values["logit_opacities"],
+        m * R["logit_opacities"],
+        atol=1e-6,
+    )
     assert_close(change[:, :1], m[:, None, None] * R["sh_dc"], atol=1e-6)
     if degree:
         assert_close(change[:, 1:], m[:, None, None] * R["sh_rest"], atol=1e-6)
@@ -63,8 +72,12 @@ def test_apply_residual__gate_scales_every_attribute(degree, two_gates):
 def test_residual_parameters__follow_the_modules():
     previous = to_gaussians(make_scene())
     assert "offset" not in residual_parameters(previous, MotionConfig(learn_offset=False))
-    assert "logit_confidence" not in residual_parameters(previous, MotionConfig(learn_confidence=False))
-    assert {"offset", "logit_confidence", "motion"} <= set(residual_parameters(previous, MotionConfig()))
+    assert "logit_confidence" not in residual_parameters(
+        previous, MotionConfig(learn_confidence=False)
+    )
+    assert {"offset", "logit_confidence", "motion"} <= set(
+        residual_parameters(previous, MotionConfig())
+    )
 
 
 @pytest.mark.parametrize("lift_confidence", [False, True])
@@ -90,12 +103,16 @@ def test_apply_residual__gradient_of_the_gate_follows_the_product_rule():
     logit = np.asarray(parameters["logit_confidence"], np.float64)
     m = 1 / (1 + np.exp(-logit))
     R = sum(np.asarray(parameters[name], np.float64) for name in ("motion", "offset"))
-    assert np.asarray(dr.grad(parameters["motion"])) == pytest.approx(np.repeat(m[:, None], 3, 1), rel=1e-5)
+    assert np.asarray(dr.grad(parameters["motion"])) == pytest.approx(
+        np.repeat(m[:, None], 3, 1), rel=1e-5
+    )
     expected = m * (1 - m) * R.sum(1)
     assert_close(dr.grad(parameters["logit_confidence"]), expected, atol=1e-6)
 
 
 def test_residual_parameters__refuse_gaussians_without_confidence():
     previous = replace(to_gaussians(make_scene()), logit_confidence=None)
-    with pytest.raises(ValueError, match="`previous` must have a confidence with `learn_confidence`, got none"):
+    with pytest.raises(
+        ValueError, match="`previous` must have a confidence with `learn_confidence`, got none"
+    ):
         residual_parameters(previous, MotionConfig())

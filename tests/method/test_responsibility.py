@@ -17,7 +17,9 @@ RENDER = RenderConfig()
 CORE = 0.6
 WALL = 400
 SIDE = 96
-CAMERAS = dict(enumerate(look_at_cameras(arc(np.linspace(-0.6, 0.6, 5), 4, y=-0.3), 40, SIDE, SIDE)))
+CAMERAS = dict(
+    enumerate(look_at_cameras(arc(np.linspace(-0.6, 0.6, 5), 4, y=-0.3), 40, SIDE, SIDE))
+)
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +33,9 @@ def gaussians():
 
 def changed_views(gaussians, changes):
     return [
-        ChangedView(ActiveView(camera), changes[view], boxes_around(gaussians, camera, RENDER, CORE))
+        ChangedView(
+            ActiveView(camera), changes[view], boxes_around(gaussians, camera, RENDER, CORE)
+        )
         for view, camera in CAMERAS.items()
     ]
 
@@ -42,8 +46,14 @@ def responsibility_for(gaussians, changes, width=640):
 
 def exact_ratio(gaussians, changes):
     """Return the ratio of blend weights over whole views, and their sum in px."""
-    images = {view: np.stack([c, np.ones_like(c)], axis=-1).astype(np.float32) for view, c in changes.items()}
-    sums = sum(backproject(gaussians, ActiveView(CAMERAS[view]), image).astype(float) for view, image in images.items())
+    images = {
+        view: np.stack([c, np.ones_like(c)], axis=-1).astype(np.float32)
+        for view, c in changes.items()
+    }
+    sums = sum(
+        backproject(gaussians, ActiveView(CAMERAS[view]), image).astype(float)
+        for view, image in images.items()
+    )
     return sums[:, 0] / np.maximum(sums[:, 1], 1e-9), sums[:, 1]
 
 

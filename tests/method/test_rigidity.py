@@ -1,4 +1,6 @@
-"""Local rigidity: zero for rigid motion, against float64 twins, and gradients against central differences."""
+"""Local rigidity: zero for rigid motion, against float64 twins, and gradients against central
+differences.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,9 @@ def other(seed: int = 0, size: float = 0.1) -> Gaussians:
     """Return the Gaussians, each moved and turned by itself."""
     rng = np.random.default_rng(seed)
     start = to_gaussians(BEFORE)
-    means, quats = (np.asarray(v) + size * rng.normal(size=v.shape) for v in (start.means, start.quats))
+    means, quats = (
+        np.asarray(v) + size * rng.normal(size=v.shape) for v in (start.means, start.quats)
+    )
     return replace(start, means=means, quats=quats)
 
 
@@ -39,7 +43,9 @@ def reference(gaussians: Gaussians) -> dict[str, float]:
     """Return the losses in float64, pair by pair."""
     start = to_gaussians(BEFORE)
     old, new = (np.asarray(g.means, np.float64) / EXTENT for g in (start, gaussians))
-    q_old, q_new = (Rotation.from_quat(unit_quats(g), scalar_first=True) for g in (start, gaussians))
+    q_old, q_new = (
+        Rotation.from_quat(unit_quats(g), scalar_first=True) for g in (start, gaussians)
+    )
     sums = dict.fromkeys(LOSSES, 0.0)
     count = 0
     turns = (q_new * q_old.inv()).as_quat(scalar_first=True)
@@ -50,7 +56,8 @@ def reference(gaussians: Gaussians) -> dict[str, float]:
             w = np.exp(-(e @ e) / REACH**2)
             turn = Rotation.from_quat(turns[i], scalar_first=True)
             sums["rigid"] += w * np.linalg.norm(e_now - turn.apply(e))
-            # A quaternion and its negative are one rotation; small changes keep the sign of both factors.
+            # A quaternion and its negative are one rotation; small changes keep the sign of both
+            # factors.
             sums["rotation"] += w * min(np.linalg.norm(turns[j] - s * turns[i]) for s in (1, -1))
             sums["isometry"] += w * abs(np.linalg.norm(e_now) - np.linalg.norm(e))
             count += 1
@@ -73,7 +80,8 @@ def test_rigidity__is_zero_for_a_body_that_moves_as_a_whole(name):
 
 
 @pytest.mark.parametrize(
-    ("name", "attribute"), [("rigid", "means"), ("rigid", "quats"), ("rotation", "quats"), ("isometry", "means")]
+    ("name", "attribute"),
+    [("rigid", "means"), ("rigid", "quats"), ("rotation", "quats"), ("isometry", "means")],
 )
 def test_rigidity__gradients_agree_with_central_differences(name, attribute):
     gaussians = other(1)
@@ -87,7 +95,9 @@ def test_rigidity__gradients_agree_with_central_differences(name, attribute):
     direction = np.random.default_rng(2).normal(size=at.shape).astype(np.float32)
     # Float32 leaves 1e-3 of a difference this small.
     ends = [
-        np.asarray(loss(replace(gaussians, **{attribute: at + s * step * direction}), neighbours())).item()
+        np.asarray(
+            loss(replace(gaussians, **{attribute: at + s * step * direction}), neighbours())
+        ).item()
         for s in (1, -1)
     ]
     expected = (ends[0] - ends[1]) / (2 * step)
@@ -99,7 +109,9 @@ def test_rigidity__has_a_finite_gradient_where_nothing_moves(name):
     still = to_gaussians(BEFORE)
     dr.enable_grad(still.means, still.quats)
     dr.backward(LOSSES[name](still, neighbours()))
-    assert all(np.isfinite(np.asarray(dr.grad(value))).all() for value in (still.means, still.quats))
+    assert all(
+        np.isfinite(np.asarray(dr.grad(value))).all() for value in (still.means, still.quats)
+    )
 
 
 def test_find_neighbours__weighs_near_ones_more():

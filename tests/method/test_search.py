@@ -32,8 +32,12 @@ def scene():
     rng = np.random.default_rng(0)
     heights = np.repeat(np.linspace(-0.4, 0.4, ROD // 2), 2) + np.tile([-0.01, 0.01], ROD // 2)
     rod = np.stack([np.zeros(ROD), heights, np.full(ROD, -0.4)], axis=1)
-    colors = np.concatenate([rng.uniform(0.8, 1.5, (ROD, 1, 3)), rng.uniform(-1.5, -0.5, (WALL, 1, 3))])
-    gaussians = isotropic(np.concatenate([rod, random_sheet(rng, WALL, 1.2, 0.6)]), 0.04, 0.95, colors)
+    colors = np.concatenate(
+        [rng.uniform(0.8, 1.5, (ROD, 1, 3)), rng.uniform(-1.5, -0.5, (WALL, 1, 3))]
+    )
+    gaussians = isotropic(
+        np.concatenate([rod, random_sheet(rng, WALL, 1.2, 0.6)]), 0.04, 0.95, colors
+    )
     places = [(x, 0.3, -3) for x in (-1, 0.1, 1.2)]
     return gaussians, dict(enumerate(map(ActiveView, look_at_cameras(places, 45, 160, 120))))
 
@@ -51,7 +55,9 @@ def still():
 
 
 def searched(gaussians, start, views, visible, config=None):
-    return search_motion(MotionProblem(gaussians, views, visible, np.random.default_rng(0)), start, config)
+    return search_motion(
+        MotionProblem(gaussians, views, visible, np.random.default_rng(0)), start, config
+    )
 
 
 @pytest.mark.parametrize("shift", [SHIFT, -SHIFT, SHIFT * [1, 1, -2]])
@@ -68,15 +74,21 @@ def test_search_motion__finds_a_fast_thin_part(scene, shift):
 
 def test_search_motion__corrects_a_wrong_start(scene):
     gaussians, views = scene
-    wrong = MotionStart((-SHIFT * MOVES[:, None]).astype(np.float32), np.where(MOVES, 1, -2).astype(np.float32))
+    wrong = MotionStart(
+        (-SHIFT * MOVES[:, None]).astype(np.float32), np.where(MOVES, 1, -2).astype(np.float32)
+    )
     motion = searched(gaussians, wrong, views, targets(moved(gaussians), views))
-    assert np.all(np.linalg.norm(motion.displacement[MOVES] - SHIFT, axis=1) < 0.1 * np.linalg.norm(SHIFT))
+    assert np.all(
+        np.linalg.norm(motion.displacement[MOVES] - SHIFT, axis=1) < 0.1 * np.linalg.norm(SHIFT)
+    )
     assert np.all(motion.logit_confidence[MOVES] == 1)
 
 
 def test_search_motion__keeps_a_start_that_explains_the_images(scene):
     gaussians, views = scene
-    right = MotionStart((SHIFT * MOVES[:, None]).astype(np.float32), np.where(MOVES, 1, -2).astype(np.float32))
+    right = MotionStart(
+        (SHIFT * MOVES[:, None]).astype(np.float32), np.where(MOVES, 1, -2).astype(np.float32)
+    )
     assert searched(gaussians, right, views, targets(moved(gaussians), views)) is right
     assert searched(gaussians, right, {}, {}) is right
 
@@ -88,11 +100,16 @@ def test_search_motion__keeps_a_part_that_vanished(scene):
     assert searched(gaussians, start, views, targets(gone, views)) is start
 
 
-@pytest.mark.parametrize("setting", [{"reach": 0.03}, {"max_parts": 0}], ids=lambda setting: next(iter(setting)))
+@pytest.mark.parametrize(
+    "setting", [{"reach": 0.03}, {"max_parts": 0}], ids=lambda setting: next(iter(setting))
+)
 def test_search_config__each_setting_can_prevent_a_finding(scene, setting):
     gaussians, views = scene
     start = still()
-    assert searched(gaussians, start, views, targets(moved(gaussians), views), SearchConfig(**setting)) is start
+    assert (
+        searched(gaussians, start, views, targets(moved(gaussians), views), SearchConfig(**setting))
+        is start
+    )
 
 
 @pytest.mark.parametrize(
@@ -126,7 +143,9 @@ def test_initial_motion__searches_where_flow_sees_nothing(scene):
     for searches in (True, False):
         config = MotionConfig(search_motion=searches)
         rng = np.random.default_rng(0)
-        initial = initial_motion(gaussians, active, flows, targets(moved(gaussians), views), config, rng)
+        initial = initial_motion(
+            gaussians, active, flows, targets(moved(gaussians), views), config, rng
+        )
         assert initial.displacement[MOVES].any() == searches
 
 
@@ -139,7 +158,10 @@ def test_cost_surface__is_the_weighted_squared_difference():
     surface = _MatchedView(camera, image, next_image, 1.0).cost_surface(weight)
     shifts = np.array([(0, 0), (4, -3), (-11, 9)])
     expected = [
-        np.sum(weight[..., None].astype(float) * (np.roll(next_image, (-y, -x), (0, 1)).astype(float) - image) ** 2)
+        np.sum(
+            weight[..., None].astype(float)
+            * (np.roll(next_image, (-y, -x), (0, 1)).astype(float) - image) ** 2
+        )
         for x, y in shifts
     ]
     origin = np.array([[32.0, 24.0]])
@@ -150,7 +172,8 @@ def test_cost_surface__is_the_weighted_squared_difference():
 
 
 @pytest.mark.parametrize(
-    ("width", "block", "factor"), [(1352, (8, 4), 4), (1352, (4, 2), 2), (700, (8, 4), 2), (160, (8, 4), 1)]
+    ("width", "block", "factor"),
+    [(1352, (8, 4), 4), (1352, (4, 2), 2), (700, (8, 4), 2), (160, (8, 4), 1)],
 )
 def test_reduction__leaves_two_pixels_per_step_and_divides_the_blocks(width, block, factor):
     camera = look_at_cameras([(0, 0, -3)], 45, width, 48)[0]

@@ -18,15 +18,27 @@ from tests.scenes.gaussians import isotropic, random_sheet
 
 @pytest.fixture(scope="module")
 def scene():
-    """A textured wall in three views of two sizes, one of them masked, with blurred noise as targets."""
+    """A textured wall in three views of two sizes, one of them masked, with blurred noise as
+    targets.
+    """
     rng = np.random.default_rng(0)
-    wall = isotropic(random_sheet(rng, 300, 1.2, 0.6), 0.06, 0.8, rng.uniform(-1.5, 1.5, (300, 1, 3)))
+    wall = isotropic(
+        random_sheet(rng, 300, 1.2, 0.6), 0.06, 0.8, rng.uniform(-1.5, 1.5, (300, 1, 3))
+    )
     cameras = look_at_cameras([(x, 0.3, -3) for x in (-0.8, 0.1, 0.8)], 45, 80, 60)
-    views = {4: ActiveView(cameras[0]), 2: ActiveView(cameras[1].resized(53, 41)), 7: ActiveView(cameras[2])}
+    views = {
+        4: ActiveView(cameras[0]),
+        2: ActiveView(cameras[1].resized(53, 41)),
+        7: ActiveView(cameras[2]),
+    }
     sizes = [(view.camera.height, view.camera.width) for view in views.values()]
     images = [cv2.GaussianBlur(rng.random((*size, 3), np.float32), (0, 0), 2) for size in sizes]
     masks = [None, rng.random(sizes[1]) > 0.3, None]
-    return wall, views, {v: Target(*pair) for v, pair in zip(views, zip(images, masks, strict=True), strict=True)}
+    return (
+        wall,
+        views,
+        {v: Target(*pair) for v, pair in zip(views, zip(images, masks, strict=True), strict=True)},
+    )
 
 
 def expected(wall, view, target):
@@ -58,7 +70,10 @@ def test_sums__are_the_sums_of_each_view(scene):
 
 def test_total_error__is_the_sum_over_all_pixels(scene):
     wall, views, targets = scene
-    total = sum(np.abs(targets[v].difference(view.render(wall).color)).sum() / 3 for v, view in views.items())
+    total = sum(
+        np.abs(targets[v].difference(view.render(wall).color)).sum() / 3
+        for v, view in views.items()
+    )
     assert KeyImages(views, targets).total_error(wall) == pytest.approx(total, rel=1e-5)
 
 

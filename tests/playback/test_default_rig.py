@@ -1,4 +1,6 @@
-"""Cameras for Gaussians without a recording: they see the scene upright, whatever lies far outside of it."""
+"""Cameras for Gaussians without a recording: they see the scene upright, whatever lies far outside
+of it.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from tests.assertions import assert_close
 from tests.scenes.changing_splats import splats
 
 
-@pytest.mark.parametrize(("axes", "up"), [("y-down", (0, -1, 0)), ("y-up", (0, 1, 0)), ("z-up", (0, 0, 1))])
+@pytest.mark.parametrize(
+    ("axes", "up"), [("y-down", (0, -1, 0)), ("y-up", (0, 1, 0)), ("z-up", (0, 0, 1))]
+)
 def test_default_rig__sees_the_gaussians_upright_from_all_sides(axes, up):
     cameras = default_rig([splats(300)], axes)
     means = splats(300).numpy()["means"]
@@ -33,8 +37,12 @@ def test_default_rig__sees_the_gaussians_upright_from_all_sides(axes, up):
 
 @pytest.mark.parametrize("side", ["front", "right", "back-left"])
 def test_default_rig__begins_where_the_scene_has_detail(side):
-    toward = next(camera for camera in default_rig([splats(1)]) if camera.name == side).viewmat[2, :3]
-    steps = np.stack(np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21)), axis=-1).reshape(-1, 2)
+    toward = next(camera for camera in default_rig([splats(1)]) if camera.name == side).viewmat[
+        2, :3
+    ]
+    steps = np.stack(np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21)), axis=-1).reshape(
+        -1, 2
+    )
     sheet = steps[:, :1] * np.cross(toward, (0, 1, 0)) + steps[:, 1:] * (0, 1, 0)
     colors = np.random.default_rng(0).uniform(-1.5, 1.5, (len(sheet), 1, 3))
     # A picture with a grey wall behind it.
@@ -57,7 +65,10 @@ def test_default_rig__ignores_far_floaters_and_what_is_nearly_transparent():
     means[100:150] = 50
     logits[100:150] = -8
     shown = replace(scene, means=means, logit_opacities=logits)
-    positions = ({camera.name: camera.position for camera in default_rig([gaussians])} for gaussians in (shown, scene))
+    positions = (
+        {camera.name: camera.position for camera in default_rig([gaussians])}
+        for gaussians in (shown, scene)
+    )
     assert_close(*(np.stack([rig[name] for name in sorted(rig)]) for rig in positions), atol=0.5)
 
 

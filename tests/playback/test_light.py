@@ -1,4 +1,6 @@
-"""Streams of HDR recordings: files of linear light, displays after an exposure, and the light of inserted scenes."""
+"""Streams of HDR recordings: files of linear light, displays after an exposure, and the light of
+inserted scenes.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,9 @@ def written(path: Path, metadata: dict) -> Path:
 
 @pytest.fixture
 def stream(tmp_path: Path):
-    return open_stream(written(tmp_path / "s.morgs", {"transfer": {"name": TRANSFER, "display_exposure": STOPS}}))
+    return open_stream(
+        written(tmp_path / "s.morgs", {"transfer": {"name": TRANSFER, "display_exposure": STOPS}})
+    )
 
 
 def rendered(stream):
@@ -55,7 +59,9 @@ def test_write_frames__png_files_show_the_streams_exposure(stream, tmp_path):
     shown = cv2.imread(str(tmp_path / "a.png"))[..., ::-1]
     expected = display_image(decode_light(rendered(stream)), STOPS)
     assert np.abs(shown.astype(int) - expected).max() <= 1
-    write_images(render_stream(stream, camera(), ("color",)), 10, tmp_path / "b.png", display_exposure=-20)
+    write_images(
+        render_stream(stream, camera(), ("color",)), 10, tmp_path / "b.png", display_exposure=-20
+    )
     assert cv2.imread(str(tmp_path / "b.png")).max() == 0
 
 
@@ -70,7 +76,10 @@ def test_write_frames__streams_of_8_bits_are_clipped_as_they_are(tmp_path):
 @pytest.mark.parametrize("stops", ["bright", 1e9, None])
 def test_stream_exposure__refuses_other_values(tmp_path, stops):
     stream = open_stream(written(tmp_path / "s.morgs", {"transfer": {"display_exposure": stops}}))
-    with pytest.raises(ValueError, match=r"s\.morgs: packet 0: `transfer.display_exposure` of the header's metadata"):
+    with pytest.raises(
+        ValueError,
+        match=r"s\.morgs: packet 0: `transfer.display_exposure` of the header's metadata",
+    ):
         stream_exposure(stream)
 
 
@@ -80,7 +89,9 @@ def test_render_inserted__guesses_clipped_light_of_recordings_of_8_bits_alone(st
 
     def inserted(stream, clipped):
         config = InsertConfig(4, shadows=False, clipped=clipped)
-        (frame,) = render_inserted(stream, camera(), lambda frame, time: {"ball": ball}, [0], config=config)
+        (frame,) = render_inserted(
+            stream, camera(), lambda frame, time: {"ball": ball}, [0], config=config
+        )
         return frame[1]["color"]
 
     recorded = inserted(stream, 1.0)

@@ -59,7 +59,10 @@ def test_render_stream__renders_the_available_channels(fitted_clip: Path, tmp_pa
     frames = list(render_stream(reader, find_camera(reader, 1)))
     assert [index for index, _ in frames] == list(range(FRAMES))
     shapes = {name: image.shape for name, image in frames[0][1].items()}
-    assert shapes == {n: (HEIGHT, WIDTH, k) for n, k in (("color", 3), ("motion", 2), ("depth", 1), ("confidence", 1))}
+    assert shapes == {
+        n: (HEIGHT, WIDTH, k)
+        for n, k in (("color", 3), ("motion", 2), ("depth", 1), ("confidence", 1))
+    }
     assert all(channel_image(n, i).shape == (HEIGHT, WIDTH, 3) for n, i in frames[0][1].items())
     write_stream(tmp_path / "s.morgs", {}, logit=None)
     assert "confidence" not in next(render_stream(open_stream(tmp_path / "s.morgs"), CAMERAS[0]))[1]
@@ -68,9 +71,21 @@ def test_render_stream__renders_the_available_channels(fitted_clip: Path, tmp_pa
 @pytest.mark.parametrize(
     ("metadata", "read", "message"),
     [
-        ({"config": 3}, render_config, r"`config.render` of the header's metadata must be an object, got None"),
-        ({"config": {"render": []}}, render_config, r"`config.render` of .* must be an object, got \[\]"),
-        ({"config": {"render": {"x": 1}}}, render_config, r"`config.render` of the header's metadata: `x` is unknown"),
+        (
+            {"config": 3},
+            render_config,
+            r"`config.render` of the header's metadata must be an object, got None",
+        ),
+        (
+            {"config": {"render": []}},
+            render_config,
+            r"`config.render` of .* must be an object, got \[\]",
+        ),
+        (
+            {"config": {"render": {"x": 1}}},
+            render_config,
+            r"`config.render` of the header's metadata: `x` is unknown",
+        ),
         (
             {"config": {"render": {"eps2d": "a"}}},
             render_config,
@@ -81,16 +96,36 @@ def test_render_stream__renders_the_available_channels(fitted_clip: Path, tmp_pa
             render_config,
             r"metadata: `block_width` must be at least 4, at most 16 and a multiple of 4",
         ),
-        ({"config": {"motion": 1}}, has_confidence, r"`config.motion.learn_confidence` of .* must be true or false"),
-        ({"num_frames": "many"}, num_frames, r"`num_frames` of the header's metadata must be an integer, got 'many'"),
-        ({"downscale": None}, capture_of, r"`downscale` of .* must be an integer or a number, got None"),
+        (
+            {"config": {"motion": 1}},
+            has_confidence,
+            r"`config.motion.learn_confidence` of .* must be true or false",
+        ),
+        (
+            {"num_frames": "many"},
+            num_frames,
+            r"`num_frames` of the header's metadata must be an integer, got 'many'",
+        ),
+        (
+            {"downscale": None},
+            capture_of,
+            r"`downscale` of .* must be an integer or a number, got None",
+        ),
         (
             {"test_view": 1.5},
             capture_of,
             r"`test_view` of .* must be a list or an integer or a string or null, got 1.5",
         ),
-        ({"reading": {"offset": {"cam0": "0.5"}}}, capture_of, r"`reading` of the header's metadata: `offset` must be"),
-        ({"reading": {"offset": {"cam0": 2}, "trim": 1}}, capture_of, r"metadata: `trim` must be true or false, got 1"),
+        (
+            {"reading": {"offset": {"cam0": "0.5"}}},
+            capture_of,
+            r"`reading` of the header's metadata: `offset` must be",
+        ),
+        (
+            {"reading": {"offset": {"cam0": 2}, "trim": 1}},
+            capture_of,
+            r"metadata: `trim` must be true or false, got 1",
+        ),
     ],
 )
 def test_open_stream__metadata_of_other_types_are_refused_where_they_are_read(
@@ -107,7 +142,8 @@ def test_open_stream__metadata_of_other_types_are_refused_where_they_are_read(
 def test_open_stream_capture__needs_a_path(tmp_path: Path, metadata: dict[str, Any]) -> None:
     write_stream(tmp_path / "s.morgs", metadata)
     with pytest.raises(
-        ValueError, match=r"expected the path of its capture in the capture\.json beside it, found none"
+        ValueError,
+        match=r"expected the path of its capture in the capture\.json beside it, found none",
     ):
         capture_of(open_stream(tmp_path / "s.morgs"))
 
@@ -144,11 +180,15 @@ def test_has_confidence__only_where_it_was_learned(fitted_clip: Path, tmp_path: 
     assert not has_confidence(open_stream(tmp_path / "none.morgs"))
 
 
-def test_render_stream__offset_is_its_share_of_the_motion(fitted_clip: Path, tmp_path: Path) -> None:
+def test_render_stream__offset_is_its_share_of_the_motion(
+    fitted_clip: Path, tmp_path: Path
+) -> None:
     write_stream(tmp_path / "s.morgs", {}, offset=0.25)
     assert has_offset(open_stream(tmp_path / "s.morgs"))
     assert not has_offset(open_stream(fitted_clip))
-    played = list(render_stream(open_stream(tmp_path / "s.morgs"), CAMERAS[0], ("motion", "offset")))
+    played = list(
+        render_stream(open_stream(tmp_path / "s.morgs"), CAMERAS[0], ("motion", "offset"))
+    )
     assert not played[0][1]["offset"].any(), "the first frame stores no offset"
     for _, images in played[1:]:
         assert np.abs(images["motion"]).max() > 0.4
@@ -159,7 +199,9 @@ def test_render_stream__offset_is_its_share_of_the_motion(fitted_clip: Path, tmp
     np.testing.assert_array_equal(tenth, channel_image("motion", images["offset"] + 0.5))
 
 
-def test_playback_speed__is_the_inverse_of_the_time_per_frame(fitted_clip: Path, tmp_path: Path) -> None:
+def test_playback_speed__is_the_inverse_of_the_time_per_frame(
+    fitted_clip: Path, tmp_path: Path
+) -> None:
     reader = open_stream(fitted_clip)
     times = playback_speed(reader, reader.cameras[0])
     assert times["fps"] == pytest.approx(1e3 / (times["decode_ms"] + times["render_ms"]))
@@ -186,13 +228,16 @@ def test_channel_image__draws_other_channels_as_grey_values() -> None:
 
 
 @pytest.mark.parametrize("stored", ["beside", "header", "header, then moved and resumed"])
-def test_open_stream_capture__finds_the_capture_of_the_fit(fitted_clip: Path, tmp_path: Path, stored: str) -> None:
+def test_open_stream_capture__finds_the_capture_of_the_fit(
+    fitted_clip: Path, tmp_path: Path, stored: str
+) -> None:
     capture = str(fitted_clip / "capture")
     header = {"test_view": 0}
     if stored != "beside":
         header |= {"capture": capture if stored == "header" else str(tmp_path / "moved")}
     write_stream(tmp_path / "stream.morgs", header)
-    # Earlier versions stored the path beside the stream as it was given, relative to an unknown folder.
+    # Earlier versions stored the path beside the stream as it was given, relative to an unknown
+    # folder.
     beside = "capture" if stored == "header" else capture
     (tmp_path / "capture.json").write_text(json.dumps({"capture": beside}))
     assert str(open_stream_capture(open_stream(tmp_path), None, [0, 1, 2]).path) == capture
@@ -205,22 +250,43 @@ def test_open_stream_capture__recognises_the_recording_by_its_fingerprint(
     capture = load_capture(fitted_clip / "capture", test_view=0)
     mark = fingerprint(capture, next(capture.partial_frames()).images, refine == "on")
     for mark_of_stream, refused in ((mark, False), ("0" * 16, True), (None, False)):
-        metadata = {"test_view": 0, "fingerprint": mark_of_stream, "config": {"fit": {"refine_cameras": refine}}}
+        metadata = {
+            "test_view": 0,
+            "fingerprint": mark_of_stream,
+            "config": {"fit": {"refine_cameras": refine}},
+        }
         write_stream(tmp_path / "stream.morgs", metadata)
         stream = open_stream(tmp_path)
-        with pytest.raises(ValueError, match="expected the recording that") if refused else nullcontext():
+        with (
+            pytest.raises(ValueError, match="expected the recording that")
+            if refused
+            else nullcontext()
+        ):
             open_stream_capture(stream, capture.path, [0, 1, 2])
-        assert open_stream_capture(stream, capture.path, [0, 1, 2], any_recording=True).path == capture.path
+        assert (
+            open_stream_capture(stream, capture.path, [0, 1, 2], any_recording=True).path
+            == capture.path
+        )
 
 
-def test_open_stream_capture__asks_for_a_capture_that_has_moved(fitted_clip: Path, tmp_path: Path) -> None:
+def test_open_stream_capture__asks_for_a_capture_that_has_moved(
+    fitted_clip: Path, tmp_path: Path
+) -> None:
     write_stream(tmp_path / "stream.morgs", {"test_view": 0})
     for content in ("{", "[]", '{"capture": 3}', "{}"):
         (tmp_path / "capture.json").write_text(content)
-        with pytest.raises(ValueError, match=r"stream\.morgs: expected the path of its capture .* --capture\.$"):
+        with pytest.raises(
+            ValueError, match=r"stream\.morgs: expected the path of its capture .* --capture\.$"
+        ):
             open_stream_capture(open_stream(tmp_path), None, [0, 1, 2])
     (tmp_path / "capture.json").write_text(json.dumps({"capture": str(tmp_path / "old")}))
-    with pytest.raises(FileNotFoundError, match=rf"{tmp_path}/old: expected the capture of .* moved, .* --capture\.$"):
+    with pytest.raises(
+        FileNotFoundError,
+        match=rf"{tmp_path}/old: expected the capture of .* moved, .* --capture\.$",
+    ):
         open_stream_capture(open_stream(tmp_path), None, [0, 1, 2])
     shutil.copytree(fitted_clip / "capture", tmp_path / "new")
-    assert open_stream_capture(open_stream(tmp_path), tmp_path / "new", [0, 1, 2]).path == tmp_path / "new"
+    assert (
+        open_stream_capture(open_stream(tmp_path), tmp_path / "new", [0, 1, 2]).path
+        == tmp_path / "new"
+    )

@@ -1,4 +1,6 @@
-"""Files of Gaussians as streams of one frame: exact Gaussians, every output, and messages for other files."""
+"""Files of Gaussians as streams of one frame: exact Gaussians, every output, and messages for other
+files.
+"""
 
 from __future__ import annotations
 
@@ -131,9 +133,13 @@ def test_splat_file__ignores_other_files_of_that_name(tmp_path):
         assert open_stream(tmp_path / "scene.ply").metadata["default_rig"] is True
 
 
-@pytest.mark.parametrize("change", [{"rotation": [[1, 0], [0, 1]]}, {"width": "wide"}, {"fx": -1}, {"position": None}])
+@pytest.mark.parametrize(
+    "change", [{"rotation": [[1, 0], [0, 1]]}, {"width": "wide"}, {"fx": -1}, {"position": None}]
+)
 def test_splat_file__of_a_model_names_a_broken_camera(tmp_path, change):
-    with pytest.raises(ValueError, match=r"cameras\.json: entry 0: expected a camera, got a broken one"):
+    with pytest.raises(
+        ValueError, match=r"cameras\.json: entry 0: expected a camera, got a broken one"
+    ):
         open_stream(write_model(tmp_path, rig(), **change))
 
 
@@ -147,8 +153,14 @@ def test_render__draws_a_file_of_gaussians(tmp_path, run, text):
     status, output, _ = run("render", stream.path, tmp_path / "a.png", "--width", 64)
     assert (status, output) == (0, f"{tmp_path}/a.png: 1 image.\n")
     image = np.array(rasterize(read_splats(stream.path), stream.cameras[0].with_width(64)).color)
-    assert_close(cv2.imread(str(tmp_path / "a.png"))[..., ::-1] / 255, image.clip(0, 1), atol=0.5 / 255 + 1e-4)
-    assert run("render", stream.path, tmp_path / "a.exr", "--width", 64, "--camera", "right")[0] == 0
+    assert_close(
+        cv2.imread(str(tmp_path / "a.png"))[..., ::-1] / 255,
+        image.clip(0, 1),
+        atol=0.5 / 255 + 1e-4,
+    )
+    assert (
+        run("render", stream.path, tmp_path / "a.exr", "--width", 64, "--camera", "right")[0] == 0
+    )
     assert read_exr(tmp_path / "a.exr")["depth.Y"].shape == (36, 64)
 
 
@@ -160,9 +172,18 @@ def test_render__orbits_a_file_of_gaussians(tmp_path, run):
         f"{tmp_path}/orbit.mp4: 150 images.\n",
     )
     path = tmp_path / "still.json"
-    path.write_text('{"keys": [{"time": 0, "camera": "left"}, {"time": 0.1, "camera": "back-left"}]}')
-    assert run("render", tmp_path / "scene.ply", tmp_path / "png", "--path", path, "--width", 32)[0] == 0
-    assert [image.name for image in sorted((tmp_path / "png").iterdir())] == ["0000.png", "0001.png", "0002.png"]
+    path.write_text(
+        '{"keys": [{"time": 0, "camera": "left"}, {"time": 0.1, "camera": "back-left"}]}'
+    )
+    assert (
+        run("render", tmp_path / "scene.ply", tmp_path / "png", "--path", path, "--width", 32)[0]
+        == 0
+    )
+    assert [image.name for image in sorted((tmp_path / "png").iterdir())] == [
+        "0000.png",
+        "0001.png",
+        "0002.png",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -170,13 +191,19 @@ def test_render__orbits_a_file_of_gaussians(tmp_path, run):
     [
         (MESH, "got vertices without f_dc_0, f_dc_1, f_dc_2, opacity, scale_0"),
         (MESH.replace("vertex 3", "vertex 0"), "got vertices without f_dc_0"),
-        ("", "expected a complete PLY file, got one that cannot be read: it does not begin with `ply`"),
+        (
+            "",
+            "expected a complete PLY file, got one that cannot be read: it does not begin with "
+            "`ply`",
+        ),
         ("solid stl", "it does not begin with `ply`"),
         (MESH[:60], "its header does not end"),
     ],
     ids=["mesh", "no vertices", "empty", "other", "truncated header"],
 )
-@pytest.mark.parametrize("command", [("render",), ("view", "--no-browser"), ("export", "web")], ids=" ".join)
+@pytest.mark.parametrize(
+    "command", [("render",), ("view", "--no-browser"), ("export", "web")], ids=" ".join
+)
 def test_commands__name_what_is_no_file_of_gaussians(tmp_path, run, content, message, command):
     (tmp_path / "scene.ply").write_text(content)
     status, _, error = run(*command, tmp_path / "scene.ply")
@@ -189,15 +216,30 @@ def test_commands__name_what_is_no_file_of_gaussians(tmp_path, run, content, mes
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (("a.png", "--path", "orbit"), "a.png: expected one image for one file, got 150; name a folder"),
+        (
+            ("a.png", "--path", "orbit"),
+            "a.png: expected one image for one file, got 150; name a folder",
+        ),
         (("--camera", "top"), "the camera must be an index in 0..7 or one of"),
         (("--camera", "0", "--path", "orbit"), "expected --camera or --path, got both"),
         (("--degrees", "0"), "--degrees must be 1 to 360, got 0"),
         (("--width", "0"), "--width must be a number in [1, inf), got 0"),
-        (("--stereo", "0.1"), "--stereo is for equirectangular images; add --projection equirectangular"),
-        (("--projection", "equirectangular", "--width", "63"), "--width must be even and at least 2, got 63"),
-        (("--projection", "equirectangular", "--channels", "depth"), "renders the colour of a stream alone"),
-        (("--projection", "equirectangular", "--stereo", "-1"), "--stereo must be a number in [0, inf), got -1"),
+        (
+            ("--stereo", "0.1"),
+            "--stereo is for equirectangular images; add --projection equirectangular",
+        ),
+        (
+            ("--projection", "equirectangular", "--width", "63"),
+            "--width must be even and at least 2, got 63",
+        ),
+        (
+            ("--projection", "equirectangular", "--channels", "depth"),
+            "renders the colour of a stream alone",
+        ),
+        (
+            ("--projection", "equirectangular", "--stereo", "-1"),
+            "--stereo must be a number in [0, inf), got -1",
+        ),
         (("--insert", "no.py"), "--insert renders for one camera, got none; add --camera CAMERA"),
     ],
 )
@@ -218,13 +260,17 @@ def ring(center, count: int = 6, distance: float = 5) -> list[Camera]:
     """Return cameras on a circle that look at its centre."""
     angles = 2 * np.pi * np.arange(count) / count
     origins = [np.add(center, (distance * np.sin(a), 0, -distance * np.cos(a))) for a in angles]
-    return look_at_cameras(origins, 45, 64, 48, [f"{i:05d}" for i in range(count)], target=center, up=(0, -1, 0))
+    return look_at_cameras(
+        origins, 45, 64, 48, [f"{i:05d}" for i in range(count)], target=center, up=(0, -1, 0)
+    )
 
 
 OTHER_SCENES = {
     "far away": ring((300, 0, 0)),
     "a dot in one image": ring((300, 0, 0), 4),
-    "looking away": [Camera.look_at((0, 0, 3), (x, 0, 9), (0, -1, 0), 45, 64, 48, f"{x}") for x in (-1, 0, 1)],
+    "looking away": [
+        Camera.look_at((0, 0, 3), (x, 0, 9), (0, -1, 0), 45, 64, 48, f"{x}") for x in (-1, 0, 1)
+    ],
     "much larger": ring((0, 0, 0), 6, 1e5),
 }
 
@@ -233,8 +279,14 @@ OTHER_SCENES = {
 def test_splat_file__has_a_ring_where_the_cameras_are_of_another_scene(tmp_path, kind, caplog, run):
     path = write_model(tmp_path, OTHER_SCENES[kind])
     stream = open_stream(path)
-    assert (len(stream.cameras), stream.metadata["default_rig"], stream.cameras_file) == (8, True, None)
-    assert re.search(r"cameras\.json: its cameras see 0\.0 % of the Gaussians of point_cloud\.ply", caplog.text)
+    assert (len(stream.cameras), stream.metadata["default_rig"], stream.cameras_file) == (
+        8,
+        True,
+        None,
+    )
+    assert re.search(
+        r"cameras\.json: its cameras see 0\.0 % of the Gaussians of point_cloud\.ply", caplog.text
+    )
     assert run("render", path, tmp_path / "a.png", "--width", 64)[0] == 0
     assert cv2.imread(str(tmp_path / "a.png")).max() > 0
 
@@ -243,7 +295,10 @@ def test_splat_file__leaves_out_single_cameras_of_another_scene(tmp_path, caplog
     foreign, *others = ring((300, 0, 0), 2)[:1] + list(rig())
     stream = open_stream(write_model(tmp_path, [foreign, *others]))
     assert [camera.name for camera in stream.cameras] == ["left", "middle", "right"]
-    assert "1 of 4 cameras are left out, because they see next to nothing of the Gaussians" in caplog.text
+    assert (
+        "1 of 4 cameras are left out, because they see next to nothing of the Gaussians"
+        in caplog.text
+    )
 
 
 def test_splat_file__keeps_cameras_that_see_a_single_gaussian(tmp_path):
@@ -253,10 +308,14 @@ def test_splat_file__keeps_cameras_that_see_a_single_gaussian(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", [("render",), ("export", "video"), ("export", "web")], ids=" ".join)
+@pytest.mark.parametrize(
+    "command", [("render",), ("export", "video"), ("export", "web")], ids=" ".join
+)
 def test_commands__name_the_cameras_that_they_use(tmp_path, run, command):
     path = write_model(tmp_path, rig())
-    status, _, error = run(*command, path, *(["--width", 32] if command != ("export", "web") else []))
+    status, _, error = run(
+        *command, path, *(["--width", 32] if command != ("export", "web") else [])
+    )
     assert (status, error) == (0, f"Cameras: {tmp_path}/cameras.json.\n")
 
 

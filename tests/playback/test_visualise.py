@@ -21,7 +21,9 @@ def test_motion_image__colours_are_as_documented():
 
 def test_motion_image__saturation_increases_with_speed():
     speeds = np.linspace(0, 10, 11)
-    green = visualise.motion_image(np.stack([speeds, 0 * speeds], -1)[None], 10)[0, :, 1].astype(int)
+    green = visualise.motion_image(np.stack([speeds, 0 * speeds], -1)[None], 10)[0, :, 1].astype(
+        int
+    )
     assert (np.diff(green) < 0).all()
 
 
@@ -45,7 +47,9 @@ def test_grey_image__is_the_mean_of_the_components():
 
 
 def test_depth_range__are_the_percentiles_of_known_depths():
-    assert_close(visualise.depth_range(np.r_[np.arange(101.0), np.nan, -5, 0]), (1.99, 99.01), atol=1e-6)
+    assert_close(
+        visualise.depth_range(np.r_[np.arange(101.0), np.nan, -5, 0]), (1.99, 99.01), atol=1e-6
+    )
     assert visualise.depth_range(np.zeros(3)) == (1, 1)
 
 
@@ -116,7 +120,10 @@ def test_write_png__removes_its_output_after_a_failure(tmp_path):
     [
         (lambda: visualise.to_uint8(np.zeros((2, 2, 4))), r"to_uint8\(\).*got \(2, 2, 4\)"),
         (lambda: visualise.motion_image(np.zeros((2, 2)), 1), r"motion_image\(\).*\[H, W, 2\]"),
-        (lambda: visualise.motion_image(np.zeros((2, 2, 2)), 0), r"motion_image\(\).*positive, got 0"),
+        (
+            lambda: visualise.motion_image(np.zeros((2, 2, 2)), 0),
+            r"motion_image\(\).*positive, got 0",
+        ),
         (lambda: visualise.side_by_side([]), "at least one"),
         (lambda: visualise.time_slice([]), "at least one column"),
         (lambda: visualise.write_png("x.png", np.zeros((0, 2))), "no pixels"),

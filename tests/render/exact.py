@@ -1,7 +1,9 @@
-"""The renderer beside the reference in extended precision, and the exact derivatives of the reference.
+"""The renderer beside the reference in extended precision, and the exact derivatives of the
+reference.
 
-The reference runs with 80-bit `longdouble` where the platform has it, because its textbook determinant cancels for
-needles. Pixels where an alpha lies within `AMBIGUOUS` of a cut-off are excluded: there, rounding decides what is drawn.
+The reference runs with 80-bit `longdouble` where the platform has it, because its textbook
+determinant cancels for needles. Pixels where an alpha lies within `AMBIGUOUS` of a cut-off are
+excluded: there, rounding decides what is drawn.
 """
 
 from __future__ import annotations
@@ -43,7 +45,11 @@ class Activated:
 
 
 def exact_image(
-    values: dict[str, Any], camera: Camera, alpha_min: float = 1 / 255, alpha_max: float = 0.99, viewmat: Any = None
+    values: dict[str, Any],
+    camera: Camera,
+    alpha_min: float = 1 / 255,
+    alpha_max: float = 0.99,
+    viewmat: Any = None,
 ) -> dict[str, Any]:
     """Return the reference's channels of activated attributes."""
     with np.errstate(all="ignore"):
@@ -75,15 +81,23 @@ def exact_image(
 
 
 def clear_pixels(values: Values, camera: Camera) -> np.ndarray:
-    """Return the mask of the pixels [H, W] where no alpha is near a cut-off, found by moving the cut-offs."""
-    low, high = (exact_image(values, camera, alpha_min=(1 + s * AMBIGUOUS) / 255)["alpha"][..., 0] for s in (-1, 1))
+    """Return the mask of the pixels [H, W] where no alpha is near a cut-off, found by moving the
+    cut-offs.
+    """
+    low, high = (
+        exact_image(values, camera, alpha_min=(1 + s * AMBIGUOUS) / 255)["alpha"][..., 0]
+        for s in (-1, 1)
+    )
     under, at, over = (
-        exact_image(values, camera, alpha_max=0.99 * (1 + s * 1e-4))["alpha"][..., 0] for s in (-1, 0, 1)
+        exact_image(values, camera, alpha_max=0.99 * (1 + s * 1e-4))["alpha"][..., 0]
+        for s in (-1, 0, 1)
     )
     return (low == high) & (np.abs(under - 2 * at + over) < 1e-6)
 
 
-def weights(expected: dict[str, np.ndarray], clear: np.ndarray, seed: int = 1) -> dict[str, np.ndarray]:
+def weights(
+    expected: dict[str, np.ndarray], clear: np.ndarray, seed: int = 1
+) -> dict[str, np.ndarray]:
     """Return random weights per channel, relative to its scale, for a loss of all channels."""
     rng = np.random.default_rng(seed)
     solid = clear & (expected["alpha"][..., 0] > 0.02)
@@ -91,12 +105,16 @@ def weights(expected: dict[str, np.ndarray], clear: np.ndarray, seed: int = 1) -
     for name in CHANNELS:
         mask = solid if name in ("depth", "motion") else clear
         scale = max(1e-30, float(np.abs(expected[name]).max()))
-        result[name] = np.float32(rng.normal(size=(*clear.shape, SIZES.get(name, 1))) * mask[..., None] / scale)
+        result[name] = np.float32(
+            rng.normal(size=(*clear.shape, SIZES.get(name, 1))) * mask[..., None] / scale
+        )
     return result
 
 
 def exact_gradients(values: Values, camera: Camera, weight: dict[str, np.ndarray]) -> Values:
-    """Return gradients by complex steps relative to each number: none from 1e-30 to 1e30 loses its imaginary part."""
+    """Return gradients by complex steps relative to each number: none from 1e-30 to 1e30 loses its
+    imaginary part.
+    """
     grads = {}
     for name in ATTRIBUTES:
         grad = np.zeros(values[name].shape)
@@ -110,23 +128,36 @@ def exact_gradients(values: Values, camera: Camera, weight: dict[str, np.ndarray
     return grads
 
 
-def exact_slope(values: Values, camera: Camera, weight: dict[str, np.ndarray], name: str, along: np.ndarray) -> float:
+def exact_slope(
+    values: Values, camera: Camera, weight: dict[str, np.ndarray], name: str, along: np.ndarray
+) -> float:
     """Return the derivative of the weighted channels along a direction of one attribute."""
-    image = exact_image({**values, name: values[name].astype(np.clongdouble) + 1e-30j * along}, camera)
+    image = exact_image(
+        {**values, name: values[name].astype(np.clongdouble) + 1e-30j * along}, camera
+    )
     return float(sum(np.sum(image[c].imag * weight[c]) for c in CHANNELS) / 1e-30)
 
 
 def run(
-    values: Values, camera: Camera, weight: dict[str, np.ndarray] | None = None, config: RenderConfig = CONFIG
+    values: Values,
+    camera: Camera,
+    weight: dict[str, np.ndarray] | None = None,
+    config: RenderConfig = CONFIG,
 ) -> tuple[Values, Values]:
-    """Return the channels and the gradients of the sum of the weighted channels; all must be finite."""
+    """Return the channels and the gradients of the sum of the weighted channels; all must be
+    finite.
+    """
     gaussians = Activated(values)
     image = rasterize(gaussians, camera, CHANNELS, BACKGROUND, config=config)
     channels = {name: np.asarray(dr.detach(image[name]), np.float64) for name in CHANNELS}
     if weight is None:
         weight = weights(channels, np.ones((camera.height, camera.width), bool))
-    dr.backward(sum(dr.sum(image[name] * mi.TensorXf(weight[name]), axis=None) for name in CHANNELS))
+    dr.backward(
+        sum(dr.sum(image[name] * mi.TensorXf(weight[name]), axis=None) for name in CHANNELS)
+    )
     grads = gaussians.gradients()
     for name, value in (*channels.items(), *grads.items()):
-        assert np.isfinite(value).all(), f"{name} is not finite at {np.argwhere(~np.isfinite(value))[:5].tolist()}"
+        assert np.isfinite(value).all(), (
+            f"{name} is not finite at {np.argwhere(~np.isfinite(value))[:5].tolist()}"
+        )
     return channels, grads

@@ -39,14 +39,18 @@ def mask(camera: Camera) -> np.ndarray:
 def split(camera, gaussians, mask) -> tuple[ActiveView, Gaussians]:
     """Return the view of the static Gaussians, and the active Gaussians."""
     active = np.isin(np.arange(N), ACTIVE)
-    view = make_active_view(camera, Region(mask), gaussians.select(~active), CHANNELS, RenderConfig())
+    view = make_active_view(
+        camera, Region(mask), gaussians.select(~active), CHANNELS, RenderConfig()
+    )
     return view, gaussians.select(active)
 
 
 def drawn_pixels(view: ActiveView) -> np.ndarray:
     """Return 1 on the pixels of the view's blocks [H, W], 0 elsewhere."""
     assert view.region is not None
-    return view.region.paste(np.ones(view.region.shape(1)[:3]), np.zeros((view.camera.height, view.camera.width)))
+    return view.region.paste(
+        np.ones(view.region.shape(1)[:3]), np.zeros((view.camera.height, view.camera.width))
+    )
 
 
 def test_active_view__renders_and_differentiates_like_the_full_view(camera, gaussians, mask):
@@ -71,7 +75,9 @@ def test_active_view__renders_and_differentiates_like_the_full_view(camera, gaus
 def test_active_view__backproject_accounts_for_static_splats(camera, gaussians, mask):
     view, active = split(camera, gaussians, mask)
     image = np.float32(np.random.default_rng(1).uniform(size=(camera.height, camera.width, 2)))
-    expected = backproject(gaussians, ActiveView(camera), image * np.float32(drawn_pixels(view))[..., None])[ACTIVE]
+    expected = backproject(
+        gaussians, ActiveView(camera), image * np.float32(drawn_pixels(view))[..., None]
+    )[ACTIVE]
     assert expected.max() > 10
     assert_close(backproject(active, view, view.crop(image)), expected, rtol=tol.SUM_ORDER_REL)
 

@@ -41,7 +41,9 @@ def test_rasterize__draws_cameras_together_as_one_by_one(gaussians, count):
         alone = rasterize(gaussians, camera, CHANNELS, background=(0.2, 0.4, 0.6))
         for name in CHANNELS:
             assert batch[name].shape == (count, *alone[name].shape)
-            np.testing.assert_array_equal(np.array(batch[name])[v], np.array(alone[name]), err_msg=name)
+            np.testing.assert_array_equal(
+                np.array(batch[name])[v], np.array(alone[name]), err_msg=name
+            )
 
 
 @pytest.mark.slow
@@ -55,15 +57,22 @@ def test_rasterize__sums_the_gradients_of_cameras():
         dr.enable_grad(poses)
         posed = [replace(camera, viewmat=pose) for camera, pose in zip(views, poses, strict=True)]
         dr.backward(draw(trained, posed))
-        grads = {name: np.array(dr.grad(getattr(trained, name))) for name in ("means", "log_scales", "sh_coeffs")}
+        grads = {
+            name: np.array(dr.grad(getattr(trained, name)))
+            for name in ("means", "log_scales", "sh_coeffs")
+        }
         return grads | {f"pose {v}": np.array(dr.grad(pose)) for v, pose in enumerate(poses)}
 
     batch = gradients(
-        lambda trained, posed: dr.sum(rasterize(trained, posed, config=EXACT).color * mi.TensorXf(weights), axis=None)
+        lambda trained, posed: dr.sum(
+            rasterize(trained, posed, config=EXACT).color * mi.TensorXf(weights), axis=None
+        )
     )
     alone = gradients(
         lambda trained, posed: sum(
-            dr.sum(rasterize(trained, camera, config=EXACT).color * mi.TensorXf(weights[v]), axis=None)
+            dr.sum(
+                rasterize(trained, camera, config=EXACT).color * mi.TensorXf(weights[v]), axis=None
+            )
             for v, camera in enumerate(posed)
         )
     )

@@ -30,13 +30,20 @@ def test_rasterize__renders_a_new_attribute_of_the_table(scene):
     assert image["color"].shape == (camera.height, camera.width, 3)
     assert_close(image["roughness"], image.confidence)
     assert_close(image["normal"], image.features)
-    dr.backward(dr.sum(dr.square(image["roughness"]), axis=None) + dr.sum(dr.square(image.confidence), axis=None))
+    dr.backward(
+        dr.sum(dr.square(image["roughness"]), axis=None)
+        + dr.sum(dr.square(image.confidence), axis=None)
+    )
     grad = np.asarray(dr.grad(gaussians.logit_confidence))
     assert np.abs(grad).max() > 0
     assert_close(dr.grad(gaussians.logit_roughness), grad, rtol=tol.SUM_ORDER_REL)
-    with pytest.raises(ValueError, match="channel 'roughness' requires Gaussians with `logit_roughness`, got none"):
+    with pytest.raises(
+        ValueError, match="channel 'roughness' requires Gaussians with `logit_roughness`, got none"
+    ):
         rasterize(to_gaussians(raw), camera, ("roughness",))
-    broken = replace(gaussians, normals=np.where(np.arange(30).reshape(10, 3) == 7, np.nan, normals))
+    broken = replace(
+        gaussians, normals=np.where(np.arange(30).reshape(10, 3) == 7, np.nan, normals)
+    )
     with pytest.raises(ValueError, match=r"`normals` must be finite, got nan at \[2, 1\]"):
         rasterize(broken, camera, ("normal",))
 

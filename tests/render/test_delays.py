@@ -19,7 +19,9 @@ from tests.scenes.gaussians import make_scene, to_gaussians
 
 @pytest.fixture(scope="module")
 def moving() -> tuple[dict[str, np.ndarray], Camera]:
-    """Gaussians that move by up to a few pixels in a frame, a learned offset included; and a camera."""
+    """Gaussians that move by up to a few pixels in a frame, a learned offset included; and a
+    camera.
+    """
     raw = make_scene()
     raw["offset"] = 0.05 * np.random.default_rng(5).normal(size=raw["means"].shape)
     return raw, make_camera()
@@ -27,7 +29,9 @@ def moving() -> tuple[dict[str, np.ndarray], Camera]:
 
 def test_rasterize__shows_gaussians_where_they_are_after_a_delay(moving) -> None:
     raw, camera = moving
-    expected = rasterize(to_gaussians({**raw, "means": raw["means"] + 0.4 * raw["motion"]}), camera, ("color",))
+    expected = rasterize(
+        to_gaussians({**raw, "means": raw["means"] + 0.4 * raw["motion"]}), camera, ("color",)
+    )
     image = rasterize(to_gaussians(raw), replace(camera, delay=0.4), ("color",))
     assert_close(image.color, np.asarray(expected.color), atol=tol.IMAGE_ABS)
     without = replace(to_gaussians(raw), motion=None, offset=None)
@@ -39,7 +43,9 @@ def test_rasterize__shows_each_gaussian_at_the_time_of_its_row(moving) -> None:
     raw, camera = moving
     rows = camera.project(raw["means"])[0][:, 1] / camera.height
     delays = 0.1 - 0.5 * (np.clip(rows, 0, 1) - 0.5)[:, None]
-    expected = rasterize(to_gaussians({**raw, "means": raw["means"] + delays * raw["motion"]}), camera, ("color",))
+    expected = rasterize(
+        to_gaussians({**raw, "means": raw["means"] + delays * raw["motion"]}), camera, ("color",)
+    )
     image = rasterize(to_gaussians(raw), replace(camera, delay=0.1, readout=-0.5), ("color",))
     assert_close(image.color, np.asarray(expected.color), atol=tol.IMAGE_ABS)
 
@@ -64,7 +70,9 @@ def test_rasterize__backward_agrees_with_central_differences_after_a_delay(movin
 
 
 def test_rasterize__shows_decoded_gaussians_with_their_offset_once(moving) -> None:
-    """The decoded motion is the whole displacement, whether or not the packet stores its learned part."""
+    """The decoded motion is the whole displacement, whether or not the packet stores its learned
+    part.
+    """
     raw, camera = moving
     start = replace(to_gaussians(raw), motion=None, offset=None)
     config = CodecConfig(quality=8, offset=True)
@@ -74,10 +82,14 @@ def test_rasterize__shows_decoded_gaussians_with_their_offset_once(moving) -> No
     packet = residual_packet(coded, target, np.arange(len(raw["means"])), [camera], config)
     gaussians = decode(coded, packet).gaussians
     assert gaussians.offset is not None
-    late = replace(gaussians, means=gaussians.means + 0.7 * gaussians.motion, motion=None, offset=None)
+    late = replace(
+        gaussians, means=gaussians.means + 0.7 * gaussians.motion, motion=None, offset=None
+    )
     expected = rasterize(late, camera, ("color",)).color
     assert_close(
-        rasterize(gaussians, replace(camera, delay=0.7), ("color",)).color, np.asarray(expected), atol=tol.IMAGE_ABS
+        rasterize(gaussians, replace(camera, delay=0.7), ("color",)).color,
+        np.asarray(expected),
+        atol=tol.IMAGE_ABS,
     )
 
 
@@ -85,8 +97,13 @@ def test_rasterize__draws_the_guided_part_of_the_motion(moving) -> None:
     raw, camera = moving
     guided = to_gaussians({**raw, "motion": raw["motion"] - raw["offset"]})
     image = rasterize(to_gaussians(raw), camera, ("motion", "guided_motion"))
-    assert_close(image["guided_motion"], np.asarray(rasterize(guided, camera, ("motion",)).motion), atol=1e-5)
-    assert_close(image.motion, np.asarray(rasterize(replace(guided, motion=raw["motion"]), camera, ("motion",)).motion))
+    assert_close(
+        image["guided_motion"], np.asarray(rasterize(guided, camera, ("motion",)).motion), atol=1e-5
+    )
+    assert_close(
+        image.motion,
+        np.asarray(rasterize(replace(guided, motion=raw["motion"]), camera, ("motion",)).motion),
+    )
     alone = replace(to_gaussians(raw), offset=None)
     image = rasterize(alone, camera, ("motion", "guided_motion"))
     assert np.array_equal(image["guided_motion"], image.motion)

@@ -40,7 +40,9 @@ def test_depth_limit__image_agrees_with_the_reference(scene, limit, channel):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("channel", "reproducible"), [*((name, False) for name in CHANNELS), ("color", True)])
+@pytest.mark.parametrize(
+    ("channel", "reproducible"), [*((name, False) for name in CHANNELS), ("color", True)]
+)
 def test_depth_limit__backward_agrees_with_the_reference(scene, limit, channel, reproducible):
     raw, camera = scene
     rng = np.random.default_rng(1)
@@ -58,13 +60,20 @@ def test_depth_limit__backward_agrees_with_the_reference(scene, limit, channel, 
     expected = reference.complex_step(loss, raw, list(RAW))
     for name in RAW:
         if np.abs(expected[name]).max() > 0:
-            assert_close(dr.grad(getattr(gaussians, name)), expected[name], rtol=5 * tol.GRADIENT_REL, name=name)
+            assert_close(
+                dr.grad(getattr(gaussians, name)),
+                expected[name],
+                rtol=5 * tol.GRADIENT_REL,
+                name=name,
+            )
 
 
 def test_depth_limit__forward_mode_agrees_with_the_reference(scene, limit):
     raw, camera = scene
     rng = np.random.default_rng(2)
-    direction = {name: np.float32(rng.normal(size=raw[name].shape)).astype(np.float64) for name in RAW}
+    direction = {
+        name: np.float32(rng.normal(size=raw[name].shape)).astype(np.float64) for name in RAW
+    }
     gaussians = to_gaussians(raw, grad=True)
     image = rasterize(gaussians, camera, ("color", "alpha"), depth_limit=limit)
     for name in RAW:
@@ -89,7 +98,9 @@ def test_depth_limit__at_infinity_changes_no_bit(scene):
 def test_depth_limit__in_front_of_everything_leaves_nothing(scene):
     raw, camera = scene
     limit = np.full((camera.height, camera.width), 0.5)
-    assert not np.array(rasterize(to_gaussians(raw), camera, ("alpha",), depth_limit=limit).alpha).any()
+    assert not np.array(
+        rasterize(to_gaussians(raw), camera, ("alpha",), depth_limit=limit).alpha
+    ).any()
 
 
 def test_depth_limit__draws_nothing_where_the_gaussian_is_too_faint(scene):
@@ -119,11 +130,15 @@ def test_depth_limit__inside_equals_the_list_cut_at_that_depth():
 def _large_gaussian() -> tuple[Gaussians, Camera]:
     (camera,) = look_at_cameras([(0, 0, -40)], 3)
     quat = np.array([[0.9, 0.2, -0.3, 0.15]])
-    return Gaussians.from_activated(np.zeros((1, 3)), [[0.5, 0.25, 0.4]], quat, [0.9], np.zeros((1, 1, 3))), camera
+    return Gaussians.from_activated(
+        np.zeros((1, 3)), [[0.5, 0.25, 0.4]], quat, [0.9], np.zeros((1, 1, 3))
+    ), camera
 
 
 def test_depth_limit__plane_through_a_gaussian_agrees_with_the_integral_along_the_ray():
-    """Transmittance exp(-integral of the density up to the plane), by quadrature in float64 on exact rays."""
+    """Transmittance exp(-integral of the density up to the plane), by quadrature in float64 on
+    exact rays.
+    """
     gaussians, camera = _large_gaussian()
     columns, rows = np.meshgrid(np.arange(0, camera.width, 6), np.arange(0, camera.height, 6))
     origin, directions = camera.rays(np.stack([columns, rows], axis=-1) + 0.5)
@@ -140,17 +155,24 @@ def test_depth_limit__plane_through_a_gaussian_agrees_with_the_integral_along_th
     fraction = np.sum(density * (points @ normal < 0), axis=0) / np.sum(density, axis=0)
 
     alpha = np.asarray(rasterize(gaussians, camera, ("alpha",)).alpha, np.float64)[rows, columns, 0]
-    cut_alpha = np.asarray(rasterize(gaussians, camera, ("alpha",), depth_limit=limit).alpha)[rows, columns, 0]
+    cut_alpha = np.asarray(rasterize(gaussians, camera, ("alpha",), depth_limit=limit).alpha)[
+        rows, columns, 0
+    ]
     assert 0.1 < fraction[alpha > 0.5].min() < 0.4 < fraction[alpha > 0.5].max() < 0.9
-    # Low-pass filter, affine approximation over 3 degrees, and approximation of the distribution function.
+    # Low-pass filter, affine approximation over 3 degrees, and approximation of the distribution
+    # function.
     assert_close(cut_alpha, 1 - (1 - alpha) ** fraction, atol=4e-3)
 
 
 def test_profile__is_the_depth_of_the_largest_response_along_the_ray():
     """t* = d'S^-1 mu / d'S^-1 d for the ray direction d, in camera space."""
     gaussians, camera = _large_gaussian()
-    z, gx, gy, r_sigma = (float(v[0]) for v in project(gaussians, camera, ("profile",), RenderConfig()).profile)
-    R = np.asarray(camera.viewmat)[:3, :3] @ reference.rotation(np.asarray(gaussians.quats[0]).ravel())
+    z, gx, gy, r_sigma = (
+        float(v[0]) for v in project(gaussians, camera, ("profile",), RenderConfig()).profile
+    )
+    R = np.asarray(camera.viewmat)[:3, :3] @ reference.rotation(
+        np.asarray(gaussians.quats[0]).ravel()
+    )
     precision = R @ np.diag(1 / np.array([0.5, 0.25, 0.4]) ** 2) @ R.T
     mean = np.array([0, 0, 40.0])
     for dx, dy in ((0, 0), (9, 0), (0, -7), (8, 8)):
@@ -178,7 +200,10 @@ def test_reference__distribution_function_is_the_normal_one():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda h, w: np.ones((h, w + 1)), r"`depth_limit` must be one depth per pixel, \[18, 21\], got \[18, 22\]"),
+        (
+            lambda h, w: np.ones((h, w + 1)),
+            r"`depth_limit` must be one depth per pixel, \[18, 21\], got \[18, 22\]",
+        ),
         (lambda h, w: np.full((h, w), np.nan), r"one depth per pixel, \[18, 21\], got NaN"),
         (lambda h, w: "far", "`depth_limit` must be"),
     ],
@@ -193,7 +218,9 @@ def test_depth_limit__refuses_gradients_and_static_splats(scene):
     raw, camera = scene
     limit = mi.TensorXf(np.ones((camera.height, camera.width), np.float32))
     static = project(to_gaussians(raw), camera, ("color",), RenderConfig())
-    with pytest.raises(ValueError, match="`depth_limit` must be None where `static_splats` are given"):
+    with pytest.raises(
+        ValueError, match="`depth_limit` must be None where `static_splats` are given"
+    ):
         rasterize(to_gaussians(raw), camera, ("color",), static_splats=static, depth_limit=limit)
     dr.enable_grad(limit)
     with pytest.raises(ValueError, match="gets no gradient"):

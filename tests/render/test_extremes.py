@@ -1,7 +1,8 @@
-"""The renderer at the extremes: every case against the reference implementation, or finite within a stated bound.
+"""The renderer at the extremes: every case against the reference implementation, or finite within a
+stated bound.
 
-Gradients are compared by attribute, relative to the largest entry. Gradients of scales, quaternions and opacities are
-per relative change, as for an optimiser of logarithms.
+Gradients are compared by attribute, relative to the largest entry. Gradients of scales, quaternions
+and opacities are per relative change, as for an optimiser of logarithms.
 """
 
 from __future__ import annotations
@@ -40,7 +41,9 @@ def errors(case: Case) -> dict[str, float]:
     image, grads = run(values, camera, weight)
     result = {"image": 0.0}
     for name in CHANNELS:
-        error = np.abs(image[name] - expected[name])[weight[name] != 0] / max(1.0, np.abs(expected[name]).max())
+        error = np.abs(image[name] - expected[name])[weight[name] != 0] / max(
+            1.0, np.abs(expected[name]).max()
+        )
         result["image"] = max(result["image"], float(error.max(initial=0)))
     # Per relative change, as for an optimiser of logarithms.
     unit = {"scales": values["scales"], "opacities": values["opacities"]}
@@ -50,9 +53,12 @@ def errors(case: Case) -> dict[str, float]:
         grads = {n: g * unit.get(n, 1) for n, g in grads.items()}
     else:
         along = {n: np.sign(g) for n, g in grads.items()}
-        exact = {n: exact_slope(values, camera, weight, n, v * unit.get(n, 1)) for n, v in along.items()}
+        exact = {
+            n: exact_slope(values, camera, weight, n, v * unit.get(n, 1)) for n, v in along.items()
+        }
         grads = {n: np.abs(g * unit.get(n, 1)).sum() for n, g in grads.items()}
-    # These three are sums of the same terms: one that almost vanishes is compared relative to the largest.
+    # These three are sums of the same terms: one that almost vanishes is compared relative to the
+    # largest.
     floor = 0.01 * max(np.abs(exact[name]).max() for name in unit)
     for name in ATTRIBUTES:
         scale = max(np.abs(exact[name]).max(), floor if name in unit else 0, 1e-30)
@@ -85,7 +91,10 @@ def test_rasterize__forward_and_reverse_mode_are_dual_at_the_extremes():
     """<g, J v> = <J' g, v> along the signs of J' g, where nothing cancels."""
     failed = []
     for case in CASES:
-        weight = weights(exact_image(case.values, case.camera), np.ones((case.camera.height, case.camera.width), bool))
+        weight = weights(
+            exact_image(case.values, case.camera),
+            np.ones((case.camera.height, case.camera.width), bool),
+        )
         _, grads = run(case.values, case.camera, weight)
         gaussians = Activated(case.values)
         image = rasterize(gaussians, case.camera, CHANNELS, BACKGROUND, config=CONFIG)
@@ -106,12 +115,20 @@ def test_rasterize__forward_and_reverse_mode_are_dual_at_the_extremes():
 
 @pytest.mark.slow
 def test_rasterize__gradients_of_the_pose_at_the_extremes():
-    """Columns are compared separately: rotating a world at 1e5 units moves it 1e5 times as far as translating it."""
+    """Columns are compared separately: rotating a world at 1e5 units moves it 1e5 times as far as
+    translating it.
+    """
     failed = []
     for case in CASES:
         camera = case.camera
         exact = np.zeros((3, 4))
-        posed = Camera(camera.K, mi.TensorXf(np.float32(camera.viewmat)), camera.width, camera.height, near=camera.near)
+        posed = Camera(
+            camera.K,
+            mi.TensorXf(np.float32(camera.viewmat)),
+            camera.width,
+            camera.height,
+            near=camera.near,
+        )
         dr.enable_grad(posed.viewmat)
         weight = weights(exact_image(case.values, camera), clear_pixels(case.values, camera))
         run(case.values, posed, weight)
@@ -130,7 +147,11 @@ def test_rasterize__gradients_of_the_pose_at_the_extremes():
 def raw_gaussians(**change: Any) -> Gaussians:
     values = cloud()
     raw = {name: values[name] for name in ("means", "quats", "sh_coeffs", "motion")}
-    raw |= {"log_scales": np.log(values["scales"]), "logit_opacities": np.zeros(6), "logit_confidence": np.zeros(6)}
+    raw |= {
+        "log_scales": np.log(values["scales"]),
+        "logit_opacities": np.zeros(6),
+        "logit_confidence": np.zeros(6),
+    }
     gaussians = Gaussians(**(raw | change))
     dr.enable_grad(*gaussians.items().values())
     return gaussians
@@ -148,7 +169,16 @@ def raw_gaussians(**change: Any) -> Gaussians:
         {"sh_coeffs": np.full((6, 4, 3), 1e18)},
         {"motion": np.full((6, 3), 1e17)},
     ],
-    ids=["scales", "needles", "opacities", "confidence", "means", "colours below 0", "colours", "motion"],
+    ids=[
+        "scales",
+        "needles",
+        "opacities",
+        "confidence",
+        "means",
+        "colours below 0",
+        "colours",
+        "motion",
+    ],
 )
 def test_rasterize__raw_extremes_stay_finite(change):
     gaussians = raw_gaussians(**change)
@@ -164,14 +194,40 @@ def test_rasterize__raw_extremes_stay_finite(change):
     ("change", "message"),
     [
         ({"log_scales": np.full((6, 3), 100.0)}, r"`scales` must be finite, got inf at \[0, 0\]"),
-        ({"means": np.full((6, 3), [0, 0, -np.inf])}, r"`means` must be finite, got -inf at \[0, 2\]"),
-        ({"means": np.full((6, 3), [0, 0, -10.0]), "quats": np.full((6, 4), np.nan)}, "`quats` must be finite"),
-        ({"quats": np.full((6, 4), [0, 0, 0, np.nan])}, r"`quats` must be finite, got nan at \[0, 3\]"),
-        ({"sh_coeffs": np.full((6, 4, 3), 3e38)}, r"`sh_coeffs` must be at most 1e18, got 3e\+38 at \[0, 0, 0\] \(72 "),
-        ({"sh_coeffs": np.full((6, 4, 3), -1e20)}, r"`sh_coeffs` must be at most 1e18, got -1e\+20"),
-        ({"motion": np.full((6, 3), 1e30)}, r"`motion` must be at most 1e18, got 1e\+30 at \[0, 0\]"),
+        (
+            {"means": np.full((6, 3), [0, 0, -np.inf])},
+            r"`means` must be finite, got -inf at \[0, 2\]",
+        ),
+        (
+            {"means": np.full((6, 3), [0, 0, -10.0]), "quats": np.full((6, 4), np.nan)},
+            "`quats` must be finite",
+        ),
+        (
+            {"quats": np.full((6, 4), [0, 0, 0, np.nan])},
+            r"`quats` must be finite, got nan at \[0, 3\]",
+        ),
+        (
+            {"sh_coeffs": np.full((6, 4, 3), 3e38)},
+            r"`sh_coeffs` must be at most 1e18, got 3e\+38 at \[0, 0, 0\] \(72 ",
+        ),
+        (
+            {"sh_coeffs": np.full((6, 4, 3), -1e20)},
+            r"`sh_coeffs` must be at most 1e18, got -1e\+20",
+        ),
+        (
+            {"motion": np.full((6, 3), 1e30)},
+            r"`motion` must be at most 1e18, got 1e\+30 at \[0, 0\]",
+        ),
     ],
-    ids=["overflow", "infinite mean", "behind", "one component", "colours", "negative colours", "motion"],
+    ids=[
+        "overflow",
+        "infinite mean",
+        "behind",
+        "one component",
+        "colours",
+        "negative colours",
+        "motion",
+    ],
 )
 def test_rasterize__refuses_non_finite_attributes_anywhere(change, message):
     with pytest.raises(ValueError, match=message):
@@ -192,7 +248,11 @@ def test_rasterize__fuzz_with_many_seeds():
 
 
 def test_rasterize__refuses_features_and_backgrounds_whose_squares_overflow():
-    with pytest.raises(ValueError, match=r"`features` must be at most 1e18, got 1e\+20 at \[0, 0\]"):
+    with pytest.raises(
+        ValueError, match=r"`features` must be at most 1e18, got 1e\+20 at \[0, 0\]"
+    ):
         rasterize(raw_gaussians(), eye(), features=np.full((6, 2), 1e20))
-    with pytest.raises(ValueError, match=r"`background` must be three finite numbers of at most 1e18, got"):
+    with pytest.raises(
+        ValueError, match=r"`background` must be three finite numbers of at most 1e18, got"
+    ):
         rasterize(raw_gaussians(), eye(), background=(0, 0, 1e30))

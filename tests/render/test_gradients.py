@@ -1,4 +1,6 @@
-"""Derivatives of the renderer in both modes: against the float64 reference, central differences and each other."""
+"""Derivatives of the renderer in both modes: against the float64 reference, central differences and
+each other.
+"""
 
 from __future__ import annotations
 
@@ -27,14 +29,18 @@ def test_rasterize__backward_agrees_with_the_reference_for_every_attribute(scene
     raw, camera = scene
     rng = np.random.default_rng(1)
     size = {"color": 3, "motion": 2}.get(channel, 1)
-    weight = rng.normal(size=(camera.height, camera.width, size)) * (rasterize_view(raw, camera)["alpha"] > 0.02)
+    weight = rng.normal(size=(camera.height, camera.width, size)) * (
+        rasterize_view(raw, camera)["alpha"] > 0.02
+    )
     background = (0.2, 0.5, 0.9) if channel == "color" else None
 
     gaussians = to_gaussians(raw, grad=True)
     image = rasterize(gaussians, camera, (channel,), background)
     dr.backward(dr.sum(image[channel] * mi.TensorXf(np.float32(weight)), axis=None))
     expected = reference.complex_step(
-        lambda values: np.sum(rasterize_view(values, camera, background)[channel] * weight), raw, list(RAW)
+        lambda values: np.sum(rasterize_view(values, camera, background)[channel] * weight),
+        raw,
+        list(RAW),
     )
     for name in RAW:
         gradient = np.asarray(dr.grad(getattr(gaussians, name)))
@@ -61,13 +67,17 @@ def test_rasterize__antialiased_image_and_gradient_agree_with_the_reference(scen
     names = ["means", "log_scales", "quats", "logit_opacities"]
     expected = reference.complex_step(lambda values: np.sum(image_of(values) * weight), raw, names)
     for name in names:
-        assert_close(dr.grad(getattr(gaussians, name)), expected[name], rtol=tol.GRADIENT_REL, name=name)
+        assert_close(
+            dr.grad(getattr(gaussians, name)), expected[name], rtol=tol.GRADIENT_REL, name=name
+        )
 
 
 def test_rasterize__forward_mode_agrees_with_the_reference(scene):
     raw, camera = scene
     rng = np.random.default_rng(2)
-    direction = {name: np.float32(rng.normal(size=raw[name].shape)).astype(np.float64) for name in RAW}
+    direction = {
+        name: np.float32(rng.normal(size=raw[name].shape)).astype(np.float64) for name in RAW
+    }
     gaussians = to_gaussians(raw, grad=True)
     image = rasterize(gaussians, camera, CHANNELS)
     for name in RAW:
@@ -75,7 +85,9 @@ def test_rasterize__forward_mode_agrees_with_the_reference(scene):
     outputs = [image[name] for name in CHANNELS]
     dr.forward_to(outputs)
     for name, output in zip(CHANNELS, outputs, strict=True):
-        expected = reference.directional(lambda v, name=name: rasterize_view(v, camera)[name], raw, direction)
+        expected = reference.directional(
+            lambda v, name=name: rasterize_view(v, camera)[name], raw, direction
+        )
         solid = rasterize_view(raw, camera)["alpha"] > 0.02
         assert_close(dr.grad(output), expected, rtol=tol.GRADIENT_REL, where=solid, name=name)
 
@@ -88,11 +100,16 @@ def test_rasterize__forward_and_reverse_mode_are_dual(scene):
 
     def loss(gaussians):
         image = rasterize(gaussians, camera, ("color", "confidence"), (0.1, 0.2, 0.3))
-        return dr.sum(dr.square(image.color), axis=None) + dr.sum(dr.sin(3 * image.confidence), axis=None)
+        return dr.sum(dr.square(image.color), axis=None) + dr.sum(
+            dr.sin(3 * image.confidence), axis=None
+        )
 
     gaussians = to_gaussians(raw, grad=True)
     dr.backward(loss(gaussians))
-    reverse = sum(np.vdot(np.asarray(dr.grad(getattr(gaussians, n)), np.float64), v) for n, v in directions.items())
+    reverse = sum(
+        np.vdot(np.asarray(dr.grad(getattr(gaussians, n)), np.float64), v)
+        for n, v in directions.items()
+    )
     gaussians = to_gaussians(raw, grad=True)
     value = loss(gaussians)
     for name, v in directions.items():
@@ -106,7 +123,9 @@ def test_rasterize__backward_agrees_with_central_differences(scene):
     raw, camera = scene
 
     def loss(values):
-        return dr.sum(dr.square(rasterize(to_gaussians(values), camera, ("color",)).color), axis=None)
+        return dr.sum(
+            dr.square(rasterize(to_gaussians(values), camera, ("color",)).color), axis=None
+        )
 
     gaussians = to_gaussians(raw, grad=True)
     dr.backward(dr.sum(dr.square(rasterize(gaussians, camera, ("color",)).color), axis=None))
@@ -153,11 +172,20 @@ def test_rasterize__backward_agrees_with_the_reference_in_a_dense_scene():
     camera = make_camera(30, 25)
     weight = np.random.default_rng(8).normal(size=(25, 30, 3))
     gaussians = to_gaussians(raw, grad=True)
-    dr.backward(dr.sum(rasterize(gaussians, camera, ("color",)).color * mi.TensorXf(np.float32(weight)), axis=None))
+    dr.backward(
+        dr.sum(
+            rasterize(gaussians, camera, ("color",)).color * mi.TensorXf(np.float32(weight)),
+            axis=None,
+        )
+    )
     names = ["means", "log_scales", "logit_opacities"]
-    expected = reference.complex_step(lambda v: np.sum(rasterize_view(v, camera)["color"] * weight), raw, names)
+    expected = reference.complex_step(
+        lambda v: np.sum(rasterize_view(v, camera)["color"] * weight), raw, names
+    )
     for name in names:
-        assert_close(dr.grad(getattr(gaussians, name)), expected[name], rtol=10 * tol.GRADIENT_REL, name=name)
+        assert_close(
+            dr.grad(getattr(gaussians, name)), expected[name], rtol=10 * tol.GRADIENT_REL, name=name
+        )
 
 
 def test_rasterize__reproducible_gradients_have_the_same_bytes_and_values():

@@ -1,4 +1,6 @@
-"""Recordings: their number is bounded, evicted ones are recorded again, and other threads do not interfere."""
+"""Recordings: their number is bounded, evicted ones are recorded again, and other threads do not
+interfere.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,9 @@ def test_recorded__bounds_the_number_of_recordings(
     made = []
     freeze = dr.freeze
     monkeypatch.setattr(kernel_recording, "MOST_RECORDINGS", 10)
-    monkeypatch.setattr(dr, "freeze", lambda *args, **settings: made.append(freeze(*args, **settings)) or made[-1])
+    monkeypatch.setattr(
+        dr, "freeze", lambda *args, **settings: made.append(freeze(*args, **settings)) or made[-1]
+    )
     function = kernel_recording.recorded(scaled, 3)
     for _ in range(2):
         for pattern in range(32):

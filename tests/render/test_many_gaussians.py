@@ -21,9 +21,12 @@ from tests.scenes.gaussians import CHANNELS, Values
 
 
 def stack(n: int, opacity: float) -> Values:
-    """Return n Gaussians of various colours behind each other, in front of a camera at the origin."""
+    """Return n Gaussians of various colours behind each other, for a camera at the origin."""
     values = cloud(n)
-    values |= {"means": np.c_[np.zeros((n, 2)), np.linspace(1, 2, n)], "opacities": np.full(n, opacity)}
+    values |= {
+        "means": np.c_[np.zeros((n, 2)), np.linspace(1, 2, n)],
+        "opacities": np.full(n, opacity),
+    }
     values["sh_coeffs"] = np.clip(values["sh_coeffs"], -0.4, 0.4)
     return {name: np.float32(value).astype(np.float64) for name, value in values.items()}
 
@@ -41,11 +44,15 @@ def test_rasterize__blends_ten_thousand_layers_on_one_pixel(opacity):
             bound = (tol.IMAGE_ABS + 2 * hidden) * max(1, np.abs(expected[name]).max())
             assert_close(image[name], np.float64(expected[name]), atol=bound, name=name)
         if opacity > 0.9:
-            assert np.abs(grads["sh_coeffs"][8:]).max() < 1e-12, "occluded Gaussians have no gradient"
+            assert np.abs(grads["sh_coeffs"][8:]).max() < 1e-12, (
+                "occluded Gaussians have no gradient"
+            )
 
 
 def test_rasterize__blends_many_equal_depths_in_the_order_of_the_input():
-    """Of 300 layers at one depth, the first in the input is the nearest; in reversed order, the last is."""
+    """Of 300 layers at one depth, the first in the input is the nearest; in reversed order, the
+    last is.
+    """
     values = stack(300, 0.3)
     values["means"][:, 2] = 1.5
     camera = Camera(np.array([[9.0, 0, 3], [0, 9, 2.5], [0, 0, 1]]), np.eye(4), 6, 5)
@@ -53,13 +60,17 @@ def test_rasterize__blends_many_equal_depths_in_the_order_of_the_input():
     for order in (slice(None), slice(None, None, -1)):
         ordered = {name: np.ascontiguousarray(value[order]) for name, value in values.items()}
         images.append(run(ordered, camera)[0]["color"])
-        assert_close(images[-1], np.float64(exact_image(ordered, camera)["color"]), atol=tol.IMAGE_ABS)
+        assert_close(
+            images[-1], np.float64(exact_image(ordered, camera)["color"]), atol=tol.IMAGE_ABS
+        )
     assert np.abs(images[0] - images[1]).max() > 0.05
 
 
 @pytest.mark.long
 def test_rasterize__two_million_gaussians_mostly_out_of_view():
-    """All but 1,000 are out of view: the image shows the 1,000, and their gradients are complete and finite."""
+    """All but 1,000 are out of view: the image shows the 1,000, and their gradients are complete
+    and finite.
+    """
     N = 2_000_000
     in_view = 1_000
     rng = np.random.default_rng(0)
@@ -94,5 +105,7 @@ def test_rasterize__refuses_lists_that_exceed_32_bits():
     """2^12 x 2^12 pixels are 2^14 tiles, and entries are counted in 32 bits."""
     camera = Camera(np.array([[1e4, 0, 2048], [0, 1e4, 2048], [0, 0, 1]]), np.eye(4), 2**12, 2**12)
     values = stack(2**18 + 1, 0.5) | {"scales": np.full((2**18 + 1, 3), 1e3)}
-    with pytest.raises(ValueError, match=r"fewer than 2\^32 entries, got 4\.29e\+09 for 262145 Gaussians"):
+    with pytest.raises(
+        ValueError, match=r"fewer than 2\^32 entries, got 4\.29e\+09 for 262145 Gaussians"
+    ):
         rasterize(Activated(values), camera, CHANNELS, BACKGROUND, config=CONFIG)

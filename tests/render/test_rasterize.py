@@ -42,7 +42,9 @@ def test_rasterize__agrees_with_the_reference_in_every_channel(scene):
         # Where alpha is small, a normalised channel divides rounding errors by it.
         solid = expected["alpha"] > 0.02
         scale = max(1.0, np.abs(expected[name]).max())
-        assert_close(image[name], expected[name], atol=tol.IMAGE_ABS * scale, where=solid, name=name)
+        assert_close(
+            image[name], expected[name], atol=tol.IMAGE_ABS * scale, where=solid, name=name
+        )
 
 
 @pytest.mark.parametrize(
@@ -50,7 +52,8 @@ def test_rasterize__agrees_with_the_reference_in_every_channel(scene):
     [
         ((0.1, 0.05, 0.2), False, (5.643, 2.822)),
         ((0.1, 0.05, 0.2), True, (5.361, 2.681)),
-        ((0.1, 0.05, 4.2), False, (5.361, 2.681)),  # behind the camera one frame ago: to first order
+        # Behind the camera one frame ago: to first order.
+        ((0.1, 0.05, 4.2), False, (5.361, 2.681)),
     ],
 )
 def test_rasterize__motion_of_one_gaussian_has_the_closed_form(motion, first_order, expected):
@@ -63,7 +66,7 @@ def test_rasterize__motion_of_one_gaussian_has_the_closed_form(motion, first_ord
 
 @pytest.mark.slow
 def test_rasterize__blends_features_like_the_confidence(scene):
-    """Twelve columns beside the colour have the image and the gradients of the confidence channel."""
+    """Twelve columns beside the colour have image and gradients of the confidence channel."""
     raw, camera = scene
     rng = np.random.default_rng(2)
     values = rng.normal(size=(len(raw["means"]), 12))
@@ -76,7 +79,11 @@ def test_rasterize__blends_features_like_the_confidence(scene):
             dr.enable_grad(features)
             image = rasterize(gaussians, camera, ("color",), features=features).features
             dr.backward(dr.sum(image * mi.TensorXf(seed), axis=None))
-            return np.asarray(dr.detach(image)), np.asarray(dr.grad(features)), np.asarray(dr.grad(gaussians.means))
+            return (
+                np.asarray(dr.detach(image)),
+                np.asarray(dr.grad(features)),
+                np.asarray(dr.grad(gaussians.means)),
+            )
         logits = mi.TensorXf(np.zeros(len(values)))
         dr.enable_grad(logits)
         one = replace(gaussians, logit_confidence=logits)
@@ -85,7 +92,9 @@ def test_rasterize__blends_features_like_the_confidence(scene):
         return dr.grad(logits)
 
     image, grad, means_grad = differentiated(None)
-    expected = sum(w[..., None] * v for w, v in zip(blend_weights(raw, camera), values, strict=True))
+    expected = sum(
+        w[..., None] * v for w, v in zip(blend_weights(raw, camera), values, strict=True)
+    )
     assert_close(image, expected, atol=tol.IMAGE_ABS * np.abs(values).max())
     assert np.abs(means_grad).max() > 0
     for column in (0, 11):
@@ -94,7 +103,9 @@ def test_rasterize__blends_features_like_the_confidence(scene):
 
 
 def blend_weights(raw, camera):
-    """Return T alpha [H, W] of every Gaussian: the confidence channel where only this one has confidence 1."""
+    """Return T alpha [H, W] of every Gaussian: the confidence channel where only this one has
+    confidence 1.
+    """
     n = len(raw["means"])
     for k in range(n):
         logits = np.where(np.arange(n) == k, 100.0, -100.0)
@@ -111,7 +122,9 @@ def test_rasterize__image_does_not_depend_on_the_block_shape(scene, shape):
 
 
 def test_rasterize__stops_early_within_its_bound_in_a_dense_opaque_scene():
-    """With hundreds of nearly opaque layers the lists are truncated; the image changes by at most the stop value."""
+    """With hundreds of nearly opaque layers the lists are truncated; the image changes by at most
+    the stop value.
+    """
     rng = np.random.default_rng(6)
     raw = as_float32(make_scene(0, 300, seed=6))
     raw["logit_opacities"] = rng.uniform(2, 8, 300)
@@ -134,7 +147,9 @@ def test_rasterize__blends_equal_depths_in_the_order_of_the_input():
 
 
 def test_rasterize__of_no_gaussians_is_the_background():
-    empty = Gaussians(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0), np.zeros((0, 1, 3)))
+    empty = Gaussians(
+        np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0), np.zeros((0, 1, 3))
+    )
     image = rasterize(empty, make_camera(5, 3), background=(0.1, 0.2, 0.3))
     assert np.allclose(np.asarray(image.color), (0.1, 0.2, 0.3))
     assert np.asarray(image.alpha).max() == 0
@@ -185,14 +200,18 @@ def test_rasterize__refuses_bad_arguments(scene):
         with pytest.raises(ValueError, match="`background` must be three finite numbers"):
             rasterize(to_gaussians(raw), camera, background=background)
     for features in (np.ones(10), np.ones((9, 2)), np.ones((10, 13))):
-        with pytest.raises(ValueError, match=r"`features` must be \[N, F\] with N=10 and F from 1 to 12"):
+        with pytest.raises(
+            ValueError, match=r"`features` must be \[N, F\] with N=10 and F from 1 to 12"
+        ):
             rasterize(to_gaussians(raw), camera, features=features)
     broken = np.where(np.arange(10)[:, None] == 3, np.nan, np.ones((10, 2)))
     with pytest.raises(ValueError, match=r"`features` must be finite, got nan at \[3, 0\]"):
         rasterize(to_gaussians(raw), camera, features=broken)
     bare = {k: v for k, v in raw.items() if k not in ("motion", "logit_confidence")}
     for channel, attribute in (("motion", "motion"), ("confidence", "logit_confidence")):
-        with pytest.raises(ValueError, match=f"channel '{channel}' requires Gaussians with `{attribute}`, got none"):
+        with pytest.raises(
+            ValueError, match=f"channel '{channel}' requires Gaussians with `{attribute}`, got none"
+        ):
             rasterize(to_gaussians(bare), camera, (channel,))
 
 
@@ -225,7 +244,9 @@ def test_rasterize__refuses_a_pose_that_is_not_finite(scene, value, on_region):
     viewmat[2, 3] = value
     posed = replace(camera, viewmat=mi.TensorXf(viewmat))
     region = Region(np.ones((camera.height, camera.width), bool)) if on_region else None
-    with pytest.raises(ValueError, match=rf"`camera.viewmat` must be finite, got {value} at \[2, 3\]"):
+    with pytest.raises(
+        ValueError, match=rf"`camera.viewmat` must be finite, got {value} at \[2, 3\]"
+    ):
         rasterize(to_gaussians(raw), posed, region=region)
 
 
@@ -247,11 +268,15 @@ def test_rasterize__copies_features_and_background_before_it_returns(scene):
     for overwritten in (False, True):
         gaussians = to_gaussians(raw, grad=True)
         arguments = [array.copy() for array in (features, background)]
-        image = rasterize(gaussians, camera, ("color",), features=arguments[0], background=arguments[1])
+        image = rasterize(
+            gaussians, camera, ("color",), features=arguments[0], background=arguments[1]
+        )
         for array in arguments if overwritten else ():
             array[:] = 0
         dr.backward(dr.sum(image.color) + dr.sum(image.features))
-        images.append([np.asarray(v) for v in (image.color, image.features, dr.grad(gaussians.means))])
+        images.append(
+            [np.asarray(v) for v in (image.color, image.features, dr.grad(gaussians.means))]
+        )
     for expected, result in zip(*images, strict=True):
         np.testing.assert_allclose(expected, result, rtol=1e-5, atol=1e-5)
 
@@ -270,5 +295,7 @@ def test_rasterize__compiles_its_kernels_once_for_all_cameras_and_sizes():
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
         step(large, make_camera(90, 61))
-        compiled = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT and not k["cache_hit"]]
+        compiled = [
+            k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT and not k["cache_hit"]
+        ]
     assert not compiled

@@ -44,7 +44,11 @@ def run(raw, camera, region=None, weight=None, config=None):
     images = {name: image[name] for name in CHANNELS}
     if weight is not None:
         cropped = {name: region.crop(w) if region else w for name, w in weight.items()}
-        dr.backward(sum(dr.sum(images[n] * mi.TensorXf(np.float32(cropped[n])), axis=None) for n in CHANNELS))
+        dr.backward(
+            sum(
+                dr.sum(images[n] * mi.TensorXf(np.float32(cropped[n])), axis=None) for n in CHANNELS
+            )
+        )
     grads = {name: np.asarray(dr.grad(getattr(gaussians, name)), np.float64) for name in RAW}
     return {name: np.asarray(value) for name, value in images.items()}, grads
 
@@ -67,11 +71,15 @@ def assert_same_gradients(result, expected, rows=slice(None)):
     for name in RAW:
         scale = np.abs(expected[name]).max()
         assert scale > 0, name
-        assert_close(result[name][rows], expected[name][rows], atol=tol.SUM_ORDER_REL * scale, name=name)
+        assert_close(
+            result[name][rows], expected[name][rows], atol=tol.SUM_ORDER_REL * scale, name=name
+        )
 
 
 @pytest.mark.parametrize("reproducible", [False, True])
-def test_rasterize__on_a_region_renders_and_differentiates_like_the_full_view(raw, camera, mask, weight, reproducible):
+def test_rasterize__on_a_region_renders_and_differentiates_like_the_full_view(
+    raw, camera, mask, weight, reproducible
+):
     config = RenderConfig(reproducible=reproducible)
     region = Region(mask, config)
     assert region.num_blocks < 0.3 * (camera.width * camera.height) / 32
@@ -131,14 +139,21 @@ def test_rasterize__forward_mode_on_a_region_agrees_with_the_full_view(raw, came
         dr.forward_to(outputs)
         tangents.append([np.asarray(dr.grad(output)) for output in outputs])
     for name, tangent, expected in zip(CHANNELS, *tangents, strict=True):
-        assert_close(tangent, region.crop(expected), atol=tol.SUM_ORDER_REL * np.abs(expected).max(), name=name)
+        assert_close(
+            tangent,
+            region.crop(expected),
+            atol=tol.SUM_ORDER_REL * np.abs(expected).max(),
+            name=name,
+        )
 
 
 def test_rasterize__on_an_empty_region_is_the_background(raw, camera, mask):
     raw = raw | {"means": raw["means"] * (1, 1, 0) + (0, 0, -50)}
     image = rasterize(Gaussians(**raw), camera, ("color", "depth"), BACKGROUND, region=Region(mask))
     pixels = Region(mask).inside()
-    assert np.array_equal(np.asarray(image.color)[pixels], np.tile(np.float32(BACKGROUND), (pixels.sum(), 1)))
+    assert np.array_equal(
+        np.asarray(image.color)[pixels], np.tile(np.float32(BACKGROUND), (pixels.sum(), 1))
+    )
     assert (np.asarray(image.color)[~pixels] == 0).all()
     assert (np.asarray(image.depth) == 0).all()
 
@@ -169,14 +184,18 @@ def test_rasterize__compiles_its_kernels_once_for_all_regions(raw, camera, mask)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
         dr.kernel_history_clear()
         step(np.roll(mask, 21, axis=1) | (np.arange(camera.width) < 20))
-        compiled = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT and not k["cache_hit"]]
+        compiled = [
+            k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT and not k["cache_hit"]
+        ]
     assert not compiled, [k["operation_count"] for k in compiled]
 
 
 def test_region__refuses_bad_masks_and_other_views(raw, camera, mask):
     gaussians = Gaussians(**raw)
     for bad in (np.zeros((4, 4), bool), np.ones((4, 4)), np.ones(4, bool)):
-        with pytest.raises(ValueError, match=r"Region\(\): `mask` must be bool \[H, W\] with at least one pixel"):
+        with pytest.raises(
+            ValueError, match=r"Region\(\): `mask` must be bool \[H, W\] with at least one pixel"
+        ):
             Region(bad)
     with pytest.raises(ValueError, match="`region` must be of a 101x75 view with 8x4 blocks"):
         rasterize(gaussians, camera, region=Region(mask[:, :-1]))
@@ -189,7 +208,9 @@ def test_region__refuses_bad_masks_and_other_views(raw, camera, mask):
 
 @pytest.mark.parametrize("offset", range(4))
 def test_rasterize__backward_reads_gradients_at_any_alignment(raw, offset):
-    """A gradient may lie in NumPy's memory, at any address, although the loops read packets of floats."""
+    """A gradient may lie in NumPy's memory, at any address, although the loops read packets of
+    floats.
+    """
     camera = Camera.look_at((0, 0, -3.0), (0, 0, 0), (0, -1, 0), 45.0, 64, 32)
     memory = np.ones(64 * 32 * 3 + 4, np.float32)
     seed = memory[offset : offset + 64 * 32 * 3].reshape(32, 64, 3)
@@ -204,7 +225,9 @@ def test_rasterize__backward_reads_gradients_at_any_alignment(raw, offset):
 
 def test_region__refuses_to_crop_an_image_of_another_size():
     region = Region(np.ones((18, 21), bool))
-    with pytest.raises(ValueError, match=r"`image` must be \[18, 21, ...\], got \[18, 22, 3\]; resize it"):
+    with pytest.raises(
+        ValueError, match=r"`image` must be \[18, 21, ...\], got \[18, 22, 3\]; resize it"
+    ):
         region.crop(np.zeros((18, 22, 3)))
 
 
@@ -219,5 +242,6 @@ def test_BlockGrid__counts_the_pixels_of_its_blocks(size):
     np.testing.assert_array_equal(grid.counts(mask), expected)
     np.testing.assert_array_equal(grid.covering(mask), expected > 0)
     np.testing.assert_array_equal(
-        Region.of(grid, expected > 0).mask, Region(mask, RenderConfig(block_width=8, block_height=4)).mask
+        Region.of(grid, expected > 0).mask,
+        Region(mask, RenderConfig(block_width=8, block_height=4)).mask,
     )

@@ -1,4 +1,6 @@
-"""A stiff fit, a needle seen along its axis in front of an almost opaque disc: it stays finite and converges."""
+"""A stiff fit, a needle seen along its axis in front of an almost opaque disc: it stays finite and
+converges.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,7 @@ CAMERA = Camera(np.array([[60.0, 0, 16], [0, 60, 12], [0, 0, 1]]), np.eye(4), 32
 
 
 def stiff_truth() -> Values:
-    """Return raw attributes of a needle seen along its axis, and an almost opaque disc behind it."""
+    """Return raw attributes of a needle seen along its axis before an almost opaque disc."""
     sh_coeffs = np.zeros((2, 4, 3))
     sh_coeffs[:, 0] = [[1.0, 0.2, -0.5], [-0.5, 0.4, 1.0]]
     return {
@@ -33,7 +35,9 @@ def stiff_truth() -> Values:
 
 
 def descend(rate: float, steps: int) -> tuple[list[float], Values]:
-    """Return the losses and the final raw attributes of Adam with one decaying learning rate for all attributes."""
+    """Return the losses and the final raw attributes of Adam with one decaying learning rate for
+    all attributes.
+    """
 
     def render(gaussians: Gaussians) -> Any:
         return rasterize(gaussians, CAMERA, CHANNELS, BACKGROUND, config=CONFIG).color
@@ -56,7 +60,9 @@ def descend(rate: float, steps: int) -> tuple[list[float], Values]:
 
 
 def test_stiff_truth__is_stiff():
-    """The diagonal of J'J of the image spans more than 1e6, between tilts of the needle and the disc's opacity."""
+    """The diagonal of J'J of the image spans more than 1e6, between tilts of the needle and the
+    disc's opacity.
+    """
     truth = stiff_truth()
     curvature = {}
     for name in ("means", "quats", "log_scales", "logit_opacities"):
@@ -65,7 +71,9 @@ def test_stiff_truth__is_stiff():
             along = np.zeros(truth[name].shape)
             along[index] = 1
             slope = reference.directional(
-                lambda v: reference.rasterize(v, CAMERA.K, CAMERA.viewmat, 32, 24, BACKGROUND)["color"],
+                lambda v: reference.rasterize(v, CAMERA.K, CAMERA.viewmat, 32, 24, BACKGROUND)[
+                    "color"
+                ],
                 truth,
                 {name: along},
             )

@@ -1,4 +1,6 @@
-"""Threads that render the same Gaussians at once, in processes of their own: Dr.Jit ends the process otherwise."""
+"""Threads that render the same Gaussians at once, in processes of their own: Dr.Jit ends the
+process otherwise.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +63,14 @@ assert len(images) == min(renderers, 1)
 
 
 def run(renderers: int, fits: int, count: int) -> None:
-    command = [sys.executable, "-X", "faulthandler", "-c", PROGRAM, *map(str, (renderers, fits, count))]
+    command = [
+        sys.executable,
+        "-X",
+        "faulthandler",
+        "-c",
+        PROGRAM,
+        *map(str, (renderers, fits, count)),
+    ]
     subprocess.run(command, check=True, timeout=110)
 
 

@@ -35,16 +35,27 @@ def moved(camera: Camera, x: float) -> Camera:
 
 
 def views_of(gaussians: Gaussians) -> list[ActiveView]:
-    """Return views of several sizes: in part, as a whole, with a rolling shutter, and without static Gaussians."""
+    """Return views of several sizes: in part, as a whole, with a rolling shutter, and without
+    static Gaussians.
+    """
     wide = make_wide_camera()
     static = gaussians.select(~np.isin(np.arange(N), ACTIVE))
-    cameras = [wide, moved(wide, 0.1), wide.resized(90, 37), replace(moved(wide, -0.2), delay=0.4, readout=0.3)]
+    cameras = [
+        wide,
+        moved(wide, 0.1),
+        wide.resized(90, 37),
+        replace(moved(wide, -0.2), delay=0.4, readout=0.3),
+    ]
     views = []
     for k, camera in enumerate(cameras):
         y, x = np.mgrid[: camera.height, : camera.width]
         mask = (x - 30) ** 2 + (y - 20) ** 2 < (10 + 5 * k) ** 2
-        views.append(make_active_view(camera, Region(mask), static, ("color", "motion"), RenderConfig()))
-    none = make_active_view(cameras[1], views[1].region, static.select(slice(0)), (), RenderConfig())
+        views.append(
+            make_active_view(camera, Region(mask), static, ("color", "motion"), RenderConfig())
+        )
+    none = make_active_view(
+        cameras[1], views[1].region, static.select(slice(0)), (), RenderConfig()
+    )
     return [*views, ActiveView(wide), none]
 
 
@@ -55,9 +66,14 @@ def test_view_group__draws_what_each_view_draws(gaussians):
     group = ViewGroup(views)
     drawing = group.draw(active)
     images = group.split(np.asarray(drawing.color).reshape(group.region.shape(3)))
-    weights = [np.random.default_rng(k).normal(size=region.shape(2)) for k, region in enumerate(group.regions)]
+    weights = [
+        np.random.default_rng(k).normal(size=region.shape(2))
+        for k, region in enumerate(group.regions)
+    ]
     sums = drawing.sums(from_numpy(mi.Float, np.concatenate(weights)), 2)
-    for view, region, image, weight, part in zip(views, group.regions, images, weights, sums, strict=True):
+    for view, region, image, weight, part in zip(
+        views, group.regions, images, weights, sums, strict=True
+    ):
         blocks = replace(view, region=region)
         assert_close(image, np.asarray(blocks.render(active).color), rtol=1e-6, atol=1e-6)
         assert_close(part, backproject(active, blocks, np.float32(weight)), rtol=1e-5, atol=1e-4)
@@ -66,9 +82,12 @@ def test_view_group__draws_what_each_view_draws(gaussians):
 def test_view_group__crops_images_of_its_views(gaussians):
     group = ViewGroup(views_of(gaussians)[:3])
     images = [
-        np.random.default_rng(k).normal(size=(v.camera.height, v.camera.width)) for k, v in enumerate(group.views)
+        np.random.default_rng(k).normal(size=(v.camera.height, v.camera.width))
+        for k, v in enumerate(group.views)
     ]
-    for region, image, part in zip(group.regions, images, group.split(group.crop(images)), strict=True):
+    for region, image, part in zip(
+        group.regions, images, group.split(group.crop(images)), strict=True
+    ):
         assert np.array_equal(part, region.crop(image))
 
 
@@ -90,15 +109,21 @@ def test_totals__are_the_sums_over_all_views(gaussians):
 
 
 def test_backproject__is_the_transpose_of_blending():
-    """<image, sum_i w_i c_i> = sum_i c_i <image, w_i> for the confidence channel, which is plain blending."""
+    """<image, sum_i w_i c_i> = sum_i c_i <image, w_i> for the confidence channel, which is plain
+    blending.
+    """
     raw = as_float32(make_scene())
     camera = make_camera()
     gaussians = to_gaussians(raw)
-    image = np.random.default_rng(0).normal(size=(camera.height, camera.width, 1)).astype(np.float32)
+    image = (
+        np.random.default_rng(0).normal(size=(camera.height, camera.width, 1)).astype(np.float32)
+    )
     sums = backproject(gaussians, ActiveView(camera), image)
     blended = np.asarray(rasterize(gaussians, camera, ("confidence",)).confidence, np.float64)
     confidence = 1 / (1 + np.exp(-raw["logit_confidence"]))
-    assert np.vdot(sums[:, 0], confidence) == pytest.approx(np.vdot(blended, image), rel=tol.DUALITY_REL)
+    assert np.vdot(sums[:, 0], confidence) == pytest.approx(
+        np.vdot(blended, image), rel=tol.DUALITY_REL
+    )
 
 
 def test_backproject__of_ones_sums_to_alpha():
@@ -111,5 +136,9 @@ def test_backproject__of_ones_sums_to_alpha():
 
 
 def test_backproject__refuses_an_image_of_another_size():
-    with pytest.raises(ValueError, match=r"`image` must be \[18, 21, C\] with C > 0, got \[4, 5, 1\]"):
-        backproject(to_gaussians(make_scene()), ActiveView(make_camera()), np.zeros((4, 5, 1), np.float32))
+    with pytest.raises(
+        ValueError, match=r"`image` must be \[18, 21, C\] with C > 0, got \[4, 5, 1\]"
+    ):
+        backproject(
+            to_gaussians(make_scene()), ActiveView(make_camera()), np.zeros((4, 5, 1), np.float32)
+        )

@@ -1,6 +1,8 @@
-"""CMU Panoptic's basketball from its folder to the committed quality: 30 frames, four held-out cameras, and a resume.
+"""CMU Panoptic's basketball from its folder to the committed quality: 30 frames, four held-out
+cameras, and a resume.
 
-The recording is not in the repository (docs/experiments/real.md says where it is); a variable names its folder:
+The recording is not in the repository (docs/experiments/real.md says where it is); a variable names
+its folder:
 
 MORGS_MI_BASKETBALL=FOLDER pytest -m slow tests/runs/test_basketball.py
 """
@@ -26,9 +28,20 @@ CUT = 27
 
 @pytest.mark.slow
 @pytest.mark.skipif(not FOLDER, reason="needs a recording: set MORGS_MI_BASKETBALL to its folder")
-def test_basketball__is_fitted_to_the_committed_quality_and_resumes_to_the_byte(tmp_path: Path) -> None:
+def test_basketball__is_fitted_to_the_committed_quality_and_resumes_to_the_byte(
+    tmp_path: Path,
+) -> None:
     out = tmp_path / "out"
-    command = ["fit", FOLDER or "", str(out), "--frames", str(FRAMES), "--epochs", "2", "--reproducible"]
+    command = [
+        "fit",
+        FOLDER or "",
+        str(out),
+        "--frames",
+        str(FRAMES),
+        "--epochs",
+        "2",
+        "--reproducible",
+    ]
     assert cli.main(command) == 0
     assert cli.main(["eval", str(out), "--json", str(tmp_path / "eval.json")]) == 0
     result = json.loads((tmp_path / "eval.json").read_text())
@@ -42,8 +55,15 @@ def test_basketball__is_fitted_to_the_committed_quality_and_resumes_to_the_byte(
     assert np.mean([row["num_bytes"] for row in rows[1:]]) < 270e3
 
     whole = (out / "stream.morgs").read_bytes()
-    offset = next(offset for _, frame, offset in StreamReader(out / "stream.morgs").index() if frame == CUT)
+    offset = next(
+        offset for _, frame, offset in StreamReader(out / "stream.morgs").index() if frame == CUT
+    )
     shutil.copytree(out, tmp_path / "cut")
     (tmp_path / "cut" / "stream.morgs").write_bytes(whole[: offset + 100])
-    assert cli.main([*(str(tmp_path / "cut") if part == str(out) else part for part in command), "--resume"]) == 0
+    assert (
+        cli.main(
+            [*(str(tmp_path / "cut") if part == str(out) else part for part in command), "--resume"]
+        )
+        == 0
+    )
     assert (tmp_path / "cut" / "stream.morgs").read_bytes() == whole

@@ -60,14 +60,20 @@ def stream_of(out: Path) -> bytes:
 def report_of(out: Path) -> dict:
     """Return the report without what differs between any two runs."""
     report = json.loads((out / "report.json").read_text())
-    return report | {"frames": [{k: v for k, v in row.items() if k != "seconds"} for row in report["frames"]]}
+    return report | {
+        "frames": [{k: v for k, v in row.items() if k != "seconds"} for row in report["frames"]]
+    }
 
 
 def assert_same(out: Path, whole: Path) -> None:
     assert stream_of(out) == stream_of(whole)
     assert report_of(out) == report_of(whole)
     assert (out / "capture.json").read_bytes() == (whole / "capture.json").read_bytes()
-    assert sorted(path.name for path in out.iterdir()) == ["capture.json", "report.json", "stream.morgs"]
+    assert sorted(path.name for path in out.iterdir()) == [
+        "capture.json",
+        "report.json",
+        "stream.morgs",
+    ]
 
 
 def process(out: Path, *left: int) -> subprocess.Popen:
@@ -79,7 +85,9 @@ def process(out: Path, *left: int) -> subprocess.Popen:
 
 
 def kill_and_resume(whole: Path, folder: Path, kills: int) -> None:
-    """Fit again and again, each time killed at a random byte of the stream or a random moment, until it is done."""
+    """Fit again and again, each time killed at a random byte of the stream or a random moment,
+    until it is done.
+    """
     rng = np.random.default_rng(0)
     size = len(stream_of(whole))
     killed = 0
@@ -104,8 +112,12 @@ def kill_and_resume(whole: Path, folder: Path, kills: int) -> None:
 
 
 @pytest.mark.slow
-def test_stream_capture__shows_a_provisional_first_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stream beside the one that is written has a frame for each round of density control, and is removed."""
+def test_stream_capture__shows_a_provisional_first_frame(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A stream beside the one that is written has a frame for each round of density control, and is
+    removed.
+    """
     shown = []
     show = Files.show
 
@@ -117,7 +129,9 @@ def test_stream_capture__shows_a_provisional_first_frame(tmp_path: Path, monkeyp
         assert not StreamReader(tmp_path / "stream.morgs").index()
 
     monkeypatch.setattr(Files, "show", spy)
-    fit = replace(CONFIG.fit, num_gaussians=80, first_frame_steps=20, density=DensityConfig(rounds=3))
+    fit = replace(
+        CONFIG.fit, num_gaussians=80, first_frame_steps=20, density=DensityConfig(rounds=3)
+    )
     stream_capture(recording(num_frames=2), tmp_path, replace(CONFIG, fit=fit))
     first = next(iter(StreamReader(tmp_path / "stream.morgs")))
     assert len(shown) == 3
@@ -141,7 +155,9 @@ def test_stream_capture__goes_on_without_a_provisional_first_frame_that_has_no_r
     stream_capture(recording(), tmp_path, CONFIG)
     assert_same(tmp_path, whole)
     (message,) = caplog.messages
-    assert message.startswith(f"{tmp_path / PROVISIONAL}: a provisional first frame cannot be written")
+    assert message.startswith(
+        f"{tmp_path / PROVISIONAL}: a provisional first frame cannot be written"
+    )
 
 
 @pytest.mark.slow
@@ -176,7 +192,9 @@ def files_of(out: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.ENOSPC, "full"), RuntimeError("crash")])
+@pytest.mark.parametrize(
+    "error", [KeyboardInterrupt(), OSError(errno.ENOSPC, "full"), RuntimeError("crash")]
+)
 def test_stream_capture__keeps_an_earlier_fit_until_its_first_frame(
     whole: Path, tmp_path: Path, error: BaseException
 ) -> None:
@@ -184,7 +202,9 @@ def test_stream_capture__keeps_an_earlier_fit_until_its_first_frame(
     shutil.copytree(whole, out)
 
     def fail(*_: Any) -> None:
-        assert {name: data for name, data in files_of(out).items() if name[0] != "."} == files_of(whole)
+        assert {name: data for name, data in files_of(out).items() if name[0] != "."} == files_of(
+            whole
+        )
         raise error
 
     with pytest.raises(type(error)):
@@ -206,7 +226,14 @@ def test_stream_capture__replaces_an_earlier_fit_together(whole: Path, tmp_path:
             metadata = json.loads((out / "capture.json").read_text())
             rows = report_of(out)["frames"]
             held = {index for _, index, _ in StreamReader(out / "stream.morgs").index()}
-            frames.append((Path(metadata["capture"]).name, report_of(out)["config"]["seed"], len(rows), len(held)))
+            frames.append(
+                (
+                    Path(metadata["capture"]).name,
+                    report_of(out)["config"]["seed"],
+                    len(rows),
+                    len(held),
+                )
+            )
             assert len(rows) == frame
         return push(loop, *args)
 
@@ -261,7 +288,9 @@ def test_stream_capture__killed_60_times_is_the_same(whole: Path, tmp_path: Path
 
 @pytest.mark.long
 def test_stream_capture__300_frames_play_as_they_were_fitted(tmp_path: Path) -> None:
-    """A reader gets the state of the loop after each frame, with births and deaths, from any frame on."""
+    """A reader gets the state of the loop after each frame, with births and deaths, from any frame
+    on.
+    """
     capture = recording(num_frames=300)
     loop = StreamLoop(capture.cameras, capture.points, capture.point_colors, CONFIG)
     states: list[CodedFrame] = []
@@ -307,7 +336,9 @@ def test_stream_capture__resumed_from_any_cut_is_the_same(whole: Path, tmp_path:
         assert_same(out, whole)
 
 
-def test_stream_capture__resumed_after_an_interrupt_is_the_same(whole: Path, tmp_path: Path) -> None:
+def test_stream_capture__resumed_after_an_interrupt_is_the_same(
+    whole: Path, tmp_path: Path
+) -> None:
     """The stream was closed, with an index that must not stay in the middle."""
 
     def stop(stage: str, done: float, total: float) -> None:
@@ -345,8 +376,16 @@ def brighter(capture: Recording) -> Recording:
 @pytest.mark.parametrize(
     ("capture", "config", "message"),
     [
-        (recording(), replace(CONFIG, seed=1), r"resume a fit with metadata\.config\.seed = 0, got 1"),
-        (recording(), replace(CONFIG, codec=CodecConfig(quality=2)), r"metadata\.config\.codec\.quality = 1\.0, got 2"),
+        (
+            recording(),
+            replace(CONFIG, seed=1),
+            r"resume a fit with metadata\.config\.seed = 0, got 1",
+        ),
+        (
+            recording(),
+            replace(CONFIG, codec=CodecConfig(quality=2)),
+            r"metadata\.config\.codec\.quality = 1\.0, got 2",
+        ),
         (brighter(recording()), CONFIG, r"resume a fit with metadata\.fingerprint = "),
         (recording(fps=50.0), CONFIG, r"resume a fit with fps = 25\.0, got 50\.0"),
         (recording(cameras=recording().cameras[::-1]), CONFIG, "resume a fit with cameras = "),
@@ -368,7 +407,9 @@ def test_stream_capture__does_not_resume_a_damaged_fit(whole: Path, tmp_path: Pa
     with pytest.raises(ValueError, match=r"report\.json: expected JSON, got a broken file"):
         stream_capture(recording(), out, CONFIG, resume=True)
     (out / "report.json").unlink()
-    with pytest.raises(ValueError, match=r"report\.json: expected the report of the fit, got none; start again"):
+    with pytest.raises(
+        ValueError, match=r"report\.json: expected the report of the fit, got none; start again"
+    ):
         stream_capture(recording(), out, CONFIG, resume=True)
     (out / "report.json").write_text('{"frames": []}')
     with pytest.raises(ValueError, match=r"report\.json: expected the rows of 6 frames, got 0"):
@@ -382,14 +423,18 @@ def test_stream_capture__does_not_resume_a_damaged_fit(whole: Path, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_stream_capture__refuses_a_folder_into_which_another_fit_writes(whole: Path, tmp_path: Path) -> None:
+def test_stream_capture__refuses_a_folder_into_which_another_fit_writes(
+    whole: Path, tmp_path: Path
+) -> None:
     """The other one goes on, and its files are whole."""
     refused = {}
 
     def fit_too(stage: str, done: float, total: float) -> None:
         frame = ceil(done)
         if stage == "Later frames" and frame in (1, 3) and frame not in refused:
-            with pytest.raises(BlockingIOError, match="out: expected a folder into which nothing else is written") as e:
+            with pytest.raises(
+                BlockingIOError, match="out: expected a folder into which nothing else is written"
+            ) as e:
                 stream_capture(recording(), tmp_path / "out", CONFIG, resume=frame == 3)
             refused[frame] = e
 
@@ -400,7 +445,9 @@ def test_stream_capture__refuses_a_folder_into_which_another_fit_writes(whole: P
 
 @pytest.mark.slow
 @pytest.mark.parametrize("change", ["removed", "removed folder", "moved", "replaced"])
-def test_stream_capture__ends_when_its_stream_is_taken_away(whole: Path, tmp_path: Path, change: str) -> None:
+def test_stream_capture__ends_when_its_stream_is_taken_away(
+    whole: Path, tmp_path: Path, change: str
+) -> None:
     out = tmp_path / "out"
     reports = []
 
@@ -420,7 +467,10 @@ def test_stream_capture__ends_when_its_stream_is_taken_away(whole: Path, tmp_pat
             out.rename(tmp_path / "moved")
 
     place = "another file" if change == "replaced" else "none"
-    with pytest.raises(FileNotFoundError, match=rf"stream\.morgs: expected the stream that is being .*, found {place}"):
+    with pytest.raises(
+        FileNotFoundError,
+        match=rf"stream\.morgs: expected the stream that is being .*, found {place}",
+    ):
         stream_capture(recording(), out, CONFIG, progress=take_away)
     assert max(reports) == 2
     if change == "replaced":
@@ -437,16 +487,24 @@ def test_stream_capture__writes_no_path_into_the_stream(tmp_path: Path) -> None:
     secret = tmp_path / "home" / "jane"
     methods = replace(CONFIG.motion, flow_method=f"files:{secret}/flow", mask_method="none")
     capture = recording(path=secret / "clip")
-    header = stream_metadata(capture, next(capture.partial_frames()), replace(CONFIG, motion=methods))
+    header = stream_metadata(
+        capture, next(capture.partial_frames()), replace(CONFIG, motion=methods)
+    )
     assert "jane" not in json.dumps(header)
     assert header["config"]["motion"]["flow_method"] == "files:flow"
-    assert _without_folder("sam2:/a/encoder.onnx,/b/decoder.onnx") == "sam2:encoder.onnx,decoder.onnx"
+    assert (
+        _without_folder("sam2:/a/encoder.onnx,/b/decoder.onnx") == "sam2:encoder.onnx,decoder.onnx"
+    )
     stream_capture(capture, tmp_path / "out", CONFIG)
     assert b"jane" not in stream_of(tmp_path / "out")
-    assert json.loads((tmp_path / "out" / "capture.json").read_text())["capture"] == str(secret / "clip")
+    assert json.loads((tmp_path / "out" / "capture.json").read_text())["capture"] == str(
+        secret / "clip"
+    )
 
 
-def test_stream_capture__resumes_a_stream_whose_header_has_a_path(whole: Path, tmp_path: Path) -> None:
+def test_stream_capture__resumes_a_stream_whose_header_has_a_path(
+    whole: Path, tmp_path: Path
+) -> None:
     """As the headers of earlier versions have; the recording may have moved."""
     reader = StreamReader(whole / "stream.morgs")
     out = tmp_path / "out"
@@ -456,12 +514,16 @@ def test_stream_capture__resumes_a_stream_whose_header_has_a_path(whole: Path, t
         for packet in list(reader)[:3]:
             writer.write(packet)
     stream_capture(recording(), out, CONFIG, resume=True)
-    assert history(coded_frames(StreamReader(out / "stream.morgs"))) == history(coded_frames(reader))
+    assert history(coded_frames(StreamReader(out / "stream.morgs"))) == history(
+        coded_frames(reader)
+    )
     assert json.loads((out / "capture.json").read_text())["capture"] == str(Path("noise").resolve())
 
 
 @pytest.mark.parametrize("text", ["[]", "[" * 100_000])
-def test_stream_capture__resumes_beside_a_hostile_description(whole: Path, tmp_path: Path, text: str) -> None:
+def test_stream_capture__resumes_beside_a_hostile_description(
+    whole: Path, tmp_path: Path, text: str
+) -> None:
     out = interrupted(whole, tmp_path / "out", len(stream_of(whole)) * 3 // 4)
     (out / "capture.json").write_text(text)
     stream_capture(recording(), out, CONFIG, resume=True)
@@ -474,10 +536,15 @@ def test_stream_capture__resumes_beside_a_hostile_description(whole: Path, tmp_p
         ("[" * 100_000, "expected JSON, got a broken file"),
         ("[]", "expected the report of the fit, got a broken one"),
         ('{"frames": [{"seconds": "many"}]}', "expected the report of the fit, got a broken one"),
-        (f'{{"frames": [{{"seconds": {10**400}}}]}}', "expected the report of the fit, got a broken one"),
+        (
+            f'{{"frames": [{{"seconds": {10**400}}}]}}',
+            "expected the report of the fit, got a broken one",
+        ),
     ],
 )
-def test_stream_capture__refuses_a_hostile_report(whole: Path, tmp_path: Path, text: str, message: str) -> None:
+def test_stream_capture__refuses_a_hostile_report(
+    whole: Path, tmp_path: Path, text: str, message: str
+) -> None:
     out = interrupted(whole, tmp_path / "out", len(stream_of(whole)))
     (out / "report.json").write_text(text)
     with pytest.raises(ValueError, match=f"report.json: {message}"):
@@ -485,13 +552,17 @@ def test_stream_capture__refuses_a_hostile_report(whole: Path, tmp_path: Path, t
 
 
 @pytest.mark.slow
-def test_stream_capture__resumes_hostile_streams_or_refuses_them_in_one_sentence(whole: Path, tmp_path: Path) -> None:
+def test_stream_capture__resumes_hostile_streams_or_refuses_them_in_one_sentence(
+    whole: Path, tmp_path: Path
+) -> None:
     data = stream_of(whole)
     index = TRAILER.unpack(data[-TRAILER.size :])[0]
     ends = [*(offset for *_, offset in StreamReader(whole / "stream.morgs").index()), index]
     packets = list(StreamReader(whole / "stream.morgs"))
     pieces = [Piece(-1, 0, 0, 12), Piece(0, 0, 12, ends[0])]
-    pieces += [Piece(p.kind, p.frame, a, b) for p, (a, b) in zip(packets, pairwise(ends), strict=True)]
+    pieces += [
+        Piece(p.kind, p.frame, a, b) for p, (a, b) in zip(packets, pairwise(ends), strict=True)
+    ]
     pieces.append(Piece(3, 0, index, len(data)))
     clip = Clip(data, pieces, {})
     out = tmp_path / "out"
@@ -522,7 +593,9 @@ def test_stream_capture__does_not_write_into_a_capture(tmp_path: Path, link: str
         out = tmp_path / "out"
         out.mkdir()
         (out / "capture.json").symlink_to(capture / "capture.json")
-    with pytest.raises(ValueError, match=rf"an output outside of captures, .* in the capture {capture}; choose"):
+    with pytest.raises(
+        ValueError, match=rf"an output outside of captures, .* in the capture {capture}; choose"
+    ):
         stream_capture(recording(), out, CONFIG)
     assert sorted(capture.rglob("*")) == old_files
     assert (capture / "capture.json").read_text() == "{}"
@@ -562,9 +635,15 @@ def test_stream_capture__stores_refined_cameras_and_resumes_with_them(tmp_path_f
     assert names == set(capture.names[1:]), "the terms of the training views"
     opened = open_stream_capture(stream, None, [0, 1])
     assert np.array_equal(opened.cameras[1].viewmat, stream.cameras[1].viewmat)
-    assert [list(terms) for terms in opened.distortions[1:]] == [*stream.metadata["distortions"].values()]
-    assert np.array_equal(stream.cameras[0].viewmat, capture.cameras[0].viewmat), "the held-out view"
-    assert all(not np.array_equal(stream.cameras[v].viewmat, capture.cameras[v].viewmat) for v in (1, 2))
+    assert [list(terms) for terms in opened.distortions[1:]] == [
+        *stream.metadata["distortions"].values()
+    ]
+    assert np.array_equal(stream.cameras[0].viewmat, capture.cameras[0].viewmat), (
+        "the held-out view"
+    )
+    assert all(
+        not np.array_equal(stream.cameras[v].viewmat, capture.cameras[v].viewmat) for v in (1, 2)
+    )
     first = report_of(tmp_path)["frames"][0]["validation"]["refinement"]
     assert first["taken"]
     assert first["held_out"]["registered_psnr"] >= first["held_out"]["calibrated_psnr"]
@@ -590,12 +669,18 @@ def test_stream_capture__resumes_where_cameras_have_delays(tmp_path):
     assert [c.delay for c in open_stream_capture(stream, None, [0, 1]).cameras] == [0, -0.25, 0.5]
 
 
-@pytest.mark.parametrize("distortion", [[1, 2], {"cam1": [0.1]}, {"cam1": ["x", "y"]}, {"cam1": None}])
+@pytest.mark.parametrize(
+    "distortion", [[1, 2], {"cam1": [0.1]}, {"cam1": ["x", "y"]}, {"cam1": None}]
+)
 def test_as_fitted__refuses_broken_distortions(tmp_path, distortion):
     capture = recording()
-    with StreamWriter(tmp_path / "stream.morgs", capture.cameras, 25.0, {"distortions": distortion}):
+    with StreamWriter(
+        tmp_path / "stream.morgs", capture.cameras, 25.0, {"distortions": distortion}
+    ):
         pass
-    with pytest.raises(ValueError, match="`distortions` must be an object with two numbers for each camera"):
+    with pytest.raises(
+        ValueError, match="`distortions` must be an object with two numbers for each camera"
+    ):
         as_fitted(capture, StreamReader(tmp_path / "stream.morgs"))
 
 
@@ -612,12 +697,17 @@ def test_stream_capture__resumes_with_the_exposures_of_the_report(tmp_path):
     (tmp_path / "stream.morgs").write_bytes(whole[: stream.index()[-1][2]])
     stream_capture(capture, tmp_path, config, resume=True)
     assert stream_of(tmp_path) == whole
-    assert [row["exposures"] for row in report_of(tmp_path)["frames"]] == [r["exposures"] for r in report["frames"]]
+    assert [row["exposures"] for row in report_of(tmp_path)["frames"]] == [
+        r["exposures"] for r in report["frames"]
+    ]
 
 
 def test_stream_metadata__names_the_calibration_that_cameras_are_refined_from():
     capture = recording()
-    other = replace(capture.cameras[0], K=capture.cameras[0].K * np.array([[1.01, 1, 1], [1, 1.01, 1], [1, 1, 1]]))
+    other = replace(
+        capture.cameras[0],
+        K=capture.cameras[0].K * np.array([[1.01, 1, 1], [1, 1.01, 1], [1, 1, 1]]),
+    )
     others = replace(capture, cameras=(other, *capture.cameras[1:]))
     first = next(capture.partial_frames())
     config = refined_config()

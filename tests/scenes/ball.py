@@ -40,7 +40,10 @@ def images_of(gaussians: Gaussians) -> list[np.ndarray]:
 def bytes_of(images: Sequence[np.ndarray], noise: float = 0.0) -> list[np.ndarray]:
     """Return images as uint8, with normal noise of a standard deviation relative to white."""
     rng = np.random.default_rng(0)
-    return [np.uint8(np.clip(255 * (image + rng.normal(0, noise, image.shape)) + 0.5, 0, 255)) for image in images]
+    return [
+        np.uint8(np.clip(255 * (image + rng.normal(0, noise, image.shape)) + 0.5, 0, 255))
+        for image in images
+    ]
 
 
 def problem(
@@ -51,8 +54,12 @@ def problem(
 ) -> FirstFrameProblem:
     """Return the problem of a first frame with some or all of the `views`."""
     masks = [None] * len(images) if masks is None else masks
-    views_of_images = [View(*view) for view in zip(views()[: len(images)], images, masks, strict=True)]
-    return FirstFrameProblem(start or ball(80), tuple(views_of_images), np.zeros((0, 3)), 3.0, render or RenderConfig())
+    views_of_images = [
+        View(*view) for view in zip(views()[: len(images)], images, masks, strict=True)
+    ]
+    return FirstFrameProblem(
+        start or ball(80), tuple(views_of_images), np.zeros((0, 3)), 3.0, render or RenderConfig()
+    )
 
 
 def mean_psnr(gaussians: Gaussians, images: list[np.ndarray]) -> float:

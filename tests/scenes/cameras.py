@@ -16,7 +16,7 @@ QUAD: tuple[Point, ...] = tuple((x, y, -3.5) for x in (-0.9, 0.9) for y in (-0.6
 
 
 def arc(angles: Iterable[float], radius: float, y: float = 0.0) -> list[Point]:
-    """Return origins on a horizontal arc in front of the scene, which is seen along +z at angle 0."""
+    """Return origins on a horizontal arc in front of the scene, seen along +z at angle 0."""
     return [(radius * np.sin(a), y, -radius * np.cos(a)) for a in angles]
 
 
@@ -35,7 +35,9 @@ def look_at_cameras(
     target: Point = (0.0, 0.0, 0.0),
     up: Point = (0.0, -1.0, 0.0),
 ) -> list[Camera]:
-    """Return one camera per origin that looks at `target`, with the names cam0, cam1, ... unless `names` are given."""
+    """Return one camera per origin that looks at `target`, with the names cam0, cam1, ... unless
+    `names` are given.
+    """
     origins = list(origins)
     names = [f"cam{i}" for i in range(len(origins))] if names is None else names
     return [
@@ -50,7 +52,9 @@ def shift_principal_point(camera: Camera, x: float, y: float) -> Camera:
 
 
 def make_camera(width: int = 21, height: int = 18) -> Camera:
-    """Return a camera of a size that no block divides, with an off-centre principal point and fx != fy."""
+    """Return a camera of a size that no block divides, with an off-centre principal point and fx !=
+    fy.
+    """
     camera = Camera.look_at((0.3, -0.4, -3.0), (0, 0, 0), (0, -1, 0), 45.0, width, height)
     K = camera.K + np.array([[0, 0, 1.3], [0, 2.0, -0.7], [0, 0, 0]])
     return Camera(K, camera.viewmat, width, height)

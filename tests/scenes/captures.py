@@ -1,4 +1,6 @@
-"""Small captures in every layout, all with the same three cameras; frame t of camera i is filled with (i, t, 0)."""
+"""Small captures in every layout, all with the same three cameras; frame t of camera i is filled
+with (i, t, 0).
+"""
 
 from __future__ import annotations
 
@@ -24,13 +26,17 @@ FPS = 25
 
 
 def make_camera(i: int, name: str, shift: float = 0.0) -> Camera:
-    """Return the camera at i radians on a circle, with its own focal length and a shifted principal point."""
+    """Return the camera at i radians on a circle, with its own focal length and a shifted principal
+    point.
+    """
     (view,) = look_at_cameras(circle([i]), 60 + i, WIDTH, HEIGHT, [name], up=(0, 0, 1))
     return shift_principal_point(view, shift, -shift)
 
 
 def rig(names: tuple[str, ...], shift: float = 0.0) -> list[Camera]:
-    """Return cameras on a circle with different focal lengths and principal points `shift` px off the centre."""
+    """Return cameras on a circle with different focal lengths and principal points `shift` px off
+    the centre.
+    """
     return [make_camera(i, name, shift) for i, name in enumerate(names)]
 
 
@@ -54,7 +60,8 @@ def write_timed_video(path: Path, images: list[np.ndarray], times: list[int]) ->
     """Write an .mp4 that shows its frames at `times`, in ascending milliseconds from 0."""
     write_video(path, images, 1000)
     data = path.read_bytes()
-    # The box `stts` is a list of (number of frames, duration in units of the track); OpenCV's has one entry.
+    # The box `stts` is a list of (number of frames, duration in units of the track); OpenCV's has
+    # one entry.
     start = data.index(b"stts") - 4
     (millisecond,) = struct.unpack(">I", data[start + 20 : start + 24])
     durations = np.diff([*times, 2 * times[-1] - times[-2]]) * millisecond
@@ -69,7 +76,9 @@ def write_timed_video(path: Path, images: list[np.ndarray], times: list[int]) ->
     path.write_bytes(grown.replace(b"edts", b"free"))
 
 
-def n3dv(path: Path, names: tuple[str, ...] = ("cam00", "cam02", "cam11"), clips: Callable = videos) -> Path:
+def n3dv(
+    path: Path, names: tuple[str, ...] = ("cam00", "cam02", "cam11"), clips: Callable = videos
+) -> Path:
     path.mkdir(parents=True)
     clips(path, names)
     write_poses_bounds(path / "poses_bounds.npy", rig(names), [[1, 9]] * len(names))
@@ -96,7 +105,9 @@ def meet_room(path: Path, clips: Callable = videos) -> Path:
     return n3dv(path, ("cam_0", "cam_2", "cam_10"), clips)
 
 
-def colmap_text(folder: Path, cameras: list[Camera], model: str, params: list[list[float]], shared: bool) -> None:
+def colmap_text(
+    folder: Path, cameras: list[Camera], model: str, params: list[list[float]], shared: bool
+) -> None:
     """Write a model of cameras with the parameters `params`; if `shared`, all have the first."""
     folder.mkdir(parents=True)
     rows = [
@@ -137,7 +148,9 @@ def transforms(path: Path, cameras: list[Camera], k1: float = 0.0) -> None:
 def nerfstudio(path: Path) -> Path:
     path.mkdir(parents=True)
     names = ("cam1", "cam2", "cam10")
-    cameras = [replace(camera, name=f"./images/{camera.name}.png") for camera in rig(names, shift=3)]
+    cameras = [
+        replace(camera, name=f"./images/{camera.name}.png") for camera in rig(names, shift=3)
+    ]
     transforms(path, cameras, k1=0.01)
     videos(path, names)
     return path
@@ -164,7 +177,9 @@ def dynamic3dgs(path: Path) -> Path:
     return path
 
 
-def anipose(path: Path, distortions: tuple[float, ...] = (0, 0, 0, 0, 0), clips: Callable = videos) -> Path:
+def anipose(
+    path: Path, distortions: tuple[float, ...] = (0, 0, 0, 0, 0), clips: Callable = videos
+) -> Path:
     """Write a calibration of Anipose, beside clips with names that contain the cameras'."""
     path.mkdir(parents=True)
     names = ("camA", "camB", "camC")
@@ -180,17 +195,21 @@ def anipose(path: Path, distortions: tuple[float, ...] = (0, 0, 0, 0, 0), clips:
             "rotation": Rotation.from_matrix(camera.viewmat[:3, :3]).as_rotvec().tolist(),
             "translation": camera.viewmat[:3, 3].tolist(),
         }
-        tables.append("\n".join([f"[cam_{i}]", *(f"{key} = {value}" for key, value in entries.items())]))
+        tables.append(
+            "\n".join([f"[cam_{i}]", *(f"{key} = {value}" for key, value in entries.items())])
+        )
     text = "\n\n".join([*tables, "[metadata]\nadjusted = false\nerror = 0.2\n"])
     (path / "calibration.toml").write_text(text)
     clips(path, tuple(f"trial_1-{name}" for name in names))
     return path
 
 
-QUALISYS = """  <camera active="1" calibrated="true" serial="{serial}" model="Miqus Video" viewrotation="0">
+QUALISYS = """  <camera active="1" calibrated="true" serial="{serial}"
+    model="Miqus Video" viewrotation="0">
     <fov_video left="10" top="20" right="{right}" bottom="{bottom}"/>
     <transform x="{x}" y="{y}" z="{z}" {axes}/>
-    <intrinsic focallength="9.27" sensorMinU="0.0" sensorMaxU="122879.0" sensorMinV="0.0" sensorMaxV="69631.0"
+    <intrinsic focallength="9.27"
+      sensorMinU="0.0" sensorMaxU="122879.0" sensorMinV="0.0" sensorMaxV="69631.0"
       focalLengthU="{fu}" focalLengthV="{fv}" centerPointU="{cu}" centerPointV="{cv}" skew="0.0"
       radialDistortion1="{k1}" radialDistortion2="{k2}" radialDistortion3="0.0"
       tangentalDistortion1="{p1}" tangentalDistortion2="{p2}"/>
@@ -199,7 +218,9 @@ QUALISYS = """  <camera active="1" calibrated="true" serial="{serial}" model="Mi
 
 
 def qualisys(path: Path, distortions: tuple[float, ...] = (0, 0, 0, 0)) -> Path:
-    """Write a calibration of Qualisys with a marker camera that has no clip, beside clips named after the others."""
+    """Write a calibration of Qualisys with a marker camera that has no clip, beside clips named
+    after the others.
+    """
     path.mkdir(parents=True)
     names = ("26580", "28984", "29005", "31111")
     elements = []
@@ -207,10 +228,19 @@ def qualisys(path: Path, distortions: tuple[float, ...] = (0, 0, 0, 0)) -> Path:
         right, down, forward = camera.viewmat[:3, :3]
         axes = np.stack([right, -down, -forward])
         values = dict(zip("xyz", 1000 * camera.position, strict=True))
-        values["axes"] = " ".join(f'r{i + 1}{j + 1}="{axes[i, j]}"' for i in range(3) for j in range(3))
+        values["axes"] = " ".join(
+            f'r{i + 1}{j + 1}="{axes[i, j]}"' for i in range(3) for j in range(3)
+        )
         # The image begins at column 10 and row 20 of the sensor.
         (fu, _, cu), (_, fv, cv) = 64 * (camera.K[:2] + np.array([[0, 0, 10], [0, 0, 20]]))
-        values |= {"fu": fu, "fv": fv, "cu": cu, "cv": cv, "right": 9 + WIDTH, "bottom": 19 + HEIGHT}
+        values |= {
+            "fu": fu,
+            "fv": fv,
+            "cu": cu,
+            "cv": cv,
+            "right": 9 + WIDTH,
+            "bottom": 19 + HEIGHT,
+        }
         values |= dict(zip(("k1", "k2", "p1", "p2"), distortions, strict=True))
         elements.append(QUALISYS.format(serial=camera.name, **values))
     text = f"<calibration>\n <cameras>\n{''.join(elements)} </cameras>\n</calibration>\n"
@@ -219,8 +249,11 @@ def qualisys(path: Path, distortions: tuple[float, ...] = (0, 0, 0, 0)) -> Path:
     return path
 
 
-def dot_clips(path: Path, names: tuple[str, ...], point: np.ndarray, lens: tuple[float, ...]) -> None:
-    """Write clips of a bright dot at `point`, recorded through OpenCV's lens by the rig with principal points off by 3.
+def dot_clips(
+    path: Path, names: tuple[str, ...], point: np.ndarray, lens: tuple[float, ...]
+) -> None:
+    """Write clips of a bright dot at `point`, recorded through OpenCV's lens by the rig with
+    principal points off by 3.
 
     The cameras of the clips are sorted by `names`.
     """

@@ -1,4 +1,6 @@
-"""Splats that move, are born and die, seen by three cameras with z up, and their stream with learned offsets."""
+"""Splats that move, are born and die, seen by three cameras with z up, and their stream with
+learned offsets.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,13 @@ import numpy as np
 
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import StreamWriter
-from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, reemitted_keyframe, residual_packet
+from morgs_mi.codec.packets import (
+    CodedFrame,
+    decode,
+    keyframe_packet,
+    reemitted_keyframe,
+    residual_packet,
+)
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from tests.scenes.cameras import look_at_cameras
@@ -47,7 +55,8 @@ def write_stream(
     metadata: dict | None = None,
     keyframe_interval: int = 0,
 ) -> list[CodedFrame]:
-    """Write a stream with offsets and return its decoded frames; 0: only the first frame has a keyframe.
+    """Write a stream with offsets and return its decoded frames; 0: only the first frame has a
+    keyframe.
 
     The first half of the splats moves from frame 1. In frame 2 one dies and two are born.
     """
@@ -63,10 +72,15 @@ def write_stream(
             gaussians = states[-1].gaussians
             source = np.arange(len(states[-1]))
             moves = np.asarray(gaussians.logit_confidence) > 0
-            target = replace(gaussians, means=gaussians.numpy()["means"] + 0.1 * moves[:, None] * np.float32([1, 0, 0]))
+            target = replace(
+                gaussians,
+                means=gaussians.numpy()["means"] + 0.1 * moves[:, None] * np.float32([1, 0, 0]),
+            )
             if t == 1:
                 born = splats(2, gaussians.sh_degree, seed=9)
-                target = Gaussians.concatenate([replace(target.select(source[1:]), motion=None, offset=None), born])
+                target = Gaussians.concatenate(
+                    [replace(target.select(source[1:]), motion=None, offset=None), born]
+                )
                 source = np.concatenate([source[1:], [-1, -1]])
             target = replace(target, offset=np.tile(np.float32(OFFSET), (len(target), 1)))
             packet = residual_packet(states[-1], target, source, cameras, CodecConfig(offset=True))

@@ -11,7 +11,13 @@ import numpy as np
 
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import Packet, StreamWriter
-from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, reemitted_keyframe, residual_packet
+from morgs_mi.codec.packets import (
+    CodedFrame,
+    decode,
+    keyframe_packet,
+    reemitted_keyframe,
+    residual_packet,
+)
 from morgs_mi.core.gaussians import Gaussians
 from tests.scenes.cameras import look_at_cameras
 
@@ -33,16 +39,23 @@ def cloud(N: int = 60, degree: int = 1, confidence: bool = True, seed: int = 0) 
 
 def jittered(gaussians: Gaussians, rng: np.random.Generator, share: float = 0.4) -> Gaussians:
     """Return the Gaussians with a share of them changed in all attributes."""
-    raw = {name: value for name, value in gaussians.numpy().items() if name not in ("motion", "offset")}
+    raw = {
+        name: value for name, value in gaussians.numpy().items() if name not in ("motion", "offset")
+    }
     active = rng.random(len(gaussians)) < share
-    change = {n: 0.05 * rng.normal(size=v.shape) * active.reshape(-1, *[1] * (v.ndim - 1)) for n, v in raw.items()}
+    change = {
+        n: 0.05 * rng.normal(size=v.shape) * active.reshape(-1, *[1] * (v.ndim - 1))
+        for n, v in raw.items()
+    }
     return Gaussians(**{name: value + change[name] for name, value in raw.items()})
 
 
 def encoded_clip(
     frames: int, config: CodecConfig | None = None, degree: int = 1
 ) -> tuple[list[Packet], list[CodedFrame]]:
-    """Return the packets and states of a cloud in which Gaussians move, die and are born in every frame."""
+    """Return the packets and states of a cloud in which Gaussians move, die and are born in every
+    frame.
+    """
     rng = np.random.default_rng(0)
     packets = [keyframe_packet(cloud(degree=degree), 0, CAMERAS, config)]
     states = [decode(None, packets[0])]
@@ -51,9 +64,15 @@ def encoded_clip(
         alive = np.flatnonzero(rng.random(len(state)) > 0.03)
         births = int(rng.integers(0, 5))
         survivors = jittered(state.gaussians, rng).select(alive)
-        target = Gaussians.concatenate([survivors, cloud(births, degree, seed=frame)]) if births else survivors
+        target = (
+            Gaussians.concatenate([survivors, cloud(births, degree, seed=frame)])
+            if births
+            else survivors
+        )
         if config is not None and config.offset:
-            target = replace(target, offset=np.random.default_rng(frame).normal(0, 0.02, (len(target), 3)))
+            target = replace(
+                target, offset=np.random.default_rng(frame).normal(0, 0.02, (len(target), 3))
+            )
         source = np.concatenate([alive, np.full(births, -1)])
         packets.append(residual_packet(state, target, source, CAMERAS, config))
         states.append(decode(state, packets[-1]))

@@ -1,4 +1,6 @@
-"""Scenes and views at the extremes of float32, each with its tolerances, and random mixtures of them."""
+"""Scenes and views at the extremes of float32, each with its tolerances, and random mixtures of
+them.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ class Case:
     camera: Camera
     image: float = tol.IMAGE_ABS
     gradient: float = tol.GRADIENT_REL
-    every_entry: bool = True  # if False, only each attribute's gradient along the direction of its signs
+    # If False, only each attribute's gradient along the direction of its signs.
+    every_entry: bool = True
 
 
 def cloud(n: int = 6, seed: int = 5) -> Values:
@@ -49,7 +52,9 @@ def eye(
     near: float = 0.01,
     viewmat: Any = None,
 ) -> Camera:
-    """Return a camera that sees the origin, of a size that no block divides, with fx != fy and off-centre cx, cy."""
+    """Return a camera that sees the origin, of a size that no block divides, with fx != fy and
+    off-centre cx, cy.
+    """
     camera = Camera.look_at(origin, np.zeros(3), up, fov, width, height)
     K = camera.K + np.array([[0, 0, shift[0]], [0, 0.08 * camera.K[0, 0], shift[1]], [0, 0, 0]])
     viewmat = camera.viewmat if viewmat is None else viewmat
@@ -57,18 +62,28 @@ def eye(
 
 
 def case(
-    name: str, camera: Camera | None = None, n: int = 6, bounds: dict[str, Any] | None = None, **change: Any
+    name: str,
+    camera: Camera | None = None,
+    n: int = 6,
+    bounds: dict[str, Any] | None = None,
+    **change: Any,
 ) -> Case:
     """Return the case of the cloud with some attributes replaced, or changed by a function."""
     values = cloud(n)
     for key, new in change.items():
-        values[key] = new(values[key]) if callable(new) else np.broadcast_to(np.asarray(new, float), values[key].shape)
+        values[key] = (
+            new(values[key])
+            if callable(new)
+            else np.broadcast_to(np.asarray(new, float), values[key].shape)
+        )
     values = {key: np.float32(value).astype(np.float64) for key, value in values.items()}
     return Case(name, values, camera or eye(), **(bounds or {}))
 
 
 def screen_bound(pixels: float) -> dict[str, float]:
-    """Return the bounds where screen coordinates are as large as `pixels`, given the spacing of float32 there."""
+    """Return the bounds where screen coordinates are as large as `pixels`, given the spacing of
+    float32 there.
+    """
     return {
         "image": tol.IMAGE_ABS + tol.ALPHA_PER_PIXEL * 2**-24 * pixels,
         "gradient": tol.GRADIENT_REL + tol.ALPHA_SLOPE_PER_PIXEL * 2**-24 * pixels,
@@ -85,8 +100,22 @@ def moved(*by: float) -> Callable:
 
 NEAR = float(np.float32(0.01))
 BELOW, ABOVE = (float(np.nextafter(np.float32(NEAR), np.float32(x))) for x in (0, 1))
-AT_NEAR_PLANE = [[1e-3, 0, NEAR], [1e-3, -1e-3, BELOW], [-1e-3, 1e-3, ABOVE], [0, 0, 0], [0, 0, -3], [1, 1, 0.02]]
-GRAZING = [[5, 0, 0.011], [0, 5, 0.02], [1e3, 1e3, 0.01], [1e-3, 0, 0.5], [1e17, 0, 1], [1, 1, 1e17]]
+AT_NEAR_PLANE = [
+    [1e-3, 0, NEAR],
+    [1e-3, -1e-3, BELOW],
+    [-1e-3, 1e-3, ABOVE],
+    [0, 0, 0],
+    [0, 0, -3],
+    [1, 1, 0.02],
+]
+GRAZING = [
+    [5, 0, 0.011],
+    [0, 5, 0.02],
+    [1e3, 1e3, 0.01],
+    [1e-3, 0, 0.5],
+    [1e17, 0, 1],
+    [1, 1, 1e17],
+]
 GRAZING_SCALES = [[0.2, 0.1, 0.3]] * 4 + [[1e16, 2e16, 1e16], [1e16, 1e17, 1e17]]
 ORIGIN = eye(viewmat=np.eye(4))
 FAR = np.array([1e5, -1e5, 1e5])
@@ -94,9 +123,10 @@ LIFT = np.eye(4)
 LIFT[:3, 3] = -FAR
 BLOCKS = np.stack(np.meshgrid(np.arange(8) * 8 + 4.0, np.arange(8) * 4 + 2.0), -1).reshape(-1, 2)
 SLOW_REFERENCE = {"every_entry": False}
-# Errors reached on a 2-core x86, 80-bit reference: image at most 6e-6, gradients at most 2e-5 (4e-5 for needles across
-# the screen), unless a comment states more. Limits: an aspect beyond 1e6 is drawn at 1e6, because a float32 rotation is
-# no more precise; beyond 1e18 units nothing is drawn; depths that a float32 cannot distinguish are equal.
+# Errors reached on a 2-core x86, 80-bit reference: image at most 6e-6, gradients at most 2e-5 (4e-5
+# for needles across the screen), unless a comment states more. Limits: an aspect beyond 1e6 is
+# drawn at 1e6, because a float32 rotation is no more precise; beyond 1e18 units nothing is drawn;
+# depths that a float32 cannot distinguish are equal.
 CASES = [
     case("plain"),
     case("one Gaussian", n=1),
@@ -104,7 +134,12 @@ CASES = [
     case("needles", scales=(1, 1e-4, 1e-4)),
     case("needles across the screen", scales=(100, 1e-2, 1e-2)),
     case("needles of 250,000 px", scales=(1e4, 1, 1)),
-    case("needles along the axis", scales=(1e-4, 1e-4, 1), means=lambda m: m * 0.05, quats=(1, 0.0656, 0.0495, 0)),
+    case(
+        "needles along the axis",
+        scales=(1e-4, 1e-4, 1),
+        means=lambda m: m * 0.05,
+        quats=(1, 0.0656, 0.0495, 0),
+    ),
     case("discs", scales=(1, 1, 1e-4)),
     case("discs across the screen", scales=(100, 100, 1e-2)),
     case("sub-pixel splats", scales=(1e-6, 2e-6, 3e-6)),
@@ -120,7 +155,8 @@ CASES = [
     case("all behind", ORIGIN, means=moved(0, 0, -5)),
     case("1e-3 units", eye(origin=(3e-4, -4e-4, -3e-3), near=1e-5), **scaled(1e-3)),
     case("1e6 units", eye(origin=(3e5, -4e5, -3e6), near=1e4), **scaled(1e6)),
-    # Means there are multiples of 2^-7; no further precision is lost, because poses are summed in double.
+    # Means there are multiples of 2^-7; no further precision is lost, because poses are summed in
+    # double.
     case("offset by 1e5", eye(viewmat=eye().viewmat @ LIFT), means=moved(*FAR)),
     case("opacities 0, 1 and near", opacities=[0, 1, 1e-7, 1 - 2**-23, 0.99, 0.004]),
     case("opacities 1", opacities=1),
@@ -131,7 +167,10 @@ CASES = [
     case("quaternions 1e33", quats=lambda q: q * 1e33),
     # Their gradients of 1e-38 underflow float32 to zero.
     case("quaternions 1e38", quats=lambda q: np.clip(q, -3, 3) * 1e38, bounds={"gradient": 1.0}),
-    case("colours 1e6 and 1e-6", sh_coeffs=lambda c: c * np.array([1e6, 1, 1e-6, 1, -1e6, 1])[:, None, None]),
+    case(
+        "colours 1e6 and 1e-6",
+        sh_coeffs=lambda c: c * np.array([1e6, 1, 1e-6, 1, -1e6, 1])[:, None, None],
+    ),
     case("colours 1e15", sh_coeffs=lambda c: c * 1e15),
     case("image 1x1", eye(1, 1)),
     case("image 33x1", eye(33, 1)),
@@ -148,8 +187,13 @@ CASES = [
     ),
     case("camera rolled", eye(up=(0.6, -0.3, 0.1))),
     case("camera upside down", eye(up=(0, 1, 0))),
-    case("principal point outside", eye(viewmat=np.eye(4), shift=(-200, 150)), means=moved(23.7, -16.4, 3)),
-    # Reached: image 1.4e-4, gradients 3e-4. fx x / z + cx cancels; double precision there is not worth its cost.
+    case(
+        "principal point outside",
+        eye(viewmat=np.eye(4), shift=(-200, 150)),
+        means=moved(23.7, -16.4, 3),
+    ),
+    # Reached: image 1.4e-4, gradients 3e-4. fx x / z + cx cancels; double precision there is not
+    # worth its cost.
     case(
         "principal point far outside",
         eye(viewmat=np.eye(4), shift=(-2e4, 1e4)),
@@ -191,7 +235,9 @@ def random_case(seed: int) -> Case:
     values = {name: np.float32(value).astype(np.float64) for name, value in values.items()}
 
     # A float32 can neither order closer ones nor decide on which side of the near plane they lie.
-    depths, keep = np.unique(np.float32(values["means"] @ viewmat[2, :3] + viewmat[2, 3]), return_index=True)
+    depths, keep = np.unique(
+        np.float32(values["means"] @ viewmat[2, :3] + viewmat[2, 3]), return_index=True
+    )
     values = {name: value[keep] for name, value in values.items()}
     between = rng.choice((depths + np.append(depths[1:], 2 * depths[-1])) / 2)
     near = max(0.01 * unit, rng.choice([0, 0, between]))

@@ -1,4 +1,6 @@
-"""A recording of two textured planes that move in front of others, by cameras with clocks that may be apart."""
+"""A recording of two textured planes that move in front of others, by cameras with clocks that may
+be apart.
+"""
 
 from __future__ import annotations
 

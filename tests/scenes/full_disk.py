@@ -9,7 +9,9 @@ from contextlib import contextmanager
 
 @contextmanager
 def files_end_at(size: int) -> Iterator[None]:
-    """Let writes beyond `size` bytes of a file fail while the body runs; Python ignores the signal of the limit."""
+    """Let writes beyond `size` bytes of a file fail while the body runs; Python ignores the signal
+    of the limit.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:

@@ -18,7 +18,13 @@ RAW = ("means", "log_scales", "quats", "logit_opacities", "sh_coeffs", "motion",
 
 # Rows that a test adds to the table of attributes: one with an activation, one of three floats.
 NEW_ATTRIBUTES = (
-    Attribute("logit_roughness", (), "roughness", BY_NAME["logit_confidence"].activation, channel="roughness"),
+    Attribute(
+        "logit_roughness",
+        (),
+        "roughness",
+        BY_NAME["logit_confidence"].activation,
+        channel="roughness",
+    ),
     Attribute("normals", (3,), "normals", channel="normal"),
 )
 
@@ -45,7 +51,8 @@ def make_scene(
     scales: tuple[float, float] = (0.1, 0.4),
     logits: tuple[float, float] = (-1.5, 1.5),
 ) -> Values:
-    """Return raw attributes of a random cloud; the default one overlaps and stays clear of cap and stop.
+    """Return raw attributes of a random cloud; the default one overlaps and stays clear of cap and
+    stop.
 
     Args:
         degree: of the spherical harmonics.
@@ -110,7 +117,9 @@ def isotropic(means: Any, scale: Any, opacity: Any, sh_coeffs: Any = 0.0, **more
     n = len(means)
     scales = np.broadcast_to(np.reshape(scale, (-1, 1)), (n, 3))
     quats = np.tile([1.0, 0, 0, 0], (n, 1))
-    return Gaussians.from_activated(means, scales, quats, np.full(n, opacity), np.zeros((n, 1, 3)) + sh_coeffs, **more)
+    return Gaussians.from_activated(
+        means, scales, quats, np.full(n, opacity), np.zeros((n, 1, 3)) + sh_coeffs, **more
+    )
 
 
 def random_sheet(rng: np.random.Generator, n: int, extent: float, z: float) -> np.ndarray:

@@ -1,4 +1,6 @@
-"""A clip of `filmed` that is played in a loop at its own speed: into a folder, or as a video through a pipe."""
+"""A clip of `filmed` that is played in a loop at its own speed: into a folder, or as a video
+through a pipe.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +66,8 @@ def filling(folder: Path):
                 file = folder / name / f"{t:04d}.png"
                 file.parent.mkdir(parents=True, exist_ok=True)
                 data = png_bytes(clip[t % len(clip)])
-                with file.open("wb") as opened:  # in two parts, as a program that is slow to write it
+                # In two parts, as a program that is slow to write it.
+                with file.open("wb") as opened:
                     opened.write(data[:5000])
                     opened.flush()
                     time.sleep(0.001)
@@ -76,7 +79,9 @@ def filling(folder: Path):
 
 
 def piping(pipe: Path, data: bytes, seconds: float):
-    """Return work that writes the bytes of a video into a pipe at the speed at which it was recorded."""
+    """Return work that writes the bytes of a video into a pipe at the speed at which it was
+    recorded.
+    """
 
     def write(stopped: Event) -> None:
         start = time.monotonic()

@@ -31,7 +31,9 @@ PIXELS = CAMERAS[0].K[0, 0] * STEP / DISTANCE
 
 
 def moved(frame: float, logit: float | None = 0.0) -> Gaussians:
-    """Return five splats in the plane z = 0 after `frame` steps along x, with a confidence unless `logit` is None."""
+    """Return five splats in the plane z = 0 after `frame` steps along x, with a confidence unless
+    `logit` is None.
+    """
     rng = np.random.default_rng(0)
     means = np.float32(rng.uniform(-1, 1, (5, 3)) * (1, 1, 0) + (frame * STEP, 0, 0))
     sh = np.float32(rng.uniform(-1, 1.5, (5, 1, 3)))
@@ -40,7 +42,11 @@ def moved(frame: float, logit: float | None = 0.0) -> Gaussians:
 
 
 def write_stream(
-    path: Path, metadata: dict, logit: float | None = 0.0, shift: float = 0, offset: float | None = None
+    path: Path,
+    metadata: dict,
+    logit: float | None = 0.0,
+    shift: float = 0,
+    offset: float | None = None,
 ) -> list[Packet]:
     """Write the stream of the splats, shifted by `shift` steps, and return its packets.
 
@@ -52,7 +58,9 @@ def write_stream(
     for frame in range(1, FRAMES):
         gaussians = moved(frame + shift, logit)
         config = replace(EXACT, offset=offset is not None)
-        gaussians = replace(gaussians, offset=np.tile((STEP * (offset or 0), 0, 0), (len(gaussians), 1)))
+        gaussians = replace(
+            gaussians, offset=np.tile((STEP * (offset or 0), 0, 0), (len(gaussians), 1))
+        )
         packets.append(residual_packet(state, gaussians, None, CAMERAS, config))
         state = decode(state, packets[-1])
     with StreamWriter(path, CAMERAS, 25, metadata) as writer:

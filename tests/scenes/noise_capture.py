@@ -1,4 +1,6 @@
-"""A capture of moving noise from three cameras, for tests of the command line, and what can be wrong with its clips."""
+"""A capture of moving noise from three cameras, for tests of the command line, and what can be
+wrong with its clips.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,8 @@ def rig() -> list[Camera]:
 
 def clip(count: int = FRAMES) -> list[np.ndarray]:
     return [
-        np.roll(np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8), t, 1) for t in range(count)
+        np.roll(np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), np.uint8), t, 1)
+        for t in range(count)
     ]
 
 

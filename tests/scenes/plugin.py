@@ -12,8 +12,12 @@ from tests.scenes.cameras import make_sensor_camera
 AOVS = "motion,confidence,depth"
 
 
-def make_mitsuba_scene(gaussians: Any, film: dict | None = None, sensor: dict | None = None, **props: Any) -> Any:
-    """Return a Mitsuba scene of one shape, `make_sensor_camera` and the integrator `gaussian_splat` with `props`."""
+def make_mitsuba_scene(
+    gaussians: Any, film: dict | None = None, sensor: dict | None = None, **props: Any
+) -> Any:
+    """Return a Mitsuba scene of one shape, `make_sensor_camera` and the integrator `gaussian_splat`
+    with `props`.
+    """
     return mi.load_dict(
         {
             "type": "scene",

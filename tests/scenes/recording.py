@@ -1,7 +1,7 @@
 """A recording of three tiny views, and a process that fits it until it is killed.
 
-`python -m tests.scenes.recording OUT` prints "ready" when it begins; with a further number it kills itself within the
-write that brings the bytes written to that many.
+`python -m tests.scenes.recording OUT` prints "ready" when it begins; with a further number it kills
+itself within the write that brings the bytes written to that many.
 """
 
 from __future__ import annotations
@@ -39,7 +39,10 @@ class Recording(Capture):
 
     def partial_frames(self, start=0, stop=None):
         rng = np.random.default_rng(0)
-        walls = [np.repeat(np.repeat(rng.integers(90, 110, (6, 8, 3), np.uint8), 4, 0), 4, 1) for _ in self.cameras]
+        walls = [
+            np.repeat(np.repeat(rng.integers(90, 110, (6, 8, 3), np.uint8), 4, 0), 4, 1)
+            for _ in self.cameras
+        ]
         for t in range(start, self.num_frames if stop is None else stop):
             images = np.stack(walls)
             images[:, 8:16, 2 * t % 24 : 2 * t % 24 + 8] = (255, 200, 40)

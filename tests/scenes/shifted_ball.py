@@ -27,7 +27,9 @@ def shifted_ball() -> Gaussians:
     return replace(ball, means=np.asarray(ball.means) + SHIFT)
 
 
-def fit_shifted(motion: MotionConfig, start: MotionStart | None = None, config: FitConfig = FIT) -> LaterFrame:
+def fit_shifted(
+    motion: MotionConfig, start: MotionStart | None = None, config: FitConfig = FIT
+) -> LaterFrame:
     """Fit the ball to images of its shifted self, with the same bytes on every run."""
     ball = opaque_ball()
     active = full_active_set(ball, dict(enumerate(views())), RenderConfig(reproducible=True))

@@ -1,4 +1,6 @@
-"""A short stream of a few Gaussians that are born and die, with the places of its packets, for damage and forgery."""
+"""A short stream of a few Gaussians that are born and die, with the places of its packets, for
+damage and forgery.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,13 @@ import numpy as np
 
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import PAYLOAD, StreamWriter
-from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, reemitted_keyframe, residual_packet
+from morgs_mi.codec.packets import (
+    CodedFrame,
+    decode,
+    keyframe_packet,
+    reemitted_keyframe,
+    residual_packet,
+)
 from morgs_mi.core.gaussians import Gaussians
 from tests.scenes.coded_clip import CAMERAS, cloud, jittered
 
@@ -45,7 +53,9 @@ class Clip(NamedTuple):
 
 
 def short_clip() -> Clip:
-    """Return a stream in which every frame has a birth and a death, with a keyframe after every third frame."""
+    """Return a stream in which every frame has a birth and a death, with a keyframe after every
+    third frame.
+    """
     file = io.BytesIO()
     rng = np.random.default_rng(0)
     config = CodecConfig(quality=0.3, offset=True)
@@ -56,7 +66,9 @@ def short_clip() -> Clip:
         for frame in range(1, FRAMES):
             old_state = states[-1]
             alive = np.arange(1, len(old_state))
-            target = Gaussians.concatenate([jittered(old_state.gaussians, rng).select(alive), cloud(1, 0, seed=frame)])
+            target = Gaussians.concatenate(
+                [jittered(old_state.gaussians, rng).select(alive), cloud(1, 0, seed=frame)]
+            )
             target = replace(target, offset=rng.normal(0, 0.05, (len(target), 3)))
             packet = residual_packet(old_state, target, np.r_[alive, -1], CAMERAS, config)
             states.append(decode(old_state, packet))

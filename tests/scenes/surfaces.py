@@ -31,7 +31,11 @@ def cloud(z: float = 0.0, n: int = 40, seed: int = 3, opacity: float = 0.7) -> G
 def wall(z: float, size: float = 5.0, **entries: Any) -> dict[str, Any]:
     """Return a square of half width `size` at depth z that faces the camera."""
     transform = mi.ScalarTransform4f().translate([0, 0, z]).rotate([0, 1, 0], 180).scale(size)
-    return {"type": "rectangle", "to_world": transform, **(entries or {"bsdf": {"type": "diffuse"}})}
+    return {
+        "type": "rectangle",
+        "to_world": transform,
+        **(entries or {"bsdf": {"type": "diffuse"}}),
+    }
 
 
 def glowing(color: Any = COLOR) -> dict[str, Any]:
@@ -40,7 +44,11 @@ def glowing(color: Any = COLOR) -> dict[str, Any]:
     return {"bsdf": {"type": "diffuse", "reflectance": 0.0}, "emitter": emitter}
 
 
-LAMP = {"type": "point", "position": [1.0, -2.0, -3.0], "intensity": {"type": "rgb", "value": [20.0, 18.0, 16.0]}}
+LAMP = {
+    "type": "point",
+    "position": [1.0, -2.0, -3.0],
+    "intensity": {"type": "rgb", "value": [20.0, 18.0, 16.0]},
+}
 
 
 def scene(
@@ -50,7 +58,9 @@ def scene(
     view: Camera | None = None,
     **more: Any,
 ) -> Any:
-    """Return the scene of Gaussians and `more`, with the plugin's nested integrator `surfaces`, and its `props`."""
+    """Return the scene of Gaussians and `more`, with the plugin's nested integrator `surfaces`, and
+    its `props`.
+    """
     props = more.pop("props", {})
     nested = {"type": surfaces, "max_depth": 2} if isinstance(surfaces, str) else surfaces
     return mi.load_dict(
@@ -69,8 +79,11 @@ def render(scene: Any, spp: int = 4, **more: Any) -> np.ndarray:
     return np.asarray(mi.render(scene, spp=spp, **more), np.float64)
 
 
-def slopes_of(scene: Any, name: str, step: float, loss: Callable[[Any], Any], spp: int) -> tuple[float, float]:
-    """Return the slope of a loss of the image along a parameter, by its gradient and by central differences.
+def slopes_of(
+    scene: Any, name: str, step: float, loss: Callable[[Any], Any], spp: int
+) -> tuple[float, float]:
+    """Return the slope of a loss of the image along a parameter, by its gradient and by central
+    differences.
 
     The direction is that in which every entry raises the loss, by a random length.
     """
@@ -91,8 +104,12 @@ def slopes_of(scene: Any, name: str, step: float, loss: Callable[[Any], Any], sp
     return float(np.vdot(gradient, direction)), (losses[0] - losses[1]) / (2 * step)
 
 
-def slopes_of_both_modes(scene: Any, names: Iterable[str], weights: Any, spp: int = 64) -> tuple[float, float]:
-    """Return the slope of the weighted sum of the image along all parameters, in reverse and in forward mode."""
+def slopes_of_both_modes(
+    scene: Any, names: Iterable[str], weights: Any, spp: int = 64
+) -> tuple[float, float]:
+    """Return the slope of the weighted sum of the image along all parameters, in reverse and in
+    forward mode.
+    """
     params = mi.traverse(scene)
     slopes = []
     for forward in (False, True):

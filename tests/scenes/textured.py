@@ -26,7 +26,9 @@ _PLANES = (
 
 
 def rig(count: int = 6, width: int = 320, height: int = 240, shift: float = 0.0) -> list[Camera]:
-    """Return cameras on an arc in front of the planes, with principal points `shift` px off the centre."""
+    """Return cameras on an arc in front of the planes, with principal points `shift` px off the
+    centre.
+    """
     cameras = []
     for i, angle in enumerate(np.linspace(-0.35, 0.35, count)):
         place = (4.0 * np.sin(angle), -0.5 + 0.5 * np.cos(5 * i), 4.2 - 4.0 * np.cos(angle))
@@ -47,14 +49,20 @@ def write_capture(path: Path) -> Capture:
 
 def with_cameras(capture: Capture, change: Callable[[int, Camera], Camera]) -> Capture:
     """Return the capture with the cameras that `change` returns for an index and a camera."""
-    return replace(capture, cameras=tuple(change(i, camera) for i, camera in enumerate(capture.cameras)))
+    return replace(
+        capture, cameras=tuple(change(i, camera) for i, camera in enumerate(capture.cameras))
+    )
 
 
 def turned(camera: Camera, degrees: float) -> Camera:
     """Return the camera rotated about its optical axis."""
     c = np.cos(np.deg2rad(degrees))
     s = np.sin(np.deg2rad(degrees))
-    return replace(camera, viewmat=np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ camera.viewmat)
+    return replace(
+        camera,
+        viewmat=np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+        @ camera.viewmat,
+    )
 
 
 def textures() -> list[np.ndarray]:
@@ -63,7 +71,9 @@ def textures() -> list[np.ndarray]:
     images = []
     for _ in _PLANES:
         octaves = [rng.uniform(0, 1, (n, n, 3)) for n in (16, 32, 64, 128)]
-        sum_ = sum(cv2.resize(o, (_TEXTURE, _TEXTURE), interpolation=cv2.INTER_CUBIC) for o in octaves)
+        sum_ = sum(
+            cv2.resize(o, (_TEXTURE, _TEXTURE), interpolation=cv2.INTER_CUBIC) for o in octaves
+        )
         images.append((255 * np.clip(sum_ / 3 - 0.1, 0, 1)).astype(np.uint8))
     return images
 
@@ -74,13 +84,21 @@ def render(
     places: Sequence[tuple] = _PLANES,
     background: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return the image of the planes in a camera, RGB uint8 [H, W, 3], in front of a `background` image."""
-    image = np.zeros((camera.height, camera.width, 3), np.uint8) if background is None else background.copy()
+    """Return the image of the planes in a camera, RGB uint8 [H, W, 3], in front of a `background`
+    image.
+    """
+    image = (
+        np.zeros((camera.height, camera.width, 3), np.uint8)
+        if background is None
+        else background.copy()
+    )
     R = camera.viewmat[:3, :3]
     t = camera.viewmat[:3, 3]
     centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV's pixel centres are integers
     for (corner, across, down), texture in zip(places, planes, strict=True):
-        plane = np.stack([R @ across, R @ down, R @ corner + t], axis=1) @ np.diag([1 / _TEXTURE, 1 / _TEXTURE, 1])
+        plane = np.stack([R @ across, R @ down, R @ corner + t], axis=1) @ np.diag(
+            [1 / _TEXTURE, 1 / _TEXTURE, 1]
+        )
         H = np.linalg.inv(centre) @ camera.K @ plane @ centre
         # Rendered at twice the size and downscaled, against aliasing.
         double = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1.0]])
@@ -90,7 +108,9 @@ def render(
             np.full(texture.shape[:2], 255, np.uint8), double @ H, size, flags=cv2.INTER_NEAREST
         )
         shrink = (camera.width, camera.height)
-        warped, cover = (cv2.resize(x, shrink, interpolation=cv2.INTER_AREA) for x in (warped, cover))
+        warped, cover = (
+            cv2.resize(x, shrink, interpolation=cv2.INTER_AREA) for x in (warped, cover)
+        )
         image[cover > 127] = warped[cover > 127]
     return image
 
@@ -100,12 +120,18 @@ def points(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray
     corners, across, down = (np.array(column) for column in zip(*_PLANES, strict=True))
     rows = rng.integers(0, len(corners), count)
     x, y = rng.uniform(0, 1, (2, count, 1))
-    columns, lines = (np.minimum(_TEXTURE * place[:, 0], _TEXTURE - 1).astype(int) for place in (x, y))
-    return corners[rows] + x * across[rows] + y * down[rows], np.array(textures())[rows, lines, columns] / 255
+    columns, lines = (
+        np.minimum(_TEXTURE * place[:, 0], _TEXTURE - 1).astype(int) for place in (x, y)
+    )
+    return corners[rows] + x * across[rows] + y * down[rows], np.array(textures())[
+        rows, lines, columns
+    ] / 255
 
 
 def distance_to_planes(points: np.ndarray) -> np.ndarray:
-    """Return the distance of each point [n, 3] from the nearest of the planes (taken as infinite), world units."""
+    """Return the distance of each point [n, 3] from the nearest of the planes (taken as infinite),
+    world units.
+    """
     distances = []
     for corner, across, down in _PLANES:
         normal = np.cross(across, down)

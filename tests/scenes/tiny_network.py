@@ -18,32 +18,45 @@ def known_flow(image: np.ndarray, other: np.ndarray) -> np.ndarray:
     return image @ OF_IMAGE.T + other @ OF_OTHER.T
 
 
-def export(path: Path, height: int | str = "h", width: int | str = "w", inputs: int = 2, channels: int = 2) -> Path:
-    """Write a network with RAFT's signature: it takes two images and returns flow at an eighth and at the full size.
+def export(
+    path: Path, height: int | str = "h", width: int | str = "w", inputs: int = 2, channels: int = 2
+) -> Path:
+    """Write a network with RAFT's signature: it takes two images and returns flow at an eighth and
+    at the full size.
 
-    It requires multiples of 8, as RAFT does: the full flow includes the small one enlarged, times 0.
+    It requires multiples of 8, as RAFT does: the full flow includes the small one enlarged, times
+    0.
     """
     names = [f"image{k}" for k in range(1, inputs + 1)]
     weights = dict(zip(names, (OF_IMAGE, OF_OTHER, OF_OTHER), strict=False))
     constants = {f"{name}.weight": w[:channels, :, None, None] for name, w in weights.items()}
-    constants |= {"ones": np.ones((channels, 1, 8, 8), np.float32), "nothing": np.zeros(1, np.float32)}
+    constants |= {
+        "ones": np.ones((channels, 1, 8, 8), np.float32),
+        "nothing": np.zeros(1, np.float32),
+    }
     nodes = [helper.make_node("Conv", [name, f"{name}.weight"], [f"{name}.part"]) for name in names]
     nodes += [
         helper.make_node("Sum", [f"{name}.part" for name in names], ["sum"]),
         helper.make_node("AveragePool", ["sum"], ["flow_low"], kernel_shape=[8, 8], strides=[8, 8]),
-        helper.make_node("ConvTranspose", ["flow_low", "ones"], ["large"], strides=[8, 8], group=channels),
+        helper.make_node(
+            "ConvTranspose", ["flow_low", "ones"], ["large"], strides=[8, 8], group=channels
+        ),
         helper.make_node("Mul", ["large", "nothing"], ["no_flow"]),
         helper.make_node("Add", ["sum", "no_flow"], ["flow_up"]),
     ]
     sizes = (1, 3, height, width), (1, channels, None, None)
     return write(
-        path, nodes, dict.fromkeys(names, sizes[0]), dict.fromkeys(("flow_low", "flow_up"), sizes[1]), constants
+        path,
+        nodes,
+        dict.fromkeys(names, sizes[0]),
+        dict.fromkeys(("flow_low", "flow_up"), sizes[1]),
+        constants,
     )
 
 
 def export_lookup(path: Path, height: int, width: int) -> Path:
-    """Write a network that looks up the second image in the first one's grid turned by 180 degrees, as RAFT looks up
-    correlations: the flow is the difference of red and of green, at half weight.
+    """Write a network that looks up the second image in the first one's grid turned by 180 degrees,
+    as RAFT looks up correlations: the flow is the difference of red and of green, at half weight.
     """
     y = np.linspace(1, -1, height)
     x = np.linspace(1, -1, width)
@@ -55,13 +68,20 @@ def export_lookup(path: Path, height: int, width: int) -> Path:
         helper.make_node("Conv", ["difference", "weights"], ["flow"]),
     ]
     inputs = dict.fromkeys(("image1", "image2"), (1, 3, height, width))
-    return write(path, nodes, inputs, {"flow": [1, 2, height, width]}, {"weights": weights, "grid": grid})
+    return write(
+        path, nodes, inputs, {"flow": [1, 2, height, width]}, {"weights": weights, "grid": grid}
+    )
 
 
-def write(path: Path, nodes: list, inputs: dict, outputs: dict, constants: dict[str, np.ndarray]) -> Path:
+def write(
+    path: Path, nodes: list, inputs: dict, outputs: dict, constants: dict[str, np.ndarray]
+) -> Path:
     """Write nodes as a network; inputs and outputs are float32, their shapes by name."""
     ends = (
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in values.items()]
+        [
+            helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
+            for name, shape in values.items()
+        ]
         for values in (inputs, outputs)
     )
     weights = [numpy_helper.from_array(value, name) for name, value in constants.items()]

@@ -33,7 +33,10 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     steps: list[str] = []
     run_demo(folder, SMALL, lambda step, done, total: steps.append(step))
     fits = [f"Fitting: {stage}" for stage in ("balancing cameras", "first frame", "later frames")]
-    plain = [f"Fitting without ML, MO, MC: {stage}" for stage in ("reading the fitted frames", "later frames")]
+    plain = [
+        f"Fitting without ML, MO, MC: {stage}"
+        for stage in ("reading the fitted frames", "later frames")
+    ]
     assert list(dict.fromkeys(steps))[:6] == ["Path-tracing the clip", *fits, *plain]
     return folder
 
@@ -41,7 +44,9 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_run_demo__report_is_consistent(out: Path) -> None:
     report = json.loads((out / "report.json").read_text())
     assert (report["full"]["num_frames"], report["plain"]["num_frames"]) == (4, 3)
-    assert report["comparison"]["frames"] == [1, 2], "the first frame has no motion, the plain fit no fourth frame"
+    assert report["comparison"]["frames"] == [1, 2], (
+        "the first frame has no motion, the plain fit no fourth frame"
+    )
     rows = report["full"]["frames"][1:3]
     mean = sum(row["motion_error_moving"] for row in rows) / 2
     assert report["comparison"]["full"]["motion_error_moving"] == pytest.approx(mean)
@@ -55,9 +60,14 @@ def test_run_demo__fits_the_first_frame_once(out: Path) -> None:
     assert first.encoded == plain.encoded
     capture = load_capture(out / "capture")
     config = replace(SMALL.stream, render=RenderConfig(reproducible=True))
-    off = replace(config, motion=MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False))
+    off = replace(
+        config, motion=MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
+    )
     images = next(capture.frames(0, 1)).images
-    packets = [StreamLoop.of(capture, c).push([images[v] for v in capture.train_views])[0] for c in (config, off)]
+    packets = [
+        StreamLoop.of(capture, c).push([images[v] for v in capture.train_views])[0]
+        for c in (config, off)
+    ]
     assert packets[0].encoded == packets[1].encoded
 
 
@@ -74,14 +84,20 @@ def test_run_demo__reuses_a_clip_with_the_same_settings(out: Path) -> None:
     marker.write_text("kept")
     _synthesize_clip(out / "capture", SMALL, lambda done, total: None)
     assert marker.exists()
-    _synthesize_clip(out / "capture", replace(SMALL, clip=replace(SMALL.clip, frames=1)), lambda done, total: None)
+    _synthesize_clip(
+        out / "capture",
+        replace(SMALL, clip=replace(SMALL.clip, frames=1)),
+        lambda done, total: None,
+    )
     assert not marker.exists()
 
 
 def test_run_demo__refuses_a_folder_into_which_another_demo_writes(tmp_path: Path) -> None:
     with (
         locked_folder(tmp_path, "test()"),
-        pytest.raises(BlockingIOError, match="expected a folder into which nothing else is written"),
+        pytest.raises(
+            BlockingIOError, match="expected a folder into which nothing else is written"
+        ),
     ):
         run_demo(tmp_path, SMALL)
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,6 @@
-"""Import: Gaussians with and without identities, the default camera, and messages for frames that do not fit."""
+"""Import: Gaussians with and without identities, the default camera, and messages for frames that
+do not fit.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,12 @@ def moving(frame: int, seed: int = 0) -> Gaussians:
     moves = (np.arange(N) < N // 2)[:, None]
     raw = start.numpy()
     means = raw["means"] + 0.1 * frame * moves * np.float32([1, 0, 0])
-    return replace(start, means=means, log_scales=raw["log_scales"] + 0.02 * frame * moves, logit_confidence=None)
+    return replace(
+        start,
+        means=means,
+        log_scales=raw["log_scales"] + 0.02 * frame * moves,
+        logit_confidence=None,
+    )
 
 
 def shuffled(gaussians: Gaussians, seed: int = 1) -> Gaussians:
@@ -51,20 +58,34 @@ def clip(tmp_path: Path) -> Path:
 
 def test_import_frames__keeps_the_ids_of_the_same_gaussians(clip, tmp_path):
     result = import_frames([clip], tmp_path / "out", 25, CodecConfig(keyframe_interval=2))
-    assert (result.path, result.num_frames, result.num_keyframes) == (tmp_path / "out" / "stream.morgs", T, 1)
+    assert (result.path, result.num_frames, result.num_keyframes) == (
+        tmp_path / "out" / "stream.morgs",
+        T,
+        1,
+    )
     stream = StreamReader(result.path)
     assert (stream.fps, stream.metadata["num_frames"]) == (25, T)
     kinds = [(kind, frame) for kind, frame, _ in stream.index()]
     key = PacketKind.KEYFRAME
     change = PacketKind.RESIDUAL
-    assert kinds == [(key, 0), (change, 1), (change, 2), (key, 2), (change, 3), (change, 4), (key, 4)]
+    assert kinds == [
+        (key, 0),
+        (change, 1),
+        (change, 2),
+        (key, 2),
+        (change, 3),
+        (change, 4),
+        (key, 4),
+    ]
     pixel = 5 / stream.cameras[0].K[0, 0]  # at the distance of the camera
     for coded in coded_frames(stream):
         np.testing.assert_array_equal(coded.ids, np.arange(N))
         raw = coded.gaussians.numpy()
         expected = moving(coded.frame).numpy()
         assert_close(raw["means"], expected["means"], atol=0.2 * pixel)
-        errors = np.abs(raw["motion"] - 0.1 * (coded.frame > 0) * (np.arange(N) < N // 2)[:, None] * [1, 0, 0])
+        errors = np.abs(
+            raw["motion"] - 0.1 * (coded.frame > 0) * (np.arange(N) < N // 2)[:, None] * [1, 0, 0]
+        )
         assert errors.max() < 0.4 * pixel
     np.testing.assert_array_equal(stream.seek(3).gaussians.means, coded_frame(stream, 3).means)
 
@@ -122,7 +143,17 @@ def test_import_frames__keeps_ids_where_gaussians_are_added_and_removed(tmp_path
         (np.r_[100:200], None),
         (np.r_[0:0], None),
     ],
-    ids=["same", "grows", "loses one", "loses and grows", "grows inside", "loses many", "shuffled", "others", "none"],
+    ids=[
+        "same",
+        "grows",
+        "loses one",
+        "loses and grows",
+        "grows inside",
+        "loses many",
+        "shuffled",
+        "others",
+        "none",
+    ],
 )
 def test_matched_rows__follow_the_order_of_both_frames(rows, expected):
     matches = matched_rows(moving(0).select(np.arange(100)), moving(1).select(rows))
@@ -145,7 +176,15 @@ def test_matched_rows__finds_none_among_equal_gaussians():
         (moving(0).select(np.r_[0:200, 250:300, 200:250]), False),
         (moving(0, seed=7), False),
     ],
-    ids=["still", "moved", "shuffled", "shifted back", "shifted on", "partly shifted", "another scene"],
+    ids=[
+        "still",
+        "moved",
+        "shuffled",
+        "shifted back",
+        "shifted on",
+        "partly shifted",
+        "another scene",
+    ],
 )
 def test_same_gaussians__compares_rows(current, same):
     assert same_gaussians(moving(0), current) is same
@@ -162,7 +201,12 @@ def test_find_frames__orders_by_number(tmp_path):
     names = ["f9.ply", "f10.ply", "f100.ply", "f1.ply"]
     for name in [*names, "notes.txt", "cameras.json", "._f1.ply", ".DS_Store", "Thumbs.db"]:
         (tmp_path / name).touch()
-    assert [path.name for path in find_frames([tmp_path])] == ["f1.ply", "f9.ply", "f10.ply", "f100.ply"]
+    assert [path.name for path in find_frames([tmp_path])] == [
+        "f1.ply",
+        "f9.ply",
+        "f10.ply",
+        "f100.ply",
+    ]
     paths = [tmp_path / name for name in names]
     assert find_frames(paths) == paths
 
@@ -172,10 +216,22 @@ def test_find_frames__orders_by_number(tmp_path):
     [
         ([], ["missing"], "missing: expected frames .* found none; check the path"),
         ([], ["a.ply"], "a.ply: expected frames .* found none; check the path"),
-        (["a.txt"], ["."], "expected files whose names end in .compressed.ply, .ply, .splat, got none"),
-        (["a.ply", "a.splat"], ["."], "expected frames of one format, got a.splat and a.ply; name the files"),
+        (
+            ["a.txt"],
+            ["."],
+            "expected files whose names end in .compressed.ply, .ply, .splat, got none",
+        ),
+        (
+            ["a.ply", "a.splat"],
+            ["."],
+            "expected frames of one format, got a.splat and a.ply; name the files",
+        ),
         (["a.ply", "a.compressed.ply"], ["."], "expected frames of one format"),
-        (["a.ply", "b.obj"], ["a.ply", "b.obj"], "b.obj: expected one folder, or files whose names end in"),
+        (
+            ["a.ply", "b.obj"],
+            ["a.ply", "b.obj"],
+            "b.obj: expected one folder, or files whose names end in",
+        ),
         (["a.ply"], ["a.ply", "."], "expected one folder, or files whose names end in"),
         ([], [], "`sources` must be a folder or at least one file, got none"),
     ],
@@ -212,9 +268,18 @@ def test_import_frames__reads_gaussians_without_extent(tmp_path):
     ("change", "message"),
     [
         ({"means": np.full((2, 3), 1e30)}, r"0\.ply: .* in 2 of 2 Gaussians \(centre of 0, 1\)"),
-        ({"log_scales": np.full((2, 3), 1000.0)}, r"0\.ply: .* in 2 of 2 Gaussians \(size of 0, 1\)"),
-        ({"sh_coeffs": np.full((2, 1, 3), -1e20)}, r"0\.ply: .* in 2 of 2 Gaussians \(colour of 0, 1\)"),
-        ({"means": np.array([[-9e11] * 3, [9e11] * 3])}, r"Camera\('front'\).*the pose must be finite, with numbers"),
+        (
+            {"log_scales": np.full((2, 3), 1000.0)},
+            r"0\.ply: .* in 2 of 2 Gaussians \(size of 0, 1\)",
+        ),
+        (
+            {"sh_coeffs": np.full((2, 1, 3), -1e20)},
+            r"0\.ply: .* in 2 of 2 Gaussians \(colour of 0, 1\)",
+        ),
+        (
+            {"means": np.array([[-9e11] * 3, [9e11] * 3])},
+            r"Camera\('front'\).*the pose must be finite, with numbers",
+        ),
     ],
 )
 def test_import_frames__names_the_file_of_huge_numbers(tmp_path, change, message):
@@ -240,7 +305,11 @@ def test_import_frames__leaves_out_invalid_gaussians_if_asked_to(tmp_path, caplo
     with pytest.raises(ValueError, match=r"frame1\.ply: .* in 2 of 300 Gaussians .*--drop-invalid"):
         import_frames([clip], tmp_path / "s.morgs")
     assert cli.main(["import", str(clip), str(tmp_path / "s.morgs"), "--drop-invalid"]) == 0
-    assert [len(gaussians) for _, gaussians in play(StreamReader(tmp_path / "s.morgs"))] == [N, N - 2, N]
+    assert [len(gaussians) for _, gaussians in play(StreamReader(tmp_path / "s.morgs"))] == [
+        N,
+        N - 2,
+        N,
+    ]
     assert "frame1.ply: 2 of 300 Gaussians are left out" in caplog.text
 
 
@@ -255,10 +324,17 @@ def test_import__reads_what_export_writes(clip, tmp_path, capsys):
         status = cli.main([str(arg) for arg in args])
         return status, *capsys.readouterr()
 
-    assert run("import", *sorted(clip.iterdir()), tmp_path / "a", "--fps", 24, "--quality", 4)[0] == 0
+    assert (
+        run("import", *sorted(clip.iterdir()), tmp_path / "a", "--fps", 24, "--quality", 4)[0] == 0
+    )
     assert run("export", "ply", tmp_path / "a", "--format", "compressed.ply")[0] == 0
-    status, output, _ = run("import", tmp_path / "a/compressed-ply", tmp_path / "b", "--axes", "z-up")
-    assert (status, output.startswith(f"{tmp_path}/b/stream.morgs: 5 frames, one set of Gaussians, ")) == (0, True)
+    status, output, _ = run(
+        "import", tmp_path / "a/compressed-ply", tmp_path / "b", "--axes", "z-up"
+    )
+    assert (
+        status,
+        output.startswith(f"{tmp_path}/b/stream.morgs: 5 frames, one set of Gaussians, "),
+    ) == (0, True)
     assert run("export", "gltf", tmp_path / "b")[0] == 0
     assert run("render", tmp_path / "b", tmp_path / "png", "--camera", "front")[0] == 0
     for args, part in (

@@ -48,7 +48,12 @@ def test_surfaces__in_front_equal_themselves_alone():
             "type": "scene",
             "sensor": camera().sensor(),
             "integrator": {"type": "path", "max_depth": 3},
-            "ball": {"type": "sphere", "center": [0.2, 0, -1], "radius": 0.6, "bsdf": {"type": "diffuse"}},
+            "ball": {
+                "type": "sphere",
+                "center": [0.2, 0, -1],
+                "radius": 0.6,
+                "bsdf": {"type": "diffuse"},
+            },
             "wall": wall(-0.2),
             "lamp": LAMP,
         }
@@ -60,19 +65,27 @@ def test_surfaces__in_front_equal_themselves_alone():
 
 
 def test_surfaces__alone_keep_their_antialiased_outline():
-    """Where there are no splats, the image is the nested integrator's, also in pixels that it covers in part."""
+    """Where there are no splats, the image is the nested integrator's, also in pixels that it
+    covers in part.
+    """
     shapes = {
         "ball": {"type": "sphere", "center": [0, 0, 0], "radius": 0.7},
         "sky": {"type": "constant", "radiance": 0.4},
     }
-    expected = mi.load_dict({"type": "scene", "sensor": camera().sensor(), "integrator": {"type": "path"}, **shapes})
+    expected = mi.load_dict(
+        {"type": "scene", "sensor": camera().sensor(), "integrator": {"type": "path"}, **shapes}
+    )
     scene_with_splats = scene(isotropic([(0, 0, -90)], 0.1, 0.5), {"type": "path"}, **shapes)
     assert_close(render(scene_with_splats, seed=1), render(expected, seed=1), atol=tol.IMAGE_ABS)
 
 
 def test_surfaces__behind_show_through_the_splats():
     gaussians = cloud(0.0)
-    assert_close(render(scene(gaussians, wall=wall(1, **glowing()))), over(gaussians, COLOR), atol=tol.IMAGE_ABS)
+    assert_close(
+        render(scene(gaussians, wall=wall(1, **glowing()))),
+        over(gaussians, COLOR),
+        atol=tol.IMAGE_ABS,
+    )
     black = {"bsdf": {"type": "diffuse", "reflectance": 0.0}}
     image = render(scene(gaussians, wall=wall(1, **black), lamp=LAMP))
     assert_close(image, decode_light(splats(gaussians)[0]), atol=tol.IMAGE_ABS)
@@ -100,7 +113,9 @@ def test_surfaces__blend_linear_splats_in_linear_light():
 
 
 def test_surfaces__white_splats_around_a_white_ball_in_white_light_are_a_furnace():
-    white = isotropic(np.random.default_rng(0).uniform(-1.5, 1.5, (80, 3)), 0.15, 0.6, 0.5 / 0.28209479177387814)
+    white = isotropic(
+        np.random.default_rng(0).uniform(-1.5, 1.5, (80, 3)), 0.15, 0.6, 0.5 / 0.28209479177387814
+    )
     ball = {"type": "sphere", "radius": 0.8, "bsdf": {"type": "diffuse", "reflectance": 1.0}}
     # Rays by the material alone, without noise.
     integrator = {"type": "direct", "emitter_samples": 0, "bsdf_samples": 1}
@@ -110,14 +125,18 @@ def test_surfaces__white_splats_around_a_white_ball_in_white_light_are_a_furnace
 
 def test_surfaces__cover_a_pixel_by_the_fraction_that_they_fill():
     """A bright rectangle before an opaque splat: pixels on its edge mix both in linear light."""
-    splat = Gaussians.from_activated([(0, 0, 1)], [(50, 50, 0.01)], [(1, 0, 0, 0)], [0.999], np.full((1, 1, 3), 0.2))
+    splat = Gaussians.from_activated(
+        [(0, 0, 1)], [(50, 50, 0.01)], [(1, 0, 0, 0)], [0.999], np.full((1, 1, 3), 0.2)
+    )
     half = 0.61
     image = render(scene(splat, card=wall(0, half, **glowing((0.9, 0.9, 0.9)))), spp=1024)
     color = decode_light(splats(splat)[0])
     f = camera().K[0, 0]
     edge = 16 + f * half / 4  # in px
     column = int(edge)
-    fraction = (image[12, column, 0] - color[12, column, 0]) / (image[12, 16, 0] - color[12, column, 0])
+    fraction = (image[12, column, 0] - color[12, column, 0]) / (
+        image[12, 16, 0] - color[12, column, 0]
+    )
     assert image[12, 16, 0] == pytest.approx(0.9, rel=1e-4)
     assert fraction == pytest.approx(edge - column, abs=0.17)  # half a step of the 3 x 3 rays
 
@@ -125,7 +144,9 @@ def test_surfaces__cover_a_pixel_by_the_fraction_that_they_fill():
 def test_surfaces__background_is_behind_all():
     gaussians = cloud(0.0)
     background = (0.1, 0.4, 0.8)
-    image = render(scene(gaussians, card=wall(1, 0.5, **glowing()), props={"background": list(background)}))
+    image = render(
+        scene(gaussians, card=wall(1, 0.5, **glowing()), props={"background": list(background)})
+    )
     expected = over(gaussians, decode_light(np.array(background)))
     outside = np.hypot(*np.meshgrid(np.arange(32) - 15.5, np.arange(24) - 11.5)) > 10
     assert_close(image, expected, atol=tol.IMAGE_ABS, where=outside[..., None])
@@ -136,7 +157,9 @@ def test_surfaces__channels_include_them():
     near = cloud(-0.5)
     both = Gaussians.concatenate([near, cloud(0.5)])
     both = Gaussians(**both.numpy(), logit_confidence=np.full(len(both), 9.0))
-    image = render(scene(both, film={"pixel_format": "rgba"}, wall=wall(0, **glowing()), props=props))
+    image = render(
+        scene(both, film={"pixel_format": "rgba"}, wall=wall(0, **glowing()), props=props)
+    )
     alone = rasterize(near, camera(), ("alpha", "depth"))
     alpha, depth = (np.asarray(v, np.float64)[..., 0] for v in (alone.alpha, alone.depth))
     assert_close(image[..., 3], 1, atol=tol.IMAGE_ABS)
@@ -149,7 +172,9 @@ def test_surfaces__crop_equals_that_of_the_full_image():
     full = render(scene(cloud(0.0), **shapes), spp=256)
     crop = {"crop_offset_x": 8, "crop_offset_y": 6, "crop_width": 13, "crop_height": 9}
     # The samples differ: noise in the pixels of the outline.
-    assert_close(render(scene(cloud(0.0), film=crop, **shapes), spp=256), full[6:15, 8:21], atol=0.06)
+    assert_close(
+        render(scene(cloud(0.0), film=crop, **shapes), spp=256), full[6:15, 8:21], atol=0.06
+    )
 
 
 def test_surfaces__of_an_environment_alone_are_its_light():
@@ -192,10 +217,21 @@ DIFFERENTIATED = {
 @pytest.fixture(scope="module")
 def differentiated() -> Any:
     # No two depths are equal: their order would change with the parameters.
-    gaussians = Gaussians.concatenate([cloud(z, 1, seed) for seed, z in enumerate(np.linspace(-0.8, 0.6, 40))])
+    gaussians = Gaussians.concatenate(
+        [cloud(z, 1, seed) for seed, z in enumerate(np.linspace(-0.8, 0.6, 40))]
+    )
     ball = {"type": "sphere", "center": [0.4, 0.3, -0.4], "radius": 0.4, **glowing()}
-    board = wall(0.05, 2, bsdf={"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.3, 0.6, 0.5]}})
-    return scene(gaussians, "prb", wall=board, ball=ball, lamp=LAMP, sky={"type": "constant", "radiance": 0.2})
+    board = wall(
+        0.05, 2, bsdf={"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.3, 0.6, 0.5]}}
+    )
+    return scene(
+        gaussians,
+        "prb",
+        wall=board,
+        ball=ball,
+        lamp=LAMP,
+        sky={"type": "constant", "radiance": 0.2},
+    )
 
 
 @pytest.fixture(scope="module")
@@ -209,7 +245,9 @@ def loss(image, target):
 
 @pytest.mark.parametrize("name", DIFFERENTIATED)
 def test_surfaces__backward_agrees_with_central_differences(differentiated, target, name):
-    gradient, difference = slopes_of(differentiated, name, DIFFERENTIATED[name], lambda image: loss(image, target), 64)
+    gradient, difference = slopes_of(
+        differentiated, name, DIFFERENTIATED[name], lambda image: loss(image, target), 64
+    )
     assert difference == pytest.approx(gradient, rel=2 * tol.CENTRAL_DIFFERENCE_REL)
 
 
@@ -238,13 +276,21 @@ def test_surfaces__gradients_of_positions_warn(target, caplog):
 
 FOG = {"type": "homogeneous", "albedo": 0.5, "sigma_t": 1.0}
 BAD_SCENES = {
-    "no emitter": ({"ball": {"type": "sphere"}}, {}, "expected an emitter that lights the surfaces, got none"),
+    "no emitter": (
+        {"ball": {"type": "sphere"}},
+        {},
+        "expected an emitter that lights the surfaces, got none",
+    ),
     "volume": (
         {"ball": {"type": "sphere", "interior": FOG}, "lamp": LAMP},
         {},
         "Sphere 'ball', the boundary of a medium",
     ),
-    "not set": ({"ball": {"type": "sphere"}}, {"surfaces": None}, "or set `surfaces` to an integrator"),
+    "not set": (
+        {"ball": {"type": "sphere"}},
+        {"surfaces": None},
+        "or set `surfaces` to an integrator",
+    ),
 }
 
 

@@ -31,12 +31,18 @@ def cloud(n: int = 300, scale: float = 0.1, degree: int = 1, seed: int = 0) -> G
 
 
 def segments(n: int = 400, seed: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return origins, directions and lengths of segments, most of which begin and end among the Gaussians."""
+    """Return origins, directions and lengths of segments, most of which begin and end among the
+    Gaussians.
+    """
     rng = np.random.default_rng(seed)
     origins = rng.uniform(-1.2, 1.2, (n, 3))
     directions = rng.normal(size=(n, 3))
     directions[:6] = [*np.eye(3), *-np.eye(3)]
-    return origins, directions / np.linalg.norm(directions, axis=1, keepdims=True), rng.uniform(0.1, 3, n)
+    return (
+        origins,
+        directions / np.linalg.norm(directions, axis=1, keepdims=True),
+        rng.uniform(0.1, 3, n),
+    )
 
 
 def rays(origins: np.ndarray, directions: np.ndarray, lengths: np.ndarray | None = None):
@@ -46,10 +52,16 @@ def rays(origins: np.ndarray, directions: np.ndarray, lengths: np.ndarray | None
     return ray
 
 
-def responses(gaussians: Gaussians, origins: np.ndarray, directions: np.ndarray, lengths: np.ndarray):
-    """Return depth and alpha [M, N] of every Gaussian on every segment, by the formulas of the module's docstring."""
+def responses(
+    gaussians: Gaussians, origins: np.ndarray, directions: np.ndarray, lengths: np.ndarray
+):
+    """Return depth and alpha [M, N] of every Gaussian on every segment, by the formulas of the
+    module's docstring.
+    """
     names = ("means", "scales", "quats", "opacities")
-    means, scales, quats, opacities = (np.asarray(getattr(gaussians, name), np.float64) for name in names)
+    means, scales, quats, opacities = (
+        np.asarray(getattr(gaussians, name), np.float64) for name in names
+    )
     axes = Rotation.from_quat(quats, scalar_first=True).as_matrix() / scales[:, None]
     o = np.einsum("nji,mnj->mni", axes, origins[:, None] - means)
     d = np.einsum("nji,mj->mni", axes, directions)
@@ -69,7 +81,9 @@ def reference(gaussians: Gaussians, *segment: np.ndarray) -> tuple[np.ndarray, n
     transmittance = np.cumprod(np.concatenate([np.ones((len(alpha), 1)), 1 - alpha], 1), 1)
     values = dr.sh_eval(mi.Vector3f(np.float32(segment[1].T)), gaussians.sh_degree)
     basis = np.stack([np.broadcast_to(np.array(value, np.float64), len(alpha)) for value in values])
-    colors = np.maximum(0.5 + np.einsum("km,nkc->mnc", basis, np.asarray(gaussians.sh_coeffs, np.float64)), 0)
+    colors = np.maximum(
+        0.5 + np.einsum("km,nkc->mnc", basis, np.asarray(gaussians.sh_coeffs, np.float64)), 0
+    )
     colors = np.take_along_axis(colors, order[..., None], 1)
     return np.einsum("mn,mnc->mc", transmittance[:, :-1] * alpha, colors), transmittance[:, -1]
 
@@ -89,7 +103,9 @@ def test_splat_rays__of_segments_agree_with_the_sum_over_all_gaussians(n):
 
 
 def test_splat_rays__blend_more_gaussians_than_one_walk_sorts():
-    """Sixty Gaussians one inside the other, half of them at equal depths, which are blended in a fixed order."""
+    """Sixty Gaussians one inside the other, half of them at equal depths, which are blended in a
+    fixed order.
+    """
     rng = np.random.default_rng(2)
     means = np.zeros((60, 3))
     means[:30, 2] = rng.permutation(30) / 30
@@ -101,13 +117,19 @@ def test_splat_rays__blend_more_gaussians_than_one_walk_sorts():
     color, transmittance = SplatRays(same).trace(rays(*segment))
     assert_close(np.array(color), (0.5 + 0.3 * SH_C0) * (1 - float(transmittance[0])), atol=1e-5)
     front = gaussians.select(np.arange(30))
-    assert_close(np.array(SplatRays(front).trace(rays(*segment))[0]).T, reference(front, *segment)[0], atol=1e-5)
+    assert_close(
+        np.array(SplatRays(front).trace(rays(*segment))[0]).T,
+        reference(front, *segment)[0],
+        atol=1e-5,
+    )
 
 
 def test_splat_rays__transmittance_of_two_halves_is_that_of_the_whole():
     traced = SplatRays(cloud(100))
     origins, directions, lengths = segments()
-    first, whole = (np.array(traced.transmittance(rays(origins, directions, s * lengths))) for s in (0.4, 1.0))
+    first, whole = (
+        np.array(traced.transmittance(rays(origins, directions, s * lengths))) for s in (0.4, 1.0)
+    )
     rest = rays(origins + 0.4 * lengths[:, None] * directions, directions, 0.6 * lengths)
     assert_close(first * np.array(traced.transmittance(rest)), whole, atol=2e-3)
 
@@ -119,7 +141,9 @@ def test_splat_rays__of_a_camera_agree_with_the_rasteriser():
     offsets = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3) @ np.linalg.inv(camera.K).T
     directions = offsets @ np.asarray(camera.viewmat)[:3, :3]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    result = SplatRays(gaussians).trace(rays(np.broadcast_to(camera.position, directions.shape), directions))
+    result = SplatRays(gaussians).trace(
+        rays(np.broadcast_to(camera.position, directions.shape), directions)
+    )
     image = rasterize(gaussians, camera, ("color", "alpha"), config=RenderConfig(eps2d=0.0))
     assert psnr(np.array(result[0]).T.reshape(72, 96, 3), np.asarray(image.color)) > 38
     assert np.abs(1 - np.array(result[1]) - np.asarray(image.alpha).ravel()).mean() < 4e-3
@@ -140,13 +164,19 @@ def test_splat_rays__of_gaussians_that_are_too_faint_or_too_thin_to_draw():
     ray = rays(np.array([[0.0, 0, -3]]), np.array([[0.0, 0, 1]]))
     faint = isotropic(np.zeros((3, 3)), 1.0, 0.003)
     assert SplatRays(faint).transmittance(ray)[0] == 1
-    disc = Gaussians.from_activated([(0, 0, 0)], [(1, 1, 1e-20)], [(1, 0, 0, 0)], [0.5], np.zeros((1, 1, 3)))
+    disc = Gaussians.from_activated(
+        [(0, 0, 0)], [(1, 1, 1e-20)], [(1, 0, 0, 0)], [0.5], np.zeros((1, 1, 3))
+    )
     assert SplatRays(disc).transmittance(ray)[0] == pytest.approx(0.5, abs=1e-5)
 
 
-@pytest.mark.parametrize("make", [lambda: "text", lambda: cloud(0)], ids=["no Gaussians", "none of them"])
+@pytest.mark.parametrize(
+    "make", [lambda: "text", lambda: cloud(0)], ids=["no Gaussians", "none of them"]
+)
 def test_splat_rays__refuse_what_are_no_gaussians(make):
-    with pytest.raises(ValueError, match=r"SplatRays\(\): `gaussians` must be at least one Gaussian, got a"):
+    with pytest.raises(
+        ValueError, match=r"SplatRays\(\): `gaussians` must be at least one Gaussian, got a"
+    ):
         SplatRays(make())
 
 
@@ -154,5 +184,7 @@ def test_splat_rays__refuse_numbers_that_are_not_finite():
     gaussians = cloud(5)
     means = gaussians.numpy()["means"]
     means[3, 1] = np.nan
-    with pytest.raises(ValueError, match=r"`means` must be finite, got nan at \[3, 1\] \(1 such values\)"):
+    with pytest.raises(
+        ValueError, match=r"`means` must be finite, got nan at \[3, 1\] \(1 such values\)"
+    ):
         SplatRays(Gaussians(**{**gaussians.numpy(), "means": means}))

@@ -28,7 +28,11 @@ BALL = {
 @pytest.mark.long
 def test_render_inserted__agrees_with_the_path_traced_clip(tmp_path: Path):
     mi.set_log_level(mi.LogLevel.Error)
-    synthesize("spheres", tmp_path / "clip", SynthConfig(cameras=7, frames=2, width=160, height=120, spp=16))
+    synthesize(
+        "spheres",
+        tmp_path / "clip",
+        SynthConfig(cameras=7, frames=2, width=160, height=120, spp=16),
+    )
     config = StreamConfig(fit=FitConfig(num_gaussians=6000, first_frame_steps=400, epochs=2))
     stream_capture(load_capture(tmp_path / "clip"), tmp_path / "fit", config)
     stream = open_stream(tmp_path / "fit")
@@ -41,12 +45,20 @@ def test_render_inserted__agrees_with_the_path_traced_clip(tmp_path: Path):
 
     def build(frame, time):
         lamps = {name: light.shape for name, light in scene.lights.items()}
-        return {"ball": BALL, **lamps, "integrator": {"type": "direct", "emitter_samples": 2, "bsdf_samples": 0}}
+        return {
+            "ball": BALL,
+            **lamps,
+            "integrator": {"type": "direct", "emitter_samples": 2, "bsdf_samples": 0},
+        }
 
     image_without = traced({})
     truth = traced({"ball": Object({"ball": BALL})})
     image, unshadowed = (
-        next(render_inserted(stream, camera, build, [0], ("color", "surfaces"), InsertConfig(64, shadows)))[1]
+        next(
+            render_inserted(
+                stream, camera, build, [0], ("color", "surfaces"), InsertConfig(64, shadows)
+            )
+        )[1]
         for shadows in (True, False)
     )
     coverage = image["surfaces"][..., 3]
@@ -58,4 +70,7 @@ def test_render_inserted__agrees_with_the_path_traced_clip(tmp_path: Path):
     assert shadow.sum() > 100
     assert psnr(image["color"][ball], truth[ball]) > 36
     assert psnr(image["color"][shadow], truth[shadow]) > 25
-    assert psnr(image["color"][shadow], truth[shadow]) > psnr(unshadowed["color"][shadow], truth[shadow]) + 10
+    assert (
+        psnr(image["color"][shadow], truth[shadow])
+        > psnr(unshadowed["color"][shadow], truth[shadow]) + 10
+    )

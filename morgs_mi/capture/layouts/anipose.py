@@ -1,12 +1,13 @@
 """Calibrations in Anipose's TOML format, which Pose2Sim, caliscope and FreeMoCap also write.
 
-A table per camera (``[cam_0]``, or nested as ``[cameras.0]``) has ``name``, ``size`` [w, h], ``matrix`` [3, 3],
-``distortions`` in OpenCV's order (k1 k2 p1 p2 k3, or k1 to k4 if ``fisheye`` is true), ``rotation`` (Rodrigues vector
-or matrix) and ``translation``: world -> camera with OpenCV's axes. Tables without any of these, such as ``[metadata]``,
-are ignored. OpenCV puts pixel centres at integers, so the principal point is shifted by half a pixel.
+A table per camera (``[cam_0]``, or nested as ``[cameras.0]``) has ``name``, ``size`` [w, h],
+``matrix`` [3, 3], ``distortions`` in OpenCV's order (k1 k2 p1 p2 k3, or k1 to k4 if ``fisheye`` is
+true), ``rotation`` (Rodrigues vector or matrix) and ``translation``: world -> camera with OpenCV's
+axes. Tables without any of these, such as ``[metadata]``, are ignored. OpenCV puts pixel centres at
+integers, so the principal point is shifted by half a pixel.
 
-World units are the units of the file, which does not state them: millimetres or the units of the calibration board for
-Anipose and FreeMoCap, metres for Pose2Sim and caliscope.
+World units are the units of the file, which does not state them: millimetres or the units of the
+calibration board for Anipose and FreeMoCap, metres for Pose2Sim and caliscope.
 """
 
 from __future__ import annotations
@@ -38,11 +39,30 @@ _KEYS = ("matrix", "distortions", "rotation", "translation")
 _CAMERA = {*_KEYS, "name", "size", "fisheye"}
 # Entries of caliscope, FreeMoCap and Pose2Sim that say nothing about the lenses and poses.
 _HARMLESS = {
-    *("cam_id", "port", "error", "exposure", "grid_count", "ignore", "rotation_count", "verified_resolutions"),
-    *("metadata", "capture_volume", "charuco", "aruco", "board", "point_estimates", "camera_count", "creation_date"),
+    *(
+        "cam_id",
+        "port",
+        "error",
+        "exposure",
+        "grid_count",
+        "ignore",
+        "rotation_count",
+        "verified_resolutions",
+    ),
+    *(
+        "metadata",
+        "capture_volume",
+        "charuco",
+        "aruco",
+        "board",
+        "point_estimates",
+        "camera_count",
+        "creation_date",
+    ),
     *("save_tracked_points_video", "fps_recording", "fps_sync_stream_processing", "version"),
 }
-# Recognises a calibration without parsing it; a broken one is then reported as a broken calibration.
+# Recognises a calibration without parsing it; a broken one is then reported as a broken
+# calibration.
 _MARKS = [re.compile(rf"^[ \t]*{key}[ \t]*=", re.MULTILINE) for key in ("matrix", "rotation")]
 
 
@@ -50,21 +70,31 @@ def read_anipose(path: Path) -> tuple[list[Camera], list[Lens]]:
     """Return the cameras, named as in the file, and their lenses.
 
     Raises:
-        ValueError: the file is broken, a key of a camera is missing or has another form, or a rotation is none.
+        ValueError: the file is broken, a key of a camera is missing or has another form, or a
+            rotation is none.
     """
     content = read_toml(path)
     nested = content.get("cameras")
     tables = nested if isinstance(nested, dict) else content
     entries = {
-        key: table for key, table in tables.items() if isinstance(table, dict) and any(k in table for k in _KEYS)
+        key: table
+        for key, table in tables.items()
+        if isinstance(table, dict) and any(k in table for k in _KEYS)
     }
     if not entries:
         raise ValueError(
-            f"{path}: expected a table for each camera, such as [cam_0], with {', '.join(_KEYS)}, found none; export "
-            "the calibration again."
+            f"{path}: expected a table for each camera, such as [cam_0], with {', '.join(_KEYS)}, "
+            "found none; export the calibration again."
         )
-    others = {key for table in (content, tables) for key in table if key not in entries and key != "cameras"}
-    warn_unread(path, {*others, *(key for entry in entries.values() for key in entry)} - _CAMERA - _HARMLESS)
+    others = {
+        key
+        for table in (content, tables)
+        for key in table
+        if key not in entries and key != "cameras"
+    }
+    warn_unread(
+        path, {*others, *(key for entry in entries.values() for key in entry)} - _CAMERA - _HARMLESS
+    )
     pairs = [_camera(path, key, entry) for key, entry in entries.items()]
     return [camera for camera, _ in pairs], [lens for _, lens in pairs]
 
@@ -73,10 +103,14 @@ def _camera(path: Path, key: str, entry: Mapping[str, Any]) -> tuple[Camera, Len
     where = f"{path}, table [{key}]"
     name = entry.get("name", key if key.startswith("cam") else f"cam_{key}")
     if not isinstance(name, str | int) or name == "":
-        raise ValueError(f"{where}: `name` must be a text, got {shortened(name)}; name the camera as its clip.")
+        raise ValueError(
+            f"{where}: `name` must be a text, got {shortened(name)}; name the camera as its clip."
+        )
     width, height = _array(where, entry, "size", (2,)).tolist()
     if not (width.is_integer() and height.is_integer()):
-        raise ValueError(f"{where}: `size` must be whole pixels [w, h], got {entry['size']}; calibrate again.")
+        raise ValueError(
+            f"{where}: `size` must be whole pixels [w, h], got {entry['size']}; calibrate again."
+        )
     K = _array(where, entry, "matrix", (3, 3)).copy()
     K[:2, 2] += 0.5
     rotation = _array(where, entry, "rotation", (3,), (3, 3))
@@ -100,8 +134,8 @@ def _array(where: str, entry: Mapping[str, Any], key: str, *shapes: tuple[int, .
         expected = " or ".join(str([*shape]) for shape in shapes)
         got = shortened(entry[key]) if key in entry else "none"
         raise ValueError(
-            f"{where}: `{key}` must be finite numbers {expected} of at most {LARGEST:g}, got {got}; calibrate this "
-            "camera, or remove its table and its clip."
+            f"{where}: `{key}` must be finite numbers {expected} of at most {LARGEST:g}, got "
+            f"{got}; calibrate this camera, or remove its table and its clip."
         )
     return value
 
@@ -132,4 +166,6 @@ def _read_calibration(path: Path) -> Calibration:
     return match_clips(path, source, required_clips(path), cameras, lenses).calibration
 
 
-LAYOUT = Layout("Anipose", ("calibration.toml",), lambda path: bool(_calibration_files(path)), _read_calibration)
+LAYOUT = Layout(
+    "Anipose", ("calibration.toml",), lambda path: bool(_calibration_files(path)), _read_calibration
+)

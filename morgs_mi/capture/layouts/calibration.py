@@ -46,11 +46,13 @@ class Calibration:
     clips: tuple[Clip, ...]  #: One per camera: its video, folder of images or list of images.
     #: [P, 3] float32, world units; P = 0 if the layout has none.
     points: np.ndarray = field(default_factory=lambda: NO_POINTS)
-    point_colors: np.ndarray = field(default_factory=lambda: NO_POINTS)  #: [P, 3] float32 in [0, 1].
-    #: Indices of the cameras that the layout holds out, in ascending order; None if it specifies none.
+    #: [P, 3] float32 in [0, 1].
+    point_colors: np.ndarray = field(default_factory=lambda: NO_POINTS)
+    #: Indices of the cameras that the layout holds out, in ascending order; None if it specifies
+    #: none.
     test_views: tuple[int, ...] | None = None
-    #: Per camera images of its clip's size or scaled versions, whose black pixels are not used; no images: all pixels
-    #: are used.
+    #: Per camera images of its clip's size or scaled versions, whose black pixels are not used; no
+    #: images: all pixels are used.
     masks: tuple[tuple[Path, ...], ...] = ()
 
     @property
@@ -59,7 +61,8 @@ class Calibration:
         return tuple(camera.name for camera in self.cameras)
 
     def without(self, path: Path, names: Collection[str]) -> Calibration:
-        """Return the calibration without the cameras called `names`; `path` is the capture, for messages.
+        """Return the calibration without the cameras called `names`; `path` is the capture, for
+        messages.
 
         Raises:
             ValueError: there is no such camera, or none is left.
@@ -91,20 +94,25 @@ class Layout:
     """One way to store a calibration in a capture folder."""
 
     name: str  #: Name of the layout in reports, e.g. ``COLMAP``.
-    files: tuple[str, ...]  #: Names of the files or folders that hold the calibration, for error messages.
+    #: Names of the files or folders that hold the calibration, for error messages.
+    files: tuple[str, ...]
     find: Callable[[Path], bool]  #: Returns whether a capture folder holds such a calibration.
-    #: Returns the calibration of a capture folder. Raises FileNotFoundError if a file or clip is missing and ValueError
-    #: if a file is broken or does not match the clips.
+    #: Returns the calibration of a capture folder. Raises FileNotFoundError if a file or clip is
+    #: missing and ValueError if a file is broken or does not match the clips.
     read: Callable[[Path], Calibration]
-    #: Convention of the pose matrices, which the rig check compares with other ones; None if poses are not stored as
-    #: 4x4 matrices.
+    #: Convention of the pose matrices, which the rig check compares with other ones; None if poses
+    #: are not stored as 4x4 matrices.
     poses: PoseConvention | None = PoseConvention()
 
 
 def calibration_files(path: Path, pattern: str) -> list[Path]:
-    """Return the files with a name that matches a pattern in lower case, in a capture or in its `calibration`."""
+    """Return the files with a name that matches a pattern in lower case, in a capture or in its
+    `calibration`.
+    """
     folders = [folder for folder in (path, path / "calibration") if folder.is_dir()]
-    return [file for folder in folders for file in listed(folder) if fnmatch(file.name.lower(), pattern)]
+    return [
+        file for folder in folders for file in listed(folder) if fnmatch(file.name.lower(), pattern)
+    ]
 
 
 def only_calibration(path: Path, files: Sequence[Path], expected: str) -> Path:
@@ -115,12 +123,15 @@ def only_calibration(path: Path, files: Sequence[Path], expected: str) -> Path:
     """
     if len(files) > 1:
         names = ", ".join(file.name for file in files)
-        raise ValueError(f"{path}: expected {expected}, got {names}; keep the one of this recording.")
+        raise ValueError(
+            f"{path}: expected {expected}, got {names}; keep the one of this recording."
+        )
     return files[0]
 
 
 def required_clips(path: Path) -> Mapping[str, Clip]:
-    """Return each camera's video, folder of images or photo by the camera's name, in numerical order.
+    """Return each camera's video, folder of images or photo by the camera's name, in numerical
+    order.
 
     Raises:
         FileNotFoundError: the capture folder has none.
@@ -128,8 +139,8 @@ def required_clips(path: Path) -> Mapping[str, Clip]:
     if clips := clips_by_camera(path) or photos(path):
         return clips
     raise FileNotFoundError(
-        f"{path}: expected videos ({', '.join(VIDEO_SUFFIXES)}) or folders of frames, found none; check the path, or "
-        f"make {EXAMPLE}"
+        f"{path}: expected videos ({', '.join(VIDEO_SUFFIXES)}) or folders of frames, found none; "
+        f"check the path, or make {EXAMPLE}"
     )
 
 
@@ -138,19 +149,24 @@ class Match:
     """Fixed cameras and their clips."""
 
     calibration: Calibration  #: One camera, lens and clip per fixed camera.
-    images: tuple[tuple[int, ...], ...]  #: Per camera the indices of its images in the file of the calibration.
+    #: Per camera the indices of its images in the file of the calibration.
+    images: tuple[tuple[int, ...], ...]
 
 
 def match_clips(
-    path: Path, source: Path, clips: Mapping[str, Clip], cameras: Sequence[Camera], lenses: Sequence[Lens]
+    path: Path,
+    source: Path,
+    clips: Mapping[str, Clip],
+    cameras: Sequence[Camera],
+    lenses: Sequence[Lens],
 ) -> Match:
     """Return the fixed cameras that have a clip, in numerical order of the clips' names.
 
     Cameras without a clip, and clips without a camera, are left out with a warning.
 
     Args:
-        path: the capture folder; its photos, its frame folders or the photos in the folder that the cameras' names
-            state are used if they match more cameras than `clips`.
+        path: the capture folder; its photos, its frame folders or the photos in the folder that the
+            cameras' names state are used if they match more cameras than `clips`.
         source: file or folder of the calibration, for messages.
         clips: from `required_clips`.
         cameras: one or more per fixed camera, named as the calibration's images.
@@ -158,7 +174,8 @@ def match_clips(
 
     Raises:
         FileNotFoundError: no camera has a clip.
-        ValueError: two images of one clip have different poses or lenses, or a frame folder is missing.
+        ValueError: two images of one clip have different poses or lenses, or a frame folder is
+            missing.
     """
     match = _best_match(path, source, clips, cameras, lenses)
     clips = match.clips
@@ -172,7 +189,9 @@ def match_clips(
     names = sorted(match.images, key=natural_key)
     images = tuple(tuple(match.images[name]) for name in names)
     calibration = Calibration(
-        tuple(replace(cameras[index[0]], name=name) for name, index in zip(names, images, strict=True)),
+        tuple(
+            replace(cameras[index[0]], name=name) for name, index in zip(names, images, strict=True)
+        ),
         tuple(lenses[index[0]] for index in images),
         tuple(clips[name] for name in names),
     )
@@ -184,14 +203,21 @@ class _NamedMatch:
     """Clips and the cameras that they belong to."""
 
     clips: Mapping[str, Clip]  # clips by name
-    images: dict[str, list[int]]  # indices of the cameras of each clip that has some, by the clip's name
+    # Indices of the cameras of each clip that has some, by the clip's name.
+    images: dict[str, list[int]]
     without: list[str]  # names of the cameras that have no clip
 
 
 def _best_match(
-    path: Path, source: Path, clips: Mapping[str, Clip], cameras: Sequence[Camera], lenses: Sequence[Lens]
+    path: Path,
+    source: Path,
+    clips: Mapping[str, Clip],
+    cameras: Sequence[Camera],
+    lenses: Sequence[Lens],
 ) -> _NamedMatch:
-    """Return the match of `clips`, photos or frame folders with the most cameras; see `match_clips`."""
+    """Return the match of `clips`, photos or frame folders with the most cameras; see
+    `match_clips`.
+    """
     matches = []
     errors = []
     attempts: Sequence[tuple[Callable[[Path], Mapping[str, Clip]], bool]] = (
@@ -214,8 +240,8 @@ def _best_match(
         expected = ", ".join(camera.name for camera in cameras[:_MAX_LISTED])
         errors.append(
             FileNotFoundError(
-                f"{source}: expected clips named after its cameras {expected}, found {', '.join(clips)}; name the "
-                "clips after the cameras."
+                f"{source}: expected clips named after its cameras {expected}, found "
+                f"{', '.join(clips)}; name the clips after the cameras."
             )
         )
         raise errors[0]
@@ -226,7 +252,11 @@ def _best_match(
 
 def _in_folders(clips: Mapping[str, Clip], cameras: Sequence[Camera]) -> bool:
     """Return whether an image of the cameras is named as one in a folder of `clips`."""
-    names = {part for camera in cameras for part in PurePosixPath(camera.name.replace("\\", "/")).parts[:-1]}
+    names = {
+        part
+        for camera in cameras
+        for part in PurePosixPath(camera.name.replace("\\", "/")).parts[:-1]
+    }
     return any(isinstance(clip, Path) and clip.is_dir() for clip in map(clips.get, names))
 
 
@@ -237,7 +267,11 @@ def _named_photos(path: Path, cameras: Sequence[Camera]) -> Mapping[str, Clip]:
 
 
 def _matched(
-    source: Path, clips: Mapping[str, Clip], cameras: Sequence[Camera], lenses: Sequence[Lens], by_folder: bool
+    source: Path,
+    clips: Mapping[str, Clip],
+    cameras: Sequence[Camera],
+    lenses: Sequence[Lens],
+    by_folder: bool,
 ) -> _NamedMatch:
     """Return the match between clips and cameras, `by_folder` as for `view_of_image`.
 
@@ -252,10 +286,14 @@ def _matched(
             continue
         match.images.setdefault(name, []).append(index)
         first = match.images[name][0]
-        same = np.allclose(cameras[first].viewmat, camera.viewmat, atol=1e-6) and lenses[first] == lenses[index]
+        same = (
+            np.allclose(cameras[first].viewmat, camera.viewmat, atol=1e-6)
+            and lenses[first] == lenses[index]
+        )
         if not (same and np.allclose(cameras[first].K, camera.K)):
             raise ValueError(
-                f"{source}: cameras must not move, but {cameras[first].name!r} and {camera.name!r}, both of {name}, "
-                "have different poses or lenses; keep one image of each fixed camera, and name the clips after them."
+                f"{source}: cameras must not move, but {cameras[first].name!r} and "
+                f"{camera.name!r}, both of {name}, have different poses or lenses; keep one image "
+                "of each fixed camera, and name the clips after them."
             )
     return match

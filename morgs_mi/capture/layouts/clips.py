@@ -1,12 +1,13 @@
 """Search for each camera's clip in a capture folder.
 
-A clip is a video file, a folder of numbered images, or a list of image files (one per frame). Clips are stored per
-camera or per frame; cameras are ordered numerically, cam_2 before cam_10:
+A clip is a video file, a folder of numbered images, or a list of image files (one per frame). Clips
+are stored per camera or per frame; cameras are ordered numerically, cam_2 before cam_10:
 
-- per camera: ``cam01.mp4``, ``cam01/0000.png`` or ``cam01/images/0000.png``, in the capture or in a folder of it
-  (``videos/cam01.mp4``, ``images/cam01/0000.png``). Of several clips of one name the lossless one in ``frames/``
-  takes precedence, then a video, then a folder; clips in the capture itself take precedence over those in a folder, and
-  those in the folder ``images`` or ``videos`` over those in others. Files that differ in their suffixes are refused;
+- per camera: ``cam01.mp4``, ``cam01/0000.png`` or ``cam01/images/0000.png``, in the capture or in a
+  folder of it (``videos/cam01.mp4``, ``images/cam01/0000.png``). Of several clips of one name the
+  lossless one in ``frames/`` takes precedence, then a video, then a folder; clips in the capture
+  itself take precedence over those in a folder, and those in the folder ``images`` or ``videos``
+  over those in others. Files that differ in their suffixes are refused;
 - per frame: ``0000/cam01.png`` or ``0000/images/cam01.png``, with the same cameras in every folder;
 - photos: ``cam01.png`` or ``images/cam01.png``, one image per camera.
 
@@ -29,7 +30,10 @@ from morgs_mi.io.video import Clip, natural_key, numbering_gap, open_frames
 
 _LOG = logging.getLogger(__name__)
 
-EXAMPLE = "one folder per camera: cam01/0000.png, cam01/0001.png, ..., cam02/0000.png, cam02/0001.png, ..."
+EXAMPLE = (
+    "one folder per camera: cam01/0000.png, cam01/0001.png, ..., cam02/0000.png, cam02/0001.png, "
+    "..."
+)
 """The layout of a recording in images, for messages."""
 
 # Folders without clips, and folders with images that do not belong to a camera.
@@ -51,14 +55,20 @@ def clips_by_camera(path: Path) -> dict[str, Path]:
         inner = [f for f in inner if not _COPIES.fullmatch(f.name)]
     inner.sort(key=lambda f: f.name in _USUAL)
     # The last clip of a camera takes precedence.
-    clips = _merged(path, map(_folders, inner)) | _merged(path, map(_videos, inner)) | _folders(path) | _videos(path)
+    clips = (
+        _merged(path, map(_folders, inner))
+        | _merged(path, map(_videos, inner))
+        | _folders(path)
+        | _videos(path)
+    )
     if (path / "frames").is_dir():
         clips |= _videos(path / "frames") | _folders(path / "frames")
     return {name: clips[name] for name in sorted(clips, key=natural_key)}
 
 
 def photos(path: Path) -> dict[str, tuple[Path]]:
-    """Return the images directly in a folder or its folder `images` as clips of one frame, by their names.
+    """Return the images directly in a folder or its folder `images` as clips of one frame, by their
+    names.
 
     Raises:
         ValueError: two images differ only in their suffixes.
@@ -69,7 +79,8 @@ def photos(path: Path) -> dict[str, tuple[Path]]:
 
 
 def clips_by_frame(path: Path) -> dict[str, tuple[Path, ...]]:
-    """Return each camera's images, one per frame folder, by the camera's name; empty without such folders.
+    """Return each camera's images, one per frame folder, by the camera's name; empty without such
+    folders.
 
     The first frame determines the cameras; images that are missing in later frames are listed too.
     """
@@ -77,7 +88,10 @@ def clips_by_frame(path: Path) -> dict[str, tuple[Path, ...]]:
     if not frames:
         return {}
     images = _by_stem(images_in(frames[0]))
-    return {name: tuple(f / images[name].name for f in frames) for name in sorted(images, key=natural_key)}
+    return {
+        name: tuple(f / images[name].name for f in frames)
+        for name in sorted(images, key=natural_key)
+    }
 
 
 def check_frames(path: Path, clips: Mapping[str, Sequence[Path]]) -> None:
@@ -89,8 +103,8 @@ def check_frames(path: Path, clips: Mapping[str, Sequence[Path]]) -> None:
     folders = [f.relative_to(path).parts[0] for f in next(iter(clips.values()))]
     if gap := numbering_gap(folders):
         raise ValueError(
-            f"{path}: the folders of the frames must be numbered without gaps, got {folders[gap - 1]} followed by "
-            f"{folders[gap]}; extract the frames again."
+            f"{path}: the folders of the frames must be numbered without gaps, got "
+            f"{folders[gap - 1]} followed by {folders[gap]}; extract the frames again."
         )
 
 
@@ -101,18 +115,22 @@ def names_without(path: Path, names: Collection[str], without: Collection[str]) 
         ValueError: a camera that is left out does not exist, or all are left out.
     """
     if unknown := [name for name in without if name not in names]:
-        raise ValueError(f"{path}: `without` must name cameras of {', '.join(names)}, got {', '.join(unknown)}.")
+        raise ValueError(
+            f"{path}: `without` must name cameras of {', '.join(names)}, got {', '.join(unknown)}."
+        )
     rest = [name for name in names if name not in without]
     if without and not rest:
-        raise ValueError(f"{path}: `without` must leave at least one camera, got all: {', '.join(names)}.")
+        raise ValueError(
+            f"{path}: `without` must leave at least one camera, got all: {', '.join(names)}."
+        )
     return rest
 
 
 def view_of_image(views: Collection[str], image: str, by_folder: bool = False) -> str | None:
     """Return the camera in `views` to which an image of a calibration belongs, or None.
 
-    It is cam01 for ``cam01.png``, ``cam01.mp4``, ``cam01``, ``cam01/0000.png`` and ``cam01/images/0000.png``. Of
-    ``1/2.png`` it is 2, or with `by_folder` 1, if there are both.
+    It is cam01 for ``cam01.png``, ``cam01.mp4``, ``cam01``, ``cam01/0000.png`` and
+    ``cam01/images/0000.png``. Of ``1/2.png`` it is 2, or with `by_folder` 1, if there are both.
     """
     place = PurePosixPath(image.replace("\\", "/"))
     folders = place.parts[-2::-1]
@@ -122,7 +140,9 @@ def view_of_image(views: Collection[str], image: str, by_folder: bool = False) -
 
 
 def clip_of_camera(clips: Collection[str], camera: str) -> str | None:
-    """Return the clip called `camera`, otherwise the only one with this word in its name (``trial_2-camA``)."""
+    """Return the clip called `camera`, otherwise the only one with this word in its name
+    (``trial_2-camA``).
+    """
     if camera in clips:
         return camera
     word = re.compile(rf"(?<![A-Za-z0-9]){re.escape(camera)}(?![A-Za-z0-9])")
@@ -134,7 +154,8 @@ class ImageSizes:
     """Sizes of the images that a calibration names, from their files or their clips.
 
     Args:
-        folder: the folder of the calibration, from which the images are named, with or without their suffixes.
+        folder: the folder of the calibration, from which the images are named, with or without
+            their suffixes.
         clips: clips by name, for images that are no files.
     """
 
@@ -174,7 +195,9 @@ class ImageSizes:
 def _clip_size(clip: Clip) -> tuple[int, int]:
     """Return the width and height of a clip or an image."""
     if isinstance(clip, Path) and _is_image(clip):
-        size = image_size(np.memmap(clip, np.uint8, "r")) if fetched(clip).stat().st_size else (0, 0)
+        size = (
+            image_size(np.memmap(clip, np.uint8, "r")) if fetched(clip).stat().st_size else (0, 0)
+        )
         if all(size):
             return size
         clip = (clip,)
@@ -201,27 +224,35 @@ def _by_stem(files: Iterable[Path]) -> dict[str, Path]:
     for file in files:
         if (other := files_by_stem.setdefault(file.stem, file)) != file:
             raise ValueError(
-                f"{file.parent}: expected one file per camera, got {other.name} and {file.name}; keep one of them, or "
-                "rename it."
+                f"{file.parent}: expected one file per camera, got {other.name} and {file.name}; "
+                "keep one of them, or rename it."
             )
     return files_by_stem
 
 
 def _merged(path: Path, places: Iterable[Mapping[str, Path]]) -> dict[str, Path]:
-    """Return the clips in folders of the capture `path`, the last one of each name, with a warning if it has others."""
+    """Return the clips in folders of the capture `path`, the last one of each name, with a warning
+    if it has others.
+    """
     result: dict[str, Path] = {}
     for clips in places:
         if repeats := [name for name in clips if name in result]:
             first, last = (paths[repeats[0]].relative_to(path) for paths in (result, clips))
             _LOG.warning(
-                "%s: %s have two clips, such as %s and %s: the latter is used.", path, ", ".join(repeats), first, last
+                "%s: %s have two clips, such as %s and %s: the latter is used.",
+                path,
+                ", ".join(repeats),
+                first,
+                last,
             )
         result |= clips
     return result
 
 
 def _image_folder(folder: Path) -> Path | None:
-    """Return the folder that holds a camera's or a frame's images: its own or the `images` folder in it, or None."""
+    """Return the folder that holds a camera's or a frame's images: its own or the `images` folder
+    in it, or None.
+    """
     for place in (folder, folder / "images"):
         if place.is_dir() and images_in(place):
             return place

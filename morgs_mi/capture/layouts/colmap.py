@@ -1,7 +1,8 @@
 """COLMAP's sparse models: reader for text and binary files, writer for text.
 
-A model is a folder of cameras, images and points3D (newer versions add rigs and frames, which repeat the
-poses). COLMAP's pixel centres lie at +0.5 and its axes are OpenCV's, as in `Camera`, so no axis is flipped.
+A model is a folder of cameras, images and points3D (newer versions add rigs and frames, which
+repeat the poses). COLMAP's pixel centres lie at +0.5 and its axes are OpenCV's, as in `Camera`, so
+no axis is flipped.
 
 The reader does not use pycolmap because pycolmap 4.2 never returns from a truncated binary file
 and silently drops every second image of a text model without blank lines.
@@ -53,7 +54,8 @@ _CAMERA_BYTES = 500
 class ColmapModel:
     """A COLMAP model, before undistortion."""
 
-    cameras: tuple[Camera, ...]  #: One camera per image in the order of the file; `name` is the name of the image.
+    #: One camera per image in the order of the file; `name` is the name of the image.
+    cameras: tuple[Camera, ...]
     lenses: tuple[Lens, ...]  #: One lens per camera.
     points: np.ndarray  #: [P, 3] float32, world units.
     point_colors: np.ndarray  #: [P, 3] float32 in [0, 1], display-referred.
@@ -62,9 +64,9 @@ class ColmapModel:
 def find_colmap(folder: Path) -> Path | None:
     """Return the folder of the COLMAP model in a capture, or None.
 
-    It is in a numbered folder of `sparse`, in `sparse`, in another folder of it, likewise in `colmap/sparse`, or in the
-    capture itself. COLMAP writes several models, in any order, if it cannot connect all images: the one of most images
-    is used.
+    It is in a numbered folder of `sparse`, in `sparse`, in another folder of it, likewise in
+    `colmap/sparse`, or in the capture itself. COLMAP writes several models, in any order, if it
+    cannot connect all images: the one of most images is used.
     """
     return next(iter(_models(folder)), None)
 
@@ -79,8 +81,11 @@ def _models(folder: Path) -> list[Path]:
             return [place]
         if inner:
             return _largest_first(inner)
-    # In the capture folder itself all three files are required: a single name may have another meaning.
-    has_model = any(all((folder / f"{name}.{kind}").exists() for name in _FILES) for kind in ("bin", "txt"))
+    # In the capture folder itself all three files are required: a single name may have another
+    # meaning.
+    has_model = any(
+        all((folder / f"{name}.{kind}").exists() for name in _FILES) for kind in ("bin", "txt")
+    )
     return [folder] if has_model else []
 
 
@@ -98,7 +103,8 @@ def read_colmap(folder: str | Path) -> ColmapModel:
 
     Raises:
         FileNotFoundError: one of the three files is missing.
-        ValueError: a file is broken, refers to a missing camera, or holds an invalid pose or an unsupported lens.
+        ValueError: a file is broken, refers to a missing camera, or holds an invalid pose or an
+            unsupported lens.
     """
     folder = Path(folder)
     kind = "bin" if (folder / "cameras.bin").exists() else "txt"
@@ -111,7 +117,9 @@ def read_colmap(folder: str | Path) -> ColmapModel:
     cameras_path, images_path, points_path = (folder / f"{name}.{kind}" for name in _FILES)
     text = kind == "txt"
     intrinsics = {}
-    for camera_id, model, width, height, params in (text_cameras if text else binary_cameras)(cameras_path):
+    for camera_id, model, width, height, params in (text_cameras if text else binary_cameras)(
+        cameras_path
+    ):
         try:
             intrinsics[camera_id] = (*lens_and_intrinsics(model, params), width, height)
         except ValueError as error:
@@ -122,8 +130,8 @@ def read_colmap(folder: str | Path) -> ColmapModel:
     for name, camera_id, pose in (text_images if text else binary_images)(images_path):
         if camera_id not in intrinsics:
             raise ValueError(
-                f"{images_path}: image {name!r} refers to camera {camera_id}, {cameras_path.name} has "
-                f"{sorted(intrinsics)}; export both files from the same model."
+                f"{images_path}: image {name!r} refers to camera {camera_id}, {cameras_path.name} "
+                f"has {sorted(intrinsics)}; export both files from the same model."
             )
         lens, K, width, height = intrinsics[camera_id]
         try:
@@ -133,12 +141,15 @@ def read_colmap(folder: str | Path) -> ColmapModel:
         lenses.append(lens)
         check_claim(images_path, _CAMERA_BYTES * len(cameras), f"{len(cameras)} images")
     if not cameras:
-        raise ValueError(f"{images_path}: expected at least one image, got none; register the images.")
+        raise ValueError(
+            f"{images_path}: expected at least one image, got none; register the images."
+        )
     rows = (text_points if text else binary_points)(points_path)
     points = np.asarray(np.fromiter(rows, np.dtype((np.float64, 6))), np.float64)
     if not bounded(points):
         raise ValueError(
-            f"{points_path}: the points must be finite and at most {LARGEST:g}, got others; export the model again."
+            f"{points_path}: the points must be finite and at most {LARGEST:g}, got others; "
+            "export the model again."
         )
     return ColmapModel(
         tuple(cameras),
@@ -159,7 +170,8 @@ def write_colmap(
 
     Args:
         folder: created if missing.
-        cameras: the views; the image of a view is called `name`, with ``.png`` added if it has no suffix.
+        cameras: the views; the image of a view is called `name`, with ``.png`` added if it has no
+            suffix.
         points: [P, 3] world units, or None for no points.
         point_colors: [P, 3] in [0, 1]; grey if None.
         lenses: one per camera, as in `ColmapModel`; pinholes if None.
@@ -204,8 +216,14 @@ def write_reconstruction(model: pycolmap.Reconstruction, folder: str | Path) -> 
     folder = Path(folder)
     images = model.num_reg_images()
     frames = model.num_reg_frames()
-    lines = {"rigs": model.num_rigs(), "frames": frames, "images": 2 * images, "points3D": model.num_points3D()}
-    lines["cameras"] = model.num_cameras()  # the last one that is renamed, because readers look for it
+    lines = {
+        "rigs": model.num_rigs(),
+        "frames": frames,
+        "images": 2 * images,
+        "points3D": model.num_points3D(),
+    }
+    # The last one that is renamed, because readers look for it.
+    lines["cameras"] = model.num_cameras()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=".partial-", dir=folder) as partial:
@@ -215,11 +233,14 @@ def write_reconstruction(model: pycolmap.Reconstruction, folder: str | Path) -> 
             for name in lines:
                 (Path(partial) / f"{name}.txt").replace(folder / f"{name}.txt")
     except (OSError, RuntimeError, ValueError) as error:
-        raise write_error(f"{folder}: the COLMAP model could not be written", error, folder) from error
+        raise write_error(
+            f"{folder}: the COLMAP model could not be written", error, folder
+        ) from error
 
 
 def _check_written(file: Path, expected: int) -> None:
-    """Check that a text file reached the disk with all its lines: pycolmap does not report a full disk.
+    """Check that a text file reached the disk with all its lines: pycolmap does not report a full
+    disk.
 
     Raises:
         OSError: it did not.
@@ -239,7 +260,10 @@ def _viewmat(pose: Sequence[float]) -> np.ndarray:
         raise ValueError(f"the pose must be finite, got {[*pose]}; export the model again.")
     # COLMAP writes unit quaternions.
     if not abs(np.linalg.norm(quat) - 1) <= 1e-2:
-        raise ValueError(f"its quaternion must have length 1, got {quat.tolist()}; check the order of the columns.")
+        raise ValueError(
+            f"its quaternion must have length 1, got {quat.tolist()}; check the order of the "
+            "columns."
+        )
     viewmat = np.eye(4)
     viewmat[:3, :3] = Rotation.from_quat(quat[[1, 2, 3, 0]]).as_matrix()
     viewmat[:3, 3] = t
@@ -260,4 +284,6 @@ def _read_calibration(path: Path) -> Calibration:
     return replace(match.calibration, points=model.points, point_colors=model.point_colors)
 
 
-LAYOUT = Layout("COLMAP", ("sparse/0", "sparse"), lambda path: find_colmap(path) is not None, _read_calibration)
+LAYOUT = Layout(
+    "COLMAP", ("sparse/0", "sparse"), lambda path: find_colmap(path) is not None, _read_calibration
+)

@@ -1,7 +1,8 @@
 """The files of a COLMAP model, as text and binary.
 
-Readers yield a tuple per record: id, model, width, height and parameters of a camera; name, id of the camera and pose
-[7] of an image, a wxyz quaternion and a translation; x, y, z and the colour, 0 to 255, of a point.
+Readers yield a tuple per record: id, model, width, height and parameters of a camera; name, id of
+the camera and pose [7] of an image, a wxyz quaternion and a translation; x, y, z and the colour, 0
+to 255, of a point.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from morgs_mi.io.bounded import encoding_of, read_bytes, regular
 
 # The least bytes of an image in a binary model.
 _IMAGE_BYTES = 73
-# What precedes the name of an image in a line of text: nine words, and one space. The name may begin with spaces.
+# What precedes the name of an image in a line of text: nine words, and one space. The name may
+# begin with spaces.
 _BEFORE_NAME = re.compile(r"\s*(?:\S+\s+){8}\S+\s")
 # More values than a line of any camera model has in a text file.
 _MAX_CAMERA_FIELDS = 20
@@ -36,11 +38,14 @@ def count_images(folder: Path) -> int:
     return 0
 
 
-# ---- text ------------------------------------------------------------------------------------------------
+# ---- text
+# ------------------------------------------------------------------------------------------------
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield the number, from 1, and the text of all lines that are not comments, including blank ones."""
+    """Yield the number, from 1, and the text of all lines that are not comments, including blank
+    ones.
+    """
     with regular(path).open("rb") as file:
         encoding = encoding_of(file.read(4))
     with path.open(encoding=encoding, errors="replace") as file:
@@ -50,7 +55,9 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _broken(path: Path, number: int, expected: str, line: str) -> ValueError:
-    return ValueError(f"{path}, line {number}: expected `{expected}`, got {line[:80]!r}; export the model again.")
+    return ValueError(
+        f"{path}, line {number}: expected `{expected}`, got {line[:80]!r}; export the model again."
+    )
 
 
 def text_cameras(path: Path) -> Iterator[tuple[int, str, int, int, list[float]]]:
@@ -76,7 +83,9 @@ def text_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
             pose = [float(f) for f in fields[1:8]]
             name = _BEFORE_NAME.sub("", line, count=1).rstrip() if fields[9] else ""
         except (ValueError, IndexError):
-            raise _broken(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line) from None
+            raise _broken(
+                path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line
+            ) from None
         number, line = next(lines, (number, ""))
         if _count_words(line) % 3:
             raise _broken(path, number, "POINTS2D[] as (X, Y, POINT3D_ID), or a blank line", line)
@@ -84,7 +93,9 @@ def text_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
 
 
 def _count_words(line: str) -> int:
-    """Return the length of `line.split()`, which would take many times the memory of a line of thousands of points."""
+    """Return the length of `line.split()`, which would take many times the memory of a line of
+    thousands of points.
+    """
     visible = np.frombuffer(f" {line}".encode(), np.uint8) > 32
     return int(np.count_nonzero(visible[1:] & ~visible[:-1]))
 
@@ -100,7 +111,8 @@ def text_points(path: Path) -> Iterator[list[float]]:
             yield xyz_rgb
 
 
-# ---- binary ----------------------------------------------------------------------------------------------
+# ---- binary
+# ----------------------------------------------------------------------------------------------
 
 
 class _Bytes:
@@ -121,7 +133,8 @@ class _Bytes:
         if count > len(self.data) - self.at:
             raise ValueError(
                 f"{self.path}: expected {count} more bytes at byte {self.at}, got "
-                f"{len(self.data) - self.at}: the file is truncated or broken; export the model again."
+                f"{len(self.data) - self.at}: the file is truncated or broken; export the model "
+                "again."
             )
         self.at += count
 
@@ -129,8 +142,8 @@ class _Bytes:
         """Check that nothing follows the `count` records that the file announces."""
         if rest := len(self.data) - self.at:
             raise ValueError(
-                f"{self.path}: expected the {count} {what} that it announces, got {rest} more bytes: the number or the "
-                "file is broken; export the model again."
+                f"{self.path}: expected the {count} {what} that it announces, got {rest} more "
+                "bytes: the number or the file is broken; export the model again."
             )
 
     def string(self) -> str:

@@ -1,9 +1,10 @@
-"""The layout of Dynamic 3D Gaussians: images in `ims/`, cameras in `train_meta.json`, points in `init_pt_cld.npz`.
+"""The layout of Dynamic 3D Gaussians: images in `ims/`, cameras in `train_meta.json`, points in
+`init_pt_cld.npz`.
 
-`train_meta.json` has `w` and `h`, and per frame and camera `fn` (the image below `ims/`), `cam_id`, `k` [3, 3] in
-pixels with centres at +0.5, and `w2c` [4, 4], world -> camera with OpenCV's axes, so no axis is flipped.
-`test_meta.json` lists the held-out cameras in the same way. The rows of `init_pt_cld.npz` are x, y, z,
-r, g, b in [0, 1] and a label.
+`train_meta.json` has `w` and `h`, and per frame and camera `fn` (the image below `ims/`), `cam_id`,
+`k` [3, 3] in pixels with centres at +0.5, and `w2c` [4, 4], world -> camera with OpenCV's axes, so
+no axis is flipped. `test_meta.json` lists the held-out cameras in the same way. The rows of
+`init_pt_cld.npz` are x, y, z, r, g, b in [0, 1] and a label.
 """
 
 from __future__ import annotations
@@ -38,36 +39,60 @@ class MetaCamera:
 
 
 def read_meta(path: Path) -> list[MetaCamera]:
-    """Return the fixed cameras of `train_meta.json` or `test_meta.json`, named by their ids and in their order.
+    """Return the fixed cameras of `train_meta.json` or `test_meta.json`, named by their ids and in
+    their order.
 
     Raises:
-        ValueError: the file is broken, a key or an entry is missing, a pose is not rigid, or a camera moves.
+        ValueError: the file is broken, a key or an entry is missing, a pose is not rigid, or a
+            camera moves.
     """
     meta = read_json(path)
     missing = [key for key in _KEYS if not isinstance(meta, dict) or key not in meta]
     if missing:
-        raise ValueError(f"{path}: expected the keys {', '.join(_KEYS)}, {', '.join(missing)} missing; export again.")
+        raise ValueError(
+            f"{path}: expected the keys {', '.join(_KEYS)}, {', '.join(missing)} missing; export "
+            "again."
+        )
     warn_unread(path, meta.keys() - set(_KEYS))
     _check_counts(path, meta)
-    columns = [{str(camera_id): column for column, camera_id in enumerate(row)} for row in meta["cam_id"]]
+    columns = [
+        {str(camera_id): column for column, camera_id in enumerate(row)} for row in meta["cam_id"]
+    ]
     names = sorted(map(str, meta["cam_id"][0]), key=natural_key)
     return [_camera(path, meta, name, [row[name] for row in columns]) for name in names]
 
 
 def _check_counts(path: Path, meta: dict[str, Any]) -> None:
     rows = {key: meta[key] for key in ("fn", "cam_id", "k", "w2c")}
-    if not all(isinstance(row, list) and row and all(isinstance(e, list) for e in row) for row in rows.values()):
-        raise ValueError(f"{path}: `fn`, `cam_id`, `k` and `w2c` must be lists of frames of cameras; export it again.")
+    if not all(
+        isinstance(row, list) and row and all(isinstance(e, list) for e in row)
+        for row in rows.values()
+    ):
+        raise ValueError(
+            f"{path}: `fn`, `cam_id`, `k` and `w2c` must be lists of frames of cameras; export it "
+            "again."
+        )
     counts = {key: [len(entry) for entry in row] for key, row in rows.items()}
-    if any(count != counts["fn"] for count in counts.values()) or len(set(counts["fn"])) > 1 or not counts["fn"][0]:
-        table = ", ".join(f"{key} {len(c)} frames of {min(c)} to {max(c)} cameras" for key, c in counts.items())
-        raise ValueError(f"{path}: expected as many cameras in every frame and list, got {table}; export it again.")
+    if (
+        any(count != counts["fn"] for count in counts.values())
+        or len(set(counts["fn"])) > 1
+        or not counts["fn"][0]
+    ):
+        table = ", ".join(
+            f"{key} {len(c)} frames of {min(c)} to {max(c)} cameras" for key, c in counts.items()
+        )
+        raise ValueError(
+            f"{path}: expected as many cameras in every frame and list, got {table}; export it "
+            "again."
+        )
     ids = [sorted(map(str, row)) for row in meta["cam_id"]]
-    frame = next((t for t, row in enumerate(ids) if row != ids[0] or len(set(row)) < len(row)), None)
+    frame = next(
+        (t for t, row in enumerate(ids) if row != ids[0] or len(set(row)) < len(row)), None
+    )
     if frame is not None:
         raise ValueError(
-            f"{path}: frame {frame}: `cam_id` must name each camera of frame 0 once, got {meta['cam_id'][frame]}; "
-            "export it again."
+            f"{path}: frame {frame}: `cam_id` must name each camera of frame 0 once, got "
+            f"{meta['cam_id'][frame]}; export it again."
         )
 
 
@@ -82,20 +107,29 @@ def _camera(path: Path, meta: dict[str, Any], name: str, columns: Sequence[int])
     except (TypeError, ValueError, OverflowError):
         K = w2c = np.zeros(0)
     if K.shape[1:] != (3, 3) or w2c.shape[1:] not in ((4, 4), (3, 4)):
-        raise ValueError(f"{where}: `k` must be [3, 3] and `w2c` [4, 4] in every frame; export it again.")
+        raise ValueError(
+            f"{where}: `k` must be [3, 3] and `w2c` [4, 4] in every frame; export it again."
+        )
     for values, what in ((w2c, "pose"), (K, "intrinsics")):
         frames = np.flatnonzero(~np.isfinite(values).all((1, 2)))
         if len(frames):
-            raise ValueError(f"{where}, frame {frames[0]}: the {what} must be finite, got NaN or Inf; calibrate again.")
-        moving_frames = np.flatnonzero(np.abs(values - values[0]).max((1, 2)) > 1e-4 * (1 + np.abs(values[0]).max()))
+            raise ValueError(
+                f"{where}, frame {frames[0]}: the {what} must be finite, got NaN or Inf; "
+                "calibrate again."
+            )
+        moving_frames = np.flatnonzero(
+            np.abs(values - values[0]).max((1, 2)) > 1e-4 * (1 + np.abs(values[0]).max())
+        )
         if len(moving_frames):
             raise ValueError(
-                f"{where}: the {what} in frame {moving_frames[0]} must equal that in frame 0, as moving cameras are "
-                "not supported; use a recording of fixed cameras."
+                f"{where}: the {what} in frame {moving_frames[0]} must equal that in frame 0, as "
+                "moving cameras are not supported; use a recording of fixed cameras."
             )
     sizes = meta["w"], meta["h"]
     if not all(isinstance(size, int) and size > 0 for size in sizes):
-        raise ValueError(f"{path}: `w` and `h` must be positive whole numbers, got {sizes}; export it again.")
+        raise ValueError(
+            f"{path}: `w` and `h` must be positive whole numbers, got {sizes}; export it again."
+        )
     try:
         camera = Camera(K[0], rigid(where, w2c[0]), *sizes, name=name)
     except ValueError as error:
@@ -113,12 +147,17 @@ def read_point_cloud(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """
     rows = read_array(path, "data")
     if rows.ndim != 2 or rows.shape[1] < 6 or rows.dtype.kind not in "fiu" or not bounded(rows):
-        raise ValueError(f"{path}: `data` must be [P, 7], finite, got {rows.dtype} {rows.shape}; export it again.")
+        raise ValueError(
+            f"{path}: `data` must be [P, 7], finite, got {rows.dtype} {rows.shape}; export it "
+            "again."
+        )
     return rows[:, :3].astype(np.float32), rows[:, 3:6].astype(np.float32)
 
 
 def _read_calibration(path: Path) -> Calibration:
-    """Return the training cameras and the test cameras, which are held out; cameras without images are left out."""
+    """Return the training cameras and the test cameras, which are held out; cameras without images
+    are left out.
+    """
     training = read_meta(path / "train_meta.json")
     test = read_meta(path / "test_meta.json") if (path / "test_meta.json").is_file() else []
     held_out = {view.camera.name for view in test}

@@ -1,7 +1,7 @@
 """The supported capture layouts.
 
-A layout of this package is a module that exposes a `LAYOUT`, whose name is in `_READERS`. Another module appends its
-layout to `LAYOUTS`.
+A layout of this package is a module that exposes a `LAYOUT`, whose name is in `_READERS`. Another
+module appends its layout to `LAYOUTS`.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ _READERS = (
     "poses_bounds",
 )
 LAYOUTS: list[Layout] = [import_module(f"{__package__}.{name}").LAYOUT for name in _READERS]
-"""The layouts in order of precedence, for folders with several calibrations. COLMAP's is the most complete one: it has
-lenses, principal points and points."""
+"""The layouts in order of precedence, for folders with several calibrations. COLMAP's is the most
+complete one: it has lenses, principal points and points."""
 
 
 def find_layout(path: Path) -> Layout:
@@ -37,27 +37,31 @@ def find_layout(path: Path) -> Layout:
         return layout
     if (path / STREAM).is_file():
         raise FileNotFoundError(
-            f"{path}: expected a capture, found a fit; `morgs-mi eval {path}` scores it, `morgs-mi view {path}` shows "
-            f"it{_fitted_capture(path)}."
+            f"{path}: expected a capture, found a fit; `morgs-mi eval {path}` scores it, "
+            f"`morgs-mi view {path}` shows it{_fitted_capture(path)}."
         )
     clips = required_clips(path)  # without clips the path itself is likely wrong
     static = all(isinstance(clip, tuple) for clip in clips.values())
-    recording = f" The {len(clips)} photos count as cameras with one frame each; a recording has {EXAMPLE}"
+    recording = (
+        f" The {len(clips)} photos count as cameras with one frame each; a recording has {EXAMPLE}"
+    )
     *files, last = [file for layout in LAYOUTS for file in layout.files]
     raise FileNotFoundError(
-        f"{path}: expected a calibration ({', '.join(files)} or {last}), found none; run `morgs-mi calibrate` on the "
-        f"folder.{recording if static else ''}"
+        f"{path}: expected a calibration ({', '.join(files)} or {last}), found none; run "
+        f"`morgs-mi calibrate` on the folder.{recording if static else ''}"
     )
 
 
 def _fitted_capture(path: Path) -> str:
-    """Return advice on the capture of a fit in the folder `path`; empty if the folder names none."""
+    """Return advice on the capture of a fit in the folder `path`; empty if it names none."""
     try:
         description = read_json(path / CAPTURE)
     except (OSError, ValueError):
         description = {}
     capture = description.get("capture") if isinstance(description, dict) else None
-    return f", and `morgs-mi info {capture}` describes its capture" if isinstance(capture, str) else ""
+    return (
+        f", and `morgs-mi info {capture}` describes its capture" if isinstance(capture, str) else ""
+    )
 
 
 def layout_called(name: str) -> Layout | None:

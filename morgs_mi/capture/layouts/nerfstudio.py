@@ -1,10 +1,11 @@
 """Nerfstudio's `transforms.json`: poses as camera -> world with OpenGL's axes.
 
-Each of its `frames` names a file and has a `transform_matrix` [4, 4]: camera -> world, x right, y up, z backward.
-Intrinsics (`fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`), lens coefficients and `mask_path` are keys of the file or of a frame;
-the frame's take precedence. `w` and `h` may be missing. Pixel centres lie at +0.5, as in `Camera`. World units are the
-units of the matrices: `applied_transform` and `applied_scale` are not undone. `train_filenames`, `val_filenames` and
-`test_filenames` split the images.
+Each of its `frames` names a file and has a `transform_matrix` [4, 4]: camera -> world, x right, y
+up, z backward. Intrinsics (`fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`), lens coefficients and `mask_path`
+are keys of the file or of a frame; the frame's take precedence. `w` and `h` may be missing. Pixel
+centres lie at +0.5, as in `Camera`. World units are the units of the matrices: `applied_transform`
+and `applied_scale` are not undone. `train_filenames`, `val_filenames` and `test_filenames` split
+the images.
 """
 
 from __future__ import annotations
@@ -47,14 +48,53 @@ _KEYS = {
     *_INTRINSICS,
     *_DISTORTION,
     *_SPLITS,
-    *("frames", "file_path", "transform_matrix", "ply_file_path", "mask_path", "camera_model", "is_fisheye"),
+    *(
+        "frames",
+        "file_path",
+        "transform_matrix",
+        "ply_file_path",
+        "mask_path",
+        "camera_model",
+        "is_fisheye",
+    ),
 }
-# Keys of exporters that say nothing about the cameras: instant-ngp's, Nerfstudio's, Blender's and Record3D's.
+# Keys of exporters that say nothing about the cameras: instant-ngp's, Nerfstudio's, Blender's and
+# Record3D's.
 _HARMLESS = {
-    *("aabb_scale", "aabb", "scale", "offset", "up", "render_aabb", "n_extra_learnable_dims", "from_na", "sharpness"),
-    *("enable_depth_loading", "enable_ray_loading", "integer_depth_scale", "depth_unit_scale_factor", "depth_path"),
-    *("applied_transform", "applied_scale", "orientation_override", "auto_scale_poses_override", "colmap_im_id"),
-    *("colmap_camera_id", "colmap_img_id", "depth_file_path", "normal_file_path", "timestamp", "time", "rotation"),
+    *(
+        "aabb_scale",
+        "aabb",
+        "scale",
+        "offset",
+        "up",
+        "render_aabb",
+        "n_extra_learnable_dims",
+        "from_na",
+        "sharpness",
+    ),
+    *(
+        "enable_depth_loading",
+        "enable_ray_loading",
+        "integer_depth_scale",
+        "depth_unit_scale_factor",
+        "depth_path",
+    ),
+    *(
+        "applied_transform",
+        "applied_scale",
+        "orientation_override",
+        "auto_scale_poses_override",
+        "colmap_im_id",
+    ),
+    *(
+        "colmap_camera_id",
+        "colmap_img_id",
+        "depth_file_path",
+        "normal_file_path",
+        "timestamp",
+        "time",
+        "rotation",
+    ),
     *("near", "far", "description", "version", "date"),
 }
 
@@ -67,7 +107,8 @@ class Transforms:
     lenses: list[Lens]  #: One per frame.
     masks: list[Path | None]  #: Per frame the image whose black pixels are not used, or None.
     points: Path | None  #: The points' PLY file, or None.
-    splits: Mapping[str, list[str]]  #: Names of images by split; empty if the file does not split them.
+    #: Names of images by split; empty if the file does not split them.
+    splits: Mapping[str, list[str]]
 
 
 def read_transforms(path: Path, clips: Mapping[str, Clip] | None = None) -> Transforms:
@@ -75,16 +116,19 @@ def read_transforms(path: Path, clips: Mapping[str, Clip] | None = None) -> Tran
 
     Args:
         path: the file.
-        clips: clips by name, whose sizes frames without `w` and `h` have if their images are no files.
+        clips: clips by name, whose sizes frames without `w` and `h` have if their images are no
+            files.
 
     Raises:
-        ValueError: the file is broken, a key is missing or not a number, a pose is not rigid, or the camera model is
-            not supported.
+        ValueError: the file is broken, a key is missing or not a number, a pose is not rigid, or
+            the camera model is not supported.
     """
     meta = read_json(path)
     frames = meta.get("frames") if isinstance(meta, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
-        raise ValueError(f"{path}: expected an object with a list of `frames`, got none; export it again.")
+        raise ValueError(
+            f"{path}: expected an object with a list of `frames`, got none; export it again."
+        )
     unread = {key for values in (meta, *frames) for key in values} - _KEYS - _HARMLESS
     sizes = ImageSizes(path.parent, clips or {})
     cameras = []
@@ -94,7 +138,9 @@ def read_transforms(path: Path, clips: Mapping[str, Clip] | None = None) -> Tran
         where = f"{path}, frame {index}"
         name = frame.get("file_path")
         if not isinstance(name, str) or not name:
-            raise ValueError(f"{where}: `file_path` must name a file, got {name!r}; export it again.")
+            raise ValueError(
+                f"{where}: `file_path` must name a file, got {name!r}; export it again."
+            )
         where += f" ({name})"
         values = meta | frame
         if not {"w", "h"} <= values.keys():
@@ -110,12 +156,17 @@ def read_transforms(path: Path, clips: Mapping[str, Clip] | None = None) -> Tran
     splits = {split: meta[split] for split in _SPLITS if meta.get(split) is not None}
     for split, names in splits.items():
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise ValueError(f"{path}: `{split}` must be a list of names of images, got another value; correct it.")
+            raise ValueError(
+                f"{path}: `{split}` must be a list of names of images, got another value; correct "
+                "it."
+            )
     return Transforms(cameras, lenses, masks, path.parent / points if points else None, splits)
 
 
 def _size(sizes: ImageSizes, name: str, frames: Sequence[Mapping[str, Any]]) -> dict[str, int]:
-    """Return `w` and `h` of an image, or another image's if it is missing: its camera is left out later."""
+    """Return `w` and `h` of an image, or another image's if it is missing: its camera is left out
+    later.
+    """
     names = [name, *(str(frame.get("file_path")) for frame in frames)]
     size = next(filter(None, map(sizes.of, names)), ())
     return dict(zip(("w", "h"), size, strict=False))
@@ -124,7 +175,9 @@ def _size(sizes: ImageSizes, name: str, frames: Sequence[Mapping[str, Any]]) -> 
 def _file_name(where: str, values: Mapping[str, Any], key: str) -> str | None:
     name = values.get(key)
     if name is not None and not isinstance(name, str):
-        raise ValueError(f"{where}: `{key}` must name a file, got {repr(name)[:80]}; export it again.")
+        raise ValueError(
+            f"{where}: `{key}` must name a file, got {repr(name)[:80]}; export it again."
+        )
     return name.replace("\\", "/") if name else None
 
 
@@ -142,13 +195,23 @@ def _camera(where: str, values: Mapping[str, Any], name: str) -> Camera:
     to_world = rigid(where, matrix)
     viewmat = np.linalg.inv(to_world @ _OPENGL_FROM_OPENCV)
     try:
-        return Camera(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), viewmat, round(width), round(height), name)
+        return Camera(
+            np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
+            viewmat,
+            round(width),
+            round(height),
+            name,
+        )
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
 
 
-def _focal_length(where: str, values: Mapping[str, Any], axis: str, size: float, default: float | None = None) -> float:
-    """Return the focal length from `fl_x` or `camera_angle_x`, px, of an axis along which the image has `size` px."""
+def _focal_length(
+    where: str, values: Mapping[str, Any], axis: str, size: float, default: float | None = None
+) -> float:
+    """Return the focal length from `fl_x` or `camera_angle_x`, px, of an axis along which the image
+    has `size` px.
+    """
     key = f"fl_{axis}"
     angle = f"camera_angle_{axis}"
     if key not in values and angle in values:
@@ -161,17 +224,23 @@ def _lens(where: str, values: Mapping[str, Any]) -> Lens:
     k1, k2, k3, k4, p1, p2 = (_number(where, values, key, 0.0) for key in _DISTORTION)
     fisheye = values.get("is_fisheye", False)
     if fisheye not in (True, False):
-        raise ValueError(f"{where}: `is_fisheye` must be true or false, got {repr(fisheye)[:80]}; correct it.")
+        raise ValueError(
+            f"{where}: `is_fisheye` must be true or false, got {repr(fisheye)[:80]}; correct it."
+        )
     if fisheye or model == "OPENCV_FISHEYE":
         return Lens("OPENCV_FISHEYE", (k1, k2, k3, k4))
     if model not in _PERSPECTIVE:
         raise ValueError(
-            f"{where}: `camera_model` must be OPENCV_FISHEYE or one of {', '.join(_PERSPECTIVE)}, got {model!r}; "
-            "undistort the images first."
+            f"{where}: `camera_model` must be OPENCV_FISHEYE or one of {', '.join(_PERSPECTIVE)}, "
+            f"got {model!r}; undistort the images first."
         )
     if k4:
-        # Nerfstudio's k4 is the coefficient of r^8, for which COLMAP has no model. OpenCV's k4 is in the denominator.
-        raise ValueError(f"{where}: `k4` must be 0 in a perspective camera, got {k4}; undistort the images first.")
+        # Nerfstudio's k4 is the coefficient of r^8, for which COLMAP has no model. OpenCV's k4 is
+        # in the denominator.
+        raise ValueError(
+            f"{where}: `k4` must be 0 in a perspective camera, got {k4}; undistort the images "
+            "first."
+        )
     return opencv_lens((k1, k2, p1, p2, k3))
 
 
@@ -180,30 +249,36 @@ def _number(where: str, values: Mapping[str, Any], key: str, default: float | No
     if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) <= LARGEST:
         got = "none" if value is None else repr(value)[:80]
         raise ValueError(
-            f"{where}: `{key}` must be a finite number of at most {LARGEST:g}, here or at the top of the file, got "
-            f"{got}."
+            f"{where}: `{key}` must be a finite number of at most {LARGEST:g}, here or at the top "
+            f"of the file, got {got}."
         )
     return float(value)
 
 
 def read_points_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions [P, 3] and colours [P, 3] in [0, 1] of a point cloud; grey if the file has no colours.
+    """Return the positions [P, 3] and colours [P, 3] in [0, 1] of a point cloud; grey if the file
+    has no colours.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: it is not a PLY file with vertices x, y, z, or they are not finite.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected the points' PLY file, found none; copy it or drop `ply_file_path`.")
+        raise FileNotFoundError(
+            f"{path}: expected the points' PLY file, found none; copy it or drop `ply_file_path`."
+        )
     vertices = read_vertices(path)
     if missing := {"x", "y", "z"} - vertices.keys():
         raise ValueError(
-            f"{path}: expected a PLY file with vertices x, y, z, got vertices without {', '.join(sorted(missing))}; "
-            "export it again."
+            f"{path}: expected a PLY file with vertices x, y, z, got vertices without "
+            f"{', '.join(sorted(missing))}; export it again."
         )
     points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float32)
     if not bounded(points):
-        raise ValueError(f"{path}: the points must be finite and at most {LARGEST:g}, got others; export them again.")
+        raise ValueError(
+            f"{path}: the points must be finite and at most {LARGEST:g}, got others; export them "
+            "again."
+        )
     if not {"red", "green", "blue"} <= vertices.keys():
         return points, np.full(points.shape, 0.5, np.float32)
     colors = np.stack([vertices[band] for band in ("red", "green", "blue")], axis=1)
@@ -219,7 +294,9 @@ def _read_calibration(path: Path) -> Calibration:
     match = match_clips(path, source, clips, content.cameras, content.lenses)
     masks = tuple(_distinct(content.masks[index] for index in images) for images in match.images)
     calibration = replace(match.calibration, points=points, point_colors=colors, masks=masks)
-    return _split(path, source, calibration, content, match.images) if content.splits else calibration
+    return (
+        _split(path, source, calibration, content, match.images) if content.splits else calibration
+    )
 
 
 def _distinct(files: Iterable[Path | None]) -> tuple[Path, ...]:
@@ -227,30 +304,46 @@ def _distinct(files: Iterable[Path | None]) -> tuple[Path, ...]:
 
 
 def _split(
-    path: Path, source: Path, calibration: Calibration, content: Transforms, images: Sequence[Sequence[int]]
+    path: Path,
+    source: Path,
+    calibration: Calibration,
+    content: Transforms,
+    images: Sequence[Sequence[int]],
 ) -> Calibration:
-    """Return the calibration with the held-out cameras of `content`, and without those that are in no split.
+    """Return the calibration with the held-out cameras of `content`, and without those that are in
+    no split.
 
-    A camera is trained on if one of its images is: is in `train_filenames` or, without these, in no other split.
+    A camera is trained on if one of its images is: is in `train_filenames` or, without these, in no
+    other split.
 
     Raises:
         ValueError: no camera is left for training.
     """
     names = [camera.name for camera in content.cameras]
-    splits = {split: _images_named(source, split, split_names, names) for split, split_names in content.splits.items()}
+    splits = {
+        split: _images_named(source, split, split_names, names)
+        for split, split_names in content.splits.items()
+    }
     held_out = splits.get("val_filenames", set()) | splits.get("test_filenames", set())
     training = splits.get("train_filenames", set(range(len(names))) - held_out)
     views = tuple(view for view, indices in enumerate(images) if training.isdisjoint(indices))
     if len(views) == len(images):
-        raise ValueError(f"{source}: expected a camera to train on, got none in `train_filenames`; correct the splits.")
+        raise ValueError(
+            f"{source}: expected a camera to train on, got none in `train_filenames`; correct the "
+            "splits."
+        )
     calibration = replace(calibration, test_views=views)
     if extras := [calibration.names[view] for view in views if held_out.isdisjoint(images[view])]:
         _LOG.warning("%s: %s in none of the splits: left out.", source, ", ".join(extras))
     return calibration.without(path, extras)
 
 
-def _images_named(source: Path, split: str, split_names: Sequence[str], names: Sequence[str]) -> set[int]:
-    """Return the indices of the images `names` that a split names, in full or by the end of one path alone."""
+def _images_named(
+    source: Path, split: str, split_names: Sequence[str], names: Sequence[str]
+) -> set[int]:
+    """Return the indices of the images `names` that a split names, in full or by the end of one
+    path alone.
+    """
     places = [_parts(name) for name in names]
     whole: dict[tuple[str, ...], set[int]] = {}
     ends: dict[tuple[str, ...], set[int]] = {}
@@ -260,7 +353,13 @@ def _images_named(source: Path, split: str, split_names: Sequence[str], names: S
             ends.setdefault(parts[start:], set()).add(index)
     ends = {parts: indices for parts, indices in ends.items() if len(indices) == 1} | whole
     if unknown := [name for name in split_names if _parts(name) not in ends]:
-        _LOG.warning("%s: `%s` names %d images without a frame, such as %s.", source, split, len(unknown), unknown[0])
+        _LOG.warning(
+            "%s: `%s` names %d images without a frame, such as %s.",
+            source,
+            split,
+            len(unknown),
+            unknown[0],
+        )
     return set().union(*(ends.get(_parts(name), set()) for name in split_names))
 
 

@@ -1,8 +1,9 @@
 """`poses_bounds.npy`, the calibration of LLFF and of Neural 3D Video (N3DV).
 
-One row [17] per camera, in the order of the existing videos by number: a 3x5 matrix in row-major order with
-the columns down, right and backward axis of the camera, its centre (all in the world) and
-(height, width, focal length); then the nearest and farthest depth. The principal point is the image centre.
+One row [17] per camera, in the order of the existing videos by number: a 3x5 matrix in row-major
+order with the columns down, right and backward axis of the camera, its centre (all in the world)
+and (height, width, focal length); then the nearest and farthest depth. The principal point is the
+image centre.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ from morgs_mi.io.bounded import read_array
 from morgs_mi.io.video import Clip
 
 
-def read_poses_bounds(path: str | Path, names: Sequence[str]) -> tuple[tuple[Camera, ...], np.ndarray]:
+def read_poses_bounds(
+    path: str | Path, names: Sequence[str]
+) -> tuple[tuple[Camera, ...], np.ndarray]:
     """Return one camera per name, and their depth bounds [C, 2] in world units.
 
     Args:
@@ -31,7 +34,8 @@ def read_poses_bounds(path: str | Path, names: Sequence[str]) -> tuple[tuple[Cam
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is not a NumPy array [C, 17] with one row per name, or a row is not a valid pose.
+        ValueError: it is not a NumPy array [C, 17] with one row per name, or a row is not a valid
+            pose.
     """
     path = Path(path)
     rows = _rows(path)
@@ -40,7 +44,9 @@ def read_poses_bounds(path: str | Path, names: Sequence[str]) -> tuple[tuple[Cam
             f"{path}: expected one row per camera, got {len(rows)} rows for {len(names)} videos "
             f"({', '.join(names)}); remove the rows of missing videos."
         )
-    cameras = tuple(_camera(path, i, row, name) for i, (row, name) in enumerate(zip(rows, names, strict=True)))
+    cameras = tuple(
+        _camera(path, i, row, name) for i, (row, name) in enumerate(zip(rows, names, strict=True))
+    )
     return cameras, rows[:, 15:].astype(np.float64)
 
 
@@ -52,7 +58,10 @@ def count_rows(path: Path) -> int:
 def _rows(path: Path) -> np.ndarray:
     rows = read_array(path)
     if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f":
-        raise ValueError(f"{path}: expected a float array [C, 17], got {rows.dtype} {rows.shape}; export it again.")
+        raise ValueError(
+            f"{path}: expected a float array [C, 17], got {rows.dtype} {rows.shape}; export it "
+            "again."
+        )
     return rows
 
 
@@ -63,7 +72,9 @@ def _camera(path: Path, index: int, row: np.ndarray, name: str) -> Camera:
     pose = row[:15].reshape(3, 5).astype(np.float64)
     down, right, back, centre, (height, width, focal) = pose.T
     R = np.stack([right, down, -back])
-    viewmat = rigid(f"{where}, columns in the order down, right, back", np.column_stack([R, -R @ centre]))
+    viewmat = rigid(
+        f"{where}, columns in the order down, right, back", np.column_stack([R, -R @ centre])
+    )
     K = np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]])
     try:
         return Camera(K, viewmat, round(width), round(height), name)
@@ -75,33 +86,43 @@ def write_poses_bounds(path: str | Path, cameras: Sequence[Camera], bounds: np.n
     """Write the cameras, in the order of their sorted videos, with their depth bounds [C, 2].
 
     Raises:
-        ValueError: a camera has two focal lengths or an off-centre principal point, which the format
-            cannot represent, or `bounds` is not [C, 2].
+        ValueError: a camera has two focal lengths or an off-centre principal point, which the
+            format cannot represent, or `bounds` is not [C, 2].
         OSError: the file could not be written.
     """
     bounds = np.asarray(bounds, dtype=np.float64)
     if bounds.shape != (len(cameras), 2):
-        raise ValueError(f"write_poses_bounds(): `bounds` must be [C, 2] with C={len(cameras)}, got {bounds.shape}.")
+        raise ValueError(
+            f"write_poses_bounds(): `bounds` must be [C, 2] with C={len(cameras)}, got "
+            f"{bounds.shape}."
+        )
     rows = []
     for camera, near_far in zip(cameras, bounds, strict=True):
         K = camera.K
         size = np.array([camera.width, camera.height])
-        if not np.allclose(K[0, 0], K[1, 1], rtol=1e-6) or not np.allclose(K[:2, 2], size / 2, atol=1e-3):
+        if not np.allclose(K[0, 0], K[1, 1], rtol=1e-6) or not np.allclose(
+            K[:2, 2], size / 2, atol=1e-3
+        ):
             raise ValueError(
-                f"write_poses_bounds(): camera {camera.name!r} must have one focal length and a centred "
-                f"principal point, got K={K.tolist()}; use write_colmap()."
+                f"write_poses_bounds(): camera {camera.name!r} must have one focal length and a "
+                f"centred principal point, got K={K.tolist()}; use write_colmap()."
             )
         right, down, forward = np.asarray(camera.viewmat, dtype=np.float64)[:3, :3]
         hwf = [camera.height, camera.width, K[0, 0]]
-        rows.append([*np.stack([down, right, -forward, camera.position, hwf], axis=1).ravel(), *near_far])
-    data = BytesIO()  # np.save() into a file does not report that the disk has no room for the last few kB
+        rows.append(
+            [*np.stack([down, right, -forward, camera.position, hwf], axis=1).ravel(), *near_far]
+        )
+    # np.save() into a file does not report that the disk has no room for the last few kB.
+    data = BytesIO()
     np.save(data, np.array(rows))
     with atomic_path(path, "write_poses_bounds()") as partial:
         partial.write_bytes(data.getvalue())
 
 
 def _read_calibration(path: Path) -> Calibration:
-    """Match the rows to the clips: a folder per camera or, if their number fits better, a folder per frame."""
+    """Match the rows to the clips: a folder per camera or, if their number fits better, a folder
+    per frame.
+    """
     source = path / "poses_bounds.npy"
     clips: Mapping[str, Clip] = required_clips(path)
     if len(clips) != count_rows(source) == len(by_frame := clips_by_frame(path)):

@@ -3,13 +3,14 @@
 A ``camera`` has a ``serial``, and three elements:
 
 - ``fov_video``: the first and last column and row of the image on the sensor, in pixels;
-- ``transform``: the camera's position x, y, z in millimetres, and in r11 r12 r13, r21 r22 r23, r31 r32 r33 its axes
-  (x right, y up, z backward) in the world;
-- ``intrinsic``: focal lengths and principal point in 1/64 pixel from the sensor's corner, and the distortion
-  coefficients of OpenCV's model, which have no unit.
+- ``transform``: the camera's position x, y, z in millimetres, and in r11 r12 r13, r21 r22 r23, r31
+  r32 r33 its axes (x right, y up, z backward) in the world;
+- ``intrinsic``: focal lengths and principal point in 1/64 pixel from the sensor's corner, and the
+  distortion coefficients of OpenCV's model, which have no unit.
 
-The format is not documented. Signs and units follow files of Qualisys systems and the programs that read them. Pose2Sim
-also divides the distortion coefficients by 64, which makes them negligible. Positions are converted to metres.
+The format is not documented. Signs and units follow files of Qualisys systems and the programs that
+read them. Pose2Sim also divides the distortion coefficients by 64, which makes them negligible.
+Positions are converted to metres.
 """
 
 from __future__ import annotations
@@ -45,7 +46,8 @@ _SUBPIXELS = 64
 _VALUE_BYTES = 200
 _METRES = 1e-3
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
-# Attributes of a camera's elements that are read, and others that QTM writes and that say nothing about the images.
+# Attributes of a camera's elements that are read, and others that QTM writes and that say nothing
+# about the images.
 _READ = {
     "fov_video": {"left", "top", "right", "bottom"},
     "transform": {*"xyz", *(f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3))},
@@ -62,15 +64,21 @@ _READ = {
     },
 }
 _HARMLESS = {"fov_marker", "fov_marker_max", "fov_video_max"}
-_DISTORTION = ("radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2")
+_DISTORTION = (
+    "radialDistortion1",
+    "radialDistortion2",
+    "tangentalDistortion1",
+    "tangentalDistortion2",
+)
 
 
 def read_qualisys(path: Path) -> tuple[list[Camera], list[Lens]]:
-    """Return the active cameras, named by their serial numbers, and their lenses; world units are metres.
+    """Return the active cameras, named by their serial numbers, and their lenses; world units are
+    metres.
 
     Raises:
-        ValueError: the file is broken, an element or attribute of a camera is missing or is no number, or its axes are
-            not orthonormal.
+        ValueError: the file is broken, an element or attribute of a camera is missing or is no
+            number, or its axes are not orthonormal.
     """
     data = read_bytes(path)
     values = data.count(b"<") + data.count(b"=")
@@ -78,18 +86,25 @@ def read_qualisys(path: Path) -> tuple[list[Camera], list[Lens]]:
     try:
         encoding = encoding_of(data)  # of which a byte order mark knows better than a declaration
         root = ElementTree.fromstring(
-            data if encoding == "utf-8" else data.decode(encoding), ElementTree.XMLParser(target=_Plain())
+            data if encoding == "utf-8" else data.decode(encoding),
+            ElementTree.XMLParser(target=_Plain()),
         )
     except (ElementTree.ParseError, ValueError) as error:
-        raise ValueError(f"{path}: expected XML, got a broken file ({error}); export it again.") from None
+        raise ValueError(
+            f"{path}: expected XML, got a broken file ({error}); export it again."
+        ) from None
     active = [element for element in root.iter("camera") if element.get("active", "1") != "0"]
     if not active:
         raise ValueError(
-            f"{path}: expected an element `camera` for each camera, found none; export the calibration again."
+            f"{path}: expected an element `camera` for each camera, found none; export the "
+            "calibration again."
         )
-    if serials := [element.get("serial", "?") for element in active if element.get("viewrotation", "0") != "0"]:
+    if serials := [
+        element.get("serial", "?") for element in active if element.get("viewrotation", "0") != "0"
+    ]:
         _LOG.warning(
-            "%s: QTM displays %s rotated (viewrotation); their clips must show the images as the sensor recorded them.",
+            "%s: QTM displays %s rotated (viewrotation); their clips must show the images as the "
+            "sensor recorded them.",
             *(path, ", ".join(serials)),
         )
     warn_unread(path, (name for element in active for name in _unread(element)))
@@ -98,7 +113,9 @@ def read_qualisys(path: Path) -> tuple[list[Camera], list[Lens]]:
 
 
 def _unread(camera: Element) -> Iterator[str]:
-    """Yield the elements of a camera and their attributes that are not read; a `skew` of 0 changes nothing."""
+    """Yield the elements of a camera and their attributes that are not read; a `skew` of 0 changes
+    nothing.
+    """
     for element in camera:
         if element.tag in _HARMLESS:
             continue
@@ -110,7 +127,9 @@ def _unread(camera: Element) -> Iterator[str]:
 
 
 class _Plain(ElementTree.TreeBuilder):
-    """Builder of a document without a document type, because its entities could expand without bound."""
+    """Builder of a document without a document type, because its entities could expand without
+    bound.
+    """
 
     def doctype(self, *_: str | None) -> None:
         raise ValueError("it declares a document type")
@@ -120,14 +139,24 @@ def _camera(path: Path, element: Element) -> tuple[Camera, Lens]:
     serial = element.get("serial", "")
     where = f"{path}, camera {serial!r}"
     if not serial:
-        raise ValueError(f"{path}: every `camera` must have a `serial`, got one without; export the calibration again.")
-    left, top, right, bottom = _numbers(where, element, "fov_video", "left", "top", "right", "bottom")
+        raise ValueError(
+            f"{path}: every `camera` must have a `serial`, got one without; export the "
+            "calibration again."
+        )
+    left, top, right, bottom = _numbers(
+        where, element, "fov_video", "left", "top", "right", "bottom"
+    )
     fu, fv, cu, cv = _numbers(
         where, element, "intrinsic", "focalLengthU", "focalLengthV", "centerPointU", "centerPointV"
     )
     K = np.array([[fu, 0, cu], [0, fv, cv], [0, 0, _SUBPIXELS]]) / _SUBPIXELS
     K[:2, 2] -= left, top
-    axes = _numbers(where, element, "transform", *(f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)))
+    axes = _numbers(
+        where,
+        element,
+        "transform",
+        *(f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)),
+    )
     R = _OPENCV_FROM_OPENGL @ np.reshape(axes, (3, 3))
     position = _METRES * np.array(_numbers(where, element, "transform", "x", "y", "z"))
     viewmat = rigid(where, np.column_stack([R, -R @ position]))
@@ -144,7 +173,9 @@ def _numbers(where: str, camera: Element, name: str, *keys: str) -> list[float]:
     """Return attributes of a camera's element `name`."""
     element = camera.find(name)
     if element is None:
-        raise ValueError(f"{where}: expected an element `{name}`, found none; export the calibration again.")
+        raise ValueError(
+            f"{where}: expected an element `{name}`, found none; export the calibration again."
+        )
     numbers = []
     for key in keys:
         text = element.get(key)
@@ -155,8 +186,8 @@ def _numbers(where: str, camera: Element, name: str, *keys: str) -> list[float]:
         if not bounded(numbers[-1]):
             got = "none" if text is None else repr(text)
             raise ValueError(
-                f"{where}: `{key}` of `{name}` must be a finite number of at most {LARGEST:g}, got {got}; calibrate in "
-                "QTM and export again."
+                f"{where}: `{key}` of `{name}` must be a finite number of at most {LARGEST:g}, "
+                f"got {got}; calibrate in QTM and export again."
             )
     return numbers
 

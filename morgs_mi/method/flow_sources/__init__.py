@@ -1,6 +1,7 @@
 """Sources of optical flow.
 
-Every module of this package is imported here. A new one only has to register itself (see `flow_registry`).
+Every module of this package is imported here. A new one only has to register itself (see
+`flow_registry`).
 """
 
 from functools import partial

@@ -8,11 +8,14 @@ import numpy as np
 from morgs_mi.method.flow_sources.flow_config import FlowConfig
 
 
-def consistency_mask(flow: np.ndarray, back: np.ndarray, config: FlowConfig | None = None) -> np.ndarray:
-    """Return the mask of reliable flow [H, W], bool: pixels that the flow back returns to where they started.
+def consistency_mask(
+    flow: np.ndarray, back: np.ndarray, config: FlowConfig | None = None
+) -> np.ndarray:
+    """Return the mask of reliable flow [H, W], bool: pixels that the flow back returns to where
+    they started.
 
-    |F + B|^2 < 0.01 (|F|^2 + |B|^2) + 0.5 px^2, with B sampled at x + F(x) (Sundaram, Brox and Keutzer, ECCV 2010).
-    Pixels that become hidden or leave the image fail.
+    |F + B|^2 < 0.01 (|F|^2 + |B|^2) + 0.5 px^2, with B sampled at x + F(x) (Sundaram, Brox and
+    Keutzer, ECCV 2010). Pixels that become hidden or leave the image fail.
 
     Args:
         flow: F [H, W, 2] in pixels, from one frame to another.
@@ -28,7 +31,8 @@ def consistency_mask(flow: np.ndarray, back: np.ndarray, config: FlowConfig | No
     mismatch = _squared(flow + back)
     length = _squared(flow) + _squared(back)
     agrees = mismatch < config.consistency_relative * length + config.consistency_absolute
-    # The image ends half a pixel beyond the outermost centres, so the flow's own error does not reject the border.
+    # The image ends half a pixel beyond the outermost centres, so the flow's own error does not
+    # reject the border.
     return agrees & (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
 
 

@@ -5,14 +5,16 @@ Layout of a folder of flow, one folder per camera of the capture and direction:
     FLOW/cam00/forward/0000.flo     from frame 0 to frame 1, on frame 0's grid
     FLOW/cam00/backward/0001.flo    from frame 1 to frame 0, on frame 1's grid
 
-A file has the number of the frame that its pixel grid belongs to. Flow tools name their output after the first image of
-a pair, so run the tool over the frames in order, then again in reverse order. The number is the last one in the file's
-name, with any prefix and any number of zeros (`frame_0001.flo`); frames count from 0.
+A file has the number of the frame that its pixel grid belongs to. Flow tools name their output
+after the first image of a pair, so run the tool over the frames in order, then again in reverse
+order. The number is the last one in the file's name, with any prefix and any number of zeros
+(`frame_0001.flo`); frames count from 0.
 
-Flow is in pixels of the images that the package fits (undistorted, downscaled), x to the right and y down. A `.flo`
-file (Middlebury) holds the float32 202021.25, width and height as int32, then x and y of every pixel row by row as
-float32, all little-endian. An EXR file holds the channels `flow.X` and `flow.Y`, `X` and `Y`, `u` and `v`, or `R` and
-`G`. The renderer's own `motion.X` and `motion.Y` point the other way and are rejected.
+Flow is in pixels of the images that the package fits (undistorted, downscaled), x to the right and
+y down. A `.flo` file (Middlebury) holds the float32 202021.25, width and height as int32, then x
+and y of every pixel row by row as float32, all little-endian. An EXR file holds the channels
+`flow.X` and `flow.Y`, `X` and `Y`, `u` and `v`, or `R` and `G`. The renderer's own `motion.X` and
+`motion.Y` point the other way and are rejected.
 """
 
 from __future__ import annotations
@@ -51,11 +53,16 @@ class FlowFolder:
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)
         if not self.folder.is_dir():
-            raise FileNotFoundError(f"{folder}: expected a folder of flow files, found none; check the path.")
+            raise FileNotFoundError(
+                f"{folder}: expected a folder of flow files, found none; check the path."
+            )
         self._listed: dict[Path, dict[int, list[Path]]] = {}
 
-    def flows(self, camera: str, frame: int, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the flow from frame t to t - 1 on frame t's grid, and from t - 1 to t on frame t - 1's grid.
+    def flows(
+        self, camera: str, frame: int, size: tuple[int, int]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the flow from frame t to t - 1 on frame t's grid, and from t - 1 to t on frame t -
+        1's grid.
 
         Args:
             camera: name of the camera.
@@ -77,8 +84,8 @@ class FlowFolder:
             height, width = size
             rows, columns = flow.shape[:2]
             raise ValueError(
-                f"{path}: expected {width}x{height} pixels as the images of {camera} have, got {columns}x{rows}; "
-                "compute the flow on undistorted and downscaled images."
+                f"{path}: expected {width}x{height} pixels as the images of {camera} have, got "
+                f"{columns}x{rows}; compute the flow on undistorted and downscaled images."
             )
         return flow
 
@@ -91,12 +98,14 @@ class FlowFolder:
         if not paths:
             content = f"files of frames {min(files)} to {max(files)}" if files else "no flow at all"
             raise FileNotFoundError(
-                f"{folder}: expected a .flo or .exr file of frame {frame}, found {content}; name each file after the "
-                "frame on whose grid its flow lives, counting from 0."
+                f"{folder}: expected a .flo or .exr file of frame {frame}, found {content}; name "
+                "each file after the frame on whose grid its flow lives, counting from 0."
             )
         if len(paths) > 1:
             names = ", ".join(path.name for path in paths)
-            raise ValueError(f"{folder}: expected one file of frame {frame}, got {names}; keep one.")
+            raise ValueError(
+                f"{folder}: expected one file of frame {frame}, got {names}; keep one."
+            )
         return paths[0]
 
 
@@ -114,8 +123,9 @@ def read_flow(path: str | Path) -> np.ndarray:
     Raises:
         FileNotFoundError: there is no such file.
         OSError: an EXR file cannot be read.
-        ValueError: another kind of file, a `.flo` file without its magic number or of another length than its header
-            states, an EXR file without exactly one known pair of channels, or pixels without flow.
+        ValueError: another kind of file, a `.flo` file without its magic number or of another
+            length than its header states, an EXR file without exactly one known pair of channels,
+            or pixels without flow.
     """
     path = Path(path)
     reader = _read_flo if _suffix("read_flow()", path) == ".flo" else _read_exr
@@ -126,8 +136,8 @@ def read_flow(path: str | Path) -> np.ndarray:
     if unknown.any():
         y, x = np.argwhere(unknown)[0]
         raise ValueError(
-            f"{path}: expected a flow at every pixel, got none at {unknown.sum()} of {unknown.size}, the first at "
-            f"x={x}, y={y}; use a method that returns dense flow."
+            f"{path}: expected a flow at every pixel, got none at {unknown.sum()} of "
+            f"{unknown.size}, the first at x={x}, y={y}; use a method that returns dense flow."
         )
     return flow
 
@@ -157,15 +167,22 @@ def _read_flo(path: Path) -> np.ndarray:
     data = path.read_bytes()
     header = np.frombuffer(data[: _HEADER.itemsize].ljust(_HEADER.itemsize, b"\0"), _HEADER)[0]
     if header["magic"] != np.float32(_MAGIC):
-        raise ValueError(f"{path}: expected a .flo file, which begins with the float {_MAGIC}, got {data[:4]!r}.")
+        raise ValueError(
+            f"{path}: expected a .flo file, which begins with the float {_MAGIC}, got {data[:4]!r}."
+        )
     width = int(header["width"])
     height = int(header["height"])
     length = _HEADER.itemsize + 8 * width * height
     if min(width, height) < 1 or len(data) != length:
         raise ValueError(
-            f"{path}: expected {length} bytes for {width}x{height} pixels, got {len(data)}; the file may be cut short."
+            f"{path}: expected {length} bytes for {width}x{height} pixels, got {len(data)}; the "
+            "file may be cut short."
         )
-    return np.frombuffer(data, "<f4", offset=_HEADER.itemsize).reshape(height, width, 2).astype(np.float32)
+    return (
+        np.frombuffer(data, "<f4", offset=_HEADER.itemsize)
+        .reshape(height, width, 2)
+        .astype(np.float32)
+    )
 
 
 def _read_exr(path: Path) -> np.ndarray:
@@ -175,7 +192,8 @@ def _read_exr(path: Path) -> np.ndarray:
     if len(pairs) != 1 or "motion.X" in channels:
         names = ", ".join("/".join(pair) for pair in _CHANNELS)
         raise ValueError(
-            f"{path}: expected one pair of the channels {names}, and no motion map, got {', '.join(sorted(channels))}."
+            f"{path}: expected one pair of the channels {names}, and no motion map, got "
+            f"{', '.join(sorted(channels))}."
         )
     return np.stack([channels[name] for name in pairs[0]], axis=-1)
 

@@ -19,9 +19,13 @@ class FlowConfig:
     """
 
     fine_width: Annotated[int, AtLeast(0)] = 480
-    """Width in pixels up to which `dis` goes to full resolution; in wider images it stops at half resolution."""
+    """Width in pixels up to which `dis` goes to full resolution; in wider images it stops at half
+    resolution.
+    """
     consistency_relative: Annotated[float, AtLeast(0)] = 0.01
-    """Forward-backward check: tolerated squared mismatch as a share of the squared lengths of both flows."""
+    """Forward-backward check: tolerated squared mismatch as a share of the squared lengths of both
+    flows.
+    """
     consistency_absolute: Annotated[float, AtLeast(0)] = 0.5
     """Forward-backward check: tolerated squared mismatch of the shortest flows, px^2."""
 

@@ -1,10 +1,11 @@
 """Selection of an optical-flow source by one string.
 
-A source takes two successive images of a camera and returns two flows in pixels: from I_t to I_{t-1} on frame t's
-grid (eq. 4), and from I_{t-1} to I_t on frame t - 1's grid.
+A source takes two successive images of a camera and returns two flows in pixels: from I_t to
+I_{t-1} on frame t's grid (eq. 4), and from I_{t-1} to I_t on frame t - 1's grid.
 
-A new source is one module in this package that decorates a factory with `FLOW_SOURCES.register`; docs/flow.md has an
-example. A source outside this package registers itself in the same way where it is imported.
+A new source is one module in this package that decorates a factory with `FLOW_SOURCES.register`;
+docs/flow.md has an example. A source outside this package registers itself in the same way where it
+is imported.
 """
 
 from __future__ import annotations
@@ -27,10 +28,12 @@ class FramePair:
     previous: np.ndarray  #: I_{t-1}, likewise.
     camera: str = ""  #: The camera's name; flow from files needs it.
     frame: int = 1  #: t; flow from files needs it.
-    valid: np.ndarray | None = None  #: [H, W] bool, False where undistortion left nothing; None: valid everywhere.
+    #: [H, W] bool, False where undistortion left nothing; None: valid everywhere.
+    valid: np.ndarray | None = None
     #: Rows and columns outside which nothing has changed; None: any pixel may have changed.
     box: tuple[slice, slice] | None = None
-    #: [H, W] bool, pixels outside which nothing has moved, all of them in the box; None: any may have.
+    #: [H, W] bool, pixels outside which nothing has moved, all of them in the box; None: any may
+    #: have.
     region: np.ndarray | None = None
 
 
@@ -45,9 +48,10 @@ def flow_source(flow_method: str, config: FlowConfig | None = None) -> FlowSourc
     The last few sources are cached, so a network is loaded once.
 
     Args:
-        flow_method: one of `FLOW_SOURCES.usages`: a key of `FLOW_METHODS`; ``files:FOLDER`` (see `files`);
-            ``onnx:FILE`` (see `network`) for a network that takes values from 0 to 255, ``onnx-unit:FILE`` for one that
-            takes 0 to 1, ``onnx-signed:FILE`` for one that takes -1 to 1.
+        flow_method: one of `FLOW_SOURCES.usages`: a key of `FLOW_METHODS`; ``files:FOLDER`` (see
+            `files`); ``onnx:FILE`` (see `network`) for a network that takes values from 0 to 255,
+            ``onnx-unit:FILE`` for one that takes 0 to 1, ``onnx-signed:FILE`` for one that takes -1
+            to 1.
         config: settings of the methods; None: the defaults.
 
     Raises:
@@ -63,7 +67,8 @@ def _flow_source(flow_method: str, config: FlowConfig) -> FlowSource:
 
 
 def both_directions(method: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> FlowSource:
-    """Return the source that computes both flows by a function of two images, inside the pair's box.
+    """Return the source that computes both flows by a function of two images, inside the pair's
+    box.
 
     Args:
         method: takes two images and returns the flow [H, W, 2] from the first to the second.
@@ -73,7 +78,9 @@ def both_directions(method: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> F
         check_images("flow_source()", pair.image, pair.previous)
         if pair.box is None:
             return method(pair.image, pair.previous), method(pair.previous, pair.image)
-        image, previous = (np.ascontiguousarray(whole[pair.box]) for whole in (pair.image, pair.previous))
+        image, previous = (
+            np.ascontiguousarray(whole[pair.box]) for whole in (pair.image, pair.previous)
+        )
         flows = np.zeros((2, *pair.image.shape[:2], 2), np.float32)
         flows[0][pair.box] = method(image, previous)
         flows[1][pair.box] = method(previous, image)
@@ -92,6 +99,6 @@ def check_images(place: str, image: np.ndarray, previous: np.ndarray) -> None:
     """
     if image.ndim != 3 or image.shape[2] != 3 or image.shape != previous.shape:
         raise ValueError(
-            f"{place}: `image` and `previous` must be RGB of one size [H, W, 3], got {image.shape} and "
-            f"{previous.shape}."
+            f"{place}: `image` and `previous` must be RGB of one size [H, W, 3], got "
+            f"{image.shape} and {previous.shape}."
         )

@@ -1,8 +1,8 @@
 """Optical flow by OpenCV's methods (eq. 4).
 
 Notation: the flow F(x) lives on frame t's pixel grid and points from x_t to x_{t-1}, so I_t(x) is
-I_{t-1}(x + F(x)). The motion x_t - x_{t-1} of the rendered motion map is -F. Units are pixels, x to the right and
-y down.
+I_{t-1}(x + F(x)). The motion x_t - x_{t-1} of the rendered motion map is -F. Units are pixels, x to
+the right and y down.
 """
 
 from __future__ import annotations
@@ -15,10 +15,15 @@ import cv2
 import numpy as np
 
 from morgs_mi.method.flow_sources.flow_config import FlowConfig
-from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FlowSource, both_directions, check_images
+from morgs_mi.method.flow_sources.flow_registry import (
+    FLOW_SOURCES,
+    FlowSource,
+    both_directions,
+    check_images,
+)
 
-# Side of an image in pixels below which the methods have too little to match: DIS needs patches of 8 pixels on its
-# coarsest level.
+# Side of an image in pixels below which the methods have too little to match: DIS needs patches of
+# 8 pixels on its coarsest level.
 MIN_SIDE = 16
 # Given None, OpenCV allocates its result; OpenCV's type stubs do not allow for it.
 _ALLOCATE: Any = None
@@ -28,7 +33,9 @@ _Method = Callable[[np.ndarray, np.ndarray, FlowConfig], np.ndarray]
 
 def _on_gray(method: _Method) -> _Method:
     def on_gray(a: np.ndarray, b: np.ndarray, config: FlowConfig) -> np.ndarray:
-        return method(cv2.cvtColor(a, cv2.COLOR_RGB2GRAY), cv2.cvtColor(b, cv2.COLOR_RGB2GRAY), config)
+        return method(
+            cv2.cvtColor(a, cv2.COLOR_RGB2GRAY), cv2.cvtColor(b, cv2.COLOR_RGB2GRAY), config
+        )
 
     return on_gray
 
@@ -38,25 +45,30 @@ def _dis(preset: int, finest: Callable[[int, FlowConfig], int] | None = None) ->
 
     Args:
         preset: OpenCV's number of the preset.
-        finest: returns the last pyramid level (0 is full resolution) for a width; None: the preset's.
+        finest: returns the last pyramid level (0 is full resolution) for a width; None: the
+            preset's.
     """
 
     def flow(a: np.ndarray, b: np.ndarray, config: FlowConfig) -> np.ndarray:
         method = cv2.DISOpticalFlow.create(preset)
         if finest is not None:
             method.setFinestScale(finest(a.shape[1], config))
-        # DIS chooses its coarsest level by the width alone and crashes where the height is less than a patch.
+        # DIS chooses its coarsest level by the width alone and crashes where the height is less
+        # than a patch.
         rows = a.shape[0]
         missing = max(0, a.shape[1] // 2 - a.shape[0])
-        a, b = (cv2.copyMakeBorder(image, 0, missing, 0, 0, cv2.BORDER_REPLICATE) for image in (a, b))
+        a, b = (
+            cv2.copyMakeBorder(image, 0, missing, 0, 0, cv2.BORDER_REPLICATE) for image in (a, b)
+        )
         return method.calc(a, b, _ALLOCATE)[:rows]
 
     return _on_gray(flow)
 
 
 def _rlof(a: np.ndarray, b: np.ndarray, config: FlowConfig) -> np.ndarray:
-    # The global motion prior is for moving cameras, and its grid never ends on images of less than 40 rows. The
-    # default interpolation (EPIC) crashes or returns NaN on small images; this one needs colours.
+    # The global motion prior is for moving cameras, and its grid never ends on images of less than
+    # 40 rows. The default interpolation (EPIC) crashes or returns NaN on small images; this one
+    # needs colours.
     parameters = cv2.optflow.RLOFOpticalFlowParameter.create()
     parameters.setUseGlobalMotionPrior(False)
     return cv2.optflow.calcOpticalFlowDenseRLOF(
@@ -68,12 +80,15 @@ def _deepflow(a: np.ndarray, b: np.ndarray, config: FlowConfig) -> np.ndarray:
     return cv2.optflow.createOptFlow_DeepFlow().calc(a, b, _ALLOCATE)
 
 
-# OpenCV's other methods are no better at any cost (Farneback, PCAFlow, dual TV-L1), or crash or return NaN on images
-# with too little to match (sparse-to-dense, SimpleFlow, RLOF with other interpolations): see docs/experiments/flow.md.
-# All take RGB as bytes.
+# OpenCV's other methods are no better at any cost (Farneback, PCAFlow, dual TV-L1), or crash or
+# return NaN on images with too little to match (sparse-to-dense, SimpleFlow, RLOF with other
+# interpolations): see docs/experiments/flow.md. All take RGB as bytes.
 FLOW_METHODS: dict[str, _Method] = {
-    # The presets stop at half or quarter resolution, where patches of 8 pixels miss small objects in small images.
-    "dis": _dis(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM, lambda width, config: int(width > config.fine_width)),
+    # The presets stop at half or quarter resolution, where patches of 8 pixels miss small objects
+    # in small images.
+    "dis": _dis(
+        cv2.DISOPTICAL_FLOW_PRESET_MEDIUM, lambda width, config: int(width > config.fine_width)
+    ),
     "dis-fine": _dis(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM, lambda width, config: 0),
     "dis-ultrafast": _dis(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST),
     "rlof": _rlof,
@@ -98,7 +113,9 @@ def optical_flow(
         ValueError: an unknown method, images that are not RGB or differ in size.
     """
     if method not in FLOW_METHODS:
-        raise ValueError(f"optical_flow(): `method` must be one of {', '.join(FLOW_METHODS)}, got {method!r}.")
+        raise ValueError(
+            f"optical_flow(): `method` must be one of {', '.join(FLOW_METHODS)}, got {method!r}."
+        )
     config = config or FlowConfig()
     image = np.asarray(image)
     previous = np.asarray(previous)

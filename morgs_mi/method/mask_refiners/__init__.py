@@ -1,6 +1,7 @@
 """Refiners of motion masks.
 
-Every module of this package is imported here. A new one only has to register itself (see `mask_registry`).
+Every module of this package is imported here. A new one only has to register itself (see
+`mask_registry`).
 """
 
 from functools import partial
@@ -12,4 +13,6 @@ from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS
 
 for _module in iter_modules(__path__):
     import_module(f"{__name__}.{_module.name}")
-MASK_REFINERS.register_entry("sam2", "ENCODER.onnx,DECODER.onnx", partial(studio_entry, "mask refiners", "sam2"))
+MASK_REFINERS.register_entry(
+    "sam2", "ENCODER.onnx,DECODER.onnx", partial(studio_entry, "mask refiners", "sam2")
+)

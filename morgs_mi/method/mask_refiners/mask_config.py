@@ -21,17 +21,17 @@ class MaskConfig:
     threshold_mads: Annotated[float, AtLeast(0)] = 4.0
     """Speed above which a pixel moves: this many median absolute deviations above the median."""
     floor: Annotated[float, AtLeast(0)] = 0.5
-    """Least threshold in pixels in an image of 1352 px width, N3DV's half resolution; it is proportional to the width,
-    as the motion of a scene is."""
+    """Least threshold in pixels in an image of 1352 px width, N3DV's half resolution; it is
+    proportional to the width, as the motion of a scene is."""
     working_width: Annotated[int, AtLeast(1)] = 320
-    """Width in pixels to which GrabCut and superpixels reduce an image. Their cost grows with the number of pixels, and
-    a mask needs the object's outline, not its details."""
+    """Width in pixels to which GrabCut and superpixels reduce an image. Their cost grows with the
+    number of pixels, and a mask needs the object's outline, not its details."""
     superpixel_share: Annotated[float, AtLeast(0)] = 0.75
-    """Share of a superpixel that must lie in the flow mask. Flow bleeds outwards onto the static surroundings of an
-    object, all of which a bare majority would include."""
+    """Share of a superpixel that must lie in the flow mask. Flow bleeds outwards onto the static
+    surroundings of an object, all of which a bare majority would include."""
     prompts: Annotated[int, AtLeast(1)] = 16
-    """Largest connected components of the flow mask that become prompts of SAM2. Each costs a run of the decoder; the
-    smaller ones stay as they are in the flow mask."""
+    """Largest connected components of the flow mask that become prompts of SAM2. Each costs a run
+    of the decoder; the smaller ones stay as they are in the flow mask."""
 
     def __post_init__(self) -> None:
         check_ranges(self)

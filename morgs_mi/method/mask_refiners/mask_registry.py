@@ -1,10 +1,11 @@
 """Selection of a mask refiner by one string.
 
-A refiner takes frame t [H, W, 3] and the flow mask [H, W] bool (eq. 9) and returns the motion mask [H, W] bool
-(eq. 10). docs/experiments/flow.md compares the refiners.
+A refiner takes frame t [H, W, 3] and the flow mask [H, W] bool (eq. 9) and returns the motion mask
+[H, W] bool (eq. 10). docs/experiments/flow.md compares the refiners.
 
-A new refiner is one module in this package that decorates a factory with `MASK_REFINERS.register`; docs/masks.md has an
-example. A refiner outside this package registers itself in the same way where it is imported.
+A new refiner is one module in this package that decorates a factory with `MASK_REFINERS.register`;
+docs/masks.md has an example. A refiner outside this package registers itself in the same way where
+it is imported.
 """
 
 from __future__ import annotations

@@ -18,18 +18,22 @@ _ITERATIONS = 2
 _REACH = 0.05
 # Share of the image above which GrabCut is skipped: the rest has too few colours to learn from.
 _COVERAGE = 0.9
-# Side of a superpixel in pixels of the reduced image, iterations of SLIC, and its weight of distance against colour.
+# Side of a superpixel in pixels of the reduced image, iterations of SLIC, and its weight of
+# distance against colour.
 _SIDE = 8
 _SLIC_ITERATIONS = 5
 _COMPACTNESS = 10.0
 
 
-def refine_mask(image: np.ndarray, mask: np.ndarray, config: MaskConfig | None = None) -> np.ndarray:
+def refine_mask(
+    image: np.ndarray, mask: np.ndarray, config: MaskConfig | None = None
+) -> np.ndarray:
     """Return the mask of the objects [H, W] bool that a motion mask lies on, by GrabCut on colours.
 
-    GrabCut (Rother, Kolmogorov and Blake, SIGGRAPH 2004) starts from the mask with specks removed and may add pixels
-    near it. If nothing is left of the mask, or it covers nearly everything, one side has no colours to learn from: the
-    mask is returned with its specks removed and holes closed.
+    GrabCut (Rother, Kolmogorov and Blake, SIGGRAPH 2004) starts from the mask with specks removed
+    and may add pixels near it. If nothing is left of the mask, or it covers nearly everything, one
+    side has no colours to learn from: the mask is returned with its specks removed and holes
+    closed.
 
     Args:
         image: [H, W, 3], RGB, uint8 or float in [0, 1].
@@ -40,7 +44,9 @@ def refine_mask(image: np.ndarray, mask: np.ndarray, config: MaskConfig | None =
         ValueError: the sizes of image and mask differ.
     """
     if image.shape != (*mask.shape, 3):
-        raise ValueError(f"refine_mask(): `image` must be [H, W, 3] with H, W = {mask.shape}, got {image.shape}.")
+        raise ValueError(
+            f"refine_mask(): `image` must be [H, W, 3] with H, W = {mask.shape}, got {image.shape}."
+        )
     config = config or MaskConfig()
     clean = clean_mask(mask)
     small = _reduced(image, config.working_width)
@@ -48,20 +54,27 @@ def refine_mask(image: np.ndarray, mask: np.ndarray, config: MaskConfig | None =
     near = cv2.dilate(seed, _disc(int(max(seed.shape) * _REACH)))
     if not seed.any() or near.all() or seed.mean() > _COVERAGE:
         return clean
-    labels = np.where(near > 0, np.where(seed > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD), cv2.GC_BGD).astype(np.uint8)
+    labels = np.where(
+        near > 0, np.where(seed > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD), cv2.GC_BGD
+    ).astype(np.uint8)
     cv2.setRNGSeed(0)  # GrabCut's k-means starts at random
     back = np.zeros((1, 65))
     front = np.zeros((1, 65))
-    labels, _, _ = cv2.grabCut(small, labels, (0, 0, 0, 0), back, front, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
+    labels, _, _ = cv2.grabCut(
+        small, labels, (0, 0, 0, 0), back, front, _ITERATIONS, cv2.GC_INIT_WITH_MASK
+    )
     return clean_mask(_enlarged(np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)), mask.shape))
 
 
-def vote_superpixels(image: np.ndarray, mask: np.ndarray, config: MaskConfig | None = None) -> np.ndarray:
+def vote_superpixels(
+    image: np.ndarray, mask: np.ndarray, config: MaskConfig | None = None
+) -> np.ndarray:
     """Return the mask of the superpixels [H, W] bool three quarters of which are in a motion mask.
 
-    SLIC (Achanta et al., PAMI 2012) on colours in Lab. Flow that bleeds over an edge is removed, and so is any part of
-    the mask thinner than a superpixel, 8 pixels in an image 320 wide. An image with a side under two superpixels has
-    none (OpenCV crashes with a segmentation fault below one): its mask is returned unchanged.
+    SLIC (Achanta et al., PAMI 2012) on colours in Lab. Flow that bleeds over an edge is removed,
+    and so is any part of the mask thinner than a superpixel, 8 pixels in an image 320 wide. An
+    image with a side under two superpixels has none (OpenCV crashes with a segmentation fault below
+    one): its mask is returned unchanged.
 
     Args:
         image: [H, W, 3], RGB, uint8 or float in [0, 1].
@@ -72,7 +85,10 @@ def vote_superpixels(image: np.ndarray, mask: np.ndarray, config: MaskConfig | N
         ValueError: the sizes of image and mask differ.
     """
     if image.shape != (*mask.shape, 3):
-        raise ValueError(f"vote_superpixels(): `image` must be [H, W, 3] with H, W = {mask.shape}, got {image.shape}.")
+        raise ValueError(
+            f"vote_superpixels(): `image` must be [H, W, 3] with H, W = {mask.shape}, got "
+            f"{image.shape}."
+        )
     config = config or MaskConfig()
     small = _reduced(image, config.working_width)
     if min(small.shape[:2]) < 2 * _SIDE:
@@ -94,7 +110,9 @@ def clean_mask(mask: np.ndarray) -> np.ndarray:
         mask: [H, W] bool.
     """
     opening = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, _disc(_OPENING))
-    return cv2.morphologyEx(opening, cv2.MORPH_CLOSE, _disc(max(1, int(mask.shape[1] * _CLOSING)))) > 0
+    return (
+        cv2.morphologyEx(opening, cv2.MORPH_CLOSE, _disc(max(1, int(mask.shape[1] * _CLOSING)))) > 0
+    )
 
 
 @MASK_REFINERS.register("grabcut")
@@ -104,7 +122,9 @@ def _grabcut(argument: str, config: MaskConfig) -> MaskRefiner:
 
 @MASK_REFINERS.register("superpixels+grabcut")
 def _both(argument: str, config: MaskConfig) -> MaskRefiner:
-    return lambda image, mask: vote_superpixels(image, mask, config) | refine_mask(image, mask, config)
+    return lambda image, mask: (
+        vote_superpixels(image, mask, config) | refine_mask(image, mask, config)
+    )
 
 
 def _reduced(image: np.ndarray, widest: int) -> np.ndarray:

@@ -18,7 +18,8 @@ from morgs_mi.playback.player import available_channels, render
 from morgs_mi.playback.stream_header import render_config
 
 Progress = Callable[[int, int], None] | None
-# Angle of an orbit around Gaussians without a recording. Scenes fall apart from behind, and may be tilted.
+# Angle of an orbit around Gaussians without a recording. Scenes fall apart from behind, and may be
+# tilted.
 _SWING = 60.0
 
 
@@ -30,12 +31,16 @@ def frame_numbers(stream: FrameSource) -> list[int]:
     """
     numbers = stream.frame_numbers()
     if not numbers:
-        raise ValueError(f"{stream.path}: at least one frame was expected, got none; the stream has only a header.")
+        raise ValueError(
+            f"{stream.path}: at least one frame was expected, got none; the stream has only a "
+            "header."
+        )
     return numbers
 
 
 def select_frames(stream: FrameSource, span: str | None) -> list[int]:
-    """Return the frames of a stream that `span` selects: ``12``, ``10:20`` (without 20), ``::5``; None selects all.
+    """Return the frames of a stream that `span` selects: ``12``, ``10:20`` (without 20), ``::5``;
+    None selects all.
 
     Raises:
         ValueError: `span` has another syntax, or selects no frame of the stream.
@@ -44,11 +49,16 @@ def select_frames(stream: FrameSource, span: str | None) -> list[int]:
     if span is None:
         return numbers
     try:
-        start, stop, step = (*(int(part) if part.strip() else None for part in span.split(":")), *([None] * 2))[:3]
+        start, stop, step = (
+            *(int(part) if part.strip() else None for part in span.split(":")),
+            *([None] * 2),
+        )[:3]
         if span.count(":") > 2 or (step is not None and step < 1):
             raise ValueError
     except ValueError:
-        raise ValueError(f"select_frames(): `span` must be like 12, 10:20 or 0:100:5, got {span!r}.") from None
+        raise ValueError(
+            f"select_frames(): `span` must be like 12, 10:20 or 0:100:5, got {span!r}."
+        ) from None
     if ":" not in span:
         stop = None if start is None else start + 1
     low = numbers[0] if start is None else start
@@ -56,7 +66,8 @@ def select_frames(stream: FrameSource, span: str | None) -> list[int]:
     indices = range(low, high, step or 1)
     if not (frames := [number for number in numbers if number in indices]):
         raise ValueError(
-            f"select_frames(): `span` must select frames of {stream.path}, {numbers[0]} to {numbers[-1]}, got {span!r}."
+            f"select_frames(): `span` must select frames of {stream.path}, {numbers[0]} to "
+            f"{numbers[-1]}, got {span!r}."
         )
     return frames
 
@@ -69,11 +80,13 @@ def write_each(
     frames: Sequence[int],
     progress: Progress = None,
 ) -> None:
-    """Write frames as ``0000.ply``, ``0001.ply``, ... into a new folder, or one frame as a file; atomically.
+    """Write frames as ``0000.ply``, ``0001.ply``, ... into a new folder, or one frame as a file;
+    atomically.
 
     Args:
         clip: (frame, Gaussians) of all frames, as `play` and `by_place` yield them.
-        output: a folder that does not exist, or for one frame a file with a name that ends in `suffix`.
+        output: a folder that does not exist, or for one frame a file with a name that ends in
+            `suffix`.
         suffix: of the files, e.g. ``.ply``.
         write: function that writes the Gaussians of one frame.
         frames: indices of the frames, ascending.
@@ -88,7 +101,8 @@ def write_each(
     is_file = Path(output).name.lower().endswith(suffix)
     if is_file and len(selection) > 1:
         raise ValueError(
-            f"{output}: expected one frame for one file, got {len(selection)}; select one (--frames), or name a folder."
+            f"{output}: expected one frame for one file, got {len(selection)}; select one "
+            "(--frames), or name a folder."
         )
     with (atomic_path if is_file else atomic_folder)(output, "write_each()") as partial:
         for frame, gaussians in clip:
@@ -145,7 +159,10 @@ def num_images(stream: FrameSource, path: CameraPath) -> int:
 
 
 def named_path(
-    stream: FrameSource, name: str = "orbit", degrees: float | None = None, least_seconds: float = 5.0
+    stream: FrameSource,
+    name: str = "orbit",
+    degrees: float | None = None,
+    least_seconds: float = 5.0,
 ) -> CameraPath:
     """Return the camera path `between` or `orbit`, as long as the clip, or the path in a JSON file.
 
@@ -170,13 +187,16 @@ def named_path(
 
 
 def repeated_seconds(clip: float, least: float) -> float:
-    """Return the duration of as many plays of a clip as last at least `least` seconds, at least one.
+    """Return the duration of as many plays of a clip as last at least `least` seconds, at least
+    one.
 
     Raises:
         ValueError: `least` is negative or not finite.
     """
     if not 0 <= least < math.inf:
-        raise ValueError(f"repeated_seconds(): `least` must be finite and not negative, got {least}.")
+        raise ValueError(
+            f"repeated_seconds(): `least` must be finite and not negative, got {least}."
+        )
     return clip * max(1, math.ceil(least / clip - 1e-9))
 
 
@@ -188,8 +208,8 @@ def repeated_frames(
     Args:
         stream: the file.
         freeze: index of a single frame to yield; None: all.
-        back_and_forth: go backwards after the last frame. Motion is then the one of the clip, opposite to the motion
-            that is shown.
+        back_and_forth: go backwards after the last frame. Motion is then the one of the clip,
+            opposite to the motion that is shown.
 
     Raises:
         ValueError: the stream has no such frame, or a packet is broken.
@@ -202,7 +222,9 @@ def repeated_frames(
 
 
 def _frames_backwards(stream: FrameSource) -> Iterator[Gaussians]:
-    """Yield the frames between the first and the last one backwards, decoded from one keyframe to the next."""
+    """Yield the frames between the first and the last one backwards, decoded from one keyframe to
+    the next.
+    """
     inner_frames = frame_numbers(stream)[1:-1]
     while inner_frames:
         block: list[FrameState] = []

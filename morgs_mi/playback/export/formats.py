@@ -1,4 +1,6 @@
-"""Formats of exports: files, or folders of files, chosen by the name of the output or by the name of the format."""
+"""Formats of exports: files, or folders of files, chosen by the name of the output or by the name
+of the format.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +18,10 @@ class Format:
 
     name: str  #: Of the format.
     ending: str  #: End of the names of its outputs; empty: of names without a suffix.
-    default: str  #: Name of the output beside a stream; ``{}`` stands for the name of a camera or a path.
-    #: Whether it is a folder with a file per frame, or for a web server. With an `ending`, the file of a single frame
-    #: is one, too.
+    #: Name of the output beside a stream; ``{}`` stands for the name of a camera or a path.
+    default: str
+    #: Whether it is a folder with a file per frame, or for a web server. With an `ending`, the file
+    #: of a single frame is one, too.
     folder: bool = False
 
     @property
@@ -37,10 +40,15 @@ class Format:
 
     def is_file(self, output: str | Path) -> bool:
         """Return whether an output of this format is a file."""
-        return not self.folder or (bool(self.ending) and Path(output).name.lower().endswith(self._suffix))
+        return not self.folder or (
+            bool(self.ending) and Path(output).name.lower().endswith(self._suffix)
+        )
 
 
-PLY = (Format("ply", ".ply", "ply", True), Format("compressed.ply", ".compressed.ply", "compressed-ply", True))
+PLY = (
+    Format("ply", ".ply", "ply", True),
+    Format("compressed.ply", ".compressed.ply", "compressed-ply", True),
+)
 GLTF = (Format("glb", ".glb", "gltf", True),)
 USD = tuple(Format(name, f".{name}", f"stream.{name}") for name in ("usdc", "usd", "usda", "usdz"))
 VIDEO = (Format("mp4", ".mp4", "{}.mp4"),)
@@ -49,31 +57,45 @@ WEB = (Format("html", ".html", "player.html"), Format("folder", "", "web", True)
 IMAGES = (*VIDEO, Format("exr", "exr", "{}-exr", True), Format("png", "png", "{}-png", True))
 
 
-def choose_format(formats: Sequence[Format], output: str | Path | None = None, name: str | None = None) -> Format:
-    """Return the format of an output: the one called `name`, or the one that the output's name determines.
+def choose_format(
+    formats: Sequence[Format], output: str | Path | None = None, name: str | None = None
+) -> Format:
+    """Return the format of an output: the one called `name`, or the one that the output's name
+    determines.
 
-    Without either, it is the first one. A name without a suffix is a folder of the first format with folders.
+    Without either, it is the first one. A name without a suffix is a folder of the first format
+    with folders.
 
     Raises:
         ValueError: no format is called `name`, or the output has another ending.
     """
     choices = [choice for choice in formats if name in (None, choice.name)]
     if not choices:
-        raise ValueError(f"choose_format(): `format` must be {_listed([f.name for f in formats])}, got {name!r}.")
+        raise ValueError(
+            f"choose_format(): `format` must be {_listed([f.name for f in formats])}, got {name!r}."
+        )
     if output is None or (name is not None and choices[0].folder):
         return choices[0]
     file_name = Path(output).name.lower()
-    if matches := [choice for choice in choices if choice.ending and file_name.endswith(choice.ending)]:
+    if matches := [
+        choice for choice in choices if choice.ending and file_name.endswith(choice.ending)
+    ]:
         return max(matches, key=lambda choice: len(choice.ending))
     suffix = re.search(r"\.[a-z]\w*$", file_name)
     if suffix is None and (folders := [choice for choice in choices if choice.folder]):
         return folders[0]
     outputs = _listed(list(dict.fromkeys(text for choice in choices for text in choice.outputs)))
-    raise ValueError(f"{output}: the output must be {outputs}, got {suffix[0] if suffix else file_name!r}.")
+    raise ValueError(
+        f"{output}: the output must be {outputs}, got {suffix[0] if suffix else file_name!r}."
+    )
 
 
 def destination(
-    stream: Path, output: Path | None, formats: Sequence[Format], name: str | None = None, stem: str = ""
+    stream: Path,
+    output: Path | None,
+    formats: Sequence[Format],
+    name: str | None = None,
+    stem: str = "",
 ) -> tuple[Path, Format]:
     """Return the path of an export and its format.
 
@@ -85,15 +107,18 @@ def destination(
         stem: name of a camera or a path, for the name of the output.
 
     Raises:
-        ValueError: as `choose_format` and `check_output`, a folder stands where a file is to be written, or the output
-            is the stream itself, by any of its names.
+        ValueError: as `choose_format` and `check_output`, a folder stands where a file is to be
+            written, or the output is the stream itself, by any of its names.
     """
     choice = choose_format(formats, output, name)
     path = check_output(output or stream.with_name(choice.default.format(stem)))
     if choice.is_file(path) and path.is_dir():
         raise ValueError(f"{path}: expected a file to write, got a folder; choose another name.")
     if path.exists() and stream.exists() and path.samefile(stream):
-        raise ValueError(f"{path}: expected an output beside its source, got the source itself; choose another name.")
+        raise ValueError(
+            f"{path}: expected an output beside its source, got the source itself; choose another "
+            "name."
+        )
     return path, choice
 
 

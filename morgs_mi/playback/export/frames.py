@@ -33,16 +33,17 @@ def write_frames(
     Args:
         stream: the file.
         camera: any view.
-        output: ``FILE.mp4`` for a video of the channels side by side, a folder ending in ``png`` for the same images as
-            ``0000.png`` ..., any other folder for multichannel ``0000.exr`` ... (see `exr_channels`), or ``FILE.png``
-            or ``FILE.exr`` for a single frame.
-        channels: out of `CHANNELS`; default: the colour, for EXR files all channels that the stream stores.
+        output: ``FILE.mp4`` for a video of the channels side by side, a folder ending in ``png``
+            for the same images as ``0000.png`` ..., any other folder for multichannel ``0000.exr``
+            ... (see `exr_channels`), or ``FILE.png`` or ``FILE.exr`` for a single frame.
+        channels: out of `CHANNELS`; default: the colour, for EXR files all channels that the stream
+            stores.
         progress: called with the number of frames done.
         format: mp4, png or exr; None: by the output's name.
 
     Raises:
-        ValueError: an unknown channel, a channel that the stream does not store, another type of video, or a stream
-            that is truncated, broken or has no frame.
+        ValueError: an unknown channel, a channel that the stream does not store, another type of
+            video, or a stream that is truncated, broken or has no frame.
         OSError: the folder exists, or a file cannot be written.
     """
     frame_numbers(stream)  # refuses a stream without frames
@@ -60,9 +61,11 @@ def write_images(
     format: str | None = None,
     display_exposure: float = 0.0,
 ) -> None:
-    """Write rendered frames, pairs of index and channels [H, W, C] by name, into files as `write_frames` does.
+    """Write rendered frames, pairs of index and channels [H, W, C] by name, into files as
+    `write_frames` does.
 
-    Videos and PNG files show colours that are brightened by the display exposure, in stops, and clipped at white.
+    Videos and PNG files show colours that are brightened by the display exposure, in stops, and
+    clipped at white.
 
     Raises:
         ValueError: another type of video.
@@ -73,7 +76,12 @@ def write_images(
     def frames() -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:
         for count, (frame, images) in enumerate(rendered, start=1):
             shows = display_exposure and kind != "exr" and "color" in images
-            yield frame, {**images, "color": exposed(images["color"], display_exposure)} if shows else images
+            yield (
+                frame,
+                {**images, "color": exposed(images["color"], display_exposure)}
+                if shows
+                else images,
+            )
             if progress is not None:
                 progress(count)
 
@@ -86,7 +94,9 @@ def write_images(
         with atomic_path(output, "write_frames()") as partial:
             for count, (_, images) in enumerate(frames()):
                 if count:
-                    raise ValueError(f"{output}: expected one frame for one file, got several; name a folder.")
+                    raise ValueError(
+                        f"{output}: expected one frame for one file, got several; name a folder."
+                    )
                 write(partial, images)
         return
     with atomic_folder(output, "write_frames()") as folder:
@@ -103,14 +113,18 @@ def _write_exr(path: Path, images: Mapping[str, np.ndarray]) -> None:
 
 
 def exr_channels(images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return rendered images [H, W, C] as EXR channels [H, W] under the names of the renderer's AOVs.
+    """Return rendered images [H, W, C] as EXR channels [H, W] under the names of the renderer's
+    AOVs.
 
-    Colour is R, G, B in linear light, as EXR readers expect, and alpha is A. Other channels are called ``depth.Y`` if
-    they have one component, ``motion.X``, ``motion.Y`` if they have several. Motion is in pixels, depth in world units.
+    Colour is R, G, B in linear light, as EXR readers expect, and alpha is A. Other channels are
+    called ``depth.Y`` if they have one component, ``motion.X``, ``motion.Y`` if they have several.
+    Motion is in pixels, depth in world units.
     """
     planes = {**images, **({"color": decode_light(images["color"])} if "color" in images else {})}
     return {
-        name: plane[..., i] for key, plane in planes.items() for i, name in enumerate(_exr_names(key, plane.shape[2]))
+        name: plane[..., i]
+        for key, plane in planes.items()
+        for i, name in enumerate(_exr_names(key, plane.shape[2]))
     }
 
 
@@ -121,12 +135,18 @@ def _exr_names(channel: str, components: int) -> list[str]:
         return ["A"]
     if channel in ("splats", "surfaces", "shadow"):  # layers of an inserted scene, see `insert`
         return [f"{channel}.{letter}" for letter in "RGBA"[:components]]
-    suffixes = "Y" if components == 1 else "XYZW"[:components] if components <= 4 else map(str, range(components))
+    suffixes = (
+        "Y"
+        if components == 1
+        else "XYZW"[:components]
+        if components <= 4
+        else map(str, range(components))
+    )
     return [f"{channel}.{suffix}" for suffix in suffixes]
 
 
 def pad_to_even(image: np.ndarray) -> np.ndarray:
-    """Return the image [H, W, 3] with its last row and column repeated where their number is odd."""
+    """Return the image [H, W, 3] with its last row and column repeated to even numbers."""
     H, W = image.shape[:2]
     return np.pad(image, ((0, H % 2), (0, W % 2), (0, 0)), mode="edge")
 

@@ -1,4 +1,6 @@
-"""Streams in notebooks: a player in the output of a cell, or an image where the stream is too long for one."""
+"""Streams in notebooks: a player in the output of a cell, or an image where the stream is too long
+for one.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +20,16 @@ LARGEST = 4_000_000
 _WIDTH = 800
 _HEIGHT = 600
 _STYLE = "width:100%;max-width:{width:.0f}px;aspect-ratio:{aspect:.4f};border:0;border-radius:8px"
-_PLAYER = '<iframe sandbox="allow-scripts" allow="fullscreen" title="{title}" style="{style}" srcdoc="{page}"></iframe>'
+_PLAYER = (
+    '<iframe sandbox="allow-scripts" allow="fullscreen" title="{title}" style="{style}" '
+    'srcdoc="{page}"></iframe>'
+)
 _POSTER = '<img alt="{title}" style="{style}" src="data:image/png;base64,{image}"><div>{text}</div>'
 
 
 def stream_html(stream: FrameSource) -> str:
-    """Return a stream as HTML: the player of `morgs-mi export web`, or the first frame where it would be too large.
+    """Return a stream as HTML: the player of `morgs-mi export web`, or the first frame where it
+    would be too large.
 
     A stream that cannot be read becomes the sentence that describes why.
     """
@@ -40,7 +46,13 @@ def stream_html(stream: FrameSource) -> str:
         color = render(gaussians, camera, ("color",), render_config(stream))["color"]
         image = channel_image("color", exposed(color, stream_exposure(stream)))
     except (OSError, ValueError, StopIteration) as error:
-        return f"<div>{html.escape(str(error) or f'{stream.path}: expected at least one frame, got none.')}</div>"
+        message = str(error) or f"{stream.path}: expected at least one frame, got none."
+        return f"<div>{html.escape(message)}</div>"
     command = f"morgs-mi export web {stream.path} page.html"
-    text = f"Frame 0 of {size / 1e6:.0f} MB. To play it, write a page with <code>{html.escape(command)}</code>."
-    return _POSTER.format(title=title, style=style, image=base64.b64encode(png_bytes(image)).decode(), text=text)
+    text = (
+        f"Frame 0 of {size / 1e6:.0f} MB. To play it, write a page with "
+        f"<code>{html.escape(command)}</code>."
+    )
+    return _POSTER.format(
+        title=title, style=style, image=base64.b64encode(png_bytes(image)).decode(), text=text
+    )

@@ -12,10 +12,11 @@ from morgs_mi.core.z_order import equal_cells, z_order
 
 
 def by_place(stream: FrameSource) -> Iterator[tuple[int, Gaussians]]:
-    """Yield (frame, Gaussians) like `play`, with the Gaussians along a Z-order curve of the places of their births.
+    """Yield (frame, Gaussians) like `play`, with the Gaussians along a Z-order curve of the places
+    of their births.
 
-    Neighbours on the curve are neighbours in space and mostly move together. As the place of the birth does not change,
-    Gaussians that live in two frames have the same order in both.
+    Neighbours on the curve are neighbours in space and mostly move together. As the place of the
+    birth does not change, Gaussians that live in two frames have the same order in both.
 
     Raises:
         ValueError: a broken packet.

@@ -1,7 +1,8 @@
 """Camera paths: splines through key views, and paths that are derived from a rig.
 
-A path has K key views at increasing times in seconds. Between them the position follows a cubic spline, the rotation a
-rotation spline (both with continuous acceleration), the focal lengths and the principal point a cubic spline in pixels.
+A path has K key views at increasing times in seconds. Between them the position follows a cubic
+spline, the rotation a rotation spline (both with continuous acceleration), the focal lengths and
+the principal point a cubic spline in pixels.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from morgs_mi.io.bounded import read_json
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
-# Weight of the Gaussians' median relative to an optical axis; it matters only where the axes do not meet.
+# Weight of the Gaussians' median relative to an optical axis; it matters only where the axes do not
+# meet.
 _MEDIAN_WEIGHT = 0.01
 # Keys of other files of cameras, and what these are.
 _OTHER_FILES = {
@@ -38,7 +40,8 @@ class CameraPath:
     """A camera that moves through key views.
 
     Raises:
-        ValueError: fewer than two keys, times that do not increase from 0, or different image sizes.
+        ValueError: fewer than two keys, times that do not increase from 0, or different image
+            sizes.
     """
 
     times: np.ndarray  #: Seconds [K], increasing from 0.
@@ -49,14 +52,17 @@ class CameraPath:
         object.__setattr__(self, "times", times)
         if len(self.keys) < 2 or times.shape != (len(self.keys),):
             raise ValueError(
-                f"CameraPath(): at least two key views with a time each were expected, got {len(self.keys)} views and "
-                f"{times.size} times."
+                "CameraPath(): at least two key views with a time each were expected, got "
+                f"{len(self.keys)} views and {times.size} times."
             )
         if times[0] != 0 or not np.all(np.diff(times) > 0):
             raise ValueError(f"CameraPath(): `times` must increase from 0, got {times.tolist()}.")
         sizes = {(key.width, key.height) for key in self.keys}
         if len(sizes) > 1:
-            raise ValueError(f"CameraPath(): `keys` must have the same image size, got {sorted(sizes)}; resize them.")
+            raise ValueError(
+                f"CameraPath(): `keys` must have the same image size, got {sorted(sizes)}; resize "
+                "them."
+            )
 
     @property
     def seconds(self) -> float:
@@ -72,7 +78,7 @@ class CameraPath:
         return replace(self, keys=tuple(key.with_width(width) for key in self.keys))
 
     def at(self, time: float) -> Camera:
-        """Return the view at a time in seconds; before the first and after the last key, that key."""
+        """Return the view at a time in seconds: the nearest key outside of all keys."""
         time = float(np.clip(time, 0, self.seconds))
         positions, rotations, intrinsics = self._splines
         R = rotations(time).as_matrix().T
@@ -90,17 +96,24 @@ class CameraPath:
             ValueError: `seconds` is not positive and finite.
         """
         if not (np.isfinite(seconds) and seconds > 0):
-            raise ValueError(f"CameraPath.with_duration(): `seconds` must be positive, got {seconds}.")
+            raise ValueError(
+                f"CameraPath.with_duration(): `seconds` must be positive, got {seconds}."
+            )
         return replace(self, times=self.times * (seconds / self.seconds))
 
     @cached_property
     def _splines(self) -> tuple[CubicSpline, RotationSpline, CubicSpline]:
-        from scipy.interpolate import CubicSpline  # not at the start of every command, which it slows down
+        # Not at the start of every command, which it slows down.
+        from scipy.interpolate import CubicSpline
 
         K = np.stack([key.K for key in self.keys])
         # With logarithms the focal lengths stay positive where the spline overshoots.
-        intrinsics = np.stack([np.log(K[:, 0, 0]), np.log(K[:, 1, 1]), K[:, 0, 2], K[:, 1, 2]], axis=1)
-        rotations = Rotation.from_matrix(np.stack([np.asarray(key.viewmat, np.float64)[:3, :3].T for key in self.keys]))
+        intrinsics = np.stack(
+            [np.log(K[:, 0, 0]), np.log(K[:, 1, 1]), K[:, 0, 2], K[:, 1, 2]], axis=1
+        )
+        rotations = Rotation.from_matrix(
+            np.stack([np.asarray(key.viewmat, np.float64)[:3, :3].T for key in self.keys])
+        )
         positions = np.stack([key.position for key in self.keys])
         return (
             CubicSpline(self.times, positions),
@@ -112,7 +125,8 @@ class CameraPath:
 def focus(cameras: Sequence[Camera], means: np.ndarray) -> np.ndarray:
     """Return the point [3] that the rig looks at: the nearest point to all optical axes.
 
-    The median of the Gaussians' centres [N, 3] has a small weight; it determines the distance of parallel axes.
+    The median of the Gaussians' centres [N, 3] has a small weight; it determines the distance of
+    parallel axes.
     """
     weight = _MEDIAN_WEIGHT * len(cameras)
     A = weight * np.eye(3)
@@ -128,10 +142,11 @@ def focus(cameras: Sequence[Camera], means: np.ndarray) -> np.ndarray:
 def orbit(
     cameras: Sequence[Camera], center: np.ndarray, degrees: float | None = None, seconds: float = 1
 ) -> CameraPath:
-    """Return the path of the first camera around the vertical axis through `center` [3], looking at `center`.
+    """Return the path of the first camera around the vertical axis through `center` [3], looking at
+    `center`.
 
-    An orbit of less than 360 degrees extends by half of it to either side. By default it is as wide as the rig, and a
-    full circle if the rig surrounds the scene.
+    An orbit of less than 360 degrees extends by half of it to either side. By default it is as wide
+    as the rig, and a full circle if the rig surrounds the scene.
 
     Raises:
         ValueError: the camera is at the centre or directly above it, or `degrees` is not in 1..360.
@@ -141,7 +156,8 @@ def orbit(
     arm = first.position - center
     if np.linalg.norm(np.cross(arm, up)) < 1e-3 * np.linalg.norm(arm) or not arm.any():
         raise ValueError(
-            f"orbit(): the camera {first.name!r} must stand beside the scene, got it directly above; use another path."
+            f"orbit(): the camera {first.name!r} must stand beside the scene, got it directly "
+            "above; use another path."
         )
     degrees = _rig_width(cameras, center, up) if degrees is None else degrees
     if not 1 <= degrees <= 360:
@@ -154,7 +170,8 @@ def orbit(
 
 
 def through_cameras(cameras: Sequence[Camera], seconds: float = 1) -> CameraPath:
-    """Return the path through all cameras at constant speed, from the first one always to the nearest remaining one.
+    """Return the path through all cameras at constant speed, from the first one always to the
+    nearest remaining one.
 
     All cameras are resized to the first one's image size.
 
@@ -163,8 +180,8 @@ def through_cameras(cameras: Sequence[Camera], seconds: float = 1) -> CameraPath
     """
     if len(cameras) < 2:
         raise ValueError(
-            f"through_cameras(): at least two cameras were expected to move between, got {len(cameras)}; use the path "
-            "`orbit`."
+            "through_cameras(): at least two cameras were expected to move between, got "
+            f"{len(cameras)}; use the path `orbit`."
         )
     candidates = [camera.resized(cameras[0].width, cameras[0].height) for camera in cameras]
     keys = [candidates.pop(0)]
@@ -178,11 +195,13 @@ def through_cameras(cameras: Sequence[Camera], seconds: float = 1) -> CameraPath
 
 
 def load_path(file: str | Path, cameras: Sequence[Camera]) -> CameraPath:
-    """Read a path from a JSON object with `keys` and, common to all of them, `width`, `height`, `fov_x` and `up`.
+    """Read a path from a JSON object with `keys` and, common to all of them, `width`, `height`,
+    `fov_x` and `up`.
 
-    A key has a `time` in seconds and one of `camera` (a name of the rig), `viewmat` (world to camera, OpenCV's axes,
-    4x4) and `position` with `target`; the last two may have their own `fov_x` (horizontal, degrees) and `up`. The
-    defaults are the size and intrinsics of the rig's first camera and the rig's mean up.
+    A key has a `time` in seconds and one of `camera` (a name of the rig), `viewmat` (world to
+    camera, OpenCV's axes, 4x4) and `position` with `target`; the last two may have their own
+    `fov_x` (horizontal, degrees) and `up`. The defaults are the size and intrinsics of the rig's
+    first camera and the rig's mean up.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -194,8 +213,8 @@ def load_path(file: str | Path, cameras: Sequence[Camera]) -> CameraPath:
     keys = document.get("keys") if isinstance(document, dict) else None
     if not isinstance(keys, list) or not all(isinstance(key, dict) for key in keys):
         raise ValueError(
-            f"{file}: expected a JSON object with a list `keys` of objects, got {_described(document)}; write the "
-            "views of the camera path as `keys`."
+            f"{file}: expected a JSON object with a list `keys` of objects, got "
+            f"{_described(document)}; write the views of the camera path as `keys`."
         )
     common = {name: value for name, value in document.items() if name != "keys"}
     views = []
@@ -230,22 +249,34 @@ def _key_view(key: Mapping[str, Any], cameras: Sequence[Camera]) -> Camera:
     if "camera" in key:
         by_name = {camera.name: camera for camera in cameras}
         if key["camera"] not in by_name:
-            raise ValueError(f"`camera` must be one of {', '.join(by_name)}, got {key['camera']!r}.")
+            raise ValueError(
+                f"`camera` must be one of {', '.join(by_name)}, got {key['camera']!r}."
+            )
         return by_name[key["camera"]].resized(like.width, like.height)
     if "fov_x" in key:
         f = 0.5 * like.width / np.tan(np.deg2rad(0.5 * float(key["fov_x"])))
-        like = replace(like, K=np.array([[f, 0, 0.5 * like.width], [0, f, 0.5 * like.height], [0, 0, 1]]))
+        like = replace(
+            like, K=np.array([[f, 0, 0.5 * like.width], [0, f, 0.5 * like.height], [0, 0, 1]])
+        )
     if "viewmat" in key:
         return replace(like, viewmat=rigid("`viewmat`", np.asarray(key["viewmat"], np.float64)))
     position, target = (np.asarray(key[name], np.float64) for name in ("position", "target"))
     up = np.asarray(key["up"], np.float64) if "up" in key else up_direction(cameras)
-    if any(v.shape != (3,) for v in (position, target, up)) or not np.cross(target - position, up).any():
-        raise ValueError("`position`, `target` and `up` must have 3 numbers each, and the view must not be along `up`.")
+    if (
+        any(v.shape != (3,) for v in (position, target, up))
+        or not np.cross(target - position, up).any()
+    ):
+        raise ValueError(
+            "`position`, `target` and `up` must have 3 numbers each, and the view must not be "
+            "along `up`."
+        )
     return _look_at(position, target, up, like)
 
 
 def _rig_width(cameras: Sequence[Camera], center: np.ndarray, up: np.ndarray) -> float:
-    """Return the angle in degrees that the rig covers around the vertical: at least 10; 360 without a gap of 90."""
+    """Return the angle in degrees that the rig covers around the vertical: at least 10; 360 without
+    a gap of 90.
+    """
     arms = np.stack([camera.position - center for camera in cameras])
     level = arms[0] - (arms[0] @ up) * up
     angles = np.sort(np.rad2deg(np.arctan2(arms @ np.cross(up, level), arms @ level)))

@@ -1,8 +1,9 @@
-"""A stream as a web page that plays it: one file, or a folder for a web server with a module for other pages.
+"""A stream as a web page that plays it: one file, or a folder for a web server with a module for
+other pages.
 
-The page and the module are built from `web/` and part of the package. The page contains its script, compressed, and in
-a single file the stream as well. Both are stored as text with 7 bits per character, see "In a web page" in
-docs/stream-format.md.
+The page and the module are built from `web/` and part of the package. The page contains its script,
+compressed, and in a single file the stream as well. Both are stored as text with 7 bits per
+character, see "In a web page" in docs/stream-format.md.
 """
 
 from __future__ import annotations
@@ -38,17 +39,21 @@ _UNSAFE = (0x00, 0x0D, 0x3C)
 _MODULE = "morgs-spark.js"
 # Gaussians per frame and camera from which the scale of the motion is estimated.
 _SAMPLES = 500
-# Smallest scale, as a fraction of the width per frame; with a smaller one, a still scene would show the fit's noise.
+# Smallest scale, as a fraction of the width per frame; with a smaller one, a still scene would show
+# the fit's noise.
 _LEAST_SCALE = 0.001
 
 
 def write_web_page(
-    stream: FrameSource, path: str | Path, title: str | None = None, progress: Progress | None = None
+    stream: FrameSource,
+    path: str | Path,
+    title: str | None = None,
+    progress: Progress | None = None,
 ) -> int:
     """Write a self-contained page that plays a stream, and return its number of bytes.
 
-    It is one HTML file that runs from a disk and requests nothing. Of the stream's metadata it has the renderer's
-    settings alone; the scale of the motion is added.
+    It is one HTML file that runs from a disk and requests nothing. Of the stream's metadata it has
+    the renderer's settings alone; the scale of the motion is added.
 
     Args:
         stream: the file.
@@ -66,18 +71,24 @@ def write_web_page(
     return len(page)
 
 
-def web_page(stream: FrameSource, title: str | None = None, progress: Progress | None = None) -> bytes:
+def web_page(
+    stream: FrameSource, title: str | None = None, progress: Progress | None = None
+) -> bytes:
     """Return the page that `write_web_page` writes; arguments and errors are the same."""
     data = _script("stream", published_bytes(stream, progress))
     return _page(title or stream_name(stream), data, "data: blob:")
 
 
 def write_web_folder(
-    stream: FrameSource, path: str | Path, title: str | None = None, progress: Progress | None = None
+    stream: FrameSource,
+    path: str | Path,
+    title: str | None = None,
+    progress: Progress | None = None,
 ) -> int:
     """Write a folder for a web server and return its number of bytes.
 
-    It contains the page `index.html`, the stream as a file, and `morgs-spark.js`, which plays it in other pages.
+    It contains the page `index.html`, the stream as a file, and `morgs-spark.js`, which plays it in
+    other pages.
 
     Args:
         stream: the file.
@@ -113,11 +124,12 @@ def served_page(title: str, has_recording: bool) -> bytes:
 
 
 def text_of_bytes(data: bytes) -> str:
-    """Return bytes as text with 7 bits per character, which HTML stores in a script without changing it.
+    """Return bytes as text with 7 bits per character, which HTML stores in a script without
+    changing it.
 
-    Bits are taken from the highest down, the last ones are filled up with zeros. 128 is added to the characters that
-    HTML would change; a reader takes the low 7 bits of each. As UTF-8, the text is 1.17 times as long as
-    random bytes; base64 is 1.33 times as long.
+    Bits are taken from the highest down, the last ones are filled up with zeros. 128 is added to
+    the characters that HTML would change; a reader takes the low 7 bits of each. As UTF-8, the text
+    is 1.17 times as long as random bytes; base64 is 1.33 times as long.
     """
     bits = np.unpackbits(np.frombuffer(data, np.uint8))
     septets = np.pad(bits, (0, -len(bits) % 7)).reshape(-1, 7)
@@ -126,7 +138,9 @@ def text_of_bytes(data: bytes) -> str:
 
 
 def published_bytes(stream: FrameSource, progress: Progress | None = None) -> bytes:
-    """Return the stream with the metadata that the page reads, after decoding it once; errors as `write_web_page`."""
+    """Return the stream with the metadata that the page reads, after decoding it once; errors as
+    `write_web_page`.
+    """
     render = metadata_entry(stream, "config.render", {}, dict)
     packets = list(stream)
     speeds = []
@@ -149,19 +163,25 @@ def published_bytes(stream: FrameSource, progress: Progress | None = None) -> by
 
 
 def _motion_scale(speeds: np.ndarray, weights: np.ndarray) -> float:
-    """Return the speed that the page draws fully saturated: the 99th percentile of speeds [S] with weights [S].
+    """Return the speed that the page draws fully saturated: the 99th percentile of speeds [S] with
+    weights [S].
 
-    It is not the maximum, because a few Gaussians that the fit has lost are several times as fast as the scene.
+    It is not the maximum, because a few Gaussians that the fit has lost are several times as fast
+    as the scene.
     """
     if not weights.any():
         return MOTION_SCALE
-    return max(_LEAST_SCALE, float(np.percentile(speeds, 99, weights=weights, method="inverted_cdf")))
+    return max(
+        _LEAST_SCALE, float(np.percentile(speeds, 99, weights=weights, method="inverted_cdf"))
+    )
 
 
 def _speeds(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarray:
-    """Return speeds of moving Gaussians in the images of the cameras, and their weights there [2, S].
+    """Return speeds of moving Gaussians in the images of the cameras, and their weights there
+    [2, S].
 
-    A speed is a fraction of the image's width per frame. A weight is the opacity times the area on the screen.
+    A speed is a fraction of the image's width per frame. A weight is the opacity times the area on
+    the screen.
     """
     if gaussians.motion is None:
         return np.zeros((2, 0))
@@ -177,8 +197,12 @@ def _speeds(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarray:
     columns = []
     for camera in cameras:
         pixels, depths = camera.project(means)
-        visible = (depths > camera.near) & ((pixels > 0) & (pixels < (camera.width, camera.height))).all(axis=1)
-        motions = np.einsum("nij,nj->ni", camera.projection_jacobian(means[visible]), motion[visible])
+        visible = (depths > camera.near) & (
+            (pixels > 0) & (pixels < (camera.width, camera.height))
+        ).all(axis=1)
+        motions = np.einsum(
+            "nij,nj->ni", camera.projection_jacobian(means[visible]), motion[visible]
+        )
         speeds = np.linalg.norm(motions, axis=1) / camera.width
         columns.append([speeds, weights[visible] / depths[visible] ** 2])
     return np.hstack(columns)
@@ -204,4 +228,7 @@ def _page(title: str, data: str, connect: str) -> bytes:
 
 
 def _script(name: str, data: bytes) -> str:
-    return f'<script type="text/plain" id="{name}" data-bytes="{len(data)}">{text_of_bytes(data)}</script>'
+    return (
+        f'<script type="text/plain" id="{name}" '
+        f'data-bytes="{len(data)}">{text_of_bytes(data)}</script>'
+    )

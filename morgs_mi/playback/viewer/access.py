@@ -1,8 +1,10 @@
-"""Access control of the viewer: it answers only its own page, under a name of this machine, and to holders of a token.
+"""Access control of the viewer: it answers only its own page, under a name of this machine, and to
+holders of a token.
 
-A web page of another site can send requests to a server on this machine; browsers report it in `Origin` and
-`Sec-Fetch-Site` but do not prevent it. By DNS rebinding, such a page can also point its own name at this machine; then
-`Host` is a foreign name. An address in digits or `localhost` cannot be rebound.
+A web page of another site can send requests to a server on this machine; browsers report it in
+`Origin` and `Sec-Fetch-Site` but do not prevent it. By DNS rebinding, such a page can also point
+its own name at this machine; then `Host` is a foreign name. An address in digits or `localhost`
+cannot be rebound.
 """
 
 from __future__ import annotations
@@ -25,7 +27,9 @@ _HEADERS = {
 
 
 def refusal(headers: Headers, name: str) -> str | None:
-    """Return why a request is refused, None if it is accepted; `name` may be the host, as may an address in digits."""
+    """Return why a request is refused, None if it is accepted; `name` may be the host, as may an
+    address in digits.
+    """
     host = headers.get("host", "")
     origin = headers.get("origin")
     try:
@@ -34,7 +38,9 @@ def refusal(headers: Headers, name: str) -> str | None:
     except ValueError:  # brackets that hold no address
         return f"expected a host and an origin, got {host!r} and {origin!r}"
     if hostname not in ("localhost", name.lower()) and not _is_address(hostname):
-        return f"expected a request for localhost or an address in digits, got the host {hostname!r}"
+        return (
+            f"expected a request for localhost or an address in digits, got the host {hostname!r}"
+        )
     if page.lower() != host.lower():
         return f"expected a request of the viewer's own page at {host}, got one of {origin!r}"
     site = headers.get("sec-fetch-site", "none")
@@ -44,7 +50,9 @@ def refusal(headers: Headers, name: str) -> str | None:
 
 
 class Access:
-    """ASGI middleware: 403 unless `token`, if any, is the first part of the path, and `refusal` accepts the request."""
+    """ASGI middleware: 403 unless `token`, if any, is the first part of the path, and `refusal`
+    accepts the request.
+    """
 
     def __init__(self, app: ASGIApp, name: str, token: str) -> None:
         self._app = app
@@ -55,7 +63,9 @@ class Access:
         start = len(self._prefix)
         path = scope["path"]
         reason = refusal(Headers(scope=scope), self._name)
-        if reason is None and not secrets.compare_digest(path[: start + 1].encode(), f"{self._prefix}/".encode()):
+        if reason is None and not secrets.compare_digest(
+            path[: start + 1].encode(), f"{self._prefix}/".encode()
+        ):
             reason = "expected the token of the printed link in the address"
 
         async def secured(message: Message) -> None:

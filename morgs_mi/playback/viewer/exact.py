@@ -31,17 +31,23 @@ class ExactImages:
         self._decoded: tuple[Any, Gaussians] | None = None
         self._thread = ThreadPoolExecutor(1, "renderer")
 
-    async def png(self, frame: int, channel: str, camera: Camera, motion_scale: float) -> bytes | None:
+    async def png(
+        self, frame: int, channel: str, camera: Camera, motion_scale: float
+    ) -> bytes | None:
         """Return an image as PNG, or None if a newer one was requested while this one waited.
 
         `channel` and `motion_scale` are as for `channel_image`.
 
         Raises:
-            OSError, ValueError: the stream is broken, or has no such frame or channel, or the image is too large.
+            OSError, ValueError: the stream is broken, or has no such frame or channel, or the image
+                is too large.
         """
         size = camera.width * camera.height
         if not 0 < motion_scale < float("inf") or size > _MOST_PIXELS:
-            raise ValueError(f"expected a motion above 0, at most {_MOST_PIXELS} pixels, got {motion_scale}, {size}.")
+            raise ValueError(
+                f"expected a motion above 0, at most {_MOST_PIXELS} pixels, got {motion_scale}, "
+                f"{size}."
+            )
         self._newest += 1
         number = self._newest
         async with self._lock:
@@ -60,7 +66,9 @@ class ExactImages:
         return png_bytes(channel_image(channel, values, motion_scale))
 
     def _gaussians(self, stream: FrameSource, frame: int) -> Gaussians:
-        """Return the Gaussians of a frame; the last ones stay decoded as long as the file is the same."""
+        """Return the Gaussians of a frame; the last ones stay decoded as long as the file is the
+        same.
+        """
         status = stream.path.stat()
         key = (frame, stream.path, status.st_ino, status.st_mtime_ns)
         if self._decoded is None or self._decoded[0] != key:

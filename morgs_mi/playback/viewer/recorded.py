@@ -13,12 +13,15 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.playback.stream_header import fitted_capture, num_frames, open_stream_capture
 
-# Frames that are decoded and dropped rather than seeking, which decodes from a keyframe of the video.
+# Frames that are decoded and dropped rather than seeking, which decodes from a keyframe of the
+# video.
 _NEAR = 8
 
 
 class RecordedImages:
-    """Recorded images by camera and frame, from the capture in `folder` or, where it is None, the one of the fit."""
+    """Recorded images by camera and frame, from the capture in `folder` or, where it is None, the
+    one of the fit.
+    """
 
     def __init__(self, folder: Path | None) -> None:
         self._folder = folder
@@ -39,16 +42,22 @@ class RecordedImages:
         """Return the image [H, W, 3] of a camera at a frame, undistorted as for the fit.
 
         Raises:
-            OSError, ValueError: the capture is missing, broken, or not the one of the stream; or the image was not
-                recorded.
+            OSError, ValueError: the capture is missing, broken, or not the one of the stream; or
+                the image was not recorded.
         """
         last = max(stream.frame_numbers(), default=-1)
         if view >= len(stream.cameras) or frame > last:
-            raise ValueError(f"{stream.path}: expected a camera and a frame of the stream, got {view} and {frame}.")
+            raise ValueError(
+                f"{stream.path}: expected a camera and a frame of the stream, got {view} and "
+                f"{frame}."
+            )
         with self._lock:
-            if self._capture is None or frame >= self._capture.num_frames:  # the capture of a live fit grows
+            # The capture of a live fit grows.
+            if self._capture is None or frame >= self._capture.num_frames:
                 count = max(num_frames(stream), last + 1)
-                self._capture = open_stream_capture(stream, self._folder, list(range(count))).displayed()
+                self._capture = open_stream_capture(
+                    stream, self._folder, list(range(count))
+                ).displayed()
                 self._view = -1
             if view != self._view or not self._next <= frame < self._next + _NEAR:
                 self._images = self._capture.images(view, frame)

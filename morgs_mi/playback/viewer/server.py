@@ -1,10 +1,11 @@
-"""A stream in the browser: the page of `export.web`, which follows a fit that is running, with images of this machine.
+"""A stream in the browser: the page of `export.web`, which follows a fit that is running, with
+images of this machine.
 
 - `/`: the page.
 - `/stream.morgs`: the stream, or the provisional first frame beside it; also ranges of its bytes.
 - `/recorded/VIEW/FRAME`: recorded image of a camera, JPEG.
-- `/exact/FRAME/CHANNEL`: image of the renderer, PNG, for the camera in the query, as JSON of a stream's header; 204 if
-  a newer image was requested meanwhile.
+- `/exact/FRAME/CHANNEL`: image of the renderer, PNG, for the camera in the query, as JSON of a
+  stream's header; 204 if a newer image was requested meanwhile.
 """
 
 from __future__ import annotations
@@ -42,8 +43,10 @@ class Viewer:
     """Server of a page that shows a stream.
 
     Args:
-        stream: stream, which may still be written, or file of Gaussians, as `open_stream` returns it.
-        host: address or name of the server. If other machines can reach it, the link has a random token.
+        stream: stream, which may still be written, or file of Gaussians, as `open_stream` returns
+            it.
+        host: address or name of the server. If other machines can reach it, the link has a random
+            token.
         port: port of the server; 0: a free one.
         capture: folder of the capture with the recorded images; None: the one that was fitted.
 
@@ -56,7 +59,11 @@ class Viewer:
     """
 
     def __init__(
-        self, stream: FrameSource, host: str = "127.0.0.1", port: int = 0, capture: Path | None = None
+        self,
+        stream: FrameSource,
+        host: str = "127.0.0.1",
+        port: int = 0,
+        capture: Path | None = None,
     ) -> None:
         self._stream = stream
         self._path = stream.path
@@ -70,18 +77,33 @@ class Viewer:
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
             self._socket = socket.create_server((host, port), family=family)
         except (OSError, OverflowError) as error:
-            raise ValueError(f"{host}:{port}: cannot serve the page there ({error}); choose another --port.") from None
+            raise ValueError(
+                f"{host}:{port}: cannot serve the page there ({error}); choose another --port."
+            ) from None
         address, port = self._socket.getsockname()[:2]
         self.is_public = not ip_address(address).is_loopback
         token = secrets.token_urlsafe() if self.is_public else ""
-        name = "localhost" if ip_address(address).is_unspecified else f"[{host}]" if ":" in host else host
+        name = (
+            "localhost"
+            if ip_address(address).is_unspecified
+            else f"[{host}]"
+            if ":" in host
+            else host
+        )
         self.url = f"http://{name}:{port}/{token and token + '/'}"
-        options = {"lifespan": "off", "ws": "none", "proxy_headers": False, "timeout_graceful_shutdown": _GRACE}
+        options = {
+            "lifespan": "off",
+            "ws": "none",
+            "proxy_headers": False,
+            "timeout_graceful_shutdown": _GRACE,
+        }
         config = uvicorn.Config(Access(self._app(), host, token), log_level="warning", **options)
         self._server = uvicorn.Server(config)
 
     def run(self) -> None:
-        """Serve the page until `stop` is called, or a signal, which is raised again after the server has ended."""
+        """Serve the page until `stop` is called, or a signal, which is raised again after the
+        server has ended.
+        """
         with self._socket:
             self._server.run(sockets=[self._socket])
 
@@ -103,28 +125,42 @@ class Viewer:
         return Starlette(routes=routes, exception_handlers={OSError: _failed, ValueError: _failed})
 
     def _newest(self) -> Path:
-        """Return the path of the stream, or of the provisional first frame beside it while it has no frame."""
+        """Return the path of the stream, or of the provisional first frame beside it while it has
+        no frame.
+        """
         provisional = self._path.with_name(PROVISIONAL)
-        return provisional if provisional.is_file() and not StreamReader(self._path).index() else self._path
+        return (
+            provisional
+            if provisional.is_file() and not StreamReader(self._path).index()
+            else self._path
+        )
 
     def _opened(self) -> FrameSource:
         """Return the stream as it is now; a file of Gaussians stays as it was opened."""
         return self._stream if isinstance(self._stream, SplatFile) else StreamReader(self._newest())
 
     def _send_page(self, _: Request) -> Response:
-        return HTMLResponse(served_page(stream_name(self._stream), self._recorded.are_present(self._stream)))
+        return HTMLResponse(
+            served_page(stream_name(self._stream), self._recorded.are_present(self._stream))
+        )
 
     def _send_stream(self, request: Request) -> Response:
         return stream_response(self._newest(), request)
 
     def _send_recorded(self, request: Request) -> Response:
         image = self._recorded.at(StreamReader(self._path), **request.path_params)
-        return Response(cv2.imencode(".jpg", image[..., ::-1])[1].tobytes(), media_type="image/jpeg")
+        return Response(
+            cv2.imencode(".jpg", image[..., ::-1])[1].tobytes(), media_type="image/jpeg"
+        )
 
     async def _send_exact(self, request: Request) -> Response:
         query = request.query_params
-        camera = camera_of_fields(load_json(query.get("camera", "").encode(), _MOST_CAMERA_BYTES), "camera")
-        png = await self._exact.png(**request.path_params, camera=camera, motion_scale=float(query.get("scale", "nan")))
+        camera = camera_of_fields(
+            load_json(query.get("camera", "").encode(), _MOST_CAMERA_BYTES), "camera"
+        )
+        png = await self._exact.png(
+            **request.path_params, camera=camera, motion_scale=float(query.get("scale", "nan"))
+        )
         return Response(status_code=204) if png is None else Response(png, media_type="image/png")
 
 

@@ -21,7 +21,8 @@ _RANGE = re.compile(r"bytes=(\d{1,15})-(\d{0,15})", re.ASCII)
 def stream_response(path: Path, request: Request) -> Response:
     """Return the answer to a request of a file, or of a range of its bytes.
 
-    Bytes that are written meanwhile are left out. The entity tag stays the same while the stream grows.
+    Bytes that are written meanwhile are left out. The entity tag stays the same while the stream
+    grows.
 
     Raises:
         OSError: the file cannot be read.
@@ -45,9 +46,11 @@ def stream_response(path: Path, request: Request) -> Response:
 
 
 def _etag(file: BinaryIO, size: int) -> str:
-    """Return an entity tag of a file's inode and the checksums of its header and its first frame."""
+    """Return an entity tag of a file's inode and the checksums of its header and first frame."""
     start = file.read(PREAMBLE.size + PAYLOAD)
-    length = HEAD.unpack_from(start, PREAMBLE.size)[2] if len(start) == PREAMBLE.size + PAYLOAD else 0
+    length = (
+        HEAD.unpack_from(start, PREAMBLE.size)[2] if len(start) == PREAMBLE.size + PAYLOAD else 0
+    )
     file.seek(min(len(start) + length, size))
     return f'"{os.fstat(file.fileno()).st_ino:x}-{start.hex()}-{file.read(PAYLOAD).hex()}"'
 

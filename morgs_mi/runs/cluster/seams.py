@@ -1,9 +1,9 @@
 """Seams: where a segment of a recording begins, and the stream continues with other Gaussians.
 
-All segments start from one common model, the first two frames of the recording. A segment is fitted from some frames
-before its first one (*overlap*). The first of these is fitted like a later frame of the common model, several times
-over, until Gaussians that have travelled far since then arrive; the others follow as usual. What has not changed
-since the first frames stays as it is, to the bit.
+All segments start from one common model, the first two frames of the recording. A segment is fitted
+from some frames before its first one (*overlap*). The first of these is fitted like a later frame
+of the common model, several times over, until Gaussians that have travelled far since then arrive;
+the others follow as usual. What has not changed since the first frames stays as it is, to the bit.
 """
 
 from __future__ import annotations
@@ -24,11 +24,13 @@ from morgs_mi.stream_loop import StreamState, step
 COMMON_FRAMES = 2
 """Frames of the common model: the second one determines the confidence."""
 
-# Factor on the learning rates of the fits of the first frame: there is further to go than between two frames.
+# Factor on the learning rates of the fits of the first frame: there is further to go than between
+# two frames.
 _RATES = 2.0
 # Largest number of births in each of them, as a fraction of the Gaussians.
 _BIRTHS = 0.1
-# Factor on the epochs of the other frames: the fit is not yet as good as one that followed from the beginning.
+# Factor on the epochs of the other frames: the fit is not yet as good as one that followed from the
+# beginning.
 _OVERLAP_EPOCHS = 2
 
 
@@ -37,14 +39,18 @@ class SegmentConfig:
     """Segments of a fit, and the seams between them."""
 
     count: int = 1
-    """Number of segments of about the same length, of two frames at least; with one, the stream equals
-    `stream_capture`'s."""
+    """Number of segments of about the same length, of two frames at least; with one, the stream
+    equals `stream_capture`'s."""
     passes: Annotated[int, AtLeast(1)] = 24
-    """Fits of the first frame of the overlap, one after the other, each with a round of density control."""
+    """Fits of the first frame of the overlap, one after the other, each with a round of density
+    control.
+    """
     epochs: Annotated[int, AtLeast(1)] = 4
     """Passes over all training views in each of them."""
     overlap: Annotated[int, AtLeast(0)] = 10
-    """Frames before a segment that are fitted as well: its Gaussians then follow the recording from its first frame."""
+    """Frames before a segment that are fitted as well: its Gaussians then follow the recording from
+    its first frame.
+    """
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -55,14 +61,26 @@ class SegmentConfig:
 
     def fit_config(self, config: StreamConfig, number: int) -> StreamConfig:
         """Return the settings of one of these fits."""
-        rates = replace(config.fit.rates, **{n: _RATES * rate for n, rate in asdict(config.fit.rates).items()})
+        rates = replace(
+            config.fit.rates, **{n: _RATES * rate for n, rate in asdict(config.fit.rates).items()}
+        )
         density = replace(config.fit.density, births=_BIRTHS)
-        fit = replace(config.fit, epochs=self.epochs, rates=rates, density=density, early_stopping_tolerance=0.0)
+        fit = replace(
+            config.fit,
+            epochs=self.epochs,
+            rates=rates,
+            density=density,
+            early_stopping_tolerance=0.0,
+        )
         return replace(config, fit=fit, seed=config.seed + number)
 
 
 def fit_seam_frame(
-    setup: Setup, common: StreamState, frame: int, images: Sequence[np.ndarray | None], config: SegmentConfig
+    setup: Setup,
+    common: StreamState,
+    frame: int,
+    images: Sequence[np.ndarray | None],
+    config: SegmentConfig,
 ) -> tuple[CodedFrame, FrameReport]:
     """Fit a frame far from the common model, and return its state and its report.
 
@@ -85,6 +103,7 @@ def fit_seam_frame(
         state, _, report = step(pass_setup, state, images)
         coded = state.coded
         assert coded is not None
-        history = replace(common.history, images=state.history.images)  # changes are relative to the common model again
+        # Changes are relative to the common model again.
+        history = replace(common.history, images=state.history.images)
         seconds += report.seconds
     return coded, replace(report, seconds=seconds)

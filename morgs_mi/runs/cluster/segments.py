@@ -1,7 +1,9 @@
-"""A fit in segments: stretches of a recording that are fitted side by side and joined into one stream.
+"""A fit in segments: stretches of a recording that are fitted side by side and joined into one
+stream.
 
-While it runs, OUT/segments has a stream and a report for each segment, to which the frames of each finished task are
-added. They are joined into OUT/stream.morgs at the end. Resuming continues every segment after its last frame.
+While it runs, OUT/segments has a stream and a report for each segment, to which the frames of each
+finished task are added. They are joined into OUT/stream.morgs at the end. Resuming continues every
+segment after its last frame.
 """
 
 from __future__ import annotations
@@ -51,7 +53,8 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 FOLDER = "segments"
-# Frames of a task, two at least: they are lost if a worker dies, and the progress is known that finely.
+# Frames of a task, two at least: they are lost if a worker dies, and the progress is known that
+# finely.
 TASK_FRAMES = 10
 _MIN_FRAMES = 2  # of a segment
 _LOG = logging.getLogger(__name__)
@@ -85,8 +88,8 @@ def _starts(num_frames: int, segments: int) -> list[int]:
     most = max(1, num_frames // _MIN_FRAMES)
     if not 1 <= segments <= most:
         raise ValueError(
-            f"SegmentedRun(): `segments` must be 1 to {most} for {num_frames} frames, {_MIN_FRAMES} for each, got "
-            f"{segments}."
+            f"SegmentedRun(): `segments` must be 1 to {most} for {num_frames} frames, "
+            f"{_MIN_FRAMES} for each, got {segments}."
         )
     return np.linspace(0, num_frames, segments + 1).round().astype(int).tolist()
 
@@ -138,12 +141,12 @@ class SegmentedRun:
         """Fit, or continue, all segments and join them; return the reports of all frames.
 
         Args:
-            resume: continue the segments in `out`. With `RenderConfig(reproducible=True)` the stream has the same bytes
-                as without an interruption.
+            resume: continue the segments in `out`. With `RenderConfig(reproducible=True)` the
+                stream has the same bytes as without an interruption.
 
         Raises:
-            OSError: as `stream_capture`, a worker died several times, or the scheduler was lost. The finished frames
-                stay.
+            OSError: as `stream_capture`, a worker died several times, or the scheduler was lost.
+                The finished frames stay.
             ValueError: as `stream_capture`.
         """
         check_outputs(self.out)
@@ -167,7 +170,9 @@ class SegmentedRun:
         if not first.frame:
             prepared = Prepared.of(self.capture, self.task.config, progress)
             if prepared.capture is not self.capture:
-                self.task = replace(self.task, points=(prepared.capture.points, prepared.capture.point_colors))
+                self.task = replace(
+                    self.task, points=(prepared.capture.points, prepared.capture.point_colors)
+                )
             self._use(prepared.capture)
         else:
             self._use(as_fitted(self.capture, StreamReader(self._files(0).stream)))
@@ -178,11 +183,15 @@ class SegmentedRun:
             first = replace(part.segment, stop=first.stop)
         self.task = replace(self.task, points=None, balance=self.recordings[0].reports[0].exposures)
         states = StreamReader(self._files(0).stream).states(stop - 1)
-        common = reemitted_keyframe(next(state for state in states if state.frame == stop - 1)).encoded
+        common = reemitted_keyframe(
+            next(state for state in states if state.frame == stop - 1)
+        ).encoded
         return [first, *(s if s.restart else replace(s, restart=(common,)) for s in segments[1:])]
 
     def _fit_side_by_side(self, segments: Iterable[Segment]) -> None:
-        """Fit what is missing of segments. Each worker continues the loop of one of them, until it is fitted."""
+        """Fit what is missing of segments. Each worker continues the loop of one of them, until it
+        is fitted.
+        """
         from distributed import as_completed
 
         queue = (segment for segment in segments if segment.frame < segment.stop)
@@ -196,12 +205,16 @@ class SegmentedRun:
             idle = max(1, num_workers(self.client)) - tasks.count()
             tasks.update(self._submitted(islice(queue, max(0, idle))))
 
-    def _submitted(self, segments: Iterable[Segment], worker: str | None = None) -> list[Future[Part]]:
+    def _submitted(
+        self, segments: Iterable[Segment], worker: str | None = None
+    ) -> list[Future[Part]]:
         """Return the tasks of the next frames of segments, if possible on a worker."""
         segments = list(segments)
         stops = [min(segment.frame + TASK_FRAMES, segment.stop) for segment in segments]
         place = {} if worker is None else {"workers": worker, "allow_other_workers": True}
-        return self.client.map(fit_frames, len(segments) * [self.task], segments, stops, pure=False, **place)
+        return self.client.map(
+            fit_frames, len(segments) * [self.task], segments, stops, pure=False, **place
+        )
 
     def _use(self, capture: Capture) -> None:
         """Fit with the cameras of a capture."""
@@ -218,14 +231,20 @@ class SegmentedRun:
         """Return a segment as an interrupted fit left it."""
 
         def finished(index: Sequence[Entry], end: int) -> tuple[Sequence[Entry], int]:
-            # After the first frame of a segment alone, a fit would continue without its displacements.
+            # After the first frame of a segment alone, a fit would continue without its
+            # displacements.
             return ([], 0) if start and index and index[-1][1] == start else (index, end)
 
         earlier = interrupted_fit(self._files(start), self.capture, self.metadata, finished, start)
         if earlier is None:
             return Segment(start, stop, start)
         self._open(start, earlier)
-        return Segment(start, stop, start + len(earlier.reports), restart_of(earlier.previous_state, earlier.last))
+        return Segment(
+            start,
+            stop,
+            start + len(earlier.reports),
+            restart_of(earlier.previous_state, earlier.last),
+        )
 
     def _open(self, start: int, earlier: Interrupted | None) -> None:
         """Open the files of a segment."""
@@ -233,7 +252,9 @@ class SegmentedRun:
         self.recordings[start] = self.open_files.enter_context(recording)
 
     def _completed(self, part: Part, prepared: Prepared) -> Part:
-        """Return the first part of the recording, with what was found about the cameras in its first report."""
+        """Return the first part of the recording, with what was found about the cameras in its
+        first report.
+        """
         gaussians = decode(None, decode_packet(part.packets[0])).gaussians
         frame = next(prepared.capture.partial_frames(0, 1))
         first = prepared.completed(part.reports[0], gaussians, frame, self.task.config)
@@ -275,12 +296,17 @@ class SegmentedRun:
         assert new.description is not None
         files.settle()
         try:
-            with StreamWriter(new.stream, self.capture.cameras, self.capture.fps, self.metadata) as writer:
+            with StreamWriter(
+                new.stream, self.capture.cameras, self.capture.fps, self.metadata
+            ) as writer:
                 for start in starts:
                     for packet in StreamReader(self._files(start).stream):
                         writer.write(packet)
             workers = {"workers": self.peaks} if len(starts) > 1 else {}
-            write_json(new.report, {**self.metadata, "frames": [asdict(report) for report in reports], **workers})
+            write_json(
+                new.report,
+                {**self.metadata, "frames": [asdict(report) for report in reports], **workers},
+            )
             write_json(new.description, described_capture(self.capture, None))
             files.replace_by_next()
         finally:

@@ -1,8 +1,8 @@
 """The task of the workers: fit a few frames of a segment.
 
-A task gets the state as packets, reads the recording from a path that the worker sees, and returns packets. It writes
-no files and can be repeated anywhere. A worker keeps the loop of its last task: where the next one continues
-it, nothing is read twice.
+A task gets the state as packets, reads the recording from a path that the worker sees, and returns
+packets. It writes no files and can be repeated anywhere. A worker keeps the loop of its last task:
+where the next one continues it, nothing is read twice.
 """
 
 from __future__ import annotations
@@ -48,7 +48,9 @@ class Source:
 
     def open(self) -> Capture:
         """Return the capture."""
-        return load_capture(self.path, self.downscale, self.test_views, self.num_frames, self.reading)
+        return load_capture(
+            self.path, self.downscale, self.test_views, self.num_frames, self.reading
+        )
 
 
 @dataclass(frozen=True)
@@ -84,8 +86,9 @@ class Segment:
     start: int
     stop: int
     frame: int  #: The next one to fit.
-    #: Encoded packets that lead a decoder to the state before that frame, a keyframe and perhaps a residual. Before a
-    #: segment begins, they lead to the common model; before the recording begins, there are none.
+    #: Encoded packets that lead a decoder to the state before that frame, a keyframe and perhaps a
+    #: residual. Before a segment begins, they lead to the common model; before the recording
+    #: begins, there are none.
     restart: tuple[bytes, ...] = ()
 
     @property
@@ -139,7 +142,9 @@ def fit_frames(fit: Fit, segment: Segment, stop: int) -> Part:
 
 
 def _first_frame(fit: Fit, segment: Segment) -> tuple[Packet, FrameReport]:
-    """Fit the frames before a segment that follow the common model, and its first one; return its keyframe."""
+    """Fit the frames before a segment that follow the common model, and its first one; return its
+    keyframe.
+    """
     capture = fit.open()
     common = segment.coded
     assert common is not None
@@ -159,7 +164,9 @@ def _first_frame(fit: Fit, segment: Segment) -> tuple[Packet, FrameReport]:
 
 
 def _opened(fit: Fit, segment: Segment) -> tuple[StreamLoop, Capture, Iterator[PartialFrame]]:
-    """Return a loop before the next frame of a segment, with the capture and its frames from there on."""
+    """Return a loop before the next frame of a segment, with the capture and its frames from there
+    on.
+    """
     last = _OPEN.pop((repr(fit), segment), None)
     _OPEN.clear()
     if last is not None:
@@ -171,7 +178,10 @@ def _opened(fit: Fit, segment: Segment) -> tuple[StreamLoop, Capture, Iterator[P
     if coded is not None:
         # Exposures are relative to the first frame of the recording.
         first = _images(capture, 0, 1) if segment.start else []
-        past = (frame.comparable(capture.train_views) for frame in islice(recorded, segment.frame - segment.start))
+        past = (
+            frame.comparable(capture.train_views)
+            for frame in islice(recorded, segment.frame - segment.start)
+        )
         loop.resume(coded, chain(first, past), fit.balance)
     return loop, capture, recorded
 

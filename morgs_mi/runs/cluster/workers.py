@@ -1,6 +1,8 @@
-"""Workers: processes of a Dask cluster, on this machine or on several, and the conditions in which they run a task.
+"""Workers: processes of a Dask cluster, on this machine or on several, and the conditions in which
+they run a task.
 
-A task is a function of the package without side effects. If its worker dies, Dask runs it again with the same result.
+A task is a function of the package without side effects. If its worker dies, Dask runs it again
+with the same result.
 """
 
 from __future__ import annotations
@@ -29,7 +31,8 @@ TIMEOUT = 10
 _SETTINGS = {
     "distributed.comm.timeouts.connect": TIMEOUT,
     "distributed.admin.large-graph-warning-threshold": "1GB",  # a task has the Gaussians before it
-    "distributed.worker.memory.pause": False,  # a worker that waits keeps its memory; one with too much is ended
+    # A worker that waits keeps its memory; one with too much is ended.
+    "distributed.worker.memory.pause": False,
 }
 _BUSY = threading.Lock()  # Dask runs several tasks at once in a worker with several threads
 
@@ -39,24 +42,31 @@ def open_client(scheduler: str | None = None, count: int | None = None) -> Itera
     """Start workers on this machine, or connect to those of a scheduler.
 
     Args:
-        scheduler: address of a Dask scheduler, such as ``tcp://host:8786``; None: workers are started.
-        count: number of workers to start, with equal shares of cores and memory; None: one per core.
+        scheduler: address of a Dask scheduler, such as ``tcp://host:8786``; None: workers are
+            started.
+        count: number of workers to start, with equal shares of cores and memory; None: one per
+            core.
 
     Raises:
-        ValueError: the number or the address is not one, Dask is missing, or the workers have another version of it.
+        ValueError: the number or the address is not one, Dask is missing, or the workers have
+            another version of it.
         ConnectionError: the scheduler does not answer, has no worker, or is lost later.
         ChildProcessError: the workers died that ran a task.
     """
     if count is not None and count < 1:
         raise ValueError(f"open_client(): `workers` must be at least 1, got {count}.")
     if scheduler is not None and "://" not in scheduler:
-        raise ValueError(f"open_client(): `scheduler` must be an address such as tcp://host:8786, got {scheduler}.")
+        raise ValueError(
+            "open_client(): `scheduler` must be an address such as tcp://host:8786, got "
+            f"{scheduler}."
+        )
     try:
         import dask.config
         from distributed import Client, LocalCluster
     except ImportError:
         raise ValueError(
-            "open_client(): several workers need the package distributed; pip install 'morgs-mi[cluster]'."
+            "open_client(): several workers need the package distributed; pip install "
+            "'morgs-mi[cluster]'."
         ) from None
     for name in ("distributed", "distributed.client"):  # what concerns a fit is raised
         logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -67,7 +77,10 @@ def open_client(scheduler: str | None = None, count: int | None = None) -> Itera
             count = count or cores()
             threads = max(1, cores() // count)
             address = LocalCluster(
-                n_workers=count, threads_per_worker=threads, dashboard_address=":0", silence_logs=logging.CRITICAL
+                n_workers=count,
+                threads_per_worker=threads,
+                dashboard_address=":0",
+                silence_logs=logging.CRITICAL,
             )
             stack.enter_context(address)
         problem = "none"
@@ -92,17 +105,18 @@ def _in_sentences(place: str) -> Iterator[None]:
         name = type(error).__name__
         if name == "KilledWorker":
             raise ChildProcessError(
-                f"{place}: expected the workers to stay alive, but all died that ran one task, perhaps for lack of "
-                "memory; use fewer workers, or process smaller images."
+                f"{place}: expected the workers to stay alive, but all died that ran one task, "
+                "perhaps for lack of memory; use fewer workers, or process smaller images."
             ) from None
         if name in ("CommClosedError", "ClosedClientError", "FutureCancelledError"):
             raise ConnectionError(
-                f"{place}: expected a scheduler that answers, but the connection was lost; start it again."
+                f"{place}: expected a scheduler that answers, but the connection was lost; start "
+                "it again."
             ) from None
         if isinstance(error, RuntimeError) and "deserialization" in str(error):
             raise ValueError(
-                f"{place}: expected a scheduler and workers with the versions of this client, got others that cannot "
-                "read its tasks; install the same versions on all machines."
+                f"{place}: expected a scheduler and workers with the versions of this client, got "
+                "others that cannot read its tasks; install the same versions on all machines."
             ) from None
         raise
 
@@ -118,7 +132,7 @@ def cores() -> int:
 
 
 def worker_name() -> str:
-    """Return the address of the worker that runs this task; without one, the name of this machine."""
+    """Return the address of the worker that runs this task, or else this machine's name."""
     worker = _worker()
     return socket.gethostname() if worker is None else worker.address
 
@@ -139,7 +153,8 @@ def installed() -> tuple[tuple[str, str], ...]:
 
 @contextmanager
 def prepared(variant: str, versions: tuple[tuple[str, str], ...]) -> Iterator[list[str]]:
-    """Run a task alone in this process, with its variant and threads; the context is a list of its warnings.
+    """Run a task alone in this process, with its variant and threads; the context is a list of its
+    warnings.
 
     Args:
         variant: Mitsuba variant of the client.
@@ -151,8 +166,8 @@ def prepared(variant: str, versions: tuple[tuple[str, str], ...]) -> Iterator[li
     for (name, expected), (_, version) in zip(versions, installed(), strict=True):
         if expected != version:
             raise ValueError(
-                f"{socket.gethostname()}: expected a worker with {name} {expected} like the client, got {version}; "
-                "install the same versions on both."
+                f"{socket.gethostname()}: expected a worker with {name} {expected} like the "
+                f"client, got {version}; install the same versions on both."
             )
     messages: list[str] = []
     with _BUSY, _logged(messages):

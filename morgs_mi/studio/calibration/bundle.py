@@ -1,21 +1,25 @@
-"""Bundle adjustment: changes of calibrated cameras, and points, that agree best with matched features.
+"""Bundle adjustment: changes of calibrated cameras, and points, that agree best with matched
+features.
 
-A point X lies at x = exp([w]) R (X - C - d) in the axes of a camera with the rotation R and the centre C, and at the
-pixel
+A point X lies at x = exp([w]) R (X - C - d) in the axes of a camera with the rotation R and the
+centre C, and at the pixel
 
     u = (1 + s) f (1 + k1 r^2 + k2 r^4) x / z + c + p W ,    r = |(x, y)| / z .
 
-The change of a camera has eleven numbers: a small rotation w [3], a displacement d [3] of its centre, the relative
-change s of its focal lengths, the displacement p [2] of its principal point in image widths W, and the radial
-distortion k [2] left in its images. They have independent normal priors around zero.
+The change of a camera has eleven numbers: a small rotation w [3], a displacement d [3] of its
+centre, the relative change s of its focal lengths, the displacement p [2] of its principal point in
+image widths W, and the radial distortion k [2] left in its images. They have independent normal
+priors around zero.
 
-Images do not determine a common similarity of cameras and points. They hardly determine a common change of the focal
-lengths, which depths compensate. With the priors alone, all cameras would turn together, relative to the cameras that
-are not adjusted, where a rotation costs less than displacements. Constraints therefore fix the gauge: changes have no
-common part. The mean of s is zero. The shifts of pixels that changes cause for fixed points are orthogonal to the
-shifts by any similarity of the points, to first order and in the metric of the equations.
+Images do not determine a common similarity of cameras and points. They hardly determine a common
+change of the focal lengths, which depths compensate. With the priors alone, all cameras would turn
+together, relative to the cameras that are not adjusted, where a rotation costs less than
+displacements. Constraints therefore fix the gauge: changes have no common part. The mean of s is
+zero. The shifts of pixels that changes cause for fixed points are orthogonal to the shifts by any
+similarity of the points, to first order and in the metric of the equations.
 
-Reprojection errors have Cauchy's loss in units of their own scale, so wrong matches have little influence.
+Reprojection errors have Cauchy's loss in units of their own scale, so wrong matches have little
+influence.
 """
 
 from __future__ import annotations
@@ -40,18 +44,23 @@ _DAMPING = 1e-3
 _MOST_DAMPING = 1e6
 # px, least scale of the reprojection errors of cameras with errors as large as the priors.
 _LARGE_ERROR = 1.7
-# px, the least scale of the reprojection errors. Cauchy's loss halves the weight of an error of 2.4 deviations.
+# px, the least scale of the reprojection errors. Cauchy's loss halves the weight of an error of 2.4
+# deviations.
 _LEAST_SCALE = 0.05
 _CAUCHY = 2.4
 
 
-def bundle_adjust(cameras: Sequence[Camera], tracks: Tracks, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the changes [V, 11] of the cameras, and the points [P, 3] in world units, that fit the tracks best.
+def bundle_adjust(
+    cameras: Sequence[Camera], tracks: Tracks, deviations: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the changes [V, 11] of the cameras, and the points [P, 3] in world units, that fit the
+    tracks best.
 
     Args:
         cameras: V views as calibrated.
         tracks: features of P > 0 points, each with at most one in a view.
-        deviations: standard deviations of the priors of a camera's changes [11], as from `likely_deviations`.
+        deviations: standard deviations of the priors of a camera's changes [11], as from
+            `likely_deviations`.
     """
     damping = _DAMPING
     changes = np.zeros((len(cameras), CHANGES))
@@ -82,10 +91,14 @@ def bundle_adjust(cameras: Sequence[Camera], tracks: Tracks, deviations: np.ndar
     return changes, points
 
 
-def likely_deviations(cameras: Sequence[Camera], tracks: Tracks, deviations: np.ndarray) -> np.ndarray:
-    """Return the deviations [11] of the errors of calibrated cameras, which are small where features reproject well.
+def likely_deviations(
+    cameras: Sequence[Camera], tracks: Tracks, deviations: np.ndarray
+) -> np.ndarray:
+    """Return the deviations [11] of the errors of calibrated cameras, which are small where
+    features reproject well.
 
-    Changes that these features do not determine, e.g. a slow bend of the rig, would otherwise follow their noise.
+    Changes that these features do not determine, e.g. a slow bend of the rig, would otherwise
+    follow their noise.
 
     Args:
         cameras: V views as calibrated.
@@ -103,20 +116,26 @@ def changed_camera(camera: Camera, changes: np.ndarray) -> Camera:
     V = np.eye(4)
     K[[0, 1], [0, 1]] *= 1 + changes[6]
     K[:2, 2] += changes[7:9] * camera.width
-    V[:3, :3] = cv2.Rodrigues(np.asarray(changes[:3], np.float64))[0] @ np.asarray(camera.viewmat)[:3, :3]
+    V[:3, :3] = (
+        cv2.Rodrigues(np.asarray(changes[:3], np.float64))[0] @ np.asarray(camera.viewmat)[:3, :3]
+    )
     V[:3, 3] = -V[:3, :3] @ (camera.position + changes[3:6])
     return replace(camera, K=K, viewmat=V)
 
 
 def prior_deviations(extent: float, priors: CameraPriors) -> np.ndarray:
-    """Return the standard deviations [11] of the changes of a camera; `extent` is the scene extent, world units."""
+    """Return the standard deviations [11] of the changes of a camera; `extent` is the scene extent,
+    world units.
+    """
     of_pose = np.deg2rad(priors.rotation), priors.position * extent
     terms = priors.distortion, 0.2 * priors.distortion
     return np.repeat((*of_pose, priors.focal, priors.principal_point, *terms), (3, 3, 1, 2, 1, 1))
 
 
 def distorted(camera: Camera, pixels: np.ndarray, distortion: np.ndarray) -> np.ndarray:
-    """Return the positions [n, 2] at which radial distortion k [2] shows the pixels [n, 2] of a pinhole camera."""
+    """Return the positions [n, 2] at which radial distortion k [2] shows the pixels [n, 2] of a
+    pinhole camera.
+    """
     focal = camera.K[[0, 1], [0, 1]]
     centre = camera.K[:2, 2]
     square = np.sum(((pixels - centre) / focal) ** 2, axis=-1, keepdims=True)
@@ -124,19 +143,25 @@ def distorted(camera: Camera, pixels: np.ndarray, distortion: np.ndarray) -> np.
 
 
 def undistorted(camera: Camera, pixels: np.ndarray, distortion: np.ndarray) -> np.ndarray:
-    """Return the pixels [n, 2] of a pinhole camera that radial distortion k [2] shows at `pixels` [n, 2]."""
+    """Return the pixels [n, 2] of a pinhole camera that radial distortion k [2] shows at `pixels`
+    [n, 2].
+    """
     if not np.any(distortion) or not len(pixels):
         return pixels
     coefficients = np.array([*distortion, 0, 0], np.float64)
-    return cv2.undistortPoints(pixels[:, None].astype(np.float64), camera.K, coefficients, P=camera.K)[:, 0]
+    return cv2.undistortPoints(
+        pixels[:, None].astype(np.float64), camera.K, coefficients, P=camera.K
+    )[:, 0]
 
 
 def camera_jacobian(
     camera: Camera, factor: float, points: np.ndarray, distortion: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of pixel positions by the changes of the camera [n, 2, 11] and by the points [n, 2, 3].
+    """Return the derivatives of pixel positions by the changes of the camera [n, 2, 11] and by the
+    points [n, 2, 3].
 
-    The derivative by w is the derivative by a further small rotation, which is equal to first order.
+    The derivative by w is the derivative by a further small rotation, which is equal to first
+    order.
 
     Args:
         camera: camera with the changes so far.
@@ -185,7 +210,12 @@ class NormalEquations:
         self._coupling = np.zeros((points, views, CHANGES, 3))
 
     def add(
-        self, view: int, ids: np.ndarray | slice, jacobians: tuple[np.ndarray, np.ndarray], G: np.ndarray, b: np.ndarray
+        self,
+        view: int,
+        ids: np.ndarray | slice,
+        jacobians: tuple[np.ndarray, np.ndarray],
+        G: np.ndarray,
+        b: np.ndarray,
     ) -> None:
         """Add the observations of n different points in a view.
 
@@ -211,23 +241,31 @@ class NormalEquations:
         self._right[view] += np.einsum("nij,ni->j", of_camera, b)
 
     def frame(self, points: np.ndarray) -> np.ndarray:
-        """Return the constraints of the gauge as rows a [8, V 11]: changes c without a common part have a c = 0.
+        """Return the constraints of the gauge as rows a [8, V 11]: changes c without a common part
+        have a c = 0.
 
         Args:
             points: [P, 3], world units.
         """
         from_centre = points - points.mean(axis=0)
         shifts = np.broadcast_to(np.eye(3), (len(points), 3, 3))
-        of_similarity = np.concatenate([-_cross(from_centre), shifts, from_centre[..., None]], axis=2)
+        of_similarity = np.concatenate(
+            [-_cross(from_centre), shifts, from_centre[..., None]], axis=2
+        )
         rows = np.zeros((8, *self._right.shape))
         rows[:7] = np.einsum("pij,pvki->jvk", of_similarity, self._coupling)
         rows[7, :, 6] = 1
         return rows.reshape(8, -1)
 
     def step(
-        self, changes: np.ndarray, deviations: np.ndarray, damping: float, frame: np.ndarray | None = None
+        self,
+        changes: np.ndarray,
+        deviations: np.ndarray,
+        damping: float,
+        frame: np.ndarray | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the step of Levenberg and Marquardt for cameras [V, 11] and points [P, 3], by Schur's complement.
+        """Return the step of Levenberg and Marquardt for cameras [V, 11] and points [P, 3], by
+        Schur's complement.
 
         Args:
             changes: changes of the cameras so far [V, 11].
@@ -243,8 +281,12 @@ class NormalEquations:
         solved = coupling @ np.linalg.inv(points)
         full = np.zeros((views, size, views, size))
         full[np.arange(views), :, np.arange(views)] = system
-        schur_complement = full.reshape(views * size, -1) - np.tensordot(solved, coupling, axes=((0, 2), (0, 2)))
-        right = (self._right + precision * changes).ravel() - np.einsum("pij,pj->i", solved, self._right_points)
+        schur_complement = full.reshape(views * size, -1) - np.tensordot(
+            solved, coupling, axes=((0, 2), (0, 2))
+        )
+        right = (self._right + precision * changes).ravel() - np.einsum(
+            "pij,pj->i", solved, self._right_points
+        )
         frame = np.zeros((0, right.size)) if frame is None else frame
         step = _solved(schur_complement, -right, frame, -frame @ changes.ravel())
         rest = -self._right_points - np.einsum("pij,i->pj", coupling, step)
@@ -252,7 +294,9 @@ class NormalEquations:
 
 
 def _solved(A: np.ndarray, b: np.ndarray, rows: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """Return the x that minimises x' A x / 2 - b' x with `rows` x = `value`; rows of zeros are ignored."""
+    """Return the x that minimises x' A x / 2 - b' x with `rows` x = `value`; rows of zeros are
+    ignored.
+    """
     scale = np.diag(A).mean()
     lengths = np.maximum(np.linalg.norm(rows, axis=1), 1e-30) / scale
     rows = rows / lengths[:, None]
@@ -269,7 +313,9 @@ def _cross(vectors: np.ndarray) -> np.ndarray:
 
 
 def _damped(blocks: np.ndarray, damping: float) -> np.ndarray:
-    """Return blocks [..., k, k] with an increased diagonal, which is above 0 for singular blocks, too."""
+    """Return blocks [..., k, k] with an increased diagonal, which is above 0 for singular blocks,
+    too.
+    """
     diagonal = np.einsum("...ii->...i", blocks)
     increase = damping * diagonal + 1e-9 * diagonal.max(axis=-1, keepdims=True) + 1e-30
     return blocks + increase[..., None] * np.eye(blocks.shape[-1])
@@ -283,19 +329,25 @@ def _equations(
     errors: np.ndarray,
     scale: float,
 ) -> NormalEquations:
-    """Return the equations of a step of iteratively reweighted least squares, in units of the errors' scale."""
+    """Return the equations of a step of iteratively reweighted least squares, in units of the
+    errors' scale.
+    """
     equations = NormalEquations(len(cameras), tracks.count)
     weights = 1 / (scale**2 + (errors**2).sum(axis=1, keepdims=True) / _CAUCHY**2)
     for view, (camera, change) in enumerate(zip(cameras, changes, strict=True)):
         rows = tracks.views == view
         changed_view = changed_camera(camera, change)
-        jacobians = camera_jacobian(changed_view, 1 + change[6], points[tracks.ids[rows]], change[9:])
+        jacobians = camera_jacobian(
+            changed_view, 1 + change[6], points[tracks.ids[rows]], change[9:]
+        )
         w = weights[rows]
         equations.add(view, tracks.ids[rows], jacobians, w[..., None] * np.eye(2), w * errors[rows])
     return equations
 
 
-def _errors(cameras: Sequence[Camera], changes: np.ndarray, points: np.ndarray, tracks: Tracks) -> np.ndarray:
+def _errors(
+    cameras: Sequence[Camera], changes: np.ndarray, points: np.ndarray, tracks: Tracks
+) -> np.ndarray:
     """Return the projections minus the features [n, 2], px; large behind a camera."""
     errors = np.empty_like(tracks.pixels)
     depths = np.empty(len(tracks.ids))

@@ -1,8 +1,9 @@
-"""Calibration from clips alone: features, matches and mapping of one frame by pycolmap, stored as a COLMAP model.
+"""Calibration from clips alone: features, matches and mapping of one frame by pycolmap, stored as a
+COLMAP model.
 
-COLMAP keeps principal points in the middle of the images. Optical stabilisation moves the lens of a phone from photo to
-photo, by up to 2 % of the image's width. A last bundle adjustment therefore moves the principal points, one for each
-image, and is used if it fits clearly better.
+COLMAP keeps principal points in the middle of the images. Optical stabilisation moves the lens of a
+phone from photo to photo, by up to 2 % of the image's width. A last bundle adjustment therefore
+moves the principal points, one for each image, and is used if it fits clearly better.
 
 The scale and the up direction of the model's world are arbitrary: images do not determine them.
 """
@@ -38,17 +39,21 @@ Mapper = Literal["incremental", "global"]
 
 # With fewer features in a view COLMAP cannot register it.
 _MIN_FEATURES = 100
-# Contrast of the weakest features. At COLMAP's 0.0067, views at the edge of a rig have too few matches for a pose.
+# Contrast of the weakest features. At COLMAP's 0.0067, views at the edge of a rig have too few
+# matches for a pose.
 _PEAK = 0.002
 # COLMAP registers a camera with fewer points, but its pose then depends on a few of them.
 _MIN_POINTS = 50
-# Relative decrease of the median error from which images get principal points of their own. On photos by stabilised
-# phones it is 0.26 and 0.28, on others at most 0.11.
+# Relative decrease of the median error from which images get principal points of their own. On
+# photos by stabilised phones it is 0.26 and 0.28, on others at most 0.11.
 _LEAST_DECREASE = 0.15
 # Files in the folder that COLMAP works in.
 _IMAGES = "images"
 _DATABASE = "database.db"
-_MORE_TEXTURE = "light the scene evenly, add textured objects, or record a frame with such objects before the take"
+_MORE_TEXTURE = (
+    "light the scene evenly, add textured objects, or record a frame with such objects before the "
+    "take"
+)
 # Seeds that COLMAP takes.
 _SEEDS = "[0, 2147483647]"
 
@@ -58,11 +63,19 @@ class CalibrateConfig:
     """Settings of the calibration."""
 
     camera_model: Literal[
-        "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"
+        "SIMPLE_PINHOLE",
+        "PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "OPENCV",
+        "OPENCV_FISHEYE",
+        "FULL_OPENCV",
     ] = "SIMPLE_RADIAL"
     """COLMAP camera model; one with more parameters needs more views, or shared intrinsics."""
     shared_intrinsics: bool = False
-    """One set of intrinsics for all cameras of an image size, which needs fewer views; for equal make and zoom."""
+    """One set of intrinsics for all cameras of an image size, which needs fewer views; for equal
+    make and zoom.
+    """
     frame: int = 0
     """Frame to calibrate on; in clips of variable frame rate, the one nearest in time."""
     partial: bool = False
@@ -107,7 +120,9 @@ class Candidate:
 
     @property
     def rank(self) -> tuple[int, int, float]:
-        """Number of cameras that fit, number of cameras with a pose, and the negative error; larger is better."""
+        """Number of cameras that fit, number of cameras with a pose, and the negative error; larger
+        is better.
+        """
         fits = [check.fits for check in self.checks]
         return fits.count(True), len(fits) - fits.count(None), -self.error
 
@@ -119,7 +134,8 @@ def calibrate(
     progress: Callable[[str, int, int], None] | None = None,
     without: Sequence[str] = (),
 ) -> CalibrationResult:
-    """Calibrate a folder of clips, one per camera, and write ``sparse/0`` there; nothing is written on failure.
+    """Calibrate a folder of clips, one per camera, and write ``sparse/0`` there; nothing is written
+    on failure.
 
     Args:
         path: the folder: videos, a folder of images per camera, or one photo per camera.
@@ -131,8 +147,8 @@ def calibrate(
     Raises:
         FileNotFoundError: there is no such folder.
         FileExistsError: there is a `sparse` folder and `overwrite` is not set.
-        ValueError: fewer than two clips, clips that cannot be read, or views that do not determine the cameras; the
-            message names them and suggests a remedy.
+        ValueError: fewer than two clips, clips that cannot be read, or views that do not determine
+            the cameras; the message names them and suggests a remedy.
         OSError: the model cannot be written.
     """
     path = Path(path)
@@ -144,7 +160,8 @@ def calibrate(
         raise FileNotFoundError(f"{path}: expected a folder of clips, found none; check the path.")
     if (path / "sparse").exists() and not overwrite:
         raise FileExistsError(
-            f"{path / 'sparse'}: expected no model, got one; remove it, or overwrite it (--overwrite)."
+            f"{path / 'sparse'}: expected no model, got one; remove it, or overwrite it "
+            "(--overwrite)."
         )
     report("Reading frames", 0, 1)
     images, masks = _frames(path, config, without)
@@ -158,14 +175,21 @@ def calibrate(
         left_out = tuple(name for name in images if name not in names)
         if left_out and not config.partial:
             raise ValueError(
-                f"{path}: expected to register all {len(images)} cameras, got {len(names)}, without "
-                f"{', '.join(left_out)}: move these so that neighbours see the same objects, {_MORE_TEXTURE}, "
-                "calibrate on another frame (--frame), or accept the partial model (--partial)."
+                f"{path}: expected to register all {len(images)} cameras, got {len(names)}, "
+                f"without {', '.join(left_out)}: move these so that neighbours see the same "
+                f"objects, {_MORE_TEXTURE}, calibrate on another frame (--frame), or accept the "
+                "partial model (--partial)."
             )
         _name_photos(best.model, path)
         with atomic_path(path / "sparse", "calibrate()") as folder:
             write_reconstruction(best.model, folder / "0")
-    measures = best.model.num_points3D(), best.error, best.checks, best.mapper, best.principal_points
+    measures = (
+        best.model.num_points3D(),
+        best.error,
+        best.checks,
+        best.mapper,
+        best.principal_points,
+    )
     return CalibrationResult(path / "sparse" / "0", names, left_out, *measures)
 
 
@@ -173,17 +197,25 @@ def _checks(model: Any, names: Sequence[str]) -> tuple[CameraCheck, ...]:
     """Return the result of each camera from its points in COLMAP's model."""
     images = {Path(model.image(i).name).stem: model.image(i) for i in model.reg_image_ids()}
     checks = {name: _check(name, images.get(name), model) for name in names}
-    poses = {name: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for name, image in images.items()}
+    poses = {
+        name: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+        for name, image in images.items()
+    }
     cameras = [Camera(np.eye(3), pose, 1, 1, name) for name, pose in poses.items()]
     for i, j in same_poses(cameras):
         for name, twin in ((cameras[i].name, cameras[j].name), (cameras[j].name, cameras[i].name)):
-            advice = f"it has the same pose as {twin}: one clip seems to be a copy of the other; replace it"
+            advice = (
+                f"it has the same pose as {twin}: one clip seems to be a copy of the other; "
+                "replace it"
+            )
             checks[name] = replace(checks[name], fits=False, advice=advice)
     return tuple(checks.values())
 
 
 def _name_photos(model: Any, path: Path) -> None:
-    """Name the images of a folder of photos after their files, which other programs open by these names."""
+    """Name the images of a folder of photos after their files, which other programs open by these
+    names.
+    """
     files = {} if clips_by_camera(path) else photos(path)
     for image in map(model.image, model.reg_image_ids()):
         if (name := Path(image.name).stem) in files:
@@ -192,14 +224,26 @@ def _name_photos(model: Any, path: Path) -> None:
 
 def _check(name: str, image: Any | None, model: Any) -> CameraCheck:
     if image is None:
-        return CameraCheck(name, 0, float("nan"), None, f"it could not be registered and has no pose: {_MORE_TEXTURE}")
+        return CameraCheck(
+            name,
+            0,
+            float("nan"),
+            None,
+            f"it could not be registered and has no pose: {_MORE_TEXTURE}",
+        )
     points = [p for p in image.points2D if p.has_point3D()]
     pixels = (image.project_point(model.point3D(p.point3D_id).xyz) for p in points)
-    errors = [np.inf if q is None else float(np.linalg.norm(q - p.xy)) for p, q in zip(points, pixels, strict=True)]
+    errors = [
+        np.inf if q is None else float(np.linalg.norm(q - p.xy))
+        for p, q in zip(points, pixels, strict=True)
+    ]
     error = float(np.median(errors)) if errors else float("nan")
     advice = ""
     if len(points) < _MIN_POINTS:
-        advice = f"only {len(points)} points, {_MIN_POINTS} are needed for a reliable pose: {_MORE_TEXTURE}"
+        advice = (
+            f"only {len(points)} points, {_MIN_POINTS} are needed for a reliable pose: "
+            f"{_MORE_TEXTURE}"
+        )
     elif error > MAX_ERROR:
         advice = "its points do not fit: try a camera model with more parameters (--camera-model)"
     return CameraCheck(name, len(points), error, not advice, advice)
@@ -208,19 +252,30 @@ def _check(name: str, image: Any | None, model: Any) -> CameraCheck:
 def _frames(
     path: Path, config: CalibrateConfig, without: Sequence[str]
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Return one image per camera by its name, and the masks of opaque pixels of images with transparent ones."""
+    """Return one image per camera by its name, and the masks of opaque pixels of images with
+    transparent ones.
+    """
     clips = clips_by_camera(path) or photos(path)
     clips = {name: clips[name] for name in names_without(path, clips, without)}
     if len(clips) < 2:
         names = ", ".join(clips) or "none"
         raise ValueError(
-            f"{path}: expected the clips of at least two cameras, found {names}; check the path, or make {EXAMPLE}"
+            f"{path}: expected the clips of at least two cameras, found {names}; check the path, "
+            f"or make {EXAMPLE}"
         )
     readers = {name: open_frames(clip) for name, clip in clips.items()}
-    short = [name for name, reader in readers.items() if not 0 <= config.frame <= _last_position(reader)]
+    short = [
+        name for name, reader in readers.items() if not 0 <= config.frame <= _last_position(reader)
+    ]
     if short:
-        raise ValueError(f"{path}: frame {config.frame} is not in the clips of {', '.join(short)}; choose another.")
-    at = {name: int(nearest_frames(reader, np.array([config.frame]))[0]) for name, reader in readers.items()}
+        raise ValueError(
+            f"{path}: frame {config.frame} is not in the clips of {', '.join(short)}; choose "
+            "another."
+        )
+    at = {
+        name: int(nearest_frames(reader, np.array([config.frame]))[0])
+        for name, reader in readers.items()
+    }
     frames = {name: next(reader.frames(at[name], at[name] + 1)) for name, reader in readers.items()}
     stops = display_stops(frames.values())
     images = {name: display_image(image, stops) for name, image in frames.items()}
@@ -241,7 +296,7 @@ def match_views(
     config: CalibrateConfig,
     report: Callable[[str, int, int], None],
 ) -> None:
-    """Write images, features and the matches of all pairs of views into a folder, for `map_views`."""
+    """Write images, features and matches of all pairs of views into a folder, for `map_views`."""
     pycolmap = import_pycolmap()
 
     folder = scratch / _IMAGES
@@ -266,16 +321,23 @@ def match_views(
         report("Finding features", done, len(by_size))
         extraction = pycolmap.FeatureExtractionOptions(max_image_size=max(size))
         extraction.sift.peak_threshold = _PEAK
-        pycolmap.import_images(database, folder, mode, names, reader)  # else threads number them in any order
-        pycolmap.extract_features(database, folder, names, mode, reader, extraction, pycolmap.Device.cpu)
+        # Else threads number them in any order.
+        pycolmap.import_images(database, folder, mode, names, reader)
+        pycolmap.extract_features(
+            database, folder, names, mode, reader, extraction, pycolmap.Device.cpu
+        )
     report("Finding features", len(by_size), len(by_size))
     _check_features(path, database)
     report("Matching views", 0, 1)
-    # Without a seed of its own, the verification keeps other matches on each run, and may lose a view with few of them.
+    # Without a seed of its own, the verification keeps other matches on each run, and may lose a
+    # view with few of them.
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = config.seed
-    # Guided matching takes several times as long, and its poses are no better by matches of other features.
-    pycolmap.match_exhaustive(database, verification_options=verification, device=pycolmap.Device.cpu)
+    # Guided matching takes several times as long, and its poses are no better by matches of other
+    # features.
+    pycolmap.match_exhaustive(
+        database, verification_options=verification, device=pycolmap.Device.cpu
+    )
     report("Matching views", 1, 1)
     _check_pairs(path, database)
 
@@ -283,19 +345,23 @@ def match_views(
 def map_views(path: Path, names: Sequence[str], scratch: Path, seed: int) -> Candidate:
     """Return the best model of incremental and of global mapping of the matches in a folder.
 
-    If none is complete, both map the matches that agree with focal lengths found from pairs of views, too.
+    If none is complete, both map the matches that agree with focal lengths found from pairs of
+    views, too.
     """
     pycolmap = import_pycolmap()
 
     candidates = _mapped(names, scratch, seed)
     if not any(candidate.complete for candidate in candidates):
-        pycolmap.calibrate_view_graph(scratch / _DATABASE, pycolmap.ViewGraphCalibrationOptions(random_seed=seed))
+        pycolmap.calibrate_view_graph(
+            scratch / _DATABASE, pycolmap.ViewGraphCalibrationOptions(random_seed=seed)
+        )
         candidates += _mapped(names, scratch, seed)
     if not candidates:
         raise ValueError(
-            f"{path}: the views match, but neither incremental nor global mapping by COLMAP found poses: their "
-            "baselines may be too short or too wide, or all shared points may lie in one plane; try shared intrinsics "
-            f"(--shared-intrinsics), another frame (--frame), or {_MORE_TEXTURE}."
+            f"{path}: the views match, but neither incremental nor global mapping by COLMAP found "
+            "poses: their baselines may be too short or too wide, or all shared points may lie "
+            "in one plane; try shared intrinsics (--shared-intrinsics), another frame (--frame), "
+            f"or {_MORE_TEXTURE}."
         )
     return _with_principal_points(max(candidates, key=lambda candidate: candidate.rank), names)
 
@@ -303,15 +369,20 @@ def map_views(path: Path, names: Sequence[str], scratch: Path, seed: int) -> Can
 def _mapped(names: Sequence[str], scratch: Path, seed: int) -> list[Candidate]:
     """Return the models of both mappers.
 
-    Threads of a mapper share its random samples, which makes other models on some runs; one thread takes as long.
+    Threads of a mapper share its random samples, which makes other models on some runs; one thread
+    takes as long.
     """
     pycolmap = import_pycolmap()
 
     inputs = scratch / _DATABASE, scratch / _IMAGES, scratch
-    incremental = pycolmap.IncrementalPipelineOptions(min_model_size=2, random_seed=seed, num_threads=1)
+    incremental = pycolmap.IncrementalPipelineOptions(
+        min_model_size=2, random_seed=seed, num_threads=1
+    )
     models_by_mapper: dict[Mapper, dict[int, Any]] = {
         "incremental": pycolmap.incremental_mapping(*inputs, incremental),
-        "global": pycolmap.global_mapping(*inputs, pycolmap.GlobalPipelineOptions(random_seed=seed, num_threads=1)),
+        "global": pycolmap.global_mapping(
+            *inputs, pycolmap.GlobalPipelineOptions(random_seed=seed, num_threads=1)
+        ),
     }
     return [
         Candidate(mapper, model, _checks(model, names))
@@ -321,7 +392,9 @@ def _mapped(names: Sequence[str], scratch: Path, seed: int) -> list[Candidate]:
 
 
 def _with_principal_points(candidate: Candidate, names: Sequence[str]) -> Candidate:
-    """Return the model with a camera and a principal point for each image, or as it is if that fits no better."""
+    """Return the model with a camera and a principal point for each image, or as it is if that fits
+    no better.
+    """
     pycolmap = import_pycolmap()
 
     model = _with_own_cameras(candidate.model)
@@ -330,7 +403,10 @@ def _with_principal_points(candidate: Candidate, names: Sequence[str]) -> Candid
         config.add_image(image)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     options = pycolmap.BundleAdjustmentOptions(
-        refine_focal_length=False, refine_extra_params=False, refine_principal_point=True, print_summary=False
+        refine_focal_length=False,
+        refine_extra_params=False,
+        refine_principal_point=True,
+        print_summary=False,
     )
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
@@ -369,12 +445,14 @@ def _check_features(path: Path, database: Path) -> None:
     pycolmap = import_pycolmap()
 
     with closing(pycolmap.Database.open(database)) as db:
-        counts = {Path(i.name).stem: db.num_keypoints_for_image(i.image_id) for i in db.read_all_images()}
+        counts = {
+            Path(i.name).stem: db.num_keypoints_for_image(i.image_id) for i in db.read_all_images()
+        }
     if poor := {name: count for name, count in counts.items() if count < _MIN_FEATURES}:
         table = ", ".join(f"{count} in {name}" for name, count in poor.items())
         raise ValueError(
-            f"{path}: expected at least {_MIN_FEATURES} features in every view, got {table}: too dark, blurred or "
-            f"uniform; {_MORE_TEXTURE}, or calibrate on another frame (--frame)."
+            f"{path}: expected at least {_MIN_FEATURES} features in every view, got {table}: too "
+            f"dark, blurred or uniform; {_MORE_TEXTURE}, or calibrate on another frame (--frame)."
         )
 
 
@@ -386,8 +464,9 @@ def _check_pairs(path: Path, database: Path) -> None:
         _, geometries = db.read_two_view_geometries()
     if not any(len(geometry.inlier_matches) for geometry in geometries):
         raise ValueError(
-            f"{path}: no two of the {count} views match: they may show different objects, be too far apart (more than "
-            f"about 30 degrees), or not be simultaneous; move the cameras closer, or {_MORE_TEXTURE}."
+            f"{path}: no two of the {count} views match: they may show different objects, be too "
+            "far apart (more than about 30 degrees), or not be simultaneous; move the cameras "
+            f"closer, or {_MORE_TEXTURE}."
         )
 
 

@@ -1,27 +1,31 @@
-"""Equations of the time offsets of cameras, from Gaussians of one instant and images of slightly different times.
+"""Equations of the time offsets of cameras, from Gaussians of one instant and images of slightly
+different times.
 
-Gaussian k moves by d_k in a frame, which view v shows as m = J_v d_k pixels, with J_v the derivative of its projection.
-If the clock of the view is o_v frames ahead, the image shows the Gaussian displaced by o_v m. Gaussians that are fitted
-to all views at once lie between the positions in these views, at a distance x_k from their true positions. With the
-error e = image - render and the gradient g of the image,
+Gaussian k moves by d_k in a frame, which view v shows as m = J_v d_k pixels, with J_v the
+derivative of its projection. If the clock of the view is o_v frames ahead, the image shows the
+Gaussian displaced by o_v m. Gaussians that are fitted to all views at once lie between the
+positions in these views, at a distance x_k from their true positions. With the error e = image -
+render and the gradient g of the image,
 
     e + g . (o_v m - J_v x_k) = 0
 
-in each pixel and colour. A Gaussian's weight in a pixel weights its equations. The sums over the pixels
+in each pixel and colour. A Gaussian's weight in a pixel weights its equations. The sums over the
+pixels
 
     A_vk = sum w_k g g^T ,    b_vk = sum w_k e g
 
-are backprojections of two images. Least squares in the offsets and the positions, with the positions eliminated like
-points in bundle adjustment (Schur complement; Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000, section
-6.1), leaves one equation per view,
+are backprojections of two images. Least squares in the offsets and the positions, with the
+positions eliminated like points in bundle adjustment (Schur complement; Triggs et al., Bundle
+Adjustment - A Modern Synthesis, 2000, section 6.1), leaves one equation per view,
 
     sum_w S_vw o_w = r_v ,    c_vk = J_v^T A_vk J_v d_k ,    H_k = sum_w J_w^T A_wk J_w + lambda ,
     S_vw = sum_k (d_k^T c_vk [v = w] - c_vk^T H_k^-1 c_wk) ,
     r_v = sum_k (c_vk^T H_k^-1 sum_w J_w^T b_wk - d_k^T J_v^T b_vk) ,
 
-where w runs over the training views. A held-out view also has an equation, but its offset is in no other equation.
-Equal offsets of all views solve S o = 0: they move the Gaussians along their motion. Offsets that other positions of
-the Gaussians explain nearly solve it, too, for example with motion along the epipolar lines of two cameras.
+where w runs over the training views. A held-out view also has an equation, but its offset is in no
+other equation. Equal offsets of all views solve S o = 0: they move the Gaussians along their
+motion. Offsets that other positions of the Gaussians explain nearly solve it, too, for example with
+motion along the epipolar lines of two cameras.
 """
 
 from __future__ import annotations
@@ -39,12 +43,14 @@ from morgs_mi.render.active_view import ActiveView
 
 # lambda, as a fraction of a Gaussian's mean curvature along an axis.
 _PRIOR = 1e-4
-# Added to the eigenvalues of S for a step and for its error, as fractions of its mean diagonal without elimination.
+# Added to the eigenvalues of S for a step and for its error, as fractions of its mean diagonal
+# without elimination.
 _DAMPING = 0.03
 _FLOOR = 1e-3
 # Standard deviation in frames of an unknown offset.
 UNKNOWN = 1.0
-# Mean number of Gaussians of a group, which counts as one error: neighbours share pixels and have similar errors.
+# Mean number of Gaussians of a group, which counts as one error: neighbours share pixels and have
+# similar errors.
 _GROUP = 32
 
 
@@ -54,8 +60,10 @@ class OffsetEquations:
 
     matrix: np.ndarray  #: S [V, V]; the columns of held-out views are zero off the diagonal.
     right: np.ndarray  #: r [V].
-    scatter: np.ndarray  #: Sum over groups of neighbouring Gaussians of the products of their parts of r [V, V].
-    own: np.ndarray  #: Sum of d^T c [V], the diagonal of S if the Gaussians were in their true positions.
+    #: Sum over groups of neighbouring Gaussians of the products of their parts of r [V, V].
+    scatter: np.ndarray
+    #: Sum of d^T c [V], the diagonal of S if the Gaussians were in their true positions.
+    own: np.ndarray
     train: np.ndarray  #: Mask of the training views, bool [V].
 
     def __add__(self, other: OffsetEquations) -> OffsetEquations:
@@ -78,14 +86,18 @@ class OffsetEquations:
     def errors(self, reference: int) -> np.ndarray:
         """Return the standard error [V] in frames of each offset relative to the view `reference`.
 
-        The parts of r of groups of neighbouring Gaussians count as independent: a sandwich estimate with clusters
-        (Liang and Zeger, Biometrika 73(1), 1986). Offsets that the equations do not determine have an error of a frame.
+        The parts of r of groups of neighbouring Gaussians count as independent: a sandwich estimate
+        with clusters (Liang and Zeger, Biometrika 73(1), 1986). Offsets that the equations do not
+        determine have an error of a frame.
         """
         inverse = self._inverse(_FLOOR)
         blindness = np.eye(len(inverse)) - inverse @ self.matrix
         noise = inverse - inverse[reference]
         lost_part = blindness - blindness[reference]
-        return np.sqrt(np.einsum("vi,ij,vj->v", noise, self.scatter, noise) + UNKNOWN**2 * (lost_part**2).sum(axis=1))
+        return np.sqrt(
+            np.einsum("vi,ij,vj->v", noise, self.scatter, noise)
+            + UNKNOWN**2 * (lost_part**2).sum(axis=1)
+        )
 
     def _inverse(self, damping: float, share: float = 1.0) -> np.ndarray:
         """Return the matrix [V, V] that turns r into o."""
@@ -99,12 +111,18 @@ class OffsetEquations:
         whole[np.ix_(train, train)] = centred @ inverse @ centred / share
         for view in np.flatnonzero(~train):
             diagonal = self.matrix[view, view] + _FLOOR * scale
-            whole[view] = (np.eye(len(train))[view] - self.matrix[view, train] @ whole[train]) / diagonal
+            whole[view] = (
+                np.eye(len(train))[view] - self.matrix[view, train] @ whole[train]
+            ) / diagonal
         return whole
 
 
 def offset_equations(
-    gaussians: Gaussians, views: Sequence[ActiveView], targets: Sequence[Target], train: np.ndarray, blur: float
+    gaussians: Gaussians,
+    views: Sequence[ActiveView],
+    targets: Sequence[Target],
+    train: np.ndarray,
+    blur: float,
 ) -> OffsetEquations:
     """Return the equations of an instant.
 
@@ -139,14 +157,20 @@ def offset_equations(
 
 
 def _grouped(parts: np.ndarray, means: np.ndarray) -> np.ndarray:
-    """Return sums of the parts [V, n] of Gaussians over groups: Gaussians with the same nearest centre form one."""
+    """Return sums of the parts [V, n] of Gaussians over groups: Gaussians with the same nearest
+    centre form one.
+    """
     if not len(means):
         return parts
     _, labels = KDTree(means[::_GROUP]).query(means)
     return np.stack([np.bincount(labels, row) for row in parts])
 
 
-def _products(gaussians: Gaussians, view: ActiveView, target: Target, blur: float) -> tuple[np.ndarray, np.ndarray]:
+def _products(
+    gaussians: Gaussians, view: ActiveView, target: Target, blur: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Return A [N, 2, 2] and b [N, 2] of a view."""
     error = target.difference(view.render(gaussians, ("color",)).color)
-    return gradient_products(gaussians, view, blurred(error, blur), image_gradient(blurred(target.image(), blur)))
+    return gradient_products(
+        gaussians, view, blurred(error, blur), image_gradient(blurred(target.image(), blur))
+    )

@@ -1,24 +1,29 @@
-"""Refinement of calibrated cameras on the first frame: poses, focal lengths, principal points and radial distortion.
+"""Refinement of calibrated cameras on the first frame: poses, focal lengths, principal points and
+radial distortion.
 
-Beyond the paper. With enough feature matches, bundle adjustment gives a first estimate (see `bundle`). Rounds then
-lower the difference between images and renderings. A round is a short fit of Gaussians, followed by Gauss-Newton steps
-for all cameras and the means of all Gaussians at once. With the blend weights w fixed, the error e = target - image of
-a view is linear in the shift u of a splat (Lucas and Kanade 1981; as in `method.photometric`): with the gradient g, it
-becomes e + g . u. A Gaussian is therefore an observation of `NormalEquations` in each view, with
+Beyond the paper. With enough feature matches, bundle adjustment gives a first estimate (see
+`bundle`). Rounds then lower the difference between images and renderings. A round is a short fit of
+Gaussians, followed by Gauss-Newton steps for all cameras and the means of all Gaussians at once.
+With the blend weights w fixed, the error e = target - image of a view is linear in the shift u of a
+splat (Lucas and Kanade 1981; as in `method.photometric`): with the gradient g, it becomes e + g .
+u. A Gaussian is therefore an observation of `NormalEquations` in each view, with
 
     G = sum_x w g g' / v,    b = sum_x w e g / v,
 
 where the variance v is the mean square error times the number of pixels with similar errors.
 
-Refined cameras are evaluated on withheld pixels: blocks of every training view that no fit uses. Three fits from the
-same start are compared by the PSNR of these pixels: with the calibrated cameras, with the cameras of the bundle
-adjustment, and with the cameras after the rounds. If there are many sharp features, the rounds only lose accuracy.
+Refined cameras are evaluated on withheld pixels: blocks of every training view that no fit uses.
+Three fits from the same start are compared by the PSNR of these pixels: with the calibrated
+cameras, with the cameras of the bundle adjustment, and with the cameras after the rounds. If there
+are many sharp features, the rounds only lose accuracy.
 
-Each round removes the distortion estimated so far from the images, because Gaussians are rendered with pinhole cameras.
+Each round removes the distortion estimated so far from the images, because Gaussians are rendered
+with pinhole cameras.
 
-Cameras stay in the calibration's frame of reference and keep their mean focal length (see `bundle`). A camera that is
-not refined therefore fits as before. Points move with the cameras to keep their projections. The held-out view keeps
-its calibrated camera; `register_camera` fits a camera to its image while the Gaussians are frozen.
+Cameras stay in the calibration's frame of reference and keep their mean focal length (see
+`bundle`). A camera that is not refined therefore fits as before. Points move with the cameras to
+keep their projections. The held-out view keeps its calibrated camera; `register_camera` fits a
+camera to its image while the Gaussians are frozen.
 """
 
 from __future__ import annotations
@@ -59,23 +64,27 @@ from morgs_mi.studio.calibration.bundle import (
 
 # A camera with features in fewer tracks is not determined by them.
 _MIN_TRACKS = 40
-# Number of pixels with similar errors, because the fit lacks a detail there. They count as one pixel: otherwise priors
-# would have no influence, and cameras would follow the errors of a short fit.
+# Number of pixels with similar errors, because the fit lacks a detail there. They count as one
+# pixel: otherwise priors would have no influence, and cameras would follow the errors of a short
+# fit.
 _ALIKE = 10.0
 # Gauss-Newton steps of a round, their damping, and the longest step of a mean in scene extents.
 _STEPS = 3
 _DAMPING = 1e-3
 _LONGEST = 0.02
-# px, standard deviations of the blur of images and gradients in the first rounds, for errors of several pixels.
+# px, standard deviations of the blur of images and gradients in the first rounds, for errors of
+# several pixels.
 _BLURS = (2.0, 1.0)
-# Error at which a pixel has half its weight, relative to white: larger errors are details that the fit lacks.
+# Error at which a pixel has half its weight, relative to white: larger errors are details that the
+# fit lacks.
 _HALF_WEIGHT = 0.1
 # Least mean square error: a rendering compared with itself has an error of 0.
 _LEAST_ERROR = 1e-10
 # Deviation of a fixed distortion; least valid share of a resampled pixel.
 _NO_DISTORTION = 1e-4
 _VALID = 0.999
-# Steps of the registration of a camera, which end when they change its pixels by less than this, px.
+# Steps of the registration of a camera, which end when they change its pixels by less than this,
+# px.
 _REGISTRATION_STEPS = 30
 _LEAST_SHIFT = 1e-3
 # Factors on the learning rates in the rounds after the first.
@@ -94,14 +103,21 @@ class Refinement:
     rotation: float  #: Largest change of a rotation, degrees.
     position: float  #: Largest change of a position, world units.
     focal: float  #: Largest relative change of a focal length.
-    distortion: float = 0.0  #: Largest shift of a pixel by the remaining distortion, in image widths.
+    #: Largest shift of a pixel by the remaining distortion, in image widths.
+    distortion: float = 0.0
 
     @property
     def sentence(self) -> str:
         """The change of the cameras and its reason, in a sentence."""
-        sizes = f"by up to {self.rotation:.2g} degrees, {self.position:.2g} units, {100 * self.focal:.2g} % of the "
+        sizes = (
+            f"by up to {self.rotation:.2g} degrees, {self.position:.2g} units, "
+            f"{100 * self.focal:.2g} % of the "
+        )
         sizes += f"focal length and {100 * self.distortion:.2g} % of the image's width by the lens"
-        scores = f"withheld pixels have {self.refined_psnr:.2f} dB instead of {self.calibrated_psnr:.2f} dB"
+        scores = (
+            f"withheld pixels have {self.refined_psnr:.2f} dB instead of "
+            f"{self.calibrated_psnr:.2f} dB"
+        )
         if np.isnan(self.calibrated_psnr):
             return f"The cameras were refined, {sizes}."
         if self.taken:
@@ -111,9 +127,11 @@ class Refinement:
     def validation(
         self, capture: Capture, gaussians: Gaussians, frame: PartialFrame, config: StreamConfig
     ) -> dict[str, Any]:
-        """Return the result with its sentence, and the PSNR of the held-out views, if there are any.
+        """Return the result with its sentence, and the PSNR of the held-out views, if there are
+        any.
 
-        The PSNR is the mean over these views, in dB: once with the calibrated cameras, once with registered ones.
+        The PSNR is the mean over these views, in dB: once with the calibrated cameras, once with
+        registered ones.
 
         Args:
             capture: with the refined cameras.
@@ -128,11 +146,16 @@ class Refinement:
         views = [View(capture.cameras[v], image, capture.masks[v]) for v, image in images]
         extent = scene_extent([capture.cameras[v] for v in capture.train_views])
         registered = [
-            view._replace(camera=register_camera(gaussians, view, extent, config.fit, config.render)) for view in views
+            view._replace(
+                camera=register_camera(gaussians, view, extent, config.fit, config.render)
+            )
+            for view in views
         ]
         calibrated_psnr = mean_psnr(gaussians, views, config.render)
         registered_psnr = mean_psnr(gaussians, registered, config.render)
-        return result | {"held_out": {"calibrated_psnr": calibrated_psnr, "registered_psnr": registered_psnr}}
+        return result | {
+            "held_out": {"calibrated_psnr": calibrated_psnr, "registered_psnr": registered_psnr}
+        }
 
 
 def refine_cameras(
@@ -142,7 +165,8 @@ def refine_cameras(
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Capture, Refinement]:
-    """Return the capture with refined training cameras and moved points, if these are better, and the result.
+    """Return the capture with refined training cameras and moved points, if these are better, and
+    the result.
 
     Args:
         capture: its first frame and its points are used, without the held-out view.
@@ -158,7 +182,8 @@ def refine_cameras(
     report = progress or (lambda done, count: None)
     problem = _Problem.of(capture, config, render or RenderConfig(), seed)
     bundle_changes, tracks, deviations = _matched(capture, problem.indices, problem.deviations)
-    # Cameras of the calibration, of the bundle adjustment, and of the images; a single set is not compared.
+    # Cameras of the calibration, of the bundle adjustment, and of the images; a single set is not
+    # compared.
     has_rival = config.refine_cameras == "auto"
     estimates = [0 * bundle_changes] * has_rival + [bundle_changes] * bool(tracks)
     fits = rounds + len(estimates) + bool(estimates)
@@ -172,7 +197,9 @@ def refine_cameras(
     best = has_rival + int(np.argmax(scores[has_rival:]))
     calibrated = scores[0] if has_rival else float("nan")
     is_better = not scores[best] < calibrated + LEAST_GAIN
-    refinement = Refinement(is_better, calibrated, scores[best], tracks, *problem.sizes(estimates[best]))
+    refinement = Refinement(
+        is_better, calibrated, scores[best], tracks, *problem.sizes(estimates[best])
+    )
     return problem.changed_capture(estimates[best]) if is_better else capture, refinement
 
 
@@ -200,13 +227,15 @@ class _Problem:
         }
         if len(train) < 2:
             raise ValueError(
-                f"refine_cameras(): expected images of at least two training views, got {len(train)}; record more, or "
-                "set `refine_cameras` to off."
+                "refine_cameras(): expected images of at least two training views, got "
+                f"{len(train)}; record more, or set `refine_cameras` to off."
             )
         rng = rng_of(seed, Stream.WITHHELD_BLOCKS)
         views, withheld_views = withheld_blocks(list(train.values()), config.short_fits.width, rng)
         extent = scene_extent([view.camera for view in train.values()])
-        return cls(capture, tuple(train), tuple(views), tuple(withheld_views), extent, config, render, seed)
+        return cls(
+            capture, tuple(train), tuple(views), tuple(withheld_views), extent, config, render, seed
+        )
 
     @property
     def cameras(self) -> list[Camera]:
@@ -218,8 +247,11 @@ class _Problem:
         """Standard deviations [11] of the priors."""
         return prior_deviations(self.extent, self.config.camera_priors)
 
-    def refined(self, changes: np.ndarray, deviations: np.ndarray, report: Callable[[int], None]) -> np.ndarray:
-        """Return the changes [V, 11] after rounds of fitting Gaussians to the images and of joint steps.
+    def refined(
+        self, changes: np.ndarray, deviations: np.ndarray, report: Callable[[int], None]
+    ) -> np.ndarray:
+        """Return the changes [V, 11] after rounds of fitting Gaussians to the images and of joint
+        steps.
 
         Args:
             changes: initial changes [V, 11].
@@ -233,7 +265,9 @@ class _Problem:
             gaussians = self._fitted(posed_problem, is_later=done > 0)
             blur = _BLURS[done] if done < len(_BLURS) else 0.0
             for _ in range(_STEPS):
-                gaussians, changes = _joint_step(gaussians, self.views, changes, deviations, blur, self.render)
+                gaussians, changes = _joint_step(
+                    gaussians, self.views, changes, deviations, blur, self.render
+                )
             problem = replace(problem, start=gaussians)
         return changes
 
@@ -243,19 +277,30 @@ class _Problem:
         return mean_psnr(self._fitted(self._begun(changes)), withheld_views, self.render)
 
     def sizes(self, changes: np.ndarray) -> tuple[float, float, float, float]:
-        """Return the largest change of a rotation, degrees, a position, a focal length, and a pixel by the lens."""
+        """Return the largest change of a rotation, degrees, a position, a focal length, and a pixel
+        by the lens.
+        """
         rotation, position = (np.linalg.norm(changes[:, k : k + 3], axis=1).max() for k in (0, 3))
         lens = max(_largest_shift(*pair) for pair in zip(self.cameras, changes, strict=True))
-        return float(np.rad2deg(rotation)), float(position), float(np.abs(changes[:, 6]).max()), lens
+        return (
+            float(np.rad2deg(rotation)),
+            float(position),
+            float(np.abs(changes[:, 6]).max()),
+            lens,
+        )
 
     def changed_capture(self, changes: np.ndarray) -> Capture:
         """Return the capture with changed cameras and moved points."""
         capture = self.capture
         pairs = zip(self.cameras, changes, strict=True)
-        refined_cameras = dict(zip(self.indices, (changed_camera(*pair) for pair in pairs), strict=True))
+        refined_cameras = dict(
+            zip(self.indices, (changed_camera(*pair) for pair in pairs), strict=True)
+        )
         distortions = dict(zip(self.indices, changes[:, 9:].tolist(), strict=True))
         cameras = [refined_cameras.get(v, camera) for v, camera in enumerate(capture.cameras)]
-        rig = capture.with_cameras(cameras, [distortions.get(v, (0.0, 0.0)) for v in range(len(cameras))])
+        rig = capture.with_cameras(
+            cameras, [distortions.get(v, (0.0, 0.0)) for v in range(len(cameras))]
+        )
         return replace(rig, points=self._points(changes))
 
     def _points(self, changes: np.ndarray) -> np.ndarray:
@@ -265,14 +310,22 @@ class _Problem:
         """Return the problem of a short fit with changed cameras."""
         points = (self._points(changes), self.capture.point_colors)
         rng = rng_of(self.seed, Stream.REFINED_POINTS)
-        return FirstFrameProblem.of(_changed(self.views, changes), points, _short(self.config), self.render, rng)
+        return FirstFrameProblem.of(
+            _changed(self.views, changes), points, _short(self.config), self.render, rng
+        )
 
     def _fitted(self, problem: FirstFrameProblem, is_later: bool = False) -> Gaussians:
-        return fit_first_frame(problem, _short(self.config, is_later), rng_of(self.seed, Stream.REFINEMENT)).gaussians
+        return fit_first_frame(
+            problem, _short(self.config, is_later), rng_of(self.seed, Stream.REFINEMENT)
+        ).gaussians
 
 
 def register_camera(
-    gaussians: Gaussians, view: View, extent: float, config: FitConfig, render: RenderConfig | None = None
+    gaussians: Gaussians,
+    view: View,
+    extent: float,
+    config: FitConfig,
+    render: RenderConfig | None = None,
 ) -> Camera:
     """Return the camera, near the given one, with which frozen Gaussians fit an image best.
 
@@ -310,8 +363,11 @@ def register_camera(
     return changed_camera(camera, best[0])
 
 
-def _matched(capture: Capture, train: Sequence[int], deviations: np.ndarray) -> tuple[np.ndarray, int, np.ndarray]:
-    """Return the changes [V, 11] by bundle adjustment, the number of its points, and the likely deviations [11].
+def _matched(
+    capture: Capture, train: Sequence[int], deviations: np.ndarray
+) -> tuple[np.ndarray, int, np.ndarray]:
+    """Return the changes [V, 11] by bundle adjustment, the number of its points, and the likely
+    deviations [11].
 
     Without enough points, there are no changes, and the deviations equal the priors' deviations.
     """
@@ -331,7 +387,9 @@ def _changed(views: Sequence[View], changes: np.ndarray) -> list[View]:
     return [_changed_view(*view, change) for view, change in zip(views, changes, strict=True)]
 
 
-def _changed_view(camera: Camera, image: np.ndarray, mask: np.ndarray | None, change: np.ndarray) -> View:
+def _changed_view(
+    camera: Camera, image: np.ndarray, mask: np.ndarray | None, change: np.ndarray
+) -> View:
     camera = changed_camera(camera, change)
     correction = undistortion(camera, Lens("RADIAL", tuple(change[9:])))
     if correction is None:
@@ -343,35 +401,48 @@ def _changed_view(camera: Camera, image: np.ndarray, mask: np.ndarray | None, ch
 
 
 def _largest_shift(camera: Camera, change: np.ndarray) -> float:
-    """Return the largest shift of a pixel by the distortion of a camera's change, in image widths."""
+    """Return the largest shift of a pixel by the distortion of a camera's change, image widths."""
     corners = np.array([(x, y) for x in (0, camera.width) for y in (0, camera.height)], float)
-    return float(np.linalg.norm(distorted(camera, corners, change[9:]) - corners, axis=1).max() / camera.width)
+    return float(
+        np.linalg.norm(distorted(camera, corners, change[9:]) - corners, axis=1).max()
+        / camera.width
+    )
 
 
 def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -> np.ndarray:
-    """Return points [P, 3] moved to keep their projections in the views that show them, with changed cameras."""
+    """Return points [P, 3] moved to keep their projections in the views that show them, with
+    changed cameras.
+    """
     rig = [changed_camera(*pair) for pair in zip(cameras, changes, strict=True)]
     hits = [seen_points(camera, points)[:2] for camera in cameras]
     ids = np.concatenate([np.flatnonzero(mask) for mask, _ in hits])
     views = np.repeat(np.arange(len(cameras)), [len(pixels) for _, pixels in hits])
     if not len(ids):
         return points
-    pixels = [undistorted(c, pixels, change[9:]) for c, (_, pixels), change in zip(rig, hits, changes, strict=True)]
+    pixels = [
+        undistorted(c, pixels, change[9:])
+        for c, (_, pixels), change in zip(rig, hits, changes, strict=True)
+    ]
     intersections = intersect(ids, views, np.concatenate(pixels), rig, len(points))
     several = np.bincount(ids, minlength=len(points)) >= 2
-    moved_points = np.where((several & np.isfinite(intersections).all(axis=1))[:, None], intersections, points)
+    moved_points = np.where(
+        (several & np.isfinite(intersections).all(axis=1))[:, None], intersections, points
+    )
     return moved_points.astype(np.float32)
 
 
 def _short(config: FitConfig, is_later: bool = False) -> FitConfig:
-    """Return the settings of a short fit; a later one continues with half the steps and lower rates.
+    """Return the settings of a short fit; a later one continues with half the steps and lower
+    rates.
 
     It has no view-dependent colours, which would hide wrong poses.
     """
     how = config.short_fits
     rates = config.first_frame_rates
     if is_later:
-        rates = replace(rates, **{name: factor * getattr(rates, name) for name, factor in _LATER_RATES.items()})
+        rates = replace(
+            rates, **{name: factor * getattr(rates, name) for name, factor in _LATER_RATES.items()}
+        )
     return replace(
         config,
         sh_degree=0,
@@ -391,7 +462,9 @@ def _joint_step(
     blur: float,
     render: RenderConfig,
 ) -> tuple[Gaussians, np.ndarray]:
-    """Return the Gaussians and the changes of the cameras [V, 11] after one Gauss-Newton step of both."""
+    """Return the Gaussians and the changes of the cameras [V, 11] after one Gauss-Newton step of
+    both.
+    """
     means = np.asarray(gaussians.means, np.float64)
     changed_views = _changed(views, changes)
     shifts = [_shifts(gaussians, view.camera, view.target, blur, render) for view in changed_views]
@@ -402,14 +475,18 @@ def _joint_step(
         equations.add(v, slice(None), jacobian, G / variance, b / variance)
     of_changes, of_means = equations.step(changes, deviations, _DAMPING, equations.frame(means))
     longest = _LONGEST * scene_extent([view.camera for view in views])
-    of_means *= np.minimum(1, longest / np.maximum(np.linalg.norm(of_means, axis=1, keepdims=True), 1e-30))
+    of_means *= np.minimum(
+        1, longest / np.maximum(np.linalg.norm(of_means, axis=1, keepdims=True), 1e-30)
+    )
     return replace(gaussians, means=(means + of_means).astype(np.float32)), changes + of_changes
 
 
 def _shifts(
     gaussians: Gaussians, camera: Camera, target: Target, blur: float, render: RenderConfig
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return G v [N, 2, 2] and b v [N, 2] of the module docstring in a view, and the mean square error."""
+    """Return G v [N, 2, 2] and b v [N, 2] of the module docstring in a view, and the mean square
+    error.
+    """
     view = ActiveView(camera, render)
     image = view.render(gaussians).color
     error = target.difference(image)

@@ -1,19 +1,20 @@
 """Time offsets of the cameras of a rig with unsynchronised clocks, from the motion in their images.
 
-At an instant, Gaussians are fitted to the images of all training views, and the flow of the views is lifted to their
-displacement in one frame (see `method.lift`). `offset_equations` gives the offsets that explain the remaining error of
-the images. The images are interpolated at the times that these offsets give, and the Gaussians are fitted again. These
-are Gauss-Newton steps. The first ones use blurred images, because the equations hold only for small displacements.
+At an instant, Gaussians are fitted to the images of all training views, and the flow of the views
+is lifted to their displacement in one frame (see `method.lift`). `offset_equations` gives the
+offsets that explain the remaining error of the images. The images are interpolated at the times
+that these offsets give, and the Gaussians are fitted again. These are Gauss-Newton steps. The first
+ones use blurred images, because the equations hold only for small displacements.
 
-A fit compensates part of the offsets with shapes and colours. The visible part kappa follows from the last two rounds
-of one blur (the secant method),
+A fit compensates part of the offsets with shapes and colours. The visible part kappa follows from
+the last two rounds of one blur (the secant method),
 
     kappa = - sum_v s_v (o'_v - o_v) / sum_v s_v^2 ,
 
-with s the step between them and o, o' the solutions of the equations before and after it, for the training views. If
-cameras are far apart, a fit can hide the whole offset, because it explains each image by separate Gaussians; then any
-offset fits. A last round therefore moves the clocks by half a frame. The errors of the offsets are divided by the part
-of this move that the equations recover.
+with s the step between them and o, o' the solutions of the equations before and after it, for the
+training views. If cameras are far apart, a fit can hide the whole offset, because it explains each
+image by separate Gaussians; then any offset fits. A last round therefore moves the clocks by half a
+frame. The errors of the offsets are divided by the part of this move that the equations recover.
 """
 
 from __future__ import annotations
@@ -45,9 +46,11 @@ from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.render_config import RenderConfig
 from morgs_mi.studio.calibration.offset_equations import UNKNOWN, OffsetEquations, offset_equations
 
-# px, least width of the images: small images are fitted fast, and an offset displaces them by few pixels.
+# px, least width of the images: small images are fitted fast, and an offset displaces them by few
+# pixels.
 _WIDTH = 160
-# Number of frames used from the start of the recording, and of instants among them at which Gaussians are fitted.
+# Number of frames used from the start of the recording, and of instants among them at which
+# Gaussians are fitted.
 _FRAMES = 12
 _INSTANTS = 2
 # Gaussians and steps of the fit at an instant; half as many of both for blurred images.
@@ -66,7 +69,8 @@ _BLUR_OF_ROUND = (*_BLURS, *[0.0] * _ROUNDS)
 # Bounds of kappa, and of a step in frames.
 _SHARES = (0.2, 1.2)
 _LONGEST_STEP = 1.0
-# Frames by which the last round moves the clocks, and the least part of it that counts as recovered.
+# Frames by which the last round moves the clocks, and the least part of it that counts as
+# recovered.
 _MOVED = 0.5
 _LEAST_FOUND = 0.05
 
@@ -75,14 +79,16 @@ _LEAST_FOUND = 0.05
 class TimeOffsets:
     """Time offsets of the cameras."""
 
-    #: By name, the frame of each camera's clip that is simultaneous with frame 0 of the reference's, as in
-    #: `ReadConfig.offset`; negative for a camera that began later.
+    #: By name, the frame of each camera's clip that is simultaneous with frame 0 of the
+    #: reference's, as in `ReadConfig.offset`; negative for a camera that began later.
     offsets: dict[str, float]
-    #: By name, standard errors of the offsets, frames: large where the images hardly depend on the offset.
+    #: By name, standard errors of the offsets, frames: large where the images hardly depend on the
+    #: offset.
     errors: dict[str, float]
     reference: str  #: Name of the held-out camera, or of the first one; its offset does not change.
     change: float  #: Largest change in the last round, frames.
-    converged: bool  #: Whether `change` is within the tolerance; the accuracy of the offsets is in `errors`.
+    #: Whether `change` is within the tolerance; the accuracy of the offsets is in `errors`.
+    converged: bool
 
 
 def estimate_time_offsets(
@@ -92,10 +98,12 @@ def estimate_time_offsets(
 ) -> TimeOffsets:
     """Return the time offsets of a capture's cameras in frames, see `TimeOffsets`.
 
-    They include the offsets that the capture was read with: its `reading` with the result as `offset` aligns the clips.
-    Two runs differ by up to 0.02 frames, because the order of summed gradients varies.
+    They include the offsets that the capture was read with: its `reading` with the result as
+    `offset` aligns the clips. Two runs differ by up to 0.02 frames, because the order of summed
+    gradients varies.
 
-    No Gaussian is fitted to the held-out view. Its offset follows from its own error and from the others' offsets.
+    No Gaussian is fitted to the held-out view. Its offset follows from its own error and from the
+    others' offsets.
 
     Args:
         capture: a capture with clips of one frame rate.
@@ -103,7 +111,8 @@ def estimate_time_offsets(
         seed: seed of the fits.
 
     Raises:
-        ValueError: the recording has one camera or fewer than four frames, an image is missing, or nothing moves.
+        ValueError: the recording has one camera or fewer than four frames, an image is missing, or
+            nothing moves.
     """
     if len(capture.cameras) < 2:
         raise ValueError(f"{capture.path}: expected at least 2 cameras to compare clocks, got 1.")
@@ -111,7 +120,8 @@ def estimate_time_offsets(
     largest = min(_LARGEST, (clips.num_frames - 2) // 2)
     if largest < 1:
         raise ValueError(
-            f"{capture.path}: expected at least 4 frames to compare clocks, got {clips.num_frames}; record longer."
+            f"{capture.path}: expected at least 4 frames to compare clocks, got "
+            f"{clips.num_frames}; record longer."
         )
     instants = np.linspace(largest, clips.num_frames - 2 - largest, _INSTANTS).round().astype(int)
     rounds = _Rounds(clips, instants, seed, progress)
@@ -123,7 +133,7 @@ def estimate_time_offsets(
 
 
 def _aligned(rounds: _Rounds, largest: int) -> tuple[np.ndarray, np.ndarray, OffsetEquations]:
-    """Return offsets [V] of at most `largest`, the last step [V], and the equations of that step."""
+    """Return offsets [V] of at most `largest`, the last step [V], and the step's equations."""
     clips = rounds.clips
     offsets = np.zeros(len(clips.cameras))
     step = np.zeros(len(clips.cameras))
@@ -132,8 +142,16 @@ def _aligned(rounds: _Rounds, largest: int) -> tuple[np.ndarray, np.ndarray, Off
         equations = rounds.equations(offsets, blur)
         previous = solution if blur in _BLUR_OF_ROUND[:index] else None
         solution = equations.solution()
-        share = 1.0 if previous is None else _share(step[clips.train], (solution - previous)[clips.train])
-        result = np.clip(offsets + np.clip(equations.solution(share), -_LONGEST_STEP, _LONGEST_STEP), -largest, largest)
+        share = (
+            1.0
+            if previous is None
+            else _share(step[clips.train], (solution - previous)[clips.train])
+        )
+        result = np.clip(
+            offsets + np.clip(equations.solution(share), -_LONGEST_STEP, _LONGEST_STEP),
+            -largest,
+            largest,
+        )
         step = result - offsets
         offsets = result
         if not blur and np.abs(step).max() < _TOLERANCE:
@@ -142,12 +160,18 @@ def _aligned(rounds: _Rounds, largest: int) -> tuple[np.ndarray, np.ndarray, Off
 
 
 def _share(step: np.ndarray, change: np.ndarray) -> float:
-    """Return kappa (see the module), within its bounds, from a step and the change of the solution after it."""
+    """Return kappa (see the module), within its bounds, from a step and the change of the solution
+    after it.
+    """
     return float(np.clip(-np.sum(step * change) / np.sum(step**2), *_SHARES)) if step.any() else 1.0
 
 
-def _found_back(rounds: _Rounds, offsets: np.ndarray, equations: OffsetEquations, reference: int) -> np.ndarray:
-    """Return the part [V] that the equations recover of a move of the clocks relative to the clock of `reference`."""
+def _found_back(
+    rounds: _Rounds, offsets: np.ndarray, equations: OffsetEquations, reference: int
+) -> np.ndarray:
+    """Return the part [V] that the equations recover of a move of the clocks relative to the clock
+    of `reference`.
+    """
     moves = np.where(np.arange(len(offsets)) % 2, _MOVED, -_MOVED)
     moves[reference] = 0
     change = rounds.equations(offsets + moves, 0.0).solution() - equations.solution()
@@ -166,7 +190,9 @@ class _Rounds:
     done: int = 0  # number of completed fits
 
     def equations(self, offsets: np.ndarray, blur: float) -> OffsetEquations:
-        """Return the sum of the equations of all instants, with images interpolated by offsets [V] and blurred."""
+        """Return the sum of the equations of all instants, with images interpolated by offsets [V]
+        and blurred.
+        """
         instants_equations = []
         for instant in self.instants:
             instants_equations.append(_equations_at(self.clips, instant - offsets, blur, self.seed))
@@ -176,8 +202,8 @@ class _Rounds:
         equations = reduce(add, instants_equations)
         if not equations.own.any():
             raise ValueError(
-                f"{self.clips.path}: expected motion in the first {self.clips.num_frames} frames, found none; record "
-                "something that moves."
+                f"{self.clips.path}: expected motion in the first {self.clips.num_frames} frames, "
+                "found none; record something that moves."
             )
         return equations
 
@@ -197,17 +223,29 @@ class _Clips:
     @classmethod
     def of(cls, capture: Capture) -> _Clips:
         display = capture.displayed()
-        clips = [[_checked(image) for image in display.images(v, 0, _FRAMES)] for v in range(len(capture.cameras))]
+        clips = [
+            [_checked(image) for image in display.images(v, 0, _FRAMES)]
+            for v in range(len(capture.cameras))
+        ]
         views = zip(capture.cameras, (clip[0] for clip in clips), capture.masks, strict=True)
         small, _, masks = zip(*(View(*view).reduced(_WIDTH) for view in views), strict=True)
         # The images are whole frames: with the capture's delays they would be displaced twice.
         cameras = tuple(camera.without_delays() for camera in small)
         images = tuple(
-            tuple(np.asarray(cv2.resize(image, (c.width, c.height), interpolation=cv2.INTER_AREA)) for image in clip)
+            tuple(
+                np.asarray(cv2.resize(image, (c.width, c.height), interpolation=cv2.INTER_AREA))
+                for image in clip
+            )
             for clip, c in zip(clips, cameras, strict=True)
         )
         return cls(
-            capture.path, cameras, masks, images, list(capture.train_views), capture.points, capture.point_colors
+            capture.path,
+            cameras,
+            masks,
+            images,
+            list(capture.train_views),
+            capture.points,
+            capture.point_colors,
         )
 
     @property
@@ -220,7 +258,10 @@ class _Clips:
         times = np.clip(times, 0, self.num_frames - 1)
         first = np.minimum(np.floor(times).astype(int), self.num_frames - 2)
         views = zip(self.images, first, times - first, strict=True)
-        return [clip[k + round(s)] if s in (0, 1) else image_between(clip[k], clip[k + 1], s) for clip, k, s in views]
+        return [
+            clip[k + round(s)] if s in (0, 1) else image_between(clip[k], clip[k + 1], s)
+            for clip, k, s in views
+        ]
 
 
 def _checked(image: ImageOrError) -> np.ndarray:
@@ -239,7 +280,9 @@ def _equations_at(clips: _Clips, times: np.ndarray, blur: float, seed: int) -> O
     views = [ActiveView(camera) for camera in clips.cameras]
     flow = lift_flow(gaussians, {v: views[v] for v in clips.train}, observe_key_views(pairs))
     train = np.isin(np.arange(len(views)), clips.train)
-    return offset_equations(replace(gaussians, motion=flow.displacement), views, targets, train, blur)
+    return offset_equations(
+        replace(gaussians, motion=flow.displacement), views, targets, train, blur
+    )
 
 
 def _fitted(clips: _Clips, images: Sequence[np.ndarray], divisor: int, seed: int) -> Gaussians:
@@ -265,12 +308,21 @@ def _fitted(clips: _Clips, images: Sequence[np.ndarray], divisor: int, seed: int
     return fit_first_frame(problem, fit, rng).gaussians
 
 
-def _relative(capture: Capture, offsets: np.ndarray, errors: np.ndarray, change: float) -> TimeOffsets:
-    """Return the result with the offsets relative to the reference, in addition to the capture's offsets."""
+def _relative(
+    capture: Capture, offsets: np.ndarray, errors: np.ndarray, change: float
+) -> TimeOffsets:
+    """Return the result with the offsets relative to the reference, in addition to the capture's
+    offsets.
+    """
     reference = capture.reference_view
     settings = capture.reading.offset
     clocks = offsets - [camera.delay for camera in capture.cameras]
-    options = {n: settings.get(n, 0.0) - (o - clocks[reference]) for n, o in zip(capture.names, clocks, strict=True)}
+    options = {
+        n: settings.get(n, 0.0) - (o - clocks[reference])
+        for n, o in zip(capture.names, clocks, strict=True)
+    }
     rounded_offsets = {name: round(float(offset), 3) + 0.0 for name, offset in options.items()}
     rounded_errors = dict(zip(capture.names, np.round(errors, 3).tolist(), strict=True))
-    return TimeOffsets(rounded_offsets, rounded_errors, capture.names[reference], change, change < _TOLERANCE)
+    return TimeOffsets(
+        rounded_offsets, rounded_errors, capture.names[reference], change, change < _TOLERANCE
+    )

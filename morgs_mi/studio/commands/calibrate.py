@@ -22,7 +22,9 @@ class Calibrate:
 
     folder: Positional[Path]
     """Folder of videos, or of one folder of images per camera."""
-    config: Annotated[CalibrateConfig, arg(name=""), FlagCreatePairsOff] = field(default_factory=CalibrateConfig)
+    config: Annotated[CalibrateConfig, arg(name=""), FlagCreatePairsOff] = field(
+        default_factory=CalibrateConfig
+    )
     without: Without = ()
     """Cameras that are left out, by name."""
     overwrite: Flag = False
@@ -32,7 +34,13 @@ class Calibrate:
         from morgs_mi.studio.calibration.calibrate import calibrate
 
         with progress() as report:
-            result = calibrate(self.folder, self.config, self.overwrite, lambda *stage: report(*stage), self.without)
+            result = calibrate(
+                self.folder,
+                self.config,
+                self.overwrite,
+                lambda *stage: report(*stage),
+                self.without,
+            )
         table = Table(title=str(result.model), box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
         for column in ("camera", "points", "error, px", "pose"):
             table.add_column(column, no_wrap=True)
@@ -41,8 +49,11 @@ class Calibrate:
         print_table(table)
         for line in advice_lines(result.checks):
             print_warning(line)
-        how = f"{result.mapper} mapping" + (", with a principal point for each" if result.principal_points else "")
+        how = f"{result.mapper} mapping" + (
+            ", with a principal point for each" if result.principal_points else ""
+        )
         print_result(
-            f"{result.model}: {len(result.cameras)} cameras, {result.points} points, mean reprojection error "
-            f"{result.error:.2f} px, by {how}; scale and up direction of its world are arbitrary."
+            f"{result.model}: {len(result.cameras)} cameras, {result.points} points, mean "
+            f"reprojection error {result.error:.2f} px, by {how}; scale and up direction of its "
+            "world are arbitrary."
         )

@@ -19,9 +19,11 @@ _DEFAULT = DemoConfig()
 
 @dataclass(frozen=True)
 class Demo:
-    """Synthesise a clip, reconstruct it with and without learned motion, and write figures and a report to OUT.
+    """Synthesise a clip, reconstruct it with and without learned motion, and write figures and a
+    report to OUT.
 
-    It takes a few minutes. A clip that is in OUT already is used again if its settings are the same.
+    It takes a few minutes. A clip that is in OUT already is used again if its settings are the
+    same.
     """
 
     out: Positional[Path]
@@ -58,15 +60,22 @@ class Demo:
             spp=self.spp,
         )
         with progress() as report:
-            result = run_demo(self.out, replace(_DEFAULT, scene=self.scene, clip=clip, stream=stream), report)
+            result = run_demo(
+                self.out, replace(_DEFAULT, scene=self.scene, clip=clip, stream=stream), report
+            )
         full = result.full
         frames = result.compared_frames
-        table = Table(title=f"held-out view, frames {f'{frames[0]} to {frames[-1]}' if frames else 'none'}")
+        table = Table(
+            title=f"held-out view, frames {f'{frames[0]} to {frames[-1]}' if frames else 'none'}"
+        )
         for column in ("", "PSNR, dB", "SSIM", "flow error, px", "moving, px", "still, px"):
             table.add_column(column, justify="right" if column else "left")
         for name, title in (("full", "with motion"), ("plain", "without")):
             row = result.comparison[name]
-            motion = (figure(row[key], 2) for key in ("motion_error", "motion_error_moving", "motion_error_still"))
+            motion = (
+                figure(row[key], 2)
+                for key in ("motion_error", "motion_error_moving", "motion_error_still")
+            )
             table.add_row(title, figure(row["psnr"], 2), figure(row["ssim"], 4), *motion)
         print_table(table)
         print_result(
@@ -76,5 +85,8 @@ class Demo:
             f"{figure(full.sizes.per_residual / 1e6, 2)} MB per later frame; "
             f"{result.seconds['total']:.0f} s in all."
         )
-        print_result(f"Video and contact sheet: {self.out / 'side_by_side.mp4'}, {self.out / 'contact_sheet.png'}")
+        print_result(
+            f"Video and contact sheet: {self.out / 'side_by_side.mp4'}, "
+            f"{self.out / 'contact_sheet.png'}"
+        )
         print_result(f"All results: {self.out / 'report.json'}")

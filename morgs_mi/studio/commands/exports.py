@@ -42,11 +42,15 @@ class Gltf(ExportKind):
 
 @dataclass(frozen=True)
 class Usd(ExportKind):
-    """Write an OpenUSD stage with a time sample per frame: ParticleField3DGaussianSplat, rotated to y up."""
+    """Write an OpenUSD stage with a time sample per frame: ParticleField3DGaussianSplat, rotated to
+    y up.
+    """
 
     output: Annotated[Positional[Path | None], DisallowNone, place("FILE")] = None
     """FILE.usd, .usdc (binary), .usda (text) or .usdz (package); by default OUT/stream.usdc."""
-    format: Annotated[str | None, DisallowNone, optional("NAME"), one_of(tuple(f.name for f in USD))] = None
+    format: Annotated[
+        str | None, DisallowNone, optional("NAME"), one_of(tuple(f.name for f in USD))
+    ] = None
     """Format: usdc, usd, usda or usdz; by default by the name."""
     frames: Annotated[str | None, DisallowNone, FRAMES] = None
     half: Flag = False

@@ -16,8 +16,9 @@ from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.playback.default_rig import Axes
 
 _PATHS = (
-    "Frames: a folder with a .ply, .compressed.ply or .splat file for each, or the files in the order of the frames. "
-    "Last, OUT: a folder for stream.morgs, or a new file whose name ends in .morgs."
+    "Frames: a folder with a .ply, .compressed.ply or .splat file for each, or the files in the "
+    "order of the frames. Last, OUT: a folder for stream.morgs, or a new file whose name ends in "
+    ".morgs."
 )
 
 
@@ -27,7 +28,8 @@ class Import:
 
     # One list, as for `cp`: the parser cannot split two of them where options follow.
     paths: Annotated[
-        Positional[tuple[Path, ...]], arg(metavar="FRAMES [FRAMES ...] OUT", help=_PATHS, help_behavior_hint="")
+        Positional[tuple[Path, ...]],
+        arg(metavar="FRAMES [FRAMES ...] OUT", help=_PATHS, help_behavior_hint=""),
     ] = ()
     fps: float = 30.0
     """Frames per second."""
@@ -45,9 +47,15 @@ class Import:
         from morgs_mi.studio.import_frames import import_frames
 
         if len(self.paths) < 2:
-            raise ValueError("morgs-mi import: expected FRAMES and OUT, got fewer; see morgs-mi import --help.")
+            raise ValueError(
+                "morgs-mi import: expected FRAMES and OUT, got fewer; see morgs-mi import --help."
+            )
         *frames, out = self.paths
-        options = {name: value for name in ("quality", "target_size") if (value := getattr(self, name)) is not None}
+        options = {
+            name: value
+            for name in ("quality", "target_size")
+            if (value := getattr(self, name)) is not None
+        }
         config = replace(CodecConfig(), keyframe_interval=self.keyframe_interval, **options)
         with progress() as report:
             result = import_frames(
@@ -61,5 +69,6 @@ class Import:
             )
         sets = "one set" if result.num_keyframes == 1 else f"{result.num_keyframes} sets"
         print_result(
-            f"{result.path}: {result.num_frames} frames, {sets} of Gaussians, {result.num_bytes / 1e6:.2f} MB."
+            f"{result.path}: {result.num_frames} frames, {sets} of Gaussians, "
+            f"{result.num_bytes / 1e6:.2f} MB."
         )

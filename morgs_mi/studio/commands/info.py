@@ -19,23 +19,32 @@ from morgs_mi.cli.console import print_result, print_table, progress
 from morgs_mi.cli.settings import Flag, GivenReading, Reading, optional
 from morgs_mi.core.files import write_json
 from morgs_mi.fit.forecast import forecast
-from morgs_mi.studio.calibration.checks.deep import MAX_FRAMES, DeepCheck, Finding, check_deep, check_exposures
+from morgs_mi.studio.calibration.checks.deep import (
+    MAX_FRAMES,
+    DeepCheck,
+    Finding,
+    check_deep,
+    check_exposures,
+)
 from morgs_mi.studio.calibration.checks.rig_check import CameraCheck, RigCheck, check_rig
 from morgs_mi.studio.calibration.checks.signals import read_signals
 from morgs_mi.studio.calibration.timing import TimeOffsets, estimate_time_offsets
 
-# Standard errors in frames above which a time offset is uncertain, and from which it counts as not found.
+# Standard errors in frames above which a time offset is uncertain, and from which it counts as not
+# found.
 _UNCERTAIN = 0.1
 _NOT_FOUND = 0.5
 _UNCERTAIN_WHY = (
-    "Their images hardly depend on the clocks: little moves, or in a direction in which an offset looks like a change "
-    "of depth, or the cameras are far apart."
+    "Their images hardly depend on the clocks: little moves, or in a direction in which an offset "
+    "looks like a change of depth, or the cameras are far apart."
 )
 
 
 @dataclass(frozen=True)
 class Info:
-    """List the contents of a capture: layout, cameras, sizes, frames, points; check its poses against the images."""
+    """List the contents of a capture: layout, cameras, sizes, frames, points; check its poses
+    against the images.
+    """
 
     capture: Positional[Path]
     """Folder of the capture."""
@@ -46,7 +55,9 @@ class Info:
     time: Flag = False
     """Estimate the time offsets of the cameras from what moves in the first frames."""
     deep: Flag = False
-    """Also check synchronisation, exposure, sharpness, lost frames, flicker and overlap, which reads many frames."""
+    """Also check synchronisation, exposure, sharpness, lost frames, flicker and overlap, which
+    reads many frames.
+    """
     json: Annotated[Path | None, DisallowNone, optional("FILE.json")] = None
     """File for all measurements of --deep."""
     reading: GivenReading = field(default_factory=Reading)
@@ -57,7 +68,9 @@ class Info:
         from morgs_mi.studio.calibration.checks.plots import check_plot, write_rig
 
         if self.deep and not self.check:
-            raise ValueError("--deep: expected the check of the poses, on which it builds; leave out --no-check.")
+            raise ValueError(
+                "--deep: expected the check of the poses, on which it builds; leave out --no-check."
+            )
         if self.json is not None and not self.deep:
             raise ValueError("--json: expected --deep, whose measurements it holds; add --deep.")
         for output in (self.plot, self.json):
@@ -72,7 +85,9 @@ class Info:
         origin = "" if len(capture.points) else "without points"
         if self.check:
             with progress() as report:
-                common = match_capture(capture, lambda done, total: report("Matching views", done, total))
+                common = match_capture(
+                    capture, lambda done, total: report("Matching views", done, total)
+                )
             rig_check = check_rig(capture, common)
             if origin:
                 capture = triangulate_points(capture, common)
@@ -85,11 +100,18 @@ class Info:
         points = origin or f"{len(capture.points)} points"
         truth = "with ground truth" if capture.truth else "without ground truth"
         print_result(f"{capture.num_frames} frames at {capture.fps:g} fps, {points}, {truth}.")
-        for line in (*capture.notes, *_check_lines(rig_check), *_color_lines(capture), *_forecast_lines(capture)):
+        for line in (
+            *capture.notes,
+            *_check_lines(rig_check),
+            *_color_lines(capture),
+            *_forecast_lines(capture),
+        ):
             print_result(line)
         if self.time:
             with progress() as report:
-                offsets = estimate_time_offsets(capture, lambda done, total: report("Comparing clocks", done, total))
+                offsets = estimate_time_offsets(
+                    capture, lambda done, total: report("Comparing clocks", done, total)
+                )
             for line in _time_lines(offsets):
                 print_result(line)
         for line in (*(finding.sentence for finding in exposures), *_deep_lines(deep)):
@@ -116,13 +138,28 @@ def _deep_lines(deep: DeepCheck | None) -> list[str]:
     count = len(deep.findings)
     result = "no findings" if not count else "1 finding" if count == 1 else f"{count} findings"
     sentences = [finding.sentence for finding in deep.findings]
-    return [f"Check of {deep.frames} frames: {result}.", *sentences, *filter(None, [deep.unmeasured])]
+    return [
+        f"Check of {deep.frames} frames: {result}.",
+        *sentences,
+        *filter(None, [deep.unmeasured]),
+    ]
 
 
 def _camera_table(capture: Capture, rig_check: RigCheck | None) -> Table:
     """Return a row per camera: size, intrinsics, use, and how well its pose fits the matches."""
     table = Table(title=f"{capture.path}: {capture.layout}", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for column in ("", "camera", "size", "focal, px", "centre, px", "seen", "use", "matches", "error, px", "pose"):
+    for column in (
+        "",
+        "camera",
+        "size",
+        "focal, px",
+        "centre, px",
+        "seen",
+        "use",
+        "matches",
+        "error, px",
+        "pose",
+    ):
         table.add_column(column, no_wrap=True)
     for index, (camera, mask) in enumerate(zip(capture.cameras, capture.masks, strict=True)):
         K = camera.K
@@ -130,7 +167,9 @@ def _camera_table(capture: Capture, rig_check: RigCheck | None) -> Table:
             str(index),
             camera.name,
             f"{camera.width}x{camera.height}",
-            f"{K[0, 0]:.1f}" if f"{K[0, 0]:.1f}" == f"{K[1, 1]:.1f}" else f"{K[0, 0]:.1f} {K[1, 1]:.1f}",
+            f"{K[0, 0]:.1f}"
+            if f"{K[0, 0]:.1f}" == f"{K[1, 1]:.1f}"
+            else f"{K[0, 0]:.1f} {K[1, 1]:.1f}",
             f"{K[0, 2]:.1f} {K[1, 2]:.1f}",
             "100 %" if mask is None else f"{100 * mask.mean():.0f} %",
             "test" if index in capture.test_views else "train",
@@ -144,7 +183,10 @@ def _check_lines(rig_check: RigCheck | None) -> list[str]:
     if rig_check is None:
         return []
     error = f"median {rig_check.error:.2f} px over " if rig_check.matches else ""
-    result = f"Reprojection check: {error}{rig_check.matches} matches in {rig_check.pairs} pairs; {rig_check.advice}"
+    result = (
+        f"Reprojection check: {error}{rig_check.matches} matches in {rig_check.pairs} pairs; "
+        f"{rig_check.advice}"
+    )
     return [result, *advice_lines(rig_check.cameras)]
 
 
@@ -158,16 +200,22 @@ def _time_lines(offsets: TimeOffsets) -> list[str]:
         worst = max(measured_errors, key=lambda name: measured_errors[name])
         lines += [
             f"Clocks: pass --offset {options} for the time of {offsets.reference}.",
-            f"Standard errors of these offsets: up to {measured_errors[worst]:.2f} frames ({worst}).",
+            f"Standard errors of these offsets: up to {measured_errors[worst]:.2f} frames "
+            f"({worst}).",
         ]
-    doubts = [f"{name} ({error:.2f})" for name, error in measured_errors.items() if error > _UNCERTAIN]
+    doubts = [
+        f"{name} ({error:.2f})" for name, error in measured_errors.items() if error > _UNCERTAIN
+    ]
     if doubts:
         lines.append(f"Uncertain: {', '.join(doubts)}. {_UNCERTAIN_WHY}")
     if len(measured_errors) < len(errors):
         names = ", ".join(name for name in errors if name not in measured_errors)
         lines.append(f"Clocks not found: {names}; keep what is known of them. {_UNCERTAIN_WHY}")
     if not offsets.converged:
-        lines.append(f"The offsets still change by {offsets.change:.2f} frames: the clips may not show enough.")
+        lines.append(
+            f"The offsets still change by {offsets.change:.2f} frames: the clips may not show "
+            "enough."
+        )
     return lines
 
 
@@ -183,7 +231,9 @@ def _color_lines(capture: Capture) -> list[str]:
     if fit is None:
         return []
     changes = zip(capture.names, fit.before, fit.after, fit.samples, strict=True)
-    errors = ", ".join(f"{name} {a:.1f} -> {b:.1f} ({n} points)" if n else f"{name} -" for name, a, b, n in changes)
+    errors = ", ".join(
+        f"{name} {a:.1f} -> {b:.1f} ({n} points)" if n else f"{name} -" for name, a, b, n in changes
+    )
     return [f"Colours towards {capture.names[fit.reference]}, dE2000 before -> after: {errors}."]
 
 

@@ -43,16 +43,25 @@ class Live:
     Whenever a frame is fitted, the newest images follow, and those between are dropped.
     """
 
-    out: Annotated[Positional[Path | None], arg(help_behavior_hint="(default: live-DATE-TIME)", metavar="[OUT]")] = None
-    """Folder for stream.morgs, capture.json and report.json, and for the fitted images in its folder capture."""
+    out: Annotated[
+        Positional[Path | None],
+        arg(help_behavior_hint="(default: live-DATE-TIME)", metavar="[OUT]"),
+    ] = None
+    """Folder for stream.morgs, capture.json and report.json, and for the fitted images in its
+    folder capture.
+    """
     camera: Annotated[tuple[str, ...], arg(metavar="SOURCE ...", help_behavior_hint="")] = ()
-    """Per camera its number, a URL, a named pipe or a video; or one folder that another program fills."""
+    """Per camera its number, a URL, a named pipe or a video; or one folder that another program
+    fills.
+    """
     live: Annotated[LiveConfig, arg(name=""), DisallowNone] = field(default_factory=LiveConfig)
     view: Flag = False
     """Show the stream in the viewer, which follows it."""
     browser: bool = True
     """Open the viewer in the browser of this machine."""
-    settings: Annotated[LiveSettings, arg(name=""), DisallowNone] = field(default_factory=LiveSettings)
+    settings: Annotated[LiveSettings, arg(name=""), DisallowNone] = field(
+        default_factory=LiveSettings
+    )
 
     def run(self) -> None:
         from morgs_mi.core.fit_names import PROVISIONAL
@@ -86,7 +95,9 @@ class Live:
 
 
 class _Lines:
-    """Lines about frames on standard error, at most one per second; each counts what was dropped since the last."""
+    """Lines about frames on standard error, at most one per second; each counts what was dropped
+    since the last.
+    """
 
     def __init__(self) -> None:
         self._last = float("-inf")
@@ -97,8 +108,8 @@ class _Lines:
         if (time_now := time.monotonic()) - self._last < _PERIOD:
             return
         print_warning(
-            f"Frame {row.frame}: {row.time:.1f} s after the first, latency {row.latency:.2f} s, {self._drops} frames "
-            f"dropped, skew {1e3 * row.skew:.0f} ms."
+            f"Frame {row.frame}: {row.time:.1f} s after the first, latency {row.latency:.2f} s, "
+            f"{self._drops} frames dropped, skew {1e3 * row.skew:.0f} ms."
         )
         self._last = time_now
         self._drops = 0
@@ -109,7 +120,10 @@ def _summary(out: Path, rows: Sequence[LiveFrame]) -> str:
     stream = out / STREAM
     later_rows = rows[1:]
     drops = sum(row.dropped for row in rows)
-    text = f"{stream}: fitted {len(rows)} of {len(rows) + drops} frames ({drops} dropped) in {rows[-1].time:.1f} s, "
+    text = (
+        f"{stream}: fitted {len(rows)} of {len(rows) + drops} frames ({drops} dropped) in "
+        f"{rows[-1].time:.1f} s, "
+    )
     text += f"{stream.stat().st_size / 1e6:.1f} MB, {rows[0].latency:.1f} s for the first one"
     if not later_rows:
         return f"{text}."
@@ -119,10 +133,23 @@ def _summary(out: Path, rows: Sequence[LiveFrame]) -> str:
 
 
 def start_viewer(out: Path, browser: bool) -> subprocess.Popen[bytes]:
-    """Start the viewer in a process of its own: in one process it would wait for the renderings of the fit."""
+    """Start the viewer in a process of its own: in one process it would wait for the renderings of
+    the fit.
+    """
     opening = "--browser" if browser else "--no-browser"
-    command = [sys.executable, "-m", "morgs_mi", "view", str(out), "--follow", opening, "--variant", mi.variant()]
-    return subprocess.Popen(command, start_new_session=True)  # Ctrl-C is for the fit, which ends the viewer
+    command = [
+        sys.executable,
+        "-m",
+        "morgs_mi",
+        "view",
+        str(out),
+        "--follow",
+        opening,
+        "--variant",
+        mi.variant(),
+    ]
+    # Ctrl-C is for the fit, which ends the viewer.
+    return subprocess.Popen(command, start_new_session=True)
 
 
 def stop_viewer(process: subprocess.Popen[bytes]) -> None:

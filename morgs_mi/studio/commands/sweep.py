@@ -31,7 +31,9 @@ class Sweep:
     downscale: float = 1
     """Factor by which the images are reduced."""
     test_view: HeldOut = ("auto",)
-    """Held-out cameras, by indices or names; none: all are fitted; auto: the capture's, or camera 0 of six or more."""
+    """Held-out cameras, by indices or names; none: all are fitted; auto: the capture's, or camera 0
+    of six or more.
+    """
     config: Annotated[Path | None, DisallowNone, optional("FILE.toml")] = None
     """File with any settings, as `fit --print-config` writes it."""
     plot: Annotated[Path | None, DisallowNone, optional("FILE")] = None
@@ -49,9 +51,16 @@ class Sweep:
         capture = load_capture(self.capture, self.downscale, held_out(self.test_view), self.frames)
         with progress() as report:
             rows = sweep(capture, self.out, self.epochs, self.seeds, config, report)
-        table = Table("epochs", *(title for title, _ in SCORES.values()), box=SIMPLE_HEAD, title="means over the seeds")
+        table = Table(
+            "epochs",
+            *(title for title, _ in SCORES.values()),
+            box=SIMPLE_HEAD,
+            title="means over the seeds",
+        )
         for row in mean_scores(rows):
-            table.add_row(figure(row["epochs"], 0), *(figure(row[name], SCORES[name][1]) for name in SCORES))
+            table.add_row(
+                figure(row["epochs"], 0), *(figure(row[name], SCORES[name][1]) for name in SCORES)
+            )
         print_table(table)
         print_result(f"All fits: {self.out / 'sweep.json'}")
         if self.plot is not None:

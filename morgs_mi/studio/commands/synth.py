@@ -18,10 +18,14 @@ class Synth:
     """Path-trace a moving scene into a multi-view capture with exact ground truth."""
 
     scene: Positional[str]
-    """Name of a scene (spheres, arm, thin, flicker, random), or path of a Python file with a function build(seed)."""
+    """Name of a scene (spheres, arm, thin, flicker, random), or path of a Python file with a
+    function build(seed).
+    """
     out: Positional[Path]
     """New folder for the capture."""
-    config: Annotated[SynthConfig, arg(name=""), OmitArgPrefixes, DisallowNone] = field(default_factory=SynthConfig)
+    config: Annotated[SynthConfig, arg(name=""), OmitArgPrefixes, DisallowNone] = field(
+        default_factory=SynthConfig
+    )
     overwrite: Flag = False
     """Replace an earlier synthetic capture in OUT."""
 

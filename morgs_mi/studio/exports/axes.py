@@ -11,7 +11,9 @@ from morgs_mi.core.rig import up_direction
 
 
 def gltf_axes(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the rotation [3, 3] from world to glTF axes: y is the cameras' mean up, x nearly the first one's right."""
+    """Return the rotation [3, 3] from world to glTF axes: y is the cameras' mean up, x nearly the
+    first one's right.
+    """
     up = up_direction(cameras)
     views = np.asarray(cameras[0].viewmat, np.float64)
     right, forward = (side - (side @ up) * up for side in (views[0, :3], views[2, :3]))

@@ -1,17 +1,18 @@
 """Gaussians as a binary glTF 2.0 file with the extension `KHR_gaussian_splatting`.
 
-A .glb file consists of a header, a JSON chunk and a binary chunk. The Gaussians are one point primitive. Each attribute
-has its own accessor and buffer view, little-endian float32:
+A .glb file consists of a header, a JSON chunk and a binary chunk. The Gaussians are one point
+primitive. Each attribute has its own accessor and buffer view, little-endian float32:
 
     POSITION                                        VEC3    centre
     KHR_gaussian_splatting:ROTATION                 VEC4    unit quaternion, xyzw
     KHR_gaussian_splatting:SCALE                    VEC3    standard deviations
     KHR_gaussian_splatting:OPACITY                  SCALAR  0 to 1
-    KHR_gaussian_splatting:SH_DEGREE_l_COEF_n       VEC3    RGB coefficient of degree l and order n - l
-    COLOR_0                                         VEC4    linear RGB and opacity, for viewers that draw points
+    KHR_gaussian_splatting:SH_DEGREE_l_COEF_n       VEC3    RGB coefficient, degree l, order n - l
+    COLOR_0                                         VEC4    linear RGB and opacity, for viewers that
+                                                            draw points
 
-glTF's axes have y up. Centres, rotations and spherical harmonics are rotated rather than the node: a viewer does
-not have to rotate the harmonics.
+glTF's axes have y up. Centres, rotations and spherical harmonics are rotated rather than the node:
+a viewer does not have to rotate the harmonics.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ def write_gltf(path: str | Path, gaussians: Gaussians, axes: np.ndarray | None =
     Args:
         path: the file.
         gaussians: N Gaussians in world axes.
-        axes: rotation [3, 3] from world axes to glTF's, see `gltf_axes`; None if the world has y up already.
+        axes: rotation [3, 3] from world axes to glTF's, see `gltf_axes`; None if the world has y up
+            already.
 
     Raises:
         ValueError: there is no Gaussian, or there are more than fit into the 4 GiB of a .glb file.
@@ -61,7 +63,10 @@ def glb(gaussians: Gaussians, axes: np.ndarray | None = None) -> bytes:
         ValueError: as for `write_gltf`.
     """
     if not len(gaussians):  # an accessor must have at least one element
-        raise ValueError("write_gltf(): at least one Gaussian was expected, got none; glTF cannot hold an empty set.")
+        raise ValueError(
+            "write_gltf(): at least one Gaussian was expected, got none; glTF cannot hold an "
+            "empty set."
+        )
     columns = _attributes(gaussians if axes is None else rotated(gaussians, axes))
     binary = b"".join(column.tobytes() for column in columns.values())
     document = json.dumps(_document(columns, axes), separators=(",", ":"), allow_nan=False).encode()
@@ -69,7 +74,8 @@ def glb(gaussians: Gaussians, axes: np.ndarray | None = None) -> bytes:
     size = 12 + 8 + len(document) + 8 + len(binary)
     if size >= 2**32:
         raise ValueError(
-            f"write_gltf(): {len(gaussians)} Gaussians take {size} bytes, a .glb file holds 2^32; use PLY."
+            f"write_gltf(): {len(gaussians)} Gaussians take {size} bytes, a .glb file holds 2^32; "
+            "use PLY."
         )
     head = struct.pack("<4sII", b"glTF", 2, size)
     chunks = ((b"JSON", document), (b"BIN\0", binary))
@@ -88,7 +94,9 @@ def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
     }
     for degree in range(gaussians.sh_degree + 1):
         for n in range(2 * degree + 1):
-            columns[f"{_NAME}:SH_DEGREE_{degree}_COEF_{n}"] = raw["sh_coeffs"][:, degree * degree + n]
+            columns[f"{_NAME}:SH_DEGREE_{degree}_COEF_{n}"] = raw["sh_coeffs"][
+                :, degree * degree + n
+            ]
     columns["COLOR_0"] = np.concatenate([diffuse, np.clip(opacities, 0, 1)[:, None]], axis=1)
     return {name: np.ascontiguousarray(column, "<f4") for name, column in columns.items()}
 
@@ -97,7 +105,12 @@ def _document(columns: dict[str, np.ndarray], axes: np.ndarray | None) -> dict[s
     sizes = [column.nbytes for column in columns.values()]
     starts = np.cumsum([0, *sizes])
     accessors = [
-        {"bufferView": i, "componentType": _FLOAT, "count": len(column), "type": _TYPES[column.shape[1]]}
+        {
+            "bufferView": i,
+            "componentType": _FLOAT,
+            "count": len(column),
+            "type": _TYPES[column.shape[1]],
+        }
         for i, column in enumerate(columns.values())
     ]
     means = columns["POSITION"]

@@ -1,15 +1,18 @@
 """Panoramas of Gaussians in the equirectangular projection, for one eye or both.
 
-A pixel (u, v) of a panorama with W columns and H rows looks to the longitude lambda = 2 pi (u / W - 1/2) and the
-latitude phi = pi (1/2 - v / H): in the axes of its camera (x right, y down, z forward), along
+A pixel (u, v) of a panorama with W columns and H rows looks to the longitude lambda = 2 pi (u / W -
+1/2) and the latitude phi = pi (1/2 - v / H): in the axes of its camera (x right, y down, z
+forward), along
 
     d = (cos phi sin lambda, -sin phi, cos phi cos lambda).
 
-Every pixel has rays of its own through the Gaussians (`SplatRays`), so there is no seam, and nothing is approximated at
-the poles. The rays have no low-pass filter; a pixel is the mean of a grid of rays.
+Every pixel has rays of its own through the Gaussians (`SplatRays`), so there is no seam, and
+nothing is approximated at the poles. The rays have no low-pass filter; a pixel is the mean of a
+grid of rays.
 
-For two eyes at a distance b, the ray of longitude lambda starts at -b/2 and +b/2 times (cos lambda, 0, -sin lambda), to
-the left and to the right of where it looks (omnidirectional stereo). The left eye's panorama is above the right eye's.
+For two eyes at a distance b, the ray of longitude lambda starts at -b/2 and +b/2 times (cos lambda,
+0, -sin lambda), to the left and to the right of where it looks (omnidirectional stereo). The left
+eye's panorama is above the right eye's.
 """
 
 from __future__ import annotations
@@ -53,16 +56,20 @@ def panorama(
         gaussians: N Gaussians.
         camera: the position and the axes of the panorama; it looks along the middle of the image.
         width: number of columns, even.
-        stereo: distance of the eyes, world units; then the result has [width, width, 3], the left eye above the right.
+        stereo: distance of the eyes, world units; then the result has [width, width, 3], the left
+            eye above the right.
         config: cut-offs.
         samples: rays of a pixel along each side.
 
     Raises:
-        ValueError: `width` is not even and positive, `stereo` is negative, or a Gaussian is not finite.
+        ValueError: `width` is not even and positive, `stereo` is negative, or a Gaussian is not
+            finite.
     """
     check_number("panorama()", "stereo", stereo, "[0, inf)")
     if width < 2 or width % 2:
-        raise ValueError(f"panorama(): `width` must be even and at least 2, got {width}; it is twice the height.")
+        raise ValueError(
+            f"panorama(): `width` must be even and at least 2, got {width}; it is twice the height."
+        )
     height = width // 2
     eyes = (-0.5, 0.5) if stereo else (0.0,)
     strip = max(_MOST_RAYS, width * samples**2)
@@ -78,7 +85,13 @@ def panorama(
     to_world = np.linalg.inv(np.asarray(camera.viewmat, np.float64))[:3]
     rows = max(1, _MOST_RAYS // (width * samples**2))
     parts = [
-        _strip(rays, to_world, eye * stereo, (width, height, samples), np.arange(start, min(start + rows, height)))
+        _strip(
+            rays,
+            to_world,
+            eye * stereo,
+            (width, height, samples),
+            np.arange(start, min(start + rows, height)),
+        )
         for eye in eyes
         for start in range(0, height, rows)
     ]
@@ -86,20 +99,30 @@ def panorama(
 
 
 def _strip(
-    rays: SplatRays, to_world: np.ndarray, shift: float, size: tuple[int, int, int], rows: np.ndarray
+    rays: SplatRays,
+    to_world: np.ndarray,
+    shift: float,
+    size: tuple[int, int, int],
+    rows: np.ndarray,
 ) -> np.ndarray:
     """Return rows of a panorama [R, W, 3] of an eye that is `shift` to the right."""
     width, height, samples = size
     offsets = (np.arange(samples) + 0.5) / samples
     longitude = 2 * np.pi * ((np.arange(width)[:, None] + offsets) / width - 0.5)
     latitude = np.pi * (0.5 - (rows[:, None] + offsets) / height)
-    latitude, longitude = np.broadcast_arrays(latitude[:, None, :, None], longitude[None, :, None, :])
+    latitude, longitude = np.broadcast_arrays(
+        latitude[:, None, :, None], longitude[None, :, None, :]
+    )
     level = np.stack([np.sin(longitude), np.zeros_like(longitude), np.cos(longitude)], axis=-1)
     right = np.stack([np.cos(longitude), np.zeros_like(longitude), -np.sin(longitude)], axis=-1)
-    directions = np.cos(latitude)[..., None] * level - np.sin(latitude)[..., None] * np.array([0, 1, 0])
+    directions = np.cos(latitude)[..., None] * level - np.sin(latitude)[..., None] * np.array(
+        [0, 1, 0]
+    )
     directions = (directions @ to_world[:, :3].T).reshape(-1, 3)
     origins = (shift * right @ to_world[:, :3].T + to_world[:, 3]).reshape(-1, 3)
-    color, _ = rays.trace(mi.Ray3f(mi.Point3f(np.float32(origins.T)), mi.Vector3f(np.float32(directions.T))))
+    color, _ = rays.trace(
+        mi.Ray3f(mi.Point3f(np.float32(origins.T)), mi.Vector3f(np.float32(directions.T)))
+    )
     values = np.array(dr.ravel(color)).reshape(len(rows), width, samples**2, 3)
     return values.mean(axis=2)
 
@@ -107,7 +130,8 @@ def _strip(
 def panoramas(
     stream: FrameSource, view: Camera | CameraPath, width: int = 2048, stereo: float = 0.0
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-    """Render the panoramas of a stream at a camera, or of the images of `flight` along a path, with a level horizon.
+    """Render the panoramas of a stream at a camera, or of the images of `flight` along a path, with
+    a level horizon.
 
     Args:
         stream: the file.
@@ -132,7 +156,8 @@ def panoramas(
 
 
 def levelled(camera: Camera, up: np.ndarray) -> Camera:
-    """Return a camera at the same position that looks to the same side with a level horizon; `up` [3] is up.
+    """Return a camera at the same position that looks to the same side with a level horizon; `up`
+    [3] is up.
 
     The side of a camera that looks straight down is where the top of its image is.
     """
@@ -141,5 +166,11 @@ def levelled(camera: Camera, up: np.ndarray) -> Camera:
     if np.linalg.norm(direction) < 1e-3:
         direction = down if forward @ up > 0 else -down
     return Camera.look_at(
-        camera.position, camera.position + direction, up, 90, camera.width, camera.height, camera.name
+        camera.position,
+        camera.position + direction,
+        up,
+        90,
+        camera.width,
+        camera.height,
+        camera.name,
     )

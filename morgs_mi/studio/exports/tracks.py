@@ -21,7 +21,8 @@ class Tracks:
         ids: uint32 [N], the Gaussians' ids in the stream, ascending.
         frames: int64 [T], indices of the frames.
         positions: float32 [T, N, 3], centres in world units; NaN before birth and after death.
-        confidence: float32 [T, N] in [0, 1]; NaN before birth, after death, and throughout if the stream stores none.
+        confidence: float32 [T, N] in [0, 1]; NaN before birth, after death, and throughout if the
+            stream stores none.
     """
 
     ids: np.ndarray
@@ -31,9 +32,11 @@ class Tracks:
 
 
 def extract_tracks(stream: FrameSource, progress: Callable[[int], None] | None = None) -> Tracks:
-    """Return the tracks of all Gaussians of a stream; they take 16 bytes of memory per Gaussian and frame.
+    """Return the tracks of all Gaussians of a stream; they take 16 bytes of memory per Gaussian and
+    frame.
 
-    Where a keyframe starts a new set of Gaussians with ids from 0, these ids continue after the earlier ones.
+    Where a keyframe starts a new set of Gaussians with ids from 0, these ids continue after the
+    earlier ones.
 
     Args:
         stream: the file.
@@ -48,14 +51,21 @@ def extract_tracks(stream: FrameSource, progress: Callable[[int], None] | None =
     for state in stream.states():
         gaussians = state.gaussians
         has_confidence = gaussians.confidence is not None
-        confidence = np.asarray(gaussians.confidence) if has_confidence else np.full(len(state), np.nan, np.float32)
+        confidence = (
+            np.asarray(gaussians.confidence)
+            if has_confidence
+            else np.full(len(state), np.nan, np.float32)
+        )
         frames.append(state.frame)
         ids_of_frames.append(state.lasting_ids)
         rows.append((gaussians.numpy()["means"], confidence))
         if progress is not None:
             progress(len(frames))
     if not frames:
-        raise ValueError(f"{stream.path}: at least one frame was expected, got none; the stream has only a header.")
+        raise ValueError(
+            f"{stream.path}: at least one frame was expected, got none; the stream has only a "
+            "header."
+        )
     ids = np.unique(np.concatenate(ids_of_frames))
     positions = np.full((len(frames), len(ids), 3), np.nan, np.float32)
     confidences = np.full((len(frames), len(ids)), np.nan, np.float32)
@@ -67,7 +77,8 @@ def extract_tracks(stream: FrameSource, progress: Callable[[int], None] | None =
 
 
 def write_tracks(path: str | Path, tracks: Tracks) -> None:
-    """Write tracks as .npz with the arrays `ids`, `frames`, `positions`, `confidence`; the file is written atomically.
+    """Write tracks as .npz with the arrays `ids`, `frames`, `positions`, `confidence`; the file is
+    written atomically.
 
     Raises:
         ValueError: `path` does not end in .npz.
@@ -76,5 +87,9 @@ def write_tracks(path: str | Path, tracks: Tracks) -> None:
     choose_format(TRACKS, path)
     with atomic_path(path, "write_tracks()") as partial, open(partial, "wb") as file:
         np.savez_compressed(
-            file, ids=tracks.ids, frames=tracks.frames, positions=tracks.positions, confidence=tracks.confidence
+            file,
+            ids=tracks.ids,
+            frames=tracks.frames,
+            positions=tracks.positions,
+            confidence=tracks.confidence,
         )

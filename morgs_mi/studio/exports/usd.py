@@ -1,27 +1,31 @@
-"""A stream as an OpenUSD stage with `ParticleField3DGaussianSplat` prims (schema UsdVol, OpenUSD 26.03 and newer).
+"""A stream as an OpenUSD stage with `ParticleField3DGaussianSplat` prims (schema UsdVol, OpenUSD
+26.03 and newer).
 
-Each frame is a time code. The attributes follow the schema, which differs from the layout of 3D Gaussian Splatting:
+Each frame is a time code. The attributes follow the schema, which differs from the layout of 3D
+Gaussian Splatting:
 
     positions                                   point3f[N]    centres
     orientations                                quatf[N]      unit quaternions
-    scales                                      float3[N]     standard deviations, not their logarithms
+    scales                                      float3[N]     standard deviations, no logarithms
     opacities                                   float[N]      0 to 1, not logits
     radiance:sphericalHarmonicsDegree           int           the same for all Gaussians and times
-    radiance:sphericalHarmonicsCoefficients     float3[N K]   RGB, the K of a Gaussian one after another
+    radiance:sphericalHarmonicsCoefficients     float3[N K]   RGB, the K of a Gaussian in a row
     extent                                      float3[2]     box around three standard deviations
 
-A prim has an element for each Gaussian that lives in any frame, in the order of their ids. In frames outside of its
-life its opacity is 0, and its other attributes are as at its birth or death. USD would also accept arrays with
-lengths that change with time. But between two time samples, as for motion blur, it interpolates arrays of equal length
-element by element: where as many Gaussians die as are born, it would mix different ones, and where the numbers differ,
-nothing would move. With constant lengths all survivors move, and a Gaussian fades in during the frame before its birth
-and out during the frame after its last. Arrays that do not change have no further samples, and few Gaussians are born
-in later frames. The additional elements take little room.
+A prim has an element for each Gaussian that lives in any frame, in the order of their ids. In
+frames outside of its life its opacity is 0, and its other attributes are as at its birth or death.
+USD would also accept arrays with lengths that change with time. But between two time samples, as
+for motion blur, it interpolates arrays of equal length element by element: where as many Gaussians
+die as are born, it would mix different ones, and where the numbers differ, nothing would move. With
+constant lengths all survivors move, and a Gaussian fades in during the frame before its birth and
+out during the frame after its last. Arrays that do not change have no further samples, and few
+Gaussians are born in later frames. The additional elements take little room.
 
-Where a keyframe starts a new set of Gaussians, a new prim begins, and `visibility` switches between them.
+Where a keyframe starts a new set of Gaussians, a new prim begins, and `visibility` switches between
+them.
 
-The stage has y up, like glTF's: centres, rotations and harmonics are rotated, because not every renderer rotates
-the harmonics with a prim. The unit of a capture is unknown; `metersPerUnit` is 1.
+The stage has y up, like glTF's: centres, rotations and harmonics are rotated, because not every
+renderer rotates the harmonics with a prim. The unit of a capture is unknown; `metersPerUnit` is 1.
 """
 
 from __future__ import annotations
@@ -47,7 +51,8 @@ from morgs_mi.studio.exports.axes import gltf_axes
 
 _COEFFICIENTS = "radiance:sphericalHarmonicsCoefficients"
 _DEGREE = "radiance:sphericalHarmonicsDegree"
-# Types of the arrays in pxr.Vt, as float and as half. Half positions would have steps of a thousandth of the scene.
+# Types of the arrays in pxr.Vt, as float and as half. Half positions would have steps of a
+# thousandth of the scene.
 _TYPES = {
     "positions": ("Vec3fArray", None),
     "orientations": ("QuatfArray", "QuathArray"),
@@ -67,15 +72,19 @@ def write_usd(
     half: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Write frames of a stream as an OpenUSD stage; the file is written atomically. See the module for its content.
+    """Write frames of a stream as an OpenUSD stage; the file is written atomically. See the module
+    for its content.
 
-    The stream is decoded twice: the first time for the lives of the Gaussians. Motion and confidence are not written.
+    The stream is decoded twice: the first time for the lives of the Gaussians. Motion and
+    confidence are not written.
 
     Args:
         stream: the file.
-        path: the stage, ``FILE.usdc`` or ``.usd`` (binary), ``.usda`` (text) or ``.usdz`` (package).
+        path: the stage, ``FILE.usdc`` or ``.usd`` (binary), ``.usda`` (text) or ``.usdz``
+            (package).
         frames: indices of the frames, ascending.
-        half: write all attributes but the positions in half precision, in the attributes that the schema has for it.
+        half: write all attributes but the positions in half precision, in the attributes that the
+            schema has for it.
         progress: called with (frames done, number of frames).
 
     Raises:
@@ -146,19 +155,25 @@ def _sets(states: Iterator[FrameState], axes: np.ndarray) -> dict[int, _Set]:
         last_id = parts[-1][0][-1] if parts else -1
         births = state.ids.astype(np.int64) > last_id
         if births.any():
-            parts.append((state.ids[births], _values(rotated(state.gaussians.select(births), axes))))
+            parts.append(
+                (state.ids[births], _values(rotated(state.gaussians.select(births), axes)))
+            )
     return {
         first_id: _Set(
             *starts[first_id],
             np.concatenate([np.zeros(0, np.uint32), *(ids for ids, _ in parts)]),
-            {name: np.concatenate([values[name] for _, values in parts]) for name in _TYPES} if parts else {},
+            {name: np.concatenate([values[name] for _, values in parts]) for name in _TYPES}
+            if parts
+            else {},
         )
         for first_id, parts in parts_of.items()
     }
 
 
 def _values(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    """Return the attributes float32 [N, ...] by the names of the schema; quaternions are xyzw, as in memory."""
+    """Return the attributes float32 [N, ...] by the names of the schema; quaternions are xyzw, as
+    in memory.
+    """
     raw = gaussians.numpy()
     values = {
         "positions": raw["means"],
@@ -176,7 +191,9 @@ class _Field:
     def __init__(self, pxr: Any, prim: Any, gaussians: _Set, half: bool) -> None:
         self._ids = gaussians.ids
         self._state = {name: value.copy() for name, value in gaussians.births.items()}
-        self._samples = {"extent": _Samples(prim.GetAttribute("extent"), pxr.Vt.Vec3fArray, np.float32)}
+        self._samples = {
+            "extent": _Samples(prim.GetAttribute("extent"), pxr.Vt.Vec3fArray, np.float32)
+        }
         for name, (full, small) in _TYPES.items():
             as_half = half and small is not None
             attribute = prim.GetAttribute(name + ("h" if as_half else ""))
@@ -198,7 +215,8 @@ class _Field:
 
 @dataclass
 class _Samples:
-    """Time samples of an attribute; a value that stays the same has one at its begin and one at its end.
+    """Time samples of an attribute; a value that stays the same has one at its begin and one at its
+    end.
 
     `UsdUtils.SparseAttrValueWriter` does the same for values that are equal up to a tolerance.
     """
@@ -236,7 +254,9 @@ def _extent(gaussians: Gaussians) -> np.ndarray:
     return np.stack([(means - reach).min(axis=0), (means + reach).max(axis=0)]).astype(np.float32)
 
 
-def _describe(pxr: Any, stage: Any, stream: FrameSource, frames: Sequence[int], axes: np.ndarray) -> None:
+def _describe(
+    pxr: Any, stage: Any, stream: FrameSource, frames: Sequence[int], axes: np.ndarray
+) -> None:
     """Write the metadata of the stage and its root prim."""
     pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.y)
     pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -251,18 +271,24 @@ def _describe(pxr: Any, stage: Any, stream: FrameSource, frames: Sequence[int], 
     stage.SetDefaultPrim(root)
 
 
-def _fields(pxr: Any, stage: Any, sets: dict[int, _Set], frames: Sequence[int], half: bool) -> dict[int, _Field]:
+def _fields(
+    pxr: Any, stage: Any, sets: dict[int, _Set], frames: Sequence[int], half: bool
+) -> dict[int, _Field]:
     """Define a prim for each set, with what does not change, and return their writers."""
     fields = {}
     ends = [*(gaussians.start for gaussians in sets.values()), None][1:]
     for number, ((first_id, gaussians), end) in enumerate(zip(sets.items(), ends, strict=True)):
-        splats = pxr.UsdVol.ParticleField3DGaussianSplat.Define(stage, f"/Stream/Gaussians{number or ''}")
+        splats = pxr.UsdVol.ParticleField3DGaussianSplat.Define(
+            stage, f"/Stream/Gaussians{number or ''}"
+        )
         prim = splats.GetPrim()
         prim.GetAttribute(_DEGREE).Set(gaussians.degree)
         splats.CreateProjectionModeHintAttr("perspective")
         splats.CreateSortingModeHintAttr("zDepth")
         # As far as the schema goes: it does not state the space of the coefficients.
-        prim.GetAttribute(_COEFFICIENTS + ("h" if half else "")).SetColorSpace(pxr.Gf.ColorSpaceNames.SRGBRec709)
+        prim.GetAttribute(_COEFFICIENTS + ("h" if half else "")).SetColorSpace(
+            pxr.Gf.ColorSpaceNames.SRGBRec709
+        )
         if gaussians.start > frames[0]:
             splats.CreateVisibilityAttr().Set("invisible", frames[0])
             splats.CreateVisibilityAttr().Set("inherited", gaussians.start)
@@ -294,11 +320,13 @@ def _pxr() -> Any:
         modules = SimpleNamespace(**{name: import_module(f"pxr.{name}") for name in names})
     except ImportError as error:
         raise ValueError(
-            "write_usd(): expected the package usd-core, found none; install it with pip install 'morgs-mi[usd]'."
+            "write_usd(): expected the package usd-core, found none; install it with pip install "
+            "'morgs-mi[usd]'."
         ) from error
     if not hasattr(modules.UsdVol, "ParticleField3DGaussianSplat"):
         version = ".".join(map(str, modules.Usd.GetVersion()[1:]))
         raise ValueError(
-            f"write_usd(): expected OpenUSD 26.3 or newer, got {version}; install it with pip install 'morgs-mi[usd]'."
+            f"write_usd(): expected OpenUSD 26.3 or newer, got {version}; install it with pip "
+            "install 'morgs-mi[usd]'."
         )
     return modules

@@ -4,8 +4,8 @@ A scene is an XML file, which is the same in all frames, or a Python file with a
 
     build(frame: int, time: float) -> dict
 
-that returns the entries of a Mitsuba scene: shapes, emitters, and optionally an `integrator` for them. The time is in
-seconds. World space and its units are the stream's.
+that returns the entries of a Mitsuba scene: shapes, emitters, and optionally an `integrator` for
+them. The time is in seconds. World space and its units are the stream's.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ from morgs_mi.studio.synth.scene import failures_in
 from morgs_mi.surfaces.surface_view import lights, rays_for, traced
 
 LAYERS = ("splats", "surfaces", "shadow")
-"""Further channels, for compositing: the splats alone and the surfaces alone, in linear light with alpha, and the
-shadow of the surfaces on the splats, a factor of their linear light."""
+"""Further channels, for compositing: the splats alone and the surfaces alone, in linear light with
+alpha, and the shadow of the surfaces on the splats, a factor of their linear light."""
 
 Light = Literal["probe", "traced"]
 
@@ -56,11 +56,11 @@ class InsertConfig:
     shadows: bool = True
     """Whether its surfaces throw shadows on the Gaussians, see `shadow_ratio`."""
     light: Light = "probe"
-    """``probe`` lights the surfaces by an environment map, see `captured_light`; ``traced`` traces rays through the
-    Gaussians (`splat_path`), which also throw shadows on them."""
+    """``probe`` lights the surfaces by an environment map, see `captured_light`; ``traced`` traces
+    rays through the Gaussians (`splat_path`), which also throw shadows on them."""
     clipped: float | None = None
-    """Radiance of colours that the video clipped at 1, see `light_probe`; None: 4, or 1 for a stream of an HDR
-    recording, which is not clipped."""
+    """Radiance of colours that the video clipped at 1, see `light_probe`; None: 4, or 1 for a
+    stream of an HDR recording, which is not clipped."""
 
     def __post_init__(self) -> None:
         check_number("render_inserted()", "samples", self.samples, "[1, inf)")
@@ -71,13 +71,15 @@ def load_insert(path: str | Path) -> Build:
     """Return the function (frame, seconds) -> entries of a Mitsuba scene of an XML or Python file.
 
     Raises:
-        ValueError: there is no such file, it is of another type, or it fails; the sentence names the file, and the line
-            of a Python file.
+        ValueError: there is no such file, it is of another type, or it fails; the sentence names
+            the file, and the line of a Python file.
     """
     path = Path(path)
     if path.suffix not in (".xml", ".py") or not path.is_file():
         kind = f"{path.suffix!r}" if path.is_file() else "none"
-        raise ValueError(f"{path}: expected a scene to insert, FILE.xml or FILE.py, got {kind}; check the path.")
+        raise ValueError(
+            f"{path}: expected a scene to insert, FILE.xml or FILE.py, got {kind}; check the path."
+        )
     if path.suffix == ".xml":
         entries = _xml_entries(path)
         return lambda frame, time: entries
@@ -90,8 +92,8 @@ def load_insert(path: str | Path) -> Build:
     build = getattr(module, "build", None)
     if not callable(build):
         raise ValueError(
-            f"{path}: expected a function `build(frame, time)` that returns the entries of a Mitsuba scene, found "
-            "none; add it."
+            f"{path}: expected a function `build(frame, time)` that returns the entries of a "
+            "Mitsuba scene, found none; add it."
         )
 
     def checked(frame: int, time: float) -> dict[str, Any]:
@@ -112,7 +114,12 @@ def inserted_channels(stream: FrameSource) -> tuple[str, ...]:
     """
     frame_numbers(stream)
     _, gaussians = next(iter(play(stream)))
-    return ("color", "alpha", *(name for name in available_channels(gaussians) if name != "color"), *LAYERS)
+    return (
+        "color",
+        "alpha",
+        *(name for name in available_channels(gaussians) if name != "color"),
+        *LAYERS,
+    )
 
 
 def selected(stream: FrameSource, frames: Sequence[int]) -> list[int]:
@@ -125,8 +132,8 @@ def selected(stream: FrameSource, frames: Sequence[int]) -> list[int]:
     missing_frames = sorted(set(frames) - set(numbers))
     if missing_frames:
         raise ValueError(
-            f"{stream.path}: the frames must be out of {numbers[0]} to {numbers[-1]}, got {missing_frames[0]}; choose "
-            "others."
+            f"{stream.path}: the frames must be out of {numbers[0]} to {numbers[-1]}, got "
+            f"{missing_frames[0]}; choose others."
         )
     return sorted(set(frames))
 
@@ -180,20 +187,32 @@ def _resized(name: str, image: np.ndarray, camera: Camera) -> np.ndarray:
 def captured_light(
     gaussians: Gaussians, camera: Camera, position: np.ndarray, clipped: float = CLIPPED
 ) -> dict[str, Any]:
-    """Return the `light_probe` at a point, where directions without Gaussians have the mean colour of a view.
+    """Return the `light_probe` at a point, where directions without Gaussians have the mean colour
+    of a view.
 
-    A capture rarely shows what is behind the cameras; black there would take half of the light away.
+    A capture rarely shows what is behind the cameras; black there would take half of the light
+    away.
     """
-    return light_probe(gaussians, position, background=_mean_color(gaussians, camera, clipped), clipped=clipped)
+    return light_probe(
+        gaussians, position, background=_mean_color(gaussians, camera, clipped), clipped=clipped
+    )
 
 
 def _mean_color(gaussians: Gaussians, camera: Camera, clipped: float) -> list[float]:
     white = np.inf if clipped == 1 else 1.0
-    return np.clip(np.asarray(rasterize(gaussians, camera, ("color",)).color), 0, white).mean((0, 1)).tolist()
+    return (
+        np.clip(np.asarray(rasterize(gaussians, camera, ("color",)).color), 0, white)
+        .mean((0, 1))
+        .tolist()
+    )
 
 
-def _in_background_light(entries: dict[str, Any], gaussians: Gaussians, camera: Camera, clipped: float) -> Any:
-    """Return the inserted scene with the light that comes from behind all Gaussians, as for `captured_light`."""
+def _in_background_light(
+    entries: dict[str, Any], gaussians: Gaussians, camera: Camera, clipped: float
+) -> Any:
+    """Return the inserted scene with the light that comes from behind all Gaussians, as for
+    `captured_light`.
+    """
     radiance = decode_light(np.array(_mean_color(gaussians, camera, clipped))).tolist()
     lamp = {"type": "constant", "radiance": {"type": "rgb", "value": radiance}}
     return mi.load_dict({"type": "scene", **entries, "captured light": lamp})
@@ -205,19 +224,26 @@ def _integrator(entry: Any, light: Light, clipped: float) -> Any:
     Raises:
         ValueError: it does not light them as the option demands.
     """
-    entry = entry or ({"type": "splat_path", "clipped": clipped} if light == "traced" else {"type": "path"})
+    entry = entry or (
+        {"type": "splat_path", "clipped": clipped} if light == "traced" else {"type": "path"}
+    )
     nested = mi.load_dict(entry) if isinstance(entry, dict) else entry
     if hasattr(nested, "splats") != (light == "traced"):
         name = type(nested).__name__ if hasattr(nested, "splats") else nested.class_name()
         raise ValueError(
-            f"The inserted scene: with light {light!r}, expected {'an' if light == 'traced' else 'no'} integrator "
-            f"`splat_path`, got {name}; remove `integrator` from the scene, or choose the other light."
+            f"The inserted scene: with light {light!r}, expected "
+            f"{'an' if light == 'traced' else 'no'} integrator `splat_path`, got {name}; remove "
+            "`integrator` from the scene, or choose the other light."
         )
     return nested
 
 
 def _render(
-    gaussians: Gaussians, camera: Camera, entries: dict[str, Any], channels: Sequence[str], config: InsertConfig
+    gaussians: Gaussians,
+    camera: Camera,
+    entries: dict[str, Any],
+    channels: Sequence[str],
+    config: InsertConfig,
 ) -> dict[str, np.ndarray]:
     entries = {name: value for name, value in entries.items() if name not in ("type", "sensor")}
     clipped = CLIPPED if config.clipped is None else config.clipped
@@ -227,10 +253,14 @@ def _render(
         surfaces = _inserted_scene(entries)
         lit_scene = surfaces
         if not surfaces.emitters():
-            lamp = captured_light(gaussians, camera, np.array(surfaces.bbox().center()).ravel(), clipped)
+            lamp = captured_light(
+                gaussians, camera, np.array(surfaces.bbox().center()).ravel(), clipped
+            )
             lit_scene = mi.load_dict({"type": "scene", **entries, "captured light": lamp})
             surfaces = (
-                lit_scene if config.light == "probe" else _in_background_light(entries, gaussians, camera, clipped)
+                lit_scene
+                if config.light == "probe"
+                else _in_background_light(entries, gaussians, camera, clipped)
             )
         if config.shadows:
             ratio = shadow_ratio(gaussians, lit_scene, camera.position)
@@ -238,7 +268,9 @@ def _render(
         images = _plugin_images(dark, camera, surfaces, nested, channels, config.samples)
         if "surfaces" in channels:
             with traced(nested, rays_for(nested, dark), srgb=True):
-                images["surfaces"] = np.asarray(nested.render(surfaces, _sensor(camera), spp=config.samples))
+                images["surfaces"] = np.asarray(
+                    nested.render(surfaces, _sensor(camera), spp=config.samples)
+                )
     except RuntimeError as error:
         raise ValueError(f"The inserted scene: {_reason(error)}; correct it.") from error
     if {"splats", "shadow"} & set(channels):
@@ -258,13 +290,15 @@ def _inserted_scene(entries: dict[str, Any]) -> Any:
     box = scene.bbox()
     if scene.shapes() and not bounded(np.array([box.min, box.max])):
         raise ValueError(
-            f"The inserted scene: expected shapes within {LARGEST:g} world units, got {box.min} to {box.max}; correct "
-            "their places and sizes."
+            f"The inserted scene: expected shapes within {LARGEST:g} world units, got {box.min} "
+            f"to {box.max}; correct their places and sizes."
         )
     return scene
 
 
-def _splat_layers(gaussians: Gaussians, shadowed_gaussians: Gaussians, camera: Camera) -> dict[str, np.ndarray]:
+def _splat_layers(
+    gaussians: Gaussians, shadowed_gaussians: Gaussians, camera: Camera
+) -> dict[str, np.ndarray]:
     """Return the layers `splats` [H, W, 4] and `shadow` [H, W, 3], in linear light."""
     image = rasterize(gaussians, camera)
     bright = decode_light(np.asarray(image.color))
@@ -276,7 +310,12 @@ def _splat_layers(gaussians: Gaussians, shadowed_gaussians: Gaussians, camera: C
 
 
 def _plugin_images(
-    gaussians: Gaussians, camera: Camera, surfaces: Any, nested: Any, channels: Sequence[str], samples: int
+    gaussians: Gaussians,
+    camera: Camera,
+    surfaces: Any,
+    nested: Any,
+    channels: Sequence[str],
+    samples: int,
 ) -> dict[str, np.ndarray]:
     """Return the colour, alpha and AOVs of `gaussian_splat` with an inserted scene."""
     aovs = [name for name in channels if name not in ("color", "alpha", *LAYERS)]

@@ -1,7 +1,9 @@
-"""The light of a captured scene at a point, as an environment map (image-based lighting, Debevec 1998).
+"""The light of a captured scene at a point, as an environment map (image-based lighting, Debevec
+1998).
 
-The Gaussians around the point are rendered into the six faces of a cube, decoded to linear light and resampled to
-latitude and longitude. Display-referred video stores at most 1: brighter light is guessed, see `light_probe`.
+The Gaussians around the point are rendered into the six faces of a cube, decoded to linear light
+and resampled to latitude and longitude. Display-referred video stores at most 1: brighter light is
+guessed, see `light_probe`.
 """
 
 from __future__ import annotations
@@ -48,25 +50,28 @@ def light_probe(
     clipped: float = CLIPPED,
     near: float = 0.01,
 ) -> dict[str, Any]:
-    """Return the dictionary of a Mitsuba `envmap` emitter with the light that Gaussians send to a point.
+    """Return the dictionary of a Mitsuba `envmap` emitter with the light that Gaussians send to a
+    point.
 
-    It represents a scene at infinity: every point gets the light at `position`. Place it in the middle of the object
-    that it lights, and make one for every frame.
+    It represents a scene at infinity: every point gets the light at `position`. Place it in the
+    middle of the object that it lights, and make one for every frame.
 
     Args:
         gaussians: N Gaussians with sRGB-encoded colours.
         position: the point [3], world units.
         height: rows of the map, which has twice as many columns.
         background: display-referred colour [3] behind all Gaussians; None: black.
-        clipped: radiance of colours that the video clipped at 1. The default of two stops above white is a guess; 1
-            takes the video as it is. Between display-referred 0.95 and 1, the radiance rises to this.
-        near: distance in world units; nearer Gaussians, such as Gaussians inside the object, are left out.
+        clipped: radiance of colours that the video clipped at 1. The default of two stops above
+            white is a guess; 1 takes the video as it is. Between display-referred 0.95 and 1, the
+            radiance rises to this.
+        near: distance in world units; nearer Gaussians, such as Gaussians inside the object, are
+            left out.
 
     Example:
+        >>> integrator = {"type": "gaussian_splat", "surfaces": {"type": "path"}}
         >>> scene = mi.load_dict({"type": "scene", "gaussians": morgs_mi.ellipsoids(gaussians),
         ...                       "light": morgs_mi.light_probe(gaussians, (0, 1, 0)), "ball": ball,
-        ...                       "sensor": camera.sensor(),
-        ...                       "integrator": {"type": "gaussian_splat", "surfaces": {"type": "path"}}})
+        ...                       "sensor": camera.sensor(), "integrator": integrator})
 
     Raises:
         ValueError: a position that is not [3] and finite, and numbers out of range.
@@ -76,7 +81,9 @@ def light_probe(
     check_number(place, "clipped", clipped, "[1, inf)")
     center = numbers(place, "position", position).astype(np.float64)
     if center.shape != (3,) or not np.isfinite(center).all():
-        raise ValueError(f"{place}: `position` must be [3] and finite, got {center.tolist()}; pass x, y and z.")
+        raise ValueError(
+            f"{place}: `position` must be [3] and finite, got {center.tolist()}; pass x, y and z."
+        )
     directions = _directions(int(height))
     # A face has as many pixels per degree as the map.
     size = max(int(height) // 2, 4)
@@ -87,7 +94,9 @@ def light_probe(
 
 
 def _directions(height: int) -> np.ndarray:
-    """Return the directions [H, 2 H, 3] of the texels of an `envmap`; its first and last rows are the poles."""
+    """Return the directions [H, 2 H, 3] of the texels of an `envmap`; its first and last rows are
+    the poles.
+    """
     theta = np.pi * np.arange(height)[:, None] / (height - 1)
     phi = 2 * np.pi * (np.arange(2 * height) + 0.5) / (2 * height)
     x = np.sin(theta) * np.sin(phi)
@@ -128,12 +137,15 @@ def _resampled(faces: list[tuple[Camera, np.ndarray]], directions: np.ndarray) -
 
 
 def radiance(color: Any, clipped: float, srgb: bool = True) -> Any:
-    """Return the linear light of display-referred colours (`mi.Color3f` [M]); clipped colours get up to `clipped`.
+    """Return the linear light of display-referred colours (`mi.Color3f` [M]); clipped colours get
+    up to `clipped`.
 
     Args:
         color: blended colours of Gaussians.
-        clipped: radiance of colours that were clipped at 1; between display-referred 0.95 and 1, it rises to this.
-        srgb: whether the colours are sRGB-encoded; others are linear light already, and were not clipped.
+        clipped: radiance of colours that were clipped at 1; between display-referred 0.95 and 1, it
+            rises to this.
+        srgb: whether the colours are sRGB-encoded; others are linear light already, and were not
+            clipped.
     """
     if not srgb:
         return color

@@ -1,8 +1,9 @@
 """Shadows of inserted surfaces on Gaussians, by differential rendering (Debevec 1998).
 
-The colour of a Gaussian is light that it reflected in the recording. Inserted surfaces scale it by the ratio of the
-irradiance with and without them, from the same lights. The ratio is traced from the Gaussian's centre, with the same
-directions in numerator and denominator: it is exactly 1 where nothing is in the way.
+The colour of a Gaussian is light that it reflected in the recording. Inserted surfaces scale it by
+the ratio of the irradiance with and without them, from the same lights. The ratio is traced from
+the Gaussian's centre, with the same directions in numerator and denominator: it is exactly 1 where
+nothing is in the way.
 """
 
 from __future__ import annotations
@@ -29,19 +30,25 @@ from morgs_mi.surfaces.surface_view import shared_scene
 _NEIGHBOURS = 16
 
 
-def shadow_ratio(gaussians: Gaussians, scene: Any, viewpoint: ArrayLike, samples: int = 256) -> np.ndarray:
-    """Return the ratio of each Gaussian's irradiance with and without a scene's surfaces, float32 [N] in [0, 1].
+def shadow_ratio(
+    gaussians: Gaussians, scene: Any, viewpoint: ArrayLike, samples: int = 256
+) -> np.ndarray:
+    """Return the ratio of each Gaussian's irradiance with and without a scene's surfaces, float32
+    [N] in [0, 1].
 
-    An approximation: light travels straight from the lights to the centre of a Gaussian. Where the Gaussians around it
-    form a surface, it receives light on the side that faces the viewpoint, by the cosine; elsewhere from everywhere.
-    Shadows among Gaussians, and light that surfaces reflect, are not computed. It has no gradient.
+    An approximation: light travels straight from the lights to the centre of a Gaussian. Where the
+    Gaussians around it form a surface, it receives light on the side that faces the viewpoint, by
+    the cosine; elsewhere from everywhere. Shadows among Gaussians, and light that surfaces reflect,
+    are not computed. It has no gradient.
 
     Args:
         gaussians: N Gaussians.
-        scene: Mitsuba scene with the surfaces and the lights of the recording, such as a `light_probe`; its
-            `ellipsoids` are ignored.
-        viewpoint: a point [3] from which the captured surfaces are seen, world units: a camera's position.
-        samples: directions per light; they are the same for all Gaussians, and shadows have no noise.
+        scene: Mitsuba scene with the surfaces and the lights of the recording, such as a
+            `light_probe`; its `ellipsoids` are ignored.
+        viewpoint: a point [3] from which the captured surfaces are seen, world units: a camera's
+            position.
+        samples: directions per light; they are the same for all Gaussians, and shadows have no
+            noise.
 
     Raises:
         ValueError: a bad argument, or a scene without an emitter.
@@ -51,7 +58,10 @@ def shadow_ratio(gaussians: Gaussians, scene: Any, viewpoint: ArrayLike, samples
     check_number(place, "samples", samples, "[1, 65536]")
     eye = numbers(place, "viewpoint", viewpoint)
     if eye.shape != (3,) or not np.isfinite(eye).all():
-        raise ValueError(f"{place}: `viewpoint` must be [3] and finite, got {eye.tolist()}; pass a camera's position.")
+        raise ValueError(
+            f"{place}: `viewpoint` must be [3] and finite, got {eye.tolist()}; pass a camera's "
+            "position."
+        )
     emitters = scene.emitters()
     shapes = [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
     if not emitters:
@@ -73,9 +83,11 @@ def shadow_ratio(gaussians: Gaussians, scene: Any, viewpoint: ArrayLike, samples
 
 
 def shadowed(gaussians: Gaussians, ratio: np.ndarray) -> Gaussians:
-    """Return Gaussians with their colours scaled by a ratio [N] of linear light, see `shadow_ratio`.
+    """Return Gaussians with their colours scaled by a ratio [N] of linear light, see
+    `shadow_ratio`.
 
-    The colours are sRGB-encoded. Their dependence on direction is scaled by the factor of the mean colour.
+    The colours are sRGB-encoded. Their dependence on direction is scaled by the factor of the mean
+    colour.
 
     Raises:
         ValueError: a ratio of another shape, or with numbers that are negative or not finite.
@@ -83,19 +95,25 @@ def shadowed(gaussians: Gaussians, ratio: np.ndarray) -> Gaussians:
     ratio = numbers("shadowed()", "ratio", ratio).astype(np.float64)
     if ratio.shape != (len(gaussians),) or not (np.isfinite(ratio) & (ratio >= 0)).all():
         raise ValueError(
-            f"shadowed(): `ratio` must be [N] with N={len(gaussians)}, finite and not negative, got "
-            f"{list(ratio.shape)}; pass the result of shadow_ratio()."
+            f"shadowed(): `ratio` must be [N] with N={len(gaussians)}, finite and not negative, "
+            f"got {list(ratio.shape)}; pass the result of shadow_ratio()."
         )
-    mean = np.maximum(0.5 + SH_C0 * np.array(dr.detach(gaussians.sh_coeffs))[:, :1], 1e-6)  # [N, 1, 3]
+    # The mean colours [N, 1, 3].
+    mean = np.maximum(0.5 + SH_C0 * np.array(dr.detach(gaussians.sh_coeffs))[:, :1], 1e-6)
     factor = encode_light(ratio[:, None, None] * decode_light(mean)) / mean
     shift = np.zeros((1, int(gaussians.sh_coeffs.shape[1]), 1))
     shift[:, 0] = 0.5 / SH_C0  # factor (0.5 + SH) = 0.5 + SH of the new coefficients
     scale = from_numpy(mi.TensorXf, np.broadcast_to(factor, gaussians.sh_coeffs.shape))
-    return replace(gaussians, sh_coeffs=gaussians.sh_coeffs * scale + from_numpy(mi.TensorXf, (factor - 1) * shift))
+    return replace(
+        gaussians,
+        sh_coeffs=gaussians.sh_coeffs * scale + from_numpy(mi.TensorXf, (factor - 1) * shift),
+    )
 
 
 class _Receivers:
-    """Centres and orientation of the Gaussians: `flat` is 0 in a round neighbourhood and 1 on a plane."""
+    """Centres and orientation of the Gaussians: `flat` is 0 in a round neighbourhood and 1 on a
+    plane.
+    """
 
     def __init__(self, gaussians: Gaussians, eye: np.ndarray) -> None:
         means: np.ndarray = np.array(dr.detach(gaussians.means), np.float64)
@@ -112,7 +130,8 @@ class _Receivers:
 
 
 def _orientation(gaussians: Gaussians, means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the thinnest direction [N, 3] of the Gaussians around each one, and how flat they are together, [N].
+    """Return the thinnest direction [N, 3] of the Gaussians around each one, and how flat they are
+    together, [N].
 
     Single Gaussians of a fitted surface lie in it, but are not all flat.
     """
@@ -122,21 +141,27 @@ def _orientation(gaussians: Gaussians, means: np.ndarray) -> tuple[np.ndarray, n
     axes = Rotation.from_quat(quats, scalar_first=True).as_matrix() * scales[:, None]
     _, near = KDTree(means).query(means, min(_NEIGHBOURS, len(means)), workers=-1)
     near = near.reshape(len(means), -1)
-    weights = np.array(dr.detach(gaussians.opacities), np.float64)[near] + 1e-9  # an opacity may be 0 in float32
+    # An opacity may be 0 in float32.
+    weights = np.array(dr.detach(gaussians.opacities), np.float64)[near] + 1e-9
     weights /= weights.sum(1, keepdims=True)
     ends = np.arange(0, near.size + 1, near.shape[1])
     mixture = csr_array((weights.ravel(), near.ravel(), ends), shape=(len(means), len(means)))
-    # The covariance of the mixture: the mean of its second moments, minus the second moment of its centre.
+    # The covariance of the mixture: the mean of its second moments, minus the second moment of its
+    # centre.
     centered = means - means.mean(0)
     moments = axes @ axes.transpose(0, 2, 1) + centered[:, :, None] * centered[:, None, :]
     center = mixture @ centered
-    covariance = (mixture @ moments.reshape(-1, 9)).reshape(-1, 3, 3) - center[:, :, None] * center[:, None, :]
+    covariance = (mixture @ moments.reshape(-1, 9)).reshape(-1, 3, 3) - center[:, :, None] * center[
+        :, None, :
+    ]
     variances, directions = np.linalg.eigh(covariance)
     return directions[:, :, 0], 1 - variances[:, 0] / np.maximum(variances[:, 1], 1e-30)
 
 
-def _irradiance(emitter: Any, receivers: _Receivers, blockers: Any, samples: int) -> tuple[Float, Float]:
-    """Return the irradiance of one light that surfaces block, and its irradiance without surfaces."""
+def _irradiance(
+    emitter: Any, receivers: _Receivers, blockers: Any, samples: int
+) -> tuple[Float, Float]:
+    """Return the irradiance of one light that surfaces block, and that without surfaces."""
     far = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
     it = dr.zeros(mi.Interaction3f, dr.width(receivers.centers))
     it.p = receivers.centers

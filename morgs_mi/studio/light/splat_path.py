@@ -1,15 +1,16 @@
-"""The Mitsuba integrator `splat_path`: paths among surfaces, along which the Gaussians emit and absorb light.
+"""The Mitsuba integrator `splat_path`: paths among surfaces, along which the Gaussians emit and
+absorb light.
 
     "integrator": {"type": "gaussian_splat", "surfaces": {"type": "splat_path"}}
 
-The Gaussians on a segment of a path act as one layer. C and T are their blended colour and transmittance, and L is the
-radiance that arrives from behind:
+The Gaussians on a segment of a path act as one layer. C and T are their blended colour and
+transmittance, and L is the radiance that arrives from behind:
 
     (1 - T) dec(C / (1 - T)) + T L
 
-`dec` decodes colours to linear light. The layer is linear in L: estimates of L may be noisy, and lights shine
-through it by the factor T, from whichever side they are found. It is left out between the camera and the first surface:
-there, `gaussian_splat` blends the splats.
+`dec` decodes colours to linear light. The layer is linear in L: estimates of L may be noisy, and
+lights shine through it by the factor T, from whichever side they are found. It is left out between
+the camera and the first surface: there, `gaussian_splat` blends the splats.
 
 Derivatives are computed by path replay (Vicini et al. 2021), with the layers as constants.
 
@@ -30,7 +31,8 @@ from morgs_mi.surfaces.splat_rays import SplatRays
 
 
 class SplatPathIntegrator(RBIntegrator):
-    r"""Path tracer for surfaces among Gaussians (:monosp:`splat_path`), the `surfaces` of a `gaussian_splat`.
+    r"""Path tracer for surfaces among Gaussians (:monosp:`splat_path`), the `surfaces` of a
+    `gaussian_splat`.
 
     .. pluginparameters::
 
@@ -50,19 +52,24 @@ class SplatPathIntegrator(RBIntegrator):
        - |bool|
        - Whether the camera does not see the environment. (Default: False)
 
-    Differentiable in materials and lights. Positions of surfaces, and the Gaussians along paths, get no gradient.
+    Differentiable in materials and lights. Positions of surfaces, and the Gaussians along paths,
+    get no gradient.
     """
 
     def __init__(self, props: Any) -> None:
         super().__init__(props)
         if not mi.is_rgb:
             raise ValueError(
-                f"splat_path: expected a variant such as 'llvm_ad_rgb', got {mi.variant()!r}; call mi.set_variant() "
-                "before the scene is loaded, because Gaussians have RGB colours."
+                f"splat_path: expected a variant such as 'llvm_ad_rgb', got {mi.variant()!r}; "
+                "call mi.set_variant() before the scene is loaded, because Gaussians have RGB "
+                "colours."
             )
         self.clipped = float(props.get("clipped", CLIPPED))
         if not 1 <= self.clipped < float("inf"):
-            raise ValueError(f"splat_path: `clipped` must be a number in [1, inf), got {self.clipped}; set another.")
+            raise ValueError(
+                f"splat_path: `clipped` must be a number in [1, inf), got {self.clipped}; set "
+                "another."
+            )
         self.splats: SplatRays | None = None
         self.srgb = True
 
@@ -80,8 +87,8 @@ class SplatPathIntegrator(RBIntegrator):
         """Return radiance or its derivative, as `ADIntegrator.sample` does."""
         if self.splats is None:
             raise ValueError(
-                "splat_path: expected Gaussians, got none; set it as the `surfaces` of a `gaussian_splat`, which "
-                "passes its own."
+                "splat_path: expected Gaussians, got none; set it as the `surfaces` of a "
+                "`gaussian_splat`, which passes its own."
             )
         primal = mode == dr.ADMode.Primal
         ctx = mi.BSDFContext()
@@ -122,9 +129,13 @@ class SplatPathIntegrator(RBIntegrator):
 
             proceed = active & (depth + 1 < self.max_depth) & si.is_valid()
             with_light = proceed & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-            ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(with_light), True, with_light)
+            ds, weight = scene.sample_emitter_direction(
+                si, sampler.next_2d(with_light), True, with_light
+            )
             with_light &= ds.pdf != 0
-            weight *= self._to_light(si, ds, with_light & (dr.max(mi.unpolarized_spectrum(weight)) > 0))
+            weight *= self._to_light(
+                si, ds, with_light & (dr.max(mi.unpolarized_spectrum(weight)) > 0)
+            )
             wo = si.to_local(ds.d)
             with dr.resume_grad(when=not primal):
                 if not primal:
@@ -135,7 +146,9 @@ class SplatPathIntegrator(RBIntegrator):
 
             # -------------------------- BSDF sampling ---------------------------
 
-            direction_sample, scale = bsdf.sample(ctx, si, sampler.next_1d(proceed), sampler.next_2d(proceed), proceed)
+            direction_sample, scale = bsdf.sample(
+                ctx, si, sampler.next_1d(proceed), sampler.next_2d(proceed), proceed
+            )
             L += sign * dr.detach(Le + Ld)
             with dr.resume_grad(when=not primal):
                 if not primal:
@@ -160,7 +173,19 @@ class SplatPathIntegrator(RBIntegrator):
             β = dr.select(roulette, β * dr.rcp(survival), β)
             delta = mi.has_flag(direction_sample.sampled_type, mi.BSDFFlags.Delta)
             depth = dr.select(si.is_valid(), depth + 1, depth)
-            return proceed, sampler, onwards, depth, L, δL, β, η, dr.detach(si), direction_sample.pdf, delta
+            return (
+                proceed,
+                sampler,
+                onwards,
+                depth,
+                L,
+                δL,
+                β,
+                η,
+                dr.detach(si),
+                direction_sample.pdf,
+                delta,
+            )
 
         state = (
             mi.Bool(active),
@@ -175,7 +200,9 @@ class SplatPathIntegrator(RBIntegrator):
             mi.Float(1),
             mi.Bool(True),
         )
-        end = dr.while_loop(state, lambda active, *_: active, bounce, label=f"splat_path ({mode.name})")
+        end = dr.while_loop(
+            state, lambda active, *_: active, bounce, label=f"splat_path ({mode.name})"
+        )
         depth, L, δL = end[3:6]
         return L if primal else δL, depth != 0, [], L
 

@@ -1,1 +1,3 @@
-"""Live cameras: fits of the newest synchronous images, calibrated once, and frames for a loop of one's own."""
+"""Live cameras: fits of the newest synchronous images, calibrated once, and frames for a loop of
+one's own.
+"""

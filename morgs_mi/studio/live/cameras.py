@@ -1,4 +1,6 @@
-"""Live images of cameras, streams and pipes: a thread for each of them reads all images and stores the newest."""
+"""Live images of cameras, streams and pipes: a thread for each of them reads all images and stores
+the newest.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,8 @@ import numpy as np
 
 from morgs_mi.studio.live.feed import Bundle, Shot, bundled
 
-# Images of a camera from which the one that agrees best with the others is chosen: networks deliver them in bursts.
+# Images of a camera from which the one that agrees best with the others is chosen: networks deliver
+# them in bursts.
 _KEPT = 4
 # Largest skew of a bundle, s: the skew of unsynchronised cameras with one image per second.
 _MAX_SKEW = 0.5
@@ -22,14 +25,15 @@ _CLOSING = 12.0  # longest wait for the threads, s; a connection or a driver may
 class CameraFeed:
     """Live images of cameras that are read side by side; it has the methods of `Feed`.
 
-    Images are bundled by the times of their arrival: the newest one of the slowest camera, and of each other camera the
-    one that is nearest in time.
+    Images are bundled by the times of their arrival: the newest one of the slowest camera, and of
+    each other camera the one that is nearest in time.
 
     Args:
-        cameras: the images of each camera, uint8 [H, W, 3], RGB, by its name, with None where one is missing. Their
-            iterators wait for the next image.
+        cameras: the images of each camera, uint8 [H, W, 3], RGB, by its name, with None where one
+            is missing. Their iterators wait for the next image.
         timeout: seconds to wait for a camera before it is left out.
-        warm_up: seconds that the cameras have, after the first image of the last of them, to adjust their exposure.
+        warm_up: seconds that the cameras have, after the first image of the last of them, to adjust
+            their exposure.
         closed: is set when the feed is closed; an iterator that waits ends then.
         ended: why there are no images any more of a camera that ends without an error.
     """
@@ -47,7 +51,9 @@ class CameraFeed:
         self._warm_up = warm_up
         self._change = Condition()
         self._stop_event = closed or Event()
-        self._cameras = [_Camera(images, self._change, self._stop_event, ended) for images in cameras.values()]
+        self._cameras = [
+            _Camera(images, self._change, self._stop_event, ended) for images in cameras.values()
+        ]
         # A thread that executes library code when the interpreter ends aborts the process.
         atexit.register(self.close)
         for camera in self._cameras:
@@ -62,11 +68,16 @@ class CameraFeed:
             while True:
                 time_left = deadline - time.monotonic()
                 is_running = any(camera.reason is None for camera in self._cameras)
-                new = [camera.newer(after.numbers[k] if after else -1) for k, camera in enumerate(self._cameras)]
+                new = [
+                    camera.newer(after.numbers[k] if after else -1)
+                    for k, camera in enumerate(self._cameras)
+                ]
                 if after is not None and is_running:
                     expected = self._expected(new, after, late=time_left <= 0)
                 else:  # the first images have to be complete, and so have the last ones
-                    expected = [after is None or after.images[k] is not None for k in range(len(new))]
+                    expected = [
+                        after is None or after.images[k] is not None for k in range(len(new))
+                    ]
                 if shots := _nearest(new, expected):
                     times = [shot.time for shot in shots if shot is not None]
                     numbers = [camera.shots[-1].number for camera in self._cameras]
@@ -77,8 +88,9 @@ class CameraFeed:
                     return None
                 else:
                     raise ValueError(
-                        f"CameraFeed(): expected simultaneous images of {', '.join(self.names)}, got none that arrived "
-                        f"within {_MAX_SKEW:g} s of each other; start the cameras together."
+                        f"CameraFeed(): expected simultaneous images of {', '.join(self.names)}, "
+                        f"got none that arrived within {_MAX_SKEW:g} s of each other; start the "
+                        "cameras together."
                     )
 
     def problem(self, camera: int) -> str:
@@ -103,13 +115,15 @@ class CameraFeed:
     def _expected(self, new: Sequence[Sequence[Shot]], bundle: Bundle, late: bool) -> list[bool]:
         """Return for each camera whether the bundle has to have its image.
 
-        A camera that runs is waited for, unless it is late or was missing before; an image of another has to be of the
-        time of the newest.
+        A camera that runs is waited for, unless it is late or was missing before; an image of
+        another has to be of the time of the newest.
         """
         waits = [not late and camera.reason is None for camera in self._cameras]
         return [
             image is not None or bool(shots) if wait else recent
-            for wait, image, shots, recent in zip(waits, bundle.images, new, _simultaneous(new), strict=True)
+            for wait, image, shots, recent in zip(
+                waits, bundle.images, new, _simultaneous(new), strict=True
+            )
         ]
 
     def _wait_for_first(self) -> None:
@@ -126,19 +140,24 @@ class CameraFeed:
                     raise camera.error
                 if camera.reason is not None or time_left <= 0:
                     raise ValueError(
-                        f"CameraFeed(): expected images of {name}, got none ({camera.reason or 'it is silent'}); check "
-                        f"that it records, or wait for it longer than {self._timeout:g} s (--timeout)."
+                        f"CameraFeed(): expected images of {name}, got none "
+                        f"({camera.reason or 'it is silent'}); check that it records, or wait for "
+                        f"it longer than {self._timeout:g} s (--timeout)."
                     )
             self._change.wait(time_left)
         end = time.monotonic() + self._warm_up
-        while (time_left := end - time.monotonic()) > 0 and all(camera.reason is None for camera in self._cameras):
+        while (time_left := end - time.monotonic()) > 0 and all(
+            camera.reason is None for camera in self._cameras
+        ):
             self._change.wait(time_left)
 
 
 class _Camera(Thread):
     """Thread that reads the images of a camera; its state is guarded by `changed`."""
 
-    def __init__(self, images: Iterable[np.ndarray | None], change: Condition, stop: Event, end_text: str) -> None:
+    def __init__(
+        self, images: Iterable[np.ndarray | None], change: Condition, stop: Event, end_text: str
+    ) -> None:
         super().__init__(daemon=True, name="camera")
         self.shots: deque[Shot] = deque(maxlen=_KEPT)
         self.reason: str | None = None  # why there are no images any more
@@ -181,7 +200,9 @@ def _simultaneous(new: Sequence[Sequence[Shot]]) -> list[bool]:
 
 
 def _nearest(new: Sequence[Sequence[Shot]], expected: Sequence[bool]) -> list[Shot | None] | None:
-    """Return a shot of each expected camera, all within `_MAX_SKEW`; None if one has none yet, or none is expected."""
+    """Return a shot of each expected camera, all within `_MAX_SKEW`; None if one has none yet, or
+    none is expected.
+    """
     groups = [shots for shots, is_expected in zip(new, expected, strict=True) if is_expected]
     if not groups or not all(groups):
         return None
@@ -198,4 +219,8 @@ def _dropped(shots: Sequence[Shot | None], bundle: Bundle | None) -> int:
     """Return the number of images that each camera delivered between two bundles."""
     if bundle is None:
         return 0
-    return min(shot.number - last - 1 for shot, last in zip(shots, bundle.numbers, strict=True) if shot is not None)
+    return min(
+        shot.number - last - 1
+        for shot, last in zip(shots, bundle.numbers, strict=True)
+        if shot is not None
+    )

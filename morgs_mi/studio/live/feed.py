@@ -22,11 +22,14 @@ class Shot:
 class Bundle:
     """Images of the cameras at about one time."""
 
-    images: tuple[np.ndarray | None, ...]  #: Per camera uint8 [H, W, 3], RGB, None where it has none.
-    numbers: tuple[int, ...]  #: Per camera the number of its image, or of its newest one before where it has none.
+    #: Per camera uint8 [H, W, 3], RGB, None where it has none.
+    images: tuple[np.ndarray | None, ...]
+    #: Per camera the number of its image, or of its newest one before where it has none.
+    numbers: tuple[int, ...]
     time: float  #: At which the last of the images arrived, s of `time.monotonic`.
     skew: float  #: Largest difference in time between two of the images, s.
-    dropped: int  #: Number of images that each camera delivered after the bundle before and that are in none.
+    #: Number of images that each camera delivered after the bundle before and that are in none.
+    dropped: int
 
 
 class Feed(Protocol):
@@ -46,7 +49,8 @@ class Feed(Protocol):
             after: the bundle before; all images of the new one are newer.
 
         Raises:
-            OSError, ValueError: a camera cannot be opened, or has no first image; the folder of the images was removed.
+            OSError, ValueError: a camera cannot be opened, or has no first image; the folder of the
+                images was removed.
         """
         ...
 
@@ -63,7 +67,9 @@ class Feed(Protocol):
         ...
 
 
-def bundled(shots: Sequence[Shot | None], numbers: Sequence[int], skew: float, dropped: int = 0) -> Bundle:
+def bundled(
+    shots: Sequence[Shot | None], numbers: Sequence[int], skew: float, dropped: int = 0
+) -> Bundle:
     """Return the bundle of at least one shot.
 
     Args:

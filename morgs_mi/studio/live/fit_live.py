@@ -1,7 +1,8 @@
-"""The loop on live cameras: whenever it is ready, it fits the newest images; those between are dropped.
+"""The loop on live cameras: whenever it is ready, it fits the newest images; those between are
+dropped.
 
-The frames of the stream are numbered in succession, since the loop and its stream know no others; the report has the
-time of each.
+The frames of the stream are numbered in succession, since the loop and its stream know no others;
+the report has the time of each.
 """
 
 from __future__ import annotations
@@ -57,7 +58,8 @@ def fit_live(
 ) -> list[LiveFrame]:
     """Fit live cameras into OUT/stream.morgs until they end, or until Ctrl-C after the first frame.
 
-    OUT/capture has the calibration and the images that were fitted, OUT/report.json the frames with their times.
+    OUT/capture has the calibration and the images that were fitted, OUT/report.json the frames with
+    their times.
 
     Args:
         sources: the cameras, see `open_feed`.
@@ -72,10 +74,10 @@ def fit_live(
 
     Raises:
         FileExistsError: OUT has the capture of an earlier fit.
-        OSError: a source cannot be opened, the folder of the images is removed, or the output cannot be written; the
-            stream ends with a complete frame.
-        ValueError: a setting is out of range, a camera has no first image, or the cameras cannot be calibrated or do
-            not have the calibrated sizes.
+        OSError: a source cannot be opened, the folder of the images is removed, or the output
+            cannot be written; the stream ends with a complete frame.
+        ValueError: a setting is out of range, a camera has no first image, or the cameras cannot be
+            calibrated or do not have the calibrated sizes.
     """
     out = Path(out)
     live = live or LiveConfig()
@@ -83,10 +85,13 @@ def fit_live(
     check_outputs(out)
     if (out / "capture").exists():
         raise FileExistsError(
-            f"{out / 'capture'}: expected no capture, got that of an earlier fit; choose another folder for this one."
+            f"{out / 'capture'}: expected no capture, got that of an earlier fit; choose another "
+            "folder for this one."
         )
     _check_outside(out, sources)
-    calibration = live.calibration and read_calibration(live.calibration).without(live.calibration, live.without)
+    calibration = live.calibration and read_calibration(live.calibration).without(
+        live.calibration, live.without
+    )
     names = calibration and [camera.name for camera in calibration.cameras]
     report = on_stage or (lambda *_: None)
     with locked_folder(out, "fit_live()"), closing(open_feed(sources, live, names)) as feed:
@@ -95,8 +100,12 @@ def fit_live(
         if first is None:
             raise ValueError("fit_live(): expected images of the cameras, got none.")
         report("Waiting for the cameras", 1, 1)
-        capture = begin_capture(out / "capture", feed.names, first.images, live, calibration, on_stage)
-        return _fit(_LiveFrames(feed, capture, first, live), out, config or LIVE_STREAM, on_frame, report)
+        capture = begin_capture(
+            out / "capture", feed.names, first.images, live, calibration, on_stage
+        )
+        return _fit(
+            _LiveFrames(feed, capture, first, live), out, config or LIVE_STREAM, on_frame, report
+        )
 
 
 def _check_outside(out: Path, sources: Sequence[Source]) -> None:
@@ -108,8 +117,8 @@ def _check_outside(out: Path, sources: Sequence[Source]) -> None:
     for folder in (Path(source) for source in sources if isinstance(source, str | Path)):
         if folder.is_dir() and out.resolve().is_relative_to(folder.resolve()):
             raise ValueError(
-                f"{out}: expected a folder outside of {folder}, into which another program writes images; choose a "
-                "different one."
+                f"{out}: expected a folder outside of {folder}, into which another program writes "
+                "images; choose a different one."
             )
 
 
@@ -131,7 +140,9 @@ class _LiveFrames:
         self._missing_names: set[str] = set()
 
     def __iter__(self) -> Iterator[tuple[Bundle, PartialFrame]]:
-        """Yield whenever the next frame is asked for the newest images, as recorded and as processed."""
+        """Yield whenever the next frame is asked for the newest images, as recorded and as
+        processed.
+        """
         bundle = self._first
         frame = 0
         begin = float("inf")
@@ -164,7 +175,9 @@ class _LiveFrames:
             return None if image is None or view in problems else self.capture.process(view, image)
 
         images = map_in_threads(process, range(len(bundle.images)))
-        return PartialFrame(frame, tuple(images), tuple(f"{name}: {problem}" for name, problem in names.items()))
+        return PartialFrame(
+            frame, tuple(images), tuple(f"{name}: {problem}" for name, problem in names.items())
+        )
 
     def _problem(self, view: int, image: np.ndarray | None) -> str:
         """Return why a camera has no image, or none of its size; empty if it has one."""
@@ -172,7 +185,11 @@ class _LiveFrames:
             return self._feed.problem(view)
         size = image.shape[1::-1]
         recorded_size = self.capture.recorded_sizes[view]
-        return "" if size == recorded_size else "expected an image of {}x{}, got {}x{}".format(*recorded_size, *size)
+        return (
+            ""
+            if size == recorded_size
+            else "expected an image of {}x{}, got {}x{}".format(*recorded_size, *size)
+        )
 
 
 def _fit(
@@ -195,7 +212,9 @@ def _fit(
         try:
             for bundle, frame in frames:
                 writing_task = in_background(partial(_record, frames, out, bundle, frame))
-                packet, report = push_frame(loop, frame, train, None if rows else on_stage, None, recording.show)
+                packet, report = push_frame(
+                    loop, frame, train, None if rows else on_stage, None, recording.show
+                )
                 report = prepared.completed(report, loop.gaussians, frame, config)
                 writing_task.result()
                 row = frames.report(bundle, frame)
@@ -215,7 +234,10 @@ def _fit(
 
 
 def _record(frames: _LiveFrames, out: Path, bundle: Bundle, frame: PartialFrame) -> None:
-    """Write the recorded images of a frame into the capture; the first frame's are there already."""
+    """Write the recorded images of a frame into the capture, which has the first frame's."""
     if frames.config.record and frame.index:
-        images = [None if result is None else image for image, result in zip(bundle.images, frame.images, strict=True)]
+        images = [
+            None if result is None else image
+            for image, result in zip(bundle.images, frame.images, strict=True)
+        ]
         write_images(out / "capture", frames.capture.names, images, frame.index)

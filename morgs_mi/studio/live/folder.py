@@ -20,12 +20,14 @@ from morgs_mi.studio.live.feed import Bundle, Shot, bundled
 
 _LOG = logging.getLogger(__name__)
 _POLL = 0.05  # s
-# Pause after which the numbers may begin again, s: images of several cameras are written in any order until then.
+# Pause after which the numbers may begin again, s: images of several cameras are written in any
+# order until then.
 PAUSE = 1.0
-# Numbers per second that grow faster than this do not count images; they are times, or one is far ahead.
+# Numbers per second that grow faster than this do not count images; they are times, or one is far
+# ahead.
 _MAX_RATE = 1000
-# Suffixes of the images, whose last bytes show that the file is complete; what these bytes contain, and how many they
-# are: cameras may add a few bytes behind an image.
+# Suffixes of the images, whose last bytes show that the file is complete; what these bytes contain,
+# and how many they are: cameras may add a few bytes behind an image.
 _SUFFIXES = (".png", ".jpg", ".jpeg")
 _ENDS = (b"IEND\xaeB`\x82", b"\xff\xd9")
 _TAIL = 64
@@ -36,8 +38,8 @@ class _Images:
     """Images of a camera."""
 
     files: Mapping[int, Path]  # by number
-    # time by which `time.monotonic` is ahead of the times of the files, s: the program that writes them may run on a
-    # machine with another clock
+    # time by which `time.monotonic` is ahead of the times of the files, s: the program that writes
+    # them may run on a machine with another clock
     lead: float = 0.0
 
     def arrival(self, number: int) -> float:
@@ -46,7 +48,9 @@ class _Images:
 
     def since(self, begin: float) -> _Images:
         """Return the images that did not arrive before `begin`, s of `time.monotonic`."""
-        return replace(self, files={n: file for n, file in self.files.items() if self.arrival(n) >= begin})
+        return replace(
+            self, files={n: file for n, file in self.files.items() if self.arrival(n) >= begin}
+        )
 
 
 _Found = Mapping[str, _Images]
@@ -56,14 +60,15 @@ _NONE = _Images({})
 class FolderFeed:
     """Live images in a folder that another program fills; it has the methods of `Feed`.
 
-    Images with one number are of one time, and an image that is not complete yet is not read. Newer images have larger
-    numbers. If none come, images that were written `PAUSE` after the last bundle are newer, too: the program may count
-    from 0 again, or one number was far ahead.
+    Images with one number are of one time, and an image that is not complete yet is not read. Newer
+    images have larger numbers. If none come, images that were written `PAUSE` after the last bundle
+    are newer, too: the program may count from 0 again, or one number was far ahead.
 
     Args:
         folder: with one folder of images per camera.
         timeout: seconds to wait for a camera before it is left out.
-        names: names of the cameras; by default the names of the folders that have images when the second number begins.
+        names: names of the cameras; by default the names of the folders that have images when the
+            second number begins.
 
     Raises:
         FileNotFoundError: there is no such folder.
@@ -71,7 +76,9 @@ class FolderFeed:
 
     def __init__(self, folder: Path, timeout: float, names: Sequence[str] | None = None) -> None:
         if not folder.is_dir():
-            raise FileNotFoundError(f"{folder}: expected a folder with the images of the cameras, found none.")
+            raise FileNotFoundError(
+                f"{folder}: expected a folder with the images of the cameras, found none."
+            )
         self.names = tuple(names or ())
         self._folder = folder
         self._timeout = timeout
@@ -79,8 +86,8 @@ class FolderFeed:
         self._leads: dict[str, float] = {}
         # When the last bundle was returned, s of `time.monotonic`.
         self._return_time = time.monotonic()
-        # By camera, when the images of the last bundle were written, and those before the ones that are counted
-        # together with it, s of their files.
+        # By camera, when the images of the last bundle were written, and those before the ones that
+        # are counted together with it, s of their files.
         self._write_times: dict[str, float] = {}
         self._old_write_times: dict[str, float] = {}
 
@@ -94,7 +101,9 @@ class FolderFeed:
             late = current_time - start >= self._timeout
             has_paused = current_time >= pause_end or late
             for images in self._newer(after, has_paused):
-                bundle = self._first(images, late) if after is None else self._next(images, after, late)
+                bundle = (
+                    self._first(images, late) if after is None else self._next(images, after, late)
+                )
                 if bundle is not None:
                     self._take(images, max(bundle.numbers), after)
                     # Images that are not waited for may have been there for longer.
@@ -117,7 +126,9 @@ class FolderFeed:
         """Do nothing: no file is open."""
 
     def _newer(self, bundle: Bundle | None, has_paused: bool) -> Iterator[_Found]:
-        """Yield the images with larger numbers than a bundle; after a pause also all that were written since."""
+        """Yield the images with larger numbers than a bundle; after a pause also all that were
+        written since.
+        """
         yield self._found(-1 if bundle is None else max(bundle.numbers), self._old_write_times)
         if has_paused and bundle is not None:
             yield self._found(-1, self._write_times)
@@ -128,10 +139,18 @@ class FolderFeed:
         common = _common(by_name, names)
         if not self.names and not late:
             # Which cameras there are is known when the next number begins.
-            common -= {max(number for images in by_name.values() for number in images.files)} if by_name else set()
+            common -= (
+                {max(number for images in by_name.values() for number in images.files)}
+                if by_name
+                else set()
+            )
         bundle = _bundle([by_name.get(name, _NONE) for name in names], common)
         if bundle is not None:
-            if not self.names and not late and set(self._found(-1, self._old_write_times)) - set(names):
+            if (
+                not self.names
+                and not late
+                and set(self._found(-1, self._old_write_times)) - set(names)
+            ):
                 # The first image of a camera came while the folders were read.
                 return None
             if silent := [name for name in self._cameras() if name not in names and not self.names]:
@@ -140,15 +159,21 @@ class FolderFeed:
         return bundle
 
     def _next(self, by_name: _Found, last_bundle: Bundle, late: bool) -> Bundle | None:
-        """Return the newest bundle of the cameras that are expected; if it is late, of those that have an image."""
+        """Return the newest bundle of the cameras that are expected; if it is late, of those that
+        have an image.
+        """
         cameras = [by_name.get(name, _NONE) for name in self.names]
         pairs = zip(cameras, last_bundle.images, strict=True)
-        numbers = [set(camera.files) for camera, image in pairs if camera.files or image is not None]
+        numbers = [
+            set(camera.files) for camera, image in pairs if camera.files or image is not None
+        ]
         if late:
             return _bundle(cameras, set.union(*numbers), last_bundle, partial=True)
         bundle = _bundle(cameras, set.intersection(*numbers), last_bundle)
         # A camera that has stopped during a fit has images that the others had, too, but long ago.
-        newest = max((camera.arrival(max(camera.files)) for camera in cameras if camera.files), default=0.0)
+        newest = max(
+            (camera.arrival(max(camera.files)) for camera in cameras if camera.files), default=0.0
+        )
         return bundle if bundle is not None and newest - bundle.time <= self._timeout else None
 
     def _take(self, by_name: _Found, number: int, last_bundle: Bundle | None) -> None:
@@ -157,11 +182,13 @@ class FolderFeed:
             if not self._old_write_times:
                 _LOG.warning("%s: the numbers go on with %d after %d", self._folder, number, last)
             self._old_write_times = self._write_times
-        images = {name: images.files[number] for name, images in by_name.items() if number in images.files}
+        images = {
+            name: images.files[number] for name, images in by_name.items() if number in images.files
+        }
         self._write_times = {name: _written(file) for name, file in images.items()}
 
     def _arrived(self, bundle: Bundle, begin: float) -> Bundle:
-        """Return a bundle that was not there at the time `begin`, whatever the clock of its files."""
+        """Return a bundle that was not there at the time `begin`, by whatever clock."""
         self._return_time = time.monotonic()
         return replace(bundle, time=min(max(bundle.time, begin), self._return_time))
 
@@ -173,12 +200,15 @@ class FolderFeed:
             ValueError: there was no bundle.
         """
         if not self._folder.is_dir():
-            raise FileNotFoundError(f"{self._folder}: expected the images of the cameras, but the folder was removed.")
+            raise FileNotFoundError(
+                f"{self._folder}: expected the images of the cameras, but the folder was removed."
+            )
         if last_bundle is None:
             raise ValueError(
-                f"{self._folder}: expected images of {', '.join(self.names) or 'the cameras'} that have the same "
-                f"number, such as CAM/0000.png, found folders called {', '.join(self._cameras()) or 'nothing'}"
-                f"{self._lack()}; check the path and the names, or wait longer than {self._timeout:g} s (--timeout)."
+                f"{self._folder}: expected images of {', '.join(self.names) or 'the cameras'} "
+                "that have the same number, such as CAM/0000.png, found folders called "
+                f"{', '.join(self._cameras()) or 'nothing'}{self._lack()}; check the path and the "
+                f"names, or wait longer than {self._timeout:g} s (--timeout)."
             )
 
     def _lack(self) -> str:
@@ -190,16 +220,19 @@ class FolderFeed:
         if common := _common(by_name, names):
             incomplete = [name for name in names if _shot(by_name[name], max(common)) is None]
             return f", but no complete image {max(common)} of {', '.join(incomplete)}"
-        numbers = ", ".join(f"{min(i.files)} to {max(i.files)} of {name}" for name, i in by_name.items())
+        numbers = ", ".join(
+            f"{min(i.files)} to {max(i.files)} of {name}" for name, i in by_name.items()
+        )
         return f", with {numbers}" if numbers else ""
 
     def _found(self, limit: int, write_times: Mapping[str, float]) -> dict[str, _Images]:
-        """Return the images of each camera with numbers larger than `limit`, without images of the time of others.
+        """Return the images of each camera with numbers larger than `limit`, without images of the
+        time of others.
 
         Args:
             limit: number.
-            write_times: by camera, when an image was written, s of the file; images written up to `PAUSE` later are of
-                the same time. Empty: no image is left out.
+            write_times: by camera, when an image was written, s of the file; images written up to
+                `PAUSE` later are of the same time. Empty: no image is left out.
         """
         by_name = {}
         for name in self.names or self._cameras():
@@ -208,7 +241,9 @@ class FolderFeed:
                 by_name[name] = _Images(files, self._leads.get(name, 0.0))
         if not write_times:
             return by_name
-        begin = PAUSE + max(write_time + self._leads.get(name, 0.0) for name, write_time in write_times.items())
+        begin = PAUSE + max(
+            write_time + self._leads.get(name, 0.0) for name, write_time in write_times.items()
+        )
         by_name = {name: images.since(begin) for name, images in by_name.items()}
         return {name: images for name, images in by_name.items() if images.files}
 
@@ -231,19 +266,34 @@ class FolderFeed:
 
 def _common(by_name: _Found, names: Sequence[str]) -> set[int]:
     """Return the numbers that all cameras have."""
-    return set.intersection(*(set(by_name.get(name, _NONE).files) for name in names)) if names else set()
+    return (
+        set.intersection(*(set(by_name.get(name, _NONE).files) for name in names))
+        if names
+        else set()
+    )
 
 
 def _bundle(
-    cameras: Sequence[_Images], numbers: Collection[int], last_bundle: Bundle | None = None, partial: bool = False
+    cameras: Sequence[_Images],
+    numbers: Collection[int],
+    last_bundle: Bundle | None = None,
+    partial: bool = False,
 ) -> Bundle | None:
-    """Return the bundle of the largest of `numbers` of which every file is complete; `partial`: or at least one."""
+    """Return the bundle of the largest of `numbers` of which every file is complete; `partial`: or
+    at least one.
+    """
     for number in sorted(numbers, reverse=True):
         shots = [_shot(images, number) for images in cameras]
-        complete = all(shot or number not in images.files for shot, images in zip(shots, cameras, strict=True))
+        complete = all(
+            shot or number not in images.files for shot, images in zip(shots, cameras, strict=True)
+        )
         if complete or (partial and any(shots)):
             bundle = bundled(shots, [number] * len(shots), 0.0)
-            return bundle if last_bundle is None else replace(bundle, dropped=_dropped(cameras, bundle, last_bundle))
+            return (
+                bundle
+                if last_bundle is None
+                else replace(bundle, dropped=_dropped(cameras, bundle, last_bundle))
+            )
     return None
 
 
@@ -254,7 +304,9 @@ def _dropped(cameras: Sequence[_Images], bundle: Bundle, last_bundle: Bundle) ->
     if 0 <= count <= _MAX_RATE * (1 + bundle.time - last_bundle.time):
         return count
     pairs = zip(cameras, bundle.images, strict=True)
-    return min(sum(n < number for n in images.files) for images, image in pairs if image is not None)
+    return min(
+        sum(n < number for n in images.files) for images, image in pairs if image is not None
+    )
 
 
 def files_of_camera(folder: Path, limit: int) -> dict[int, Path]:

@@ -35,7 +35,9 @@ def read_calibration(folder: Path) -> Calibration:
         FileNotFoundError, ValueError: it is missing or broken.
     """
     if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: expected a calibrated capture of the cameras, found none; check the path.")
+        raise FileNotFoundError(
+            f"{folder}: expected a calibrated capture of the cameras, found none; check the path."
+        )
     calibration = find_layout(folder).read(folder)
     if any(calibration.masks):
         _LOG.warning("%s: its masks are not used by a live fit.", folder)
@@ -50,7 +52,8 @@ def begin_capture(
     calibration: Calibration | None = None,
     on_stage: Report | None = None,
 ) -> Capture:
-    """Write the first images and the calibration of live cameras, and return the capture, which has one frame.
+    """Write the first images and the calibration of live cameras, and return the capture, which has
+    one frame.
 
     Args:
         folder: is made, and must not exist.
@@ -62,7 +65,8 @@ def begin_capture(
 
     Raises:
         OSError: the disk is full or not writable.
-        ValueError: the cameras cannot be calibrated, or the images do not have the calibrated sizes.
+        ValueError: the cameras cannot be calibrated, or the images do not have the calibrated
+            sizes.
     """
     try:
         write_images(folder, names, images, 0)
@@ -71,7 +75,13 @@ def begin_capture(
             _calibrate(folder, on_stage)
         else:
             model = folder / "sparse" / "0"
-            write_colmap(model, calibration.cameras, calibration.points, calibration.point_colors, calibration.lenses)
+            write_colmap(
+                model,
+                calibration.cameras,
+                calibration.points,
+                calibration.point_colors,
+                calibration.lenses,
+            )
         return _opened(folder, config)
     except (OSError, ValueError) as error:
         # The fit can be started again; images that cannot be calibrated stay.
@@ -80,7 +90,9 @@ def begin_capture(
         raise
 
 
-def write_images(folder: Path, names: Sequence[str], images: Sequence[np.ndarray | None], frame: int) -> None:
+def write_images(
+    folder: Path, names: Sequence[str], images: Sequence[np.ndarray | None], frame: int
+) -> None:
     """Write the images of a frame into a capture, side by side.
 
     Raises:
@@ -103,12 +115,14 @@ def _calibrate(folder: Path, on_stage: Report | None) -> None:
         calibrate(folder, progress=on_stage)
     except ValueError as error:
         error.add_note(
-            f"The images are in {folder}: calibrate them with morgs-mi calibrate, which has more options, and pass "
-            "that folder with --calibration."
+            f"The images are in {folder}: calibrate them with morgs-mi calibrate, which has more "
+            "options, and pass that folder with --calibration."
         )
         raise
 
 
 def _opened(folder: Path, config: LiveConfig) -> Capture:
     # A camera may stop: later frames are read without its images.
-    return load_capture(folder, config.downscale, config.test_view or None, reading=ReadConfig(gaps=True))
+    return load_capture(
+        folder, config.downscale, config.test_view or None, reading=ReadConfig(gaps=True)
+    )

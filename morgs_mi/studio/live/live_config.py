@@ -11,8 +11,8 @@ from morgs_mi.core.ranges import Above, AtLeast, check_ranges
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
 
-# Default settings of the loop. Dropped frames cost more than the last epochs of a frame gain, and nothing should move
-# during the first frame.
+# Default settings of the loop. Dropped frames cost more than the last epochs of a frame gain, and
+# nothing should move during the first frame.
 LIVE_STREAM = StreamConfig(fit=FitConfig(epochs=2, first_frame_seconds=30.0))
 # Frame rates of streams, and times for which a thread can wait.
 _FPS = "[1e-6, 1e6]"
@@ -24,7 +24,9 @@ class LiveConfig:
     """Settings of a live fit, besides the loop's."""
 
     calibration: Path | None = None
-    """Folder of a calibrated capture of the same cameras; by default they are calibrated by their first images."""
+    """Folder of a calibrated capture of the same cameras; by default they are calibrated by their
+    first images.
+    """
     without: tuple[str, ...] = ()
     """Calibrated cameras that are left out, by name."""
     downscale: Annotated[float, AtLeast(1)] = 1
@@ -42,11 +44,15 @@ class LiveConfig:
     timeout: Annotated[float, Above(0)] = 10
     """Seconds to wait for a camera before it is left out."""
     warm_up: Annotated[float, AtLeast(0)] = 1
-    """Seconds in which the cameras adjust their exposure before the first images are taken; not of files."""
+    """Seconds in which the cameras adjust their exposure before the first images are taken; not of
+    files.
+    """
     loop: bool = False
     """Repeat videos until the fit is ended; by default they are played once."""
     size: tuple[int, int] | None = None
-    """Width and height of the images that cameras of this machine are asked for; by default they choose."""
+    """Width and height of the images that cameras of this machine are asked for; by default they
+    choose.
+    """
 
     def check(self, place: str) -> None:
         """Check the settings; an error's sentence begins with `place`.
@@ -56,8 +62,9 @@ class LiveConfig:
         """
         if self.without and self.calibration is None:
             raise ValueError(
-                f"{place}: `without` must name cameras of a calibration, got {', '.join(self.without)} and no "
-                "calibration; name the sources that are used (--camera)."
+                f"{place}: `without` must name cameras of a calibration, got "
+                f"{', '.join(self.without)} and no calibration; name the sources that are used "
+                "(--camera)."
             )
         check_ranges(self, place)
         check_number(place, "fps", self.fps, _FPS)

@@ -4,8 +4,8 @@ A source yields the images of one camera, at the size of its recorded clip:
 
 - an int: a camera of this machine, by OpenCV's index;
 - a path or URL: anything that FFmpeg opens, e.g. a named pipe, ``/dev/video0`` or ``rtsp://...``;
-- a binary file, e.g. the end of a pipe: raw RGB images, 8 bits per channel
-  (``ffmpeg ... -f rawvideo -pix_fmt rgb24 -``);
+- a binary file, e.g. the end of a pipe: raw RGB images, 8 bits per channel (``ffmpeg ... -f
+  rawvideo -pix_fmt rgb24 -``);
 - an iterable of arrays uint8 [H, W, 3], RGB, with None for a missed instant.
 """
 
@@ -27,28 +27,36 @@ from morgs_mi.studio.live.reading import raw_images, read_camera
 Source = int | str | Path | BinaryIO | Iterable[np.ndarray | None]
 
 
-def live_frames(rig: Capture, sources: Sequence[Source], newest: bool = False) -> Iterator[PartialFrame]:
-    """Yield the frames of live sources, undistorted, downscaled and colour-corrected like those of `rig`.
+def live_frames(
+    rig: Capture, sources: Sequence[Source], newest: bool = False
+) -> Iterator[PartialFrame]:
+    """Yield the frames of live sources, undistorted, downscaled and colour-corrected like those of
+    `rig`.
 
-    A background thread reads one image of each source in turn; the cameras must be synchronised. A source that fails
-    or ends is left out. The frames end when no source yields an image any more.
+    A background thread reads one image of each source in turn; the cameras must be synchronised. A
+    source that fails or ends is left out. The frames end when no source yields an image any more.
 
     Args:
         rig: a capture of the same cameras.
         sources: one per camera of the rig.
-        newest: whether to drop all but the newest of the frames that arrive while one is being processed.
+        newest: whether to drop all but the newest of the frames that arrive while one is being
+            processed.
 
     Raises:
         OSError: a source cannot be opened.
-        ValueError: the number of sources differs from the number of cameras, or an image from the size of the rig's.
+        ValueError: the number of sources differs from the number of cameras, or an image from the
+            size of the rig's.
     """
     if len(sources) != len(rig.cameras):
         raise ValueError(
-            f"live_frames(): `sources` must be one for each of {len(rig.cameras)} cameras ({', '.join(rig.names)}), "
-            f"got {len(sources)}."
+            f"live_frames(): `sources` must be one for each of {len(rig.cameras)} cameras "
+            f"({', '.join(rig.names)}), got {len(sources)}."
         )
     stop = Event()
-    streams = [_images(source, *size, stop) for source, size in zip(sources, rig.recorded_sizes, strict=True)]
+    streams = [
+        _images(source, *size, stop)
+        for source, size in zip(sources, rig.recorded_sizes, strict=True)
+    ]
     return prefetched(_frames(rig, streams), newest=newest, closed=stop)
 
 
@@ -58,10 +66,17 @@ def _frames(rig: Capture, streams: Sequence[Iterator[np.ndarray | None]]) -> Ite
             images = [next(stream, None) for stream in streams]
             if all(image is None for image in images):
                 return
-            problems = [f"{n}: no image" for n, image in zip(rig.names, images, strict=True) if image is None]
+            problems = [
+                f"{n}: no image"
+                for n, image in zip(rig.names, images, strict=True)
+                if image is None
+            ]
             for view, image in enumerate(images):
                 _check_size(rig, view, image)
-            processed = [None if image is None else rig.process(view, image) for view, image in enumerate(images)]
+            processed = [
+                None if image is None else rig.process(view, image)
+                for view, image in enumerate(images)
+            ]
             yield PartialFrame(index, tuple(processed), tuple(problems))
     finally:
         for stream in streams:
@@ -73,8 +88,8 @@ def _check_size(rig: Capture, view: int, image: np.ndarray | None) -> None:
     width, height = rig.recorded_sizes[view]
     if image is not None and (image.shape != (height, width, 3) or image.dtype != np.uint8):
         raise ValueError(
-            f"live_frames(): the images of {rig.names[view]} must be uint8 [{height}, {width}, 3] as in its clip, "
-            f"got {image.dtype} {list(image.shape)}; calibrate at the live size."
+            f"live_frames(): the images of {rig.names[view]} must be uint8 [{height}, {width}, 3] "
+            f"as in its clip, got {image.dtype} {list(image.shape)}; calibrate at the live size."
         )
 
 

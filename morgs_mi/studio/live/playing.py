@@ -21,19 +21,26 @@ _DESCRIPTIONS = (".sdp", ".m3u8")  # files that name streams
 
 def is_video(source: object) -> TypeGuard[str | Path]:
     """Return whether a source is a video file."""
-    return isinstance(source, str | Path) and Path(source).is_file() and Path(source).suffix not in _DESCRIPTIONS
+    return (
+        isinstance(source, str | Path)
+        and Path(source).is_file()
+        and Path(source).suffix not in _DESCRIPTIONS
+    )
 
 
 class ClipClock:
-    """Common clock of clips that are played at their own speed, or slower if they cannot be decoded in time.
+    """Common clock of clips that are played at their own speed, or slower if they cannot be decoded
+    in time.
 
-    A clip waits until the others have reached its time, as otherwise the ones that are decoded faster would run ahead.
+    A clip waits until the others have reached its time, as otherwise the ones that are decoded
+    faster would run ahead.
 
     Args:
         clips: their number.
 
     Attributes:
-        length: time after which the clips are repeated, s: the length of the shortest one, once it has ended.
+        length: time after which the clips are repeated, s: the length of the shortest one, once it
+            has ended.
     """
 
     def __init__(self, clips: int = 1) -> None:
@@ -56,7 +63,8 @@ class ClipClock:
             self._change.notify_all()
             while min(self._times) < due - interval / 2 and not closed.is_set():
                 self._change.wait(_POLL)
-            self._start = max(self._start, time.monotonic() - due)  # a late clip does not hurry afterwards
+            # A late clip does not hurry afterwards.
+            self._start = max(self._start, time.monotonic() - due)
             time_left = self._start + due - time.monotonic()
         closed.wait(max(0.0, time_left))
 
@@ -67,7 +75,9 @@ class ClipClock:
             self._change.notify_all()
 
 
-def play(path: str | Path, clock: ClipClock, closed: Event, clip: int = 0, loop: bool = False) -> Iterator[np.ndarray]:
+def play(
+    path: str | Path, clock: ClipClock, closed: Event, clip: int = 0, loop: bool = False
+) -> Iterator[np.ndarray]:
     """Yield the images of a video, RGB uint8 [H, W, 3], at their times.
 
     Args:
@@ -94,7 +104,10 @@ def play(path: str | Path, clock: ClipClock, closed: Event, clip: int = 0, loop:
                 end = at + interval
             else:  # it has ended, before the others
                 if not end:
-                    raise OSError(f"play(): expected images in {path}, found none; check that it is a whole video.")
+                    raise OSError(
+                        f"play(): expected images in {path}, found none; check that it is a whole "
+                        "video."
+                    )
                 if not loop:
                     return
                 clock.length = min(clock.length, end)
@@ -104,7 +117,9 @@ def play(path: str | Path, clock: ClipClock, closed: Event, clip: int = 0, loop:
 
 
 def timed_images(path: str | Path) -> Iterator[tuple[np.ndarray, float, float]]:
-    """Yield the images of a video, BGR, with their times from its beginning and the time between two of them, s."""
+    """Yield the images of a video, BGR, with their times from its beginning and the time between
+    two of them, s.
+    """
     stream = open_stream(str(path), path)
     try:
         interval = 1 / (stream.get(cv2.CAP_PROP_FPS) or _RATE)

@@ -19,17 +19,23 @@ import numpy as np
 _FAILURES = 10
 PAUSE = 0.02
 RETRY = 1.0  # pause before a connection is opened again, s
-# Longest wait of FFmpeg for a connection or its next bytes, s; some streams come in parts of a few seconds.
+# Longest wait of FFmpeg for a connection or its next bytes, s; some streams come in parts of a few
+# seconds.
 _SILENCE = 10.0
-# Silence after which the reader of a pipe looks whether it is to end, s, and how many bytes it copies at most.
+# Silence after which the reader of a pipe looks whether it is to end, s, and how many bytes it
+# copies at most.
 _POLL = 0.3
 _CHUNK = 1 << 20
 
 
 def read_camera(
-    source: int | str | Path, closed: Event, size: tuple[int, int] | None = None, reconnect: bool = True
+    source: int | str | Path,
+    closed: Event,
+    size: tuple[int, int] | None = None,
+    reconnect: bool = True,
 ) -> Iterator[np.ndarray | None]:
-    """Yield the images of a source, RGB uint8 [H, W, 3], as they arrive, with None where a read has failed.
+    """Yield the images of a source, RGB uint8 [H, W, 3], as they arrive, with None where a read has
+    failed.
 
     Args:
         source: a camera of this machine, by OpenCV's index; or a path or URL that FFmpeg opens.
@@ -47,7 +53,9 @@ def read_camera(
             yield from _until_end(source, closed, size)
 
 
-def _until_end(source: int | str | Path, stop: Event, size: tuple[int, int] | None) -> Iterator[np.ndarray | None]:
+def _until_end(
+    source: int | str | Path, stop: Event, size: tuple[int, int] | None
+) -> Iterator[np.ndarray | None]:
     """Yield the images of a source, which is opened once; see `read_camera`."""
     with _place(source, stop) as place:
         if stop.is_set():
@@ -77,10 +85,19 @@ def open_stream(place: int | str, source: int | str | Path) -> cv2.VideoCapture:
     if isinstance(place, int):
         stream = cv2.VideoCapture(place)
     else:
-        limits = (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC) if "://" in place else ()
-        stream = cv2.VideoCapture(place, cv2.CAP_FFMPEG, [n for key in limits for n in (key, int(1000 * _SILENCE))])
+        limits = (
+            (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC)
+            if "://" in place
+            else ()
+        )
+        stream = cv2.VideoCapture(
+            place, cv2.CAP_FFMPEG, [n for key in limits for n in (key, int(1000 * _SILENCE))]
+        )
     if not stream.isOpened():
-        raise OSError(f"open_stream(): cannot open the source {source}; check that it exists and is not in use.")
+        raise OSError(
+            f"open_stream(): cannot open the source {source}; check that it exists and is not in "
+            "use."
+        )
     return stream
 
 
@@ -88,18 +105,23 @@ def open_stream(place: int | str, source: int | str | Path) -> cv2.VideoCapture:
 def _place(source: int | str | Path, stop: Event) -> Iterator[int | str]:
     """Yield what OpenCV is to open for a source; a named pipe is relayed.
 
-    FFmpeg itself waits for a silent named pipe, or for one without a writer, and cannot be interrupted. A thread that
-    returns from OpenCV when the interpreter has ended aborts the process.
+    FFmpeg itself waits for a silent named pipe, or for one without a writer, and cannot be
+    interrupted. A thread that returns from OpenCV when the interpreter has ended aborts the
+    process.
     """
     if isinstance(source, int) or not Path(source).is_fifo():
         yield source if isinstance(source, int) else str(source)
         return
     exit_event = Event()
-    with open(source, "rb", 0, opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK)) as pipe:
+    with open(
+        source, "rb", 0, opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK)
+    ) as pipe:
         first = _next_bytes(pipe, False, stop.is_set)
         reader, writer = os.pipe()
         has_ended = lambda: stop.is_set() or exit_event.is_set()  # noqa: E731
-        relay = Thread(target=_relay, args=(pipe, first, writer, has_ended), daemon=True, name="pipe")
+        relay = Thread(
+            target=_relay, args=(pipe, first, writer, has_ended), daemon=True, name="pipe"
+        )
         relay.start()
         try:
             yield f"/dev/fd/{reader}"
@@ -110,7 +132,9 @@ def _place(source: int | str | Path, stop: Event) -> Iterator[int | str]:
 
 
 def _relay(pipe: FileIO, data: bytes, writer: int, has_ended: Callable[[], bool]) -> None:
-    """Write `data` and the further bytes of a pipe to the file descriptor `writer` until one side ends."""
+    """Write `data` and the further bytes of a pipe to the file descriptor `writer` until one side
+    ends.
+    """
     with suppress(BrokenPipeError), open(writer, "wb", 0) as copy:
         while data:
             rest = memoryview(data)
@@ -120,7 +144,8 @@ def _relay(pipe: FileIO, data: bytes, writer: int, has_ended: Callable[[], bool]
 
 
 def _next_bytes(pipe: FileIO, had_writer: bool, has_ended: Callable[[], bool]) -> bytes:
-    """Wait for the next bytes of a pipe and return them; none if its writer ended, or if it is silent and `has_ended`.
+    """Wait for the next bytes of a pipe and return them; none if its writer ended, or if it is
+    silent and `has_ended`.
 
     Args:
         pipe: is opened without waiting for its writer.
@@ -145,7 +170,7 @@ def raw_images(pipe: BinaryIO, width: int, height: int) -> Iterator[np.ndarray]:
 
 
 def _exactly(pipe: BinaryIO, size: int) -> bytes:
-    """Return `size` bytes, fewer only at the end of the file: one read of a pipe may return fewer."""
+    """Return `size` bytes, fewer only at the end: one read of a pipe may return fewer."""
     data = bytearray()
     while len(data) < size and (chunk := pipe.read(size - len(data))):
         data += chunk

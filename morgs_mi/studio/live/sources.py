@@ -16,45 +16,59 @@ from morgs_mi.studio.live.playing import ClipClock, is_video, play
 from morgs_mi.studio.live.reading import read_camera
 
 Source = int | str | Path
-"""A camera of this machine, by OpenCV's index; a path or URL that FFmpeg opens; or a folder with images of all."""
+"""A camera of this machine, by OpenCV's index; a path or URL that FFmpeg opens; or a folder with
+images of all.
+"""
 
 
-def open_feed(sources: Sequence[Source], config: LiveConfig, names: Sequence[str] | None = None) -> Feed:
+def open_feed(
+    sources: Sequence[Source], config: LiveConfig, names: Sequence[str] | None = None
+) -> Feed:
     """Return the feed of a folder with the images of all cameras, or of one source per camera.
 
     Args:
         sources: the folder alone, or one source per camera, in the order of `names`.
         config: settings.
-        names: names of the cameras; by default the names of the folders in a folder, otherwise cam0, cam1, ...
+        names: names of the cameras; by default the names of the folders in a folder, otherwise
+            cam0, cam1, ...
 
     Raises:
         FileNotFoundError: there is no such folder.
-        ValueError: there is no source, one occurs twice, their number differs from the number of names, or the settings
-            repeat videos and there is none.
+        ValueError: there is no source, one occurs twice, their number differs from the number of
+            names, or the settings repeat videos and there is none.
     """
     if not sources:
-        raise ValueError("open_feed(): `camera` must have a source per camera, or a folder, got none; name them.")
+        raise ValueError(
+            "open_feed(): `camera` must have a source per camera, or a folder, got none; name them."
+        )
     if len(set(sources)) < len(sources):
-        raise ValueError(f"open_feed(): `camera` must have different sources, got {_listed(sources)}; name each once.")
-    folders = [source for source in sources if isinstance(source, str | Path) and Path(source).is_dir()]
+        raise ValueError(
+            f"open_feed(): `camera` must have different sources, got {_listed(sources)}; name "
+            "each once."
+        )
+    folders = [
+        source for source in sources if isinstance(source, str | Path) and Path(source).is_dir()
+    ]
     if folders and len(sources) == 1:
         return FolderFeed(Path(folders[0]), config.timeout, names)
     if folders:
         raise ValueError(
-            f"open_feed(): `camera` must be one folder with the images of all cameras, or one source per "
-            f"camera, got {_listed(sources)}; name one folder."
+            "open_feed(): `camera` must be one folder with the images of all cameras, or one "
+            f"source per camera, got {_listed(sources)}; name one folder."
         )
     if names is None:
         names = [f"cam{k}" for k in range(len(sources))]
     if len(names) != len(sources):
         raise ValueError(
-            f"open_feed(): `camera` must have a source for each of the {len(names)} calibrated cameras "
-            f"({', '.join(names)}), got {_listed(sources)}; name them in that order."
+            f"open_feed(): `camera` must have a source for each of the {len(names)} calibrated "
+            f"cameras ({', '.join(names)}), got {_listed(sources)}; name them in that order."
         )
     stop = Event()
     videos = [source for source in sources if is_video(source)]
     if config.loop and not videos:
-        raise ValueError(f"open_feed(): `loop` repeats videos, got none in {_listed(sources)}; leave it out.")
+        raise ValueError(
+            f"open_feed(): `loop` repeats videos, got none in {_listed(sources)}; leave it out."
+        )
     clock = ClipClock(len(videos))
 
     def images(source: Source) -> Iterator[np.ndarray | None]:
@@ -62,7 +76,9 @@ def open_feed(sources: Sequence[Source], config: LiveConfig, names: Sequence[str
             return play(source, clock, stop, videos.index(source), config.loop)
         return read_camera(source, stop, config.size)
 
-    end_text = "it has ended; --loop repeats videos" if videos and not config.loop else "it has ended"
+    end_text = (
+        "it has ended; --loop repeats videos" if videos and not config.loop else "it has ended"
+    )
     cameras = {name: images(source) for name, source in zip(names, sources, strict=True)}
     warm_up = 0.0 if len(videos) == len(sources) else config.warm_up
     return CameraFeed(cameras, config.timeout, warm_up, stop, end_text)

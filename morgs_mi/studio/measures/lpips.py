@@ -1,7 +1,9 @@
-"""LPIPS with a user-supplied ONNX network, run by `onnxruntime`; the package has neither weights nor PyTorch.
+"""LPIPS with a user-supplied ONNX network, run by `onnxruntime`; the package has neither weights
+nor PyTorch.
 
-Zhang, Isola, Efros, Shechtman and Wang, "The unreasonable effectiveness of deep features as a perceptual metric",
-CVPR 2018. With PyTorch and the authors' package ``lpips`` installed, this writes the file:
+Zhang, Isola, Efros, Shechtman and Wang, "The unreasonable effectiveness of deep features as a
+perceptual metric", CVPR 2018. With PyTorch and the authors' package ``lpips`` installed, this
+writes the file:
 
     import lpips, torch
     net, x = lpips.LPIPS(net="alex", spatial=True).eval(), torch.zeros(1, 3, HEIGHT, WIDTH)
@@ -26,15 +28,16 @@ _ADVICE = "export the network as the documentation of morgs_mi.studio.measures.l
 class Lpips:
     """Perceptual distance: 0 for equal images, larger for larger differences.
 
-    The network has two inputs, ``in0`` and ``in1``, RGB [1, 3, H, W] from -1 to 1, and one output: a distance per
-    pixel [1, 1, H, W] (``spatial=True``), or a single number without regions.
+    The network has two inputs, ``in0`` and ``in1``, RGB [1, 3, H, W] from -1 to 1, and one output:
+    a distance per pixel [1, 1, H, W] (``spatial=True``), or a single number without regions.
 
     Args:
         path: ONNX file.
 
     Raises:
         FileNotFoundError: the file is missing.
-        ValueError: `onnxruntime` is not installed or cannot load the file, or the network has other inputs.
+        ValueError: `onnxruntime` is not installed or cannot load the file, or the network has other
+            inputs.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -47,25 +50,31 @@ class Lpips:
             )
 
     def distance_map(self, image: np.ndarray, truth: np.ndarray) -> np.ndarray:
-        """Return the distance per pixel [H, W], or of the whole image [1, 1] if the network returns a single number.
+        """Return the distance per pixel [H, W], or of the whole image [1, 1] if the network returns
+        a single number.
 
         Args:
             image: display-referred RGB [H, W, 3], float in [0, 1] or uint8.
             truth: likewise.
 
         Raises:
-            ValueError: the sizes differ, or the network does not accept images of that size, has another output, or
-                returns NaN or infinity.
+            ValueError: the sizes differ, or the network does not accept images of that size, has
+                another output, or returns NaN or infinity.
         """
         pair = unit_pair("Lpips", image, truth)
         H, W = pair[0].shape[:2]
-        blobs = (np.ascontiguousarray(2 * each.transpose(2, 0, 1)[None] - 1, np.float32) for each in pair)
+        blobs = (
+            np.ascontiguousarray(2 * each.transpose(2, 0, 1)[None] - 1, np.float32) for each in pair
+        )
         distance = next(iter(self._network.run(dict(zip(_INPUTS, blobs, strict=True))).values()))
         if distance.size not in (1, H * W):
             raise ValueError(
-                f"{self.path}: expected one distance, or one for each of {W}x{H} pixels, got {list(distance.shape)}; "
-                f"{_ADVICE}."
+                f"{self.path}: expected one distance, or one for each of {W}x{H} pixels, got "
+                f"{list(distance.shape)}; {_ADVICE}."
             )
         if not np.isfinite(distance).all():
-            raise ValueError(f"{self.path}: expected finite distances, got NaN or infinity; export it in float32.")
+            raise ValueError(
+                f"{self.path}: expected finite distances, got NaN or infinity; export it in "
+                "float32."
+            )
         return distance.reshape((H, W) if distance.size > 1 else (1, 1))

@@ -1,14 +1,16 @@
 """Tracks of 3D points through a stream: a point moves with the Gaussians that dominate it.
 
-The response of a Gaussian at a point x is o exp(-d^2 / 2), with its opacity o and the Mahalanobis distance d of x from
-its mean. A query point x at frame q is bound to the K Gaussians of the largest response at q, with weights w_k
-proportional to it. Each of them carries the point rigidly, with its mean and its rotation:
+The response of a Gaussian at a point x is o exp(-d^2 / 2), with its opacity o and the Mahalanobis
+distance d of x from its mean. A query point x at frame q is bound to the K Gaussians of the largest
+response at q, with weights w_k proportional to it. Each of them carries the point rigidly, with its
+mean and its rotation:
 
     x_k(t) = mean_k(t) + R_k(t) R_k(q)^T (x - mean_k(q)),
 
-and the track is the mean of the x_k(t), weighted by the w_k of the Gaussians that are alive at t, forward and backward
-from q. With K = 1 this is the rule of Dynamic 3D Gaussians (Luiten et al. 2024). Where none of a point's Gaussians is
-alive, the point stays where it was and is marked as lost.
+and the track is the mean of the x_k(t), weighted by the w_k of the Gaussians that are alive at t,
+forward and backward from q. With K = 1 this is the rule of Dynamic 3D Gaussians (Luiten et al.
+2024). Where none of a point's Gaussians is alive, the point stays where it was and is marked as
+lost.
 """
 
 from __future__ import annotations
@@ -27,8 +29,8 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import unit_quats
 
 _MOST_ENTRIES = 2**24
-# Floor of the scales, as a share of the distance of the farthest point or mean, so that a flat Gaussian has an inverse
-# covariance that float64 can represent.
+# Floor of the scales, as a share of the distance of the farthest point or mean, so that a flat
+# Gaussian has an inverse covariance that float64 can represent.
 _FLATTEST = 1e-6
 # A point counts as hidden if it lies behind the rendered depth by more than this share.
 _DEPTH_TOLERANCE = 0.02
@@ -41,8 +43,10 @@ class PointTracks:
     Attributes:
         frames: int64 [T], indices of the frames.
         points: float64 [P, T, 3], positions in world units.
-        alive: bool [P, T], whether any of a point's Gaussians is alive; otherwise the point keeps its last position.
-        ids: int64 [P, K], the Gaussians by falling response, unique in the whole stream; -1 for none.
+        alive: bool [P, T], whether any of a point's Gaussians is alive; otherwise the point keeps
+            its last position.
+        ids: int64 [P, K], the Gaussians by falling response, unique in the whole stream; -1 for
+            none.
         weights: float64 [P, K], their weights, which sum to 1.
     """
 
@@ -60,13 +64,15 @@ def track_points(
     num_gaussians: int = 8,
     progress: Callable[[int], None] | None = None,
 ) -> PointTracks:
-    """Return the tracks of points on the surfaces of a scene, forward and backward from the frames of their queries.
+    """Return the tracks of points on the surfaces of a scene, forward and backward from the frames
+    of their queries.
 
     Args:
         stream: the file, which is read twice.
         points: query points [P, 3], world units.
         frame: the frame of each query, one for all or [P].
-        num_gaussians: largest number of Gaussians to which a point is bound; 1: the one of the largest response.
+        num_gaussians: largest number of Gaussians to which a point is bound; 1: the one of the
+            largest response.
         progress: called with the number of frames done.
 
     Example:
@@ -75,20 +81,25 @@ def track_points(
         >>> print(tracks.points[0, -1], tracks.alive[0, -1])
 
     Raises:
-        ValueError: an argument has another shape, a point is not finite, the stream has no such frame, or a packet is
-            broken.
+        ValueError: an argument has another shape, a point is not finite, the stream has no such
+            frame, or a packet is broken.
     """
     points = numbers("track_points()", "points", points).astype(np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-        raise ValueError(f"track_points(): `points` must be [P, 3] and finite, got {points.shape}; pass world points.")
+        raise ValueError(
+            f"track_points(): `points` must be [P, 3] and finite, got {points.shape}; pass world "
+            "points."
+        )
     queries = np.asarray(frame)
     if queries.shape not in ((), (len(points),)) or queries.dtype.kind not in "iu":
         raise ValueError(
-            f"track_points(): `frame` must be an integer or integers [{len(points)}], got {queries.dtype} "
-            f"{queries.shape}; pass the frame of each query."
+            f"track_points(): `frame` must be an integer or integers [{len(points)}], got "
+            f"{queries.dtype} {queries.shape}; pass the frame of each query."
         )
     if num_gaussians < 1:
-        raise ValueError(f"track_points(): `num_gaussians` must be at least 1, got {num_gaussians}.")
+        raise ValueError(
+            f"track_points(): `num_gaussians` must be at least 1, got {num_gaussians}."
+        )
     queries = np.broadcast_to(queries, len(points))
     ids, weights, local = _bindings(stream, points, queries, num_gaussians)
     frames = []
@@ -98,7 +109,9 @@ def track_points(
         candidates = means + np.einsum("pkij,pkj->pki", axes, local)
         weight = weights * living_mask
         total = weight.sum(1, keepdims=True)
-        positions.append(np.einsum("pk,pki->pi", weight / np.where(total > 0, total, 1), candidates))
+        positions.append(
+            np.einsum("pk,pki->pi", weight / np.where(total > 0, total, 1), candidates)
+        )
         alive.append(total[:, 0] > 0)
         frames.append(t)
         if progress is not None:
@@ -108,11 +121,16 @@ def track_points(
     living = np.stack(alive, 1)
     at_query = order == queries[:, None]
     tracks[at_query] = points
-    return PointTracks(order, _held(tracks, living | at_query, order >= queries[:, None]), living, ids, weights)
+    return PointTracks(
+        order, _held(tracks, living | at_query, order >= queries[:, None]), living, ids, weights
+    )
 
 
-def bind(gaussians: Gaussians, points: np.ndarray, num_gaussians: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the Gaussians of the largest response at each point [P, K] by falling response, and their weights.
+def bind(
+    gaussians: Gaussians, points: np.ndarray, num_gaussians: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the Gaussians of the largest response at each point [P, K] by falling response, and
+    their weights.
 
     Args:
         gaussians: N Gaussians.
@@ -130,15 +148,22 @@ def bind(gaussians: Gaussians, points: np.ndarray, num_gaussians: int) -> tuple[
     points = points - center
     size = max(np.abs(means).max(), np.abs(points).max(), 1e-30)
     scales = np.maximum(np.exp(raw["log_scales"].astype(np.float64)), _FLATTEST * size)
-    axes = Rotation.from_quat(unit_quats(gaussians), scalar_first=True).as_matrix() / scales[:, None]
+    axes = (
+        Rotation.from_quat(unit_quats(gaussians), scalar_first=True).as_matrix() / scales[:, None]
+    )
     inverse = axes @ axes.transpose(0, 2, 1)
     moment = np.einsum("nij,nj->ni", inverse, means)
     log_opacity = -np.logaddexp(0, -raw["logit_opacities"].astype(np.float64))
-    # The logarithm of the response is a quadratic polynomial in x, hence all of them are one matrix product.
+    # The logarithm of the response is a quadratic polynomial in x, hence all of them are one matrix
+    # product.
     i, j = np.triu_indices(3)
     double = np.where(i == j, -0.5, -1.0)
     polynomial = np.vstack(
-        [(double * inverse[:, i, j]).T, moment.T, log_opacity - 0.5 * np.einsum("ni,ni->n", moment, means)]
+        [
+            (double * inverse[:, i, j]).T,
+            moment.T,
+            log_opacity - 0.5 * np.einsum("ni,ni->n", moment, means),
+        ]
     )
     step = max(1, _MOST_ENTRIES // len(gaussians))
     for start in range(0, len(points), step):
@@ -156,11 +181,14 @@ def bind(gaussians: Gaussians, points: np.ndarray, num_gaussians: int) -> tuple[
     return rows, weights / weights.sum(1, keepdims=True)
 
 
-def seen_in_depth(depth: np.ndarray, alpha: np.ndarray, camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Return the mask of the points [P] that a camera sees: inside its image, and not behind the rendered surface.
+def seen_in_depth(
+    depth: np.ndarray, alpha: np.ndarray, camera: Camera, points: np.ndarray
+) -> np.ndarray:
+    """Return the mask of the points [P] that a camera sees: inside its image, and not behind the
+    rendered surface.
 
-    A point is behind if it is farther by more than 2 % than the farthest rendered depth in the 3x3 pixels around it;
-    pixels with an alpha below 0.5 hide nothing.
+    A point is behind if it is farther by more than 2 % than the farthest rendered depth in the 3x3
+    pixels around it; pixels with an alpha below 0.5 hide nothing.
 
     Args:
         depth: rendered depth [H, W], world units.
@@ -176,7 +204,9 @@ def seen_in_depth(depth: np.ndarray, alpha: np.ndarray, camera: Camera, points: 
     front = front[mask]
     column, row = pixels[mask].astype(int).T
     surface = np.pad(np.where(alpha < 0.5, np.inf, depth), 1, mode="edge")
-    farthest = np.max([surface[row + dy, column + dx] for dy in range(3) for dx in range(3)], axis=0, initial=0)
+    farthest = np.max(
+        [surface[row + dy, column + dx] for dy in range(3) for dx in range(3)], axis=0, initial=0
+    )
     visible = np.zeros(len(points), bool)
     visible[front] = z[front] <= (1 + _DEPTH_TOLERANCE) * farthest
     return visible
@@ -185,7 +215,9 @@ def seen_in_depth(depth: np.ndarray, alpha: np.ndarray, camera: Camera, points: 
 def _bindings(
     stream: FrameSource, points: np.ndarray, queries: np.ndarray, num_gaussians: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return ids and weights [P, K] of the points' Gaussians, and the points in their axes [P, K, 3]."""
+    """Return ids and weights [P, K] of the points' Gaussians, and the points in their axes
+    [P, K, 3].
+    """
     shape = len(points), num_gaussians
     ids = np.full(shape, -1)
     weights = np.zeros(shape)
@@ -201,18 +233,25 @@ def _bindings(
             columns = slice(rows.shape[1])
             ids[rows_of_frame, columns] = state.lasting_ids[rows]
             weights[rows_of_frame, columns] = weight
-            local[rows_of_frame, columns] = np.einsum("pkji,pkj->pki", axes, points[rows_of_frame][:, None] - means)
+            local[rows_of_frame, columns] = np.einsum(
+                "pkji,pkj->pki", axes, points[rows_of_frame][:, None] - means
+            )
         if state.frame >= last:
             break
     if rest:
         raise ValueError(
-            f"track_points(): `frame` must be a frame of {stream.path}, got {min(rest)}; choose one that it contains."
+            f"track_points(): `frame` must be a frame of {stream.path}, got {min(rest)}; choose "
+            "one that it contains."
         )
     return ids, weights, local
 
 
-def _bound(stream: FrameSource, ids: np.ndarray) -> Iterator[tuple[int, np.ndarray, tuple[np.ndarray, np.ndarray]]]:
-    """Yield (frame, mask of the living [P, K], their means [P, K, 3] and axes [P, K, 3, 3]) of the bound Gaussians."""
+def _bound(
+    stream: FrameSource, ids: np.ndarray
+) -> Iterator[tuple[int, np.ndarray, tuple[np.ndarray, np.ndarray]]]:
+    """Yield (frame, mask of the living [P, K], their means [P, K, 3] and axes [P, K, 3, 3]) of the
+    bound Gaussians.
+    """
     for state in stream.states():
         present = state.lasting_ids
         rows = np.searchsorted(present, ids)
@@ -228,11 +267,14 @@ def _means_and_axes(gaussians: Gaussians, rows: np.ndarray) -> tuple[np.ndarray,
     """Return means [..., 3] and axes [..., 3, 3] of the Gaussians at `rows` [...]."""
     means = gaussians.numpy()["means"].astype(np.float64)[rows]
     quats = unit_quats(gaussians)[rows].reshape(-1, 4)
-    return means, Rotation.from_quat(quats, scalar_first=True).as_matrix().reshape(*rows.shape, 3, 3)
+    return means, Rotation.from_quat(quats, scalar_first=True).as_matrix().reshape(
+        *rows.shape, 3, 3
+    )
 
 
 def _held(tracks: np.ndarray, known_mask: np.ndarray, forward: np.ndarray) -> np.ndarray:
-    """Return tracks [P, T, 3] that keep their last known position, in the direction away from the query.
+    """Return tracks [P, T, 3] that keep their last known position, in the direction away from the
+    query.
 
     Args:
         tracks: positions [P, T, 3], meaningless where they are not known.
@@ -241,5 +283,7 @@ def _held(tracks: np.ndarray, known_mask: np.ndarray, forward: np.ndarray) -> np
     """
     time = np.arange(known_mask.shape[1])
     last_known = np.maximum.accumulate(np.where(known_mask, time, -1), axis=1)
-    next_known = np.minimum.accumulate(np.where(known_mask, time, len(time))[:, ::-1], axis=1)[:, ::-1]
+    next_known = np.minimum.accumulate(np.where(known_mask, time, len(time))[:, ::-1], axis=1)[
+        :, ::-1
+    ]
     return np.take_along_axis(tracks, np.where(forward, last_known, next_known)[..., None], axis=1)

@@ -14,7 +14,7 @@ from morgs_mi.studio.calibration.refine import register_camera
 
 
 class Registration(Measure):
-    """PSNR of the held-out views in the first frame, from the cameras that fit their images best."""
+    """PSNR of the held-out views in the first frame, from the cameras that fit best."""
 
     def __init__(self, clip: ComparedClip) -> None:
         self._clip = clip
@@ -29,7 +29,9 @@ class Registration(Measure):
         target = View(clip.stream.cameras[view.index], image, view.valid)
         extent = scene_extent([clip.stream.cameras[v] for v in clip.recording.train_views])
         gaussians = view.frame.state.gaussians
-        registered_view = target._replace(camera=register_camera(gaussians, target, extent, FitConfig(), clip.render))
+        registered_view = target._replace(
+            camera=register_camera(gaussians, target, extent, FitConfig(), clip.render)
+        )
         self._psnr[view.camera.name] = mean_psnr(gaussians, [registered_view], clip.render)
 
     def add_frame(self, frame: ComparedFrame) -> dict[str, Any]:

@@ -1,9 +1,10 @@
 """True 3D tracks of a recording: ground truth of synthetic captures, and annotations of TAPVid-3D.
 
-TAPVid-3D (Koppula et al. 2024) annotates the recordings of Panoptic Studio that Dynamic 3D Gaussians uses, in the
-layout of `train_meta.json`. A file ``NAME_CAMERA.npz`` holds the tracks of one view: ``tracks_XYZ`` [T, P, 3] in the
-camera's axes (OpenCV's), ``visibility`` [T, P], ``queries_xyt`` [P, 3] and ``fx_fy_cx_cy`` [4]. NAME is the name of
-the capture's folder; the files lie in that folder or beside it.
+TAPVid-3D (Koppula et al. 2024) annotates the recordings of Panoptic Studio that Dynamic 3D
+Gaussians uses, in the layout of `train_meta.json`. A file ``NAME_CAMERA.npz`` holds the tracks of
+one view: ``tracks_XYZ`` [T, P, 3] in the camera's axes (OpenCV's), ``visibility`` [T, P],
+``queries_xyt`` [P, 3] and ``fx_fy_cx_cy`` [4]. NAME is the name of the capture's folder; the files
+lie in that folder or beside it.
 """
 
 from __future__ import annotations
@@ -25,28 +26,36 @@ _SHORT_SIDE = 256
 
 @dataclass(frozen=True)
 class TrackTruth:
-    """True tracks of P points through T frames, in one video: one view, or several that see as one."""
+    """True tracks of P points through T frames, in one view or several that see as one."""
 
     cameras: tuple[Camera, ...]  #: The views.
     points: np.ndarray  #: [P, T, 3], world units.
-    visible: np.ndarray | None  #: bool [P, T], whether any of the views sees the point; None if unknown.
+    #: Bool [P, T], whether any of the views sees the point; None if unknown.
+    visible: np.ndarray | None
     queries: np.ndarray  #: int [P], the frame at which each track starts.
 
     @property
     def pixel(self) -> np.ndarray | None:
-        """Width of a pixel at each point [P, T], world units, for an image with a shorter side of 256; of one view."""
+        """Width of a pixel at each point [P, T], world units, for an image with a shorter side of
+        256; of one view.
+        """
         if len(self.cameras) != 1:
             return None
         (camera,) = self.cameras
-        focal = np.sqrt(camera.K[0, 0] * camera.K[1, 1]) * _SHORT_SIDE / min(camera.width, camera.height)
+        focal = (
+            np.sqrt(camera.K[0, 0] * camera.K[1, 1])
+            * _SHORT_SIDE
+            / min(camera.width, camera.height)
+        )
         return camera.project(self.points)[1] / focal
 
 
 def synthetic_tracks(capture: Capture, views: Sequence[int]) -> list[TrackTruth]:
-    """Return the tracks of a synthetic capture as the video of some of its views together; empty without any.
+    """Return the tracks of a synthetic capture as the video of some of its views together; empty
+    without any.
 
-    A track starts at the first frame in which one of the views sees it. Tracks that none of them sees are left out.
-    Without stored visibility, all tracks start at frame 0.
+    A track starts at the first frame in which one of the views sees it. Tracks that none of them
+    sees are left out. Without stored visibility, all tracks start at frame 0.
     """
     if capture.truth is None or not (capture.truth / "tracks.npz").is_file():
         return []
@@ -69,13 +78,21 @@ def tapvid3d_tracks(capture: Capture) -> list[TrackTruth]:
     # The frames of the annotations are numbered like the frames of the clips.
     if capture.reading.aligns_clips or not (folder / "train_meta.json").is_file():
         return []
-    files = [file for place in (folder, folder.parent) for file in place.glob(f"{folder.name}_*.npz")]
+    files = [
+        file for place in (folder, folder.parent) for file in place.glob(f"{folder.name}_*.npz")
+    ]
     if not files:
         return []
-    metas = [file for name in ("train_meta", "test_meta") if (file := folder / f"{name}.json").is_file()]
+    metas = [
+        file for name in ("train_meta", "test_meta") if (file := folder / f"{name}.json").is_file()
+    ]
     rig = {view.camera.name: view.camera for meta in metas for view in read_meta(meta)}
     file_by_name = {file.stem.removeprefix(f"{folder.name}_"): file for file in reversed(files)}
-    return [read_annotation(file, rig[name]) for name, file in sorted(file_by_name.items()) if name in rig]
+    return [
+        read_annotation(file, rig[name])
+        for name, file in sorted(file_by_name.items())
+        if name in rig
+    ]
 
 
 def read_annotation(path: Path, camera: Camera) -> TrackTruth:
@@ -86,30 +103,42 @@ def read_annotation(path: Path, camera: Camera) -> TrackTruth:
         camera: the view.
 
     Raises:
-        ValueError: the file is broken, its arrays do not have the shapes above, or its intrinsics are not the camera's.
+        ValueError: the file is broken, its arrays do not have the shapes above, or its intrinsics
+            are not the camera's.
     """
     tracks = read_array(path, "tracks_XYZ")
     visible = read_array(path, "visibility")
     queries = read_array(path, "queries_xyt")
     intrinsics = read_array(path, "fx_fy_cx_cy")
     T, P = tracks.shape[:2] if tracks.ndim == 3 else (0, 0)
-    shapes = {"tracks_XYZ": (T, P, 3), "visibility": (T, P), "queries_xyt": (P, 3), "fx_fy_cx_cy": (4,)}
-    for (name, shape), array in zip(shapes.items(), (tracks, visible, queries, intrinsics), strict=True):
+    shapes = {
+        "tracks_XYZ": (T, P, 3),
+        "visibility": (T, P),
+        "queries_xyt": (P, 3),
+        "fx_fy_cx_cy": (4,),
+    }
+    for (name, shape), array in zip(
+        shapes.items(), (tracks, visible, queries, intrinsics), strict=True
+    ):
         if array.shape != shape or array.dtype.kind not in "fiub":
             raise ValueError(
-                f"{path}: expected `{name}` {[*shape]} with {T} frames and {P} points, got {array.dtype} "
-                f"{[*array.shape]}; download the annotation again."
+                f"{path}: expected `{name}` {[*shape]} with {T} frames and {P} points, got "
+                f"{array.dtype} {[*array.shape]}; download the annotation again."
             )
     K = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]
     if not np.allclose(intrinsics, K, rtol=1e-3):
         raise ValueError(
             f"{path}: expected the intrinsics of camera {camera.name}, {K.round(2).tolist()}, got "
-            f"{np.round(intrinsics.astype(float), 2).tolist()} in `fx_fy_cx_cy`; use the annotation of this capture."
+            f"{np.round(intrinsics.astype(float), 2).tolist()} in `fx_fy_cx_cy`; use the "
+            "annotation of this capture."
         )
     if not np.isfinite(tracks).all() or not ((queries[:, 2] >= 0) & (queries[:, 2] < T)).all():
         raise ValueError(
-            f"{path}: `tracks_XYZ` must be finite and the frames in `queries_xyt` below {T}; download it again."
+            f"{path}: `tracks_XYZ` must be finite and the frames in `queries_xyt` below {T}; "
+            "download it again."
         )
     V = np.asarray(camera.viewmat, np.float64)
     points = (tracks.astype(np.float64) - V[:3, 3]) @ V[:3, :3]
-    return TrackTruth((camera,), points.transpose(1, 0, 2), visible.T.astype(bool), queries[:, 2].astype(int))
+    return TrackTruth(
+        (camera,), points.transpose(1, 0, 2), visible.T.astype(bool), queries[:, 2].astype(int)
+    )

@@ -18,7 +18,13 @@ from morgs_mi.evaluate.results import TrackingScores
 from morgs_mi.playback.player import render
 from morgs_mi.playback.stream_header import render_config
 from morgs_mi.studio.measures.point_tracks import seen_in_depth, track_points
-from morgs_mi.studio.measures.track_scores import DYNAMIC_3D_GAUSSIANS, MVTRACKER, TAPVID3D, Comparison, score_tracks
+from morgs_mi.studio.measures.track_scores import (
+    DYNAMIC_3D_GAUSSIANS,
+    MVTRACKER,
+    TAPVID3D,
+    Comparison,
+    score_tracks,
+)
 from morgs_mi.studio.measures.track_truth import TrackTruth, synthetic_tracks, tapvid3d_tracks
 
 
@@ -29,15 +35,21 @@ class Tracking(Measure):
         self._clip = clip
 
     def result(self) -> dict[str, Any]:
-        return {"tracking": evaluate_tracks(self._clip.stream, self._clip.recording, self._clip.views)}
+        return {
+            "tracking": evaluate_tracks(self._clip.stream, self._clip.recording, self._clip.views)
+        }
 
 
-def evaluate_tracks(stream: FrameSource, recording: Capture, views: Sequence[int]) -> tuple[TrackingScores, ...]:
-    """Return the scores of a stream's point tracks by each protocol; empty without true tracks or a second frame.
+def evaluate_tracks(
+    stream: FrameSource, recording: Capture, views: Sequence[int]
+) -> tuple[TrackingScores, ...]:
+    """Return the scores of a stream's point tracks by each protocol; empty without true tracks or a
+    second frame.
 
-    Queries are the true points at the frames where their tracks start. In a synthetic capture, each of `views` is a
-    video of TAPVid-3D's protocol; in the other protocols a point is visible if a training view sees it. Annotations of
-    TAPVid-3D know the visibility in their own view only, which all protocols then use.
+    Queries are the true points at the frames where their tracks start. In a synthetic capture, each
+    of `views` is a video of TAPVid-3D's protocol; in the other protocols a point is visible if a
+    training view sees it. Annotations of TAPVid-3D know the visibility in their own view only,
+    which all protocols then use.
 
     Args:
         stream: the file.
@@ -61,21 +73,31 @@ def evaluate_tracks(stream: FrameSource, recording: Capture, views: Sequence[int
     joint_comparisons = comparisons[len(single) :] or comparisons
     scale = read_settings(recording.path / CAPTURE).get("meters_per_unit") or 1
     extent = scene_extent([recording.cameras[view] for view in recording.train_views])
-    protocols = ((TAPVID3D, per_view), (DYNAMIC_3D_GAUSSIANS, joint_comparisons), (MVTRACKER, joint_comparisons))
+    protocols = (
+        (TAPVID3D, per_view),
+        (DYNAMIC_3D_GAUSSIANS, joint_comparisons),
+        (MVTRACKER, joint_comparisons),
+    )
     return tuple(score_tracks(protocol, videos, scale, extent) for protocol, videos in protocols)
 
 
 def _during(video: TrackTruth, frames: Sequence[int]) -> TrackTruth:
-    """Return the part of true tracks in the consecutive frames of a stream, without tracks that start in others."""
+    """Return the part of true tracks in the consecutive frames of a stream, without tracks that
+    start in others.
+    """
     start = frames[0]
     stop = min(frames[-1] + 1, video.points.shape[1])
     mask = (video.queries >= start) & (video.queries < stop)
     visible = None if video.visible is None else video.visible[mask, start:stop]
-    return TrackTruth(video.cameras, video.points[mask, start:stop], visible, video.queries[mask] - start)
+    return TrackTruth(
+        video.cameras, video.points[mask, start:stop], visible, video.queries[mask] - start
+    )
 
 
 def _compared(stream: FrameSource, videos: Sequence[TrackTruth], start: int) -> list[Comparison]:
-    """Return the tracks of the stream beside the true ones of each video, which begins with the frame `start`."""
+    """Return the tracks of the stream beside the true ones of each video, which begins with the
+    frame `start`.
+    """
     points = [video.points[np.arange(len(video.queries)), video.queries] for video in videos]
     queries = np.concatenate([video.queries for video in videos]) + start
     tracks = track_points(stream, np.concatenate(points), queries)
@@ -83,23 +105,36 @@ def _compared(stream: FrameSource, videos: Sequence[TrackTruth], start: int) -> 
     points = np.split(tracks.points, ends[:-1])
     alive = np.split(tracks.alive, ends[:-1])
     lengths = [video.points.shape[1] for video in videos]
-    pairs = [(p[:, :length], a[:, :length]) for p, a, length in zip(points, alive, lengths, strict=True)]
+    pairs = [
+        (p[:, :length], a[:, :length]) for p, a, length in zip(points, alive, lengths, strict=True)
+    ]
     masks = _seen(stream, videos, [positions for positions, _ in pairs])
     return [
-        Comparison(video.points, positions, video.visible, mask & alive, alive, video.queries, video.pixel)
+        Comparison(
+            video.points, positions, video.visible, mask & alive, alive, video.queries, video.pixel
+        )
         for video, (positions, alive), mask in zip(videos, pairs, masks, strict=True)
     ]
 
 
-def _seen(stream: FrameSource, videos: Sequence[TrackTruth], tracks: Sequence[np.ndarray]) -> list[np.ndarray]:
+def _seen(
+    stream: FrameSource, videos: Sequence[TrackTruth], tracks: Sequence[np.ndarray]
+) -> list[np.ndarray]:
     """Return the masks of the tracked points [P, T, 3] that a view of their video sees, [P, T]."""
     masks = [np.zeros(positions.shape[:2], bool) for positions in tracks]
     config = render_config(stream)
-    cameras = {camera.name: camera for video in videos if video.visible is not None for camera in video.cameras}
+    cameras = {
+        camera.name: camera
+        for video in videos
+        if video.visible is not None
+        for camera in video.cameras
+    }
     for t, (_, gaussians) in enumerate(play(stream) if cameras else ()):
         for name, camera in cameras.items():
             maps = render(gaussians, camera, ("depth", "alpha"), config)
             for video, positions, mask in zip(videos, tracks, masks, strict=True):
                 if t < positions.shape[1] and name in [view.name for view in video.cameras]:
-                    mask[:, t] |= seen_in_depth(maps["depth"][..., 0], maps["alpha"][..., 0], camera, positions[:, t])
+                    mask[:, t] |= seen_in_depth(
+                        maps["depth"][..., 0], maps["alpha"][..., 0], camera, positions[:, t]
+                    )
     return masks

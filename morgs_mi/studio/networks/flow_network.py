@@ -1,12 +1,12 @@
 """Optical flow from a trained network in an ONNX file, run by `onnxruntime`.
 
-The network takes two images [1, 3, H, W], RGB, and returns the flow [1, 2, H, W] in pixels from the first to the
-second, like RAFT (Teed and Deng, ECCV 2020), SEA-RAFT (Wang, Lipson and Deng, ECCV 2024) and similar networks. It may
-have other outputs, such as RAFT's flow at an eighth of the size.
+The network takes two images [1, 3, H, W], RGB, and returns the flow [1, 2, H, W] in pixels from the
+first to the second, like RAFT (Teed and Deng, ECCV 2020), SEA-RAFT (Wang, Lipson and Deng, ECCV
+2024) and similar networks. It may have other outputs, such as RAFT's flow at an eighth of the size.
 
-If the network leaves H and W open, the images are padded to multiples of 8 by repeating their border, and the padding
-is cropped from the flow. If it fixes them, the images are resized, and the flow is resized back and scaled by the same
-factors.
+If the network leaves H and W open, the images are padded to multiples of 8 by repeating their
+border, and the padding is cropped from the flow. If it fixes them, the images are resized, and the
+flow is resized back and scaled by the same factors.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ class FlowNetwork:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: `onnxruntime` is not installed or cannot load it, or it does not take two images.
+        ValueError: `onnxruntime` is not installed or cannot load it, or it does not take two
+            images.
     """
 
     def __init__(self, path: str | Path, low: float = 0.0, high: float = 255.0) -> None:
@@ -47,18 +48,20 @@ class FlowNetwork:
         images = all(len(s) == 4 and s[0] in (1, None) and s[1] in (3, None) for s in shapes)
         if len(shapes) != 2 or not images or shapes[0] != shapes[1]:
             raise ValueError(
-                f"{path}: expected a network with two images [1, 3, H, W] as its inputs, got {written_shapes(shapes)}; "
-                "export it with one input per image."
+                f"{path}: expected a network with two images [1, 3, H, W] as its inputs, got "
+                f"{written_shapes(shapes)}; export it with one input per image."
             )
         height, width = shapes[0][2:]
         if (height is None) != (width is None):
             raise ValueError(
-                f"{path}: expected height and width both fixed or both open, got {written_shapes(shapes[:1])}."
+                f"{path}: expected height and width both fixed or both open, got "
+                f"{written_shapes(shapes[:1])}."
             )
         self._size = None if height is None or width is None else (width, height)
 
     def __call__(self, image: np.ndarray, other: np.ndarray) -> np.ndarray:
-        """Return the flow [H, W, 2] in pixels, float32, from `image` to `other` on the grid of `image`.
+        """Return the flow [H, W, 2] in pixels, float32, from `image` to `other` on the grid of
+        `image`.
 
         Args:
             image: [H, W, 3], RGB, uint8 or float in [0, 1].
@@ -71,11 +74,18 @@ class FlowNetwork:
         if self._size is None:
             flow = self._padded(image, other)
         else:
-            image, other = (cv2.resize(each, self._size, interpolation=cv2.INTER_AREA) for each in (image, other))
-            flow = cv2.resize(self._run(image, other), (width, height), interpolation=cv2.INTER_LINEAR)
+            image, other = (
+                cv2.resize(each, self._size, interpolation=cv2.INTER_AREA)
+                for each in (image, other)
+            )
+            flow = cv2.resize(
+                self._run(image, other), (width, height), interpolation=cv2.INTER_LINEAR
+            )
             flow = flow * np.array((width / self._size[0], height / self._size[1]), np.float32)
         if not np.isfinite(flow).all():
-            raise ValueError(f"{self.path}: expected a finite flow, got NaN or infinity; check the value range.")
+            raise ValueError(
+                f"{self.path}: expected a finite flow, got NaN or infinity; check the value range."
+            )
         return flow
 
     def _padded(self, image: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -98,17 +108,24 @@ class FlowNetwork:
         flows = [output for output in outputs if output.shape == (1, 2, height, width)]
         if not flows:
             shapes = written_shapes([output.shape for output in outputs])
-            raise ValueError(f"{self.path}: expected an output [1, 2, {height}, {width}], the flow, got {shapes}.")
+            raise ValueError(
+                f"{self.path}: expected an output [1, 2, {height}, {width}], the flow, got "
+                f"{shapes}."
+            )
         return np.ascontiguousarray(np.moveaxis(flows[-1][0], 0, 2), dtype=np.float32)
 
     def _blob(self, image: np.ndarray) -> np.ndarray:
         """Return an image as the network's input, [1, 3, H, W] float32."""
         unit = unit_values(image, np.float32)
-        return np.ascontiguousarray(np.moveaxis(self.low + (self.high - self.low) * unit, 2, 0)[None], np.float32)
+        return np.ascontiguousarray(
+            np.moveaxis(self.low + (self.high - self.low) * unit, 2, 0)[None], np.float32
+        )
 
 
 def onnx(path: str, config: FlowConfig) -> FlowSource:
-    """Return the flow source of a network that takes values from 0 to 255, as RAFT's and SEA-RAFT's own code does."""
+    """Return the flow source of a network that takes values from 0 to 255, as RAFT's and SEA-RAFT's
+    own code does.
+    """
     return both_directions(FlowNetwork(path, 0, 255))
 
 
@@ -118,5 +135,7 @@ def onnx_unit(path: str, config: FlowConfig) -> FlowSource:
 
 
 def onnx_signed(path: str, config: FlowConfig) -> FlowSource:
-    """Return the flow source of a network that takes values from -1 to 1, as torchvision's RAFT does."""
+    """Return the flow source of a network that takes values from -1 to 1, as torchvision's RAFT
+    does.
+    """
     return both_directions(FlowNetwork(path, -1, 1))

@@ -11,19 +11,23 @@ import numpy as np
 
 from morgs_mi.core.color_space import unit_values
 
-# Mean and standard deviation of ImageNet's colours, by which most networks for images normalise their input.
+# Mean and standard deviation of ImageNet's colours, by which most networks for images normalise
+# their input.
 _MEAN = np.array([0.485, 0.456, 0.406], np.float32)
 _DEVIATION = np.array([0.229, 0.224, 0.225], np.float32)
-# Largest input that a file may fix: an image of 4096 x 4096, to which smaller ones would be enlarged.
+# Largest input that a file may fix: an image of 4096 x 4096, to which smaller ones would be
+# enlarged.
 _MAX_VALUES = 3 * 4096**2
-# Of its own messages, `onnxruntime` prints only those before it ends the process: errors are raised.
+# Of its own messages, `onnxruntime` prints only those before it ends the process: errors are
+# raised.
 _FATAL = 4
 
 
 class OnnxNetwork:
     """Network in an ONNX file, which several threads may share.
 
-    Weights in further files are read only from the folder of the network, which `onnxruntime` checks.
+    Weights in further files are read only from the folder of the network, which `onnxruntime`
+    checks.
 
     Args:
         path: the ONNX file.
@@ -36,7 +40,8 @@ class OnnxNetwork:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: `onnxruntime` is not installed or cannot load the network, or an input has too many values.
+        ValueError: `onnxruntime` is not installed or cannot load the network, or an input has too
+            many values.
     """
 
     def __init__(self, path: str | Path, instead: str = "") -> None:
@@ -48,12 +53,14 @@ class OnnxNetwork:
             import onnxruntime
         except ImportError:
             raise ValueError(
-                f"{path}: running a network needs the package onnxruntime; pip install 'morgs-mi[networks]'."
+                f"{path}: running a network needs the package onnxruntime; pip install "
+                "'morgs-mi[networks]'."
             ) from None
         self._runtime = f"onnxruntime {onnxruntime.__version__}"
         options = onnxruntime.SessionOptions()
         options.log_severity_level = _FATAL
-        options.intra_op_num_threads = cv2.getNumThreads()  # which limits a worker to its share of the cores
+        # Which limits a worker to its share of the cores.
+        options.intra_op_num_threads = cv2.getNumThreads()
         try:
             # A fallback would try the same again, and print.
             self._session = onnxruntime.InferenceSession(
@@ -63,12 +70,15 @@ class OnnxNetwork:
             self.outputs = tuple(value.name for value in self._session.get_outputs())
         except Exception as error:  # its errors have no class in common
             raise ValueError(
-                f"{path}: {self._runtime} cannot load this network ({_reason(error)}); export it again{instead}."
+                f"{path}: {self._runtime} cannot load this network ({_reason(error)}); export it "
+                f"again{instead}."
             ) from error
-        if large := [s for s in self.inputs.values() if math.prod(size or 1 for size in s) > _MAX_VALUES]:
+        if large := [
+            s for s in self.inputs.values() if math.prod(size or 1 for size in s) > _MAX_VALUES
+        ]:
             raise ValueError(
-                f"{path}: expected inputs of at most {_MAX_VALUES} values, got {written_shapes(large)}; export it for "
-                "smaller images."
+                f"{path}: expected inputs of at most {_MAX_VALUES} values, got "
+                f"{written_shapes(large)}; export it for smaller images."
             )
 
     def run(self, inputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -78,27 +88,32 @@ class OnnxNetwork:
             inputs: arrays by name.
 
         Raises:
-            ValueError: `onnxruntime` cannot run the network on them, or it returns other values than numbers.
+            ValueError: `onnxruntime` cannot run the network on them, or it returns other values
+                than numbers.
         """
         try:
             results = self._session.run(None, dict(inputs))
         except Exception as error:  # its errors have no class in common
             shapes = ", ".join(f"{name} {list(value.shape)}" for name, value in inputs.items())
             raise ValueError(
-                f"{self.path}: {self._runtime} cannot run this network on {shapes} ({_reason(error)}); export it for "
-                f"these sizes{self._alternative}."
+                f"{self.path}: {self._runtime} cannot run this network on {shapes} "
+                f"({_reason(error)}); export it for these sizes{self._alternative}."
             ) from error
         pairs = zip(self.outputs, results, strict=True)
-        arrays = {name: x for name, x in pairs if isinstance(x, np.ndarray) and x.dtype.kind in "biuf"}
+        arrays = {
+            name: x for name, x in pairs if isinstance(x, np.ndarray) and x.dtype.kind in "biuf"
+        }
         if others := [name for name in self.outputs if name not in arrays]:
             raise ValueError(
-                f"{self.path}: expected arrays of numbers, got others from {', '.join(others)}; export again."
+                f"{self.path}: expected arrays of numbers, got others from {', '.join(others)}; "
+                "export again."
             )
         return arrays
 
 
 def imagenet_blob(image: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Return an image as a network's input [1, 3, height, width] float32, normalised by ImageNet's colours.
+    """Return an image as a network's input [1, 3, height, width] float32, normalised by ImageNet's
+    colours.
 
     Args:
         image: [H, W, 3], RGB, uint8 or float in [0, 1]; it is stretched to the size.
@@ -107,13 +122,18 @@ def imagenet_blob(image: np.ndarray, width: int, height: int) -> np.ndarray:
     """
     unit = unit_values(image, np.float32)
     shrinks = image.shape[1] > width
-    unit = cv2.resize(unit, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+    unit = cv2.resize(
+        unit, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
+    )
     return np.ascontiguousarray(np.moveaxis((unit - _MEAN) / _DEVIATION, 2, 0)[None])
 
 
 def written_shapes(shapes: Iterable[tuple[int | None, ...]]) -> str:
     """Return shapes as in an error message, with ? for a size that is left open."""
-    texts = ("[" + ", ".join("?" if size is None else str(size) for size in shape) + "]" for shape in shapes)
+    texts = (
+        "[" + ", ".join("?" if size is None else str(size) for size in shape) + "]"
+        for shape in shapes
+    )
     return " and ".join(texts) or "none"
 
 

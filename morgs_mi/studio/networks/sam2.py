@@ -1,15 +1,18 @@
-"""Motion masks refined by SAM2, a promptable segmentation network in two ONNX files, run on the CPU by `onnxruntime`.
+"""Motion masks refined by SAM2, a promptable segmentation network in two ONNX files, run on the CPU
+by `onnxruntime`.
 
-SAM2 (Ravi et al., "SAM 2: Segment anything in images and videos", 2024) is exported as an image encoder, run once per
-image, and a mask decoder, run once per prompt. Names and shapes are those that `samexporter` writes:
+SAM2 (Ravi et al., "SAM 2: Segment anything in images and videos", 2024) is exported as an image
+encoder, run once per image, and a mask decoder, run once per prompt. Names and shapes are those
+that `samexporter` writes:
 
     encoder   image [1, 3, 1024, 1024] -> high_res_feats_0, high_res_feats_1, image_embed
-    decoder   these three, point_coords [1, P, 2], point_labels [1, P], mask_input [1, 1, 256, 256], has_mask_input [1]
+    decoder   these three, point_coords [1, P, 2], point_labels [1, P],
+              mask_input [1, 1, 256, 256], has_mask_input [1]
               -> masks [1, M, 256, 256], logits, and iou_predictions [1, M]
 
-Images are stretched to the encoder's size and normalised by ImageNet's mean and standard deviation. A point's label is
-1 for a point on the object, 2 and 3 for the upper left and lower right corner of its box. The package contains no
-weights; docs/masks.md explains how to export them.
+Images are stretched to the encoder's size and normalised by ImageNet's mean and standard deviation.
+A point's label is 1 for a point on the object, 2 and 3 for the upper left and lower right corner of
+its box. The package contains no weights; docs/masks.md explains how to export them.
 """
 
 from __future__ import annotations
@@ -38,7 +41,8 @@ _LOWER_RIGHT = 3
 
 
 class SegmentNetwork:
-    """SAM2: called with an image and a mask, it returns the objects that the mask's connected components lie on.
+    """SAM2: called with an image and a mask, it returns the objects that the mask's connected
+    components lie on.
 
     Args:
         encoder: the image encoder's ONNX file.
@@ -47,29 +51,36 @@ class SegmentNetwork:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: `onnxruntime` is not installed, cannot load a file, or the networks' inputs and outputs are not
-            as in the module's docstring.
+        ValueError: `onnxruntime` is not installed, cannot load a file, or the networks' inputs and
+            outputs are not as in the module's docstring.
     """
 
-    def __init__(self, encoder: str | Path, decoder: str | Path, count: int = MaskConfig.prompts) -> None:
+    def __init__(
+        self, encoder: str | Path, decoder: str | Path, count: int = MaskConfig.prompts
+    ) -> None:
         self._count = count
         self._encoder = OnnxNetwork(encoder)
         self._decoder = OnnxNetwork(decoder)
         shapes = list(self._encoder.inputs.values())
         if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] != 3:
             raise ValueError(
-                f"{encoder}: expected an image encoder with one input [1, 3, {_SIZE}, {_SIZE}], got "
-                f"{written_shapes(shapes)}; give the encoder first, then the decoder."
+                f"{encoder}: expected an image encoder with one input [1, 3, {_SIZE}, {_SIZE}], "
+                f"got {written_shapes(shapes)}; give the encoder first, then the decoder."
             )
         height, width = (side or _SIZE for side in shapes[0][2:])
         self._size = width, height
         names = {*self._encoder.outputs, *_PROMPTS}
         missing_names = {*_PROMPTS[:2]} - {*self._decoder.inputs}
-        if missing_names or not set(self._decoder.inputs) <= names or not set(_RESULTS) <= set(self._decoder.outputs):
+        if (
+            missing_names
+            or not set(self._decoder.inputs) <= names
+            or not set(_RESULTS) <= set(self._decoder.outputs)
+        ):
             raise ValueError(
-                f"{decoder}: expected a mask decoder with inputs among {', '.join(sorted(names))} and outputs "
-                f"{' and '.join(_RESULTS)}, got {', '.join(self._decoder.inputs)} and "
-                f"{', '.join(self._decoder.outputs)}; export both networks as described in {page('masks')}."
+                f"{decoder}: expected a mask decoder with inputs among {', '.join(sorted(names))} "
+                f"and outputs {' and '.join(_RESULTS)}, got {', '.join(self._decoder.inputs)} and "
+                f"{', '.join(self._decoder.outputs)}; export both networks as described in "
+                f"{page('masks')}."
             )
 
     def __call__(self, image: np.ndarray, mask: np.ndarray) -> np.ndarray:
@@ -80,19 +91,24 @@ class SegmentNetwork:
             mask: [H, W] bool.
 
         Raises:
-            ValueError: the decoder cannot run on the encoder's outputs, or its results differ from SAM2's.
+            ValueError: the decoder cannot run on the encoder's outputs, or its results differ from
+                SAM2's.
         """
         objects = np.zeros(mask.shape, bool)
         components = _components(mask, self._count)
         if not components:
             return objects
-        features = self._encoder.run({next(iter(self._encoder.inputs)): imagenet_blob(image, *self._size)})
+        features = self._encoder.run(
+            {next(iter(self._encoder.inputs)): imagenet_blob(image, *self._size)}
+        )
         for component in components:
             objects |= self._segment(features, component)
         return objects
 
     def _segment(self, features: Mapping[str, np.ndarray], component: np.ndarray) -> np.ndarray:
-        """Return the object [H, W] under one component: the decoder's mask with the highest predicted IoU."""
+        """Return the object [H, W] under one component: the decoder's mask with the highest
+        predicted IoU.
+        """
         height, width = component.shape
         input_width, input_height = self._size
         points, labels = prompts(component)
@@ -111,17 +127,23 @@ class SegmentNetwork:
         masks, quality = (results[name] for name in _RESULTS)
         if masks.ndim != 4 or quality.shape != masks.shape[:2] or len(masks) != 1:
             raise ValueError(
-                f"{self._decoder.path}: expected masks [1, M, H, W] and iou_predictions [1, M], got "
-                f"{list(masks.shape)} and {list(quality.shape)}."
+                f"{self._decoder.path}: expected masks [1, M, H, W] and iou_predictions [1, M], "
+                f"got {list(masks.shape)} and {list(quality.shape)}."
             )
         logits = masks[0, np.argmax(quality[0])].astype(np.float32)
         if not np.isfinite(logits).all():
-            raise ValueError(f"{self._decoder.path}: expected finite masks, got NaN or infinity; export in float32.")
+            raise ValueError(
+                f"{self._decoder.path}: expected finite masks, got NaN or infinity; export in "
+                "float32."
+            )
         return cv2.resize(logits, (width, height), interpolation=cv2.INTER_LINEAR) > 0
 
 
-def prompts(component: np.ndarray, count: int = 3, spacing: float = 0.25) -> tuple[np.ndarray, np.ndarray]:
-    """Return SAM2's prompt for the object under a connected component: its box and a few points deep inside it.
+def prompts(
+    component: np.ndarray, count: int = 3, spacing: float = 0.25
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return SAM2's prompt for the object under a connected component: its box and a few points
+    deep inside it.
 
     Each point is the deepest one that is not too near to the others.
 
@@ -131,8 +153,8 @@ def prompts(component: np.ndarray, count: int = 3, spacing: float = 0.25) -> tup
         spacing: least distance between them, in longer sides of the box.
 
     Returns:
-        Coordinates [P, 2] in pixels of the image, float32, pixel centres at +0.5, and labels [P], float32; first the
-        box's corners, then the points.
+        Coordinates [P, 2] in pixels of the image, float32, pixel centres at +0.5, and labels [P],
+        float32; first the box's corners, then the points.
     """
     rows = np.flatnonzero(component.any(1))
     columns = np.flatnonzero(component.any(0))
@@ -151,7 +173,9 @@ def prompts(component: np.ndarray, count: int = 3, spacing: float = 0.25) -> tup
 
 
 def _components(mask: np.ndarray, most: int) -> list[np.ndarray]:
-    """Return the mask's largest connected components [H, W] bool, at most `most`, the largest first."""
+    """Return the mask's largest connected components [H, W] bool, at most `most`, the largest
+    first.
+    """
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     order = 1 + np.argsort(-stats[1:count, cv2.CC_STAT_AREA], kind="stable")
     return [labels == label for label in order[:most]]
@@ -162,7 +186,8 @@ def sam2(files: str, config: MaskConfig) -> MaskRefiner:
     encoder, _, decoder = files.partition(",")
     if not encoder or not decoder:
         raise ValueError(
-            f"mask_refiner(): `mask_method` must be sam2:ENCODER.onnx,DECODER.onnx, got {'sam2:' + files!r}."
+            "mask_refiner(): `mask_method` must be sam2:ENCODER.onnx,DECODER.onnx, got "
+            f"{'sam2:' + files!r}."
         )
     network = SegmentNetwork(encoder, decoder, config.prompts)
     return lambda image, mask: mask | network(image, clean_mask(mask))

@@ -1,8 +1,10 @@
-"""Disturbances of a recording: time offsets, rolling shutters, changes of exposure, lens distortion, and compression.
+"""Disturbances of a recording: time offsets, rolling shutters, changes of exposure, lens
+distortion, and compression.
 
-Frame k of a camera with the time offset o is exposed at (k + o) / fps, and its row r of H at
-(k + o + s ((r + 0.5) / H - 0.5)) / fps, with s the rolling shutter: the time of a frame is the time of its middle row.
-Ground truth refers to this time and to the view without distortion, which `load_capture` returns.
+Frame k of a camera with the time offset o is exposed at (k + o) / fps, and its row r of H at (k + o
++ s ((r + 0.5) / H - 0.5)) / fps, with s the rolling shutter: the time of a frame is the time of its
+middle row. Ground truth refers to this time and to the view without distortion, which
+`load_capture` returns.
 
 On disk: ``truth/disturbances.json``.
 """
@@ -34,15 +36,23 @@ class Disturbances:
     time_offset: Annotated[float, AtLeast(0)] = 0.0
     """Largest time offset of a camera from cam00 in frames; drawn per camera."""
     rolling_shutter: Annotated[float, AtLeast(0), AtMost(1)] = 0.0
-    """Time in which all cameras read their rows, as a share of a frame; a rolling shutter has about 0.5."""
+    """Time in which all cameras read their rows, as a share of a frame; a rolling shutter has about
+    0.5.
+    """
     exposure_gain: Annotated[float, AtLeast(0), AtMost(10)] = 0.0
-    """Largest deviation of a camera's exposure, drawn per camera: 0.2 for factors from 1 / 1.2 to 1.2."""
+    """Largest deviation of a camera's exposure, drawn per camera: 0.2 for factors from 1 / 1.2 to
+    1.2.
+    """
     exposure_drift: Annotated[float, AtLeast(0), AtMost(10)] = 0.0
-    """Largest change of a camera's exposure from its first frame to its last, as for exposure-gain."""
+    """Largest change of a camera's exposure from its first frame to its last, as for exposure-gain.
+    """
     exposure_flicker: Annotated[float, AtLeast(0), AtMost(1)] = 0.0
     """Standard deviation of the exposure from frame to frame, drawn per camera and frame."""
-    distortion: Annotated[float, AtLeast(0), AtMost(0.5)] = 0.0  # beyond, the corners of a wide view fold
-    """Largest radial distortion of the lenses, COLMAP's SIMPLE_RADIAL k, drawn per camera; 0.1 is moderate."""
+    # Beyond, the corners of a wide view fold.
+    distortion: Annotated[float, AtLeast(0), AtMost(0.5)] = 0.0
+    """Largest radial distortion of the lenses, COLMAP's SIMPLE_RADIAL k, drawn per camera; 0.1 is
+    moderate.
+    """
     jpeg_quality: Annotated[int, AtLeast(0), AtMost(100)] = 0
     """Quality from 1 to 100 of the JPEG compression of every image; 0: none."""
 
@@ -51,7 +61,8 @@ class Disturbances:
 class CameraDisturbance:
     """The disturbance of one camera."""
 
-    time_offset: float  #: Frame k shows the time of frame k + time_offset of the reference, at its middle row.
+    #: Frame k shows the time of frame k + time_offset of the reference, at its middle row.
+    time_offset: float
     rolling_shutter: float  #: Time from the first row to the last, frames.
     gains: tuple[float, ...]  #: Factor on the linear light of each frame [T].
     distortion: float  #: k of COLMAP's SIMPLE_RADIAL lens.
@@ -79,11 +90,17 @@ def draw_disturbances(
     check_ranges(disturbances, "draw_disturbances()")
     d = disturbances
     shape = (num_cameras, num_frames)
-    offsets, gains, drifts, flicker, lenses = (np.random.default_rng([seed, 3, kind]) for kind in range(5))
+    offsets, gains, drifts, flicker, lenses = (
+        np.random.default_rng([seed, 3, kind]) for kind in range(5)
+    )
     offset = d.time_offset * offsets.uniform(-1, 1, num_cameras)
-    log_gain = (np.log1p(d.exposure_gain) * gains.uniform(-1, 1, num_cameras))[:, None] + np.zeros(num_frames)
+    log_gain = (np.log1p(d.exposure_gain) * gains.uniform(-1, 1, num_cameras))[:, None] + np.zeros(
+        num_frames
+    )
     drift = np.log1p(d.exposure_drift) * drifts.uniform(-1, 1, num_cameras)
-    log_gain += drift[:, None] * np.linspace(0, 1, num_frames) + d.exposure_flicker * flicker.standard_normal(shape)
+    log_gain += drift[:, None] * np.linspace(
+        0, 1, num_frames
+    ) + d.exposure_flicker * flicker.standard_normal(shape)
     offset[0] = 0
     log_gain[0] = 0
     k = d.distortion * lenses.uniform(-1, 1, num_cameras) + 0.0  # not -0
@@ -100,19 +117,25 @@ def draw_disturbances(
 
 
 def undistorted(camera: Camera, lens: Lens | None, pixels: np.ndarray) -> np.ndarray:
-    """Return the pixels of the pinhole `camera` that `lens` shows at `pixels` [P, 2], float64 [P, 2]."""
+    """Return the pixels of the pinhole `camera` that `lens` shows at `pixels` [P, 2], float64
+    [P, 2].
+    """
     if lens is None or not any(lens.distortion):
         return pixels
     precise = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-10)
     points = np.ascontiguousarray(pixels[:, None], np.float64)
-    return cv2.undistortPoints(points, camera.K, lens.opencv_coefficients, None, np.eye(3), camera.K, precise)[:, 0]
+    return cv2.undistortPoints(
+        points, camera.K, lens.opencv_coefficients, None, np.eye(3), camera.K, precise
+    )[:, 0]
 
 
 def compressed(image: np.ndarray, quality: int) -> np.ndarray:
     """Return an image, uint8 RGB [H, W, 3], after JPEG compression; unchanged for the quality 0."""
     if not quality:
         return image
-    data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    data = cv2.imencode(
+        ".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality]
+    )[1]
     result = cv2.imdecode(data, cv2.IMREAD_COLOR)
     assert result is not None
     return cv2.cvtColor(result, cv2.COLOR_BGR2RGB)
@@ -137,15 +160,19 @@ def load_disturbances(folder: str | Path) -> dict[str, CameraDisturbance]:
     path = _path(folder)
     if not path.is_file():
         raise FileNotFoundError(
-            f"load_disturbances(): there is no file {path}; pass the truth folder of a synthetic capture."
+            f"load_disturbances(): there is no file {path}; pass the truth folder of a synthetic "
+            "capture."
         )
     content = read_json(path)
     try:
-        return {name: CameraDisturbance(**{**entry, "gains": tuple(entry["gains"])}) for name, entry in content.items()}
+        return {
+            name: CameraDisturbance(**{**entry, "gains": tuple(entry["gains"])})
+            for name, entry in content.items()
+        }
     except (AttributeError, KeyError, TypeError) as error:
         raise ValueError(
-            f"{path}: expected the disturbances of each camera, got a broken file ({error}); synthesise the capture "
-            "again."
+            f"{path}: expected the disturbances of each camera, got a broken file ({error}); "
+            "synthesise the capture again."
         ) from None
 
 

@@ -1,9 +1,10 @@
 """Exact ground truth of a clip: motion, depth, object ids and motion masks.
 
-A surface point x_t of a rigid object with pose M_t was at x_{t-1} = M_{t-1} M_t^{-1} x_t. With pi the
-projection, the motion map of frame t is pi(x_t) - pi(x_{t-1}) at each pixel of frame t.
+A surface point x_t of a rigid object with pose M_t was at x_{t-1} = M_{t-1} M_t^{-1} x_t. With pi
+the projection, the motion map of frame t is pi(x_t) - pi(x_{t-1}) at each pixel of frame t.
 
-On disk: ``truth/cam00/0000.exr`` holds one camera's frame, ``truth/tracks.npz`` the clip's trajectories.
+On disk: ``truth/cam00/0000.exr`` holds one camera's frame, ``truth/tracks.npz`` the clip's
+trajectories.
 """
 
 from __future__ import annotations
@@ -72,13 +73,21 @@ def compute_ground_truth(
         after: the same in the next frame, which determines the mask of the first frame.
     """
     hit = surface.ids >= 0
-    # Where there is no surface, a point in front of the camera avoids a division by zero; its values are not used.
-    points = np.where(hit[..., None], surface.positions, camera.position + np.asarray(camera.viewmat)[2, :3])
+    # Where there is no surface, a point in front of the camera avoids a division by zero; its
+    # values are not used.
+    points = np.where(
+        hit[..., None], surface.positions, camera.position + np.asarray(camera.viewmat)[2, :3]
+    )
     pixels, depth = camera.project(points)
-    other = move_with_objects(replace(surface, positions=points), poses, after if before is None else before)
+    other = move_with_objects(
+        replace(surface, positions=points), poses, after if before is None else before
+    )
     motion = np.zeros_like(pixels) if before is None else pixels - camera.project(other)[0]
     # Coordinates are single-precision: motion below their rounding error counts as zero.
     mask = np.linalg.norm(other - points, axis=-1) > 1e-6 * np.abs(points).max()
     return GroundTruth(
-        motion.astype(np.float32), np.where(hit, depth, 0).astype(np.float32), surface.ids.astype(np.int32), mask
+        motion.astype(np.float32),
+        np.where(hit, depth, 0).astype(np.float32),
+        surface.ids.astype(np.int32),
+        mask,
     )

@@ -16,14 +16,16 @@ from morgs_mi.studio.synth.disturbances import undistorted
 from morgs_mi.studio.synth.ground_truth import SurfacePoints
 from morgs_mi.studio.synth.scene import Scene
 
-# A hit within this share of a point's distance is its own surface: intersections are single-precision.
+# A hit within this share of a point's distance is its own surface: intersections are
+# single-precision.
 _OWN_SURFACE = 1e-4
 
 
 def srgb_bytes(linear: np.ndarray, noise: np.ndarray | float = 0.0) -> np.ndarray:
     """Return linear light [...] in [0, 1] as sRGB plus `noise`, clipped and rounded to uint8.
 
-    Mitsuba's bitmap conversion is not used because it dithers, and dither looks like noise in a static scene.
+    Mitsuba's bitmap conversion is not used because it dithers, and dither looks like noise in a
+    static scene.
     """
     values = encode_light(np.clip(linear, 0, 1))
     return np.rint(255 * np.clip(values + noise, 0, 1)).astype(np.uint8)
@@ -34,8 +36,9 @@ def developed(linear: np.ndarray, noise: float, seed: int) -> np.ndarray:
 
     Args:
         linear: the light; 1 is white.
-        noise: standard deviation of the sensor noise per channel, relative to white. It does not depend on the
-            brightness: photon noise grows with the square root of the light, which the sRGB encoding approximates.
+        noise: standard deviation of the sensor noise per channel, relative to white. It does not
+            depend on the brightness: photon noise grows with the square root of the light, which
+            the sRGB encoding approximates.
         seed: seed of the noise.
     """
     grain = noise * np.random.default_rng([seed, 1]).standard_normal(linear.shape) if noise else 0.0
@@ -48,13 +51,16 @@ def _load(name: str, content: dict[str, Any]) -> Any:
     except RuntimeError as error:
         # Mitsuba's message begins with a line of its own source.
         reason = re.sub(r"^\[\w+\.cpp:\d+\] ", "", str(error)).rstrip(".! ")
-        raise ValueError(f"scene {name!r}: Mitsuba cannot load it: {reason}; correct the dictionary.") from error
+        raise ValueError(
+            f"scene {name!r}: Mitsuba cannot load it: {reason}; correct the dictionary."
+        ) from error
 
 
 class PathTracer:
     """Path tracer of a scene at one time.
 
-    The scene is loaded once. Only the transforms of instances change, so all views and frames run the same kernels.
+    The scene is loaded once. Only the transforms of instances change, so all views and frames run
+    the same kernels.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -64,26 +70,39 @@ class PathTracer:
             ValueError: Mitsuba cannot load it.
         """
         self.scene = scene
-        content: dict[str, Any] = {"type": "scene", **{name: light.shape for name, light in scene.lights.items()}}
+        content: dict[str, Any] = {
+            "type": "scene",
+            **{name: light.shape for name, light in scene.lights.items()},
+        }
         owners: dict[str, int] = {}
         for index, (name, item) in enumerate(scene.objects.items()):
             if item.pose is None:
                 shapes = {f"{name}_{part}": shape for part, shape in item.shapes.items()}
             else:
                 content[f"{name}_group"] = {"type": "shapegroup", **item.shapes}
-                shapes = {name: {"type": "instance", "group": {"type": "ref", "id": f"{name}_group"}}}
+                shapes = {
+                    name: {"type": "instance", "group": {"type": "ref", "id": f"{name}_group"}}
+                }
             content |= shapes
             owners |= dict.fromkeys(shapes, index)
-        # The optimisation would merge meshes that share a material, even meshes of different objects.
+        # The optimisation would merge meshes that share a material, even meshes of different
+        # objects.
         self._scene: Any = _load(scene.name, content)
         shapes = [shape for shape in self._scene.shapes() if shape.id() in owners]
         self._owners = [(mi.ShapePtr(shape), owners[shape.id()]) for shape in shapes]
         self._params: Any = mi.traverse(self._scene)
-        moving = {name: light.pose for name, light in scene.lights.items() if light.pose is not None}
-        self._lamps = {f"{name}.to_world": (pose, self._lamp_transform(name)) for name, pose in moving.items()}
+        moving = {
+            name: light.pose for name, light in scene.lights.items() if light.pose is not None
+        }
+        self._lamps = {
+            f"{name}.to_world": (pose, self._lamp_transform(name)) for name, pose in moving.items()
+        }
         self._exposure = 1.0
-        # Only lamps are sampled: 16 samples have as little noise as 64 samples with a sky, and are seven times faster.
-        self._integrator: Any = mi.load_dict({"type": "direct", "emitter_samples": 1, "bsdf_samples": 0})
+        # Only lamps are sampled: 16 samples have as little noise as 64 samples with a sky, and are
+        # seven times faster.
+        self._integrator: Any = mi.load_dict(
+            {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0}
+        )
         self.set_time(0.0)
 
     @property
@@ -95,14 +114,17 @@ class PathTracer:
         """Return the transform [4, 4] of a lamp's shape within the lamp's space."""
         if f"{light}.to_world" not in self._params:
             raise ValueError(
-                f"scene {self.scene.name!r}, light {light!r}: a lamp with a pose must be a shape with an "
-                "emitter, e.g. a rectangle; use one, or leave out the pose."
+                f"scene {self.scene.name!r}, light {light!r}: a lamp with a pose must be a shape "
+                "with an emitter, e.g. a rectangle; use one, or leave out the pose."
             )
         return np.array(self._params[f"{light}.to_world"].matrix, float).reshape(4, 4)
 
     def poses(self, time: float) -> list[np.ndarray]:
         """Return each object's pose [4, 4] at `time` in seconds."""
-        return [np.eye(4) if item.pose is None else item.pose(time) for item in self.scene.objects.values()]
+        return [
+            np.eye(4) if item.pose is None else item.pose(time)
+            for item in self.scene.objects.values()
+        ]
 
     def set_time(self, time: float) -> None:
         """Set the poses of all objects and lamps, and the exposure, to `time` in seconds."""
@@ -133,8 +155,11 @@ class PathTracer:
         linear = render(self._scene, sensor=sensor, integrator=self._integrator, spp=spp, seed=seed)
         return self._exposure * np.array(linear)[..., :3]
 
-    def light_of_rows(self, camera: Camera, rows: np.ndarray, spp: int, seed: int, lens: Lens | None) -> np.ndarray:
-        """Return the exposed light of some rows of an image that a lens has distorted, linear [R, W, 3].
+    def light_of_rows(
+        self, camera: Camera, rows: np.ndarray, spp: int, seed: int, lens: Lens | None
+    ) -> np.ndarray:
+        """Return the exposed light of some rows of an image that a lens has distorted, linear
+        [R, W, 3].
 
         Args:
             camera: the view without distortion.
@@ -159,7 +184,9 @@ class PathTracer:
 
     def surface_points(self, camera: Camera) -> SurfacePoints:
         """Return the surface points at the pixel centres [H, W]."""
-        pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1) + 0.5
+        pixels = (
+            np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1) + 0.5
+        )
         position, directions = camera.rays(pixels.reshape(-1, 2))
         origins = np.repeat(position[:, None], len(directions), axis=1)
         ray = mi.Ray3f(mi.Point3f(origins), mi.Vector3f(directions.T))
@@ -168,12 +195,20 @@ class PathTracer:
         ids = np.full(len(directions), -1, np.int32)
         for pointer, index in self._owners:
             ids[np.array((hit.shape == pointer) | (hit.instance == pointer))] = index
-        return SurfacePoints(np.array(hit.p, float).T.copy(), ids).reshaped(camera.height, camera.width)
+        return SurfacePoints(np.array(hit.p, float).T.copy(), ids).reshaped(
+            camera.height, camera.width
+        )
 
     def sees(self, camera: Camera, points: np.ndarray) -> np.ndarray:
-        """Return the mask of the surface points [P, 3] that a camera sees: inside its image, with nothing in front."""
+        """Return the mask of the surface points [P, 3] that a camera sees: inside its image, with
+        nothing in front.
+        """
         pixels, depth = camera.project(points)
-        mask = ((depth > camera.near)[:, None] & (pixels >= 0) & (pixels < (camera.width, camera.height))).all(-1)
+        mask = (
+            (depth > camera.near)[:, None]
+            & (pixels >= 0)
+            & (pixels < (camera.width, camera.height))
+        ).all(-1)
         offset = points - camera.position
         distance = np.linalg.norm(offset, axis=-1)
         origins = np.repeat(camera.position[:, None], len(points), axis=1)

@@ -1,7 +1,8 @@
 """Descriptions of moving scenes: rigid objects with a pose at each time, lights and a rig.
 
-A scene is a Python file with a function ``build(seed: int) -> Scene``. Poses are functions of the time in
-seconds, so a clip may have any frame rate and length. World space has y up; lengths are world units.
+A scene is a Python file with a function ``build(seed: int) -> Scene``. Poses are functions of the
+time in seconds, so a clip may have any frame rate and length. World space has y up; lengths are
+world units.
 """
 
 from __future__ import annotations
@@ -39,8 +40,10 @@ class Object:
 class Light:
     """A lamp. It has no id in the ground truth, so it must not be visible."""
 
-    shape: dict[str, Any]  #: Mitsuba dictionary of an emitter, or of a shape with one, in the lamp's space.
-    pose: Pose | None = None  #: Seconds -> rigid lamp-to-world matrix [4, 4]; None for a static lamp, in world space.
+    #: Mitsuba dictionary of an emitter, or of a shape with one, in the lamp's space.
+    shape: dict[str, Any]
+    #: Seconds -> rigid lamp-to-world matrix [4, 4]; None for a static lamp, in world space.
+    pose: Pose | None = None
 
 
 @dataclass(frozen=True)
@@ -54,13 +57,18 @@ class Rig:
     spread: tuple[float, float] = (26.0, 10.0)  #: Half-width and half-height of the cap, degrees.
 
     def cameras(self, count: int, width: int, height: int) -> list[Camera]:
-        """Return `count` cameras: ``cam00`` at the centre of the cap, the others evenly distributed around it."""
+        """Return `count` cameras: ``cam00`` at the centre of the cap, the others evenly distributed
+        around it.
+        """
         # A sunflower spiral covers the cap evenly for any count.
         radius = np.sqrt(np.arange(count) / max(count - 1, 1))
         angle = np.arange(count) * np.pi * (3 - np.sqrt(5))
         azimuth = np.deg2rad(self.spread[0] * radius * np.cos(angle))
         polar = np.deg2rad(self.elevation + self.spread[1] * radius * np.sin(angle))
-        outward = np.stack([np.sin(azimuth) * np.cos(polar), np.sin(polar), np.cos(azimuth) * np.cos(polar)], axis=1)
+        outward = np.stack(
+            [np.sin(azimuth) * np.cos(polar), np.sin(polar), np.cos(azimuth) * np.cos(polar)],
+            axis=1,
+        )
         origins = np.asarray(self.center) + self.distance * outward
         return [
             Camera.look_at(origin, self.center, (0, 1, 0), self.fov, width, height, f"cam{i:02d}")
@@ -82,25 +90,29 @@ class Scene:
     """A moving scene."""
 
     name: str  #: The scene's name in the capture.
-    objects: Mapping[str, Object]  #: Objects by name; the index in this mapping is the id in the ground truth.
+    #: Objects by name; the index in this mapping is the id in the ground truth.
+    objects: Mapping[str, Object]
     lights: Mapping[str, Light]  #: Lamps by name.
     rig: Rig = field(default_factory=Rig)  #: Positions of the cameras.
-    exposure: Callable[[float], float] | None = None  #: Seconds -> exposure factor of all cameras; None for 1.
-    recording: RecordingDefaults = field(default_factory=RecordingDefaults)  #: Number of cameras and noise.
+    #: Seconds -> exposure factor of all cameras; None for 1.
+    exposure: Callable[[float], float] | None = None
+    #: Number of cameras and noise.
+    recording: RecordingDefaults = field(default_factory=RecordingDefaults)
 
 
 def load_scene(scene: str | Path, seed: int = 0) -> Scene:
     """Build the scene of a Python file, given by its path or by its name in ``scenes/``.
 
     Raises:
-        ValueError: there is no such scene, its file has no ``build(seed) -> Scene``, or running the file fails; the
-            message names the file and its line.
+        ValueError: there is no such scene, its file has no ``build(seed) -> Scene``, or running the
+            file fails; the message names the file and its line.
     """
     files = _scene_files()
     path = Path(scene) if Path(scene).suffix == ".py" else files.get(str(scene))
     if path is None or not path.is_file():
         raise ValueError(
-            f"load_scene(): no scene {str(scene)!r}; name one of {sorted(files)} or pass the path of a .py file."
+            f"load_scene(): no scene {str(scene)!r}; name one of {sorted(files)} or pass the path "
+            "of a .py file."
         )
     spec = importlib.util.spec_from_file_location(f"morgs_mi_scene_{path.stem}", path)
     assert spec
@@ -112,13 +124,18 @@ def load_scene(scene: str | Path, seed: int = 0) -> Scene:
         spec.loader.exec_module(module)
     build = getattr(module, "build", None)
     if not callable(build):
-        raise ValueError(f"load_scene(): {path} must define `build(seed) -> Scene`; add that function.")
+        raise ValueError(
+            f"load_scene(): {path} must define `build(seed) -> Scene`; add that function."
+        )
     _check_signature(path, build)
     with failures_in(path):
         result = build(seed)
     if not isinstance(result, Scene):
         value_text = "None" if result is None else f"a {type(result).__name__}"
-        raise ValueError(f"load_scene(): `build` in {path} must return a Scene, got {value_text}; return Scene(...).")
+        raise ValueError(
+            f"load_scene(): `build` in {path} must return a Scene, got {value_text}; return "
+            "Scene(...)."
+        )
     return result
 
 
@@ -130,12 +147,16 @@ def failures_in(path: Path) -> Iterator[None]:
     except Exception as error:
         # The file name of a frame is absolute.
         frames = extract_tb(error.__traceback__)
-        lines = [frame.lineno for frame in frames if Path(frame.filename).resolve() == path.resolve()]
+        lines = [
+            frame.lineno for frame in frames if Path(frame.filename).resolve() == path.resolve()
+        ]
         # A syntax error has no frame in the file.
         line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
         reason = error.msg if isinstance(error, SyntaxError) else str(error)
         place = f"{path}, line {line}" if line else str(path)
-        raise ValueError(f"{place}: {type(error).__name__}: {reason.rstrip('.')}; correct the scene file.") from error
+        raise ValueError(
+            f"{place}: {type(error).__name__}: {reason.rstrip('.')}; correct the scene file."
+        ) from error
 
 
 def _check_signature(path: Path, build: Callable[..., Any]) -> None:
@@ -145,8 +166,8 @@ def _check_signature(path: Path, build: Callable[..., Any]) -> None:
         signature.bind(0)
     except TypeError:
         raise ValueError(
-            f"load_scene(): `build` in {path} must take the seed alone, `build(seed) -> Scene`, got "
-            f"`build{signature}`; give further parameters a default."
+            f"load_scene(): `build` in {path} must take the seed alone, `build(seed) -> Scene`, "
+            f"got `build{signature}`; give further parameters a default."
         ) from None
 
 
@@ -159,17 +180,22 @@ def check_scene(scene: Scene, times: Sequence[float]) -> None:
     """
     place = f"scene {scene.name!r}"
     names: set[str] = set()
-    for kind, expected, items in (("object", Object, scene.objects), ("light", Light, scene.lights)):
+    for kind, expected, items in (
+        ("object", Object, scene.objects),
+        ("light", Light, scene.lights),
+    ):
         for name, item in items.items():
             where = f"{place}, {kind} {name!r}"
             if not isinstance(item, expected):
                 raise ValueError(
-                    f"{where}: expected {expected.__name__}(...), got a value of type {type(item).__name__}; see "
-                    f"{page('scenes')}."
+                    f"{where}: expected {expected.__name__}(...), got a value of type "
+                    f"{type(item).__name__}; see {page('scenes')}."
                 )
             for identifier in _ids(name, item):
                 if identifier in names:
-                    raise ValueError(f"{where}: the name {identifier!r} is used twice; rename one of the two.")
+                    raise ValueError(
+                        f"{where}: the name {identifier!r} is used twice; rename one of the two."
+                    )
                 names.add(identifier)
             shapes = item.shapes if isinstance(item, Object) else {"": item.shape}
             for shape_name, shape in shapes.items():
@@ -182,12 +208,18 @@ def check_scene(scene: Scene, times: Sequence[float]) -> None:
 def _ids(name: str, item: Object | Light) -> list[str]:
     """Return the names of an object's or a lamp's shapes in Mitsuba."""
     if isinstance(item, Object):
-        return [f"{name}_{part}" for part in item.shapes] if item.pose is None else [name, f"{name}_group"]
+        return (
+            [f"{name}_{part}" for part in item.shapes]
+            if item.pose is None
+            else [name, f"{name}_group"]
+        )
     return [name]
 
 
 def _check_node(where: str, node: Any) -> None:
-    """Check a Mitsuba dictionary, because Mitsuba's errors do not name the object or end the process."""
+    """Check a Mitsuba dictionary, because Mitsuba's errors do not name the object or end the
+    process.
+    """
     if not isinstance(node, Mapping) or "type" not in node:
         expected = "expected a Mitsuba dictionary with a `type`"
         raise ValueError(f"{where}: {expected}, got {node!r:.60}; see {page('scenes')}.")
@@ -200,7 +232,9 @@ def _check_node(where: str, node: Any) -> None:
                 f"str(Path(__file__).parent / {Path(value).name!r})."
             )
         if key == "filename" and not isinstance(value, str):
-            raise ValueError(f"{where}: `filename` must be text, got a {type(value).__name__}; wrap it in str().")
+            raise ValueError(
+                f"{where}: `filename` must be text, got a {type(value).__name__}; wrap it in str()."
+            )
         if isinstance(value, Mapping):
             _check_node(f"{where}, {key}", value)
 
@@ -210,12 +244,14 @@ def _check_pose(where: str, pose: Pose, time: float) -> None:
         matrix = np.asarray(pose(time), np.float64)
     except Exception as error:
         reason = f"{type(error).__name__}: {error}".rstrip(".")
-        raise ValueError(f"{where}: its pose at {time:.4g} s fails with {reason}; correct the function.") from error
+        raise ValueError(
+            f"{where}: its pose at {time:.4g} s fails with {reason}; correct the function."
+        ) from error
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         value = f"the shape {matrix.shape}" if matrix.shape != (4, 4) else "NaN or infinity"
         raise ValueError(
-            f"{where}: its pose at {time:.4g} s must be a finite matrix [4, 4], got {value}; multiply translate() and "
-            "rotate()."
+            f"{where}: its pose at {time:.4g} s must be a finite matrix [4, 4], got {value}; "
+            "multiply translate() and rotate()."
         )
     rigid(f"{where}: its pose at {time:.4g} s is not rigid", matrix)
 
@@ -228,7 +264,9 @@ def translate(x: float, y: float, z: float) -> np.ndarray:
 
 
 def rotate(axis: str, angle: float) -> np.ndarray:
-    """Return the rotation about the ``x``, ``y`` or ``z`` axis by `angle` in radians as a matrix [4, 4]."""
+    """Return the rotation about the ``x``, ``y`` or ``z`` axis by `angle` in radians as a matrix
+    [4, 4].
+    """
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_euler(axis, angle).as_matrix()
     return matrix
@@ -240,4 +278,6 @@ def _scene_files() -> dict[str, Path]:
     if checkout.is_dir():
         return {path.stem: path for path in checkout.glob("*.py")}
     installed = metadata.files("morgs-mi") or []
-    return {Path(f).stem: Path(str(f.locate())) for f in installed if f.match("morgs_mi/scenes/*.py")}
+    return {
+        Path(f).stem: Path(str(f.locate())) for f in installed if f.match("morgs_mi/scenes/*.py")
+    }

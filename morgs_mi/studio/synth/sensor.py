@@ -11,7 +11,8 @@ from morgs_mi.studio.synth.disturbances import CameraDisturbance
 from morgs_mi.studio.synth.path_tracer import PathTracer
 from morgs_mi.studio.synth.synth_config import SynthConfig
 
-# Rows that a rolling shutter reads at one time; at 10 pixels per frame, objects move by 0.2 pixels in this time.
+# Rows that a rolling shutter reads at one time; at 10 pixels per frame, objects move by 0.2 pixels
+# in this time.
 _BAND = 4
 
 
@@ -28,15 +29,17 @@ def check_lenses(cameras: Sequence[Camera], disturbed: Sequence[CameraDisturbanc
             largest = 2 / (3 * np.sqrt(-3 * item.distortion))
             if not corner < 0.98 * largest:
                 raise ValueError(
-                    f"synthesize(): `distortion` must be small enough for the field of view, got {item.distortion:.3g} "
-                    f"with corners at the radius {corner:.3g}, which must be below {largest:.3g}; set a smaller one."
+                    "synthesize(): `distortion` must be small enough for the field of view, got "
+                    f"{item.distortion:.3g} with corners at the radius {corner:.3g}, which must "
+                    f"be below {largest:.3g}; set a smaller one."
                 )
 
 
 def record_light(
     tracer: PathTracer, camera: Camera, own: CameraDisturbance, frame: int, config: SynthConfig
 ) -> np.ndarray:
-    """Return the light of a frame that a camera with its clock, shutter and lens receives, linear [H, W, 3].
+    """Return the light of a frame that a camera with its clock, shutter and lens receives, linear
+    [H, W, 3].
 
     Args:
         tracer: the scene; its time is changed.
@@ -52,7 +55,9 @@ def record_light(
     bands = np.arange(camera.height), own.row_times(frame, camera.height)
     count = -(-camera.height // _BAND) if own.rolling_shutter else 1
     light = []
-    for band, (rows, times) in enumerate(zip(*(np.array_split(values, count) for values in bands), strict=True)):
+    for band, (rows, times) in enumerate(
+        zip(*(np.array_split(values, count) for values in bands), strict=True)
+    ):
         tracer.set_time(times.mean() / config.fps)
         band_seed = int(np.random.SeedSequence([config.seed, band]).generate_state(1)[0])
         light.append(tracer.light_of_rows(camera, rows, config.spp, band_seed, own.lens))

@@ -20,12 +20,24 @@ def ball(radius: float, material: Material, center: Sequence[float] = (0, 0, 0))
 
 def box(center: Sequence[float], half: Sequence[float], material: Material) -> dict[str, Any]:
     """Return a box with half-widths `half` along the axes."""
-    return {"type": "cube", "to_world": _transform(translate(*center) @ np.diag([*half, 1])), "bsdf": material}
+    return {
+        "type": "cube",
+        "to_world": _transform(translate(*center) @ np.diag([*half, 1])),
+        "bsdf": material,
+    }
 
 
-def rod(start: Sequence[float], end: Sequence[float], radius: float, material: Material) -> dict[str, Any]:
+def rod(
+    start: Sequence[float], end: Sequence[float], radius: float, material: Material
+) -> dict[str, Any]:
     """Return a cylinder that is open at both ends."""
-    return {"type": "cylinder", "p0": list(start), "p1": list(end), "radius": radius, "bsdf": material}
+    return {
+        "type": "cylinder",
+        "p0": list(start),
+        "p1": list(end),
+        "radius": radius,
+        "bsdf": material,
+    }
 
 
 def disk(center: Sequence[float], radius: float, material: Material) -> dict[str, Any]:

@@ -13,7 +13,8 @@ from morgs_mi.studio.synth.disturbances import Disturbances
 if TYPE_CHECKING:
     from morgs_mi.studio.synth.scene import RecordingDefaults
 
-# Frame rates that the encoders of videos take, and numbers of samples that a sampler of Mitsuba takes.
+# Frame rates that the encoders of videos take, and numbers of samples that a sampler of Mitsuba
+# takes.
 _FPS = "(0, 1000]"
 _SPP = "[1, 1e6]"
 
@@ -34,8 +35,8 @@ class SynthConfig:
     spp: Annotated[int, AtLeast(1)] | None = None
     """Samples per pixel; 16 gives noise at 42 dB. The scene's own, usually 16, if not given."""
     noise: Annotated[float, AtLeast(0), Below(1)] | None = None
-    """Standard deviation of sensor noise as a share of white; an indoor camera has 0.01, 2.5 grey levels. The scene's
-    own, usually 0, if not given."""
+    """Standard deviation of sensor noise as a share of white; an indoor camera has 0.01, 2.5 grey
+    levels. The scene's own, usually 0, if not given."""
     fps: Annotated[float, Above(0)] = 30.0
     """Frames per second."""
     lossless: bool = True
@@ -43,7 +44,9 @@ class SynthConfig:
     disturbances: Disturbances = field(default_factory=Disturbances)
     """Disturbances of the recording."""
     seed: Annotated[int, AtLeast(0)] = 0
-    """Seed of textures, sampling noise, disturbances and the choice of points; of everything in the scene random."""
+    """Seed of textures, sampling noise, disturbances and the choice of points; of everything in the
+    scene random.
+    """
 
     def check(self) -> None:
         """Raise an error unless all settings are in range.
@@ -58,8 +61,14 @@ class SynthConfig:
 
     def completed(self, recording: RecordingDefaults) -> SynthConfig:
         """Return the settings, with the scene's own values for missing ones."""
-        defaults = {"cameras": recording.num_cameras, "spp": recording.spp, "noise": recording.noise}
-        return replace(self, **{name: value for name, value in defaults.items() if getattr(self, name) is None})
+        defaults = {
+            "cameras": recording.num_cameras,
+            "spp": recording.spp,
+            "noise": recording.noise,
+        }
+        return replace(
+            self, **{name: value for name, value in defaults.items() if getattr(self, name) is None}
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return the settings as stored in `capture.json`."""

@@ -1,7 +1,7 @@
 """Synthetic captures: a scene path-traced from a rig of cameras, with exact ground truth.
 
-Light is linear inside the path tracer and sRGB-encoded once, for the video. The ground truth is sampled at pixel
-centres, so it has no noise and does not mix foreground and background.
+Light is linear inside the path tracer and sRGB-encoded once, for the video. The ground truth is
+sampled at pixel centres, so it has no noise and does not mix foreground and background.
 """
 
 from __future__ import annotations
@@ -56,15 +56,17 @@ def synthesize(
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
-    """Path-trace a moving scene into a multi-view capture in N3DV's layout, with exact ground truth.
+    """Path-trace a moving scene into a multi-view capture in N3DV's layout, with exact ground
+    truth.
 
-    Writes ``frames/cam00/0000.png`` ..., ``cam00.mp4`` ... for players, ``poses_bounds.npy``, a COLMAP text
-    model ``sparse/0`` with points as from structure from motion, ``capture.json`` and ``truth/`` (see `ground_truth`
-    and `disturbances`). ``cam00`` is the central camera of the rig and the held-out test view, as in
-    N3DV. With lens distortion there is no ``poses_bounds.npy``, which cannot represent it. The folder is written
-    atomically.
+    Writes ``frames/cam00/0000.png`` ..., ``cam00.mp4`` ... for players, ``poses_bounds.npy``, a
+    COLMAP text model ``sparse/0`` with points as from structure from motion, ``capture.json`` and
+    ``truth/`` (see `ground_truth` and `disturbances`). ``cam00`` is the central camera of the rig
+    and the held-out test view, as in N3DV. With lens distortion there is no ``poses_bounds.npy``,
+    which cannot represent it. The folder is written atomically.
 
-    Tracks are at the times of the frames of ``cam00``, the other ground truth at the times of each camera.
+    Tracks are at the times of the frames of ``cam00``, the other ground truth at the times of each
+    camera.
 
     Args:
         scene: a scene, its name, or the path of its Python file.
@@ -77,9 +79,11 @@ def synthesize(
         The folder `out`.
 
     Raises:
-        ValueError: a setting is out of range, there is no such scene, `out` lies in a capture, the scene is not as
-            `check_scene` requires, a camera sees none of its objects, or Mitsuba's variant is not vectorised.
-        FileExistsError: `out` is not empty and `overwrite` is not set, or `out` is not a synthetic capture.
+        ValueError: a setting is out of range, there is no such scene, `out` lies in a capture, the
+            scene is not as `check_scene` requires, a camera sees none of its objects, or Mitsuba's
+            variant is not vectorised.
+        FileExistsError: `out` is not empty and `overwrite` is not set, or `out` is not a synthetic
+            capture.
         OSError: a file cannot be written, or a mesh or texture of the scene does not exist.
     """
     if not str(mi.variant()).startswith(("llvm", "cuda", "metal")):
@@ -91,7 +95,9 @@ def synthesize(
     config.check()
     pixels = config.width * config.height
     size = f"images of {config.width}x{config.height} pixels"
-    check_memory("synthesize()", _PIXEL_BYTES * pixels, size, "make them smaller (`width`, `height`)")
+    check_memory(
+        "synthesize()", _PIXEL_BYTES * pixels, size, "make them smaller (`width`, `height`)"
+    )
     scene = scene if isinstance(scene, Scene) else load_scene(scene, config.seed)
     rig = _Rig.of(scene, config.completed(scene.recording))
     check_lenses(rig.cameras, rig.disturbed)
@@ -128,13 +134,26 @@ class _Rig:
     def of(cls, scene: Scene, config: SynthConfig) -> _Rig:
         assert config.cameras is not None
         cameras = scene.rig.cameras(config.cameras, config.width, config.height)
-        return cls(cameras, draw_disturbances(config.disturbances, config.cameras, config.frames, config.seed), config)
+        return cls(
+            cameras,
+            draw_disturbances(config.disturbances, config.cameras, config.frames, config.seed),
+            config,
+        )
 
     def times(self) -> list[float]:
-        """Return the times of the frames, the time after the last one, and the extreme times of read rows, seconds."""
+        """Return the times of the frames, the time after the last one, and the extreme times of
+        read rows, seconds.
+        """
         ends = (0, 0), (self.config.frames, -1)
-        times = [camera.row_times(frame, self.config.height)[row] for camera in self.disturbed for frame, row in ends]
-        return [float(t) / self.config.fps for t in sorted({*range(self.config.frames + 1), min(times), max(times)})]
+        times = [
+            camera.row_times(frame, self.config.height)[row]
+            for camera in self.disturbed
+            for frame, row in ends
+        ]
+        return [
+            float(t) / self.config.fps
+            for t in sorted({*range(self.config.frames + 1), min(times), max(times)})
+        ]
 
 
 def _write_clips(
@@ -168,29 +187,37 @@ def _images(tracer: PathTracer, rig: _Rig, index: int) -> Iterator[np.ndarray]:
     disturbance = rig.disturbed[index]
     assert config.noise is not None
     for frame in range(config.frames):
-        # The noise must differ between views and frames; otherwise it would look like a moving texture.
+        # The noise must differ between views and frames; otherwise it would look like a moving
+        # texture.
         seed = int(np.random.SeedSequence([config.seed, index, frame]).generate_state(1)[0])
-        light = record_light(tracer, rig.cameras[index], disturbance, frame, replace(config, seed=seed))
-        yield compressed(developed(disturbance.gains[frame] * light, config.noise, seed), disturbance.jpeg_quality)
+        light = record_light(
+            tracer, rig.cameras[index], disturbance, frame, replace(config, seed=seed)
+        )
+        yield compressed(
+            developed(disturbance.gains[frame] * light, config.noise, seed),
+            disturbance.jpeg_quality,
+        )
 
 
 def _check_views(tracer: PathTracer, cameras: Sequence[Camera]) -> None:
-    """Raise `ValueError` without light or if a camera sees no object in the first frame; warn of black images."""
+    """Raise `ValueError` without light or if a camera sees no object in the first frame; warn of
+    black images.
+    """
     if not tracer.has_emitters:
         raise ValueError(
-            f"scene {tracer.scene.name!r}: it has no emitter, so its images would be black; give it lights, e.g. "
-            "`lights()` of morgs_mi.studio.synth.textures."
+            f"scene {tracer.scene.name!r}: it has no emitter, so its images would be black; give "
+            "it lights, e.g. `lights()` of morgs_mi.studio.synth.textures."
         )
     for camera in cameras:
         if not (tracer.surface_points(camera).ids >= 0).any():
             raise ValueError(
-                f"scene {tracer.scene.name!r}: {camera.name} sees no object at 0 s; move the objects, or "
-                "the centre and distance of the rig."
+                f"scene {tracer.scene.name!r}: {camera.name} sees no object at 0 s; move the "
+                "objects, or the centre and distance of the rig."
             )
     if not tracer.render(cameras[0], 1, 0).any():
         _LOG.warning(
-            "scene %r: %s is black at 0 s: no lamp reaches the objects that it sees; check the sides to which lamps "
-            "and surfaces face (a rectangle emits along its +z).",
+            "scene %r: %s is black at 0 s: no lamp reaches the objects that it sees; check the "
+            "sides to which lamps and surfaces face (a rectangle emits along its +z).",
             tracer.scene.name,
             cameras[0].name,
         )
@@ -206,7 +233,9 @@ def _write_truth(tracer: PathTracer, rig: _Rig, folder: Path) -> None:
             tracer.set_time(time)
             surface = tracer.surface_points(camera)
             old_poses = tracer.poses(times[frame - 1]) if frame else None
-            truth = compute_ground_truth(camera, surface, tracer.poses(time), old_poses, tracer.poses(time + 1 / fps))
+            truth = compute_ground_truth(
+                camera, surface, tracer.poses(time), old_poses, tracer.poses(time + 1 / fps)
+            )
             save_truth(folder, camera.name, frame, truth)
     rng = np.random.default_rng([rig.config.seed, 1])
     save_tracks(folder, _sample_tracks(tracer, rig.cameras, frames / fps, rng))
@@ -235,7 +264,11 @@ def _sample_tracks(
                 pixels = np.flatnonzero((visible.ids >= 0) & (can_move[visible.ids] == moving))
                 pixels = rng.choice(pixels, min(share, len(pixels)), replace=False)
                 sample = visible.pick(pixels)
-                points.append(np.stack([move_with_objects(sample, poses[start], pose) for pose in poses], axis=1))
+                points.append(
+                    np.stack(
+                        [move_with_objects(sample, poses[start], pose) for pose in poses], axis=1
+                    )
+                )
                 owners.append(sample.ids)
     tracks = np.concatenate(points)
     visible = {camera.name: np.zeros(tracks.shape[:2], bool) for camera in cameras}
@@ -247,7 +280,8 @@ def _sample_tracks(
 
 
 def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], folder: Path) -> None:
-    """Write the cameras as `poses_bounds.npy` and as a COLMAP model with points from the training views.
+    """Write the cameras as `poses_bounds.npy` and as a COLMAP model with points from the training
+    views.
 
     The points have the colours of the `clips`, one per camera.
     """
@@ -267,8 +301,11 @@ def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], fol
         bounds.append(np.percentile(depths, [0.1, 99.9]))
         if index == 0:
             continue  # the held-out view must not contribute points or colours
-        choice = rng.choice(len(pixels), min(_NUM_SFM_POINTS // (len(cameras) - 1), len(pixels)), replace=False)
-        # Structure from motion has an error of about half a pixel; here it is the same along the ray.
+        choice = rng.choice(
+            len(pixels), min(_NUM_SFM_POINTS // (len(cameras) - 1), len(pixels)), replace=False
+        )
+        # Structure from motion has an error of about half a pixel; here it is the same along the
+        # ray.
         noise = rng.normal(size=(len(choice), 3)) * (0.5 * depths[choice, None] / camera.K[0, 0])
         points.append(visible.pick(pixels[choice]).positions + noise)
         image = next(open_frames(clips[index]).frames(0, 1))
@@ -277,7 +314,9 @@ def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], fol
     if not any(disturbance.distortion for disturbance in disturbed):
         write_poses_bounds(folder / "poses_bounds.npy", cameras, np.array(bounds))
     lenses = [disturbance.lens for disturbance in disturbed]
-    write_colmap(folder / "sparse" / "0", cameras, np.concatenate(points), np.concatenate(colors), lenses)
+    write_colmap(
+        folder / "sparse" / "0", cameras, np.concatenate(points), np.concatenate(colors), lenses
+    )
 
 
 def _check_folder(out: Path, overwrite: bool) -> None:
@@ -286,15 +325,20 @@ def _check_folder(out: Path, overwrite: bool) -> None:
         raise FileExistsError(f"synthesize(): {out} is a file; choose another folder.")
     occupied = out.is_dir() and not all(is_added(file.name) for file in out.iterdir())
     if occupied and not overwrite:
-        raise FileExistsError(f"synthesize(): {out} is not empty; choose another folder, or set `overwrite`.")
+        raise FileExistsError(
+            f"synthesize(): {out} is not empty; choose another folder, or set `overwrite`."
+        )
     if occupied and not _is_synthetic(out):
         raise FileExistsError(
-            f"synthesize(): {out} is not a synthetic capture, so it is not replaced; choose another folder."
+            f"synthesize(): {out} is not a synthetic capture, so it is not replaced; choose "
+            "another folder."
         )
 
 
 def _is_synthetic(folder: Path) -> bool:
-    """Return whether a folder is a capture written by `synthesize`: recordings and fits have a `capture.json` too."""
+    """Return whether a folder is a capture written by `synthesize`: recordings and fits have a
+    `capture.json` too.
+    """
     try:
         settings = read_json(folder / CAPTURE)
     except (OSError, ValueError):

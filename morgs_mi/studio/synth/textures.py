@@ -1,7 +1,7 @@
 """Procedural textures, and the walls and lights that the synthetic scenes share.
 
-Optical flow and splats need texture, so every surface has detail at all scales down to a few pixels. Unlike white
-noise, a 1/f spectrum has the same contrast at any distance.
+Optical flow and splats need texture, so every surface has detail at all scales down to a few
+pixels. Unlike white noise, a 1/f spectrum has the same contrast at any distance.
 """
 
 from __future__ import annotations
@@ -17,15 +17,20 @@ _SIZE = 512  # texels across
 
 
 def fractal(rng: np.random.Generator, size: int, finest: float) -> np.ndarray:
-    """Return periodic 1/f noise [size, size] of unit variance with at most `finest` cycles across."""
-    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(size, 1 / size), np.fft.rfftfreq(size, 1 / size), indexing="ij"))
+    """Return periodic 1/f noise [size, size] of unit variance, at most `finest` cycles across."""
+    frequency = np.hypot(
+        *np.meshgrid(np.fft.fftfreq(size, 1 / size), np.fft.rfftfreq(size, 1 / size), indexing="ij")
+    )
     amplitude = np.where((frequency >= 1) & (frequency <= finest), 1 / np.maximum(frequency, 1), 0)
-    noise = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((size, size))) * amplitude, s=(size, size))
+    noise = np.fft.irfft2(
+        np.fft.rfft2(rng.standard_normal((size, size))) * amplitude, s=(size, size)
+    )
     return noise / noise.std()
 
 
 def pattern(seed: int, first: RGB, second: RGB, cells: int, finest: float) -> np.ndarray:
-    """Return a reflectance texture [512, 512, 3], linear: a checker of two colours under coloured noise.
+    """Return a reflectance texture [512, 512, 3], linear: a checker of two colours under coloured
+    noise.
 
     Args:
         seed: seed of the noise.
@@ -51,7 +56,8 @@ def textured(
     Args:
         texture: reflectance [size, size, 3], linear.
         roughness: roughness of the plastic; None for diffuse.
-        repeat: repetitions of the texture along u and v, which avoid stretching on long, thin shapes.
+        repeat: repetitions of the texture along u and v, which avoid stretching on long, thin
+            shapes.
     """
     import mitsuba as mi
 
@@ -67,8 +73,12 @@ def textured(
     }
 
 
-def room(seed: int, half_width: float = 2.4, height: float = 3.2, depth: float = 1.7) -> dict[str, Object]:
-    """Return a room's floor, back wall and side walls around the origin, open above and towards the cameras (+z)."""
+def room(
+    seed: int, half_width: float = 2.4, height: float = 3.2, depth: float = 1.7
+) -> dict[str, Object]:
+    """Return a room's floor, back wall and side walls around the origin, open above and towards the
+    cameras (+z).
+    """
     import mitsuba as mi
 
     T = mi.ScalarTransform4f
@@ -85,11 +95,17 @@ def room(seed: int, half_width: float = 2.4, height: float = 3.2, depth: float =
             pattern(seed + 1, (0.30, 0.38, 0.46), (0.46, 0.48, 0.44), 8, 56),
         ),
         "left": (
-            T().translate([-half_width, 0.5 * height, middle]).rotate([0, 1, 0], 90).scale([length, 0.5 * height, 1]),
+            T()
+            .translate([-half_width, 0.5 * height, middle])
+            .rotate([0, 1, 0], 90)
+            .scale([length, 0.5 * height, 1]),
             pattern(seed + 2, (0.48, 0.26, 0.20), (0.52, 0.44, 0.34), 8, 56),
         ),
         "right": (
-            T().translate([half_width, 0.5 * height, middle]).rotate([0, 1, 0], -90).scale([length, 0.5 * height, 1]),
+            T()
+            .translate([half_width, 0.5 * height, middle])
+            .rotate([0, 1, 0], -90)
+            .scale([length, 0.5 * height, 1]),
             pattern(seed + 3, (0.22, 0.42, 0.26), (0.44, 0.50, 0.36), 8, 56),
         ),
     }
@@ -100,12 +116,18 @@ def room(seed: int, half_width: float = 2.4, height: float = 3.2, depth: float =
 
 
 def lights() -> dict[str, Light]:
-    """Return a lamp above the room and a weaker one beside the cameras, which brightens the shadows."""
+    """Return a lamp above the room and a weaker one beside the cameras, which brightens the
+    shadows.
+    """
     import mitsuba as mi
 
     T = mi.ScalarTransform4f
-    lamp = T().look_at(origin=[1.6, 5.0, 2.6], target=[0, 0.4, 0], up=[0, 0, 1]).scale([0.6, 0.6, 1])
-    fill = T().look_at(origin=[-2.0, 3.6, 5.5], target=[0, 0.8, 0], up=[0, 1, 0]).scale([0.8, 0.8, 1])
+    lamp = (
+        T().look_at(origin=[1.6, 5.0, 2.6], target=[0, 0.4, 0], up=[0, 0, 1]).scale([0.6, 0.6, 1])
+    )
+    fill = (
+        T().look_at(origin=[-2.0, 3.6, 5.5], target=[0, 0.8, 0], up=[0, 1, 0]).scale([0.8, 0.8, 1])
+    )
     return {
         name: Light(
             {

@@ -27,12 +27,17 @@ def test_anchor_matrix__has_one_anchor_for_points_fewer_than_asked_for():
 
 def test_anchored_motion__sums_the_rounded_motions_of_the_levels():
     gaussians = to_gaussians(make_wide_scene())
-    config = AnchorConfig(levels=2, gaussians=2, ratio=10**6, translation_step=0.1, rotation_step=0.25)
+    config = AnchorConfig(
+        levels=2, gaussians=2, ratio=10**6, translation_step=0.1, rotation_step=0.25
+    )
     model = anchored_motion(gaussians, 2.0, config)
     translation = np.zeros(tuple(model.parameters["translation"].shape), np.float32)
     rotation = np.zeros(tuple(model.parameters["rotation"].shape), np.float32)
-    translation[-1] = (0.97, 0.09, -0.49)  # of the one anchor of the coarse level; the step is 0.2 world units
+    # Of the one anchor of the coarse level; the step is 0.2 world units.
+    translation[-1] = (0.97, 0.09, -0.49)
     rotation[-1] = (0, 0.2, 0.1, 0.4)
-    translations, turned = model.motion({"translation": mi.TensorXf(translation), "rotation": mi.TensorXf(rotation)})
+    translations, turned = model.motion(
+        {"translation": mi.TensorXf(translation), "rotation": mi.TensorXf(rotation)}
+    )
     assert_close(np.asarray(translations), np.tile([1.0, 0, -0.4], (len(gaussians), 1)), atol=1e-6)
     assert_close(np.asarray(turned), np.tile([0, 0.25, 0, 0.5], (len(gaussians), 1)), atol=1e-6)

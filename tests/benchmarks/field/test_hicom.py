@@ -27,7 +27,9 @@ def test_coherent_motion__sums_the_levels():
     translation = np.zeros(tuple(model.parameters["translation"].shape), np.float32)
     translation[0] = (1, 2, 3)  # of the one cell of the coarse level
     translation[1] = (0.5, 0, 0)
-    translations, rotation = model.motion({**model.parameters, "translation": mi.TensorXf(translation)})
+    translations, rotation = model.motion(
+        {**model.parameters, "translation": mi.TensorXf(translation)}
+    )
     fine = np.asarray(translations) - (1, 2, 3)
     mask = fine.any(axis=1)
     assert 0 < mask.sum() < len(gaussians)

@@ -71,19 +71,25 @@ def model_of(config: Any) -> MotionModel:
 
 
 for _name, _config in SMALL.items():
-    MOTION_MODELS.register(f"small-{_name}")(lambda *_, config=_config: lambda *__: model_of(config))
+    MOTION_MODELS.register(f"small-{_name}")(
+        lambda *_, config=_config: lambda *__: model_of(config)
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SMALL)
 def test_fit_later_frame__finds_the_motion_that_gaussians_share(name):
-    """With as many steps, the motion of a rigid body is nearer to the truth than the motion of free Gaussians."""
+    """With as many steps, the motion of a rigid body is nearer to the truth than the motion of free
+    Gaussians.
+    """
     free = fit_shifted(PLAIN)
     shared = [fit_shifted(replace(PLAIN, model=f"small-{name}")) for _ in range(2)]
     assert motion_error(shared[0]) < 0.7 * motion_error(free)
     assert psnr_of(shared[0]) > psnr_of(free)
     other = shared[1].gaussians.numpy()
-    assert all(np.array_equal(x, other[n]) for n, x in shared[0].gaussians.numpy().items()), "it repeats to the bit"
+    assert all(np.array_equal(x, other[n]) for n, x in shared[0].gaussians.numpy().items()), (
+        "it repeats to the bit"
+    )
 
 
 @pytest.mark.parametrize("name", ["hicom", "cache", "grid", "grid-slow", "anchors"])
@@ -99,10 +105,16 @@ def behaviour(config: Any) -> list[np.ndarray]:
     """Return start, rates, motions and losses of a model at random parameters."""
     model = model_of(config)
     rng = np.random.default_rng(1)
-    drawn = {n: np.float32(rng.normal(0, 0.01, tuple(x.shape))) for n, x in model.parameters.items()}
+    drawn = {
+        n: np.float32(rng.normal(0, 0.01, tuple(x.shape))) for n, x in model.parameters.items()
+    }
     p = {name: mi.TensorXf(value) for name, value in drawn.items()}
     starts = [np.asarray(value) for value in model.parameters.values()]
-    return [*starts, np.array([*model.rates.values()]), *map(np.asarray, (*model.motion(p), *model.losses(p).values()))]
+    return [
+        *starts,
+        np.array([*model.rates.values()]),
+        *map(np.asarray, (*model.motion(p), *model.losses(p).values())),
+    ]
 
 
 @pytest.mark.parametrize("name", OTHER)

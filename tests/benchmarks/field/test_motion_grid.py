@@ -1,4 +1,6 @@
-"""Motion grid with its rate: interpolation, bits against float64, gradients, and what a heavy rate does."""
+"""Motion grid with its rate: interpolation, bits against float64, gradients, and what a heavy rate
+does.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ def test_corner_matrix__reproduces_linear_fields():
     side = 0.3
     matrix, levels = corner_matrix(points, [side])
     corner = np.unique(
-        (np.floor(points / side)[:, None] + np.indices((2, 2, 2)).reshape(3, 8).T).reshape(-1, 3), axis=0
+        (np.floor(points / side)[:, None] + np.indices((2, 2, 2)).reshape(3, 8).T).reshape(-1, 3),
+        axis=0,
     )
     assert not levels.any()
     assert_close(matrix @ (side * corner), points, atol=1e-6)
@@ -42,7 +45,9 @@ def test_bits__are_those_of_the_logistic_density():
     x = X.astype(np.float64)
     assert_close(rates, -np.log2(sigmoid((x + 0.5) / 0.8) - sigmoid((x - 0.5) / 0.8)), atol=1e-2)
     whole = np.arange(-30, 31, dtype=np.float32)
-    assert np.sum(2.0 ** -np.asarray(bits(mi.Float(whole), mi.Float(2.0)))) == pytest.approx(1, abs=1e-3)
+    assert np.sum(2.0 ** -np.asarray(bits(mi.Float(whole), mi.Float(2.0)))) == pytest.approx(
+        1, abs=1e-3
+    )
 
 
 def test_bits__are_finite_far_away():
@@ -62,7 +67,10 @@ def test_motion_grid__gradients_of_the_rate_agree_with_central_differences(name)
     at = dr.detach(p[name])
     direction = mi.TensorXf(rng.normal(size=shapes[name]).astype(np.float32))
     step = 1e-2
-    ends = [np.asarray(model.losses({**p, name: at + s * step * direction})["rate"]).item() for s in (1, -1)]
+    ends = [
+        np.asarray(model.losses({**p, name: at + s * step * direction})["rate"]).item()
+        for s in (1, -1)
+    ]
     expected = (ends[0] - ends[1]) / (2 * step)
     assert np.vdot(gradient, np.asarray(direction)) == pytest.approx(expected, rel=0.01)
 
@@ -71,7 +79,9 @@ def test_motion_grid__moves_in_steps():
     config = GridConfig(cells=(10.0,), translation_step=0.01)
     extent = 2.0
     model = motion_grid(to_gaussians(make_wide_scene(30)), extent, config)
-    corner_values = mi.TensorXf(np.full(tuple(model.parameters["translation"].shape), 3.4, np.float32))
+    corner_values = mi.TensorXf(
+        np.full(tuple(model.parameters["translation"].shape), 3.4, np.float32)
+    )
     displacement, rotation = model.motion({**model.parameters, "translation": corner_values})
     assert_close(displacement, np.full((30, 3), 3 * 0.01 * extent), atol=1e-6)
     assert not np.asarray(rotation).any()

@@ -18,7 +18,10 @@ CONFIG = CacheConfig(levels=3, table=64, features=2, hidden=8)
 
 def random_parameters(model, seed: int = 0) -> dict[str, mi.TensorXf]:
     rng = np.random.default_rng(seed)
-    return {n: mi.TensorXf(rng.normal(0, 0.3, tuple(v.shape)).astype(np.float32)) for n, v in model.parameters.items()}
+    return {
+        n: mi.TensorXf(rng.normal(0, 0.3, tuple(v.shape)).astype(np.float32))
+        for n, v in model.parameters.items()
+    }
 
 
 def test_hash_matrix__interpolates_between_eight_entries_of_each_level():
@@ -71,6 +74,8 @@ def test_transformation_cache__gradients_agree_with_central_differences(name):
     dr.backward(dr.sum(mi.TensorXf(weight) * model.motion(p)[1], axis=None))
     direction = rng.normal(size=values[name].shape)
     step = 1e-6
-    ends = [reference({**values, name: values[name] + s * step * direction})[:, 3:] for s in (1, -1)]
+    ends = [
+        reference({**values, name: values[name] + s * step * direction})[:, 3:] for s in (1, -1)
+    ]
     expected = np.vdot(weight, ends[0] - ends[1]) / (2 * step)
     assert np.vdot(np.asarray(dr.grad(p[name])), direction) == pytest.approx(expected, rel=1e-4)

@@ -18,7 +18,9 @@ from morgs_mi.fit.unseen_views import REGRESSION, WIDEST
 
 TEXTS = {path.name: path.read_text(encoding="utf-8") for path in PAGES.glob("*.md")}
 WORDS = {name: " ".join(text.split()) for name, text in TEXTS.items()}
-CLAIMS = re.split(r"^### ", TEXTS["index.md"].partition("## What is not shown")[0], flags=re.MULTILINE)[1:]
+CLAIMS = re.split(
+    r"^### ", TEXTS["index.md"].partition("## What is not shown")[0], flags=re.MULTILINE
+)[1:]
 # "22 November 2026, commit `c41387b`", also of several days or commits.
 SETUP = r"\d+ (?:and \d+ )?[A-Z][a-z]+ \d{4},\s+commits?\s+`[0-9a-f]{7}`"
 
@@ -45,14 +47,26 @@ def test_plots__are_drawn_and_shown(tmp_path: Path):
 def test_claims__have_a_table_or_figure_a_command_and_committed_results():
     assert len(CLAIMS) == 13
     result = r"\]\(\.\./\.\./benchmarks/results/\w+\.json\)"
-    parts = r"<!-- table: |!\[", r"`(?:make demo|python\s+-m\s+(?:benchmarks|tests)\.[^`]+)`", SETUP, result
-    assert [(claim.partition("\n")[0], part) for claim in CLAIMS for part in parts if not re.search(part, claim)] == []
+    parts = (
+        r"<!-- table: |!\[",
+        r"`(?:make demo|python\s+-m\s+(?:benchmarks|tests)\.[^`]+)`",
+        SETUP,
+        result,
+    )
+    assert [
+        (claim.partition("\n")[0], part)
+        for claim in CLAIMS
+        for part in parts
+        if not re.search(part, claim)
+    ] == []
 
 
 def test_commands__follow_date_and_commit():
     for name, text in TEXTS.items():
         commands = len(re.findall(r"^\n    python -m ", text, re.MULTILINE))
-        setups = re.findall(rf"^{SETUP}[^.\n]*(?:\n[^.\n]+)?\bby\n\n    python -m ", text, re.MULTILINE)
+        setups = re.findall(
+            rf"^{SETUP}[^.\n]*(?:\n[^.\n]+)?\bby\n\n    python -m ", text, re.MULTILINE
+        )
         assert len(setups) == commands, name
 
 
@@ -77,7 +91,12 @@ def test_index__quotes_the_gains():
     clips = committed("method_report")["clips"]
 
     def scores(preset: str, name: str) -> np.ndarray:
-        rows = [row for clip in clips for row in clip["rows"] if (row["preset"], row["epochs"]) == (preset, 2)]
+        rows = [
+            row
+            for clip in clips
+            for row in clip["rows"]
+            if (row["preset"], row["epochs"]) == (preset, 2)
+        ]
         return np.array([row["mean"][name] for row in rows if row["best"]])
 
     def gains(name: str) -> str:
@@ -88,9 +107,10 @@ def test_index__quotes_the_gains():
     assert not missing(
         "index.md",
         [
-            f"{gains('psnr')} above residuals alone at their best rates ({gains('psnr_moving')} where things move), "
-            f"with {min(shares):.1f} to {max(shares):.1f} of their motion error, and PSNR falls by "
-            f"{-min(scores('default', 'psnr_slope')):.3f} dB a frame at most"
+            f"{gains('psnr')} above residuals alone at their best rates ({gains('psnr_moving')} "
+            f"where things move), with {min(shares):.1f} to {max(shares):.1f} of their motion "
+            f"error, and PSNR falls by {-min(scores('default', 'psnr_slope')):.3f} dB a frame at "
+            "most"
         ],
     )
 
@@ -120,21 +140,34 @@ def test_index__quotes_the_field_and_the_drift():
 def test_pages__quote_the_forecasts_of_unseen_views():
     fits = list(out_of_capture(committed("unseen")["fits"]))
     narrow = [fit for fit in fits if fit["width"] <= WIDEST]
-    fresh = [fit for fit in fits if fit["set"] in ("flame_steak", "kitchen", "spheres", "random-406", "random-407")]
-    in_all, in_narrow, in_fresh = (sum(fit["within"] for fit in some) for some in (fits, narrow, fresh))
+    fresh = [
+        fit
+        for fit in fits
+        if fit["set"] in ("flame_steak", "kitchen", "spheres", "random-406", "random-407")
+    ]
+    in_all, in_narrow, in_fresh = (
+        sum(fit["within"] for fit in some) for some in (fits, narrow, fresh)
+    )
 
     def word(fit: Mapping[str, float], name: str) -> str:
         return quality_of(fit[name], fit["training"] - fit[name])
 
     right = sum(word(fit, "forecast") == word(fit, "mean") for fit in fits)
     off = [abs(fit["forecast"] - fit["mean"]) for fit in fits]
-    single = np.mean([abs(psnr - fit["forecast"]) <= fit["width"] / 2 for fit in fits for psnr in fit["held_out"]])
+    single = np.mean(
+        [
+            abs(psnr - fit["forecast"]) <= fit["width"] / 2
+            for fit in fits
+            for psnr in fit["held_out"]
+        ]
+    )
     counts = f"{in_all} of {len(fits)}"
     assert not missing(
         "index.md",
         [
-            f"{counts} are within their interval, and the word (good, fair, poor) is right for {right}. `fit` prints a "
-            f"number for {len(narrow)} of them, of which {in_narrow} are within the interval",
+            f"{counts} are within their interval, and the word (good, fair, poor) is right for "
+            f"{right}. `fit` prints a number for {len(narrow)} of them, of which {in_narrow} are "
+            "within the interval",
             f"{in_fresh} of {len(fresh)} fits within their interval",
         ],
     )
@@ -144,7 +177,8 @@ def test_pages__quote_the_forecasts_of_unseen_views():
             f"{np.mean(off):.1f} dB in the mean of all fits, to {max(off):.1f} dB at worst",
             f"within the interval of the mean in {100 * single:.0f} % of all cases",
             f"by the forecast {right}.",
-            f"loss = {REGRESSION.intercept:.2f} + {REGRESSION.slopes[0]:.3f} d - {-REGRESSION.slopes[1]:.3f} t",
+            f"loss = {REGRESSION.intercept:.2f} + {REGRESSION.slopes[0]:.3f} d - "
+            f"{-REGRESSION.slopes[1]:.3f} t",
             f"in nine fits of ten within {REGRESSION.spread:.2f} (1 + loss)",
         ],
     )
@@ -156,7 +190,9 @@ def test_index__quotes_the_clocks():
     fits = committed("timing")["fits"]
     names = "synchronised", "recorded", "aligned"
     means = [np.mean([fit[f"{name}_moving"] for fit in fits]) for name in names]
-    assert not missing("index.md", ["PSNR is {:.1f}, {:.1f} and {:.1f} dB in the mean.".format(*means)])
+    assert not missing(
+        "index.md", ["PSNR is {:.1f}, {:.1f} and {:.1f} dB in the mean.".format(*means)]
+    )
 
 
 def test_index__quotes_the_renderer_and_the_fuzzers():
@@ -169,8 +205,10 @@ def test_index__quotes_the_renderer_and_the_fuzzers():
         [
             f"{min(ratios):.2f} to {max(ratios):.2f} of the time of tuned C++",
             f"takes {plain[0]:.0f} ms in the first row and {plain[1]:.0f} ms in the second",
-            f"a step of the second row takes {100 * committed('render_speed_W2b')['tenth_share']:.0f} % of the time",
-            f"in {fuzzers['damage']['streams']:,} damaged streams and {fuzzers['bytes']['streams']:,} with changed",
+            "a step of the second row takes "
+            f"{100 * committed('render_speed_W2b')['tenth_share']:.0f} % of the time",
+            f"in {fuzzers['damage']['streams']:,} damaged streams and "
+            f"{fuzzers['bytes']['streams']:,} with changed",
         ],
     )
 
@@ -178,7 +216,9 @@ def test_index__quotes_the_renderer_and_the_fuzzers():
 def test_method_page__quotes_the_unseen_scenes_without_seed_4():
     fits = [fit for fit in committed("random_scenes")["fits"] if fit["seed"] != 4]
     psnr, moving = (np.mean([fit[name] for fit in fits]) for name in ("psnr", "psnr_moving"))
-    assert not missing("method.md", [f"the means are {psnr:.2f} dB and {moving:.2f} dB where things move"])
+    assert not missing(
+        "method.md", [f"the means are {psnr:.2f} dB and {moving:.2f} dB where things move"]
+    )
 
 
 def test_captures_page__quotes_the_recording():
@@ -186,8 +226,10 @@ def test_captures_page__quotes_the_recording():
     assert not missing(
         "captures.md",
         [
-            f"{walk4['psnr']['first']:.2f} dB in the first frame and {walk4['psnr']['last']:.2f} dB in the last",
+            f"{walk4['psnr']['first']:.2f} dB in the first frame and {walk4['psnr']['last']:.2f} "
+            "dB in the last",
             f"{walk4['psnr_moving']:.2f} dB where things move",
-            f"takes {walk4['seconds']['per_later_frame']:.1f} s and {walk4['bytes']['per_residual'] / 1000:.0f} kB",
+            f"takes {walk4['seconds']['per_later_frame']:.1f} s and "
+            f"{walk4['bytes']['per_residual'] / 1000:.0f} kB",
         ],
     )

@@ -13,7 +13,8 @@ import pytest
 
 @contextmanager
 def client_here() -> Iterator[Any]:
-    """Yield the client of a worker that is a thread of this process; its number of threads is restored.
+    """Yield the client of a worker that is a thread of this process; its number of threads is
+    restored.
 
     With one thread of Dr.Jit, Mitsuba waits forever when it reads or writes an EXR file.
     """
@@ -21,7 +22,11 @@ def client_here() -> Iterator[Any]:
     threads = dr.thread_count(), cv2.getNumThreads()
     try:
         with distributed.Client(
-            processes=False, n_workers=1, threads_per_worker=1, dashboard_address=None, set_as_default=False
+            processes=False,
+            n_workers=1,
+            threads_per_worker=1,
+            dashboard_address=None,
+            set_as_default=False,
         ) as client:
             yield client
     finally:

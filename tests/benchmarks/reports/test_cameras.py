@@ -29,7 +29,9 @@ def test_disturbed__turns_and_displaces_every_camera_as_far_as_it_should():
     for true_camera, wrong_camera in zip(true, wrong, strict=True):
         turn = Rotation.from_matrix(wrong_camera.viewmat[:3, :3] @ true_camera.viewmat[:3, :3].T)
         assert np.rad2deg(turn.magnitude()) == pytest.approx(0.5)
-        assert np.linalg.norm(wrong_camera.position - true_camera.position) == pytest.approx(0.005 * scene_extent(true))
+        assert np.linalg.norm(wrong_camera.position - true_camera.position) == pytest.approx(
+            0.005 * scene_extent(true)
+        )
         assert abs(wrong_camera.K[0, 0] / true_camera.K[0, 0] - 1) == pytest.approx(0.01)
 
 

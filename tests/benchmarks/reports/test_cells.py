@@ -19,10 +19,14 @@ def square(number: int) -> int:
 
 
 @pytest.mark.parametrize("opened", [nullcontext, client_here])
-def test_run_cells__returns_the_results_in_order_with_their_warnings(opened, caplog: pytest.LogCaptureFixture):
+def test_run_cells__returns_the_results_in_order_with_their_warnings(
+    opened, caplog: pytest.LogCaptureFixture
+):
     arrived = []
     with opened() as client:
-        results = run_cells(square, {"b": (2,), "a": (1,)}, client, lambda *each: arrived.append(each))
+        results = run_cells(
+            square, {"b": (2,), "a": (1,)}, client, lambda *each: arrived.append(each)
+        )
     assert list(results.items()) == sorted(arrived, reverse=True) == [("b", 4), ("a", 1)]
     assert "squared" in caplog.messages
 

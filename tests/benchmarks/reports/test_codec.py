@@ -35,7 +35,10 @@ def test_measure__finds_coarser_streams_smaller_and_lzma_larger(reported) -> Non
     rows = clips["rows"]
     assert [row["quality"] for row in rows] == [4, 40, 1000]
     for row in rows:
-        assert row["file"] == (options.out / "capture" / f"{row['quality']:g}" / "stream.morgs").stat().st_size
+        assert (
+            row["file"]
+            == (options.out / "capture" / f"{row['quality']:g}" / "stream.morgs").stat().st_size
+        )
         assert row["later"] < row["lzma"] < row["raw"]
         assert row["loss"] == pytest.approx(rows[-1]["psnr"]["later"] - row["psnr"]["later"])
         assert min(row["encode_ms"], row["decode_ms"], row["lzma_ms"]) > 0
@@ -69,7 +72,9 @@ def test_measure__of_workers_is_that_of_one_process(fitted_clip: Path, tmp_path:
     capture = load_capture(fitted_clip / "capture", max_frames=2)
     with client_here() as here:
         for name, client in (("alone", None), ("workers", here)):
-            measure(capture, replace(QUICK, qualities=(4,), stream=stream, out=tmp_path / name), client)
+            measure(
+                capture, replace(QUICK, qualities=(4,), stream=stream, out=tmp_path / name), client
+            )
     alone, streams = (
         {path.relative_to(folder): path.read_bytes() for path in folder.rglob("stream.morgs")}
         for folder in (tmp_path / "alone", tmp_path / "workers")

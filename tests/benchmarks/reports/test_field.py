@@ -34,7 +34,13 @@ def test_main__measures_a_tiny_clip(tmp_path: Path) -> None:
         "methods": ("hicom", "default"),
     }
     field.main(
-        Options(json=tmp_path / "out.json", plot=tmp_path / "out.png", seeds=(3,), clips=tmp_path / "clips", **work)
+        Options(
+            json=tmp_path / "out.json",
+            plot=tmp_path / "out.png",
+            seeds=(3,),
+            clips=tmp_path / "clips",
+            **work,
+        )
     )
     cells = json.loads((tmp_path / "out.json").read_text())["cells"]
     assert list(cells) == ["3/0"]

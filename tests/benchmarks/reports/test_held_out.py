@@ -23,10 +23,14 @@ def test_scores_of__has_the_scores_of_each_view_and_frame(clip: Path, tmp_path: 
     scores = scores_of(out)
     assert (scores["recording"], scores["training_views"]) == ("spheres", 3)
     assert list(scores["views"]) == list(result.views)
-    assert [frame["num_bytes"] for frame in scores["frames"]] == [frame.num_bytes for frame in result.frames]
+    assert [frame["num_bytes"] for frame in scores["frames"]] == [
+        frame.num_bytes for frame in result.frames
+    ]
     assert scores["frames"][0]["active"] is None
     assert 0 <= scores["frames"][1]["active"] <= 1
-    means = [sum(view[key] for view in scores["views"].values()) / 2 for key in ("psnr", "psnr_matched")]
+    means = [
+        sum(view[key] for view in scores["views"].values()) / 2 for key in ("psnr", "psnr_matched")
+    ]
     table = first_frames([scores])
     assert all(f"{mean:.2f}" in table for mean in means)
     assert later_frames([scores]).count("| spheres |") == 3

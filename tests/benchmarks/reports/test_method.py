@@ -27,9 +27,30 @@ from morgs_mi.loop.stream_config import StreamConfig
 from tests.benchmarks.reports.here import client_here
 from tests.benchmarks.reports.pages import ROOT, page
 
-ARGS = ["--presets", "baseline", "default", "--epochs", "1", "2", "--key-views", "1", "2", "99", "--rates", "1", "2"]
+ARGS = [
+    "--presets",
+    "baseline",
+    "default",
+    "--epochs",
+    "1",
+    "2",
+    "--key-views",
+    "1",
+    "2",
+    "99",
+    "--rates",
+    "1",
+    "2",
+]
 ARGS += ["--tuned", "baseline", "--seeds", "1", "--num-gaussians", "200", "--version", "test"]
-ARGS += ["--stream.fit.sh-degree", "0", "--stream.fit.first-frame-steps", "10", "--stream.fit.confidence-steps", "2"]
+ARGS += [
+    "--stream.fit.sh-degree",
+    "0",
+    "--stream.fit.first-frame-steps",
+    "10",
+    "--stream.fit.confidence-steps",
+    "2",
+]
 
 
 def tiny(clip: Path, out: Path) -> Options:
@@ -60,16 +81,35 @@ def made_up(source, first, config):
     if not LEFT[0]:
         raise ChildProcessError("it died.")
     score = 20.0 + config.fit.epochs + 0.1 * config.motion.key_views + 100 * config.fit.rates.means
-    names = ("psnr", "psnr_moving", "psnr_still", "ssim", "motion_error_moving", "motion_error_still")
-    names += ("true_motion_moving", "num_bytes", *(f"motion_3d_{name}" for name in method._MOTION_3D))
+    names = (
+        "psnr",
+        "psnr_moving",
+        "psnr_still",
+        "ssim",
+        "motion_error_moving",
+        "motion_error_still",
+    )
+    names += (
+        "true_motion_moving",
+        "num_bytes",
+        *(f"motion_3d_{name}" for name in method._MOTION_3D),
+    )
     frames = {name: [score - 1, score + 1] for name in method._BY_FRAME}
-    rest = {"confidence_iou": None, "mtv": 0.5, "mtv_input": 0.6, "psnr_slope": 2.0, "seconds": 0.1 * score}
+    rest = {
+        "confidence_iou": None,
+        "mtv": 0.5,
+        "mtv_input": 0.6,
+        "psnr_slope": 2.0,
+        "seconds": 0.1 * score,
+    }
     return dict.fromkeys(names, score) | rest | {"by_frame": frames}
 
 
 @pytest.fixture(scope="module", params=["made up", pytest.param("fitted", marks=pytest.mark.slow)])
 def interrupted(request, clip, tmp_path_factory):
-    """A report that was interrupted in its third cell and run again: its JSON, its folder and the number of fits."""
+    """A report that was interrupted in its third cell and run again: its JSON, its folder and the
+    number of fits.
+    """
     out = tmp_path_factory.mktemp("report")
     fits = []
     fit = made_up if request.param == "made up" else method.later_frames
@@ -95,7 +135,8 @@ def interrupted(request, clip, tmp_path_factory):
 @pytest.mark.slow
 def test_method_command__continues_an_interrupted_report(interrupted):
     result, out, fits = interrupted
-    # 2 epochs of a default and a baseline at 2 rates; 2 presets with 1, 2 and all 4 views at 2 epochs.
+    # 2 epochs of a default and a baseline at 2 rates; 2 presets with 1, 2 and all 4 views at 2
+    # epochs.
     assert fits == 6 + 6 + 1
     (clip,) = result["clips"]
     assert [(row["preset"], row["epochs"], row["rates"]) for row in best_rows(clip)[2:]] == [
@@ -128,7 +169,11 @@ def test_method_command__scores_are_those_of_the_held_out_view(interrupted):
 @pytest.mark.slow
 def test_method_tables__are_complete(interrupted):
     (clip,) = interrupted[0]["clips"]
-    for table, rows in ((ablation_table(clip, 2), 2), (epochs_table(clip), 4), (key_views_table(clip), 6)):
+    for table, rows in (
+        (ablation_table(clip, 2), 2),
+        (epochs_table(clip), 4),
+        (key_views_table(clip), 6),
+    ):
         lines = table.splitlines()
         assert len(lines) == 2 + rows
         assert len({line.count("|") for line in lines}) == 1
@@ -137,9 +182,15 @@ def test_method_tables__are_complete(interrupted):
 
 def test_method_page__warns_of_a_best_rate_that_is_the_largest_one(interrupted):
     def warns(best: float) -> bool:
-        rows = [{**row, "best": row["rates"] == best or row["preset"] == "default"} for row in clip["rows"]]
+        rows = [
+            {**row, "best": row["rates"] == best or row["preset"] == "default"}
+            for row in clip["rows"]
+        ]
         page = method_page([{**clip, "rows": rows}], 2)
-        return "Larger rates than were tried may be better for `baseline` at 1 epochs, `baseline` at 2 epochs." in page
+        return (
+            "Larger rates than were tried may be better for `baseline` at 1 epochs, `baseline` at "
+            "2 epochs." in page
+        )
 
     (clip,) = interrupted[0]["clips"]
     assert warns(2.0)
@@ -149,10 +200,21 @@ def test_method_page__warns_of_a_best_rate_that_is_the_largest_one(interrupted):
 def test_gains_table__has_the_best_rates():
     def row(preset: str, epochs: int, rates: float, best: bool, psnr: float, error: float) -> dict:
         mean = {"psnr": psnr, "psnr_moving": psnr - 10, "motion_error_moving": error, "mtv": None}
-        return {"preset": preset, "epochs": epochs, "key_views": 4, "rates": rates, "mean": mean, "best": best}
+        return {
+            "preset": preset,
+            "epochs": epochs,
+            "key_views": 4,
+            "rates": rates,
+            "mean": mean,
+            "best": best,
+        }
 
     rows = [row("baseline", 8, 1, False, 30.0, 2.0), row("baseline", 8, 4, True, 31.0, 3.0)]
-    rows += [row("ml", 8, 1, True, 32.5, 1.5), row("default", 8, 2, True, 33.0, 0.9), row("default", 2, 1, True, 31, 1)]
+    rows += [
+        row("ml", 8, 1, True, 32.5, 1.5),
+        row("default", 8, 2, True, 33.0, 0.9),
+        row("default", 2, 1, True, 31, 1),
+    ]
     clip = {"name": "balls", "cue": {"error": 0.5}, "rows": rows}
     gains = [line.split(" | ") for line in gains_table([clip]).splitlines()]
     assert gains[3][:4] == ["| balls", "8", "+1.50 / +1.50 / -1.50", "- / - / -"]
@@ -209,7 +271,15 @@ def test_aggregate__selects_the_best_rate_by_the_first_seed():
         keys = {"preset": "baseline", "epochs": 2, "key_views": 4, "rates": rate}
         variants.append(Variant(keys, StreamConfig()))
         for seed, psnr in enumerate(values):
-            rows.append({**keys, "fit_seed": seed, "psnr": psnr, "ssim": None, "by_frame": {"psnr": [psnr, 1.0]}})
+            rows.append(
+                {
+                    **keys,
+                    "fit_seed": seed,
+                    "psnr": psnr,
+                    "ssim": None,
+                    "by_frame": {"psnr": [psnr, 1.0]},
+                }
+            )
     table = aggregate(rows, variants)
     assert [row["best"] for row in table] == [False, True, False]
     assert table[1]["mean"]["psnr"] == 32
@@ -220,7 +290,9 @@ def test_aggregate__selects_the_best_rate_by_the_first_seed():
 
 
 def test_variants_of__tunes_the_given_presets_and_limits_the_key_views():
-    presets, key_views = ([v.keys for v in group] for group in variants_of(tiny(Path(), Path()), num_views=3))
+    presets, key_views = (
+        [v.keys for v in group] for group in variants_of(tiny(Path(), Path()), num_views=3)
+    )
     assert len(presets) == 2 * 3
     assert {keys["rates"] for keys in presets if keys["preset"] == "default"} == {1.0}
     assert {keys["key_views"] for keys in presets} == {3}
@@ -258,7 +330,9 @@ def no_packet(source, config):
 
 
 def test_options__refuse_bad_settings_and_captures(clip, tmp_path):
-    with pytest.raises(ValueError, match=r"`presets` and `tuned` must be among default, .*, got none"):
+    with pytest.raises(
+        ValueError, match=r"`presets` and `tuned` must be among default, .*, got none"
+    ):
         Options(captures=(), presets=("ml", "none"))
     for name, value in (("epochs", ()), ("seeds", 0), ("presets", ())):
         with pytest.raises(ValueError, match="one seed or more, got none"):
@@ -272,7 +346,9 @@ def test_options__refuse_bad_settings_and_captures(clip, tmp_path):
 def test_method_page__has_no_other_figures_than_the_report():
     for name, section in (("method_report", "Four clips"), ("method_parts", "Parts")):
         result = json.loads((ROOT / f"benchmarks/results/{name}.json").read_text(encoding="utf-8"))
-        (section_text,) = re.findall(rf"^## {section}\n(.*?)^##", page("method.md"), re.DOTALL | re.MULTILINE)
+        (section_text,) = re.findall(
+            rf"^## {section}\n(.*?)^##", page("method.md"), re.DOTALL | re.MULTILINE
+        )
         tables = method_page(result["clips"], result["table_epochs"])
         figures = set(re.findall(r"\d+\.\d+", tables))
         for clip in result["clips"]:
@@ -282,4 +358,6 @@ def test_method_page__has_no_other_figures_than_the_report():
             figures |= {f"{error / clip['cue']['error']:.2f}" for error in errors}
         assert set(re.findall(r"\d+\.\d+", section_text)) - figures == set()
         # Null means all frames.
-        assert f"{result['settings']['frames'] or result['clips'][0]['frames']} frames" in section_text
+        assert (
+            f"{result['settings']['frames'] or result['clips'][0]['frames']} frames" in section_text
+        )

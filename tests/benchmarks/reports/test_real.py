@@ -1,7 +1,7 @@
 """Real images: which views are held out, and photos from their folder to the committed figures.
 
-The photos are not in the repository (docs/experiments/real.md says where they are); a variable names their folder, with
-a folder for each set:
+The photos are not in the repository (docs/experiments/real.md says where they are); a variable
+names their folder, with a folder for each set:
 
 MORGS_MI_PHOTOS=FOLDER pytest -m slow tests/benchmarks/reports/test_real.py
 """
@@ -25,7 +25,12 @@ from morgs_mi.runs.cluster.tasks import Source
 
 FOLDER = os.environ.get("MORGS_MI_PHOTOS")
 # Number of photos, and whether each has a principal point of its own.
-SETS = {"fern": (20, "own"), "flower": (25, "own"), "kitchen": (25, "shared"), "sceaux": (11, "shared")}
+SETS = {
+    "fern": (20, "own"),
+    "flower": (25, "own"),
+    "kitchen": (25, "shared"),
+    "sceaux": (11, "shared"),
+}
 
 
 def test_held_out__is_every_eighth_view_or_each_of_a_few_in_turn():
@@ -34,7 +39,9 @@ def test_held_out__is_every_eighth_view_or_each_of_a_few_in_turn():
     assert real.held_out(3) == [[0], [1], [2]]
 
 
-def test_measure__starts_from_points_of_the_training_views(clip: Path, monkeypatch: pytest.MonkeyPatch):
+def test_measure__starts_from_points_of_the_training_views(
+    clip: Path, monkeypatch: pytest.MonkeyPatch
+):
     def stop(capture, seed, progress):
         raise InterruptedError(str(capture.test_views))
 
@@ -45,7 +52,9 @@ def test_measure__starts_from_points_of_the_training_views(clip: Path, monkeypat
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not FOLDER, reason="needs photos: set MORGS_MI_PHOTOS to the folder of their sets")
+@pytest.mark.skipif(
+    not FOLDER, reason="needs photos: set MORGS_MI_PHOTOS to the folder of their sets"
+)
 @pytest.mark.parametrize("name", SETS)
 def test_photos__are_calibrated_and_reach_the_committed_quality(name: str, tmp_path: Path) -> None:
     photos = tmp_path / name
@@ -59,6 +68,8 @@ def test_photos__are_calibrated_and_reach_the_committed_quality(name: str, tmp_p
     (row,) = json.loads((tmp_path / "out.json").read_text())["fits"]
     assert row["views"] + row["held_out_views"] == count, "every photo is registered"
     assert row["principal_points"] == points
-    fits = [f for f in committed("real")["fits"] if (f["set"], f["principal_points"]) == (name, points)]
+    fits = [
+        f for f in committed("real")["fits"] if (f["set"], f["principal_points"]) == (name, points)
+    ]
     # Two fits of Sceaux, with one held-out photo, differ by 1 dB, the others by 0.4 dB at most.
     assert row["held_out"] > np.mean([fit["held_out"] for fit in fits]) - 1

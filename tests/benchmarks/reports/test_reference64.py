@@ -29,7 +29,13 @@ def scene(degree: int) -> tuple[dict[str, np.ndarray], Camera]:
 
 def slow(raw: dict[str, np.ndarray], camera: Camera) -> np.ndarray:
     image = reference.rasterize(
-        raw, np.float64(camera.K), camera.viewmat, 13, 9, alpha_min=CONFIG.alpha_min, alpha_max=CONFIG.alpha_max
+        raw,
+        np.float64(camera.K),
+        camera.viewmat,
+        13,
+        9,
+        alpha_min=CONFIG.alpha_min,
+        alpha_max=CONFIG.alpha_max,
     )
     return np.concatenate([image["color"], image["alpha"]], axis=2)
 
@@ -61,4 +67,6 @@ def test_reference64__gradients_agree_with_complex_steps_through_everything(degr
     for name in ATTRIBUTES:
         assert gradients[name].shape == raw[name].shape
         assert np.abs(expected[name]).max() > 0
-        assert np.abs(gradients[name] - expected[name]).max() < 1e-11 * np.abs(expected[name]).max(), name
+        assert (
+            np.abs(gradients[name] - expected[name]).max() < 1e-11 * np.abs(expected[name]).max()
+        ), name

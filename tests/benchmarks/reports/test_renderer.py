@@ -56,7 +56,10 @@ def test_renderer__errors_are_those_of_the_cut_offs(reported):
     for row in reported:
         stopped = float(row["value"]) if row["knob"] == "stop_transmittance" else 1e-4
         # Colours reach slightly more than 1; the error results from the stop and from rounding.
-        assert row["rounding"]["image"]["max"] < 1.5 * stopped + tol.IMAGE_ABS, (row["knob"], row["value"])
+        assert row["rounding"]["image"]["max"] < 1.5 * stopped + tol.IMAGE_ABS, (
+            row["knob"],
+            row["value"],
+        )
     no_stop = rows["stop_transmittance", "0"]["rounding"]["gradients"]
     assert max(error["relative_l2"] for error in no_stop.values()) < tol.GRADIENT_REL
     assert min(error["cosine"] for error in no_stop.values()) > 1 - 1e-6

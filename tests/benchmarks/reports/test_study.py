@@ -9,7 +9,17 @@ from types import SimpleNamespace
 
 import pytest
 
-from benchmarks.reports import cameras, cells, drift, fits, random_scenes, real, study, timing, unseen
+from benchmarks.reports import (
+    cameras,
+    cells,
+    drift,
+    fits,
+    random_scenes,
+    real,
+    study,
+    timing,
+    unseen,
+)
 from benchmarks.reports.cells import run_cells
 from benchmarks.reports.study import Scene, Study, Variant, method_version, rounded
 from morgs_mi import StreamLoop
@@ -42,12 +52,17 @@ FAST = (random_scenes,)
 def tiny_loop(cameras, points, colors, config, image_masks):
     """Return a loop that fits a few Gaussians in a few steps."""
     fit = replace(TINY.fit, dropping=config.fit.dropping)
-    return StreamLoop(cameras, points, colors, replace(config, fit=fit, render=TINY.render), image_masks)
+    return StreamLoop(
+        cameras, points, colors, replace(config, fit=fit, render=TINY.render), image_masks
+    )
 
 
 def true_offsets(capture):
     """Return the true time offsets in place of those that a minute of work would find."""
-    offsets = {name: -truth.time_offset for name, truth in load_disturbances(capture.path / "truth").items()}
+    offsets = {
+        name: -truth.time_offset
+        for name, truth in load_disturbances(capture.path / "truth").items()
+    }
     return SimpleNamespace(offsets=offsets, errors=dict.fromkeys(offsets, 0.1), reference="cam00")
 
 
@@ -66,18 +81,23 @@ def without_times(value):
     [pytest.param(report, marks=[pytest.mark.slow] * (report not in FAST)) for report in STUDIES],
     ids=lambda report: report.__name__.rpartition(".")[2],
 )
-def test_study_options__of_workers_write_the_rows_of_one_process(report, clip: Path, tmp_path: Path, monkeypatch):
+def test_study_options__of_workers_write_the_rows_of_one_process(
+    report, clip: Path, tmp_path: Path, monkeypatch
+):
     for name in ("random-1", "random-2", "random-1-lens-0.1", "spheres-3x64"):
         (tmp_path / name).symlink_to(clip)
     study_options, num_rows = STUDIES[report]
     place = {"captures": (clip,)} if report in (real, unseen) else {"clips": tmp_path}
     tables = {}
     monkeypatch.setattr(fits, "StreamLoop", tiny_loop)
-    monkeypatch.setattr(cameras, "refine_cameras", lambda capture, *_: (capture, Scene({}, ())))  # needs larger images
+    # Needs larger images.
+    monkeypatch.setattr(cameras, "refine_cameras", lambda capture, *_: (capture, Scene({}, ())))
     monkeypatch.setattr(timing, "estimate_time_offsets", true_offsets)
     monkeypatch.setattr(cells, "open_client", lambda scheduler, count: client_here())
     for count in (None, 2):
-        options = report.Options(json=tmp_path / "out.json", workers=count, **place, **study_options)
+        options = report.Options(
+            json=tmp_path / "out.json", workers=count, **place, **study_options
+        )
         options.run()
         result = json.loads((tmp_path / "out.json").read_text())
         tables[count] = result["fits"]
@@ -146,5 +166,7 @@ def test_run_cells__of_processes_gives_the_scores_of_one_process(clip: Path):
     args = {seed: (Source.of(capture), 2, replace(TINY, seed=seed)) for seed in (0, 1)}
     pytest.importorskip("distributed", reason="comes with the extra `cluster`")
     with open_client(count=2) as client:
-        ours, theirs = (run_cells(random_scenes.measure, args, each, lambda *_: None) for each in (client, None))
+        ours, theirs = (
+            run_cells(random_scenes.measure, args, each, lambda *_: None) for each in (client, None)
+        )
     assert without_times(list(ours.values())) == without_times(list(theirs.values()))

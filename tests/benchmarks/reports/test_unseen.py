@@ -17,7 +17,9 @@ COEFFICIENTS_REL = 1e-3
 
 
 def test_regression_of__is_the_one_of_the_package():
-    for ours, theirs in zip(astuple(regression_of(committed("unseen")["fits"])), astuple(REGRESSION), strict=True):
+    for ours, theirs in zip(
+        astuple(regression_of(committed("unseen")["fits"])), astuple(REGRESSION), strict=True
+    ):
         np.testing.assert_allclose(ours, theirs, rtol=COEFFICIENTS_REL)
 
 
@@ -34,14 +36,19 @@ def test_out_of_capture__has_not_seen_the_capture():
     fern = [row for row in committed("unseen")["fits"] if row["set"] == "fern"]
     spoiled = [{**row, "held_out": [0.0]} for row in fern]
     forecasts = [
-        [row["forecast"] for row in out_of_capture([*rows, *fits]) if row["set"] == "fern"] for fits in (fern, spoiled)
+        [row["forecast"] for row in out_of_capture([*rows, *fits]) if row["set"] == "fern"]
+        for fits in (fern, spoiled)
     ]
     assert forecasts[0] == forecasts[1]
 
 
 @pytest.mark.parametrize(
     ("captures", "error"),
-    [([[0.1 * k] for k in range(1, 20)], 1.8), ([[0.0, 0.1 * k] for k in range(1, 20)], 1.7), ([[1.0]] * 8, np.inf)],
+    [
+        ([[0.1 * k] for k in range(1, 20)], 1.8),
+        ([[0.0, 0.1 * k] for k in range(1, 20)], 1.7),
+        ([[1.0]] * 8, np.inf),
+    ],
 )
 def test_conformal__is_a_rank_of_captures(captures: list[list[float]], error: float):
     assert _conformal([np.array(errors) for errors in captures]) == pytest.approx(error)

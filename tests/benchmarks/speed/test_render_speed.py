@@ -40,7 +40,15 @@ def run(*args: object) -> subprocess.CompletedProcess[str]:
 def test_figures__are_times_memory_and_error(workload: Path):
     options = render_speed.Options(workload, repeats=1, rounds=2)
     result = render_speed.figures(*workloads.load(workload), options)
-    for stage in ("lists_ms", "forward_ms", "adjoint_ms", "step_ms", "loss_ms", "peak_megabytes", "pairs"):
+    for stage in (
+        "lists_ms",
+        "forward_ms",
+        "adjoint_ms",
+        "step_ms",
+        "loss_ms",
+        "peak_megabytes",
+        "pairs",
+    ):
         assert result[stage] > 0, stage
     assert result["tenth_share"] > 0
     assert result["error_rms"] <= result["error_max"] < 2e-4
@@ -60,9 +68,22 @@ def test_baselines__are_omitted_for_large_workloads(workload: Path):
 
 
 @pytest.mark.slow
-def test_render_speed__compares_a_workload_with_a_yardstick(workload: Path, yardstick: Path, tmp_path: Path):
+def test_render_speed__compares_a_workload_with_a_yardstick(
+    workload: Path, yardstick: Path, tmp_path: Path
+):
     out = tmp_path / "out.json"
-    done = run("--workload", workload, "--json", out, "--yardstick", yardstick, "--repeats", 2, "--rounds", 1)
+    done = run(
+        "--workload",
+        workload,
+        "--json",
+        out,
+        "--yardstick",
+        yardstick,
+        "--repeats",
+        2,
+        "--rounds",
+        1,
+    )
     assert done.returncode == 0, done.stderr
     result = json.loads(out.read_text())
     assert json.loads(done.stdout) == result

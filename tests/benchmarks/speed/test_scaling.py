@@ -24,7 +24,14 @@ def test_efficiencies__compare_with_one_worker() -> None:
 @pytest.mark.slow
 def test_main__measures_a_tiny_clip(tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="comes with the extra `cluster`")
-    size = {"cameras": 3, "frames": 6, "width": 64, "gaussians": 100, "first_frame_steps": 8, "epochs": 1}
+    size = {
+        "cameras": 3,
+        "frames": 6,
+        "width": 64,
+        "gaussians": 100,
+        "first_frame_steps": 8,
+        "epochs": 1,
+    }
     scaling.main(Options(json=tmp_path / "scaling.json", segments=2, **size))
     output = json.loads((tmp_path / "scaling.json").read_text())
     assert [run["workers"] for run in output["runs"]] == [1, 2]

@@ -1,4 +1,6 @@
-"""Calibrations of Anipose, Pose2Sim, caliscope and FreeMoCap: forms of the file, and projections against OpenCV."""
+"""Calibrations of Anipose, Pose2Sim, caliscope and FreeMoCap: forms of the file, and projections
+against OpenCV.
+"""
 
 from __future__ import annotations
 
@@ -46,13 +48,19 @@ def test_anipose__projects_as_opencv_does(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("lens", [LENS[:4], LENS, (*LENS, 0.02, 0.01, 0.005)])
-def test_anipose__undistorts_a_dot_to_where_the_camera_projects_it(tmp_path: Path, lens: tuple[float, ...]) -> None:
+def test_anipose__undistorts_a_dot_to_where_the_camera_projects_it(
+    tmp_path: Path, lens: tuple[float, ...]
+) -> None:
     point = np.array([0.25, 0.2, 0.1])
-    path = layouts.anipose(tmp_path / "a", lens, lambda folder, names: dot_clips(folder, names, point, lens))
+    path = layouts.anipose(
+        tmp_path / "a", lens, lambda folder, names: dot_clips(folder, names, point, lens)
+    )
     capture = load_capture(path)
     for camera, image in zip(capture.cameras, next(capture.frames()).images, strict=True):
         assert_close(shown_dot(image), camera.project(point)[0], atol=0.15)
-    assert capture.metadata()["cameras"][0]["lens"] == ("OPENCV" if len(lens) == 4 else "FULL_OPENCV")
+    assert capture.metadata()["cameras"][0]["lens"] == (
+        "OPENCV" if len(lens) == 4 else "FULL_OPENCV"
+    )
 
 
 def test_anipose__reads_a_fisheye_lens(tmp_path: Path) -> None:
@@ -79,20 +87,31 @@ def test_anipose__reads_the_tables_of_caliscope(tmp_path: Path) -> None:
     assert_close(result.viewmat, camera.viewmat, atol=1e-9)
 
 
-def test_anipose__finds_the_calibration_of_pose2sim_and_ignores_other_toml_files(tmp_path: Path) -> None:
+def test_anipose__finds_the_calibration_of_pose2sim_and_ignores_other_toml_files(
+    tmp_path: Path,
+) -> None:
     path = layouts.anipose(tmp_path / "a")
     (path / "calibration").mkdir()
     (path / "calibration.toml").rename(path / "calibration" / "Calib_scene.toml")
     (path / "Config.toml").write_text('[project]\nrotation = "none"\n')
     assert load_capture(path).names == NAMES
     (path / "old.toml").write_text((path / "calibration" / "Calib_scene.toml").read_text())
-    with pytest.raises(ValueError, match=r"expected one calibration in TOML, got old.toml, Calib_scene.toml; keep"):
+    with pytest.raises(
+        ValueError, match=r"expected one calibration in TOML, got old.toml, Calib_scene.toml; keep"
+    ):
         load_capture(path)
 
 
 def test_clip_of_camera__finds_a_word_in_one_name() -> None:
     clips = ("vid1-camA", "vid1-camB", "cam_1", "cam_10", "x_2", "2_y")
-    expected = {"camA": "vid1-camA", "cam_1": "cam_1", "cam_10": "cam_10", "10": "cam_10", "cam": None, "2": None}
+    expected = {
+        "camA": "vid1-camA",
+        "cam_1": "cam_1",
+        "cam_10": "cam_10",
+        "10": "cam_10",
+        "cam": None,
+        "2": None,
+    }
     assert {name: clip_of_camera(clips, name) for name in expected} == expected
 
 
@@ -100,7 +119,9 @@ def test_read_anipose__accepts_a_rotation_of_any_axis(tmp_path: Path) -> None:
     path = layouts.anipose(tmp_path / "a")
     cameras, _ = read_anipose(path / "calibration.toml")
     table = tomllib.loads((path / "calibration.toml").read_text())["cam_2"]
-    assert_close(cameras[2].viewmat[:3, :3], cv2.Rodrigues(np.array(table["rotation"]))[0], atol=1e-12)
+    assert_close(
+        cameras[2].viewmat[:3, :3], cv2.Rodrigues(np.array(table["rotation"]))[0], atol=1e-12
+    )
     assert Rotation.from_matrix(cameras[2].viewmat[:3, :3]).magnitude() > 1
 
 

@@ -28,7 +28,11 @@ def cameras() -> list[Camera]:
 
 
 def write(folder: Path, kind: str = "txt") -> Path:
-    lenses = [Lens(), Lens("OPENCV", (0.1, -0.02, 0.003, 0.004)), Lens("OPENCV_FISHEYE", (0.1, 0, 0, 0.01))]
+    lenses = [
+        Lens(),
+        Lens("OPENCV", (0.1, -0.02, 0.003, 0.004)),
+        Lens("OPENCV_FISHEYE", (0.1, 0, 0, 0.01)),
+    ]
     write_colmap(folder, cameras(), POINTS, COLORS, lenses)
     if kind == "bin":
         model = pycolmap.Reconstruction(str(folder))
@@ -67,9 +71,13 @@ def test_read_colmap__projection_agrees_with_pycolmap(tmp_path: Path) -> None:
 
 def test_models__are_numbered_as_in_colmap() -> None:
     for i, name in enumerate(MODELS):
-        # INVALID is -1 and not every later id is public; the first seven are fixed by the file format.
+        # INVALID is -1 and not every later id is public; the first seven are fixed by the file
+        # format.
         assert int(getattr(pycolmap.CameraModelId, name)) == i
-        assert len(pycolmap.Camera.create_from_model_name(1, name, 50.0, 64, 48).params) == sum(MODELS[name]) + 2
+        assert (
+            len(pycolmap.Camera.create_from_model_name(1, name, 50.0, 64, 48).params)
+            == sum(MODELS[name]) + 2
+        )
 
 
 def test_read_colmap__accepts_blank_lines_and_no_points(tmp_path: Path) -> None:
@@ -88,9 +96,14 @@ def test_write_colmap__of_a_full_disk_leaves_the_model_before(tmp_path: Path) ->
     old_files = {file.name: file.read_bytes() for file in write(tmp_path / "sparse").iterdir()}
     assert sorted(sizes)[-2] < size // 2, "of the points"
     for limit in (0, 100, size // 2, *range(size - 200, size, 7), size - 1):
-        with pytest.raises(OSError, match="sparse: the COLMAP model could not be written: "), files_end_at(limit):
+        with (
+            pytest.raises(OSError, match="sparse: the COLMAP model could not be written: "),
+            files_end_at(limit),
+        ):
             write_colmap(tmp_path / "sparse", cameras(), points)
-        assert {file.name: file.read_bytes() for file in (tmp_path / "sparse").iterdir()} == old_files
+        assert {
+            file.name: file.read_bytes() for file in (tmp_path / "sparse").iterdir()
+        } == old_files
     with files_end_at(size):
         write_colmap(tmp_path / "sparse", cameras(), points)
     assert len(read_colmap(tmp_path / "sparse").points) == 100
@@ -102,14 +115,21 @@ def test_read_colmap__refuses_every_truncation_of_a_binary_file(tmp_path: Path, 
     whole = file.read_bytes()
     for length in range(len(whole)):
         file.write_bytes(whole[:length])
-        with pytest.raises(ValueError, match=rf"{name}: expected \d+ more bytes at byte \d+, got \d+"):
+        with pytest.raises(
+            ValueError, match=rf"{name}: expected \d+ more bytes at byte \d+, got \d+"
+        ):
             read_colmap(tmp_path)
 
 
 @pytest.mark.parametrize(
     ("file", "old", "new", "message"),
     [
-        ("cameras.txt", " OPENCV ", " WHAT ", "cameras.txt: camera 2: the camera model must be one of"),
+        (
+            "cameras.txt",
+            " OPENCV ",
+            " WHAT ",
+            "cameras.txt: camera 2: the camera model must be one of",
+        ),
         (
             "cameras.txt",
             " OPENCV ",
@@ -130,7 +150,9 @@ def test_read_colmap__refuses_every_truncation_of_a_binary_file(tmp_path: Path, 
         ("points3D.txt", "\n1 ", "\n1 inf ", "points3D.txt: the points must be finite"),
     ],
 )
-def test_read_colmap__refuses_broken_text(tmp_path: Path, file: str, old: str, new: str, message: str) -> None:
+def test_read_colmap__refuses_broken_text(
+    tmp_path: Path, file: str, old: str, new: str, message: str
+) -> None:
     path = write(tmp_path) / file
     text, count = re.subn(old, new, path.read_text())
     assert count
@@ -142,12 +164,18 @@ def test_read_colmap__refuses_broken_text(tmp_path: Path, file: str, old: str, n
 @pytest.mark.parametrize(
     ("file", "line", "message"),
     [
-        ("cameras.txt", "1 PINHOLE 1 1 1 1 1 1 {}", "camera 1: .* takes 4 parameters, got 16|expected `CAMERA_ID"),
+        (
+            "cameras.txt",
+            "1 PINHOLE 1 1 1 1 1 1 {}",
+            "camera 1: .* takes 4 parameters, got 16|expected `CAMERA_ID",
+        ),
         ("images.txt", "1 1 0 0 0 0 0 0 1 a.png\n{}", "expected `POINTS2D"),
         ("points3D.txt", "1 0 0 0 word 0 0 0 {}", "expected `POINT3D_ID"),
     ],
 )
-def test_read_colmap__does_not_split_long_lines(tmp_path: Path, file: str, line: str, message: str) -> None:
+def test_read_colmap__does_not_split_long_lines(
+    tmp_path: Path, file: str, line: str, message: str
+) -> None:
     (write(tmp_path) / file).write_text(line.format("10 " * 2_000_000 + "10 10"))
     tracemalloc.start()
     with pytest.raises(ValueError, match=message):
@@ -157,7 +185,9 @@ def test_read_colmap__does_not_split_long_lines(tmp_path: Path, file: str, line:
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_read_colmap__refuses_a_binary_file_that_claims_more_than_its_size(tmp_path: Path, name: str) -> None:
+def test_read_colmap__refuses_a_binary_file_that_claims_more_than_its_size(
+    tmp_path: Path, name: str
+) -> None:
     file = write(tmp_path, "bin") / f"{name}.bin"
     file.write_bytes((2**63).to_bytes(8, "little") + file.read_bytes()[8:])
     with pytest.raises(ValueError, match=rf"{name}.bin: expected \d+ more bytes"):
@@ -178,18 +208,24 @@ def test_read_colmap__names_a_missing_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_read_colmap__refuses_a_binary_file_that_holds_more_than_it_announces(tmp_path: Path, name: str) -> None:
+def test_read_colmap__refuses_a_binary_file_that_holds_more_than_it_announces(
+    tmp_path: Path, name: str
+) -> None:
     file = write(tmp_path, "bin") / f"{name}.bin"
     count = int.from_bytes(file.read_bytes()[:8], "little")
     file.write_bytes((count - 1).to_bytes(8, "little") + file.read_bytes()[8:])
-    with pytest.raises(ValueError, match=rf"{name}.bin: expected the {count - 1} \w+ that it announces, got \d+"):
+    with pytest.raises(
+        ValueError, match=rf"{name}.bin: expected the {count - 1} \w+ that it announces, got \d+"
+    ):
         read_colmap(tmp_path)
 
 
 def test_read_colmap__keeps_the_spaces_of_names(tmp_path: Path) -> None:
     names = (" cam1", "cam 2 ", "  cam3")
     write_colmap(tmp_path, rig(names))
-    assert {camera.name for camera in read_colmap(tmp_path).cameras} == {f"{name}.png" for name in names}
+    assert {camera.name for camera in read_colmap(tmp_path).cameras} == {
+        f"{name}.png" for name in names
+    }
     videos(tmp_path, names)
     assert set(load_capture(tmp_path).names) == set(names)
 
@@ -216,7 +252,10 @@ def test_find_colmap__takes_the_model_of_most_images(
     (tmp_path / place / "._1").touch()
     videos(tmp_path, names)
     assert load_capture(tmp_path).names == names
-    assert f"{place}: the largest of 3 models, 1 with 3 images, is used; 10 has 2, 0 has 1." in caplog.text
+    assert (
+        f"{place}: the largest of 3 models, 1 with 3 images, is used; 10 has 2, 0 has 1."
+        in caplog.text
+    )
 
 
 def test_find_colmap__takes_the_first_of_equal_models_and_the_only_one(tmp_path: Path) -> None:

@@ -26,15 +26,25 @@ from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.io.video_writer import write_video
 from tests.assertions import assert_close
 from tests.scenes import captures as layouts
-from tests.scenes.captures import COUNT, FPS, HEIGHT, WIDTH, folder_per_camera, folder_per_frame, rig
+from tests.scenes.captures import (
+    COUNT,
+    FPS,
+    HEIGHT,
+    WIDTH,
+    folder_per_camera,
+    folder_per_frame,
+    rig,
+)
 
 # Files store poses in text or float64; the focal length of a rig is near 50 px.
 POSE_ABS = 1e-9
 PIXEL_ABS = 1e-6
 
 
-def assert_holds(capture: Capture, names: tuple[str, ...], order: tuple[int, ...], shift: float = 0.0) -> None:
-    """Check that camera j has the name, pose, intrinsics and images of the rig's camera `order[j]`."""
+def assert_holds(
+    capture: Capture, names: tuple[str, ...], order: tuple[int, ...], shift: float = 0.0
+) -> None:
+    """Check that camera j has name, pose, intrinsics and images of the rig's `order[j]`."""
     cameras = rig(names, shift)
     assert capture.names == tuple(names[i] for i in order)
     assert capture.num_frames == COUNT
@@ -78,10 +88,22 @@ def test_poses_bounds__halves_n3dv_at_its_own_size(tmp_path: Path) -> None:
         folder_per_frame,
         lambda path, names: folder_per_frame(path, names, "images"),
     ],
-    ids=["videos", "inner videos", "folders", "inner folders", "cam/images", "frames", "frames/images"],
+    ids=[
+        "videos",
+        "inner videos",
+        "folders",
+        "inner folders",
+        "cam/images",
+        "frames",
+        "frames/images",
+    ],
 )
 def test_poses_bounds__reads_meet_room(tmp_path: Path, clips) -> None:
-    assert_holds(load_capture(layouts.meet_room(tmp_path / "a", clips)), ("cam_0", "cam_2", "cam_10"), (0, 1, 2))
+    assert_holds(
+        load_capture(layouts.meet_room(tmp_path / "a", clips)),
+        ("cam_0", "cam_2", "cam_10"),
+        (0, 1, 2),
+    )
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -106,7 +128,9 @@ def test_colmap__reads_all_models(tmp_path: Path, model: str, shared: bool, kind
     for camera, i in zip(capture.cameras, (2, 1, 0), strict=True):
         assert_close(camera.viewmat, cameras[i].viewmat, atol=POSE_ABS)
         number = 0 if shared else i
-        np.testing.assert_allclose(camera.K, [[50 + number, 0, 33], [0, 50 + number, 20 + number], [0, 0, 1]])
+        np.testing.assert_allclose(
+            camera.K, [[50 + number, 0, 33], [0, 50 + number, 20 + number], [0, 0, 1]]
+        )
     metadata = capture.metadata()
     assert [view["lens"] for view in metadata["cameras"]] == [model] * 3
     np.testing.assert_allclose(metadata["cameras"][0]["distortion"], lens)
@@ -128,7 +152,9 @@ def test_find_layout__follows_the_order_of_precedence(tmp_path: Path) -> None:
     path = layouts.nerfstudio(tmp_path / "a")
     write_poses_bounds(path / "poses_bounds.npy", rig(("cam1", "cam2", "cam10")), [[1, 9]] * 3)
     assert load_capture(path).layout == "Nerfstudio"
-    layouts.colmap_text(path / "sparse", rig(("cam1", "cam2")), "PINHOLE", [[50.0, 50, 31, 23]], shared=True)
+    layouts.colmap_text(
+        path / "sparse", rig(("cam1", "cam2")), "PINHOLE", [[50.0, 50, 31, 23]], shared=True
+    )
     assert load_capture(path).names == ("cam1", "cam2")
     model = pycolmap.Reconstruction(str(path / "sparse"))
     model.cameras[1].params = [60.0, 60, 31, 23]
@@ -186,7 +212,12 @@ def colmap_by_frame(path: Path) -> Path:
     ],
 )
 def test_load_capture__leaves_out_cameras_without_clips_with_a_warning(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, build, remove, camera: str, left: tuple[str, ...]
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    build,
+    remove,
+    camera: str,
+    left: tuple[str, ...],
 ) -> None:
     path = build(tmp_path / "a")
     remove(path)
@@ -196,7 +227,9 @@ def test_load_capture__leaves_out_cameras_without_clips_with_a_warning(
     assert f"{camera}: left out." in warning or f"{camera} was found: left out." in warning
     assert capture.names == left
     whole = load_capture(build(tmp_path / "b"))
-    for camera_, expected in zip(capture.cameras, (whole.cameras[whole.names.index(n)] for n in left), strict=True):
+    for camera_, expected in zip(
+        capture.cameras, (whole.cameras[whole.names.index(n)] for n in left), strict=True
+    ):
         assert_close(camera_.viewmat, expected.viewmat, atol=POSE_ABS)
 
 
@@ -204,7 +237,9 @@ def test_load_capture__lists_some_of_many_cameras_without_clips(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     names = tuple(f"cam{i}" for i in range(30))
-    layouts.colmap_text(tmp_path / "sparse", rig(names), "PINHOLE", [[50.0, 50, 31, 23]], shared=True)
+    layouts.colmap_text(
+        tmp_path / "sparse", rig(names), "PINHOLE", [[50.0, 50, 31, 23]], shared=True
+    )
     layouts.videos(tmp_path, names[:2])
     with caplog.at_level(logging.WARNING):
         assert load_capture(tmp_path).names == names[:2]
@@ -215,7 +250,10 @@ def test_load_capture__names_what_reads_a_fit(tmp_path: Path) -> None:
     (tmp_path / "stream.morgs").touch()
     start = f"{tmp_path}: expected a capture, found a fit; `morgs-mi eval {tmp_path}` scores it, "
     for content, rest in (
-        ('{"capture": "clips/walk"}', "shows it, and `morgs-mi info clips/walk` describes its capture."),
+        (
+            '{"capture": "clips/walk"}',
+            "shows it, and `morgs-mi info clips/walk` describes its capture.",
+        ),
         ("{}", f"`morgs-mi view {tmp_path}` shows it."),
         ('{"capture": 3}', "shows it."),
     ):
@@ -224,11 +262,15 @@ def test_load_capture__names_what_reads_a_fit(tmp_path: Path) -> None:
             load_capture(tmp_path)
         assert str(error.value).startswith(start)
         assert str(error.value).endswith(rest)
-    with pytest.raises(FileNotFoundError, match=r"stream\.morgs: expected a capture folder, found a file"):
+    with pytest.raises(
+        FileNotFoundError, match=r"stream\.morgs: expected a capture folder, found a file"
+    ):
         load_capture(tmp_path / "stream.morgs")
 
 
-def test_find_layout__finds_a_layout_that_is_added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_find_layout__finds_a_layout_that_is_added(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A new layout costs its `Layout` and an entry in `LAYOUTS`."""
     names = ("cam1", "cam2", "cam10")
     path = tmp_path / "a"
@@ -240,7 +282,9 @@ def test_find_layout__finds_a_layout_that_is_added(tmp_path: Path, monkeypatch: 
     toy = Layout("toy", ("toy.txt",), lambda path: (path / "toy.txt").is_file(), read)
     monkeypatch.setattr(layout_registry, "LAYOUTS", (*layout_registry.LAYOUTS, toy))
     layouts.videos(path, names)
-    with pytest.raises(FileNotFoundError, match=r"sparse/0, sparse, .*, poses_bounds.npy or toy.txt\), found none"):
+    with pytest.raises(
+        FileNotFoundError, match=r"sparse/0, sparse, .*, poses_bounds.npy or toy.txt\), found none"
+    ):
         load_capture(path)
     (path / "toy.txt").touch()
     capture = load_capture(path)
@@ -251,9 +295,9 @@ def test_find_layout__finds_a_layout_that_is_added(tmp_path: Path, monkeypatch: 
 
 
 def test_layout_called__returns_every_layout_by_its_name() -> None:
-    assert [layout_registry.layout_called(layout.name) for layout in layout_registry.LAYOUTS] == list(
-        layout_registry.LAYOUTS
-    )
+    assert [
+        layout_registry.layout_called(layout.name) for layout in layout_registry.LAYOUTS
+    ] == list(layout_registry.LAYOUTS)
     assert layout_registry.layout_called("toy") is None
 
 
@@ -311,10 +355,15 @@ def test_nerfstudio__frames_override_the_keys_of_the_file(tmp_path: Path) -> Non
 
     edit(path, change)
     capture = load_capture(path)
-    np.testing.assert_allclose(capture.cameras[1].K, [[40, 0, WIDTH / 2], [0, 40, HEIGHT / 2], [0, 0, 1]])
+    np.testing.assert_allclose(
+        capture.cameras[1].K, [[40, 0, WIDTH / 2], [0, 40, HEIGHT / 2], [0, 0, 1]]
+    )
     first, second, _ = capture.metadata()["cameras"]
     assert (first["lens"], first["distortion"]) == ("OPENCV_FISHEYE", [0.07, 0, 0.05, 0.09])
-    assert (second["lens"], second["distortion"]) == ("FULL_OPENCV", [0.02, 0, 0, 0.03, 0.05, 0, 0, 0])
+    assert (second["lens"], second["distortion"]) == (
+        "FULL_OPENCV",
+        [0.02, 0, 0, 0.03, 0.05, 0, 0, 0],
+    )
 
 
 def test_nerfstudio__reads_a_field_of_view_all_frames_and_points(tmp_path: Path) -> None:
@@ -334,7 +383,8 @@ def test_nerfstudio__reads_a_field_of_view_all_frames_and_points(tmp_path: Path)
 
     edit(path, change)
     vertex = np.array(
-        [(1, 2, 3, 255, 0, 51)], [(n, "f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")]
+        [(1, 2, 3, 255, 0, 51)],
+        [(n, "f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")],
     )
     PlyData([PlyElement.describe(vertex, "vertex")]).write(str(path / "cloud.ply"))
     capture = load_capture(path)
@@ -350,7 +400,12 @@ def test_nerfstudio__reads_a_folder_per_frame(tmp_path: Path) -> None:
     for file in path.glob("*.mkv"):
         file.unlink()
     folder_per_frame(path, ("cam1", "cam2", "cam10"))
-    edit(path, lambda meta: [f.update(file_path="frame000000/" + Path(f["file_path"]).name) for f in meta["frames"]])
+    edit(
+        path,
+        lambda meta: [
+            f.update(file_path="frame000000/" + Path(f["file_path"]).name) for f in meta["frames"]
+        ],
+    )
     assert_holds(load_capture(path), ("cam1", "cam2", "cam10"), (0, 1, 2), shift=3)
 
 
@@ -375,7 +430,9 @@ def split_meta(path: Path, **cameras: tuple[int, ...]) -> Path:
     return path
 
 
-def test_dynamic3dgs__holds_out_all_test_cameras(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_dynamic3dgs__holds_out_all_test_cameras(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     path = split_meta(layouts.dynamic3dgs(tmp_path / "a"), train_meta=(1,), test_meta=(10, 2))
     calibration = layout_registry.find_layout(path).read(path)
     assert (calibration.names, calibration.test_views) == (("1", "2", "10"), (1, 2))
@@ -385,11 +442,19 @@ def test_dynamic3dgs__holds_out_all_test_cameras(tmp_path: Path, caplog: pytest.
     shutil.rmtree(path / "ims" / "2")
     assert layout_registry.find_layout(path).read(path).test_views == (1,)
     assert "no image of 2 was found: left out" in caplog.text
-    path = split_meta(layouts.dynamic3dgs(tmp_path / "b"), test_meta=(10,))  # which is trained on, too
+    # Which is trained on, too.
+    path = split_meta(layouts.dynamic3dgs(tmp_path / "b"), test_meta=(10,))
     assert layout_registry.find_layout(path).read(path).test_views == (2,)
 
 
-JUNK = ("._{}", ".DS_Store", "Thumbs.db", "__MACOSX/{}", "__MACOSX/._{}", "@eaDir/{}/SYNOPHOTO_THUMB_XL.jpg")
+JUNK = (
+    "._{}",
+    ".DS_Store",
+    "Thumbs.db",
+    "__MACOSX/{}",
+    "__MACOSX/._{}",
+    "@eaDir/{}/SYNOPHOTO_THUMB_XL.jpg",
+)
 
 
 @pytest.mark.parametrize(
@@ -424,14 +489,19 @@ def test_load_capture__ignores_what_systems_add(
 
 @pytest.mark.parametrize("mark", ["utf-8-sig", "utf-16"])
 @pytest.mark.parametrize(
-    "build", [layouts.colmap, layouts.nerfstudio, layouts.dynamic3dgs, layouts.anipose, layouts.qualisys]
+    "build",
+    [layouts.colmap, layouts.nerfstudio, layouts.dynamic3dgs, layouts.anipose, layouts.qualisys],
 )
-def test_load_capture__reads_texts_of_windows(tmp_path: Path, mark: str, build: Callable[[Path], Path]) -> None:
+def test_load_capture__reads_texts_of_windows(
+    tmp_path: Path, mark: str, build: Callable[[Path], Path]
+) -> None:
     path = build(tmp_path / "a")
     (path / "capture.json").write_text('{"fps": 12}')
     unix_capture = load_capture(path)
     for file in [file for file in path.rglob("*") if file.suffix in (".txt", ".json", ".toml")]:
-        declared = "<?xml version='1.0' encoding='utf-8'?>\n" if file.name.endswith(".qca.txt") else ""
+        declared = (
+            "<?xml version='1.0' encoding='utf-8'?>\n" if file.name.endswith(".qca.txt") else ""
+        )
         file.write_bytes((declared + file.read_text()).replace("\n", "\r\n").encode(mark))
     result = load_capture(path)
     assert (result.names, result.fps) == (unix_capture.names, 12)
@@ -467,37 +537,64 @@ def test_match_clips__reads_cameras_and_frames_numbered_alike(
 
 
 @pytest.mark.parametrize("image", ["0/{}.png", "0/images/{}.png"])
-def test_match_clips__reads_a_folder_per_frame_numbered_like_cameras(tmp_path: Path, image: str) -> None:
+def test_match_clips__reads_a_folder_per_frame_numbered_like_cameras(
+    tmp_path: Path, image: str
+) -> None:
     names = ("0", "1", "2")
     for i, name in enumerate(names):
         for t in range(COUNT):
             layouts.write_image(tmp_path / image.format(name).replace("0/", f"{t}/", 1), i, t)
-    write_colmap(tmp_path / "sparse/0", [replace(camera, name=image.format(camera.name)) for camera in rig(names)])
+    write_colmap(
+        tmp_path / "sparse/0",
+        [replace(camera, name=image.format(camera.name)) for camera in rig(names)],
+    )
     assert_holds(load_capture(tmp_path), names, (0, 1, 2))
 
 
 def test_clips__refuse_files_that_differ_in_their_suffixes(tmp_path: Path) -> None:
     path = layouts.colmap(tmp_path / "a")
     shutil.copy(path / "cam2.mkv", path / "cam2.mov")
-    with pytest.raises(ValueError, match=r"expected one file per camera, got cam2.mkv and cam2.mov; keep one of them"):
+    with pytest.raises(
+        ValueError,
+        match=r"expected one file per camera, got cam2.mkv and cam2.mov; keep one of them",
+    ):
         load_capture(path)
     for suffix in (".png", ".jpg"):
         layouts.write_image(tmp_path / "b" / f"cam2{suffix}", 0, 0)
-    with pytest.raises(ValueError, match=r"expected one file per camera, got cam2.jpg and cam2.png"):
+    with pytest.raises(
+        ValueError, match=r"expected one file per camera, got cam2.jpg and cam2.png"
+    ):
         photos(tmp_path / "b")
 
 
-def test_clips_by_camera__names_clips_in_several_folders(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_clips_by_camera__names_clips_in_several_folders(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     for folder in ("depth", "images", "images_2", "rgb"):
         folder_per_camera(tmp_path / folder, ("cam1", "cam2"))
-    assert clips_by_camera(tmp_path) == {name: tmp_path / "images" / name for name in ("cam1", "cam2")}
-    assert "cam1, cam2 have two clips, such as rgb/cam1 and images/cam1: the latter is used" in caplog.text
+    assert clips_by_camera(tmp_path) == {
+        name: tmp_path / "images" / name for name in ("cam1", "cam2")
+    }
+    assert (
+        "cam1, cam2 have two clips, such as rgb/cam1 and images/cam1: the latter is used"
+        in caplog.text
+    )
     assert "images_2" not in caplog.text
 
 
 UNREAD = {
-    "Dynamic 3D Gaussians": (layouts.dynamic3dgs, "train_meta.json", ('{"w": ', '{"lens": 1, "w": '), "lens"),
-    "Anipose": (layouts.anipose, "calibration.toml", ("[cam_1]", "[extra]\na = 1\n[cam_1]\nskew = 2"), "extra, skew"),
+    "Dynamic 3D Gaussians": (
+        layouts.dynamic3dgs,
+        "train_meta.json",
+        ('{"w": ', '{"lens": 1, "w": '),
+        "lens",
+    ),
+    "Anipose": (
+        layouts.anipose,
+        "calibration.toml",
+        ("[cam_1]", "[extra]\na = 1\n[cam_1]\nskew = 2"),
+        "extra, skew",
+    ),
     "Qualisys": (
         layouts.qualisys,
         "rig.qca.txt",
@@ -510,7 +607,12 @@ UNREAD = {
 
 @pytest.mark.parametrize(("build", "file", "change", "names"), UNREAD.values(), ids=UNREAD)
 def test_load_capture__names_what_it_does_not_understand_once(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, build, file: str, change: tuple[str, str], names: str
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    build,
+    file: str,
+    change: tuple[str, str],
+    names: str,
 ) -> None:
     path = build(tmp_path / "a")
     old, new = change
@@ -522,13 +624,18 @@ def test_load_capture__names_what_it_does_not_understand_once(
     assert re.search(f"{file}: not understood and not used: {names}.$", message)
 
 
-def test_at_clip_size__scales_the_intrinsics_of_smaller_clips(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_at_clip_size__scales_the_intrinsics_of_smaller_clips(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     path = layouts.colmap(tmp_path / "a")
     small = np.full((HEIGHT // 2, WIDTH // 2, 3), 7, np.uint8)
     write_video(path / "frames" / "cam2", [small] * COUNT, FPS)
     with caplog.at_level(logging.WARNING):
         capture = load_capture(path)
-    assert "the clips of cam2 do not have the calibrated size (the first has 31x23); the intrinsics" in caplog.text
+    assert (
+        "the clips of cam2 do not have the calibrated size (the first has 31x23); the intrinsics"
+        in caplog.text
+    )
     assert [(c.width, c.height) for c in capture.cameras] == [(62, 46), (31, 23), (62, 46)]
     assert_close(capture.cameras[1].K[:2], rig(("a", "b"), shift=3)[1].K[:2] / 2, atol=PIXEL_ABS)
 
@@ -538,10 +645,19 @@ def test_metadata__describes_how_frames_were_read(tmp_path: Path) -> None:
     path = layouts.nerfstudio(tmp_path / "a")
     metadata = load_capture(path, downscale=2, test_view=1, max_frames=3).metadata()
     assert json.loads(json.dumps(metadata)) == metadata
-    assert (metadata["filter"], metadata["downscale"], metadata["test_view"], metadata["frames"]) == ("area", 2, [1], 3)
+    assert (
+        metadata["filter"],
+        metadata["downscale"],
+        metadata["test_view"],
+        metadata["frames"],
+    ) == ("area", 2, [1], 3)
     assert (metadata["layout"], metadata["fps"], metadata["points"]) == ("Nerfstudio", FPS, 0)
     view = metadata["cameras"][2]
-    assert (view["name"], view["recorded_size"], view["size"]) == ("cam10", [WIDTH, HEIGHT], [WIDTH // 2, HEIGHT // 2])
+    assert (view["name"], view["recorded_size"], view["size"]) == (
+        "cam10",
+        [WIDTH, HEIGHT],
+        [WIDTH // 2, HEIGHT // 2],
+    )
     assert (view["lens"], view["undistortion"]) == ("OPENCV", "cubic, same intrinsics")
     assert 0.5 < view["valid_share"] <= 1
     assert load_capture(path).metadata()["filter"] == "none"

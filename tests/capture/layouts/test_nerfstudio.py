@@ -21,7 +21,9 @@ NAMES = ("cam1", "cam2", "cam10")
 PIXEL_ABS = 1e-6  # the file stores float64
 
 
-def photos(path: Path, folder: str = "images", suffix: str = ".png", change: Callable = lambda meta: None) -> Path:
+def photos(
+    path: Path, folder: str = "images", suffix: str = ".png", change: Callable = lambda meta: None
+) -> Path:
     """Write three photos and their `transforms.json`, after `change`."""
     layouts.nerfstudio(path)
     for i, name in enumerate(NAMES):
@@ -54,7 +56,10 @@ def lenses(capture: Capture) -> list[tuple[str, list[float]]]:
 def test_nerfstudio__reads_fisheyes_by_their_flag(tmp_path: Path, camera_model: str | None) -> None:
     def change(meta: dict) -> None:
         meta.pop("camera_model")
-        meta.update({"is_fisheye": True, "k1": 0.01} | ({"camera_model": camera_model} if camera_model else {}))
+        meta.update(
+            {"is_fisheye": True, "k1": 0.01}
+            | ({"camera_model": camera_model} if camera_model else {})
+        )
         meta["frames"][1]["is_fisheye"] = False
 
     first, second, _ = lenses(load_capture(photos(tmp_path / "a", change=change)))
@@ -64,7 +69,9 @@ def test_nerfstudio__reads_fisheyes_by_their_flag(tmp_path: Path, camera_model: 
 
 def test_nerfstudio__refuses_a_flag_that_is_none(tmp_path: Path) -> None:
     path = photos(tmp_path / "a", change=lambda meta: meta.update(is_fisheye="yes"))
-    with pytest.raises(ValueError, match=r"frame 0 .*: `is_fisheye` must be true or false, got 'yes'"):
+    with pytest.raises(
+        ValueError, match=r"frame 0 .*: `is_fisheye` must be true or false, got 'yes'"
+    ):
         load_capture(path)
 
 
@@ -89,7 +96,10 @@ def test_nerfstudio__combines_masks_with_alpha_lens_and_downscaling(tmp_path: Pa
     path = photos(tmp_path / "a", change=change)
     write_mask(path / "masks/all.png", left_half())
     rows = np.where(np.arange(HEIGHT) < 10, 0, 255)[:, None] + np.zeros((1, WIDTH), int)
-    cv2.imwrite(str(path / "images/cam1.png"), np.dstack([*[np.full((HEIGHT, WIDTH), 9)] * 3, rows]).astype(np.uint8))
+    cv2.imwrite(
+        str(path / "images/cam1.png"),
+        np.dstack([*[np.full((HEIGHT, WIDTH), 9)] * 3, rows]).astype(np.uint8),
+    )
     full = load_capture(path)
     small = load_capture(path, 2)
     alone = full.at_recorded_size()._sources[0].undistortion.mask
@@ -127,13 +137,19 @@ def test_nerfstudio__masks_what_any_mask_of_a_camera_has_black(tmp_path: Path) -
 
 SPLITS = {
     "test": ({"test_filenames": ["images/cam2.png"]}, (1,)),
-    "validation and test": ({"val_filenames": ["images/cam1.png"], "test_filenames": ["./images/cam2.png"]}, (0, 1)),
+    "validation and test": (
+        {"val_filenames": ["images/cam1.png"], "test_filenames": ["./images/cam2.png"]},
+        (0, 1),
+    ),
     "other than training": (
         {"train_filenames": ["images/cam1.png"], "test_filenames": ["images/cam10.png", "cam2"]},
         (1, 2),
     ),
     "trained and tested": (
-        {"train_filenames": [f"images/{n}.png" for n in NAMES], "val_filenames": ["images/cam2.png"]},
+        {
+            "train_filenames": [f"images/{n}.png" for n in NAMES],
+            "val_filenames": ["images/cam2.png"],
+        },
         (),
     ),
     "none": ({"test_filenames": []}, ()),
@@ -141,32 +157,47 @@ SPLITS = {
 
 
 @pytest.mark.parametrize(("lists", "views"), SPLITS.values(), ids=SPLITS)
-def test_nerfstudio__holds_out_the_views_of_its_splits(tmp_path: Path, lists: dict, views: tuple[int, ...]) -> None:
+def test_nerfstudio__holds_out_the_views_of_its_splits(
+    tmp_path: Path, lists: dict, views: tuple[int, ...]
+) -> None:
     path = photos(tmp_path / "a", change=lambda meta: meta.update(lists))
     assert LAYOUT.read(path).test_views == views
     assert load_capture(path).test_views == views
     assert load_capture(path, test_view=None).test_views == ()
 
 
-def test_nerfstudio__leaves_out_views_of_no_split(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    lists = {"train_filenames": ["images/cam1.png", "gone.png"], "test_filenames": ["images/cam10.png"]}
+def test_nerfstudio__leaves_out_views_of_no_split(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    lists = {
+        "train_filenames": ["images/cam1.png", "gone.png"],
+        "test_filenames": ["images/cam10.png"],
+    }
     path = photos(tmp_path / "a", change=lambda meta: meta.update(lists))
     capture = load_capture(path)
     assert (capture.names, capture.test_views) == (("cam1", "cam10"), (1,))
     assert "cam2 in none of the splits: left out" in caplog.text
     assert "`train_filenames` names 1 images without a frame, such as gone.png" in caplog.text
     path = photos(tmp_path / "b", change=lambda meta: meta.update(train_filenames=[]))
-    with pytest.raises(ValueError, match=r"transforms.json: expected a camera to train on, got none"):
+    with pytest.raises(
+        ValueError, match=r"transforms.json: expected a camera to train on, got none"
+    ):
         load_capture(path)
 
 
 @pytest.mark.parametrize(
-    "file_names", [("fl_x", "fl_y"), ("fl_x",), ("camera_angle_x",), ("camera_angle_x", "camera_angle_y")]
+    "file_names",
+    [("fl_x", "fl_y"), ("fl_x",), ("camera_angle_x",), ("camera_angle_x", "camera_angle_y")],
 )
 @pytest.mark.parametrize("suffix", [".png", ".JPG", ".tif"])
 @pytest.mark.parametrize("named", [True, False])
-def test_nerfstudio__takes_missing_sizes_from_the_images(tmp_path: Path, file_names, suffix: str, named: bool) -> None:
-    angles = {"camera_angle_x": 2 * np.arctan(WIDTH / 100), "camera_angle_y": 2 * np.arctan(HEIGHT / 100)}
+def test_nerfstudio__takes_missing_sizes_from_the_images(
+    tmp_path: Path, file_names, suffix: str, named: bool
+) -> None:
+    angles = {
+        "camera_angle_x": 2 * np.arctan(WIDTH / 100),
+        "camera_angle_y": 2 * np.arctan(HEIGHT / 100),
+    }
 
     def change(meta: dict) -> None:
         del meta["w"], meta["h"]
@@ -174,7 +205,11 @@ def test_nerfstudio__takes_missing_sizes_from_the_images(tmp_path: Path, file_na
             for key in ("fl_x", "fl_y", "cx", "cy"):
                 del frame[key]
             frame.update(
-                {key: value for key, value in {"fl_x": 50.0, "fl_y": 50.0, **angles}.items() if key in file_names}
+                {
+                    key: value
+                    for key, value in {"fl_x": 50.0, "fl_y": 50.0, **angles}.items()
+                    if key in file_names
+                }
             )
             if not named:
                 frame["file_path"] = "./" + frame["file_path"].removesuffix(suffix)
@@ -186,25 +221,38 @@ def test_nerfstudio__takes_missing_sizes_from_the_images(tmp_path: Path, file_na
         assert_close(camera.K, [[50, 0, WIDTH / 2], [0, 50, HEIGHT / 2], [0, 0, 1]], atol=PIXEL_ABS)
 
 
-def test_nerfstudio__takes_missing_sizes_from_clips_and_leaves_out_missing_ones(tmp_path: Path) -> None:
+def test_nerfstudio__takes_missing_sizes_from_clips_and_leaves_out_missing_ones(
+    tmp_path: Path,
+) -> None:
     path = layouts.nerfstudio(tmp_path / "a")
     meta = json.loads((path / "transforms.json").read_text())
     del meta["w"], meta["h"]
     (path / "transforms.json").write_text(json.dumps(meta))
     (path / "cam1.mkv").unlink()
     capture = load_capture(path)
-    assert [(camera.name, camera.width) for camera in capture.cameras] == [("cam2", WIDTH), ("cam10", WIDTH)]
+    assert [(camera.name, camera.width) for camera in capture.cameras] == [
+        ("cam2", WIDTH),
+        ("cam10", WIDTH),
+    ]
 
 
 def test_nerfstudio__names_keys_that_it_does_not_understand_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     def change(meta: dict) -> None:
-        meta.update(aabb_scale=16, scale=1, applied_transform=[], applied_scale=1.0, rolling_shutter=[0, 0, 1])
+        meta.update(
+            aabb_scale=16,
+            scale=1,
+            applied_transform=[],
+            applied_scale=1.0,
+            rolling_shutter=[0, 0, 1],
+        )
         for frame in meta["frames"]:
             frame.update(sharpness=9.5, colmap_im_id=3, depth_file_path="d.png", k5=0.1)
 
     path = photos(tmp_path / "a", change=change)
     with caplog.at_level(logging.WARNING):
         load_capture(path)
-    assert caplog.messages == [f"{path / 'transforms.json'}: not understood and not used: k5, rolling_shutter."]
+    assert caplog.messages == [
+        f"{path / 'transforms.json'}: not understood and not used: k5, rolling_shutter."
+    ]

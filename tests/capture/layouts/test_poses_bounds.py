@@ -45,7 +45,8 @@ def test_write_poses_bounds__of_a_full_disk_leaves_the_file_before(tmp_path: Pat
 
 
 def test_read_poses_bounds__columns_are_down_right_back(tmp_path: Path) -> None:
-    # A camera at (5, 6, 7) that looks along world +y with world +x to its right: down is -z, back is -y.
+    # A camera at (5, 6, 7) that looks along world +y with world +x to its right: down is -z, back
+    # is -y.
     pose = [[0, 1, 0, 5, 48], [0, 0, -1, 6, 64], [-1, 0, 0, 7, 100]]
     np.save(tmp_path / "p.npy", [[*np.ravel(pose).astype(float), 1.0, 2.0]])
     (camera,), _ = read_poses_bounds(tmp_path / "p.npy", ["cam"])
@@ -76,7 +77,11 @@ def mirrored(rows: np.ndarray) -> np.ndarray:
     ("change", "message"),
     [
         (with_nan, r"row 1 \(cam01\): the pose must be finite"),
-        (mirrored, r"row 0 \(cam00\), columns in the order down, right, back: the axes must be a right-handed"),
+        (
+            mirrored,
+            r"row 0 \(cam00\), columns in the order down, right, back: the axes must be a "
+            r"right-handed",
+        ),
         (lambda rows: rows[:1], r"got 1 rows for 2 videos \(cam00, cam01\)"),
         (lambda rows: rows[:, :16], r"expected a float array \[C, 17\], got float64 \(2, 16\)"),
         (lambda rows: rows.astype(object), "got a broken file"),
@@ -87,7 +92,9 @@ def test_read_poses_bounds__refuses_bad_files(tmp_path: Path, change, message: s
         read_poses_bounds(broken(tmp_path / "poses_bounds.npy", change), ["cam00", "cam01"])
 
 
-def test_write_poses_bounds__refuses_cameras_that_the_format_cannot_represent(tmp_path: Path) -> None:
+def test_write_poses_bounds__refuses_cameras_that_the_format_cannot_represent(
+    tmp_path: Path,
+) -> None:
     K = np.array([[50, 0, 30], [0, 50, 24], [0, 0, 1.0]])
     camera = Camera(K, np.eye(4), 64, 48, "cam00")
     with pytest.raises(ValueError, match=r"'cam00' must have one focal length .* use write_colmap"):

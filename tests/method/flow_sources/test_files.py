@@ -25,7 +25,9 @@ def folder(tmp_path):
         (tmp_path / "cam00" / direction).mkdir(parents=True)
         for frame in frames:
             seed = frame + 10 * (direction == "forward")
-            write_flow(tmp_path / "cam00" / direction / f"v2_frame_{frame:04d}.flo", random_flow(seed=seed))
+            write_flow(
+                tmp_path / "cam00" / direction / f"v2_frame_{frame:04d}.flo", random_flow(seed=seed)
+            )
     return tmp_path
 
 
@@ -123,7 +125,13 @@ def test_write_flow__rejects_another_shape(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "names", [("motion.X", "motion.Y"), ("B", "G", "R", "motion.X", "motion.Y"), ("X", "Y", "u", "v"), ("u",)]
+    "names",
+    [
+        ("motion.X", "motion.Y"),
+        ("B", "G", "R", "motion.X", "motion.Y"),
+        ("X", "Y", "u", "v"),
+        ("u",),
+    ],
 )
 def test_read_flow__rejects_channels_that_are_not_flow(tmp_path, names):
     # The renderer's motion points the other way, and the colours beside it are not flow.
@@ -135,19 +143,41 @@ def test_read_flow__rejects_channels_that_are_not_flow(tmp_path, names):
 @pytest.mark.parametrize(
     ("camera", "frame", "size", "exception", "message"),
     [
-        ("cam00", 3, (6, 9), FileNotFoundError, "cam00/backward: .* of frame 3, found files of frames 1 to 2; name"),
-        ("cam01", 1, (6, 9), FileNotFoundError, "cam01/backward: .* of frame 1, found no flow at all"),
-        ("cam00", 1, (9, 6), ValueError, r"0001\.flo: expected 6x9 pixels as the images of cam00 have, got 9x6"),
+        (
+            "cam00",
+            3,
+            (6, 9),
+            FileNotFoundError,
+            "cam00/backward: .* of frame 3, found files of frames 1 to 2; name",
+        ),
+        (
+            "cam01",
+            1,
+            (6, 9),
+            FileNotFoundError,
+            "cam01/backward: .* of frame 1, found no flow at all",
+        ),
+        (
+            "cam00",
+            1,
+            (9, 6),
+            ValueError,
+            r"0001\.flo: expected 6x9 pixels as the images of cam00 have, got 9x6",
+        ),
     ],
 )
-def test_flow_folder__rejects_missing_frames_and_other_sizes(folder, camera, frame, size, exception, message):
+def test_flow_folder__rejects_missing_frames_and_other_sizes(
+    folder, camera, frame, size, exception, message
+):
     with pytest.raises(exception, match=message):
         FlowFolder(folder).flows(camera, frame, size)
 
 
 def test_flow_folder__rejects_two_files_of_one_frame(folder):
     write_flow(folder / "cam00/backward/frame_1.exr", random_flow())
-    with pytest.raises(ValueError, match=r"one file of frame 1, got frame_1\.exr, v2_frame_0001\.flo"):
+    with pytest.raises(
+        ValueError, match=r"one file of frame 1, got frame_1\.exr, v2_frame_0001\.flo"
+    ):
         FlowFolder(folder).flows("cam00", 1, (6, 9))
 
 

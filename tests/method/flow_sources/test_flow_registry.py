@@ -24,8 +24,12 @@ def test_flow_sources__include_every_method_of_opencv():
 
 @pytest.mark.parametrize("method", ["raft", "files", "files:", "dis:", "dis:1", "", ":FLOW"])
 def test_flow_source__rejects_unknown_methods_with_the_known_ones(method):
-    names_text = "one of dis, dis-fine, .*, files:FOLDER, onnx:FILE, onnx-unit:FILE, onnx-signed:FILE, got "
-    with pytest.raises(ValueError, match=rf"flow_source\(\): `flow_method` must be {names_text}{method!r}\."):
+    names_text = (
+        "one of dis, dis-fine, .*, files:FOLDER, onnx:FILE, onnx-unit:FILE, onnx-signed:FILE, got "
+    )
+    with pytest.raises(
+        ValueError, match=rf"flow_source\(\): `flow_method` must be {names_text}{method!r}\."
+    ):
         flow_source(method)
 
 

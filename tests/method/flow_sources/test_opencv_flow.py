@@ -20,7 +20,8 @@ def test_optical_flow__recovers_a_translation_with_its_sign(method):
         image = scene[10 - dy : 130 - dy, 10 - dx : 170 - dx]
         motion = -optical_flow(image, previous, method)
         error = np.linalg.norm(motion - (dx, dy), axis=-1)[10:-10, 10:-10]
-        assert np.median(error) < 0.5, (dx, dy)  # `dis-ultrafast` stops at a quarter of the resolution
+        # `dis-ultrafast` stops at a quarter of the resolution.
+        assert np.median(error) < 0.5, (dx, dy)
 
 
 def test_observe_key_views__motion_is_the_shift_on_frame_ts_grid():
@@ -91,7 +92,9 @@ def test_optical_flow__rejects_bad_input(arguments, message):
 
 def test_flow_source__passes_its_config_to_the_method():
     previous, image, _ = moving_disc(144, 200, shift=(6, 1))
-    flow, changed = (optical_flow(image, previous, config=FlowConfig(fine_width=width)) for width in (480, 64))
+    flow, changed = (
+        optical_flow(image, previous, config=FlowConfig(fine_width=width)) for width in (480, 64)
+    )
     assert not np.array_equal(flow, changed)
     source_flow, _ = flow_source("dis", FlowConfig(fine_width=64))(FramePair(image, previous))
     np.testing.assert_array_equal(source_flow, changed)
@@ -99,9 +102,14 @@ def test_flow_source__passes_its_config_to_the_method():
 
 def test_flow_config__fine_width_selects_the_finest_level_of_dis():
     previous, image, _ = moving_disc(64, 96, shift=(6, 1))
-    fine, half = (optical_flow(image, previous, "dis", FlowConfig(fine_width=width)) for width in (96, 95))
+    fine, half = (
+        optical_flow(image, previous, "dis", FlowConfig(fine_width=width)) for width in (96, 95)
+    )
     np.testing.assert_array_equal(fine, optical_flow(image, previous, "dis-fine"))
-    gray = (cv2.cvtColor((255 * a + 0.5).astype(np.uint8), cv2.COLOR_RGB2GRAY) for a in (image, previous))
+    gray = (
+        cv2.cvtColor((255 * a + 0.5).astype(np.uint8), cv2.COLOR_RGB2GRAY)
+        for a in (image, previous)
+    )
     method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)  # at half resolution
     np.testing.assert_array_equal(half, method.calc(*gray, None))
 

@@ -19,7 +19,9 @@ def test_mask_refiner__is_repeatable(method):
     _, image, disc = moving_disc(120, 160, (3, 2), CAMERA_NOISE)
     refine = mask_refiner(method)
     np.testing.assert_array_equal(refine(image, disc), refine(image, disc))
-    np.testing.assert_array_equal(refine((image * 255 + 0.5).astype(np.uint8), disc), refine(image, disc))
+    np.testing.assert_array_equal(
+        refine((image * 255 + 0.5).astype(np.uint8), disc), refine(image, disc)
+    )
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,12 @@ from tests.scenes.changing_splats import rig, splats, write_stream
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory) -> tuple[Path, list[CodedFrame]]:
-    """Return the folder of a stream and its page, with SH of degree 3, births and a death, and its states."""
+    """Return the folder of a stream and its page, with SH of degree 3, births and a death, and its
+    states.
+    """
     folder = tmp_path_factory.mktemp("web")
-    states = write_stream(folder / "stream.morgs", start=splats(degree=3), cameras=rig(WIDTH, HEIGHT))
+    states = write_stream(
+        folder / "stream.morgs", start=splats(degree=3), cameras=rig(WIDTH, HEIGHT)
+    )
     write_web_page(open_stream(folder), folder / "page.html")
     return folder, states

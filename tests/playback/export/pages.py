@@ -29,7 +29,10 @@ class Page:
         self.page.set_default_timeout(TIMEOUT_MS)
         self.errors: list[str] = []
         self.requests: list[str] = []
-        self.page.on("console", lambda m: self.errors.append(m.text) if m.type in ("error", "warning") else None)
+        self.page.on(
+            "console",
+            lambda m: self.errors.append(m.text) if m.type in ("error", "warning") else None,
+        )
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.page.on("request", lambda request: self.requests.append(request.url))
         self.page.goto(address)
@@ -54,7 +57,9 @@ class Page:
     def image(self) -> np.ndarray:
         """Return the image behind the controls."""
         style = self.page.add_style_tag(content=HIDDEN)
-        image = cv2.cvtColor(cv2.imdecode(np.frombuffer(self.page.screenshot(), np.uint8), 1), cv2.COLOR_BGR2RGB)
+        image = cv2.cvtColor(
+            cv2.imdecode(np.frombuffer(self.page.screenshot(), np.uint8), 1), cv2.COLOR_BGR2RGB
+        )
         style.evaluate("node => node.remove()")
         return image
 

@@ -43,7 +43,9 @@ def video(path) -> list[np.ndarray]:
 
 def test_export_ply__writes_every_frame(stream, tmp_path):
     assert run("export", "ply", tmp_path) == 0
-    assert [path.name for path in sorted((tmp_path / "ply").iterdir())] == [f"{t:04d}.ply" for t in range(4)]
+    assert [path.name for path in sorted((tmp_path / "ply").iterdir())] == [
+        f"{t:04d}.ply" for t in range(4)
+    ]
     for t, state in enumerate(stream):
         read = read_ply(tmp_path / "ply" / f"{t:04d}.ply")
         np.testing.assert_array_equal(read.numpy()["means"], state.gaussians.numpy()["means"])
@@ -54,11 +56,15 @@ def test_export_ply__writes_compressed_files(stream, tmp_path):
     files = sorted((tmp_path / "compressed-ply").iterdir())
     assert [path.name for path in files] == ["0002.compressed.ply", "0003.compressed.ply"]
     for path, state in zip(files, stream[2:], strict=True):
-        read, expected = (np.sort(g.numpy()["means"], axis=0) for g in (read_splats(path), state.gaussians))
+        read, expected = (
+            np.sort(g.numpy()["means"], axis=0) for g in (read_splats(path), state.gaussians)
+        )
         assert_close(read, expected, atol=2e-3)
 
 
-@pytest.mark.parametrize(("kind", "name"), [("ply", "a.ply"), ("ply", "a.compressed.ply"), ("gltf", "a.glb")])
+@pytest.mark.parametrize(
+    ("kind", "name"), [("ply", "a.ply"), ("ply", "a.compressed.ply"), ("gltf", "a.glb")]
+)
 def test_export__writes_one_frame_into_a_file(stream, tmp_path, capsys, kind, name):
     suffix = name.removeprefix("a")
     assert run("export", kind, tmp_path, tmp_path / name, "--frames", 2) == 0
@@ -89,7 +95,9 @@ def format_of(name: str) -> tuple[str, ...]:
         (USD, "b.usda", "usda", "usda"),
     ],
 )
-def test_choose_format__follows_the_name_of_the_format_or_of_the_output(formats, output, name, expected):
+def test_choose_format__follows_the_name_of_the_format_or_of_the_output(
+    formats, output, name, expected
+):
     assert choose_format(formats, output, name).name == expected
 
 
@@ -100,16 +108,27 @@ def test_choose_format__names_the_formats():
 
 def test_export__refuses_a_folder_in_place_of_a_file_before_it_begins(stream, tmp_path, capsys):
     (tmp_path / "page.html").mkdir()
-    for args in (("web", tmp_path, tmp_path / "page.html"), ("web", tmp_path, "--format", "folder")):
+    for args in (
+        ("web", tmp_path, tmp_path / "page.html"),
+        ("web", tmp_path, "--format", "folder"),
+    ):
         (tmp_path / "web").mkdir(exist_ok=True)
         assert run("export", *args) == 1
     errors = capsys.readouterr().err.splitlines()
-    assert errors[0] == f"{tmp_path}/page.html: expected a file to write, got a folder; choose another name."
-    assert errors[-1] == f"{tmp_path}/web: expected a new folder, got one that exists; remove it first."
+    assert (
+        errors[0]
+        == f"{tmp_path}/page.html: expected a file to write, got a folder; choose another name."
+    )
+    assert (
+        errors[-1]
+        == f"{tmp_path}/web: expected a new folder, got one that exists; remove it first."
+    )
 
 
 def test_export_gltf__writes_selected_frames(stream, tmp_path):
-    assert run("export", "gltf", tmp_path / "stream.morgs", tmp_path / "g", "--frames", "1:4:2") == 0
+    assert (
+        run("export", "gltf", tmp_path / "stream.morgs", tmp_path / "g", "--frames", "1:4:2") == 0
+    )
     assert [path.name for path in sorted((tmp_path / "g").iterdir())] == ["0001.glb", "0003.glb"]
 
 
@@ -122,7 +141,9 @@ def test_flight__shows_rendered_images_and_restarts_the_clip(stream, tmp_path):
     keys = [{"time": 0, "camera": "middle"}, {"time": 0.6, "camera": "middle"}]
     (tmp_path / "still.json").write_text(json.dumps({"keys": keys}))
     assert run("export", "video", tmp_path, "--path", tmp_path / "still.json") == 0
-    expected = [np.clip(np.array(rasterize(state.gaussians, rig()[1]).color), 0, 1) for state in stream]
+    expected = [
+        np.clip(np.array(rasterize(state.gaussians, rig()[1]).color), 0, 1) for state in stream
+    ]
     frames = video(tmp_path / "still.mp4")
     assert len(frames) == 6
     for t, frame in enumerate(frames):
@@ -134,10 +155,15 @@ def test_flight__shows_rendered_images_and_restarts_the_clip(stream, tmp_path):
 def test_flight__plays_back_and_forth(stream, tmp_path):
     keys = [{"time": 0, "camera": "middle"}, {"time": 0.9, "camera": "middle"}]
     (tmp_path / "still.json").write_text(json.dumps({"keys": keys}))
-    assert run("export", "video", tmp_path, "--path", tmp_path / "still.json", "--back-and-forth") == 0
-    expected = [np.clip(np.array(rasterize(state.gaussians, rig()[1]).color), 0, 1) for state in stream]
+    assert (
+        run("export", "video", tmp_path, "--path", tmp_path / "still.json", "--back-and-forth") == 0
+    )
+    expected = [
+        np.clip(np.array(rasterize(state.gaussians, rig()[1]).color), 0, 1) for state in stream
+    ]
     shown = [
-        np.argmin([np.abs(frame / 255 - image).mean() for image in expected]) for frame in video(tmp_path / "still.mp4")
+        np.argmin([np.abs(frame / 255 - image).mean() for image in expected])
+        for frame in video(tmp_path / "still.mp4")
     ]
     assert shown == [0, 1, 2, 3, 2, 1, 0, 1, 2]
 
@@ -167,13 +193,17 @@ def test_write_frames__writes_videos_that_browsers_play(stream, tmp_path):
 
 
 def test_repeated_seconds__plays_whole_clips():
-    seconds = [repeated_seconds(clip, least) for clip, least in ((0.4, 5), (2.0, 5), (5.0, 5), (7.0, 5), (0.4, 0))]
+    seconds = [
+        repeated_seconds(clip, least)
+        for clip, least in ((0.4, 5), (2.0, 5), (5.0, 5), (7.0, 5), (0.4, 0))
+    ]
     assert_close(np.array(seconds), np.array([5.2, 6, 5, 7, 0.4]), atol=1e-9)
 
 
 def test_export_video__repeats_a_short_clip(stream, tmp_path):
     assert run("export", "video", tmp_path, "--least-seconds", 1, "--width", 32) == 0
-    assert len(video(tmp_path / "between.mp4")) == 12  # three plays of 4 frames at 10 frames per second
+    # Three plays of 4 frames at 10 frames per second.
+    assert len(video(tmp_path / "between.mp4")) == 12
     assert run("export", "video", tmp_path, "--least-seconds", 0, "--width", 32) == 0
     assert len(video(tmp_path / "between.mp4")) == 4
 
@@ -194,16 +224,30 @@ def test_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
         (("tracks", "folder"), "folder: the output must be FILE.npz, got 'folder'."),
         (
             ("ply", "a.glb"),
-            "must be a folder, FILE.ply for one frame or FILE.compressed.ply for one frame, got '.glb'.",
+            "must be a folder, FILE.ply for one frame or FILE.compressed.ply for one frame, got "
+            "'.glb'.",
         ),
-        (("ply", "a.ply"), "a.ply: expected one frame for one file, got 4; select one (--frames), or name a folder."),
-        (("gltf", "a.usd"), "a.usd: the output must be a folder or FILE.glb for one frame, got '.usd'."),
+        (
+            ("ply", "a.ply"),
+            "a.ply: expected one frame for one file, got 4; select one (--frames), or name a "
+            "folder.",
+        ),
+        (
+            ("gltf", "a.usd"),
+            "a.usd: the output must be a folder or FILE.glb for one frame, got '.usd'.",
+        ),
         (("web", "a.htm"), "a.htm: the output must be FILE.html or a folder, got '.htm'."),
-        (("usd", "a.usdz", "--format", "usda"), "a.usdz: the output must be FILE.usda, got '.usdz'."),
+        (
+            ("usd", "a.usdz", "--format", "usda"),
+            "a.usdz: the output must be FILE.usda, got '.usdz'.",
+        ),
         (("video", "--freeze", "7"), "--freeze must be in 0 to 3, got 7"),
         (("video", "--width", "0"), "--width must be a number in [1, inf), got 0"),
         (("video", "--seconds", "-1"), "--seconds must be positive"),
-        (("video", "--least-seconds", "-1"), "--least-seconds must be finite and not negative, got -1"),
+        (
+            ("video", "--least-seconds", "-1"),
+            "--least-seconds must be finite and not negative, got -1",
+        ),
         (("video", "--path", "none.json"), "expected a camera path, found none"),
     ],
 )
@@ -222,7 +266,9 @@ def test_exr_channels__are_read_by_mitsuba(stream, tmp_path):
     assert run("render", tmp_path, tmp_path / "exr", "--camera", "middle") == 0
     image = mi.Bitmap(str(tmp_path / "exr" / "0001.exr"))
     names = [field.name for field in image.struct_()]
-    assert sorted(names) == sorted(["R", "G", "B", "motion.X", "motion.Y", "confidence.Y", "depth.Y"])
+    assert sorted(names) == sorted(
+        ["R", "G", "B", "motion.X", "motion.Y", "confidence.Y", "depth.Y"]
+    )
     planes = dict(zip(names, np.moveaxis(np.array(image), -1, 0), strict=True))
     rendered = rasterize(stream[1].gaussians, rig()[1], ("color", "motion", "confidence", "depth"))
     assert_close(planes["motion.X"], np.array(rendered.motion)[..., 0], atol=1e-5)
@@ -234,7 +280,9 @@ def test_exr_channels__are_read_by_mitsuba(stream, tmp_path):
 
 def test_exr_channels__names_follow_the_number_of_components():
     sizes = {"color": 3, "alpha": 1, "wetness": 1, "offset": 2, "normal": 3, "wide": 5}
-    images = {name: np.random.default_rng(0).uniform(size=(2, 3, size)) for name, size in sizes.items()}
+    images = {
+        name: np.random.default_rng(0).uniform(size=(2, 3, size)) for name, size in sizes.items()
+    }
     planes = exr_channels(images)
     wide = [f"wide.{i}" for i in range(5)]
     normal = ["normal.X", "normal.Y", "normal.Z"]

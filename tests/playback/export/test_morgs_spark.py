@@ -1,4 +1,6 @@
-"""The module for pages with three.js and Spark, in the example of the documentation, in headless Chromium."""
+"""The module for pages with three.js and Spark, in the example of the documentation, in headless
+Chromium.
+"""
 
 from __future__ import annotations
 
@@ -24,9 +26,14 @@ MODULE = "morgs-spark.js"
 FRAMES = 4
 
 # Spark displays the values of the mesh's present version, in their order.
-DISPLAYED = "spark.current === spark.display && spark.current.mapping[0]?.version === splats.mesh.version"
+DISPLAYED = (
+    "spark.current === spark.display && spark.current.mapping[0]?.version === splats.mesh.version"
+)
 DRAWN = f"!spark.sorting && !spark.sortDirty && {DISPLAYED}"
-FAILURE = "import('./morgs-spark.js').then((m) => m.MorgsSplats.load('{}')).then(() => null, (error) => error.message)"
+FAILURE = (
+    "import('./morgs-spark.js').then((m) => m.MorgsSplats.load('{}')).then(() => null, (error) => "
+    "error.message)"
+)
 
 
 def test_write_web_folder__contains_the_module(tmp_path):
@@ -44,8 +51,10 @@ def test_module__imports_only_three_and_spark_and_is_small():
 
 
 def example() -> str:
-    """Return the page of the documentation with the installed packages, at a time that a test sets."""
-    page = re.search(r"```html\n(.*?)```", (ROOT / "docs/web-player.md").read_text(encoding="utf-8"), re.DOTALL)
+    """Return the page of the documentation with the installed packages, at a given time."""
+    page = re.search(
+        r"```html\n(.*?)```", (ROOT / "docs/web-player.md").read_text(encoding="utf-8"), re.DOTALL
+    )
     assert page is not None
     lock = json.loads((ROOT / "web/package-lock.json").read_text(encoding="utf-8"))["packages"]
 
@@ -59,12 +68,16 @@ def example() -> str:
     loop = "renderer.setAnimationLoop"
     assert text.count(loop) == text.count("milliseconds / 1000") == 1
     text = f'<link rel="icon" href="data:,">{text}'  # a missing one is an error in the log
-    return text.replace("milliseconds / 1000", "window.time").replace(loop, f"{variables}\n  {loop}")
+    return text.replace("milliseconds / 1000", "window.time").replace(
+        loop, f"{variables}\n  {loop}"
+    )
 
 
 @pytest.fixture(scope="module")
 def site(clip, tmp_path_factory):
-    """Return the folder of an exported clip, with the example, the packages and broken streams, and its address."""
+    """Return the folder of an exported clip, with the example, the packages and broken streams, and
+    its address.
+    """
     packages = ROOT / "web/node_modules"
     if not (packages / "three").exists():
         pytest.skip("three.js and Spark are not installed; run npm ci in web/")
@@ -80,7 +93,13 @@ def site(clip, tmp_path_factory):
     version[8] += 1
     first[index[0][2] + 100] ^= 1
     late_bytes[index[2][2] + 100] ^= 1
-    broken = {"page": b"something else", "version": version, "first": first, "later": late_bytes, "cut": data[:-10]}
+    broken = {
+        "page": b"something else",
+        "version": version,
+        "first": first,
+        "later": late_bytes,
+        "cut": data[:-10],
+    }
     for name, content in broken.items():
         (folder / f"{name}.morgs").write_bytes(content)
     with served(folder) as address:
@@ -92,7 +111,9 @@ class Scene(Page):
 
     def show(self, frame: int, camera: int = 0) -> np.ndarray:
         """Return the image of a frame from a camera."""
-        self.page.evaluate(f"time = {frame} / splats.fps; controls.target.copy(splats.place(camera, {camera}))")
+        self.page.evaluate(
+            f"time = {frame} / splats.fps; controls.target.copy(splats.place(camera, {camera}))"
+        )
         for _ in range(1000):
             self.image()  # makes a browser draw that has paused its animation
             if self.page.evaluate(f"splats.position === {frame} && {DRAWN}"):
@@ -120,7 +141,9 @@ def scene(opened):
 def test_module__shows_the_images_of_the_renderer(scene, site, clip):
     stream = open_stream(site[0])
     for camera, frame in ((0, 0), (0, 3), (2, 2), (2, 1)):
-        expected = render(clip[1][frame].gaussians, stream.cameras[camera], ("color",), render_config(stream))["color"]
+        expected = render(
+            clip[1][frame].gaussians, stream.cameras[camera], ("color",), render_config(stream)
+        )["color"]
         assert psnr(scene.show(frame, camera) / 255, np.clip(expected, 0, 1)) > 40
 
 
@@ -134,23 +157,32 @@ def test_module__places_cameras_with_an_off_centre_principal_point(scene, site, 
 
 def test_module__follows_the_mesh(scene):
     image = scene.show(1)
-    scene.page.evaluate("splats.mesh.position.set(3, 1, -2); splats.mesh.rotateY(1); splats.mesh.scale.setScalar(0.5)")
+    scene.page.evaluate(
+        "splats.mesh.position.set(3, 1, -2); splats.mesh.rotateY(1); "
+        "splats.mesh.scale.setScalar(0.5)"
+    )
     moved_image = scene.show(1)
-    scene.page.evaluate("splats.mesh.position.set(0, 0, 0); splats.mesh.rotateY(-1); splats.mesh.scale.setScalar(1)")
+    scene.page.evaluate(
+        "splats.mesh.position.set(0, 0, 0); splats.mesh.rotateY(-1); splats.mesh.scale.setScalar(1)"
+    )
     assert psnr(moved_image / 255, image / 255) > 40
 
 
 def test_module__is_hidden_by_other_meshes(scene):
     image = scene.show(1)
     scene.page.evaluate("""{
-      const wall = new THREE.Mesh(new THREE.PlaneGeometry(4, 4), new THREE.MeshBasicMaterial({ color: 0x00ff00 }));
+      const green = new THREE.MeshBasicMaterial({ color: 0x00ff00 });
+      const wall = new THREE.Mesh(new THREE.PlaneGeometry(4, 4), green);
       wall.quaternion.copy(camera.quaternion);
-      wall.position.copy(splats.place(camera)).add(new THREE.Vector3(2, 0, -1.5).applyQuaternion(camera.quaternion));
+      const shift = new THREE.Vector3(2, 0, -1.5).applyQuaternion(camera.quaternion);
+      wall.position.copy(splats.place(camera)).add(shift);
       scene.add(wall);
       window.wall = wall;
     }""")
     behind = scene.show(1)
-    scene.page.evaluate("wall.position.add(new THREE.Vector3(0, 0, 3).applyQuaternion(camera.quaternion))")
+    scene.page.evaluate(
+        "wall.position.add(new THREE.Vector3(0, 0, 3).applyQuaternion(camera.quaternion))"
+    )
     ahead = scene.show(1)
     scene.page.evaluate("scene.remove(wall)")
     green = np.array([0, 255, 0])
@@ -159,7 +191,9 @@ def test_module__is_hidden_by_other_meshes(scene):
     assert psnr(behind[:, :100] / 255, image[:, :100] / 255) > 40
 
 
-@pytest.mark.parametrize(("seconds", "frame"), [(0.15, 1), (0.2, 2), (0.7, 3), (-0.1, 3), (1.25, 0)])
+@pytest.mark.parametrize(
+    ("seconds", "frame"), [(0.15, 1), (0.2, 2), (0.7, 3), (-0.1, 3), (1.25, 0)]
+)
 def test_module__repeats(scene, seconds, frame):
     scene.page.evaluate(f"time = {seconds}; splats.update(time)")
     scene.wait(f"splats.position === {frame}")
@@ -168,7 +202,9 @@ def test_module__repeats(scene, seconds, frame):
 def test_module__knows_the_size_of_a_frame(scene, clip):
     scene.show(0)
     means = clip[1][0].gaussians.numpy()["means"]
-    box = scene.page.evaluate("(({min, max}) => [min.toArray(), max.toArray()])(splats.mesh.getBoundingBox())")
+    box = scene.page.evaluate(
+        "(({min, max}) => [min.toArray(), max.toArray()])(splats.mesh.getBoundingBox())"
+    )
     assert np.allclose(box, [means.min(axis=0), means.max(axis=0)], atol=1e-4)
 
 
@@ -189,7 +225,8 @@ def test_module__refuses_what_it_cannot_play(browser, site, name, reason):
 
 
 @pytest.mark.parametrize(
-    ("name", "last", "reason"), [("later", 1, "frame 2: the packet at byte"), ("cut", 2, "truncated or damaged")]
+    ("name", "last", "reason"),
+    [("later", 1, "frame 2: the packet at byte"), ("cut", 2, "truncated or damaged")],
 )
 def test_module__plays_the_frames_before_the_damage(scene, name, last, reason):
     load = f"import('./morgs-spark.js').then((module) => module.MorgsSplats.load('{name}.morgs'))"

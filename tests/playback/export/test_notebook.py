@@ -37,7 +37,9 @@ def test_stream_html__is_the_player_in_a_frame_without_access_to_the_notebook(tm
     assert html.unescape(source[1]).encode() == web_page(stream)
 
 
-def test_stream_html__of_a_large_stream_is_its_first_frame_and_the_command_for_a_page(tmp_path, monkeypatch):
+def test_stream_html__of_a_large_stream_is_its_first_frame_and_the_command_for_a_page(
+    tmp_path, monkeypatch
+):
     states = write_stream(tmp_path / "stream.morgs")
     stream = open_stream(tmp_path)
     monkeypatch.setattr(notebook, "LARGEST", 1000)
@@ -45,8 +47,12 @@ def test_stream_html__of_a_large_stream_is_its_first_frame_and_the_command_for_a
     assert f"morgs-mi export web {stream.path} page.html" in text
     source = re.search(r"base64,([^\"]+)", text)
     assert source is not None
-    image = render(states[0].gaussians, stream.cameras[0], ("color",), render_config(stream))["color"]
-    np.testing.assert_array_equal(decoded(base64.b64decode(source[1])), channel_image("color", image))
+    image = render(states[0].gaussians, stream.cameras[0], ("color",), render_config(stream))[
+        "color"
+    ]
+    np.testing.assert_array_equal(
+        decoded(base64.b64decode(source[1])), channel_image("color", image)
+    )
 
 
 @pytest.mark.parametrize("largest", [0, 10**9])

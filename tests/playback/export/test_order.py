@@ -45,4 +45,8 @@ def test_by_place__yields_frames_without_gaussians(tmp_path):
     with StreamWriter(tmp_path / "s.morgs", rig(), 10) as writer:
         for t, count in enumerate((0, 5, 0)):
             writer.write(keyframe_packet(splats(count), t, rig()))
-    assert [len(gaussians) for _, gaussians in by_place(StreamReader(tmp_path / "s.morgs"))] == [0, 5, 0]
+    assert [len(gaussians) for _, gaussians in by_place(StreamReader(tmp_path / "s.morgs"))] == [
+        0,
+        5,
+        0,
+    ]

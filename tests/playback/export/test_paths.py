@@ -51,17 +51,21 @@ def test_through_cameras__visits_the_nearest_next_at_constant_speed():
 
 
 def test_through_cameras__names_the_path_for_a_single_camera():
-    with pytest.raises(ValueError, match=r"at least two cameras were expected .* use the path `orbit`"):
+    with pytest.raises(
+        ValueError, match=r"at least two cameras were expected .* use the path `orbit`"
+    ):
         through_cameras(rig()[:1])
 
 
 def test_orbit__has_a_constant_distance_and_looks_at_the_centre():
     path = orbit(ring(8), TARGET, seconds=4)
-    assert_close(path.at(0).position, path.at(4).position, atol=1e-9)  # no gap of 90 degrees: a full turn
+    # No gap of 90 degrees: a full turn.
+    assert_close(path.at(0).position, path.at(4).position, atol=1e-9)
     for time in np.linspace(0, 4, 30):
         camera = path.at(time)
         pixel, depth = camera.project(TARGET)
-        # Splines through keys 10 degrees apart: less than a hundredth of a pixel at this focal length.
+        # Splines through keys 10 degrees apart: less than a hundredth of a pixel at this focal
+        # length.
         assert np.linalg.norm((pixel - camera.K[:2, 2]) / np.diag(camera.K)[:2]) < 1e-4
         assert depth > 0
         assert np.linalg.norm(camera.position - TARGET) == pytest.approx(np.hypot(3, 0.8), rel=1e-4)
@@ -70,7 +74,8 @@ def test_orbit__has_a_constant_distance_and_looks_at_the_centre():
 def test_orbit__of_a_frontal_rig_is_as_wide_as_the_rig():
     path = orbit(rig(), TARGET, seconds=1)
     a, b = (path.at(time).position - TARGET for time in (0, 1))
-    # Around the rig's mean up, which is tilted from z by the 11 degrees by which the cameras look down.
+    # Around the rig's mean up, which is tilted from z by the 11 degrees by which the cameras look
+    # down.
     x, y = (rig()[k].position - TARGET for k in (0, 2))
     assert np.arccos(a @ b / (a @ a)) == pytest.approx(np.arccos(x @ y / (x @ x)), abs=0.02)
 
@@ -79,7 +84,9 @@ def test_focus__is_the_intersection_of_the_axes_or_the_median_of_the_gaussians()
     means = np.random.default_rng(0).normal(size=(99, 3))
     assert_close(focus(ring(8), means), TARGET, atol=0.02)
     parallel = [Camera.look_at((x, -4, 0), (x, 0, 0), (0, 0, 1), 45, 64, 48) for x in (-1, 1)]
-    assert focus(parallel, means + np.array([0, 2, 0]))[1] == pytest.approx(np.median(means[:, 1]) + 2)
+    assert focus(parallel, means + np.array([0, 2, 0]))[1] == pytest.approx(
+        np.median(means[:, 1]) + 2
+    )
 
 
 def test_load_path__accepts_cameras_matrices_and_positions(tmp_path):
@@ -88,7 +95,9 @@ def test_load_path__accepts_cameras_matrices_and_positions(tmp_path):
         {"time": 1, "viewmat": rig()[1].viewmat.tolist()},
         {"time": 2, "position": [-1, -4, 1], "target": [0, 0, 0.2], "fov_x": 45},
     ]
-    (tmp_path / "path.json").write_text(json.dumps({"width": 128, "height": 96, "up": [0, 0, 1], "keys": keys}))
+    (tmp_path / "path.json").write_text(
+        json.dumps({"width": 128, "height": 96, "up": [0, 0, 1], "keys": keys})
+    )
     path = load_path(tmp_path / "path.json", rig())
     for key, camera in zip(path.keys, rig()[::-1], strict=True):
         assert_close(key.viewmat, camera.viewmat, atol=1e-12)
@@ -105,20 +114,44 @@ def test_load_path__accepts_cameras_matrices_and_positions(tmp_path):
             "key 0: cannot convert float infinity",
         ),
         ("[]", "expected a JSON object with a list `keys`"),
-        ('{"cameras": []}', "a list `keys` of objects, got an object with `cameras`; write the views of"),
+        (
+            '{"cameras": []}',
+            "a list `keys` of objects, got an object with `cameras`; write the views of",
+        ),
         ('{"keys": {"time": 0}}', "a list `keys` of objects, got an object with `keys`; write"),
-        ('{"fps": 24, "camera_path": []}', "with `fps`, `camera_path`, a camera path of Nerfstudio; write"),
-        ('{"path": [], "time": 0}', "got an object with `path`, `time`, a camera path of instant-ngp; write"),
-        ('{"w": 3, "frames": []}', "got an object with `w`, `frames`, the calibration of a capture; write"),
+        (
+            '{"fps": 24, "camera_path": []}',
+            "with `fps`, `camera_path`, a camera path of Nerfstudio; write",
+        ),
+        (
+            '{"path": [], "time": 0}',
+            "got an object with `path`, `time`, a camera path of instant-ngp; write",
+        ),
+        (
+            '{"w": 3, "frames": []}',
+            "got an object with `w`, `frames`, the calibration of a capture; write",
+        ),
         ('[{"id": 0, "img_name": "a"}]', "a list `keys` of objects, got a list; write"),
         ("3", "a list `keys` of objects, got 3; write"),
         ('{"keys": [{"time": 0, "camera": "left"}]}', "at least two key views"),
-        ('{"keys": [{"time": 0, "camera": "up"}]}', "key 0: `camera` must be one of left, middle, right, got 'up'"),
+        (
+            '{"keys": [{"time": 0, "camera": "up"}]}',
+            "key 0: `camera` must be one of left, middle, right, got 'up'",
+        ),
         ('{"keys": [{"camera": "left"}]}', "key 0: 'time' is missing"),
         ('{"keys": [{"time": 0}]}', "key 0: 'position' is missing"),
-        ('{"keys": [{"time": 0, "position": [0, 0], "target": [0, 0, 1]}]}', "key 0: `position`, `target`"),
-        ('{"keys": [{"time": 0, "viewmat": [[1, 0], [0, 1]]}]}', "key 0: `viewmat`: the pose must be a matrix"),
-        ('{"keys": [{"time": 1, "camera": "left"}, {"time": 0, "camera": "left"}]}', "must increase from 0"),
+        (
+            '{"keys": [{"time": 0, "position": [0, 0], "target": [0, 0, 1]}]}',
+            "key 0: `position`, `target`",
+        ),
+        (
+            '{"keys": [{"time": 0, "viewmat": [[1, 0], [0, 1]]}]}',
+            "key 0: `viewmat`: the pose must be a matrix",
+        ),
+        (
+            '{"keys": [{"time": 1, "camera": "left"}, {"time": 0, "camera": "left"}]}',
+            "must increase from 0",
+        ),
     ],
 )
 def test_load_path__reports_broken_json(tmp_path, text, message):

@@ -1,4 +1,6 @@
-"""Exported files in another program, splat-transform, which npm fetches; skipped without npm or a network."""
+"""Exported files in another program, splat-transform, which npm fetches; skipped without npm or a
+network.
+"""
 
 from __future__ import annotations
 
@@ -30,13 +32,17 @@ def program() -> str:
     (name,) = set(re.findall(r"npx --yes (\S+)", PAGE))
     if shutil.which("npx") is None:
         pytest.skip("npx is missing")
-    if subprocess.run(["npx", "--yes", name, "--version"], capture_output=True, timeout=300, check=False).returncode:
+    if subprocess.run(
+        ["npx", "--yes", name, "--version"], capture_output=True, timeout=300, check=False
+    ).returncode:
         pytest.skip(f"npm cannot fetch {name}")
     return name
 
 
 def convert(program: str, *files: Path) -> None:
-    subprocess.run(["npx", "--yes", program, "-g", "cpu", *map(str, files)], check=True, timeout=300)
+    subprocess.run(
+        ["npx", "--yes", program, "-g", "cpu", *map(str, files)], check=True, timeout=300
+    )
 
 
 def assert_same(original: Gaussians, converted: Gaussians, atol: float) -> None:
@@ -46,7 +52,13 @@ def assert_same(original: Gaussians, converted: Gaussians, atol: float) -> None:
         raw = gaussians.numpy()
         quats = raw["quats"] / np.linalg.norm(raw["quats"], axis=1, keepdims=True)
         rotations = np.einsum("ni,nj->nij", quats, quats)
-        parts = [raw["means"], raw["log_scales"], np.asarray(gaussians.opacities), rotations, raw["sh_coeffs"]]
+        parts = [
+            raw["means"],
+            raw["log_scales"],
+            np.asarray(gaussians.opacities),
+            rotations,
+            raw["sh_coeffs"],
+        ]
         table = np.concatenate([part.reshape(len(gaussians), -1) for part in parts], axis=1)
         columns.append(table[np.argsort(raw["means"][:, 0], kind="stable")])
     assert_close(columns[1], columns[0], atol=atol)
@@ -56,7 +68,9 @@ def assert_same(original: Gaussians, converted: Gaussians, atol: float) -> None:
 def test_write_compressed_ply__is_read_by_splat_transform(program, tmp_path, degree):
     write_compressed_ply(tmp_path / "a.compressed.ply", splats(700, degree))
     convert(program, tmp_path / "a.compressed.ply", tmp_path / "b.ply")
-    assert_same(read_compressed_ply(tmp_path / "a.compressed.ply"), read_ply(tmp_path / "b.ply"), atol=2e-6)
+    assert_same(
+        read_compressed_ply(tmp_path / "a.compressed.ply"), read_ply(tmp_path / "b.ply"), atol=2e-6
+    )
 
 
 @pytest.mark.parametrize("degree", [0, 2])
@@ -81,7 +95,8 @@ def test_read_splats__agrees_with_splat_transform_on_a_splat_file(program, tmp_p
     numbers = rng.uniform(0.05, 1, (50, 6)).astype("<f4").view(np.uint8)
     (tmp_path / "a.splat").write_bytes(np.concatenate([numbers, bytes_of], axis=1).tobytes())
     convert(program, tmp_path / "a.splat", tmp_path / "b.ply")
-    # splat-transform takes the middle of 0 to 255 for the zero of a quaternion, the program that defined it 128.
+    # splat-transform takes the middle of 0 to 255 for the zero of a quaternion, the program that
+    # defined it 128.
     assert_same(read_splats(tmp_path / "a.splat"), read_ply(tmp_path / "b.ply"), atol=0.03)
 
 

@@ -1,4 +1,6 @@
-"""The web page in headless Chromium: what it decodes, what it draws, its controls, and damaged streams."""
+"""The web page in headless Chromium: what it decodes, what it draws, its controls, and damaged
+streams.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,13 @@ import pytest
 from morgs_mi.cli import main
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.frame_source import play
-from morgs_mi.codec.packets import CodedFrame, coded_frames, keyframe_packet, reemitted_keyframe, residual_packet
+from morgs_mi.codec.packets import (
+    CodedFrame,
+    coded_frames,
+    keyframe_packet,
+    reemitted_keyframe,
+    residual_packet,
+)
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import TRANSFER, exposed
 from morgs_mi.core.gaussians import Gaussians
@@ -63,7 +71,9 @@ def test_write_web_page__does_not_publish_the_metadata_of_the_fit(tmp_path):
     write_web_folder(open_stream(tmp_path), tmp_path / "folder")
     published = open_stream(tmp_path / "folder")
     assert "capture" not in published.metadata
-    assert [state.digest.tobytes() for state in coded_frames(published)] == [state.digest.tobytes() for state in states]
+    assert [state.digest.tobytes() for state in coded_frames(published)] == [
+        state.digest.tobytes() for state in states
+    ]
 
 
 def test_write_web_page__refuses_a_damaged_stream_and_writes_nothing(tmp_path):
@@ -79,7 +89,9 @@ def test_write_web_page__refuses_a_damaged_stream_and_writes_nothing(tmp_path):
 @pytest.mark.parametrize("config", [3, {"render": []}])
 def test_write_web_page__refuses_settings_of_another_type(tmp_path, config):
     write_stream(tmp_path / "stream.morgs", metadata={"config": config})
-    with pytest.raises(ValueError, match=r"`config.render` of the header's metadata must be an object"):
+    with pytest.raises(
+        ValueError, match=r"`config.render` of the header's metadata must be an object"
+    ):
         write_web_page(open_stream(tmp_path), tmp_path / "page.html")
 
 
@@ -89,7 +101,9 @@ def test_write_web_page__refuses_a_second_residual_of_a_frame(tmp_path):
     with StreamWriter(tmp_path / "stream.morgs", rig(), 30) as writer:
         for packet in (*packets, packets[-1]):
             writer.write(packet)
-    with pytest.raises(ValueError, match="its frame must be above 3, that of the state before, got 3"):
+    with pytest.raises(
+        ValueError, match="its frame must be above 3, that of the state before, got 3"
+    ):
         write_web_page(open_stream(tmp_path), tmp_path / "page.html")
 
 
@@ -108,7 +122,9 @@ def test_write_web_page__replaces_bytes_of_a_name_that_are_not_utf_8(tmp_path):
     write_stream(folder / "stream.morgs")
     write_web_page(open_stream(folder), tmp_path / "named.html")
     write_web_page(open_stream(folder), tmp_path / "titled.html", title="clip\udcff")
-    assert "<title>clip\N{REPLACEMENT CHARACTER}</title>" in (tmp_path / "named.html").read_text(encoding="utf-8")
+    assert "<title>clip\N{REPLACEMENT CHARACTER}</title>" in (tmp_path / "named.html").read_text(
+        encoding="utf-8"
+    )
     assert "<title>clip?</title>" in (tmp_path / "titled.html").read_text(encoding="utf-8")
     assert "clip\N{REPLACEMENT CHARACTER}" in stream_html(open_stream(folder)).encode().decode()
 
@@ -120,9 +136,13 @@ def test_write_web_page__scales_motion_by_its_99th_percentile(tmp_path):
     # Small and close to the camera in the middle.
     means[0] = (0, -3.4, 0.9)
     log_scales[0] = -5
-    states = write_stream(tmp_path / "stream.morgs", start=replace(start, means=means, log_scales=log_scales))
+    states = write_stream(
+        tmp_path / "stream.morgs", start=replace(start, means=means, log_scales=log_scales)
+    )
     write_web_folder(open_stream(tmp_path), tmp_path / "folder")
-    speeds = np.hstack([screen_speeds(state.gaussians, camera) for state in states[1:] for camera in rig()])
+    speeds = np.hstack(
+        [screen_speeds(state.gaussians, camera) for state in states[1:] for camera in rig()]
+    )
     speed, weight = speeds[:, np.argsort(speeds[0])]
     expected = speed[np.searchsorted(np.cumsum(weight), 0.99 * weight.sum())]
     scale = open_stream(tmp_path / "folder").metadata["motion_scale"]
@@ -133,8 +153,13 @@ def test_write_web_page__scales_motion_by_its_99th_percentile(tmp_path):
 def test_write_web_page__keeps_a_still_scene_still(tmp_path):
     cameras = rig(1920, 1440)
     state = write_stream(tmp_path / "stream.morgs", 1, cameras=cameras)[0]
-    noise = replace(state.gaussians, means=state.gaussians.numpy()["means"] + np.float32([0.0005, 0, 0]))
-    packets = [*open_stream(tmp_path), residual_packet(state, noise, np.arange(len(state)), cameras)]
+    noise = replace(
+        state.gaussians, means=state.gaussians.numpy()["means"] + np.float32([0.0005, 0, 0])
+    )
+    packets = [
+        *open_stream(tmp_path),
+        residual_packet(state, noise, np.arange(len(state)), cameras),
+    ]
     with StreamWriter(tmp_path / "stream.morgs", cameras, 30) as writer:
         for packet in packets:
             writer.write(packet)
@@ -152,7 +177,11 @@ def screen_speeds(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     means = gaussians.numpy()["means"][moves].astype(np.float64)
     motion = motion[moves]
     pixels, depths = camera.project(means)
-    mask = (depths > camera.near) & (pixels > 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+    mask = (
+        (depths > camera.near)
+        & (pixels > 0).all(axis=1)
+        & (pixels < (camera.width, camera.height)).all(axis=1)
+    )
     step = 1e-4 * motion[mask]
     ahead = camera.project(means[mask] + step)[0]
     behind = camera.project(means[mask] - step)[0]
@@ -163,14 +192,18 @@ def screen_speeds(gaussians: Gaussians, camera: Camera) -> np.ndarray:
 
 
 def test_notice__names_the_runtime_of_assemblyscript():
-    notice = (files("morgs_mi.playback.export") / "web_player" / "NOTICE").read_text(encoding="utf-8")
+    notice = (files("morgs_mi.playback.export") / "web_player" / "NOTICE").read_text(
+        encoding="utf-8"
+    )
     assert re.search(r"^assemblyscript [\d.]+ \(Apache-2.0\)$", notice, re.MULTILINE)
     assert "Apache License" in notice
 
 
 def test_write_web_page__escapes_the_title(tmp_path):
     write_stream(tmp_path / "stream.morgs")
-    write_web_page(open_stream(tmp_path), tmp_path / "page.html", title="</title><script>alert()</script>")
+    write_web_page(
+        open_stream(tmp_path), tmp_path / "page.html", title="</title><script>alert()</script>"
+    )
     assert b"<title>&lt;/title&gt;" in (tmp_path / "page.html").read_bytes()
 
 
@@ -211,9 +244,13 @@ def opened(browser, clip):
 
 @pytest.fixture
 def page(opened):
-    """Return the page of the clip, paused at the first frame, and check afterwards what it reported and requested."""
+    """Return the page of the clip, paused at the first frame, and check afterwards what it reported
+    and requested.
+    """
     opened.page.evaluate("player.playback.play(false); player.playback.loop = true")
-    opened.page.evaluate("player.selectMode('color'); player.selectCamera(0); player.selectSpeed(3)")
+    opened.page.evaluate(
+        "player.selectMode('color'); player.selectCamera(0); player.selectSpeed(3)"
+    )
     opened.show(0)
     yield opened
     assert not opened.errors
@@ -231,7 +268,12 @@ def decodes(page: Player, position: int, coded: CodedFrame) -> bool:
         }""",
         position,
     )
-    expected = [coded.ids, coded.grid.largest_components, *coded.grid.exponents.T, *coded.grid.values.T]
+    expected = [
+        coded.ids,
+        coded.grid.largest_components,
+        *coded.grid.exponents.T,
+        *coded.grid.values.T,
+    ]
     return all(itertools.starmap(np.array_equal, zip(values, expected, strict=True)))
 
 
@@ -250,10 +292,13 @@ def test_page__plays_a_stream_with_a_missing_frame(browser, clip, tmp_path):
     write_web_page(open_stream(tmp_path), tmp_path / "page.html")
     with Player(browser, (tmp_path / "page.html").as_uri() + "#pause&frame=3") as page:
         assert page.text("#count") == "3 / 3"
-        assert all(decodes(page, position, states[frame]) for position, frame in enumerate((0, 2, 3)))
+        assert all(
+            decodes(page, position, states[frame]) for position, frame in enumerate((0, 2, 3))
+        )
 
 
-# Motion is divided by alpha, so it depends on rounding where little is drawn. A camera that is off by a degree: 20 dB.
+# Motion is divided by alpha, so it depends on rounding where little is drawn. A camera that is off
+# by a degree: 20 dB.
 @pytest.mark.parametrize(("mode", "least"), [("color", 40), ("motion", 30), ("confidence", 40)])
 def test_page__shows_the_images_of_the_renderer(page, clip, mode, least):
     folder, states = clip
@@ -262,7 +307,9 @@ def test_page__shows_the_images_of_the_renderer(page, clip, mode, least):
     for camera, frame in ((0, 0), (0, 3), (2, 2), (2, 1)):
         page.page.locator("#camera").select_option(str(camera))
         page.show(frame)
-        image = render(states[frame].gaussians, stream.cameras[camera], (mode,), render_config(stream))[mode]
+        image = render(
+            states[frame].gaussians, stream.cameras[camera], (mode,), render_config(stream)
+        )[mode]
         scale = WIDTH * page.page.evaluate("player.motionScale")
         assert psnr(page.image() / 255, channel_image(mode, image, scale) / 255) > least
 
@@ -270,7 +317,9 @@ def test_page__shows_the_images_of_the_renderer(page, clip, mode, least):
 def test_page__plays_to_the_end_and_scrubs_back(page, clip):
     page.page.keyboard.press("l")
     page.page.keyboard.press(" ")
-    page.wait(f"!player.playback.playing && player.playback.position === {FRAMES - 1} && player.settled")
+    page.wait(
+        f"!player.playback.playing && player.playback.position === {FRAMES - 1} && player.settled"
+    )
     played = page.image()
     page.page.locator("#slider").fill("1")
     page.wait("player.playback.position === 1 && player.settled")
@@ -286,7 +335,9 @@ def test_page__steps_to_frames_that_are_being_decoded(page):
     jumped = page.image()
     page.show(0)
     decoded = page.page.evaluate("player.playback.decodeTimes.length")
-    page.page.evaluate("for (let position = 1; position <= 3; position++) player.playback.seek(position)")
+    page.page.evaluate(
+        "for (let position = 1; position <= 3; position++) player.playback.seek(position)"
+    )
     page.wait("player.playback.position === 3 && player.settled")
     assert np.array_equal(page.image(), jumped)
     # Each intermediate frame was shown once, and none was decoded twice.
@@ -297,7 +348,12 @@ def test_page__has_no_controls_that_need_a_server(page):
     page.page.keyboard.press("v")
     page.page.keyboard.press("x")
     page.wait("player.settled")
-    assert page.page.locator(".of-server, #recording, #rendering, #share, #split").locator("visible=true").count() == 0
+    assert (
+        page.page.locator(".of-server, #recording, #rendering, #share, #split")
+        .locator("visible=true")
+        .count()
+        == 0
+    )
 
 
 def test_page__opens_on_the_first_frame_with_motion(browser, clip):
@@ -391,7 +447,9 @@ def drag(page: Player, pixels: int, cameras: Sequence[Camera]) -> float:
     page.page.mouse.move(WIDTH / 2 + pixels, HEIGHT / 2, steps=4)
     page.page.mouse.up()
     page.wait(AT_REST)
-    position, target = (np.array(page.page.evaluate(f"player.view.{name}.toArray()")) for name in VIEW)
+    position, target = (
+        np.array(page.page.evaluate(f"player.view.{name}.toArray()")) for name in VIEW
+    )
     unit = page.page.evaluate("player.view.unit")
     offset = position - target
     directions = unit * np.stack([camera.position for camera in cameras]) - target
@@ -404,14 +462,19 @@ def test_page__draws_orbits_back_to_the_cameras_unless_it_is_switched_off(page):
     page.page.keyboard.press("r")
     assert drag(page, -90, rig()) == pytest.approx(8, abs=0.2)
     page.page.keyboard.press("b")
-    assert page.page.get_by_label("Keep the view near the cameras").get_attribute("aria-pressed") == "false"
+    assert (
+        page.page.get_by_label("Keep the view near the cameras").get_attribute("aria-pressed")
+        == "false"
+    )
     assert drag(page, -30, rig()) > 20
     page.page.get_by_label("Keep the view near the cameras").click()
     assert drag(page, 0, rig()) == pytest.approx(8, abs=0.2)
 
 
 def test_page__draws_orbits_back_farther_to_cameras_without_neighbours(browser, tmp_path):
-    cameras = tuple(look_at_cameras([(0, -4, 1), (4, 0, 1)], 45, WIDTH, HEIGHT, ("front", "side"), up=(0, 0, 1)))
+    cameras = tuple(
+        look_at_cameras([(0, -4, 1), (4, 0, 1)], 45, WIDTH, HEIGHT, ("front", "side"), up=(0, 0, 1))
+    )
     write_stream(tmp_path / "stream.morgs", 2, cameras=cameras)
     write_web_page(open_stream(tmp_path), tmp_path / "page.html")
     with Player(browser, (tmp_path / "page.html").as_uri() + "#pause") as page:
@@ -431,7 +494,10 @@ def test_page__shows_a_file_of_gaussians_and_orbits_freely(browser, tmp_path):
         image = render(state.gaussians, camera, ("color",), render_config(stream))["color"]
         assert psnr(opened.image() / 255, channel_image("color", image) / 255) > 40
         assert opened.page.evaluate("player.view.bounded") is False
-        shown = [opened.page.locator(f"#{name}").is_visible() for name in ("slider", "speed", "loop", "camera", "full")]
+        shown = [
+            opened.page.locator(f"#{name}").is_visible()
+            for name in ("slider", "speed", "loop", "camera", "full")
+        ]
         assert shown == [False, False, False, True, True]
         assert opened.errors == []
 
@@ -444,12 +510,16 @@ def test_page__shows_an_hdr_stream_at_its_exposure(browser, clip, tmp_path):
         writer.write(keyframe_packet(bright, 0))
     stream = open_stream(tmp_path)
     write_web_page(stream, tmp_path / "page.html")
-    color = render(next(play(stream))[1], stream.cameras[0], ("color",), render_config(stream))["color"]
+    color = render(next(play(stream))[1], stream.cameras[0], ("color",), render_config(stream))[
+        "color"
+    ]
     assert color.max() > 1.2
     with Player(browser, (tmp_path / "page.html").as_uri() + "#pause") as page:
         for stops, key in ((-2, "]"), (-1.5, "[")):
             page.wait("player.settled")
-            assert psnr(page.image() / 255, channel_image("color", exposed(color, stops)) / 255) > 35
+            assert (
+                psnr(page.image() / 255, channel_image("color", exposed(color, stops)) / 255) > 35
+            )
             page.page.keyboard.press(key)
         assert page.errors == []
 
@@ -477,14 +547,18 @@ def test_page__is_operated_by_keyboard(page):
 
 def test_page__fits_a_phone_and_is_operated_by_touch(browser, clip):
     phone = {"viewport": {"width": 390, "height": 780}, "has_touch": True, "is_mobile": True}
-    with Player(browser, (clip[0] / "page.html").as_uri() + "#pause&frame=1&mode=motion", **phone) as page:
+    with Player(
+        browser, (clip[0] / "page.html").as_uri() + "#pause&frame=1&mode=motion", **phone
+    ) as page:
         assert page.text("#count") == f"1 / {FRAMES - 1}"
         page.page.get_by_text("Confidence", exact=True).first.tap()
         page.wait("player.settled")
         assert "moving" in page.text("#legend")
         for control in page.page.locator("#bar button, #bar select, #bar input").all():
             box = control.bounding_box()
-            assert box is None or (box["x"] >= 0 and box["x"] + box["width"] <= 390 and box["height"] >= 32)
+            assert box is None or (
+                box["x"] >= 0 and box["x"] + box["width"] <= 390 and box["height"] >= 32
+            )
         assert not page.errors
 
 
@@ -531,7 +605,10 @@ def test_page__names_what_is_no_stream(browser, hosted):
     address, stream = hosted
     data = bytearray(stream.path.read_bytes())
     data[stream.index()[0][2] + 100] ^= 1
-    for content, reason in ((b"something else", "this is not a .morgs stream"), (data, "frame 0: the packet at byte")):
+    for content, reason in (
+        (b"something else", "this is not a .morgs stream"),
+        (data, "frame 0: the packet at byte"),
+    ):
         stream.path.write_bytes(content)
         with Player(browser, address, f"This page could not start: {reason}") as page:
             assert "frames before" not in page.text("#message")

@@ -35,7 +35,11 @@ def get(url: str, path: str = "", **headers: str) -> tuple[HTTPResponse, bytes]:
     """Return the answer to a request, and its content; the path is sent as it is."""
     parts = urlsplit(url)
     connection = HTTPConnection("127.0.0.1", parts.port, timeout=120)
-    connection.request("GET", parts.path + path, headers={name.replace("_", "-"): headers[name] for name in headers})
+    connection.request(
+        "GET",
+        parts.path + path,
+        headers={name.replace("_", "-"): headers[name] for name in headers},
+    )
     response = connection.getresponse()
     content = response.read()
     connection.close()

@@ -1,4 +1,6 @@
-"""The page of the viewer in headless Chromium: a stream that grows, the recorded image, exact images."""
+"""The page of the viewer in headless Chromium: a stream that grows, the recorded image, exact
+images.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,9 @@ class Viewed(Page):
     def exact_image(self) -> np.ndarray:
         """Return the exact image that the page shows, as it was sent."""
         self.page.locator("#rendering").wait_for()
-        code = "fetch(document.getElementById('rendering').src).then((answer) => answer.arrayBuffer())"
+        code = (
+            "fetch(document.getElementById('rendering').src).then((answer) => answer.arrayBuffer())"
+        )
         data = self.page.evaluate(f"{code}.then((data) => [...new Uint8Array(data)])")
         image = cv2.imdecode(np.array(data, np.uint8), 1)
         assert image is not None
@@ -62,7 +66,9 @@ def clip(tmp_path_factory):
     folder = tmp_path_factory.mktemp("viewed")
     cameras = rig(WIDTH, HEIGHT)
     metadata = {"num_frames": 4, "test_view": None}
-    states = write_stream(folder / "stream.morgs", start=splats(degree=3), cameras=cameras, metadata=metadata)
+    states = write_stream(
+        folder / "stream.morgs", start=splats(degree=3), cameras=cameras, metadata=metadata
+    )
     write_colmap(folder / "capture" / "sparse" / "0", cameras)
     for name in NAMES:
         clip = [np.full((HEIGHT, WIDTH, 3), color, np.uint8) for color in RECORDED]
@@ -82,8 +88,17 @@ def test_page__follows_a_stream_that_grows(browser, clip, tmp_path):
     ends = [offset for _, _, offset in open_stream(clip[0]).index()]
     file = tmp_path / "stream.morgs"
     file.write_bytes(complete[: ends[0]])
-    with viewing(tmp_path) as url, Viewed(browser, url, "follow", "the stream has no frame yet") as page:
-        write_stream(tmp_path / PROVISIONAL, 1, splats(30, seed=3), rig(WIDTH, HEIGHT), open_stream(tmp_path).metadata)
+    with (
+        viewing(tmp_path) as url,
+        Viewed(browser, url, "follow", "the stream has no frame yet") as page,
+    ):
+        write_stream(
+            tmp_path / PROVISIONAL,
+            1,
+            splats(30, seed=3),
+            rig(WIDTH, HEIGHT),
+            open_stream(tmp_path).metadata,
+        )
         page.page.get_by_text("Provisional first frame").wait_for()
         page.wait(READY)
         assert not page.page.locator("#message").is_visible()
@@ -115,7 +130,9 @@ def test_page__starts_again_with_another_stream(browser, tmp_path):
     with viewing(tmp_path) as url, Viewed(browser, url, "pause&frame=3") as page:
         write_stream(tmp_path / "stream.morgs", 2, splats(30, seed=3))
         page.shows("1 / 1")
-        cameras = tuple(look_at_cameras([(0, -4, 1), (4, 0, 1)], 45, 64, 48, ("front", "side"), up=(0, 0, 1)))
+        cameras = tuple(
+            look_at_cameras([(0, -4, 1), (4, 0, 1)], 45, 64, 48, ("front", "side"), up=(0, 0, 1))
+        )
         with page.page.expect_navigation():
             write_stream(tmp_path / "stream.morgs", 3, cameras=cameras)
         page.wait(f"{READY} && player.cameras.length === 2")
@@ -134,7 +151,9 @@ def test_page__wipes_between_the_rendered_and_the_recorded_image(browser, url):
         page.page.get_by_label("Share of the recorded image").fill("75")
         image = page.image().astype(int)
         column = WIDTH * 3 // 4
-        assert np.abs(image[:90, : column - 3] - RECORDED[1]).max() < 12, "compressed video and JPEG"
+        assert np.abs(image[:90, : column - 3] - RECORDED[1]).max() < 12, (
+            "compressed video and JPEG"
+        )
         assert np.array_equal(image[:90, column + 3 :], rendered[:90, column + 3 :])
         page.page.locator("#canvas").focus()
         page.press("ArrowRight", RECORDING)
@@ -155,7 +174,9 @@ def test_page__shows_the_image_of_rasterize_when_the_view_rests(browser, clip, u
             page.press(str(key), RENDERING)
             image = np.array(rasterize(gaussians, camera, (mode,))[mode])
             expected = channel_image(mode, image, 0.03 * WIDTH)
-            assert np.abs(page.exact_image() - expected.astype(int)).max() <= 3, "the page rounds the camera"
+            assert np.abs(page.exact_image() - expected.astype(int)).max() <= 3, (
+                "the page rounds the camera"
+            )
         assert np.array_equal(page.image(), page.exact_image()), "the page shows it pixel by pixel"
         page.page.mouse.move(WIDTH / 2, 60)
         page.page.mouse.down()
@@ -175,7 +196,12 @@ def test_page__two_at_once_have_their_own_views(browser, clip, url):
         for page, frame, index in ((left, 1, 0), (right, 2, 2)):
             page.wait(f"player.settled && {RENDERING}")
             image = rasterize(clip[1][frame].gaussians, rig(WIDTH, HEIGHT)[index], ("color",)).color
-            assert np.abs(page.exact_image() - channel_image("color", np.array(image)).astype(int)).max() <= 3
+            assert (
+                np.abs(
+                    page.exact_image() - channel_image("color", np.array(image)).astype(int)
+                ).max()
+                <= 3
+            )
             assert not page.errors
 
 

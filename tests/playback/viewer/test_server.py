@@ -1,4 +1,6 @@
-"""The server of the viewer without a browser: bytes of a growing file, images, and hostile requests."""
+"""The server of the viewer without a browser: bytes of a growing file, images, and hostile
+requests.
+"""
 
 from __future__ import annotations
 
@@ -81,33 +83,57 @@ def test_refusal__accepts_the_viewers_own_page(host, origin):
 @pytest.mark.parametrize(
     ("headers", "message"),
     [
-        ({"host": "localhost:8080", "origin": "https://evil.example"}, "got one of 'https://evil.example'"),
-        ({"host": "localhost:8080", "origin": "http://localhost:3000"}, "got one of 'http://localhost:3000'"),
+        (
+            {"host": "localhost:8080", "origin": "https://evil.example"},
+            "got one of 'https://evil.example'",
+        ),
+        (
+            {"host": "localhost:8080", "origin": "http://localhost:3000"},
+            "got one of 'http://localhost:3000'",
+        ),
         ({"host": "localhost:8080", "origin": "null"}, "the viewer's own page at localhost:8080"),
-        ({"host": "evil.example:8080", "origin": "http://evil.example:8080"}, "got the host 'evil.example'"),
+        (
+            {"host": "evil.example:8080", "origin": "http://evil.example:8080"},
+            "got the host 'evil.example'",
+        ),
         ({"host": "localhost.evil.example"}, "got the host 'localhost.evil.example'"),
         ({"host": "127.0.0.1.evil.example"}, "got the host"),
         ({"host": "user@localhost@evil.example"}, "got the host 'evil.example'"),
         ({}, "got the host ''"),
         ({"host": "[evil"}, "expected a host and an origin, got '[evil'"),
         ({"host": "localhost", "origin": "http://[evil"}, "expected a host and an origin"),
-        ({"host": "localhost", "sec-fetch-site": "cross-site", "sec-fetch-mode": "no-cors"}, "one of another page"),
-        ({"host": "localhost", "sec-fetch-site": "same-site"}, "one of another page"),  # of another port
+        (
+            {"host": "localhost", "sec-fetch-site": "cross-site", "sec-fetch-mode": "no-cors"},
+            "one of another page",
+        ),
+        # Of another port.
+        ({"host": "localhost", "sec-fetch-site": "same-site"}, "one of another page"),
     ],
 )
 def test_refusal__names_a_foreign_page_or_host(headers, message):
     assert message in str(refusal(Headers(headers), "127.0.0.1"))
 
 
-@pytest.mark.parametrize("path", ["/", "/stream.morgs", "/exact/0/color", "/recorded/0/0", "/nothing"])
+@pytest.mark.parametrize(
+    "path", ["/", "/stream.morgs", "/exact/0/color", "/recorded/0/0", "/nothing"]
+)
 def test_viewer__refuses_other_pages_and_rebound_names(url, path):
     port = url.rstrip("/").rpartition(":")[2]
-    foreign = raw(url, f"GET {path} HTTP/1.1", f"Host: localhost:{port}", "Origin: https://evil.example")
-    rebound = raw(url, f"GET {path} HTTP/1.1", f"Host: evil.example:{port}", f"Origin: http://evil.example:{port}")
+    foreign = raw(
+        url, f"GET {path} HTTP/1.1", f"Host: localhost:{port}", "Origin: https://evil.example"
+    )
+    rebound = raw(
+        url,
+        f"GET {path} HTTP/1.1",
+        f"Host: evil.example:{port}",
+        f"Origin: http://evil.example:{port}",
+    )
     assert foreign.startswith("HTTP/1.1 403 ")
     assert rebound.startswith("HTTP/1.1 403 ")
     assert "got the host 'evil.example'" in rebound
-    assert raw(url, f"GET {path} HTTP/1.1").startswith(("HTTP/1.1 400 ", "HTTP/1.1 403 ")), "no host"
+    assert raw(url, f"GET {path} HTTP/1.1").startswith(("HTTP/1.1 400 ", "HTTP/1.1 403 ")), (
+        "no host"
+    )
 
 
 @pytest.mark.parametrize(
@@ -133,7 +159,9 @@ def test_viewer__serves_no_other_files(url, clip, path):
     (clip[0] / "capture.json").write_text('{"capture": "secret"}')
     response, content = get(url, path)
     assert response.status in (400, 404)
-    assert b"secret" not in content or response.status == 400, "at most a sentence with the path itself"
+    assert b"secret" not in content or response.status == 400, (
+        "at most a sentence with the path itself"
+    )
     assert b"root:" not in content
 
 
@@ -145,7 +173,14 @@ def test_viewer__requires_the_token_where_other_machines_can_reach_it(clip):
         assert re.fullmatch(r"http://localhost:\d+", start)
         for path in ("", "stream.morgs"):
             assert get(url, path)[0].status == 200
-            for wrong in ("/", f"/{token[:-1]}/", f"/{token}x/", f"/{token.lower()}/", "/%FF/", f"/?token={token}/"):
+            for wrong in (
+                "/",
+                f"/{token[:-1]}/",
+                f"/{token}x/",
+                f"/{token.lower()}/",
+                "/%FF/",
+                f"/?token={token}/",
+            ):
                 response, content = get(start + wrong, path)
                 assert response.status == 403
                 assert b"expected the token" in content
@@ -153,7 +188,8 @@ def test_viewer__requires_the_token_where_other_machines_can_reach_it(clip):
 
 
 @pytest.mark.parametrize(
-    "lines", [("GET / HTTP/1.1\x00",), ("\x16\x03\x01",), ("GET / HTTP/1.1", "Range bytes"), ("A" * 99999,)]
+    "lines",
+    [("GET / HTTP/1.1\x00",), ("\x16\x03\x01",), ("GET / HTTP/1.1", "Range bytes"), ("A" * 99999,)],
 )
 def test_viewer__survives_what_is_no_http(url, lines):
     assert raw(url, *lines).startswith("HTTP/1.1 400 ")
@@ -162,7 +198,8 @@ def test_viewer__survives_what_is_no_http(url, lines):
 
 def test_viewer__answers_many_connections_at_once(url, clip):
     idle = [
-        socket.create_connection(("127.0.0.1", int(url.rstrip("/").rpartition(":")[2]))) for _ in range(CONNECTIONS)
+        socket.create_connection(("127.0.0.1", int(url.rstrip("/").rpartition(":")[2])))
+        for _ in range(CONNECTIONS)
     ]
     with ThreadPoolExecutor(CONNECTIONS) as pool:
         answers = list(pool.map(lambda _: get(url, "stream.morgs")[1], range(CONNECTIONS)))
@@ -187,7 +224,10 @@ def test_viewer__answers_many_connections_at_once(url, clip):
         ("bytes=999999999999999-", 416, slice(0)),
         ("bytes=20-10", 416, slice(0)),
         # Ignored: malformed, or more than one.
-        *((header, 200, slice(None)) for header in ("bytes=a-b", "bytes=-", "bytes", "bytes=-5", "octets=0-1", "")),
+        *(
+            (header, 200, slice(None))
+            for header in ("bytes=a-b", "bytes=-", "bytes", "bytes=-5", "octets=0-1", "")
+        ),
         *(
             (header, 200, slice(None))
             for header in ("bytes=0-1,3-4", "bytes=--5", f"bytes={'9' * 5000}-", "bytes=\xb2-")
@@ -307,7 +347,10 @@ def test_exact_images__refuse_what_the_stream_has_not(url, path, message):
         ("camera=[[[[NaN]]]]", "numbers must be finite, got NaN"),
         (exact(1, "color", rig(4096, 4097)[0]).partition("?")[2], "at most 16777216 pixels"),
         (exact(1, "color", rig()[0], float("nan")).partition("?")[2], "expected a motion above 0"),
-        (exact(1, "color", rig()[0]).partition("?")[2].replace("near", "far"), "`camera.near` is missing"),
+        (
+            exact(1, "color", rig()[0]).partition("?")[2].replace("near", "far"),
+            "`camera.near` is missing",
+        ),
     ],
 )
 def test_exact_images__refuse_a_broken_view(url, query, message):
@@ -337,7 +380,9 @@ def test_exact_images__render_one_at_a_time_and_the_newest_wins(url, monkeypatch
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("forge", [damaged, with_forged_bytes, with_forged_packets, with_forged_header])
+@pytest.mark.parametrize(
+    "forge", [damaged, with_forged_bytes, with_forged_packets, with_forged_header]
+)
 def test_viewer__shows_or_refuses_hostile_streams(tmp_path, forge):
     path = tmp_path / "s"
     camera = rig()[0]
@@ -361,7 +406,9 @@ def test_viewer__shows_or_refuses_hostile_streams(tmp_path, forge):
 
 @pytest.fixture
 def live(tmp_path):
-    """Return a stream and its capture, which grow by a frame with each call of `add`, and the images."""
+    """Return a stream and its capture, which grow by a frame with each call of `add`, and the
+    images.
+    """
     capture = tmp_path / "capture"
     images = noise_capture.clip(3)
     write_colmap(capture / "sparse" / "0", noise_capture.rig())
@@ -382,7 +429,9 @@ def test_recorded_images__follow_a_live_fit_in_any_order(live):
     folder, add, images = live
     recorded = RecordedImages(None)
     np.testing.assert_array_equal(recorded.at(open_stream(folder), 1, 0), images[0])
-    with pytest.raises(ValueError, match="expected a camera and a frame of the stream, got 1 and 1"):
+    with pytest.raises(
+        ValueError, match="expected a camera and a frame of the stream, got 1 and 1"
+    ):
         recorded.at(open_stream(folder), 1, 1)
     add(1)
     add(2)
@@ -428,7 +477,9 @@ def test_viewer__starts_whatever_a_header_calls_its_capture(tmp_path, capture):
 # --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("args", "opens"), [((), ""), (("--follow",), "#follow"), (("--no-browser",), None)])
+@pytest.mark.parametrize(
+    ("args", "opens"), [((), ""), (("--follow",), "#follow"), (("--no-browser",), None)]
+)
 def test_view__prints_and_opens_the_link(clip, monkeypatch, capsys, args, opens):
     opened = []
     monkeypatch.setattr(webbrowser, "open", opened.append)
@@ -439,7 +490,9 @@ def test_view__prints_and_opens_the_link(clip, monkeypatch, capsys, args, opens)
     assert opened == ([] if opens is None else [url[0] + opens])
 
 
-def test_view__prints_a_link_with_a_token_where_other_machines_can_reach_it(clip, monkeypatch, capsys):
+def test_view__prints_a_link_with_a_token_where_other_machines_can_reach_it(
+    clip, monkeypatch, capsys
+):
     monkeypatch.setattr(Viewer, "run", lambda viewer: viewer.close())
     assert cli.main(["view", str(clip[0]), "--host", "0.0.0.0", "--no-browser"]) == 0
     output = " ".join(capsys.readouterr().out.split())
@@ -451,7 +504,9 @@ def test_view__refuses_a_port_that_is_taken(clip, capsys):
     with socket.create_server(("127.0.0.1", 0)) as socket_in_use:
         port = socket_in_use.getsockname()[1]
         assert cli.main(["view", str(clip[0]), "--port", str(port), "--no-browser"]) == 1
-    assert f"127.0.0.1:{port}: cannot serve the page there" in " ".join(capsys.readouterr().err.split())
+    assert f"127.0.0.1:{port}: cannot serve the page there" in " ".join(
+        capsys.readouterr().err.split()
+    )
 
 
 @pytest.mark.slow
@@ -459,7 +514,9 @@ def test_view__refuses_a_port_that_is_taken(clip, capsys):
 def test_view__ends_on_ctrl_c(clip):
     code = "import sys; from morgs_mi.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", code, "view", str(clip[0]), "--no-browser"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as server:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as server:
         assert server.stdout is not None
         link = next(line for line in server.stdout if "http://" in line)
         assert get(link.split()[0], exact(0, "color", rig()[0]))[0].status == 200

@@ -45,11 +45,14 @@ def cluster() -> Iterator[subprocess.Popen[str]]:
         "import sys\n"
         "from distributed import LocalCluster\n"
         "if __name__ == '__main__':\n"
-        "    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=':0', silence_logs=50) as it:\n"
+        "    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=':0', "
+        "silence_logs=50) as it:\n"
         "        print(it.scheduler_address, flush=True)\n"
         "        sys.stdin.read()\n"
     )
-    with subprocess.Popen([sys.executable, "-c", script], stdin=-1, stdout=-1, text=True) as process:
+    with subprocess.Popen(
+        [sys.executable, "-c", script], stdin=-1, stdout=-1, text=True
+    ) as process:
         yield process
         process.communicate()
 
@@ -67,13 +70,18 @@ def test_open_client__connects_to_a_scheduler(cluster: subprocess.Popen[str]) ->
 
 @pytest.mark.slow
 def test_SegmentedRun__names_a_lost_scheduler_and_is_resumed(
-    capture: Capture, whole: bytes, cluster: subprocess.Popen[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    capture: Capture,
+    whole: bytes,
+    cluster: subprocess.Popen[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("morgs_mi.runs.cluster.workers.TIMEOUT", 2)
     lost = when_fitted(4, cluster.kill)
     with (
         pytest.raises(
-            ConnectionError, match=r"tcp://[\d.:]+: expected a scheduler that answers, .* lost; start it again"
+            ConnectionError,
+            match=r"tcp://[\d.:]+: expected a scheduler that answers, .* lost; start it again",
         ),
         open_client(address(cluster)) as client,
     ):

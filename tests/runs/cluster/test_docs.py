@@ -23,7 +23,14 @@ ROOT = Path(__file__).parents[3]
 TEXT = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"<!-- (run|start) -->\n```\w+\n(.*?)```", TEXT, re.DOTALL)
 FRAMES = 4
-REPORT = ("--stream.fit.num-gaussians", "80", "--stream.fit.first-frame-steps", "8", "--stream.fit.epochs", "1")
+REPORT = (
+    "--stream.fit.num-gaussians",
+    "80",
+    "--stream.fit.first-frame-steps",
+    "8",
+    "--stream.fit.epochs",
+    "1",
+)
 
 
 def started(command: str) -> subprocess.Popen[str]:
@@ -31,7 +38,9 @@ def started(command: str) -> subprocess.Popen[str]:
     program, *args = shlex.split(command)
     assert program == "dask"
     env = {**os.environ, "PYTHONPATH": str(ROOT)}
-    process = subprocess.Popen([sys.executable, "-m", "dask", *args], stderr=subprocess.PIPE, text=True, env=env)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "dask", *args], stderr=subprocess.PIPE, text=True, env=env
+    )
     assert process.stderr is not None
     next(line for line in process.stderr if "Scheduler at:" in line or "Registered to:" in line)
     return process
@@ -67,11 +76,15 @@ def test_cluster_page__commands_run(workplace: Path) -> None:
                     continue
                 assert program == "morgs-mi"
                 assert cli.main([*args, *(OPTIONS if args[0] == "fit" else [])]) == 0, command
-    streams = sorted(str(path.parent.relative_to("out")) for path in Path("out").rglob("stream.morgs"))
+    streams = sorted(
+        str(path.parent.relative_to("out")) for path in Path("out").rglob("stream.morgs")
+    )
     qualities = [f"codec/capture/{quality}" for quality in (1, 1000)]
     assert streams == ["cluster", *qualities, "segments", "url"]
     for name in streams:
-        assert {frame for _, frame, _ in StreamReader(f"out/{name}/stream.morgs").index()} == set(range(FRAMES))
+        assert {frame for _, frame, _ in StreamReader(f"out/{name}/stream.morgs").index()} == set(
+            range(FRAMES)
+        )
 
 
 def test_cluster_page__has_commands() -> None:

@@ -1,4 +1,6 @@
-"""Segments: the joined stream is an ordinary one, and what dies or is interrupted meanwhile leaves no trace."""
+"""Segments: the joined stream is an ordinary one, and what dies or is interrupted meanwhile leaves
+no trace.
+"""
 
 from __future__ import annotations
 
@@ -81,7 +83,9 @@ def rows_of(out: Path) -> list[dict]:
 
 
 @pytest.mark.slow
-def test_SegmentedRun__of_one_is_the_fit_in_one_process(capture: Capture, client: Client, tmp_path: Path) -> None:
+def test_SegmentedRun__of_one_is_the_fit_in_one_process(
+    capture: Capture, client: Client, tmp_path: Path
+) -> None:
     fit(capture, tmp_path / "one", client, segments=SegmentConfig(1))
     stream_capture(capture, tmp_path / "plain", SETTINGS)
     assert stream_of(tmp_path / "one") == stream_of(tmp_path / "plain")
@@ -95,7 +99,9 @@ def test_SegmentedRun__joins_them_to_an_ordinary_stream(whole: Path) -> None:
     assert reader.closed()
     assert sorted(path.name for path in whole.iterdir()) == sorted(FILES)
     first = {frame: kind for kind, frame, _ in reversed(reader.index())}
-    assert [frame for frame, kind in sorted(first.items()) if kind == PacketKind.KEYFRAME] == list(STARTS)
+    assert [frame for frame, kind in sorted(first.items()) if kind == PacketKind.KEYFRAME] == list(
+        STARTS
+    )
     states = list(coded_frames(reader))
     assert [coded.frame for coded in states] == list(range(FRAMES))
     for state in states:
@@ -110,14 +116,21 @@ def test_SegmentedRun__joins_them_to_an_ordinary_stream(whole: Path) -> None:
 def test_SegmentedRun__reports_frames_and_workers(whole: Path) -> None:
     report = json.loads((whole / "report.json").read_text())
     assert [row["frame"] for row in report["frames"]] == list(range(FRAMES))
-    sizes = {packet.frame: packet.num_bytes for packet in reversed(list(StreamReader(whole / "stream.morgs")))}
-    assert [row["num_bytes"] for row in report["frames"]] == [sizes[frame] for frame in range(FRAMES)]
+    sizes = {
+        packet.frame: packet.num_bytes
+        for packet in reversed(list(StreamReader(whole / "stream.morgs")))
+    }
+    assert [row["num_bytes"] for row in report["frames"]] == [
+        sizes[frame] for frame in range(FRAMES)
+    ]
     assert 1 <= len(report["workers"]) <= 2
     assert all(peak > 1e7 for peak in report["workers"].values())
 
 
 @pytest.mark.parametrize("command", [("eval",), ("export", "tracks"), ("render", "--camera", "0")])
-def test_SegmentedRun__is_read_by_the_commands(whole: Path, tmp_path: Path, command: tuple[str, ...]) -> None:
+def test_SegmentedRun__is_read_by_the_commands(
+    whole: Path, tmp_path: Path, command: tuple[str, ...]
+) -> None:
     assert cli.main([*command, str(shutil.copytree(whole, tmp_path / "fit"))]) == 0
 
 
@@ -137,7 +150,9 @@ def interrupt() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("count", [5, *(pytest.param(count, marks=pytest.mark.slow) for count in (0, 2, 9))])
+@pytest.mark.parametrize(
+    "count", [5, *(pytest.param(count, marks=pytest.mark.slow) for count in (0, 2, 9))]
+)
 def test_SegmentedRun__interrupted_and_resumed_is_the_same(
     capture: Capture, client: Client, whole: Path, tmp_path: Path, count: int
 ) -> None:
@@ -188,7 +203,9 @@ def test_SegmentedRun__of_a_url_is_the_same(
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "client"))
         fit(load_capture(f"file://{capture.path}"), tmp_path / "out", client)
     assert len(list((tmp_path / "worker").rglob("cam1"))) == 1
-    packets = ([p.encoded for p in StreamReader(out / "stream.morgs")] for out in (tmp_path / "out", whole))
+    packets = (
+        [p.encoded for p in StreamReader(out / "stream.morgs")] for out in (tmp_path / "out", whole)
+    )
     assert next(packets) == next(packets)
 
 
@@ -212,19 +229,28 @@ def test_SegmentedRun__with_a_killed_process_is_the_same(
         (6, r"`segments` must be 1 to 5 for 10 frames, 2 for each, got 6"),
     ],
 )
-def test_SegmentedRun__refuses_too_many(capture: Capture, client, tmp_path: Path, count, message) -> None:
+def test_SegmentedRun__refuses_too_many(
+    capture: Capture, client, tmp_path: Path, count, message
+) -> None:
     with pytest.raises(ValueError, match=message):
         fit(capture, tmp_path / "out", client, segments=SegmentConfig(count))
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
-def test_SegmentedRun__does_not_resume_other_settings(capture: Capture, client: Client, tmp_path: Path) -> None:
+def test_SegmentedRun__does_not_resume_other_settings(
+    capture: Capture, client: Client, tmp_path: Path
+) -> None:
     with pytest.raises(KeyboardInterrupt):
         fit(capture, tmp_path, client, on_stage=when_fitted(2, interrupt))
-    with pytest.raises(ValueError, match=r"0\.morgs: expected to resume a fit with metadata\.config\.seed = 0, got 1"):
+    with pytest.raises(
+        ValueError,
+        match=r"0\.morgs: expected to resume a fit with metadata\.config\.seed = 0, got 1",
+    ):
         fit(capture, tmp_path, client, config=replace(SETTINGS, seed=1), resume=True)
-    with pytest.raises(ValueError, match=r"expected to resume a fit with metadata\.segments\.starts = \[0, 3, 7\]"):
+    with pytest.raises(
+        ValueError, match=r"expected to resume a fit with metadata\.segments\.starts = \[0, 3, 7\]"
+    ):
         fit(capture, tmp_path, client, segments=replace(SEGMENTS, count=2), resume=True)
 
 
@@ -236,7 +262,9 @@ def test_SegmentedRun__keeps_an_earlier_fit_until_the_segments_are_joined(
     other = replace(SETTINGS, seed=1)
     with pytest.raises(KeyboardInterrupt):
         fit(capture, out, client, config=other, on_stage=when_fitted(FRAMES, interrupt))
-    assert {name: (out / name).read_bytes() for name in FILES} == {name: (whole / name).read_bytes() for name in FILES}
+    assert {name: (out / name).read_bytes() for name in FILES} == {
+        name: (whole / name).read_bytes() for name in FILES
+    }
     rmtree = shutil.rmtree
     monkeypatch.setattr(shutil, "rmtree", lambda path, **options: path.exists() and interrupt())
     with pytest.raises(KeyboardInterrupt):
@@ -254,12 +282,23 @@ def test_SegmentedRun__triangulates_points_where_there_are_few(
 ) -> None:
     few = replace(capture, points=capture.points[:3], point_colors=capture.point_colors[:3])
     monkeypatch.setattr("morgs_mi.runs.fit_capture.with_points", lambda *_: capture)
-    fit(few, tmp_path / "few", client, segments=SegmentConfig(1), config=StreamConfig(SETTINGS.fit, SETTINGS.motion))
-    assert len(next(coded_frames(StreamReader(tmp_path / "few" / "stream.morgs")))) == SETTINGS.fit.num_gaussians
+    fit(
+        few,
+        tmp_path / "few",
+        client,
+        segments=SegmentConfig(1),
+        config=StreamConfig(SETTINGS.fit, SETTINGS.motion),
+    )
+    assert (
+        len(next(coded_frames(StreamReader(tmp_path / "few" / "stream.morgs"))))
+        == SETTINGS.fit.num_gaussians
+    )
 
 
 @pytest.mark.slow
-def test_SegmentedRun__refines_cameras_once(capture: Capture, client: Client, tmp_path: Path) -> None:
+def test_SegmentedRun__refines_cameras_once(
+    capture: Capture, client: Client, tmp_path: Path
+) -> None:
     held_out = load_capture(capture.path, test_view=0)
     how = ShortFitConfig(gaussians=40, steps=4, rounds=1)
     config = replace(SETTINGS, fit=replace(SETTINGS.fit, refine_cameras="on", short_fits=how))
@@ -271,7 +310,9 @@ def test_SegmentedRun__refines_cameras_once(capture: Capture, client: Client, tm
     stream_capture(held_out, tmp_path / "plain", config)
     plain = StreamReader(tmp_path / "plain" / "stream.morgs")
     assert stream.metadata["distortions"] == plain.metadata["distortions"]
-    assert [c.viewmat.tolist() for c in stream.cameras] == [c.viewmat.tolist() for c in plain.cameras]
+    assert [c.viewmat.tolist() for c in stream.cameras] == [
+        c.viewmat.tolist() for c in plain.cameras
+    ]
     first = [next(coded_frames(s)).gaussians for s in (stream, plain)]
     assert np.array_equal(first[0].means, first[1].means)
 
@@ -288,4 +329,6 @@ def test_SegmentedRun__has_the_same_balance_of_the_cameras_in_all_segments(
     assert max(max(gain) for gain in balance) > 1.001
     for row in rows[1:]:
         for exposure, first in zip(row["exposures"], balance, strict=True):
-            np.testing.assert_allclose(exposure["gain"], first, atol=0.05, err_msg=f"frame {row['frame']}")
+            np.testing.assert_allclose(
+                exposure["gain"], first, atol=0.05, err_msg=f"frame {row['frame']}"
+            )

@@ -55,7 +55,9 @@ def test_fit_frames__begins_a_segment_with_a_keyframe_after_the_common_model(fit
 
 def test_fit_frames__refuses_other_versions(fit: Fit) -> None:
     versions = tuple((name, "0.1" if name == "drjit" else version) for name, version in installed())
-    with pytest.raises(ValueError, match=r"expected a worker with drjit 0\.1 like the client, got 1\.5\.0; install"):
+    with pytest.raises(
+        ValueError, match=r"expected a worker with drjit 0\.1 like the client, got 1\.5\.0; install"
+    ):
         fit_frames(replace(fit, versions=versions), Segment(0, 1, 0), 1)
 
 
@@ -65,7 +67,9 @@ def test_source__opens_the_capture_as_it_is(tmp_path: Path) -> None:
     assert (again.num_frames, again.test_views, again.names) == (4, (1,), capture.names)
 
 
-def test_source__of_a_url_is_opened_by_its_url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_source__of_a_url_is_opened_by_its_url(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("fsspec", reason="comes with the extra `cluster`")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     url = f"file://{write_recording(tmp_path / 'clip', 2)}"

@@ -52,7 +52,10 @@ def test_open_client__names_workers_that_die() -> None:
 
     with (
         dask.config.set({"distributed.scheduler.allowed-failures": 0}),
-        pytest.raises(ChildProcessError, match="this machine: expected the workers to stay alive, but all died that"),
+        pytest.raises(
+            ChildProcessError,
+            match="this machine: expected the workers to stay alive, but all died that",
+        ),
         open_client(count=1) as client,
     ):
         client.submit(die).result()
@@ -68,7 +71,9 @@ def test_open_client__has_workers_that_end_with_their_parent() -> None:
         "        print(client.submit(os.getpid).result(), flush=True)\n"
         "        os.kill(os.getpid(), signal.SIGKILL)\n"
     )
-    result = subprocess.run([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, check=False)
+    result = subprocess.run(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, check=False
+    )
     deadline = time.monotonic() + 20
     while Path(f"/proc/{result.stdout.strip()}").exists():
         assert time.monotonic() < deadline
@@ -81,10 +86,16 @@ def test_open_client__has_workers_that_end_with_their_parent() -> None:
         (None, 0, r"`workers` must be at least 1, got 0"),
         ("here", None, r"`scheduler` must be an address such as tcp://host:8786, got here"),
         ("nothing://here", None, r"nothing://here: expected a scheduler with workers, got none"),
-        ("tcp://127.0.0.1:1", None, r"tcp://127\.0\.0\.1:1: expected a scheduler with workers, got none"),
+        (
+            "tcp://127.0.0.1:1",
+            None,
+            r"tcp://127\.0\.0\.1:1: expected a scheduler with workers, got none",
+        ),
     ],
 )
-def test_open_client__refuses_in_one_sentence(scheduler, count, message, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_open_client__refuses_in_one_sentence(
+    scheduler, count, message, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("morgs_mi.runs.cluster.workers.TIMEOUT", 1)
     with pytest.raises((ValueError, ConnectionError), match=message), open_client(scheduler, count):
         pass
@@ -92,5 +103,8 @@ def test_open_client__refuses_in_one_sentence(scheduler, count, message, monkeyp
 
 def test_open_client__names_the_extra_that_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(ValueError, match=r"need the package distributed; pip .*morgs-mi\[cluster\]"), open_client():
+    with (
+        pytest.raises(ValueError, match=r"need the package distributed; pip .*morgs-mi\[cluster\]"),
+        open_client(),
+    ):
         pass

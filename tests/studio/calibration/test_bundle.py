@@ -55,7 +55,9 @@ def test_camera_jacobian__is_that_of_finite_differences(distortion):
     of_changes, of_points = camera_jacobian(changed_camera(camera, start), 1.02, POINTS, start[9:])
     for k in range(11):
         ahead, back = (seen(start + sign * step * np.eye(11)[k]) for sign in (1, -1))
-        assert_close(of_changes[:, :, k], (ahead - back) / (2 * step), rtol=1e-5, atol=1e-4, name=str(k))
+        assert_close(
+            of_changes[:, :, k], (ahead - back) / (2 * step), rtol=1e-5, atol=1e-4, name=str(k)
+        )
     ends = [seen(start, POINTS + sign * step * np.eye(3)[0]) for sign in (1, -1)]
     assert_close(of_points[:, :, 0], (ends[0] - ends[1]) / (2 * step), rtol=1e-5, atol=1e-4)
 
@@ -116,7 +118,9 @@ def test_bundle_adjust__keeps_points_in_place_for_a_camera_that_takes_no_part(se
     tracks.pixels[:] += rng.normal(scale=0.3, size=tracks.pixels.shape)
     start = intersect(tracks.ids, tracks.views, tracks.pixels, rig_of_nine, tracks.count)
     _, end = bundle_adjust(rig_of_nine, tracks, priors_of(rig_of_nine))
-    shifts = [unseen.project(positions)[0] - unseen.project(points)[0] for positions in (start, end)]
+    shifts = [
+        unseen.project(positions)[0] - unseen.project(points)[0] for positions in (start, end)
+    ]
     errors = [np.median(np.linalg.norm(shift, axis=1)) for shift in shifts]
     assert errors[1] < errors[0] + 0.03
 

@@ -1,4 +1,4 @@
-"""Calibration from clips alone, up to the scale of the world, and the errors for unsuitable clips."""
+"""Calibration from clips alone, up to the scale of the world, and errors for unsuitable clips."""
 
 from __future__ import annotations
 
@@ -44,7 +44,9 @@ def film(path: Path, cameras: list[Camera], suffix: str = ".mkv") -> Path:
 
 
 def aligned(estimate: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return `estimate` [n, 3] aligned to `true` by translation, rotation and scale, and the rotation."""
+    """Return `estimate` [n, 3] aligned to `true` by translation, rotation and scale, and the
+    rotation.
+    """
     a = estimate - estimate.mean(0)
     b = true - true.mean(0)
     U, _, Vt = np.linalg.svd(a.T @ b)
@@ -62,7 +64,8 @@ def test_calibrate__recovers_a_rig(tmp_path: Path, capsys) -> None:
     assert len(capture.points) > 500
     true = np.array([camera.position for camera in cameras])
     positions, R = aligned(np.array([camera.position for camera in capture.cameras]), true)
-    # Features are accurate to 0.1 px of 208 px focal length; the rig is 2.8 wide and 4 from the scene.
+    # Features are accurate to 0.1 px of 208 px focal length; the rig is 2.8 wide and 4 from the
+    # scene.
     assert_close(positions, true, atol=5e-3)
     for camera, expected in zip(capture.cameras, cameras, strict=True):
         assert_close(camera.viewmat[:3, :3] @ R.T, expected.viewmat[:3, :3], atol=3e-3)
@@ -82,7 +85,9 @@ def test_calibrate__finds_the_same_poses_on_every_run(tmp_path: Path) -> None:
     match_views(tmp_path, images, {}, scratch, config, lambda *_: None)
     with closing(pycolmap.Database.open(scratch / _DATABASE)) as db:
         numbered = sorted((image.image_id, Path(image.name).stem) for image in db.read_all_images())
-    assert [name for _, name in numbered] == list(images), "other numbers change the world's axes by 0.1"
+    assert [name for _, name in numbered] == list(images), (
+        "other numbers change the world's axes by 0.1"
+    )
     poses = []
     for _ in range(3):
         model = map_views(tmp_path, tuple(images), scratch, config.seed).model
@@ -101,7 +106,9 @@ def test_calibrate__names_images_after_photos(tmp_path: Path, names: tuple[str, 
     for name, camera in zip(names, textured.rig(4), strict=True):
         image = textured.render(camera.resized(240, 180), planes)[..., ::-1]
         options = [cv2.IMWRITE_JPEG_QUALITY, 98] if name.endswith("JPG") else []
-        (tmp_path / name).write_bytes(cv2.imencode(Path(name).suffix.lower(), image, options)[1].tobytes())
+        (tmp_path / name).write_bytes(
+            cv2.imencode(Path(name).suffix.lower(), image, options)[1].tobytes()
+        )
         (tmp_path / f"._{name}").write_bytes(b"\0\5\x16\7")
     result = calibrate(tmp_path, CalibrateConfig(shared_intrinsics=True))
     assert {camera.name for camera in read_colmap(result.model).cameras} == set(names)
@@ -128,7 +135,9 @@ def test_calibrate__moves_principal_points_that_differ(tmp_path: Path, capsys) -
     film(tmp_path, cameras)
     assert cli.main(["calibrate", str(tmp_path), "--shared-intrinsics"]) == 0
     assert "with a principal point for each" in " ".join(capsys.readouterr().out.split())
-    positions, true = (np.array([c.position for c in views]) for views in (load_capture(tmp_path).cameras, cameras))
+    positions, true = (
+        np.array([c.position for c in views]) for views in (load_capture(tmp_path).cameras, cameras)
+    )
     # With principal points in the middle of the images, positions are off by 0.022.
     assert_close(aligned(positions, true)[0], true, atol=0.012)
 
@@ -142,7 +151,9 @@ def test_calibrate__takes_global_mapping_where_incremental_mapping_fails(
     assert cli.main(["calibrate", str(tmp_path), "--shared-intrinsics"]) == 0
     assert re.search(r"6 cameras, .* by\s+global\s+mapping", capsys.readouterr().out)
     monkeypatch.setattr(pycolmap, "global_mapping", lambda *_: {})
-    with pytest.raises(ValueError, match="neither incremental nor global mapping by COLMAP found poses"):
+    with pytest.raises(
+        ValueError, match="neither incremental nor global mapping by COLMAP found poses"
+    ):
         calibrate(tmp_path, overwrite=True)
 
 
@@ -152,7 +163,9 @@ def test_candidate__ranks_fitting_cameras_then_poses_then_the_error() -> None:
             self.compute_mean_reprojection_error = lambda: error
 
     def rank(error: float, *fits: bool | None) -> tuple[int, int, float]:
-        return Candidate("global", Model(error), tuple(CameraCheck("", 0, 0.0, each) for each in fits)).rank
+        return Candidate(
+            "global", Model(error), tuple(CameraCheck("", 0, 0.0, each) for each in fits)
+        ).rank
 
     ordered = [
         rank(0.1, True, None, None),
@@ -175,13 +188,20 @@ def test_check__of_a_camera_without_points_does_not_fit() -> None:
 def test_calibrate__names_a_camera_with_another_scene(tmp_path: Path) -> None:
     film(tmp_path, [camera.resized(240, 180) for camera in textured.rig()[1:5]])
     noise = np.random.default_rng(1).integers(0, 255, (90, 120, 3), np.uint8)
-    write_video(tmp_path / "other.mkv", [cv2.resize(noise, (240, 180), interpolation=cv2.INTER_CUBIC)] * 2, 30)
+    write_video(
+        tmp_path / "other.mkv",
+        [cv2.resize(noise, (240, 180), interpolation=cv2.INTER_CUBIC)] * 2,
+        30,
+    )
     with pytest.raises(
-        ValueError, match=r"to register all 5 cameras, got 4, without other: .* or accept the partial model"
+        ValueError,
+        match=r"to register all 5 cameras, got 4, without other: .* or accept the partial model",
     ):
         calibrate(tmp_path)
     assert not (tmp_path / "sparse").exists()
-    with pytest.raises(ValueError, match="`without` must name cameras of cam1, cam2, cam3, cam4, other, got cam7"):
+    with pytest.raises(
+        ValueError, match="`without` must name cameras of cam1, cam2, cam3, cam4, other, got cam7"
+    ):
         calibrate(tmp_path, without=["cam7"])
     assert calibrate(tmp_path, without=["other"]).cameras == ("cam1", "cam2", "cam3", "cam4")
     result = calibrate(tmp_path, CalibrateConfig(partial=True), overwrite=True)
@@ -196,7 +216,11 @@ def test_calibrate__prints_a_verdict_per_camera(tmp_path: Path, capsys) -> None:
     film(tmp_path, cameras)
     shutil.copy(tmp_path / "cam1.mkv", tmp_path / "cam9.mkv")
     noise = np.random.default_rng(1).integers(0, 255, (90, 120, 3), np.uint8)
-    write_video(tmp_path / "other.mkv", [cv2.resize(noise, (240, 180), interpolation=cv2.INTER_CUBIC)] * 2, 30)
+    write_video(
+        tmp_path / "other.mkv",
+        [cv2.resize(noise, (240, 180), interpolation=cv2.INTER_CUBIC)] * 2,
+        30,
+    )
     assert cli.main(["calibrate", str(tmp_path), "--shared-intrinsics", "--partial"]) == 0
     printed = capsys.readouterr()
     rows = {name: rest for name, rest in re.findall(r"^ (\w+)  +(.*)$", printed.out, re.MULTILINE)}
@@ -204,33 +228,46 @@ def test_calibrate__prints_a_verdict_per_camera(tmp_path: Path, capsys) -> None:
         assert re.match(r"\d{3} +0\.\d\d +fits", rows[name])
     assert re.match(r"\d{3} +0\.\d\d +does not fit", rows["cam9"])
     assert re.match(r"0 +- +not checked", rows["other"])
-    assert "cam9 does not fit: it has the same pose as cam1: one clip seems to be a copy" in printed.err
+    assert (
+        "cam9 does not fit: it has the same pose as cam1: one clip seems to be a copy"
+        in printed.err
+    )
     assert "other not checked: it could not be registered and has no pose" in printed.err
 
 
-def test_calibrate__of_a_full_disk_leaves_no_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_calibrate__of_a_full_disk_leaves_no_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write_colmap(tmp_path / "found", textured.rig(4), np.random.default_rng(0).normal(size=(60, 3)))
     model = pycolmap.Reconstruction(str(tmp_path / "found"))
     clips = film(tmp_path / "clips", textured.rig(4))
     checks = tuple(CameraCheck(camera.name, 60, 0.1, True) for camera in textured.rig(4))
     monkeypatch.setattr("morgs_mi.studio.calibration.calibrate.match_views", lambda *_: None)
     monkeypatch.setattr(
-        "morgs_mi.studio.calibration.calibrate.map_views", lambda *_: Candidate("incremental", model, checks)
+        "morgs_mi.studio.calibration.calibrate.map_views",
+        lambda *_: Candidate("incremental", model, checks),
     )
     size = (tmp_path / "found" / "points3D.txt").stat().st_size
-    with pytest.raises(OSError, match=r"cannot write .*sparse, the partial output was removed"), files_end_at(size - 1):
+    with (
+        pytest.raises(OSError, match=r"cannot write .*sparse, the partial output was removed"),
+        files_end_at(size - 1),
+    ):
         calibrate(clips)
     assert not (clips / "sparse").exists()
 
 
 def test_calibrate__refuses_an_unknown_camera_model(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"calibrate\(\): `camera_model` must be SIMPLE_PINHOLE, PINHOLE, .*'PIN'"):
+    with pytest.raises(
+        ValueError, match=r"calibrate\(\): `camera_model` must be SIMPLE_PINHOLE, PINHOLE, .*'PIN'"
+    ):
         calibrate(tmp_path, CalibrateConfig(camera_model="PIN"))
 
 
 @pytest.mark.parametrize("seed", [-1, 10**23])
 def test_calibrate__refuses_a_seed_that_colmap_does_not_take(tmp_path: Path, seed: int) -> None:
-    with pytest.raises(ValueError, match=rf"`seed` must be a number in \[0, 2147483647\], got {seed}"):
+    with pytest.raises(
+        ValueError, match=rf"`seed` must be a number in \[0, 2147483647\], got {seed}"
+    ):
         calibrate(tmp_path, CalibrateConfig(seed=seed))
 
 
@@ -241,13 +278,17 @@ def test_calibrate__finds_no_features_in_transparent_pixels(tmp_path: Path) -> N
         image[:, 10:, 3] = 0
         (tmp_path / camera.name).mkdir()
         cv2.imwrite(str(tmp_path / camera.name / "0000.png"), image)
-    with pytest.raises(ValueError, match=r"expected at least 100 features in every view, got \d\d? in cam"):
+    with pytest.raises(
+        ValueError, match=r"expected at least 100 features in every view, got \d\d? in cam"
+    ):
         calibrate(tmp_path)
 
 
 def test_frames__are_the_nearest_in_time_at_a_variable_frame_rate(tmp_path: Path) -> None:
     for name, times in (("a", [0, 50, 100, 150, 200, 250, 300]), ("b", [0, 50, 100, 250, 300])):
-        write_timed_video(tmp_path / f"{name}.mp4", [np.full((48, 64, 3), t // 2, np.uint8) for t in times], times)
+        write_timed_video(
+            tmp_path / f"{name}.mp4", [np.full((48, 64, 3), t // 2, np.uint8) for t in times], times
+        )
     images, _ = _frames(tmp_path, CalibrateConfig(frame=5), ())
     assert_close(images["b"].astype(float), images["a"], atol=2)
     with pytest.raises(ValueError, match="frame 7 is not in the clips of a, b"):
@@ -257,7 +298,9 @@ def test_frames__are_the_nearest_in_time_at_a_variable_frame_rate(tmp_path: Path
 def noise_clips(path: Path) -> None:
     for name in ("a", "b", "c"):
         noise = np.random.default_rng(ord(name)).integers(0, 255, (60, 80, 3), np.uint8)
-        write_video(path / f"{name}.mkv", [cv2.resize(noise, (160, 120), interpolation=cv2.INTER_CUBIC)], 30)
+        write_video(
+            path / f"{name}.mkv", [cv2.resize(noise, (160, 120), interpolation=cv2.INTER_CUBIC)], 30
+        )
 
 
 def grey(path: Path) -> None:

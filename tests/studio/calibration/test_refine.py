@@ -30,7 +30,9 @@ from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import isotropic
 
 # Too little to find a gain.
-LEAST = FitConfig(refine_cameras="auto", short_fits=ShortFitConfig(gaussians=50, steps=2, rounds=1, width=40))
+LEAST = FitConfig(
+    refine_cameras="auto", short_fits=ShortFitConfig(gaussians=50, steps=2, rounds=1, width=40)
+)
 SHORT = ShortFitConfig(gaussians=300, steps=200, rounds=3, width=96)
 REPRODUCIBLE = RenderConfig(reproducible=True)
 WRONG = np.array([0.006, -0.008, 0.004, 0.01, 0.008, -0.01, 0.004, 0, 0, 0, 0])
@@ -76,7 +78,9 @@ def splat_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 @pytest.fixture(scope="module")
 def far_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    """A capture of distant splats in nine noisy views on a plane, the middle one of which is held out."""
+    """A capture of distant splats in nine noisy views on a plane, the middle one of which is held
+    out.
+    """
     path = tmp_path_factory.mktemp("far")
     rng = np.random.default_rng(0)
     means = rng.uniform((-3, -2.2, 6), (3, 2.2, 12), (150, 3))
@@ -86,23 +90,31 @@ def far_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     cameras = look_at_cameras(places, 45, 96, 72, target=(0, 0, 10))
     write_colmap(path / "sparse", cameras, means, np.full((150, 3), 0.5))
     for camera in cameras:
-        image = 255 * rendered(gaussians, camera, RenderConfig()) + rng.normal(scale=5, size=(72, 96, 3))
+        image = 255 * rendered(gaussians, camera, RenderConfig()) + rng.normal(
+            scale=5, size=(72, 96, 3)
+        )
         write_png(path / camera.name / "0000.png", to_uint8(image / 255))
     return load_capture(path, test_view=4)
 
 
 def shift_of_splats(capture: Capture, true: Capture) -> float:
-    """Return how far the training cameras show the splats from where the true ones do, px, median."""
+    """Return the median distance of the splats in training cameras from the true ones, px."""
     means = np.asarray(true.points, float)
     pairs = [(capture.cameras[v], true.cameras[v]) for v in true.train_views]
-    return float(np.median([np.linalg.norm(a.project(means)[0] - b.project(means)[0], axis=1) for a, b in pairs]))
+    return float(
+        np.median(
+            [np.linalg.norm(a.project(means)[0] - b.project(means)[0], axis=1) for a, b in pairs]
+        )
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("scale", "most"), [(0.0, 0.35), (1.0, 0.35)])
 @pytest.mark.parametrize("seed", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_refine_cameras__stays_in_the_frame_of_what_takes_no_part(far_capture, scale, most, seed):
-    """Noise alone moves correct cameras by 0.2 to 0.3 px; disturbed ones show the splats 0.6 to 0.8 px off."""
+    """Noise alone moves correct cameras by 0.2 to 0.3 px; disturbed ones show the splats 0.6 to 0.8
+    px off.
+    """
     deviations = scale * np.array([0.005] * 3 + [0.006] * 3 + [0.008, 0, 0, 0, 0])
     errors = deviations * np.random.default_rng(seed).normal(size=(9, 11))
     errors[list(far_capture.test_views)] = 0
@@ -123,7 +135,9 @@ def test_joint_step__turns_cameras_to_where_the_images_were_taken():
     for _ in range(8):
         gaussians, changes = _joint_step(gaussians, views, changes, deviations, 0.0, RenderConfig())
     cameras = [changed_camera(*pair) for pair in zip(start, changes, strict=True)]
-    errors = [np.abs(relative_turns(rig) - relative_turns(CAMERAS)).max() for rig in (start, cameras)]
+    errors = [
+        np.abs(relative_turns(rig) - relative_turns(CAMERAS)).max() for rig in (start, cameras)
+    ]
     assert errors[1] < 0.15 * errors[0]
     assert abs(changes[:, 6].mean()) < 1e-6, "a camera that takes no part keeps its focal length"
 
@@ -158,7 +172,9 @@ def test_refine_cameras__returns_the_calibrated_cameras_without_a_gain(splat_cap
 
 
 @pytest.mark.parametrize(("gain", "accepted"), [(0.05, False), (0.2, True)])
-def test_refine_cameras__takes_cameras_with_which_withheld_pixels_gain(splat_capture, monkeypatch, gain, accepted):
+def test_refine_cameras__takes_cameras_with_which_withheld_pixels_gain(
+    splat_capture, monkeypatch, gain, accepted
+):
     scores = iter((25.0, 25.0 + gain))
     monkeypatch.setattr("morgs_mi.studio.calibration.refine.mean_psnr", lambda *_: next(scores))
     refined, refinement = refine_cameras(splat_capture, LEAST)
@@ -173,7 +189,10 @@ def test_refine_cameras__compares_the_views_that_have_withheld_pixels(splat_capt
 
     def with_an_empty_view(views, width, rng):
         rest, unseen = withheld_blocks(views, width, rng)
-        return rest, [unseen[0]._replace(mask=np.zeros(unseen[0].image.shape[:2], bool)), *unseen[1:]]
+        return rest, [
+            unseen[0]._replace(mask=np.zeros(unseen[0].image.shape[:2], bool)),
+            *unseen[1:],
+        ]
 
     monkeypatch.setattr("morgs_mi.studio.calibration.refine.withheld_blocks", with_an_empty_view)
     _, refinement = refine_cameras(splat_capture, LEAST)
@@ -182,13 +201,17 @@ def test_refine_cameras__compares_the_views_that_have_withheld_pixels(splat_capt
 
 @pytest.mark.long
 def test_refine_cameras__improves_withheld_pixels_of_disturbed_cameras(textured_capture):
-    disturbed_capture = replace(textured_capture, cameras=tuple(disturbed(textured_capture.cameras, 1.5)))
+    disturbed_capture = replace(
+        textured_capture, cameras=tuple(disturbed(textured_capture.cameras, 1.5))
+    )
     capture = with_points(disturbed_capture, 0, Progress())
     how = ShortFitConfig(steps=200, rounds=2, width=160)
     refined, refinement = refine_cameras(capture, FitConfig(refine_cameras="auto", short_fits=how))
     assert refinement.taken
     assert refinement.refined_psnr > refinement.calibrated_psnr + 0.5
-    true, start, result = ([c.cameras[v] for v in capture.train_views] for c in (textured_capture, capture, refined))
+    true, start, result = (
+        [c.cameras[v] for v in capture.train_views] for c in (textured_capture, capture, refined)
+    )
     errors = [np.abs(relative_turns(rig) - relative_turns(true)).max() for rig in (start, result)]
     assert errors[1] < 0.5 * errors[0], "two rounds, where the default has five"
 
@@ -205,7 +228,9 @@ def test_matched__finds_the_cameras_by_features(textured_capture, monkeypatch):
     monkeypatch.setattr("morgs_mi.capture.features.MAX_FEATURES", 300)
     capture = replace(textured_capture, cameras=tuple(disturbed(textured_capture.cameras)))
     start, true = ([c.cameras[v] for v in capture.train_views] for c in (capture, textured_capture))
-    changes, tracks, _ = _matched(capture, capture.train_views, prior_deviations(scene_extent(start), CameraPriors()))
+    changes, tracks, _ = _matched(
+        capture, capture.train_views, prior_deviations(scene_extent(start), CameraPriors())
+    )
     cameras = [changed_camera(*pair) for pair in zip(start, changes, strict=True)]
     errors = [np.abs(relative_turns(rig) - relative_turns(true)).max() for rig in (start, cameras)]
     assert tracks > 100
@@ -218,7 +243,9 @@ def test_matched__finds_the_distortion_that_is_left(textured_capture, monkeypatc
     terms = [(0.08 * (-1) ** v, 0.0) for v in range(len(textured_capture.cameras))]
     bent = textured_capture.with_cameras(textured_capture.cameras, terms)
     cameras = [bent.cameras[v] for v in bent.train_views]
-    changes, *_ = _matched(bent, bent.train_views, prior_deviations(scene_extent(cameras), CameraPriors()))
+    changes, *_ = _matched(
+        bent, bent.train_views, prior_deviations(scene_extent(cameras), CameraPriors())
+    )
     # Images that were undistorted without need have the opposite distortion.
     assert_close(changes[:, 9], [-terms[v][0] for v in bent.train_views], atol=0.03)
 
@@ -232,7 +259,8 @@ def test_refine_cameras__needs_two_images(splat_capture):
 def test_Refinement__reports_the_changes_and_the_gain():
     refinement = Refinement(True, 26.0, 31.5, 200, 0.51, 0.02, 0.011, 0.003)
     assert refinement.sentence == (
-        "The cameras were refined, by up to 0.51 degrees, 0.02 units, 1.1 % of the focal length and 0.3 % of the "
-        "image's width by the lens: withheld pixels have 31.50 dB instead of 26.00 dB."
+        "The cameras were refined, by up to 0.51 degrees, 0.02 units, 1.1 % of the focal length "
+        "and 0.3 % of the image's width by the lens: withheld pixels have 31.50 dB instead of "
+        "26.00 dB."
     )
     assert "dB" not in replace(refinement, calibrated_psnr=np.nan, refined_psnr=np.nan).sentence

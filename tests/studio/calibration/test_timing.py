@@ -16,7 +16,9 @@ from morgs_mi.studio.synth.synthesize import synthesize
 
 
 def test_estimate_time_offsets__refuses_a_single_frame(textured_capture: Capture) -> None:
-    with pytest.raises(ValueError, match="expected at least 4 frames to compare clocks, got 1; record longer"):
+    with pytest.raises(
+        ValueError, match="expected at least 4 frames to compare clocks, got 1; record longer"
+    ):
         estimate_time_offsets(textured_capture)
 
 
@@ -30,13 +32,19 @@ def test_estimate_time_offsets__refuses_a_single_camera(textured_capture: Captur
 def test_estimate_time_offsets__finds_the_offsets_of_a_clip(tmp_path: Path) -> None:
     clip = tmp_path / "clip"
     synthesize(
-        "spheres", clip, SynthConfig(cameras=7, width=128, height=96, disturbances=Disturbances(time_offset=1.5))
+        "spheres",
+        clip,
+        SynthConfig(cameras=7, width=128, height=96, disturbances=Disturbances(time_offset=1.5)),
     )
     estimate = estimate_time_offsets(load_capture(clip))
-    truth = {name: -camera.time_offset for name, camera in load_disturbances(clip / "truth").items()}
+    truth = {
+        name: -camera.time_offset for name, camera in load_disturbances(clip / "truth").items()
+    }
     assert estimate.reference == "cam00"
     # Things move by about a pixel per frame in images of 128 pixels.
     assert estimate.offsets == pytest.approx(truth, abs=0.15)
     assert all(error < 0.1 for error in estimate.errors.values())
-    second_estimate = estimate_time_offsets(load_capture(clip, reading=ReadConfig(offset=estimate.offsets)))
+    second_estimate = estimate_time_offsets(
+        load_capture(clip, reading=ReadConfig(offset=estimate.offsets))
+    )
     assert second_estimate.offsets == pytest.approx(truth, abs=0.15)

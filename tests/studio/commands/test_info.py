@@ -26,7 +26,9 @@ from tests.scenes.noise_capture import FRAMES, HEIGHT, NAMES, WIDTH
 def test_info__names_standard_output_if_it_is_full(capture: Path, option: str) -> None:
     with open("/dev/full", "w") as full:
         command = [sys.executable, "-m", "morgs_mi", "info", str(capture), option]
-        result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+        result = subprocess.run(
+            command, stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
     assert (result.returncode, result.stderr) == (1, "standard output: No space left on device.\n")
 
 
@@ -38,7 +40,9 @@ def test_info__lists_the_cameras_of_a_capture(capture: Path, run) -> None:
 
 
 @pytest.mark.slow
-def test_info__prints_complete_columns_and_a_verdict_per_camera(textured_capture: Capture, tmp_path: Path, run) -> None:
+def test_info__prints_complete_columns_and_a_verdict_per_camera(
+    textured_capture: Capture, tmp_path: Path, run
+) -> None:
     path = tmp_path / ("capture of a rig in a folder with a long name" * 2)
     shutil.copytree(textured_capture.path, path)
     grey = np.full((240, 320, 3), 128, np.uint8)
@@ -57,7 +61,9 @@ def test_info__prints_complete_columns_and_a_verdict_per_camera(textured_capture
 
 
 @pytest.mark.slow
-def test_info__prints_the_check_and_draws_the_rig(textured_capture: Capture, tmp_path: Path, run) -> None:
+def test_info__prints_the_check_and_draws_the_rig(
+    textured_capture: Capture, tmp_path: Path, run
+) -> None:
     plot = tmp_path / "new" / "rig.png"
     times = {file: file.stat().st_mtime_ns for file in textured_capture.path.rglob("*")}
     status, out, _ = run("info", textured_capture.path, "--plot", plot)
@@ -66,7 +72,9 @@ def test_info__prints_the_check_and_draws_the_rig(textured_capture: Capture, tmp
     assert "1 frames at 30 fps, without points (" in out
     assert "Reprojection check: median 0.0" in out
     assert "in 15 pairs; the poses fit the images." in out
-    assert "Views between the cameras will be good: 5 cameras, 7 degrees apart" in " ".join(out.split())
+    assert "Views between the cameras will be good: 5 cameras, 7 degrees apart" in " ".join(
+        out.split()
+    )
     image = cv2.imread(str(plot))
     assert image.shape == (760, 1440, 3)
     assert {file: file.stat().st_mtime_ns for file in textured_capture.path.rglob("*")} == times
@@ -77,7 +85,9 @@ def test_info__prints_the_check_and_draws_the_rig(textured_capture: Capture, tmp
     assert_refused(refused, "the suffix of a plot must be .png, .jpg, .svg or .pdf, got '.gif'")
 
 
-def test_info__prints_the_time_offsets_as_options(capture: Path, run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_info__prints_the_time_offsets_as_options(
+    capture: Path, run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     names = (*NAMES[:3], "other")
     offsets = dict(zip(names, (0.0, -0.254, 1.5, 0.7), strict=True))
     errors = dict(zip(names, (0.0, 0.023, 0.41, 1.0), strict=True))
@@ -97,10 +107,14 @@ def test_info__prints_the_time_offsets_as_options(capture: Path, run, monkeypatc
 def test_info__checks_a_whole_recording(textured_capture: Capture, tmp_path: Path, run) -> None:
     plot = tmp_path / "rig.png"
     measured = tmp_path / "deep.json"
-    status, out, _ = run("info", textured_capture.path, "--deep", "--plot", plot, "--json", measured)
+    status, out, _ = run(
+        "info", textured_capture.path, "--deep", "--plot", plot, "--json", measured
+    )
     assert status == 0
     assert "Check of 1 frames: no findings." in out
-    assert "Not measured, without enough common motion or matches: time offsets of all cameras." in out
+    assert (
+        "Not measured, without enough common motion or matches: time offsets of all cameras." in out
+    )
     assert cv2.imread(str(plot)).shape == (760 + 560, 1440, 3)
     content = json.loads(measured.read_text())
     assert content["offsets"] == [None] * 6
@@ -110,7 +124,10 @@ def test_info__checks_a_whole_recording(textured_capture: Capture, tmp_path: Pat
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        (["--json", "deep.json"], "--json: expected --deep, whose measurements it holds; add --deep."),
+        (
+            ["--json", "deep.json"],
+            "--json: expected --deep, whose measurements it holds; add --deep.",
+        ),
         (
             ["--deep", "--no-check"],
             "--deep: expected the check of the poses, on which it builds; leave out --no-check.",

@@ -35,19 +35,28 @@ def test_Live__fits_videos_until_they_end(
     monkeypatch.setattr(module, "start_viewer", lambda *args: started.append(args))
     monkeypatch.setattr(module, "stop_viewer", started.append)
     out = tmp_path / "out"
-    status, printed, error = run("live", out, "--camera", *videos, "--calibration", capture, "--view", *OPTIONS)
+    status, printed, error = run(
+        "live", out, "--camera", *videos, "--calibration", capture, "--view", *OPTIONS
+    )
     assert status == 0
     assert re.fullmatch(
-        rf"{out}/stream.morgs: fitted \d+ of \d+ frames \(\d+ dropped\) in [\d.]+ s, [\d.]+ MB, [\d.]+ s for .*\.\n",
+        rf"{out}/stream.morgs: fitted \d+ of \d+ frames \(\d+ dropped\) in [\d.]+ s, [\d.]+ MB, "
+        r"[\d.]+ s for .*\.\n",
         printed,
     )
     assert "Frame 0: 0.0 s after the first, latency " in error
     assert re.search(
-        r"the fit ends after frame \d+: cam0, cam1, cam2: it has ended; --loop repeats videos", caplog.text
+        r"the fit ends after frame \d+: cam0, cam1, cam2: it has ended; --loop repeats videos",
+        caplog.text,
     )
     assert started == [(out, True), None]
     assert open_stream(out).closed()
-    assert {path.name for path in out.iterdir()} == {"stream.morgs", "report.json", "capture.json", "capture"}
+    assert {path.name for path in out.iterdir()} == {
+        "stream.morgs",
+        "report.json",
+        "capture.json",
+        "capture",
+    }
 
 
 @pytest.mark.slow
@@ -56,17 +65,32 @@ def test_Live__starts_the_viewer_at_a_provisional_first_frame(
 ) -> None:
     states = []
     monkeypatch.setattr(
-        module, "start_viewer", lambda out, _: states.append(sorted(path.name for path in out.iterdir()))
+        module,
+        "start_viewer",
+        lambda out, _: states.append(sorted(path.name for path in out.iterdir())),
     )
     monkeypatch.setattr(module, "stop_viewer", lambda _: None)
-    args = ("--camera", *videos, "--calibration", capture, "--view", "--frames", 1, *OPTIONS, "--first-frame-steps", 20)
+    args = (
+        "--camera",
+        *videos,
+        "--calibration",
+        capture,
+        "--view",
+        "--frames",
+        1,
+        *OPTIONS,
+        "--first-frame-steps",
+        20,
+    )
     assert run("live", tmp_path / "out", *args)[0] == 0
     assert len(states) == 1
     assert PROVISIONAL in states[0]
 
 
 @pytest.mark.slow
-def test_Live__repeats_videos(capture: Path, tmp_path: Path, videos: list[Path], run, caplog) -> None:
+def test_Live__repeats_videos(
+    capture: Path, tmp_path: Path, videos: list[Path], run, caplog
+) -> None:
     args = ("--camera", *videos, "--calibration", capture, "--loop", "--seconds", 1, *OPTIONS)
     status, printed, _ = run("live", tmp_path / "out", *args)
     assert status == 0
@@ -75,12 +99,16 @@ def test_Live__repeats_videos(capture: Path, tmp_path: Path, videos: list[Path],
     assert not caplog.messages, "it is ended by the time"
 
 
-def test_Live__ends_with_a_summary_on_ctrl_c(capture: Path, tmp_path: Path, videos, run, monkeypatch) -> None:
+def test_Live__ends_with_a_summary_on_ctrl_c(
+    capture: Path, tmp_path: Path, videos, run, monkeypatch
+) -> None:
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(_Lines, "add", interrupt)
-    status, printed, error = run("live", tmp_path / "out", "--camera", *videos, "--calibration", capture, *OPTIONS)
+    status, printed, error = run(
+        "live", tmp_path / "out", "--camera", *videos, "--calibration", capture, *OPTIONS
+    )
     assert status == 0
     assert "fitted 1 of 1 frames (0 dropped) in 0.0 s" in printed
     assert "Interrupted" not in error
@@ -93,7 +121,10 @@ def test_Live__ends_with_a_summary_on_ctrl_c(capture: Path, tmp_path: Path, vide
         (("--camera", 60, 61, 61), ("--camera must have different sources, got 3 (60, 61, 61)",)),
         (
             ("--camera", 61, 62),
-            ("--camera must have a source for each of the 3 calibrated cameras (cam0, cam1, cam2)",),
+            (
+                "--camera must have a source for each of the 3 calibrated cameras (cam0, cam1, "
+                "cam2)",
+            ),
         ),
         (
             ("--camera", "a", "b", "nowhere"),
@@ -106,10 +137,15 @@ def test_Live__ends_with_a_summary_on_ctrl_c(capture: Path, tmp_path: Path, vide
         (("--timeout", 0), ("--timeout must be above 0, got 0",)),
         (("--timeout", 1e18), ("--timeout must be a number in [0, 1e6], got 1e+18",)),
         (("--fps", 1e9), ("--fps must be a number in [1e-6, 1e6], got 1000000000.0",)),
-        (("--test-view", "x", "--camera", "VIDEOS"), ("test_view` must be an index in 0..2, one of cam0, cam1, cam2",)),
+        (
+            ("--test-view", "x", "--camera", "VIDEOS"),
+            ("test_view` must be an index in 0..2, one of cam0, cam1, cam2",),
+        ),
     ],
 )
-def test_Live__refuses_in_one_sentence(capture: Path, tmp_path: Path, videos, run, args, parts) -> None:
+def test_Live__refuses_in_one_sentence(
+    capture: Path, tmp_path: Path, videos, run, args, parts
+) -> None:
     arguments = [arg for a in args for arg in (videos if a == "VIDEOS" else [a])]
     assert_refused(run("live", tmp_path / "out", "--calibration", capture, *arguments), *parts)
     assert not (tmp_path / "out").exists()
@@ -154,8 +190,12 @@ def test_Lines__count_what_was_dropped_since_the_last_one(monkeypatch: pytest.Mo
 
 def test_summary__has_means_of_the_later_frames(tmp_path: Path) -> None:
     (tmp_path / "stream.morgs").write_bytes(b"x" * 2_340_000)
-    rows = [LiveFrame(0, 0, 30, 0.001, 0), LiveFrame(1, 31, 0.5, 0.012, 900), LiveFrame(2, 32, 0.7, 0.003, 20)]
+    rows = [
+        LiveFrame(0, 0, 30, 0.001, 0),
+        LiveFrame(1, 31, 0.5, 0.012, 900),
+        LiveFrame(2, 32, 0.7, 0.003, 20),
+    ]
     assert _summary(tmp_path, rows) == (
-        f"{tmp_path}/stream.morgs: fitted 3 of 923 frames (920 dropped) in 32.0 s, 2.3 MB, 30.0 s for the first one, "
-        "mean latency of the others 0.60 s, largest skew 12 ms."
+        f"{tmp_path}/stream.morgs: fitted 3 of 923 frames (920 dropped) in 32.0 s, 2.3 MB, 30.0 s "
+        "for the first one, mean latency of the others 0.60 s, largest skew 12 ms."
     )

@@ -13,7 +13,9 @@ SIZE = ("--cameras", 2, "--frames", 2, "--width", 32, "--height", 24, "--spp", 1
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "[]"])
-def test_synth__replaces_no_folder_with_a_hostile_description(tmp_path: Path, run, text: str) -> None:
+def test_synth__replaces_no_folder_with_a_hostile_description(
+    tmp_path: Path, run, text: str
+) -> None:
     (tmp_path / "capture.json").write_text(text)
     assert_refused(run("synth", "arm", tmp_path, "--overwrite"), "is not a synthetic capture")
 
@@ -32,7 +34,10 @@ def test_synth__renders_a_scene_with_disturbances(tmp_path: Path, run) -> None:
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (("spheres", "--rolling-shutter", 2), "--rolling-shutter must be at least 0 and at most 1, got 2.0"),
+        (
+            ("spheres", "--rolling-shutter", 2),
+            "--rolling-shutter must be at least 0 and at most 1, got 2.0",
+        ),
         (("model.glb",), "no scene 'model.glb'; name one of"),
     ],
 )

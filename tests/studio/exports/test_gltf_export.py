@@ -1,4 +1,6 @@
-"""glTF: the file is read by a reader written from the specifications, and renders to the same image."""
+"""glTF: the file is read by a reader written from the specifications, and renders to the same
+image.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +20,15 @@ from tests.scenes.changing_splats import rig, splats
 
 KHR = "KHR_gaussian_splatting"
 SIZES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-# KHR_gaussian_splatting's table of attributes; all may be float, with the component type 5126. All others are VEC3.
+# KHR_gaussian_splatting's table of attributes; all may be float, with the component type 5126. All
+# others are VEC3.
 TYPES = {f"{KHR}:ROTATION": "VEC4", f"{KHR}:OPACITY": "SCALAR", "COLOR_0": "VEC4"}
 
 
 def read_glb(data: bytes) -> tuple[dict, bytes]:
-    """Return the JSON and binary chunks of a .glb file, according to glTF 2.0's section on the binary format."""
+    """Return the JSON and binary chunks of a .glb file, according to glTF 2.0's section on the
+    binary format.
+    """
     assert struct.unpack_from("<4sII", data) == (b"glTF", 2, len(data))
     chunks = []
     at = 12
@@ -40,7 +45,9 @@ def read_glb(data: bytes) -> tuple[dict, bytes]:
 
 
 def attributes(document: dict, binary: bytes) -> dict[str, np.ndarray]:
-    """Return the arrays of the one primitive, checked against glTF 2.0's rules on accessors and buffer views."""
+    """Return the arrays of the one primitive, checked against glTF 2.0's rules on accessors and
+    buffer views.
+    """
     arrays = {}
     for name, index in document["meshes"][0]["primitives"][0]["attributes"].items():
         accessor = document["accessors"][index]
@@ -51,9 +58,13 @@ def attributes(document: dict, binary: bytes) -> dict[str, np.ndarray]:
         assert start % 4 == 0
         assert "byteStride" not in view
         assert accessor["count"] * width * 4 <= view["byteLength"]
-        assert view.get("byteOffset", 0) + view["byteLength"] <= document["buffers"][0]["byteLength"]
+        assert (
+            view.get("byteOffset", 0) + view["byteLength"] <= document["buffers"][0]["byteLength"]
+        )
         assert view["target"] == 34962
-        arrays[name] = np.frombuffer(binary, "<f4", accessor["count"] * width, start).reshape(-1, width)
+        arrays[name] = np.frombuffer(binary, "<f4", accessor["count"] * width, start).reshape(
+            -1, width
+        )
     assert len({len(array) for array in arrays.values()}) == 1
     return arrays
 
@@ -97,7 +108,9 @@ def test_glb__conforms_to_the_extension(degree):
 def test_glb__fallback_colour_is_linear():
     grey = replace(splats(1), sh_coeffs=np.zeros((1, 1, 3)))
     # sRGB's 0.5 is 0.21404 in linear light.
-    assert attributes(*read_glb(glb(grey)))["COLOR_0"][0, :3] == pytest.approx([0.21404] * 3, abs=1e-5)
+    assert attributes(*read_glb(glb(grey)))["COLOR_0"][0, :3] == pytest.approx(
+        [0.21404] * 3, abs=1e-5
+    )
 
 
 @pytest.mark.parametrize("degree", range(4))
@@ -120,7 +133,8 @@ def test_gltf_axes__have_y_up_and_the_cameras_at_positive_z():
     axes = gltf_axes(rig())
     assert_close(axes @ axes.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(axes) == pytest.approx(1)
-    assert (axes @ [0, 0, 1])[1] > 0.95  # the world's up is nearly y, since the cameras look down a little
+    # The world's up is nearly y, since the cameras look down a little.
+    assert (axes @ [0, 0, 1])[1] > 0.95
     assert (axes @ rig()[1].position)[2] > 3  # the cameras are at positive z
 
 

@@ -1,4 +1,6 @@
-"""Panoramas against closed forms of one Gaussian, at the poles, at the seam and for both eyes; what commands write."""
+"""Panoramas against closed forms of one Gaussian, at the poles, at the seam and for both eyes; what
+commands write.
+"""
 
 from __future__ import annotations
 
@@ -24,11 +26,12 @@ DISTANCE = 3.0
 SIZE = 0.7
 OPACITY = 0.9
 WHITE = 0.5 / SH_C0  # the coefficient of white
-CAMERA = Camera.look_at((0.3, -0.2, 0.1), (0.3, -0.2, 1.1), (0, -1, 0), 60, 48, 36)  # the axes of the world
+# The axes of the world.
+CAMERA = Camera.look_at((0.3, -0.2, 0.1), (0.3, -0.2, 1.1), (0, -1, 0), 60, 48, 36)
 
 
 def directions(width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
-    """Return the direction of each pixel's centre [height, width, 3], x right, y down, z forward."""
+    """Return the direction of each pixel [height, width, 3], x right, y down, z forward."""
     longitude = 2 * np.pi * ((np.arange(width) + 0.5) / width - 0.5)
     latitude = np.pi * (0.5 - (np.arange(height)[:, None] + 0.5) / height)
     x = np.cos(latitude) * np.sin(longitude)
@@ -38,11 +41,15 @@ def directions(width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
 
 def ball_at(direction: np.ndarray, size: float = SIZE):
     """Return a white Gaussian in a direction of the camera."""
-    return isotropic([CAMERA.position + DISTANCE * np.asarray(direction)], size, OPACITY, (WHITE,) * 3)
+    return isotropic(
+        [CAMERA.position + DISTANCE * np.asarray(direction)], size, OPACITY, (WHITE,) * 3
+    )
 
 
 def expected(direction: np.ndarray) -> np.ndarray:
-    """Return the alpha of `ball_at` on each pixel's ray: opacity exp(-p^2 / 2), p the distance over the size."""
+    """Return the alpha of `ball_at` on each pixel's ray: opacity exp(-p^2 / 2), p the distance over
+    the size.
+    """
     rays = directions()
     p = DISTANCE * np.linalg.norm(np.cross(rays, direction), axis=-1) / SIZE
     alpha = OPACITY * np.exp(-0.5 * p**2) * (rays @ direction > 0)
@@ -85,9 +92,12 @@ def test_panorama__of_two_eyes_has_the_disparity_of_the_distance(longitude):
         weights = eye[..., 0].sum(axis=0)
         assert weights.max() > 0.5
         disparities.append(np.angle(np.sum(weights * np.exp(1j * angles))))
-    # The ray of an eye starts beside the centre: sin of the angle between both rays is (b / 2) / distance.
+    # The ray of an eye starts beside the centre: sin of the angle between both rays is (b / 2) /
+    # distance.
     shift = np.arcsin(0.5 * distance / DISTANCE)
-    assert_close(np.angle(np.exp(1j * (np.array(disparities) - longitude))), [shift, -shift], atol=1e-3)
+    assert_close(
+        np.angle(np.exp(1j * (np.array(disparities) - longitude))), [shift, -shift], atol=1e-3
+    )
 
 
 def test_panorama__shows_in_its_middle_what_the_camera_sees():
@@ -105,7 +115,9 @@ def test_panorama__shows_in_its_middle_what_the_camera_sees():
     assert np.abs(warped - picture).mean() < 0.02
 
 
-@pytest.mark.parametrize("target", [(0, 0, -5), (0, 1, -5), (3, 1, 0)], ids=["down", "nearly down", "level"])
+@pytest.mark.parametrize(
+    "target", [(0, 0, -5), (0, 1, -5), (3, 1, 0)], ids=["down", "nearly down", "level"]
+)
 def test_levelled__looks_to_the_same_side(target):
     camera = Camera.look_at((0, 0, 0), target, (0, 1, 0.1), 60, 48, 36)
     level = levelled(camera, np.array([0.0, 0, 1]))
@@ -122,7 +134,14 @@ def test_panorama__of_no_gaussians_is_black():
 
 def test_render__writes_panoramas(tmp_path: Path):
     write_ply(tmp_path / "scene.ply", splats())
-    base = ["render", str(tmp_path / "scene.ply"), "--projection", "equirectangular", "--width", "64"]
+    base = [
+        "render",
+        str(tmp_path / "scene.ply"),
+        "--projection",
+        "equirectangular",
+        "--width",
+        "64",
+    ]
     assert cli.main([*base, str(tmp_path / "a.png"), "--camera", "left"]) == 0
     assert cli.main([*base, str(tmp_path / "b.png"), "--stereo", "0.1"]) == 0
     shapes = [cv2.imread(str(tmp_path / name)).shape for name in ("a.png", "b.png")]

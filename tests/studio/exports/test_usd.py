@@ -1,4 +1,6 @@
-"""OpenUSD: attributes are read back frame by frame, births and deaths, and OpenUSD's own validation."""
+"""OpenUSD: attributes are read back frame by frame, births and deaths, and OpenUSD's own
+validation.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,10 @@ def written(path: Path, states: int = 4, **options: Any) -> tuple[list[CodedFram
 
 def values(prim: Any, time: float, half: bool = False) -> dict[str, np.ndarray]:
     """Return the attributes of a prim at a time by their names as floats; quaternions are wxyz."""
-    names = ["positions", *(name + ("h" if half else "") for name in ("orientations", "scales", "opacities", SH))]
+    names = [
+        "positions",
+        *(name + ("h" if half else "") for name in ("orientations", "scales", "opacities", SH)),
+    ]
     arrays = {name: np.array(prim.GetAttribute(name).Get(time), np.float64) for name in names}
     quats = prim.GetAttribute(names[1]).Get(time)
     arrays[names[1]] = np.array([[q.GetReal(), *q.GetImaginary()] for q in quats], np.float64)
@@ -100,7 +105,10 @@ def test_write_usd__passes_the_validators_of_openusd(tmp_path, suffix, half):
     # The values have the types of the schema, and nothing else is written.
     definition = Usd.SchemaRegistry().FindConcretePrimDefinition("ParticleField3DGaussianSplat")
     for attribute in stage.GetPrimAtPath("/Stream/Gaussians").GetAuthoredAttributes():
-        assert definition.GetAttributeDefinition(attribute.GetName()).GetTypeName() == attribute.GetTypeName()
+        assert (
+            definition.GetAttributeDefinition(attribute.GetName()).GetTypeName()
+            == attribute.GetTypeName()
+        )
 
 
 def test_write_usd__interpolates_the_same_gaussians_between_frames(tmp_path):
@@ -163,7 +171,12 @@ def test_write_usd__begins_a_prim_for_a_new_set_of_gaussians(tmp_path):
     write_usd(StreamReader(tmp_path / "s.morgs"), tmp_path / "a.usdc", FRAMES)
     stage = Usd.Stage.Open(str(tmp_path / "a.usdc"))
     prims = stage.GetDefaultPrim().GetChildren()
-    assert [prim.GetName() for prim in prims] == ["Gaussians", "Gaussians1", "Gaussians2", "Gaussians3"]
+    assert [prim.GetName() for prim in prims] == [
+        "Gaussians",
+        "Gaussians1",
+        "Gaussians2",
+        "Gaussians3",
+    ]
     for t in FRAMES:
         visible = [UsdGeom.Imageable(prim).ComputeVisibility(t) == "inherited" for prim in prims]
         assert visible == [k == t for k in range(4)]
@@ -177,13 +190,17 @@ def test_write_usd__saves_now_and_then(tmp_path, monkeypatch):
     states, stage = written(tmp_path / "a.usdc")
     for state in states:
         alive = np.isin(np.arange(42), state.ids)
-        positions = values(stage.GetPrimAtPath("/Stream/Gaussians"), state.frame)["positions"][alive]
+        positions = values(stage.GetPrimAtPath("/Stream/Gaussians"), state.frame)["positions"][
+            alive
+        ]
         assert_close(positions, expected(state.gaussians)["positions"], atol=1e-6)
 
 
 def test_export_usd__writes_selected_frames(tmp_path, capsys):
     write_stream(tmp_path / "stream.morgs")
-    assert cli.main(["export", "usd", str(tmp_path), str(tmp_path / "a.usda"), "--frames", "1:3"]) == 0
+    assert (
+        cli.main(["export", "usd", str(tmp_path), str(tmp_path / "a.usda"), "--frames", "1:3"]) == 0
+    )
     assert capsys.readouterr().out.startswith(f"{tmp_path}/a.usda: 2 frames, ")
     stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
     assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (1, 2)
@@ -223,6 +240,8 @@ def test_export_usd__removes_its_output_on_a_full_disk(tmp_path, capfd, suffix):
 def test_write_usd__names_the_missing_package(tmp_path, monkeypatch):
     write_stream(tmp_path / "s.morgs", 1)
     monkeypatch.setitem(sys.modules, "pxr.UsdVol", None)
-    with pytest.raises(ValueError, match=r"expected the package usd-core, found none; .* 'morgs-mi\[usd\]'"):
+    with pytest.raises(
+        ValueError, match=r"expected the package usd-core, found none; .* 'morgs-mi\[usd\]'"
+    ):
         write_usd(StreamReader(tmp_path / "s.morgs"), tmp_path / "a.usdc", [0])
     assert len(list(tmp_path.iterdir())) == 1

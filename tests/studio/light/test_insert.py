@@ -14,13 +14,20 @@ from morgs_mi.core.color_space import decode_light
 from morgs_mi.io.exr import read_exr
 from morgs_mi.playback.export.frames import write_images
 from morgs_mi.playback.player import render_stream
-from morgs_mi.studio.light.insert import InsertConfig, inserted_channels, load_insert, render_inserted, selected
+from morgs_mi.studio.light.insert import (
+    InsertConfig,
+    inserted_channels,
+    load_insert,
+    render_inserted,
+    selected,
+)
 from tests.scenes.surfaces import camera, cloud
 
 CARD = """
 def build(frame, time):
     radiance = {"type": "rgb", "value": [0.25 * frame, time, 0.5]}
-    glowing = {"bsdf": {"type": "diffuse", "reflectance": 0.0}, "emitter": {"type": "area", "radiance": radiance}}
+    black = {"type": "diffuse", "reflectance": 0.0}
+    glowing = {"bsdf": black, "emitter": {"type": "area", "radiance": radiance}}
     return {"card": {"type": "sphere", "center": [0, 0, -1], "radius": 0.3, **glowing}}
 """
 
@@ -42,7 +49,11 @@ def stream(tmp_path: Path):
 
 def test_render_inserted__shows_the_scene_of_each_frame(stream, tmp_path):
     (tmp_path / "card.py").write_text(CARD)
-    images = dict(render_inserted(stream, camera(), load_insert(tmp_path / "card.py"), [0, 2], ("color", "alpha")))
+    images = dict(
+        render_inserted(
+            stream, camera(), load_insert(tmp_path / "card.py"), [0, 2], ("color", "alpha")
+        )
+    )
     assert list(images) == [0, 2]
     for frame, expected in ((0, (0, 0, 0.735)), (2, (0.735, 0.485, 0.735))):
         np.testing.assert_allclose(images[frame]["color"][12, 16], expected, atol=2e-3)
@@ -57,7 +68,8 @@ def test_render_inserted__honours_two_focal_lengths(stream, tmp_path):
     view = camera().resized(camera().width, 2 * camera().height)
     build = load_insert(tmp_path / "card.py")
     tall, square = (
-        dict(render_inserted(stream, each, build, [2], ("color", "alpha")))[2]["color"] for each in (view, camera())
+        dict(render_inserted(stream, each, build, [2], ("color", "alpha")))[2]["color"]
+        for each in (view, camera())
     )
     assert tall.shape == (view.height, view.width, 3)
     np.testing.assert_allclose(0.5 * (tall[::2] + tall[1::2]), square, atol=0.2)
@@ -69,12 +81,16 @@ def test_render_inserted__honours_two_focal_lengths(stream, tmp_path):
 def test_render_inserted__takes_shapes_lights_and_integrator_of_an_xml_file(stream, tmp_path):
     (tmp_path / "ball.xml").write_text(XML)
     build = load_insert(tmp_path / "ball.xml")
-    images = dict(render_inserted(stream, camera(), build, [1], ("color",), InsertConfig(samples=64)))
+    images = dict(
+        render_inserted(stream, camera(), build, [1], ("color",), InsertConfig(samples=64))
+    )
     np.testing.assert_allclose(images[1]["color"][12, 16], (0.735, 0.537, 0), atol=0.05)
 
 
 def test_render_inserted__lights_a_scene_without_emitters_by_the_stream(stream, tmp_path):
-    (tmp_path / "ball.py").write_text('def build(frame, time):\n    return {"ball": {"type": "sphere"}}\n')
+    (tmp_path / "ball.py").write_text(
+        'def build(frame, time):\n    return {"ball": {"type": "sphere"}}\n'
+    )
     images = dict(render_inserted(stream, camera(), load_insert(tmp_path / "ball.py"), [0]))
     assert images[0]["color"][12, 16].min() > 0.05
 
@@ -84,11 +100,16 @@ def test_render_inserted__traces_rays_through_the_stream(stream, tmp_path):
     (tmp_path / "mirror.py").write_text(
         "def build(frame, time):\n"
         '    mirror = {"type": "conductor", "material": "none"}\n'
-        '    return {"ball": {"type": "sphere", "center": [0, 0, 1.3], "radius": 0.5, "bsdf": mirror}}\n'
+        '    place = {"center": [0, 0, 1.3], "radius": 0.5}\n'
+        '    return {"ball": {"type": "sphere", **place, "bsdf": mirror}}\n'
     )
     build = load_insert(tmp_path / "mirror.py")
     images = [
-        dict(render_inserted(stream, camera(), build, [0], ("color", "surfaces"), InsertConfig(light=light)))[0]
+        dict(
+            render_inserted(
+                stream, camera(), build, [0], ("color", "surfaces"), InsertConfig(light=light)
+            )
+        )[0]
         for light in ("probe", "traced")
     ]
     assert np.abs(images[0]["color"] - images[1]["color"]).max() > 0.05
@@ -100,19 +121,26 @@ def test_render_inserted__refuses_an_integrator_that_does_not_trace_the_light(st
     def build(frame, time):
         return {"ball": {"type": "sphere"}, "integrator": {"type": "direct"}}
 
-    with pytest.raises(ValueError, match="with light 'traced', expected an integrator `splat_path`, got"):
+    with pytest.raises(
+        ValueError, match="with light 'traced', expected an integrator `splat_path`, got"
+    ):
         next(render_inserted(stream, camera(), build, config=InsertConfig(light="traced")))
 
 
-def test_render_inserted__layers_compose_to_the_image_where_surfaces_cover_nothing(stream, tmp_path):
+def test_render_inserted__layers_compose_to_the_image_where_surfaces_cover_nothing(
+    stream, tmp_path
+):
     (tmp_path / "ball.py").write_text(
         "def build(frame, time):\n"
         '    return {"ball": {"type": "sphere", "center": [0, -0.5, -0.3], "radius": 0.4},\n'
-        '            "sun": {"type": "directional", "direction": [0, 0.8, 0.8], "irradiance": 2.0}}\n'
+        '            "sun": {"type": "directional", "direction": [0, 0.8, 0.8],\n'
+        '                    "irradiance": 2.0}}\n'
     )
     channels = inserted_channels(stream)
     assert channels == ("color", "alpha", "motion", "depth", "splats", "surfaces", "shadow")
-    images = dict(render_inserted(stream, camera(), load_insert(tmp_path / "ball.py"), [0], channels))[0]
+    images = dict(
+        render_inserted(stream, camera(), load_insert(tmp_path / "ball.py"), [0], channels)
+    )[0]
     outside = images["surfaces"][..., 3] == 0
     assert images["shadow"].min() < 0.7 < images["shadow"].max() == pytest.approx(1)
     shadowed = images["splats"][..., :3] * images["shadow"]
@@ -134,17 +162,35 @@ BAD = {
     "a.json": ("{}", "FILE.xml or FILE.py, got '.json'"),
     "syntax.py": ("def build(:", "syntax.py, line 1: SyntaxError"),
     "empty.py": ("", r"expected a function `build\(frame, time\)`"),
-    "none.py": ("def build(frame, time):\n    pass\n", "`build` must return a dict, got a NoneType"),
-    "fails.py": ("def build(frame, time):\n    return 1 / 0\n", "fails.py, line 2: ZeroDivisionError"),
-    "plugin.py": ("def build(frame, time):\n    return {'a': {'type': 'bal'}}\n", "The inserted scene: .*bal"),
-    "nan.py": (SPHERE % "'center': [float('nan'), 0, 0]", "expected shapes within 1e.12 world units, got .*nan"),
+    "none.py": (
+        "def build(frame, time):\n    pass\n",
+        "`build` must return a dict, got a NoneType",
+    ),
+    "fails.py": (
+        "def build(frame, time):\n    return 1 / 0\n",
+        "fails.py, line 2: ZeroDivisionError",
+    ),
+    "plugin.py": (
+        "def build(frame, time):\n    return {'a': {'type': 'bal'}}\n",
+        "The inserted scene: .*bal",
+    ),
+    "nan.py": (
+        SPHERE % "'center': [float('nan'), 0, 0]",
+        "expected shapes within 1e.12 world units, got .*nan",
+    ),
     "endless.py": (SPHERE % "'radius': float('inf')", "expected shapes within 1e.12 world units"),
-    "far.py": (SPHERE % "'center': [1e30, 0, 0]", "expected shapes within 1e.12 world units, got .*1e.30"),
+    "far.py": (
+        SPHERE % "'center': [1e30, 0, 0]",
+        "expected shapes within 1e.12 world units, got .*1e.30",
+    ),
     "misspelt.py": (
         SPHERE % "'colour': 3",
         "The inserted scene: While loading .*unreferenced property .*colour.*; correct",
     ),
-    "bare.py": ("def build(frame, time):\n    return {}\n", "expected at least one shape, got none"),
+    "bare.py": (
+        "def build(frame, time):\n    return {}\n",
+        "expected at least one shape, got none",
+    ),
     "broken.xml": ("<scene", "broken.xml: "),
 }
 

@@ -50,8 +50,12 @@ def test_light_probe__of_a_uniform_shell_is_uniform():
 def test_light_probe__assigns_a_radiance_to_what_is_clipped():
     white = shell(0.5 / SH_C0)
     directions = np.random.default_rng(2).normal(size=(100, 3))
-    assert_close(radiance(light_probe(white, CENTER, height=32, clipped=8.0), directions), 8.0, atol=0.05)
-    assert_close(radiance(light_probe(white, CENTER, height=32, clipped=1.0), directions), 1.0, atol=0.01)
+    assert_close(
+        radiance(light_probe(white, CENTER, height=32, clipped=8.0), directions), 8.0, atol=0.05
+    )
+    assert_close(
+        radiance(light_probe(white, CENTER, height=32, clipped=1.0), directions), 1.0, atol=0.01
+    )
 
 
 def test_light_probe__leaves_out_what_is_near_and_shows_the_background():

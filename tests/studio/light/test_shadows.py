@@ -20,7 +20,9 @@ BULB = {"type": "point", "position": [0, 2, 0], "intensity": 1.0}
 
 
 def floor(positions: np.ndarray, up: bool = True) -> Gaussians:
-    """Return thin discs at positions (x, z) [M, 2] of the plane y = 0, with either sign of their axis."""
+    """Return thin discs at positions (x, z) [M, 2] of the plane y = 0, with either sign of their
+    axis.
+    """
     n = len(positions)
     means = np.stack([positions[:, 0], np.zeros(n), positions[:, 1]], axis=1)
     quats = np.tile([1.0, 0, 0, 0] if up else [0.0, 1, 0, 0], (n, 1))
@@ -55,9 +57,14 @@ def test_shadow_ratio__of_a_directional_light_is_the_projected_outline():
 
 @pytest.mark.parametrize("up", [True, False])
 def test_shadow_ratio__under_a_disk_in_a_uniform_sky_is_its_form_factor(up):
-    """A disk of radius r at height h above the point takes r^2 / (r^2 + h^2) of the irradiance of the hemisphere."""
+    """A disk of radius r at height h above the point takes r^2 / (r^2 + h^2) of the irradiance of
+    the hemisphere.
+    """
     heights = (0.25, 0.5, 1.0)
-    ratios = [shadow_ratio(floor(np.zeros((1, 2)), up), scene(sky=SKY, disk=disk(h)), EYE, 4096)[0] for h in heights]
+    ratios = [
+        shadow_ratio(floor(np.zeros((1, 2)), up), scene(sky=SKY, disk=disk(h)), EYE, 4096)[0]
+        for h in heights
+    ]
     assert_close(np.array(ratios), 1 - 0.25 / (0.25 + np.square(heights)), atol=6e-3)
 
 
@@ -68,19 +75,31 @@ def test_shadow_ratio__of_a_round_gaussian_is_the_solid_angle():
 
 
 def test_shadow_ratio__weighs_lights_by_their_irradiance():
-    """A point light of intensity 1 at height 2 gives 1/4, the sky pi; the disk hides the light and some sky."""
-    ratios = shadow_ratio(floor(np.zeros((1, 2))), scene(bulb=BULB, sky=SKY, disk=disk(1.0, 0.05)), EYE, 4096)
+    """A point light of intensity 1 at height 2 gives 1/4, the sky pi; the disk hides the light and
+    some sky.
+    """
+    ratios = shadow_ratio(
+        floor(np.zeros((1, 2))), scene(bulb=BULB, sky=SKY, disk=disk(1.0, 0.05)), EYE, 4096
+    )
     sky = np.pi * (1 - 0.0025 / 1.0025)
     assert ratios[0] == pytest.approx(sky / (np.pi + 0.25), abs=2e-3)
 
 
 def test_shadow_ratio__of_an_area_light_is_the_hidden_part_of_it():
-    """A disk at half the height of a small lamp hides that part of it which it covers, seen from the floor."""
+    """A disk at half the height of a small lamp hides that part of it which it covers, seen from
+    the floor.
+    """
     down = mi.ScalarTransform4f().translate([0, 2, 0]).rotate([1, 0, 0], 90).scale([0.1, 0.1, 1])
     lamp = {"type": "rectangle", "to_world": down, "emitter": {"type": "area", "radiance": 1.0}}
-    edge = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([1, 1, 0]).rotate([1, 0, 0], 90)}
+    edge = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().translate([1, 1, 0]).rotate([1, 0, 0], 90),
+    }
     ratios = shadow_ratio(
-        floor(np.array([[0.0, 0], [-0.05, 0], [-1, 0], [1, 0]])), scene(lamp=lamp, edge=edge), EYE, 4096
+        floor(np.array([[0.0, 0], [-0.05, 0], [-1, 0], [1, 0]])),
+        scene(lamp=lamp, edge=edge),
+        EYE,
+        4096,
     )
     # From x, the edge at x = 0 is seen on the lamp at -x.
     assert_close(ratios, np.array([0.5, 0.75, 1, 0]), atol=0.01)
@@ -116,8 +135,14 @@ def test_shadowed__scales_all_directions_alike_and_one_changes_nothing():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda g: shadow_ratio(g, scene(disk=disk(1)), EYE), "expected a scene with an emitter, got none"),
-        (lambda g: shadow_ratio(g, scene(sky=SKY, disk=disk(1)), (0, 0)), r"`viewpoint` must be \[3\]"),
+        (
+            lambda g: shadow_ratio(g, scene(disk=disk(1)), EYE),
+            "expected a scene with an emitter, got none",
+        ),
+        (
+            lambda g: shadow_ratio(g, scene(sky=SKY, disk=disk(1)), (0, 0)),
+            r"`viewpoint` must be \[3\]",
+        ),
         (lambda g: shadow_ratio(g, scene(sky=SKY, disk=disk(1)), EYE, 0), "`samples` must be"),
         (lambda g: shadow_ratio("g", scene(sky=SKY), EYE), "`gaussians` must be"),
         (lambda g: shadowed(g, np.ones(2)), r"`ratio` must be \[N\] with N=1"),

@@ -1,4 +1,6 @@
-"""`splat_path`: closed forms of the shadows, reflections and light of Gaussians, derivatives, and bad input."""
+"""`splat_path`: closed forms of the shadows, reflections and light of Gaussians, derivatives, and
+bad input.
+"""
 
 from __future__ import annotations
 
@@ -36,12 +38,15 @@ WHITE = 0.5 / SH_C0
 BLACK = -0.5 / SH_C0
 
 
-def ratio(gaussians: Gaussians, integrator: dict = TRACED, spp: int = 128, **more: Any) -> np.ndarray:
+def ratio(
+    gaussians: Gaussians, integrator: dict = TRACED, spp: int = 128, **more: Any
+) -> np.ndarray:
     """Return the image of the lit wall with Gaussians beside the view, over that without them."""
     far = isotropic([(0, 0, -90)], 0.1, 0.5)
     shapes = {"wall": wall(1), "sun": SUN}
     light, alone = (
-        render(scene(g, integrator, **shapes, **entries), spp=spp) for g, entries in ((gaussians, more), (far, {}))
+        render(scene(g, integrator, **shapes, **entries), spp=spp)
+        for g, entries in ((gaussians, more), (far, {}))
     )
     return (light / alone)[..., 0]
 
@@ -51,7 +56,9 @@ def points_on_wall() -> np.ndarray:
     view = camera()
     y, x = np.mgrid[: view.height, : view.width] + 0.5
     K = view.K
-    return np.stack([5 * (x - K[0, 2]) / K[0, 0], 5 * (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1)
+    return np.stack(
+        [5 * (x - K[0, 2]) / K[0, 0], 5 * (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1
+    )
 
 
 def distance_to_aside() -> np.ndarray:
@@ -87,7 +94,11 @@ def test_splat_path__shadow_of_a_dense_shell_is_that_of_the_mesh():
     quats = np.stack([1 + z, -y, x, np.zeros_like(x)], axis=1)  # from the z axis to the normal
     black = np.full((3000, 1, 3), BLACK)
     shell = Gaussians.from_activated(
-        ASIDE + 0.6 * directions, np.tile([0.03, 0.03, 1e-3], (3000, 1)), quats, np.full(3000, 0.95), black
+        ASIDE + 0.6 * directions,
+        np.tile([0.03, 0.03, 1e-3], (3000, 1)),
+        quats,
+        np.full(3000, 0.95),
+        black,
     )
     mesh = {"type": "sphere", "center": ASIDE.tolist(), "radius": 0.6}
     shadow = ratio(shell)
@@ -101,10 +112,14 @@ def test_splat_path__shadow_of_a_dense_shell_is_that_of_the_mesh():
 
 
 def test_splat_path__shadow_of_a_point_light_ends_at_the_light():
-    """Gaussians behind the light cast no shadow; one that is cut by the light's position casts half its depth."""
+    """Gaussians behind the light cast no shadow; one that is cut by the light's position casts half
+    its depth.
+    """
     bulb = {"type": "point", "position": ASIDE.tolist(), "intensity": 9.0}
     shapes = {"wall": wall(1), "bulb": bulb}
-    behind, cut, far = (isotropic([place], 0.3, 0.75, BLACK) for place in (ASIDE - 2 * TO_WALL, ASIDE, (0, 0, -90)))
+    behind, cut, far = (
+        isotropic([place], 0.3, 0.75, BLACK) for place in (ASIDE - 2 * TO_WALL, ASIDE, (0, 0, -90))
+    )
     images = [render(scene(gaussians, TRACED, **shapes), spp=1) for gaussians in (behind, cut, far)]
     assert_close(images[0], images[2], atol=1e-5)
     assert_close((images[1] / images[2])[12, 16], 0.5, atol=1e-3)
@@ -128,10 +143,14 @@ def test_splat_path__mirror_shows_the_view_of_the_mirrored_camera(srgb):
     }
     dark = {"type": "constant", "radiance": 0.0}
     props = {"srgb_primitives": srgb}
-    image = render(scene(gaussians, TRACED, view=view, mirror=mirror, dark=dark, props=props), spp=64)
+    image = render(
+        scene(gaussians, TRACED, view=view, mirror=mirror, dark=dark, props=props), spp=64
+    )
     # A pixel averages over a square of variance 1 / 12 px^2 in each direction.
     expected = rasterize(gaussians, mirrored, ("color", "alpha"), config=RenderConfig(eps2d=1 / 12))
-    color, alpha = (np.asarray(value, np.float64)[:, ::-1] for value in (expected.color, expected.alpha))
+    color, alpha = (
+        np.asarray(value, np.float64)[:, ::-1] for value in (expected.color, expected.alpha)
+    )
     layer = alpha * decode_light(color / np.maximum(alpha, 1e-6)) if srgb else color
     assert psnr(image, layer) > 36
 
@@ -148,14 +167,19 @@ def test_splat_path__glass_without_refraction_shows_what_is_behind_it():
 
 def test_splat_path__camera_sees_the_splats_in_front_of_surfaces_as_before():
     """Gaussians between the camera and a glowing wall are blended by the rasteriser alone."""
-    images = [render(scene(cloud(0.0), kind, wall=wall(1, **glowing())), spp=4) for kind in (TRACED, "path")]
+    images = [
+        render(scene(cloud(0.0), kind, wall=wall(1, **glowing())), spp=4)
+        for kind in (TRACED, "path")
+    ]
     assert_close(images[0], images[1], atol=1e-5)
 
 
 def test_splat_path__clipped_colours_are_brighter_than_white():
     """An opaque white shell lights a white ball inside it with the radiance of what was clipped."""
     directions = np.random.default_rng(0).normal(size=(2000, 3))
-    shell = isotropic(6 * directions / np.linalg.norm(directions, axis=1, keepdims=True), 0.5, 0.98, WHITE)
+    shell = isotropic(
+        6 * directions / np.linalg.norm(directions, axis=1, keepdims=True), 0.5, 0.98, WHITE
+    )
     ball = {"type": "sphere", "radius": 0.8, "bsdf": {"type": "conductor", "material": "none"}}
     dark = {"type": "constant", "radiance": 0.0}
     image = render(scene(shell, {**TRACED, "clipped": 3.0}, ball=ball, dark=dark), spp=4)
@@ -166,7 +190,9 @@ def test_splat_path__white_splats_around_a_white_ball_in_white_light_are_a_furna
     white = isotropic(np.random.default_rng(0).uniform(-1.5, 1.5, (80, 3)), 0.15, 0.6, WHITE)
     ball = {"type": "sphere", "radius": 0.8, "bsdf": {"type": "diffuse", "reflectance": 1.0}}
     endless = {**TRACED, "max_depth": -1, "rr_depth": 100}
-    image = render(scene(white, endless, ball=ball, sky={"type": "constant", "radiance": 1.0}), spp=128)
+    image = render(
+        scene(white, endless, ball=ball, sky={"type": "constant", "radiance": 1.0}), spp=128
+    )
     assert image.mean() == pytest.approx(1, abs=1e-3)
     assert_close(image, 1, atol=0.06)
 
@@ -187,7 +213,9 @@ DIFFERENTIATED = {
 def differentiated() -> Any:
     ball = {"type": "sphere", "center": [0.4, 0.3, -0.4], "radius": 0.4}
     ball |= {"bsdf": {"type": "diffuse"}, "emitter": {"type": "area", "radiance": 0.7}}
-    board = wall(0.5, 2, bsdf={"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.3, 0.6, 0.5]}})
+    board = wall(
+        0.5, 2, bsdf={"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.3, 0.6, 0.5]}}
+    )
     sky = {"type": "constant", "radiance": 0.2}
     traced = {**TRACED, "max_depth": 4}
     return scene(cloud(-0.2), traced, wall=board, ball=ball, lamp=LAMP, sky=sky)
@@ -231,7 +259,9 @@ def test_splat_path__gradients_of_gaussians_warn(caplog):
 
 
 def test_splat_path__refuses_scenes_without_a_gaussian_splat_integrator():
-    alone = mi.load_dict({"type": "scene", "integrator": TRACED, "ball": {"type": "sphere"}, "lamp": LAMP})
+    alone = mi.load_dict(
+        {"type": "scene", "integrator": TRACED, "ball": {"type": "sphere"}, "lamp": LAMP}
+    )
     with pytest.raises(ValueError, match="splat_path: expected Gaussians, got none"):
         alone.integrator().render(alone, mi.load_dict(camera().sensor()))
 

@@ -1,4 +1,6 @@
-"""Images of cameras that are read side by side: the newest ones that agree best in time, and what faults do."""
+"""Images of cameras that are read side by side: the newest ones that agree best in time, and what
+faults do.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ IMAGE = np.zeros((4, 6, 3), np.uint8)
 
 
 class Source:
-    """A camera that delivers an image whenever the test requests it; None ends it, an error is raised."""
+    """A camera that delivers an image whenever the test requests it; None ends it, an error is
+    raised.
+    """
 
     def __init__(self, shots: int = 0) -> None:
         self._images: SimpleQueue = SimpleQueue()
@@ -44,7 +48,9 @@ def opened():
 
     def open_feed(*shots: int, timeout: float = 0.3) -> tuple[CameraFeed, list[Source]]:
         sources = [Source(count) for count in shots]
-        feeds.append((CameraFeed({f"cam{k}": source for k, source in enumerate(sources)}, timeout), sources))
+        feeds.append(
+            (CameraFeed({f"cam{k}": source for k, source in enumerate(sources)}, timeout), sources)
+        )
         return feeds[-1]
 
     yield open_feed
@@ -89,7 +95,9 @@ def test_CameraFeed__skips_what_arrived_during_a_fit(opened) -> None:
         source.deliver(count)
     wait_for(feed, 8, 10)
     second = feed.newest(first)
-    assert all(last - 4 < number <= last for number, last in zip(second.numbers, (7, 9), strict=True))
+    assert all(
+        last - 4 < number <= last for number, last in zip(second.numbers, (7, 9), strict=True)
+    )
     assert max(second.numbers[0] - 7, second.numbers[1] - 9) == 0, "the newest of one camera"
     assert second.dropped == min(second.numbers) - 1, "of the camera that dropped fewer"
     assert second.time >= first.time
@@ -139,7 +147,9 @@ def test_CameraFeed__leaves_out_a_camera_that_ends_at_once_and_ends_with_the_las
 
 def test_CameraFeed__names_a_camera_without_a_first_image(opened) -> None:
     feed, (_, b) = opened(1, 0)
-    with pytest.raises(ValueError, match=r"images of cam1, got none \(it is silent\); .* longer than 0.3 s"):
+    with pytest.raises(
+        ValueError, match=r"images of cam1, got none \(it is silent\); .* longer than 0.3 s"
+    ):
         feed.newest()
     b.end()
     with pytest.raises(ValueError, match=r"images of cam1, got none \(it has ended\)"):
@@ -178,5 +188,7 @@ def test_CameraFeed__refuses_images_of_different_times(opened) -> None:
     feed, (a, b) = opened(1, 0, timeout=0.7)
     a.end()
     Timer(0.6, b.deliver).start()
-    with pytest.raises(ValueError, match=r"simultaneous images of cam0, cam1, got none that arrived within 0.5 s"):
+    with pytest.raises(
+        ValueError, match=r"simultaneous images of cam0, cam1, got none that arrived within 0.5 s"
+    ):
         feed.newest()

@@ -1,4 +1,6 @@
-"""Live fits of a clip that is played at real speed: frames are dropped, and the stream shows those that are not."""
+"""Live fits of a clip that is played at real speed: frames are dropped, and the stream shows those
+that are not.
+"""
 
 from __future__ import annotations
 
@@ -61,7 +63,9 @@ def test_fit_live__follows_a_folder_that_is_filled(tmp_path: Path, rig: Path, im
     grown = []
     with in_background(filling(images)):
         live = LiveConfig(rig, downscale=4, frames=4)
-        rows = fit_live([images], out, live, CONFIG, lambda *_: grown.append(open_stream(out).index()[-1][1]))
+        rows = fit_live(
+            [images], out, live, CONFIG, lambda *_: grown.append(open_stream(out).index()[-1][1])
+        )
     assert grown == [0, 1, 2, 3], "the stream can be read while it grows"
     assert [row.frame for row in rows] == [0, 1, 2, 3]
     for previous_row, row in pairwise(rows):
@@ -87,10 +91,15 @@ def test_fit_live__follows_a_folder_that_is_filled(tmp_path: Path, rig: Path, im
 
 
 def counts_what_is_dropped(dropped: list[int], recorded: list[Any], clip: list[np.ndarray]) -> bool:
-    """Return whether recorded images are a looped clip's, from any frame on, without the dropped ones."""
+    """Return whether recorded images are a looped clip's, from any frame on, without the dropped
+    ones.
+    """
     numbers = np.cumsum([0, *(count + 1 for count in dropped[1:])])
     return any(
-        all(np.array_equal(image, clip[(begin + n) % len(clip)]) for n, image in zip(numbers, recorded, strict=True))
+        all(
+            np.array_equal(image, clip[(begin + n) % len(clip)])
+            for n, image in zip(numbers, recorded, strict=True)
+        )
         for begin in range(len(clip))
     )
 
@@ -119,7 +128,9 @@ def test_fit_live__reads_videos_through_pipes(tmp_path: Path, rig: Path) -> None
     assert evaluate_stream(tmp_path / "out").num_frames == 4
 
 
-def write(images: Path, number: int, names: Sequence[str] = NAMES, **sizes: tuple[int, int]) -> None:
+def write(
+    images: Path, number: int, names: Sequence[str] = NAMES, **sizes: tuple[int, int]
+) -> None:
     """Write an image of each camera, at the sizes that are given and otherwise the recorded one."""
     for name, clip in zip(NAMES, clips(), strict=True):
         if name in names:
@@ -129,11 +140,19 @@ def write(images: Path, number: int, names: Sequence[str] = NAMES, **sizes: tupl
 
 
 @pytest.mark.slow
-def test_fit_live__leaves_out_a_camera_that_stops(tmp_path: Path, rig: Path, images: Path, caplog) -> None:
+def test_fit_live__leaves_out_a_camera_that_stops(
+    tmp_path: Path, rig: Path, images: Path, caplog
+) -> None:
     write(images, 0)
     live = LiveConfig(rig, downscale=4, frames=3, timeout=0.5)
     others = ("cam0", "cam2", "cam3")
-    rows = fit_live([images], tmp_path / "out", live, CONFIG, lambda row, _: write(images, row.frame + 1, names=others))
+    rows = fit_live(
+        [images],
+        tmp_path / "out",
+        live,
+        CONFIG,
+        lambda row, _: write(images, row.frame + 1, names=others),
+    )
     assert [bool(row.problems) for row in rows] == [False, True, True]
     assert [record.message for record in caplog.records if "left out" in record.message] == [
         f"frame 1: cam1 is left out: no complete image in {images / 'cam1'} for 0.5 s"
@@ -143,18 +162,29 @@ def test_fit_live__leaves_out_a_camera_that_stops(tmp_path: Path, rig: Path, ima
 
 
 @pytest.mark.slow
-def test_fit_live__needs_no_images_of_a_camera_that_is_left_out(tmp_path: Path, rig: Path, images: Path) -> None:
+def test_fit_live__needs_no_images_of_a_camera_that_is_left_out(
+    tmp_path: Path, rig: Path, images: Path
+) -> None:
     with in_background(filling(images)):
-        fit_live([images], tmp_path / "out", LiveConfig(rig, without=("cam1",), downscale=4, frames=1), CONFIG)
+        fit_live(
+            [images],
+            tmp_path / "out",
+            LiveConfig(rig, without=("cam1",), downscale=4, frames=1),
+            CONFIG,
+        )
     assert load_capture(tmp_path / "out" / "capture").names == ("cam0", "cam2", "cam3")
     assert not (tmp_path / "out" / "capture" / "cam1").exists()
 
 
 @pytest.mark.slow
-def test_fit_live__leaves_out_images_of_another_size(tmp_path: Path, rig: Path, images: Path) -> None:
+def test_fit_live__leaves_out_images_of_another_size(
+    tmp_path: Path, rig: Path, images: Path
+) -> None:
     write(images, 0)
     live = LiveConfig(rig, downscale=4, frames=2, timeout=5)
-    _, row = fit_live([images], tmp_path / "out", live, CONFIG, lambda *_: write(images, 1, cam2=(100, 75)))
+    _, row = fit_live(
+        [images], tmp_path / "out", live, CONFIG, lambda *_: write(images, 1, cam2=(100, 75))
+    )
     assert row.problems == ("cam2: expected an image of 200x150, got 100x75",)
     assert not (tmp_path / "out" / "capture" / "cam2" / "0001.png").exists()
 
@@ -171,7 +201,9 @@ def test_fit_live__calibrates_the_cameras_once(tmp_path: Path, images: Path) -> 
 
 
 @pytest.mark.slow
-def test_fit_live__ends_with_a_whole_stream_when_it_is_interrupted(tmp_path: Path, rig: Path, images: Path) -> None:
+def test_fit_live__ends_with_a_whole_stream_when_it_is_interrupted(
+    tmp_path: Path, rig: Path, images: Path
+) -> None:
     def interrupt(row, report) -> None:
         if row.frame == 1:
             raise KeyboardInterrupt
@@ -187,7 +219,13 @@ def test_fit_live__ends_with_a_whole_stream_when_it_is_interrupted(tmp_path: Pat
                 raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            fit_live([images], tmp_path / "first", LiveConfig(rig, downscale=2), CONFIG, on_stage=interrupt_first)
+            fit_live(
+                [images],
+                tmp_path / "first",
+                LiveConfig(rig, downscale=2),
+                CONFIG,
+                on_stage=interrupt_first,
+            )
 
 
 @pytest.mark.slow
@@ -196,7 +234,11 @@ def test_fit_live__ends_with_a_reason(tmp_path: Path, rig: Path, images: Path, c
     write(images, 0)
     live = LiveConfig(rig, downscale=4, timeout=0.2)
     assert len(fit_live([images], tmp_path / "out", live, CONFIG)) == 1
-    (message,) = (record.message for record in caplog.records if record.name == "morgs_mi.studio.live.fit_live")
+    (message,) = (
+        record.message
+        for record in caplog.records
+        if record.name == "morgs_mi.studio.live.fit_live"
+    )
     assert message == f"the fit ends after frame 0: no complete new images in {images} for 0.2 s"
     with pytest.raises(FileNotFoundError, match="but the folder was removed") as failed:
         fit_live([images], tmp_path / "gone", live, CONFIG, lambda *_: shutil.rmtree(images))
@@ -222,17 +264,39 @@ def other_names(images: Path) -> None:
 FAULTS = [
     (lambda images: None, [], "`camera` must have a source per camera, or a folder, got none"),
     (lambda images: None, ["a", "a"], r"must have different sources, got 2 \(a, a\)"),
-    (lambda images: None, ["images", "b"], "must be one folder with the images of all cameras, or one source per"),
-    (lambda images: None, [61, 62], r"each of the 4 calibrated cameras \(cam0, cam1, cam2, cam3\), got 2 \(61, 62\)"),
+    (
+        lambda images: None,
+        ["images", "b"],
+        "must be one folder with the images of all cameras, or one source per",
+    ),
+    (
+        lambda images: None,
+        [61, 62],
+        r"each of the 4 calibrated cameras \(cam0, cam1, cam2, cam3\), got 2 \(61, 62\)",
+    ),
     (lambda images: None, [60, 61, 62, 63], "cannot open the source 6.; check that it exists"),
-    (lambda images: None, ["images"], "expected images of cam0, cam1, cam2, cam3 .* found folders called nothing"),
-    (other_size, ["images"], "expected 200x150, the calibrated size of cam2, or a scaled version of it, got 90x90"),
-    (other_names, ["images"], "expected images of cam0, .* found folders called cam0, cam1, cam2, camera3"),
+    (
+        lambda images: None,
+        ["images"],
+        "expected images of cam0, cam1, cam2, cam3 .* found folders called nothing",
+    ),
+    (
+        other_size,
+        ["images"],
+        "expected 200x150, the calibrated size of cam2, or a scaled version of it, got 90x90",
+    ),
+    (
+        other_names,
+        ["images"],
+        "expected images of cam0, .* found folders called cam0, cam1, cam2, camera3",
+    ),
 ]
 
 
 @pytest.mark.parametrize(("spoil", "sources", "message"), FAULTS)
-def test_fit_live__names_what_is_wrong(tmp_path: Path, rig: Path, images: Path, spoil, sources, message: str) -> None:
+def test_fit_live__names_what_is_wrong(
+    tmp_path: Path, rig: Path, images: Path, spoil, sources, message: str
+) -> None:
     spoil(images)
     sources = [images if source == "images" else source for source in sources]
     with pytest.raises((ValueError, OSError), match=message):
@@ -240,25 +304,38 @@ def test_fit_live__names_what_is_wrong(tmp_path: Path, rig: Path, images: Path, 
     assert not (tmp_path / "out").exists()
 
 
-def test_fit_live__refuses_an_output_among_the_images(tmp_path: Path, rig: Path, images: Path) -> None:
+def test_fit_live__refuses_an_output_among_the_images(
+    tmp_path: Path, rig: Path, images: Path
+) -> None:
     write(images, 0)
     for out in (images, images / "out", images / "cam0" / "out"):
-        with pytest.raises(ValueError, match=f"expected a folder outside of {images}, into which another program"):
+        with pytest.raises(
+            ValueError, match=f"expected a folder outside of {images}, into which another program"
+        ):
             fit_live([images], out, LiveConfig(rig, timeout=0.2), CONFIG)
     assert sorted(file.name for file in images.iterdir()) == list(NAMES)
 
 
 def test_fit_live__keeps_images_that_cannot_be_calibrated(tmp_path: Path, images: Path) -> None:
     other_size(images)
-    with pytest.raises(ValueError, match="expected at least 100 features in every view, got 0 in cam") as failed:
+    with pytest.raises(
+        ValueError, match="expected at least 100 features in every view, got 0 in cam"
+    ) as failed:
         fit_live([images], tmp_path / "out", LiveConfig(timeout=0.2), CONFIG)
-    assert f"The images are in {tmp_path / 'out' / 'capture'}: calibrate them with" in failed.value.__notes__[0]
+    assert (
+        f"The images are in {tmp_path / 'out' / 'capture'}: calibrate them with"
+        in failed.value.__notes__[0]
+    )
     assert (tmp_path / "out" / "capture" / "cam0" / "0000.png").exists()
 
 
-def test_fit_live__can_be_started_again_after_a_full_disk(tmp_path: Path, rig: Path, images: Path) -> None:
+def test_fit_live__can_be_started_again_after_a_full_disk(
+    tmp_path: Path, rig: Path, images: Path
+) -> None:
     write(images, 0)
-    largest, least = (end(file.stat().st_size for file in images.rglob("*.png")) for end in (max, min))
+    largest, least = (
+        end(file.stat().st_size for file in images.rglob("*.png")) for end in (max, min)
+    )
     assert (rig / "sparse" / "0" / "points3D.txt").stat().st_size > largest
     live = LiveConfig(rig, timeout=0.2)
     full = "check that its folder is writable and the disk has room"
@@ -268,19 +345,29 @@ def test_fit_live__can_be_started_again_after_a_full_disk(tmp_path: Path, rig: P
         assert not (tmp_path / "out").exists()
 
 
-def test_fit_live__does_not_replace_an_earlier_capture(tmp_path: Path, rig: Path, images: Path) -> None:
+def test_fit_live__does_not_replace_an_earlier_capture(
+    tmp_path: Path, rig: Path, images: Path
+) -> None:
     (tmp_path / "out" / "capture").mkdir(parents=True)
     with pytest.raises(FileExistsError, match="got that of an earlier fit; choose another folder"):
         fit_live([images], tmp_path / "out", LiveConfig(rig), CONFIG)
-    with pytest.raises(FileNotFoundError, match="expected a calibrated capture of the cameras, found none"):
+    with pytest.raises(
+        FileNotFoundError, match="expected a calibrated capture of the cameras, found none"
+    ):
         fit_live([images], tmp_path / "new", LiveConfig(tmp_path / "nowhere"), CONFIG)
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"without": ("cam0",)}, r"`without` must name cameras of a calibration, got cam0 and no calibration"),
-        ({"calibration": Path("RIG"), "without": ("cam7",)}, "`without` must name cameras of cam0, cam1, .*, got cam7"),
+        (
+            {"without": ("cam0",)},
+            r"`without` must name cameras of a calibration, got cam0 and no calibration",
+        ),
+        (
+            {"calibration": Path("RIG"), "without": ("cam7",)},
+            "`without` must name cameras of cam0, cam1, .*, got cam7",
+        ),
         ({"downscale": 0.5}, "`downscale` must be at least 1, got 0.5"),
         ({"frames": 0}, "`frames` must be at least 1, got 0"),
         ({"seconds": 0.0}, "`seconds` must be above 0, got 0.0"),

@@ -41,7 +41,9 @@ def test_FolderFeed__reads_the_newest_number_that_is_complete(tmp_path: Path, su
     assert first is not None
     assert feed.names == ("cam2", "cam10")
     assert first.numbers == (3, 3)
-    assert all(np.abs(image.astype(int) - 3).max() <= 1 for image in first.images if image is not None)
+    assert all(
+        np.abs(image.astype(int) - 3).max() <= 1 for image in first.images if image is not None
+    )
     assert (first.skew, first.dropped) == (0, 0)
     fill(tmp_path, range(4, 9), "cam2", "cam10", suffix=suffix)
     second = feed.newest(first)
@@ -52,7 +54,9 @@ def test_FolderFeed__reads_the_newest_number_that_is_complete(tmp_path: Path, su
 
 
 def test_FolderFeed__begins_when_all_cameras_do(tmp_path: Path) -> None:
-    """The folders count at the time of the second number: the first images' folders are made one after the other."""
+    """The folders count at the time of the second number: the first images' folders are made one
+    after the other.
+    """
     feed = FolderFeed(fill(tmp_path, range(1), "a", "b"), 5)
     timer = Timer(0.2, fill, (tmp_path, range(2), "a", "b", "c"))
     timer.start()
@@ -108,7 +112,9 @@ def test_FolderFeed__leaves_out_a_camera_that_stops_until_it_is_back(tmp_path: P
     assert feed.newest(fourth) is None
 
 
-def test_FolderFeed__leaves_out_a_camera_that_stopped_long_before_the_others(tmp_path: Path) -> None:
+def test_FolderFeed__leaves_out_a_camera_that_stopped_long_before_the_others(
+    tmp_path: Path,
+) -> None:
     """During a fit: its last images have numbers that the others have, too."""
     feed = FolderFeed(fill(tmp_path, range(1), "a", "b"), 0.2, ["a", "b"])
     first = feed.newest()
@@ -116,7 +122,9 @@ def test_FolderFeed__leaves_out_a_camera_that_stopped_long_before_the_others(tmp
     fill(tmp_path, range(1, 3), "b")
     for number in range(1, 3):
         for name in ("a", "b"):
-            os.utime(tmp_path / name / f"{number:04d}.png", times=(time.time() - 60, time.time() - 60))
+            os.utime(
+                tmp_path / name / f"{number:04d}.png", times=(time.time() - 60, time.time() - 60)
+            )
     second = feed.newest(first)
     assert second is not None
     assert second.numbers == (8, 8)
@@ -153,7 +161,9 @@ def test_FolderFeed__goes_on_after_a_number_far_ahead(tmp_path: Path, short_paus
     assert time.monotonic() - start < 0.15, "without a pause"
 
 
-def test_FolderFeed__goes_on_when_numbers_begin_again(tmp_path: Path, short_pause: None, caplog) -> None:
+def test_FolderFeed__goes_on_when_numbers_begin_again(
+    tmp_path: Path, short_pause: None, caplog
+) -> None:
     """In place of the first images, and in a folder that was cleared."""
     feed = FolderFeed(fill(tmp_path, range(9), "a", "b"), 2, ["a", "b"])
     bundle = feed.newest()
@@ -172,11 +182,15 @@ def test_FolderFeed__goes_on_when_numbers_begin_again(tmp_path: Path, short_paus
     assert bundle is not None
     assert bundle.numbers == (3, 3)
     assert bundle.dropped == 1
-    assert [record.message for record in caplog.records] == [f"{tmp_path}: the numbers go on with 2 after 8"]
+    assert [record.message for record in caplog.records] == [
+        f"{tmp_path}: the numbers go on with 2 after 8"
+    ]
 
 
 def test_FolderFeed__reads_no_image_twice(tmp_path: Path, short_pause: None) -> None:
-    """Of a disk with another clock, and of a program that writes the images of a moment in any order."""
+    """Of a disk with another clock, and of a program that writes the images of a moment in any
+    order.
+    """
     ahead = time.time() + 3600
     feed = FolderFeed(fill(tmp_path, range(3), "a", "b"), 0.7, ["a", "b"])
     for file in tmp_path.rglob("*.png"):
@@ -196,25 +210,38 @@ def test_FolderFeed__that_is_removed_is_an_error(tmp_path: Path) -> None:
     first = feed.newest()
     shutil.rmtree(tmp_path / "images")
     for bundle in (first, None):
-        with pytest.raises(FileNotFoundError, match="images: expected the images of the cameras, but the folder was"):
+        with pytest.raises(
+            FileNotFoundError,
+            match="images: expected the images of the cameras, but the folder was",
+        ):
             feed.newest(bundle)
 
 
 def test_FolderFeed__begins_with_the_only_number(tmp_path: Path, caplog) -> None:
-    """Without given cameras, when no second number has come in time; a folder without images is named."""
+    """Without given cameras, when no second number has come in time; a folder without images is
+    named.
+    """
     fill(tmp_path, range(1), "a", "b")
     (tmp_path / "c").mkdir()
     feed = FolderFeed(tmp_path, 0.2)
     first = feed.newest()
     assert first is not None
     assert feed.names == ("a", "b")
-    assert [record.message for record in caplog.records] == [f"c is left out: no image in {tmp_path}"]
+    assert [record.message for record in caplog.records] == [
+        f"c is left out: no image in {tmp_path}"
+    ]
 
 
 LACKS = [
     (lambda _: None, "found folders called nothing, but no image of a, b; check the path"),
-    (lambda folder: fill(folder, range(3), "left", "b"), "found folders called b, left, but no image of a; check"),
-    (lambda folder: (fill(folder, range(3), "b"), (folder / "a").mkdir()), "called a, b, but no image of a; check"),
+    (
+        lambda folder: fill(folder, range(3), "left", "b"),
+        "found folders called b, left, but no image of a; check",
+    ),
+    (
+        lambda folder: (fill(folder, range(3), "b"), (folder / "a").mkdir()),
+        "called a, b, but no image of a; check",
+    ),
     (
         lambda folder: (fill(folder, range(3), "a"), fill(folder, range(5, 9), "b")),
         "found folders called a, b, with 0 to 2 of a, 5 to 8 of b; check",
@@ -227,18 +254,25 @@ LACKS = [
 
 
 @pytest.mark.parametrize(("write_images", "message"), LACKS)
-def test_FolderFeed__names_the_camera_that_lacks_images(tmp_path: Path, write_images, message: str) -> None:
+def test_FolderFeed__names_the_camera_that_lacks_images(
+    tmp_path: Path, write_images, message: str
+) -> None:
     write_images(tmp_path)
     with pytest.raises(
-        ValueError, match=f"images of a, b that have the same number, such as CAM/0000.png, .*{message}"
+        ValueError,
+        match=f"images of a, b that have the same number, such as CAM/0000.png, .*{message}",
     ):
         FolderFeed(tmp_path, 0.1, ["a", "b"]).newest()
 
 
 def test_FolderFeed__names_what_it_lacks(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match="expected a folder with the images of the cameras, found none"):
+    with pytest.raises(
+        FileNotFoundError, match="expected a folder with the images of the cameras, found none"
+    ):
         FolderFeed(tmp_path / "nowhere", 1)
-    with pytest.raises(ValueError, match=r"images of the cameras that have .* found folders called nothing; check"):
+    with pytest.raises(
+        ValueError, match=r"images of the cameras that have .* found folders called nothing; check"
+    ):
         FolderFeed(tmp_path, 0.1).newest()
 
 
@@ -255,7 +289,9 @@ CLOCKS = [{"a": -300, "b": -300}, {"a": 300, "b": 300}, {"a": -300, "b": 0}, {"a
 
 
 @pytest.mark.parametrize("clocks", CLOCKS)
-def test_FolderFeed__has_times_of_this_machine_whatever_the_clocks_of_the_files(tmp_path: Path, clocks) -> None:
+def test_FolderFeed__has_times_of_this_machine_whatever_the_clocks_of_the_files(
+    tmp_path: Path, clocks
+) -> None:
     start = time.monotonic()
     feed = FolderFeed(fill(tmp_path, range(2), "a", "b"), 2, ["a", "b"])
     stamp(tmp_path, **clocks)
@@ -275,7 +311,9 @@ def test_FolderFeed__has_times_of_this_machine_whatever_the_clocks_of_the_files(
     assert bundle.time == pytest.approx(written, abs=0.25)
 
 
-def test_FolderFeed__has_no_times_before_the_last_bundle_if_a_clock_is_set_back(tmp_path: Path) -> None:
+def test_FolderFeed__has_no_times_before_the_last_bundle_if_a_clock_is_set_back(
+    tmp_path: Path,
+) -> None:
     feed = FolderFeed(fill(tmp_path, range(2), "a", "b"), 2, ["a", "b"])
     first = feed.newest()
     assert first is not None
@@ -286,14 +324,18 @@ def test_FolderFeed__has_no_times_before_the_last_bundle_if_a_clock_is_set_back(
     assert first.time <= second.time <= time.monotonic()
 
 
-def test_FolderFeed__has_the_time_at_which_it_finds_images_that_were_copied_with_old_times(tmp_path: Path) -> None:
+def test_FolderFeed__has_the_time_at_which_it_finds_images_that_were_copied_with_old_times(
+    tmp_path: Path,
+) -> None:
     feed = FolderFeed(fill(tmp_path, range(1), "a", "b"), 2, ["a", "b"])
 
     def copy(number: int) -> None:
         fill(tmp_path / "other", range(number, number + 1), "a", "b")
         for name in ("a", "b"):
             os.utime(tmp_path / "other" / name / f"{number:04d}.png", times=(1e9, 1e9))
-            (tmp_path / "other" / name / f"{number:04d}.png").rename(tmp_path / name / f"{number:04d}.png")
+            (tmp_path / "other" / name / f"{number:04d}.png").rename(
+                tmp_path / name / f"{number:04d}.png"
+            )
 
     copy(0)
     first = feed.newest()
@@ -305,7 +347,9 @@ def test_FolderFeed__has_the_time_at_which_it_finds_images_that_were_copied_with
 
 
 @pytest.mark.parametrize("clocks", CLOCKS)
-def test_FolderFeed__goes_on_when_numbers_begin_again_whatever_the_clocks(tmp_path: Path, short_pause, clocks) -> None:
+def test_FolderFeed__goes_on_when_numbers_begin_again_whatever_the_clocks(
+    tmp_path: Path, short_pause, clocks
+) -> None:
     feed = FolderFeed(fill(tmp_path, range(9), "a", "b"), 2, ["a", "b"])
     stamp(tmp_path, **clocks)
     first = feed.newest()

@@ -1,4 +1,6 @@
-"""Live sources: iterators, pipes and anything that FFmpeg opens, processed like the rig's clips, in a loop."""
+"""Live sources: iterators, pipes and anything that FFmpeg opens, processed like the rig's clips, in
+a loop.
+"""
 
 from __future__ import annotations
 
@@ -45,11 +47,15 @@ def assert_as_recorded(rig: Capture, frames) -> None:
             np.testing.assert_array_equal(a, b)
 
 
-def test_live_frames__process_iterators_pipes_and_files_like_clips(rig: Capture, tmp_path: Path) -> None:
+def test_live_frames__process_iterators_pipes_and_files_like_clips(
+    rig: Capture, tmp_path: Path
+) -> None:
     np.array(clip()).tofile(tmp_path / "raw")
     program = f"import sys; sys.stdout.buffer.write(open({str(tmp_path / 'raw')!r}, 'rb').read())"
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) as process:
-        assert_as_recorded(rig, live_frames(rig, [iter(clip()), process.stdout, rig.path / "cam3.mkv"]))
+        assert_as_recorded(
+            rig, live_frames(rig, [iter(clip()), process.stdout, rig.path / "cam3.mkv"])
+        )
 
 
 def test_live_frames__read_a_named_pipe_while_it_is_written(rig: Capture, tmp_path: Path) -> None:
@@ -64,7 +70,11 @@ def test_live_frames__read_a_named_pipe_while_it_is_written(rig: Capture, tmp_pa
 def test_live_frames__leave_out_a_source_that_misses_an_instant_or_ends(rig: Capture) -> None:
     a, b, c = clip()
     frames = list(live_frames(rig, [[a, None, c], [a, b], clip()]))
-    assert [[image is not None for image in frame.images] for frame in frames] == [[1, 1, 1], [0, 1, 1], [1, 0, 1]]
+    assert [[image is not None for image in frame.images] for frame in frames] == [
+        [1, 1, 1],
+        [0, 1, 1],
+        [1, 0, 1],
+    ]
     assert [frame.problems for frame in frames] == [(), ("cam1: no image",), ("cam2: no image",)]
 
 
@@ -79,10 +89,22 @@ def test_live_frames__read_an_endless_source(rig: Capture) -> None:
 @pytest.mark.parametrize(
     ("sources", "error", "message"),
     [
-        ([[]], ValueError, r"`sources` must be one for each of 3 cameras \(cam1, cam2, cam3\), got 1"),
-        ([63, [], []], OSError, "cannot open the source 63; check that it exists and is not in use"),
+        (
+            [[]],
+            ValueError,
+            r"`sources` must be one for each of 3 cameras \(cam1, cam2, cam3\), got 1",
+        ),
+        (
+            [63, [], []],
+            OSError,
+            "cannot open the source 63; check that it exists and is not in use",
+        ),
         ([[], [], "/nowhere/cam.sdp"], OSError, "cannot open the source /nowhere/cam.sdp"),
-        ([[np.zeros((8, 8, 3), np.uint8)], [], []], ValueError, r"of cam1 must be uint8 \[46, 62, 3\] as in its clip"),
+        (
+            [[np.zeros((8, 8, 3), np.uint8)], [], []],
+            ValueError,
+            r"of cam1 must be uint8 \[46, 62, 3\] as in its clip",
+        ),
     ],
 )
 def test_live_frames__refuse_bad_sources(rig: Capture, sources, error, message: str) -> None:
@@ -101,7 +123,9 @@ def test_live_page__loop_runs(rig: Capture, monkeypatch: pytest.MonkeyPatch) -> 
         assert command[0] == "ffmpeg"
         read, write = os.pipe()
         next(reads)
-        threading.Thread(target=lambda: os.fdopen(write, "wb").write(np.array(clip()).tobytes()), daemon=True).start()
+        threading.Thread(
+            target=lambda: os.fdopen(write, "wb").write(np.array(clip()).tobytes()), daemon=True
+        ).start()
         return type("Process", (), {"stdout": os.fdopen(read, "rb")})
 
     class Loop:
@@ -110,7 +134,9 @@ def test_live_page__loop_runs(rig: Capture, monkeypatch: pytest.MonkeyPatch) -> 
 
         def push(self, images):
             pushed.append(images)
-            return None, type("Report", (), {"frame": len(pushed) - 1, "missing_views": (), "seconds": 0.0})
+            return None, type(
+                "Report", (), {"frame": len(pushed) - 1, "missing_views": (), "seconds": 0.0}
+            )
 
     monkeypatch.setattr("subprocess.Popen", popen)
     monkeypatch.setattr("morgs_mi.StreamLoop", Loop)

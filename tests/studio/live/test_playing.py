@@ -51,10 +51,16 @@ def test_play__plays_a_clip_once_at_its_own_speed(tmp_path: Path) -> None:
 
 
 def test_play__repeats_clips_together_after_the_shortest(tmp_path: Path) -> None:
-    a, b, c = played([clip(tmp_path / f"{n}.mkv", n, fps) for n, fps in ((6, 50), (9, 50), (5, 25))], 20, loop=True)
+    a, b, c = played(
+        [clip(tmp_path / f"{n}.mkv", n, fps) for n, fps in ((6, 50), (9, 50), (5, 25))],
+        20,
+        loop=True,
+    )
     assert [number for _, number in a] == [*range(6)] * 3 + [0, 1]
     assert [number for _, number in b] == [number for _, number in a], "without its last three"
-    assert [number for _, number in c] == [0, 1, 2] * 6 + [0, 1], "at half the rate, without its last two"
+    assert [number for _, number in c] == [0, 1, 2] * 6 + [0, 1], (
+        "at half the rate, without its last two"
+    )
     starts = [np.array([time for time, number in rows if number == 0][:4]) for rows in (a, b, c)]
     # The median, because a busy machine may show one image late.
     assert np.median(np.abs(starts - starts[0]), axis=1).max() < 0.019, "within an interval"
@@ -91,7 +97,9 @@ def test_play__ends_when_it_is_closed(tmp_path: Path) -> None:
     """Also while it waits for another clip, which has not begun."""
     closed = Event()
     reader = Thread(
-        target=list, args=(play(clip(tmp_path / "a.mkv", 3), ClipClock(2), closed, loop=True),), daemon=True
+        target=list,
+        args=(play(clip(tmp_path / "a.mkv", 3), ClipClock(2), closed, loop=True),),
+        daemon=True,
     )
     reader.start()
     time.sleep(0.2)
@@ -113,20 +121,29 @@ def test_play__refuses_what_has_no_image(tmp_path: Path, monkeypatch: pytest.Mon
 def test_is_video__is_not_the_description_of_a_stream(tmp_path: Path) -> None:
     for name in ("clip.mp4", "cam.sdp"):
         (tmp_path / name).touch()
-    sources = (tmp_path / "clip.mp4", str(tmp_path / "cam.sdp"), tmp_path, tmp_path / "nowhere.mp4", 0)
+    sources = (
+        tmp_path / "clip.mp4",
+        str(tmp_path / "cam.sdp"),
+        tmp_path,
+        tmp_path / "nowhere.mp4",
+        0,
+    )
     assert [is_video(source) for source in sources] == [True, False, False, False, False]
 
 
 def test_open_feed__repeats_videos_alone() -> None:
     with pytest.raises(
-        ValueError, match=r"`loop` repeats videos, got none in 2 \(0, rtsp://10.0.0.10/live\); leave it"
+        ValueError,
+        match=r"`loop` repeats videos, got none in 2 \(0, rtsp://10.0.0.10/live\); leave it",
     ):
         open_feed([0, "rtsp://10.0.0.10/live"], LiveConfig(loop=True))
 
 
 @pytest.mark.parametrize("loop", [False, True])
 def test_open_feed__of_videos_begins_with_their_first_images(tmp_path: Path, loop: bool) -> None:
-    feed = open_feed([clip(tmp_path / f"{k}.mkv", 10) for k in range(2)], LiveConfig(timeout=1, loop=loop))
+    feed = open_feed(
+        [clip(tmp_path / f"{k}.mkv", 10) for k in range(2)], LiveConfig(timeout=1, loop=loop)
+    )
     try:
         bundle = first = feed.newest()
         assert first is not None

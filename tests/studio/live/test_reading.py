@@ -70,7 +70,9 @@ def test_read_camera__opens_a_broken_connection_again(monkeypatch: pytest.Monkey
     assert list(closing) == []
 
 
-def test_read_camera__requests_the_size_of_a_camera_of_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_read_camera__requests_the_size_of_a_camera_of_this_machine(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     requested = {}
 
     class Camera:
@@ -93,7 +95,11 @@ def test_read_camera__requests_the_size_of_a_camera_of_this_machine(monkeypatch:
     assert image[0, 0].tolist() == [3, 2, 1], "RGB"
     assert isinstance(images, Generator)
     images.close()
-    assert requested == {cv2.CAP_PROP_FRAME_WIDTH: 640, cv2.CAP_PROP_FRAME_HEIGHT: 480, "released": True}
+    assert requested == {
+        cv2.CAP_PROP_FRAME_WIDTH: 640,
+        cv2.CAP_PROP_FRAME_HEIGHT: 480,
+        "released": True,
+    }
 
 
 @pytest.fixture
@@ -104,9 +110,15 @@ def pipe(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("written", [0, 2000, 40_000])
-def test_read_camera__of_a_silent_pipe_ends_when_it_is_closed(pipe: Path, tmp_path: Path, written: int) -> None:
+def test_read_camera__of_a_silent_pipe_ends_when_it_is_closed(
+    pipe: Path, tmp_path: Path, written: int
+) -> None:
     """Before its writer begins, within the header, and after some images."""
-    write_video(tmp_path / "clip.mkv", list(np.random.default_rng(0).integers(0, 256, (9, 64, 64, 3), np.uint8)), 20)
+    write_video(
+        tmp_path / "clip.mkv",
+        list(np.random.default_rng(0).integers(0, 256, (9, 64, 64, 3), np.uint8)),
+        20,
+    )
     closed = Event()
     images = []
     reader = Thread(target=lambda: images.extend(read_camera(pipe, closed)), daemon=True)
@@ -137,7 +149,9 @@ def test_read_camera__of_a_pipe_with_something_else_ends_with_an_error(pipe: Pat
 
 
 @pytest.mark.slow
-def test_read_camera__lets_the_interpreter_end_while_it_waits_for_a_pipe(pipe: Path, tmp_path: Path) -> None:
+def test_read_camera__lets_the_interpreter_end_while_it_waits_for_a_pipe(
+    pipe: Path, tmp_path: Path
+) -> None:
     """A thread that returns from OpenCV after the end of the interpreter aborts the process."""
     write_video(tmp_path / "clip.mkv", [IMAGE] * 6, 20)
     script = f"""
@@ -156,6 +170,8 @@ data = open({str(tmp_path / "clip.mkv")!r}, "rb").read()
 writer = Writer()
 open_feed([{str(pipe)!r}], LiveConfig(timeout=0.3)).newest()
 """
-    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    result = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=False
+    )
     assert result.returncode == 1
     assert "or wait for it longer than 0.3 s (--timeout).\n" in result.stderr

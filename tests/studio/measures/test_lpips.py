@@ -39,12 +39,19 @@ def test_lpips__refuses_unsuitable_networks(tmp_path):
     (tmp_path / "bad.onnx").write_bytes(b"rubbish")
     with pytest.raises(ValueError, match=r"bad\.onnx: onnxruntime .* cannot load this network"):
         Lpips(tmp_path / "bad.onnx")
-    with pytest.raises(ValueError, match="inputs in0 and in1, got left, right; export the network as"):
+    with pytest.raises(
+        ValueError, match="inputs in0 and in1, got left, right; export the network as"
+    ):
         Lpips(squared_difference(tmp_path / "other.onnx", H, W, inputs=("left", "right")))
     net = Lpips(squared_difference(tmp_path / "net.onnx", H, W))
-    with pytest.raises(ValueError, match=r"cannot run this network on in0 \[1, 3, 12, 16\], .*; export it for these"):
+    with pytest.raises(
+        ValueError,
+        match=r"cannot run this network on in0 \[1, 3, 12, 16\], .*; export it for these",
+    ):
         net.distance_map(IMAGE[:, 1:], TRUTH[:, 1:])
-    with pytest.raises(ValueError, match=r"net\.onnx: expected finite distances, got NaN or infinity"):
+    with pytest.raises(
+        ValueError, match=r"net\.onnx: expected finite distances, got NaN or infinity"
+    ):
         net.distance_map(np.full_like(IMAGE, 1e30), TRUTH)
     with pytest.raises(ValueError, match="one size"):
         net.distance_map(IMAGE, TRUTH[1:])

@@ -18,12 +18,21 @@ from morgs_mi.studio.measures.track_scores import (
 )
 
 
-def case(errors: list[list[float]], visible: list[str], tracked: list[str] | None = None, query: int = 0) -> Comparison:
-    """Return tracks that are off by `errors` [P, T] in x; "1" in a row marks a frame with a visible point."""
+def case(
+    errors: list[list[float]], visible: list[str], tracked: list[str] | None = None, query: int = 0
+) -> Comparison:
+    """Return tracks that are off by `errors` [P, T] in x; "1" in a row marks a frame with a visible
+    point.
+    """
     truth = np.zeros((*np.shape(errors), 3))
     offset = np.array(errors)[..., None] * (1, 0, 0)
-    masks = [np.array([[c == "1" for c in row] for row in rows]) for rows in (visible, tracked or visible)]
-    return Comparison(truth, truth + offset, *masks, np.ones(truth.shape[:2], bool), np.full(len(truth), query))
+    masks = [
+        np.array([[c == "1" for c in row] for row in rows])
+        for rows in (visible, tracked or visible)
+    ]
+    return Comparison(
+        truth, truth + offset, *masks, np.ones(truth.shape[:2], bool), np.full(len(truth), query)
+    )
 
 
 ONE = Protocol("one threshold", (10,), 50)
@@ -32,15 +41,27 @@ ONE = Protocol("one threshold", (10,), 50)
 def test_score__of_exact_tracks_is_perfect() -> None:
     video = case([[0, 0, 0]], ["111"])
     scores = score(DYNAMIC_3D_GAUSSIANS, [video], 1, extent=2)
-    assert (scores.num_tracks, scores.average_jaccard, scores.delta_avg, scores.occlusion_accuracy) == (1, 1, 1, 1)
-    assert (scores.median_error, scores.median_error_percent, scores.survival, scores.bound) == (0, 0, 1, 1)
+    assert (
+        scores.num_tracks,
+        scores.average_jaccard,
+        scores.delta_avg,
+        scores.occlusion_accuracy,
+    ) == (1, 1, 1, 1)
+    assert (scores.median_error, scores.median_error_percent, scores.survival, scores.bound) == (
+        0,
+        0,
+        1,
+        1,
+    )
 
 
 def test_score__jaccard_of_a_hand_made_track() -> None:
-    """Frames after the query: a hit; too far; visible but missed; hidden and missed; hidden but claimed.
+    """Frames after the query: a hit; too far; visible but missed; hidden and missed; hidden but
+    claimed.
 
-    Visible are three, within 10 cm two of them. True positives: 1. False positives: the one too far, and the hidden one
-    that is claimed. J = 1 / (3 + 2); the visibility is right in frames 1, 2 and 4.
+    Visible are three, within 10 cm two of them. True positives: 1. False positives: the one too
+    far, and the hidden one that is claimed. J = 1 / (3 + 2); the visibility is right in frames 1, 2
+    and 4.
     """
     video = case([[0, 0.05, 0.2, 0.05, 0, 0]], ["111100"], ["111001"])
     scores = score(ONE, [video], 1, extent=1)
@@ -78,7 +99,9 @@ def test_score__scale_converts_thresholds_and_leaves_errors_in_world_units() -> 
 
 
 def test_score__survival_is_the_share_of_frames_before_the_first_visible_failure() -> None:
-    """Track 1 fails in the last of 4 frames from its query on; track 2 fails where it is hidden; track 3 never."""
+    """Track 1 fails in the last of 4 frames from its query on; track 2 fails where it is hidden;
+    track 3 never.
+    """
     errors = [[9, 0, 0, 0, 0.6], [0, 0, 0, 0.6, 0], [0, 0, 0, 0.5, 0]]
     video = case(errors, ["11111", "11101", "11111"], query=1)
     assert score(ONE, [video], 1, 1).survival == pytest.approx((3 / 4 + 1 + 1) / 3)
@@ -101,17 +124,23 @@ def test_score__ignores_frames_before_the_query_and_tracks_without_a_second_visi
 
 
 def test_score__tapvid3d_scales_pixels_by_depth_over_focal_length() -> None:
-    """A pixel is 2 cm wide: an error of 5 cm is within 4, 8 and 16 px but not within 1 and 2 (2 and 4 cm)."""
+    """A pixel is 2 cm wide: an error of 5 cm is within 4, 8 and 16 px but not within 1 and 2 (2 and
+    4 cm).
+    """
     video = replace(case([[0.05]], ["1"]), pixel=np.array([[0.02]]))
     scores = score(TAPVID3D, [video], 1, 1)
     assert (scores.delta_avg, scores.average_jaccard) == pytest.approx((3 / 5, 3 / 5))
-    assert np.isnan([scores.median_error, scores.survival]).all(), "the benchmark does not define them"
+    assert np.isnan([scores.median_error, scores.survival]).all(), (
+        "the benchmark does not define them"
+    )
 
 
 def test_score__tapvid3d_counts_all_points_of_a_video_together_and_averages_videos() -> None:
-    """The first video has 3 visible points, 2 of them exact and 1 far; the second one has an exact one.
+    """The first video has 3 visible points, 2 of them exact and 1 far; the second one has an exact
+    one.
 
-    Frames before the query count too. Per track the first video would have 1 and 0, hence 1/2 and not 2/3.
+    Frames before the query count too. Per track the first video would have 1 and 0, hence 1/2 and
+    not 2/3.
     """
     first = replace(case([[0, 0], [99, 99]], ["11", "01"], query=1), pixel=np.ones((2, 2)))
     second = replace(case([[0, 0]], ["10"]), pixel=np.ones((1, 2)))

@@ -32,7 +32,9 @@ def test_flow_network__returns_the_known_flow_at_any_size(network, size):
     assert_close(flow, known_flow(image, other), atol=TOLERANCE)
 
 
-@pytest.mark.parametrize(("kind", "low", "high"), [("onnx", 0, 255), ("onnx-unit", 0, 1), ("onnx-signed", -1, 1)])
+@pytest.mark.parametrize(
+    ("kind", "low", "high"), [("onnx", 0, 255), ("onnx-unit", 0, 1), ("onnx-signed", -1, 1)]
+)
 def test_flow_source__runs_a_network_both_ways_in_its_value_range(network, kind, low, high):
     image, previous = image_pair(24, 40)
     back, forward_flow = flow_source(f"{kind}:{network}")(FramePair(image, previous))
@@ -95,13 +97,19 @@ def test_flow_source__rejects_a_file_that_is_not_a_flow_network(tmp_path, name, 
 
 def test_flow_network__rejects_an_output_that_is_not_flow(tmp_path):
     path = export(tmp_path / "scalar.onnx", channels=1)
-    with pytest.raises(ValueError, match=r"output \[1, 2, 16, 24\], the flow, got \[1, 1, 2, 3\] and \[1, 1, 16, 24\]"):
+    with pytest.raises(
+        ValueError,
+        match=r"output \[1, 2, 16, 24\], the flow, got \[1, 1, 2, 3\] and \[1, 1, 16, 24\]",
+    ):
         FlowNetwork(path)(*image_pair(16, 24))
 
 
 def test_flow_network__names_the_file_where_it_fails(network, monkeypatch):
     monkeypatch.setattr("morgs_mi.studio.networks.flow_network.MULTIPLE", 1)
-    with pytest.raises(ValueError, match=r"tiny\.onnx: onnxruntime .* on image1 \[1, 3, 20, 30\], image2 .*from files"):
+    with pytest.raises(
+        ValueError,
+        match=r"tiny\.onnx: onnxruntime .* on image1 \[1, 3, 20, 30\], image2 .*from files",
+    ):
         FlowNetwork(network)(*image_pair(20, 30))
 
 

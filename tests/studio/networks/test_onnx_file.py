@@ -28,22 +28,31 @@ def test_onnx_network__has_names_and_shapes(tmp_path):
 
 def test_onnx_network__has_at_most_the_threads_of_opencv(tmp_path, monkeypatch):
     monkeypatch.setattr(cv2, "getNumThreads", lambda: 1)
-    assert OnnxNetwork(export(tmp_path / "a.onnx"))._session.get_session_options().intra_op_num_threads == 1
+    assert (
+        OnnxNetwork(export(tmp_path / "a.onnx"))._session.get_session_options().intra_op_num_threads
+        == 1
+    )
 
 
 def test_onnx_network__names_the_extra_that_is_missing(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(ValueError, match=r"a\.onnx: .* needs the package onnxruntime; pip .*'morgs-mi\[networks\]'"):
+    with pytest.raises(
+        ValueError, match=r"a\.onnx: .* needs the package onnxruntime; pip .*'morgs-mi\[networks\]'"
+    ):
         OnnxNetwork(export(tmp_path / "a.onnx"))
 
 
 def with_weights_at(path: Path, location: str) -> Path:
     """Write a network that adds weights in a further file at `location`."""
-    weights = TensorProto(name="w", data_type=TensorProto.FLOAT, dims=[VALUES], data_location=TensorProto.EXTERNAL)
+    weights = TensorProto(
+        name="w", data_type=TensorProto.FLOAT, dims=[VALUES], data_location=TensorProto.EXTERNAL
+    )
     for key, value in (("location", location), ("offset", "0"), ("length", str(4 * VALUES))):
         weights.external_data.add(key=key, value=value)
     ends = (helper.make_tensor_value_info(name, TensorProto.FLOAT, [VALUES]) for name in "xy")
-    graph = helper.make_graph([helper.make_node("Add", ["x", "w"], ["y"])], "sum", *([end] for end in ends), [weights])
+    graph = helper.make_graph(
+        [helper.make_node("Add", ["x", "w"], ["y"])], "sum", *([end] for end in ends), [weights]
+    )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 16)], ir_version=8)
     path.write_bytes(model.SerializeToString())
     return path
@@ -55,14 +64,18 @@ def test_onnx_network__reads_weights_in_its_folder(tmp_path):
     assert network.run({"x": np.ones(VALUES, np.float32)})["y"][0] == 4
 
 
-@pytest.mark.parametrize("location", ["../secret.bin", "{}/secret.bin", "link.bin", "a/../../secret.bin"])
+@pytest.mark.parametrize(
+    "location", ["../secret.bin", "{}/secret.bin", "link.bin", "a/../../secret.bin"]
+)
 def test_onnx_network__reads_no_weights_outside_its_folder(tmp_path, location):
     np.zeros(VALUES, np.float32).tofile(tmp_path / "secret.bin")
     folder = tmp_path / "network"
     (folder / "a").mkdir(parents=True)
     (folder / "link.bin").symlink_to("../secret.bin")
     path = with_weights_at(folder / "a.onnx", location.format(tmp_path))
-    with pytest.raises(ValueError, match=r"a\.onnx: onnxruntime .* cannot load this network .*; export it again\."):
+    with pytest.raises(
+        ValueError, match=r"a\.onnx: onnxruntime .* cannot load this network .*; export it again\."
+    ):
         OnnxNetwork(path)
 
 
@@ -73,7 +86,11 @@ def endless_number(path: Path) -> None:
 @pytest.mark.parametrize(
     ("make", "kind", "message"),
     [
-        (endless_number, ValueError, r"onnxruntime .* cannot load this network \(.*\); export it again"),
+        (
+            endless_number,
+            ValueError,
+            r"onnxruntime .* cannot load this network \(.*\); export it again",
+        ),
         (lambda path: path.write_bytes(b"\x08"), ValueError, r"cannot load this network"),
         (os.mkfifo, FileNotFoundError, "expected an ONNX file, found none"),
         (
@@ -107,16 +124,22 @@ def test_onnx_network__refuses_damaged_files_with_one_sentence(tmp_path, capfd):
             failed.append(str(error))
     assert len(failed) > 50
     assert capfd.readouterr() == ("", "")
-    assert [message for message in failed if not message.startswith(f"{path}: ") or "\n" in message] == []
+    assert [
+        message for message in failed if not message.startswith(f"{path}: ") or "\n" in message
+    ] == []
 
 
 def test_onnx_network__refuses_results_that_are_not_numbers(tmp_path):
     nodes = [helper.make_node("Cast", ["image"], ["text"], to=TensorProto.STRING)]
     path = write(tmp_path / "a.onnx", nodes, {"image": (1, 3, 2, 2)}, {}, {})
     model = onnx.load(path)
-    model.graph.output.append(helper.make_tensor_value_info("text", TensorProto.STRING, (1, 3, 2, 2)))
+    model.graph.output.append(
+        helper.make_tensor_value_info("text", TensorProto.STRING, (1, 3, 2, 2))
+    )
     path.write_bytes(model.SerializeToString())
-    with pytest.raises(ValueError, match=r"a\.onnx: expected arrays of numbers, got others from text"):
+    with pytest.raises(
+        ValueError, match=r"a\.onnx: expected arrays of numbers, got others from text"
+    ):
         OnnxNetwork(path).run({"image": np.zeros((1, 3, 2, 2), np.float32)})
 
 

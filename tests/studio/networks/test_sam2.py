@@ -44,7 +44,8 @@ def discs(height, width, *centres, radius=20, color=RED):
 def test_segment_network__segments_an_object_to_the_pixel_at_any_size(network, size):
     height, width = size
     image, (disc,) = discs(height, width, (0.4 * width, 0.55 * height), radius=0.2 * height)
-    # A cell of the network's mask is width / 256 pixels wide; half a cell may be wrong around the disc.
+    # A cell of the network's mask is width / 256 pixels wide; half a cell may be wrong around the
+    # disc.
     off = np.pi * 0.4 * height * (max(size) / 256) / 2
     assert iou(network(image, disc), disc) > 1 - off / disc.sum()
 
@@ -73,7 +74,8 @@ def test_segment_network__bytes_and_unit_floats_agree(network):
 
 
 def test_segment_network__normalises_as_imagenet(network):
-    # The tiny decoder's limit is R - B = 0.2 of the input colours: a ramp of R crosses it at R = 0.5.
+    # The tiny decoder's limit is R - B = 0.2 of the input colours: a ramp of R crosses it at R =
+    # 0.5.
     image = np.full((64, 256, 3), 0.3)
     image[..., 0] = (np.arange(256) + 0.5) / 256
     mask = np.ones((64, 256), bool)
@@ -122,7 +124,9 @@ def test_motion_mask__is_the_union_of_flow_mask_and_sam2_objects(files):
 
 def test_segment_network__accepts_an_encoder_of_open_size(tmp_path, files):
     image, (disc,) = discs(120, 160, (80, 60))
-    result = SegmentNetwork(export_encoder(tmp_path / "open.onnx", open_size=True), files[1])(image, disc)
+    result = SegmentNetwork(export_encoder(tmp_path / "open.onnx", open_size=True), files[1])(
+        image, disc
+    )
     assert iou(result, disc) > 0.9
 
 
@@ -147,10 +151,26 @@ def bad(folder, files, name):
     ("name", "exception", "message"),
     [
         ("missing", FileNotFoundError, "missing.onnx: expected an ONNX file, found none"),
-        ("text", ValueError, r"text.onnx: onnxruntime .* cannot load this network \(.*export it again"),
-        ("swapped", ValueError, r"decoder.onnx: expected an image encoder .* give the encoder first"),
-        ("flow", ValueError, "other.onnx: expected a mask decoder .* got image1, image2 and flow_low, flow_up"),
-        ("extra", ValueError, "other.onnx: expected a mask decoder with inputs among .*orig_im_size and masks"),
+        (
+            "text",
+            ValueError,
+            r"text.onnx: onnxruntime .* cannot load this network \(.*export it again",
+        ),
+        (
+            "swapped",
+            ValueError,
+            r"decoder.onnx: expected an image encoder .* give the encoder first",
+        ),
+        (
+            "flow",
+            ValueError,
+            "other.onnx: expected a mask decoder .* got image1, image2 and flow_low, flow_up",
+        ),
+        (
+            "extra",
+            ValueError,
+            "other.onnx: expected a mask decoder with inputs among .*orig_im_size and masks",
+        ),
     ],
 )
 def test_mask_refiner__rejects_files_that_are_not_sam2(tmp_path, files, name, exception, message):
@@ -162,7 +182,9 @@ def test_mask_refiner__rejects_files_that_are_not_sam2(tmp_path, files, name, ex
 def test_segment_network__rejects_masks_that_are_not_finite(tmp_path, files):
     image, (disc,) = discs(60, 80, (40, 30))
     with pytest.raises(ValueError, match=r"decoder\.onnx: expected finite masks"):
-        SegmentNetwork(files[0], export_decoder(tmp_path / "decoder.onnx", scale=float("inf")))(image, disc)
+        SegmentNetwork(files[0], export_decoder(tmp_path / "decoder.onnx", scale=float("inf")))(
+            image, disc
+        )
 
 
 def test_prompts__limits_points_and_their_spacing():
@@ -180,6 +202,9 @@ def test_mask_config__limits_prompts_to_the_largest(files):
     hole[55:65, 55:65] = hole[115:122, 215:222] = True
     mask = (small | large) & ~hole
     config = MaskConfig(prompts=1)
-    for model, filled in ((mask_refiner(f"sam2:{files[0]},{files[1]}", config), large), (SegmentNetwork(*files), hole)):
+    for model, filled in (
+        (mask_refiner(f"sam2:{files[0]},{files[1]}", config), large),
+        (SegmentNetwork(*files), hole),
+    ):
         assert model(image, mask)[hole & filled].mean() > 0.9
     assert not mask_refiner(f"sam2:{files[0]},{files[1]}", config)(image, mask)[hole & small].any()

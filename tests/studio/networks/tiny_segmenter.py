@@ -1,4 +1,6 @@
-"""Two networks with SAM2's signature, as ONNX files: they segment pixels redder than blue around the prompts."""
+"""Two networks with SAM2's signature, as ONNX files: they segment pixels redder than blue around
+the prompts.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ from tests.scenes.tiny_network import write
 
 SIZE = 1024
 CELL = 4
-# Radius around a point on the object within which pixels are segmented, in pixels of the network's image.
+# Radius around a point on the object within which pixels are segmented, in pixels of the network's
+# image.
 REACH = 300.0
 # Index of the decoder's mask with the highest predicted IoU, of three.
 BEST = 1
@@ -20,22 +23,28 @@ DEVIATION = np.array([0.229, 0.224, 0.225])
 
 
 def export_encoder(path: Path, open_size: bool = False) -> Path:
-    """Write an encoder with the image itself as features, at a quarter, an eighth and a sixteenth of its side."""
+    """Write an encoder with the image itself as features, at a quarter, an eighth and a sixteenth
+    of its side.
+    """
     names = {"high_res_feats_0": 4, "high_res_feats_1": 8, "image_embed": 16}
     nodes = [
         helper.make_node("AveragePool", ["image"], [name], kernel_shape=[k, k], strides=[k, k])
         for name, k in names.items()
     ]
     sides = ("h", "w") if open_size else (SIZE, SIZE)
-    outputs = {name: (1, 3, None, None) if open_size else (1, 3, SIZE // k, SIZE // k) for name, k in names.items()}
+    outputs = {
+        name: (1, 3, None, None) if open_size else (1, 3, SIZE // k, SIZE // k)
+        for name, k in names.items()
+    }
     return write(path, nodes, {"image": (1, 3, *sides)}, outputs, {})
 
 
 def export_decoder(path: Path, extra: str = "", scale: float = 1.0) -> Path:
     """Write a decoder that returns three masks, of which the second is the correct one.
 
-    It contains the pixels that are redder than blue by more than 0.2, inside the box (the first two points), and within
-    `REACH` of a point of label 1. It is empty if there is a mask on input, or labels other than 2 and 3 for the box.
+    It contains the pixels that are redder than blue by more than 0.2, inside the box (the first two
+    points), and within `REACH` of a point of label 1. It is empty if there is a mask on input, or
+    labels other than 2 and 3 for the box.
     """
     cells = SIZE // CELL
     centres = (np.arange(cells, dtype=np.float32) + 0.5) * CELL - 0.5
@@ -105,7 +114,9 @@ def export_decoder(path: Path, extra: str = "", scale: float = 1.0) -> Path:
         node("Sum", "wrong_labels mask_given mask_flag", "wrong"),
         node("Mul", "wrong far", "penalty"),
         node("Mul", "redness far", "sharp_redness"),
-        node("Min", "sharp_redness inside_left inside_right inside_upper inside_lower near", "bare"),
+        node(
+            "Min", "sharp_redness inside_left inside_right inside_upper inside_lower near", "bare"
+        ),
         node("Sub", "bare penalty", "right_mask"),
         node("Neg", "right_mask", "inverse"),
         node("Concat", "flat right_mask inverse", "all", axis=1),
@@ -123,4 +134,6 @@ def export_decoder(path: Path, extra: str = "", scale: float = 1.0) -> Path:
     }
     if extra:
         inputs[extra] = (1,)
-    return write(path, nodes, inputs, {"masks": (1, 3, cells, cells), "iou_predictions": (1, 3)}, constants)
+    return write(
+        path, nodes, inputs, {"masks": (1, 3, cells, cells), "iou_predictions": (1, 3)}, constants
+    )

@@ -22,4 +22,6 @@ def tracer() -> PathTracer:
 def clip(tmp_path_factory) -> Path:
     """The scene `arm` from 3 cameras, 3 frames of 64x48, with lossless frames."""
     out = tmp_path_factory.mktemp("synth") / "arm"
-    return synthesize("arm", out, SynthConfig(cameras=3, frames=3, width=64, height=48, spp=4, lossless=True))
+    return synthesize(
+        "arm", out, SynthConfig(cameras=3, frames=3, width=64, height=48, spp=4, lossless=True)
+    )

@@ -1,4 +1,6 @@
-"""Disturbances: what is drawn, what is stored, and recordings that show exactly what the truth states."""
+"""Disturbances: what is drawn, what is stored, and recordings that show exactly what the truth
+states.
+"""
 
 from __future__ import annotations
 
@@ -71,10 +73,13 @@ def test_draw_disturbances__a_setting_acts_and_changes_nothing_else(name: str) -
         "jpeg_quality": "jpeg_quality",
     }.get(name, "gains")
     none, one, every = (
-        draw_disturbances(d, 3, 4, 0) for d in (Disturbances(), Disturbances(**{name: getattr(ALL, name)}), ALL)
+        draw_disturbances(d, 3, 4, 0)
+        for d in (Disturbances(), Disturbances(**{name: getattr(ALL, name)}), ALL)
     )
     for field in fields(CameraDisturbance):
-        zeros, values, expected = ([getattr(d, field.name) for d in drawn] for drawn in (none, one, every))
+        zeros, values, expected = (
+            [getattr(d, field.name) for d in drawn] for drawn in (none, one, every)
+        )
         assert (values != zeros) == (field.name == field_of_setting)
         if field.name == field_of_setting != "gains":
             assert values == expected
@@ -94,17 +99,33 @@ def test_load_disturbances__reads_back_what_was_saved(tmp_path: Path) -> None:
 
 
 def test_load_disturbances__names_a_missing_or_broken_file(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"no file .*disturbances\.json; pass the truth folder"):
+    with pytest.raises(
+        FileNotFoundError, match=r"no file .*disturbances\.json; pass the truth folder"
+    ):
         load_disturbances(tmp_path)
-    for text in ('{"cam00": {}}', '{"cam00": {"gains": 3}}', "[]", '{"cam00": {"gains": [], "x": 1}}'):
+    for text in (
+        '{"cam00": {}}',
+        '{"cam00": {"gains": 3}}',
+        "[]",
+        '{"cam00": {"gains": [], "x": 1}}',
+    ):
         (tmp_path / "disturbances.json").write_text(text)
-        with pytest.raises(ValueError, match="expected the disturbances of each camera, got a broken file"):
+        with pytest.raises(
+            ValueError, match="expected the disturbances of each camera, got a broken file"
+        ):
             load_disturbances(tmp_path)
 
 
 def test_draw_disturbances__refuses_values_out_of_range() -> None:
-    for name, value in (("time_offset", -1), ("rolling_shutter", 1.5), ("distortion", 2), ("jpeg_quality", 101)):
-        with pytest.raises(ValueError, match=rf"draw_disturbances\(\): `{name}` must be at least 0.*, got {value}"):
+    for name, value in (
+        ("time_offset", -1),
+        ("rolling_shutter", 1.5),
+        ("distortion", 2),
+        ("jpeg_quality", 101),
+    ):
+        with pytest.raises(
+            ValueError, match=rf"draw_disturbances\(\): `{name}` must be at least 0.*, got {value}"
+        ):
             draw_disturbances(Disturbances(**{name: value}), 2, 1, 0)
 
 
@@ -114,15 +135,21 @@ def test_undistorted__is_the_inverse_of_the_lens(k: float) -> None:
     pixels = np.random.default_rng(0).uniform(0, (64, 48), (50, 2))
     there = undistorted(camera, Lens("SIMPLE_RADIAL", (k,)), pixels)
     local = np.append((there - camera.K[:2, 2]) / camera.K[0, 0], np.ones((50, 1)), axis=1)
-    back = cv2.projectPoints(local, np.zeros(3), np.zeros(3), camera.K, np.array([k, 0, 0, 0.0]))[0][:, 0]
+    back = cv2.projectPoints(local, np.zeros(3), np.zeros(3), camera.K, np.array([k, 0, 0, 0.0]))[
+        0
+    ][:, 0]
     assert_close(back, pixels, atol=1e-6)
     assert np.abs(there - pixels).max() > 0.5
 
 
 @pytest.mark.slow
 def test_synthesize__shows_a_camera_with_a_time_offset_at_its_own_time(tmp_path: Path) -> None:
-    """The motion of a camera's truth leads between its own times; tracks are at the reference's times."""
-    clip = synthesize("arm", tmp_path / "clip", replace(SIZE, disturbances=Disturbances(time_offset=2)))
+    """The motion of a camera's truth leads between its own times; tracks are at the reference's
+    times.
+    """
+    clip = synthesize(
+        "arm", tmp_path / "clip", replace(SIZE, disturbances=Disturbances(time_offset=2))
+    )
     offset = load_disturbances(clip / "truth")["cam01"].time_offset
     assert abs(offset) > 0.2
     scene = load_scene("arm")
@@ -155,7 +182,9 @@ def bar_scene(speed: float) -> Scene:
 
 
 def test_synthesize__reads_the_rows_of_a_rolling_shutter_at_their_times(tmp_path: Path) -> None:
-    """A vertical bar is slanted: in every row, its middle is where the bar is at the time of that row."""
+    """A vertical bar is slanted: in every row, its middle is where the bar is at the time of that
+    row.
+    """
     scene = bar_scene(speed=6.0)
     config = replace(SIZE, width=128, height=64, disturbances=Disturbances(rolling_shutter=0.8))
     clip = synthesize(scene, tmp_path / "clip", config)
@@ -163,7 +192,9 @@ def test_synthesize__reads_the_rows_of_a_rolling_shutter_at_their_times(tmp_path
     camera = scene.rig.cameras(2, 128, 64)[0]
     image = frame_of(clip, "cam00", 1).astype(float).mean(axis=-1)
     columns = (image * (np.arange(128) + 0.5)).sum(axis=1) / image.sum(axis=1)
-    bar = np.stack([6.0 * disturbance.row_times(1, 64) / FPS, np.zeros(64), np.full(64, 0.02)], axis=1)
+    bar = np.stack(
+        [6.0 * disturbance.row_times(1, 64) / FPS, np.zeros(64), np.full(64, 0.02)], axis=1
+    )
     expected = camera.project(bar)[0][:, 0]
     assert np.ptp(expected) > 5
     assert np.abs(columns - expected).max() < 0.5
@@ -175,7 +206,9 @@ def test_synthesize__reads_the_rows_of_a_rolling_shutter_at_their_times(tmp_path
 
 @pytest.mark.slow
 def test_synthesize__undistorted_images_are_those_of_the_pinhole_cameras(tmp_path: Path) -> None:
-    config = replace(SIZE, width=96, height=72, spp=16, frames=1, disturbances=Disturbances(distortion=0.4))
+    config = replace(
+        SIZE, width=96, height=72, spp=16, frames=1, disturbances=Disturbances(distortion=0.4)
+    )
     clip = synthesize("spheres", tmp_path / "clip", config)
     assert abs(load_disturbances(clip / "truth")["cam01"].distortion) > 0.1
     assert not (clip / "poses_bounds.npy").exists(), "it cannot hold a lens"
@@ -198,27 +231,43 @@ def test_synthesize__undistorted_images_are_those_of_the_pinhole_cameras(tmp_pat
 def test_synthesize__refuses_a_lens_that_folds_its_corners(tmp_path: Path) -> None:
     scene = bar_scene(0.0)
     wide = Scene("wide", scene.objects, scene.lights, Rig(center=(0, 0, 0), fov=80, elevation=0))
-    with pytest.raises(ValueError, match="`distortion` must be small enough for the field of view, got -0"):
-        synthesize(wide, tmp_path / "clip", replace(SIZE, cameras=8, disturbances=Disturbances(distortion=0.5)))
+    with pytest.raises(
+        ValueError, match="`distortion` must be small enough for the field of view, got -0"
+    ):
+        synthesize(
+            wide,
+            tmp_path / "clip",
+            replace(SIZE, cameras=8, disturbances=Disturbances(distortion=0.5)),
+        )
 
 
 @pytest.mark.slow
-def test_synthesize__exposes_frames_with_the_gains_of_the_truth(clean: Path, tmp_path: Path) -> None:
+def test_synthesize__exposes_frames_with_the_gains_of_the_truth(
+    clean: Path, tmp_path: Path
+) -> None:
     hard = Disturbances(exposure_gain=0.3, exposure_drift=0.2, exposure_flicker=0.1)
     dimmed = synthesize("spheres", tmp_path / "clip", replace(SIZE, disturbances=hard))
     gains = load_disturbances(dimmed / "truth")
     for camera in ("cam00", "cam01"):
         for frame in (0, 1):
-            light, dimmed_light = (decode_light(frame_of(c, camera, frame) / 255.0) for c in (clean, dimmed))
+            light, dimmed_light = (
+                decode_light(frame_of(c, camera, frame) / 255.0) for c in (clean, dimmed)
+            )
             usable = (light > 0.1) & (dimmed_light > 0.1) & (light < 0.8) & (dimmed_light < 0.95)
-            assert_close(np.median(dimmed_light[usable] / light[usable]), gains[camera].gains[frame], rtol=0.01)
+            assert_close(
+                np.median(dimmed_light[usable] / light[usable]),
+                gains[camera].gains[frame],
+                rtol=0.01,
+            )
     assert gains["cam00"].gains == (1.0, 1.0)
     assert gains["cam01"].gains[0] != gains["cam01"].gains[1]
 
 
 @pytest.mark.slow
 def test_synthesize__compresses_every_image(clean: Path, tmp_path: Path) -> None:
-    lossy = synthesize("spheres", tmp_path / "clip", replace(SIZE, disturbances=Disturbances(jpeg_quality=30)))
+    lossy = synthesize(
+        "spheres", tmp_path / "clip", replace(SIZE, disturbances=Disturbances(jpeg_quality=30))
+    )
     whole = frame_of(clean, "cam01", 1)
     pixels = frame_of(lossy, "cam01", 1)
     np.testing.assert_array_equal(pixels, compressed(whole, 30))
@@ -240,8 +289,14 @@ def test_light_of_rows__agrees_with_the_image_of_the_sensor() -> None:
 
 
 def test_synthesize__checks_a_scene_at_all_times_that_are_recorded(tmp_path: Path) -> None:
-    """A pose that fails before 0 s, when a rolling shutter reads the first rows of the first frame."""
+    """A pose that fails before 0 s, when a rolling shutter reads the first rows."""
     late = bar_scene(0.0).objects["bar"].shapes
     scene = Scene("late", {"bar": Object(late, lambda t: translate(1 / (t >= 0), 0, 0))}, {}, Rig())
-    with pytest.raises(ValueError, match=r"object 'bar': its pose at -0\.0083.* s fails with ZeroDivisionError"):
-        synthesize(scene, tmp_path / "clip", replace(SIZE, height=1000, disturbances=Disturbances(rolling_shutter=0.5)))
+    with pytest.raises(
+        ValueError, match=r"object 'bar': its pose at -0\.0083.* s fails with ZeroDivisionError"
+    ):
+        synthesize(
+            scene,
+            tmp_path / "clip",
+            replace(SIZE, height=1000, disturbances=Disturbances(rolling_shutter=0.5)),
+        )

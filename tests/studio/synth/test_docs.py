@@ -43,7 +43,9 @@ def test_scenes_page__example_is_rendered_with_its_mesh_and_texture(
     assert gem.sum() > 40
     assert truth.mask[gem].all()
     assert np.linalg.norm(truth.motion[gem], axis=-1).mean() > 0.2
-    assert image[load_truth("out/truth", "cam00", 0).ids == 4].std(0).min() > 10, "the tiles are visible"
+    assert image[load_truth("out/truth", "cam00", 0).ids == 4].std(0).min() > 10, (
+        "the tiles are visible"
+    )
 
 
 SMALL = ("--cameras", "2", "--frames", "2", "--width", "32", "--height", "24", "--spp", "1")
@@ -52,7 +54,9 @@ COMMANDS = [line.split() for line in re.findall(r"^    morgs-mi (synth .+)", TEX
 
 @pytest.mark.slow
 @pytest.mark.parametrize("command", [c for c in COMMANDS if "gem.py" not in c[1]], ids=" ".join)
-def test_scenes_page__commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: list[str]) -> None:
+def test_scenes_page__commands_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: list[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "out").mkdir()
     assert cli.main([*command, *SMALL]) == 0

@@ -27,7 +27,9 @@ def test_compute_ground_truth__motion_map_warps_the_previous_frame_onto_the_curr
     source = grid - truth.motion
     # Visible in both frames: all neighbours of the source belong to the same object.
     corners = [np.floor(source).astype(int) + corner for corner in ((0, 0), (0, 1), (1, 0), (1, 1))]
-    ids = [truth_before.ids[np.clip(c[..., 1], 0, 239), np.clip(c[..., 0], 0, 319)] for c in corners]
+    ids = [
+        truth_before.ids[np.clip(c[..., 1], 0, 239), np.clip(c[..., 0], 0, 319)] for c in corners
+    ]
     same = truth.mask & (np.stack(ids) == truth.ids).all(axis=0)
     same = cv2.erode(same.astype(np.uint8), np.ones((3, 3))) > 0
     assert same.sum() > 5000
@@ -36,7 +38,8 @@ def test_compute_ground_truth__motion_map_warps_the_previous_frame_onto_the_curr
         warped = cv2.remap(previous_image, grid - motion, None, cv2.INTER_CUBIC)
         return psnr(warped[same], image[same])
 
-    # Resampling and changes of shading limit the score to 31 dB, of which noise costs 0.2 dB (measured).
+    # Resampling and changes of shading limit the score to 31 dB, of which noise costs 0.2 dB
+    # (measured).
     assert score(truth.motion) > 29
     for wrong in (
         0 * truth.motion,
@@ -82,17 +85,23 @@ def test_load_tracks__tracks_reproject_to_the_motion_map(clip):
             row = np.clip(row, 0, 47)
             at_centre &= np.abs(depth - truth.depth[row, col]) < 1e-4
             np.testing.assert_array_equal(truth.ids[row, col][at_centre], tracks.ids[at_centre])
-            assert_close((pixels - old_pixels)[at_centre], truth.motion[row, col][at_centre], atol=2e-3)
+            assert_close(
+                (pixels - old_pixels)[at_centre], truth.motion[row, col][at_centre], atol=2e-3
+            )
             compared += int((truth.mask[row, col] & at_centre).sum())
     assert compared > 100
 
 
 def test_compute_ground_truth__marks_pixels_without_a_surface():
     square = {"type": "rectangle"}
-    scene = Scene("square", {"square": Object({"square": square}, lambda t: translate(t, 0.8, 0))}, {})
+    scene = Scene(
+        "square", {"square": Object({"square": square}, lambda t: translate(t, 0.8, 0))}, {}
+    )
     tracer = PathTracer(scene)
     camera = scene.rig.cameras(2, 64, 48)[0]
-    truth = compute_ground_truth(camera, tracer.surface_points(camera), tracer.poses(0), None, tracer.poses(1))
+    truth = compute_ground_truth(
+        camera, tracer.surface_points(camera), tracer.poses(0), None, tracer.poses(1)
+    )
     assert set(np.unique(truth.ids)) == {-1, 0}
     nothing = truth.ids < 0
     assert (truth.depth[nothing] == 0).all()

@@ -29,7 +29,9 @@ def test_surface_points__agree_with_rays_of_the_mitsuba_sensor(tracer):
     pixels, depth = camera.project(points)
     assert_close(pixels, np.stack([x, y], axis=-1).reshape(48, 64, 2), atol=1e-3)
     poses = tracer.poses(0)
-    np.testing.assert_allclose(compute_ground_truth(camera, surface, poses, None, poses).depth, depth, rtol=1e-6)
+    np.testing.assert_allclose(
+        compute_ground_truth(camera, surface, poses, None, poses).depth, depth, rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize("radiance", [0.001, 0.18, 0.6, 3.0])

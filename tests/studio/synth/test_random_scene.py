@@ -11,7 +11,9 @@ import pytest
 from morgs_mi.capture.truth import load_truth
 from morgs_mi.studio.synth.synth_config import SynthConfig
 from morgs_mi.studio.synth.synthesize import synthesize
-from scenes.random import MOTIONS, Body, RandomScene, draw_scene  # pyright: ignore[reportMissingImports]  (not tests.scenes)
+
+# Not tests.scenes.
+from scenes.random import MOTIONS, Body, RandomScene, draw_scene  # pyright: ignore[reportMissingImports]
 from tests.assertions import assert_close
 
 NUM_SEEDS = 50
@@ -39,7 +41,7 @@ def thin_and_fast(scene: RandomScene) -> bool:
 
 
 def surface(body: Body, times: np.ndarray) -> np.ndarray:
-    """Return points of the surface, at its farthest from the object's centre, over time [T, P, 3]."""
+    """Return points of the surface farthest from the object's centre, over time [T, P, 3]."""
     octahedron = body.solid.margin * np.concatenate([np.eye(3), -np.eye(3)])
     points = (body.solid.points[:, None] + octahedron).reshape(-1, 3)
     poses = np.stack([body.pose(time) for time in times])
@@ -88,7 +90,10 @@ def test_draw_scene__held_out_view_and_most_others_see_every_object(scenes):
         cameras = scene.rig.cameras(scene.recording.num_cameras, 320, 240)
         for body in scene.bodies.values():
             points = surface(body, TIMES[:8])
-            views = [((p > 0) & (p < [320, 240])).all() for p in (camera.project(points)[0] for camera in cameras)]
+            views = [
+                ((p > 0) & (p < [320, 240])).all()
+                for p in (camera.project(points)[0] for camera in cameras)
+            ]
             assert views[0]
             assert np.mean(views) >= 0.75
 
@@ -99,7 +104,8 @@ def test_draw_scene__speed_is_that_of_the_fastest_point_in_the_held_out_view(sce
         for name, body in scene.bodies.items():
             pixels = camera.project(surface(body, TIMES))[0]
             fastest = np.linalg.norm(np.diff(pixels, axis=0), axis=-1).max()
-            # A frame covers up to a ninth of an oscillation, over which the mean speed is below the peak.
+            # A frame covers up to a ninth of an oscillation, over which the mean speed is below the
+            # peak.
             assert 0.7 * body.speed <= fastest <= 1.02 * body.speed, name
 
 
@@ -167,4 +173,6 @@ def test_synthesize__writes_the_same_bytes_for_the_same_seed(clip, tmp_path):
     again = synthesize("random", tmp_path / "again", SMALL)
     files = sorted(path.relative_to(clip) for path in clip.rglob("*") if path.is_file())
     assert files == sorted(path.relative_to(again) for path in again.rglob("*") if path.is_file())
-    assert [str(file) for file in files if (clip / file).read_bytes() != (again / file).read_bytes()] == []
+    assert [
+        str(file) for file in files if (clip / file).read_bytes() != (again / file).read_bytes()
+    ] == []

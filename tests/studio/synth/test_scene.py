@@ -50,7 +50,9 @@ def test_spheres__balls_roll_without_slipping(name, radius):
         here = pose(time)
         contact = here[:3, 3] - [0, radius, 0]
         point = SurfacePoints(contact[None], np.zeros(1, int))
-        ahead, behind = (move_with_objects(point, [here], [pose(time + s)])[0] for s in (step, -step))
+        ahead, behind = (
+            move_with_objects(point, [here], [pose(time + s)])[0] for s in (step, -step)
+        )
         assert abs(contact[1]) < 1e-12
         assert np.linalg.norm(ahead - behind) / (2 * step) < 1e-6
         assert np.linalg.norm(pose(time + step)[:3, 3] - here[:3, 3]) / step > 0.1
@@ -94,7 +96,8 @@ def test_rig__test_view_is_at_the_centre():
 
 def test_load_scene__accepts_any_file_path(tmp_path):
     (tmp_path / "mine.py").write_text(
-        "from morgs_mi.studio.synth.scene import Scene\n\n\ndef build(seed):\n    return Scene('mine', {}, {})\n"
+        "from morgs_mi.studio.synth.scene import Scene\n\n\ndef build(seed):\n    return "
+        "Scene('mine', {}, {})\n"
     )
     assert load_scene(tmp_path / "mine.py").name == "mine"
 
@@ -111,9 +114,18 @@ def test_load_scene__accepts_any_file_path(tmp_path):
         ),
         ("def build(seed): pass", "`build` in .*scene.py must return a Scene, got None"),
         ("def build(seed): return {}", "must return a Scene, got a dict"),
-        ("import nowhere\n", "scene.py, line 1: ModuleNotFoundError: No module named 'nowhere'; correct the scene"),
-        ("\ndef build(seed:\n", "scene.py, line 2: SyntaxError: '.' was never closed; correct the scene"),
-        ("import math\ndef build(seed):\n\n    return math.sqrt(-1)", "scene.py, line 4: ValueError: "),
+        (
+            "import nowhere\n",
+            "scene.py, line 1: ModuleNotFoundError: No module named 'nowhere'; correct the scene",
+        ),
+        (
+            "\ndef build(seed:\n",
+            "scene.py, line 2: SyntaxError: '.' was never closed; correct the scene",
+        ),
+        (
+            "import math\ndef build(seed):\n\n    return math.sqrt(-1)",
+            "scene.py, line 4: ValueError: ",
+        ),
         (
             "import mitsuba as mi\ndef build(seed):\n    return mi.Bitmap('no.png')",
             "scene.py, line 3: RuntimeError: .*no.png.*No such file",

@@ -87,11 +87,14 @@ def test_synthesize__replaces_a_folder_of_system_files_but_no_hidden_ones(tmp_pa
 
 
 @pytest.mark.slow
-def test_synthesize__rejects_a_non_empty_folder_and_replaces_a_capture_with_overwrite(tmp_path, clip):
+def test_synthesize__rejects_a_non_empty_folder_and_replaces_a_capture_with_overwrite(
+    tmp_path, clip
+):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(FileExistsError, match="not empty; choose another folder"):
         synthesize("spheres", tmp_path, TINY)
-    for content in (None, "{", '{"layout": "COLMAP"}'):  # the last belongs to a fit; a recording may have one too
+    # The last belongs to a fit; a recording may have one too.
+    for content in (None, "{", '{"layout": "COLMAP"}'):
         if content is not None:
             (tmp_path / "capture.json").write_text(content)
         with pytest.raises(FileExistsError, match="is not a synthetic capture"):
@@ -99,11 +102,19 @@ def test_synthesize__rejects_a_non_empty_folder_and_replaces_a_capture_with_over
     (tmp_path / "capture.json").unlink()
     out = shutil.copytree(clip, tmp_path / "clip")
     counts = []
-    synthesize("spheres", out, TINY, overwrite=True, progress=lambda done, total: counts.append((done, total)))
+    synthesize(
+        "spheres",
+        out,
+        TINY,
+        overwrite=True,
+        progress=lambda done, total: counts.append((done, total)),
+    )
     assert json.loads((out / "capture.json").read_text())["scene"] == "spheres"
     assert not (out / "cam02.mp4").exists()
     assert counts == [(1, 2), (2, 2)]
-    with pytest.raises(ValueError, match=f"expected an output outside of captures, .* in the capture {out}"):
+    with pytest.raises(
+        ValueError, match=f"expected an output outside of captures, .* in the capture {out}"
+    ):
         synthesize("spheres", out / "clip", TINY)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["clip", "notes.txt"]
 
@@ -114,7 +125,9 @@ def test_synthesize__removes_its_output_after_a_failure(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("morgs_mi.studio.synth.synthesize.write_colmap", full)
-    with pytest.raises(OSError, match=r"cannot write .*the partial output was removed.*No space left"):
+    with pytest.raises(
+        OSError, match=r"cannot write .*the partial output was removed.*No space left"
+    ):
         synthesize("spheres", tmp_path / "clip", TINY)
     assert list(tmp_path.iterdir()) == []
 
@@ -137,7 +150,9 @@ def test_synthesize__rejects_settings_out_of_range(tmp_path, settings, message):
 
 
 def test_synthesize__names_the_scenes(tmp_path):
-    with pytest.raises(ValueError, match=r"no scene 'nowhere'; name one of .*'arm', 'flicker', 'random', 'spheres'"):
+    with pytest.raises(
+        ValueError, match=r"no scene 'nowhere'; name one of .*'arm', 'flicker', 'random', 'spheres'"
+    ):
         synthesize("nowhere", tmp_path / "clip")
 
 
@@ -176,15 +191,31 @@ WRONG_SCENES = {
         lights(),
         'scene .mine.: Mitsuba cannot load it: .*"a_b.bsdf.reflectance"',
     ),
-    "plugin": ({"a": Object({"b": {"type": "spere"}})}, lights(), 'Mitsuba cannot load it: .*"a_b".*"spere"'),
+    "plugin": (
+        {"a": Object({"b": {"type": "spere"}})},
+        lights(),
+        'Mitsuba cannot load it: .*"a_b".*"spere"',
+    ),
     "no dictionary": (
         {"a": Object({"b": None})},
         {},
         "shape 'b': expected a Mitsuba dictionary with a `type`, got None",
     ),
-    "none": ({"a": Object({"b": sphere(radius=None)})}, {}, "shape 'b': `radius` must have a value, got None"),
-    "no object": ({"a": sphere()}, {}, r"object 'a': expected Object\(...\), got a value of type dict"),
-    "no light": (BALL, {"lamp": sphere()}, r"light 'lamp': expected Light\(...\), got a value of type dict"),
+    "none": (
+        {"a": Object({"b": sphere(radius=None)})},
+        {},
+        "shape 'b': `radius` must have a value, got None",
+    ),
+    "no object": (
+        {"a": sphere()},
+        {},
+        r"object 'a': expected Object\(...\), got a value of type dict",
+    ),
+    "no light": (
+        BALL,
+        {"lamp": sphere()},
+        r"light 'lamp': expected Light\(...\), got a value of type dict",
+    ),
     "names": (
         {"lamp": Object({"a": sphere()}, lambda t: np.eye(4))},
         lights(),
@@ -205,13 +236,21 @@ WRONG_SCENES = {
         {},
         r"must be a finite matrix \[4, 4\], got the shape \(3, 3\)",
     ),
-    "nan": ({"a": Object({"b": sphere()}, lambda t: np.nan * np.eye(4))}, {}, "must be a finite matrix .*, got NaN"),
+    "nan": (
+        {"a": Object({"b": sphere()}, lambda t: np.nan * np.eye(4))},
+        {},
+        "must be a finite matrix .*, got NaN",
+    ),
     "pose fails": (
         {"a": Object({"b": sphere()}, fails)},
         {},
         "object 'a': its pose at 0 s fails with KeyError: 'hinge'",
     ),
-    "lamp pose": (BALL, {"p": Light({"type": "point"}, lambda t: np.eye(4))}, "a lamp with a pose must be a shape"),
+    "lamp pose": (
+        BALL,
+        {"p": Light({"type": "point"}, lambda t: np.eye(4))},
+        "a lamp with a pose must be a shape",
+    ),
     "black": (BALL, {}, "it has no emitter, so its images would be black; give it lights"),
     "nothing": ({}, lights(), "cam00 sees no object at 0 s; move the objects"),
 }
@@ -228,7 +267,9 @@ def test_synthesize__refuses_a_wrong_scene_before_rendering(tmp_path, case):
 def test_synthesize__warns_of_black_images(tmp_path, caplog):
     dark = Light({"type": "point", "position": [0, 0, 0]})
     synthesize(
-        Scene("mine", {"a": Object({"b": sphere(center=[0, 0.8, 0])})}, {"inside": dark}), tmp_path / "clip", TINY
+        Scene("mine", {"a": Object({"b": sphere(center=[0, 0.8, 0])})}, {"inside": dark}),
+        tmp_path / "clip",
+        TINY,
     )
     assert "scene 'mine': cam00 is black at 0 s: no lamp reaches" in caplog.text
 
@@ -236,10 +277,14 @@ def test_synthesize__warns_of_black_images(tmp_path, caplog):
 def test_synthesize__writes_videos_that_browsers_play_beside_the_lossless_frames(clip):
     video = cv2.VideoCapture(str(clip / "cam01.mp4"))
     assert int(video.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little") == b"VP90"
-    played, stored = (np.array(list(open_frames(clip / name).frames())) for name in ("cam01.mp4", "frames/cam01"))
+    played, stored = (
+        np.array(list(open_frames(clip / name).frames())) for name in ("cam01.mp4", "frames/cam01")
+    )
     assert played.shape == stored.shape
     assert psnr(played, stored) > 25
-    np.testing.assert_array_equal(np.array([f.images[1] for f in load_capture(clip).frames()]), stored)
+    np.testing.assert_array_equal(
+        np.array([f.images[1] for f in load_capture(clip).frames()]), stored
+    )
 
 
 @pytest.mark.slow
@@ -248,4 +293,6 @@ def test_synthesize__without_lossless_frames_records_the_videos(tmp_path):
     out = synthesize("spheres", tmp_path / "clip", config)
     assert not (out / "frames").exists()
     played = np.array(list(open_frames(out / "cam01.mp4").frames()))
-    np.testing.assert_array_equal(np.array([f.images[1] for f in load_capture(out).frames()]), played)
+    np.testing.assert_array_equal(
+        np.array([f.images[1] for f in load_capture(out).frames()]), played
+    )

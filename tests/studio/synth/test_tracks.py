@@ -1,4 +1,6 @@
-"""Exact tracks of a synthetic clip: visibility against the ground truth of the views, and against a known occluder."""
+"""Exact tracks of a synthetic clip: visibility against the ground truth of the views, and against a
+known occluder.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ from tests.scenes.gaussians import isotropic
 
 @pytest.mark.slow
 def test_load_tracks__visible_points_have_the_depth_of_the_view(clip: Path) -> None:
-    """Visible points lie on the surface of their pixel, up to its slope; hidden ones behind it or outside."""
+    """Visible points lie on the surface of their pixel, up to its slope; hidden ones behind it or
+    outside.
+    """
     tracks = load_tracks(clip / "truth")
     compared = np.zeros(2, int)
     cameras = load_capture(clip).cameras
@@ -50,7 +54,9 @@ def test_load_tracks__every_point_is_visible_where_it_was_sampled(clip: Path) ->
 
 @pytest.mark.parametrize(("x", "expected"), [(0.0, [False, True]), (1.0, [True, True])])
 def test_sees__a_ball_hides_what_is_behind_it(x: float, expected: list[bool]) -> None:
-    """Of two points on the axis, the ball at the origin hides the farther one, unless it is moved aside."""
+    """Of two points on the axis, the ball at the origin hides the farther one, unless it is moved
+    aside.
+    """
     grey = {"type": "diffuse"}
     front = Object({"ball": ball(0.2, grey)}, lambda time: translate(x, 0, 0))
     back = Object({"ball": ball(0.1, grey, (0, 0, -1))})
@@ -59,7 +65,9 @@ def test_sees__a_ball_hides_what_is_behind_it(x: float, expected: list[bool]) ->
     camera = type(camera).look_at((0, 0, 4), (0, 0, 0), (0, 1, 0), 40, 64, 48)
     points = np.array([(0, 0, -0.9), (x, 0, 0.2)])
     assert tracer.sees(camera, points).tolist() == expected
-    assert not tracer.sees(camera, np.array([(0, 0, 4.5), (9, 0, 0)])).any(), "behind the camera and outside its image"
+    assert not tracer.sees(camera, np.array([(0, 0, 4.5), (9, 0, 0)])).any(), (
+        "behind the camera and outside its image"
+    )
 
 
 def test_save_tracks__load_tracks_reads_them_back(tmp_path: Path) -> None:
@@ -68,14 +76,19 @@ def test_save_tracks__load_tracks_reads_them_back(tmp_path: Path) -> None:
     for visible in ({}, {"cam00": np.array([[True, False], [False, False]])}):
         save_tracks(tmp_path, Tracks(points, ids, visible))
         tracks_of_file = load_tracks(tmp_path)
-        assert (tracks_of_file.points.tolist(), tracks_of_file.ids.tolist()) == (points.tolist(), ids.tolist())
+        assert (tracks_of_file.points.tolist(), tracks_of_file.ids.tolist()) == (
+            points.tolist(),
+            ids.tolist(),
+        )
         assert {name: mask.tolist() for name, mask in tracks_of_file.visible.items()} == {
             n: m.tolist() for n, m in visible.items()
         }
 
 
 def test_synthesize__tracks_score_a_stream_that_moves_like_them(clip: Path, tmp_path: Path) -> None:
-    """The splats lie on the tracked points; the surface that they render decides which points are visible."""
+    """The splats lie on the tracked points; the surface that they render decides which points are
+    visible.
+    """
     capture = load_capture(clip, test_view=0)
     tracks = load_tracks(clip / "truth")
     states = [isotropic(tracks.points[:, t], 0.05, 0.95) for t in range(capture.num_frames)]

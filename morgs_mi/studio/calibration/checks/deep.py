@@ -1,8 +1,9 @@
-"""Check of a whole recording: cameras that differ from the others in time, exposure, sharpness or position.
+"""Check of a whole recording: cameras that differ from the others in time, exposure, sharpness or
+position.
 
-`rig_check` checks the poses on the first frame; this module reads many frames. A finding is a sentence with numbers and
-advice. Each row of `_QUESTIONS` has a question, its measure, its limit and its sentence. The limits are far above the
-values of clips without faults.
+`rig_check` checks the poses on the first frame; this module reads many frames. A finding is a
+sentence with numbers and advice. Each row of `_QUESTIONS` has a question, its measure, its limit
+and its sentence. The limits are far above the values of clips without faults.
 """
 
 from __future__ import annotations
@@ -33,14 +34,17 @@ from morgs_mi.studio.calibration.checks.synchrony import consensus, time_offsets
 MAX_FRAMES = 120
 # Multiple of the other cameras' reprojection error from which an error is a finding.
 _TIMES_ERROR = 3.0
-# Frames. Half a recording has at least this many, and its time offset differs from the other half's by less than this.
+# Frames. Half a recording has at least this many, and its time offset differs from the other half's
+# by less than this.
 _MIN_HALF = 24
 _OFFSET_CHANGE = 0.75
 # Least number of matches of a pair of views whose gains are compared.
 _MIN_SAMPLES = 16
-# Error of a median log ratio that no number of points removes, because surfaces look different from two sides.
+# Error of a median log ratio that no number of points removes, because surfaces look different from
+# two sides.
 _LOG_ERROR = 0.02
-# Octaves, and multiples of the usual deviation, by which a blurred image is less sharp than the others of its camera.
+# Octaves, and multiples of the usual deviation, by which a blurred image is less sharp than the
+# others of its camera.
 _BLURRED_FRAME = 0.5
 _SPREADS = 6.0
 # Number of frames that a sentence lists.
@@ -52,7 +56,8 @@ _CORRECTION = "; fit corrects it (not with --exposure off)"
 class Finding:
     """A fault of a recording."""
 
-    question: str  #: Name of the check: error, time, exposure, variation, flicker, blur, repeats or overlap.
+    #: Name of the check: error, time, exposure, variation, flicker, blur, repeats or overlap.
+    question: str
     cameras: tuple[str, ...]  #: Names of the cameras that it concerns.
     sentence: str  #: Numbers and advice.
 
@@ -68,8 +73,10 @@ class DeepCheck:
     errors: np.ndarray  #: Median reprojection error of each camera [C], px.
     offsets: np.ndarray  #: Time offset of each camera from the median [C], frames.
     halves: np.ndarray  #: The same in the first and the last half of the frames [2, C].
-    gains: np.ndarray  #: Log gain of each camera's channels in linear light, relative to the median [C, 3].
-    brightness: np.ndarray  #: Log brightness of each camera over time, relative to its median [T, C].
+    #: Log gain of each camera's channels in linear light, relative to the median [C, 3].
+    gains: np.ndarray
+    #: Log brightness of each camera over time, relative to its median [T, C].
+    brightness: np.ndarray
     sharpness: np.ndarray  #: Per image [T, C], octaves.
     repeated: tuple[tuple[int, ...], ...]  #: Per camera the frames that repeat the previous one.
     lamps: tuple[Lamp | None, ...]  #: Per camera the flicker of lamps, or None.
@@ -85,21 +92,36 @@ class DeepCheck:
     @property
     def unmeasured(self) -> str:
         """The missing measurements and their cameras, in a sentence; empty if none is missing."""
-        values = {"time offsets": self.offsets, "exposure against the other cameras": self.gains.mean(axis=1)}
+        values = {
+            "time offsets": self.offsets,
+            "exposure against the other cameras": self.gains.mean(axis=1),
+        }
         parts = []
         for quantity, value in values.items():
-            cameras = [name for name, is_missing in zip(self.names, np.isnan(value), strict=True) if is_missing]
+            cameras = [
+                name
+                for name, is_missing in zip(self.names, np.isnan(value), strict=True)
+                if is_missing
+            ]
             if cameras:
                 subject = "all cameras" if len(cameras) == len(self.names) else ", ".join(cameras)
                 parts.append(f"{quantity} of {subject}")
-        return f"Not measured, without enough common motion or matches: {'; '.join(parts)}." if parts else ""
+        return (
+            f"Not measured, without enough common motion or matches: {'; '.join(parts)}."
+            if parts
+            else ""
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return all measurements and findings in JSON types."""
-        return {key: x.tolist() if isinstance(x, np.ndarray) else x for key, x in asdict(self).items()}
+        return {
+            key: x.tolist() if isinstance(x, np.ndarray) else x for key, x in asdict(self).items()
+        }
 
 
-def check_deep(capture: Capture, shared: SharedFeatures, rig: RigCheck, signals: Signals) -> DeepCheck:
+def check_deep(
+    capture: Capture, shared: SharedFeatures, rig: RigCheck, signals: Signals
+) -> DeepCheck:
     """Return the measurements and the faults of a recording.
 
     Args:
@@ -128,12 +150,15 @@ def check_deep(capture: Capture, shared: SharedFeatures, rig: RigCheck, signals:
         overlaps=overlaps(capture.cameras, capture.points),
     )
     findings = [f for question in _QUESTIONS for f in question.findings(check.names, check)]
-    findings += [f for question in (_EXPOSURE, _BALANCE) for f in question.findings(check.names, check.gains)]
+    findings += [
+        f for question in (_EXPOSURE, _BALANCE) for f in question.findings(check.names, check.gains)
+    ]
     return replace(check, findings=tuple(findings))
 
 
 def check_exposures(capture: Capture, shared: SharedFeatures) -> list[Finding]:
-    """Return a finding for each camera with a different exposure or white balance in the first frame.
+    """Return a finding for each camera with a different exposure or white balance in the first
+    frame.
 
     Args:
         capture: a capture.
@@ -144,20 +169,27 @@ def check_exposures(capture: Capture, shared: SharedFeatures) -> list[Finding]:
 
 
 def _gains(capture: Capture, shared: SharedFeatures) -> np.ndarray:
-    """Return the log gains of all cameras [C, 3] that explain the colours of points in two views."""
+    """Return the log gains of all cameras [C, 3] that explain colours of points in two views."""
     images = next(capture.displayed().partial_frames(0, 1)).images
     pairs, colors = matched_colors(capture.cameras, images, shared.features, shared.matches)
     pairs = [pair for pair in pairs if len(pair.features) >= _MIN_SAMPLES]
-    light = [[colors[view][pair.features[:, k]] for k, view in enumerate(pair.views)] for pair in pairs]
+    light = [
+        [colors[view][pair.features[:, k]] for k, view in enumerate(pair.views)] for pair in pairs
+    ]
     ratios = [np.log(b / a) for a, b in light]
     middles = np.reshape([np.median(ratio, axis=0) for ratio in ratios], (-1, 3))
     spreads = [np.abs(ratio - middle).mean() for ratio, middle in zip(ratios, middles, strict=True)]
-    weights = np.array([1 / (s**2 / len(r) + _LOG_ERROR**2) for s, r in zip(spreads, ratios, strict=True)])
+    weights = np.array(
+        [1 / (s**2 / len(r) + _LOG_ERROR**2) for s, r in zip(spreads, ratios, strict=True)]
+    )
     views = [pair.views for pair in pairs]
-    return np.stack([consensus(len(colors), views, channel, weights) for channel in middles.T], axis=1)
+    return np.stack(
+        [consensus(len(colors), views, channel, weights) for channel in middles.T], axis=1
+    )
 
 
-# Values of each camera [C] by name: `value` is compared with the limit, the others stand in the sentence.
+# Values of each camera [C] by name: `value` is compared with the limit, the others stand in the
+# sentence.
 _Values = Mapping[str, Sequence[Any] | np.ndarray]
 
 
@@ -176,14 +208,22 @@ class _Question:
         values = self.measure(measured)
         groups: dict[Any, list[str]] = {}
         for view in np.flatnonzero(np.asarray(values["value"], float) > self.limit).tolist():
-            text = self.sentence.format(**{key: column[view] for key, column in values.items()}).replace("%", " %")
+            text = self.sentence.format(
+                **{key: column[view] for key, column in values.items()}
+            ).replace("%", " %")
             groups.setdefault((text, None if self.common else view), []).append(names[view])
-        return [Finding(self.name, tuple(n), f"{', '.join(n)} {text}.") for (text, _), n in groups.items()]
+        return [
+            Finding(self.name, tuple(n), f"{', '.join(n)} {text}.")
+            for (text, _), n in groups.items()
+        ]
 
 
 def _errors(check: DeepCheck) -> _Values:
     usual = others_median(check.errors)
-    return {"value": np.where(check.errors > _TIMES_ERROR * usual, check.errors, np.nan), "usual": usual}
+    return {
+        "value": np.where(check.errors > _TIMES_ERROR * usual, check.errors, np.nan),
+        "usual": usual,
+    }
 
 
 def _drifts(check: DeepCheck) -> _Values:
@@ -196,7 +236,13 @@ def _times(check: DeepCheck) -> _Values:
     value = np.where((np.abs(changes) >= _OFFSET_CHANGE).any(axis=0), np.nan, np.abs(check.offsets))
     option = np.array(check.given) - np.round(np.nan_to_num(check.offsets))
     seconds = value / check.fps
-    return {"value": value, "ms": 1e3 * seconds, "side": _sides(check.offsets), "name": check.names, "option": option}
+    return {
+        "value": value,
+        "ms": 1e3 * seconds,
+        "side": _sides(check.offsets),
+        "name": check.names,
+        "option": option,
+    }
 
 
 def _sides(offsets: np.ndarray) -> np.ndarray:
@@ -214,7 +260,10 @@ def _balances(gains: np.ndarray) -> _Values:
 
 
 def _flickers(check: DeepCheck) -> _Values:
-    strongest = {lamp.mains: lamp for lamp in sorted(filter(None, check.lamps), key=lambda lamp: lamp.amplitude)}
+    strongest = {
+        lamp.mains: lamp
+        for lamp in sorted(filter(None, check.lamps), key=lambda lamp: lamp.amplitude)
+    }
     lamps = [strongest[lamp.mains] if lamp else Lamp((), 0.0, 0.0) for lamp in check.lamps]
     return {
         "value": [lamp.amplitude for lamp in lamps],
@@ -231,7 +280,9 @@ def _variations(check: DeepCheck) -> _Values:
 
 
 def _common_brightness(check: DeepCheck) -> np.ndarray:
-    """Return the log brightness over time [T, 1] if it changes alike in all cameras, otherwise zeros."""
+    """Return the log brightness over time [T, 1] if it changes alike in all cameras, otherwise
+    zeros.
+    """
     common = known_median(check.brightness, axis=1)[:, None]
     rest = known_median(_range(check.brightness - common), axis=0)
     alike = len(check.names) > 2 and rest < 0.5 * _range(common)[0]
@@ -239,7 +290,9 @@ def _common_brightness(check: DeepCheck) -> np.ndarray:
 
 
 def _changes(check: DeepCheck, values: np.ndarray) -> np.ndarray:
-    """Return the relative change of each camera's log brightness [T, C], NaN if its flicker explains it."""
+    """Return the relative change of each camera's log brightness [T, C], NaN if its flicker
+    explains it.
+    """
     # The range of a flicker is twice its amplitude; twice that range has another cause as well.
     flicker = np.array([4 * lamp.amplitude if lamp else 0 for lamp in check.lamps])
     return np.where(_range(values) > flicker, np.expm1(_range(values)), np.nan)
@@ -261,11 +314,15 @@ def _blurred_frames(check: DeepCheck) -> _Values:
     # Compression changes from frame to frame, equally in all cameras if they share an encoder.
     dips = relative - np.nan_to_num(others_median(relative))
     spread = 1.5 * known_median(np.abs(dips - known_median(dips, axis=0)), axis=0)
-    return _listed([np.flatnonzero(mask) for mask in (dips < -np.fmax(_BLURRED_FRAME, _SPREADS * spread)).T])
+    return _listed(
+        [np.flatnonzero(mask) for mask in (dips < -np.fmax(_BLURRED_FRAME, _SPREADS * spread)).T]
+    )
 
 
 def _listed(frames: Sequence[Sequence[int] | np.ndarray]) -> _Values:
-    """Return the number of frames of each camera, and the frames as text, shortened if they are many."""
+    """Return the number of frames of each camera, and the frames as text, shortened if they are
+    many.
+    """
     counts = [len(camera) for camera in frames]
     texts = [", ".join(map(str, camera[:_MAX_LISTED])) for camera in frames]
     ends = [", ..." if count > _MAX_LISTED else "" for count in counts]
@@ -283,8 +340,8 @@ _BALANCE = _Question(
     "exposure",
     _balances,
     0.05,
-    "has another white balance than the other cameras (R {R:+.0%}, G {G:+.0%}, B {B:+.0%}): set a fixed one"
-    + _CORRECTION,
+    "has another white balance than the other cameras (R {R:+.0%}, G {G:+.0%}, B {B:+.0%}): set a "
+    "fixed one" + _CORRECTION,
 )
 # Change of the brightness over time; a person walking through a room causes 0.05.
 _VARIATION = 0.08
@@ -294,52 +351,54 @@ _QUESTIONS = (
         "error",
         _errors,
         0.7,  # px
-        "has a reprojection error of {value:.2f} px, the others {usual:.2f} px: check its lens model and focal length, "
-        "or calibrate again (morgs-mi calibrate)",
+        "has a reprojection error of {value:.2f} px, the others {usual:.2f} px: check its lens "
+        "model and focal length, or calibrate again (morgs-mi calibrate)",
     ),
     _Question(
         "time",
         _drifts,
         _OFFSET_CHANGE,
-        "moves {value:.1f} frames {side} the other cameras during the first {frames} frames: frames were lost or its "
-        "clock runs at another rate; copy the clip again, or convert it with its true time stamps",
+        "moves {value:.1f} frames {side} the other cameras during the first {frames} frames: "
+        "frames were lost or its clock runs at another rate; copy the clip again, or convert it "
+        "with its true time stamps",
     ),
     _Question(
         "time",
         _times,
         0.65,  # frames, nearer to a whole frame than to none
-        "is {value:.1f} frames ({ms:.0f} ms) {side} the other cameras: use --offset {name} {option:g}, or record with "
-        "synchronised cameras",
+        "is {value:.1f} frames ({ms:.0f} ms) {side} the other cameras: use --offset {name} "
+        "{option:g}, or record with synchronised cameras",
     ),
     _Question(
         "flicker",
         _flickers,
         0,
-        "flicker by {value:.1%} at {alias:.1f} Hz, as lamps on {mains} Hz mains do: expose "
-        "for a multiple of {exposure} s, or use lamps without flicker; fit corrects what the cameras do not have in "
-        "common",
+        "flicker by {value:.1%} at {alias:.1f} Hz, as lamps on {mains} Hz mains do: expose for a "
+        "multiple of {exposure} s, or use lamps without flicker; fit corrects what the cameras do "
+        "not have in common",
         common=True,
     ),
     _Question(
         "variation",
         lambda check: {"value": _changes(check, _common_brightness(check) + 0 * check.brightness)},
         _VARIATION,
-        "change their brightness alike, by {value:.0%} over time: the light of the scene changes; use constant light",
+        "change their brightness alike, by {value:.0%} over time: the light of the scene changes; "
+        "use constant light",
         common=True,
     ),
     _Question(
         "variation",
         _variations,
         _VARIATION,
-        "changes its brightness by {value:.0%} over time, up to {jump:.0%} from frame to frame: fix the exposure"
-        + _CORRECTION,
+        "changes its brightness by {value:.0%} over time, up to {jump:.0%} from frame to frame: "
+        "fix the exposure" + _CORRECTION,
     ),
     _Question(
         "blur",
         _blurs,
         1.0,  # octaves
-        "is less sharp than the other cameras, with {detail:.0%} of their fine detail: check focus and lens, and that "
-        "its clip is not enlarged or strongly compressed",
+        "is less sharp than the other cameras, with {detail:.0%} of their fine detail: check "
+        "focus and lens, and that its clip is not enlarged or strongly compressed",
     ),
     _Question(
         "blur",
@@ -351,14 +410,14 @@ _QUESTIONS = (
         "repeats",
         lambda check: _listed(check.repeated),
         0,
-        "repeats its last image in frames {frames} while the other cameras see motion: frames were lost; copy or "
-        "record the clip again, without converting its frame rate",
+        "repeats its last image in frames {frames} while the other cameras see motion: frames "
+        "were lost; copy or record the clip again, without converting its frame rate",
     ),
     _Question(
         "overlap",
         lambda check: {"value": 1 - check.largest_overlaps, "share": check.largest_overlaps},
         0.7,  # px
-        "shares at most {share:.0%} of its image with another camera: turn it towards what the others see, or add a "
-        "camera in between",
+        "shares at most {share:.0%} of its image with another camera: turn it towards what the "
+        "others see, or add a camera in between",
     ),
 )

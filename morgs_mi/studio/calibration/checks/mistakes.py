@@ -1,7 +1,7 @@
 """Common mistakes of a calibration, and the poses that would correct them.
 
-A candidate is a pair of corrected cameras and the description of the mistake. The rig check accepts a candidate that
-explains the matches between the images.
+A candidate is a pair of corrected cameras and the description of the mistake. The rig check accepts
+a candidate that explains the matches between the images.
 """
 
 from __future__ import annotations
@@ -27,12 +27,20 @@ _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 _ABOUT_FACE = np.diag([-1.0, 1.0, -1.0, 1.0])
 # Corrects columns right, up of a camera that were read as down, right.
 _UPRIGHT = np.array([[0, 1.0, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-_AXES = {"OpenCV": "OpenCV's axes (x right, y down, z forward)", "OpenGL": "OpenGL's axes (x right, y up, z backward)"}
-# Share of the rig's radius, and entries of a rotation: neighbours of a dense rig differ by far more than this.
+_AXES = {
+    "OpenCV": "OpenCV's axes (x right, y down, z forward)",
+    "OpenGL": "OpenGL's axes (x right, y up, z backward)",
+}
+# Share of the rig's radius, and entries of a rotation: neighbours of a dense rig differ by far more
+# than this.
 _SAME = 1e-3
 # Rotations of a single wrong pose, and what is wrong with it.
-_UPSIDE_DOWN = "its images are upside down relative to its pose: turn the clip or the pose by 180 degrees"
-_SIDEWAYS = "its pose is turned by 90 degrees about the optical axis: check the order and signs of its axes"
+_UPSIDE_DOWN = (
+    "its images are upside down relative to its pose: turn the clip or the pose by 180 degrees"
+)
+_SIDEWAYS = (
+    "its pose is turned by 90 degrees about the optical axis: check the order and signs of its axes"
+)
 _CAMERA_MISTAKES = (
     (_HALF_TURN, _UPSIDE_DOWN),
     (_UPRIGHT, _SIDEWAYS),
@@ -43,7 +51,8 @@ _CAMERA_MISTAKES = (
 # Every exchange of poses is compared with all matches, so their number is limited.
 _MAX_EXCHANGED = 12
 _MAX_PERMUTED = 4
-# Factors of the focal length that are tried, and their step: at a wrong focal length the error has several minima.
+# Factors of the focal length that are tried, and their step: at a wrong focal length the error has
+# several minima.
 _FACTOR_OCTAVES = 2.0
 _FACTOR_STEP = 0.25
 # Factors nearer to 1 than this are no mistake in the calibration's image size or field of view.
@@ -58,11 +67,14 @@ def same_poses(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     return [
         (i, j)
         for i, j in combinations(range(len(cameras)), 2)
-        if np.linalg.norm(positions[i] - positions[j]) <= near and np.abs(rotations[i] - rotations[j]).max() < _SAME
+        if np.linalg.norm(positions[i] - positions[j]) <= near
+        and np.abs(rotations[i] - rotations[j]).max() < _SAME
     ]
 
 
-def rig_candidates(capture: Capture, wrong: Sequence[int]) -> Iterator[tuple[Sequence[Camera], str]]:
+def rig_candidates(
+    capture: Capture, wrong: Sequence[int]
+) -> Iterator[tuple[Sequence[Camera], str]]:
     """Yield the corrected cameras for each mistake that concerns several poses.
 
     Args:
@@ -88,7 +100,10 @@ def rig_candidates(capture: Capture, wrong: Sequence[int]) -> Iterator[tuple[Seq
     if 3 <= len(wrong) <= _MAX_PERMUTED:
         for order in permutations(wrong):
             exchanged = dict(zip(wrong, order, strict=True))
-            names = ", ".join(f"{cameras[view].name} has that of {cameras[k].name}" for view, k in exchanged.items())
+            names = ", ".join(
+                f"{cameras[view].name} has that of {cameras[k].name}"
+                for view, k in exchanged.items()
+            )
             yield (
                 [cameras[exchanged.get(v, v)] for v in every],
                 f"the poses seem to be in another order ({names}); reorder them",
@@ -104,11 +119,17 @@ def camera_candidates(camera: Camera) -> Iterator[tuple[Camera, str]]:
     opposite = (camera.width, camera.height, 2) - camera.K[:, 2]
     turned_image = np.column_stack([camera.K[:, :2], opposite])
     yield replace(camera, viewmat=_HALF_TURN @ pose, K=turned_image), _UPSIDE_DOWN
-    yield replace(camera, viewmat=np.linalg.inv(pose)), "its pose is inverted, the other poses are not: invert it"
+    yield (
+        replace(camera, viewmat=np.linalg.inv(pose)),
+        "its pose is inverted, the other poses are not: invert it",
+    )
 
 
-def focal_candidates(what: str, scaled: Callable[[float], T], error: Callable[[T], float]) -> list[tuple[T, str]]:
-    """Return what a factor from 1/4 to 4 on focal lengths corrects, if the best factor differs from 1.
+def focal_candidates(
+    what: str, scaled: Callable[[float], T], error: Callable[[T], float]
+) -> list[tuple[T, str]]:
+    """Return what a factor from 1/4 to 4 on focal lengths corrects, if the best factor differs from
+    1.
 
     Args:
         what: start of the sentence on the mistake.
@@ -123,15 +144,18 @@ def focal_candidates(what: str, scaled: Callable[[float], T], error: Callable[[T
     steps = np.arange(-_FACTOR_OCTAVES, _FACTOR_OCTAVES + _FACTOR_STEP, _FACTOR_STEP)
     start = min(steps, key=of_octaves)
     bounds = (start - _FACTOR_STEP, start + _FACTOR_STEP)
-    from scipy.optimize import minimize_scalar  # imported here because it slows down the start of every command
+    # Imported here because it slows down the start of every command.
+    from scipy.optimize import minimize_scalar
 
-    minimum: Any = minimize_scalar(of_octaves, bounds=bounds, method="bounded", options={"xatol": 3e-3})
+    minimum: Any = minimize_scalar(
+        of_octaves, bounds=bounds, method="bounded", options={"xatol": 3e-3}
+    )
     factor = float(2.0**minimum.x)
     if abs(factor - 1) <= _LEAST_FACTOR:
         return []
     sentence = (
-        f"{what} to be wrong by a factor, {factor:.2g} times the given value fits: check the image size of the "
-        "calibration, and whether its field of view is horizontal or vertical"
+        f"{what} to be wrong by a factor, {factor:.2g} times the given value fits: check the "
+        "image size of the calibration, and whether its field of view is horizontal or vertical"
     )
     return [(scaled(factor), sentence)]
 
@@ -149,16 +173,26 @@ def _other_rows(capture: Capture) -> list[tuple[Sequence[Camera], str]]:
     rig = [replace(c, viewmat=_UPRIGHT @ c.viewmat) for c in cameras]
     order = ", ".join(alphabetical[:4])
     return [
-        (rows, f"the rows seem to be in alphabetical order ({order}, ...); put them in numerical order"),
-        (rig, "the columns seem to be the camera's right, up and backward axes; expected down, right, backward"),
+        (
+            rows,
+            f"the rows seem to be in alphabetical order ({order}, ...); put them in numerical "
+            "order",
+        ),
+        (
+            rig,
+            "the columns seem to be the camera's right, up and backward axes; expected down, "
+            "right, backward",
+        ),
     ]
 
 
-def _other_conventions(cameras: Sequence[Camera], expected: PoseConvention) -> list[tuple[Sequence[Camera], str]]:
+def _other_conventions(
+    cameras: Sequence[Camera], expected: PoseConvention
+) -> list[tuple[Sequence[Camera], str]]:
     """Return the alternatives for poses in 4x4 matrices.
 
-    Images do not determine a rotation of the world, so there are only four distinguishable conventions: camera to
-    world or the inverse, in OpenCV's axes or OpenGL's.
+    Images do not determine a rotation of the world, so there are only four distinguishable
+    conventions: camera to world or the inverse, in OpenCV's axes or OpenGL's.
     """
     inverses = [replace(c, viewmat=np.linalg.inv(c.viewmat)) for c in cameras]
     other_axes = "OpenCV" if expected.axes == "OpenGL" else "OpenGL"

@@ -43,15 +43,21 @@ def check_plot(path: Path) -> None:
     """
     suffix = path.suffix.lower()
     if suffix not in _SUFFIXES:
-        raise ValueError(f"{path}: the suffix of a plot must be .png, .jpg, .svg or .pdf, got {suffix!r}; rename it.")
+        raise ValueError(
+            f"{path}: the suffix of a plot must be .png, .jpg, .svg or .pdf, got {suffix!r}; "
+            "rename it."
+        )
     try:
         import matplotlib.figure  # noqa: F401
     except ImportError:
-        raise ValueError(f"{path}: a plot needs the package matplotlib; pip install 'morgs-mi[plots]'.") from None
+        raise ValueError(
+            f"{path}: a plot needs the package matplotlib; pip install 'morgs-mi[plots]'."
+        ) from None
 
 
 def write_rig(path: Path, capture: Capture, deep: DeepCheck | None = None) -> None:
-    """Write the plot of a capture's rig, and below it the plot of a check; the file is written atomically.
+    """Write the plot of a capture's rig, and below it the plot of a check; the file is written
+    atomically.
 
     Args:
         path: .png, .jpg, .svg or .pdf.
@@ -73,7 +79,9 @@ def write_rig(path: Path, capture: Capture, deep: DeepCheck | None = None) -> No
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
         figure = Figure(figsize=(_WIDTH, sum(heights)), layout="constrained")
         rows = figure.subfigures(len(heights), height_ratios=heights, squeeze=False)[:, 0]
-        draw_rig(rows[0], capture.cameras, (capture.points, capture.point_colors), capture.test_views)
+        draw_rig(
+            rows[0], capture.cameras, (capture.points, capture.point_colors), capture.test_views
+        )
         if deep:
             draw_deep(rows[1], deep)
         figure.savefig(data, format=path.suffix[1:].lower(), dpi=_DPI)
@@ -83,17 +91,22 @@ def write_rig(path: Path, capture: Capture, deep: DeepCheck | None = None) -> No
 
 
 def draw_rig(
-    figure: Any, cameras: Sequence[Camera], points: tuple[np.ndarray, np.ndarray], test_views: Collection[int] = ()
+    figure: Any,
+    cameras: Sequence[Camera],
+    points: tuple[np.ndarray, np.ndarray],
+    test_views: Collection[int] = (),
 ) -> None:
     """Plot the cameras' frusta and names, the points and the world axes, in world units.
 
-    Up is the mean of the cameras' up directions, forward the mean of their viewing directions. The left half is seen
-    from above with forward to the top, the right half from the right with forward to the right.
+    Up is the mean of the cameras' up directions, forward the mean of their viewing directions. The
+    left half is seen from above with forward to the top, the right half from the right with forward
+    to the right.
 
     Args:
         figure: an empty figure or subfigure of matplotlib.
         cameras: the rig.
-        points: positions [P, 3] in world units and colours [P, 3] in [0, 1]; distant ones are cut off.
+        points: positions [P, 3] in world units and colours [P, 3] in [0, 1]; distant ones are cut
+            off.
         test_views: indices of the held-out cameras, drawn in red.
     """
     right, forward, up = _directions(cameras)
@@ -124,7 +137,11 @@ def draw_rig(
         axes.grid(color="0.9")
         for name, color, direction in zip("xyz", _THREE_COLORS, plane.T, strict=True):
             arrow = {"arrowstyle": "<-", "color": color}
-            places_of_arrow = {"xycoords": "axes fraction", "xytext": 36 * direction, "textcoords": "offset points"}
+            places_of_arrow = {
+                "xycoords": "axes fraction",
+                "xytext": 36 * direction,
+                "textcoords": "offset points",
+            }
             if np.linalg.norm(direction) > 0.4:
                 axes.annotate(name, (0.12, 0.12), **places_of_arrow, color=color, arrowprops=arrow)
 
@@ -141,7 +158,7 @@ def _directions(cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def _frustum(camera: Camera, depth: float) -> np.ndarray:
-    """Return the camera's centre and the four corners of its image at `depth` [5, 3], world units."""
+    """Return the camera's centre and the corners of its image at `depth` [5, 3], world units."""
     corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (camera.width, camera.height)
     return np.vstack([camera.position, camera.unproject(corners, np.full(4, depth))])
 
@@ -149,14 +166,17 @@ def _frustum(camera: Camera, depth: float) -> np.ndarray:
 def draw_deep(figure: Any, check: DeepCheck) -> None:
     """Plot a check: a panel per question.
 
-    The panels show reprojection error, time offset, exposure per channel, brightness and sharpness over time, repeated
-    frames and overlap. Cameras with a finding are red; a question mark stands for a missing measurement.
+    The panels show reprojection error, time offset, exposure per channel, brightness and sharpness
+    over time, repeated frames and overlap. Cameras with a finding are red; a question mark stands
+    for a missing measurement.
 
     Args:
         figure: an empty figure or subfigure of matplotlib.
         check: result of `check_deep`.
     """
-    panels = figure.subplot_mosaic([["error", "time", "exposure", "overlap"], ["variation", "blur", *2 * ["repeats"]]])
+    panels = figure.subplot_mosaic(
+        [["error", "time", "exposure", "overlap"], ["variation", "blur", *2 * ["repeats"]]]
+    )
     for question, values, title, least in (
         ("error", check.errors[:, None], "Reprojection error, px", (0, 1)),
         ("time", check.offsets[:, None], "Time offset, frames", (-1, 1)),
@@ -174,8 +194,16 @@ def draw_deep(figure: Any, check: DeepCheck) -> None:
     _label(panels["repeats"], "Repeated frames (red) and missing ones (grey)", "frame")
 
 
-def _label(axes: Any, title: str, xlabel: str = "", ylabel: str = "", least: tuple[float, float] | None = None) -> None:
-    """Set the title and the labels of a panel, and the least range of its vertical axis, where values look small."""
+def _label(
+    axes: Any,
+    title: str,
+    xlabel: str = "",
+    ylabel: str = "",
+    least: tuple[float, float] | None = None,
+) -> None:
+    """Set the title and the labels of a panel, and the least range of its vertical axis, where
+    values look small.
+    """
     axes.set_title(title, fontsize=11, loc="left")
     axes.set(xlabel=xlabel, ylabel=ylabel)
     if least is not None:
@@ -188,7 +216,12 @@ def _bars(axes: Any, values: np.ndarray, names: Sequence[str], colors: Sequence[
     count = values.shape[1]
     for k, column in enumerate(values.T):
         places = np.arange(len(values)) + _BAR * ((k + 0.5) / count - 0.5)
-        axes.bar(places, np.nan_to_num(column), _BAR / count, color=_THREE_COLORS[k] if count > 1 else colors)
+        axes.bar(
+            places,
+            np.nan_to_num(column),
+            _BAR / count,
+            color=_THREE_COLORS[k] if count > 1 else colors,
+        )
         for place in places[~np.isfinite(column)]:
             axes.annotate("?", (place, 0), ha="center", va="bottom", color="0.5")
     axes.axhline(0, color="black", linewidth=0.8)
@@ -196,10 +229,18 @@ def _bars(axes: Any, values: np.ndarray, names: Sequence[str], colors: Sequence[
 
 
 def _curves(axes: Any, values: np.ndarray, names: Sequence[str], colors: Sequence[str]) -> None:
-    """Draw a curve per camera, for values [T, C]; cameras with a finding are drawn last and named in a legend."""
+    """Draw a curve per camera, for values [T, C]; cameras with a finding are drawn last and named
+    in a legend.
+    """
     for name, color, curve in zip(names, colors, values.T, strict=True):
         has_finding = color == _MARKED
-        axes.plot(curve, color=color, linewidth=1, zorder=3 if has_finding else 2, label=name if has_finding else "_")
+        axes.plot(
+            curve,
+            color=color,
+            linewidth=1,
+            zorder=3 if has_finding else 2,
+            label=name if has_finding else "_",
+        )
     if _MARKED in colors:
         axes.legend(fontsize=8)
     axes.set_xlim(-0.5, len(values) - 0.5)
@@ -216,7 +257,9 @@ def _events(axes: Any, check: DeepCheck) -> None:
     _name_cameras(axes.yaxis, check.names, _colors(check, "repeats"))
 
 
-def _name_cameras(axis: Any, names: Sequence[str], colors: Sequence[str], rotation: float = 0) -> None:
+def _name_cameras(
+    axis: Any, names: Sequence[str], colors: Sequence[str], rotation: float = 0
+) -> None:
     """Label the positions along an axis with the cameras' names, red with a finding."""
     axis.set_ticks(np.arange(len(names)), names, fontsize=8, rotation=rotation)
     for color, label in zip(colors, axis.get_ticklabels(), strict=True):
@@ -225,5 +268,10 @@ def _name_cameras(axis: Any, names: Sequence[str], colors: Sequence[str], rotati
 
 def _colors(check: DeepCheck, *questions: str) -> list[str]:
     """Return the colour of each camera, red with a finding about one of the questions."""
-    names = {name for finding in check.findings if finding.question in questions for name in finding.cameras}
+    names = {
+        name
+        for finding in check.findings
+        if finding.question in questions
+        for name in finding.cameras
+    }
     return [_MARKED if name in names else _USUAL for name in check.names]

@@ -1,8 +1,8 @@
 """Check of the camera poses against feature matches that are found without the poses.
 
-A camera fits if most of its matches with other fitting cameras have a small reprojection error. If a pose does not fit,
-the common mistakes of `mistakes` are tried. The check reports the mistake that explains the matches.
-Pixels refer to the recorded size, as in `capture.points`.
+A camera fits if most of its matches with other fitting cameras have a small reprojection error. If
+a pose does not fit, the common mistakes of `mistakes` are tried. The check reports the mistake that
+explains the matches. Pixels refer to the recorded size, as in `capture.points`.
 """
 
 from __future__ import annotations
@@ -28,16 +28,18 @@ from morgs_mi.studio.calibration.checks.mistakes import (
 _MIN_MATCHES = 50
 # px. Features of two cameras at different places are farther apart.
 _SAME_IMAGE = 0.5
-# A correction must lower the error by this factor, and to less than twice the error of the poses that fit or to this
-# many pixels: among many candidates, a wrong one may be slightly better than the given poses.
+# A correction must lower the error by this factor, and to less than twice the error of the poses
+# that fit or to this many pixels: among many candidates, a wrong one may be slightly better than
+# the given poses.
 _GAIN = 3.0
 _GOOD_ERROR = 0.5
-# Number of matches of a pair, and of pairs, to compare candidates with: more are slower, but not more accurate.
+# Number of matches of a pair, and of pairs, to compare candidates with: more are slower, but not
+# more accurate.
 _SAMPLE = 40
 _FACTOR_PAIRS = 8
 _NO_OVERLAP = (
-    "check that the clip is of this scene and not mirrored, compare the camera's place in the plot of the rig (--plot) "
-    "with the real one, or add cameras in between and textured objects"
+    "check that the clip is of this scene and not mirrored, compare the camera's place in the "
+    "plot of the rig (--plot) with the real one, or add cameras in between and textured objects"
 )
 
 
@@ -47,8 +49,8 @@ class CameraCheck:
 
     name: str  #: Name of the camera.
     matches: int  #: Number of its matches with other cameras.
-    #: Median reprojection error of its matches with the cameras that fit, or of all its matches if there are none, px.
-    #: NaN without matches, infinite if most of the points lie behind a camera.
+    #: Median reprojection error of its matches with the cameras that fit, or of all its matches if
+    #: there are none, px. NaN without matches, infinite if most of the points lie behind a camera.
     error: float
     fits: bool | None  #: Whether the pose fits the images; None if that could not be checked.
     advice: str = ""  #: The reason and a remedy; empty if the pose fits.
@@ -67,7 +69,8 @@ class RigCheck:
     pairs: int  #: Number of pairs of views with matches.
     error: float  #: Median reprojection error, px; NaN without matches.
     cameras: tuple[CameraCheck, ...]  #: Result of each camera.
-    #: Whether all poses fit the images; None if no pose is known to be wrong but some could not be checked.
+    #: Whether all poses fit the images; None if no pose is known to be wrong but some could not be
+    #: checked.
     fits: bool | None
     advice: str  #: One sentence with the result, and the remedy if it is the same for all cameras.
 
@@ -86,17 +89,29 @@ def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
         culprits = {view for view in views if cameras[view] is not capture.cameras[view]}
         checks = [_check(view, pairs, set(views) - culprits) for view in views]
         checks = [
-            replace(c, fits=False, advice="") if view in culprits and c.matches else c for view, c in enumerate(checks)
+            replace(c, fits=False, advice="") if view in culprits and c.matches else c
+            for view, c in enumerate(checks)
         ]
         advice = f"the poses do not fit the images: {explanation}."
     else:
         copies = _copies(shared, checks, capture.cameras)
-        checks = [replace(c, fits=False, advice=copies[view]) if view in copies else c for view, c in enumerate(checks)]
+        checks = [
+            replace(c, fits=False, advice=copies[view]) if view in copies else c
+            for view, c in enumerate(checks)
+        ]
         for view, check in enumerate(checks):
             if check.fits is False and not check.advice:
-                checks[view] = replace(check, advice=_explain_camera(view, check, pairs.sampled(), group))
+                checks[view] = replace(
+                    check, advice=_explain_camera(view, check, pairs.sampled(), group)
+                )
         advice = _summary(checks)
-    fits = False if any(c.fits is False for c in checks) else None if any(c.fits is None for c in checks) else True
+    fits = (
+        False
+        if any(c.fits is False for c in checks)
+        else None
+        if any(c.fits is None for c in checks)
+        else True
+    )
     return RigCheck(len(errors), len(shared.matches), _median(errors), tuple(checks), fits, advice)
 
 
@@ -120,32 +135,43 @@ class _Pairs:
         return np.concatenate([np.zeros(0), *parts])
 
     def of_replaced(self, view: int, camera: Camera, partners: Collection[int]) -> float:
-        """Return the median error of a view's matches with `partners` if it had another camera, px."""
+        """Return the median error of a view's matches with `partners` for another camera, px."""
         matches = [match for match in self.shared.matches if _is_shared(match, view, partners)]
         cameras = [camera if i == view else c for i, c in enumerate(self.cameras)]
-        return _median(_Pairs.of(replace(self.shared, matches=tuple(matches)), cameras).of_view(view))
+        return _median(
+            _Pairs.of(replace(self.shared, matches=tuple(matches)), cameras).of_view(view)
+        )
 
     def sampled(self, max_pairs: int | None = None) -> _Pairs:
-        """Return the errors of a part of each pair's matches, for the `max_pairs` pairs with the most matches."""
+        """Return the errors of a part of each pair's matches, for the `max_pairs` pairs with the
+        most matches.
+        """
         largest = sorted(self.shared.matches, key=lambda match: -len(match.features))[:max_pairs]
         few = (replace(m, features=m.features[:: -(-len(m.features) // _SAMPLE)]) for m in largest)
         return self.of(replace(self.shared, matches=tuple(few)), self.cameras)
 
     def worst(self) -> float:
         """Return the largest median error of a view, px; NaN without matches."""
-        medians = [_median(errors) for view in range(len(self.cameras)) if len(errors := self.of_view(view))]
+        medians = [
+            _median(errors)
+            for view in range(len(self.cameras))
+            if len(errors := self.of_view(view))
+        ]
         return max(medians, default=float("nan"))
 
     def agreeing(self) -> set[int]:
         """Return the views with mostly small errors in the matches between them.
 
-        The view with the largest share of large errors is removed until no share exceeds a half, because a wrong pose
-        spoils the matches of the other views too.
+        The view with the largest share of large errors is removed until no share exceeds a half,
+        because a wrong pose spoils the matches of the other views too.
         """
         group = {view for match in self.shared.matches for view in match.views}
         while group:
             errors = {view: self.of_view(view, group) for view in sorted(group)}
-            shares = {view: np.mean(values > MAX_ERROR) if len(values) else 1.0 for view, values in errors.items()}
+            shares = {
+                view: np.mean(values > MAX_ERROR) if len(values) else 1.0
+                for view, values in errors.items()
+            }
             worst = max(shares, key=lambda view: shares[view])
             if shares[worst] <= 0.5:
                 break
@@ -154,8 +180,12 @@ class _Pairs:
 
 
 def _is_shared(match: Match, view: int, partners: Collection[int] | None) -> bool:
-    """Return whether a match is between a view and one of its `partners`, which are all views if None."""
-    return view in match.views and (partners is None or (set(match.views) - {view}) <= set(partners))
+    """Return whether a match is between a view and one of its `partners`, which are all views if
+    None.
+    """
+    return view in match.views and (
+        partners is None or (set(match.views) - {view}) <= set(partners)
+    )
 
 
 def _median(errors: np.ndarray) -> float:
@@ -182,8 +212,12 @@ def _check(view: int, pairs: _Pairs, group: set[int]) -> CameraCheck:
     return CameraCheck(name, len(all_errors), _median(errors), fits, advice)
 
 
-def _correct_rig(capture: Capture, pairs: _Pairs, checks: Sequence[CameraCheck]) -> tuple[Sequence[Camera], str] | None:
-    """Return the cameras corrected for a mistake in several poses, and its description; None if none explains all."""
+def _correct_rig(
+    capture: Capture, pairs: _Pairs, checks: Sequence[CameraCheck]
+) -> tuple[Sequence[Camera], str] | None:
+    """Return the cameras corrected for a mistake in several poses, and its description; None if
+    none explains all.
+    """
     wrong = [view for view, check in enumerate(checks) if check.fits is False]
     largest = pairs.sampled(_FACTOR_PAIRS)
     error = pairs.worst()
@@ -196,10 +230,14 @@ def _correct_rig(capture: Capture, pairs: _Pairs, checks: Sequence[CameraCheck])
         candidates = [*rig_candidates(capture, wrong), *candidates]
     errors = [_Pairs.of(pairs.shared, cameras).worst() for cameras, _ in candidates]
     index = int(np.argmin([*errors, np.inf]))
-    return candidates[index] if min(errors, default=np.inf) <= min(error / _GAIN, MAX_ERROR) else None
+    return (
+        candidates[index] if min(errors, default=np.inf) <= min(error / _GAIN, MAX_ERROR) else None
+    )
 
 
-def _copies(shared: SharedFeatures, checks: Sequence[CameraCheck], cameras: Sequence[Camera]) -> dict[int, str]:
+def _copies(
+    shared: SharedFeatures, checks: Sequence[CameraCheck], cameras: Sequence[Camera]
+) -> dict[int, str]:
     """Return the reason for each camera with the pose or the clip of another one."""
     reasons: dict[int, str] = {}
     for pair in same_poses(cameras):
@@ -209,12 +247,16 @@ def _copies(shared: SharedFeatures, checks: Sequence[CameraCheck], cameras: Sequ
             remedy = "give each camera its own, or leave the copy out (--without)"
             reasons.setdefault(view, f"it has the same pose as {other}: {remedy}")
     for match in shared.matches:
-        a, b = (shared.features[view].points[match.features[:, k]] for k, view in enumerate(match.views))
+        a, b = (
+            shared.features[view].points[match.features[:, k]] for k, view in enumerate(match.views)
+        )
         if np.median(np.linalg.norm(a - b, axis=1)) < _SAME_IMAGE:
             for view in match.views:
                 if view in reasons or not checks[view].fits:
                     other = checks[sum(match.views) - view].name
-                    reasons[view] = f"its clip is a copy of the clip of {other}; replace one of them"
+                    reasons[view] = (
+                        f"its clip is a copy of the clip of {other}; replace one of them"
+                    )
     return reasons
 
 
@@ -233,14 +275,16 @@ def _explain_camera(view: int, check: CameraCheck, pairs: _Pairs, group: set[int
     ]
     errors = [pairs.of_replaced(view, camera, partners) for camera, _ in candidates]
     of_group = [_median(pairs.of_view(other, group)) for other in group]
-    if min(errors) <= min(check.error / _GAIN, MAX_ERROR, max(_GOOD_ERROR, 2 * max(of_group, default=MAX_ERROR))):
+    if min(errors) <= min(
+        check.error / _GAIN, MAX_ERROR, max(_GOOD_ERROR, 2 * max(of_group, default=MAX_ERROR))
+    ):
         return candidates[int(np.argmin(errors))][1]
     cause = "no common mistake explains it"
     if np.isinf(check.error):
         cause = "the points in its images lie behind it, so it looks away from them"
     return (
-        f"{cause}: check its place in the order of the cameras, its axes and the image size of the calibration, or "
-        "calibrate again (morgs-mi calibrate)"
+        f"{cause}: check its place in the order of the cameras, its axes and the image size of "
+        "the calibration, or calibrate again (morgs-mi calibrate)"
     )
 
 
@@ -249,7 +293,10 @@ def _summary(checks: Sequence[CameraCheck]) -> str:
     wrong, open_ = (", ".join(c.name for c in checks if c.fits is fits) for fits in (False, None))
     count = sum(c.fits is True for c in checks)
     if not wrong and not count:
-        return "too few matches to check the poses: the views have little overlap, or the scene has little texture."
+        return (
+            "too few matches to check the poses: the views have little overlap, or the scene has "
+            "little texture."
+        )
     text = f"the poses of {wrong} do not fit the images" if wrong else "the poses fit the images"
     if open_ and not wrong:
         text = f"the poses of {count} of {len(checks)} cameras fit the images"

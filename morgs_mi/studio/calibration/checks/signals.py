@@ -1,7 +1,8 @@
-"""Measurements of each camera's images over time: brightness, sharpness, repeated frames, flicker of lamps.
+"""Measurements of each camera's images over time: brightness, sharpness, repeated frames, flicker
+of lamps.
 
-Notation: T frames, C cameras; an image is reduced to a grey thumbnail [h, w] of display-referred values in [0, 255], on
-which all but the sharpness is measured. Missing values are NaN.
+Notation: T frames, C cameras; an image is reduced to a grey thumbnail [h, w] of display-referred
+values in [0, 255], on which all but the sharpness is measured. Missing values are NaN.
 """
 
 from __future__ import annotations
@@ -23,13 +24,14 @@ _BRIGHT = 240
 _MIN_PIXELS = 30
 # Bands of rows: a rolling shutter reads each at another phase of a lamp.
 _BANDS = 6
-# A repeated frame changes by less than this share of its camera's usual change, while the other cameras change by more
-# than half of their usual change.
+# A repeated frame changes by less than this share of its camera's usual change, while the other
+# cameras change by more than half of their usual change.
 _REPEATED = 0.1
 _CHANGING = 0.5
 # Lamps flicker at twice the frequency of the mains, Hz.
 _MAINS = (50, 60)
-# Least amplitude of a flicker that is reported, and its power relative to the median over all frequencies.
+# Least amplitude of a flicker that is reported, and its power relative to the median over all
+# frequencies.
 _MIN_AMPLITUDE = 0.004
 _MIN_POWER = 12.0
 _MIN_FLICKER_FRAMES = 20
@@ -40,8 +42,10 @@ _MIN_PERIODS = 2
 class Signals:
     """Measurements taken while the frames of a capture are read."""
 
-    thumbs: tuple[np.ndarray, ...]  #: Per camera float32 [T, h, w], NaN where no pixel was recorded.
-    sharpness: np.ndarray  #: Per image [T, C], octaves: log2 of the detail at the finest scale relative to the next one
+    #: Per camera float32 [T, h, w], NaN where no pixel was recorded.
+    thumbs: tuple[np.ndarray, ...]
+    #: Per image [T, C], octaves: log2 of the detail at the finest scale relative to the next one.
+    sharpness: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -53,8 +57,11 @@ class Lamp:
     amplitude: float  #: Amplitude of the brightness, as a share.
 
 
-def read_signals(capture: Capture, max_frames: int, progress: Callable[[int, int], None] | None = None) -> Signals:
-    """Return the measurements of the first frames; takes about 10 ms per image of 640x480, and 100 ms of full HD.
+def read_signals(
+    capture: Capture, max_frames: int, progress: Callable[[int, int], None] | None = None
+) -> Signals:
+    """Return the measurements of the first frames; takes about 10 ms per image of 640x480, and 100
+    ms of full HD.
 
     Args:
         capture: a capture; its images are measured in the size in which it is read.
@@ -65,7 +72,10 @@ def read_signals(capture: Capture, max_frames: int, progress: Callable[[int, int
     sizes = [(_WIDTH, max(1, round(c.height * _WIDTH / c.width))) for c in capture.cameras]
     thumbs = [np.full((count, *size[::-1]), np.nan, np.float32) for size in sizes]
     sharpness = np.full((count, len(sizes)), np.nan)
-    inner = [None if m is None else cv2.erode(m.astype(np.uint8), np.ones((9, 9))) > 0 for m in capture.masks]
+    inner = [
+        None if m is None else cv2.erode(m.astype(np.uint8), np.ones((9, 9))) > 0
+        for m in capture.masks
+    ]
     for t, frame in enumerate(capture.displayed().partial_frames(0, count)):
         for c, image in enumerate(frame.images):
             if image is None:
@@ -83,7 +93,8 @@ def read_signals(capture: Capture, max_frames: int, progress: Callable[[int, int
 
 
 def brightness(signals: Signals) -> np.ndarray:
-    """Return the log of the linear brightness of each band of rows, relative to its median over time [T, C, bands].
+    """Return the log of the linear brightness of each band of rows, relative to its median over
+    time [T, C, bands].
 
     It is the median over the well-exposed pixels, most of which show a static surface.
     """
@@ -91,11 +102,15 @@ def brightness(signals: Signals) -> np.ndarray:
 
 
 def repeated_frames(signals: Signals) -> tuple[tuple[int, ...], ...]:
-    """Return per camera the frames that repeat the previous one while the other cameras' images change."""
+    """Return per camera the frames that repeat the previous one while the other cameras' images
+    change.
+    """
     with warnings.catch_warnings(), np.errstate(invalid="ignore", divide="ignore"):
         # The mean or the quartile of no value is NaN.
         warnings.simplefilter("ignore", RuntimeWarning)
-        steps = [np.nanmean(np.abs(np.diff(thumbs, axis=0)), axis=(1, 2)) for thumbs in signals.thumbs]
+        steps = [
+            np.nanmean(np.abs(np.diff(thumbs, axis=0)), axis=(1, 2)) for thumbs in signals.thumbs
+        ]
         changes = np.stack(steps, axis=1)
         # The upper quartile is the usual change even if every second frame is repeated.
         relative = changes / np.nanpercentile(changes, 75, axis=0)
@@ -109,9 +124,9 @@ def repeated_frames(signals: Signals) -> tuple[tuple[int, ...], ...]:
 def lamp_flicker(bands: np.ndarray, fps: float) -> Lamp | None:
     """Return the flicker of lamps in one camera's `brightness` [T, bands], or None.
 
-    A lamp flickers at 100 or 120 Hz. A camera sees this frequency at its difference from the nearest multiple of the
-    frame rate. A flicker of fewer than two periods is not found. A multiple of the frame rate is not found, either,
-    because each frame sees the same phase.
+    A lamp flickers at 100 or 120 Hz. A camera sees this frequency at its difference from the
+    nearest multiple of the frame rate. A flicker of fewer than two periods is not found. A multiple
+    of the frame rate is not found, either, because each frame sees the same phase.
     """
     count = len(bands)
     if count < _MIN_FLICKER_FRAMES or not np.isfinite(bands).any():
@@ -125,10 +140,14 @@ def lamp_flicker(bands: np.ndarray, fps: float) -> Lamp | None:
     amplitude = _rms(np.fft.rfft(bands * window, axis=0))
     peak = int(amplitude.argmax())
     step = fps / count
-    if amplitude[peak] < _MIN_AMPLITUDE or amplitude[peak] ** 2 < _MIN_POWER * np.median(amplitude**2):
+    if amplitude[peak] < _MIN_AMPLITUDE or amplitude[peak] ** 2 < _MIN_POWER * np.median(
+        amplitude**2
+    ):
         return None
     aliases = {mains: abs(2 * mains - fps * round(2 * mains / fps)) for mains in _MAINS}
-    explaining = tuple(m for m, f in aliases.items() if f >= _MIN_PERIODS * step and abs(f - peak * step) <= step)
+    explaining = tuple(
+        m for m, f in aliases.items() if f >= _MIN_PERIODS * step and abs(f - peak * step) <= step
+    )
     if not explaining:
         return None
     alias = float(aliases[explaining[0]])
@@ -137,7 +156,7 @@ def lamp_flicker(bands: np.ndarray, fps: float) -> Lamp | None:
 
 
 def known_median(values: np.ndarray, axis: int) -> np.ndarray:
-    """Return the median of the values that are not NaN; NaN, without a warning, where all are NaN."""
+    """Return the median of the values that are not NaN; NaN, without a warning, of none."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         return np.nanmedian(values, axis=axis)
@@ -145,7 +164,9 @@ def known_median(values: np.ndarray, axis: int) -> np.ndarray:
 
 def others_median(values: np.ndarray) -> np.ndarray:
     """Return for each camera the median of the other cameras' known values [..., C]."""
-    medians = [known_median(np.delete(values, view, axis=-1), axis=-1) for view in range(values.shape[-1])]
+    medians = [
+        known_median(np.delete(values, view, axis=-1), axis=-1) for view in range(values.shape[-1])
+    ]
     return np.stack(medians, axis=-1)
 
 
@@ -155,10 +176,15 @@ def _rms(amplitudes: np.ndarray) -> np.ndarray:
 
 
 def _sharpness(grey: np.ndarray, mask: np.ndarray | None) -> float:
-    """Return the sharpness of an image: a blur removes detail at the finest scale, a change of contrast at both."""
+    """Return the sharpness of an image: a blur removes detail at the finest scale, a change of
+    contrast at both.
+    """
     blur = cv2.GaussianBlur(grey, (0, 0), 1.0)
     strong_blur = cv2.GaussianBlur(blur, (0, 0), 2.0)
-    fine, coarse = (float(np.abs(x if mask is None else x[mask]).mean()) for x in (grey - blur, blur - strong_blur))
+    fine, coarse = (
+        float(np.abs(x if mask is None else x[mask]).mean())
+        for x in (grey - blur, blur - strong_blur)
+    )
     return float(np.log2(fine / coarse)) if fine > 0 and coarse > 0 else float("nan")
 
 
@@ -169,5 +195,8 @@ def _brightness(thumbs: np.ndarray) -> np.ndarray:
         ratios = np.log(decode_light(thumbs / 255) / decode_light(reference / 255))
     ratios = np.where(good, ratios, np.nan)
     bands = [band.reshape(len(thumbs), -1) for band in np.array_split(ratios, _BANDS, axis=1)]
-    columns = [np.where(np.isfinite(x).sum(axis=1) < _MIN_PIXELS, np.nan, known_median(x, axis=1)) for x in bands]
+    columns = [
+        np.where(np.isfinite(x).sum(axis=1) < _MIN_PIXELS, np.nan, known_median(x, axis=1))
+        for x in bands
+    ]
     return np.stack(columns, axis=1)

@@ -1,13 +1,13 @@
 """Time offsets between calibrated cameras, from the changes of their images.
 
-An object lies between the same two epipolar planes of a pair of cameras in both views. The *epipolar profile* of a view
-is the change per epipolar plane and frame. The profiles of both views are similar, but shifted in time by the
-difference of the cameras' time offsets (after Pundik and Moses, Video Synchronization Using Temporal Signals from
-Epipolar Lines, ECCV 2010).
+An object lies between the same two epipolar planes of a pair of cameras in both views. The
+*epipolar profile* of a view is the change per epipolar plane and frame. The profiles of both views
+are similar, but shifted in time by the difference of the cameras' time offsets (after Pundik and
+Moses, Video Synchronization Using Temporal Signals from Epipolar Lines, ECCV 2010).
 
-The offsets of `calibration.timing` are more exact. On 12 frames of `spheres` by 7 cameras of 128x96 pixels, which are
-up to 1.1 frames apart, their largest error is 0.05 frames, here 0.30. But its fits take minutes instead of half a
-second, and it finds no offsets beyond 3 frames.
+The offsets of `calibration.timing` are more exact. On 12 frames of `spheres` by 7 cameras of 128x96
+pixels, which are up to 1.1 frames apart, their largest error is 0.05 frames, here 0.30. But its
+fits take minutes instead of half a second, and it finds no offsets beyond 3 frames.
 
 Notation: frame k of camera i shows the time k + o_i, with o_i its time offset in frames.
 """
@@ -24,7 +24,8 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.studio.calibration.checks.signals import known_median
 
 _PLANES = 48
-# Grey levels, and multiples of a frame's median change, below which a change is noise or compression.
+# Grey levels, and multiples of a frame's median change, below which a change is noise or
+# compression.
 _NOISE = 6.0
 _MEDIANS = 5.0
 # Largest shift, in frames and as a share of the clip: fewer overlapping frames correlate by chance.
@@ -34,22 +35,25 @@ _MAX_SHARE = 0.25
 _MIN_CORRELATION = 0.3
 _MIN_PROMINENCE = 0.05
 _BESIDE = 3
-# Difference in frames up to which a pair agrees with the offsets of its cameras, and the share of a camera's pairs that
-# must agree.
+# Difference in frames up to which a pair agrees with the offsets of its cameras, and the share of a
+# camera's pairs that must agree.
 _AGREEING = 0.5
 _MIN_AGREEMENT = 0.75
 _ITERATIONS = 30
 
 
 def time_offsets(cameras: Sequence[Camera], thumbs: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the time offset of each camera from the others' median [C], frames; NaN where it is not determined.
+    """Return the time offset of each camera from the others' median [C], frames; NaN where it is
+    not determined.
 
-    An offset is determined if three quarters of the camera's pairs with others agree about it. It is accurate to 0.4
-    frames where objects hardly move across the epipolar planes (see `timing` for fractions of frames).
+    An offset is determined if three quarters of the camera's pairs with others agree about it. It
+    is accurate to 0.4 frames where objects hardly move across the epipolar planes (see `timing` for
+    fractions of frames).
 
     Args:
         cameras: C views.
-        thumbs: per camera thumbnails [T, h, w] of the same instants, values in [0, 255], NaN where missing.
+        thumbs: per camera thumbnails [T, h, w] of the same instants, values in [0, 255], NaN where
+            missing.
     """
     pairs = np.reshape(list(_pair_shifts(cameras, thumbs)), (-1, 4))
     views = pairs[:, :2].astype(int)
@@ -57,12 +61,17 @@ def time_offsets(cameras: Sequence[Camera], thumbs: Sequence[np.ndarray]) -> np.
     offsets = consensus(len(cameras), views, frames, pairs[:, 3])
     agreeing = np.abs(offsets[views[:, 1]] - offsets[views[:, 0]] - frames) <= _AGREEING
     of_camera = (views[:, :, None] == np.arange(len(cameras))).any(axis=1)
-    is_determined = (of_camera & agreeing[:, None]).sum(axis=0) >= _MIN_AGREEMENT * of_camera.sum(axis=0)
+    is_determined = (of_camera & agreeing[:, None]).sum(axis=0) >= _MIN_AGREEMENT * of_camera.sum(
+        axis=0
+    )
     return np.where(is_determined, offsets, np.nan)
 
 
-def consensus(count: int, views: ArrayLike, differences: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return values x [count] that best explain differences x_j - x_i [P] of pairs (i, j) [P, 2], by weighted L1.
+def consensus(
+    count: int, views: ArrayLike, differences: np.ndarray, weights: np.ndarray
+) -> np.ndarray:
+    """Return values x [count] that best explain differences x_j - x_i [P] of pairs (i, j) [P, 2],
+    by weighted L1.
 
     The median of x, or the lower one of two, is zero; x is NaN for an index in no pair.
     """
@@ -80,7 +89,9 @@ def consensus(count: int, views: ArrayLike, differences: np.ndarray, weights: np
     return values
 
 
-def _pair_shifts(cameras: Sequence[Camera], thumbs: Sequence[np.ndarray]) -> Iterator[tuple[int, int, float, float]]:
+def _pair_shifts(
+    cameras: Sequence[Camera], thumbs: Sequence[np.ndarray]
+) -> Iterator[tuple[int, int, float, float]]:
     """Yield i, j, o_j - o_i and a weight for each pair of cameras with distinct common motion."""
     changes = [_changes(frames) for frames in thumbs]
     rays = [_rays(camera, frames.shape[1:]) for camera, frames in zip(cameras, thumbs, strict=True)]
@@ -102,7 +113,9 @@ def _changes(thumbs: np.ndarray) -> np.ndarray:
     # A change of the exposure is no motion.
     frames = frames * (known_median(level, axis=0) / np.maximum(level, 1))
     steps = np.nan_to_num(np.abs(np.diff(frames, axis=0)))
-    return np.maximum(steps - np.maximum(_NOISE, _MEDIANS * np.median(steps, axis=1, keepdims=True)), 0)
+    return np.maximum(
+        steps - np.maximum(_NOISE, _MEDIANS * np.median(steps, axis=1, keepdims=True)), 0
+    )
 
 
 def _rays(camera: Camera, shape: tuple[int, ...]) -> np.ndarray:
@@ -113,7 +126,9 @@ def _rays(camera: Camera, shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _plane_angles(a: Camera, b: Camera, *rays: np.ndarray) -> list[np.ndarray]:
-    """Return the angle of the epipolar half plane of each ray about the baseline of two cameras, radians."""
+    """Return the angle of the epipolar half plane of each ray about the baseline of two cameras,
+    radians.
+    """
     baseline = b.position - a.position
     baseline = baseline / max(float(np.linalg.norm(baseline)), 1e-12)
     forward = sum(np.asarray(camera.viewmat, np.float64)[2, :3] for camera in (a, b))
@@ -123,7 +138,9 @@ def _plane_angles(a: Camera, b: Camera, *rays: np.ndarray) -> list[np.ndarray]:
 
 
 def _profile(changes: np.ndarray, angles: np.ndarray, low: float, high: float) -> np.ndarray:
-    """Return the epipolar profile [T - 1, planes], relative to the mean over time and over the planes."""
+    """Return the epipolar profile [T - 1, planes], relative to the mean over time and over the
+    planes.
+    """
     planes = np.floor((angles - low) / (high - low) * _PLANES).astype(int)
     mask = (planes >= 0) & (planes < _PLANES)
     pixels = np.maximum(np.bincount(planes[mask], minlength=_PLANES), 1)
@@ -132,16 +149,21 @@ def _profile(changes: np.ndarray, angles: np.ndarray, low: float, high: float) -
 
 
 def _best_shift(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
-    """Return the shift of the largest correlation, between frames by a parabola, and its height above other shifts.
+    """Return the shift of the largest correlation, between frames by a parabola, and its height
+    above other shifts.
 
-    The height is zero if the correlation is low, or largest at the longest shift, or if the clip is short.
+    The height is zero if the correlation is low, or largest at the longest shift, or if the clip is
+    short.
     """
     largest = min(_MAX_SHIFT, int(_MAX_SHARE * len(a)))
     if largest < 2:
         return 0.0, 0.0
     shifts = np.arange(-largest, largest + 1)
     curve = np.array(
-        [_correlation(a[max(0, s) : len(a) + min(0, s)], b[max(0, -s) : len(b) - max(0, s)]) for s in shifts]
+        [
+            _correlation(a[max(0, s) : len(a) + min(0, s)], b[max(0, -s) : len(b) - max(0, s)])
+            for s in shifts
+        ]
     )
     k = int(curve.argmax())
     if k in (0, len(curve) - 1) or curve[k] < _MIN_CORRELATION:

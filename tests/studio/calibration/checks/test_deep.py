@@ -37,7 +37,9 @@ def changed(clips: Clips, camera: int, change: Callable[[int, np.ndarray], np.nd
 
 def flickering(clips: Clips) -> Clips:
     for camera in range(len(clips)):
-        clips = changed(clips, camera, lambda t, x: brighter(x, 1 + 0.02 * np.sin(2 * np.pi * 100 * t / FPS)))
+        clips = changed(
+            clips, camera, lambda t, x: brighter(x, 1 + 0.02 * np.sin(2 * np.pi * 100 * t / FPS))
+        )
     return clips
 
 
@@ -54,19 +56,30 @@ def lost_frames(clips: Clips) -> Clips:
 
 
 FAULTS = {
-    "cam1 is 1.4 frames (47 ms) ahead of the other cameras: use --offset cam1 -1": lambda _: film((0, 1.4, 0, 0)),
-    "cam3 is 2.0 frames (67 ms) behind the other cameras: use --offset cam3 2": lambda _: film((0, 0, 0, -2)),
-    "cam3 moves 2.0 frames ahead of the other cameras during the first 56 frames: frames were lost": lost_frames,
-    "cam2 is 25 % brighter than the other cameras": lambda c: changed(c, 2, lambda _, x: brighter(x, 1.25)),
+    "cam1 is 1.4 frames (47 ms) ahead of the other cameras: use --offset cam1 -1": lambda _: film(
+        (0, 1.4, 0, 0)
+    ),
+    "cam3 is 2.0 frames (67 ms) behind the other cameras: use --offset cam3 2": lambda _: film(
+        (0, 0, 0, -2)
+    ),
+    (
+        "cam3 moves 2.0 frames ahead of the other cameras during the first 56 frames: frames were "
+        "lost"
+    ): lost_frames,
+    "cam2 is 25 % brighter than the other cameras": lambda c: changed(
+        c, 2, lambda _, x: brighter(x, 1.25)
+    ),
     "cam0 has another white balance than the other cameras (R +": lambda c: changed(
         c, 0, lambda _, x: np.concatenate([brighter(x[..., :1], 1.15), x[..., 1:]], axis=2)
     ),
-    "cam1 changes its brightness by 15 % over time, up to 15 % from frame to frame": lambda c: changed(
-        c, 1, lambda t, x: brighter(x, 1.15 if t > 15 else 1)
+    "cam1 changes its brightness by 15 % over time, up to 15 % from frame to frame": lambda c: (
+        changed(c, 1, lambda t, x: brighter(x, 1.15 if t > 15 else 1))
     ),
     "cam0, cam1, cam2, cam3 flicker by 1.9 % at 10.0 Hz, as lamps on 50 Hz mains do": flickering,
     "cam0, cam1, cam2, cam3 change their brightness alike, by 36 % over time: the light": darkening,
-    "cam3 is less sharp than the other cameras": lambda c: changed(c, 3, lambda _, x: cv2.GaussianBlur(x, (0, 0), 2.0)),
+    "cam3 is less sharp than the other cameras": lambda c: changed(
+        c, 3, lambda _, x: cv2.GaussianBlur(x, (0, 0), 2.0)
+    ),
     "cam2 is blurred in frames 8, 9:": lambda c: changed(
         c, 2, lambda t, x: cv2.GaussianBlur(x, (0, 0), 1.5) if t in (8, 9) else x
     ),
@@ -95,15 +108,17 @@ def test_check_deep__states_what_it_cannot_measure(clips: Clips) -> None:
     check = checked(grey)
     assert check.findings == ()
     assert check.unmeasured == (
-        "Not measured, without enough common motion or matches: time offsets of all cameras; exposure against the "
-        "other cameras of all cameras."
+        "Not measured, without enough common motion or matches: time offsets of all cameras; "
+        "exposure against the other cameras of all cameras."
     )
     json.dumps(json_finite(check.as_dict()), allow_nan=False)
 
 
 @pytest.mark.parametrize(("cameras", "frames"), [(1, 32), (2, 32), (4, 1), (4, 2)])
 @pytest.mark.filterwarnings("error")
-def test_check_deep__finds_nothing_in_few_cameras_or_frames(cameras: int, frames: int, clips: Clips) -> None:
+def test_check_deep__finds_nothing_in_few_cameras_or_frames(
+    cameras: int, frames: int, clips: Clips
+) -> None:
     check = checked([clip[:frames] for clip in clips[:cameras]])
     assert check.findings == ()
     drawn(check).canvas.draw()
@@ -120,7 +135,12 @@ def test_draw_deep__marks_the_cameras_with_findings(clips: Clips) -> None:
     time = panel_of(figure, "Time offset, frames")
     heights = [bar.get_height() for bar in time.patches]
     assert heights == [0, 1.4, 0, 0]
-    assert [same_color(bar.get_facecolor(), "tab:red") for bar in time.patches] == [False, True, False, False]
+    assert [same_color(bar.get_facecolor(), "tab:red") for bar in time.patches] == [
+        False,
+        True,
+        False,
+        False,
+    ]
     assert [(text.get_text(), text.xy[0]) for text in time.texts] == [("?", 3)]  # was not measured
 
 
@@ -139,6 +159,8 @@ def red_names(figure: Figure) -> dict[str, list[str]]:
     names_by_plot = {}
     for panel in figure.axes:
         labels = [*panel.get_xticklabels(), *panel.get_yticklabels()]
-        if names := [label.get_text() for label in labels if same_color(label.get_color(), "tab:red")]:
+        if names := [
+            label.get_text() for label in labels if same_color(label.get_color(), "tab:red")
+        ]:
             names_by_plot[panel.get_title(loc="left")] = names
     return names_by_plot

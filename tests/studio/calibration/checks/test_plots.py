@@ -19,18 +19,25 @@ from tests.scenes.cameras import circle, look_at_cameras
 
 
 def test_draw_rig__draws_cameras_at_their_positions() -> None:
-    """Cameras on a line lie side by side seen from above; the held-out one is red, and distant points are cut off."""
-    cameras = [Camera.look_at((x, 0, 0), (x, 0, 5), (0, -1, 0), 60, 64, 48, "") for x in (-1.0, 0.0, 1.0)]
+    """Cameras on a line lie side by side seen from above; the held-out one is red, and distant
+    points are cut off.
+    """
+    cameras = [
+        Camera.look_at((x, 0, 0), (x, 0, 5), (0, -1, 0), 60, 64, 48, "") for x in (-1.0, 0.0, 1.0)
+    ]
     points = np.array([[0.0, 0, 3], [1e6, 0, 0]])
     green = np.array([[0, 1.0, 0], [0, 1, 0]])
     figure = Figure()
     draw_rig(figure, cameras, (points, green), test_views=(1,))
     above = figure.axes[0]
-    assert_close(np.array([name.xy for name in above.texts[:3]]), [(-1, 0), (0, 0), (1, 0)], atol=1e-6)
+    assert_close(
+        np.array([name.xy for name in above.texts[:3]]), [(-1, 0), (0, 0), (1, 0)], atol=1e-6
+    )
     assert [name.get_text() for name in above.texts[:3]] == ["0", "1", "2"]
     frusta = above.lines[::2]
     assert [same_color(line.get_color(), "tab:red") for line in frusta] == [False, True, False]
-    assert all(np.asarray(line.get_ydata()).min() >= -1e-6 for line in frusta)  # ahead of the cameras is up
+    # Ahead of the cameras is up.
+    assert all(np.asarray(line.get_ydata()).min() >= -1e-6 for line in frusta)
     (cloud,) = above.collections
     assert_close(np.asarray(cloud.get_offsets()), [(0, 3)], atol=1e-6)
     assert_close(cloud.get_facecolor()[:, :3], [(0, 1, 0)])
@@ -47,13 +54,18 @@ def test_draw_rig__draws_any_rig(count: int) -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_write_rig__writes_vector_graphics_with_any_names(textured_capture: Capture, tmp_path: Path) -> None:
-    cameras = tuple(replace(camera, name="$\\frac$ カメラ") for camera in textured_capture.cameras)
+def test_write_rig__writes_vector_graphics_with_any_names(
+    textured_capture: Capture, tmp_path: Path
+) -> None:
+    name = "$\\frac$ カメラ"
+    cameras = tuple(replace(camera, name=name) for camera in textured_capture.cameras)
     write_rig(tmp_path / "new" / "rig.svg", replace(textured_capture, cameras=cameras))
     assert "<svg" in (tmp_path / "new" / "rig.svg").read_text()
 
 
 def test_check_plot__names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(ValueError, match=r"rig.png: a plot needs .* matplotlib; pip install 'morgs-mi\[plots\]'"):
+    with pytest.raises(
+        ValueError, match=r"rig.png: a plot needs .* matplotlib; pip install 'morgs-mi\[plots\]'"
+    ):
         check_plot(tmp_path / "rig.png")

@@ -35,14 +35,19 @@ def test_check_rig__accepts_true_poses(capture: Capture, shared: SharedFeatures)
     assert not any(camera.advice for camera in check.cameras)
 
 
-def test_check_rig__does_not_check_a_camera_without_matches(capture: Capture, shared: SharedFeatures) -> None:
+def test_check_rig__does_not_check_a_camera_without_matches(
+    capture: Capture, shared: SharedFeatures
+) -> None:
     others = tuple(match for match in shared.matches if 3 not in match.views)
     check = check_rig(capture, SharedFeatures(shared.features, others))
     assert check.fits is None
     assert check.advice == "the poses of 5 of 6 cameras fit the images; not checked: cam3."
     assert (check.cameras[3].fits, check.cameras[3].matches) == (None, 0)
     assert np.isnan(check.cameras[3].error)
-    assert "no matches with any other camera: check that the clip is of this scene" in check.cameras[3].advice
+    assert (
+        "no matches with any other camera: check that the clip is of this scene"
+        in check.cameras[3].advice
+    )
 
 
 def test_check_rig__does_not_check_a_camera_that_matches_only_a_wrong_one(
@@ -51,21 +56,29 @@ def test_check_rig__does_not_check_a_camera_that_matches_only_a_wrong_one(
     some = tuple(match for match in shared.matches if 5 not in match.views or match.views == (4, 5))
     wrong = with_cameras(capture, lambda i, c: turned(c, 20) if i == 4 else c)
     check = check_rig(wrong, SharedFeatures(shared.features, some))
-    assert [camera.verdict for camera in check.cameras] == [*4 * ["fits"], "does not fit", "not checked"]
+    assert [camera.verdict for camera in check.cameras] == [
+        *4 * ["fits"],
+        "does not fit",
+        "not checked",
+    ]
     assert "matches only with cameras that do not fit" in check.cameras[5].advice
 
 
 def test_check_rig__is_undecided_without_matches(capture: Capture) -> None:
     blank = detect(np.full((48, 64, 3), 128, np.uint8))
     assert blank.points.shape == (0, 2)
-    check = check_rig(capture, SharedFeatures((blank,) * 6, tuple(match_views([blank] * 6, capture.cameras))))
+    check = check_rig(
+        capture, SharedFeatures((blank,) * 6, tuple(match_views([blank] * 6, capture.cameras)))
+    )
     assert check.fits is None
     assert check.matches == 0
     assert np.isnan(check.error)
     assert "too few matches" in check.advice
 
 
-def test_check_rig__is_undecided_with_fewer_than_fifty_matches(capture: Capture, shared: SharedFeatures) -> None:
+def test_check_rig__is_undecided_with_fewer_than_fifty_matches(
+    capture: Capture, shared: SharedFeatures
+) -> None:
     first = shared.matches[0]
     for count, fits in ((49, None), (50, True)):
         few = SharedFeatures(shared.features, (replace(first, features=first.features[:count]),))
@@ -75,55 +88,78 @@ def test_check_rig__is_undecided_with_fewer_than_fifty_matches(capture: Capture,
 
 
 @pytest.mark.slow
-def test_check_rig__hardly_detects_a_common_shift_of_principal_points(capture: Capture, shared: SharedFeatures) -> None:
-    """A limitation of comparing two views at a time: principal points that are all off by 5 px still fit."""
+def test_check_rig__hardly_detects_a_common_shift_of_principal_points(
+    capture: Capture, shared: SharedFeatures
+) -> None:
+    """A limitation of comparing two views at a time: principal points that are all off by 5 px
+    still fit.
+    """
     shift = np.array([[0, 0, 5], [0, 0, 5], [0, 0, 0]])
     check = check_rig(with_cameras(capture, lambda i, c: replace(c, K=c.K + shift)), shared)
     assert check.fits
     assert check.error > 3 * check_rig(capture, shared).error
 
 
-def test_triangulate_points__ignores_the_held_out_view(capture: Capture, shared: SharedFeatures) -> None:
+def test_triangulate_points__ignores_the_held_out_view(
+    capture: Capture, shared: SharedFeatures
+) -> None:
     points = triangulate_points(capture, shared)
     assert len(points.points) == len(points.point_colors) > 1000
     held_out = replace(capture, test_views=(3,))
     fewer = triangulate_points(held_out, shared)
     blind = SharedFeatures(
-        tuple(detect(np.zeros((48, 64, 3), np.uint8)) if i == 3 else f for i, f in enumerate(shared.features)),
+        tuple(
+            detect(np.zeros((48, 64, 3), np.uint8)) if i == 3 else f
+            for i, f in enumerate(shared.features)
+        ),
         tuple(match for match in shared.matches if 3 not in match.views),
     )
     np.testing.assert_array_equal(fewer.points, triangulate_points(held_out, blind).points)
     assert len(fewer.points) < len(points.points)
-    wrong = with_cameras(capture, lambda i, c: replace(c, viewmat=np.diag([1.0, -1, -1, 1]) @ c.viewmat))
+    wrong = with_cameras(
+        capture, lambda i, c: replace(c, viewmat=np.diag([1.0, -1, -1, 1]) @ c.viewmat)
+    )
     assert len(triangulate_points(wrong, shared).points) == 0
 
 
 @pytest.mark.slow
-def test_match_capture__finds_features_at_the_recorded_size(capture: Capture, shared: SharedFeatures) -> None:
+def test_match_capture__finds_features_at_the_recorded_size(
+    capture: Capture, shared: SharedFeatures
+) -> None:
     small = load_capture(capture.path, 4)
     matches = match_capture(small)
     assert [len(f.points) for f in matches.features] == [len(f.points) for f in shared.features]
-    assert check_rig(small, matches).error == pytest.approx(check_rig(capture, shared).error, abs=0.01)
+    assert check_rig(small, matches).error == pytest.approx(
+        check_rig(capture, shared).error, abs=0.01
+    )
     few = triangulate_points(small, matches)
     all_ = triangulate_points(capture, shared)
     assert len(few.points) == pytest.approx(len(all_.points), rel=0.01)
     assert few.cameras is small.cameras
 
 
-def test_triangulate_points__matches_distant_views_with_their_poses(capture: Capture, shared: SharedFeatures) -> None:
-    ends = replace(capture, cameras=(capture.cameras[0], capture.cameras[5]), masks=(None, None), test_views=())
+def test_triangulate_points__matches_distant_views_with_their_poses(
+    capture: Capture, shared: SharedFeatures
+) -> None:
+    ends = replace(
+        capture, cameras=(capture.cameras[0], capture.cameras[5]), masks=(None, None), test_views=()
+    )
     unmatched = SharedFeatures((shared.features[0], shared.features[5]), ())
     points = triangulate_points(ends, unmatched)
     assert len(points.points) > 50
     depth = [camera.project(points.points)[1] for camera in ends.cameras]
     assert np.min(depth) > 1
-    wrong = with_cameras(ends, lambda i, c: replace(c, viewmat=np.diag([1.0, -1, -1, 1]) @ c.viewmat) if i else c)
+    wrong = with_cameras(
+        ends, lambda i, c: replace(c, viewmat=np.diag([1.0, -1, -1, 1]) @ c.viewmat) if i else c
+    )
     assert len(triangulate_points(wrong, unmatched).points) < 0.2 * len(points.points)
 
 
 @pytest.mark.slow
 def test_check_rig__fits_with_undistortion_only(tmp_path: Path) -> None:
-    """The recorded images are distorted by OpenCV's own model; the poses fit only if the lens is read."""
+    """The recorded images are distorted by OpenCV's own model; the poses fit only if the lens is
+    read.
+    """
     planes = textured.textures()
     k1 = -0.25
     cameras = textured.rig(4)
@@ -132,9 +168,13 @@ def test_check_rig__fits_with_undistortion_only(tmp_path: Path) -> None:
         K = camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
         pixels = np.stack([columns, rows], -1).reshape(-1, 1, 2)
         straight = (
-            cv2.undistortPoints(pixels, K, np.array([k1, 0, 0, 0]), P=K).reshape(*rows.shape, 2).astype(np.float32)
+            cv2.undistortPoints(pixels, K, np.array([k1, 0, 0, 0]), P=K)
+            .reshape(*rows.shape, 2)
+            .astype(np.float32)
         )
-        image = cv2.remap(textured.render(camera, planes), straight[..., 0], straight[..., 1], cv2.INTER_CUBIC)
+        image = cv2.remap(
+            textured.render(camera, planes), straight[..., 0], straight[..., 1], cv2.INTER_CUBIC
+        )
         write_video(tmp_path / f"{camera.name}.mkv", [image], 30)
     errors = []
     for lens in (Lens("SIMPLE_RADIAL", (k1,)), Lens()):

@@ -19,7 +19,9 @@ from tests.scenes.filmed import Clips, filmed
 
 def brighter(image: np.ndarray, gain: float) -> np.ndarray:
     """Return an image at `gain` times the linear light."""
-    return np.rint(255 * np.clip(encode_light(gain * decode_light(image / 255)), 0, 1)).astype(np.uint8)
+    return np.rint(255 * np.clip(encode_light(gain * decode_light(image / 255)), 0, 1)).astype(
+        np.uint8
+    )
 
 
 def flickering(mains: float, fps: float, amplitude: float = 0.03, count: int = 60) -> np.ndarray:
@@ -32,7 +34,9 @@ def flickering(mains: float, fps: float, amplitude: float = 0.03, count: int = 6
 
 def test_brightness__is_the_log_of_the_gain(clips: Clips) -> None:
     gains = np.exp(np.linspace(-0.2, 0.2, 9))
-    signals = read_signals(filmed([[brighter(clip[0], gain) for gain in gains] for clip in clips]), 9)
+    signals = read_signals(
+        filmed([[brighter(clip[0], gain) for gain in gains] for clip in clips]), 9
+    )
     log_gains = known_median(brightness(signals), axis=2)
     assert_close(log_gains, np.repeat(np.log(gains)[:, None], len(clips), 1), atol=0.01)
 

@@ -24,10 +24,15 @@ def test_time_offsets__are_recovered_to_a_fraction_of_a_frame() -> None:
 
 @pytest.mark.long
 def test_time_offsets__are_those_of_a_path_traced_clip(tmp_path: Path) -> None:
-    options = "--cameras 4 --frames 20 --width 160 --height 120 --spp 4 --no-lossless --time-offset 3 --seed 3"
+    options = (
+        "--cameras 4 --frames 20 --width 160 --height 120 --spp 4 --no-lossless --time-offset 3 "
+        "--seed 3"
+    )
     assert cli.main(["synth", "arm", str(tmp_path / "clip"), *options.split()]) == 0
     capture = load_capture(tmp_path / "clip")
-    true = np.array([camera.time_offset for camera in load_disturbances(tmp_path / "clip" / "truth").values()])
+    true = np.array(
+        [camera.time_offset for camera in load_disturbances(tmp_path / "clip" / "truth").values()]
+    )
     offsets = time_offsets(capture.cameras, read_signals(capture, 20).thumbs)
     # Near enough to distinguish whole frames.
     assert_close(offsets - offsets[0], true, atol=0.5)
@@ -36,7 +41,10 @@ def test_time_offsets__are_those_of_a_path_traced_clip(tmp_path: Path) -> None:
 def test_time_offsets__do_not_depend_on_the_exposure(clips: Clips) -> None:
     gains = np.random.default_rng(0).uniform(0.9, 1.1, (4, 32))
     dimmed = [
-        [(gain * image).clip(0, 255).astype(np.uint8) for gain, image in zip(factors, clip, strict=True)]
+        [
+            (gain * image).clip(0, 255).astype(np.uint8)
+            for gain, image in zip(factors, clip, strict=True)
+        ]
         for factors, clip in zip(gains, clips, strict=True)
     ]
     offsets = time_offsets(rig(), read_signals(filmed(dimmed), 32).thumbs)
@@ -46,7 +54,8 @@ def test_time_offsets__do_not_depend_on_the_exposure(clips: Clips) -> None:
 def test_time_offsets__are_not_determined_without_motion(clips: Clips) -> None:
     noise = np.random.default_rng(0).integers(-2, 3, (4, 32, 150, 200, 3))
     still = [
-        [(clip[0] + n).clip(0, 255).astype(np.uint8) for n in shifts] for shifts, clip in zip(noise, clips, strict=True)
+        [(clip[0] + n).clip(0, 255).astype(np.uint8) for n in shifts]
+        for shifts, clip in zip(noise, clips, strict=True)
     ]
     assert np.isnan(time_offsets(rig(), read_signals(filmed(still), 32).thumbs)).all()
 
