@@ -1,4 +1,4 @@
-"""The blocks of docs/mitsuba.md run, and its table names the properties and channels that exist."""
+"""The blocks of docs/mitsuba.md run, and its tables name the properties and channels that exist."""
 
 from __future__ import annotations
 
