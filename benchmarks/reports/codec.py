@@ -48,7 +48,6 @@ COLUMNS = (
     Column("loss, dB", lambda row: round(row["loss"], 2) + 0.0, spread=False),
     Column("kB", "later", 1, 1e-3, spread=False),
     Column("kB by lzma", "lzma", 1, 1e-3, spread=False),
-    *(Column(f"{name} ms", f"{name}_ms", 0, spread=False) for name in ("encode", "decode")),
 )
 
 

@@ -32,11 +32,8 @@ def known(row: Row, score: str) -> np.ndarray:
 
 COLUMNS = (
     Column("PSNR, dB", lambda row: known(row, "psnr").mean(), spread=False),
-    Column("moving: first", lambda row: known(row, "psnr_moving")[0], spread=False),
-    Column("last", lambda row: known(row, "psnr_moving")[-1], spread=False),
-    Column("mean", lambda row: known(row, "psnr_moving").mean(), spread=False),
+    Column("moving, dB", lambda row: known(row, "psnr_moving").mean(), spread=False),
     Column("slope, dB a frame", "slope_moving_db_a_frame", 3, spread=False),
-    Column("IoU", lambda row: known(row, "confidence_iou").mean(), spread=False),
 )
 
 

@@ -29,11 +29,10 @@ from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.cluster.tasks import Source
 
 COLUMNS = (
-    Column("PSNR, dB", "psnr"),
+    Column("PSNR, dB", "psnr", spread=False),
     Column("moving, dB", "psnr_moving"),
-    Column("IoU of the confidence", "confidence_iou"),
-    Column("motion error, px", "motion_error_moving"),
-    Column("kB", "bytes", 0, 1e-3, spread=False),
+    Column("IoU of the confidence", "confidence_iou", spread=False),
+    Column("motion error, px", "motion_error_moving", spread=False),
 )
 
 

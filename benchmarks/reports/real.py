@@ -39,10 +39,8 @@ from morgs_mi.runs.fit_capture import with_points
 from morgs_mi.studio.calibration.refine import register_camera
 
 COLUMNS = (
-    Column("training views, dB", "training"),
-    Column("held out, as calibrated", "held_out"),
-    Column("registered", "registered"),
-    Column("difference", lambda fit: fit["registered"] - fit["held_out"], spread=False),
+    Column("held out, dB", "held_out"),
+    Column("registered, dB", "registered"),
 )
 _FIRST = 4
 _EVERY = 8
@@ -94,12 +92,9 @@ class Options(StudyOptions):
         """Return the scores by set, and by the time of the first frame or by the calibration."""
         if rows[0].get("seconds"):
             return over_time_table(rows)
-        keys = {
-            "photos": "set",
-            "principal points": "principal_points",
-            "held out": "held_out_views",
-        }
-        return scores_table(rows, keys, COLUMNS, left=2)
+        return scores_table(
+            rows, {"photos": "set", "principal points": "principal_points"}, COLUMNS, left=2
+        )
 
 
 def over_time_table(rows: Sequence[Row]) -> str:

@@ -33,12 +33,10 @@ from morgs_mi.studio.calibration.timing import estimate_time_offsets
 from morgs_mi.studio.synth.disturbances import Disturbances, load_disturbances
 
 COLUMNS = (
-    Column("views", "views", 0, spread=False),
     Column("mean error", "mean_error", 3, spread=False),
-    Column("largest", "largest_error", 3, spread=False),
-    Column("synchronised, dB", "synchronised_moving"),
-    Column("apart", "recorded_moving"),
-    Column("aligned", "aligned_moving"),
+    Column("synchronised, dB", "synchronised_moving", spread=False),
+    Column("apart", "recorded_moving", spread=False),
+    Column("aligned", "aligned_moving", spread=False),
 )
 
 

@@ -71,7 +71,7 @@ def test_commands__follow_date_and_commit():
 
 
 def test_index__lists_every_page():
-    listed = re.findall(r"^\| \[[^]]+\]\(([\w-]+\.md)\)", TEXTS["index.md"], re.MULTILINE)
+    listed = re.findall(r"\[[^]]+\]\(([\w-]+\.md)\)", TEXTS["index.md"].partition("## Pages")[2])
     assert sorted(listed) == sorted(TEXTS.keys() - {"index.md"})
 
 
@@ -209,6 +209,21 @@ def test_index__quotes_the_renderer_and_the_fuzzers():
             f"{100 * committed('render_speed_W2b')['tenth_share']:.0f} % of the time",
             f"in {fuzzers['damage']['streams']:,} damaged streams and "
             f"{fuzzers['bytes']['streams']:,} with changed",
+        ],
+    )
+
+
+def test_renderer_page__quotes_the_times_of_other_settings():
+    rows = {
+        (row["knob"], row["value"]): row["step_ratio"]
+        for row in committed("renderer_report")["rows"]
+    }
+    small, large, same = rows["block", "4x4"], rows["block", "8x8"], rows["reproducible", "true"]
+    assert not missing(
+        "renderer.md",
+        [
+            f"Blocks of 4x4 and 8x8 pixels take {small:.2f} and {large:.2f} of the time, "
+            f"`reproducible` takes {same:.2f}"
         ],
     )
 
