@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pytest
+
 from benchmarks.ewa import rendered, write_picture
 from benchmarks.pictures import draw
 from morgs_mi.stream_loop import StreamLoop
@@ -15,6 +17,7 @@ from tests.scenes.recording import CONFIG, recording
 PAGE = Path(__file__).parents[2] / "docs/how-it-works.md"
 
 
+@pytest.mark.slow
 def test_draw__returns_every_picture_of_the_page():
     capture = recording()
     loop = StreamLoop.of(capture, CONFIG)

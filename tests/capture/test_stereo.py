@@ -39,6 +39,7 @@ def test_stereo_points__lie_on_the_surfaces(views, points_and_colors) -> None:
     assert np.median(np.abs(image[rows, columns] / 255.0 - colors[mask])) < 0.05
 
 
+@pytest.mark.slow
 def test_stereo_points__are_the_same_every_time(views, points_and_colors) -> None:
     cameras, images = views
     again = stereo_points(cameras, images, [None] * 3, NO_POINTS, np.random.default_rng(0))

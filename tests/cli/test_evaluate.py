@@ -44,6 +44,7 @@ def test_eval__refuses_another_recording_by_the_same_cameras(tmp_path: Path, run
     assert run("eval", out, "--capture", clip.rename(tmp_path / "moved"))[0] == 0
 
 
+@pytest.mark.slow
 def test_eval__says_that_a_first_frame_is_provisional(
     tmp_path: Path, run, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -403,6 +403,7 @@ def test_fit__prints_the_first_problem_of_its_frames(tmp_path: Path, run) -> Non
     )
 
 
+@pytest.mark.slow
 def test_fit__resumes_a_stream_to_the_same_bytes(capture: Path, tmp_path: Path, run) -> None:
     out = tmp_path / "out"
     fit = ("fit", capture, out, *OPTIONS, "--reproducible")

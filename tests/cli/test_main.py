@@ -67,6 +67,7 @@ def test_main__leaves_cameras_out(capture: Path, tmp_path: Path, run) -> None:
         assert_refused(run(*args, "--without", "cam7", "cam2"), refused)
 
 
+@pytest.mark.slow
 def test_main__leaves_out_a_camera_without_a_clip(
     capture: Path, tmp_path: Path, run, caplog
 ) -> None:

@@ -62,6 +62,7 @@ def test_render__draws_a_stream_without_gaussians_black(tmp_path: Path, run) -> 
     assert not any(channel.any() for channel in read_exr(tmp_path / "exr" / "0000.exr").values())
 
 
+@pytest.mark.slow
 def test_render__inserts_a_scene_into_some_frames(stream: Path, tmp_path: Path, run) -> None:
     (tmp_path / "ball.py").write_text(
         'def build(frame, time):\n    return {"ball": {"type": "sphere"}}\n'

@@ -89,6 +89,7 @@ def shifted(shift: tuple[float, float, float]) -> tuple[Gaussians, Gaussians, np
     return ball, replace(ball, means=np.asarray(ball.means) + by), by
 
 
+@pytest.mark.slow
 def test_fit_later_frame__rigid_neighbours_move_alike():
     start, truth, shift = shifted((0.06, -0.03, 0.02))
     usual = FitConfig(sh_degree=0, epochs=8, density=DensityConfig(later_frames=False))

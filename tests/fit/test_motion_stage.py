@@ -7,6 +7,7 @@ from dataclasses import replace
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import pytest
 from scipy.sparse import csr_array
 
 from morgs_mi.fit.fit_config import FitConfig
@@ -50,6 +51,7 @@ def fit(
     return fit_shifted(replace(MODEL, model_share=share), start, config)
 
 
+@pytest.mark.slow
 def test_fit_later_frame__finds_the_motion_that_gaussians_share():
     free = fit_shifted(PLAIN)
     shared = fit()

@@ -68,6 +68,7 @@ def test_depth_limit__backward_agrees_with_the_reference(scene, limit, channel, 
             )
 
 
+@pytest.mark.slow
 def test_depth_limit__forward_mode_agrees_with_the_reference(scene, limit):
     raw, camera = scene
     rng = np.random.default_rng(2)
@@ -86,6 +87,7 @@ def test_depth_limit__forward_mode_agrees_with_the_reference(scene, limit):
         assert_close(dr.grad(image[name]), expected, rtol=5 * tol.GRADIENT_REL, name=name)
 
 
+@pytest.mark.slow
 def test_depth_limit__at_infinity_changes_no_bit(scene):
     raw, camera = scene
     limit = np.full((camera.height, camera.width), np.inf)

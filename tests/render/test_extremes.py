@@ -239,7 +239,12 @@ def fuzz(seeds: range) -> list[str]:
 
 
 def test_rasterize__fuzz():
-    assert not fuzz(range(10))
+    assert not fuzz(range(4))
+
+
+@pytest.mark.slow
+def test_rasterize__fuzz_with_further_seeds():
+    assert not fuzz(range(4, 10))
 
 
 @pytest.mark.long

@@ -64,6 +64,7 @@ def test_surfaces__in_front_equal_themselves_alone():
     assert_close(render(scene_with_splats, seed=1), render(expected, seed=1), atol=tol.IMAGE_ABS)
 
 
+@pytest.mark.slow
 def test_surfaces__alone_keep_their_antialiased_outline():
     """Where there are no splats, the image is the nested integrator's, also in pixels that it
     covers in part.
@@ -79,6 +80,7 @@ def test_surfaces__alone_keep_their_antialiased_outline():
     assert_close(render(scene_with_splats, seed=1), render(expected, seed=1), atol=tol.IMAGE_ABS)
 
 
+@pytest.mark.slow
 def test_surfaces__behind_show_through_the_splats():
     gaussians = cloud(0.0)
     assert_close(
@@ -123,6 +125,7 @@ def test_surfaces__white_splats_around_a_white_ball_in_white_light_are_a_furnace
     assert_close(image, 1, atol=tol.IMAGE_ABS)
 
 
+@pytest.mark.slow
 def test_surfaces__cover_a_pixel_by_the_fraction_that_they_fill():
     """A bright rectangle before an opaque splat: pixels on its edge mix both in linear light."""
     splat = Gaussians.from_activated(
@@ -167,6 +170,7 @@ def test_surfaces__channels_include_them():
     assert_close(image[..., 5], alpha / (1 + np.exp(-9)), atol=tol.IMAGE_ABS)
 
 
+@pytest.mark.slow
 def test_surfaces__crop_equals_that_of_the_full_image():
     shapes = {"ball": {"type": "sphere", "radius": 0.7, **glowing()}}
     full = render(scene(cloud(0.0), **shapes), spp=256)

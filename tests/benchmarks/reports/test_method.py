@@ -180,6 +180,7 @@ def test_method_tables__are_complete(interrupted):
         assert "nan" not in table
 
 
+@pytest.mark.slow
 def test_method_page__warns_of_a_best_rate_that_is_the_largest_one(interrupted):
     def warns(best: float) -> bool:
         rows = [

@@ -39,6 +39,7 @@ def test_held_out__is_every_eighth_view_or_each_of_a_few_in_turn():
     assert real.held_out(3) == [[0], [1], [2]]
 
 
+@pytest.mark.slow
 def test_measure__starts_from_points_of_the_training_views(
     clip: Path, monkeypatch: pytest.MonkeyPatch
 ):

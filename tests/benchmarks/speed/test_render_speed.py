@@ -37,6 +37,7 @@ def run(*args: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
 
 
+@pytest.mark.slow
 def test_figures__are_times_memory_and_error(workload: Path):
     options = render_speed.Options(workload, repeats=1, rounds=2)
     result = render_speed.figures(*workloads.load(workload), options)

@@ -262,6 +262,7 @@ def test_select_frames__like_slices(stream, tmp_path):
     assert selected == {"2": [2], "1:3": [1, 2], ":2": [0, 1], "::2": [0, 2], "3:": [3]}
 
 
+@pytest.mark.slow
 def test_exr_channels__are_read_by_mitsuba(stream, tmp_path):
     assert run("render", tmp_path, tmp_path / "exr", "--camera", "middle") == 0
     image = mi.Bitmap(str(tmp_path / "exr" / "0001.exr"))

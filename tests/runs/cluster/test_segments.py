@@ -127,6 +127,7 @@ def test_SegmentedRun__reports_frames_and_workers(whole: Path) -> None:
     assert all(peak > 1e7 for peak in report["workers"].values())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [("eval",), ("export", "tracks"), ("render", "--camera", "0")])
 def test_SegmentedRun__is_read_by_the_commands(
     whole: Path, tmp_path: Path, command: tuple[str, ...]

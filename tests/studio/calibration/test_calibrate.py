@@ -54,6 +54,7 @@ def aligned(estimate: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndar
     return np.sqrt((b**2).sum() / (a**2).sum()) * a @ R.T + true.mean(0), R
 
 
+@pytest.mark.slow
 def test_calibrate__recovers_a_rig(tmp_path: Path, capsys) -> None:
     cameras = [camera.resized(240, 180) for camera in textured.rig()]
     film(tmp_path, cameras)

@@ -28,6 +28,7 @@ def videos(tmp_path: Path) -> list[Path]:
     return paths
 
 
+@pytest.mark.slow
 def test_Live__fits_videos_until_they_end(
     capture, tmp_path: Path, videos: list[Path], run, monkeypatch, caplog
 ) -> None:

@@ -87,6 +87,7 @@ def test_render_inserted__takes_shapes_lights_and_integrator_of_an_xml_file(stre
     np.testing.assert_allclose(images[1]["color"][12, 16], (0.735, 0.537, 0), atol=0.05)
 
 
+@pytest.mark.slow
 def test_render_inserted__lights_a_scene_without_emitters_by_the_stream(stream, tmp_path):
     (tmp_path / "ball.py").write_text(
         'def build(frame, time):\n    return {"ball": {"type": "sphere"}}\n'
@@ -127,6 +128,7 @@ def test_render_inserted__refuses_an_integrator_that_does_not_trace_the_light(st
         next(render_inserted(stream, camera(), build, config=InsertConfig(light="traced")))
 
 
+@pytest.mark.slow
 def test_render_inserted__layers_compose_to_the_image_where_surfaces_cover_nothing(
     stream, tmp_path
 ):

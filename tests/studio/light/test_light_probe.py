@@ -64,6 +64,7 @@ def test_light_probe__leaves_out_what_is_near_and_shows_the_background():
     assert_close(np.array(probe["bitmap"]), decode_light(np.array(0.5)), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_light_probe__in_a_plane_mirror_is_the_view_of_the_mirrored_camera():
     """A probe at the mirrored camera is exact for a plane mirror."""
     rng = np.random.default_rng(3)

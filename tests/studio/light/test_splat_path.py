@@ -78,6 +78,7 @@ def test_splat_path__shadow_of_one_gaussian_is_its_transmittance():
     assert_close(shadow, 1 - np.where(alpha < 1 / 255, 0, alpha), atol=0.02)
 
 
+@pytest.mark.slow
 def test_splat_path__shadows_have_the_cut_off_of_the_plugin():
     image = ratio(isotropic([ASIDE], 0.3, 0.8, BLACK), props={"alpha_min": 0.5})
     alpha = 0.8 * np.exp(-0.5 * (distance_to_aside() / 0.3) ** 2)
@@ -86,6 +87,7 @@ def test_splat_path__shadows_have_the_cut_off_of_the_plugin():
     assert_close(image[clear], np.where(alpha < 0.5, 1, 1 - alpha)[clear], atol=0.03)
 
 
+@pytest.mark.slow
 def test_splat_path__shadow_of_a_dense_shell_is_that_of_the_mesh():
     rng = np.random.default_rng(0)
     directions = rng.normal(size=(3000, 3))
@@ -130,6 +132,7 @@ def test_splat_path__shadow_of_a_point_light_ends_at_the_light():
 # --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("srgb", [True, False])
 def test_splat_path__mirror_shows_the_view_of_the_mirrored_camera(srgb):
     rng = np.random.default_rng(3)

@@ -181,6 +181,7 @@ def bar_scene(speed: float) -> Scene:
     return Scene("bar", {"bar": bar}, {"sky": sky}, rig)
 
 
+@pytest.mark.slow
 def test_synthesize__reads_the_rows_of_a_rolling_shutter_at_their_times(tmp_path: Path) -> None:
     """A vertical bar is slanted: in every row, its middle is where the bar is at the time of that
     row.

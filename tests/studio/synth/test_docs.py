@@ -71,6 +71,7 @@ def test_scenes_page__lists_every_disturbance() -> None:
     assert listed == ["noise", *(field.name.replace("_", "-") for field in fields(Disturbances))]
 
 
+@pytest.mark.slow
 def test_scenes_page__lists_the_files_of_a_capture(clip: Path) -> None:
     listed = {
         name.split("/")[0]

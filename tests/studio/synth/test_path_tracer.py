@@ -15,6 +15,7 @@ from tests.assertions import assert_close
 from tests.studio.synth.frames import psnr
 
 
+@pytest.mark.slow
 def test_surface_points__agree_with_rays_of_the_mitsuba_sensor(tracer):
     camera = tracer.scene.rig.cameras(3, 64, 48)[2]
     K = camera.K.copy()
@@ -52,6 +53,7 @@ def test_render__sampling_noise_is_below_that_of_a_camera(tracer):
     assert psnr(tracer.render(camera, 16, 1), tracer.render(camera, 1024, 2)) > 38
 
 
+@pytest.mark.slow
 def test_render__sensor_noise_has_the_requested_standard_deviation(tracer):
     tracer.set_time(0.0)
     camera = tracer.scene.rig.cameras(3, 160, 120)[0]

@@ -79,6 +79,7 @@ def test_draw_scene__objects_stay_in_the_room(scenes):
             assert (high < body.bounds[1] + 0.01).all(), name
 
 
+@pytest.mark.slow
 def test_draw_scene__objects_never_touch(scenes):
     for scene in scenes:
         for a, b in combinations(scene.bodies.values(), 2):

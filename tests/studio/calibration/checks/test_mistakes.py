@@ -118,6 +118,7 @@ def test_check_rig__names_a_single_wrong_camera(
     )
 
 
+@pytest.mark.slow
 def test_check_rig__names_each_of_two_wrong_cameras(
     capture: Capture, shared: SharedFeatures
 ) -> None:
