@@ -46,6 +46,7 @@ def test_stereo_points__are_the_same_every_time(views, points_and_colors) -> Non
     np.testing.assert_array_equal(points_and_colors[0], again[0])
 
 
+@pytest.mark.slow
 def test_stereo_points__leaves_out_pixels_that_are_not_valid(views) -> None:
     cameras, images = views
     halves = [np.arange(camera.width) < camera.width // 2 for camera in cameras]

@@ -83,6 +83,7 @@ def test_stream_exposure__refuses_other_values(tmp_path, stops):
         stream_exposure(stream)
 
 
+@pytest.mark.slow
 def test_render_inserted__guesses_clipped_light_of_recordings_of_8_bits_alone(stream, tmp_path):
     ball = {"type": "sphere", "center": [0, 0, -1], "radius": 0.2}
     plain = open_stream(written(tmp_path / "plain.morgs", {}))

@@ -502,6 +502,7 @@ def test_stream_capture__writes_no_path_into_the_stream(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_stream_capture__resumes_a_stream_whose_header_has_a_path(
     whole: Path, tmp_path: Path
 ) -> None:

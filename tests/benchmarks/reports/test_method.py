@@ -303,6 +303,7 @@ def test_variants_of__tunes_the_given_presets_and_limits_the_key_views():
     assert {keys["epochs"] for keys in key_views} == {2}
 
 
+@pytest.mark.slow
 def test_fitted__runs_later_seeds_at_the_best_rate_only(clip, tmp_path, monkeypatch):
     ran = []
 

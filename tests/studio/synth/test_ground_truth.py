@@ -68,6 +68,7 @@ def test_compute_ground_truth__first_frame_has_no_motion_and_the_mask_of_the_nex
     assert (first.mask == np.isin(first.ids, np.unique(second.ids[second.mask]))).all()
 
 
+@pytest.mark.slow
 def test_load_tracks__tracks_reproject_to_the_motion_map(clip):
     tracks = load_tracks(clip / "truth")
     assert tracks.points.shape == (len(tracks.ids), 3, 3)

@@ -86,6 +86,7 @@ def test_draw_scene__objects_never_touch(scenes):
             assert ((a.bounds[0] > b.bounds[1]) | (b.bounds[0] > a.bounds[1])).any()
 
 
+@pytest.mark.slow
 def test_draw_scene__held_out_view_and_most_others_see_every_object(scenes):
     for scene in scenes:
         cameras = scene.rig.cameras(scene.recording.num_cameras, 320, 240)
