@@ -90,7 +90,7 @@ def fit_later_frame(
         elif fit.has_converged:
             break
         fit.run_epoch(epoch)
-    gaussians, source = _merge(previous, active, fit.gaussians, fit.source)
+    gaussians, source = active.merge(previous, fit.gaussians, fit.source)
     return LaterFrame(gaussians, source, fit.losses, fit.steps // len(active.views))
 
 
@@ -261,21 +261,3 @@ def _on_active_views(problem: FrameProblem) -> dict[int, Observations]:
 
 def _tensor(array: np.ndarray, view: ActiveView) -> Tensor:
     return from_numpy(mi.TensorXf, view.crop(array))
-
-
-def _merge(
-    previous: Gaussians, active: ActiveSet, gaussians: Gaussians, source: np.ndarray
-) -> tuple[Gaussians, np.ndarray]:
-    """Return the fitted and the static Gaussians in the previous frame's order, and `source`."""
-    if len(active.indices) == len(previous):
-        return gaussians, source
-    is_static = np.ones(len(previous), bool)
-    is_static[active.indices] = False
-    static = np.flatnonzero(is_static)
-    previous_index = np.concatenate(
-        [static, np.where(source < 0, len(previous), active.indices[source])]
-    )
-    order = np.argsort(previous_index, kind="stable")  # births come last
-    all_gaussians = Gaussians.concatenate([with_zero_motion(previous.select(static)), gaussians])
-    merged_source = np.where(previous_index < len(previous), previous_index, -1)
-    return all_gaussians.select(order), merged_source[order]

@@ -85,6 +85,32 @@ class ActiveSet:
         """Return the active ones among N Gaussians."""
         return gaussians if len(self.indices) == len(gaussians) else gaussians.select(self.indices)
 
+    def merge(
+        self, previous: Gaussians, gaussians: Gaussians, source: np.ndarray
+    ) -> tuple[Gaussians, np.ndarray]:
+        """Return active Gaussians after a fit among the static ones, which have not moved.
+
+        Args:
+            previous: N Gaussians before the fit.
+            gaussians: the active ones after it, detached.
+            source: int, index of each among the active ones before it; -1 for births, which come
+                last.
+
+        Returns:
+            The Gaussians in the order of the previous frame, and their index in it; births have -1.
+        """
+        if len(self.indices) == len(previous):
+            return gaussians, source
+        is_static = np.ones(len(previous), bool)
+        is_static[self.indices] = False
+        static = np.flatnonzero(is_static)
+        index = np.where(source < 0, len(previous), self.indices[source])
+        previous_index = np.concatenate([static, index])
+        order = np.argsort(previous_index, kind="stable")  # births come last
+        merged = Gaussians.concatenate([with_zero_motion(previous.select(static)), gaussians])
+        merged_source = np.where(previous_index < len(previous), previous_index, -1)
+        return merged.select(order), merged_source[order]
+
     @property
     def fractions(self) -> dict[str, float]:
         """Fractions of the Gaussians, of the views and of all their pixels that are active, from 0

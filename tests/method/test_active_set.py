@@ -196,3 +196,16 @@ def test_fit_later_frame__ends_early_once_the_loss_stops_falling(previous, densi
     config = FitConfig(sh_degree=0, epochs=12, density=density)
     assert fit(previous, whole, images, replace(config, early_stopping_tolerance=0)).epochs == 12
     assert fit(previous, whole, images, config).epochs < 12
+
+
+def test_merge__has_the_order_of_the_previous_frame_and_births_last():
+    sheet = isotropic(np.arange(15.0).reshape(5, 3), 0.1, 0.9, np.zeros((5, 1, 3)))
+    sheet = replace(sheet, motion=np.ones((5, 3)), offset=np.ones((5, 3)))
+    active = ActiveSet(np.array([1, 3]), 5, {}, 0)
+    fitted = sheet.select([3, 0])  # the first active one died, and another one was born
+    merged, source = active.merge(sheet, fitted, np.array([1, -1]))
+    assert source.tolist() == [0, 2, 3, 4, -1]
+    np.testing.assert_array_equal(
+        np.asarray(merged.means), np.asarray(sheet.means)[[0, 2, 3, 4, 0]]
+    )
+    assert np.asarray(merged.motion)[:, 0].tolist() == [0, 0, 1, 0, 1], "static ones have no motion"
