@@ -101,28 +101,24 @@ def step(
     start = time.perf_counter()
     frame = state.frame
     frame_progress = Progress(progress, f"Frame {frame}")
-    observed = (
-        images
-        if isinstance(images, FrameObservation)
-        else observe_frame(setup, frame, state.history, images)
-    )
+    observed = images
+    if not isinstance(observed, FrameObservation):
+        observed = observe_frame(setup, frame, state.history, observed)
     if state.coded is None:
         fitted = fitted_first_frame(setup, observed, frame_progress, on_provisional)
     else:
         fitted = _fit_later_frame(setup, state, observed, frame_progress)
     coded = decode(state.coded, fitted.packet)
+    present = observed.history.images
+    missing = [camera.name for v, camera in enumerate(setup.cameras) if v not in present]
     report = FrameReport(
         frame=frame,
         seconds=time.perf_counter() - start,
         num_bytes=fitted.packet.num_bytes,
         losses=fitted.losses,
         num_gaussians=len(coded),
-        status=_status(setup, state, observed.history.images, fitted.status),
-        missing_views=tuple(
-            camera.name
-            for v, camera in enumerate(setup.cameras)
-            if v not in observed.history.images
-        ),
+        status=_status(setup, state, present, fitted.status),
+        missing_views=tuple(missing),
         active=fitted.active,
         validation=fitted.validation,
         steps=fitted.steps,
@@ -132,9 +128,7 @@ def step(
 
 
 def _status(setup: Setup, state: StreamState, images: Images, status: str) -> str:
-    """Return the status of a frame with the problems of its images, which are logged in the first
-    frame.
-    """
+    """Return the status of a frame with the problems of its images; log those of the first one."""
     problems = image_status([camera.name for camera in setup.cameras], state.history.images, images)
     for problem in problems if state.coded is None else ():
         _LOG.warning("frame 0: %s", problem)
@@ -144,7 +138,7 @@ def _status(setup: Setup, state: StreamState, images: Images, status: str) -> st
 def _fit_later_frame(
     setup: Setup, state: StreamState, observed: FrameObservation, progress: Progress
 ) -> FittedFrame:
-    """Return the fit of a later frame; numbers in brackets are the paper's equations."""
+    """Return the fit of a later frame; equations are the paper's."""
     assert state.coded is not None
     config = setup.config
     motion = config.motion
@@ -250,10 +244,8 @@ class StreamLoop:
         )
 
     def __repr__(self) -> str:
-        return (
-            f"StreamLoop({len(self.setup.cameras)} cameras, frame {self.state.frame} is next, "
-            f"{self.gaussians})"
-        )
+        count = len(self.setup.cameras)
+        return f"StreamLoop({count} cameras, frame {self.state.frame} is next, {self.gaussians})"
 
     @property
     def gaussians(self) -> Gaussians | None:
@@ -283,20 +275,16 @@ class StreamLoop:
         start = time.perf_counter()
         frame = self.state.frame
         previous = self.state.history
-        observed = self._observed_ahead(images) or observe_frame(
-            self.setup, frame, previous, images
-        )
-        history = (
-            observed.history
-            if recorded is None
-            else extended_history(self.setup, frame, previous, recorded)
-        )
+        observed = self._observed_ahead(images)
+        if observed is None:
+            observed = observe_frame(self.setup, frame, previous, images)
+        history = observed.history
+        if recorded is not None:
+            history = extended_history(self.setup, frame, previous, recorded)
         if upcoming is not None:
             copies = [None if image is None else np.array(as_array(image)) for image in upcoming]
-            observation = in_background(
-                partial(observe_frame, self.setup, frame + 1, history, copies)
-            )
-            self._next_observation = frame + 1, observation
+            observe_next = partial(observe_frame, self.setup, frame + 1, history, copies)
+            self._next_observation = frame + 1, in_background(observe_next)
         state, packet, report = step(self.setup, self.state, observed, progress, on_provisional)
         self.state = replace(state, history=history)
         return packet, replace(report, seconds=time.perf_counter() - start)
