@@ -111,12 +111,11 @@ class Camera:
         width: int,
         height: int,
         name: str = "",
-        near: float | None = None,
     ) -> Camera:
         """Return the camera at `origin` [3] that looks at `target` [3]; `fov_x` in degrees across,
         below 180.
 
-        The default of `near` is 0.01, or a hundredth of the distance to `target` if that is less.
+        The near plane is at 0.01, or at a hundredth of the distance to `target` if that is less.
 
         Raises:
             ValueError: `target` is at `origin` or above or below it in the direction of `up`, and
@@ -135,9 +134,8 @@ class Camera:
                 )
         forward = vectors["target"] - vectors["origin"]
         right = np.cross(forward, vectors["up"])
-        if not np.linalg.norm(right) > 1e-12 * np.linalg.norm(forward) * np.linalg.norm(
-            vectors["up"]
-        ):
+        longest = np.linalg.norm(forward) * np.linalg.norm(vectors["up"])
+        if not np.linalg.norm(right) > 1e-12 * longest:
             text = ", ".join(f"{key} {value.tolist()}" for key, value in vectors.items())
             raise ValueError(
                 f"{where}: `up` must not be parallel to the direction of view, got {text}; tilt it."
@@ -151,9 +149,7 @@ class Camera:
         viewmat[:3, 3] = -R @ vectors["origin"]
         f = 0.5 * width / np.tan(np.deg2rad(0.5 * fov_x))
         K = np.array([[f, 0, 0.5 * width], [0, f, 0.5 * height], [0, 0, 1.0]])
-        return cls(
-            K, viewmat, width, height, name, min(0.01, distance / 100) if near is None else near
-        )
+        return cls(K, viewmat, width, height, name, near=min(0.01, distance / 100))
 
     @classmethod
     def from_sensor(cls, sensor: Any) -> Camera:

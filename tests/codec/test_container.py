@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +42,7 @@ METADATA = {"seed": 3, "parent": "äé", "preset": {"epochs": [1, 2.5, None]}}
 
 
 def cameras() -> list[Camera]:
-    view = Camera.look_at((1, 2, 3), (0, 0, 0), (0, 0, 1), 55, 40, 30, "cam00", near=0.2)
+    view = replace(Camera.look_at((1, 2, 3), (0, 0, 0), (0, 0, 1), 55, 40, 30, "cam00"), near=0.2)
     return [view, Camera(view.K + np.diag([1, 1, 0]) / 3, view.viewmat, 41, 31, "cam01")]
 
 

@@ -198,9 +198,6 @@ def test_look_at__refuses_bad_input(change, message):
 def test_look_at__has_a_near_plane_before_its_target(distance: float, near: float) -> None:
     camera = Camera.look_at((0, 0, -distance), (0, 0, 0), (0, -1, 0), 40, 32, 24)
     assert camera.near == pytest.approx(near)
-    assert (
-        Camera.look_at((0, 0, -distance), (0, 0, 0), (0, -1, 0), 40, 32, 24, near=0.5).near == 0.5
-    )
 
 
 def test_repr__has_name_size_and_place():

@@ -129,7 +129,8 @@ def test_plan_growth__splits_large_long_gaussians_along_their_longest_axis():
 
 
 def test_plan_growth__leaves_the_space_before_near_planes_empty():
-    camera = Camera.look_at((0, 0, -4), (0, 0, 0), (0, -1, 0), 40, 64, 48, near=3.0)
+    camera = Camera.look_at((0, 0, -4), (0, 0, 0), (0, -1, 0), 40, 64, 48)
+    camera = dataclasses.replace(camera, near=3.0)
     z = np.where(np.arange(400) < 100, -2.0, -0.99)  # before and close behind the near plane at -1
     crowd = isotropic(np.stack([0 * z, 0 * z, z], 1), 0.05, 0.6, 0.5)
     plan = growth(crowd, np.ones(400), [camera])

@@ -9,6 +9,7 @@ guessed, see `light_probe`.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import cv2
@@ -116,7 +117,8 @@ def _face(
     forward, up = (np.array(axis, float) for axis in axes)
     width = size + 2 * _MARGIN
     fov = np.rad2deg(2 * np.arctan(width / size))
-    camera = Camera.look_at(center, center + forward, up, fov, width, width, near=near)
+    camera = Camera.look_at(center, center + forward, up, fov, width, width)
+    camera = replace(camera, near=near)
     return camera, np.asarray(rasterize(gaussians, camera, ("color",), background).color)
 
 
