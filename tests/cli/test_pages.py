@@ -25,6 +25,7 @@ SMALLER = {
     "fit": "--num-gaussians 1500 --first-frame-steps 60 --epochs 1",
     "live": "--calibration CAPTURE --frames 2 --loop --first-frame-steps 30 --epochs 1",
     "demo": "--frames 3 --cameras 7",
+    "render": "--width 240",
 }
 # Settings of a command that refines cameras, which have no options.
 SHORT_FITS = "[fit.short_fits]\ngaussians = 400\nsteps = 30\nrounds = 1\n"
@@ -51,7 +52,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     synthesize(
         "spheres",
         folder / "CAPTURE",
-        SynthConfig(cameras=7, frames=6, width=320, height=240, spp=8),
+        SynthConfig(cameras=7, frames=6, width=240, height=180, spp=8),
     )
     (folder / "FOLDER").mkdir()
     capture = load_capture(folder / "CAPTURE")
@@ -70,6 +71,9 @@ def test_commands__of_a_page_run_to_the_end(
 ) -> None:
     shutil.copytree(recordings, tmp_path / "there")
     monkeypatch.chdir(tmp_path / "there")
+    # Of `info --time`, which has no options.
+    monkeypatch.setattr("morgs_mi.studio.calibration.timing.GAUSSIANS", 500)
+    monkeypatch.setattr("morgs_mi.studio.calibration.timing.STEPS", 40)
     cameras = " ".join(str(clip) for clip in sorted(Path("CAPTURE").glob("*.mp4")))
     lines = commands(page)
     assert lines, f"{page} has no commands"

@@ -54,8 +54,8 @@ _WIDTH = 160
 _FRAMES = 12
 _INSTANTS = 2
 # Gaussians and steps of the fit at an instant; half as many of both for blurred images.
-_GAUSSIANS = 8000
-_STEPS = 600
+GAUSSIANS = 8000
+STEPS = 600
 # Standard deviations in pixels of the filters of the first rounds, one round each.
 _BLURS = (6.0, 3.0, 1.5)
 # Largest number of rounds after these, with unblurred images.
@@ -296,8 +296,8 @@ def _fitted(clips: _Clips, images: Sequence[np.ndarray], divisor: int, seed: int
     """
     fit = FitConfig(
         sh_degree=0,
-        num_gaussians=_GAUSSIANS // divisor,
-        first_frame_steps=_STEPS // divisor,
+        num_gaussians=GAUSSIANS // divisor,
+        first_frame_steps=STEPS // divisor,
         dropping=0.0,
         density=DensityConfig(rounds=0),
     )
