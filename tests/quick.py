@@ -28,6 +28,8 @@ MOTION = MotionConfig(key_views=1)
 REPRODUCIBLE = RenderConfig(reproducible=True)
 # The same for the command line, as far as it has options.
 OPTIONS = ["--num-gaussians", "80", "--first-frame-steps", "8", "--epochs", "1", "--sh-degree", "0"]
+# A settings file with short fits for the refinement of cameras and for exposures.
+SHORT_FITS = "[fit.short_fits]\ngaussians = 400\nsteps = 30\nrounds = 1\n"
 
 
 def quick(

@@ -23,11 +23,12 @@ from morgs_mi.io.ply import write_ply
 from morgs_mi.playback.visualise import write_png
 from morgs_mi.studio.synth.synth_config import SynthConfig
 from morgs_mi.studio.synth.synthesize import synthesize
+from tests.quick import SHORT_FITS
 from tests.scenes.changing_splats import splats
 
 PAGE = (Path(__file__).parents[2] / "docs/coming-from.md").read_text(encoding="utf-8")
 COMMANDS = re.findall(r"^    ((?:morgs-mi|ln) .*)$", PAGE, re.MULTILINE)
-QUICK = "--num-gaussians 400 --first-frame-steps 20 --epochs 1"
+QUICK = "--num-gaussians 400 --first-frame-steps 20 --epochs 1 --config short.toml"
 CAMERAS = 7
 FRAMES = 2
 
@@ -129,6 +130,7 @@ def test_coming_from__commands_run_on_the_folders_of_the_tools(
         write(recording)
     write_ply("splat.ply", splats())
     os.mkdir("out")
+    Path("short.toml").write_text(SHORT_FITS, encoding="utf-8")
     frames = {}
     outputs = {}
     for command in COMMANDS:

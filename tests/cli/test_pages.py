@@ -16,6 +16,7 @@ from morgs_mi.io.ply import write_ply
 from morgs_mi.playback.visualise import write_png
 from morgs_mi.studio.synth.synth_config import SynthConfig
 from morgs_mi.studio.synth.synthesize import synthesize
+from tests.quick import SHORT_FITS
 from tests.scenes.changing_splats import splats
 
 ROOT = Path(__file__).parents[2]
@@ -27,8 +28,6 @@ SMALLER = {
     "demo": "--frames 3 --cameras 7",
     "render": "--width 240",
 }
-# Settings of a command that refines cameras, which have no options.
-SHORT_FITS = "[fit.short_fits]\ngaussians = 400\nsteps = 30\nrounds = 1\n"
 GUIDES = ("quickstart", "splat-files", "captures", "cameras", "colours", "checks")
 PAGES = ("README.md", *(f"docs/{name}.md" for name in GUIDES))
 # Commands that never end, or write outside of the folder.

@@ -18,7 +18,7 @@ from morgs_mi.studio.synth.synthesize import synthesize
 PAGE = Path(__file__).parents[2] / "docs/experiments/index.md"
 FRAMES = 3
 # Appended to the fits, which then take seconds.
-SMALLER = "--num-gaussians 5000 --first-frame-steps 400 --epochs 1"
+SMALLER = "--num-gaussians 2500 --first-frame-steps 200 --epochs 1"
 
 
 def stand_in(path: Path, width: int, height: int, number: str) -> None:
@@ -41,8 +41,8 @@ def stand_in(path: Path, width: int, height: int, number: str) -> None:
 @pytest.mark.slow
 def test_commands_for_public_recordings__give_scores_of_camera_0(tmp_path, run, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    stand_in(tmp_path / "N3DV/cut_roasted_beef", 640, 480, "cam{:02d}.mp4")
-    stand_in(tmp_path / "MeetRoom/discussion", 320, 240, "cam_{}.mp4")
+    stand_in(tmp_path / "N3DV/cut_roasted_beef", 320, 240, "cam{:02d}.mp4")
+    stand_in(tmp_path / "MeetRoom/discussion", 160, 120, "cam_{}.mp4")
     block = PAGE.read_text().partition("<!-- commands: recordings -->\n")[2]
     commands = re.findall(r"^    morgs-mi (.*)$", block, re.MULTILINE)
     assert len(commands) == 7
