@@ -218,12 +218,12 @@ def test_renderer_page__quotes_the_times_of_other_settings():
         (row["knob"], row["value"]): row["step_ratio"]
         for row in committed("renderer_report")["rows"]
     }
-    small, large, same = rows["block", "4x4"], rows["block", "8x8"], rows["reproducible", "true"]
     assert not missing(
         "renderer.md",
         [
-            f"Blocks of 4x4 and 8x8 pixels take {small:.2f} and {large:.2f} of the time, "
-            f"`reproducible` takes {same:.2f}"
+            f"Blocks of 4x4 and 8x8 pixels take {rows['block', '4x4']:.2f} and "
+            f"{rows['block', '8x8']:.2f} of the time, `reproducible` takes "
+            f"{rows['reproducible', 'true']:.2f}"
         ],
     )
 
