@@ -1,5 +1,6 @@
-"""Results of an evaluation as frozen dataclasses; `Evaluation.as_dict` is the JSON that `morgs-mi
-eval` writes.
+"""Results of an evaluation as frozen dataclasses.
+
+`Evaluation.as_dict` is the JSON that `morgs-mi eval` writes.
 
 NaN stands for an unknown score. A name with ``_moving`` or ``_still`` is the score of a region; see
 `measures`.
