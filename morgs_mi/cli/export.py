@@ -73,8 +73,8 @@ class Flight(ExportKind):
     """File for the video; by default OUT/PATH.mp4, e.g. OUT/orbit.mp4."""
     path: Annotated[str, arg(help=_PATH)] = "between"
     seconds: Annotated[float | None, DisallowNone, optional("FLOAT")] = None
-    """Duration in seconds; by default that of the JSON file, or that of the clip, repeated to
-    LEAST_SECONDS.
+    """Duration in seconds; by default the duration in the JSON file, or of the clip, which is
+    repeated up to LEAST_SECONDS.
     """
     least_seconds: float = 5.0
     """Least duration without SECONDS; a shorter clip is played several times, as a whole. 0: once.

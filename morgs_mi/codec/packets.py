@@ -200,7 +200,7 @@ def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
     try:
         if previous is not None and packet.frame <= previous.frame:
             raise ValueError(
-                f"its frame must be above {previous.frame}, that of the state before, got "
+                f"its frame must be above {previous.frame}, the frame of the state, got "
                 f"{packet.frame}"
             )
         if packet.kind == PacketKind.KEYFRAME:

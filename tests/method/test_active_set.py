@@ -75,12 +75,12 @@ def test_find_active_set__selects_moving_but_not_occluded_gaussians(previous, cu
     active = find_active_set(
         previous, cameras(), changes(previous, current), CHANNELS, RENDER, config
     )
-    chosen = np.isin(np.arange(len(previous)), active.indices)
-    assert chosen[HIDDEN:].mean() > 0.9  # the others are inside the ball
-    assert chosen[:HIDDEN].mean() < 0.15
+    mask = np.isin(np.arange(len(previous)), active.indices)
+    assert mask[HIDDEN:].mean() > 0.9  # the others are inside the ball
+    assert mask[:HIDDEN].mean() < 0.15
     assert len(active.views) == V
     assert active.fractions["pixels"] < 0.4
-    assert active.fractions["gaussians"] == chosen.mean()
+    assert active.fractions["gaussians"] == mask.mean()
 
 
 def test_find_active_set__is_empty_without_changes(previous):

@@ -296,7 +296,19 @@ def match_views(
     config: CalibrateConfig,
     report: Callable[[str, int, int], None],
 ) -> None:
-    """Write images, features and matches of all pairs of views into a folder, for `map_views`."""
+    """Write images, features and matches of all pairs of views into a folder, for `map_views`.
+
+    Args:
+        path: the clips, for messages.
+        images: image [H, W, 3] of each view, RGB uint8, by name.
+        masks: bool [H, W], by name of a view: pixels in which features are looked for.
+        scratch: the folder.
+        config: settings of the features.
+        report: called with (stage, done, total).
+
+    Raises:
+        ValueError: no two views match.
+    """
     pycolmap = import_pycolmap()
 
     folder = scratch / _IMAGES
@@ -347,6 +359,15 @@ def map_views(path: Path, names: Sequence[str], scratch: Path, seed: int) -> Can
 
     If none is complete, both map the matches that agree with focal lengths found from pairs of
     views, too.
+
+    Args:
+        path: the clips, for messages.
+        names: of the views.
+        scratch: the folder that `match_views` has written.
+        seed: of COLMAP.
+
+    Raises:
+        ValueError: no model was found.
     """
     pycolmap = import_pycolmap()
 

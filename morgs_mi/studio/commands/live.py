@@ -153,5 +153,6 @@ def start_viewer(out: Path, browser: bool) -> subprocess.Popen[bytes]:
 
 
 def stop_viewer(process: subprocess.Popen[bytes]) -> None:
+    """End the viewer and wait for its end."""
     process.kill()  # asked to end, it would report an interruption
     process.wait()

@@ -310,7 +310,7 @@ def _dropped(cameras: Sequence[_Images], bundle: Bundle, last_bundle: Bundle) ->
 
 
 def files_of_camera(folder: Path, limit: int) -> dict[int, Path]:
-    """Return the images in a folder, by their numbers, that are larger than `limit`."""
+    """Return the image files of a camera's folder by number, of numbers above `limit`."""
     files = {}
     with suppress(FileNotFoundError, NotADirectoryError):
         for name in os.listdir(folder):

@@ -117,8 +117,11 @@ def play(
 
 
 def timed_images(path: str | Path) -> Iterator[tuple[np.ndarray, float, float]]:
-    """Yield the images of a video, BGR, with their times from its beginning and the time between
-    two of them, s.
+    """Yield each image [H, W, 3] of a video, BGR uint8, its time from the beginning of the video,
+    and the interval between two images, s.
+
+    Raises:
+        OSError: the video cannot be opened.
     """
     stream = open_stream(str(path), path)
     try:

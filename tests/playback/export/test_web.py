@@ -102,7 +102,7 @@ def test_write_web_page__refuses_a_second_residual_of_a_frame(tmp_path):
         for packet in (*packets, packets[-1]):
             writer.write(packet)
     with pytest.raises(
-        ValueError, match="its frame must be above 3, that of the state before, got 3"
+        ValueError, match="its frame must be above 3, the frame of the state, got 3"
     ):
         write_web_page(open_stream(tmp_path), tmp_path / "page.html")
 
