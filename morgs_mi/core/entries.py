@@ -29,6 +29,11 @@ STUDIO: Mapping[str, Mapping[str, str]] = {
     },
     "integrators": {"splat_path": "light.splat_path:SplatPathIntegrator"},
     "renderings": {"insert": "light.insert", "panorama": "exports.panorama"},
+    "layouts": {
+        "dynamic3dgs": "layouts.dynamic3dgs:LAYOUT",
+        "qualisys": "layouts.qualisys:LAYOUT",
+        "anipose": "layouts.anipose:LAYOUT",
+    },
     "camera refinement": {"first frame": "calibration.refine:refine_cameras"},
     "flow sources": {
         "onnx": "networks.flow_network:onnx",

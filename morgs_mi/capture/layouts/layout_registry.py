@@ -1,30 +1,28 @@
 """The supported capture layouts.
 
-A layout of this package is a module that exposes a `LAYOUT`, whose name is in `_READERS`. Another
-module appends its layout to `LAYOUTS`.
+A layout is a module that exposes a `LAYOUT`. A module outside of this package appends it to
+`LAYOUTS`.
 """
 
 from __future__ import annotations
 
-from importlib import import_module
 from pathlib import Path
 
+from morgs_mi.capture.layouts import colmap, nerfstudio, poses_bounds
 from morgs_mi.capture.layouts.calibration import Layout, required_clips
 from morgs_mi.capture.layouts.clips import EXAMPLE
+from morgs_mi.core.entries import STUDIO, studio_entry
 from morgs_mi.core.fit_names import CAPTURE, STREAM
 from morgs_mi.io.bounded import read_json
 
-_READERS = (
-    "colmap",
-    "nerfstudio",
-    "dynamic3dgs",
-    "qualisys",
-    "anipose",
-    "poses_bounds",
-)
-LAYOUTS: list[Layout] = [import_module(f"{__package__}.{name}").LAYOUT for name in _READERS]
+LAYOUTS: list[Layout] = [
+    colmap.LAYOUT,
+    nerfstudio.LAYOUT,
+    *(studio_entry("layouts", name) for name in STUDIO["layouts"]),
+    poses_bounds.LAYOUT,
+]
 """The layouts in order of precedence, for folders with several calibrations. COLMAP's is the most
-complete one: it has lenses, principal points and points."""
+complete one: it has lenses, principal points and points. `poses_bounds.npy` has none of them."""
 
 
 def find_layout(path: Path) -> Layout:

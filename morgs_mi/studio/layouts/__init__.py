@@ -1,0 +1,1 @@
+"""Capture layouts of motion capture systems and of Dynamic 3D Gaussians."""
