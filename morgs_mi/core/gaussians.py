@@ -75,6 +75,12 @@ def displaced(gaussians: Gaussians, displacement: np.ndarray) -> Gaussians:
     )
 
 
+def at_rest(gaussians: Gaussians) -> Gaussians:
+    """Return the Gaussians with a motion and an offset of zero."""
+    zero = np.zeros((len(gaussians), 3))
+    return replace(gaussians, motion=zero, offset=zero)
+
+
 def tensor_rows(tensor: Tensor, index: UInt32) -> list[Float]:
     """Return rows of a tensor [N, ...], one Dr.Jit float [M] per number of a row, differentiable.
 

@@ -18,19 +18,16 @@ Parents are the Gaussians with the largest densification scores (see `method.att
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
-import drjit as dr
 import numpy as np
-from drjit.opt import Adam
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.empty_space import in_empty_space
 from morgs_mi.fit.fit_config import DensityConfig
-from morgs_mi.fit.optimise import replace_parameter
 
 # float32 has no opacity closer to 1.
 _MAX_OPACITY = 1 - 1e-6
@@ -62,9 +59,14 @@ class DensityPlan:
     edits: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
+    def is_birth(self) -> np.ndarray:
+        """Which of them are births, bool [M]."""
+        return self.source < 0
+
+    @property
     def num_births(self) -> int:
         """Number of births."""
-        return int((self.source < 0).sum())
+        return int(self.is_birth.sum())
 
 
 class Room(NamedTuple):
@@ -230,28 +232,3 @@ def apply_plan(gaussians: Gaussians, plan: DensityPlan) -> Gaussians:
     parents = gaussians.select(plan.parent)
     columns = parents.numpy()
     return replace(parents, **{name: columns[name] + edit for name, edit in plan.edits.items()})
-
-
-def resize_optimizer(
-    optimizer: Adam, plan: DensityPlan, edits: Mapping[str, np.ndarray] | None = None
-) -> None:
-    """Replace an optimiser's parameters [N, ...] and moments by the rows of a plan [M, ...];
-    moments of births are 0.
-
-    Args:
-        optimizer: holds tensors of N rows; its learning rates and its count of steps stay.
-        plan: one round of density control.
-        edits: changes added to the parameters, by name.
-    """
-    is_birth = plan.source < 0
-
-    def carry(moment: np.ndarray) -> np.ndarray:
-        rows = moment[plan.parent]
-        rows[is_birth] = 0
-        return rows
-
-    for name in list(optimizer):
-        value = np.asarray(dr.detach(optimizer[name]))[plan.parent]
-        replace_parameter(
-            optimizer, name, value + edits[name] if edits and name in edits else value, carry
-        )

@@ -20,10 +20,18 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.progress import Progress
 from morgs_mi.core.types import Tensor
-from morgs_mi.fit.density import Room, plan_growth, resize_optimizer
+from morgs_mi.fit.density import Room, plan_growth
 from morgs_mi.fit.dropping import dropped
 from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.fit.optimise import Steps, adam, optimise, replace_parameter, values_of, view_order
+from morgs_mi.fit.optimise import (
+    Steps,
+    adam,
+    optimise,
+    replace_parameter,
+    select_rows,
+    values_of,
+    view_order,
+)
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.method.attribution import densification_scores
 from morgs_mi.method.losses import mask_loss, recon_loss
@@ -167,7 +175,7 @@ class _Fit:
         plan = plan_growth(
             gaussians, scores, room, problem.extent, config.density, self._rng, problem.cameras
         )
-        resize_optimizer(self._optimizer, plan, plan.edits)
+        select_rows(self._optimizer, plan.parent, plan.is_birth, plan.edits)
         self._base = self._base.select(plan.parent)
 
 

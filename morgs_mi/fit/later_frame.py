@@ -9,22 +9,22 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.gaussians import Gaussians, at_rest
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.progress import Progress
 from morgs_mi.core.types import Tensor
-from morgs_mi.fit.density import apply_plan, plan_additions, resize_optimizer
+from morgs_mi.fit.density import apply_plan, plan_additions
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.motion_stage import fit_motion
-from morgs_mi.fit.optimise import Steps, adam, optimise, values_of, view_order
-from morgs_mi.method.active_set import ActiveSet, with_zero_motion
+from morgs_mi.fit.optimise import Steps, adam, optimise, select_rows, values_of, view_order
+from morgs_mi.method.active_set import ActiveSet
 from morgs_mi.method.attribution import Attribution
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import motion_model
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.objective import Observations, Prediction, channels_of, losses_of, weights_of
 from morgs_mi.method.residual import apply_residual, residual_parameters
-from morgs_mi.method.rigidity import find_neighbours
+from morgs_mi.method.rigidity import Neighbours, find_neighbours
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 
@@ -81,7 +81,7 @@ def fit_later_frame(
     previous = problem.previous
     active = problem.active
     if not active.views or not len(active.indices):
-        return LaterFrame(with_zero_motion(previous), np.arange(len(previous)), {}, 0)
+        return LaterFrame(at_rest(previous), np.arange(len(previous)), {}, 0)
     fit = _Fit(problem, config, motion, rng, progress)
     last_chance = round(_DENSITY_ROUND * config.epochs)
     for epoch in range(fit.start(), config.epochs):
@@ -140,7 +140,7 @@ class _Fit:
         self._observations = _on_active_views(problem)
         self._base = problem.active.select(problem.previous)
         self.source = np.arange(len(problem.active.indices))
-        self._neighbours = self._neighbour_observation()
+        self._neighbours: Neighbours | None = None
         self._densifies = config.density.later_frames
         self._attribution = None
         self._objectives = list[float]()
@@ -171,7 +171,7 @@ class _Fit:
             model = factory(self._base, problem.extent, self._rng)
             shared = MotionProblem(self._base, problem.active.views, problem.targets, self._rng)
             weight = self._config.objective.dssim_weight
-            steps = self._begin(Epoch.after(self.steps, len(self._views), epochs))
+            steps = self._begin(epochs)
             start, self.losses = fit_motion(shared, model, start, steps, weight)
         parameters = residual_parameters(self._base, motion, start)
         self._optimizer = adam(parameters, self._config.momentum)
@@ -179,9 +179,11 @@ class _Fit:
 
     def run_epoch(self, epoch: int) -> None:
         """Make one step in every active view."""
+        steps = self._begin()
+        if self._neighbours is None and self._config.objective.is_rigid:
+            self._neighbours = find_neighbours(self._base, self._problem.extent)
         rates = self._config.rates_at(epoch).by_parameter(self._problem.extent)
         weights = weights_of(self._config.objective)
-        steps = self._begin(Epoch.after(self.steps, len(self._views)))
         self.losses = optimise(self._optimizer, rates, self._losses_at, steps, weights)
         self._objectives.append(sum(weights[name] * loss for name, loss in self.losses.items()))
 
@@ -202,18 +204,19 @@ class _Fit:
         # residual.
         self._base = apply_plan(self._base, plan)
         self.source = plan.source
-        self._neighbours = self._neighbour_observation()
-        resize_optimizer(self._optimizer, plan)
+        select_rows(self._optimizer, plan.parent, plan.is_birth)
+        self._neighbours = None
         self._densifies = False
         self._attribution = None
 
-    def _begin(self, epoch: Epoch) -> Steps:
-        """Begin an epoch, and return its steps."""
+    def _begin(self, epochs: int = 1) -> Steps:
+        """Return the steps of the next epochs, which begin."""
+        count = len(self._views)
+        epoch = Epoch.after(self.steps, count, epochs)
         self.steps = epoch.stop
         if self._densifies:
             self._attribution = Attribution(len(self.source), epoch.first_score - epoch.first)
         views = self._order[epoch.first : epoch.stop]
-        count = len(self._views)
         return Steps(views, epoch.first, None, self._report_step, self._attribution, last=count)
 
     def _report_step(self, step: int) -> None:
@@ -224,7 +227,9 @@ class _Fit:
         problem = self._problem
         objective = self._config.objective
         view = problem.active.views[index]
-        observations = {**self._observations[index], **self._neighbours}
+        observations = dict(self._observations[index])
+        if self._neighbours is not None:
+            observations["neighbours"] = self._neighbours
         channels = channels_of(observations, objective)
         # The other terms are about motion and confidence, and must not move opacity and geometry.
         other_channels = [name for name in channels if name != "color"]
@@ -240,14 +245,6 @@ class _Fit:
             image, parameters, view.region, num_pixels, num_gaussians, problem.extent, gaussians
         )
         return losses_of(prediction, observations, objective)
-
-    def _neighbour_observation(self) -> Observations:
-        """Return the observation of all views that compares neighbours, if a term does."""
-        objective = self._config.objective
-        if not objective.is_rigid:
-            return {}
-        neighbours = find_neighbours(self._base, self._problem.extent)
-        return {} if neighbours is None else {"neighbours": neighbours}
 
 
 def _on_active_views(problem: FrameProblem) -> dict[int, Observations]:

@@ -56,6 +56,33 @@ def replace_parameter(
     optimizer.state[name] = state
 
 
+def select_rows(
+    optimizer: Adam,
+    rows: np.ndarray,
+    is_birth: np.ndarray,
+    edits: Mapping[str, np.ndarray] | None = None,
+) -> None:
+    """Replace the parameters [N, ...] and their moments by rows of them [M, ...]; moments of births
+    are 0.
+
+    Args:
+        optimizer: holds tensors of N rows; its learning rates and its count of steps stay.
+        rows: int [M], indices of rows.
+        is_birth: bool [M].
+        edits: changes [M, ...] added to the parameters, by name.
+    """
+
+    def carry(moment: np.ndarray) -> np.ndarray:
+        selection = moment[rows]
+        selection[is_birth] = 0
+        return selection
+
+    edits = edits or {}
+    for name in list(optimizer):
+        value = np.asarray(dr.detach(optimizer[name]))[rows]
+        replace_parameter(optimizer, name, value + edits[name] if name in edits else value, carry)
+
+
 class Observer(Protocol):
     """Reads further gradients from the backward pass of every step, without a pass of its own."""
 

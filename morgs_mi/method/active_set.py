@@ -16,7 +16,7 @@ Gaussians are active: leaving out the others would cost more than it saves.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated
 
 import cv2
@@ -25,7 +25,7 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.documentation import documented
-from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.gaussians import Gaussians, at_rest
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.ranges import AtLeast, check_ranges
 from morgs_mi.core.rig import choose_key_views
@@ -107,7 +107,7 @@ class ActiveSet:
         index = np.where(source < 0, len(previous), self.indices[source])
         previous_index = np.concatenate([static, index])
         order = np.argsort(previous_index, kind="stable")  # births come last
-        merged = Gaussians.concatenate([with_zero_motion(previous.select(static)), gaussians])
+        merged = Gaussians.concatenate([at_rest(previous.select(static)), gaussians])
         merged_source = np.where(previous_index < len(previous), previous_index, -1)
         return merged.select(order), merged_source[order]
 
@@ -173,7 +173,7 @@ def find_active_set(
             table = from_numpy(mi.UInt32, summed_area(unexplained))
             active |= np.asarray(boxes.within(table, grid) > 0.5 * boxes.area)
     blocks_by_view = _drawn(active, shares > QUIET, changed_views, config)
-    static = with_zero_motion(gaussians.select(~active))
+    static = at_rest(gaussians.select(~active))
     views = {
         v: make_active_view(
             cameras[v], Region.of(changed_views[v].view.grid, blocks), static, channels[v], render
@@ -182,12 +182,6 @@ def find_active_set(
         if blocks.any()
     }
     return ActiveSet(np.flatnonzero(active), len(gaussians), views, len(cameras))
-
-
-def with_zero_motion(gaussians: Gaussians) -> Gaussians:
-    """Return the Gaussians with a motion and an offset of zero."""
-    zero = np.zeros((len(gaussians), 3))
-    return replace(gaussians, motion=zero, offset=zero)
 
 
 def _drawn(

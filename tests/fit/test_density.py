@@ -1,28 +1,20 @@
-"""Density control: which Gaussians are added and pruned, their order, and the state of the
-optimiser.
-"""
-
+"""Density control: which Gaussians are added and pruned, and their order."""
 from __future__ import annotations
 
 import dataclasses
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from morgs_mi import Camera, Gaussians, rasterize
 from morgs_mi.fit.density import (
-    DensityPlan,
     Room,
     apply_plan,
     plan_additions,
     plan_growth,
-    resize_optimizer,
 )
 from morgs_mi.fit.fit_config import DensityConfig
-from morgs_mi.fit.optimise import adam, values_of
 from morgs_mi.method.attribution import densification_scores
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
@@ -175,41 +167,6 @@ def test_plan_growth__draws_births_from_the_parents_density():
     # Standard errors of 4000 draws are 0.016 for means and 0.022 for variances.
     assert np.abs(white.mean(0)).max() < 0.08
     assert np.abs(np.cov(white.T) - np.eye(3)).max() < 0.1
-
-
-def test_resize_optimizer__keeps_moments_of_survivors_only():
-    """After a plan that only adds and removes, survivors take the same steps as without it."""
-    rng = np.random.default_rng(2)
-    start, slope = rng.normal(size=(2, 6, 3)).astype(np.float32)
-    plan = DensityPlan(np.array([0, 2, 5, 2]), np.array([0, 2, 5, -1]))
-
-    def run(rebuild):
-        optimizer = adam({"x": mi.TensorXf(start)})
-        optimizer.set_learning_rate({"x": 0.1})
-        gradients = slope
-        for step in range(8):
-            if rebuild and step == 4:
-                resize_optimizer(optimizer, plan)
-                gradients = slope[plan.parent]
-            dr.backward(dr.sum(dr.square(optimizer["x"]) * mi.TensorXf(gradients), axis=None))
-            optimizer.step()
-        return np.asarray(values_of(optimizer)["x"])
-
-    whole = run(False)
-    rebuilt = run(True)
-    assert rebuilt.shape == (4, 3)
-    assert np.array_equal(rebuilt[:3], whole[plan.parent[:3]])
-    assert not np.array_equal(rebuilt[3], rebuilt[1])
-
-
-def test_resize_optimizer__applies_edits_to_the_parameters():
-    gaussians = cloud()
-    plan = growth(gaussians, np.ones(6))
-    optimizer = adam({"means": gaussians.means, "log_scales": gaussians.log_scales})
-    resize_optimizer(optimizer, plan, plan.edits)
-    result = apply_plan(gaussians, plan)
-    for name, value in values_of(optimizer).items():
-        assert np.array_equal(np.asarray(value), np.asarray(getattr(result, name))), name
 
 
 def test_densification_scores__attribute_the_error_to_the_wrong_gaussian():

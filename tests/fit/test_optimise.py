@@ -7,7 +7,15 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi.fit.optimise import Steps, adam, optimise, replace_parameter, values_of, view_order
+from morgs_mi.fit.optimise import (
+    Steps,
+    adam,
+    optimise,
+    replace_parameter,
+    select_rows,
+    values_of,
+    view_order,
+)
 from tests.assertions import assert_close
 
 
@@ -102,6 +110,42 @@ def test_replace_parameter__keeps_moments():
     assert np.array_equal(ends[0][:, 0], ends[1][:, 0])
     assert ends[1].shape == (2, 3)
     assert 0 < ends[1][0, 1] < ends[1][0, 0]
+
+
+def test_select_rows__keeps_moments_of_survivors_only():
+    """After rows were only added and removed, survivors take the same steps as without it."""
+    rng = np.random.default_rng(2)
+    start, slope = rng.normal(size=(2, 6, 3)).astype(np.float32)
+    rows = np.array([0, 2, 5, 2])
+    is_birth = np.array([False, False, False, True])
+
+    def run(rebuild):
+        optimizer = adam({"x": mi.TensorXf(start)})
+        optimizer.set_learning_rate({"x": 0.1})
+        gradients = slope
+        for step in range(8):
+            if rebuild and step == 4:
+                select_rows(optimizer, rows, is_birth)
+                gradients = slope[rows]
+            dr.backward(dr.sum(dr.square(optimizer["x"]) * mi.TensorXf(gradients), axis=None))
+            optimizer.step()
+        return np.asarray(values_of(optimizer)["x"])
+
+    whole = run(False)
+    rebuilt = run(True)
+    assert rebuilt.shape == (4, 3)
+    assert np.array_equal(rebuilt[:3], whole[rows[:3]])
+    assert not np.array_equal(rebuilt[3], rebuilt[1])
+
+
+def test_select_rows__adds_edits_to_the_parameters():
+    start = np.arange(6, dtype=np.float32).reshape(3, 2)
+    optimizer = adam({"x": mi.TensorXf(start), "y": mi.TensorXf(start)})
+    edit = np.array([[1, 0], [0, 2]], np.float32)
+    select_rows(optimizer, np.array([2, 0]), np.array([False, True]), {"x": edit})
+    values = values_of(optimizer)
+    assert np.array_equal(np.asarray(values["x"]), start[[2, 0]] + edit)
+    assert np.array_equal(np.asarray(values["y"]), start[[2, 0]])
 
 
 def test_view_order__draws_without_repetition():

@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
-from morgs_mi.studio.layouts.dynamic3dgs import read_meta
 from morgs_mi.capture.truth import load_tracks
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.bounded import read_array
+from morgs_mi.studio.layouts.dynamic3dgs import read_meta
 
 _SHORT_SIDE = 256
 

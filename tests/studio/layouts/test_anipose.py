@@ -14,9 +14,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.studio.layouts.anipose import read_anipose
 from morgs_mi.capture.layouts.clips import clip_of_camera
 from morgs_mi.io.video_writer import write_video
+from morgs_mi.studio.layouts.anipose import read_anipose
 from tests.assertions import assert_close
 from tests.scenes import captures as layouts
 from tests.scenes.captures import HEIGHT, WIDTH, dot_clips, rig, shown_dot

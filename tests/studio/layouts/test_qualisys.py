@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.studio.layouts.qualisys import read_qualisys
 from morgs_mi.io.video_writer import write_video
+from morgs_mi.studio.layouts.qualisys import read_qualisys
 from tests.assertions import assert_close
 from tests.scenes import captures as layouts
 from tests.scenes.captures import COUNT, FPS, dot_clips, frames, rig, shown_dot
