@@ -8,16 +8,21 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-from morgs_mi.capture.capture import Capture
 from morgs_mi.core.entries import STUDIO, studio_entry
 from morgs_mi.core.fit_names import REPORT
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.evaluate.comparison import ComparedClip
-from morgs_mi.evaluate.measures import ImageDistance, Measure, Motion3D, Quality, Variation
-from morgs_mi.evaluate.results import Evaluation, FrameScores, PlaybackTimes, Sizes, known_mean
-from morgs_mi.fit.forecast import forecast
+from morgs_mi.evaluate.measures import (
+    Forecast,
+    ImageDistance,
+    Measure,
+    Motion3D,
+    Quality,
+    Speed,
+    Variation,
+)
+from morgs_mi.evaluate.results import Evaluation, FrameScores, Sizes, known_mean
 from morgs_mi.io.bounded import read_json
-from morgs_mi.playback.player import playback_speed
 from morgs_mi.playback.streams import open_stream
 
 
@@ -53,7 +58,8 @@ def evaluate_stream(
     clip = ComparedClip.of(stream, capture, any_recording)
     recording = clip.recording
     seconds, of_fit = _of_fit(stream.path)
-    measures: list[Measure] = [Quality(lpips), Variation(clip), Motion3D(clip)]
+    measures: list[Measure] = [Quality(lpips), Variation(clip), Motion3D(clip), Speed(clip)]
+    measures.append(Forecast(recording, of_fit))
     measures += [studio_entry("measures", name)(clip) for name in STUDIO["measures"]]
     rows: list[FrameScores] = []
     for frame in clip.frames():
@@ -76,9 +82,7 @@ def evaluate_stream(
         complete=len(rows) == stream.metadata.get("num_frames", len(rows)),
         regions="recorded change" if recording.truth is None else "true masks",
         sizes=_sizes(stream.path.stat().st_size, rows),
-        playback=PlaybackTimes(**playback_speed(stream, stream.cameras[clip.views[0]])),
         frames=tuple(rows),
-        **(of_fit or {"expected": _forecast(recording)}),
         **_merged(measure.result() for measure in measures),
     )
 
@@ -130,9 +134,3 @@ def _of_fit(stream: Path) -> tuple[dict[int, float], dict[str, Any]]:
         raise ValueError(
             f"{path}: expected a fit's report, got a broken one ({error!r}); remove it."
         ) from None
-
-
-def _forecast(recording: Capture) -> str:
-    """Return the expected quality of views between the training cameras; empty with one camera."""
-    cameras = [recording.cameras[v] for v in recording.train_views]
-    return forecast(cameras, recording.points).sentence if len(cameras) > 1 else ""

@@ -104,12 +104,17 @@ def channel_image(name: str, image: np.ndarray, motion_scale: float | None = Non
     return draw.get(name, grey_image)(image)
 
 
-def playback_speed(stream: FrameSource, camera: Camera) -> dict[str, float]:
+def playback_speed(stream: FrameSource, camera: Camera, config: RenderConfig) -> dict[str, float]:
     """Return the speed at which this machine plays a stream: decode a frame, render its colour,
     copy it to the host.
 
     At most the first 30 frames are measured. The first one compiles kernels and is excluded if
     there are others.
+
+    Args:
+        stream: the file.
+        camera: any view.
+        config: settings of the renderer, see `render_config`.
 
     Returns:
         ``fps``, frames per second at the size of `camera`, and the medians ``decode_ms`` and
@@ -118,7 +123,6 @@ def playback_speed(stream: FrameSource, camera: Camera) -> dict[str, float]:
     Raises:
         ValueError: a broken packet.
     """
-    config = render_config(stream)
     times = []
     frames = islice(play(stream), _MOST_TIMED_FRAMES)
     while True:

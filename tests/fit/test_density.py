@@ -1,4 +1,5 @@
 """Density control: which Gaussians are added and pruned, and their order."""
+
 from __future__ import annotations
 
 import dataclasses

@@ -35,6 +35,7 @@ from morgs_mi.playback.stream_header import (
     truth_for_camera,
 )
 from morgs_mi.playback.streams import open_stream
+from morgs_mi.render.render_config import RenderConfig
 from tests.assertions import assert_close
 from tests.scenes.moving_splats import CAMERAS, FRAMES, HEIGHT, WIDTH, moved, write_stream
 
@@ -202,14 +203,17 @@ def test_render_stream__offset_is_its_share_of_the_motion(
 def test_playback_speed__is_the_inverse_of_the_time_per_frame(
     fitted_clip: Path, tmp_path: Path
 ) -> None:
+    config = RenderConfig()
     reader = open_stream(fitted_clip)
-    times = playback_speed(reader, reader.cameras[0])
+    times = playback_speed(reader, reader.cameras[0], config)
     assert times["fps"] == pytest.approx(1e3 / (times["decode_ms"] + times["render_ms"]))
     assert min(times.values()) > 0
     with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25) as writer:
-        assert np.isnan(playback_speed(open_stream(tmp_path / "s.morgs"), CAMERAS[0])["fps"])
+        assert np.isnan(
+            playback_speed(open_stream(tmp_path / "s.morgs"), CAMERAS[0], config)["fps"]
+        )
         writer.write(keyframe_packet(moved(0), 0))
-    assert playback_speed(open_stream(tmp_path / "s.morgs"), CAMERAS[0])["fps"] > 0
+    assert playback_speed(open_stream(tmp_path / "s.morgs"), CAMERAS[0], config)["fps"] > 0
 
 
 def test_channels__include_those_of_the_attribute_table() -> None:
