@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from morgs_mi.core.camera import Camera
+from morgs_mi import Camera
 from morgs_mi.studio.synth.scene import (
     Light,
     Object,
