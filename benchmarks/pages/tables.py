@@ -16,7 +16,6 @@ from benchmarks.reports import (
     field,
     held_out,
     random_scenes,
-    real,
     renderer,
     timing,
 )
@@ -263,7 +262,6 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "held_out_views": lambda: held_out.first_frames(committed("held_out")["fits"]),
     "held_out_views_over_time": lambda: held_out.later_frames(committed("held_out")["fits"]),
     "parts": parts,
-    "principal_points": partial(study_table, real, "real"),
     "splat_files": splat_files,
     "plugin_step": plugin_step,
     "steps": steps,

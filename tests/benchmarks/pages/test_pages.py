@@ -228,11 +228,11 @@ def test_renderer_page__quotes_the_times_of_other_settings():
     )
 
 
-def test_method_page__quotes_the_unseen_scenes_without_seed_4():
+def test_index__quotes_the_unseen_scenes_without_seed_4():
     fits = [fit for fit in committed("random_scenes")["fits"] if fit["seed"] != 4]
     psnr, moving = (np.mean([fit[name] for fit in fits]) for name in ("psnr", "psnr_moving"))
     assert not missing(
-        "method.md", [f"the means are {psnr:.2f} dB and {moving:.2f} dB where things move"]
+        "index.md", [f"the means are {psnr:.2f} dB and {moving:.2f} dB where things move"]
     )
 
 
