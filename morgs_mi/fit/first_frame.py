@@ -146,9 +146,9 @@ class _Fit:
         stretch = Steps(
             views,
             first,
-            decay=lambda step: _FINAL_RATE ** (step / steps),
+            rate_factor=lambda step: _FINAL_RATE ** (step / steps),
             on_step=None if progress is None else lambda count: progress(count, steps),
-            last=max(_LEAST, _PASSES * len(self._views)),
+            averaged_steps=max(_LEAST, _PASSES * len(self._views)),
         )
         return optimise(self._optimizer, self._rates, self._losses_at, stretch)
 

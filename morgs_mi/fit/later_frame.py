@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from drjit.opt import Adam
 
 from morgs_mi.core.gaussians import Gaussians, at_rest
 from morgs_mi.core.memory import from_numpy
@@ -28,37 +29,38 @@ from morgs_mi.method.rigidity import Neighbours, find_neighbours
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 
-# The round of density control is due when the loss hardly falls, and at this fraction of the epochs
-# at the latest: the residual has shown by then where Gaussians are missing, and enough steps are
-# left to fit the births.
-_DENSITY_ROUND = 0.625
+# Fraction of the epochs after which the round of density control is due, even if the loss still
+# falls: the residual has shown by then where Gaussians are missing, and enough steps are left to
+# fit the births.
+_LATEST_DENSITY_ROUND = 0.625
 
 
 @dataclass(frozen=True, eq=False)
 class FrameProblem:
-    """Data to which one later frame is fitted."""
+    """Input of the fit of a later frame."""
 
     previous: Gaussians  #: N Gaussians of the previous frame, detached.
     active: ActiveSet  #: The active Gaussians and views.
     targets: Mapping[int, Target]  #: Images of the active views, by view index.
-    #: Of the key views, arrays [H, W, ...] by name, by view index.
+    #: Observations of the key views: arrays [H, W, ...] by name, by view index.
     observations: Mapping[int, Mapping[str, np.ndarray]]
-    #: Start of motion and confidence of the M active Gaussians; None: no motion, confidence as
-    #: before.
+    #: Start of the motion, confidence, colour and rotation of the A active Gaussians; None: no
+    #: motion, and all else as before.
     start: MotionStart | None
-    extent: float  #: Of the scene in world units.
+    extent: float  #: Extent of the scene in world units.
 
 
 @dataclass(frozen=True, eq=False)
 class LaterFrame:
     """Result of fitting one later frame."""
 
-    #: M Gaussians, with the `motion` that moved them and the learned `offset` that is part of it.
+    #: M Gaussians after the fit, with the `motion` that moved them and the learned `offset` that is
+    #: part of it.
     gaussians: Gaussians
     #: int [M], index of each Gaussian in the previous frame, ascending; -1 for births, which come
     #: last.
     source: np.ndarray
-    losses: dict[str, float]  #: Means over the last epoch, by the names of the terms.
+    losses: dict[str, float]  #: Mean losses of the last epoch, by the names of the terms.
     epochs: int  #: Number of epochs that were run.
 
 
@@ -69,23 +71,25 @@ def fit_later_frame(
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> LaterFrame:
-    """Fit one frame's residual (eq. 12) by L_recon + L_mask + L_flow + L_off (eq. 13).
+    """Return the Gaussians after the gated residual (eq. 12) that minimises the objective (eq. 13
+    and its further terms).
 
     Args:
-        problem: the data of the frame.
+        problem: input of the fit.
         config: epochs, rates, weights of the losses, density control.
-        motion: which modules are on.
+        motion: which parts of the method are on.
         rng: draws the order of the views and the positions of births.
-        progress: of the steps.
+        progress: called with the numbers of steps made and of all steps.
     """
     previous = problem.previous
     active = problem.active
     if not active.views or not len(active.indices):
         return LaterFrame(at_rest(previous), np.arange(len(previous)), {}, 0)
-    fit = _Fit(problem, config, motion, rng, progress)
-    last_chance = round(_DENSITY_ROUND * config.epochs)
-    for epoch in range(fit.start(), config.epochs):
-        if fit.can_densify and (fit.has_converged or epoch >= last_chance):
+    fit = _LaterFrameFit(problem, config, motion, rng, progress)
+    latest_density_epoch = round(_LATEST_DENSITY_ROUND * config.epochs)
+    first_epoch = fit.fit_motion_model()
+    for epoch in range(first_epoch, config.epochs):
+        if fit.can_densify and (fit.has_converged or epoch >= latest_density_epoch):
             fit.densify()
         elif fit.has_converged:
             break
@@ -96,13 +100,13 @@ def fit_later_frame(
 
 @dataclass(frozen=True)
 class Epoch:
-    """Steps of one or several epochs, each with a step in every active view."""
+    """An epoch: a step in every active view. The stage of a motion model may be several ones."""
 
-    first: int  #: Number of the first step.
+    first_step: int  #: Number of the first step.
     stop: int  #: Number of the step after the last one.
-    #: Number of the step from which densification scores are collected: the first steps of an epoch
-    #: still correct what the last ones show.
-    first_score: int
+    #: Number of the first step that counts for densification scores, which are collected in the
+    #: last quarter: an error that is seen earlier may be gone by the end of the epoch.
+    first_scored_step: int
 
     @classmethod
     def after(cls, steps: int, num_views: int, count: int = 1) -> Epoch:
@@ -110,14 +114,19 @@ class Epoch:
         stop = steps + count * num_views
         return cls(steps, stop, stop - (num_views + 3) // 4)
 
+    @property
+    def unscored_steps(self) -> int:
+        """Number of steps before the first one that counts for densification scores."""
+        return self.first_scored_step - self.first_step
 
-class _Fit:
+
+class _LaterFrameFit:
     """Optimiser of a later frame's residual: the stage of a motion model, epochs, and a round of
     density control.
 
     Attributes:
         source: as in `LaterFrame`, among the active Gaussians.
-        losses: means over the last epoch, by name.
+        losses: mean losses of the last epoch, by name.
         steps: number of steps that were made.
     """
 
@@ -137,12 +146,15 @@ class _Fit:
         self._views = sorted(problem.active.views)
         count = len(self._views)
         self._order = [self._views[k] for k in view_order(count, config.epochs * count, rng)]
-        self._observations = _on_active_views(problem)
-        self._base = problem.active.select(problem.previous)
+        self._observations = _cropped_observations(problem)
+        self._previous = problem.active.select(problem.previous)
+        self._optimizer = self._residual_optimizer(problem.start)
         self.source = np.arange(len(problem.active.indices))
         self._neighbours: Neighbours | None = None
-        self._densifies = config.density.later_frames
-        self._attribution = None
+        # The round of density control is still to come, and the scores of the last epoch, which it
+        # needs.
+        self._awaits_density_round = config.density.later_frames
+        self._scores: Attribution | None = None
         self._objectives = list[float]()
         self.losses = dict[str, float]()
         self.steps = 0
@@ -151,76 +163,93 @@ class _Fit:
     def gaussians(self) -> Gaussians:
         """The active Gaussians after the residual."""
         with dr.suspend_grad():
-            return apply_residual(self._base, values_of(self._optimizer), self._motion)
+            return apply_residual(self._previous, values_of(self._optimizer), self._motion)
 
     @property
     def has_converged(self) -> bool:
-        """Whether the objective (eq. 13) hardly decreased over two epochs: one may overshoot."""
+        """Whether the objective (eq. 13) decreased by less than the tolerance over the last two
+        epochs; it may rise in a single one.
+        """
         tolerance = self._config.early_stopping_tolerance
         values = self._objectives
         return tolerance > 0 and len(values) > 2 and values[-1] > (1 - tolerance) * values[-3]
 
-    def start(self) -> int:
-        """Fit the motion model, if there is one, and start the residual; return the epochs used."""
+    def fit_motion_model(self) -> int:
+        """Fit the motion model, if there is one, and let the residual start from its motion; return
+        the number of epochs that it took.
+        """
+        factory = motion_model(self._motion)
+        if factory is None:
+            return 0
         problem = self._problem
-        motion = self._motion
-        start = self._problem.start
-        epochs = 0
-        if (factory := motion_model(motion)) is not None:
-            epochs = max(1, round(motion.model_share * self._config.epochs))
-            model = factory(self._base, problem.extent, self._rng)
-            shared = MotionProblem(self._base, problem.active.views, problem.targets, self._rng)
-            weight = self._config.objective.dssim_weight
-            steps = self._begin(epochs)
-            start, self.losses = fit_motion(shared, model, start, steps, weight)
-        parameters = residual_parameters(self._base, motion, start)
-        self._optimizer = adam(parameters, self._config.momentum)
+        model = factory(self._previous, problem.extent, self._rng)
+        motion_problem = MotionProblem(
+            self._previous, problem.active.views, problem.targets, self._rng
+        )
+        epochs = max(1, round(self._motion.model_share * self._config.epochs))
+        steps = self._steps_of(self._next_epoch(epochs))
+        weight = self._config.objective.dssim_weight
+        start, self.losses = fit_motion(motion_problem, model, problem.start, steps, weight)
+        self._optimizer = self._residual_optimizer(start)
         return epochs
 
-    def run_epoch(self, epoch: int) -> None:
-        """Make one step in every active view."""
-        steps = self._begin()
+    def run_epoch(self, number: int) -> None:
+        """Make one step in every active view, at the rates of epoch `number`."""
+        epoch = self._next_epoch()
+        if self._awaits_density_round:
+            self._scores = Attribution(len(self.source), epoch.unscored_steps)
         if self._neighbours is None and self._config.objective.is_rigid:
-            self._neighbours = find_neighbours(self._base, self._problem.extent)
-        rates = self._config.rates_at(epoch).by_parameter(self._problem.extent)
+            self._neighbours = find_neighbours(self._previous, self._problem.extent)
+        rates = self._config.rates_at(number).by_parameter(self._problem.extent)
         weights = weights_of(self._config.objective)
+        steps = self._steps_of(epoch, self._scores)
         self.losses = optimise(self._optimizer, rates, self._losses_at, steps, weights)
         self._objectives.append(sum(weights[name] * loss for name, loss in self.losses.items()))
 
     @property
     def can_densify(self) -> bool:
-        """Whether a round of density control is due, and an epoch has shown where it is needed."""
-        return self._attribution is not None
+        """Whether a round of density control is to come, and an epoch has shown where to add
+        Gaussians.
+        """
+        return self._scores is not None
 
     def densify(self) -> None:
         """Add and prune active Gaussians by density control, once."""
-        assert self._attribution is not None
+        assert self._scores is not None
         problem = self._problem
-        density = self._config.density
-        scores = self._attribution.scores()
         num_static = len(problem.previous) - len(problem.active.indices)
-        plan = plan_additions(self.gaussians, scores, density, self._rng, num_static)
-        # A birth has the motion of its parent: it starts from the parent's past and shares the
-        # residual.
-        self._base = apply_plan(self._base, plan)
+        plan = plan_additions(
+            self.gaussians, self._scores.scores(), self._config.density, self._rng, num_static
+        )
+        # The optimiser has the residual, so the plan changes the previous Gaussians: a birth starts
+        # from the past of its parent, and shares its residual.
+        self._previous = apply_plan(self._previous, plan)
         self.source = plan.source
         select_rows(self._optimizer, plan.parent, plan.is_birth)
         self._neighbours = None
-        self._densifies = False
-        self._attribution = None
+        self._awaits_density_round = False
+        self._scores = None
 
-    def _begin(self, epochs: int = 1) -> Steps:
-        """Return the steps of the next epochs, which begin."""
-        count = len(self._views)
-        epoch = Epoch.after(self.steps, count, epochs)
+    def _residual_optimizer(self, start: MotionStart | None) -> Adam:
+        """Return the optimiser of the residual of the active Gaussians, at its start."""
+        parameters = residual_parameters(self._previous, self._motion, start)
+        return adam(parameters, self._config.momentum)
+
+    def _next_epoch(self, count: int = 1) -> Epoch:
+        """Return the next epochs, and count their steps."""
+        epoch = Epoch.after(self.steps, len(self._views), count)
         self.steps = epoch.stop
-        if self._densifies:
-            self._attribution = Attribution(len(self.source), epoch.first_score - epoch.first)
-        views = self._order[epoch.first : epoch.stop]
-        return Steps(views, epoch.first, None, self._report_step, self._attribution, last=count)
+        return epoch
 
-    def _report_step(self, step: int) -> None:
-        self._progress(step, len(self._order))
+    def _steps_of(self, epoch: Epoch, scores: Attribution | None = None) -> Steps:
+        """Return the steps of an epoch, which collect densification scores, if any."""
+        return Steps(
+            views=self._order[epoch.first_step : epoch.stop],
+            first_step=epoch.first_step,
+            on_step=lambda step: self._progress(step, len(self._order)),
+            observer=scores,
+            averaged_steps=len(self._views),
+        )
 
     def _losses_at(self, parameters: Mapping[str, Tensor], index: int) -> dict[str, Tensor]:
         """Render one view and return its losses by name."""
@@ -231,14 +260,15 @@ class _Fit:
         if self._neighbours is not None:
             observations["neighbours"] = self._neighbours
         channels = channels_of(observations, objective)
-        # The other terms are about motion and confidence, and must not move opacity and geometry.
-        other_channels = [name for name in channels if name != "color"]
-        gaussians = apply_residual(self._base, parameters, self._motion)
-        features = None if self._attribution is None else self._attribution.features()
-        gradients = other_channels if features is None else [*other_channels, "features"]
-        image = view.render(gaussians, channels, gradients, features)
-        if self._attribution is not None and features is not None:
-            self._attribution.observe(image, problem.targets[index], view.region)
+        gaussians = apply_residual(self._previous, parameters, self._motion)
+        features = None if self._scores is None else self._scores.features()
+        # Motion, confidence and scores must not move opacity and geometry.
+        detached_channels = [name for name in channels if name != "color"]
+        if features is not None:
+            detached_channels.append("features")
+        image = view.render(gaussians, channels, detached_channels, features)
+        if self._scores is not None and features is not None:
+            self._scores.observe(image, problem.targets[index], view.region)
         num_pixels = view.camera.width * view.camera.height
         num_gaussians = problem.active.num_gaussians
         prediction = Prediction(
@@ -247,7 +277,7 @@ class _Fit:
         return losses_of(prediction, observations, objective)
 
 
-def _on_active_views(problem: FrameProblem) -> dict[int, Observations]:
+def _cropped_observations(problem: FrameProblem) -> dict[int, Observations]:
     """Return the observations of each active view as tensors on its region, its target included."""
     return {
         v: {"target": problem.targets[v]}

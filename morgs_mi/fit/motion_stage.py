@@ -55,7 +55,7 @@ def fit_motion(
     optimizer = adam(model.parameters)
     total = len([*steps.views])
     # Adam's steps are as long as the rate; long ones find the motion, short ones settle it.
-    decaying_steps = replace(steps, decay=lambda step: _FINAL_RATE ** (step / total))
+    decaying_steps = replace(steps, rate_factor=lambda step: _FINAL_RATE ** (step / total))
     losses = optimise(optimizer, model.rates, losses_at, decaying_steps)
     with dr.suspend_grad():
         displacement, rotation = model.motion(values_of(optimizer))

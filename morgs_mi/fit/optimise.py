@@ -26,7 +26,7 @@ def adam(parameters: Mapping[str, Tensor], momentum: float = 0.9) -> Adam:
         momentum: decay of the mean of the gradients from step to step (beta_1).
     """
     # Gradients of means over a million pixels are tiny: Adam's usual epsilon of 1e-8 would dominate
-    # them.
+    # them. `optimise` sets the rate of each parameter, so the 1 is never used.
     return Adam(lr=1.0, params=dict(parameters), beta_1=momentum, epsilon=1e-15)
 
 
@@ -38,15 +38,16 @@ def values_of(optimizer: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def replace_parameter(
     optimizer: Adam, name: str, value: np.ndarray, carry: Callable[[np.ndarray], np.ndarray]
 ) -> None:
-    """Give a parameter another value and shape, and Adam's two moments with it, which an assignment
-    would reset.
+    """Replace a parameter by one of another shape, and map Adam's moments to it, where an assignment
+    would reset them.
 
     Args:
         optimizer: its learning rates and its count of steps stay.
-        name: of the parameter.
-        value: the new one.
+        name: name of the parameter.
+        value: its new value.
         carry: maps a moment of the old shape to one of the new shape.
     """
+    # Dr.Jit 1.5 has no public access to the moments. `largest` is None unless AMSGrad is used.
     _, is_promoted, rate, (steps, first, second, largest) = optimizer.state[name]
     shape = tuple(optimizer[name].shape)
     moments = [from_numpy(mi.Float, carry(np.asarray(m).reshape(shape))) for m in (first, second)]
@@ -84,7 +85,11 @@ def select_rows(
 
 
 class Observer(Protocol):
-    """Reads further gradients from the backward pass of every step, without a pass of its own."""
+    """Reads further gradients from the backward pass of every step, without a pass of its own.
+
+    In each step the losses are computed first, where an observer may render features; then its term
+    joins the loss, and the gradients are collected.
+    """
 
     def term(self) -> Tensor | None:
         """Return a term of value 0, which joins the losses of the step in its backward pass; None:
@@ -99,14 +104,14 @@ class Observer(Protocol):
 
 @dataclass(frozen=True)
 class Steps:
-    """Steps of an optimisation, one view each."""
+    """Steps of an optimisation, one view each, and what is done beside them."""
 
-    views: Iterable[int]  #: The view of every step.
-    first: int = 0  #: Number of steps before these.
-    decay: Callable[[int], float] | None = None  #: Step -> factor on all learning rates; None: 1.
-    on_step: Callable[[int], None] | None = None  #: Called with the number of steps done.
-    observer: Observer | None = None  #: Of the backward passes.
-    last: int = 8  #: Number of steps over which the losses are averaged.
+    views: Iterable[int]  #: Index of the view of every step, as the losses take it.
+    first_step: int = 0  #: Number of the first step.
+    rate_factor: Callable[[int], float] | None = None  #: Step -> factor of all rates; None: 1.
+    on_step: Callable[[int], None] | None = None  #: Called with the number of steps made.
+    observer: Observer | None = None  #: Observer of the backward passes.
+    averaged_steps: int = 8  #: Number of last steps over which the losses are averaged.
 
 
 def optimise(
@@ -120,11 +125,11 @@ def optimise(
     parameters.
 
     Args:
-        optimizer: as from `adam`.
+        optimizer: an optimiser from `adam`, which is also a mapping of its parameters.
         rates: learning rate of each parameter.
         losses_at: (parameters, view) -> losses by name; a view may lack some of them.
         steps: the steps.
-        weights: of the losses by name; 1 where not named.
+        weights: weights of the losses by name; 1 where not named.
 
     Returns:
         The mean of each loss over the last steps that had it, by name.
@@ -132,15 +137,16 @@ def optimise(
     Raises:
         FloatingPointError: the losses of the last steps are not finite.
     """
-    scale = {name: float(rates[name]) for name in optimizer}
     # As Python numbers: Dr.Jit 1.5 multiplies a rate that is an array in place, once per step.
-    optimizer.set_learning_rate(scale)
+    base_rates = {name: float(rates[name]) for name in optimizer}
+    optimizer.set_learning_rate(base_rates)
     history = dict[str, list[Tensor]]()
     weights = weights or {}
-    for step, view in enumerate(steps.views, steps.first):
-        if steps.decay is not None:
-            factor = steps.decay(step)
-            optimizer.set_learning_rate({name: factor * rate for name, rate in scale.items()})
+    step = steps.first_step
+    for step, view in enumerate(steps.views, steps.first_step):
+        if steps.rate_factor is not None:
+            factor = steps.rate_factor(step)
+            optimizer.set_learning_rate({name: factor * rate for name, rate in base_rates.items()})
         losses = losses_at(optimizer, view)
         total: Tensor = sum(weights.get(name, 1.0) * loss for name, loss in losses.items())
         _backward(total, steps.observer)
@@ -149,17 +155,19 @@ def optimise(
             history.setdefault(name, []).append(dr.detach(loss))
         if steps.on_step is not None:
             steps.on_step(step + 1)
-    final = {
-        name: float(np.mean([np.asarray(v).item() for v in losses[-steps.last :]]))
-        for name, losses in history.items()
-    }
-    broken_losses = [name for name, value in final.items() if not np.isfinite(value)]
+    means = {name: _mean(values[-steps.averaged_steps :]) for name, values in history.items()}
+    broken_losses = [name for name, mean in means.items() if not np.isfinite(mean)]
     if broken_losses:
         raise FloatingPointError(
-            f"optimise(): the losses {', '.join(broken_losses)} are not finite after "
-            f"{steps.first + len(history[broken_losses[0]])} steps; lower the learning rates."
+            f"optimise(): the losses {', '.join(broken_losses)} are not finite after {step + 1} "
+            "steps; lower the learning rates."
         )
-    return final
+    return means
+
+
+def _mean(losses: list[Tensor]) -> float:
+    """Return the mean of losses, which are computed here if they are still pending."""
+    return float(np.mean([np.asarray(loss).item() for loss in losses]))
 
 
 def _backward(total: Tensor, observer: Observer | None) -> None:
@@ -175,5 +183,7 @@ def view_order(num_views: int, steps: int, rng: np.random.Generator) -> list[int
     """Return the views of `steps` steps in random order: each is drawn once before any is drawn
     again.
     """
+    if steps == 0:
+        return []
     epochs = -(-steps // num_views)
     return np.concatenate([rng.permutation(num_views) for _ in range(epochs)])[:steps].tolist()

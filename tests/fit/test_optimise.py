@@ -31,11 +31,11 @@ def bowl(values, view):
 def test_optimise__minimises_the_weighted_sum(decay):
     start = {"x": mi.TensorXf(np.zeros(4, np.float32))}
     near = adam(start)
-    losses = optimise(near, {"x": 0.1}, bowl, Steps([0] * 200, decay=decay), {"far": 0.0})
+    losses = optimise(near, {"x": 0.1}, bowl, Steps([0] * 200, rate_factor=decay), {"far": 0.0})
     assert_close(values_of(near)["x"], np.ones(4), atol=0.02)
     assert losses["far"] == pytest.approx(16, rel=0.05)
     both = adam(start)
-    optimise(both, {"x": 0.1}, bowl, Steps([0] * 200, decay=decay))
+    optimise(both, {"x": 0.1}, bowl, Steps([0] * 200, rate_factor=decay))
     assert_close(values_of(both)["x"], np.full(4, 2.0), atol=0.02)
 
 
@@ -153,3 +153,4 @@ def test_view_order__draws_without_repetition():
     assert len(order) == 13
     assert sorted(order[:5]) == sorted(order[5:10]) == list(range(5))
     assert order == view_order(5, 13, np.random.default_rng(0))
+    assert view_order(5, 0, np.random.default_rng(0)) == []
