@@ -55,15 +55,15 @@ _LOG = logging.getLogger(__name__)
 class StreamState:
     """State that one frame hands to the next.
 
-    It follows from the stream and the recording. An interrupted fit can therefore be resumed
-    exactly (see `recording`).
+    It follows from the stream and the recording, so an interrupted fit can be resumed exactly (see
+    `StreamLoop.resume`).
     """
 
     frame: int = 0  #: Index of the next frame.
     #: State of a decoder after the last frame; None before the first.
     coded: CodedFrame | None = None
     history: ImageHistory = field(default_factory=ImageHistory)  #: Images up to the last frame.
-    #: Of the images to the colours of the scene.
+    #: Maps recorded images to the colours of the scene.
     correction: Correction = field(default_factory=Correction)
 
     @property
@@ -98,22 +98,22 @@ def step(
         ValueError: an image has another size or type than its camera, or the first frame has no
             image at all.
     """
-    start = time.perf_counter()
+    start_time = time.perf_counter()
     frame = state.frame
     frame_progress = Progress(progress, f"Frame {frame}")
-    observed = images
-    if not isinstance(observed, FrameObservation):
-        observed = observe_frame(setup, frame, state.history, observed)
+    observation = images
+    if not isinstance(observation, FrameObservation):
+        observation = observe_frame(setup, frame, state.history, observation)
     if state.coded is None:
-        fitted = fitted_first_frame(setup, observed, frame_progress, on_provisional)
+        fitted = fitted_first_frame(setup, observation, frame_progress, on_provisional)
     else:
-        fitted = _fit_later_frame(setup, state, observed, frame_progress)
+        fitted = _fit_later_frame(setup, state, observation, frame_progress)
     coded = decode(state.coded, fitted.packet)
-    present = observed.history.images
+    present = observation.history.images
     missing = [camera.name for v, camera in enumerate(setup.cameras) if v not in present]
     report = FrameReport(
         frame=frame,
-        seconds=time.perf_counter() - start,
+        seconds=time.perf_counter() - start_time,
         num_bytes=fitted.packet.num_bytes,
         losses=fitted.losses,
         num_gaussians=len(coded),
@@ -122,39 +122,47 @@ def step(
         active=fitted.active,
         validation=fitted.validation,
         steps=fitted.steps,
-        exposures=fitted.correction.followed_by(observed.history.exposures),
+        exposures=fitted.correction.followed_by(observation.history.exposures),
     )
-    return StreamState(frame + 1, coded, observed.history, fitted.correction), fitted.packet, report
+    next_state = StreamState(frame + 1, coded, observation.history, fitted.correction)
+    return next_state, fitted.packet, report
 
 
 def _status(setup: Setup, state: StreamState, images: Images, status: str) -> str:
-    """Return the status of a frame with the problems of its images; log those of the first one."""
+    """Return the status of a frame with the problems of its images, which are logged in frame 0."""
     problems = image_status([camera.name for camera in setup.cameras], state.history.images, images)
-    for problem in problems if state.coded is None else ():
-        _LOG.warning("frame 0: %s", problem)
+    if state.coded is None:
+        for problem in problems:
+            _LOG.warning("frame 0: %s", problem)
     return "; ".join([*([] if status == "ok" else [status]), *problems]) or "ok"
 
 
 def _fit_later_frame(
-    setup: Setup, state: StreamState, observed: FrameObservation, progress: Progress
+    setup: Setup, state: StreamState, observation: FrameObservation, progress: Progress
 ) -> FittedFrame:
     """Return the fit of a later frame; equations are the paper's."""
     assert state.coded is not None
     config = setup.config
     motion = config.motion
-    images = observed.history.images
+    images = observation.history.images
     # A new generator for each frame, so that it is no state.
     rng = rng_of(config.seed, Stream.LATER_FRAMES, state.frame)
     previous = state.coded.gaussians
     if state.frame == 1:
-        # The masks of frame 0 need the flow to this frame (eqs. 9-11).
-        previous = with_first_confidence(setup, previous, state.history.images, observed.flows, rng)
-    observations = observe(observed.key_views, motion, config.fit.objective)
-    active = _active_set(setup, previous, images, observed.changes, observations)
-    corrected = state.correction.corrected({view: observed.encoded[view] for view in active.views})
-    targets = {view: Target(image, setup.masks[view]) for view, image in corrected.items()}
-    initial = initial_motion(previous, active, observed.flows, targets, motion, rng)  # eq. 5
-    problem = FrameProblem(previous, active, targets, observations, initial, setup.extent)
+        # The masks of frame 0 need the flow to this frame (eqs. 9-11). The confidence is coded with
+        # the residual of this frame.
+        first_images = state.history.images
+        previous = with_first_confidence(setup, previous, first_images, observation.flows, rng)
+    observations = observe(observation.key_views, motion, config.fit.objective)
+    active = _active_set(setup, previous, images, observation.changes, observations)
+    recorded = {view: observation.encoded[view] for view in active.views}
+    targets = {
+        view: Target(image, setup.masks[view])
+        for view, image in state.correction.corrected(recorded).items()
+    }
+    # The motion (eq. 5) starts from zero in the paper, and here from lifted flow and proposals.
+    start = initial_motion(previous, active, observation.flows, targets, motion, rng)
+    problem = FrameProblem(previous, active, targets, observations, start, setup.extent)
     # Residual (eqs. 6-8, 12) and objective (eq. 13).
     fitted = fit_later_frame(problem, config.fit, motion, rng, progress)
     # The next frame starts from what a decoder reads (eq. 3).
@@ -200,9 +208,9 @@ class StreamLoop:
         point_colors: [P, 3], encoded: 1 is white.
         config: settings.
         masks: per view [H, W] bool of valid pixels, or None.
-        display_exposure: stops by which images in linear light are brightened where flow and
-            changes are computed, which see 8 bits; None: if any light of the first frame exceeds 1,
-            the 99th percentile becomes 1.
+        display_exposure: exposure in stops at which images in linear light are converted to 8 bits
+            for optical flow and the detection of changes; losses do not depend on it. None: 0 if no
+            light of the first frame exceeds 1, otherwise the 99th percentile becomes white.
 
     Example:
         >>> loop = morgs_mi.StreamLoop(cameras, points, point_colors)
@@ -225,7 +233,7 @@ class StreamLoop:
     ) -> None:
         self.setup = prepare(cameras, points, point_colors, config, masks, display_exposure)
         self.state = StreamState()
-        # Of the next frame, with its index.
+        # Index and pending observation of the next frame.
         self._next_observation: tuple[int, Future[FrameObservation]] | None = None
 
     @classmethod
@@ -268,40 +276,43 @@ class StreamLoop:
             progress: as for `step`.
             upcoming: images of the frame after it, if they are there already: their optical flow is
                 computed while this frame is fitted. They change nothing else.
-            recorded: images with which the next frame's images are compared, if not with `images`:
-                for the first frame, where `images` are interpolated because cameras have delays.
+            recorded: images with which those of the next frame are compared for flow and changes;
+                None: `images`. They differ in a first frame whose `images` are interpolated to one
+                instant, because cameras have delays.
             on_provisional: as for `step`.
         """
-        start = time.perf_counter()
+        start_time = time.perf_counter()
         frame = self.state.frame
         previous = self.state.history
-        observed = self._observed_ahead(images)
-        if observed is None:
-            observed = observe_frame(self.setup, frame, previous, images)
-        history = observed.history
+        observation = self._observation_ahead(images)
+        if observation is None:
+            observation = observe_frame(self.setup, frame, previous, images)
+        history = observation.history
         if recorded is not None:
             history = extended_history(self.setup, frame, previous, recorded)
-        if upcoming is not None:
+        if upcoming is not None:  # beside the fit, which starts below
             copies = [None if image is None else np.array(as_array(image)) for image in upcoming]
             observe_next = partial(observe_frame, self.setup, frame + 1, history, copies)
             self._next_observation = frame + 1, in_background(observe_next)
-        state, packet, report = step(self.setup, self.state, observed, progress, on_provisional)
+        state, packet, report = step(self.setup, self.state, observation, progress, on_provisional)
         self.state = replace(state, history=history)
-        return packet, replace(report, seconds=time.perf_counter() - start)
+        return packet, replace(report, seconds=time.perf_counter() - start_time)
 
-    def _observed_ahead(self, images: Sequence[Given | None]) -> FrameObservation | None:
-        """Return the observation made ahead of time, if its images are the same."""
+    def _observation_ahead(self, images: Sequence[Given | None]) -> FrameObservation | None:
+        """Return the observation that was made ahead of time if its images are the same; it is used
+        once.
+        """
         task = self._next_observation
         self._next_observation = None
         if task is None or task[0] != self.state.frame:
             return None
-        observed = task[1].result()
+        observation = task[1].result()
         present = {v: as_array(image) for v, image in enumerate(images) if image is not None}
-        same_views = present.keys() == observed.recorded.keys()
-        same = same_views and all(
-            np.array_equal(image, observed.recorded[v]) for v, image in present.items()
+        same_views = present.keys() == observation.recorded.keys()
+        same_images = same_views and all(
+            np.array_equal(image, observation.recorded[v]) for v, image in present.items()
         )
-        return observed if same else None
+        return observation if same_images else None
 
     def resume(
         self,
@@ -313,9 +324,10 @@ class StreamLoop:
 
         Args:
             coded: state of the stream after that frame.
-            frames: images of all frames up to it, as for `push`; the last frame suffices without
-                `skip_static` and `exposure`, if they have 8 bits or the display exposure is given.
-            exposures: in the report of the first frame.
+            frames: images of all frames up to it, as for `push`. The last frame suffices if
+                `fit.skip_static` is off, `fit.exposure` is "off", and the images have 8 bits or
+                `display_exposure` is given.
+            exposures: `FrameReport.exposures` of the first frame.
         """
         history = ImageHistory()
         for images in frames:

@@ -38,8 +38,8 @@ def values_of(optimizer: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def replace_parameter(
     optimizer: Adam, name: str, value: np.ndarray, carry: Callable[[np.ndarray], np.ndarray]
 ) -> None:
-    """Replace a parameter by one of another shape, and map Adam's moments to it. An assignment would
-    reset them.
+    """Replace a parameter by one of another shape, and map Adam's moments to it, which are lost in
+    an assignment.
 
     Args:
         optimizer: its learning rates and its count of steps stay.

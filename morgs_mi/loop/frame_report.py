@@ -16,7 +16,8 @@ class FrameReport:
 
     Attributes:
         frame: its index.
-        seconds: wall time from the images to the packet, optical flow and optimisation included.
+        seconds: wall time from the images to the packet. It includes the optical flow, unless
+            `StreamLoop.push` got the images early, as `upcoming` ones of the last frame.
         num_bytes: size of the packet in the stream.
         losses: means over the last steps, by the names of the terms.
         num_gaussians: number of Gaussians of the frame.
