@@ -65,40 +65,20 @@ class Camera:
         check_number(where, "near", self.near, "[1e-30, inf)")  # its reciprocal is a finite float32
         for name in ("delay", "readout"):
             check_number(where, name, getattr(self, name), "[-1, 1]")
-        K = numbers(where, "K", self.K).astype(np.float64)
-        if K.shape != (3, 3):
-            raise ValueError(
-                f"{where}: `K` must be [3, 3], got {K.shape}; pass one camera's intrinsics."
-            )
-        viewmat = self.viewmat
-        if not isinstance(viewmat, dr.ArrayBase):
-            viewmat = numbers(where, "viewmat", viewmat).astype(np.float64)
-        if tuple(viewmat.shape) != (4, 4):
-            raise ValueError(
-                f"{where}: `viewmat` must be [4, 4], got {tuple(viewmat.shape)}; pass one "
-                "world-to-camera matrix."
-            )
-        if not bounded(K) or not K[0, 0] > 0 or not K[1, 1] > 0:
-            raise ValueError(
-                f"{where}: `K` must be finite with positive focal lengths, got {K.tolist()}; "
-                "check the calibration."
-            )
+        K = _intrinsics(where, self.K)
+        viewmat = _extrinsics(where, self.viewmat)
+        _check_focal_lengths(where, K)
         if isinstance(viewmat, np.ndarray):
             viewmat = rigid(f"{where}, `viewmat`", viewmat)
-        if K[0, 1] or K[1, 0] or not np.array_equal(K[2], (0, 0, 1)):
-            raise ValueError(
-                f"{where}: `K` must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}; "
-                "resample the images to a camera without skew."
-            )
+        _check_skew(where, K)
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "viewmat", viewmat)
 
     def __repr__(self) -> str:
         place = ", ".join(f"{x:.4g}" for x in self.position + 0.0)  # without -0
-        fov = np.rad2deg(2 * np.arctan(0.5 * self.width / self.K[0, 0]))
         return (
-            f"Camera({self.name!r}, {self.width}x{self.height}, {fov:.3g} degrees across, at "
-            f"({place}))"
+            f"Camera({self.name!r}, {self.width}x{self.height}, {self._fov_x:.3g} degrees across, "
+            f"at ({place}))"
         )
 
     @classmethod
@@ -124,31 +104,13 @@ class Camera:
         where = "Camera.look_at()"
         check_size(where, width, height)
         check_number(where, "fov_x", fov_x, "(0, 180)")
-        vectors = {}
-        for key, value in (("origin", origin), ("target", target), ("up", up)):
-            vectors[key] = numbers(where, key, value).astype(np.float64)
-            if vectors[key].shape != (3,):
-                raise ValueError(
-                    f"{where}: `{key}` must be [3], got {list(vectors[key].shape)}; pass x, y and "
-                    "z."
-                )
-        forward = vectors["target"] - vectors["origin"]
-        right = np.cross(forward, vectors["up"])
-        longest = np.linalg.norm(forward) * np.linalg.norm(vectors["up"])
-        if not np.linalg.norm(right) > 1e-12 * longest:
-            text = ", ".join(f"{key} {value.tolist()}" for key, value in vectors.items())
-            raise ValueError(
-                f"{where}: `up` must not be parallel to the direction of view, got {text}; tilt it."
-            )
-        distance = float(np.linalg.norm(forward))
-        forward /= distance
-        right /= np.linalg.norm(right)
-        R = np.stack([right, np.cross(forward, right), forward])
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = R
-        viewmat[:3, 3] = -R @ vectors["origin"]
-        f = 0.5 * width / np.tan(np.deg2rad(0.5 * fov_x))
-        K = np.array([[f, 0, 0.5 * width], [0, f, 0.5 * height], [0, 0, 1.0]])
+        vectors = {
+            key: _vector(where, key, value)
+            for key, value in (("origin", origin), ("target", target), ("up", up))
+        }
+        viewmat = _viewmat_towards(where, **vectors)
+        distance = float(np.linalg.norm(vectors["target"] - vectors["origin"]))
+        K = _intrinsics_of_fov(fov_x, width, height)
         return cls(K, viewmat, width, height, name, near=min(0.01, distance / 100))
 
     @classmethod
@@ -163,56 +125,55 @@ class Camera:
         """
         import mitsuba as mi
 
-        if not isinstance(sensor, mi.Sensor) or sensor.class_name() != "PerspectiveCamera":
-            kind = (
-                sensor.class_name()
-                if isinstance(sensor, mi.Sensor)
-                else f"a {type(sensor).__name__}"
-            )
-            raise ValueError(
-                f"Camera.from_sensor(): `sensor` must be a `perspective` sensor, got {kind}; "
-                "splats are drawn only by pinhole cameras without lens distortion."
-            )
+        _check_perspective(sensor)
         params: Any = mi.traverse(sensor)
         width, height = (int(size) for size in sensor.film().size())
         names = ("x_fov", "principal_point_offset_x", "principal_point_offset_y", "near_clip")
-        fov, offset_x, offset_y, near = (float(np.asarray(params[name]).item()) for name in names)
-        f = 0.5 * width / np.tan(np.deg2rad(0.5 * fov))
-        # Mitsuba adds its offset to the pixel's position, so the principal point moves the other
-        # way.
-        K = np.array(
-            [[f, 0, width * (0.5 - offset_x)], [0, f, height * (0.5 - offset_y)], [0, 0, 1.0]]
-        )
+        fov, *offset, near = (float(np.asarray(params[name]).item()) for name in names)
+        K = _intrinsics_of_fov(fov, width, height, *offset)
         to_world = np.asarray(params["to_world"].matrix, float).reshape(4, 4)
-        return cls(
-            K, _OPENCV_FROM_MITSUBA @ np.linalg.inv(to_world), width, height, sensor.id(), near
-        )
+        viewmat = _OPENCV_FROM_MITSUBA @ np.linalg.inv(to_world)
+        return cls(K, viewmat, width, height, sensor.id(), near)
+
+    @property
+    def _fov_x(self) -> float:
+        """Field of view in degrees across."""
+        return np.rad2deg(2 * np.arctan(0.5 * self.width / self.K[0, 0]))
+
+    @property
+    def _world_to_camera(self) -> np.ndarray:
+        """The extrinsics [4, 4] in NumPy, float64, without gradients."""
+        return np.asarray(self.viewmat, dtype=np.float64)
 
     @property
     def position(self) -> np.ndarray:
         """The camera's centre [3] in world units."""
-        V = np.asarray(self.viewmat, dtype=np.float64)
+        V = self._world_to_camera
         return -V[:3, :3].T @ V[:3, 3]
 
     @property
     def to_world(self) -> np.ndarray:
         """Mitsuba's `to_world` matrix [4, 4]: camera -> world with x to the left and y up."""
-        return np.linalg.inv(np.asarray(self.viewmat, dtype=np.float64)) @ _OPENCV_FROM_MITSUBA
+        return np.linalg.inv(self._world_to_camera) @ _OPENCV_FROM_MITSUBA
+
+    def _local(self, points: np.ndarray) -> np.ndarray:
+        """Return world points [..., 3] in the camera's coordinates."""
+        V = self._world_to_camera
+        return points @ V[:3, :3].T + V[:3, 3]
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the pixel positions [..., 2] and the depths z [...] of world points [..., 3].
 
         A point with z <= 0 is behind the camera and its pixel position is meaningless.
         """
-        V = np.asarray(self.viewmat, dtype=np.float64)
-        local = points @ V[:3, :3].T + V[:3, 3]
+        local = self._local(points)
         return (local @ self.K.T)[..., :2] / local[..., 2:], local[..., 2]
 
     def unproject(self, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
         """Return the world points [..., 3] at pixel positions [..., 2] and depths z [...]: the
         inverse of `project`.
         """
-        V = np.asarray(self.viewmat, dtype=np.float64)
+        V = self._world_to_camera
         K = self.K
         x = (pixels[..., 0] - K[0, 2]) / K[0, 0]
         y = (pixels[..., 1] - K[1, 2]) / K[1, 1]
@@ -230,16 +191,13 @@ class Camera:
         """Return d(pixel) / d(point) [N, 2, 3] at world points [N, 3]; zero for points behind the
         near plane.
         """
-        V = np.asarray(self.viewmat, dtype=np.float64)
-        x, y, z = (points @ V[:3, :3].T + V[:3, 3]).T
+        x, y, z = self._local(points).T
         inverse = np.where(z > self.near, 1 / np.maximum(z, self.near), 0)
         fx = self.K[0, 0] * inverse
         fy = self.K[1, 1] * inverse
         zero = np.zeros_like(z)
-        J = np.stack([fx, zero, -fx * x * inverse, zero, fy, -fy * y * inverse], axis=1).reshape(
-            -1, 2, 3
-        )
-        return J @ V[:3, :3]
+        rows = [fx, zero, -fx * x * inverse, zero, fy, -fy * y * inverse]
+        return np.stack(rows, axis=1).reshape(-1, 2, 3) @ self._world_to_camera[:3, :3]
 
     def without_delays(self) -> Camera:
         """Return the same view with images of the instants themselves: no delay and no rolling
@@ -278,36 +236,134 @@ class Camera:
         """
         import mitsuba as mi
 
-        f = self.K[0, 0]
-        fy = self.K[1, 1]
-        cx = self.K[0, 2]
-        cy = self.K[1, 2]
-        if abs(f / fy - 1) * self.height > 1:
-            raise ValueError(
-                "Camera.sensor(): `K` must have equal focal lengths, because Mitsuba's sensor "
-                f"has one, got {f:g} and {fy:g}; render `camera.square()`, of "
-                f"{self.square().width}x{self.square().height} pixels, and resize the image."
-            )
+        self._check_square()
         # Mitsuba adds its offset to the pixel's position, so the principal point moves the other
         # way.
         return {
             "type": "perspective",
             "to_world": mi.ScalarTransform4f(self.to_world),
-            "fov": float(np.rad2deg(2 * np.arctan(0.5 * self.width / f))),
+            "fov": float(self._fov_x),
             "fov_axis": "x",
-            "principal_point_offset_x": float(0.5 - cx / self.width),
-            "principal_point_offset_y": float(0.5 - cy / self.height),
+            "principal_point_offset_x": float(0.5 - self.K[0, 2] / self.width),
+            "principal_point_offset_y": float(0.5 - self.K[1, 2] / self.height),
             "near_clip": self.near,
             "far_clip": 1e4,
-            "film": {
-                "type": "hdrfilm",
-                "width": self.width,
-                "height": self.height,
-                "rfilter": {"type": "box"},
-                "component_format": "float32",
-                **film,
-            },
+            "film": self._film() | film,
         }
+
+    def _check_square(self) -> None:
+        """Raise an error unless the focal lengths are equal, to a pixel of the image's height."""
+        fx = self.K[0, 0]
+        fy = self.K[1, 1]
+        if abs(fx / fy - 1) * self.height > 1:
+            raise ValueError(
+                "Camera.sensor(): `K` must have equal focal lengths, because Mitsuba's sensor "
+                f"has one, got {fx:g} and {fy:g}; render `camera.square()`, of "
+                f"{self.square().width}x{self.square().height} pixels, and resize the image."
+            )
+
+    def _film(self) -> dict[str, Any]:
+        """Return Mitsuba's dictionary of a film of this size."""
+        return {
+            "type": "hdrfilm",
+            "width": self.width,
+            "height": self.height,
+            "rfilter": {"type": "box"},
+            "component_format": "float32",
+        }
+
+
+def _intrinsics(where: str, K: ArrayLike) -> np.ndarray:
+    """Return intrinsics as float64 if they are a matrix [3, 3]."""
+    K = numbers(where, "K", K).astype(np.float64)
+    if K.shape != (3, 3):
+        raise ValueError(
+            f"{where}: `K` must be [3, 3], got {K.shape}; pass one camera's intrinsics."
+        )
+    return K
+
+
+def _extrinsics(where: str, viewmat: np.ndarray | Tensor) -> np.ndarray | Tensor:
+    """Return extrinsics, as float64 unless they are a Dr.Jit tensor, if they are [4, 4]."""
+    if not isinstance(viewmat, dr.ArrayBase):
+        viewmat = numbers(where, "viewmat", viewmat).astype(np.float64)
+    if tuple(viewmat.shape) != (4, 4):
+        raise ValueError(
+            f"{where}: `viewmat` must be [4, 4], got {tuple(viewmat.shape)}; pass one "
+            "world-to-camera matrix."
+        )
+    return viewmat
+
+
+def _check_focal_lengths(where: str, K: np.ndarray) -> None:
+    if not bounded(K) or not K[0, 0] > 0 or not K[1, 1] > 0:
+        raise ValueError(
+            f"{where}: `K` must be finite with positive focal lengths, got {K.tolist()}; "
+            "check the calibration."
+        )
+
+
+def _check_skew(where: str, K: np.ndarray) -> None:
+    if K[0, 1] or K[1, 0] or not np.array_equal(K[2], (0, 0, 1)):
+        raise ValueError(
+            f"{where}: `K` must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}; "
+            "resample the images to a camera without skew."
+        )
+
+
+def _vector(where: str, name: str, value: ArrayLike) -> np.ndarray:
+    """Return an argument as float64 if it is a vector [3]."""
+    vector = numbers(where, name, value).astype(np.float64)
+    if vector.shape != (3,):
+        raise ValueError(
+            f"{where}: `{name}` must be [3], got {list(vector.shape)}; pass x, y and z."
+        )
+    return vector
+
+
+def _viewmat_towards(
+    where: str, origin: np.ndarray, target: np.ndarray, up: np.ndarray
+) -> np.ndarray:
+    """Return the extrinsics [4, 4] of the view from one point to another, with `up` upwards."""
+    forward = target - origin
+    right = np.cross(forward, up)
+    if not np.linalg.norm(right) > 1e-12 * (np.linalg.norm(forward) * np.linalg.norm(up)):
+        raise ValueError(
+            f"{where}: `up` must not be parallel to the direction of view, got origin "
+            f"{origin.tolist()}, target {target.tolist()}, up {up.tolist()}; tilt it."
+        )
+    R = _axes(forward, right)
+    return np.vstack([np.column_stack([R, -R @ origin]), [0, 0, 0, 1.0]])
+
+
+def _axes(forward: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return the axes [3, 3] of a camera as unit vectors: to the right, down and forward."""
+    forward = forward / np.linalg.norm(forward)
+    right = right / np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward])
+
+
+def _intrinsics_of_fov(
+    fov_x: float, width: int, height: int, offset_x: float = 0.0, offset_y: float = 0.0
+) -> np.ndarray:
+    """Return intrinsics [3, 3] of a field of view in degrees across, with Mitsuba's offsets."""
+    f = 0.5 * width / np.tan(np.deg2rad(0.5 * fov_x))
+    # Mitsuba adds its offset to the pixel's position, so the principal point moves the other way.
+    return np.array(
+        [[f, 0, width * (0.5 - offset_x)], [0, f, height * (0.5 - offset_y)], [0, 0, 1.0]]
+    )
+
+
+def _check_perspective(sensor: Any) -> None:
+    """Raise an error unless a value is a Mitsuba `perspective` sensor."""
+    import mitsuba as mi
+
+    kind = sensor.class_name() if isinstance(sensor, mi.Sensor) else f"a {type(sensor).__name__}"
+    if kind != "PerspectiveCamera":
+        raise ValueError(
+            f"Camera.from_sensor(): `sensor` must be a `perspective` sensor, got {kind}; "
+            "splats are drawn only by pinhole cameras without lens distortion."
+        )
 
 
 def rigid(where: str, matrix: np.ndarray) -> np.ndarray:
@@ -326,16 +382,24 @@ def rigid(where: str, matrix: np.ndarray) -> np.ndarray:
             f"{where}: the pose must be finite, with numbers of at most {LARGEST:g}, got "
             f"{matrix.tolist()}; calibrate again."
         )
-    R = matrix[:3, :3]
+    _check_axes(where, matrix[:3, :3])
+    _check_last_row(where, matrix[3:])
+    return np.vstack([matrix[:3], [0, 0, 0, 1.0]])
+
+
+def _check_axes(where: str, R: np.ndarray) -> None:
     # Files with six digits are off by 1e-6, scaled or sheared poses by far more than 1e-3.
     if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
         raise ValueError(
             f"{where}: the axes must be a right-handed orthonormal frame, got "
             f"{R.round(4).tolist()}; undo any scaling or mirroring of the poses."
         )
-    if not np.allclose(matrix[3:], (0, 0, 0, 1), atol=1e-6):
+
+
+def _check_last_row(where: str, rows: np.ndarray) -> None:
+    """Raise an error unless the rows after the third of a pose, if any, are [0, 0, 0, 1]."""
+    if not np.allclose(rows, (0, 0, 0, 1), atol=1e-6):
         raise ValueError(
-            f"{where}: the last row must be [0, 0, 0, 1], got {matrix[3].tolist()}; transpose the "
+            f"{where}: the last row must be [0, 0, 0, 1], got {rows[0].tolist()}; transpose the "
             "matrix if its translation is there."
         )
-    return np.vstack([matrix[:3], [0, 0, 0, 1.0]])

@@ -29,15 +29,18 @@ def check_number(place: str, name: str, value: Any, interval: str) -> None:
     Raises:
         ValueError: it is not, which includes NaN.
     """
+    is_number = isinstance(value, Real) and not isinstance(value, bool)
+    if not is_number or not _lies_in(value, interval):
+        raise ValueError(
+            f"{place}: `{name}` must be a number in {interval}, got {value!r}; set another value."
+        )
+
+
+def _lies_in(x: Any, interval: str) -> bool:
+    """Return whether an interval contains a number, also an integer of hundreds of digits."""
     low, high = map(float, interval[1:-1].split(","))
-    if isinstance(value, Real) and not isinstance(value, bool):
-        x: Any = value  # not as a float, which cannot hold an integer of hundreds of digits
-        above = low <= x if interval[0] == "[" else low < x
-        if above and (x <= high if interval[-1] == "]" else x < high):
-            return
-    raise ValueError(
-        f"{place}: `{name}` must be a number in {interval}, got {value!r}; set another value."
-    )
+    above = low <= x if interval[0] == "[" else low < x
+    return above and (x <= high if interval[-1] == "]" else x < high)
 
 
 def check_type(place: str, name: str, value: Any, kind: type) -> None:
@@ -74,15 +77,19 @@ def check_mask(place: str, mask: Any, height: int, width: int) -> None:
         ValueError: it is not.
     """
     if not isinstance(mask, np.ndarray) or mask.shape != (height, width) or mask.dtype != bool:
-        kind = (
-            f"{mask.dtype} {list(mask.shape)}"
-            if isinstance(mask, np.ndarray)
-            else type(mask).__name__
-        )
         raise ValueError(
-            f"{place}: the mask must be bool [{height}, {width}] like its image, got {kind}; "
-            "resize it without interpolation, or compare it with a threshold."
+            f"{place}: the mask must be bool [{height}, {width}] like its image, got "
+            f"{kind_of(mask)}; resize it without interpolation, or compare it with a threshold."
         )
+
+
+def kind_of(value: Any) -> str:
+    """Return the numbers and the shape of an array in words, or the name of another type."""
+    return (
+        f"{value.dtype} {list(value.shape)}"
+        if isinstance(value, np.ndarray)
+        else type(value).__name__
+    )
 
 
 def numbers(place: str, name: str, values: ArrayLike) -> np.ndarray:
@@ -96,11 +103,7 @@ def numbers(place: str, name: str, values: ArrayLike) -> np.ndarray:
     except (TypeError, ValueError, RuntimeError):  # for instance rows of different lengths
         array = np.array(None)
     if array.dtype.kind not in "fiub":
-        kind = (
-            f"{array.dtype} {list(array.shape)}"
-            if isinstance(values, np.ndarray)
-            else repr(values)[:80]
-        )
+        kind = kind_of(values) if isinstance(values, np.ndarray) else repr(values)[:80]
         raise ValueError(
             f"{place}: `{name}` must be an array of real numbers, got {kind}; convert it to floats."
         )
@@ -120,6 +123,17 @@ def check_points(
     colors = numbers(place, "point_colors", colors)
     if not points.size and not colors.size:
         return np.zeros((0, 3)), np.zeros((0, 3))
+    _check_point_shapes(place, points, colors)
+    is_bounded = np.abs(points) <= LARGEST
+    is_color = (colors >= 0) & (colors <= most)
+    coordinates = f"`points` must be finite and at most {LARGEST:g}"
+    _check_rows(place, coordinates, points, is_bounded, "remove this point")
+    light = f"`point_colors` must be in [0, {most:g}]"
+    _check_rows(place, light, colors, is_color, "divide colours of 8 bits by 255")
+    return points, colors
+
+
+def _check_point_shapes(place: str, points: np.ndarray, colors: np.ndarray) -> None:
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(
             f"{place}: `points` must be [P, 3], got {list(points.shape)}; pass one row for each "
@@ -130,26 +144,12 @@ def check_points(
             f"{place}: `point_colors` must be {list(points.shape)} like `points`, got "
             f"{list(colors.shape)}; pass one colour for each point."
         )
-    for name, values, good, expected, remedy in (
-        (
-            "points",
-            points,
-            np.abs(points) <= LARGEST,
-            f"finite and at most {LARGEST:g}",
-            "remove this point",
-        ),
-        (
-            "point_colors",
-            colors,
-            (colors >= 0) & (colors <= most),
-            f"in [0, {most:g}]",
-            "divide colours of 8 bits by 255",
-        ),
-    ):
-        if not good.all():
-            row = np.flatnonzero(~good.all(axis=1))[0]
-            raise ValueError(
-                f"{place}: `{name}` must be {expected}, got {values[row].tolist()} at {row}; "
-                f"{remedy}."
-            )
-    return points, colors
+
+
+def _check_rows(
+    place: str, requirement: str, values: np.ndarray, good: np.ndarray, remedy: str
+) -> None:
+    """Raise an error about the first row of `values` [P, 3] that is not all `good` [P, 3]."""
+    if not good.all():
+        row = np.flatnonzero(~good.all(axis=1))[0]
+        raise ValueError(f"{place}: {requirement}, got {values[row].tolist()} at {row}; {remedy}.")

@@ -40,21 +40,28 @@ def field_docs(config_type: type) -> dict[str, str]:
     """Return the docstrings of a dataclass's fields by name; none without source code."""
     docs: dict[str, str] = {}
     for base in reversed(config_type.__mro__):
-        try:
-            (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
-        except (OSError, TypeError, SyntaxError):
-            continue
-        body = definition.body if isinstance(definition, ast.ClassDef) else []
-        for node, sibling in pairwise(body):
-            if (
-                isinstance(node, ast.AnnAssign)
-                and isinstance(node.target, ast.Name)
-                and isinstance(sibling, ast.Expr)
-            ):
-                text = sibling.value.value if isinstance(sibling.value, ast.Constant) else None
-                if isinstance(text, str):
+        for node, sibling in pairwise(_body_of(base)):
+            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
+                text = _string_of(sibling)
+                if text is not None:
                     docs[node.target.id] = inspect.cleandoc(text)
     return docs
+
+
+def _body_of(kind: type) -> list[ast.stmt]:
+    """Return the statements of the definition of a class; none without source code."""
+    try:
+        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
+    except (OSError, TypeError, SyntaxError):
+        return []
+    return definition.body if isinstance(definition, ast.ClassDef) else []
+
+
+def _string_of(node: ast.stmt) -> str | None:
+    """Return the text of a statement that is only a string, or None."""
+    value = node.value if isinstance(node, ast.Expr) else None
+    text = value.value if isinstance(value, ast.Constant) else None
+    return text if isinstance(text, str) else None
 
 
 def documented(config_type: type[Class]) -> type[Class]:

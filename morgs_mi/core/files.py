@@ -38,7 +38,7 @@ def atomic_path(path: str | os.PathLike[str], place: str) -> Generator[Path, Non
         final.with_name(f".{what}-{os.getpid()}-{final.name}") for what in ("partial", "old")
     )
     replaces_folder = os.path.isdir(final)  # unlike Path's, never raises
-    if os.path.exists(final) and not (replaces_folder or os.path.isfile(final)):
+    if _is_special(final):
         raise FileExistsError(
             f"{place}: {path} is a device or a pipe, which would be replaced; name a file."
         )
@@ -57,6 +57,11 @@ def atomic_path(path: str | os.PathLike[str], place: str) -> Generator[Path, Non
             old.rename(final)
         _remove(partial)
         _remove(old)
+
+
+def _is_special(path: Path) -> bool:
+    """Return whether `path` exists and is neither a file nor a folder."""
+    return os.path.exists(path) and not (os.path.isdir(path) or os.path.isfile(path))
 
 
 @contextmanager
@@ -91,17 +96,11 @@ def locked_folder(path: str | os.PathLike[str], place: str) -> Generator[None, N
         OSError: the folder cannot be created or written; the sentence begins with `place`.
     """
     folder = Path(path)
-    file = Path(path) / _LOCK
+    file = folder / _LOCK
     new_folders = [parent for parent in (folder, *folder.parents) if not os.path.lexists(parent)]
     with ExitStack() as undo:
         undo.callback(_remove_empty, new_folders)
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            lock = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
-        except FileExistsError:
-            raise FileExistsError(f"{place}: {path} is a file; name a folder.") from None
-        except OSError as error:
-            raise write_error(f"{place}: cannot write into {path}", error, folder) from error
+        lock = _opened_lock(path, place)
         undo.callback(os.close, lock)
         # A writer that has just ended may have removed the file between its opening and its
         # locking.
@@ -113,6 +112,18 @@ def locked_folder(path: str | os.PathLike[str], place: str) -> Generator[None, N
             )
         undo.callback(_remove_own, file, lock)
         yield
+
+
+def _opened_lock(path: str | os.PathLike[str], place: str) -> int:
+    """Return the opened lock file of a folder, which is created if it is missing."""
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        return os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
+    except FileExistsError:
+        raise FileExistsError(f"{place}: {path} is a file; name a folder.") from None
+    except OSError as error:
+        raise write_error(f"{place}: cannot write into {path}", error, folder) from error
 
 
 def is_same_file(path: str | os.PathLike[str], status: os.stat_result) -> bool:

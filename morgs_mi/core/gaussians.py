@@ -16,7 +16,14 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
-from morgs_mi.core.attributes import ATTRIBUTES, BY_ACTIVATED_NAME, EXP, SIGMOID, sigmoid
+from morgs_mi.core.attributes import (
+    ATTRIBUTES,
+    BY_ACTIVATED_NAME,
+    EXP,
+    SIGMOID,
+    Attribute,
+    sigmoid,
+)
 from morgs_mi.core.checks import numbers
 from morgs_mi.core.memory import float_tensor
 from morgs_mi.core.types import Float, Tensor, UInt32
@@ -168,24 +175,10 @@ class Gaussians:
                 f"Gaussians(): `means` must be [N, 3], got {tuple(self.means.shape)}; pass one "
                 "row for each."
             )
-        N = len(self)
         for attribute in ATTRIBUTES:
-            if attribute.activated_name == "sh_coeffs":  # two rows in one tensor, checked below
-                continue
-            value = getattr(self, attribute.name)
-            tail = attribute.shape
-            if value is not None and tuple(value.shape) != (N, *tail):
-                expected = ", ".join(["N", *map(str, tail)])
-                raise ValueError(
-                    f"Gaussians(): `{attribute.name}` must be [{expected}] with N={N}, got "
-                    f"{tuple(value.shape)}; all attributes describe the same Gaussians."
-                )
-        shape = tuple(self.sh_coeffs.shape)
-        if len(shape) != 3 or shape[0] != N or shape[2] != 3 or shape[1] not in (1, 4, 9, 16):
-            raise ValueError(
-                f"Gaussians(): `sh_coeffs` must be [N, K, 3] with N={N} and K in 1, 4, 9, 16, got "
-                f"{shape}; K is (degree + 1)^2 for degree 0 to 3."
-            )
+            if attribute.activated_name != "sh_coeffs":  # two rows in one tensor, checked below
+                _check_shape(attribute, getattr(self, attribute.name), len(self))
+        _check_sh_shape(tuple(self.sh_coeffs.shape), len(self))
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
@@ -219,14 +212,8 @@ class Gaussians:
         place = "Gaussians.from_activated()"
         opacities = numbers(place, "opacities", opacities)
         scales = numbers(place, "scales", scales)
-        for name, values, high in (("scales", scales, np.inf), ("opacities", opacities, 1)):
-            bad = np.argwhere((values < 0) | (values > high))
-            if len(bad):
-                raise ValueError(
-                    f"{place}: `{name}` must be {'at least 0' if high > 1 else 'in [0, 1]'}, got "
-                    f"{values[tuple(bad[0])]} at {bad[0].tolist()}; pass activated values, not "
-                    "logarithms or logits."
-                )
+        _check_activated(f"{place}: `scales` must be at least 0", scales, np.inf)
+        _check_activated(f"{place}: `opacities` must be in [0, 1]", opacities, 1)
         return cls(means, EXP.inverse(scales), quats, SIGMOID.inverse(opacities), sh_coeffs, **more)
 
     @property
@@ -332,6 +319,35 @@ class Gaussians:
             )
         return Gaussians(
             **{k: np.concatenate([column[k] for column in columns]) for k in columns[0]}
+        )
+
+
+def _check_shape(attribute: Attribute, value: Tensor | None, N: int) -> None:
+    """Raise an error if an attribute is present, and not one row for each of N Gaussians."""
+    tail = attribute.shape
+    if value is not None and tuple(value.shape) != (N, *tail):
+        expected = ", ".join(["N", *map(str, tail)])
+        raise ValueError(
+            f"Gaussians(): `{attribute.name}` must be [{expected}] with N={N}, got "
+            f"{tuple(value.shape)}; all attributes describe the same Gaussians."
+        )
+
+
+def _check_sh_shape(shape: tuple[int, ...], N: int) -> None:
+    if len(shape) != 3 or shape[0] != N or shape[2] != 3 or shape[1] not in (1, 4, 9, 16):
+        raise ValueError(
+            f"Gaussians(): `sh_coeffs` must be [N, K, 3] with N={N} and K in 1, 4, 9, 16, got "
+            f"{shape}; K is (degree + 1)^2 for degree 0 to 3."
+        )
+
+
+def _check_activated(requirement: str, values: np.ndarray, high: float) -> None:
+    """Raise an error about the first value that is not in [0, high]."""
+    bad = np.argwhere((values < 0) | (values > high))
+    if len(bad):
+        raise ValueError(
+            f"{requirement}, got {values[tuple(bad[0])]} at {bad[0].tolist()}; pass activated "
+            "values, not logarithms or logits."
         )
 
 

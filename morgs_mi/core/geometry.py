@@ -27,7 +27,7 @@ def unit_quats(gaussians: Gaussians) -> np.ndarray:
 
 def covariances(gaussians: Gaussians) -> np.ndarray:
     """Return the covariances in world axes, float64 [N, 3, 3]."""
-    axes = Rotation.from_quat(unit_quats(gaussians), scalar_first=True).as_matrix()
+    axes = _rotations(gaussians).as_matrix()
     axes = axes * np.exp(np.asarray(gaussians.numpy()["log_scales"], np.float64))[:, None]
     return axes @ axes.transpose(0, 2, 1)
 
@@ -47,19 +47,27 @@ def rotated(gaussians: Gaussians, R: np.ndarray) -> Gaussians:
     basis invertible.
     """
     R = np.asarray(R, np.float64)
-    turn = Rotation.from_matrix(R)
-    quats = (turn * Rotation.from_quat(unit_quats(gaussians), scalar_first=True)).as_quat(
-        scalar_first=True
-    )
+    turns = Rotation.from_matrix(R) * _rotations(gaussians)
     raw = gaussians.numpy()
     vectors = {name: raw[name] @ R.T for name in ("means", "motion", "offset") if name in raw}
-    # Golden spiral: evenly spread directions, twice as many as the 16 functions of degree 3.
-    z = 1 - (2 * np.arange(32) + 1) / 32
-    angle = np.pi * (1 + 5**0.5) * np.arange(32)
-    directions = np.stack(
-        [np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1
-    )
-    degree = gaussians.sh_degree
-    change = np.linalg.pinv(sh_basis(directions, degree)) @ sh_basis(directions @ R, degree)
-    coeffs = np.einsum("kl,nlc->nkc", change, raw["sh_coeffs"])
-    return replace(gaussians, quats=quats, sh_coeffs=coeffs, **vectors)
+    coeffs = np.einsum("kl,nlc->nkc", _sh_rotation(R, gaussians.sh_degree), raw["sh_coeffs"])
+    return replace(gaussians, quats=turns.as_quat(scalar_first=True), sh_coeffs=coeffs, **vectors)
+
+
+def _rotations(gaussians: Gaussians) -> Rotation:
+    return Rotation.from_quat(unit_quats(gaussians), scalar_first=True)
+
+
+def _sh_rotation(R: np.ndarray, degree: int) -> np.ndarray:
+    """Return the matrix [K, K] that rotates SH coefficients by R [3, 3]."""
+    # Twice as many directions as the 16 functions of degree 3.
+    directions = _golden_spiral(32)
+    return np.linalg.pinv(sh_basis(directions, degree)) @ sh_basis(directions @ R, degree)
+
+
+def _golden_spiral(count: int) -> np.ndarray:
+    """Return evenly spread unit directions [count, 3]."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.pi * (1 + 5**0.5) * np.arange(count)
+    radius = np.sqrt(1 - z * z)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)

@@ -74,17 +74,12 @@ class ProgressBar:
         if seconds - self._shown < _PERIOD and done != total:
             return
         self._shown = seconds
-        text = (
-            f"{done:.0f}{'' if total is None else f'/{total:.0f}'}, "
-            f"{timedelta(seconds=round(seconds))}"
-        )
+        share = f"{done:.0f}" if total is None else f"{done:.0f}/{total:.0f}"
+        text = f"{share}, {timedelta(seconds=round(seconds))}"
         if self._is_notebook:
             self._show_html(done, total, text)
         elif sys.stderr.isatty():
-            bar_length = round(_WIDTH * done / total) if total else 0
-            end = "\n" if done == total else ""
-            sys.stderr.write(f"\r{self._name} {'━' * bar_length:{_WIDTH}} {text}{end}")
-            sys.stderr.flush()
+            self._show_line(done, total, text)
 
     def report(self, stage: str, done: float, total: float) -> None:
         """Show that `done` of `total` is done in a stage; for calls that report stages."""
@@ -97,6 +92,12 @@ class ProgressBar:
     @property
     def _name(self) -> str:
         return f"{self._title}: {self._stage}" if self._stage else self._title
+
+    def _show_line(self, done: float, total: float | None, text: str) -> None:
+        bar_length = round(_WIDTH * done / total) if total else 0
+        end = "\n" if done == total else ""
+        sys.stderr.write(f"\r{self._name} {'━' * bar_length:{_WIDTH}} {text}{end}")
+        sys.stderr.flush()
 
     def _show_html(self, done: float, total: float | None, text: str) -> None:
         from IPython.display import HTML, display  # type: ignore[import-not-found]

@@ -116,34 +116,29 @@ def arms_of(kind: Any) -> tuple[Any, ...]:
     return get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
 
 
+def item_kinds(kinds: tuple[Any, ...], count: int) -> tuple[Any, ...]:
+    """Return the types of the items of a tuple, for `count` of them where any number is allowed.
+
+    Args:
+        kinds: the arguments of the tuple's type, such as (int, str), or (int, ...).
+        count: number of items.
+    """
+    return kinds[:1] * count if kinds[1:] == (...,) else kinds
+
+
 def _fits(value: Any, kind: Any) -> bool:
     origin = get_origin(kind)
-    args = get_args(kind)
-    if origin in (Union, UnionType):
-        return any(_fits(value, arm) for arm in args)
-    if origin is Annotated:
-        bounds = (bound for bound in args[1:] if isinstance(bound, _Bound))
-        return _fits(value, args[0]) and all(bound.holds(value, bound.limit) for bound in bounds)
-    if origin is Literal:
-        return any(type(value) is type(choice) and value == choice for choice in args)
-    if origin is tuple:
-        kinds = args[:1] * len(value) if args[1:] == (...,) and isinstance(value, tuple) else args
-        return (
-            isinstance(value, tuple) and len(kinds) == len(value) and all(map(_fits, value, kinds))
-        )
-    if origin is dict:
-        return isinstance(value, dict) and all(
-            _fits(k, args[0]) and _fits(v, args[1]) for k, v in value.items()
-        )
+    if origin in _GENERIC_CHECKS:
+        return _GENERIC_CHECKS[origin](value, get_args(kind))
     if kind is int:
-        return (
-            isinstance(value, Integral)
-            and not isinstance(value, bool)
-            and -(2**63) <= int(value) < 2**64
-        )
+        return _is_number(value, Integral) and -(2**63) <= int(value) < 2**64
     if kind is float:
-        return isinstance(value, Real) and not isinstance(value, bool) and _is_finite(value)
+        return _is_number(value, Real) and _is_finite(value)
     return isinstance(value, kind)
+
+
+def _is_number(value: Any, kind: type) -> bool:
+    return isinstance(value, kind) and not isinstance(value, bool)
 
 
 def _is_finite(value: Real) -> bool:
@@ -151,6 +146,43 @@ def _is_finite(value: Real) -> bool:
         return isfinite(value)
     except OverflowError:  # an integer of hundreds of digits
         return False
+
+
+def _fits_union(value: Any, arms: tuple[Any, ...]) -> bool:
+    return any(_fits(value, arm) for arm in arms)
+
+
+def _fits_bounds(value: Any, args: tuple[Any, ...]) -> bool:
+    bounds = (bound for bound in args[1:] if isinstance(bound, _Bound))
+    return _fits(value, args[0]) and all(bound.holds(value, bound.limit) for bound in bounds)
+
+
+def _is_choice(value: Any, choices: tuple[Any, ...]) -> bool:
+    return any(type(value) is type(choice) and value == choice for choice in choices)
+
+
+def _fits_tuple(value: Any, args: tuple[Any, ...]) -> bool:
+    if not isinstance(value, tuple):
+        return False
+    kinds = item_kinds(args, len(value))
+    return len(kinds) == len(value) and all(map(_fits, value, kinds))
+
+
+def _fits_dict(value: Any, args: tuple[Any, ...]) -> bool:
+    return isinstance(value, dict) and all(
+        _fits(k, args[0]) and _fits(v, args[1]) for k, v in value.items()
+    )
+
+
+# By the origin of a type; each takes a value and the arguments of the type.
+_GENERIC_CHECKS: dict[Any, Callable[[Any, tuple[Any, ...]], bool]] = {
+    Union: _fits_union,
+    UnionType: _fits_union,
+    Annotated: _fits_bounds,
+    Literal: _is_choice,
+    tuple: _fits_tuple,
+    dict: _fits_dict,
+}
 
 
 def _in_words(kind: Any) -> str:
@@ -164,12 +196,21 @@ def _in_words(kind: Any) -> str:
     if origin is Literal:
         return _joined(list(map(str, args)), "or")
     if origin is tuple:
-        items = (
-            f"each {_in_words(args[0])}" if args[1:] == (...,) else ", ".join(map(_in_words, args))
-        )
-        return f"a list ({items})"
+        return f"a list ({_items_in_words(args)})"
+    return _name_in_words(kind)
+
+
+def _items_in_words(args: tuple[Any, ...]) -> str:
+    if args[1:] == (...,):
+        return f"each {_in_words(args[0])}"
+    return ", ".join(map(_in_words, args))
+
+
+def _name_in_words(kind: Any) -> str:
     name = getattr(kind, "__name__", str(kind))
-    return f"a table ({name})" if is_dataclass(kind) else _WORDS.get(origin or kind, name)
+    if is_dataclass(kind):
+        return f"a table ({name})"
+    return _WORDS.get(get_origin(kind) or kind, name)
 
 
 def _expected(value: Any, kind: Any) -> str:

@@ -30,9 +30,18 @@ def scene_extent(cameras: Sequence[Camera]) -> float:
 
     It is 1 for a single camera.
     """
-    positions = np.array([camera.position for camera in cameras])
-    radius = np.linalg.norm(positions - positions.mean(0), axis=1).max()
+    radius = _central_distances(_positions(cameras)).max()
     return float(1.1 * radius) if radius > 0 else 1.0
+
+
+def _positions(cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the positions of the cameras [V, 3]."""
+    return np.array([camera.position for camera in cameras])
+
+
+def _central_distances(positions: np.ndarray) -> np.ndarray:
+    """Return the distance of each of the positions [V, 3] from their mean [V]."""
+    return np.linalg.norm(positions - positions.mean(0), axis=1)
 
 
 def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
@@ -77,10 +86,13 @@ def seen_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndar
     """
     with np.errstate(divide="ignore", invalid="ignore"):  # points beside the camera
         pixels, depths = camera.project(np.asarray(points, np.float64).reshape(-1, 3))
-    visible = (depths > camera.near) & (
-        (pixels >= 0) & (pixels < (camera.width, camera.height))
-    ).all(axis=1)
+    visible = (depths > camera.near) & in_image(camera, pixels)
     return visible, pixels[visible], depths[visible]
+
+
+def in_image(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """Return the mask [...] of the pixel positions [..., 2] that lie in the image of a camera."""
+    return ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=-1)
 
 
 def with_near_planes(
@@ -144,7 +156,7 @@ def _rig_depths(cameras: Sequence[Camera]) -> np.ndarray:
     """Return a depth within which each camera shares nothing with the others, by the rig alone [V];
     0 if unknown.
     """
-    positions = np.array([camera.position for camera in cameras])
+    positions = _positions(cameras)
     distances = np.linalg.norm(positions[:, None] - positions, axis=-1)
     np.fill_diagonal(distances, np.inf)
     focus = focus_depths(cameras)
@@ -163,12 +175,17 @@ def choose_key_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:
     """
     if not cameras:
         return ()
-    positions = np.array([camera.position for camera in cameras])
-    views = [int(np.argmin(np.linalg.norm(positions - positions.mean(0), axis=1)))]
+    positions = _positions(cameras)
+    views = [int(np.argmin(_central_distances(positions)))]
     while len(views) < min(count, len(cameras)):
-        distance = np.linalg.norm(positions[:, None] - positions[views], axis=-1).min(1)
-        views.append(int(np.argmax(distance)))
+        views.append(_farthest(positions, views))
     return tuple(sorted(views))
+
+
+def _farthest(positions: np.ndarray, views: Sequence[int]) -> int:
+    """Return the index of the position [V, 3] that is farthest from those of some views."""
+    distance = np.linalg.norm(positions[:, None] - positions[views], axis=-1).min(1)
+    return int(np.argmax(distance))
 
 
 def mean_views(cameras: Sequence[Camera], points: np.ndarray) -> float:
