@@ -96,19 +96,28 @@ class Packet:
         if not 0 <= self.frame < 2**32:
             raise ValueError(f"Packet.encoded: `frame` must be in 0..2^32-1, got {self.frame}.")
         for name, array in self.arrays.items():
-            if array.dtype.name not in _DTYPES:
-                raise ValueError(
-                    f"Packet.encoded: `{name}` must be one of {', '.join(_DTYPES)}, got "
-                    f"{array.dtype}; convert it."
-                )
-        table = json.dumps([[n, a.dtype.name, a.shape] for n, a in self.arrays.items()]).encode()
-        arrays = (a.astype(a.dtype.newbyteorder("<")).tobytes() for a in self.arrays.values())
-        return _sealed(self.kind, self.frame, b"".join([_U32.pack(len(table)), table, *arrays]))
+            _check_dtype(name, array)
+        return _sealed(self.kind, self.frame, _payload(self.arrays))
 
     @property
     def num_bytes(self) -> int:
         """Number of bytes that the packet takes in the file."""
         return len(self.encoded)
+
+
+def _check_dtype(name: str, array: np.ndarray) -> None:
+    if array.dtype.name not in _DTYPES:
+        raise ValueError(
+            f"Packet.encoded: `{name}` must be one of {', '.join(_DTYPES)}, got "
+            f"{array.dtype}; convert it."
+        )
+
+
+def _payload(arrays: Mapping[str, np.ndarray]) -> bytes:
+    """Return a table of arrays and their bytes; `_arrays` reads them."""
+    table = json.dumps([[n, a.dtype.name, a.shape] for n, a in arrays.items()]).encode()
+    contents = (a.astype(a.dtype.newbyteorder("<")).tobytes() for a in arrays.values())
+    return b"".join([_U32.pack(len(table)), table, *contents])
 
 
 def encode_packet(packet: Packet) -> bytes:
@@ -251,10 +260,7 @@ class StreamWriter:
                 rest = rest[self._file.write(rest) :]
             self._file.flush()
         except BaseException as error:  # Ctrl-C must leave complete packets too
-            if self._owns_file:
-                with contextlib.suppress(OSError):  # a device cannot be truncated
-                    self._file.truncate(self.num_bytes)
-                    self._file.seek(self.num_bytes)
+            self._remove_rest()
             if not isinstance(error, OSError):
                 raise
             raise OSError(
@@ -266,10 +272,17 @@ class StreamWriter:
         self.num_bytes += len(data)
         return len(data)
 
+    def _remove_rest(self) -> None:
+        """Truncate the file to its complete packets, as far as that is possible."""
+        if self._owns_file:
+            with contextlib.suppress(OSError):  # a device cannot be truncated
+                self._file.truncate(self.num_bytes)
+                self._file.seek(self.num_bytes)
+
 
 def _sealed(kind: int, frame: int, payload: bytes) -> bytes:
     head = HEAD.pack(kind, frame, len(payload))
-    return b"".join([head, _U32.pack(zlib.crc32(payload, zlib.crc32(head))), payload])
+    return b"".join([head, _U32.pack(_crc(head, payload)), payload])
 
 
 def open_packet(data: bytes) -> tuple[int, int, memoryview]:
@@ -286,11 +299,16 @@ def open_packet(data: bytes) -> tuple[int, int, memoryview]:
     if length != len(payload):
         raise ValueError(f"its payload should have {length} bytes, got {len(payload)}")
     (stated_crc,) = _U32.unpack_from(data, HEAD.size)
-    if (crc := zlib.crc32(payload, zlib.crc32(head))) != stated_crc:
+    crc = _crc(head, payload)
+    if crc != stated_crc:
         raise ValueError(
             f"its CRC should be {stated_crc:08x}, got {crc:08x}: the bytes are damaged"
         )
     return kind, frame, payload
+
+
+def _crc(head: bytes, payload: bytes | memoryview) -> int:
+    return zlib.crc32(payload, zlib.crc32(head))
 
 
 def _arrays(payload: memoryview) -> dict[str, np.ndarray]:
@@ -298,15 +316,19 @@ def _arrays(payload: memoryview) -> dict[str, np.ndarray]:
     at = _U32.size + length
     arrays: dict[str, np.ndarray] = {}
     for name, dtype, shape in _table(load_json(payload[_U32.size : at], _MAX_TABLE)):
-        file_dtype = np.dtype(dtype).newbyteorder("<")
-        end = at + math.prod(shape) * file_dtype.itemsize
+        end = at + math.prod(shape) * np.dtype(dtype).itemsize
         if end > len(payload):
             raise ValueError(f"`{name}` {shape} would end at byte {end} of {len(payload)}")
-        arrays[name] = np.frombuffer(payload[at:end], file_dtype).reshape(shape).astype(dtype)
+        arrays[name] = _array(payload[at:end], dtype, shape)
         at = end
     if at != len(payload):
         raise ValueError(f"it describes {at} bytes of {len(payload)}")
     return arrays
+
+
+def _array(data: memoryview, dtype: str, shape: list[int]) -> np.ndarray:
+    """Return an array of this machine's byte order from little-endian bytes."""
+    return np.frombuffer(data, np.dtype(dtype).newbyteorder("<")).reshape(shape).astype(dtype)
 
 
 def _table(rows: Any) -> list[tuple[str, str, list[int]]]:
@@ -320,14 +342,17 @@ def _table(rows: Any) -> list[tuple[str, str, list[int]]]:
     ):
         raise ValueError("it must be a list of [name, dtype, shape]")
     for name, dtype, shape in rows:
-        sound = (
-            isinstance(name, str)
-            and dtype in _DTYPES
-            and isinstance(shape, list)
-            and len(shape) <= _MAX_AXES
-        )
-        if not sound or any(type(n) is not int or not 0 <= n < 2**63 for n in shape):
+        if not isinstance(name, str) or dtype not in _DTYPES or not _is_shape(shape):
             raise ValueError(f"`{name!s:.60}` is declared as {dtype!s:.60} {shape!s:.60}")
     if len({name for name, *_ in rows}) < len(rows):
         raise ValueError("two arrays have one name")
     return [tuple(row) for row in rows]
+
+
+def _is_shape(value: Any) -> bool:
+    """Return whether a value of JSON is the shape of an array."""
+    return (
+        isinstance(value, list)
+        and len(value) <= _MAX_AXES
+        and all(type(n) is int and 0 <= n < 2**63 for n in value)
+    )

@@ -42,16 +42,17 @@ class ColumnWriter:
     def put(self, values: np.ndarray) -> None:
         """Append a column [n] of integers between -LIMIT and LIMIT."""
         tokens, bits, rest = _tokens(values)
+        self._put_tokens(tokens)
+        for shift, some in _halves(bits):
+            half = (rest[some] >> shift) & (2**_LOW - 1)
+            counts = _value_counts(bits[some] - shift)
+            self._encoder.encode(half.astype(np.int32), _MODEL.Uniform(), counts)
+
+    def _put_tokens(self, tokens: np.ndarray) -> None:
         counts = _PRIOR.copy()
         for block in _blocks(len(tokens)):
             self._encoder.encode(tokens[block], _model(counts) if block.start else _FIRST)
             counts += _WEIGHT * np.bincount(tokens[block], minlength=_TOKENS)
-        for shift, some in _halves(bits):
-            half = (rest[some] >> shift) & (2**_LOW - 1)
-            width = np.minimum(bits[some] - shift, _LOW)
-            self._encoder.encode(
-                half.astype(np.int32), _MODEL.Uniform(), (1 << width).astype(np.int32)
-            )
 
     def words(self) -> np.ndarray:
         """Return the words of all columns so far, uint32."""
@@ -75,31 +76,32 @@ class ColumnReader:
         Raises:
             ValueError: the words do not encode such a column.
         """
-        tokens = np.zeros(count, np.int64)
-        counts = _PRIOR.copy()
         try:
-            for block in _blocks(count):
-                tokens[block] = self._decoder.decode(
-                    _model(counts) if block.start else _FIRST, block.stop - block.start
-                )
-                counts += _WEIGHT * np.bincount(tokens[block], minlength=_TOKENS)
-            m = (tokens + 1) // 2
-            if not np.any(m >= _DIRECT):
-                return np.where(tokens % 2, m, -m)
-            bits = np.where(m < _DIRECT, 0, m - 12)
-            rest = np.zeros(count, np.int64)
-            for shift, some in _halves(bits):
-                width = np.minimum(bits[some] - shift, _LOW)
-                rest[some] |= (
-                    self._decoder.decode(_MODEL.Uniform(), (1 << width).astype(np.int32)).astype(
-                        np.int64
-                    )
-                    << shift
-                )
+            tokens = self._take_tokens(count)
+            size = self._take_sizes((tokens + 1) // 2)
         except AssertionError as error:  # raised by constriction where no symbol has this code
             raise ValueError(f"its code is broken ({error})") from None
-        size = np.where(bits > 0, (1 << bits) + rest, m)
         return np.where(tokens % 2, size, -size)
+
+    def _take_tokens(self, count: int) -> np.ndarray:
+        tokens = np.zeros(count, np.int64)
+        counts = _PRIOR.copy()
+        for block in _blocks(count):
+            model = _model(counts) if block.start else _FIRST
+            tokens[block] = self._decoder.decode(model, block.stop - block.start)
+            counts += _WEIGHT * np.bincount(tokens[block], minlength=_TOKENS)
+        return tokens
+
+    def _take_sizes(self, m: np.ndarray) -> np.ndarray:
+        """Return the absolute values of integers with the magnitudes m [n] of the module."""
+        if not np.any(m >= _DIRECT):
+            return m
+        bits = np.where(m < _DIRECT, 0, m - 12)
+        rest = np.zeros(len(m), np.int64)
+        for shift, some in _halves(bits):
+            half = self._decoder.decode(_MODEL.Uniform(), _value_counts(bits[some] - shift))
+            rest[some] |= half.astype(np.int64) << shift
+        return np.where(bits > 0, (1 << bits) + rest, m)
 
 
 def column_bits(values: np.ndarray) -> float:
@@ -115,14 +117,24 @@ def column_bits(values: np.ndarray) -> float:
 def _tokens(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the tokens as int32, the number of remaining bits of each, and those bits."""
     size = np.abs(values.astype(np.int64))
-    assert size.max(initial=0) < LIMIT
-    if size.max(initial=0) < _DIRECT:
+    largest = size.max(initial=0)
+    assert largest < LIMIT
+    if largest < _DIRECT:
         zeros = np.zeros(len(size), np.int64)
-        return np.where(values > 0, 2 * size - 1, 2 * size).astype(np.int32), zeros, zeros
+        return _signed(size, values), zeros, zeros
     bits = np.where(size < _DIRECT, 0, np.frexp(size.astype(np.float64))[1] - 1)
-    m = np.where(bits > 0, 12 + bits, size)
-    tokens = np.where(values > 0, 2 * m - 1, 2 * m).astype(np.int32)
+    tokens = _signed(np.where(bits > 0, 12 + bits, size), values)
     return tokens, bits, np.where(bits > 0, size - (1 << bits), 0)
+
+
+def _signed(m: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the tokens of values with the magnitudes m, int32."""
+    return np.where(values > 0, 2 * m - 1, 2 * m).astype(np.int32)
+
+
+def _value_counts(bits: np.ndarray) -> np.ndarray:
+    """Return the number of values of the next half of some remaining bits, int32."""
+    return (1 << np.minimum(bits, _LOW)).astype(np.int32)
 
 
 def _blocks(count: int) -> Iterator[slice]:

@@ -109,12 +109,17 @@ def load_json(data: bytes | memoryview, most: int) -> Any:
     except RecursionError:
         value = None
     else:
-        level = [value]
-        for _ in range(_MAX_LEVELS):
-            level = [child for parent in level for child in _children(parent)]
-        if not level:
+        if _is_shallow(value):
             return value
     raise ValueError(f"the JSON must be nested at most {_MAX_LEVELS} levels deep")
+
+
+def _is_shallow(value: Any) -> bool:
+    """Return whether a value of JSON has at most `_MAX_LEVELS` levels."""
+    level = [value]
+    for _ in range(_MAX_LEVELS):
+        level = [child for parent in level for child in _children(parent)]
+    return not level
 
 
 def _children(value: Any) -> Any:
@@ -143,20 +148,21 @@ def camera_of_fields(fields: Any, where: str) -> Camera:
     name = _entry(fields, "name", str, where)
     if not name.isprintable():
         raise ValueError(f"`{where}.name` must be printable, got {name!r:.60}")
+    size = _image_size(fields, where)
+    near = _within(_entry(fields, "near", float, where), 1 / LARGEST, LARGEST, f"{where}.near")
+    K = _matrix(fields, "K", 3, where)
+    viewmat = _matrix(fields, "viewmat", 4, where)
+    return Camera(K, viewmat, *size, name=name, near=near)
+
+
+def _image_size(fields: dict[str, Any], where: str) -> tuple[int, int]:
+    """Return the width and the height of a camera's JSON object."""
     width, height = (
         _within(_entry(fields, key, int, where), 1, _MAX_PIXELS, f"{where}.{key}")
         for key in ("width", "height")
     )
     _within(width * height, 1, _MAX_PIXELS, f"{where}.width * height")
-    near = _within(_entry(fields, "near", float, where), 1 / LARGEST, LARGEST, f"{where}.near")
-    return Camera(
-        _matrix(fields, "K", 3, where),
-        _matrix(fields, "viewmat", 4, where),
-        width,
-        height,
-        name,
-        near,
-    )
+    return width, height
 
 
 def _matrix(fields: dict[str, Any], key: str, size: int, where: str) -> np.ndarray:

@@ -148,29 +148,39 @@ def residual_packet(
     source = _checked(np.arange(len(grid)) if source is None else source, len(grid), len(gaussians))
     fields = finite_fields(gaussians)
     survivors = source[source >= 0]
-    offset = (
-        np.zeros((len(gaussians), 3)) if gaussians.offset is None else np.asarray(gaussians.offset)
-    )
-    coder = _coder(previous, fields, survivors, offset if config.offset else None)
+    coder = _coder(previous, fields, survivors, _offset_of(gaussians) if config.offset else None)
     births = len(gaussians) - len(survivors)
     birth_grid = None
     if births:
-        birth_grid = new_grid(
-            {n: v[len(survivors) :] for n, v in split_groups(fields).items()}, cameras, config
-        )
-    coarseness = round(4 * np.log2(config.birth_precision))
-    if config.target_size:
-        coarseness = _fitting(coder, coarseness, config.target_size)
-    codes = _codes(coder, coarseness, birth_grid)
-    while (
-        config.target_size
-        and coarseness < _COARSEST
-        and sum(c.nbytes for c in codes.values()) > config.target_size
-    ):
-        coarseness += 1
-        codes = _codes(coder, coarseness, birth_grid)
+        groups = {name: v[len(survivors) :] for name, v in split_groups(fields).items()}
+        birth_grid = new_grid(groups, cameras, config)
+    coarseness, codes = _sized_codes(coder, birth_grid, config)
     arrays = {"parent": previous.digest, "head": np.array([births, coarseness], np.uint32), **codes}
     return Packet(PacketKind.RESIDUAL, previous.frame + 1, arrays)
+
+
+def _offset_of(gaussians: Gaussians) -> np.ndarray:
+    """Return the offsets of Gaussians [N, 3], 0 where they have none."""
+    if gaussians.offset is None:
+        return np.zeros((len(gaussians), 3))
+    return np.asarray(gaussians.offset)
+
+
+def _sized_codes(
+    coder: Coder, birth_grid: Grid | None, config: CodecConfig
+) -> tuple[int, dict[str, np.ndarray]]:
+    """Return the coarseness of the changes, at which they fit into the `target_size` if there is
+    one, and their words.
+    """
+    target = config.target_size
+    coarseness = round(4 * np.log2(config.birth_precision))
+    if target:
+        coarseness = _fitting(coder, coarseness, target)
+    codes = _codes(coder, coarseness, birth_grid)
+    while target and coarseness < _COARSEST and sum(c.nbytes for c in codes.values()) > target:
+        coarseness += 1
+        codes = _codes(coder, coarseness, birth_grid)
+    return coarseness, codes
 
 
 def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
@@ -185,39 +195,45 @@ def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
             itself, or a packet of a frame that is not after the frame of `previous`.
     """
     where = packet.place or f"packet of frame {packet.frame}"
+    try:
+        _check_names(packet)
+        _check_dtypes(packet)
+        return _next_state(previous, packet)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}.") from None
+
+
+def _check_names(packet: Packet) -> None:
     names = {"head", "code"} | ({"parent"} if packet.kind == PacketKind.RESIDUAL else set())
     optional = {"offset"} if packet.kind == PacketKind.RESIDUAL else set()
     if packet.arrays.keys() - optional != names:
-        raise ValueError(
-            f"{where}: expected the arrays {sorted(names)}, got {sorted(packet.arrays)}."
-        )
+        raise ValueError(f"expected the arrays {sorted(names)}, got {sorted(packet.arrays)}")
+
+
+def _check_dtypes(packet: Packet) -> None:
     for name, array in packet.arrays.items():
         if array.ndim != 1 or array.dtype != _DTYPES[name]:
             raise ValueError(
-                f"{where}: `{name}` must be {_DTYPES[name]} [n], got {array.dtype} "
-                f"{list(array.shape)}."
+                f"`{name}` must be {_DTYPES[name]} [n], got {array.dtype} {list(array.shape)}"
             )
-    try:
-        if previous is not None and packet.frame <= previous.frame:
-            raise ValueError(
-                f"its frame must be above {previous.frame}, the frame of the state, got "
-                f"{packet.frame}"
-            )
-        if packet.kind == PacketKind.KEYFRAME:
-            return _decoded_keyframe(
-                packet, 0 if previous is None else previous.first_id + max(previous.next_id, 1)
-            )
-        if previous is None:
-            raise ValueError(
-                "a residual needs the frame before it, got none; start from a keyframe"
-            )
-        if not np.array_equal(packet.arrays["parent"], previous.digest):
-            raise ValueError(
-                f"it does not continue the state after frame {previous.frame}; a packet is missing"
-            )
-        return _decoded_residual(previous, packet)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}.") from None
+
+
+def _next_state(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
+    """Return the state after a packet, if it may follow on `previous`."""
+    if previous is not None and packet.frame <= previous.frame:
+        raise ValueError(
+            f"its frame must be above {previous.frame}, the frame of the state, got {packet.frame}"
+        )
+    if packet.kind == PacketKind.KEYFRAME:
+        first_id = 0 if previous is None else previous.first_id + max(previous.next_id, 1)
+        return _decoded_keyframe(packet, first_id)
+    if previous is None:
+        raise ValueError("a residual needs the frame before it, got none; start from a keyframe")
+    if not np.array_equal(packet.arrays["parent"], previous.digest):
+        raise ValueError(
+            f"it does not continue the state after frame {previous.frame}; a packet is missing"
+        )
+    return _decoded_residual(previous, packet)
 
 
 def coded_frames(packets: Iterable[Packet]) -> Iterator[CodedFrame]:
@@ -232,12 +248,7 @@ def coded_frames(packets: Iterable[Packet]) -> Iterator[CodedFrame]:
 def _decoded_keyframe(packet: Packet, first_id: int) -> CodedFrame:
     code = packet.arrays["code"]
     N, degree, optional, next_id = _head(packet, 4)
-    if unknown_bits := optional & ~KNOWN_OPTIONAL:
-        raise ValueError(
-            f"its mask of optional attributes must have no bits beyond {KNOWN_OPTIONAL:#b}, got "
-            f"{optional:#b} with the unknown {unknown_bits:#b}; read it with the release that "
-            "wrote it"
-        )
+    _check_optional(optional)
     _check_most(degree, 3, "its degree")
     _check_most(next_id, LIMIT - 1, "its next id")
     _check_words(code, N, N, degree, optional)
@@ -251,6 +262,15 @@ def _decoded_keyframe(packet: Packet, first_id: int) -> CodedFrame:
     )
 
 
+def _check_optional(mask: int) -> None:
+    if unknown_bits := mask & ~KNOWN_OPTIONAL:
+        raise ValueError(
+            f"its mask of optional attributes must have no bits beyond {KNOWN_OPTIONAL:#b}, got "
+            f"{mask:#b} with the unknown {unknown_bits:#b}; read it with the release that "
+            "wrote it"
+        )
+
+
 def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
     births, coarseness = _head(packet, 2)
     code = packet.arrays["code"]
@@ -262,28 +282,51 @@ def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
     survivors = np.flatnonzero(~dead)
     _check_words(code, births, len(survivors) + births, grid.degree, grid.optional)
     new = replace(grid, values=values).select(survivors)
-    motion = np.zeros((len(survivors) + births, 3), np.float32)
-    starts = np.asarray(previous.gaussians.means)[survivors]
-    motion[: len(survivors)] = new.real("means").astype(np.float32) - starts
-    offset = None
-    if "offset" in packet.arrays:
-        offset = np.zeros_like(motion)
-        at = grid.columns["means"]
-        rows = np.flatnonzero(np.any(new.values[:, at] != grid.values[survivors, at], axis=1))
-        offset[rows] = _taken_offsets(packet.arrays["offset"], new.select(rows), coarseness)
+    motion = new.real("means").astype(np.float32) - np.asarray(previous.gaussians.means)[survivors]
+    offset = _taken_offset(packet, new, grid.values[survivors, grid.columns["means"]], coarseness)
     if births:
         new = new.concatenate(_taken_grid(reader, births, grid.degree, grid.optional))
-    ids = np.concatenate(
-        [previous.ids[survivors], previous.next_id + np.arange(births, dtype=np.uint32)]
-    )
     return replace(
         previous,
         frame=packet.frame,
-        ids=ids.astype(np.uint32),
-        gaussians=new.gaussians(motion, offset),
+        ids=_next_ids(previous, survivors, births),
+        gaussians=new.gaussians(
+            _with_births(motion, births), None if offset is None else _with_births(offset, births)
+        ),
         grid=new,
         next_id=previous.next_id + births,
     )
+
+
+def _next_ids(previous: CodedFrame, survivors: np.ndarray, births: int) -> np.ndarray:
+    """Return the numbers of the survivors of a state and of births, uint32."""
+    new_ids = previous.next_id + np.arange(births, dtype=np.uint32)
+    return np.concatenate([previous.ids[survivors], new_ids]).astype(np.uint32)
+
+
+def _with_births(rows: np.ndarray, births: int) -> np.ndarray:
+    """Return rows [S, 3] of the survivors, followed by zeros for births."""
+    return np.pad(rows, ((0, births), (0, 0)))
+
+
+def _taken_offset(
+    packet: Packet, grid: Grid, previous_means: np.ndarray, coarseness: int
+) -> np.ndarray | None:
+    """Return the offsets of the survivors [S, 3], float32, or None if a packet has none.
+
+    Args:
+        packet: a residual.
+        grid: the survivors.
+        previous_means: integers of their means in the state before, int32 [S, 3].
+        coarseness: of the changes.
+    """
+    if "offset" not in packet.arrays:
+        return None
+    means = grid.values[:, grid.columns["means"]]
+    rows = np.flatnonzero(np.any(means != previous_means, axis=1))
+    offset = np.zeros((len(grid), 3), np.float32)
+    offset[rows] = _taken_offsets(packet.arrays["offset"], grid.select(rows), coarseness)
+    return offset
 
 
 def _taken_offsets(code: np.ndarray, grid: Grid, coarseness: int) -> np.ndarray:
@@ -304,17 +347,20 @@ def _put_grid(writer: ColumnWriter, grid: Grid) -> None:
     columns = np.concatenate(
         [grid.largest_components[:, None], grid.exponents, grid.values], axis=1, dtype=np.int64
     )
-    middle = (
-        np.sort(columns, axis=0)[len(grid) // 2]
-        if len(grid)
-        else np.zeros(columns.shape[1], np.int64)
-    )
-    # The difference must not leave the limit.
-    middle[np.abs(columns - middle).max(0, initial=0) >= LIMIT] = 0
+    middle = _middle(columns)
     writer.put(middle)
     # Small integers have a token of their own, large ones one per octave.
     for column in (columns - middle).T:
         writer.put(column)
+
+
+def _middle(columns: np.ndarray) -> np.ndarray:
+    """Return the medians of columns [N, C], or 0 where the difference would leave the limit."""
+    if not len(columns):
+        return np.zeros(columns.shape[1], np.int64)
+    middle = np.sort(columns, axis=0)[len(columns) // 2]
+    middle[np.abs(columns - middle).max(0, initial=0) >= LIMIT] = 0
+    return middle
 
 
 def _taken_grid(reader: ColumnReader, N: int, degree: int, optional: int) -> Grid:
@@ -325,11 +371,17 @@ def _taken_grid(reader: ColumnReader, N: int, degree: int, optional: int) -> Gri
         raise ValueError("the largest component of a quaternion must be 0 to 3")
     exponents = np.empty((N, first - 1), np.int8)
     values = np.empty((N, len(middle) - first), np.int32)
-    for column, shift in zip(exponents.T, middle[1:first], strict=True):
-        column[:] = bounded(reader.take(N) + shift, 128, "exponent")
-    for column, shift in zip(values.T, middle[first:], strict=True):
-        column[:] = bounded(reader.take(N) + shift, LIMIT, "value")
+    _fill(exponents, reader, middle[1:first], 128, "exponent")
+    _fill(values, reader, middle[first:], LIMIT, "value")
     return Grid(values, exponents, largest.astype(np.uint8), degree, optional)
+
+
+def _fill(
+    columns: np.ndarray, reader: ColumnReader, shifts: np.ndarray, limit: int, what: str
+) -> None:
+    """Fill columns [N, C] with those of a reader, each of which is increased by a shift."""
+    for column, shift in zip(columns.T, shifts, strict=True):
+        column[:] = bounded(reader.take(len(columns)) + shift, limit, what)
 
 
 def _coder(
@@ -342,18 +394,25 @@ def _coder(
     are skipped.
     """
     grid = previous.grid
-    previous_fields = stored_fields(previous.gaussians)
+    indices = np.flatnonzero(_differs(stored_fields(previous.gaussians), fields, survivors))
+    rows = survivors[indices]
+    groups = {name: value[indices] for name, value in split_groups(fields).items()}
+    change = real_values(groups, grid.select(rows))
+    change -= grid.values[rows].T
+    return Coder(grid, survivors, rows, change, offset)
+
+
+def _differs(
+    previous_fields: Mapping[str, np.ndarray],
+    fields: Mapping[str, np.ndarray],
+    survivors: np.ndarray,
+) -> np.ndarray:
+    """Return the mask [S] of the survivors of which a field is another one than before."""
     differs = np.zeros(len(survivors), bool)
     for name, value in fields.items():
         differences = value[: len(survivors)] != previous_fields[name][survivors]
         differs |= differences.reshape(len(survivors), prod(value.shape[1:])).any(1)
-    indices = np.flatnonzero(differs)
-    rows = survivors[indices]
-    change = real_values(
-        {name: value[indices] for name, value in split_groups(fields).items()}, grid.select(rows)
-    )
-    change -= grid.values[rows].T
-    return Coder(grid, survivors, rows, change, offset)
+    return differs
 
 
 def _codes(coder: Coder, coarseness: int, birth_grid: Grid | None) -> dict[str, np.ndarray]:

@@ -113,32 +113,45 @@ class Grid:
             motion: displacement since the frame before, float32 [N, 3]; None for zero.
             offset: learned part of the displacement, float32 [N, 3]; None if it is unknown.
         """
+        optional = {
+            name: self._single(name).reshape(len(self), *_STORED[name].shape)
+            for name in optional_names(self.optional)
+        }
+        return Gaussians(
+            means=self._single("means"),
+            log_scales=self._single("log_scales"),
+            quats=self._quats(),
+            logit_opacities=self._single("logit_opacities")[:, 0],
+            sh_coeffs=self._sh_coeffs(),
+            motion=np.zeros((len(self), 3), np.float32) if motion is None else motion,
+            offset=offset,
+            **optional,
+        )
+
+    def _single(self, name: str) -> np.ndarray:
+        """Return the numbers of a group in float32 [N, its width]."""
+        return self.real(name).astype(np.float32)
+
+    def _sh_coeffs(self) -> np.ndarray:
+        """Return the spherical harmonics, float32 [N, K, 3]."""
+        parts = [self._single(name) for name in ("sh_dc", "sh_rest") if name in self.columns]
+        return np.concatenate(parts, 1).reshape(len(self), (self.degree + 1) ** 2, 3)
+
+    def _quats(self) -> np.ndarray:
+        """Return the rotations as unit quaternions wxyz, float32 [N, 4]."""
         u, v, w = np.ascontiguousarray(self.real("quats").T)
         length = np.sqrt(((1 + u * u) + v * v) + w * w)
         quats = np.empty((len(self), 4), np.float32)
         rows = np.arange(len(self))
         quats[rows, self.largest_components] = 1 / length
         for k, ratio in enumerate((u, v, w)):
-            quats[rows, k + (k >= self.largest_components)] = ratio / length
-        sh = [
-            self.real(name).astype(np.float32)
-            for name in ("sh_dc", "sh_rest")
-            if name in self.columns
-        ]
-        optional = {
-            name: self.real(name).astype(np.float32).reshape(len(self), *_STORED[name].shape)
-            for name in optional_names(self.optional)
-        }
-        return Gaussians(
-            means=self.real("means").astype(np.float32),
-            log_scales=self.real("log_scales").astype(np.float32),
-            quats=quats,
-            logit_opacities=self.real("logit_opacities")[:, 0].astype(np.float32),
-            sh_coeffs=np.concatenate(sh, 1).reshape(len(self), (self.degree + 1) ** 2, 3),
-            motion=np.zeros((len(self), 3), np.float32) if motion is None else motion,
-            offset=offset,
-            **optional,
-        )
+            quats[rows, _component(k, self.largest_components)] = ratio / length
+        return quats
+
+
+def _component(k: int, largest_components: np.ndarray) -> np.ndarray:
+    """Return the place [N] of the k-th stored component among the four of each quaternion."""
+    return k + (k >= largest_components)
 
 
 def optional_mask(names: Collection[str]) -> int:
@@ -275,24 +288,30 @@ def real_values(raw: Mapping[str, np.ndarray], grid: Grid) -> np.ndarray:
     """Return unrounded `Grid.values` of other raw attributes by group, float64 [C, N], with the
     steps of `grid`.
     """
-    largest_components = grid.largest_components
-    rows = np.arange(len(grid.largest_components))
-    quats = np.asarray(raw["quats"], np.float64)
-    others = np.stack([quats[rows, k + (k >= largest_components)] for k in range(3)], axis=1)
+    N = len(grid.largest_components)
+    numbers = {name: _bounded_optional(name, raw[name]) for name in optional_names(grid.optional)}
+    numbers |= {name: raw[name] for name in ("means", "log_scales", "sh_dc", "sh_rest")}
+    numbers["quats"] = _quat_ratios(raw["quats"], grid.largest_components)
+    numbers["logit_opacities"] = np.clip(raw["logit_opacities"], -_MAX_LOGIT, _MAX_LOGIT)
+    real = np.empty((max(at.stop for at in grid.columns.values()), N))
+    for name, at in grid.columns.items():
+        columns = numbers[name].reshape(N, at.stop - at.start).T
+        np.divide(columns, grid.steps(name).T, out=real[at])
+    return np.clip(real, -_MAX_VALUE, _MAX_VALUE, out=real)
+
+
+def _quat_ratios(quats: np.ndarray, largest_components: np.ndarray) -> np.ndarray:
+    """Return the other components of quaternions [N, 4] relative to the largest one, float64
+    [N, 3].
+    """
+    quats = np.asarray(quats, np.float64)
+    rows = np.arange(len(largest_components))
+    others = np.stack([quats[rows, _component(k, largest_components)] for k in range(3)], axis=1)
     largest = quats[rows, largest_components][:, None]
     # The component that was the largest at birth is zero after a turn by 180 degrees; the ratio is
     # then very large.
     ratios = others / np.where(np.abs(largest) < 1e-12, 1e-12, largest)
-    numbers = {name: _bounded_optional(name, raw[name]) for name in optional_names(grid.optional)}
-    numbers |= {name: raw[name] for name in ("means", "log_scales", "sh_dc", "sh_rest")}
-    numbers["quats"] = np.clip(ratios, -_MAX_RATIO, _MAX_RATIO)
-    numbers["logit_opacities"] = np.clip(raw["logit_opacities"], -_MAX_LOGIT, _MAX_LOGIT)
-    real = np.empty((max(at.stop for at in grid.columns.values()), len(rows)))
-    for name, at in grid.columns.items():
-        np.divide(
-            numbers[name].reshape(len(rows), at.stop - at.start).T, grid.steps(name).T, out=real[at]
-        )
-    return np.clip(real, -_MAX_VALUE, _MAX_VALUE, out=real)
+    return np.clip(ratios, -_MAX_RATIO, _MAX_RATIO)
 
 
 def _exponents(
@@ -308,11 +327,18 @@ def _exponents(
     for name in (*_ALWAYS, *optional_names(optional_mask(raw))):
         group = steps.get(name) or [(_generic_step(name, config), ones)]
         for (step, factor), magnitude in zip(group, magnitudes.get(name) or [ones], strict=True):
-            # The factor of a Gaussian in whole octaves, which take fewer bits than they save.
-            e = np.floor(4 * np.log2(step)) + 4 * np.floor(np.log2(factor))
-            finest = np.ceil(4 * (np.log2(np.maximum(magnitude, 1e-38)) - _MAX_BITS))
-            columns.append(np.maximum(e, finest))
+            columns.append(_quarter_octaves(step, factor, magnitude))
     return np.clip(np.stack(columns, axis=1), -128, 127).astype(np.int8)
+
+
+def _quarter_octaves(step: float, factor: np.ndarray, magnitude: np.ndarray) -> np.ndarray:
+    """Return the exponents of steps [N], at which values of a magnitude [N] have at most
+    `_MAX_BITS`.
+    """
+    # The factor of a Gaussian in whole octaves, which take fewer bits than they save.
+    e = np.floor(4 * np.log2(step)) + 4 * np.floor(np.log2(factor))
+    finest = np.ceil(4 * (np.log2(np.maximum(magnitude, 1e-38)) - _MAX_BITS))
+    return np.maximum(e, finest)
 
 
 def _steps_of_groups(
@@ -327,8 +353,7 @@ def _steps_of_groups(
     ones = np.ones(len(pixel))
     # In px.
     sizes = np.maximum(np.exp(np.minimum(raw["log_scales"], 80.0)) / pixel[:, None], _MIN_SIZE_PX)
-    # A ball tolerates any turn.
-    elongation = np.maximum(np.sqrt(sizes.max(1) ** 2 - sizes.min(1) ** 2), _MIN_SIZE_PX)
+    elongation = _elongation(sizes)
     return {
         "means": [(error, pixel)],
         "log_scales": [(error, 1 / size) for size in sizes.T],
@@ -337,6 +362,12 @@ def _steps_of_groups(
         "sh_dc": [(color / SH_C0, ones)],
         "sh_rest": [(color, ones)],
     }
+
+
+def _elongation(sizes: np.ndarray) -> np.ndarray:
+    """Return how far splats of sizes [N, 3] are from a ball, px [N]."""
+    # A ball tolerates any turn.
+    return np.maximum(np.sqrt(sizes.max(1) ** 2 - sizes.min(1) ** 2), _MIN_SIZE_PX)
 
 
 def _magnitudes(raw: Mapping[str, np.ndarray]) -> dict[str, list[np.ndarray]]:
@@ -376,10 +407,15 @@ def _world_per_pixel(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray
     """
     pixel = np.full(len(means), np.inf)
     for camera in cameras:
-        view = np.asarray(camera.viewmat, np.float64)
-        depth = means @ view[2, :3] + view[2, 3]
-        focal = max(camera.K[0, 0], camera.K[1, 1])
-        pixel = np.minimum(pixel, np.where(depth > camera.near, depth, np.inf) / focal)
+        pixel = np.minimum(pixel, _pixel_sizes(means, camera))
     sizes = pixel[np.isfinite(pixel)]
     # A Gaussian behind every camera is invisible but may come into view.
     return np.where(np.isfinite(pixel), pixel, np.median(sizes) if len(sizes) else 1e-3)
+
+
+def _pixel_sizes(means: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return the size of a pixel [N] at each mean, world units; infinite behind a camera."""
+    view = np.asarray(camera.viewmat, np.float64)
+    depth = means @ view[2, :3] + view[2, 3]
+    focal = max(camera.K[0, 0], camera.K[1, 1])
+    return np.where(depth > camera.near, depth, np.inf) / focal

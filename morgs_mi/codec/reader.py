@@ -70,34 +70,33 @@ class StreamReader(FrameSource):
         )
         with self._opened() as file:
             preamble = _read(file, PREAMBLE.size)
-            if not MAGIC.startswith(preamble[:8]):
-                raise ValueError(
-                    f"{self.path}: expected a stream that starts with {MAGIC!r}, got "
-                    f"{preamble[:8]!r}; check the path."
-                )
-            if (
-                len(preamble) == PREAMBLE.size
-                and (version := PREAMBLE.unpack(preamble)[1]) != VERSION
-            ):
-                raise ValueError(
-                    f"{self.path}: expected format version {VERSION}, got {version}; "
-                    "read it with the release that wrote it."
-                )
+            self._check_preamble(preamble)
             data = self._packet(file, 0, len(preamble))
             if data is None:
                 raise TruncatedStreamError(
                     self._sentence(0, len(preamble), "the header is missing")
                 )
             with self._located(0, PREAMBLE.size):
-                kind, _, payload = open_packet(data)
-                if kind != PacketKind.HEADER:
-                    raise ValueError(f"the first packet must be the header, got kind {kind}")
-                self.cameras, self.fps, self.metadata = header_fields(payload)
+                self.cameras, self.fps, self.metadata = header_fields(_header_payload(data))
         self._first = PREAMBLE.size + len(data)
         self._playable_entries: list[_Entry] | None = None
         self.skipped: list[int] = []
         if skip_damaged:
             self._playable_entries, self.skipped = self._playable()
+
+    def _check_preamble(self, preamble: bytes) -> None:
+        """Raise an error about the first bytes of a file; fewer of them are no error."""
+        if not MAGIC.startswith(preamble[:8]):
+            raise ValueError(
+                f"{self.path}: expected a stream that starts with {MAGIC!r}, got "
+                f"{preamble[:8]!r}; check the path."
+            )
+        version = PREAMBLE.unpack(preamble)[1] if len(preamble) == PREAMBLE.size else VERSION
+        if version != VERSION:
+            raise ValueError(
+                f"{self.path}: expected format version {VERSION}, got {version}; "
+                "read it with the release that wrote it."
+            )
 
     def __repr__(self) -> str:
         frames = f"{self.metadata['num_frames']} frames, " if "num_frames" in self.metadata else ""
@@ -144,8 +143,7 @@ class StreamReader(FrameSource):
             TruncatedStreamError: as `index`.
             ValueError: it is a pipe, which cannot seek, or a packet is broken.
         """
-        if self._pipe is not None:
-            raise ValueError(f"{self.path}: expected a file to seek in, got a pipe; save it first.")
+        self._check_is_file("to seek in")
         number = 1
         at = self._first
         for k, (kind, packet_frame, offset) in enumerate(self.index(), start=1):
@@ -178,25 +176,30 @@ class StreamReader(FrameSource):
         with open(self.path, "rb") as file:
             if (entries := self._last_index(file)) is not None:
                 return entries
-            entries = []
-            size = file.seek(0, 2)
-            at = self._first
-            while at + PAYLOAD <= size:
-                file.seek(at)
-                kind, frame, length = HEAD.unpack(file.read(HEAD.size))
-                if at + PAYLOAD + length <= size and kind != PacketKind.INDEX:
-                    entries.append((kind, frame, at))
-                at += PAYLOAD + length
-            return entries
+            return self._complete_entries(file)
+
+    def _complete_entries(self, file: BinaryIO) -> list[_Entry]:
+        """Return the entries of the packets up to the file's end, from their heads."""
+        entries = []
+        size = file.seek(0, 2)
+        at = self._first
+        while at + PAYLOAD <= size:
+            file.seek(at)
+            kind, frame, length = HEAD.unpack(file.read(HEAD.size))
+            if at + PAYLOAD + length <= size and kind != PacketKind.INDEX:
+                entries.append((kind, frame, at))
+            at += PAYLOAD + length
+        return entries
+
+    def _check_is_file(self, use: str) -> None:
+        if self._pipe is not None:
+            raise ValueError(f"{self.path}: expected a file {use}, got a pipe; save it first.")
 
     def _playable(self) -> tuple[list[_Entry], list[int]]:
         """Return the entries of the packets that play without the damaged ones, and the frames that
         do not play.
         """
-        if self._pipe is not None:
-            raise ValueError(
-                f"{self.path}: expected a file to skip damage in, got a pipe; save it first."
-            )
+        self._check_is_file("to skip damage in")
         entries = list[_Entry]()
         frames = [-1]
         plays = False
@@ -225,12 +228,7 @@ class StreamReader(FrameSource):
     def _last_index(self, file: BinaryIO) -> list[_Entry] | None:
         """Return the entries of the index at the file's end, None if there is none."""
         size = file.seek(0, 2)
-        if size < self._first:
-            problem = (
-                f"the header ended at byte {self._first}, now the file has {size} bytes: replaced "
-                "or truncated"
-            )
-            raise TruncatedStreamError(self._sentence(0, PREAMBLE.size, problem))
+        self._check_size(size)
         file.seek(size - TRAILER.size)
         at, magic = TRAILER.unpack(file.read(TRAILER.size))
         if magic == INDEX_MAGIC and self._first <= at < size:
@@ -242,6 +240,14 @@ class StreamReader(FrameSource):
                 if kind == PacketKind.INDEX and self._plausible(entries, at):
                     return entries
         return None
+
+    def _check_size(self, size: int) -> None:
+        if size < self._first:
+            problem = (
+                f"the header ended at byte {self._first}, now the file has {size} bytes: replaced "
+                "or truncated"
+            )
+            raise TruncatedStreamError(self._sentence(0, PREAMBLE.size, problem))
 
     def _plausible(self, entries: list[_Entry], end: int) -> bool:
         """Return whether entries name keyframes and residuals at ascending offsets of the packets
@@ -262,10 +268,7 @@ class StreamReader(FrameSource):
         Raises:
             ValueError: it is a pipe, or a packet is broken.
         """
-        if self._pipe is not None:
-            raise ValueError(
-                f"{self.path}: expected a file that is read twice, got a pipe; save it first."
-            )
+        self._check_is_file("that is read twice")
         entries = []
         end = self._first
         with contextlib.suppress(TruncatedStreamError):
@@ -357,6 +360,14 @@ class StreamReader(FrameSource):
 
     def _place(self, number: int, at: int) -> str:
         return f"{self.path}: packet {number} at byte {at}"
+
+
+def _header_payload(data: bytes) -> memoryview:
+    """Return the payload of the first packet, if that is a header."""
+    kind, _, payload = open_packet(data)
+    if kind != PacketKind.HEADER:
+        raise ValueError(f"the first packet must be the header, got kind {kind}")
+    return payload
 
 
 def _read(file: BinaryIO, count: int) -> bytes:

@@ -49,19 +49,20 @@ class Coder:
 
     def columns(self, r: np.ndarray) -> Iterator[np.ndarray]:
         """Yield the columns of changes `r` [C, N] and of the deaths; `take_change` reads them."""
-        dead = np.ones(len(self.grid), bool)
-        dead[self.survivors] = False
         change_masks = {name: np.any(r[at], axis=0) for name, at in self.grid.columns.items()}
-        geometry = np.where(dead, _DEAD, _flags(change_masks, _GEOMETRY, len(self.grid)))
+        geometry = _flags(change_masks, _GEOMETRY, len(self.grid))
+        geometry = np.where(self._dead(), _DEAD, geometry)
         appearance = _flags(change_masks, _APPEARANCE, len(self.grid))
         for rows in _classes(self.grid):
-            shape = geometry[rows]
-            shading = appearance[rows]
-            yield shape
-            yield shading[shape == 0]
-            yield shading[(shape > 0) & (shape < _DEAD)]
+            yield from _flag_columns(geometry[rows], appearance[rows])
             for name, at in self.grid.columns.items():
                 yield from r[at].take(rows[change_masks[name][rows]], axis=1)
+
+    def _dead(self) -> np.ndarray:
+        """Return the mask of the Gaussians that die, bool [N]."""
+        dead = np.ones(len(self.grid), bool)
+        dead[self.survivors] = False
+        return dead
 
     def offsets(self, r: np.ndarray, coarseness: int) -> Iterator[np.ndarray]:
         """Yield the columns of the offsets of the survivors with changed means; none if they are
@@ -93,26 +94,46 @@ def take_change(reader: ColumnReader, grid: Grid, coarseness: int) -> tuple[np.n
     dead = np.zeros(len(grid), bool)
     step = float(_step(coarseness))
     for rows in _classes(grid):
-        geometry = reader.take(len(rows))
-        appearance = np.zeros(len(rows), np.int64)
-        for some in (geometry == 0, (geometry > 0) & (geometry < _DEAD)):
-            appearance[some] = reader.take(int(some.sum()))
-        bits = sum(1 << bit for bit, name in enumerate(_APPEARANCE) if name in grid.columns)
-        if np.any((geometry < 0) | (geometry > _DEAD) | (appearance & ~bits != 0)):
-            raise ValueError("its flags name groups that do not exist")
+        geometry, appearance = _taken_flags(reader, len(rows), grid)
         dead[rows] = geometry == _DEAD
-        flags = {
-            name: (geometry >> bit & 1) & (geometry < _DEAD) for bit, name in enumerate(_GEOMETRY)
-        }
-        flags |= {name: appearance >> bit & 1 for bit, name in enumerate(_APPEARANCE)}
+        flags = _flags_by_name(geometry, appearance)
         for name, at in grid.columns.items():
             change_rows = rows[flags[name] == 1]
-            for column in range(at.start, at.stop):
-                new = values[change_rows, column] + np.rint(
-                    reader.take(len(change_rows)) * step
-                ).astype(np.int64)
-                values[change_rows, column] = bounded(new, LIMIT, "value")
+            for column in values.T[at]:
+                change = np.rint(reader.take(len(change_rows)) * step).astype(np.int64)
+                column[change_rows] = bounded(column[change_rows] + change, LIMIT, "value")
     return values, dead
+
+
+def _taken_flags(reader: ColumnReader, count: int, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Return the flags of the geometry and of the other groups of some Gaussians, int64 [count];
+    `_flag_columns` wrote them.
+    """
+    geometry = reader.take(count)
+    appearance = np.zeros(count, np.int64)
+    for some in _shape_classes(geometry):
+        appearance[some] = reader.take(int(some.sum()))
+    bits = sum(1 << bit for bit, name in enumerate(_APPEARANCE) if name in grid.columns)
+    if np.any((geometry < 0) | (geometry > _DEAD) | (appearance & ~bits != 0)):
+        raise ValueError("its flags name groups that do not exist")
+    return geometry, appearance
+
+
+def _flag_columns(geometry: np.ndarray, appearance: np.ndarray) -> list[np.ndarray]:
+    """Return the columns of flags [n]; dead Gaussians have none of the appearance."""
+    return [geometry, *(appearance[some] for some in _shape_classes(geometry))]
+
+
+def _shape_classes(geometry: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the masks of the Gaussians that keep their geometry, and of those that change it."""
+    return geometry == 0, (geometry > 0) & (geometry < _DEAD)
+
+
+def _flags_by_name(geometry: np.ndarray, appearance: np.ndarray) -> dict[str, np.ndarray]:
+    """Return 1 where a group changes and 0 elsewhere, by name of the group."""
+    flags = {name: appearance >> bit & 1 for bit, name in enumerate(_APPEARANCE)}
+    is_alive = geometry < _DEAD
+    return flags | {name: (geometry >> bit & 1) & is_alive for bit, name in enumerate(_GEOMETRY)}
 
 
 def _flags(change_masks: dict[str, np.ndarray], names: tuple[str, ...], N: int) -> np.ndarray:
