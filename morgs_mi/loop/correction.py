@@ -55,18 +55,23 @@ def estimate_correction(
     identity = Correction((Exposure(),) * len(setup.cameras))
     if len(images) < 2:
         return identity, {}
-    start_rng = rng_of(config.seed, Stream.BALANCED_POINTS)
-    views = views_of(setup, images)
-    problem = FirstFrameProblem.of(
-        views, setup.cloud, balance_config(config.fit), config.render, start_rng
-    )
-    balance = balance_cameras(problem, config.fit, config.seed, progress)
+    balance = _balance(setup, images, progress)
     if not balance.taken:
         return identity, _entry(balance)
     exposures = dict(zip(images, balance.exposures, strict=True))
     return Correction(
         tuple(exposures.get(v, Exposure()) for v in range(len(setup.cameras)))
     ), _entry(balance)
+
+
+def _balance(setup: Setup, images: Images, progress: Progress) -> Balance:
+    """Return the balance of the cameras that have one of `images`."""
+    config = setup.config
+    rng = rng_of(config.seed, Stream.BALANCED_POINTS)
+    views = views_of(setup, images)
+    fit = balance_config(config.fit)
+    problem = FirstFrameProblem.of(views, setup.cloud, fit, config.render, rng)
+    return balance_cameras(problem, config.fit, config.seed, progress)
 
 
 def _entry(balance: Balance) -> dict[str, Any]:

@@ -50,22 +50,25 @@ def fitted_first_frame(
     problem = FirstFrameProblem.of(views, setup.cloud, plan.config, config.render, rng)
     fit_config = adapted_to_images(plan.config, problem)
 
-    def packed(gaussians: Gaussians) -> Packet:
-        return keyframe_packet(gaussians, 0, setup.cameras, config.codec)
-
     on_round = (
-        None if on_provisional is None else lambda gaussians: on_provisional(packed(gaussians))
+        None
+        if on_provisional is None
+        else lambda gaussians: on_provisional(_packet(setup, gaussians))
     )
     fitted = fit_first_frame(problem, fit_config, rng, progress.of(plan.stage), on_round)
     forecast = unseen_views(problem, fitted.gaussians).entries if len(views) > 1 else {}
     return FittedFrame(
-        packet=packed(fitted.gaussians),
+        packet=_packet(setup, fitted.gaussians),
         correction=correction,
         losses=fitted.losses,
         steps=fitted.steps,
         status=_start_status(setup, plan.config),
         validation=forecast | correction_entry,
     )
+
+
+def _packet(setup: Setup, gaussians: Gaussians) -> Packet:
+    return keyframe_packet(gaussians, 0, setup.cameras, setup.config.codec)
 
 
 def _start_status(setup: Setup, config: FitConfig) -> str:

@@ -36,11 +36,9 @@ def image_status(
         images: of this frame, likewise.
     """
     thumbnails = {v: _thumbnail(image) for v, image in images.items()}
-    plain = [v for v, image in thumbnails.items() if image.std((0, 1)).max() < _PLAIN]
-    pairs = {
-        v: (_thumbnail(previous[v]), thumbnails[v]) for v in thumbnails.keys() & previous.keys()
-    }
-    cuts = [v for v, pair in pairs.items() if v not in plain and _is_cut(*pair)]
+    plain = [v for v, image in thumbnails.items() if _is_plain(image)]
+    views = (v for v in thumbnails.keys() & previous.keys() if v not in plain)
+    cuts = [v for v in views if _is_cut(_thumbnail(previous[v]), thumbnails[v])]
     return (*_plain_status(names, thumbnails, plain), *_cut_status(names, len(thumbnails), cuts))
 
 
@@ -80,11 +78,15 @@ def _thumbnail(image: np.ndarray) -> np.ndarray:
     return cv2.resize(image, (_WIDTH, height), interpolation=cv2.INTER_AREA).astype(np.float64)
 
 
+def _is_plain(thumbnail: np.ndarray) -> bool:
+    return bool(thumbnail.std((0, 1)).max() < _PLAIN)
+
+
 def _is_cut(a: np.ndarray, b: np.ndarray) -> bool:
     """Return whether two thumbnails show different scenes; another exposure, or light after black,
     is no cut.
     """
-    if a.std((0, 1)).max() < _PLAIN:
+    if _is_plain(a):
         return False
     a = a - a.mean((0, 1))
     b = b - b.mean((0, 1))

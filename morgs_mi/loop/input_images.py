@@ -10,6 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import kind_of
 from morgs_mi.core.color_space import positive_light
 
 Given: TypeAlias = Any
@@ -40,14 +41,7 @@ def copied_images(
         ValueError: their number is not that of the cameras, an image has another size or type than
             its camera, or light that is not finite, or the first frame has no image at all.
     """
-    count = (
-        len(images) if isinstance(images, (Sequence, np.ndarray)) else f"a {type(images).__name__}"
-    )
-    if count != len(cameras):
-        raise ValueError(
-            f"step(): frame {frame} must have one image or None for each of {len(cameras)} views, "
-            f"got {count}."
-        )
+    _check_count(images, len(cameras), frame)
     if not frame and all(image is None for image in images):
         raise ValueError(
             "step(): frame 0 must have an image of at least one view, got none; begin with one "
@@ -61,6 +55,17 @@ def copied_images(
     }
 
 
+def _check_count(images: Any, count: int, frame: int) -> None:
+    """Raise an error unless there are as many images as views."""
+    is_sequence = isinstance(images, (Sequence, np.ndarray))
+    image_count = len(images) if is_sequence else f"a {type(images).__name__}"
+    if image_count != count:
+        raise ValueError(
+            f"step(): frame {frame} must have one image or None for each of {count} views, "
+            f"got {image_count}."
+        )
+
+
 def _copy(image: Given, camera: Camera, place: str) -> np.ndarray:
     array = as_array(image)
     shape = (camera.height, camera.width, 3)
@@ -69,11 +74,7 @@ def _copy(image: Given, camera: Camera, place: str) -> np.ndarray:
         return array.copy()
     if is_image and array.dtype.kind == "f":
         return positive_light(array, place)
-    kind = (
-        f"{array.dtype} {list(array.shape)}"
-        if isinstance(array, np.ndarray)
-        else type(array).__name__
-    )
     raise ValueError(
-        f"{place} must be uint8 {list(shape)}, or linear light in floats, got {kind}; convert it."
+        f"{place} must be uint8 {list(shape)}, or linear light in floats, got {kind_of(array)}; "
+        "convert it."
     )

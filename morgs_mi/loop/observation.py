@@ -133,26 +133,10 @@ def prepare(
     """Return the data that all frames share; arguments and errors as for `StreamLoop`."""
     config = StreamConfig() if config is None else config
     check_type("StreamLoop()", "config", config, StreamConfig)
-    if not isinstance(cameras, Sequence) or not cameras:
-        kind = f"a {type(cameras).__name__}" if cameras else "none"
-        raise ValueError(
-            f"StreamLoop(): `cameras` must be a sequence of at least one view, got {kind}; pass a "
-            "list."
-        )
-    for camera in cameras:
-        check_type("StreamLoop()", "cameras", camera, Camera)
+    _check_cameras(cameras)
     points, point_colors = check_points("StreamLoop()", points, point_colors, BRIGHTEST)
     masks = (None,) * len(cameras) if masks is None else masks
-    if len(masks) != len(cameras):
-        raise ValueError(
-            f"StreamLoop(): `masks` must have one mask or None for each of {len(cameras)} views, "
-            f"got {len(masks)}; pass None where all pixels are valid."
-        )
-    for view, (camera, mask) in enumerate(zip(cameras, masks, strict=True)):
-        if mask is not None:
-            check_mask(
-                f"StreamLoop(): view {camera.name or view!r}", mask, camera.height, camera.width
-            )
+    _check_masks(cameras, masks)
     check_near_planes("StreamLoop()", cameras, points)
     check_capacity("StreamLoop()", cameras, config.fit)
     # A file that they name and that is missing is reported now, not at the second frame.
@@ -166,6 +150,29 @@ def prepare(
         check_number("StreamLoop()", "display_exposure", display_exposure, "[-100, 100]")
     cloud = points.copy(), point_colors.copy()
     return Setup(tuple(cameras), copies, *cloud, key_views, extent, config, display_exposure)
+
+
+def _check_cameras(cameras: Sequence[Camera]) -> None:
+    if not isinstance(cameras, Sequence) or not cameras:
+        kind = f"a {type(cameras).__name__}" if cameras else "none"
+        raise ValueError(
+            f"StreamLoop(): `cameras` must be a sequence of at least one view, got {kind}; pass a "
+            "list."
+        )
+    for camera in cameras:
+        check_type("StreamLoop()", "cameras", camera, Camera)
+
+
+def _check_masks(cameras: Sequence[Camera], masks: Sequence[np.ndarray | None]) -> None:
+    if len(masks) != len(cameras):
+        raise ValueError(
+            f"StreamLoop(): `masks` must have one mask or None for each of {len(cameras)} views, "
+            f"got {len(masks)}; pass None where all pixels are valid."
+        )
+    for view, (camera, mask) in enumerate(zip(cameras, masks, strict=True)):
+        if mask is not None:
+            place = f"StreamLoop(): view {camera.name or view!r}"
+            check_mask(place, mask, camera.height, camera.width)
 
 
 def views_of(setup: Setup, images: Images) -> list[View]:
@@ -212,28 +219,46 @@ def _extended(
     """
     skip = setup.config.fit.skip_static
     follow = setup.config.fit.exposure != "off"
-    stops = history.display_exposure if setup.display_exposure is None else setup.display_exposure
-    stops = display_stops(recorded.values()) if stops is None else stops
-    display_images = {v: display_image(image, stops) for v, image in recorded.items()}
+    stops = _display_exposure(setup, history, recorded)
+    images = {v: display_image(image, stops) for v, image in recorded.items()}
     if not (skip or follow):
-        return ImageHistory(display_images, display_exposure=stops), None
-    references = history.references
-    exposures = _exposures(setup, history, display_images) if follow else {}
+        return ImageHistory(images, display_exposure=stops), None
+    exposures = _exposures(setup, history, images) if follow else {}
     images = {
-        v: exposures[v].corrected(image) if v in exposures else image
-        for v, image in display_images.items()
+        v: exposures[v].corrected(image) if v in exposures else image for v, image in images.items()
     }
-    # Where it is the view's first image.
+    changes = _changes(setup, history.references, images)
+    references = {**history.references, **_references(history.references, images, changes)}
+    return ImageHistory(images, references, exposures, stops), changes if skip else None
+
+
+def _display_exposure(setup: Setup, history: ImageHistory, recorded: Images) -> float:
+    """Return the stops by which linear light is brightened; the first frame may determine them."""
+    stops = history.display_exposure if setup.display_exposure is None else setup.display_exposure
+    return display_stops(recorded.values()) if stops is None else stops
+
+
+def _changes(setup: Setup, references: Images, images: Images) -> dict[int, np.ndarray]:
+    """Return the masks of the pixels [H, W] that differ from the references, by view index; a
+    view's first image has no changes.
+    """
     changes = {v: np.zeros(image.shape[:2], bool) for v, image in images.items()}
     views = sorted(images.keys() & references.keys())
     config = setup.config.motion.change
     masks = map_in_threads(
         lambda v: change_mask(references[v], images[v], setup.masks[v], config), views
     )
-    changes |= dict(zip(views, masks, strict=True))
-    new_references = {v: update_reference(references[v], images[v], changes[v]) for v in views}
-    new_history = ImageHistory(images, {**references, **images, **new_references}, exposures, stops)
-    return new_history, changes if skip else None
+    return changes | dict(zip(views, masks, strict=True))
+
+
+def _references(
+    references: Images, images: Images, changes: Mapping[int, np.ndarray]
+) -> dict[int, np.ndarray]:
+    """Return the references of the next frame, by view index, of the views with an image."""
+    return {
+        v: update_reference(references[v], image, changes[v]) if v in references else image
+        for v, image in images.items()
+    }
 
 
 def _encoded(recorded: Images, history: ImageHistory) -> dict[int, np.ndarray]:
@@ -258,14 +283,13 @@ def _exposures(setup: Setup, history: ImageHistory, recorded: Images) -> dict[in
         views,
     )
     light = common_change(view_exposures)
-    exposures = {
-        v: exposure.without(light) for v, exposure in zip(views, view_exposures, strict=True)
-    }
-    exposures = {
-        v: exposure if exposure.change > LEAST_CHANGE else Exposure()
-        for v, exposure in exposures.items()
-    }
-    return {**history.exposures, **exposures}
+    exposures = (_visible(exposure.without(light)) for exposure in view_exposures)
+    return {**history.exposures, **dict(zip(views, exposures, strict=True))}
+
+
+def _visible(exposure: Exposure) -> Exposure:
+    """Return an exposure, or the identity if it hardly changes an image."""
+    return exposure if exposure.change > LEAST_CHANGE else Exposure()
 
 
 def _flows(
@@ -282,6 +306,24 @@ def _flows(
     with_masks = motion.learn_confidence and frame % motion.mask_interval == 0
     if not (motion.learn_motion or with_masks or (motion.learn_confidence and frame == 1)):
         return {}, {}
+    pairs = _pairs(setup, frame, previous, images, changes)
+    if not pairs:
+        return {}, {}
+    masks = motion.mask_method if with_masks else None
+    flows = observe_key_views(pairs, motion.flow_method, masks, motion.flow, motion.masks)
+    return flows, {v: KeyView(pairs[v], flow) for v, flow in flows.items()}
+
+
+def _pairs(
+    setup: Setup,
+    frame: int,
+    previous: Images,
+    images: Images,
+    changes: Mapping[int, np.ndarray] | None,
+) -> dict[int, FramePair]:
+    """Return the images of the key views that changed, with those of the frame before, by view
+    index.
+    """
     pairs = {}
     for v in _frame_key_views(setup, previous, images):
         box = None if changes is None else box_around(changes[v])
@@ -290,11 +332,7 @@ def _flows(
             name = setup.cameras[v].name
             valid = setup.masks[v]
             pairs[v] = FramePair(images[v], previous[v], name, frame, valid, box, region)
-    if not pairs:
-        return {}, {}
-    masks = motion.mask_method if with_masks else None
-    flows = observe_key_views(pairs, motion.flow_method, masks, motion.flow, motion.masks)
-    return flows, {v: KeyView(pairs[v], flow) for v, flow in flows.items()}
+    return pairs
 
 
 def _frame_key_views(setup: Setup, previous: Images, images: Images) -> tuple[int, ...]:

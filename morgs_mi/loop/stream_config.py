@@ -22,7 +22,7 @@ from __future__ import annotations
 import json
 import re
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, is_dataclass, replace
 from difflib import get_close_matches
@@ -33,7 +33,14 @@ from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.core.documentation import documented, field_docs, with_pages
-from morgs_mi.core.ranges import AtLeast, arms_of, check_ranges, check_value, types_of
+from morgs_mi.core.ranges import (
+    AtLeast,
+    arms_of,
+    check_ranges,
+    check_value,
+    item_kinds,
+    types_of,
+)
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.io.bounded import read_toml
 from morgs_mi.method.motion_config import MotionConfig
@@ -200,15 +207,9 @@ def _replaced(config: Any, values: Mapping[str, Any], source: str, prefix: str) 
         if name not in kinds:
             near = " or ".join(f"`{prefix}{n}`" for n in get_close_matches(name, kinds, 1) or kinds)
             raise ValueError(f"{source}: `{key}` is unknown, expected {near}.")
-        nested = next(
-            (arm for arm in arms_of(kinds[name]) if is_dataclass(arm) and isinstance(arm, type)),
-            None,
-        )
-        if nested and isinstance(value, Mapping):
-            current = getattr(config, name)
-            changes[name] = _replaced(
-                nested() if current is None else current, value, source, f"{key}."
-            )
+        nested = _nested_config(getattr(config, name), kinds[name])
+        if nested is not None and isinstance(value, Mapping):
+            changes[name] = _replaced(nested, value, source, f"{key}.")
         else:
             changes[name] = _converted(value, kinds[name])
             check_value(source, key, changes[name], kinds[name])
@@ -216,6 +217,17 @@ def _replaced(config: Any, values: Mapping[str, Any], source: str, prefix: str) 
         return replace(config, **changes)
     except ValueError as error:
         raise relocated(error, source, prefix, list(kinds)) from None
+
+
+def _nested_config(value: Any, kind: Any) -> Any:
+    """Return the value of a field whose type is or may be a config, which is the default one in
+    place of None; None for other types.
+    """
+    types = (arm for arm in arms_of(kind) if is_dataclass(arm) and isinstance(arm, type))
+    config_type = next(types, None)
+    if config_type is None:
+        return None
+    return config_type() if value is None else value
 
 
 def _converted(value: Any, kind: Any) -> Any:
@@ -229,37 +241,41 @@ def _converted(value: Any, kind: Any) -> Any:
         with suppress(OverflowError):
             return float(value)
     if isinstance(value, (list, tuple)):
-        kinds = next((get_args(arm) for arm in arms if get_origin(arm) is tuple), ())
-        kinds = kinds[:1] * len(value) if kinds[1:] == (...,) else kinds
+        kinds = item_kinds(_arguments(arms, tuple), len(value))
         if len(kinds) == len(value):
             return tuple(map(_converted, value, kinds))
-    if isinstance(value, dict):
-        types = next((get_args(arm) for arm in arms if get_origin(arm) is dict), None)
-        return {k: _converted(v, types[1]) for k, v in value.items()} if types else value
+    types = _arguments(arms, dict)
+    if isinstance(value, dict) and types:
+        return {k: _converted(v, types[1]) for k, v in value.items()}
     return value
+
+
+def _arguments(arms: Sequence[Any], origin: type) -> tuple[Any, ...]:
+    """Return the arguments of the first type of an origin among `arms`; none if there is none."""
+    return next((get_args(arm) for arm in arms if get_origin(arm) is origin), ())
 
 
 def _table(config: Any, key: str) -> Iterator[str]:
     """Yield the lines of a table: its own settings, then the tables inside it."""
     docs = field_docs(type(config))
-    kinds = types_of(type(config))
-    values = {name: getattr(config, name) for name in kinds}
+    values = {name: getattr(config, name) for name in types_of(type(config))}
     nested = {name: value for name, value in values.items() if is_dataclass(value)}
     for name, value in values.items():
-        if name in nested:
-            continue
-        if value == _NONE and NoneType in arms_of(kinds[name]):
-            raise ValueError(
-                f"config_toml(): `{name}` must not be the string 'none', which stands for None."
-            )
-        yield from _comment(docs.get(name, ""))
-        yield f"{name} = {_toml(value)}"
+        if name not in nested:
+            _check_no_word(config, name)
+            yield from _comment(docs.get(name, ""))
+            yield f"{name} = {_toml(value)}"
     for name, value in nested.items():
         path = f"{key}.{name}" if key else name
-        yield ""
-        yield from _comment(docs.get(name, ""))
-        yield f"[{path}]"
-        yield from _table(value, path)
+        yield from ("", *_comment(docs.get(name, "")), f"[{path}]", *_table(value, path))
+
+
+def _check_no_word(config: Any, name: str) -> None:
+    """Raise an error if an optional string is the word that stands for None in a file."""
+    if getattr(config, name) == _NONE and NoneType in arms_of(types_of(type(config))[name]):
+        raise ValueError(
+            f"config_toml(): `{name}` must not be the string 'none', which stands for None."
+        )
 
 
 def _comment(text: str) -> list[str]:
