@@ -166,12 +166,7 @@ def find_active_set(
     if gaussians.logit_confidence is not None:
         active |= np.asarray(gaussians.logit_confidence) > 0
     for changed_view in changed_views.values():
-        grid = changed_view.view.grid
-        boxes = changed_view.boxes
-        unexplained = _unexplained(changed_view.counts, boxes.union(active, grid), grid.block)
-        if unexplained.any():
-            table = from_numpy(mi.UInt32, summed_area(unexplained))
-            active |= np.asarray(boxes.within(table, grid) > 0.5 * boxes.area)
+        active |= _inside_unexplained(changed_view, active)
     blocks_by_view = _drawn(active, shares > QUIET, changed_views, config)
     static = at_rest(gaussians.select(~active))
     views = {
@@ -205,6 +200,19 @@ def _drawn(
         v: entry.boxes.union(selections[v], entry.view.grid) | (entry.counts > 0)
         for v, entry in views.items()
     }
+
+
+def _inside_unexplained(changed_view: ChangedView, active: np.ndarray) -> np.ndarray:
+    """Return the Gaussians that lie by more than half in changes that active ones do not explain,
+    bool [N].
+    """
+    grid = changed_view.view.grid
+    boxes = changed_view.boxes
+    unexplained = _unexplained(changed_view.counts, boxes.union(active, grid), grid.block)
+    if not unexplained.any():
+        return np.zeros_like(active)
+    table = from_numpy(mi.UInt32, summed_area(unexplained))
+    return np.asarray(boxes.within(table, grid) > 0.5 * boxes.area)
 
 
 def _unexplained(counts: np.ndarray, covered: np.ndarray, block: tuple[int, int]) -> np.ndarray:

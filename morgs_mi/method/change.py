@@ -79,23 +79,24 @@ def change_mask(
     """
     config = config or ChangeConfig()
     H, W = reference.shape[:2]
-    if reference.dtype == np.uint8 and image.dtype == np.uint8:
-        difference = cv2.subtract(image, reference, dtype=cv2.CV_16S)
-        unit = _GREY_LEVEL
-    else:
-        difference = np.subtract(image, reference, dtype=np.float32)
-        unit = 1.0
-    # Integers as long as possible: these images are large.
+    difference, unit = _difference(reference, image)
     levels = _levels(cv2.transform(difference, _SUM) * np.float32(unit / 3), 1, config)
-    half = cv2.resize(
-        difference, (max(W // 2, 1), max(H // 2, 1)), interpolation=cv2.INTER_AREA
-    ).astype(np.float32)
+    half_size = (max(W // 2, 1), max(H // 2, 1))
+    half = cv2.resize(difference, half_size, interpolation=cv2.INTER_AREA).astype(np.float32)
     for channel in cv2.split(cv2.transform(half, unit * _COLORS)):
-        pixel_levels = cv2.resize(
-            _levels(channel, 2, config), (W, H), interpolation=cv2.INTER_NEAREST
-        )
+        color_levels = _levels(channel, 2, config)
+        pixel_levels = cv2.resize(color_levels, (W, H), interpolation=cv2.INTER_NEAREST)
         levels = np.maximum(levels, pixel_levels)
     return _with_peaks(levels if valid is None else levels * valid)
+
+
+def _difference(reference: np.ndarray, image: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the difference of two images, and its unit. It is in integers where they are: large
+    images.
+    """
+    if reference.dtype == np.uint8 and image.dtype == np.uint8:
+        return cv2.subtract(image, reference, dtype=cv2.CV_16S), _GREY_LEVEL
+    return np.subtract(image, reference, dtype=np.float32), 1.0
 
 
 def _levels(change: np.ndarray, scale: int, config: ChangeConfig) -> np.ndarray:
@@ -110,15 +111,18 @@ def _levels(change: np.ndarray, scale: int, config: ChangeConfig) -> np.ndarray:
     window = max(_WINDOW // scale, 1) | 1
     # Zero padding: reflection would double the noise at the border.
     average = cv2.blur(change, (window, window), borderType=cv2.BORDER_CONSTANT)
-    sample = average.ravel()[:: max(1, average.size // 20_000)]
-    everywhere = min(
-        _NORMAL * float(np.median(np.abs(sample - np.median(sample)))), config.min_change
-    )
+    everywhere = min(_noise(average), config.min_change)
     noise = np.maximum(_noise_of_surroundings(change, _NOISE_STEP // scale) / window, everywhere)
     threshold = np.maximum(config.sigmas * noise, config.min_change).astype(np.float32)
     size = np.abs(average)
     exceeds = size > cv2.resize(threshold, change.shape[::-1])
     return exceeds * np.where(size > config.min_peak, np.uint8(2), np.uint8(1))
+
+
+def _noise(average: np.ndarray) -> float:
+    """Return the standard deviation of the noise of an averaged change, from a sample of it."""
+    sample = average.ravel()[:: max(1, average.size // 20_000)]
+    return _NORMAL * float(np.median(np.abs(sample - np.median(sample))))
 
 
 def _with_peaks(levels: np.ndarray) -> np.ndarray:
@@ -182,11 +186,13 @@ def box_around(mask: np.ndarray) -> tuple[slice, slice] | None:
     """
     if not mask.any():
         return None
-    spans = []
-    for axis in (0, 1):
-        (places,) = np.nonzero(mask.any(axis=1 - axis))
-        low = int(places[0])
-        high = int(places[-1]) + 1
-        margin = max(_MARGIN, (high - low) // 2)
-        spans.append(slice(max(low - margin, 0), min(high + margin, mask.shape[axis])))
-    return spans[0], spans[1]
+    return _span(mask.any(axis=1)), _span(mask.any(axis=0))
+
+
+def _span(line: np.ndarray) -> slice:
+    """Return the range from the first to the last set place of a line, with its margin."""
+    (places,) = np.nonzero(line)
+    low = int(places[0])
+    high = int(places[-1]) + 1
+    margin = max(_MARGIN, (high - low) // 2)
+    return slice(max(low - margin, 0), min(high + margin, len(line)))

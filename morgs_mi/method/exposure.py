@@ -116,9 +116,7 @@ def fit_exposure(
         images that do not show the same.
     """
     prior = prior or Exposure()
-    good = ((recorded > _DARK) & (recorded < _BRIGHT) & (scene > _DARK) & (scene < _BRIGHT)).all(
-        axis=-1
-    )
+    good = (_is_well_exposed(recorded) & _is_well_exposed(scene)).all(axis=-1)
     good = good if mask is None else good & mask
     if good.sum() < _MIN_PIXELS:
         return prior
@@ -132,6 +130,11 @@ def fit_exposure(
     gains, biases = zip(*(_line(x, y, line, weights) for x, y, *line in channels), strict=True)
     plausible = min(gains) > 0 and np.abs(np.log(gains)).max() < _MAX_LOG_GAIN
     return _exposure(np.array(gains), np.array(biases)) if plausible else prior
+
+
+def _is_well_exposed(values: np.ndarray) -> np.ndarray:
+    """Return the mask of values that are neither nearly black nor nearly white."""
+    return (values > _DARK) & (values < _BRIGHT)
 
 
 def _line(
@@ -151,10 +154,14 @@ def _line(
         change = np.linalg.solve((rows * counts) @ rows.T + regular, (rows * counts) @ rest)
         if np.abs(change - last).max() < _CONVERGED:
             break
-        errors = rest - change @ rows
-        scale = 2 * max(_NORMAL * float(np.median(np.abs(errors))), _LEAST_SCALE)
-        counts = (1 + (errors / scale) ** 2) ** -2.0
+        counts = _robust_weights(rest - change @ rows)
     return float(prior[0] + change[0]), float(prior[1] + change[1] + _TOE * change[0])
+
+
+def _robust_weights(errors: np.ndarray) -> np.ndarray:
+    """Return the weights of errors [P], which are small for outliers."""
+    scale = 2 * max(_NORMAL * float(np.median(np.abs(errors))), _LEAST_SCALE)
+    return (1 + (errors / scale) ** 2) ** -2.0
 
 
 def centred(exposures: Mapping[int, Exposure]) -> dict[int, Exposure]:
@@ -201,18 +208,18 @@ def follow_exposure(
         mask: pixels that count [H, W]; None: all.
         last: exposure of the last frame, the prior; None: the reference's exposure.
     """
+    small_reference, small_image = (
+        _thumbnail(x.astype(np.float32) / 255) for x in (reference, image)
+    )
+    small_mask = None if mask is None else _thumbnail(mask.astype(np.float32)) > 0.99
+    return fit_exposure(small_reference, small_image, small_mask, last)
+
+
+def _thumbnail(image: np.ndarray) -> np.ndarray:
+    """Return an image, no wider than `_WIDTH`."""
     height, width = image.shape[:2]
     size = (min(width, _WIDTH), max(1, round(height * min(1, _WIDTH / width))))
-    small_reference, small_image = (
-        cv2.resize(x.astype(np.float32) / 255, size, interpolation=cv2.INTER_AREA)
-        for x in (reference, image)
-    )
-    small = (
-        None
-        if mask is None
-        else cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
-    )
-    return fit_exposure(small_reference, small_image, small, last)
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
 def _straightened(encoded: np.ndarray) -> np.ndarray:

@@ -30,7 +30,7 @@ noise of the flow in some view.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -127,40 +127,64 @@ def lift_flow(
         masks: settings of the motion masks; their floor is the noise of the flow.
     """
     config = config or LiftConfig()
-    means = gaussians.numpy()["means"].astype(np.float64)
-    top = config.max_logit
     indices = sorted(observations.keys() & views.keys())
     if not indices:
-        return MotionStart(
-            np.zeros((len(means), 3), np.float32), np.full(len(means), -top, np.float32)
-        )
-    group = ViewGroup([views[v] for v in indices])
-    flow = group.crop([observations[v].forward_flow for v in indices])
-    maps = _flow_maps(flow, group.crop([observations[v].forward_reliable for v in indices]))
-    sums = group.draw(gaussians).sums(from_numpy(mi.Float, maps), _FLOW_MAPS).astype(float)
+        N = len(gaussians)
+        logit = np.full(N, -config.max_logit, np.float32)
+        return MotionStart(np.zeros((N, 3), np.float32), logit)
+    key_views = [views[v] for v in indices]
+    sums = _flow_sums(gaussians, key_views, [observations[v] for v in indices])
+    means = gaussians.numpy()["means"].astype(np.float64)
     view_motions = [
         _lift_view(view_sums, means, camera, motion_floor(camera.width, masks), config.noise_px)
-        for view_sums, camera in zip(sums, [views[v].camera for v in indices], strict=True)
+        for view_sums, camera in zip(sums, [view.camera for view in key_views], strict=True)
     ]
-    d = _solve(view_motions, [np.ones(len(means))] * len(view_motions))
+    d = _robust_displacement(view_motions, len(means))
+    logit = _logits(view_motions, d, config)
+    return MotionStart(
+        np.where(logit[:, None] > 0, d, 0).astype(np.float32), logit.astype(np.float32)
+    )
+
+
+def _flow_sums(
+    gaussians: Gaussians, views: Sequence[ActiveView], observations: Sequence[FlowObservation]
+) -> np.ndarray:
+    """Return the sums of `_flow_maps` over the pixels of each Gaussian, [V, N, 4]."""
+    group = ViewGroup(views)
+    flow = group.crop([observation.forward_flow for observation in observations])
+    reliable = group.crop([observation.forward_reliable for observation in observations])
+    maps = from_numpy(mi.Float, _flow_maps(flow, reliable))
+    return group.draw(gaussians).sums(maps, _FLOW_MAPS).astype(float)
+
+
+def _robust_displacement(views: list[_LiftView], N: int) -> np.ndarray:
+    """Return d [N, 3] by iteratively reweighted least squares."""
+    d = _solve(views, [np.ones(N)] * len(views))
     for _ in range(_ROUNDS):
-        d = _solve(view_motions, [np.exp(-view.cost(d, view.project(d))) for view in view_motions])
-    gain = np.zeros(len(means))
-    total = np.full(len(means), 1e-6)
-    moves = np.zeros(len(means), bool)
-    for view in view_motions:
+        d = _solve(views, [np.exp(-view.cost(d, view.project(d))) for view in views])
+    return d
+
+
+def _logits(views: list[_LiftView], d: np.ndarray, config: LiftConfig) -> np.ndarray:
+    """Return the logits [N] of the confidence that Gaussians move by d [N, 3]."""
+    top = config.max_logit
+    logit = np.clip(_CONFIDENCE_SLOPE * (_evidence(views, d) - config.min_evidence), -top, top)
+    moves = np.zeros(len(d), bool)
+    for view in views:
+        moves |= np.linalg.norm(view.project(d), axis=1) > view.floor
+    return np.where(moves, logit, -top)
+
+
+def _evidence(views: list[_LiftView], d: np.ndarray) -> np.ndarray:
+    """Return e [N], by which motions d [N, 3] explain the flow better than no motion does."""
+    gain = np.zeros(len(d))
+    total = np.full(len(d), 1e-6)
+    for view in views:
         motion = view.project(d)
         a = view.weight / (view.weight + _HALF_WEIGHT_PIXELS)
         gain += a * (view.cost(np.zeros_like(d), motion) - view.cost(d, motion))
         total += a
-        moves |= np.linalg.norm(motion, axis=1) > view.floor
-    evidence = gain / total
-    logit = np.where(
-        moves, np.clip(_CONFIDENCE_SLOPE * (evidence - config.min_evidence), -top, top), -top
-    )
-    return MotionStart(
-        np.where(logit[:, None] > 0, d, 0).astype(np.float32), logit.astype(np.float32)
-    )
+    return gain / total
 
 
 def _flow_maps(flow: np.ndarray, reliable: np.ndarray) -> np.ndarray:
@@ -186,12 +210,15 @@ def _solve(views: list[_LiftView], trust: list[np.ndarray]) -> np.ndarray:
     """Return d [N, 3] of the system with the weights k = `trust`."""
     system: np.ndarray | float = 0.0
     right: np.ndarray | float = 0.0
-    scale = []
     for view, k in zip(views, trust, strict=True):
         J = view.jacobian
         weight = k * view.weight
         system = system + weight[:, None, None] * np.einsum("nij,nik->njk", J, J)
         right = right + np.einsum("nij,ni->nj", J, weight[:, None] * view.flow)
-        scale.append(np.median(np.sum(J[:, 0] ** 2, axis=1)))
-    prior = max(_PRIOR_PIXELS * float(np.mean(scale)), 1e-30)
-    return np.linalg.solve(system + prior * np.eye(3), np.asarray(right)[..., None])[..., 0]
+    return np.linalg.solve(system + _prior(views) * np.eye(3), np.asarray(right)[..., None])[..., 0]
+
+
+def _prior(views: list[_LiftView]) -> float:
+    """Return lambda, which has the unit of J' J."""
+    scales = [np.median(np.sum(view.jacobian[:, 0] ** 2, axis=1)) for view in views]
+    return max(_PRIOR_PIXELS * float(np.mean(scales)), 1e-30)

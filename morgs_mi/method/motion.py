@@ -88,10 +88,7 @@ def initial_motion(
         return _constant_velocity(gaussians) if config.constant_velocity else None
     views = {v: active.views[v] for v in sorted(flows.keys() & active.views.keys())}
     problem = MotionProblem(gaussians, views, targets, rng, flows)
-    start = MotionStart.without_motion(gaussians)
-    for stage in STAGES:
-        if stage.acts(config):
-            start = stage.run(problem, start, config)
+    start = _staged_motion(problem, config)
     neighbours = (
         problem.neighbours if gaussians is previous else NeighbourIndex(np.asarray(previous.means))
     )
@@ -100,6 +97,15 @@ def initial_motion(
         previous, active.indices, logit, -config.lift.max_logit, config.cohesion_weight, neighbours
     )
     return replace(start, logit_confidence=shared)
+
+
+def _staged_motion(problem: MotionProblem, config: MotionConfig) -> MotionStart:
+    """Return the start after all stages that are on."""
+    start = MotionStart.without_motion(problem.gaussians)
+    for stage in STAGES:
+        if stage.acts(config):
+            start = stage.run(problem, start, config)
+    return start
 
 
 def _constant_velocity(gaussians: Gaussians) -> MotionStart:

@@ -60,11 +60,8 @@ def refine_start(problem: MotionProblem, start: MotionStart) -> MotionStart:
     if not moves.any():
         return replace(start, color_change=_color_change(start_sums["color"], start_sums["weight"]))
     near = problem.neighbours.nearest(_NEIGHBOURS)
-    places = np.asarray(problem.gaussians.means) + d
-    jacobians = np.stack(
-        [view.camera.projection_jacobian(places) for view in problem.views.values()]
-    )
-    step = np.where(moves[:, None], _step(jacobians, start_sums, near, moves), 0).astype(np.float32)
+    step = np.where(moves[:, None], _step(_jacobians(problem, d), start_sums, near, moves), 0)
+    step = step.astype(np.float32)
     step_sums = problem.images.sums(
         displaced(problem.gaussians, d + step), ("error", "weight", "color")
     )
@@ -76,6 +73,12 @@ def refine_start(problem: MotionProblem, start: MotionStart) -> MotionStart:
         displacement=(d + np.where(better[:, None], step, 0)).astype(np.float32),
         color_change=_color_change(color, weight),
     )
+
+
+def _jacobians(problem: MotionProblem, d: np.ndarray) -> np.ndarray:
+    """Return J [V, N, 2, 3] in all views at the means displaced by d [N, 3]."""
+    places = np.asarray(problem.gaussians.means) + d
+    return np.stack([view.camera.projection_jacobian(places) for view in problem.views.values()])
 
 
 def _color_change(color: np.ndarray, weight: np.ndarray) -> np.ndarray:
@@ -99,5 +102,10 @@ def _step(
     right = right + np.einsum("nk,nka->na", counts, right[near])
     prior = _PRIOR_PIXELS * np.median(np.sum(jacobians[:, :, 0] ** 2, axis=-1))
     step = np.linalg.solve(system + max(prior, 1e-30) * np.eye(3), right[..., None])[..., 0]
+    return _bounded(step, jacobians)
+
+
+def _bounded(step: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
+    """Return steps [N, 3], shortened to `LONGEST_PX` in the view where they are longest."""
     length = np.linalg.norm(np.einsum("vnij,nj->vni", jacobians, step), axis=-1).max(axis=0)
     return step * np.minimum(1, LONGEST_PX / np.maximum(length, 1e-30))[:, None]

@@ -67,13 +67,21 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
         if not differs.any():
             continue
         new_error = error_of(proposal)
-        ratio = np.where(d.any(axis=1), _ERROR_RATIO, _ERROR_RATIO_STATIC)
-        is_better = differs & (new_error < ratio * error)
+        is_better = differs & (new_error < _error_ratio(d) * error)
         d = np.where(is_better[:, None], proposal, d)
         error = np.where(is_better, new_error, error)
-        moves = np.where(d.any(axis=1), np.maximum(logit, _LOGIT), np.minimum(logit, -_LOGIT))
-        logit = np.where(is_better, moves, logit)
+        logit = np.where(is_better, _accepted_logit(logit, d), logit)
     return MotionStart(d, logit.astype(np.float32))
+
+
+def _error_ratio(d: np.ndarray) -> np.ndarray:
+    """Return the ratio [N] of errors up to which Gaussians with motions d [N, 3] accept others."""
+    return np.where(d.any(axis=1), _ERROR_RATIO, _ERROR_RATIO_STATIC)
+
+
+def _accepted_logit(logit: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Return the logits [N] of the confidence of Gaussians that accepted motions d [N, 3]."""
+    return np.where(d.any(axis=1), np.maximum(logit, _LOGIT), np.minimum(logit, -_LOGIT))
 
 
 def _previous_motion(gaussians: Gaussians) -> np.ndarray:

@@ -24,9 +24,10 @@ overlap is the mean over these views,
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import cv2
 import drjit as dr
@@ -70,38 +71,54 @@ def responsibility(
     """
     near = dr.zeros(mi.Float, len(gaussians))
     area = dr.zeros(mi.Float, len(gaussians))
-    active_views = list[ActiveView]()
-    shares = list[np.ndarray]()
-    factors = list[int]()
+    reduced_views = list[_ReducedView]()
     for changed_view in views:
-        view = changed_view.view
         boxes = changed_view.boxes
         area += boxes.area
-        if not changed_view.change.any():
-            continue
-        factors.append(max(view.camera.width // width, 1))
-        shares.append(_reduced(changed_view.change, factors[-1]))
-        region = Region(shares[-1] > 0, view.config)
-        active_views.append(
-            ActiveView(view.camera.resized(*shares[-1].shape[::-1]), view.config, region)
-        )
-        near += boxes.within(region.block_table, region.grid, factors[-1])
-    if not active_views:
+        if changed_view.change.any():
+            view = _reduced_view(changed_view, width)
+            reduced_views.append(view)
+            near += boxes.within(view.region.block_table, view.region.grid, view.factor)
+    if not reduced_views:
         return np.zeros(len(gaussians), np.float32)
-    group = ViewGroup(active_views)
-    change = group.crop(shares)
-    blocks = [region.num_blocks for region in group.regions]
-    # px of the view per reduced pixel.
-    area_of = np.repeat(np.square(factors), blocks)[:, None, None]
-    maps = from_numpy(
-        mi.Float, np.stack([area_of * change, np.broadcast_to(area_of, change.shape)], axis=-1)
-    )
-    change_weight, weight = group.draw(gaussians).totals(maps, 2).T
+    change_weight, weight = _weights(gaussians, reduced_views)
     visible = weight > min_weight
     # At least 1: the box of a Gaussian beside the view may be empty, although it reaches into the
     # view.
     area_ratio = np.maximum(np.asarray(area / dr.maximum(near, 1)), 1)
     return np.where(visible, change_weight / np.where(visible, weight * area_ratio, 1), 0)
+
+
+class _ReducedView(NamedTuple):
+    """A view with changes at a fraction of its resolution."""
+
+    view: ActiveView  # the blocks with changes
+    region: Region  # these blocks
+    share: np.ndarray  # changed share of each reduced pixel [h, w]
+    factor: int  # by which the view is reduced
+
+
+def _reduced_view(changed_view: ChangedView, width: int) -> _ReducedView:
+    """Return a view reduced by the largest whole factor that leaves a width, in px."""
+    view = changed_view.view
+    factor = max(view.camera.width // width, 1)
+    share = _reduced(changed_view.change, factor)
+    region = Region(share > 0, view.config)
+    camera = view.camera.resized(*share.shape[::-1])
+    return _ReducedView(ActiveView(camera, view.config, region), region, share, factor)
+
+
+def _weights(gaussians: Gaussians, views: Sequence[_ReducedView]) -> np.ndarray:
+    """Return the blend weights [2, N] summed over changed pixels, and over all in their blocks, in
+    px of the whole views.
+    """
+    group = ViewGroup([view.view for view in views])
+    change = group.crop([view.share for view in views])
+    blocks = [region.num_blocks for region in group.regions]
+    # px of the view per reduced pixel.
+    area = np.repeat(np.square([view.factor for view in views]), blocks)[:, None, None]
+    maps = np.stack([area * change, np.broadcast_to(area, change.shape)], axis=-1)
+    return group.draw(gaussians).totals(from_numpy(mi.Float, maps), 2).T
 
 
 def overlap(count: int, views: Iterable[ChangedView]) -> np.ndarray:

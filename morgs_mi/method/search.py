@@ -84,20 +84,27 @@ def search_motion(
     displacement = start.displacement
     logit = start.logit_confidence
     parts = _unexplained_parts(problem, displacement, config.max_parts)
-    for part, d in _find(problem, parts, config):
+    for part, d in _find(problem, parts, config.reach):
         proposal = np.where(part[:, None], d, displacement).astype(np.float32)
-        images = problem.images_around(part, [displacement, proposal])
-        if images is None:
-            continue
-        old_error, new_error = (
-            images.total_error(displaced(problem.gaussians, at)) for at in (displacement, proposal)
-        )
-        if new_error < _ERROR_RATIO * old_error:
+        if _is_better(problem, part, displacement, proposal):
             displacement = proposal
             logit = np.where(part, np.maximum(logit, _LOGIT), logit)
     if displacement is start.displacement:
         return start
     return replace(start, displacement=displacement, logit_confidence=logit.astype(np.float32))
+
+
+def _is_better(
+    problem: MotionProblem, part: np.ndarray, displacement: np.ndarray, proposal: np.ndarray
+) -> bool:
+    """Return whether another displacement [N, 3] of a part clearly lowers the error around it."""
+    images = problem.images_around(part, [displacement, proposal])
+    if images is None:
+        return False
+    old_error, new_error = (
+        images.total_error(displaced(problem.gaussians, at)) for at in (displacement, proposal)
+    )
+    return new_error < _ERROR_RATIO * old_error
 
 
 def _unexplained_parts(
@@ -107,64 +114,84 @@ def _unexplained_parts(
     mask [N].
     """
     sums = problem.sums_at(displacement)
-    error_sums = sums["error"].sum(0)
-    weight = sums["weight"].sum(0)
-    error = error_sums / (weight + 1)
-    visible = weight > 1
-    if not visible.any():
-        return []
-    unexplained = visible & (error > _UNEXPLAINED * max(float(np.median(error[visible])), 1 / 255))
+    error = sums["error"].sum(0)
+    unexplained = _unexplained(error, sums["weight"].sum(0))
     if np.count_nonzero(unexplained) < _MIN_SIZE:
         return []
     near = NeighbourIndex(np.asarray(problem.gaussians.means) + displacement).nearest(_NEIGHBOURS)
-    ends = unexplained[:, None] & unexplained[near]
-    rows = np.broadcast_to(np.arange(len(near))[:, None], near.shape)[ends]
-    graph = coo_array((np.ones(len(rows), bool), (rows, near[ends])), (len(near), len(near)))
-    label = connected_components(graph, directed=False)[1]
+    label = _connected(near, unexplained)
     size = np.bincount(label, unexplained)
-    total = np.bincount(label, np.where(unexplained, error_sums, 0))
+    total = np.bincount(label, np.where(unexplained, error, 0))
     largest = np.argsort(-total, kind="stable")[:count]
     return [label == part for part in largest if size[part] >= _MIN_SIZE]
 
 
+def _unexplained(error_sums: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return the visible Gaussians with large errors, bool [N], from the sums of errors and of
+    weights.
+    """
+    error = error_sums / (weight + 1)
+    visible = weight > 1
+    if not visible.any():
+        return visible
+    return visible & (error > _UNEXPLAINED * max(float(np.median(error[visible])), 1 / 255))
+
+
+def _connected(near: np.ndarray, unexplained: np.ndarray) -> np.ndarray:
+    """Return a number [N] that unexplained neighbours have in common; `near` [N, k] are indices."""
+    ends = unexplained[:, None] & unexplained[near]
+    rows = np.broadcast_to(np.arange(len(near))[:, None], near.shape)[ends]
+    graph = coo_array((np.ones(len(rows), bool), (rows, near[ends])), (len(near), len(near)))
+    return connected_components(graph, directed=False)[1]
+
+
 def _find(
-    problem: MotionProblem, parts: Sequence[np.ndarray], config: SearchConfig
+    problem: MotionProblem, parts: Sequence[np.ndarray], reach: float
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the parts that are found elsewhere, each with its displacement [3]."""
-    if not parts:
-        return []
-    previous = problem.gaussians
+    centers = np.asarray(problem.gaussians.means)
     displaced_parts = []
     for first in range(0, len(parts), 3):
         few = parts[first : first + 3]
-        images = problem.images_around(np.any(few, axis=0), [])
-        if images is None:
-            continue
-        factor = _reduction(images.group, config.reach)
-        renderings = [
-            images.rendered(gaussians, factor) for gaussians in (previous, _brighter(previous, few))
-        ]
-        matched_views = [
-            _MatchedView(
-                view.camera, color, _reduced(problem.targets[v].image(), factor), 1 / factor
-            )
-            for (v, view), color in zip(images.views.items(), renderings[0], strict=True)
-        ]
-        # The weight of a part is the increase of a pixel if the part is brighter by 1.
-        weights = [
-            np.clip(brighter - color, 0, 1) for color, brighter in zip(*renderings, strict=True)
-        ]
-        for k, part in enumerate(few):
-            pairs = zip(matched_views, weights, strict=True)
-            surfaces = [
-                view.cost_surface(weight[..., k]) for view, weight in pairs if weight[..., k].any()
-            ]
-            d = _best_displacement(
-                np.asarray(previous.means)[part].mean(axis=0), surfaces, config.reach
-            )
+        for part, surfaces in zip(few, _cost_surfaces(problem, few, reach), strict=True):
+            d = _best_displacement(centers[part].mean(axis=0), surfaces, reach)
             if d.any():
                 displaced_parts.append((part, d))
     return displaced_parts
+
+
+def _cost_surfaces(
+    problem: MotionProblem, parts: Sequence[np.ndarray], reach: float
+) -> list[list[_CostSurface]]:
+    """Return the cost surfaces of each of up to three parts, in the views that show it."""
+    images = problem.images_around(np.any(parts, axis=0), [])
+    if images is None:
+        return [[] for _ in parts]
+    factor = _reduction(images.group, reach)
+    previous = problem.gaussians
+    colors, brighter_colors = (
+        images.rendered(gaussians, factor) for gaussians in (previous, _brighter(previous, parts))
+    )
+    views = [
+        _MatchedView(view.camera, color, _reduced(problem.targets[v].image(), factor), 1 / factor)
+        for (v, view), color in zip(images.views.items(), colors, strict=True)
+    ]
+    # The weight of a part is the increase of a pixel if the part is brighter by 1.
+    weights = [
+        np.clip(brighter - color, 0, 1)
+        for color, brighter in zip(colors, brighter_colors, strict=True)
+    ]
+    return [
+        _part_surfaces(views, [weight[..., k] for weight in weights]) for k in range(len(parts))
+    ]
+
+
+def _part_surfaces(
+    views: Sequence[_MatchedView], weights: Sequence[np.ndarray]
+) -> list[_CostSurface]:
+    """Return the cost surfaces of a part in the views in which a weight [h, w] is not 0."""
+    pairs = zip(views, weights, strict=True)
+    return [view.cost_surface(weight) for view, weight in pairs if weight.any()]
 
 
 def _brighter(gaussians: Gaussians, parts: Sequence[np.ndarray]) -> Gaussians:
@@ -188,15 +215,10 @@ def _best_displacement(
         return np.sum([surface.at(center, d) for surface in surfaces], axis=0)
 
     camera = surfaces[0].camera
-    unit = (
-        reach
-        * camera.width
-        / _GRID
-        / np.linalg.norm(camera.projection_jacobian(center[None])[0, 0])
-    )
-    coarse = np.stack(
-        np.meshgrid(*[np.arange(-_GRID, _GRID + 1)] * 3, indexing="ij"), axis=-1
-    ).reshape(-1, 3)
+    px_per_unit = np.linalg.norm(camera.projection_jacobian(center[None])[0, 0])
+    unit = reach * camera.width / _GRID / px_per_unit
+    axes = [np.arange(-_GRID, _GRID + 1)] * 3
+    coarse = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     fine = coarse[np.abs(coarse).max(axis=1) <= 4] / 4
     d = np.zeros(3)
     for grid in (coarse, fine):
@@ -234,19 +256,21 @@ class _MatchedView:
 
     def cost_surface(self, weight: np.ndarray) -> _CostSurface:
         """Match the pixels of a part with the weight m [h, w], not all 0."""
-        # In reduced pixels: twice the grid along an axis, as its corners are farther.
-        margin = 4 * _GRID
         rows, columns = np.nonzero(weight > 0.01 * weight.max())
         box = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
-        surroundings = cv2.copyMakeBorder(
-            self.target, margin, margin, margin, margin, cv2.BORDER_REPLICATE
-        )
-        surroundings = surroundings[
-            box[0].start : box[0].stop + 2 * margin, box[1].start : box[1].stop + 2 * margin
-        ]
+        # In reduced pixels: twice the grid along an axis, as its corners are farther.
+        surroundings = _surroundings(self.target, box, 4 * _GRID)
         mask = np.repeat(np.sqrt(weight[box])[..., None], 3, axis=2)  # squared by OpenCV
         cost = cv2.matchTemplate(surroundings, self.rendering[box], cv2.TM_SQDIFF, mask=mask)
         return _CostSurface(np.maximum(cost, 0) / self.scale**2, self.camera, self.scale)
+
+
+def _surroundings(image: np.ndarray, box: tuple[slice, slice], margin: int) -> np.ndarray:
+    """Return a box of an image, enlarged by a margin on all sides; beyond its border, the image is
+    continued.
+    """
+    image = cv2.copyMakeBorder(image, margin, margin, margin, margin, cv2.BORDER_REPLICATE)
+    return image[box[0].start : box[0].stop + 2 * margin, box[1].start : box[1].stop + 2 * margin]
 
 
 def _reduction(group: ViewGroup, reach: float) -> int:

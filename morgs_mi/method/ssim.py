@@ -187,23 +187,20 @@ class Target:
 
 
 def _check_image(image: np.ndarray) -> None:
-    if (
-        not isinstance(image, np.ndarray)
-        or image.ndim != 3
-        or image.shape[2] != 3
-        or not image.size
-    ):
-        kind = list(image.shape) if isinstance(image, np.ndarray) else type(image).__name__
+    is_array = isinstance(image, np.ndarray)
+    if not is_array or image.ndim != 3 or image.shape[2] != 3 or not image.size:
+        kind = list(image.shape) if is_array else type(image).__name__
         raise ValueError(f"Target(): `image` must be [H, W, 3], got {kind}; pass one RGB image.")
-    if image.dtype == np.uint8:
-        return
-    low, high = (image.min(), image.max()) if image.dtype.kind == "f" else (np.nan, np.nan)
+    if image.dtype != np.uint8:
+        _check_light(image)
+
+
+def _check_light(image: np.ndarray) -> None:
+    """Raise an error unless an image has floats in the range of encoded values."""
+    is_float = image.dtype.kind == "f"
+    low, high = (image.min(), image.max()) if is_float else (np.nan, np.nan)
     if not (low >= -_MARGIN and high <= BRIGHTEST):
-        kind = (
-            f"{image.dtype} from {low:g} to {high:g}"
-            if image.dtype.kind == "f"
-            else str(image.dtype)
-        )
+        kind = f"{image.dtype} from {low:g} to {high:g}" if is_float else str(image.dtype)
         raise ValueError(
             f"Target(): `image` must be uint8, or floats from 0 to {BRIGHTEST:g} with white at 1, "
             f"got {kind}; divide 8-bit values by 255."

@@ -175,32 +175,46 @@ class Planes:
         """Return the runs that cover a region, or the whole view, and `reach` <= 8 pixels around
         it.
         """
-        cells = np.ones((self.height, self.num_strips), bool)
-        if region is not None:
-            mask = np.pad(region.mask, ((0, 0), (0, self.num_strips * STRIP - self.width)))
-            cells = mask.reshape(self.height, self.num_strips, STRIP).any(axis=2)
-        cells = np.pad(cells, ((reach, reach), (1, 1)))
-        if reach:
-            cells[:, 1:-1] |= cells[:, 2:] | cells[:, :-2]
-            cells[:, 0] = cells[:, 1]
-            cells[:, -1] = cells[:, -2]
-            count = np.pad(cells, ((1, 0), (0, 0))).cumsum(0)
-            cells = count[2 * reach + 1 :] > count[: -2 * reach - 1]
-        strip, first, end = _cell_runs(cells.T)
+        strip, first, end = _cell_runs(_enlarged(self._cells(region), reach).T)
         columns = np.clip(self.width - (strip - 1) * STRIP, 0, STRIP) * (strip > 0)
+        lanes = Lanes(
+            self._lane_places(strip),
+            from_numpy(mi.Int32, np.tile(first, 3)),
+            from_numpy(mi.Int32, np.tile(end, 3)),
+            from_numpy(mi.UInt32, np.tile(columns, 3)),
+        )
+        return Runs(lanes, 3 * int(((end - first) * columns).sum()))
+
+    def _cells(self, region: Region | None) -> np.ndarray:
+        """Return the strips of each row that a region, or the whole view, covers, bool [H, S]."""
+        if region is None:
+            return np.ones((self.height, self.num_strips), bool)
+        mask = np.pad(region.mask, ((0, 0), (0, self.num_strips * STRIP - self.width)))
+        return mask.reshape(self.height, self.num_strips, STRIP).any(axis=2)
+
+    def _lane_places(self, strip: np.ndarray) -> tuple[UInt32, UInt32, UInt32]:
+        """Return `Lanes.places` of strips [n] in all three planes; 1 is the first of an image."""
         component = np.repeat(np.arange(3), len(strip))
         x = np.tile(strip - 1, 3) * STRIP
         places = (
             _place(component, 0, x + k * STRIP, self.height, self.num_columns) // STRIP
             for k in (-1, 0, 1)
         )
-        lanes = Lanes(
-            tuple(from_numpy(mi.UInt32, place) for place in places),  # pyright: ignore[reportArgumentType]
-            from_numpy(mi.Int32, np.tile(first, 3)),
-            from_numpy(mi.Int32, np.tile(end, 3)),
-            from_numpy(mi.UInt32, np.tile(columns, 3)),
-        )
-        return Runs(lanes, 3 * int(((end - first) * columns).sum()))
+        return tuple(from_numpy(mi.UInt32, place) for place in places)  # pyright: ignore[reportReturnType]
+
+
+def _enlarged(cells: np.ndarray, reach: int) -> np.ndarray:
+    """Return cells [H, S] with a column of cells added on either side, and those within `reach`
+    rows, or in the next strip, of a set one.
+    """
+    cells = np.pad(cells, ((reach, reach), (1, 1)))
+    if not reach:
+        return cells
+    cells[:, 1:-1] |= cells[:, 2:] | cells[:, :-2]
+    cells[:, 0] = cells[:, 1]
+    cells[:, -1] = cells[:, -2]
+    count = np.pad(cells, ((1, 0), (0, 0))).cumsum(0)
+    return count[2 * reach + 1 :] > count[: -2 * reach - 1]
 
 
 def read_packet(values: Float, place: UInt32, active: Bool | bool = True) -> Jit:
@@ -233,9 +247,7 @@ def _cell_runs(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (line, first, end) of all runs of set cells in the lines of [L, M], none longer than
     `_LONGEST`.
     """
-    edges = np.diff(np.pad(cells, ((0, 0), (1, 1))).astype(np.int8), axis=1)
-    line, first = np.nonzero(edges == 1)
-    end = np.nonzero(edges == -1)[1]
+    line, first, end = _long_runs(cells)
     parts = -(-(end - first) // _LONGEST)
     index = np.repeat(np.arange(len(line)), parts)
     first = first[index] + _LONGEST * (
@@ -246,3 +258,10 @@ def _cell_runs(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     # The lanes of a packet are neighbours in one column.
     order = np.lexsort((line, first, (line + _SPARE - 1) // COLUMN))
     return line[order], first[order], end[order]
+
+
+def _long_runs(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (line, first, end) of all runs of set cells in the lines of [L, M]."""
+    edges = np.diff(np.pad(cells, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    line, first = np.nonzero(edges == 1)
+    return line, first, np.nonzero(edges == -1)[1]

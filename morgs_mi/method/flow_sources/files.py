@@ -94,19 +94,18 @@ class FlowFolder:
         if frame not in self._listed.get(folder, {}):
             self._listed[folder] = _files_by_frame(folder)
         files = self._listed[folder]
-        paths = files.get(frame, [])
-        if not paths:
+        if frame not in files:
             content = f"files of frames {min(files)} to {max(files)}" if files else "no flow at all"
             raise FileNotFoundError(
                 f"{folder}: expected a .flo or .exr file of frame {frame}, found {content}; name "
                 "each file after the frame on whose grid its flow lives, counting from 0."
             )
-        if len(paths) > 1:
-            names = ", ".join(path.name for path in paths)
+        if len(files[frame]) > 1:
+            names = ", ".join(path.name for path in files[frame])
             raise ValueError(
                 f"{folder}: expected one file of frame {frame}, got {names}; keep one."
             )
-        return paths[0]
+        return files[frame][0]
 
 
 def _files_by_frame(folder: Path) -> dict[int, list[Path]]:
@@ -156,33 +155,38 @@ def write_flow(path: str | Path, flow: np.ndarray) -> None:
         raise ValueError(f"write_flow(): `flow` must be [H, W, 2], got {flow.shape}.")
     if suffix == ".exr":
         write_exr(path, dict(zip(_CHANNELS[0], np.moveaxis(flow, 2, 0), strict=True)))
-        return
+    else:
+        with atomic_path(path, "write_flow()") as partial:
+            partial.write_bytes(_flo_bytes(flow))
+
+
+def _flo_bytes(flow: np.ndarray) -> bytes:
     height, width = flow.shape[:2]
     header = np.array([(_MAGIC, width, height)], _HEADER)
-    with atomic_path(path, "write_flow()") as partial:
-        partial.write_bytes(header.tobytes() + flow.astype("<f4").tobytes())
+    return header.tobytes() + flow.astype("<f4").tobytes()
 
 
 def _read_flo(path: Path) -> np.ndarray:
     data = path.read_bytes()
-    header = np.frombuffer(data[: _HEADER.itemsize].ljust(_HEADER.itemsize, b"\0"), _HEADER)[0]
-    if header["magic"] != np.float32(_MAGIC):
-        raise ValueError(
-            f"{path}: expected a .flo file, which begins with the float {_MAGIC}, got {data[:4]!r}."
-        )
-    width = int(header["width"])
-    height = int(header["height"])
+    width, height = _flo_size(path, data)
     length = _HEADER.itemsize + 8 * width * height
     if min(width, height) < 1 or len(data) != length:
         raise ValueError(
             f"{path}: expected {length} bytes for {width}x{height} pixels, got {len(data)}; the "
             "file may be cut short."
         )
-    return (
-        np.frombuffer(data, "<f4", offset=_HEADER.itemsize)
-        .reshape(height, width, 2)
-        .astype(np.float32)
-    )
+    numbers = np.frombuffer(data, "<f4", offset=_HEADER.itemsize)
+    return numbers.reshape(height, width, 2).astype(np.float32)
+
+
+def _flo_size(path: Path, data: bytes) -> tuple[int, int]:
+    """Return the width and the height in the header of a `.flo` file."""
+    header = np.frombuffer(data[: _HEADER.itemsize].ljust(_HEADER.itemsize, b"\0"), _HEADER)[0]
+    if header["magic"] != np.float32(_MAGIC):
+        raise ValueError(
+            f"{path}: expected a .flo file, which begins with the float {_MAGIC}, got {data[:4]!r}."
+        )
+    return int(header["width"]), int(header["height"])
 
 
 def _read_exr(path: Path) -> np.ndarray:
