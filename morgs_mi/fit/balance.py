@@ -49,10 +49,7 @@ class Balance:
     @property
     def sentence(self) -> str:
         """Sentence on the change of the cameras and its reason."""
-        change = (
-            "exposures differ by up to "
-            f"{100 * max(exposure.change for exposure in self.exposures):.1f} % of white"
-        )
+        change = f"exposures differ by up to {100 * self._largest_change:.1f} % of white"
         if np.isnan(self.recorded_psnr):
             return f"The cameras {'were balanced' if self.taken else 'stay as recorded'}: {change}."
         scores = (
@@ -62,6 +59,10 @@ class Balance:
         if self.taken:
             return f"The cameras were balanced: {change}, and {scores}."
         return f"The cameras stay as recorded: balanced ones are no clear gain, {scores}."
+
+    @property
+    def _largest_change(self) -> float:
+        return max(exposure.change for exposure in self.exposures)
 
 
 def balance_config(config: FitConfig) -> FitConfig:
@@ -101,9 +102,8 @@ def balance_cameras(
             return Balance(tuple(exposures.values()), False)
     if config.exposure == "on":
         return Balance(tuple(exposures.values()), True)
-    recorded_psnr, balanced_psnr = (
-        fits.withheld_psnr(candidate) for candidate in (as_recorded, exposures)
-    )
+    recorded_psnr = fits.withheld_psnr(as_recorded)
+    balanced_psnr = fits.withheld_psnr(exposures)
     is_gain = balanced_psnr >= recorded_psnr + LEAST_GAIN
     return Balance(tuple(exposures.values()), is_gain, recorded_psnr, balanced_psnr)
 

@@ -108,18 +108,29 @@ def plan_growth(
     is_parent = np.isin(parent, parents)
     scales = np.asarray(gaussians.scales)[parent]
     is_large = is_parent & (scales.max(axis=1) > config.split_scale * extent)
-    _, second, longest = np.sort(scales, axis=1).T
-    is_halved = is_large & (longest > _LONG * second)
+    is_halved = is_large & _is_long(scales)
     is_shrunk = is_large & ~is_halved
-    opacity = np.minimum(np.asarray(gaussians.opacities)[parent], _MAX_OPACITY)
-    new_opacity = np.where(is_halved, _SPLIT_OPACITY * opacity, 1 - np.sqrt(1 - opacity))
-    logit_change = _logit(new_opacity) - np.asarray(gaussians.logit_opacities)[parent]
-    logits = np.where(is_parent & ~is_shrunk, logit_change, 0)
+    logits = np.where(is_parent & ~is_shrunk, _logit_changes(gaussians, parent, is_halved), 0)
     plan = _plan(gaussians, survivors, parents, np.where(is_shrunk, _LOG_SHRINK, 0), logits, rng)
     _halve(plan, is_halved, np.asarray(gaussians.quats)[parent], scales)
     shift = plan.edits["means"]
     shift[in_empty_space(cameras, means[parent] + shift)] = 0
     return plan
+
+
+def _is_long(scales: np.ndarray) -> np.ndarray:
+    """Return the mask [M] of long Gaussians of scales [M, 3]."""
+    _, second, longest = np.sort(scales, axis=1).T
+    return longest > _LONG * second
+
+
+def _logit_changes(gaussians: Gaussians, parent: np.ndarray, is_halved: np.ndarray) -> np.ndarray:
+    """Return the changes of the logits of the opacities [M] of both parts of each parent; those
+    with `is_halved` [M] are parts of a split one.
+    """
+    opacity = np.minimum(np.asarray(gaussians.opacities)[parent], _MAX_OPACITY)
+    new_opacity = np.where(is_halved, _SPLIT_OPACITY * opacity, 1 - np.sqrt(1 - opacity))
+    return _logit(new_opacity) - np.asarray(gaussians.logit_opacities)[parent]
 
 
 def _halve(plan: DensityPlan, is_halved: np.ndarray, quats: np.ndarray, scales: np.ndarray) -> None:

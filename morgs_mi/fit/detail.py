@@ -59,16 +59,30 @@ def count_details(image: np.ndarray, mask: np.ndarray | None) -> float:
     noise = _NOISE * noise_of(image)
     count = 0
     while min(values.shape[:2]) > 1:
-        height, width = (size // 2 for size in values.shape[:2])
-        values = values[: 2 * height, : 2 * width]
-        valid = valid[: 2 * height, : 2 * width]
-        means, fractions = (
-            cv2.resize(v, (width, height), interpolation=cv2.INTER_AREA) for v in (values, valid)
-        )
-        differences = np.abs(values - means.repeat(2, axis=0).repeat(2, axis=1)).max(axis=-1)
-        is_complete = (fractions == 1).repeat(2, axis=0).repeat(2, axis=1)
-        count += np.count_nonzero((differences > max(_THRESHOLD, noise)) & is_complete)
+        values = _whole_blocks(values)
+        means = _block_means(values)
+        fractions = _block_means(_whole_blocks(valid))
+        differences = np.abs(values - _repeated(means)).max(axis=-1)
+        is_detail = (differences > max(_THRESHOLD, noise)) & _repeated(fractions == 1)
+        count += np.count_nonzero(is_detail)
         values = means
         valid = fractions
         noise = noise / 2
     return _INDEPENDENT * count
+
+
+def _whole_blocks(values: np.ndarray) -> np.ndarray:
+    """Return an image without the last row or column where their number is odd."""
+    height, width = (size // 2 for size in values.shape[:2])
+    return values[: 2 * height, : 2 * width]
+
+
+def _block_means(values: np.ndarray) -> np.ndarray:
+    """Return the means of the blocks of an image of whole blocks."""
+    height, width = (size // 2 for size in values.shape[:2])
+    return cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _repeated(values: np.ndarray) -> np.ndarray:
+    """Return the values of blocks at each pixel."""
+    return values.repeat(2, axis=0).repeat(2, axis=1)

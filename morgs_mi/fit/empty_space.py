@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.rig import in_image
 
 
 def in_empty_space(cameras: Sequence[Camera], means: np.ndarray) -> np.ndarray:
@@ -25,5 +26,5 @@ def in_empty_space(cameras: Sequence[Camera], means: np.ndarray) -> np.ndarray:
         depths = means @ forward[:3] + forward[3]
         near = np.flatnonzero((depths > 0) & (depths < camera.near))
         pixels, _ = camera.project(np.asarray(means[near], np.float64))
-        mask[near] |= ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+        mask[near] |= in_image(camera, pixels)
     return mask

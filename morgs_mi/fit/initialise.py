@@ -56,21 +56,25 @@ def from_points(
             "from_points(): `points` must be [P, 3] with P > 0, got none; give a capture with SfM "
             "points, or seed some with seed_points()."
         )
-    neighbours = min(4, n)
-    distance = KDTree(points).query(points, k=neighbours)[0].reshape(n, neighbours)[:, 1:]
-    spacing = np.sqrt(np.mean(distance**2, axis=1)) if neighbours > 1 else np.ones(n)
-    # Coincident points would have no size, and outliers would cover the view.
-    spacing = np.clip(spacing, 0.1 * np.median(spacing) + 1e-9, 10 * np.median(spacing) + 1e-9)
     sh = np.zeros((n, (sh_degree + 1) ** 2, 3))
     sh[:, 0] = (colors - 0.5) / SH_C0
     return Gaussians.from_activated(
         points,
-        np.repeat(spacing[:, None], 3, axis=1),
+        np.repeat(_spacing(points)[:, None], 3, axis=1),
         np.tile([1.0, 0, 0, 0], (n, 1)),
         np.full(n, opacity),
         sh,
         **{a.name: np.full((n, *a.shape), a.initial) for a in ATTRIBUTES if a.initial is not None},
     )
+
+
+def _spacing(points: np.ndarray) -> np.ndarray:
+    """Return the distance of each of the points [P, 3] from its three nearest neighbours [P]."""
+    count = min(4, len(points))
+    distance = KDTree(points).query(points, k=count)[0].reshape(len(points), count)[:, 1:]
+    spacing = np.sqrt(np.mean(distance**2, axis=1)) if count > 1 else np.ones(len(points))
+    # Coincident points would have no size, and outliers would cover the view.
+    return np.clip(spacing, 0.1 * np.median(spacing) + 1e-9, 10 * np.median(spacing) + 1e-9)
 
 
 def initial_points(
@@ -114,15 +118,20 @@ def _in_light(points: Points, views: Sequence[View]) -> Points:
     hdr_views = [view for view in views if np.isinf(view.white)]
     if not hdr_views or not len(positions):
         return points
-    colors = np.full((len(hdr_views), *positions.shape), np.nan)
-    for k, (camera, image, mask) in enumerate(hdr_views):
-        visible, pixels, _ = seen_points(camera, positions)
-        columns, rows = pixels.astype(int).T
-        recorded = np.ones(len(rows), bool) if mask is None else mask[rows, columns]
-        colors[k, visible] = np.where(recorded[:, None], image[rows, columns], np.nan)
+    colors = np.stack([_recorded_colors(view, positions) for view in hdr_views])
     unseen = np.isnan(colors).all(axis=(0, 2))
     colors[:, unseen] = own_colors[unseen]
     return positions, np.nanmedian(colors, axis=0)
+
+
+def _recorded_colors(view: View, points: np.ndarray) -> np.ndarray:
+    """Return the colours of points [P, 3] in a view, NaN where it does not show them."""
+    colors = np.full(points.shape, np.nan)
+    visible, pixels, _ = seen_points(view.camera, points)
+    columns, rows = pixels.astype(int).T
+    is_valid = np.ones(len(rows), bool) if view.mask is None else view.mask[rows, columns]
+    colors[visible] = np.where(is_valid[:, None], view.image[rows, columns], np.nan)
+    return colors
 
 
 def resample_points(points: Points, count: int, rng: np.random.Generator) -> Points:
@@ -135,12 +144,21 @@ def resample_points(points: Points, count: int, rng: np.random.Generator) -> Poi
         return positions[rows], colors[rows]
     if len(positions) < 2:
         return points
-    parent = rng.integers(0, len(positions), count - len(positions))
+    new_positions, new_colors = _points_between(points, count - len(positions), rng)
+    return np.concatenate([positions, new_positions]), np.concatenate([colors, new_colors])
+
+
+def _points_between(points: Points, count: int, rng: np.random.Generator) -> Points:
+    """Return points [count, 3] between random ones of the P >= 2 points and near neighbours."""
+    positions, colors = points
+    parent = rng.integers(0, len(positions), count)
     neighbours = np.asarray(KDTree(positions).query(positions[parent], k=min(4, len(positions)))[1])
-    partner = neighbours[np.arange(len(parent)), rng.integers(1, neighbours.shape[1], len(parent))]
-    blend = rng.uniform(0.2, 0.8, (len(parent), 1))
-    blends = [(1 - blend) * values[parent] + blend * values[partner] for values in points]
-    return np.concatenate([positions, blends[0]]), np.concatenate([colors, blends[1]])
+    partner = neighbours[np.arange(count), rng.integers(1, neighbours.shape[1], count)]
+    blend = rng.uniform(0.2, 0.8, (count, 1))
+    new_positions, new_colors = (
+        (1 - blend) * values[parent] + blend * values[partner] for values in (positions, colors)
+    )
+    return new_positions, new_colors
 
 
 def seed_points(views: Sequence[View], count: int, rng: np.random.Generator) -> Points:
@@ -164,19 +182,29 @@ def seed_points(views: Sequence[View], count: int, rng: np.random.Generator) -> 
         for pair in zip(views, depths, strict=True)
         if pair[0].mask is None or pair[0].mask.any()
     ]
-    points = [np.zeros((0, 3))]
-    colors = [np.zeros((0, 3))]
-    for index, ((camera, image, mask), depth) in enumerate(pairs):
-        n = _share(count, index, len(pairs))
-        distance = max(depth, 10 * camera.near)
-        rows, columns = np.nonzero(np.ones(image.shape[:2], bool) if mask is None else mask)
-        pixels = rng.integers(0, len(rows), n)
-        rows = rows[pixels]
-        columns = columns[pixels]
-        within = np.stack([columns, rows], axis=1) + rng.uniform(0, 1, (n, 2))
-        points.append(camera.unproject(within, distance / rng.uniform(1 / 3, 3, n)))
-        colors.append(unit_values(image[rows, columns]))
-    return np.concatenate(points), np.concatenate(colors)
+    parts = [
+        _view_points(view, depth, _share(count, index, len(pairs)), rng)
+        for index, (view, depth) in enumerate(pairs)
+    ]
+    return _concatenated([(np.zeros((0, 3)), np.zeros((0, 3))), *parts])
+
+
+def _view_points(view: View, depth: float, count: int, rng: np.random.Generator) -> Points:
+    """Return random points [count, 3] at valid pixels of a view, at random depths around one."""
+    camera, image, mask = view
+    distance = max(depth, 10 * camera.near)
+    rows, columns = np.nonzero(np.ones(image.shape[:2], bool) if mask is None else mask)
+    pixels = rng.integers(0, len(rows), count)
+    rows = rows[pixels]
+    columns = columns[pixels]
+    within = np.stack([columns, rows], axis=1) + rng.uniform(0, 1, (count, 2))
+    points = camera.unproject(within, distance / rng.uniform(1 / 3, 3, count))
+    return points, unit_values(image[rows, columns])
+
+
+def _concatenated(parts: Sequence[Points]) -> Points:
+    positions, colors = zip(*parts, strict=True)
+    return np.concatenate(positions), np.concatenate(colors)
 
 
 def fill_points(
@@ -195,32 +223,48 @@ def fill_points(
         count: number of points.
         rng: draws pixels and depths.
     """
-    new_points = []
-    new_colors = []
-    for index, (camera, image, mask) in enumerate(views):
-        _, point_pixels, depths = seen_points(camera, points[0])
-        if not len(point_pixels):
-            continue
-        pixels = rng.uniform(
-            0, (camera.width, camera.height), (_share(count, index, len(views)), 2)
-        )
+    parts = []
+    for index, view in enumerate(views):
+        _, point_pixels, depths = seen_points(view.camera, points[0])
+        if len(point_pixels):
+            pixels = _free_pixels(view, point_pixels, _share(count, index, len(views)), rng)
+            depth = _depths_near(point_pixels, depths, pixels)
+            depth = depth * rng.uniform(1 - _SPREAD, 1 + _SPREAD, len(depth))
+            columns, rows = pixels.astype(int).T
+            colors = unit_values(view.image[rows, columns])
+            parts.append((view.camera.unproject(pixels, depth), colors))
+    num_new = sum(len(positions) for positions, _ in parts)
+    return _concatenated([resample_points(points, count - num_new, rng), *parts])
+
+
+def _free_pixels(
+    view: View, point_pixels: np.ndarray, count: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Return those of `count` random pixel positions [n, 2] that are valid, in cells without a
+    point; `point_pixels` [P, 2] are the positions of the points.
+    """
+    camera = view.camera
+    pixels = rng.uniform(0, (camera.width, camera.height), (count, 2))
+    is_free = ~_shown_cells(camera, point_pixels)[_cells_of(camera, pixels)]
+    if view.mask is not None:
         columns, rows = pixels.astype(int).T
-        is_free = ~_shown_cells(camera, point_pixels)[_cells_of(camera, pixels)]
-        if mask is not None:
-            is_free &= mask[rows, columns]
-        k = min(_NEIGHBOURS, len(point_pixels))
-        nearest = KDTree(point_pixels).query(pixels[is_free], k=k)
-        distance, near = (np.reshape(values, (-1, k)) for values in nearest)
-        weights = 1 / (distance + 1e-3)
-        depth = weights.sum(axis=1) / (weights / depths[near]).sum(axis=1)
-        new_points.append(
-            camera.unproject(
-                pixels[is_free], depth * rng.uniform(1 - _SPREAD, 1 + _SPREAD, len(depth))
-            )
-        )
-        new_colors.append(unit_values(image[rows[is_free], columns[is_free]]))
-    positions, colors = resample_points(points, count - sum(map(len, new_points)), rng)
-    return np.concatenate([positions, *new_points]), np.concatenate([colors, *new_colors])
+        is_free &= view.mask[rows, columns]
+    return pixels[is_free]
+
+
+def _depths_near(point_pixels: np.ndarray, depths: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Return the mean depths [n] of the points nearest to pixel positions [n, 2].
+
+    Args:
+        point_pixels: positions of the points in the image [P, 2].
+        depths: of the points [P].
+        pixels: n positions.
+    """
+    k = min(_NEIGHBOURS, len(point_pixels))
+    nearest = KDTree(point_pixels).query(pixels, k=k)
+    distance, near = (np.reshape(values, (-1, k)) for values in nearest)
+    weights = 1 / (distance + 1e-3)
+    return weights.sum(axis=1) / (weights / depths[near]).sum(axis=1)
 
 
 def _share(count: int, index: int, views: int) -> int:

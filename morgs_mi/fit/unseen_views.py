@@ -25,9 +25,10 @@ from typing import Any
 import cv2
 import numpy as np
 
+from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import unit_values
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.rig import angles_to, scene_depths
+from morgs_mi.core.rig import angles_to, in_image, scene_depths
 from morgs_mi.fit.forecast import Forecast, forecast, quality_of
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.view import View, mean_psnr
@@ -196,13 +197,16 @@ def features_of(
     depths = scene_depths(cameras, points)
     squares = []
     for index in np.linspace(0, len(views) - 1, min(len(views), _VIEWS)).round().astype(int):
-        angles = angles_to(cameras[index], depths[index], cameras)
-        angles[index] = np.inf
-        nearest = angles.argsort(kind="stable")[: min(_NEAREST, len(views) - 1)]
-        squares.append(
-            _disagreement(gaussians, views[index], [views[other] for other in nearest], render)
-        )
+        others = [views[other] for other in _nearest(cameras, index, depths[index])]
+        squares.append(_disagreement(gaussians, views[index], others, render))
     return float(10 * np.log10(1 + np.mean(squares) * 10 ** (psnr / 10))), psnr
+
+
+def _nearest(cameras: Sequence[Camera], index: int, depth: float) -> np.ndarray:
+    """Return the indices of the cameras with the least angles to one, seen from a depth in it."""
+    angles = angles_to(cameras[index], depth, cameras)
+    angles[index] = np.inf
+    return angles.argsort(kind="stable")[: min(_NEAREST, len(cameras) - 1)]
 
 
 def _disagreement(
@@ -228,18 +232,23 @@ def _squares(color: np.ndarray, points: np.ndarray, is_drawn: np.ndarray, view: 
     """Return the square differences [H, W] of colours from a view of their points [H, W, 3];
     infinite outside it.
     """
+    pixels, visible = _places_in(view, points)
+    visible &= is_drawn
+    x, y = (pixels - 0.5).astype(np.float32).transpose(2, 0, 1)
+    recorded = cv2.remap(view.image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.where(visible, ((unit_values(recorded) - color) ** 2).mean(axis=-1), np.inf)
+
+
+def _places_in(view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pixel positions [H, W, 2] of points [H, W, 3] in a view, 0 outside it, and the
+    mask of the points that it has recorded.
+    """
     camera = view.camera
     with np.errstate(divide="ignore", invalid="ignore"):  # points beside the camera
         pixels, depths = camera.project(points)
-    visible = (
-        is_drawn
-        & (depths > camera.near)
-        & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=-1)
-    )
+    visible = (depths > camera.near) & in_image(camera, pixels)
     pixels = np.where(visible[..., None], pixels, 0)
     if view.mask is not None:
         columns, rows = pixels.astype(int).transpose(2, 0, 1)
         visible &= view.mask[rows, columns]
-    x, y = (pixels - 0.5).astype(np.float32).transpose(2, 0, 1)
-    recorded = cv2.remap(view.image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.where(visible, ((unit_values(recorded) - color) ** 2).mean(axis=-1), np.inf)
+    return pixels, visible
