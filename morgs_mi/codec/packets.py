@@ -150,13 +150,18 @@ def residual_packet(
     survivors = source[source >= 0]
     coder = _coder(previous, fields, survivors, _offset_of(gaussians) if config.offset else None)
     births = len(gaussians) - len(survivors)
-    birth_grid = None
-    if births:
-        groups = {name: v[len(survivors) :] for name, v in split_groups(fields).items()}
-        birth_grid = new_grid(groups, cameras, config)
+    birth_grid = _birth_grid(fields, births, cameras, config) if births else None
     coarseness, codes = _sized_codes(coder, birth_grid, config)
     arrays = {"parent": previous.digest, "head": np.array([births, coarseness], np.uint32), **codes}
     return Packet(PacketKind.RESIDUAL, previous.frame + 1, arrays)
+
+
+def _birth_grid(
+    fields: Mapping[str, np.ndarray], births: int, cameras: Sequence[Camera], config: CodecConfig
+) -> Grid:
+    """Return the last Gaussians of stored `fields`, which are new."""
+    groups = {name: value[-births:] for name, value in split_groups(fields).items()}
+    return new_grid(groups, cameras, config)
 
 
 def _offset_of(gaussians: Gaussians) -> np.ndarray:
@@ -204,8 +209,9 @@ def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
 
 
 def _check_names(packet: Packet) -> None:
-    names = {"head", "code"} | ({"parent"} if packet.kind == PacketKind.RESIDUAL else set())
-    optional = {"offset"} if packet.kind == PacketKind.RESIDUAL else set()
+    is_residual = packet.kind == PacketKind.RESIDUAL
+    names = {"head", "code", "parent"} if is_residual else {"head", "code"}
+    optional = {"offset"} if is_residual else set()
     if packet.arrays.keys() - optional != names:
         raise ValueError(f"expected the arrays {sorted(names)}, got {sorted(packet.arrays)}")
 
@@ -286,13 +292,13 @@ def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
     offset = _taken_offset(packet, new, grid.values[survivors, grid.columns["means"]], coarseness)
     if births:
         new = new.concatenate(_taken_grid(reader, births, grid.degree, grid.optional))
+        motion = _with_births(motion, births)
+        offset = None if offset is None else _with_births(offset, births)
     return replace(
         previous,
         frame=packet.frame,
         ids=_next_ids(previous, survivors, births),
-        gaussians=new.gaussians(
-            _with_births(motion, births), None if offset is None else _with_births(offset, births)
-        ),
+        gaussians=new.gaussians(motion, offset),
         grid=new,
         next_id=previous.next_id + births,
     )
@@ -366,14 +372,20 @@ def _middle(columns: np.ndarray) -> np.ndarray:
 def _taken_grid(reader: ColumnReader, N: int, degree: int, optional: int) -> Grid:
     first = 1 + num_exponents(optional)  # column of the values
     middle = reader.take(num_integers(degree, optional))
-    largest = reader.take(N) + middle[0]
-    if np.any((largest < 0) | (largest > 3)):
-        raise ValueError("the largest component of a quaternion must be 0 to 3")
+    largest = _taken_largest(reader, N, middle[0])
     exponents = np.empty((N, first - 1), np.int8)
     values = np.empty((N, len(middle) - first), np.int32)
     _fill(exponents, reader, middle[1:first], 128, "exponent")
     _fill(values, reader, middle[first:], LIMIT, "value")
-    return Grid(values, exponents, largest.astype(np.uint8), degree, optional)
+    return Grid(values, exponents, largest, degree, optional)
+
+
+def _taken_largest(reader: ColumnReader, N: int, shift: int) -> np.ndarray:
+    """Return the largest components of N quaternions, uint8."""
+    largest = reader.take(N) + shift
+    if np.any((largest < 0) | (largest > 3)):
+        raise ValueError("the largest component of a quaternion must be 0 to 3")
+    return largest.astype(np.uint8)
 
 
 def _fill(
@@ -460,16 +472,20 @@ def _check_attributes(previous: CodedFrame, degree: int, optional: int) -> None:
 def _checked(source: np.ndarray, N: int, next_N: int) -> np.ndarray:
     """Return the sources of the next Gaussians, if they are in order and refer to N Gaussians."""
     source = np.asarray(source)
-    births = source < 0
-    survivors = source[~births]
-    is_ordered = np.all(np.diff(survivors) > 0) and np.all(np.diff(births.astype(int)) >= 0)
-    if source.shape != (next_N,) or not is_ordered or np.any(survivors >= N):
+    if source.shape != (next_N,) or not _is_ordered(source) or np.any(source >= N):
         raise ValueError(
             f"residual_packet(): `source` must be [{next_N}] with survivors of 0..{N - 1} in "
             f"ascending order, then -1 for each birth, got {source.shape}; sort the Gaussians in "
             "this order."
         )
     return source
+
+
+def _is_ordered(source: np.ndarray) -> bool:
+    """Return whether survivors ascend and births come last."""
+    births = source < 0
+    ascends = np.all(np.diff(source[~births]) > 0)
+    return bool(ascends and np.all(np.diff(births.astype(int)) >= 0))
 
 
 def _head(packet: Packet, count: int) -> list[int]:

@@ -265,14 +265,17 @@ def new_grid(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: C
     chosen here.
     """
     raw = {name: np.asarray(value, np.float64) for name, value in raw.items()}
-    largest_components = np.abs(raw["quats"]).argmax(1).astype(np.uint8)
-    degree = round((1 + raw["sh_rest"].shape[1]) ** 0.5) - 1
-    exponents = _exponents(raw, cameras, config)
-    grid = Grid(
-        np.zeros((0, 0), np.int32), exponents, largest_components, degree, optional_mask(raw)
-    )
+    grid = _empty_grid(raw, _exponents(raw, cameras, config))
     values = np.rint(real_values(raw, grid)).astype(np.int32)
     return replace(grid, values=np.ascontiguousarray(values.T))
+
+
+def _empty_grid(raw: Mapping[str, np.ndarray], exponents: np.ndarray) -> Grid:
+    """Return the grid of raw attributes by group, without its values."""
+    largest_components = np.abs(raw["quats"]).argmax(1).astype(np.uint8)
+    degree = round((1 + raw["sh_rest"].shape[1]) ** 0.5) - 1
+    no_values = np.zeros((0, 0), np.int32)
+    return Grid(no_values, exponents, largest_components, degree, optional_mask(raw))
 
 
 def _bounded_optional(name: str, values: np.ndarray) -> np.ndarray:
@@ -289,15 +292,21 @@ def real_values(raw: Mapping[str, np.ndarray], grid: Grid) -> np.ndarray:
     steps of `grid`.
     """
     N = len(grid.largest_components)
-    numbers = {name: _bounded_optional(name, raw[name]) for name in optional_names(grid.optional)}
-    numbers |= {name: raw[name] for name in ("means", "log_scales", "sh_dc", "sh_rest")}
-    numbers["quats"] = _quat_ratios(raw["quats"], grid.largest_components)
-    numbers["logit_opacities"] = np.clip(raw["logit_opacities"], -_MAX_LOGIT, _MAX_LOGIT)
+    numbers = _bounded_numbers(raw, grid)
     real = np.empty((max(at.stop for at in grid.columns.values()), N))
     for name, at in grid.columns.items():
         columns = numbers[name].reshape(N, at.stop - at.start).T
         np.divide(columns, grid.steps(name).T, out=real[at])
     return np.clip(real, -_MAX_VALUE, _MAX_VALUE, out=real)
+
+
+def _bounded_numbers(raw: Mapping[str, np.ndarray], grid: Grid) -> dict[str, np.ndarray]:
+    """Return the numbers of each group that are rounded to steps, within visible bounds."""
+    numbers = {name: _bounded_optional(name, raw[name]) for name in optional_names(grid.optional)}
+    numbers |= {name: raw[name] for name in ("means", "log_scales", "sh_dc", "sh_rest")}
+    numbers["quats"] = _quat_ratios(raw["quats"], grid.largest_components)
+    numbers["logit_opacities"] = np.clip(raw["logit_opacities"], -_MAX_LOGIT, _MAX_LOGIT)
+    return numbers
 
 
 def _quat_ratios(quats: np.ndarray, largest_components: np.ndarray) -> np.ndarray:
@@ -351,8 +360,7 @@ def _steps_of_groups(
     error, color = (2 * _tolerated(name) / precision for name in ("means", "sh_dc"))
     pixel = _world_per_pixel(raw["means"], cameras)
     ones = np.ones(len(pixel))
-    # In px.
-    sizes = np.maximum(np.exp(np.minimum(raw["log_scales"], 80.0)) / pixel[:, None], _MIN_SIZE_PX)
+    sizes = _sizes_px(raw["log_scales"], pixel)
     elongation = _elongation(sizes)
     return {
         "means": [(error, pixel)],
@@ -362,6 +370,11 @@ def _steps_of_groups(
         "sh_dc": [(color / SH_C0, ones)],
         "sh_rest": [(color, ones)],
     }
+
+
+def _sizes_px(log_scales: np.ndarray, pixel: np.ndarray) -> np.ndarray:
+    """Return the sizes of splats [N, 3] in px, for sizes of a pixel [N] at them."""
+    return np.maximum(np.exp(np.minimum(log_scales, 80.0)) / pixel[:, None], _MIN_SIZE_PX)
 
 
 def _elongation(sizes: np.ndarray) -> np.ndarray:

@@ -69,20 +69,23 @@ class StreamReader(FrameSource):
             source if isinstance(source, str | Path) else str(getattr(source, "name", "stream"))
         )
         with self._opened() as file:
-            preamble = _read(file, PREAMBLE.size)
-            self._check_preamble(preamble)
-            data = self._packet(file, 0, len(preamble))
-            if data is None:
-                raise TruncatedStreamError(
-                    self._sentence(0, len(preamble), "the header is missing")
-                )
-            with self._located(0, PREAMBLE.size):
-                self.cameras, self.fps, self.metadata = header_fields(_header_payload(data))
+            data = self._header(file)
+        with self._located(0, PREAMBLE.size):
+            self.cameras, self.fps, self.metadata = header_fields(_header_payload(data))
         self._first = PREAMBLE.size + len(data)
         self._playable_entries: list[_Entry] | None = None
         self.skipped: list[int] = []
         if skip_damaged:
             self._playable_entries, self.skipped = self._playable()
+
+    def _header(self, file: BinaryIO) -> bytes:
+        """Return the bytes of the first packet of a file that begins as a stream."""
+        preamble = _read(file, PREAMBLE.size)
+        self._check_preamble(preamble)
+        data = self._packet(file, 0, len(preamble))
+        if data is None:
+            raise TruncatedStreamError(self._sentence(0, len(preamble), "the header is missing"))
+        return data
 
     def _check_preamble(self, preamble: bytes) -> None:
         """Raise an error about the first bytes of a file; fewer of them are no error."""
@@ -235,8 +238,7 @@ class StreamReader(FrameSource):
             file.seek(at)
             # A payload that looks like an index by chance.
             with contextlib.suppress(ValueError, struct.error):
-                kind, _, payload = open_packet(file.read(size - at))
-                entries = list(ENTRY.iter_unpack(payload[: -TRAILER.size]))
+                kind, entries = _index_packet(file.read(size - at))
                 if kind == PacketKind.INDEX and self._plausible(entries, at):
                     return entries
         return None
@@ -360,6 +362,12 @@ class StreamReader(FrameSource):
 
     def _place(self, number: int, at: int) -> str:
         return f"{self.path}: packet {number} at byte {at}"
+
+
+def _index_packet(data: bytes) -> tuple[int, list[_Entry]]:
+    """Return the kind of a packet, and the entries of its payload if it is an index."""
+    kind, _, payload = open_packet(data)
+    return kind, list(ENTRY.iter_unpack(payload[: -TRAILER.size]))
 
 
 def _header_payload(data: bytes) -> memoryview:

@@ -61,10 +61,7 @@ class Camera:
 
     def __post_init__(self) -> None:
         where = f"Camera({self.name!r})" if self.name else "Camera()"
-        check_size(where, self.width, self.height)
-        check_number(where, "near", self.near, "[1e-30, inf)")  # its reciprocal is a finite float32
-        for name in ("delay", "readout"):
-            check_number(where, name, getattr(self, name), "[-1, 1]")
+        self._check_numbers(where)
         K = _intrinsics(where, self.K)
         viewmat = _extrinsics(where, self.viewmat)
         _check_focal_lengths(where, K)
@@ -73,6 +70,12 @@ class Camera:
         _check_skew(where, K)
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "viewmat", viewmat)
+
+    def _check_numbers(self, where: str) -> None:
+        check_size(where, self.width, self.height)
+        check_number(where, "near", self.near, "[1e-30, inf)")  # its reciprocal is a finite float32
+        for name in ("delay", "readout"):
+            check_number(where, name, getattr(self, name), "[-1, 1]")
 
     def __repr__(self) -> str:
         place = ", ".join(f"{x:.4g}" for x in self.position + 0.0)  # without -0
@@ -191,13 +194,17 @@ class Camera:
         """Return d(pixel) / d(point) [N, 2, 3] at world points [N, 3]; zero for points behind the
         near plane.
         """
-        x, y, z = self._local(points).T
+        return self._local_jacobian(self._local(points)) @ self._world_to_camera[:3, :3]
+
+    def _local_jacobian(self, local: np.ndarray) -> np.ndarray:
+        """Return d(pixel) / d(point) [N, 2, 3] at points in the camera's coordinates [N, 3]."""
+        x, y, z = local.T
         inverse = np.where(z > self.near, 1 / np.maximum(z, self.near), 0)
         fx = self.K[0, 0] * inverse
         fy = self.K[1, 1] * inverse
         zero = np.zeros_like(z)
         rows = [fx, zero, -fx * x * inverse, zero, fy, -fy * y * inverse]
-        return np.stack(rows, axis=1).reshape(-1, 2, 3) @ self._world_to_camera[:3, :3]
+        return np.stack(rows, axis=1).reshape(-1, 2, 3)
 
     def without_delays(self) -> Camera:
         """Return the same view with images of the instants themselves: no delay and no rolling
@@ -373,6 +380,13 @@ def rigid(where: str, matrix: np.ndarray) -> np.ndarray:
         ValueError: it is not, in a sentence that begins with `where`.
     """
     matrix = np.asarray(matrix, dtype=np.float64)
+    _check_pose(where, matrix)
+    _check_axes(where, matrix[:3, :3])
+    _check_last_row(where, matrix[3:])
+    return np.vstack([matrix[:3], [0, 0, 0, 1.0]])
+
+
+def _check_pose(where: str, matrix: np.ndarray) -> None:
     if matrix.shape not in ((3, 4), (4, 4)):
         raise ValueError(
             f"{where}: the pose must be a matrix [4, 4], got {matrix.shape}; calibrate again."
@@ -382,9 +396,6 @@ def rigid(where: str, matrix: np.ndarray) -> np.ndarray:
             f"{where}: the pose must be finite, with numbers of at most {LARGEST:g}, got "
             f"{matrix.tolist()}; calibrate again."
         )
-    _check_axes(where, matrix[:3, :3])
-    _check_last_row(where, matrix[3:])
-    return np.vstack([matrix[:3], [0, 0, 0, 1.0]])
 
 
 def _check_axes(where: str, R: np.ndarray) -> None:

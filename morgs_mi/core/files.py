@@ -105,13 +105,17 @@ def locked_folder(path: str | os.PathLike[str], place: str) -> Generator[None, N
         # A writer that has just ended may have removed the file between its opening and its
         # locking.
         if not _locked(lock) or not is_same_file(file, os.fstat(lock)):
-            raise BlockingIOError(
-                f"{path}: expected a folder into which nothing else is written, got one into "
-                "which another process is writing; wait until it has ended, or choose another "
-                "folder."
-            )
+            raise _blocked_error(path)
         undo.callback(_remove_own, file, lock)
         yield
+
+
+def _blocked_error(path: str | os.PathLike[str]) -> BlockingIOError:
+    """Return the error about a folder that another writer has locked."""
+    return BlockingIOError(
+        f"{path}: expected a folder into which nothing else is written, got one into which "
+        "another process is writing; wait until it has ended, or choose another folder."
+    )
 
 
 def _opened_lock(path: str | os.PathLike[str], place: str) -> int:

@@ -184,11 +184,15 @@ class Gaussians:
         return int(self.means.shape[0])
 
     def __repr__(self) -> str:
-        means = np.asarray(dr.detach(self.means))
-        size = " x ".join(f"{side:.3g}" for side in np.ptp(means, axis=0)) if len(self) else "0"
         more = [name for name in self.items() if name in ("motion", "logit_confidence", "offset")]
-        parts = [f"N={len(self)}", f"SH degree {self.sh_degree}", f"box of {size}", *more]
+        parts = [f"N={len(self)}", f"SH degree {self.sh_degree}", f"box of {self._size}", *more]
         return f"Gaussians({', '.join(parts)})"
+
+    @property
+    def _size(self) -> str:
+        """Sides of the box around the means, as text."""
+        means = np.asarray(dr.detach(self.means))
+        return " x ".join(f"{side:.3g}" for side in np.ptp(means, axis=0)) if len(self) else "0"
 
     @classmethod
     def from_activated(

@@ -99,15 +99,20 @@ def begin_command() -> None:
     """
     if not _is_command():
         return
-    for stream in ("stdin", "stdout", "stderr"):
-        if getattr(sys, stream) is None:
-            setattr(sys, stream, open(os.devnull, "r" if stream == "stdin" else "w"))  # noqa: SIM115
+    _open_closed_streams()
     if "--multiprocessing-fork" in sys.orig_argv:  # its parent alone reacts
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         return
     for number in _SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _end)
+
+
+def _open_closed_streams() -> None:
+    """Open the null device in place of each standard stream that is closed."""
+    for stream in ("stdin", "stdout", "stderr"):
+        if getattr(sys, stream) is None:
+            setattr(sys, stream, open(os.devnull, "r" if stream == "stdin" else "w"))  # noqa: SIM115
 
 
 def _release(error: BaseException) -> None:

@@ -116,11 +116,11 @@ def with_near_planes(
     """
     if near is not None:
         return tuple(replace(camera, near=near) for camera in cameras)
-    depths = zip(_reliable_depths(cameras, points), _rig_depths(cameras), strict=True)
-    nearest = [_NEAR_SHARE * (rig if np.isnan(reliable) else reliable) for reliable, rig in depths]
+    reliable = _reliable_depths(cameras, points)
+    depths = _NEAR_SHARE * np.where(np.isnan(reliable), _rig_depths(cameras), reliable)
     return tuple(
         replace(camera, near=float(depth)) if depth > 0 else camera
-        for camera, depth in zip(cameras, nearest, strict=True)
+        for camera, depth in zip(cameras, depths, strict=True)
     )
 
 
@@ -157,15 +157,19 @@ def _rig_depths(cameras: Sequence[Camera]) -> np.ndarray:
     0 if unknown.
     """
     positions = _positions(cameras)
-    distances = np.linalg.norm(positions[:, None] - positions, axis=-1)
-    np.fill_diagonal(distances, np.inf)
     focus = focus_depths(cameras)
-    depths = np.where(
-        np.isfinite(focus), np.minimum(focus, scene_extent(cameras)), distances.min(axis=1)
-    )
+    nearest = _nearest_distances(positions)
+    depths = np.where(np.isfinite(focus), np.minimum(focus, scene_extent(cameras)), nearest)
     # Cameras at one place are apart by rounding errors.
     rounding = 1e-9 * np.abs(positions).max()
     return np.where(np.isfinite(depths) & (depths > rounding), depths, 0)
+
+
+def _nearest_distances(positions: np.ndarray) -> np.ndarray:
+    """Return the distance of each of the positions [V, 3] from the nearest other one [V]."""
+    distances = np.linalg.norm(positions[:, None] - positions, axis=-1)
+    np.fill_diagonal(distances, np.inf)
+    return distances.min(axis=1)
 
 
 def choose_key_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:

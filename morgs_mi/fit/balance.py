@@ -9,7 +9,7 @@ the recorded images is compared in withheld pixels, blocks of every view that no
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -102,10 +102,7 @@ def balance_cameras(
             return Balance(tuple(exposures.values()), False)
     if config.exposure == "on":
         return Balance(tuple(exposures.values()), True)
-    recorded_psnr = fits.withheld_psnr(as_recorded)
-    balanced_psnr = fits.withheld_psnr(exposures)
-    is_gain = balanced_psnr >= recorded_psnr + LEAST_GAIN
-    return Balance(tuple(exposures.values()), is_gain, recorded_psnr, balanced_psnr)
+    return fits.compared(as_recorded, exposures)
 
 
 class _ShortFits:
@@ -130,10 +127,7 @@ class _ShortFits:
 
     def fit(self, start: Gaussians, exposures: Mapping[int, Exposure], steps: int) -> Gaussians:
         """Return Gaussians after some steps, from a start."""
-        views = [
-            view._replace(image=exposures[v].corrected(view.image))
-            for v, view in enumerate(self._visible)
-        ]
+        views = _corrected(self._visible, exposures)
         problem = replace(self._problem, start=start, views=tuple(views))
         config = replace(self._config, first_frame_steps=steps)
         gaussians = fit_first_frame(problem, config, rng_of(self._seed, Stream.BALANCE)).gaussians
@@ -154,12 +148,23 @@ class _ShortFits:
             }
         )
 
+    def compared(
+        self, as_recorded: Mapping[int, Exposure], exposures: Mapping[int, Exposure]
+    ) -> Balance:
+        """Return the balance by the withheld pixels of fits without exposures and with them."""
+        recorded_psnr = self.withheld_psnr(as_recorded)
+        balanced_psnr = self.withheld_psnr(exposures)
+        is_gain = balanced_psnr >= recorded_psnr + LEAST_GAIN
+        return Balance(tuple(exposures.values()), is_gain, recorded_psnr, balanced_psnr)
+
     def withheld_psnr(self, exposures: Mapping[int, Exposure]) -> float:
         """Return the PSNR of the withheld pixels of a fit from the start, dB."""
         gaussians = self.fit(self._problem.start, exposures, self.steps)
-        views = [
-            View(camera, exposures[v].corrected(image), mask)
-            for v, (camera, image, mask) in enumerate(self._withheld)
-            if mask is not None and mask.any()
-        ]
-        return mean_psnr(gaussians, views, self._problem.render)
+        views = _corrected(self._withheld, exposures)
+        some = [view for view in views if view.mask is not None and view.mask.any()]
+        return mean_psnr(gaussians, some, self._problem.render)
+
+
+def _corrected(views: Sequence[View], exposures: Mapping[int, Exposure]) -> list[View]:
+    """Return views with images in the colours of the scene, by exposures by view index."""
+    return [view._replace(image=exposures[v].corrected(view.image)) for v, view in enumerate(views)]

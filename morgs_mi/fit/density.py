@@ -100,9 +100,7 @@ def plan_growth(
         cameras: the training cameras.
     """
     means = np.asarray(gaussians.means)
-    visible = (np.asarray(gaussians.opacities) >= config.min_opacity) & ~in_empty_space(
-        cameras, means
-    )
+    visible = _is_visible(gaussians, config) & ~in_empty_space(cameras, means)
     survivors, parents = _select(visible, scores, room, 0)
     parent = np.concatenate([survivors, parents])
     is_parent = np.isin(parent, parents)
@@ -116,6 +114,11 @@ def plan_growth(
     shift = plan.edits["means"]
     shift[in_empty_space(cameras, means[parent] + shift)] = 0
     return plan
+
+
+def _is_visible(gaussians: Gaussians, config: DensityConfig) -> np.ndarray:
+    """Return the mask [N] of the Gaussians that are not pruned for their opacity."""
+    return np.asarray(gaussians.opacities) >= config.min_opacity
 
 
 def _is_long(scales: np.ndarray) -> np.ndarray:
@@ -169,8 +172,7 @@ def plan_additions(
     """
     births = round(config.births * (len(gaussians) + num_static))
     room = Room(births, max(config.max_gaussians - num_static, 0))
-    visible = np.asarray(gaussians.opacities) >= config.min_opacity
-    survivors, parents = _select(visible, scores, room, config.min_error)
+    survivors, parents = _select(_is_visible(gaussians, config), scores, room, config.min_error)
     is_birth = np.arange(len(survivors) + len(parents)) >= len(survivors)
     logits = np.asarray(gaussians.logit_opacities)[np.concatenate([survivors, parents])]
     fainter = np.where(is_birth, _logit(_BIRTH_OPACITY) - logits, 0)

@@ -222,10 +222,15 @@ def _disagreement(
     step = max(1, camera.width // _COLUMNS)
     color = np.clip(np.asarray(image.color)[::step, ::step], 0, view.white)
     depth = np.asarray(image.depth)[::step, ::step, 0].astype(float)
-    rows, columns = np.mgrid[: camera.height : step, : camera.width : step]
-    points = camera.unproject(np.stack([columns, rows], axis=-1) + 0.5, depth)
+    points = _points_at(camera, depth, step)
     least = np.min([_squares(color, points, depth > 0, other) for other in others], axis=0)
     return float(least[np.isfinite(least)].mean()) if np.isfinite(least).any() else 1.0
+
+
+def _points_at(camera: Camera, depth: np.ndarray, step: int) -> np.ndarray:
+    """Return the world points [h, w, 3] of every `step`-th pixel at depths [h, w]."""
+    rows, columns = np.mgrid[: camera.height : step, : camera.width : step]
+    return camera.unproject(np.stack([columns, rows], axis=-1) + 0.5, depth)
 
 
 def _squares(color: np.ndarray, points: np.ndarray, is_drawn: np.ndarray, view: View) -> np.ndarray:

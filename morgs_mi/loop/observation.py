@@ -27,6 +27,7 @@ from morgs_mi.method.exposure import LEAST_CHANGE, Exposure, common_change, foll
 from morgs_mi.method.flow import FlowObservation, observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FramePair, flow_source
 from morgs_mi.method.mask_refiners.mask_registry import mask_refiner
+from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import motion_model
 from morgs_mi.method.objective import KeyView
 
@@ -139,10 +140,7 @@ def prepare(
     _check_masks(cameras, masks)
     check_near_planes("StreamLoop()", cameras, points)
     check_capacity("StreamLoop()", cameras, config.fit)
-    # A file that they name and that is missing is reported now, not at the second frame.
-    flow_source(config.motion.flow_method, config.motion.flow)
-    mask_refiner(config.motion.mask_method, config.motion.masks)
-    motion_model(config.motion)
+    _check_methods(config.motion)
     copies = tuple(None if mask is None else mask.copy() for mask in masks)
     key_views = choose_key_views(cameras, config.motion.key_views)
     extent = scene_extent(cameras)
@@ -150,6 +148,13 @@ def prepare(
         check_number("StreamLoop()", "display_exposure", display_exposure, "[-100, 100]")
     cloud = points.copy(), point_colors.copy()
     return Setup(tuple(cameras), copies, *cloud, key_views, extent, config, display_exposure)
+
+
+def _check_methods(motion: MotionConfig) -> None:
+    """Raise an error now, not at the second frame, if a file that a method names is missing."""
+    flow_source(motion.flow_method, motion.flow)
+    mask_refiner(motion.mask_method, motion.masks)
+    motion_model(motion)
 
 
 def _check_cameras(cameras: Sequence[Camera]) -> None:

@@ -22,7 +22,7 @@ from __future__ import annotations
 import json
 import re
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, is_dataclass, replace
 from difflib import get_close_matches
@@ -205,7 +205,7 @@ def _replaced(config: Any, values: Mapping[str, Any], source: str, prefix: str) 
     for name, value in values.items():
         key = f"{prefix}{name}"
         if name not in kinds:
-            near = " or ".join(f"`{prefix}{n}`" for n in get_close_matches(name, kinds, 1) or kinds)
+            near = _near_keys(prefix, name, kinds)
             raise ValueError(f"{source}: `{key}` is unknown, expected {near}.")
         nested = _nested_config(getattr(config, name), kinds[name])
         if nested is not None and isinstance(value, Mapping):
@@ -217,6 +217,12 @@ def _replaced(config: Any, values: Mapping[str, Any], source: str, prefix: str) 
         return replace(config, **changes)
     except ValueError as error:
         raise relocated(error, source, prefix, list(kinds)) from None
+
+
+def _near_keys(prefix: str, name: str, names: Iterable[str]) -> str:
+    """Return the key with the most similar name, or all keys if none is similar."""
+    names = list(names)
+    return " or ".join(f"`{prefix}{n}`" for n in get_close_matches(name, names, 1) or names)
 
 
 def _nested_config(value: Any, kind: Any) -> Any:
@@ -267,7 +273,8 @@ def _table(config: Any, key: str) -> Iterator[str]:
             yield f"{name} = {_toml(value)}"
     for name, value in nested.items():
         path = f"{key}.{name}" if key else name
-        yield from ("", *_comment(docs.get(name, "")), f"[{path}]", *_table(value, path))
+        yield from ("", *_comment(docs.get(name, "")), f"[{path}]")
+        yield from _table(value, path)
 
 
 def _check_no_word(config: Any, name: str) -> None:

@@ -15,11 +15,10 @@ Gaussians are active: leaving out the others would cost more than it saves.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
-import cv2
 import mitsuba as mi
 import numpy as np
 
@@ -30,6 +29,7 @@ from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.ranges import AtLeast, check_ranges
 from morgs_mi.core.rig import choose_key_views
 from morgs_mi.method.boxes import boxes_around
+from morgs_mi.method.change import connected_labels
 from morgs_mi.method.responsibility import ChangedView, overlap, responsibility
 from morgs_mi.render.active_view import ActiveView, make_active_view
 from morgs_mi.render.region import Region, summed_area
@@ -160,13 +160,7 @@ def find_active_set(
         for v, camera in cameras.items()
     }
     shares = responsibility(gaussians, changed_views.values(), config.min_weight)
-    active = (shares > config.min_responsibility) & (
-        overlap(len(gaussians), changed_views.values()) > config.min_overlap
-    )
-    if gaussians.logit_confidence is not None:
-        active |= np.asarray(gaussians.logit_confidence) > 0
-    for changed_view in changed_views.values():
-        active |= _inside_unexplained(changed_view, active)
+    active = _active(gaussians, shares, changed_views.values(), config)
     blocks_by_view = _drawn(active, shares > QUIET, changed_views, config)
     static = at_rest(gaussians.select(~active))
     views = {
@@ -177,6 +171,23 @@ def find_active_set(
         if blocks.any()
     }
     return ActiveSet(np.flatnonzero(active), len(gaussians), views, len(cameras))
+
+
+def _active(
+    gaussians: Gaussians,
+    shares: np.ndarray,
+    views: Collection[ChangedView],
+    config: ActiveSetConfig,
+) -> np.ndarray:
+    """Return the active Gaussians by their responsibilities [N], bool [N]."""
+    active = (shares > config.min_responsibility) & (
+        overlap(len(gaussians), views) > config.min_overlap
+    )
+    if gaussians.logit_confidence is not None:
+        active |= np.asarray(gaussians.logit_confidence) > 0
+    for view in views:
+        active |= _inside_unexplained(view, active)
+    return active
 
 
 def _drawn(
@@ -227,8 +238,7 @@ def _unexplained(counts: np.ndarray, covered: np.ndarray, block: tuple[int, int]
     changes = counts > _CHANGED * block[0] * block[1]
     if not (changes & ~covered).any():
         return np.zeros_like(changes)
-    count, components = cv2.connectedComponents(changes.astype(np.uint8))
-    labels = np.asarray(components, np.int32)
+    labels, count = connected_labels(changes)
     area, covered_area = (
         np.bincount(labels[blocks], counts[blocks], count)
         for blocks in (changes, changes & covered)

@@ -127,12 +127,18 @@ def _noise(average: np.ndarray) -> float:
 
 def _with_peaks(levels: np.ndarray) -> np.ndarray:
     """Return the connected changes that have a peak, bool [H, W]; `levels` as from `_levels`."""
-    mask = levels > 0
-    count, components = cv2.connectedComponents(mask.astype(np.uint8))
-    labels = np.asarray(components, np.int32)
+    labels, count = connected_labels(levels > 0)
     has_peak = np.zeros(count, bool)
     has_peak[labels[levels > 1]] = True
     return has_peak[labels]
+
+
+def connected_labels(mask: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return the number of each pixel's connected part of a mask [H, W], int32, 0 outside the mask,
+    and how many numbers there are.
+    """
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8))
+    return np.asarray(labels, np.int32), count
 
 
 def _noise_of_surroundings(change: np.ndarray, step: int) -> np.ndarray:

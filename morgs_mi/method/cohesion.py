@@ -59,12 +59,7 @@ def share_confidence(
     near = neighbours.nearest_of(indices, _NEIGHBOURS)
     if not near.size:
         return logit
-    chroma = _chromaticity(gaussians)
-    opacity = np.asarray(gaussians.opacities)
-    affinity = np.exp(
-        -np.sum((chroma[indices][:, None] - chroma[near]) ** 2, axis=2) / (2 * _CHROMA_SCALE**2)
-    )
-    affinity = weight * (opacity[near] * affinity).astype(np.float32)
+    affinity = weight * _affinity(gaussians, indices, near)
     starts = np.arange(0, near.size + 1, near.shape[1])
     weights = csr_array((affinity.ravel(), near.ravel(), starts), (len(indices), len(gaussians)))
     total = 1 + affinity.sum(axis=1)
@@ -73,6 +68,14 @@ def share_confidence(
     for _ in range(ROUNDS):
         everywhere[indices] = (logit + weights @ everywhere) / total
     return everywhere[indices]
+
+
+def _affinity(gaussians: Gaussians, indices: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Return the affinities [M, k] of the Gaussians at `indices` [M] to neighbours [M, k]."""
+    chroma = _chromaticity(gaussians)
+    opacity = np.asarray(gaussians.opacities)
+    square = np.sum((chroma[indices][:, None] - chroma[near]) ** 2, axis=2)
+    return (opacity[near] * np.exp(-square / (2 * _CHROMA_SCALE**2))).astype(np.float32)
 
 
 def _chromaticity(gaussians: Gaussians) -> np.ndarray:

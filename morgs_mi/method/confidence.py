@@ -61,14 +61,18 @@ def flow_mask(
     Raises:
         ValueError: `motion` is not [H, W, 2] or `reliable` has another size.
     """
+    _check_shapes(motion, reliable)
+    moving = np.linalg.norm(motion, axis=-1) > flow_threshold(motion, reliable, config)
+    return moving if reliable is None else moving & reliable
+
+
+def _check_shapes(motion: np.ndarray, reliable: np.ndarray | None) -> None:
     if motion.ndim != 3 or motion.shape[2] != 2:
         raise ValueError(f"flow_mask(): `motion` must be [H, W, 2], got {motion.shape}.")
     if reliable is not None and reliable.shape != motion.shape[:2]:
         raise ValueError(
             f"flow_mask(): `reliable` must be {motion.shape[:2]}, got {reliable.shape}."
         )
-    moving = np.linalg.norm(motion, axis=-1) > flow_threshold(motion, reliable, config)
-    return moving if reliable is None else moving & reliable
 
 
 def motion_mask(

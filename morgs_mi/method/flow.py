@@ -5,7 +5,7 @@ follow from it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -53,23 +53,19 @@ def observe_key_views(
     """
     source = flow_source(method, flow)
     flows = map_in_threads(lambda pair: _checked_flow(source, pair, flow), pairs.values())
-    observations = {}
-    for (view, pair), (backward, forward, reliable, forward_reliable) in zip(
-        pairs.items(), flows, strict=True
-    ):
-        # Eqs. 9 and 10.
-        mask = (
-            motion_mask(pair.image, -backward, reliable, mask_method, masks)
-            if mask_method
-            else None
-        )
-        observations[view] = FlowObservation(-backward, reliable, forward, forward_reliable, mask)
-    return observations
+    observations = dict(zip(pairs, flows, strict=True))
+    if not mask_method:
+        return observations
+    # Eqs. 9 and 10.
+    return {
+        v: replace(o, mask=motion_mask(pairs[v].image, o.motion, o.reliable, mask_method, masks))
+        for v, o in observations.items()
+    }
 
 
 def _checked_flow(
     source: FlowSource, pair: FramePair, config: FlowConfig | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+) -> FlowObservation:
     """Return the backward flow (eq. 4), the forward flow, and where each is reliable."""
     backward, forward = source(pair)
     reliable, forward_reliable = _reliable(pair, backward, forward, config)
@@ -79,7 +75,7 @@ def _checked_flow(
         still = ~pair.region if pair.valid is None else ~pair.region & pair.valid
         reliable = reliable | still
         forward_reliable = forward_reliable | still
-    return backward, forward, reliable, forward_reliable
+    return FlowObservation(-backward, reliable, forward, forward_reliable)
 
 
 def _reliable(
@@ -89,12 +85,16 @@ def _reliable(
     reliable, forward_reliable = (
         consistency_mask(*flows, config) for flows in ((backward, forward), (forward, backward))
     )
-    valid = pair.valid
-    if pair.box is not None:
-        valid = np.zeros(reliable.shape, bool)
-        valid[pair.box] = True if pair.valid is None else pair.valid[pair.box]
-    return (
-        (reliable, forward_reliable)
-        if valid is None
-        else (reliable & valid, forward_reliable & valid)
-    )
+    valid = _valid_in_box(pair, reliable.shape)
+    if valid is None:
+        return reliable, forward_reliable
+    return reliable & valid, forward_reliable & valid
+
+
+def _valid_in_box(pair: FramePair, shape: tuple[int, ...]) -> np.ndarray | None:
+    """Return the valid pixels inside the box of a pair, bool [H, W]; None if all are."""
+    if pair.box is None:
+        return pair.valid
+    valid = np.zeros(shape, bool)
+    valid[pair.box] = True if pair.valid is None else pair.valid[pair.box]
+    return valid

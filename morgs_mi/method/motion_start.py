@@ -83,12 +83,17 @@ class MotionProblem:
         """
         some = self.gaussians.select(np.flatnonzero(selection))
         places = [some, *(displaced(some, d[selection]) for d in displacements if d.any())]
-        narrow_views = {}
-        all_rows = np.ones(len(some), bool)
-        for index, view in self.views.items():
-            boxes = [boxes_around(place, view.camera, view.config, 1.0) for place in places]
-            narrow_views[index] = view.narrowed(
-                np.any([box.union(all_rows, view.grid) for box in boxes], axis=0)
-            )
+        narrow_views = {
+            index: view.narrowed(_blocks_around(view, places)) for index, view in self.views.items()
+        }
         views = {index: view for index, view in narrow_views.items() if view is not None}
         return KeyImages(views, self.targets) if views else None
+
+
+def _blocks_around(view: ActiveView, places: Sequence[Gaussians]) -> np.ndarray:
+    """Return the blocks of a view that Gaussians reach in any of some places, bool
+    [rows, columns].
+    """
+    boxes = [boxes_around(place, view.camera, view.config, 1.0) for place in places]
+    all_rows = np.ones(len(places[0]), bool)
+    return np.any([box.union(all_rows, view.grid) for box in boxes], axis=0)

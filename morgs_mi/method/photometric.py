@@ -100,9 +100,13 @@ def _step(
     counts = moves[near].astype(float)
     system = system + np.einsum("nk,nkab->nab", counts, system[near])
     right = right + np.einsum("nk,nka->na", counts, right[near])
-    prior = _PRIOR_PIXELS * np.median(np.sum(jacobians[:, :, 0] ** 2, axis=-1))
-    step = np.linalg.solve(system + max(prior, 1e-30) * np.eye(3), right[..., None])[..., 0]
+    step = np.linalg.solve(system + _prior(jacobians) * np.eye(3), right[..., None])[..., 0]
     return _bounded(step, jacobians)
+
+
+def _prior(jacobians: np.ndarray) -> float:
+    """Return lambda, which has the unit of J' J; `jacobians` are [V, N, 2, 3]."""
+    return max(_PRIOR_PIXELS * np.median(np.sum(jacobians[:, :, 0] ** 2, axis=-1)), 1e-30)
 
 
 def _bounded(step: np.ndarray, jacobians: np.ndarray) -> np.ndarray:

@@ -58,11 +58,8 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
         return relative_error(images.sums(displaced(problem.gaussians, d), ("error", "weight")))
 
     error = error_of(d)
-    continues = np.any(last_motion, axis=1, keepdims=True)
     for k in range(1 + rounds):
-        proposal = (
-            d[_moving_neighbour(near, d, problem.rng)] if k else np.where(continues, last_motion, d)
-        )
+        proposal = d[_moving_neighbour(near, d, problem.rng)] if k else _continued(d, last_motion)
         differs = np.any(proposal != d, axis=1)
         if not differs.any():
             continue
@@ -72,6 +69,11 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
         error = np.where(is_better, new_error, error)
         logit = np.where(is_better, _accepted_logit(logit, d), logit)
     return MotionStart(d, logit.astype(np.float32))
+
+
+def _continued(d: np.ndarray, last_motion: np.ndarray) -> np.ndarray:
+    """Return the motions [N, 3] into the previous frame, and d for Gaussians that did not move."""
+    return np.where(np.any(last_motion, axis=1, keepdims=True), last_motion, d)
 
 
 def _error_ratio(d: np.ndarray) -> np.ndarray:

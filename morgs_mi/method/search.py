@@ -217,15 +217,19 @@ def _best_displacement(
     camera = surfaces[0].camera
     px_per_unit = np.linalg.norm(camera.projection_jacobian(center[None])[0, 0])
     unit = reach * camera.width / _GRID / px_per_unit
-    axes = [np.arange(-_GRID, _GRID + 1)] * 3
-    coarse = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    fine = coarse[np.abs(coarse).max(axis=1) <= 4] / 4
     d = np.zeros(3)
-    for grid in (coarse, fine):
+    for grid in _grids():
         steps = d + unit * grid
         d = steps[np.argmin(cost_of(steps))]
     at_d, at_rest = cost_of(np.stack([d, np.zeros(3)]))
     return d if at_d < _COST_RATIO * at_rest else np.zeros(3)
+
+
+def _grids() -> tuple[np.ndarray, np.ndarray]:
+    """Return the steps [K, 3] of the whole grid, and quarters of steps around its middle."""
+    axes = [np.arange(-_GRID, _GRID + 1)] * 3
+    coarse = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    return coarse, coarse[np.abs(coarse).max(axis=1) <= 4] / 4
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,9 +31,16 @@ def consistency_mask(
     mismatch = _squared(flow + back)
     length = _squared(flow) + _squared(back)
     agrees = mismatch < config.consistency_relative * length + config.consistency_absolute
-    # The image ends half a pixel beyond the outermost centres, so the flow's own error does not
-    # reject the border.
-    return agrees & (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
+    return agrees & _is_within(x, width) & _is_within(y, height)
+
+
+def _is_within(coordinates: np.ndarray, size: int) -> np.ndarray:
+    """Return the mask of the coordinates that lie in an image of a width or height.
+
+    It ends half a pixel beyond the outermost centres, so the flow's own error does not reject the
+    border.
+    """
+    return (coordinates > -0.5) & (coordinates < size - 0.5)
 
 
 def _squared(vectors: np.ndarray) -> np.ndarray:

@@ -100,12 +100,13 @@ class FlowFolder:
                 f"{folder}: expected a .flo or .exr file of frame {frame}, found {content}; name "
                 "each file after the frame on whose grid its flow lives, counting from 0."
             )
-        if len(files[frame]) > 1:
+        path, *others = files[frame]
+        if others:
             names = ", ".join(path.name for path in files[frame])
             raise ValueError(
                 f"{folder}: expected one file of frame {frame}, got {names}; keep one."
             )
-        return files[frame][0]
+        return path
 
 
 def _files_by_frame(folder: Path) -> dict[int, list[Path]]:
@@ -131,6 +132,11 @@ def read_flow(path: str | Path) -> np.ndarray:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a flow file, found none; check the path.")
     flow = reader(path)
+    _check_dense(path, flow)
+    return flow
+
+
+def _check_dense(path: Path, flow: np.ndarray) -> None:
     unknown = ~(np.abs(flow) < _UNKNOWN).all(axis=2)
     if unknown.any():
         y, x = np.argwhere(unknown)[0]
@@ -138,7 +144,6 @@ def read_flow(path: str | Path) -> np.ndarray:
             f"{path}: expected a flow at every pixel, got none at {unknown.sum()} of "
             f"{unknown.size}, the first at x={x}, y={y}; use a method that returns dense flow."
         )
-    return flow
 
 
 def write_flow(path: str | Path, flow: np.ndarray) -> None:

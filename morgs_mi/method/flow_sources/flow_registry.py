@@ -78,15 +78,22 @@ def both_directions(method: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> F
         check_images("flow_source()", pair.image, pair.previous)
         if pair.box is None:
             return method(pair.image, pair.previous), method(pair.previous, pair.image)
-        image, previous = (
-            np.ascontiguousarray(whole[pair.box]) for whole in (pair.image, pair.previous)
-        )
-        flows = np.zeros((2, *pair.image.shape[:2], 2), np.float32)
-        flows[0][pair.box] = method(image, previous)
-        flows[1][pair.box] = method(previous, image)
-        return flows[0], flows[1]
+        return _flows_in_box(method, pair, pair.box)
 
     return source
+
+
+def _flows_in_box(
+    method: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    pair: FramePair,
+    box: tuple[slice, slice],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return both flows of a pair inside a box, 0 outside it."""
+    image, previous = (np.ascontiguousarray(whole[box]) for whole in (pair.image, pair.previous))
+    flows = np.zeros((2, *pair.image.shape[:2], 2), np.float32)
+    flows[0][box] = method(image, previous)
+    flows[1][box] = method(previous, image)
+    return flows[0], flows[1]
 
 
 def check_images(place: str, image: np.ndarray, previous: np.ndarray) -> None:
