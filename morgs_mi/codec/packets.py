@@ -278,16 +278,12 @@ def _check_optional(mask: int) -> None:
 
 
 def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
-    births, coarseness = _head(packet, 2)
+    births, coarseness = _residual_head(previous, packet)
     code = packet.arrays["code"]
     grid = previous.grid
-    _check_most(coarseness, _COARSEST, "its coarseness")
-    _check_most(previous.next_id + births, LIMIT - 1, "its next id")
     reader = ColumnReader(code)
-    values, dead = take_change(reader, grid, coarseness)
-    survivors = np.flatnonzero(~dead)
+    survivors, new = _taken_survivors(reader, grid, coarseness)
     _check_words(code, births, len(survivors) + births, grid.degree, grid.optional)
-    new = replace(grid, values=values).select(survivors)
     motion = new.real("means").astype(np.float32) - np.asarray(previous.gaussians.means)[survivors]
     offset = _taken_offset(packet, new, grid.values[survivors, grid.columns["means"]], coarseness)
     if births:
@@ -302,6 +298,23 @@ def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
         grid=new,
         next_id=previous.next_id + births,
     )
+
+
+def _residual_head(previous: CodedFrame, packet: Packet) -> tuple[int, int]:
+    """Return the number of births and the coarseness of a residual."""
+    births, coarseness = _head(packet, 2)
+    _check_most(coarseness, _COARSEST, "its coarseness")
+    _check_most(previous.next_id + births, LIMIT - 1, "its next id")
+    return births, coarseness
+
+
+def _taken_survivors(reader: ColumnReader, grid: Grid, coarseness: int) -> tuple[np.ndarray, Grid]:
+    """Return the indices of the survivors in `grid`, ascending, and the survivors after their
+    changes.
+    """
+    values, dead = take_change(reader, grid, coarseness)
+    survivors = np.flatnonzero(~dead)
+    return survivors, replace(grid, values=values).select(survivors)
 
 
 def _next_ids(previous: CodedFrame, survivors: np.ndarray, births: int) -> np.ndarray:

@@ -42,8 +42,7 @@ class Coder:
         r = np.zeros((len(self.change), len(self.grid)), np.int32)
         steps = self.change / _step(coarseness)
         for name, at in self.grid.columns.items():
-            largest = np.max(np.abs(steps[at]), axis=0)
-            steps[at][:, largest < (_THRESHOLD_DC if name == "sh_dc" else _THRESHOLD)] = 0
+            _remove_jitter(steps[at], _THRESHOLD_DC if name == "sh_dc" else _THRESHOLD)
         r[:, self.rows] = np.clip(np.rint(steps, out=steps), 1 - LIMIT, LIMIT - 1, out=steps)
         return r
 
@@ -76,6 +75,11 @@ class Coder:
             yield from np.clip(np.rint(real), 1 - LIMIT, LIMIT - 1).astype(np.int32).T
 
 
+def _remove_jitter(steps: np.ndarray, threshold: float) -> None:
+    """Set changes of a group [n, M] to 0 where all of them are below a threshold."""
+    steps[:, np.max(np.abs(steps), axis=0) < threshold] = 0
+
+
 def offset_steps(grid: Grid, coarseness: int) -> np.ndarray:
     """Return the steps of the offsets, float64 [N, 1], world units, which are the steps of the
     changes of the means.
@@ -98,11 +102,15 @@ def take_change(reader: ColumnReader, grid: Grid, coarseness: int) -> tuple[np.n
         dead[rows] = geometry == _DEAD
         flags = _flags_by_name(geometry, appearance)
         for name, at in grid.columns.items():
-            change_rows = rows[flags[name] == 1]
-            for column in values.T[at]:
-                change = np.rint(reader.take(len(change_rows)) * step).astype(np.int64)
-                column[change_rows] = bounded(column[change_rows] + change, LIMIT, "value")
+            _add_changes(values.T[at], rows[flags[name] == 1], reader, step)
     return values, dead
+
+
+def _add_changes(columns: np.ndarray, rows: np.ndarray, reader: ColumnReader, step: float) -> None:
+    """Add the changes of some rows, in steps, to columns of integers [n, N]."""
+    for column in columns:
+        change = np.rint(reader.take(len(rows)) * step).astype(np.int64)
+        column[rows] = bounded(column[rows] + change, LIMIT, "value")
 
 
 def _taken_flags(reader: ColumnReader, count: int, grid: Grid) -> tuple[np.ndarray, np.ndarray]:

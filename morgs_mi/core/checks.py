@@ -124,12 +124,8 @@ def check_points(
     if not points.size and not colors.size:
         return np.zeros((0, 3)), np.zeros((0, 3))
     _check_point_shapes(place, points, colors)
-    is_bounded = np.abs(points) <= LARGEST
-    is_color = (colors >= 0) & (colors <= most)
-    coordinates = f"`points` must be finite and at most {LARGEST:g}"
-    _check_rows(place, coordinates, points, is_bounded, "remove this point")
-    light = f"`point_colors` must be in [0, {most:g}]"
-    _check_rows(place, light, colors, is_color, "divide colours of 8 bits by 255")
+    _check_coordinates(place, points)
+    _check_colors(place, colors, most)
     return points, colors
 
 
@@ -144,6 +140,18 @@ def _check_point_shapes(place: str, points: np.ndarray, colors: np.ndarray) -> N
             f"{place}: `point_colors` must be {list(points.shape)} like `points`, got "
             f"{list(colors.shape)}; pass one colour for each point."
         )
+
+
+def _check_coordinates(place: str, points: np.ndarray) -> None:
+    is_bounded = np.abs(points) <= LARGEST
+    requirement = f"`points` must be finite and at most {LARGEST:g}"
+    _check_rows(place, requirement, points, is_bounded, "remove this point")
+
+
+def _check_colors(place: str, colors: np.ndarray, most: float) -> None:
+    is_color = (colors >= 0) & (colors <= most)
+    requirement = f"`point_colors` must be in [0, {most:g}]"
+    _check_rows(place, requirement, colors, is_color, "divide colours of 8 bits by 255")
 
 
 def _check_rows(

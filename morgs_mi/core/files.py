@@ -34,9 +34,8 @@ def atomic_path(path: str | os.PathLike[str], place: str) -> Generator[Path, Non
             ``write_json()``.
     """
     final = Path(path).resolve()  # a rename would replace a link, and `.` has no name
-    partial, old = (
-        final.with_name(f".{what}-{os.getpid()}-{final.name}") for what in ("partial", "old")
-    )
+    partial = _hidden(final, "partial")
+    old = _hidden(final, "old")
     replaces_folder = os.path.isdir(final)  # unlike Path's, never raises
     if _is_special(final):
         raise FileExistsError(
@@ -53,10 +52,20 @@ def atomic_path(path: str | os.PathLike[str], place: str) -> Generator[Path, Non
         remark = ", the partial output was removed" if os.path.lexists(partial) else ""
         raise write_error(f"{place}: cannot write {path}{remark}", error, partial) from error
     finally:
-        if os.path.exists(old) and not os.path.exists(final):
-            old.rename(final)
+        _restore(old, final)
         _remove(partial)
         _remove(old)
+
+
+def _hidden(path: Path, use: str) -> Path:
+    """Return a hidden path of this process beside another one."""
+    return path.with_name(f".{use}-{os.getpid()}-{path.name}")
+
+
+def _restore(old: Path, final: Path) -> None:
+    """Rename `old` to `final` if nothing has replaced it."""
+    if os.path.exists(old) and not os.path.exists(final):
+        old.rename(final)
 
 
 def _is_special(path: Path) -> bool:

@@ -166,10 +166,7 @@ class Gaussians:
     offset: Tensor | None = None
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if value is not None or f.default is MISSING:
-                object.__setattr__(self, f.name, float_tensor("Gaussians()", f.name, value))
+        self._convert_fields()
         if len(self.means.shape) != 2:
             raise ValueError(
                 f"Gaussians(): `means` must be [N, 3], got {tuple(self.means.shape)}; pass one "
@@ -179,6 +176,13 @@ class Gaussians:
             if attribute.activated_name != "sh_coeffs":  # two rows in one tensor, checked below
                 _check_shape(attribute, getattr(self, attribute.name), len(self))
         _check_sh_shape(tuple(self.sh_coeffs.shape), len(self))
+
+    def _convert_fields(self) -> None:
+        """Replace the fields that are not tensors by tensors."""
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if value is not None or f.default is MISSING:
+                object.__setattr__(self, f.name, float_tensor("Gaussians()", f.name, value))
 
     def __len__(self) -> int:
         return int(self.means.shape[0])

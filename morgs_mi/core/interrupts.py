@@ -18,7 +18,7 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -66,21 +66,12 @@ def interruptible() -> Iterator[None]:
     handlers = {number: signal.getsignal(number) for number in _SIGNALS}
     hook = sys.unraisablehook
     timers: list[threading.Timer] = []
-
-    def handle(problem: Any) -> None:
-        """Repeat an interruption that Python is about to print and to ignore."""
-        if not isinstance(problem.exc_value, KeyboardInterrupt):
-            hook(problem)
-            return
-        timers.append(threading.Timer(_PAUSE, _interrupt_main_thread))
-        timers[-1].start()
-
     try:
         # A shell lets the processes that it starts in the background ignore Ctrl-C.
         if handlers[signal.SIGINT] is not signal.SIG_IGN:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-        sys.unraisablehook = handle
+        sys.unraisablehook = _repeating_hook(hook, timers)
         yield
     finally:
         sys.unraisablehook = hook
@@ -88,6 +79,23 @@ def interruptible() -> Iterator[None]:
             timer.cancel()
         for number, handler in handlers.items():
             signal.signal(number, handler)
+
+
+def _repeating_hook(
+    hook: Callable[[Any], Any], timers: list[threading.Timer]
+) -> Callable[[Any], None]:
+    """Return a hook that repeats an interruption that Python is about to print and to ignore, by a
+    timer that it adds to `timers`; other errors go to `hook`.
+    """
+
+    def handle(problem: Any) -> None:
+        if not isinstance(problem.exc_value, KeyboardInterrupt):
+            hook(problem)
+            return
+        timers.append(threading.Timer(_PAUSE, _interrupt_main_thread))
+        timers[-1].start()
+
+    return handle
 
 
 def begin_command() -> None:

@@ -179,7 +179,7 @@ def ensure_llvm() -> None:
         warnings.warn(problem, RuntimeWarning, stacklevel=3)
     os.environ[VARIABLE] = str(path or _NOWHERE)
     # Dr.Jit reads the variable once, when it is imported.
-    major = sys.modules["drjit"].detail.llvm_version()[0] if "drjit" in sys.modules else 0
+    major = _loaded_major()
     if 0 < major < SAFE_MAJOR:
         warnings.warn(
             f"Dr.Jit was imported before morgs_mi and has loaded LLVM {major}, which can abort the "
@@ -187,6 +187,11 @@ def ensure_llvm() -> None:
             RuntimeWarning,
             stacklevel=3,
         )
+
+
+def _loaded_major() -> int:
+    """Return the version of the LLVM that Dr.Jit has loaded, or 0."""
+    return sys.modules["drjit"].detail.llvm_version()[0] if "drjit" in sys.modules else 0
 
 
 if __name__ == "__main__":

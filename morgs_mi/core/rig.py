@@ -92,7 +92,7 @@ def seen_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 def in_image(camera: Camera, pixels: np.ndarray) -> np.ndarray:
     """Return the mask [...] of the pixel positions [..., 2] that lie in the image of a camera."""
-    return ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=-1)
+    return np.all((pixels >= 0) & (pixels < (camera.width, camera.height)), axis=-1)
 
 
 def with_near_planes(

@@ -11,13 +11,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import cv2
 import numpy as np
 
 from morgs_mi.core.color_space import unit_values
 from morgs_mi.core.rig import mean_views
 from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.fit.noise import noise_of
+from morgs_mi.fit.noise import block_means, noise_of, whole_blocks
 from morgs_mi.fit.view import View
 
 # A value of a block follows from its mean and the other three.
@@ -59,9 +58,9 @@ def count_details(image: np.ndarray, mask: np.ndarray | None) -> float:
     noise = _NOISE * noise_of(image)
     count = 0
     while min(values.shape[:2]) > 1:
-        values = _whole_blocks(values)
-        means = _block_means(values)
-        fractions = _block_means(_whole_blocks(valid))
+        values = whole_blocks(values)
+        means = block_means(values)
+        fractions = block_means(whole_blocks(valid))
         differences = np.abs(values - _repeated(means)).max(axis=-1)
         is_detail = (differences > max(_THRESHOLD, noise)) & _repeated(fractions == 1)
         count += np.count_nonzero(is_detail)
@@ -69,18 +68,6 @@ def count_details(image: np.ndarray, mask: np.ndarray | None) -> float:
         valid = fractions
         noise = noise / 2
     return _INDEPENDENT * count
-
-
-def _whole_blocks(values: np.ndarray) -> np.ndarray:
-    """Return an image without the last row or column where their number is odd."""
-    height, width = (size // 2 for size in values.shape[:2])
-    return values[: 2 * height, : 2 * width]
-
-
-def _block_means(values: np.ndarray) -> np.ndarray:
-    """Return the means of the blocks of an image of whole blocks."""
-    height, width = (size // 2 for size in values.shape[:2])
-    return cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA)
 
 
 def _repeated(values: np.ndarray) -> np.ndarray:

@@ -46,10 +46,20 @@ def white_noise_of(image: np.ndarray) -> float:
     """Return the standard deviation of the white noise of an image [H, W, 3], uint8 or floats,
     relative to white.
     """
-    height, width = (size // 2 for size in image.shape[:2])
-    if not (height and width):
+    if min(image.shape[:2]) < 2:
         return 0.0
-    values = image[: 2 * height, : 2 * width].astype(np.float32)
-    half = cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA)
+    half = block_means(whole_blocks(image).astype(np.float32))
     half = half / 255 if image.dtype == np.uint8 else half
     return float(np.sqrt(max(4 / 3 * (noise_of(image) ** 2 - noise_of(half) ** 2), 0)))
+
+
+def whole_blocks(values: np.ndarray) -> np.ndarray:
+    """Return an image without the last row or column where their number is odd."""
+    height, width = (size // 2 for size in values.shape[:2])
+    return values[: 2 * height, : 2 * width]
+
+
+def block_means(values: np.ndarray) -> np.ndarray:
+    """Return the means of the blocks of 2x2 pixels of an image of whole blocks."""
+    height, width = (size // 2 for size in values.shape[:2])
+    return cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA)

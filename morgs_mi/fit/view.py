@@ -82,7 +82,7 @@ def withheld_blocks(
     visible = []
     withheld = []
     for camera, image, mask in (view.reduced(width) for view in views):
-        is_withheld = _random_blocks(*image.shape[:2], rng)
+        is_withheld = _random_blocks(image.shape[0], image.shape[1], rng)
         valid = np.ones_like(is_withheld) if mask is None else mask
         visible.append(View(camera, image, valid & ~is_withheld))
         withheld.append(View(camera, image, valid & is_withheld))

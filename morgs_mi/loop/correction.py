@@ -49,19 +49,18 @@ def estimate_correction(
         images: of the first frame, by view index.
         progress: of the short fits.
     """
-    config = setup.config
-    if config.fit.exposure == "off":
+    if setup.config.fit.exposure == "off":
         return Correction(), {}
-    identity = Correction((Exposure(),) * len(setup.cameras))
     if len(images) < 2:
-        return identity, {}
+        return _correction(setup, {}), {}
     balance = _balance(setup, images, progress)
-    if not balance.taken:
-        return identity, _entry(balance)
-    exposures = dict(zip(images, balance.exposures, strict=True))
-    return Correction(
-        tuple(exposures.get(v, Exposure()) for v in range(len(setup.cameras)))
-    ), _entry(balance)
+    exposures = dict(zip(images, balance.exposures, strict=True)) if balance.taken else {}
+    return _correction(setup, exposures), _entry(balance)
+
+
+def _correction(setup: Setup, exposures: Mapping[int, Exposure]) -> Correction:
+    """Return the correction of all views by exposures by view index, the identity without one."""
+    return Correction(tuple(exposures.get(v, Exposure()) for v in range(len(setup.cameras))))
 
 
 def _balance(setup: Setup, images: Images, progress: Progress) -> Balance:

@@ -207,16 +207,21 @@ def _replaced(config: Any, values: Mapping[str, Any], source: str, prefix: str) 
         if name not in kinds:
             near = _near_keys(prefix, name, kinds)
             raise ValueError(f"{source}: `{key}` is unknown, expected {near}.")
-        nested = _nested_config(getattr(config, name), kinds[name])
-        if nested is not None and isinstance(value, Mapping):
-            changes[name] = _replaced(nested, value, source, f"{key}.")
-        else:
-            changes[name] = _converted(value, kinds[name])
-            check_value(source, key, changes[name], kinds[name])
+        changes[name] = _setting(getattr(config, name), value, kinds[name], source, key)
     try:
         return replace(config, **changes)
     except ValueError as error:
         raise relocated(error, source, prefix, list(kinds)) from None
+
+
+def _setting(current: Any, value: Any, kind: Any, source: str, key: str) -> Any:
+    """Return the setting of a type that a value stands for, in place of the current one."""
+    nested = _nested_config(current, kind)
+    if nested is not None and isinstance(value, Mapping):
+        return _replaced(nested, value, source, f"{key}.")
+    setting = _converted(value, kind)
+    check_value(source, key, setting, kind)
+    return setting
 
 
 def _near_keys(prefix: str, name: str, names: Iterable[str]) -> str:

@@ -101,15 +101,19 @@ class ActiveSet:
         """
         if len(self.indices) == len(previous):
             return gaussians, source
-        is_static = np.ones(len(previous), bool)
-        is_static[self.indices] = False
-        static = np.flatnonzero(is_static)
+        static = self._static_indices(len(previous))
         index = np.where(source < 0, len(previous), self.indices[source])
         previous_index = np.concatenate([static, index])
         order = np.argsort(previous_index, kind="stable")  # births come last
         merged = Gaussians.concatenate([at_rest(previous.select(static)), gaussians])
         merged_source = np.where(previous_index < len(previous), previous_index, -1)
         return merged.select(order), merged_source[order]
+
+    def _static_indices(self, count: int) -> np.ndarray:
+        """Return the indices of the others among `count` Gaussians, ascending."""
+        is_static = np.ones(count, bool)
+        is_static[self.indices] = False
+        return np.flatnonzero(is_static)
 
     @property
     def fractions(self) -> dict[str, float]:
@@ -200,12 +204,8 @@ def _drawn(
     Gaussians [N].
     """
     indices = list(views)
-    some = {
-        indices[k]
-        for k in choose_key_views(
-            [entry.view.camera for entry in views.values()], config.quiet_views
-        )
-    }
+    cameras = [entry.view.camera for entry in views.values()]
+    some = {indices[k] for k in choose_key_views(cameras, config.quiet_views)}
     selections = {v: active if v in some else active & changing for v in views}
     return {
         v: entry.boxes.union(selections[v], entry.view.grid) | (entry.counts > 0)

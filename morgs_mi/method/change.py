@@ -81,13 +81,17 @@ def change_mask(
     H, W = reference.shape[:2]
     difference, unit = _difference(reference, image)
     levels = _levels(cv2.transform(difference, _SUM) * np.float32(unit / 3), 1, config)
-    half_size = (max(W // 2, 1), max(H // 2, 1))
-    half = cv2.resize(difference, half_size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    for channel in cv2.split(cv2.transform(half, unit * _COLORS)):
+    for channel in cv2.split(cv2.transform(_half_sized(difference), unit * _COLORS)):
         color_levels = _levels(channel, 2, config)
         pixel_levels = cv2.resize(color_levels, (W, H), interpolation=cv2.INTER_NEAREST)
         levels = np.maximum(levels, pixel_levels)
     return _with_peaks(levels if valid is None else levels * valid)
+
+
+def _half_sized(image: np.ndarray) -> np.ndarray:
+    """Return an image at half the resolution, float32."""
+    size = (max(image.shape[1] // 2, 1), max(image.shape[0] // 2, 1))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32)
 
 
 def _difference(reference: np.ndarray, image: np.ndarray) -> tuple[np.ndarray, float]:
@@ -192,7 +196,7 @@ def box_around(mask: np.ndarray) -> tuple[slice, slice] | None:
     """
     if not mask.any():
         return None
-    return _span(mask.any(axis=1)), _span(mask.any(axis=0))
+    return _span(np.any(mask, axis=1)), _span(np.any(mask, axis=0))
 
 
 def _span(line: np.ndarray) -> slice:

@@ -190,8 +190,13 @@ def common_change(exposures: Sequence[Exposure]) -> Exposure:
         return Exposure()
     lines = np.array([(e.gain, e.bias) for e in exposures])
     middle = _exposure(*np.median(lines, axis=0))
-    spread = float(np.median([np.abs(e(_TONES) - middle(_TONES)).max() for e in exposures]))
+    spread = float(np.median([_tone_difference(e, middle) for e in exposures]))
     return middle if spread < 0.5 * middle.change else Exposure()
+
+
+def _tone_difference(a: Exposure, b: Exposure) -> float:
+    """Return the largest difference of a dark, middle or bright tone, of 1."""
+    return np.abs(a(_TONES) - b(_TONES)).max()
 
 
 def follow_exposure(

@@ -133,11 +133,12 @@ def lift_flow(
         logit = np.full(N, -config.max_logit, np.float32)
         return MotionStart(np.zeros((N, 3), np.float32), logit)
     key_views = [views[v] for v in indices]
+    cameras = [view.camera for view in key_views]
     sums = _flow_sums(gaussians, key_views, [observations[v] for v in indices])
     means = gaussians.numpy()["means"].astype(np.float64)
     view_motions = [
         _lift_view(view_sums, means, camera, motion_floor(camera.width, masks), config.noise_px)
-        for view_sums, camera in zip(sums, [view.camera for view in key_views], strict=True)
+        for view_sums, camera in zip(sums, cameras, strict=True)
     ]
     d = _robust_displacement(view_motions, len(means))
     logit = _logits(view_motions, d, config)

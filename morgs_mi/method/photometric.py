@@ -61,13 +61,20 @@ def refine_start(problem: MotionProblem, start: MotionStart) -> MotionStart:
         return replace(start, color_change=_color_change(start_sums["color"], start_sums["weight"]))
     near = problem.neighbours.nearest(_NEIGHBOURS)
     step = np.where(moves[:, None], _step(_jacobians(problem, d), start_sums, near, moves), 0)
-    step = step.astype(np.float32)
+    return _stepped(problem, start, start_sums, step.astype(np.float32))
+
+
+def _stepped(
+    problem: MotionProblem, start: MotionStart, sums: Mapping[str, np.ndarray], step: np.ndarray
+) -> MotionStart:
+    """Return a start after the steps [N, 3] that lower the error; `sums` are those without them."""
+    d = start.displacement
     step_sums = problem.images.sums(
         displaced(problem.gaussians, d + step), ("error", "weight", "color")
     )
-    better = relative_error(step_sums) < relative_error(start_sums)
-    color = np.where(better[:, None], step_sums["color"], start_sums["color"])
-    weight = np.where(better, step_sums["weight"], start_sums["weight"])
+    better = relative_error(step_sums) < relative_error(sums)
+    color = np.where(better[:, None], step_sums["color"], sums["color"])
+    weight = np.where(better, step_sums["weight"], sums["weight"])
     return replace(
         start,
         displacement=(d + np.where(better[:, None], step, 0)).astype(np.float32),

@@ -19,7 +19,7 @@ import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
-from morgs_mi.method.sweep import relative_error
+from morgs_mi.method.sweep import KeyImages, relative_error
 
 # Rounds of proposals from neighbours, after the one from the previous frame.
 _ROUNDS = 2
@@ -42,33 +42,47 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
         start: by lifted flow.
     """
     d = start.displacement  # [N, 3]
-    logit = start.logit_confidence  # [N]
     last_motion = _previous_motion(problem.gaussians)
     if not problem.views or not (d.any() or last_motion.any()):
         return start
     near = problem.neighbours.nearest(_NEIGHBOURS)
-    rounds = _ROUNDS if near.size else 0
-    images = problem.images_around(
-        _reached(near, np.any([d, last_motion], axis=(0, 2)), rounds), (d, last_motion)
-    )
-    if images is None:
-        return start
+    moving = np.any([d, last_motion], axis=(0, 2))
+    images = problem.images_around(_reached(near, moving, _rounds(near)), (d, last_motion))
+    return start if images is None else _propagated(problem, start, images, near)
 
-    def error_of(d: np.ndarray) -> np.ndarray:
-        return relative_error(images.sums(displaced(problem.gaussians, d), ("error", "weight")))
 
-    error = error_of(d)
-    for k in range(1 + rounds):
-        proposal = d[_moving_neighbour(near, d, problem.rng)] if k else _continued(d, last_motion)
+def _rounds(near: np.ndarray) -> int:
+    """Return the number of rounds of proposals from neighbours `near` [N, k]."""
+    return _ROUNDS if near.size else 0
+
+
+def _propagated(
+    problem: MotionProblem, start: MotionStart, images: KeyImages, near: np.ndarray
+) -> MotionStart:
+    """Return a start with the proposals that lower the error in `images`."""
+    d = start.displacement
+    logit = start.logit_confidence
+    error = _error_of(problem, images, d)
+    for k in range(1 + _rounds(near)):
+        proposal = (
+            d[_moving_neighbour(near, d, problem.rng)]
+            if k
+            else _continued(d, _previous_motion(problem.gaussians))
+        )
         differs = np.any(proposal != d, axis=1)
         if not differs.any():
             continue
-        new_error = error_of(proposal)
+        new_error = _error_of(problem, images, proposal)
         is_better = differs & (new_error < _error_ratio(d) * error)
         d = np.where(is_better[:, None], proposal, d)
         error = np.where(is_better, new_error, error)
         logit = np.where(is_better, _accepted_logit(logit, d), logit)
     return MotionStart(d, logit.astype(np.float32))
+
+
+def _error_of(problem: MotionProblem, images: KeyImages, d: np.ndarray) -> np.ndarray:
+    """Return the errors [N] of Gaussians displaced by d [N, 3]."""
+    return relative_error(images.sums(displaced(problem.gaussians, d), ("error", "weight")))
 
 
 def _continued(d: np.ndarray, last_motion: np.ndarray) -> np.ndarray:

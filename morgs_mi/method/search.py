@@ -260,13 +260,18 @@ class _MatchedView:
 
     def cost_surface(self, weight: np.ndarray) -> _CostSurface:
         """Match the pixels of a part with the weight m [h, w], not all 0."""
-        rows, columns = np.nonzero(weight > 0.01 * weight.max())
-        box = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+        box = _box_of(weight > 0.01 * weight.max())
         # In reduced pixels: twice the grid along an axis, as its corners are farther.
         surroundings = _surroundings(self.target, box, 4 * _GRID)
         mask = np.repeat(np.sqrt(weight[box])[..., None], 3, axis=2)  # squared by OpenCV
         cost = cv2.matchTemplate(surroundings, self.rendering[box], cv2.TM_SQDIFF, mask=mask)
         return _CostSurface(np.maximum(cost, 0) / self.scale**2, self.camera, self.scale)
+
+
+def _box_of(mask: np.ndarray) -> tuple[slice, slice]:
+    """Return the rows and columns of the smallest box around a mask [h, w] that is not empty."""
+    rows, columns = np.nonzero(mask)
+    return np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
 
 
 def _surroundings(image: np.ndarray, box: tuple[slice, slice], margin: int) -> np.ndarray:

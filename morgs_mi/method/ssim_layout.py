@@ -190,7 +190,7 @@ class Planes:
         if region is None:
             return np.ones((self.height, self.num_strips), bool)
         mask = np.pad(region.mask, ((0, 0), (0, self.num_strips * STRIP - self.width)))
-        return mask.reshape(self.height, self.num_strips, STRIP).any(axis=2)
+        return np.any(mask.reshape(self.height, self.num_strips, STRIP), axis=2)
 
     def _lane_places(self, strip: np.ndarray) -> tuple[UInt32, UInt32, UInt32]:
         """Return `Lanes.places` of strips [n] in all three planes; 1 is the first of an image."""

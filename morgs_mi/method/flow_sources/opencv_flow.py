@@ -53,16 +53,19 @@ def _dis(preset: int, finest: Callable[[int, FlowConfig], int] | None = None) ->
         method = cv2.DISOpticalFlow.create(preset)
         if finest is not None:
             method.setFinestScale(finest(a.shape[1], config))
-        # DIS chooses its coarsest level by the width alone and crashes where the height is less
-        # than a patch.
-        rows = a.shape[0]
-        missing = max(0, a.shape[1] // 2 - a.shape[0])
-        a, b = (
-            cv2.copyMakeBorder(image, 0, missing, 0, 0, cv2.BORDER_REPLICATE) for image in (a, b)
-        )
-        return method.calc(a, b, _ALLOCATE)[:rows]
+        return method.calc(_high_enough(a), _high_enough(b), _ALLOCATE)[: a.shape[0]]
 
     return _on_gray(flow)
+
+
+def _high_enough(image: np.ndarray) -> np.ndarray:
+    """Return an image with its last row repeated, so that it is at least half as high as wide.
+
+    DIS chooses its coarsest level by the width alone and crashes where the height is less than a
+    patch.
+    """
+    missing = max(0, image.shape[1] // 2 - image.shape[0])
+    return cv2.copyMakeBorder(image, 0, missing, 0, 0, cv2.BORDER_REPLICATE)
 
 
 def _rlof(a: np.ndarray, b: np.ndarray, config: FlowConfig) -> np.ndarray:
