@@ -81,6 +81,13 @@ def unit_values(image: np.ndarray, dtype: type[np.floating[Any]] = np.float64) -
     return image.astype(dtype) / 255 if image.dtype == np.uint8 else image.astype(dtype)
 
 
+def byte_values(image: np.ndarray) -> np.ndarray:
+    """Return encoded values of an image as uint8, 255 being white; floats are clipped to [0, 1]."""
+    if image.dtype == np.uint8:
+        return image
+    return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
 def positive_light(light: np.ndarray, place: str) -> np.ndarray:
     """Return a copy of linear light [H, W, 3] as float32 with 0 for negative values, which are
     warned of once.

@@ -170,10 +170,12 @@ def _logits(views: list[_LiftView], d: np.ndarray, config: LiftConfig) -> np.nda
     """Return the logits [N] of the confidence that Gaussians move by d [N, 3]."""
     top = config.max_logit
     logit = np.clip(_CONFIDENCE_SLOPE * (_evidence(views, d) - config.min_evidence), -top, top)
-    moves = np.zeros(len(d), bool)
-    for view in views:
-        moves |= np.linalg.norm(view.project(d), axis=1) > view.floor
-    return np.where(moves, logit, -top)
+    return np.where(_moves(views, d), logit, -top)
+
+
+def _moves(views: list[_LiftView], d: np.ndarray) -> np.ndarray:
+    """Return the mask [N] of motions d [N, 3] above the floor in some view."""
+    return np.any([np.linalg.norm(view.project(d), axis=1) > view.floor for view in views], axis=0)
 
 
 def _evidence(views: list[_LiftView], d: np.ndarray) -> np.ndarray:

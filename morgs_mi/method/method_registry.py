@@ -39,13 +39,7 @@ class Registry(Generic[Made, Config]):
         Raises:
             ValueError: the name is empty, has a colon or is taken.
         """
-        if not name or ":" in name:
-            raise ValueError(f"register(): `name` must be a name without a colon, got {name!r}.")
-        if name in self._factories:
-            raise ValueError(
-                f"register(): `name` must be new, got {name!r}, which is registered already; "
-                "rename one."
-            )
+        self._check_new(name)
 
         def add(factory: Callable[[str, Config], Made]) -> Callable[[str, Config], Made]:
             self._factories[name] = factory
@@ -53,6 +47,16 @@ class Registry(Generic[Made, Config]):
             return factory
 
         return add
+
+    def _check_new(self, name: str) -> None:
+        """Raise an error unless a method can be registered by this name."""
+        if not name or ":" in name:
+            raise ValueError(f"register(): `name` must be a name without a colon, got {name!r}.")
+        if name in self._factories:
+            raise ValueError(
+                f"register(): `name` must be new, got {name!r}, which is registered already; "
+                "rename one."
+            )
 
     def register_entry(
         self, name: str, argument: str, entry: Callable[[], Callable[[str, Config], Made]]

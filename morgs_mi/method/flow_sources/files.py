@@ -80,9 +80,9 @@ class FlowFolder:
     def _read(self, camera: str, direction: str, frame: int, size: tuple[int, int]) -> np.ndarray:
         path = self._find(self.folder / camera / direction, frame)
         flow = read_flow(path)
-        if flow.shape[:2] != size:
-            height, width = size
-            rows, columns = flow.shape[:2]
+        height, width = size
+        rows, columns = flow.shape[:2]
+        if (rows, columns) != (height, width):
             raise ValueError(
                 f"{path}: expected {width}x{height} pixels as the images of {camera} have, got "
                 f"{columns}x{rows}; compute the flow on undistorted and downscaled images."

@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from morgs_mi.core.color_space import byte_values
 from morgs_mi.method.flow_sources.flow_config import FlowConfig
 from morgs_mi.method.flow_sources.flow_registry import (
     FLOW_SOURCES,
@@ -125,7 +126,8 @@ def optical_flow(
     check_images("optical_flow()", image, previous)
     if min(image.shape[:2]) < MIN_SIDE:
         return np.zeros((*image.shape[:2], 2), np.float32)
-    return FLOW_METHODS[method](_bytes(image), _bytes(previous), config)
+    a, b = (np.ascontiguousarray(byte_values(each)) for each in (image, previous))
+    return FLOW_METHODS[method](a, b, config)
 
 
 def _make(method: str, argument: str, config: FlowConfig) -> FlowSource:
@@ -134,9 +136,3 @@ def _make(method: str, argument: str, config: FlowConfig) -> FlowSource:
 
 for _name in FLOW_METHODS:
     FLOW_SOURCES.register(_name)(partial(_make, _name))
-
-
-def _bytes(image: np.ndarray) -> np.ndarray:
-    if image.dtype != np.uint8:
-        image = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
-    return np.ascontiguousarray(image)

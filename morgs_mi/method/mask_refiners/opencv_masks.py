@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from morgs_mi.core.color_space import byte_values
 from morgs_mi.method.mask_refiners.mask_config import MaskConfig
 from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskRefiner
 
@@ -137,12 +138,10 @@ def _both(argument: str, config: MaskConfig) -> MaskRefiner:
 
 def _reduced(image: np.ndarray, widest: int) -> np.ndarray:
     """Return an image as bytes, no wider than `widest` pixels."""
-    if image.dtype != np.uint8:
-        image = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
     height, width = image.shape[:2]
     scale = min(1.0, widest / width)
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    return cv2.resize(byte_values(image), size, interpolation=cv2.INTER_AREA)
 
 
 def _enlarged(mask: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
