@@ -6,7 +6,7 @@ a candidate that explains the matches between the images.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations, permutations
 from typing import Any, TypeVar
@@ -62,14 +62,17 @@ _LEAST_FACTOR = 0.1
 def same_poses(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     """Return the pairs of cameras with the same pose."""
     positions = np.array([camera.position for camera in cameras])
-    rotations = np.array([np.asarray(camera.viewmat, np.float64)[:3, :3] for camera in cameras])
     near = _SAME * np.linalg.norm(positions - positions.mean(0), axis=1).max()
-    return [
-        (i, j)
-        for i, j in combinations(range(len(cameras)), 2)
-        if np.linalg.norm(positions[i] - positions[j]) <= near
-        and np.abs(rotations[i] - rotations[j]).max() < _SAME
-    ]
+    pairs = combinations(range(len(cameras)), 2)
+    return [(i, j) for i, j in pairs if _have_same_pose(cameras[i], cameras[j], near)]
+
+
+def _have_same_pose(a: Camera, b: Camera, near: float) -> bool:
+    """Return whether two cameras have the same rotation, and positions up to `near` apart."""
+    if not np.linalg.norm(a.position - b.position) <= near:
+        return False
+    rotations = [np.asarray(camera.viewmat, np.float64)[:3, :3] for camera in (a, b)]
+    return bool(np.abs(rotations[0] - rotations[1]).max() < _SAME)
 
 
 def rig_candidates(
@@ -87,27 +90,40 @@ def rig_candidates(
         layout = layout_called(capture.layout)
         poses = layout.poses if layout else PoseConvention()
         yield from _other_conventions(capture.cameras, poses) if poses else ()
-    cameras = capture.cameras
-    every = range(len(capture.cameras))
-    if len(cameras) <= _MAX_EXCHANGED:
-        for i, j in combinations(every, 2):
-            order = [{i: j, j: i}.get(view, view) for view in every]
-            names = f"{cameras[i].name} and {cameras[j].name}"
-            yield (
-                [cameras[k] for k in order],
-                f"the clips of {names}, or their poses, seem to be swapped; exchange them",
-            )
+    if len(capture.cameras) <= _MAX_EXCHANGED:
+        yield from _exchanges(capture.cameras)
     if 3 <= len(wrong) <= _MAX_PERMUTED:
-        for order in permutations(wrong):
-            exchanged = dict(zip(wrong, order, strict=True))
-            names = ", ".join(
-                f"{cameras[view].name} has that of {cameras[k].name}"
-                for view, k in exchanged.items()
-            )
-            yield (
-                [cameras[exchanged.get(v, v)] for v in every],
-                f"the poses seem to be in another order ({names}); reorder them",
-            )
+        yield from _permutations(capture.cameras, wrong)
+
+
+def _exchanges(cameras: Sequence[Camera]) -> Iterator[tuple[Sequence[Camera], str]]:
+    """Yield the cameras for each exchange of two poses."""
+    for i, j in combinations(range(len(cameras)), 2):
+        names = f"{cameras[i].name} and {cameras[j].name}"
+        yield (
+            _reordered(cameras, {i: j, j: i}),
+            f"the clips of {names}, or their poses, seem to be swapped; exchange them",
+        )
+
+
+def _permutations(
+    cameras: Sequence[Camera], wrong: Sequence[int]
+) -> Iterator[tuple[Sequence[Camera], str]]:
+    """Yield the cameras for each order of the poses of the views `wrong`."""
+    for order in permutations(wrong):
+        sources = dict(zip(wrong, order, strict=True))
+        names = ", ".join(
+            f"{cameras[view].name} has that of {cameras[k].name}" for view, k in sources.items()
+        )
+        yield (
+            _reordered(cameras, sources),
+            f"the poses seem to be in another order ({names}); reorder them",
+        )
+
+
+def _reordered(cameras: Sequence[Camera], sources: Mapping[int, int]) -> list[Camera]:
+    """Return the camera of each view, or the camera of its source, if it has one."""
+    return [cameras[sources.get(view, view)] for view in range(len(cameras))]
 
 
 def camera_candidates(camera: Camera) -> Iterator[tuple[Camera, str]]:
@@ -115,14 +131,18 @@ def camera_candidates(camera: Camera) -> Iterator[tuple[Camera, str]]:
     pose = np.asarray(camera.viewmat, np.float64)
     for rotation, sentence in _CAMERA_MISTAKES:
         yield replace(camera, viewmat=rotation @ pose), sentence
-    # A turned pose keeps the principal point; a turned image has the opposite one.
-    opposite = (camera.width, camera.height, 2) - camera.K[:, 2]
-    turned_image = np.column_stack([camera.K[:, :2], opposite])
-    yield replace(camera, viewmat=_HALF_TURN @ pose, K=turned_image), _UPSIDE_DOWN
+    yield replace(camera, viewmat=_HALF_TURN @ pose, K=_turned_intrinsics(camera)), _UPSIDE_DOWN
     yield (
         replace(camera, viewmat=np.linalg.inv(pose)),
         "its pose is inverted, the other poses are not: invert it",
     )
+
+
+def _turned_intrinsics(camera: Camera) -> np.ndarray:
+    """Return the matrix K of a camera whose images are turned by 180 degrees."""
+    # A turned pose keeps the principal point; a turned image has the opposite one.
+    opposite = (camera.width, camera.height, 2) - camera.K[:, 2]
+    return np.column_stack([camera.K[:, :2], opposite])
 
 
 def focal_candidates(
@@ -136,21 +156,9 @@ def focal_candidates(
         scaled: returns what has a factor on its focal lengths.
         error: error of what is scaled, px.
     """
-
-    def of_octaves(octaves: float) -> float:
-        # The search cannot compare infinite errors.
-        return min(error(scaled(float(2.0**octaves))), 1e9)
-
-    steps = np.arange(-_FACTOR_OCTAVES, _FACTOR_OCTAVES + _FACTOR_STEP, _FACTOR_STEP)
-    start = min(steps, key=of_octaves)
-    bounds = (start - _FACTOR_STEP, start + _FACTOR_STEP)
-    # Imported here because it slows down the start of every command.
-    from scipy.optimize import minimize_scalar
-
-    minimum: Any = minimize_scalar(
-        of_octaves, bounds=bounds, method="bounded", options={"xatol": 3e-3}
-    )
-    factor = float(2.0**minimum.x)
+    # The search cannot compare infinite errors.
+    octaves = _minimum(lambda octaves: min(error(scaled(float(2.0**octaves))), 1e9))
+    factor = float(2.0**octaves)
     if abs(factor - 1) <= _LEAST_FACTOR:
         return []
     sentence = (
@@ -160,6 +168,20 @@ def focal_candidates(
     return [(scaled(factor), sentence)]
 
 
+def _minimum(of_octaves: Callable[[float], float]) -> float:
+    """Return the place of the least value of a function of octaves: the best step, then refined."""
+    steps = np.arange(-_FACTOR_OCTAVES, _FACTOR_OCTAVES + _FACTOR_STEP, _FACTOR_STEP)
+    start = min(steps, key=of_octaves)
+    bounds = (start - _FACTOR_STEP, start + _FACTOR_STEP)
+    # Imported here because it slows down the start of every command.
+    from scipy.optimize import minimize_scalar
+
+    minimum: Any = minimize_scalar(
+        of_octaves, bounds=bounds, method="bounded", options={"xatol": 3e-3}
+    )
+    return minimum.x
+
+
 def with_focal_factor(camera: Camera, factor: float) -> Camera:
     """Return the camera with its focal lengths multiplied by `factor`."""
     return replace(camera, K=camera.K @ np.diag([factor, factor, 1.0]))
@@ -167,23 +189,25 @@ def with_focal_factor(camera: Camera, factor: float) -> Camera:
 
 def _other_rows(capture: Capture) -> list[tuple[Sequence[Camera], str]]:
     """Return the alternatives for poses in the rows of `poses_bounds.npy`."""
-    cameras = capture.cameras
     alphabetical = sorted(capture.names)
-    rows = [cameras[alphabetical.index(name)] for name in capture.names]
-    rig = [replace(c, viewmat=_UPRIGHT @ c.viewmat) for c in cameras]
     order = ", ".join(alphabetical[:4])
     return [
         (
-            rows,
+            [capture.cameras[alphabetical.index(name)] for name in capture.names],
             f"the rows seem to be in alphabetical order ({order}, ...); put them in numerical "
             "order",
         ),
         (
-            rig,
+            _turned(capture.cameras, _UPRIGHT),
             "the columns seem to be the camera's right, up and backward axes; expected down, "
             "right, backward",
         ),
     ]
+
+
+def _turned(cameras: Sequence[Camera], rotation: np.ndarray) -> list[Camera]:
+    """Return the cameras with a rotation [4, 4] of their axes."""
+    return [replace(camera, viewmat=rotation @ camera.viewmat) for camera in cameras]
 
 
 def _other_conventions(
@@ -198,9 +222,9 @@ def _other_conventions(
     other_axes = "OpenCV" if expected.axes == "OpenGL" else "OpenGL"
     inverse = "world to camera" if expected.direction == "camera to world" else "camera to world"
     options = [
-        ([replace(c, viewmat=_FLIP @ c.viewmat) for c in cameras], expected.direction, other_axes),
+        (_turned(cameras, _FLIP), expected.direction, other_axes),
         (inverses, inverse, "OpenCV"),
-        ([replace(c, viewmat=_FLIP @ c.viewmat) for c in inverses], inverse, "OpenGL"),
+        (_turned(inverses, _FLIP), inverse, "OpenGL"),
     ]
     remedy = f"expected {expected.direction} in {_AXES[expected.axes]}; convert them"
     return [

@@ -8,7 +8,7 @@ values in [0, 255], on which all but the sharpness is measured. Missing values a
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -69,27 +69,50 @@ def read_signals(
         progress: called with (frames done, frames).
     """
     count = min(max_frames, capture.num_frames)
-    sizes = [(_WIDTH, max(1, round(c.height * _WIDTH / c.width))) for c in capture.cameras]
-    thumbs = [np.full((count, *size[::-1]), np.nan, np.float32) for size in sizes]
-    sharpness = np.full((count, len(sizes)), np.nan)
-    inner = [
-        None if m is None else cv2.erode(m.astype(np.uint8), np.ones((9, 9))) > 0
-        for m in capture.masks
-    ]
+    signals = _missing_signals(capture, count)
+    masks = [(mask, _inner(mask)) for mask in capture.masks]
     for t, frame in enumerate(capture.displayed().partial_frames(0, count)):
         for c, image in enumerate(frame.images):
-            if image is None:
-                continue
-            grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-            thumbs[c][t] = cv2.resize(grey, sizes[c], interpolation=cv2.INTER_AREA)
-            mask = capture.masks[c]
-            if mask is not None:
-                valid = cv2.resize(mask.astype(np.float32), sizes[c], interpolation=cv2.INTER_AREA)
-                thumbs[c][t][valid <= 0.999] = np.nan
-            sharpness[t, c] = _sharpness(grey, inner[c])
+            if image is not None:
+                _store_image(signals, (t, c), image, *masks[c])
         if progress is not None:
             progress(t + 1, count)
-    return Signals(tuple(thumbs), sharpness)
+    return signals
+
+
+def _missing_signals(capture: Capture, count: int) -> Signals:
+    """Return signals of `count` frames with all values missing."""
+    heights = [max(1, round(c.height * _WIDTH / c.width)) for c in capture.cameras]
+    thumbs = [np.full((count, height, _WIDTH), np.nan, np.float32) for height in heights]
+    return Signals(tuple(thumbs), np.full((count, len(heights)), np.nan))
+
+
+def _inner(mask: np.ndarray | None) -> np.ndarray | None:
+    """Return the mask without the pixels near its edges."""
+    return None if mask is None else cv2.erode(mask.astype(np.uint8), np.ones((9, 9))) > 0
+
+
+def _store_image(
+    signals: Signals,
+    place: tuple[int, int],
+    image: np.ndarray,
+    mask: np.ndarray | None,
+    inner: np.ndarray | None,
+) -> None:
+    """Store the measurements of an image at its frame and camera."""
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    t, c = place
+    _store_thumb(signals.thumbs[c][t], grey, mask)
+    signals.sharpness[place] = _sharpness(grey, inner)
+
+
+def _store_thumb(thumb: np.ndarray, grey: np.ndarray, mask: np.ndarray | None) -> None:
+    """Store the reduced image in `thumb`, NaN where a pixel is not valid."""
+    size = thumb.shape[::-1]
+    thumb[:] = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    if mask is not None:
+        valid = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        thumb[valid <= 0.999] = np.nan
 
 
 def brightness(signals: Signals) -> np.ndarray:
@@ -105,20 +128,28 @@ def repeated_frames(signals: Signals) -> tuple[tuple[int, ...], ...]:
     """Return per camera the frames that repeat the previous one while the other cameras' images
     change.
     """
+    relative = _relative_changes(signals.thumbs)
+    others_change = others_median(relative) > _CHANGING
+    repeats = (relative < _REPEATED) & others_change & _are_isolated(relative)
+    return tuple(tuple((np.flatnonzero(camera) + 1).tolist()) for camera in repeats.T)
+
+
+def _relative_changes(thumbs: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the change from frame to frame relative to each camera's usual change [T - 1, C]."""
     with warnings.catch_warnings(), np.errstate(invalid="ignore", divide="ignore"):
         # The mean or the quartile of no value is NaN.
         warnings.simplefilter("ignore", RuntimeWarning)
-        steps = [
-            np.nanmean(np.abs(np.diff(thumbs, axis=0)), axis=(1, 2)) for thumbs in signals.thumbs
-        ]
+        steps = [np.nanmean(np.abs(np.diff(camera, axis=0)), axis=(1, 2)) for camera in thumbs]
         changes = np.stack(steps, axis=1)
         # The upper quartile is the usual change even if every second frame is repeated.
-        relative = changes / np.nanpercentile(changes, 75, axis=0)
+        return changes / np.nanpercentile(changes, 75, axis=0)
+
+
+def _are_isolated(relative: np.ndarray) -> np.ndarray:
+    """Return the mask [T - 1, C] of steps with a change before or after them."""
     # Motion in a view pauses gradually, so a frame before or after a repeated one has changed.
     neighbours = np.pad(relative, ((1, 1), (0, 0)), constant_values=np.nan)
-    isolated = np.fmax(neighbours[:-2], neighbours[2:]) > _CHANGING
-    repeats = (relative < _REPEATED) & (others_median(relative) > _CHANGING) & isolated
-    return tuple(tuple((np.flatnonzero(camera) + 1).tolist()) for camera in repeats.T)
+    return np.fmax(neighbours[:-2], neighbours[2:]) > _CHANGING
 
 
 def lamp_flicker(bands: np.ndarray, fps: float) -> Lamp | None:
@@ -131,28 +162,55 @@ def lamp_flicker(bands: np.ndarray, fps: float) -> Lamp | None:
     count = len(bands)
     if count < _MIN_FLICKER_FRAMES or not np.isfinite(bands).any():
         return None
-    times = np.arange(count) - (count - 1) / 2
+    bands = _without_trend(bands) * _window(count)
+    amplitude = _rms(np.fft.rfft(bands, axis=0))
+    aliases = _aliases(int(amplitude.argmax()), fps, fps / count) if _has_peak(amplitude) else {}
+    if not aliases:
+        return None
+    alias = float(next(iter(aliases.values())))
+    wave = np.exp(2j * np.pi * alias / fps * _centred_times(count))
+    return Lamp(tuple(aliases), alias, float(_rms(wave @ bands)))
+
+
+def _centred_times(count: int) -> np.ndarray:
+    return np.arange(count) - (count - 1) / 2
+
+
+def _without_trend(bands: np.ndarray) -> np.ndarray:
+    """Return the bands over time [T, bands] without their median and their linear trend."""
+    times = _centred_times(len(bands))
     bands = np.where(np.isfinite(bands), bands, 0)
     bands = bands - np.median(bands, axis=0)
-    bands = bands - times[:, None] * (times @ bands) / (times @ times)
+    return bands - times[:, None] * (times @ bands) / (times @ times)
+
+
+def _window(count: int) -> np.ndarray:
+    """Return Hann's window [count, 1], with which an oscillation's sum is its amplitude."""
     window = np.hanning(count + 2)[1:-1, None]
-    window = 2 * window / window.sum()
-    amplitude = _rms(np.fft.rfft(bands * window, axis=0))
-    peak = int(amplitude.argmax())
-    step = fps / count
-    if amplitude[peak] < _MIN_AMPLITUDE or amplitude[peak] ** 2 < _MIN_POWER * np.median(
-        amplitude**2
-    ):
-        return None
+    return 2 * window / window.sum()
+
+
+def _has_peak(amplitude: np.ndarray) -> bool:
+    """Return whether a spectrum has one strong frequency."""
+    peak = amplitude.max()
+    return not (peak < _MIN_AMPLITUDE or peak**2 < _MIN_POWER * np.median(amplitude**2))
+
+
+def _aliases(peak: int, fps: float, step: float) -> dict[int, float]:
+    """Return the frequency at which a camera sees a lamp, by the frequencies of mains that explain
+    the peak of a spectrum.
+
+    Args:
+        peak: index of the peak.
+        fps: frames per second.
+        step: between the frequencies of the spectrum, Hz.
+    """
     aliases = {mains: abs(2 * mains - fps * round(2 * mains / fps)) for mains in _MAINS}
-    explaining = tuple(
-        m for m, f in aliases.items() if f >= _MIN_PERIODS * step and abs(f - peak * step) <= step
-    )
-    if not explaining:
-        return None
-    alias = float(aliases[explaining[0]])
-    wave = np.exp(2j * np.pi * alias / fps * times)
-    return Lamp(explaining, alias, float(_rms(wave @ (bands * window))))
+    return {
+        mains: alias
+        for mains, alias in aliases.items()
+        if alias >= _MIN_PERIODS * step and abs(alias - peak * step) <= step
+    }
 
 
 def known_median(values: np.ndarray, axis: int) -> np.ndarray:
@@ -180,23 +238,35 @@ def _sharpness(grey: np.ndarray, mask: np.ndarray | None) -> float:
     contrast at both.
     """
     blur = cv2.GaussianBlur(grey, (0, 0), 1.0)
-    strong_blur = cv2.GaussianBlur(blur, (0, 0), 2.0)
-    fine, coarse = (
-        float(np.abs(x if mask is None else x[mask]).mean())
-        for x in (grey - blur, blur - strong_blur)
-    )
+    fine = _mean_size(grey - blur, mask)
+    coarse = _mean_size(blur - cv2.GaussianBlur(blur, (0, 0), 2.0), mask)
     return float(np.log2(fine / coarse)) if fine > 0 and coarse > 0 else float("nan")
 
 
+def _mean_size(values: np.ndarray, mask: np.ndarray | None) -> float:
+    return float(np.abs(values if mask is None else values[mask]).mean())
+
+
 def _brightness(thumbs: np.ndarray) -> np.ndarray:
+    bands = np.array_split(_log_ratios(thumbs), _BANDS, axis=1)
+    return np.stack([_band_brightness(band.reshape(len(thumbs), -1)) for band in bands], axis=1)
+
+
+def _log_ratios(thumbs: np.ndarray) -> np.ndarray:
+    """Return the log ratios of linear values to their medians over time [T, h, w], NaN where a
+    value is too dark or too bright.
+    """
     reference = known_median(thumbs, axis=0)
-    good = (thumbs > _DARK) & (thumbs < _BRIGHT) & (reference > _DARK) & (reference < _BRIGHT)
     with np.errstate(invalid="ignore", divide="ignore"):
         ratios = np.log(decode_light(thumbs / 255) / decode_light(reference / 255))
-    ratios = np.where(good, ratios, np.nan)
-    bands = [band.reshape(len(thumbs), -1) for band in np.array_split(ratios, _BANDS, axis=1)]
-    columns = [
-        np.where(np.isfinite(x).sum(axis=1) < _MIN_PIXELS, np.nan, known_median(x, axis=1))
-        for x in bands
-    ]
-    return np.stack(columns, axis=1)
+    return np.where(_are_exposed(thumbs) & _are_exposed(reference), ratios, np.nan)
+
+
+def _are_exposed(values: np.ndarray) -> np.ndarray:
+    return (values > _DARK) & (values < _BRIGHT)
+
+
+def _band_brightness(ratios: np.ndarray) -> np.ndarray:
+    """Return the median [T] of the ratios [T, pixels] of a band, NaN with too few of them."""
+    is_poor = np.isfinite(ratios).sum(axis=1) < _MIN_PIXELS
+    return np.where(is_poor, np.nan, known_median(ratios, axis=1))

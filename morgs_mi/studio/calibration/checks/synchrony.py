@@ -15,6 +15,7 @@ Notation: frame k of camera i shows the time k + o_i, with o_i its time offset i
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -55,16 +56,22 @@ def time_offsets(cameras: Sequence[Camera], thumbs: Sequence[np.ndarray]) -> np.
         thumbs: per camera thumbnails [T, h, w] of the same instants, values in [0, 255], NaN where
             missing.
     """
-    pairs = np.reshape(list(_pair_shifts(cameras, thumbs)), (-1, 4))
-    views = pairs[:, :2].astype(int)
-    frames = pairs[:, 2]
-    offsets = consensus(len(cameras), views, frames, pairs[:, 3])
-    agreeing = np.abs(offsets[views[:, 1]] - offsets[views[:, 0]] - frames) <= _AGREEING
-    of_camera = (views[:, :, None] == np.arange(len(cameras))).any(axis=1)
-    is_determined = (of_camera & agreeing[:, None]).sum(axis=0) >= _MIN_AGREEMENT * of_camera.sum(
-        axis=0
-    )
-    return np.where(is_determined, offsets, np.nan)
+    *pairs, frames, weights = np.reshape(list(_pair_shifts(cameras, thumbs)), (-1, 4)).T
+    views = np.stack(pairs, axis=1).astype(int)
+    offsets = consensus(len(cameras), views, frames, weights)
+    return np.where(_are_determined(offsets, views, frames), offsets, np.nan)
+
+
+def _are_determined(offsets: np.ndarray, views: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """Return the mask of the offsets [C] with which enough pairs [P, 2] of their cameras agree."""
+    of_camera = (views[:, :, None] == np.arange(len(offsets))).any(axis=1)
+    count = (of_camera & _agree(offsets, views, frames)[:, None]).sum(axis=0)
+    return count >= _MIN_AGREEMENT * of_camera.sum(axis=0)
+
+
+def _agree(offsets: np.ndarray, views: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """Return the mask of the pairs [P, 2] whose difference [P] agrees with the offsets [C]."""
+    return np.abs(offsets[views[:, 1]] - offsets[views[:, 0]] - frames) <= _AGREEING
 
 
 def consensus(
@@ -77,16 +84,28 @@ def consensus(
     """
     values = np.full(count, np.nan)
     pairs = np.reshape(views, (-1, 2)).astype(int)
-    if not len(pairs):
-        return values
-    system = np.eye(count)[pairs[:, 1]] - np.eye(count)[pairs[:, 0]]
+    if len(pairs):
+        members = np.unique(pairs)
+        x = _least_deviations(_difference_matrix(count, pairs), differences, weights)[members]
+        values[members] = x - np.quantile(x, 0.5, method="lower")
+    return values
+
+
+def _difference_matrix(count: int, pairs: np.ndarray) -> np.ndarray:
+    """Return the matrix [P, count] that turns values x into x_j - x_i of pairs (i, j) [P, 2]."""
+    unit = np.eye(count)
+    return unit[pairs[:, 1]] - unit[pairs[:, 0]]
+
+
+def _least_deviations(A: np.ndarray, b: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the x with the least weighted sum of |A x - b|, by iteratively reweighted least
+    squares.
+    """
     scale = np.sqrt(weights)
     for _ in range(_ITERATIONS):
-        solution = np.linalg.lstsq(system * scale[:, None], differences * scale, rcond=None)[0]
-        scale = np.sqrt(weights / np.maximum(np.abs(system @ solution - differences), 1e-2))
-    members = np.unique(pairs)
-    values[members] = solution[members] - np.quantile(solution[members], 0.5, method="lower")
-    return values
+        x = np.linalg.lstsq(A * scale[:, None], b * scale, rcond=None)[0]
+        scale = np.sqrt(weights / np.maximum(np.abs(A @ x - b), 1e-2))
+    return x
 
 
 def _pair_shifts(
@@ -97,25 +116,28 @@ def _pair_shifts(
     rays = [_rays(camera, frames.shape[1:]) for camera, frames in zip(cameras, thumbs, strict=True)]
     for i, j in combinations(range(len(cameras)), 2):
         angles = _plane_angles(cameras[i], cameras[j], rays[i], rays[j])
-        low = max(np.percentile(a, 2) for a in angles)
-        high = min(np.percentile(a, 98) for a in angles)
-        if high > low:
-            a, b = (_profile(changes[v], x, low, high) for v, x in zip((i, j), angles, strict=True))
-            frames, weight = _best_shift(a, b)
+        if profiles := _profiles((changes[i], changes[j]), angles):
+            frames, weight = _best_shift(*profiles)
             if weight >= _MIN_PROMINENCE:
                 yield i, j, frames, weight
 
 
 def _changes(thumbs: np.ndarray) -> np.ndarray:
     """Return the change of each pixel from frame to frame above the noise [T - 1, h * w]."""
-    frames = thumbs.reshape(len(thumbs), -1)
-    level = known_median(frames, axis=1)[:, None]
-    # A change of the exposure is no motion.
-    frames = frames * (known_median(level, axis=0) / np.maximum(level, 1))
+    frames = _with_one_level(thumbs.reshape(len(thumbs), -1))
     steps = np.nan_to_num(np.abs(np.diff(frames, axis=0)))
-    return np.maximum(
-        steps - np.maximum(_NOISE, _MEDIANS * np.median(steps, axis=1, keepdims=True)), 0
-    )
+    return np.maximum(steps - _noise(steps), 0)
+
+
+def _noise(steps: np.ndarray) -> np.ndarray:
+    """Return the change of a pixel [T - 1, 1] below which it is noise or compression."""
+    return np.maximum(_NOISE, _MEDIANS * np.median(steps, axis=1, keepdims=True))
+
+
+def _with_one_level(frames: np.ndarray) -> np.ndarray:
+    """Return frames [T, h * w] scaled to one median: a change of the exposure is no motion."""
+    level = known_median(frames, axis=1)[:, None]
+    return frames * (known_median(level, axis=0) / np.maximum(level, 1))
 
 
 def _rays(camera: Camera, shape: tuple[int, ...]) -> np.ndarray:
@@ -129,12 +151,31 @@ def _plane_angles(a: Camera, b: Camera, *rays: np.ndarray) -> list[np.ndarray]:
     """Return the angle of the epipolar half plane of each ray about the baseline of two cameras,
     radians.
     """
-    baseline = b.position - a.position
-    baseline = baseline / max(float(np.linalg.norm(baseline)), 1e-12)
+    baseline = _unit(b.position - a.position)
     forward = sum(np.asarray(camera.viewmat, np.float64)[2, :3] for camera in (a, b))
-    across = forward - baseline * (baseline @ forward)
-    across = across / max(float(np.linalg.norm(across)), 1e-12)
+    across = _unit(forward - baseline * (baseline @ forward))
     return [np.arctan2(r @ np.cross(baseline, across), r @ across) for r in rays]
+
+
+def _unit(vector: np.ndarray) -> np.ndarray:
+    return vector / max(float(np.linalg.norm(vector)), 1e-12)
+
+
+def _profiles(
+    changes: tuple[np.ndarray, np.ndarray], angles: Sequence[np.ndarray]
+) -> list[np.ndarray]:
+    """Return the epipolar profiles of two views on the planes that both see; none without such
+    planes.
+    """
+    low, high = _common_range(angles)
+    if not high > low:
+        return []
+    return [_profile(*view, low, high) for view in zip(changes, angles, strict=True)]
+
+
+def _common_range(angles: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Return the range of angles that each view has, without the outermost ones."""
+    return max(np.percentile(a, 2) for a in angles), min(np.percentile(a, 98) for a in angles)
 
 
 def _profile(changes: np.ndarray, angles: np.ndarray, low: float, high: float) -> np.ndarray:
@@ -143,9 +184,9 @@ def _profile(changes: np.ndarray, angles: np.ndarray, low: float, high: float) -
     """
     planes = np.floor((angles - low) / (high - low) * _PLANES).astype(int)
     mask = (planes >= 0) & (planes < _PLANES)
-    pixels = np.maximum(np.bincount(planes[mask], minlength=_PLANES), 1)
-    sums = [np.bincount(planes[mask], change[mask], _PLANES) for change in changes]
-    return np.sqrt(np.array(sums).reshape(len(changes), _PLANES) / pixels)
+    sum_of = partial(np.bincount, planes[mask], minlength=_PLANES)
+    sums = [sum_of(change[mask]) for change in changes]
+    return np.sqrt(np.array(sums).reshape(len(changes), _PLANES) / np.maximum(sum_of(), 1))
 
 
 def _best_shift(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
@@ -158,22 +199,37 @@ def _best_shift(a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
     largest = min(_MAX_SHIFT, int(_MAX_SHARE * len(a)))
     if largest < 2:
         return 0.0, 0.0
-    shifts = np.arange(-largest, largest + 1)
-    curve = np.array(
-        [
-            _correlation(a[max(0, s) : len(a) + min(0, s)], b[max(0, -s) : len(b) - max(0, s)])
-            for s in shifts
-        ]
-    )
+    curve = np.array([_shifted_correlation(a, b, s) for s in range(-largest, largest + 1)])
     k = int(curve.argmax())
     if k in (0, len(curve) - 1) or curve[k] < _MIN_CORRELATION:
         return 0.0, 0.0
-    left, top, right = curve[k - 1 : k + 2]
-    beside = max(curve[x] for x in (max(0, k - _BESIDE), min(len(curve) - 1, k + _BESIDE)))
-    peak = shifts[k] + 0.5 * (left - right) / (left - 2 * top + right)
-    return float(peak), float(top - beside)
+    return k - largest + _vertex(*curve[k - 1 : k + 2]), _prominence(curve, k)
+
+
+def _vertex(left: float, top: float, right: float) -> float:
+    """Return the place of the vertex of a parabola through values at -1, 0 and 1."""
+    return float(0.5 * (left - right) / (left - 2 * top + right))
+
+
+def _prominence(curve: np.ndarray, k: int) -> float:
+    """Return the height of a curve at k above the larger one of two values beside it."""
+    beside = max(curve[max(0, k - _BESIDE)], curve[min(len(curve) - 1, k + _BESIDE)])
+    return float(curve[k] - beside)
+
+
+def _shifted_correlation(a: np.ndarray, b: np.ndarray, shift: int) -> float:
+    """Return the correlation of frame k + shift of a with frame k of b, over all such frames."""
+    return _correlation(
+        a[max(0, shift) : len(a) + min(0, shift)], b[max(0, -shift) : len(b) - max(0, shift)]
+    )
 
 
 def _correlation(*profiles: np.ndarray) -> float:
-    a, b = (p - p.mean(axis=0) - p.mean(axis=1, keepdims=True) + p.mean() for p in profiles)
+    a, b = map(_centred, profiles)
     return float((a * b).sum() / max(np.sqrt((a * a).sum() * (b * b).sum()), 1e-9))
+
+
+def _centred(profile: np.ndarray) -> np.ndarray:
+    """Return a profile without the means of its rows and columns."""
+    columns = profile.mean(axis=0)
+    return profile - columns - profile.mean(axis=1, keepdims=True) + profile.mean()
