@@ -16,6 +16,7 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.color_correction import matched_colors
+from morgs_mi.capture.features import Match
 from morgs_mi.capture.points import SharedFeatures
 from morgs_mi.core.rig import overlaps
 from morgs_mi.studio.calibration.checks.rig_check import RigCheck
@@ -96,21 +97,20 @@ class DeepCheck:
             "time offsets": self.offsets,
             "exposure against the other cameras": self.gains.mean(axis=1),
         }
-        parts = []
-        for quantity, value in values.items():
-            cameras = [
-                name
-                for name, is_missing in zip(self.names, np.isnan(value), strict=True)
-                if is_missing
-            ]
-            if cameras:
-                subject = "all cameras" if len(cameras) == len(self.names) else ", ".join(cameras)
-                parts.append(f"{quantity} of {subject}")
-        return (
-            f"Not measured, without enough common motion or matches: {'; '.join(parts)}."
-            if parts
-            else ""
-        )
+        parts = [
+            f"{quantity} of {cameras}"
+            for quantity, value in values.items()
+            if (cameras := self._cameras_without(value))
+        ]
+        if not parts:
+            return ""
+        return f"Not measured, without enough common motion or matches: {'; '.join(parts)}."
+
+    def _cameras_without(self, values: np.ndarray) -> str:
+        """Return the names of the cameras with a missing one of the values [C]."""
+        pairs = zip(self.names, np.isnan(values), strict=True)
+        cameras = [name for name, is_missing in pairs if is_missing]
+        return "all cameras" if len(cameras) == len(self.names) else ", ".join(cameras)
 
     def as_dict(self) -> dict[str, Any]:
         """Return all measurements and findings in JSON types."""
@@ -131,9 +131,6 @@ def check_deep(
         signals: measurements of its frames.
     """
     bands = brightness(signals)
-    half = len(bands) // 2
-    parts = ([t[:half] for t in signals.thumbs], [t[half:] for t in signals.thumbs])
-    halves = [time_offsets(capture.cameras, part) for part in parts] if half >= _MIN_HALF else []
     check = DeepCheck(
         names=capture.names,
         frames=len(bands),
@@ -141,7 +138,7 @@ def check_deep(
         given=tuple(capture.reading.offset.get(name, 0) for name in capture.names),
         errors=np.array([camera.error for camera in rig.cameras]),
         offsets=time_offsets(capture.cameras, signals.thumbs),
-        halves=np.array(halves or np.full((2, len(capture.cameras)), np.nan)),
+        halves=_half_offsets(capture, signals.thumbs),
         gains=_gains(capture, shared),
         brightness=known_median(bands, axis=2),
         sharpness=signals.sharpness,
@@ -150,10 +147,18 @@ def check_deep(
         overlaps=overlaps(capture.cameras, capture.points),
     )
     findings = [f for question in _QUESTIONS for f in question.findings(check.names, check)]
-    findings += [
-        f for question in (_EXPOSURE, _BALANCE) for f in question.findings(check.names, check.gains)
-    ]
-    return replace(check, findings=tuple(findings))
+    return replace(check, findings=(*findings, *_exposure_findings(check.names, check.gains)))
+
+
+def _half_offsets(capture: Capture, thumbs: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the time offsets in the first and the last half of the frames [2, C], NaN in short
+    recordings.
+    """
+    half = len(thumbs[0]) // 2
+    if half < _MIN_HALF:
+        return np.full((2, len(capture.cameras)), np.nan)
+    parts = ([t[:half] for t in thumbs], [t[half:] for t in thumbs])
+    return np.array([time_offsets(capture.cameras, part) for part in parts])
 
 
 def check_exposures(capture: Capture, shared: SharedFeatures) -> list[Finding]:
@@ -164,8 +169,11 @@ def check_exposures(capture: Capture, shared: SharedFeatures) -> list[Finding]:
         capture: a capture.
         shared: features of its first frame in its size.
     """
-    gains = _gains(capture, shared)
-    return [*_EXPOSURE.findings(capture.names, gains), *_BALANCE.findings(capture.names, gains)]
+    return _exposure_findings(capture.names, _gains(capture, shared))
+
+
+def _exposure_findings(names: Sequence[str], gains: np.ndarray) -> list[Finding]:
+    return [*_EXPOSURE.findings(names, gains), *_BALANCE.findings(names, gains)]
 
 
 def _gains(capture: Capture, shared: SharedFeatures) -> np.ndarray:
@@ -173,19 +181,24 @@ def _gains(capture: Capture, shared: SharedFeatures) -> np.ndarray:
     images = next(capture.displayed().partial_frames(0, 1)).images
     pairs, colors = matched_colors(capture.cameras, images, shared.features, shared.matches)
     pairs = [pair for pair in pairs if len(pair.features) >= _MIN_SAMPLES]
-    light = [
-        [colors[view][pair.features[:, k]] for k, view in enumerate(pair.views)] for pair in pairs
-    ]
-    ratios = [np.log(b / a) for a, b in light]
+    ratios = [_log_ratios(pair, colors) for pair in pairs]
     middles = np.reshape([np.median(ratio, axis=0) for ratio in ratios], (-1, 3))
-    spreads = [np.abs(ratio - middle).mean() for ratio, middle in zip(ratios, middles, strict=True)]
-    weights = np.array(
-        [1 / (s**2 / len(r) + _LOG_ERROR**2) for s, r in zip(spreads, ratios, strict=True)]
-    )
+    weights = np.array([_weight(*each) for each in zip(ratios, middles, strict=True)])
     views = [pair.views for pair in pairs]
-    return np.stack(
-        [consensus(len(colors), views, channel, weights) for channel in middles.T], axis=1
-    )
+    gains = [consensus(len(colors), views, channel, weights) for channel in middles.T]
+    return np.stack(gains, axis=1)
+
+
+def _log_ratios(pair: Match, colors: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the log ratios [n, 3] of the colours of points in the second and the first view."""
+    a, b = (colors[view][pair.features[:, k]] for k, view in enumerate(pair.views))
+    return np.log(b / a)
+
+
+def _weight(ratios: np.ndarray, middle: np.ndarray) -> float:
+    """Return the weight of a median of log ratios [n, 3]: the inverse of its variance."""
+    spread = np.abs(ratios - middle).mean()
+    return 1 / (spread**2 / len(ratios) + _LOG_ERROR**2)
 
 
 # Values of each camera [C] by name: `value` is compared with the limit, the others stand in the
@@ -208,14 +221,17 @@ class _Question:
         values = self.measure(measured)
         groups: dict[Any, list[str]] = {}
         for view in np.flatnonzero(np.asarray(values["value"], float) > self.limit).tolist():
-            text = self.sentence.format(
-                **{key: column[view] for key, column in values.items()}
-            ).replace("%", " %")
-            groups.setdefault((text, None if self.common else view), []).append(names[view])
+            key = (self._text(values, view), None if self.common else view)
+            groups.setdefault(key, []).append(names[view])
         return [
             Finding(self.name, tuple(n), f"{', '.join(n)} {text}.")
             for (text, _), n in groups.items()
         ]
+
+    def _text(self, values: _Values, view: int) -> str:
+        """Return the sentence with the values of a view."""
+        row = {key: column[view] for key, column in values.items()}
+        return self.sentence.format(**row).replace("%", " %")
 
 
 def _errors(check: DeepCheck) -> _Values:
@@ -232,8 +248,7 @@ def _drifts(check: DeepCheck) -> _Values:
 
 
 def _times(check: DeepCheck) -> _Values:
-    changes = np.vstack([check.halves - check.offsets, check.halves[1] - check.halves[0]])
-    value = np.where((np.abs(changes) >= _OFFSET_CHANGE).any(axis=0), np.nan, np.abs(check.offsets))
+    value = np.where(_are_drifting(check), np.nan, np.abs(check.offsets))
     option = np.array(check.given) - np.round(np.nan_to_num(check.offsets))
     seconds = value / check.fps
     return {
@@ -243,6 +258,12 @@ def _times(check: DeepCheck) -> _Values:
         "name": check.names,
         "option": option,
     }
+
+
+def _are_drifting(check: DeepCheck) -> np.ndarray:
+    """Return the mask of the cameras whose offset changes during the recording."""
+    changes = np.vstack([check.halves - check.offsets, check.halves[1] - check.halves[0]])
+    return (np.abs(changes) >= _OFFSET_CHANGE).any(axis=0)
 
 
 def _sides(offsets: np.ndarray) -> np.ndarray:
@@ -260,17 +281,20 @@ def _balances(gains: np.ndarray) -> _Values:
 
 
 def _flickers(check: DeepCheck) -> _Values:
-    strongest = {
-        lamp.mains: lamp
-        for lamp in sorted(filter(None, check.lamps), key=lambda lamp: lamp.amplitude)
-    }
-    lamps = [strongest[lamp.mains] if lamp else Lamp((), 0.0, 0.0) for lamp in check.lamps]
+    lamps = _strongest(check.lamps)
     return {
         "value": [lamp.amplitude for lamp in lamps],
         "alias": [lamp.alias for lamp in lamps],
         "mains": [" or ".join(map(str, lamp.mains)) for lamp in lamps],
         "exposure": [" or ".join(f"1/{2 * mains}" for mains in lamp.mains) for lamp in lamps],
     }
+
+
+def _strongest(lamps: Sequence[Lamp | None]) -> list[Lamp]:
+    """Return for each camera the strongest flicker by the same mains, or one of no amplitude."""
+    flickers = sorted(filter(None, lamps), key=lambda lamp: lamp.amplitude)
+    strongest = {lamp.mains: lamp for lamp in flickers}
+    return [strongest[lamp.mains] if lamp else Lamp((), 0.0, 0.0) for lamp in lamps]
 
 
 def _variations(check: DeepCheck) -> _Values:
@@ -310,23 +334,30 @@ def _blurs(check: DeepCheck) -> _Values:
 
 
 def _blurred_frames(check: DeepCheck) -> _Values:
-    relative = check.sharpness - known_median(check.sharpness, axis=0)
-    # Compression changes from frame to frame, equally in all cameras if they share an encoder.
-    dips = relative - np.nan_to_num(others_median(relative))
+    dips = _dips(check.sharpness)
     spread = 1.5 * known_median(np.abs(dips - known_median(dips, axis=0)), axis=0)
-    return _listed(
-        [np.flatnonzero(mask) for mask in (dips < -np.fmax(_BLURRED_FRAME, _SPREADS * spread)).T]
-    )
+    limits = -np.fmax(_BLURRED_FRAME, _SPREADS * spread)
+    return _listed([np.flatnonzero(mask) for mask in (dips < limits).T])
+
+
+def _dips(sharpness: np.ndarray) -> np.ndarray:
+    """Return each image's sharpness relative to its camera's and to the other cameras' [T, C]."""
+    relative = sharpness - known_median(sharpness, axis=0)
+    # Compression changes from frame to frame, equally in all cameras if they share an encoder.
+    return relative - np.nan_to_num(others_median(relative))
 
 
 def _listed(frames: Sequence[Sequence[int] | np.ndarray]) -> _Values:
     """Return the number of frames of each camera, and the frames as text, shortened if they are
     many.
     """
-    counts = [len(camera) for camera in frames]
-    texts = [", ".join(map(str, camera[:_MAX_LISTED])) for camera in frames]
-    ends = [", ..." if count > _MAX_LISTED else "" for count in counts]
-    return {"value": counts, "frames": [text + end for text, end in zip(texts, ends, strict=True)]}
+    return {"value": [len(camera) for camera in frames], "frames": [_text(f) for f in frames]}
+
+
+def _text(frames: Sequence[int] | np.ndarray) -> str:
+    """Return the first ones of some frames as text."""
+    end = ", ..." if len(frames) > _MAX_LISTED else ""
+    return ", ".join(map(str, frames[:_MAX_LISTED])) + end
 
 
 # These two rows measure the gains [C, 3], which `check_exposures` has without the rest of a check.

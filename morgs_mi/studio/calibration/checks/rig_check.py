@@ -7,8 +7,9 @@ explains the matches. Pixels refer to the recorded size, as in `capture.points`.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -79,40 +80,59 @@ def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
     """Return the result of checking the capture's cameras against the matches between its views."""
     capture = capture.at_recorded_size()
     pairs = _Pairs.of(shared, capture.cameras)
-    views = range(len(capture.cameras))
     group = pairs.agreeing()
-    checks = [_check(view, pairs, group) for view in views]
+    checks = [_check(view, pairs, group) for view in range(len(capture.cameras))]
     errors = np.concatenate([np.zeros(0), *pairs.errors])
     correction = _correct_rig(capture, pairs.sampled(), checks) if len(errors) else None
     if correction:
         cameras, explanation = correction
-        culprits = {view for view in views if cameras[view] is not capture.cameras[view]}
-        checks = [_check(view, pairs, set(views) - culprits) for view in views]
-        checks = [
-            replace(c, fits=False, advice="") if view in culprits and c.matches else c
-            for view, c in enumerate(checks)
-        ]
+        checks = _checks_of_mistake(pairs, cameras)
         advice = f"the poses do not fit the images: {explanation}."
     else:
-        copies = _copies(shared, checks, capture.cameras)
-        checks = [
-            replace(c, fits=False, advice=copies[view]) if view in copies else c
-            for view, c in enumerate(checks)
-        ]
-        for view, check in enumerate(checks):
-            if check.fits is False and not check.advice:
-                checks[view] = replace(
-                    check, advice=_explain_camera(view, check, pairs.sampled(), group)
-                )
+        checks = _with_reasons(_with_copies(checks, pairs), pairs, group)
         advice = _summary(checks)
-    fits = (
-        False
-        if any(c.fits is False for c in checks)
-        else None
-        if any(c.fits is None for c in checks)
-        else True
+    return RigCheck(
+        len(errors), len(shared.matches), _median(errors), tuple(checks), _all_fit(checks), advice
     )
-    return RigCheck(len(errors), len(shared.matches), _median(errors), tuple(checks), fits, advice)
+
+
+def _checks_of_mistake(pairs: _Pairs, corrected: Sequence[Camera]) -> list[CameraCheck]:
+    """Return the result of each view if the views with another corrected camera are wrong."""
+    views = range(len(corrected))
+    culprits = {view for view in views if corrected[view] is not pairs.cameras[view]}
+    checks = [_check(view, pairs, set(views) - culprits) for view in views]
+    return [
+        replace(c, fits=False, advice="") if view in culprits and c.matches else c
+        for view, c in enumerate(checks)
+    ]
+
+
+def _with_copies(checks: Sequence[CameraCheck], pairs: _Pairs) -> list[CameraCheck]:
+    """Return the results with the reasons for cameras with the pose or the clip of another one."""
+    reasons = _pose_copies(checks, pairs.cameras)
+    reasons |= _clip_copies(checks, pairs.shared, set(reasons))
+    return [
+        replace(c, fits=False, advice=reasons[view]) if view in reasons else c
+        for view, c in enumerate(checks)
+    ]
+
+
+def _with_reasons(
+    checks: Sequence[CameraCheck], pairs: _Pairs, group: set[int]
+) -> list[CameraCheck]:
+    """Return the results with the mistake, and a remedy, of each pose that does not fit."""
+    return [
+        replace(check, advice=_explain_camera(view, check, pairs.sampled(), group))
+        if check.fits is False and not check.advice
+        else check
+        for view, check in enumerate(checks)
+    ]
+
+
+def _all_fit(checks: Sequence[CameraCheck]) -> bool | None:
+    """Return whether all poses fit, as in `RigCheck.fits`."""
+    verdicts = [check.fits for check in checks]
+    return False if False in verdicts else None if None in verdicts else True
 
 
 @dataclass(frozen=True)
@@ -136,11 +156,9 @@ class _Pairs:
 
     def of_replaced(self, view: int, camera: Camera, partners: Collection[int]) -> float:
         """Return the median error of a view's matches with `partners` for another camera, px."""
-        matches = [match for match in self.shared.matches if _is_shared(match, view, partners)]
+        matches = tuple(m for m in self.shared.matches if _is_shared(m, view, partners))
         cameras = [camera if i == view else c for i, c in enumerate(self.cameras)]
-        return _median(
-            _Pairs.of(replace(self.shared, matches=tuple(matches)), cameras).of_view(view)
-        )
+        return _median(_Pairs.of(replace(self.shared, matches=matches), cameras).of_view(view))
 
     def sampled(self, max_pairs: int | None = None) -> _Pairs:
         """Return the errors of a part of each pair's matches, for the `max_pairs` pairs with the
@@ -167,16 +185,17 @@ class _Pairs:
         """
         group = {view for match in self.shared.matches for view in match.views}
         while group:
-            errors = {view: self.of_view(view, group) for view in sorted(group)}
-            shares = {
-                view: np.mean(values > MAX_ERROR) if len(values) else 1.0
-                for view, values in errors.items()
-            }
+            shares = {view: self._wrong_share(view, group) for view in sorted(group)}
             worst = max(shares, key=lambda view: shares[view])
             if shares[worst] <= 0.5:
                 break
             group = group - {worst}
         return group
+
+    def _wrong_share(self, view: int, group: set[int]) -> float:
+        """Return the share of large errors among a view's matches with a group; 1 without any."""
+        errors = self.of_view(view, group)
+        return float(np.mean(errors > MAX_ERROR)) if len(errors) else 1.0
 
 
 def _is_shared(match: Match, view: int, partners: Collection[int] | None) -> bool:
@@ -194,22 +213,29 @@ def _median(errors: np.ndarray) -> float:
 
 def _check(view: int, pairs: _Pairs, group: set[int]) -> CameraCheck:
     """Return the result of a view; its advice is empty if the pose does not fit."""
-    name = pairs.cameras[view].name
     all_errors = pairs.of_view(view)
     group_errors = pairs.of_view(view, group)
     errors = group_errors if len(group_errors) else all_errors
-    fits = bool(_median(errors) <= MAX_ERROR)
-    advice = ""
-    if not len(all_errors):
-        fits = None
-        advice = f"no matches with any other camera: {_NO_OVERLAP}"
-    elif group and not len(group_errors):
-        fits = None
-        advice = "matches only with cameras that do not fit: correct those first"
-    elif len(errors) < _MIN_MATCHES:
-        fits = None
-        advice = f"only {len(errors)} matches, {_MIN_MATCHES} are needed: {_NO_OVERLAP}"
-    return CameraCheck(name, len(all_errors), _median(errors), fits, advice)
+    error = _median(errors)
+    advice = _too_few(len(errors), bool(group) and not len(group_errors))
+    fits = None if advice else error <= MAX_ERROR
+    return CameraCheck(pairs.cameras[view].name, len(all_errors), error, fits, advice)
+
+
+def _too_few(count: int, are_wrong: bool) -> str:
+    """Return the reason why matches do not check a pose, or nothing.
+
+    Args:
+        count: number of the matches.
+        are_wrong: whether they are matches only with cameras that do not fit.
+    """
+    if not count:
+        return f"no matches with any other camera: {_NO_OVERLAP}"
+    if are_wrong:
+        return "matches only with cameras that do not fit: correct those first"
+    if count < _MIN_MATCHES:
+        return f"only {count} matches, {_MIN_MATCHES} are needed: {_NO_OVERLAP}"
+    return ""
 
 
 def _correct_rig(
@@ -218,27 +244,31 @@ def _correct_rig(
     """Return the cameras corrected for a mistake in several poses, and its description; None if
     none explains all.
     """
-    wrong = [view for view, check in enumerate(checks) if check.fits is False]
-    largest = pairs.sampled(_FACTOR_PAIRS)
     error = pairs.worst()
-    candidates = focal_candidates(
-        "the focal lengths of all cameras seem",
-        lambda factor: [with_focal_factor(camera, factor) for camera in capture.cameras],
-        lambda cameras: _median(np.concatenate(_Pairs.of(largest.shared, cameras).errors)),
-    )
+    candidates = _rig_factors(pairs)
     if error > _GOOD_ERROR:
+        wrong = [view for view, check in enumerate(checks) if check.fits is False]
         candidates = [*rig_candidates(capture, wrong), *candidates]
     errors = [_Pairs.of(pairs.shared, cameras).worst() for cameras, _ in candidates]
-    index = int(np.argmin([*errors, np.inf]))
-    return (
-        candidates[index] if min(errors, default=np.inf) <= min(error / _GAIN, MAX_ERROR) else None
+    if not min(errors, default=np.inf) <= min(error / _GAIN, MAX_ERROR):
+        return None
+    return candidates[int(np.argmin(errors))]
+
+
+def _rig_factors(pairs: _Pairs) -> list[tuple[Sequence[Camera], str]]:
+    """Return the candidates with a factor on all focal lengths, which the pairs with the most
+    matches determine.
+    """
+    largest = pairs.sampled(_FACTOR_PAIRS).shared
+    return focal_candidates(
+        "the focal lengths of all cameras seem",
+        lambda factor: [with_focal_factor(camera, factor) for camera in pairs.cameras],
+        lambda cameras: _median(np.concatenate(_Pairs.of(largest, cameras).errors)),
     )
 
 
-def _copies(
-    shared: SharedFeatures, checks: Sequence[CameraCheck], cameras: Sequence[Camera]
-) -> dict[int, str]:
-    """Return the reason for each camera with the pose or the clip of another one."""
+def _pose_copies(checks: Sequence[CameraCheck], cameras: Sequence[Camera]) -> dict[int, str]:
+    """Return the reason for each camera with the pose of another one."""
     reasons: dict[int, str] = {}
     for pair in same_poses(cameras):
         # If one of the two fits, the pose is its own.
@@ -246,38 +276,42 @@ def _copies(
             other = checks[sum(pair) - view].name
             remedy = "give each camera its own, or leave the copy out (--without)"
             reasons.setdefault(view, f"it has the same pose as {other}: {remedy}")
-    for match in shared.matches:
-        a, b = (
-            shared.features[view].points[match.features[:, k]] for k, view in enumerate(match.views)
-        )
-        if np.median(np.linalg.norm(a - b, axis=1)) < _SAME_IMAGE:
-            for view in match.views:
-                if view in reasons or not checks[view].fits:
-                    other = checks[sum(match.views) - view].name
-                    reasons[view] = (
-                        f"its clip is a copy of the clip of {other}; replace one of them"
-                    )
     return reasons
+
+
+def _clip_copies(
+    checks: Sequence[CameraCheck], shared: SharedFeatures, suspects: set[int]
+) -> dict[int, str]:
+    """Return the reason for each camera with the clip of another one, among the views `suspects`
+    and those that do not fit.
+    """
+    reasons: dict[int, str] = {}
+    for match in filter(partial(_shows_one_clip, shared), shared.matches):
+        for view in match.views:
+            if view in suspects or not checks[view].fits:
+                other = checks[sum(match.views) - view].name
+                reasons[view] = f"its clip is a copy of the clip of {other}; replace one of them"
+    return reasons
+
+
+def _shows_one_clip(shared: SharedFeatures, match: Match) -> bool:
+    """Return whether the features of two views are at the same pixels."""
+    a, b = (
+        shared.features[view].points[match.features[:, k]] for k, view in enumerate(match.views)
+    )
+    return bool(np.median(np.linalg.norm(a - b, axis=1)) < _SAME_IMAGE)
 
 
 def _explain_camera(view: int, check: CameraCheck, pairs: _Pairs, group: set[int]) -> str:
     """Return the common mistake that explains the matches of a view, and a remedy."""
     # Without views that agree, a correction can only be compared with all others.
     partners = group or set(range(len(pairs.cameras)))
-    calibration = pairs.cameras[view]
-    candidates = [
-        *camera_candidates(calibration),
-        *focal_candidates(
-            "its focal length seems",
-            lambda factor: with_focal_factor(calibration, factor),
-            lambda camera: pairs.of_replaced(view, camera, partners),
-        ),
-    ]
-    errors = [pairs.of_replaced(view, camera, partners) for camera, _ in candidates]
+    error_of = partial(pairs.of_replaced, view, partners=partners)
+    candidates = _camera_mistakes(pairs.cameras[view], error_of)
+    errors = [error_of(camera) for camera, _ in candidates]
     of_group = [_median(pairs.of_view(other, group)) for other in group]
-    if min(errors) <= min(
-        check.error / _GAIN, MAX_ERROR, max(_GOOD_ERROR, 2 * max(of_group, default=MAX_ERROR))
-    ):
+    good_error = max(_GOOD_ERROR, 2 * max(of_group, default=MAX_ERROR))
+    if min(errors) <= min(check.error / _GAIN, MAX_ERROR, good_error):
         return candidates[int(np.argmin(errors))][1]
     cause = "no common mistake explains it"
     if np.isinf(check.error):
@@ -288,9 +322,19 @@ def _explain_camera(view: int, check: CameraCheck, pairs: _Pairs, group: set[int
     )
 
 
+def _camera_mistakes(
+    camera: Camera, error_of: Callable[[Camera], float]
+) -> list[tuple[Camera, str]]:
+    """Return the corrected camera for each mistake of a single pose or focal length."""
+    factors = focal_candidates(
+        "its focal length seems", lambda factor: with_focal_factor(camera, factor), error_of
+    )
+    return [*camera_candidates(camera), *factors]
+
+
 def _summary(checks: Sequence[CameraCheck]) -> str:
     """Return a sentence on the poses that fit, do not fit, and were not checked."""
-    wrong, open_ = (", ".join(c.name for c in checks if c.fits is fits) for fits in (False, None))
+    wrong, open_ = (_names(checks, fits) for fits in (False, None))
     count = sum(c.fits is True for c in checks)
     if not wrong and not count:
         return (
@@ -301,3 +345,8 @@ def _summary(checks: Sequence[CameraCheck]) -> str:
     if open_ and not wrong:
         text = f"the poses of {count} of {len(checks)} cameras fit the images"
     return f"{text}; not checked: {open_}." if open_ else f"{text}."
+
+
+def _names(checks: Sequence[CameraCheck], fits: bool | None) -> str:
+    """Return the names of the cameras with a result."""
+    return ", ".join(c.name for c in checks if c.fits is fits)
