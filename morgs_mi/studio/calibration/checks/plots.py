@@ -69,6 +69,14 @@ def write_rig(path: Path, capture: Capture, deep: DeepCheck | None = None) -> No
         OSError: the file cannot be written.
     """
     check_plot(path)
+    data = _plot(path.suffix[1:].lower(), capture, deep)
+    with atomic_path(path, "write_rig()") as partial:
+        partial.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_bytes(data)
+
+
+def _plot(suffix: str, capture: Capture, deep: DeepCheck | None) -> bytes:
+    """Return the file of the plot of a capture's rig, and of a check, if there is one."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -79,15 +87,12 @@ def write_rig(path: Path, capture: Capture, deep: DeepCheck | None = None) -> No
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
         figure = Figure(figsize=(_WIDTH, sum(heights)), layout="constrained")
         rows = figure.subfigures(len(heights), height_ratios=heights, squeeze=False)[:, 0]
-        draw_rig(
-            rows[0], capture.cameras, (capture.points, capture.point_colors), capture.test_views
-        )
+        points = (capture.points, capture.point_colors)
+        draw_rig(rows[0], capture.cameras, points, capture.test_views)
         if deep:
             draw_deep(rows[1], deep)
-        figure.savefig(data, format=path.suffix[1:].lower(), dpi=_DPI)
-    with atomic_path(path, "write_rig()") as partial:
-        partial.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(data.getbuffer())
+        figure.savefig(data, format=suffix, dpi=_DPI)
+    return data.getvalue()
 
 
 def draw_rig(
@@ -110,51 +115,94 @@ def draw_rig(
         test_views: indices of the held-out cameras, drawn in red.
     """
     right, forward, up = _directions(cameras)
-    positions = np.array([camera.position for camera in cameras])
-    middle = positions.mean(0)
-    radius = np.linalg.norm(positions - middle, axis=1).max() or 1.0
-    places, colors = (values[:: max(1, len(values) // _MAX_POINTS)] for values in points)
-    near = np.linalg.norm(places - middle, axis=1) < 8 * radius
-    places = places[near] - middle
-    frusta = np.array([_frustum(camera, 0.25 * radius) for camera in cameras]) - middle
-    core = np.percentile(places, [1, 99], axis=0) if len(places) else np.zeros((0, 3))
-    box = np.concatenate([frusta.reshape(-1, 3), core])
+    frusta, *cloud = _around_middle(cameras, *points)
+    labels = [
+        (camera.name or str(view), _MARKED if view in test_views else _USUAL)
+        for view, camera in enumerate(cameras)
+    ]
     above, side = figure.subplots(1, 2)
     _label(above, "From above", "right, world units", ylabel="forward, world units")
     _label(side, "From the right", "forward, world units", ylabel="up, world units")
     for axes, plane in ((above, np.stack([right, forward])), (side, np.stack([forward, up]))):
-        axes.scatter(*(plane @ places.T), s=1, c=np.clip(colors[near], 0, 1), rasterized=True)
-        for index, (camera, frustum) in enumerate(zip(cameras, frusta @ plane.T, strict=True)):
-            color = _MARKED if index in test_views else _USUAL
-            axes.plot(*frustum[_EDGES].T, color=color, linewidth=1)
-            axes.plot(*frustum[0], "o", color=color, markersize=4)
-            name = camera.name or str(index)
-            axes.annotate(name, frustum[0], xytext=(4, 4), textcoords="offset points", fontsize=8)
-        corners = box @ plane.T
-        half = 0.6 * max(np.ptp(corners, axis=0).max(), 1e-12)
-        limits = (corners.min(0) + corners.max(0))[:, None] / 2 + (-half, half)
-        axes.set(xlim=limits[0], ylim=limits[1], aspect="equal", axisbelow=True)
-        axes.grid(color="0.9")
-        for name, color, direction in zip("xyz", _THREE_COLORS, plane.T, strict=True):
-            arrow = {"arrowstyle": "<-", "color": color}
-            places_of_arrow = {
-                "xycoords": "axes fraction",
-                "xytext": 36 * direction,
-                "textcoords": "offset points",
-            }
-            if np.linalg.norm(direction) > 0.4:
-                axes.annotate(name, (0.12, 0.12), **places_of_arrow, color=color, arrowprops=arrow)
+        _draw_projection(axes, plane, frusta, labels, *cloud)
+        _draw_world_axes(axes, plane)
+
+
+def _draw_projection(
+    axes: Any,
+    plane: np.ndarray,
+    frusta: np.ndarray,
+    labels: Sequence[tuple[str, str]],
+    places: np.ndarray,
+    colors: np.ndarray,
+) -> None:
+    """Draw frusta [V, 5, 3], each with a name and a colour, and points on a plane [2, 3]."""
+    axes.scatter(*(plane @ places.T), s=1, c=np.clip(colors, 0, 1), rasterized=True)
+    for frustum, label in zip(frusta @ plane.T, labels, strict=True):
+        _draw_frustum(axes, frustum, *label)
+    core = np.percentile(places, [1, 99], axis=0) if len(places) else np.zeros((0, 3))
+    _frame(axes, np.concatenate([frusta.reshape(-1, 3), core]) @ plane.T)
+
+
+def _around_middle(
+    cameras: Sequence[Camera], points: np.ndarray, colors: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the frusta [V, 5, 3] of the cameras, a selection of the points [n, 3] near them, both
+    relative to the middle of the cameras, and the colours [n, 3].
+    """
+    positions = np.array([camera.position for camera in cameras])
+    middle = positions.mean(0)
+    radius = np.linalg.norm(positions - middle, axis=1).max() or 1.0
+    frusta = np.array([_frustum(camera, 0.25 * radius) for camera in cameras])
+    places, colors = (values[:: max(1, len(values) // _MAX_POINTS)] for values in (points, colors))
+    near = np.linalg.norm(places - middle, axis=1) < 8 * radius
+    return frusta - middle, places[near] - middle, colors[near]
+
+
+def _draw_frustum(axes: Any, frustum: np.ndarray, name: str, color: str) -> None:
+    """Draw a frustum [5, 2] with the camera's name."""
+    axes.plot(*frustum[_EDGES].T, color=color, linewidth=1)
+    axes.plot(*frustum[0], "o", color=color, markersize=4)
+    axes.annotate(name, frustum[0], xytext=(4, 4), textcoords="offset points", fontsize=8)
+
+
+def _frame(axes: Any, corners: np.ndarray) -> None:
+    """Set the limits of a panel to a square around positions [n, 2], and draw its grid."""
+    half = 0.6 * max(np.ptp(corners, axis=0).max(), 1e-12)
+    limits = (corners.min(0) + corners.max(0))[:, None] / 2 + (-half, half)
+    axes.set(xlim=limits[0], ylim=limits[1], aspect="equal", axisbelow=True)
+    axes.grid(color="0.9")
+
+
+def _draw_world_axes(axes: Any, plane: np.ndarray) -> None:
+    """Draw the world's axes in the corner of a panel that shows a plane [2, 3]."""
+    for name, color, direction in zip("xyz", _THREE_COLORS, plane.T, strict=True):
+        if np.linalg.norm(direction) > 0.4:
+            axes.annotate(
+                name,
+                (0.12, 0.12),
+                xycoords="axes fraction",
+                xytext=36 * direction,
+                textcoords="offset points",
+                color=color,
+                arrowprops={"arrowstyle": "<-", "color": color},
+            )
 
 
 def _directions(cameras: Sequence[Camera]) -> np.ndarray:
     """Return the rig's right, forward and up [3, 3], orthonormal."""
-    rotations = np.array([np.asarray(camera.viewmat, np.float64)[:3, :3] for camera in cameras])
     up = up_direction(cameras)
-    # Cameras all around a scene have no common forward direction: use the first camera's direction.
-    candidates = np.array([rotations[:, 2].mean(0), rotations[0, 2], np.cross(up, rotations[0, 0])])
+    candidates = _forward_candidates(cameras, up)
     level = candidates - np.outer(candidates @ up, up)
     forward = next(vector / length for vector in level if (length := np.linalg.norm(vector)) > 1e-3)
     return np.stack([np.cross(forward, up), forward, up])
+
+
+def _forward_candidates(cameras: Sequence[Camera], up: np.ndarray) -> np.ndarray:
+    """Return directions [3, 3] of which the first one that is not vertical is the rig's forward."""
+    rotations = np.array([np.asarray(camera.viewmat, np.float64)[:3, :3] for camera in cameras])
+    # Cameras all around a scene have no common forward direction: use the first camera's direction.
+    return np.array([rotations[:, 2].mean(0), rotations[0, 2], np.cross(up, rotations[0, 0])])
 
 
 def _frustum(camera: Camera, depth: float) -> np.ndarray:
@@ -177,6 +225,18 @@ def draw_deep(figure: Any, check: DeepCheck) -> None:
     panels = figure.subplot_mosaic(
         [["error", "time", "exposure", "overlap"], ["variation", "blur", *2 * ["repeats"]]]
     )
+    _draw_measures(panels, check)
+    brightness = 100 * np.expm1(check.brightness)
+    _curves(panels["variation"], brightness, check.names, _colors(check, "variation", "flicker"))
+    _label(panels["variation"], "Brightness over time, %", "frame", least=(-5, 5))
+    _curves(panels["blur"], check.sharpness, check.names, _colors(check, "blur"))
+    _label(panels["blur"], "Sharpness over time, octaves", "frame", least=(-1, 1))
+    _events(panels["repeats"], check)
+    _label(panels["repeats"], "Repeated frames (red) and missing ones (grey)", "frame")
+
+
+def _draw_measures(panels: dict[str, Any], check: DeepCheck) -> None:
+    """Plot what a check measures once for each camera."""
     for question, values, title, least in (
         ("error", check.errors[:, None], "Reprojection error, px", (0, 1)),
         ("time", check.offsets[:, None], "Time offset, frames", (-1, 1)),
@@ -185,13 +245,6 @@ def draw_deep(figure: Any, check: DeepCheck) -> None:
     ):
         _bars(panels[question], values, check.names, _colors(check, question))
         _label(panels[question], title, least=least)
-    brightness = 100 * np.expm1(check.brightness)
-    _curves(panels["variation"], brightness, check.names, _colors(check, "variation", "flicker"))
-    _label(panels["variation"], "Brightness over time, %", "frame", least=(-5, 5))
-    _curves(panels["blur"], check.sharpness, check.names, _colors(check, "blur"))
-    _label(panels["blur"], "Sharpness over time, octaves", "frame", least=(-1, 1))
-    _events(panels["repeats"], check)
-    _label(panels["repeats"], "Repeated frames (red) and missing ones (grey)", "frame")
 
 
 def _label(
@@ -216,16 +269,17 @@ def _bars(axes: Any, values: np.ndarray, names: Sequence[str], colors: Sequence[
     count = values.shape[1]
     for k, column in enumerate(values.T):
         places = np.arange(len(values)) + _BAR * ((k + 0.5) / count - 0.5)
-        axes.bar(
-            places,
-            np.nan_to_num(column),
-            _BAR / count,
-            color=_THREE_COLORS[k] if count > 1 else colors,
-        )
-        for place in places[~np.isfinite(column)]:
-            axes.annotate("?", (place, 0), ha="center", va="bottom", color="0.5")
+        color = _THREE_COLORS[k] if count > 1 else colors
+        axes.bar(places, np.nan_to_num(column), _BAR / count, color=color)
+        _mark_missing(axes, places[~np.isfinite(column)])
     axes.axhline(0, color="black", linewidth=0.8)
     _name_cameras(axes.xaxis, names, colors, rotation=90 if len(values) > 6 else 0)
+
+
+def _mark_missing(axes: Any, places: np.ndarray) -> None:
+    """Draw a question mark at each place along the horizontal axis."""
+    for place in places:
+        axes.annotate("?", (place, 0), ha="center", va="bottom", color="0.5")
 
 
 def _curves(axes: Any, values: np.ndarray, names: Sequence[str], colors: Sequence[str]) -> None:
@@ -233,14 +287,8 @@ def _curves(axes: Any, values: np.ndarray, names: Sequence[str], colors: Sequenc
     in a legend.
     """
     for name, color, curve in zip(names, colors, values.T, strict=True):
-        has_finding = color == _MARKED
-        axes.plot(
-            curve,
-            color=color,
-            linewidth=1,
-            zorder=3 if has_finding else 2,
-            label=name if has_finding else "_",
-        )
+        emphasis = {"zorder": 3, "label": name} if color == _MARKED else {"zorder": 2, "label": "_"}
+        axes.plot(curve, color=color, linewidth=1, **emphasis)
     if _MARKED in colors:
         axes.legend(fontsize=8)
     axes.set_xlim(-0.5, len(values) - 0.5)
@@ -249,12 +297,17 @@ def _curves(axes: Any, values: np.ndarray, names: Sequence[str], colors: Sequenc
 
 def _events(axes: Any, check: DeepCheck) -> None:
     """Draw a row per camera with the frames that repeat another or are missing."""
+    colors = np.array([(255, 255, 255), (190, 190, 190), (214, 39, 40)], np.uint8)
+    axes.imshow(colors[_states(check)], aspect="auto", interpolation="none")
+    _name_cameras(axes.yaxis, check.names, _colors(check, "repeats"))
+
+
+def _states(check: DeepCheck) -> np.ndarray:
+    """Return 0 for each image [C, T], 1 for a missing one, and 2 for one that repeats another."""
     states = np.isnan(check.sharpness.T).astype(int)
     for row, frames in zip(states, check.repeated, strict=True):
         row[list(frames)] = 2
-    colors = np.array([(255, 255, 255), (190, 190, 190), (214, 39, 40)], np.uint8)
-    axes.imshow(colors[states], aspect="auto", interpolation="none")
-    _name_cameras(axes.yaxis, check.names, _colors(check, "repeats"))
+    return states
 
 
 def _name_cameras(
