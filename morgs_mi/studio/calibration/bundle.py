@@ -24,8 +24,9 @@ influence.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -50,6 +51,14 @@ _LEAST_SCALE = 0.05
 _CAUCHY = 2.4
 
 
+class _Estimate(NamedTuple):
+    """Estimate of the cameras and points, and its errors."""
+
+    changes: np.ndarray  # of the cameras [V, 11]
+    points: np.ndarray  # [P, 3], world units
+    errors: np.ndarray  # projections minus the features [n, 2], px
+
+
 def bundle_adjust(
     cameras: Sequence[Camera], tracks: Tracks, deviations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -63,32 +72,41 @@ def bundle_adjust(
             `likely_deviations`.
     """
     damping = _DAMPING
-    changes = np.zeros((len(cameras), CHANGES))
-    points = intersect(tracks.ids, tracks.views, tracks.pixels, cameras, tracks.count)
-    errors = _errors(cameras, changes, points, tracks)
-    scale = _scale(errors)
-    loss = _loss(errors, changes, scale, deviations)
-    frame = _equations(cameras, changes, points, tracks, errors, scale).frame(points)
+    estimate = _initial_estimate(cameras, tracks)
+    scale = _scale(estimate.errors)
+    loss = _loss(estimate, scale, deviations)
+    frame = _equations(cameras, tracks, estimate, scale).frame(estimate.points)
     for _ in range(_STEPS):
-        equations = _equations(cameras, changes, points, tracks, errors, scale)
-        of_changes, of_points = equations.step(changes, deviations, damping, frame)
-        trial = changes + of_changes, points + of_points
-        trial_errors = _errors(cameras, *trial, tracks)
-        trial_loss = _loss(trial_errors, trial[0], scale, deviations)
-        if not trial_loss < loss:
+        equations = _equations(cameras, tracks, estimate, scale)
+        of_changes, of_points = equations.step(estimate.changes, deviations, damping, frame)
+        trial = _estimate(
+            cameras, tracks, estimate.changes + of_changes, estimate.points + of_points
+        )
+        trial_loss = _loss(trial, scale, deviations)
+        if trial_loss < loss:
+            estimate = trial
+            damping = damping / 10
+            if loss - trial_loss < _LEAST_DECREASE * loss:
+                break
+            scale = min(scale, _scale(estimate.errors))
+            loss = _loss(estimate, scale, deviations)
+        else:
             damping *= 10
             if damping > _MOST_DAMPING:
                 break
-            continue
-        converged = loss - trial_loss < _LEAST_DECREASE * loss
-        changes, points = trial
-        errors = trial_errors
-        damping = damping / 10
-        if converged:
-            break
-        scale = min(scale, _scale(errors))
-        loss = _loss(errors, changes, scale, deviations)
-    return changes, points
+    return estimate.changes, estimate.points
+
+
+def _initial_estimate(cameras: Sequence[Camera], tracks: Tracks) -> _Estimate:
+    """Return the estimate without changes of the cameras."""
+    points = intersect(tracks.ids, tracks.views, tracks.pixels, cameras, tracks.count)
+    return _estimate(cameras, tracks, np.zeros((len(cameras), CHANGES)), points)
+
+
+def _estimate(
+    cameras: Sequence[Camera], tracks: Tracks, changes: np.ndarray, points: np.ndarray
+) -> _Estimate:
+    return _Estimate(changes, points, _errors(cameras, changes, points, tracks))
 
 
 def likely_deviations(
@@ -105,22 +123,25 @@ def likely_deviations(
         tracks: features of P > 0 points.
         deviations: standard deviations of the priors [11], the upper bound of the result.
     """
-    points = intersect(tracks.ids, tracks.views, tracks.pixels, cameras, tracks.count)
-    errors = _errors(cameras, np.zeros((len(cameras), CHANGES)), points, tracks)
+    errors = _initial_estimate(cameras, tracks).errors
     return deviations * min(1.0, _scale(errors) / _LARGE_ERROR)
 
 
 def changed_camera(camera: Camera, changes: np.ndarray) -> Camera:
     """Return a camera with the changes [11] of the module docstring, without the distortion."""
     K = camera.K.copy()
-    V = np.eye(4)
     K[[0, 1], [0, 1]] *= 1 + changes[6]
     K[:2, 2] += changes[7:9] * camera.width
-    V[:3, :3] = (
-        cv2.Rodrigues(np.asarray(changes[:3], np.float64))[0] @ np.asarray(camera.viewmat)[:3, :3]
-    )
-    V[:3, 3] = -V[:3, :3] @ (camera.position + changes[3:6])
-    return replace(camera, K=K, viewmat=V)
+    return replace(camera, K=K, viewmat=_changed_pose(camera, changes[:3], changes[3:6]))
+
+
+def _changed_pose(camera: Camera, rotation: np.ndarray, displacement: np.ndarray) -> np.ndarray:
+    """Return the `viewmat` [4, 4] of a camera with a small rotation [3] and a displacement [3]."""
+    turn = cv2.Rodrigues(np.asarray(rotation, np.float64))[0]
+    V = np.eye(4)
+    V[:3, :3] = turn @ np.asarray(camera.viewmat)[:3, :3]
+    V[:3, 3] = -V[:3, :3] @ (camera.position + displacement)
+    return V
 
 
 def prior_deviations(extent: float, priors: CameraPriors) -> np.ndarray:
@@ -136,10 +157,18 @@ def distorted(camera: Camera, pixels: np.ndarray, distortion: np.ndarray) -> np.
     """Return the positions [n, 2] at which radial distortion k [2] shows the pixels [n, 2] of a
     pinhole camera.
     """
-    focal = camera.K[[0, 1], [0, 1]]
-    centre = camera.K[:2, 2]
-    square = np.sum(((pixels - centre) / focal) ** 2, axis=-1, keepdims=True)
-    return pixels + (pixels - centre) * (distortion[0] + distortion[1] * square) * square
+    from_centre = pixels - camera.K[:2, 2]
+    square = _square_radius(camera, from_centre)
+    return pixels + from_centre * (distortion[0] + distortion[1] * square) * square
+
+
+def _focal_lengths(camera: Camera) -> np.ndarray:
+    return camera.K[[0, 1], [0, 1]]
+
+
+def _square_radius(camera: Camera, from_centre: np.ndarray) -> np.ndarray:
+    """Return r^2 [n, 1] of pixels at positions [n, 2] relative to the principal point."""
+    return np.sum((from_centre / _focal_lengths(camera)) ** 2, axis=-1, keepdims=True)
 
 
 def undistorted(camera: Camera, pixels: np.ndarray, distortion: np.ndarray) -> np.ndarray:
@@ -173,27 +202,51 @@ def camera_jacobian(
     R = np.asarray(camera.viewmat, np.float64)[:3, :3]
     x = (points - camera.position) @ R.T
     front = x[:, 2] > camera.near
-    J = np.zeros((len(x), 2, CHANGES))
-    J[:, :, :3] = by_point @ R.T @ -_cross(x)
-    J[:, :, 3:6] = -by_point
     from_centre = camera.project(points[front])[0] - camera.K[:2, 2]
-    J[front, :, 6] = from_centre / factor
-    ray = from_centre / camera.K[[0, 1], [0, 1]]
-    square = np.sum(ray**2, axis=1, keepdims=True)
-    J[front, :, 9] = from_centre * square
-    J[front, :, 10] = from_centre * square**2
+    J = np.zeros((len(x), 2, CHANGES))
+    J[:, :, :6] = _pose_jacobian(R, x, by_point)
+    J[front, :, 6:] = _intrinsics_jacobian(camera, factor, from_centre)
     if distortion is not None and distortion.any():
-        k1, k2 = distortion
-        scale = 1 + (k1 + k2 * square) * square
-        slope = 2 * k1 + 4 * k2 * square
-        by_pixel = scale[..., None] * np.eye(2) + slope[..., None] * np.einsum(
-            "ni,nj,j->nij", from_centre, ray, 1 / camera.K[[0, 1], [0, 1]]
-        )
+        scale, by_pixel = _distortion_jacobian(camera, from_centre, distortion)
         J[front, :, :7] = by_pixel @ J[front, :, :7]
         by_point[front] = by_pixel @ by_point[front]
         J[front, :, 6] = from_centre * scale / factor
-    J[front, 0, 7] = J[front, 1, 8] = camera.width
     return J, by_point
+
+
+def _pose_jacobian(R: np.ndarray, x: np.ndarray, by_point: np.ndarray) -> np.ndarray:
+    """Return the derivatives [n, 2, 6] by w and d of pixels with derivatives by the points, which
+    are at x [n, 3] in the axes of a camera with the rotation R.
+    """
+    return np.concatenate([by_point @ R.T @ -_cross(x), -by_point], axis=2)
+
+
+def _intrinsics_jacobian(camera: Camera, factor: float, from_centre: np.ndarray) -> np.ndarray:
+    """Return the derivatives [n, 2, 5] by s, p and k of undistorted pixels at positions [n, 2]
+    relative to the principal point.
+    """
+    square = _square_radius(camera, from_centre)
+    J = np.zeros((len(from_centre), 2, 5))
+    J[:, :, 0] = from_centre / factor
+    J[:, [0, 1], [1, 2]] = camera.width
+    J[:, :, 3] = from_centre * square
+    J[:, :, 4] = from_centre * square**2
+    return J
+
+
+def _distortion_jacobian(
+    camera: Camera, from_centre: np.ndarray, distortion: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the factors [n, 1] by which distortion k [2] moves pixels away from the principal
+    point, and the derivatives [n, 2, 2] of the distorted pixels by the pixels.
+    """
+    k1, k2 = distortion
+    focal = _focal_lengths(camera)
+    square = _square_radius(camera, from_centre)
+    scale = 1 + (k1 + k2 * square) * square
+    slope = 2 * k1 + 4 * k2 * square
+    by_square = np.einsum("ni,nj,j->nij", from_centre, from_centre / focal, 1 / focal)
+    return scale, scale[..., None] * np.eye(2) + slope[..., None] * by_square
 
 
 class NormalEquations:
@@ -247,13 +300,8 @@ class NormalEquations:
         Args:
             points: [P, 3], world units.
         """
-        from_centre = points - points.mean(axis=0)
-        shifts = np.broadcast_to(np.eye(3), (len(points), 3, 3))
-        of_similarity = np.concatenate(
-            [-_cross(from_centre), shifts, from_centre[..., None]], axis=2
-        )
         rows = np.zeros((8, *self._right.shape))
-        rows[:7] = np.einsum("pij,pvki->jvk", of_similarity, self._coupling)
+        rows[:7] = np.einsum("pij,pvki->jvk", _similarity_jacobian(points), self._coupling)
         rows[7, :, 6] = 1
         return rows.reshape(8, -1)
 
@@ -273,24 +321,54 @@ class NormalEquations:
             damping: relative increase of the diagonal.
             frame: constraints on the changes after the step, as from `frame`; None: no constraints.
         """
-        views, size = changes.shape
         precision = deviations**-2.0
-        system = _damped(self._cameras + np.diag(precision), damping)
+        cameras = _damped(self._cameras + np.diag(precision), damping)
         points = _damped(self._points, damping)
-        coupling = self._coupling.reshape(len(points), views * size, 3)
-        solved = coupling @ np.linalg.inv(points)
-        full = np.zeros((views, size, views, size))
-        full[np.arange(views), :, np.arange(views)] = system
-        schur_complement = full.reshape(views * size, -1) - np.tensordot(
-            solved, coupling, axes=((0, 2), (0, 2))
-        )
-        right = (self._right + precision * changes).ravel() - np.einsum(
-            "pij,pj->i", solved, self._right_points
-        )
+        right = (self._right + precision * changes).ravel()
+        matrix, right = self._without_points(cameras, points, right)
         frame = np.zeros((0, right.size)) if frame is None else frame
-        step = _solved(schur_complement, -right, frame, -frame @ changes.ravel())
-        rest = -self._right_points - np.einsum("pij,i->pj", coupling, step)
-        return step.reshape(views, size), np.linalg.solve(points, rest[..., None])[..., 0]
+        step = _solved(matrix, -right, frame, -frame @ changes.ravel())
+        rest = -self._right_points - np.einsum("pij,i->pj", self._flat_coupling(), step)
+        return step.reshape(changes.shape), np.linalg.solve(points, rest[..., None])[..., 0]
+
+    def _without_points(
+        self, cameras: np.ndarray, points: np.ndarray, right: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the matrix [V 11, V 11] and the right side [V 11] after elimination of the points.
+
+        Args:
+            cameras: blocks [V, 11, 11] of the matrix.
+            points: blocks [P, 3, 3] of the matrix.
+            right: right side [V 11] before the elimination.
+        """
+        coupling = self._flat_coupling()
+        solved = coupling @ np.linalg.inv(points)
+        by_points = np.tensordot(solved, coupling, axes=((0, 2), (0, 2)))
+        return (
+            _block_diagonal(cameras) - by_points,
+            right - np.einsum("pij,pj->i", solved, self._right_points),
+        )
+
+    def _flat_coupling(self) -> np.ndarray:
+        """Return the blocks [P, V 11, 3] of the matrix that couple cameras and points."""
+        return self._coupling.reshape(len(self._points), self._right.size, 3)
+
+
+def _similarity_jacobian(points: np.ndarray) -> np.ndarray:
+    """Return the derivatives [P, 3, 7] of points [P, 3] by a rotation about their mean, a
+    displacement and a factor.
+    """
+    from_centre = points - points.mean(axis=0)
+    shifts = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    return np.concatenate([-_cross(from_centre), shifts, from_centre[..., None]], axis=2)
+
+
+def _block_diagonal(blocks: np.ndarray) -> np.ndarray:
+    """Return the matrix [n k, n k] of blocks [n, k, k]."""
+    count, size, _ = blocks.shape
+    matrix = np.zeros((count, size, count, size))
+    matrix[np.arange(count), :, np.arange(count)] = blocks
+    return matrix.reshape(count * size, -1)
 
 
 def _solved(A: np.ndarray, b: np.ndarray, rows: np.ndarray, value: np.ndarray) -> np.ndarray:
@@ -321,27 +399,28 @@ def _damped(blocks: np.ndarray, damping: float) -> np.ndarray:
     return blocks + increase[..., None] * np.eye(blocks.shape[-1])
 
 
+def _changed_views(
+    cameras: Sequence[Camera], changes: np.ndarray, tracks: Tracks
+) -> Iterator[tuple[np.ndarray, Camera, np.ndarray]]:
+    """Yield the mask of the features of each view, its changed camera, and the change [11]."""
+    for view, (camera, change) in enumerate(zip(cameras, changes, strict=True)):
+        yield tracks.views == view, changed_camera(camera, change), change
+
+
 def _equations(
-    cameras: Sequence[Camera],
-    changes: np.ndarray,
-    points: np.ndarray,
-    tracks: Tracks,
-    errors: np.ndarray,
-    scale: float,
+    cameras: Sequence[Camera], tracks: Tracks, estimate: _Estimate, scale: float
 ) -> NormalEquations:
     """Return the equations of a step of iteratively reweighted least squares, in units of the
     errors' scale.
     """
+    changes, points, errors = estimate
     equations = NormalEquations(len(cameras), tracks.count)
     weights = 1 / (scale**2 + (errors**2).sum(axis=1, keepdims=True) / _CAUCHY**2)
-    for view, (camera, change) in enumerate(zip(cameras, changes, strict=True)):
-        rows = tracks.views == view
-        changed_view = changed_camera(camera, change)
-        jacobians = camera_jacobian(
-            changed_view, 1 + change[6], points[tracks.ids[rows]], change[9:]
-        )
+    for view, (rows, camera, change) in enumerate(_changed_views(cameras, changes, tracks)):
+        ids = tracks.ids[rows]
+        jacobians = camera_jacobian(camera, 1 + change[6], points[ids], change[9:])
         w = weights[rows]
-        equations.add(view, tracks.ids[rows], jacobians, w[..., None] * np.eye(2), w * errors[rows])
+        equations.add(view, ids, jacobians, w[..., None] * np.eye(2), w * errors[rows])
     return equations
 
 
@@ -352,11 +431,9 @@ def _errors(
     errors = np.empty_like(tracks.pixels)
     depths = np.empty(len(tracks.ids))
     with np.errstate(divide="ignore", invalid="ignore"):
-        for view, (camera, change) in enumerate(zip(cameras, changes, strict=True)):
-            rows = tracks.views == view
-            changed_view = changed_camera(camera, change)
-            pixels, depths[rows] = changed_view.project(points[tracks.ids[rows]])
-            errors[rows] = distorted(changed_view, pixels, change[9:])
+        for rows, camera, change in _changed_views(cameras, changes, tracks):
+            pixels, depths[rows] = camera.project(points[tracks.ids[rows]])
+            errors[rows] = distorted(camera, pixels, change[9:])
         errors -= tracks.pixels
     return np.where((depths[:, None] > 0) & np.isfinite(errors), errors, 1e6)
 
@@ -367,6 +444,7 @@ def _scale(errors: np.ndarray) -> float:
     return max(_LEAST_SCALE, float(np.median(np.linalg.norm(errors, axis=1))) / 1.18)
 
 
-def _loss(errors: np.ndarray, changes: np.ndarray, scale: float, deviations: np.ndarray) -> float:
-    squares = (errors**2).sum(axis=1) / (_CAUCHY * scale) ** 2
-    return float(_CAUCHY**2 * np.log1p(squares).sum() + np.sum((changes / deviations) ** 2))
+def _loss(estimate: _Estimate, scale: float, deviations: np.ndarray) -> float:
+    squares = (estimate.errors**2).sum(axis=1) / (_CAUCHY * scale) ** 2
+    cost = _CAUCHY**2 * np.log1p(squares).sum()
+    return float(cost + np.sum((estimate.changes / deviations) ** 2))

@@ -102,19 +102,23 @@ class OffsetEquations:
     def _inverse(self, damping: float, share: float = 1.0) -> np.ndarray:
         """Return the matrix [V, V] that turns r into o."""
         train = self.train
+        block = np.ix_(train, train)
         scale = self.own.mean() or 1.0
-        count = int(self.train.sum())
-        centred = np.eye(count) - 1 / count
-        values, vectors = np.linalg.eigh(centred @ self.matrix[np.ix_(train, train)] @ centred)
-        inverse = (vectors / (np.maximum(values, 0) + damping * scale)) @ vectors.T
+        diagonal = np.diag(self.matrix) + _FLOOR * scale
         whole = np.zeros_like(self.matrix)
-        whole[np.ix_(train, train)] = centred @ inverse @ centred / share
+        whole[block] = _centred_inverse(self.matrix[block], damping * scale) / share
         for view in np.flatnonzero(~train):
-            diagonal = self.matrix[view, view] + _FLOOR * scale
-            whole[view] = (
-                np.eye(len(train))[view] - self.matrix[view, train] @ whole[train]
-            ) / diagonal
+            unit = np.eye(len(train))[view]
+            whole[view] = (unit - self.matrix[view, train] @ whole[train]) / diagonal[view]
         return whole
+
+
+def _centred_inverse(matrix: np.ndarray, damping: float) -> np.ndarray:
+    """Return the inverse of a damped matrix [n, n] among vectors with a mean of zero."""
+    centred = np.eye(len(matrix)) - 1 / len(matrix)
+    values, vectors = np.linalg.eigh(centred @ matrix @ centred)
+    inverse = (vectors / (np.maximum(values, 0) + damping)) @ vectors.T
+    return centred @ inverse @ centred
 
 
 def offset_equations(
@@ -134,26 +138,28 @@ def offset_equations(
         blur: standard deviation in pixels of a Gaussian filter of errors and gradients. Offsets
             with displacements up to about this value can be found; 0: no filter.
     """
-    motion = np.asarray(gaussians.motion, np.float64)
-    moving = (motion != 0).any(axis=1)
-    d = motion[moving]
+    moving = (np.asarray(gaussians.motion) != 0).any(axis=1)
+    d = np.asarray(gaussians.motion, np.float64)[moving]
     means = np.asarray(gaussians.means, np.float64)[moving]
+    products = [_products(gaussians, *each, blur) for each in zip(views, targets, strict=True)]
+    A, b = (np.stack([each[moving] for each in kind]) for kind in zip(*products, strict=True))
     J = np.stack([view.camera.projection_jacobian(means) for view in views])
-    sums = [_products(gaussians, *each, blur) for each in zip(views, targets, strict=True)]
-    A, b = (np.stack([each[moving] for each in kind]) for kind in zip(*sums, strict=True))
     b = np.einsum("vkai,vka->vki", J, b)
     H = np.einsum("vkai,vkab,vkbj->vkij", J, A, J)
     c = np.einsum("vkij,kj->vki", H, d)
-    total = H[train].sum(axis=0)
-    prior = _PRIOR * np.trace(total, axis1=1, axis2=2) / 3 + np.finfo(float).tiny
-    inverse = np.linalg.inv(total + prior[:, None, None] * np.eye(3))
-    weights = np.einsum("vki,kij->vkj", c, inverse)
+    weights = np.einsum("vki,kij->vkj", c, _inverses(H[train].sum(axis=0)))
     diagonal = np.einsum("vki,ki->v", c, d)
     matrix = np.diag(diagonal)
     matrix[:, train] -= np.einsum("vki,wki->vw", weights, c[train])
     parts = np.einsum("vki,ki->vk", weights, b[train].sum(axis=0)) - np.einsum("vki,ki->vk", b, d)
     groups = _grouped(parts, means)
     return OffsetEquations(matrix, parts.sum(axis=1), groups @ groups.T, diagonal, train)
+
+
+def _inverses(curvatures: np.ndarray) -> np.ndarray:
+    """Return the inverses [n, 3, 3] of H from its sums over the views."""
+    prior = _PRIOR * np.trace(curvatures, axis1=1, axis2=2) / 3 + np.finfo(float).tiny
+    return np.linalg.inv(curvatures + prior[:, None, None] * np.eye(3))
 
 
 def _grouped(parts: np.ndarray, means: np.ndarray) -> np.ndarray:

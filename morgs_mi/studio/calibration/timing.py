@@ -117,12 +117,7 @@ def estimate_time_offsets(
     if len(capture.cameras) < 2:
         raise ValueError(f"{capture.path}: expected at least 2 cameras to compare clocks, got 1.")
     clips = _Clips.of(capture)
-    largest = min(_LARGEST, (clips.num_frames - 2) // 2)
-    if largest < 1:
-        raise ValueError(
-            f"{capture.path}: expected at least 4 frames to compare clocks, got "
-            f"{clips.num_frames}; record longer."
-        )
+    largest = _largest_offset(clips)
     instants = np.linspace(largest, clips.num_frames - 2 - largest, _INSTANTS).round().astype(int)
     rounds = _Rounds(clips, instants, seed, progress)
     offsets, step, equations = _aligned(rounds, largest)
@@ -132,31 +127,41 @@ def estimate_time_offsets(
     return _relative(capture, offsets, errors, float(np.abs(step).max()))
 
 
+def _largest_offset(clips: _Clips) -> int:
+    """Return the largest offset in frames that clips can show."""
+    largest = min(_LARGEST, (clips.num_frames - 2) // 2)
+    if largest < 1:
+        raise ValueError(
+            f"{clips.path}: expected at least 4 frames to compare clocks, got "
+            f"{clips.num_frames}; record longer."
+        )
+    return largest
+
+
 def _aligned(rounds: _Rounds, largest: int) -> tuple[np.ndarray, np.ndarray, OffsetEquations]:
     """Return offsets [V] of at most `largest`, the last step [V], and the step's equations."""
-    clips = rounds.clips
-    offsets = np.zeros(len(clips.cameras))
-    step = np.zeros(len(clips.cameras))
-    solution = None
+    train = rounds.clips.train
+    offsets = np.zeros(len(rounds.clips.cameras))
+    step = offsets
+    solution = offsets
     for index, blur in enumerate(_BLUR_OF_ROUND):
         equations = rounds.equations(offsets, blur)
-        previous = solution if blur in _BLUR_OF_ROUND[:index] else None
+        previous = solution
         solution = equations.solution()
-        share = (
-            1.0
-            if previous is None
-            else _share(step[clips.train], (solution - previous)[clips.train])
-        )
-        result = np.clip(
-            offsets + np.clip(equations.solution(share), -_LONGEST_STEP, _LONGEST_STEP),
-            -largest,
-            largest,
-        )
+        change = solution - previous
+        share = _share(step[train], change[train]) if blur in _BLUR_OF_ROUND[:index] else 1.0
+        result = _next_offsets(offsets, equations.solution(share), largest)
         step = result - offsets
         offsets = result
         if not blur and np.abs(step).max() < _TOLERANCE:
             break
     return offsets, step, equations
+
+
+def _next_offsets(offsets: np.ndarray, solution: np.ndarray, largest: int) -> np.ndarray:
+    """Return the offsets [V] after a step, both within their bounds."""
+    step = np.clip(solution, -_LONGEST_STEP, _LONGEST_STEP)
+    return np.clip(offsets + step, -largest, largest)
 
 
 def _share(step: np.ndarray, change: np.ndarray) -> float:
@@ -193,18 +198,20 @@ class _Rounds:
         """Return the sum of the equations of all instants, with images interpolated by offsets [V]
         and blurred.
         """
-        instants_equations = []
-        for instant in self.instants:
-            instants_equations.append(_equations_at(self.clips, instant - offsets, blur, self.seed))
-            self.done += 1
-            if self.progress is not None:
-                self.progress(self.done, (len(_BLUR_OF_ROUND) + 1) * len(self.instants))
-        equations = reduce(add, instants_equations)
+        equations = reduce(add, [self._instant_equations(i - offsets, blur) for i in self.instants])
         if not equations.own.any():
             raise ValueError(
                 f"{self.clips.path}: expected motion in the first {self.clips.num_frames} frames, "
                 "found none; record something that moves."
             )
+        return equations
+
+    def _instant_equations(self, times: np.ndarray, blur: float) -> OffsetEquations:
+        """Return the equations of an instant, and report the fit."""
+        equations = _equations_at(self.clips, times, blur, self.seed)
+        self.done += 1
+        if self.progress is not None:
+            self.progress(self.done, (len(_BLUR_OF_ROUND) + 1) * len(self.instants))
         return equations
 
 
@@ -223,26 +230,16 @@ class _Clips:
     @classmethod
     def of(cls, capture: Capture) -> _Clips:
         display = capture.displayed()
-        clips = [
-            [_checked(image) for image in display.images(v, 0, _FRAMES)]
-            for v in range(len(capture.cameras))
-        ]
+        clips = [_clip(display, view) for view in range(len(capture.cameras))]
         views = zip(capture.cameras, (clip[0] for clip in clips), capture.masks, strict=True)
         small, _, masks = zip(*(View(*view).reduced(_WIDTH) for view in views), strict=True)
         # The images are whole frames: with the capture's delays they would be displaced twice.
         cameras = tuple(camera.without_delays() for camera in small)
-        images = tuple(
-            tuple(
-                np.asarray(cv2.resize(image, (c.width, c.height), interpolation=cv2.INTER_AREA))
-                for image in clip
-            )
-            for clip, c in zip(clips, cameras, strict=True)
-        )
         return cls(
             capture.path,
             cameras,
             masks,
-            images,
+            tuple(_reduced(*each) for each in zip(clips, cameras, strict=True)),
             list(capture.train_views),
             capture.points,
             capture.point_colors,
@@ -258,10 +255,26 @@ class _Clips:
         times = np.clip(times, 0, self.num_frames - 1)
         first = np.minimum(np.floor(times).astype(int), self.num_frames - 2)
         views = zip(self.images, first, times - first, strict=True)
-        return [
-            clip[k + round(s)] if s in (0, 1) else image_between(clip[k], clip[k + 1], s)
-            for clip, k, s in views
-        ]
+        return [_image_at(*view) for view in views]
+
+
+def _image_at(clip: Sequence[np.ndarray], frame: int, share: float) -> np.ndarray:
+    """Return the image of a clip at a share of the time from a frame to the next one."""
+    if share in (0, 1):
+        return clip[frame + round(share)]
+    return image_between(clip[frame], clip[frame + 1], share)
+
+
+def _clip(capture: Capture, view: int) -> list[np.ndarray]:
+    """Return the first images of a view."""
+    return [_checked(image) for image in capture.images(view, 0, _FRAMES)]
+
+
+def _reduced(clip: Sequence[np.ndarray], camera: Camera) -> tuple[np.ndarray, ...]:
+    """Return the images of a clip in the size of a camera."""
+    size = (camera.width, camera.height)
+    images = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in clip)
+    return tuple(map(np.asarray, images))
 
 
 def _checked(image: ImageOrError) -> np.ndarray:
@@ -276,13 +289,19 @@ def _equations_at(clips: _Clips, times: np.ndarray, blur: float, seed: int) -> O
     next_images = clips.at(times + 1)
     targets = [Target(image, mask) for image, mask in zip(images, clips.masks, strict=True)]
     gaussians = _fitted(clips, images, 2 if blur else 1, seed)
-    pairs = {v: FramePair(next_images[v], images[v], valid=clips.masks[v]) for v in clips.train}
     views = [ActiveView(camera) for camera in clips.cameras]
-    flow = lift_flow(gaussians, {v: views[v] for v in clips.train}, observe_key_views(pairs))
+    pairs = {v: FramePair(next_images[v], images[v], valid=clips.masks[v]) for v in clips.train}
+    gaussians = _with_motion(gaussians, {v: views[v] for v in clips.train}, pairs)
     train = np.isin(np.arange(len(views)), clips.train)
-    return offset_equations(
-        replace(gaussians, motion=flow.displacement), views, targets, train, blur
-    )
+    return offset_equations(gaussians, views, targets, train, blur)
+
+
+def _with_motion(
+    gaussians: Gaussians, views: dict[int, ActiveView], pairs: dict[int, FramePair]
+) -> Gaussians:
+    """Return Gaussians with the motion to the next frame that the flow of some views shows."""
+    flow = lift_flow(gaussians, views, observe_key_views(pairs))
+    return replace(gaussians, motion=flow.displacement)
 
 
 def _fitted(clips: _Clips, images: Sequence[np.ndarray], divisor: int, seed: int) -> Gaussians:
@@ -294,18 +313,23 @@ def _fitted(clips: _Clips, images: Sequence[np.ndarray], divisor: int, seed: int
         divisor: divisor of the numbers of Gaussians and steps.
         seed: seed of the fit.
     """
-    fit = FitConfig(
+    fit = _fit_config(divisor)
+    views = [View(clips.cameras[v], images[v], clips.masks[v]) for v in clips.train]
+    rng = rng_of(seed, Stream.TIMING)
+    points = (clips.points, clips.point_colors)
+    problem = FirstFrameProblem.of(views, points, fit, RenderConfig(), rng)
+    return fit_first_frame(problem, fit, rng).gaussians
+
+
+def _fit_config(divisor: int) -> FitConfig:
+    """Return the settings of a fit, with the numbers of Gaussians and steps divided."""
+    return FitConfig(
         sh_degree=0,
         num_gaussians=GAUSSIANS // divisor,
         first_frame_steps=STEPS // divisor,
         dropping=0.0,
         density=DensityConfig(rounds=0),
     )
-    views = [View(clips.cameras[v], images[v], clips.masks[v]) for v in clips.train]
-    rng = rng_of(seed, Stream.TIMING)
-    points = (clips.points, clips.point_colors)
-    problem = FirstFrameProblem.of(views, points, fit, RenderConfig(), rng)
-    return fit_first_frame(problem, fit, rng).gaussians
 
 
 def _relative(
@@ -314,15 +338,22 @@ def _relative(
     """Return the result with the offsets relative to the reference, in addition to the capture's
     offsets.
     """
-    reference = capture.reference_view
-    settings = capture.reading.offset
     clocks = offsets - [camera.delay for camera in capture.cameras]
-    options = {
-        n: settings.get(n, 0.0) - (o - clocks[reference])
-        for n, o in zip(capture.names, clocks, strict=True)
-    }
-    rounded_offsets = {name: round(float(offset), 3) + 0.0 for name, offset in options.items()}
-    rounded_errors = dict(zip(capture.names, np.round(errors, 3).tolist(), strict=True))
     return TimeOffsets(
-        rounded_offsets, rounded_errors, capture.names[reference], change, change < _TOLERANCE
+        _options(capture, clocks),
+        dict(zip(capture.names, np.round(errors, 3).tolist(), strict=True)),
+        capture.names[capture.reference_view],
+        change,
+        change < _TOLERANCE,
     )
+
+
+def _options(capture: Capture, clocks: np.ndarray) -> dict[str, float]:
+    """Return the setting `offset` that aligns cameras with clocks [V], in frames."""
+    settings = capture.reading.offset
+    reference = clocks[capture.reference_view]
+    options = {
+        name: settings.get(name, 0.0) - (clock - reference)
+        for name, clock in zip(capture.names, clocks, strict=True)
+    }
+    return {name: round(float(offset), 3) + 0.0 for name, offset in options.items()}
