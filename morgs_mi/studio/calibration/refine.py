@@ -35,14 +35,14 @@ from typing import Any
 import numpy as np
 
 from morgs_mi.capture.capture import Capture, PartialFrame
-from morgs_mi.capture.features import detect, intersect, join_matches, match_views
+from morgs_mi.capture.features import Tracks, detect, intersect, join_matches, match_views
 from morgs_mi.capture.lens import Lens, undistortion
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.rig import scene_extent, seen_points
 from morgs_mi.fit.first_frame import fit_first_frame
-from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.fit.fit_config import FitConfig, LearningRates
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.view import LEAST_GAIN, View, mean_psnr, withheld_blocks
 from morgs_mi.loop.stream_config import StreamConfig
@@ -109,20 +109,24 @@ class Refinement:
     @property
     def sentence(self) -> str:
         """The change of the cameras and its reason, in a sentence."""
-        sizes = (
-            f"by up to {self.rotation:.2g} degrees, {self.position:.2g} units, "
-            f"{100 * self.focal:.2g} % of the "
-        )
-        sizes += f"focal length and {100 * self.distortion:.2g} % of the image's width by the lens"
         scores = (
             f"withheld pixels have {self.refined_psnr:.2f} dB instead of "
             f"{self.calibrated_psnr:.2f} dB"
         )
         if np.isnan(self.calibrated_psnr):
-            return f"The cameras were refined, {sizes}."
+            return f"The cameras were refined, {self._sizes}."
         if self.taken:
-            return f"The cameras were refined, {sizes}: {scores}."
+            return f"The cameras were refined, {self._sizes}: {scores}."
         return f"The cameras stay as calibrated: refined ones are no clear gain, {scores}."
+
+    @property
+    def _sizes(self) -> str:
+        """The sizes of the changes in words."""
+        return (
+            f"by up to {self.rotation:.2g} degrees, {self.position:.2g} units, "
+            f"{100 * self.focal:.2g} % of the focal length and {100 * self.distortion:.2g} % of "
+            "the image's width by the lens"
+        )
 
     def validation(
         self, capture: Capture, gaussians: Gaussians, frame: PartialFrame, config: StreamConfig
@@ -140,22 +144,32 @@ class Refinement:
             config: settings of the fit.
         """
         result = {**asdict(self), "sentence": self.sentence}
-        images = [(v, image) for v in capture.test_views if (image := frame.images[v]) is not None]
-        if not images:
+        views = [view for v in capture.test_views if (view := _view(capture, frame.images, v))]
+        if not views:
             return result
-        views = [View(capture.cameras[v], image, capture.masks[v]) for v, image in images]
-        extent = scene_extent([capture.cameras[v] for v in capture.train_views])
-        registered = [
-            view._replace(
-                camera=register_camera(gaussians, view, extent, config.fit, config.render)
-            )
-            for view in views
-        ]
         calibrated_psnr = mean_psnr(gaussians, views, config.render)
+        registered = _registered_views(capture, gaussians, views, config)
         registered_psnr = mean_psnr(gaussians, registered, config.render)
         return result | {
             "held_out": {"calibrated_psnr": calibrated_psnr, "registered_psnr": registered_psnr}
         }
+
+
+def _view(capture: Capture, images: Sequence[np.ndarray | None], view: int) -> View | None:
+    """Return a view of a capture with its image, or None without an image."""
+    image = images[view]
+    return None if image is None else View(capture.cameras[view], image, capture.masks[view])
+
+
+def _registered_views(
+    capture: Capture, gaussians: Gaussians, views: Sequence[View], config: StreamConfig
+) -> list[View]:
+    """Return views of a capture with registered cameras."""
+    extent = scene_extent([capture.cameras[v] for v in capture.train_views])
+    cameras = [
+        register_camera(gaussians, view, extent, config.fit, config.render) for view in views
+    ]
+    return [view._replace(camera=camera) for view, camera in zip(views, cameras, strict=True)]
 
 
 def refine_cameras(
@@ -178,22 +192,20 @@ def refine_cameras(
     Raises:
         ValueError: fewer than two training views have an image of the first frame.
     """
-    rounds = config.short_fits.rounds
-    report = progress or (lambda done, count: None)
     problem = _Problem.of(capture, config, render or RenderConfig(), seed)
     bundle_changes, tracks, deviations = _matched(capture, problem.indices, problem.deviations)
     # Cameras of the calibration, of the bundle adjustment, and of the images; a single set is not
     # compared.
     has_rival = config.refine_cameras == "auto"
     estimates = [0 * bundle_changes] * has_rival + [bundle_changes] * bool(tracks)
-    fits = rounds + len(estimates) + bool(estimates)
-    estimates.append(problem.refined(bundle_changes, deviations, lambda done: report(done, fits)))
-    scores = [float("nan")]
-    if len(estimates) > 1:
-        scores = []
-        for done, changes in enumerate(estimates, rounds):
-            report(done, fits)
-            scores.append(problem.score(changes))
+    fits = config.short_fits.rounds + len(estimates) + bool(estimates)
+
+    def report(done: int) -> None:
+        if progress is not None:
+            progress(done, fits)
+
+    estimates.append(problem.refined(bundle_changes, deviations, report))
+    scores = problem.scores(estimates, report) if len(estimates) > 1 else [float("nan")]
     best = has_rival + int(np.argmax(scores[has_rival:]))
     calibrated = scores[0] if has_rival else float("nan")
     is_better = not scores[best] < calibrated + LEAST_GAIN
@@ -219,17 +231,7 @@ class _Problem:
     @classmethod
     def of(cls, capture: Capture, config: FitConfig, render: RenderConfig, seed: int) -> _Problem:
         """Return the problem of the first frame of a capture; raises as `refine_cameras`."""
-        images = next(capture.displayed().partial_frames(0, 1)).images
-        train = {
-            v: View(capture.cameras[v], image, capture.masks[v])
-            for v in capture.train_views
-            if (image := images[v]) is not None
-        }
-        if len(train) < 2:
-            raise ValueError(
-                "refine_cameras(): expected images of at least two training views, got "
-                f"{len(train)}; record more, or set `refine_cameras` to off."
-            )
+        train = _training_views(capture)
         rng = rng_of(seed, Stream.WITHHELD_BLOCKS)
         views, withheld_views = withheld_blocks(list(train.values()), config.short_fits.width, rng)
         extent = scene_extent([view.camera for view in train.values()])
@@ -271,6 +273,16 @@ class _Problem:
             problem = replace(problem, start=gaussians)
         return changes
 
+    def scores(self, estimates: Sequence[np.ndarray], report: Callable[[int], None]) -> list[float]:
+        """Return the score of each of several changes; `report` is called with the number of
+        completed fits.
+        """
+        scores = []
+        for done, changes in enumerate(estimates, self.config.short_fits.rounds):
+            report(done)
+            scores.append(self.score(changes))
+        return scores
+
     def score(self, changes: np.ndarray) -> float:
         """Return the PSNR of the withheld pixels after a fit with changed cameras, dB."""
         withheld_views = [view for view in _changed(self.unseen, changes) if np.any(view.mask)]
@@ -291,16 +303,15 @@ class _Problem:
 
     def changed_capture(self, changes: np.ndarray) -> Capture:
         """Return the capture with changed cameras and moved points."""
-        capture = self.capture
-        pairs = zip(self.cameras, changes, strict=True)
-        refined_cameras = dict(
-            zip(self.indices, (changed_camera(*pair) for pair in pairs), strict=True)
-        )
-        distortions = dict(zip(self.indices, changes[:, 9:].tolist(), strict=True))
-        cameras = [refined_cameras.get(v, camera) for v, camera in enumerate(capture.cameras)]
-        rig = capture.with_cameras(
-            cameras, [distortions.get(v, (0.0, 0.0)) for v in range(len(cameras))]
-        )
+        rows = dict(zip(self.indices, changes, strict=True))
+        cameras = [
+            changed_camera(camera, rows[v]) if v in rows else camera
+            for v, camera in enumerate(self.capture.cameras)
+        ]
+        distortions = [
+            rows[v][9:].tolist() if v in rows else (0.0, 0.0) for v in range(len(cameras))
+        ]
+        rig = self.capture.with_cameras(cameras, distortions)
         return replace(rig, points=self._points(changes))
 
     def _points(self, changes: np.ndarray) -> np.ndarray:
@@ -320,6 +331,18 @@ class _Problem:
         ).gaussians
 
 
+def _training_views(capture: Capture) -> dict[int, View]:
+    """Return the training views with an image of the first frame, by index."""
+    images = next(capture.displayed().partial_frames(0, 1)).images
+    views = {v: view for v in capture.train_views if (view := _view(capture, images, v))}
+    if len(views) < 2:
+        raise ValueError(
+            "refine_cameras(): expected images of at least two training views, got "
+            f"{len(views)}; record more, or set `refine_cameras` to off."
+        )
+    return views
+
+
 def register_camera(
     gaussians: Gaussians,
     view: View,
@@ -337,30 +360,55 @@ def register_camera(
         render: cut-offs.
     """
     render = render or RenderConfig()
-    camera = view.camera
-    target = view.target
     priors = replace(config.camera_priors, distortion=_NO_DISTORTION)  # the image is not changed
     deviations = prior_deviations(extent, priors)
-    best = np.zeros((1, CHANGES))
-    means = np.asarray(gaussians.means, np.float64)
+    changes = np.zeros((1, CHANGES))
     for blur in (*_BLURS, 0.0):
-        changes = best
-        error = np.inf
-        for _ in range(_REGISTRATION_STEPS):
-            changed_view = changed_camera(camera, changes[0])
-            G, b, new_error = _shifts(gaussians, changed_view, target, blur, render)
-            if not new_error < error:
-                break
-            best = changes
-            error = new_error
-            equations = NormalEquations(1, 0)
-            of_camera, _ = camera_jacobian(changed_view, 1 + changes[0, 6], means)
-            equations.add_camera(0, of_camera, G / new_error / _ALIKE, b / new_error / _ALIKE)
-            step, _ = equations.step(changes, deviations, 0.0)
-            changes = changes + step
-            if np.abs(of_camera @ step[0]).mean() < _LEAST_SHIFT:
-                break
-    return changed_camera(camera, best[0])
+        changes = _registration(gaussians, view, changes, deviations, blur, render)
+    return changed_camera(view.camera, changes[0])
+
+
+def _registration(
+    gaussians: Gaussians,
+    view: View,
+    changes: np.ndarray,
+    deviations: np.ndarray,
+    blur: float,
+    render: RenderConfig,
+) -> np.ndarray:
+    """Return the changes [1, 11] of a camera, from initial ones, with which a blurred image fits
+    best.
+    """
+    target = view.target
+    means = np.asarray(gaussians.means, np.float64)
+    best = changes
+    error = np.inf
+    for _ in range(_REGISTRATION_STEPS):
+        camera = changed_camera(view.camera, changes[0])
+        observations = _shifts(gaussians, camera, target, blur, render)
+        if not observations[2] < error:
+            break
+        best = changes
+        error = observations[2]
+        of_camera, _ = camera_jacobian(camera, 1 + changes[0, 6], means)
+        step = _registration_step(of_camera, observations, changes, deviations)
+        changes = changes + step
+        if np.abs(of_camera @ step[0]).mean() < _LEAST_SHIFT:
+            break
+    return best
+
+
+def _registration_step(
+    of_camera: np.ndarray,
+    observations: tuple[np.ndarray, np.ndarray, float],
+    changes: np.ndarray,
+    deviations: np.ndarray,
+) -> np.ndarray:
+    """Return the Gauss-Newton step [1, 11] of a camera; observations as from `_shifts`."""
+    G, b, error = observations
+    equations = NormalEquations(1, 0)
+    equations.add_camera(0, of_camera, G / error / _ALIKE, b / error / _ALIKE)
+    return equations.step(changes, deviations, 0.0)[0]
 
 
 def _matched(
@@ -372,14 +420,19 @@ def _matched(
     Without enough points, there are no changes, and the deviations equal the priors' deviations.
     """
     recording = capture.displayed().at_recorded_size()
-    images = next(recording.partial_frames(0, 1)).images
     cameras = [recording.cameras[v] for v in train]
-    features = [detect(images[v], recording.masks[v]) for v in train]
-    tracks = join_matches(match_views(features, cameras), features)
+    tracks = _tracks(recording, train)
     if np.bincount(tracks.views, minlength=len(train)).min() < _MIN_TRACKS:
         return np.zeros((len(train), CHANGES)), 0, deviations
     deviations = likely_deviations(cameras, tracks, deviations)
     return bundle_adjust(cameras, tracks, deviations)[0], tracks.count, deviations
+
+
+def _tracks(recording: Capture, train: Sequence[int]) -> Tracks:
+    """Return the tracks of features between some views of the first frame."""
+    images = next(recording.partial_frames(0, 1)).images
+    features = [detect(images[v], recording.masks[v]) for v in train]
+    return join_matches(match_views(features, [recording.cameras[v] for v in train]), features)
 
 
 def _changed(views: Sequence[View], changes: np.ndarray) -> list[View]:
@@ -413,22 +466,32 @@ def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -
     """Return points [P, 3] moved to keep their projections in the views that show them, with
     changed cameras.
     """
-    rig = [changed_camera(*pair) for pair in zip(cameras, changes, strict=True)]
     hits = [seen_points(camera, points)[:2] for camera in cameras]
-    ids = np.concatenate([np.flatnonzero(mask) for mask, _ in hits])
-    views = np.repeat(np.arange(len(cameras)), [len(pixels) for _, pixels in hits])
-    if not len(ids):
+    counts = np.sum([mask for mask, _ in hits], axis=0)
+    if not counts.any():
         return points
+    intersections = _intersections(hits, cameras, changes)
+    is_determined = (counts >= 2) & np.isfinite(intersections).all(axis=1)
+    return np.where(is_determined[:, None], intersections, points).astype(np.float32)
+
+
+def _intersections(
+    hits: Sequence[tuple[np.ndarray, np.ndarray]], cameras: Sequence[Camera], changes: np.ndarray
+) -> np.ndarray:
+    """Return the points [P, 3] that changed cameras see at the same pixels.
+
+    Args:
+        hits: per view the mask [P] of the points in it, and their pixels [n, 2].
+        cameras: V views before the changes.
+        changes: changes of the cameras [V, 11].
+    """
+    rig = [changed_camera(*pair) for pair in zip(cameras, changes, strict=True)]
     pixels = [
         undistorted(c, pixels, change[9:])
         for c, (_, pixels), change in zip(rig, hits, changes, strict=True)
     ]
-    intersections = intersect(ids, views, np.concatenate(pixels), rig, len(points))
-    several = np.bincount(ids, minlength=len(points)) >= 2
-    moved_points = np.where(
-        (several & np.isfinite(intersections).all(axis=1))[:, None], intersections, points
-    )
-    return moved_points.astype(np.float32)
+    views, ids = np.nonzero([mask for mask, _ in hits])
+    return intersect(ids, views, np.concatenate(pixels), rig, len(hits[0][0]))
 
 
 def _short(config: FitConfig, is_later: bool = False) -> FitConfig:
@@ -439,19 +502,21 @@ def _short(config: FitConfig, is_later: bool = False) -> FitConfig:
     """
     how = config.short_fits
     rates = config.first_frame_rates
-    if is_later:
-        rates = replace(
-            rates, **{name: factor * getattr(rates, name) for name, factor in _LATER_RATES.items()}
-        )
     return replace(
         config,
         sh_degree=0,
         num_gaussians=how.gaussians,
         first_frame_steps=how.steps // 2 if is_later else how.steps,
-        first_frame_rates=rates,
+        first_frame_rates=_later(rates) if is_later else rates,
         dropping=0.0,
         density=replace(config.density, rounds=0),
     )
+
+
+def _later(rates: LearningRates) -> LearningRates:
+    """Return the learning rates of the rounds after the first."""
+    factors = _LATER_RATES.items()
+    return replace(rates, **{name: factor * getattr(rates, name) for name, factor in factors})
 
 
 def _joint_step(
@@ -468,17 +533,32 @@ def _joint_step(
     means = np.asarray(gaussians.means, np.float64)
     changed_views = _changed(views, changes)
     shifts = [_shifts(gaussians, view.camera, view.target, blur, render) for view in changed_views]
-    variance = _ALIKE * np.mean([error for *_, error in shifts])
-    equations = NormalEquations(len(views), len(means))
-    for v, (view, (G, b, _)) in enumerate(zip(changed_views, shifts, strict=True)):
-        jacobian = camera_jacobian(view.camera, 1 + changes[v, 6], means)
-        equations.add(v, slice(None), jacobian, G / variance, b / variance)
+    equations = _joint_equations([view.camera for view in changed_views], changes, means, shifts)
     of_changes, of_means = equations.step(changes, deviations, _DAMPING, equations.frame(means))
     longest = _LONGEST * scene_extent([view.camera for view in views])
-    of_means *= np.minimum(
-        1, longest / np.maximum(np.linalg.norm(of_means, axis=1, keepdims=True), 1e-30)
-    )
-    return replace(gaussians, means=(means + of_means).astype(np.float32)), changes + of_changes
+    means = means + _shortened(of_means, longest)
+    return replace(gaussians, means=means.astype(np.float32)), changes + of_changes
+
+
+def _joint_equations(
+    cameras: Sequence[Camera],
+    changes: np.ndarray,
+    means: np.ndarray,
+    shifts: Sequence[tuple[np.ndarray, np.ndarray, float]],
+) -> NormalEquations:
+    """Return the equations of V changed cameras and N means; `shifts` as from `_shifts`."""
+    variance = _ALIKE * np.mean([error for *_, error in shifts])
+    equations = NormalEquations(len(cameras), len(means))
+    for v, (camera, (G, b, _)) in enumerate(zip(cameras, shifts, strict=True)):
+        jacobian = camera_jacobian(camera, 1 + changes[v, 6], means)
+        equations.add(v, slice(None), jacobian, G / variance, b / variance)
+    return equations
+
+
+def _shortened(steps: np.ndarray, longest: float) -> np.ndarray:
+    """Return steps [N, 3] of at most a length."""
+    lengths = np.linalg.norm(steps, axis=1, keepdims=True)
+    return steps * np.minimum(1, longest / np.maximum(lengths, 1e-30))
 
 
 def _shifts(
