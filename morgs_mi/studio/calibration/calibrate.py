@@ -49,6 +49,7 @@ _MIN_POINTS = 50
 _LEAST_DECREASE = 0.15
 # Files in the folder that COLMAP works in.
 _IMAGES = "images"
+_MASKS = "masks"
 _DATABASE = "database.db"
 _MORE_TEXTURE = (
     "light the scene evenly, add textured objects, or record a frame with such objects before the "
@@ -156,13 +157,7 @@ def calibrate(
     check_number("calibrate()", "seed", config.seed, _SEEDS)
     check_ranges(config, "calibrate()")
     report = progress or (lambda stage, done, total: None)
-    if not path.is_dir():
-        raise FileNotFoundError(f"{path}: expected a folder of clips, found none; check the path.")
-    if (path / "sparse").exists() and not overwrite:
-        raise FileExistsError(
-            f"{path / 'sparse'}: expected no model, got one; remove it, or overwrite it "
-            "(--overwrite)."
-        )
+    _check_folder(path, overwrite)
     report("Reading frames", 0, 1)
     images, masks = _frames(path, config, without)
     report("Reading frames", 1, 1)
@@ -171,45 +166,71 @@ def calibrate(
         report("Mapping", 0, 1)
         best = map_views(path, tuple(images), Path(scratch), config.seed)
         report("Mapping", 1, 1)
-        names = tuple(check.name for check in best.checks if check.fits is not None)
-        left_out = tuple(name for name in images if name not in names)
-        if left_out and not config.partial:
-            raise ValueError(
-                f"{path}: expected to register all {len(images)} cameras, got {len(names)}, "
-                f"without {', '.join(left_out)}: move these so that neighbours see the same "
-                f"objects, {_MORE_TEXTURE}, calibrate on another frame (--frame), or accept the "
-                "partial model (--partial)."
-            )
+        result = _result(path, best)
+        if result.left_out and not config.partial:
+            raise _incomplete(path, result)
         _name_photos(best.model, path)
         with atomic_path(path / "sparse", "calibrate()") as folder:
             write_reconstruction(best.model, folder / "0")
-    measures = (
+    return result
+
+
+def _check_folder(path: Path, overwrite: bool) -> None:
+    """Check that there is a folder of clips, and that its model may be written."""
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path}: expected a folder of clips, found none; check the path.")
+    if (path / "sparse").exists() and not overwrite:
+        raise FileExistsError(
+            f"{path / 'sparse'}: expected no model, got one; remove it, or overwrite it "
+            "(--overwrite)."
+        )
+
+
+def _result(path: Path, best: Candidate) -> CalibrationResult:
+    """Return the result of the calibration of a folder with its best model."""
+    return CalibrationResult(
+        path / "sparse" / "0",
+        tuple(check.name for check in best.checks if check.fits is not None),
+        tuple(check.name for check in best.checks if check.fits is None),
         best.model.num_points3D(),
         best.error,
         best.checks,
         best.mapper,
         best.principal_points,
     )
-    return CalibrationResult(path / "sparse" / "0", names, left_out, *measures)
+
+
+def _incomplete(path: Path, result: CalibrationResult) -> ValueError:
+    """Return the error of a model that lacks some of the cameras."""
+    return ValueError(
+        f"{path}: expected to register all {len(result.checks)} cameras, got "
+        f"{len(result.cameras)}, without {', '.join(result.left_out)}: move these so that "
+        f"neighbours see the same objects, {_MORE_TEXTURE}, calibrate on another frame (--frame), "
+        "or accept the partial model (--partial)."
+    )
 
 
 def _checks(model: Any, names: Sequence[str]) -> tuple[CameraCheck, ...]:
     """Return the result of each camera from its points in COLMAP's model."""
     images = {Path(model.image(i).name).stem: model.image(i) for i in model.reg_image_ids()}
     checks = {name: _check(name, images.get(name), model) for name in names}
-    poses = {
-        name: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
-        for name, image in images.items()
-    }
-    cameras = [Camera(np.eye(3), pose, 1, 1, name) for name, pose in poses.items()]
-    for i, j in same_poses(cameras):
-        for name, twin in ((cameras[i].name, cameras[j].name), (cameras[j].name, cameras[i].name)):
-            advice = (
-                f"it has the same pose as {twin}: one clip seems to be a copy of the other; "
-                "replace it"
-            )
-            checks[name] = replace(checks[name], fits=False, advice=advice)
+    for name, twin in _twins(images):
+        advice = (
+            f"it has the same pose as {twin}: one clip seems to be a copy of the other; replace it"
+        )
+        checks[name] = replace(checks[name], fits=False, advice=advice)
     return tuple(checks.values())
+
+
+def _twins(images: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """Yield the names of each image and of another one with the same pose."""
+    cameras = [
+        Camera(np.eye(3), np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]), 1, 1, name)
+        for name, image in images.items()
+    ]
+    for i, j in same_poses(cameras):
+        yield cameras[i].name, cameras[j].name
+        yield cameras[j].name, cameras[i].name
 
 
 def _name_photos(model: Any, path: Path) -> None:
@@ -224,29 +245,29 @@ def _name_photos(model: Any, path: Path) -> None:
 
 def _check(name: str, image: Any | None, model: Any) -> CameraCheck:
     if image is None:
-        return CameraCheck(
-            name,
-            0,
-            float("nan"),
-            None,
-            f"it could not be registered and has no pose: {_MORE_TEXTURE}",
-        )
-    points = [p for p in image.points2D if p.has_point3D()]
-    pixels = (image.project_point(model.point3D(p.point3D_id).xyz) for p in points)
-    errors = [
-        np.inf if q is None else float(np.linalg.norm(q - p.xy))
-        for p, q in zip(points, pixels, strict=True)
-    ]
+        advice = f"it could not be registered and has no pose: {_MORE_TEXTURE}"
+        return CameraCheck(name, 0, float("nan"), None, advice)
+    errors = _image_errors(image, model)
     error = float(np.median(errors)) if errors else float("nan")
     advice = ""
-    if len(points) < _MIN_POINTS:
+    if len(errors) < _MIN_POINTS:
         advice = (
-            f"only {len(points)} points, {_MIN_POINTS} are needed for a reliable pose: "
+            f"only {len(errors)} points, {_MIN_POINTS} are needed for a reliable pose: "
             f"{_MORE_TEXTURE}"
         )
     elif error > MAX_ERROR:
         advice = "its points do not fit: try a camera model with more parameters (--camera-model)"
-    return CameraCheck(name, len(points), error, not advice, advice)
+    return CameraCheck(name, len(errors), error, not advice, advice)
+
+
+def _image_errors(image: Any, model: Any) -> list[float]:
+    """Return the reprojection errors of the points in an image, px; infinite behind its camera."""
+    points = [p for p in image.points2D if p.has_point3D()]
+    pixels = (image.project_point(model.point3D(p.point3D_id).xyz) for p in points)
+    return [
+        np.inf if q is None else float(np.linalg.norm(q - p.xy))
+        for p, q in zip(points, pixels, strict=True)
+    ]
 
 
 def _frames(
@@ -255,6 +276,17 @@ def _frames(
     """Return one image per camera by its name, and the masks of opaque pixels of images with
     transparent ones.
     """
+    readers = {name: open_frames(clip) for name, clip in _clips(path, without).items()}
+    _check_lengths(path, readers, config.frame)
+    frames = {name: _frame(reader, config.frame) for name, reader in readers.items()}
+    stops = display_stops(frames.values())
+    images = {name: display_image(image, stops) for name, image in frames.items()}
+    masks = {name: opaque_pixels(reader, name)[0] for name, reader in readers.items()}
+    return images, {name: mask for name, mask in masks.items() if mask is not None}
+
+
+def _clips(path: Path, without: Sequence[str]) -> dict[str, Path | tuple[Path]]:
+    """Return the files of at least two cameras by name, except of those to leave out."""
     clips = clips_by_camera(path) or photos(path)
     clips = {name: clips[name] for name in names_without(path, clips, without)}
     if len(clips) < 2:
@@ -263,24 +295,22 @@ def _frames(
             f"{path}: expected the clips of at least two cameras, found {names}; check the path, "
             f"or make {EXAMPLE}"
         )
-    readers = {name: open_frames(clip) for name, clip in clips.items()}
-    short = [
-        name for name, reader in readers.items() if not 0 <= config.frame <= _last_position(reader)
-    ]
+    return clips
+
+
+def _check_lengths(path: Path, readers: dict[str, FrameReader], frame: int) -> None:
+    """Check that all clips have a frame."""
+    short = [n for n, reader in readers.items() if not 0 <= frame <= _last_position(reader)]
     if short:
         raise ValueError(
-            f"{path}: frame {config.frame} is not in the clips of {', '.join(short)}; choose "
-            "another."
+            f"{path}: frame {frame} is not in the clips of {', '.join(short)}; choose another."
         )
-    at = {
-        name: int(nearest_frames(reader, np.array([config.frame]))[0])
-        for name, reader in readers.items()
-    }
-    frames = {name: next(reader.frames(at[name], at[name] + 1)) for name, reader in readers.items()}
-    stops = display_stops(frames.values())
-    images = {name: display_image(image, stops) for name, image in frames.items()}
-    masks = {name: opaque_pixels(reader, name)[0] for name, reader in readers.items()}
-    return images, {name: mask for name, mask in masks.items() if mask is not None}
+
+
+def _frame(reader: FrameReader, frame: int) -> np.ndarray:
+    """Return the image of a clip that is nearest to a frame of a constant rate."""
+    position = int(nearest_frames(reader, np.array([frame]))[0])
+    return next(reader.frames(position, position + 1))
 
 
 def _last_position(reader: FrameReader) -> int:
@@ -311,47 +341,76 @@ def match_views(
     """
     pycolmap = import_pycolmap()
 
-    folder = scratch / _IMAGES
-    mask_folder = scratch / "masks"
-    database = scratch / _DATABASE
-    folder.mkdir()
-    mask_folder.mkdir()
-    by_size: dict[tuple[int, ...], list[str]] = {}
-    for name, image in images.items():
-        by_size.setdefault(image.shape[:2], []).append(f"{name}.png")
-        _write_png(folder / f"{name}.png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-        if masks:  # COLMAP needs a mask for every image, or none
-            opaque = masks.get(name, np.ones(image.shape[:2], bool))
-            _write_png(mask_folder / f"{name}.png.png", 255 * opaque.astype(np.uint8))
-    pycolmap.set_random_seed(config.seed)
-    mode = pycolmap.CameraMode.SINGLE if config.shared_intrinsics else pycolmap.CameraMode.PER_IMAGE
+    _write_images(scratch / _IMAGES, images)
     reader = pycolmap.ImageReaderOptions(camera_model=config.camera_model)
     if masks:
-        reader.mask_path = mask_folder
-    pycolmap.Database.open(database).close()
-    for done, (size, names) in enumerate(by_size.items()):  # each call makes a camera of its own
-        report("Finding features", done, len(by_size))
-        extraction = pycolmap.FeatureExtractionOptions(max_image_size=max(size))
-        extraction.sift.peak_threshold = _PEAK
-        # Else threads number them in any order.
-        pycolmap.import_images(database, folder, mode, names, reader)
-        pycolmap.extract_features(
-            database, folder, names, mode, reader, extraction, pycolmap.Device.cpu
-        )
-    report("Finding features", len(by_size), len(by_size))
-    _check_features(path, database)
+        _write_masks(scratch / _MASKS, images, masks)
+        reader.mask_path = scratch / _MASKS
+    pycolmap.set_random_seed(config.seed)
+    pycolmap.Database.open(scratch / _DATABASE).close()
+    names_by_size = _names_by_size(images)
+    for done, (size, names) in enumerate(names_by_size.items()):  # each makes a camera of its own
+        report("Finding features", done, len(names_by_size))
+        _extract_features(scratch, names, max(size), config, reader)
+    report("Finding features", len(names_by_size), len(names_by_size))
+    _check_features(path, scratch / _DATABASE)
     report("Matching views", 0, 1)
+    _match_features(scratch / _DATABASE, config.seed)
+    report("Matching views", 1, 1)
+    _check_pairs(path, scratch / _DATABASE)
+
+
+def _write_images(folder: Path, images: dict[str, np.ndarray]) -> None:
+    """Write the images of all views into a new folder."""
+    folder.mkdir()
+    for name, image in images.items():
+        _write_png(folder / f"{name}.png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+
+
+def _write_masks(folder: Path, images: dict[str, np.ndarray], masks: dict[str, np.ndarray]) -> None:
+    """Write a mask for every image, which COLMAP needs, into a new folder."""
+    folder.mkdir()
+    for name, image in images.items():
+        opaque = masks.get(name, np.ones(image.shape[:2], bool))
+        _write_png(folder / f"{name}.png.png", 255 * opaque.astype(np.uint8))
+
+
+def _names_by_size(images: dict[str, np.ndarray]) -> dict[tuple[int, ...], list[str]]:
+    """Return the names of the files with the images of each size [H, W]."""
+    names: dict[tuple[int, ...], list[str]] = {}
+    for name, image in images.items():
+        names.setdefault(image.shape[:2], []).append(f"{name}.png")
+    return names
+
+
+def _extract_features(
+    scratch: Path, names: list[str], max_side: int, config: CalibrateConfig, reader: Any
+) -> None:
+    """Write the features of images of one size, and their camera or cameras, into the database."""
+    pycolmap = import_pycolmap()
+
+    inputs = scratch / _DATABASE, scratch / _IMAGES
+    mode = pycolmap.CameraMode.SINGLE if config.shared_intrinsics else pycolmap.CameraMode.PER_IMAGE
+    extraction = pycolmap.FeatureExtractionOptions(max_image_size=max_side)
+    extraction.sift.peak_threshold = _PEAK
+    # Else threads number them in any order.
+    pycolmap.import_images(*inputs, mode, names, reader)
+    pycolmap.extract_features(*inputs, names, mode, reader, extraction, pycolmap.Device.cpu)
+
+
+def _match_features(database: Path, seed: int) -> None:
+    """Write the verified matches of all pairs of views into the database."""
+    pycolmap = import_pycolmap()
+
     # Without a seed of its own, the verification keeps other matches on each run, and may lose a
     # view with few of them.
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = config.seed
+    verification.ransac.random_seed = seed
     # Guided matching takes several times as long, and its poses are no better by matches of other
     # features.
     pycolmap.match_exhaustive(
         database, verification_options=verification, device=pycolmap.Device.cpu
     )
-    report("Matching views", 1, 1)
-    _check_pairs(path, database)
 
 
 def map_views(path: Path, names: Sequence[str], scratch: Path, seed: int) -> Candidate:
@@ -396,14 +455,11 @@ def _mapped(names: Sequence[str], scratch: Path, seed: int) -> list[Candidate]:
     pycolmap = import_pycolmap()
 
     inputs = scratch / _DATABASE, scratch / _IMAGES, scratch
-    incremental = pycolmap.IncrementalPipelineOptions(
-        min_model_size=2, random_seed=seed, num_threads=1
-    )
+    settings = {"random_seed": seed, "num_threads": 1}
+    incremental = pycolmap.IncrementalPipelineOptions(min_model_size=2, **settings)
     models_by_mapper: dict[Mapper, dict[int, Any]] = {
         "incremental": pycolmap.incremental_mapping(*inputs, incremental),
-        "global": pycolmap.global_mapping(
-            *inputs, pycolmap.GlobalPipelineOptions(random_seed=seed, num_threads=1)
-        ),
+        "global": pycolmap.global_mapping(*inputs, pycolmap.GlobalPipelineOptions(**settings)),
     }
     return [
         Candidate(mapper, model, _checks(model, names))
@@ -416,9 +472,18 @@ def _with_principal_points(candidate: Candidate, names: Sequence[str]) -> Candid
     """Return the model with a camera and a principal point for each image, or as it is if that fits
     no better.
     """
+    model = _with_own_cameras(candidate.model)
+    _adjust_principal_points(model)
+    old_error, new_error = (_median_error(model) for model in (candidate.model, model))
+    if not new_error < (1 - _LEAST_DECREASE) * old_error:
+        return candidate
+    return Candidate(candidate.mapper, model, _checks(model, names), principal_points=True)
+
+
+def _adjust_principal_points(model: Any) -> None:
+    """Change the poses, points and principal points of a model by a bundle adjustment."""
     pycolmap = import_pycolmap()
 
-    model = _with_own_cameras(candidate.model)
     config = pycolmap.BundleAdjustmentConfig()
     for image in model.reg_image_ids():
         config.add_image(image)
@@ -431,10 +496,6 @@ def _with_principal_points(candidate: Candidate, names: Sequence[str]) -> Candid
     )
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     pycolmap.create_default_bundle_adjuster(options, config, model).solve()
-    old_error, new_error = (_median_error(model) for model in (candidate.model, model))
-    if not new_error < (1 - _LEAST_DECREASE) * old_error:
-        return candidate
-    return Candidate(candidate.mapper, model, _checks(model, names), principal_points=True)
 
 
 def _with_own_cameras(model: Any) -> Any:
@@ -443,16 +504,23 @@ def _with_own_cameras(model: Any) -> Any:
 
     copy = pycolmap.Reconstruction()
     for i in model.reg_image_ids():
-        image = model.image(i)
-        camera = pycolmap.Camera(model.camera(model.image(i).camera_id).todict())
-        camera.camera_id = i
-        copy.add_camera_with_trivial_rig(camera)
-        keypoints = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
-        image_copy = pycolmap.Image(image_id=i, camera_id=i, name=image.name, keypoints=keypoints)
-        copy.add_image_with_trivial_frame(image_copy, image.cam_from_world())
+        _add_image(copy, i, model)
     for point in model.points3D.values():
         copy.add_point3D(point.xyz, point.track, point.color)
     return copy
+
+
+def _add_image(copy: Any, i: int, model: Any) -> None:
+    """Add an image of a model, with a camera of its own, to a copy of the model."""
+    pycolmap = import_pycolmap()
+
+    image = model.image(i)
+    camera = pycolmap.Camera(model.camera(image.camera_id).todict())
+    camera.camera_id = i
+    copy.add_camera_with_trivial_rig(camera)
+    keypoints = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
+    image_copy = pycolmap.Image(image_id=i, camera_id=i, name=image.name, keypoints=keypoints)
+    copy.add_image_with_trivial_frame(image_copy, image.cam_from_world())
 
 
 def _median_error(model: Any) -> float:
@@ -463,18 +531,22 @@ def _median_error(model: Any) -> float:
 
 
 def _check_features(path: Path, database: Path) -> None:
-    pycolmap = import_pycolmap()
-
-    with closing(pycolmap.Database.open(database)) as db:
-        counts = {
-            Path(i.name).stem: db.num_keypoints_for_image(i.image_id) for i in db.read_all_images()
-        }
+    counts = _feature_counts(database)
     if poor := {name: count for name, count in counts.items() if count < _MIN_FEATURES}:
         table = ", ".join(f"{count} in {name}" for name, count in poor.items())
         raise ValueError(
             f"{path}: expected at least {_MIN_FEATURES} features in every view, got {table}: too "
             f"dark, blurred or uniform; {_MORE_TEXTURE}, or calibrate on another frame (--frame)."
         )
+
+
+def _feature_counts(database: Path) -> dict[str, int]:
+    """Return the number of features of each view by name."""
+    pycolmap = import_pycolmap()
+
+    with closing(pycolmap.Database.open(database)) as db:
+        images = db.read_all_images()
+        return {Path(i.name).stem: db.num_keypoints_for_image(i.image_id) for i in images}
 
 
 def _check_pairs(path: Path, database: Path) -> None:

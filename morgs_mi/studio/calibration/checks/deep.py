@@ -263,7 +263,7 @@ def _times(check: DeepCheck) -> _Values:
 def _are_drifting(check: DeepCheck) -> np.ndarray:
     """Return the mask of the cameras whose offset changes during the recording."""
     changes = np.vstack([check.halves - check.offsets, check.halves[1] - check.halves[0]])
-    return (np.abs(changes) >= _OFFSET_CHANGE).any(axis=0)
+    return np.any(np.abs(changes) >= _OFFSET_CHANGE, axis=0)
 
 
 def _sides(offsets: np.ndarray) -> np.ndarray:
