@@ -129,10 +129,21 @@ def likely_deviations(
 
 def changed_camera(camera: Camera, changes: np.ndarray) -> Camera:
     """Return a camera with the changes [11] of the module docstring, without the distortion."""
+    return replace(
+        camera,
+        K=_changed_intrinsics(camera, changes[6], changes[7:9]),
+        viewmat=_changed_pose(camera, changes[:3], changes[3:6]),
+    )
+
+
+def _changed_intrinsics(camera: Camera, focal: float, displacement: np.ndarray) -> np.ndarray:
+    """Return the matrix K of a camera with a relative change of its focal lengths and a
+    displacement [2] of its principal point in image widths.
+    """
     K = camera.K.copy()
-    K[[0, 1], [0, 1]] *= 1 + changes[6]
-    K[:2, 2] += changes[7:9] * camera.width
-    return replace(camera, K=K, viewmat=_changed_pose(camera, changes[:3], changes[3:6]))
+    K[[0, 1], [0, 1]] *= 1 + focal
+    K[:2, 2] += displacement * camera.width
+    return K
 
 
 def _changed_pose(camera: Camera, rotation: np.ndarray, displacement: np.ndarray) -> np.ndarray:
@@ -445,6 +456,10 @@ def _scale(errors: np.ndarray) -> float:
 
 
 def _loss(estimate: _Estimate, scale: float, deviations: np.ndarray) -> float:
-    squares = (estimate.errors**2).sum(axis=1) / (_CAUCHY * scale) ** 2
-    cost = _CAUCHY**2 * np.log1p(squares).sum()
-    return float(cost + np.sum((estimate.changes / deviations) ** 2))
+    priors = np.sum((estimate.changes / deviations) ** 2)
+    return float(_cauchy_loss(estimate.errors, scale) + priors)
+
+
+def _cauchy_loss(errors: np.ndarray, scale: float) -> float:
+    squares = (errors**2).sum(axis=1) / (_CAUCHY * scale) ** 2
+    return _CAUCHY**2 * np.log1p(squares).sum()

@@ -224,13 +224,16 @@ def _checks(model: Any, names: Sequence[str]) -> tuple[CameraCheck, ...]:
 
 def _twins(images: dict[str, Any]) -> Iterator[tuple[str, str]]:
     """Yield the names of each image and of another one with the same pose."""
-    cameras = [
-        Camera(np.eye(3), np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]), 1, 1, name)
-        for name, image in images.items()
-    ]
+    cameras = [_posed_camera(*item) for item in images.items()]
     for i, j in same_poses(cameras):
         yield cameras[i].name, cameras[j].name
         yield cameras[j].name, cameras[i].name
+
+
+def _posed_camera(name: str, image: Any) -> Camera:
+    """Return a camera with the pose of an image, and any intrinsics."""
+    pose = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+    return Camera(np.eye(3), pose, 1, 1, name)
 
 
 def _name_photos(model: Any, path: Path) -> None:
@@ -247,27 +250,25 @@ def _check(name: str, image: Any | None, model: Any) -> CameraCheck:
     if image is None:
         advice = f"it could not be registered and has no pose: {_MORE_TEXTURE}"
         return CameraCheck(name, 0, float("nan"), None, advice)
-    errors = _image_errors(image, model)
+    errors = [_error(p, image, model) for p in image.points2D if p.has_point3D()]
     error = float(np.median(errors)) if errors else float("nan")
-    advice = ""
-    if len(errors) < _MIN_POINTS:
-        advice = (
-            f"only {len(errors)} points, {_MIN_POINTS} are needed for a reliable pose: "
-            f"{_MORE_TEXTURE}"
-        )
-    elif error > MAX_ERROR:
-        advice = "its points do not fit: try a camera model with more parameters (--camera-model)"
+    advice = _advice(len(errors), error)
     return CameraCheck(name, len(errors), error, not advice, advice)
 
 
-def _image_errors(image: Any, model: Any) -> list[float]:
-    """Return the reprojection errors of the points in an image, px; infinite behind its camera."""
-    points = [p for p in image.points2D if p.has_point3D()]
-    pixels = (image.project_point(model.point3D(p.point3D_id).xyz) for p in points)
-    return [
-        np.inf if q is None else float(np.linalg.norm(q - p.xy))
-        for p, q in zip(points, pixels, strict=True)
-    ]
+def _advice(count: int, error: float) -> str:
+    """Return the remedy for a camera with few points or a large error, px; otherwise nothing."""
+    if count < _MIN_POINTS:
+        return f"only {count} points, {_MIN_POINTS} are needed for a reliable pose: {_MORE_TEXTURE}"
+    if error > MAX_ERROR:
+        return "its points do not fit: try a camera model with more parameters (--camera-model)"
+    return ""
+
+
+def _error(point: Any, image: Any, model: Any) -> float:
+    """Return the reprojection error of a point in an image, px; infinite behind its camera."""
+    pixel = image.project_point(model.point3D(point.point3D_id).xyz)
+    return np.inf if pixel is None else float(np.linalg.norm(pixel - point.xy))
 
 
 def _frames(
@@ -447,7 +448,16 @@ def map_views(path: Path, names: Sequence[str], scratch: Path, seed: int) -> Can
 
 
 def _mapped(names: Sequence[str], scratch: Path, seed: int) -> list[Candidate]:
-    """Return the models of both mappers.
+    """Return the models of both mappers."""
+    return [
+        Candidate(mapper, model, _checks(model, names))
+        for mapper, models in _models_by_mapper(scratch, seed).items()
+        for model in models.values()
+    ]
+
+
+def _models_by_mapper(scratch: Path, seed: int) -> dict[Mapper, dict[int, Any]]:
+    """Return the reconstructions of both mappers.
 
     Threads of a mapper share its random samples, which makes other models on some runs; one thread
     takes as long.
@@ -457,15 +467,10 @@ def _mapped(names: Sequence[str], scratch: Path, seed: int) -> list[Candidate]:
     inputs = scratch / _DATABASE, scratch / _IMAGES, scratch
     settings = {"random_seed": seed, "num_threads": 1}
     incremental = pycolmap.IncrementalPipelineOptions(min_model_size=2, **settings)
-    models_by_mapper: dict[Mapper, dict[int, Any]] = {
+    return {
         "incremental": pycolmap.incremental_mapping(*inputs, incremental),
         "global": pycolmap.global_mapping(*inputs, pycolmap.GlobalPipelineOptions(**settings)),
     }
-    return [
-        Candidate(mapper, model, _checks(model, names))
-        for mapper, models in models_by_mapper.items()
-        for model in models.values()
-    ]
 
 
 def _with_principal_points(candidate: Candidate, names: Sequence[str]) -> Candidate:
@@ -488,6 +493,14 @@ def _adjust_principal_points(model: Any) -> None:
     for image in model.reg_image_ids():
         config.add_image(image)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    options = _principal_point_options()
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+
+
+def _principal_point_options() -> Any:
+    """Return the settings of a bundle adjustment of poses, points and principal points."""
+    pycolmap = import_pycolmap()
+
     options = pycolmap.BundleAdjustmentOptions(
         refine_focal_length=False,
         refine_extra_params=False,
@@ -495,7 +508,7 @@ def _adjust_principal_points(model: Any) -> None:
         print_summary=False,
     )
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    return options
 
 
 def _with_own_cameras(model: Any) -> Any:

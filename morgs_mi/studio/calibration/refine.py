@@ -292,13 +292,11 @@ class _Problem:
         """Return the largest change of a rotation, degrees, a position, a focal length, and a pixel
         by the lens.
         """
-        rotation, position = (np.linalg.norm(changes[:, k : k + 3], axis=1).max() for k in (0, 3))
-        lens = max(_largest_shift(*pair) for pair in zip(self.cameras, changes, strict=True))
         return (
-            float(np.rad2deg(rotation)),
-            float(position),
+            float(np.rad2deg(_largest_norm(changes[:, :3]))),
+            float(_largest_norm(changes[:, 3:6])),
             float(np.abs(changes[:, 6]).max()),
-            lens,
+            max(_largest_shift(*pair) for pair in zip(self.cameras, changes, strict=True)),
         )
 
     def changed_capture(self, changes: np.ndarray) -> Capture:
@@ -453,13 +451,15 @@ def _changed_view(
     return View(camera, correction(image), valid)
 
 
+def _largest_norm(vectors: np.ndarray) -> float:
+    return np.linalg.norm(vectors, axis=1).max()
+
+
 def _largest_shift(camera: Camera, change: np.ndarray) -> float:
     """Return the largest shift of a pixel by the distortion of a camera's change, image widths."""
     corners = np.array([(x, y) for x in (0, camera.width) for y in (0, camera.height)], float)
-    return float(
-        np.linalg.norm(distorted(camera, corners, change[9:]) - corners, axis=1).max()
-        / camera.width
-    )
+    shifts = distorted(camera, corners, change[9:]) - corners
+    return float(_largest_norm(shifts) / camera.width)
 
 
 def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -> np.ndarray:

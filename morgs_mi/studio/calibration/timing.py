@@ -211,8 +211,13 @@ class _Rounds:
         equations = _equations_at(self.clips, times, blur, self.seed)
         self.done += 1
         if self.progress is not None:
-            self.progress(self.done, (len(_BLUR_OF_ROUND) + 1) * len(self.instants))
+            self.progress(self.done, self._most_fits)
         return equations
+
+    @property
+    def _most_fits(self) -> int:
+        """Number of the fits if no round is left out."""
+        return (len(_BLUR_OF_ROUND) + 1) * len(self.instants)
 
 
 @dataclass(frozen=True, eq=False)

@@ -156,9 +156,7 @@ def focal_candidates(
         scaled: returns what has a factor on its focal lengths.
         error: error of what is scaled, px.
     """
-    # The search cannot compare infinite errors.
-    octaves = _minimum(lambda octaves: min(error(scaled(float(2.0**octaves))), 1e9))
-    factor = float(2.0**octaves)
+    factor = _best_factor(lambda factor: error(scaled(factor)))
     if abs(factor - 1) <= _LEAST_FACTOR:
         return []
     sentence = (
@@ -168,8 +166,13 @@ def focal_candidates(
     return [(scaled(factor), sentence)]
 
 
-def _minimum(of_octaves: Callable[[float], float]) -> float:
-    """Return the place of the least value of a function of octaves: the best step, then refined."""
+def _best_factor(error: Callable[[float], float]) -> float:
+    """Return the factor from 1/4 to 4 with the least error: the best step, then refined."""
+
+    def of_octaves(octaves: float) -> float:
+        # The search cannot compare infinite errors.
+        return min(error(float(2.0**octaves)), 1e9)
+
     steps = np.arange(-_FACTOR_OCTAVES, _FACTOR_OCTAVES + _FACTOR_STEP, _FACTOR_STEP)
     start = min(steps, key=of_octaves)
     bounds = (start - _FACTOR_STEP, start + _FACTOR_STEP)
@@ -179,7 +182,7 @@ def _minimum(of_octaves: Callable[[float], float]) -> float:
     minimum: Any = minimize_scalar(
         of_octaves, bounds=bounds, method="bounded", options={"xatol": 3e-3}
     )
-    return minimum.x
+    return float(2.0**minimum.x)
 
 
 def with_focal_factor(camera: Camera, factor: float) -> Camera:

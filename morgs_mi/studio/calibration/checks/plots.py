@@ -168,10 +168,15 @@ def _draw_frustum(axes: Any, frustum: np.ndarray, name: str, color: str) -> None
 
 def _frame(axes: Any, corners: np.ndarray) -> None:
     """Set the limits of a panel to a square around positions [n, 2], and draw its grid."""
-    half = 0.6 * max(np.ptp(corners, axis=0).max(), 1e-12)
-    limits = (corners.min(0) + corners.max(0))[:, None] / 2 + (-half, half)
-    axes.set(xlim=limits[0], ylim=limits[1], aspect="equal", axisbelow=True)
+    xlim, ylim = _square(corners)
+    axes.set(xlim=xlim, ylim=ylim, aspect="equal", axisbelow=True)
     axes.grid(color="0.9")
+
+
+def _square(corners: np.ndarray) -> np.ndarray:
+    """Return the limits [2, 2] of a square with positions [n, 2] and a margin."""
+    half = 0.6 * max(np.ptp(corners, axis=0).max(), 1e-12)
+    return (corners.min(0) + corners.max(0))[:, None] / 2 + (-half, half)
 
 
 def _draw_world_axes(axes: Any, plane: np.ndarray) -> None:

@@ -270,13 +270,18 @@ def _rig_factors(pairs: _Pairs) -> list[tuple[Sequence[Camera], str]]:
 def _pose_copies(checks: Sequence[CameraCheck], cameras: Sequence[Camera]) -> dict[int, str]:
     """Return the reason for each camera with the pose of another one."""
     reasons: dict[int, str] = {}
+    remedy = "give each camera its own, or leave the copy out (--without)"
     for pair in same_poses(cameras):
         # If one of the two fits, the pose is its own.
         for view in [view for view in pair if not checks[view].fits] or pair:
-            other = checks[sum(pair) - view].name
-            remedy = "give each camera its own, or leave the copy out (--without)"
+            other = _other(checks, pair, view)
             reasons.setdefault(view, f"it has the same pose as {other}: {remedy}")
     return reasons
+
+
+def _other(checks: Sequence[CameraCheck], pair: tuple[int, int], view: int) -> str:
+    """Return the name of the camera that is in a pair of views with `view`."""
+    return checks[sum(pair) - view].name
 
 
 def _clip_copies(
@@ -289,17 +294,22 @@ def _clip_copies(
     for match in filter(partial(_shows_one_clip, shared), shared.matches):
         for view in match.views:
             if view in suspects or not checks[view].fits:
-                other = checks[sum(match.views) - view].name
+                other = _other(checks, match.views, view)
                 reasons[view] = f"its clip is a copy of the clip of {other}; replace one of them"
     return reasons
 
 
 def _shows_one_clip(shared: SharedFeatures, match: Match) -> bool:
     """Return whether the features of two views are at the same pixels."""
-    a, b = (
-        shared.features[view].points[match.features[:, k]] for k, view in enumerate(match.views)
-    )
+    a, b = (_pixels(shared, match, k) for k in (0, 1))
     return bool(np.median(np.linalg.norm(a - b, axis=1)) < _SAME_IMAGE)
+
+
+def _pixels(shared: SharedFeatures, match: Match, k: int) -> np.ndarray:
+    """Return the pixels [M, 2] of matching features in the first or the second view, `k` = 0 or
+    1.
+    """
+    return shared.features[match.views[k]].points[match.features[:, k]]
 
 
 def _explain_camera(view: int, check: CameraCheck, pairs: _Pairs, group: set[int]) -> str:

@@ -10,11 +10,13 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
+from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import decode_light
 
 _WIDTH = 128  # of a thumbnail, px
@@ -82,9 +84,13 @@ def read_signals(
 
 def _missing_signals(capture: Capture, count: int) -> Signals:
     """Return signals of `count` frames with all values missing."""
-    heights = [max(1, round(c.height * _WIDTH / c.width)) for c in capture.cameras]
-    thumbs = [np.full((count, height, _WIDTH), np.nan, np.float32) for height in heights]
-    return Signals(tuple(thumbs), np.full((count, len(heights)), np.nan))
+    shapes = [(count, _thumb_height(camera), _WIDTH) for camera in capture.cameras]
+    thumbs = tuple(np.full(shape, np.nan, np.float32) for shape in shapes)
+    return Signals(thumbs, np.full((count, len(shapes)), np.nan))
+
+
+def _thumb_height(camera: Camera) -> int:
+    return max(1, round(camera.height * _WIDTH / camera.width))
 
 
 def _inner(mask: np.ndarray | None) -> np.ndarray | None:
@@ -108,11 +114,10 @@ def _store_image(
 
 def _store_thumb(thumb: np.ndarray, grey: np.ndarray, mask: np.ndarray | None) -> None:
     """Store the reduced image in `thumb`, NaN where a pixel is not valid."""
-    size = thumb.shape[::-1]
-    thumb[:] = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    reduced = partial(cv2.resize, dsize=thumb.shape[::-1], interpolation=cv2.INTER_AREA)
+    thumb[:] = reduced(grey)
     if mask is not None:
-        valid = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        thumb[valid <= 0.999] = np.nan
+        thumb[reduced(mask.astype(np.float32)) <= 0.999] = np.nan
 
 
 def brightness(signals: Signals) -> np.ndarray:
@@ -139,10 +144,14 @@ def _relative_changes(thumbs: Sequence[np.ndarray]) -> np.ndarray:
     with warnings.catch_warnings(), np.errstate(invalid="ignore", divide="ignore"):
         # The mean or the quartile of no value is NaN.
         warnings.simplefilter("ignore", RuntimeWarning)
-        steps = [np.nanmean(np.abs(np.diff(camera, axis=0)), axis=(1, 2)) for camera in thumbs]
-        changes = np.stack(steps, axis=1)
+        changes = np.stack([_changes(camera) for camera in thumbs], axis=1)
         # The upper quartile is the usual change even if every second frame is repeated.
         return changes / np.nanpercentile(changes, 75, axis=0)
+
+
+def _changes(thumbs: np.ndarray) -> np.ndarray:
+    """Return the mean change of a camera's pixels from frame to frame [T - 1]."""
+    return np.nanmean(np.abs(np.diff(thumbs, axis=0)), axis=(1, 2))
 
 
 def _are_isolated(relative: np.ndarray) -> np.ndarray:

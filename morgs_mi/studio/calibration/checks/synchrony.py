@@ -143,8 +143,13 @@ def _with_one_level(frames: np.ndarray) -> np.ndarray:
 def _rays(camera: Camera, shape: tuple[int, ...]) -> np.ndarray:
     """Return the directions of a thumbnail's pixels [h * w, 3]."""
     height, width = shape
+    return camera.resized(width, height).rays(_pixel_centres(width, height))[1]
+
+
+def _pixel_centres(width: int, height: int) -> np.ndarray:
+    """Return the positions of the centres of an image's pixels [h * w, 2], row by row."""
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    return camera.resized(width, height).rays(np.stack([x, y], axis=-1).reshape(-1, 2))[1]
+    return np.stack([x, y], axis=-1).reshape(-1, 2)
 
 
 def _plane_angles(a: Camera, b: Camera, *rays: np.ndarray) -> list[np.ndarray]:
