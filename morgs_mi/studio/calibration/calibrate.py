@@ -282,8 +282,13 @@ def _frames(
     frames = {name: _frame(reader, config.frame) for name, reader in readers.items()}
     stops = display_stops(frames.values())
     images = {name: display_image(image, stops) for name, image in frames.items()}
+    return images, _masks(readers)
+
+
+def _masks(readers: dict[str, FrameReader]) -> dict[str, np.ndarray]:
+    """Return the mask of opaque pixels of each clip with transparent ones."""
     masks = {name: opaque_pixels(reader, name)[0] for name, reader in readers.items()}
-    return images, {name: mask for name, mask in masks.items() if mask is not None}
+    return {name: mask for name, mask in masks.items() if mask is not None}
 
 
 def _clips(path: Path, without: Sequence[str]) -> dict[str, Path | tuple[Path]]:

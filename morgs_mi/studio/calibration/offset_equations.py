@@ -143,17 +143,20 @@ def offset_equations(
     means = np.asarray(gaussians.means, np.float64)[moving]
     products = [_products(gaussians, *each, blur) for each in zip(views, targets, strict=True)]
     A, b = (np.stack([each[moving] for each in kind]) for kind in zip(*products, strict=True))
-    J = np.stack([view.camera.projection_jacobian(means) for view in views])
-    b = np.einsum("vkai,vka->vki", J, b)
-    H = np.einsum("vkai,vkab,vkbj->vkij", J, A, J)
+    H, b = _by_position(A, b, np.stack([v.camera.projection_jacobian(means) for v in views]))
     c = np.einsum("vkij,kj->vki", H, d)
     weights = np.einsum("vki,kij->vkj", c, _inverses(H[train].sum(axis=0)))
+    parts = np.einsum("vki,ki->vk", weights, b[train].sum(axis=0)) - np.einsum("vki,ki->vk", b, d)
+    groups = _grouped(parts, means)
     diagonal = np.einsum("vki,ki->v", c, d)
     matrix = np.diag(diagonal)
     matrix[:, train] -= np.einsum("vki,wki->vw", weights, c[train])
-    parts = np.einsum("vki,ki->vk", weights, b[train].sum(axis=0)) - np.einsum("vki,ki->vk", b, d)
-    groups = _grouped(parts, means)
     return OffsetEquations(matrix, parts.sum(axis=1), groups @ groups.T, diagonal, train)
+
+
+def _by_position(A: np.ndarray, b: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return J^T A J [V, n, 3, 3] and J^T b [V, n, 3] of each view and Gaussian."""
+    return np.einsum("vkai,vkab,vkbj->vkij", J, A, J), np.einsum("vkai,vka->vki", J, b)
 
 
 def _inverses(curvatures: np.ndarray) -> np.ndarray:

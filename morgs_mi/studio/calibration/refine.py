@@ -196,8 +196,7 @@ def refine_cameras(
     bundle_changes, tracks, deviations = _matched(capture, problem.indices, problem.deviations)
     # Cameras of the calibration, of the bundle adjustment, and of the images; a single set is not
     # compared.
-    has_rival = config.refine_cameras == "auto"
-    estimates = [0 * bundle_changes] * has_rival + [bundle_changes] * bool(tracks)
+    estimates = [0 * bundle_changes] * problem.has_rival + [bundle_changes] * bool(tracks)
     fits = config.short_fits.rounds + len(estimates) + bool(estimates)
 
     def report(done: int) -> None:
@@ -206,13 +205,21 @@ def refine_cameras(
 
     estimates.append(problem.refined(bundle_changes, deviations, report))
     scores = problem.scores(estimates, report) if len(estimates) > 1 else [float("nan")]
-    best = has_rival + int(np.argmax(scores[has_rival:]))
-    calibrated = scores[0] if has_rival else float("nan")
+    changes, refinement = _best(problem, estimates, scores, tracks)
+    return problem.changed_capture(changes) if refinement.taken else capture, refinement
+
+
+def _best(
+    problem: _Problem, estimates: Sequence[np.ndarray], scores: Sequence[float], tracks: int
+) -> tuple[np.ndarray, Refinement]:
+    """Return the changes [V, 11] with the best score, apart from the calibrated cameras, and the
+    result.
+    """
+    best = problem.has_rival + int(np.argmax(scores[problem.has_rival :]))
+    calibrated = scores[0] if problem.has_rival else float("nan")
     is_better = not scores[best] < calibrated + LEAST_GAIN
-    refinement = Refinement(
-        is_better, calibrated, scores[best], tracks, *problem.sizes(estimates[best])
-    )
-    return problem.changed_capture(estimates[best]) if is_better else capture, refinement
+    sizes = problem.sizes(estimates[best])
+    return estimates[best], Refinement(is_better, calibrated, scores[best], tracks, *sizes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,6 +250,11 @@ class _Problem:
     def cameras(self) -> list[Camera]:
         """The calibrated cameras at the size of the capture."""
         return [self.capture.cameras[v] for v in self.indices]
+
+    @property
+    def has_rival(self) -> bool:
+        """Whether the refined cameras are compared with the calibrated ones."""
+        return self.config.refine_cameras == "auto"
 
     @property
     def deviations(self) -> np.ndarray:

@@ -291,22 +291,21 @@ def _checked(image: ImageOrError) -> np.ndarray:
 def _equations_at(clips: _Clips, times: np.ndarray, blur: float, seed: int) -> OffsetEquations:
     """Return the equations of an instant, which each view shows at its own time [V]."""
     images = clips.at(times)
-    next_images = clips.at(times + 1)
+    pairs = _frame_pairs(clips, images, clips.at(times + 1))
     targets = [Target(image, mask) for image, mask in zip(images, clips.masks, strict=True)]
     gaussians = _fitted(clips, images, 2 if blur else 1, seed)
     views = [ActiveView(camera) for camera in clips.cameras]
-    pairs = {v: FramePair(next_images[v], images[v], valid=clips.masks[v]) for v in clips.train}
-    gaussians = _with_motion(gaussians, {v: views[v] for v in clips.train}, pairs)
+    flow = lift_flow(gaussians, {v: views[v] for v in clips.train}, observe_key_views(pairs))
+    gaussians = replace(gaussians, motion=flow.displacement)
     train = np.isin(np.arange(len(views)), clips.train)
     return offset_equations(gaussians, views, targets, train, blur)
 
 
-def _with_motion(
-    gaussians: Gaussians, views: dict[int, ActiveView], pairs: dict[int, FramePair]
-) -> Gaussians:
-    """Return Gaussians with the motion to the next frame that the flow of some views shows."""
-    flow = lift_flow(gaussians, views, observe_key_views(pairs))
-    return replace(gaussians, motion=flow.displacement)
+def _frame_pairs(
+    clips: _Clips, images: Sequence[np.ndarray], next_images: Sequence[np.ndarray]
+) -> dict[int, FramePair]:
+    """Return the images of two frames in each training view."""
+    return {v: FramePair(next_images[v], images[v], valid=clips.masks[v]) for v in clips.train}
 
 
 def _fitted(clips: _Clips, images: Sequence[np.ndarray], divisor: int, seed: int) -> Gaussians:

@@ -178,15 +178,22 @@ def _exposure_findings(names: Sequence[str], gains: np.ndarray) -> list[Finding]
 
 def _gains(capture: Capture, shared: SharedFeatures) -> np.ndarray:
     """Return the log gains of all cameras [C, 3] that explain colours of points in two views."""
-    images = next(capture.displayed().partial_frames(0, 1)).images
-    pairs, colors = matched_colors(capture.cameras, images, shared.features, shared.matches)
-    pairs = [pair for pair in pairs if len(pair.features) >= _MIN_SAMPLES]
+    pairs, colors = _samples(capture, shared)
     ratios = [_log_ratios(pair, colors) for pair in pairs]
     middles = np.reshape([np.median(ratio, axis=0) for ratio in ratios], (-1, 3))
     weights = np.array([_weight(*each) for each in zip(ratios, middles, strict=True)])
     views = [pair.views for pair in pairs]
     gains = [consensus(len(colors), views, channel, weights) for channel in middles.T]
     return np.stack(gains, axis=1)
+
+
+def _samples(capture: Capture, shared: SharedFeatures) -> tuple[list[Match], list[np.ndarray]]:
+    """Return the matches of pairs of views with enough of them, and the colours [K, 3] of all
+    features.
+    """
+    images = next(capture.displayed().partial_frames(0, 1)).images
+    pairs, colors = matched_colors(capture.cameras, images, shared.features, shared.matches)
+    return [pair for pair in pairs if len(pair.features) >= _MIN_SAMPLES], colors
 
 
 def _log_ratios(pair: Match, colors: Sequence[np.ndarray]) -> np.ndarray:

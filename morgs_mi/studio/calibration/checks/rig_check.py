@@ -319,9 +319,7 @@ def _explain_camera(view: int, check: CameraCheck, pairs: _Pairs, group: set[int
     error_of = partial(pairs.of_replaced, view, partners=partners)
     candidates = _camera_mistakes(pairs.cameras[view], error_of)
     errors = [error_of(camera) for camera, _ in candidates]
-    of_group = [_median(pairs.of_view(other, group)) for other in group]
-    good_error = max(_GOOD_ERROR, 2 * max(of_group, default=MAX_ERROR))
-    if min(errors) <= min(check.error / _GAIN, MAX_ERROR, good_error):
+    if min(errors) <= min(check.error / _GAIN, MAX_ERROR, _good_error(pairs, group)):
         return candidates[int(np.argmin(errors))][1]
     cause = "no common mistake explains it"
     if np.isinf(check.error):
@@ -330,6 +328,12 @@ def _explain_camera(view: int, check: CameraCheck, pairs: _Pairs, group: set[int
         f"{cause}: check its place in the order of the cameras, its axes and the image size of "
         "the calibration, or calibrate again (morgs-mi calibrate)"
     )
+
+
+def _good_error(pairs: _Pairs, group: set[int]) -> float:
+    """Return the error of a view that is as good as the errors of the views that agree, px."""
+    of_group = [_median(pairs.of_view(view, group)) for view in group]
+    return max(_GOOD_ERROR, 2 * max(of_group, default=MAX_ERROR))
 
 
 def _camera_mistakes(

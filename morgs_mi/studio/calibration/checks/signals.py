@@ -172,8 +172,7 @@ def lamp_flicker(bands: np.ndarray, fps: float) -> Lamp | None:
     if count < _MIN_FLICKER_FRAMES or not np.isfinite(bands).any():
         return None
     bands = _without_trend(bands) * _window(count)
-    amplitude = _rms(np.fft.rfft(bands, axis=0))
-    aliases = _aliases(int(amplitude.argmax()), fps, fps / count) if _has_peak(amplitude) else {}
+    aliases = _aliases(_rms(np.fft.rfft(bands, axis=0)), fps, fps / count)
     if not aliases:
         return None
     alias = float(next(iter(aliases.values())))
@@ -205,20 +204,23 @@ def _has_peak(amplitude: np.ndarray) -> bool:
     return not (peak < _MIN_AMPLITUDE or peak**2 < _MIN_POWER * np.median(amplitude**2))
 
 
-def _aliases(peak: int, fps: float, step: float) -> dict[int, float]:
+def _aliases(amplitude: np.ndarray, fps: float, step: float) -> dict[int, float]:
     """Return the frequency at which a camera sees a lamp, by the frequencies of mains that explain
     the peak of a spectrum.
 
     Args:
-        peak: index of the peak.
+        amplitude: the spectrum.
         fps: frames per second.
         step: between the frequencies of the spectrum, Hz.
     """
+    if not _has_peak(amplitude):
+        return {}
+    peak = int(amplitude.argmax()) * step
     aliases = {mains: abs(2 * mains - fps * round(2 * mains / fps)) for mains in _MAINS}
     return {
         mains: alias
         for mains, alias in aliases.items()
-        if alias >= _MIN_PERIODS * step and abs(alias - peak * step) <= step
+        if alias >= _MIN_PERIODS * step and abs(alias - peak) <= step
     }
 
 
