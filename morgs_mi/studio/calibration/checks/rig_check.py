@@ -215,23 +215,20 @@ def _check(view: int, pairs: _Pairs, group: set[int]) -> CameraCheck:
     """Return the result of a view; its advice is empty if the pose does not fit."""
     all_errors = pairs.of_view(view)
     group_errors = pairs.of_view(view, group)
-    errors = group_errors if len(group_errors) else all_errors
-    error = _median(errors)
-    advice = _too_few(len(errors), bool(group) and not len(group_errors))
+    error = _median(group_errors if len(group_errors) else all_errors)
+    advice = _obstacle(len(all_errors), len(group_errors), group)
     fits = None if advice else error <= MAX_ERROR
     return CameraCheck(pairs.cameras[view].name, len(all_errors), error, fits, advice)
 
 
-def _too_few(count: int, are_wrong: bool) -> str:
-    """Return the reason why matches do not check a pose, or nothing.
-
-    Args:
-        count: number of the matches.
-        are_wrong: whether they are matches only with cameras that do not fit.
+def _obstacle(all_matches: int, group_matches: int, group: set[int]) -> str:
+    """Return the reason why the numbers of a view's matches with all views and with a group do not
+    suffice to check its pose, and a remedy; empty if they do.
     """
+    count = group_matches or all_matches
     if not count:
         return f"no matches with any other camera: {_NO_OVERLAP}"
-    if are_wrong:
+    if group and not group_matches:
         return "matches only with cameras that do not fit: correct those first"
     if count < _MIN_MATCHES:
         return f"only {count} matches, {_MIN_MATCHES} are needed: {_NO_OVERLAP}"
@@ -331,7 +328,7 @@ def _explain_camera(view: int, check: CameraCheck, pairs: _Pairs, group: set[int
 
 
 def _good_error(pairs: _Pairs, group: set[int]) -> float:
-    """Return the error of a view that is as good as the errors of the views that agree, px."""
+    """Return the largest error of a view that is as good as the errors in a group of views, px."""
     of_group = [_median(pairs.of_view(view, group)) for view in group]
     return max(_GOOD_ERROR, 2 * max(of_group, default=MAX_ERROR))
 
