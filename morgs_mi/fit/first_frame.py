@@ -1,6 +1,8 @@
-"""The first frame: all attributes from its images, then the confidence from its masks.
+"""The fit of the first frame.
 
-Up to the last round of density control, the images have half the size.
+`fit_first_frame` fits all attributes but the confidence; up to the last round of density control,
+the images have half the size. `fit_confidence` follows when the second frame, and with it the flow,
+is there.
 """
 
 from __future__ import annotations
@@ -39,12 +41,12 @@ from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
 
-# Passes over all views of which the loss is averaged.
-_PASSES = 4
-# Least number of steps of which it is averaged.
-_LEAST = 8
-# Fraction of the steps after which another SH band is added, as in 3DGS.
+# Passes over all views over which the losses are averaged, and the least number of steps.
+_AVERAGED_PASSES = 4
+_LEAST_AVERAGED_STEPS = 8
+# Fraction of the steps after which another SH band is added: 1000 of 30,000 steps in 3DGS.
 BAND = 1 / 30
+# First round of density control, as a fraction of the steps: before it, errors are everywhere.
 _FIRST_ROUND = 0.1
 LAST_ROUND = 0.5
 """Last round of density control, as a fraction of the steps: the remaining steps fit the births."""
@@ -57,7 +59,7 @@ class FirstFrame:
     """Result of fitting the first frame."""
 
     gaussians: Gaussians  #: The fitted Gaussians.
-    losses: dict[str, float]  #: By name, means over the last steps.
+    losses: dict[str, float]  #: Means over the last steps, by name.
     steps: int  #: Number of steps.
 
 
@@ -68,8 +70,8 @@ def fit_first_frame(
     progress: Progress | None = None,
     on_round: Callable[[Gaussians], None] | None = None,
 ) -> FirstFrame:
-    """Fit Gaussians to the images of one instant by L_recon (eq. 2); the confidence stays
-    unchanged.
+    """Return Gaussians fitted to the images of one instant by L_recon (eq. 2); their confidence
+    stays unchanged.
 
     As in 3DGS, the bands of the spherical harmonics are added one after the other. Between a tenth
     and a half of the planned steps, rounds of density control (see `density`) let the Gaussians
@@ -79,10 +81,10 @@ def fit_first_frame(
         problem: views and initial Gaussians.
         config: steps and rates.
         rng: draws the views and the means of births.
-        progress: of the steps.
+        progress: called with the numbers of steps made and of all steps.
         on_round: called with the Gaussians before each round of density control.
     """
-    fit = _Fit(problem, config, rng, progress)
+    fit = _FirstFrameFit(problem, config, rng, progress)
     steps = config.planned_steps
     losses = {}
     order = iter(view_order(len(problem.views), steps, rng))
@@ -94,7 +96,7 @@ def fit_first_frame(
     return FirstFrame(fit.gaussians, losses, steps)
 
 
-class _Fit:
+class _FirstFrameFit:
     """Optimiser of the first frame, and its events: SH bands and rounds of density control."""
 
     def __init__(
@@ -108,20 +110,21 @@ class _Fit:
         self._config = config
         self._rng = rng
         self._progress = progress
-        self._base = problem.start
-        self._optimizer = adam(_start(problem.start))
+        self._initial = problem.start
+        self._optimizer = adam(_first_parameters(problem.start))
         self._rates = config.first_frame_rates.by_parameter(problem.extent)
+        # Steps before which a band is added; 3 times a thirtieth of 30 is 3, and not below.
         self._bands = [
             int(band * config.planned_steps * BAND + 1e-9)
             for band in range(1, problem.start.sh_degree + 1)
         ]
         self._rounds = density_rounds(config)
-        self._look_at(problem.halved() if self._rounds else problem)
+        self._use_views(problem.halved() if self._rounds else problem)
 
     @property
     def gaussians(self) -> Gaussians:
         """The Gaussians with the current parameters."""
-        return self._base.with_parameters(values_of(self._optimizer))
+        return self._initial.with_parameters(values_of(self._optimizer))
 
     def stretches(self, steps: int) -> list[tuple[int, int]]:
         """Return (first step, end) of the stretches of steps without an event."""
@@ -134,9 +137,10 @@ class _Fit:
     def prepare(self, step: int) -> None:
         """Do what is due before a step: an SH band, a round of density control, larger images."""
         for _ in range(self._bands.count(step)):
-            _add_band(self._optimizer, self._base)
+            _add_band(self._optimizer, self._initial)
+        # Before the round, so that its scores come from the full images.
         if self._rounds and step == self._rounds[-1]:
-            self._look_at(self._problem)
+            self._use_views(self._problem)
         if self.has_round(step):
             self._grow(len(self._rounds) - self._rounds.index(step))
 
@@ -148,35 +152,36 @@ class _Fit:
             first,
             rate_factor=lambda step: _FINAL_RATE ** (step / steps),
             on_step=None if progress is None else lambda count: progress(count, steps),
-            averaged_steps=max(_LEAST, _PASSES * len(self._views)),
+            averaged_steps=max(_LEAST_AVERAGED_STEPS, _AVERAGED_PASSES * len(self._views)),
         )
         return optimise(self._optimizer, self._rates, self._losses_at, stretch)
 
-    def _look_at(self, problem: FirstFrameProblem) -> None:
-        """Fit the views of a problem."""
+    def _use_views(self, problem: FirstFrameProblem) -> None:
+        """Let the next steps fit the views of `problem`."""
         self._views = [ActiveView(camera, problem.render) for camera in problem.cameras]
         self._targets = [view.target for view in problem.views]
 
-    def _losses_at(self, values: Mapping[str, Tensor], view: int) -> dict[str, Tensor]:
-        gaussians = self._base.with_parameters(values)
+    def _losses_at(self, parameters: Mapping[str, Tensor], view: int) -> dict[str, Tensor]:
+        gaussians = self._initial.with_parameters(parameters)
         gaussians = dropped(gaussians, self._config.dropping or 0.0, self._rng)
         image = self._views[view].render(gaussians, ("color",))
         weight = self._config.objective.dssim_weight
         return {"recon": recon_loss(image.color, self._targets[view], weight)}
 
-    def _grow(self, rounds: int) -> None:
-        """Add and prune Gaussians by density control; `rounds` are left, with this one."""
+    def _grow(self, rounds_left: int) -> None:
+        """Add and prune Gaussians in the next of the rounds of density control that are left."""
         gaussians = self.gaussians
         config = self._config
         planned = config.planned_gaussians
-        room = Room(-(-max(planned - len(gaussians), 0) // rounds), planned)
+        births = -(-max(planned - len(gaussians), 0) // rounds_left)
+        room = Room(births, limit=planned)
         scores = densification_scores(gaussians, self._views, self._targets)
         problem = self._problem
         plan = plan_growth(
             gaussians, scores, room, problem.extent, config.density, self._rng, problem.cameras
         )
         select_rows(self._optimizer, plan.parent, plan.is_birth, plan.edits)
-        self._base = self._base.select(plan.parent)
+        self._initial = self._initial.select(plan.parent)
 
 
 def density_rounds(config: FitConfig) -> list[int]:
@@ -185,8 +190,8 @@ def density_rounds(config: FitConfig) -> list[int]:
     return sorted(set(steps.astype(int).tolist()))
 
 
-def _start(gaussians: Gaussians) -> dict[str, Tensor]:
-    """Return the parameters that the first frame fits at the start: without higher SH bands."""
+def _first_parameters(gaussians: Gaussians) -> dict[str, Tensor]:
+    """Return the parameters that the first steps fit: all but the higher SH bands."""
     parameters = gaussians.parameters()
     names = [
         a.name for a in ATTRIBUTES if a.first_frame and a.name in parameters and a.name != "sh_rest"
@@ -201,7 +206,8 @@ def _add_band(optimizer: Adam, base: Gaussians) -> None:
         optimizer["sh_rest"] = from_numpy(mi.TensorXf, rest[:, :3])
         return
     coefficients = np.asarray(dr.detach(optimizer["sh_rest"]))
-    width = (round((coefficients.shape[1] + 1) ** 0.5) + 1) ** 2 - 1
+    next_degree = round((coefficients.shape[1] + 1) ** 0.5)
+    width = (next_degree + 1) ** 2 - 1
     value = np.concatenate([coefficients, rest[:, coefficients.shape[1] : width]], axis=1)
     replace_parameter(
         optimizer,
@@ -219,8 +225,8 @@ def fit_confidence(
     render: RenderConfig,
     rng: np.random.Generator,
 ) -> tuple[Gaussians, dict[str, float]]:
-    """Learn the confidence alone from motion masks on key views (eq. 11); all other attributes are
-    frozen.
+    """Return Gaussians with a confidence that is learned from motion masks on key views (eq. 11);
+    all other attributes are frozen.
 
     Args:
         gaussians: N Gaussians with a confidence.
@@ -236,15 +242,15 @@ def fit_confidence(
     views = sorted(masks)
     targets = {view: from_numpy(mi.TensorXf, masks[view]) for view in views}
 
-    def losses_at(values: Mapping[str, Tensor], k: int) -> dict[str, Tensor]:
-        trial = replace(gaussians, logit_confidence=values["logit_confidence"])
+    def losses_at(parameters: Mapping[str, Tensor], view: int) -> dict[str, Tensor]:
+        trial = replace(gaussians, logit_confidence=parameters["logit_confidence"])
         image = rasterize(
-            trial, cameras[views[k]], ("confidence",), detach_weights=("confidence",), config=render
+            trial, cameras[view], ("confidence",), detach_weights=("confidence",), config=render
         )
-        return {"mask": mask_loss(image.confidence, targets[views[k]])}
+        return {"mask": mask_loss(image.confidence, targets[view])}
 
     rates = {"logit_confidence": config.first_frame_rates.confidence}
-    order = view_order(len(views), config.confidence_steps, rng)
+    order = [views[k] for k in view_order(len(views), config.confidence_steps, rng)]
     optimizer = adam({"logit_confidence": gaussians.logit_confidence})
     losses = optimise(optimizer, rates, losses_at, Steps(order))
     return replace(gaussians, **values_of(optimizer)), losses
