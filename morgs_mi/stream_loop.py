@@ -30,12 +30,12 @@ from morgs_mi.loop.correction import Correction
 from morgs_mi.loop.first_frame import fitted_first_frame, with_first_confidence
 from morgs_mi.loop.frame_report import FittedFrame, FrameReport
 from morgs_mi.loop.image_status import image_status
-from morgs_mi.loop.input_images import Given, as_array
+from morgs_mi.loop.input_images import InputImage, as_array
 from morgs_mi.loop.observation import (
     FrameObservation,
     ImageHistory,
     Images,
-    Recorded,
+    RecordedViews,
     Setup,
     extended_history,
     observe_frame,
@@ -76,7 +76,7 @@ class StreamState:
 def step(
     setup: Setup,
     state: StreamState,
-    images: Sequence[Given | None] | FrameObservation,
+    images: Sequence[InputImage | None] | FrameObservation,
     progress: Report | None = None,
     on_provisional: Callable[[Packet], None] | None = None,
 ) -> tuple[StreamState, Packet, FrameReport]:
@@ -237,7 +237,7 @@ class StreamLoop:
         self._next_observation: tuple[int, Future[FrameObservation]] | None = None
 
     @classmethod
-    def of(cls, capture: Recorded, config: StreamConfig | None = None) -> StreamLoop:
+    def of(cls, capture: RecordedViews, config: StreamConfig | None = None) -> StreamLoop:
         """Return the loop of the training views of a capture.
 
         Args:
@@ -263,10 +263,10 @@ class StreamLoop:
     @interrupts_raised()
     def push(
         self,
-        images: Sequence[Given | None],
+        images: Sequence[InputImage | None],
         progress: Report | None = None,
-        upcoming: Sequence[Given | None] | None = None,
-        recorded: Sequence[Given | None] | None = None,
+        upcoming: Sequence[InputImage | None] | None = None,
+        recorded: Sequence[InputImage | None] | None = None,
         on_provisional: Callable[[Packet], None] | None = None,
     ) -> tuple[Packet, FrameReport]:
         """Fit the next frame and return its packet for the stream, and its report; see `step`.
@@ -298,7 +298,7 @@ class StreamLoop:
         self.state = replace(state, history=history)
         return packet, replace(report, seconds=time.perf_counter() - start_time)
 
-    def _observation_ahead(self, images: Sequence[Given | None]) -> FrameObservation | None:
+    def _observation_ahead(self, images: Sequence[InputImage | None]) -> FrameObservation | None:
         """Return the observation that was made ahead of time if its images are the same; it is used
         once.
         """
@@ -317,7 +317,7 @@ class StreamLoop:
     def resume(
         self,
         coded: CodedFrame,
-        frames: Iterable[Sequence[Given | None]],
+        frames: Iterable[Sequence[InputImage | None]],
         exposures: Sequence[Exposure] = (),
     ) -> None:
         """Continue after a frame of a stream, as if it had just been pushed.

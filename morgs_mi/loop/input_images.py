@@ -13,7 +13,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import kind_of
 from morgs_mi.core.color_space import positive_light
 
-Given: TypeAlias = Any
+InputImage: TypeAlias = Any
 """An image [H, W, 3]: a uint8 array in sRGB; linear light as a float array or a `mi.TensorXf`; or a
 `mi.Bitmap`, whose flag `srgb_gamma` counts."""
 
@@ -32,7 +32,7 @@ def as_array(image: Any) -> Any:
 
 
 def copied_images(
-    cameras: Sequence[Camera], images: Sequence[Given | None], frame: int
+    cameras: Sequence[Camera], images: Sequence[InputImage | None], frame: int
 ) -> dict[int, np.ndarray]:
     """Return copies of the images of those views that have one, by view index, negative light set
     to 0.
@@ -66,7 +66,7 @@ def _check_count(images: Any, count: int, frame: int) -> None:
         )
 
 
-def _copy(image: Given, camera: Camera, place: str) -> np.ndarray:
+def _copy(image: InputImage, camera: Camera, place: str) -> np.ndarray:
     array = as_array(image)
     shape = (camera.height, camera.width, 3)
     is_image = isinstance(array, np.ndarray) and array.shape == shape

@@ -20,7 +20,7 @@ from morgs_mi.core.threads import map_in_threads
 from morgs_mi.fit.capacity import check_capacity
 from morgs_mi.fit.initialise import Points
 from morgs_mi.fit.view import View
-from morgs_mi.loop.input_images import Given, copied_images
+from morgs_mi.loop.input_images import InputImage, copied_images
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.change import box_around, change_mask, moving_region, update_reference
 from morgs_mi.method.exposure import LEAST_CHANGE, Exposure, common_change, follow_exposure
@@ -31,11 +31,11 @@ from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import motion_model
 from morgs_mi.method.objective import KeyView
 
-# By view index: the images of those views that have one.
+# Images of those views that have one, by view index.
 Images = Mapping[int, np.ndarray]
 
 
-class Recorded(Protocol):
+class RecordedViews(Protocol):
     """Cameras and points of a recording, as a `Capture` has them."""
 
     @property
@@ -186,7 +186,7 @@ def views_of(setup: Setup, images: Images) -> list[View]:
 
 
 def observe_frame(
-    setup: Setup, frame: int, history: ImageHistory, images: Sequence[Given | None]
+    setup: Setup, frame: int, history: ImageHistory, images: Sequence[InputImage | None]
 ) -> FrameObservation:
     """Return the observations of a frame: changes, flow (eq. 4) and masks (eqs. 9, 10).
 
@@ -194,8 +194,8 @@ def observe_frame(
         setup: data that all frames share.
         frame: its index.
         history: images up to the frame before; `ImageHistory()` for the first.
-        images: per training view uint8 [H, W, 3], RGB, or linear light (see `Given`), or None where
-            the view has no image. They are copied.
+        images: per training view uint8 [H, W, 3], RGB, or linear light (see `InputImage`), or None
+            where the view has no image. They are copied.
 
     Raises:
         ValueError: an image has another size or type than its camera, or the first frame has no
@@ -210,7 +210,7 @@ def observe_frame(
 
 
 def extended_history(
-    setup: Setup, frame: int, history: ImageHistory, images: Sequence[Given | None]
+    setup: Setup, frame: int, history: ImageHistory, images: Sequence[InputImage | None]
 ) -> ImageHistory:
     """Return the images up to a frame, without flow; arguments and errors of `observe_frame`."""
     return _extended(setup, history, copied_images(setup.cameras, images, frame))[0]
