@@ -5,8 +5,9 @@ and draw images.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,12 @@ from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.core.environment import machine, versions
 from morgs_mi.core.files import locked_folder, write_json
-from morgs_mi.core.fit_names import CAPTURE, REPORT
+from morgs_mi.core.fit_names import REPORT
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.figures import motion_scale
 from morgs_mi.evaluate.results import Evaluation
 from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.io.bounded import read_json
 from morgs_mi.io.video_writer import PLAYABLE, write_video
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.export.frames import pad_to_even
@@ -34,7 +34,7 @@ from morgs_mi.playback.visualise import contact_sheet, label, motion_legend, sid
 from morgs_mi.runs.fit_capture import stream_capture
 from morgs_mi.runs.fit_files import FitFiles, Recording, read_reports, stream_metadata
 from morgs_mi.studio.synth.synth_config import SynthConfig
-from morgs_mi.studio.synth.synthesize import synthesize
+from morgs_mi.studio.synth.synthesize import stored_settings, synthesize
 
 _COMPARED = (
     "psnr",
@@ -125,59 +125,69 @@ def run_demo(
 def _run(root: Path, config: DemoConfig, report_stage: Report | None) -> DemoReport:
     """Run the demonstration in a locked folder."""
     seconds: dict[str, float] = {}
-
-    def run_step(name: str, work: Callable[[Progress], Any]) -> Any:
-        start = time.perf_counter()
-        result = work(Progress(report_stage, name))
-        seconds[name] = time.perf_counter() - start
-        return result
-
-    def fit(
-        capture: Capture,
-        folder: str,
-        settings: StreamConfig,
-        progress: Progress,
-        resume: bool = False,
-    ) -> None:
-        def report(stage: str, done: float, total: float) -> None:
-            progress.of(f"{progress.stage}: {stage.lower()}")(done, total)
-
-        stream_capture(capture, root / folder, settings, resume, report)
-
-    def fit_plain(progress: Progress) -> None:
-        capture = load_capture(
-            root / "capture", max_frames=min(config.plain_frames, config.clip.frames)
-        )
-        _begin_with_first_frame(root / "stream_plain", root / "stream", capture, plain)
-        fit(capture, "stream_plain", plain, progress, resume=True)
-
-    run_step(
-        "Path-tracing the clip", lambda report: _synthesize_clip(root / "capture", config, report)
-    )
-    switches = {"learn_motion": False, "learn_offset": False, "learn_confidence": False}
-    plain = replace(config.stream, motion=replace(config.stream.motion, **switches))
+    run_step = partial(_timed, seconds, report_stage)
+    capture = root / "capture"
+    run_step("Path-tracing the clip", partial(_synthesize_clip, capture, config))
     run_step(
         "Fitting",
-        lambda report: fit(load_capture(root / "capture"), "stream", config.stream, report),
+        lambda progress: _fit(load_capture(capture), root / "stream", config.stream, progress),
     )
-    run_step("Fitting without ML, MO, MC", fit_plain)
+    run_step("Fitting without ML, MO, MC", partial(_fit_plain, root, config))
     results = {
         name: run_step(
             f"Evaluating {folder}",
-            lambda report, folder=folder: evaluate_stream(root / folder, progress=report),
+            lambda progress, folder=folder: evaluate_stream(root / folder, progress=progress),
         )
         for name, folder in (("full", "stream"), ("plain", "stream_plain"))
     }
-    run_step("Drawing", lambda report: _draw(root, load_capture(root / "capture"), report))
+    run_step("Drawing", lambda report: _draw(root, load_capture(capture), report))
     frames, comparison = _compare(results)
     seconds["total"] = sum(seconds.values())
-    full = results["full"]
-    plain_result = results["plain"]
     report = DemoReport(
-        config, full, plain_result, frames, comparison, seconds, machine(), versions()
+        config,
+        results["full"],
+        results["plain"],
+        frames,
+        comparison,
+        seconds,
+        machine(),
+        versions(),
     )
     write_json(root / REPORT, report.as_dict())
     return report
+
+
+def _timed(
+    seconds: dict[str, float],
+    report_stage: Report | None,
+    name: str,
+    work: Callable[[Progress], Any],
+) -> Any:
+    """Return the result of a step's work, and store its time in `seconds`."""
+    start = time.perf_counter()
+    result = work(Progress(report_stage, name))
+    seconds[name] = time.perf_counter() - start
+    return result
+
+
+def _fit(
+    capture: Capture, out: Path, config: StreamConfig, progress: Progress, resume: bool = False
+) -> None:
+    def report(stage: str, done: float, total: float) -> None:
+        progress.of(f"{progress.stage}: {stage.lower()}")(done, total)
+
+    stream_capture(capture, out, config, resume, report)
+
+
+def _fit_plain(root: Path, config: DemoConfig, progress: Progress) -> None:
+    """Fit without motion, offset and confidence, from the first frame of the fit with them."""
+    capture = load_capture(
+        root / "capture", max_frames=min(config.plain_frames, config.clip.frames)
+    )
+    switches = {"learn_motion": False, "learn_offset": False, "learn_confidence": False}
+    plain = replace(config.stream, motion=replace(config.stream.motion, **switches))
+    _begin_with_first_frame(root / "stream_plain", root / "stream", capture, plain)
+    _fit(capture, root / "stream_plain", plain, progress, resume=True)
 
 
 def _synthesize_clip(
@@ -189,13 +199,7 @@ def _synthesize_clip(
     clip = replace(config.clip, seed=config.stream.seed)
     settings = {"scene": config.scene, **clip.as_dict()}
     set_values = {name: value for name, value in settings.items() if value is not None}
-    try:
-        metadata = read_json(folder / CAPTURE)
-    except (OSError, ValueError):
-        metadata = None
-    if isinstance(metadata, dict) and all(
-        metadata.get(name) == value for name, value in set_values.items()
-    ):
+    if set_values.items() <= stored_settings(folder).items():
         report(1, 1)
         return
     synthesize(config.scene, folder, clip, overwrite=True, progress=report)
@@ -252,14 +256,24 @@ def _draw(out: Path, capture: Capture, report: Callable[[float, float], None]) -
     fps = min(capture.fps, len(rows) / _LEAST_SECONDS)
     write_video(out / "side_by_side.mp4", map(pad_to_even, rows), fps, PLAYABLE)
     report(1, 2)
+    write_png(out / "contact_sheet.png", contact_sheet(_sheet(full, plain, scale)))
+    report(2, 2)
+
+
+def _sheet(
+    full: Sequence[Mapping[str, np.ndarray]],
+    plain: Sequence[Mapping[str, np.ndarray]],
+    scale: float,
+) -> list[list[np.ndarray]]:
+    """Return the rows of the contact sheet: three frames of the one fit, and one of the other."""
     last = len(plain) - 1
     frames = sorted({min(1, len(full) - 1), last, len(full) - 1})
-    sheet = [list(full[frame].values()) for frame in frames]
     # The plain fit does not learn the confidence.
     plain_panels = [panel for name, panel in plain[last].items() if name != "confidence"]
-    sheet.append([*plain_panels, motion_legend(scale)])
-    write_png(out / "contact_sheet.png", contact_sheet(sheet))
-    report(2, 2)
+    return [
+        *(list(full[frame].values()) for frame in frames),
+        [*plain_panels, motion_legend(scale)],
+    ]
 
 
 def _panels(
@@ -275,14 +289,8 @@ def _panels(
     for frame, (index, images) in zip(
         capture.frames(), render_stream(reader, camera), strict=False
     ):
+        panels = _compared_images(frame.images[view], images["color"])
         truth = truth_for_camera(capture, camera, index)
-        picture = channel_image("color", images["color"])
-        error = np.abs(picture.astype(float) - frame.images[view]) * _ERROR_GAIN / 255
-        panels = {
-            "truth": frame.images[view],
-            "render": picture,
-            "error": channel_image("color", error),
-        }
         if truth is not None:
             panels["true motion"] = channel_image("motion", truth.motion, scale)
         panels |= {
@@ -297,3 +305,10 @@ def _panels(
             {name: label(panel, labels.get(name, name + note)) for name, panel in panels.items()}
         )
     return frames
+
+
+def _compared_images(truth: np.ndarray, color: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the recorded image, the rendered one and their difference."""
+    picture = channel_image("color", color)
+    error = np.abs(picture.astype(float) - truth) * _ERROR_GAIN / 255
+    return {"truth": truth, "render": picture, "error": channel_image("color", error)}

@@ -15,7 +15,7 @@ frames.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -23,8 +23,9 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from morgs_mi.codec.codec_config import CodecConfig
-from morgs_mi.codec.container import PacketKind, StreamWriter
+from morgs_mi.codec.container import Packet, PacketKind, StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
+from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_number
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.fit_names import STREAM
@@ -90,55 +91,70 @@ def import_frames(
     check_number("import_frames()", "fps", fps, "[1e-6, 1e6]")
     config = config or CodecConfig()
     paths = find_frames(sources)
+    path = _new_stream(out)
+    cameras = _rig_around(paths, axes, most_invalid)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    metadata = {"num_frames": len(paths), DEFAULT_RIG: True, "config": {"codec": asdict(config)}}
+    frames = (read_splats(source, most_invalid) for source in paths)
+    keyframes = 0
+    with (
+        atomic_path(path, "import_frames()") as partial,
+        StreamWriter(partial, cameras, fps, metadata) as writer,
+    ):
+        for done, packets in enumerate(_packets_of_frames(frames, cameras, config), 1):
+            keyframes += packets[0].kind == PacketKind.KEYFRAME
+            for packet in packets:
+                writer.write(packet)
+            if progress is not None:
+                progress(done, len(paths))
+    return Imported(path, len(paths), keyframes, path.stat().st_size)
+
+
+def _new_stream(out: str | Path) -> Path:
+    """Return the path of the stream, a file that does not exist yet."""
     path = Path(out) if Path(out).suffix.lower() == ".morgs" else Path(out) / STREAM
     if path.exists():
         raise FileExistsError(
             f"{path}: expected a new stream, got a file that exists; remove it, or name another."
         )
+    return path
+
+
+def _rig_around(paths: Sequence[Path], axes: Axes, most_invalid: float) -> tuple[Camera, ...]:
+    """Return the ring of cameras that sees the Gaussians of several frames."""
     in_view = np.unique(np.linspace(0, len(paths) - 1, _FRAMES_IN_VIEW).astype(int))
     try:
-        cameras = default_rig([read_splats(paths[t], most_invalid) for t in in_view], axes)
+        return default_rig([read_splats(paths[t], most_invalid) for t in in_view], axes)
     except ValueError as error:
         if any(str(error).startswith(f"{path}: ") for path in paths):
             raise
         raise ValueError(f"{paths[0].parent}: {error}") from None
-    path.parent.mkdir(parents=True, exist_ok=True)
+
+
+def _packets_of_frames(
+    frames: Iterable[Gaussians], cameras: Sequence[Camera], config: CodecConfig
+) -> Iterator[list[Packet]]:
+    """Yield the packet of each frame, and after it the keyframe that is due, if any."""
     state = None
-    order = np.zeros(0, np.int64)
-    keyframes = 0
-    metadata = {"num_frames": len(paths), DEFAULT_RIG: True, "config": {"codec": asdict(config)}}
-    with (
-        atomic_path(path, "import_frames()") as partial,
-        StreamWriter(partial, cameras, fps, metadata) as writer,
-    ):
-        for frame, source in enumerate(paths):
-            gaussians = read_splats(source, most_invalid)
-            rows = (
-                None
-                if state is None
-                else matched_rows(state.gaussians.select(np.argsort(order)), gaussians)
-            )
-            if state is None or rows is None:
-                order = np.arange(len(gaussians))
-                packet = keyframe_packet(gaussians, frame, cameras, config)
-            else:
-                # Of the state, where births are last.
-                rows = np.where(rows < 0, -1, np.argsort(order)[rows])
-                order = np.argsort(np.where(rows < 0, len(state), rows), kind="stable")
-                packet = residual_packet(
-                    state, gaussians.select(order), rows[order], cameras, config
-                )
+    order = np.zeros(0, np.int64)  # of the frame's Gaussians in the state
+    for frame, gaussians in enumerate(frames):
+        rows = (
+            None
+            if state is None
+            else matched_rows(state.gaussians.select(np.argsort(order)), gaussians)
+        )
+        if state is None or rows is None:
+            order = np.arange(len(gaussians))
+            packet = keyframe_packet(gaussians, frame, cameras, config)
             state = decode(state, packet)
-            is_keyframe = packet.kind == PacketKind.KEYFRAME
-            keyframes += is_keyframe
-            for each in (
-                packet,
-                *([] if is_keyframe else due_keyframe(state, config.keyframe_interval)),
-            ):
-                writer.write(each)
-            if progress is not None:
-                progress(frame + 1, len(paths))
-    return Imported(path, len(paths), keyframes, path.stat().st_size)
+            yield [packet]
+            continue
+        # Of the state, where births are last.
+        rows = np.where(rows < 0, -1, np.argsort(order)[rows])
+        order = np.argsort(np.where(rows < 0, len(state), rows), kind="stable")
+        packet = residual_packet(state, gaussians.select(order), rows[order], cameras, config)
+        state = decode(state, packet)
+        yield [packet, *due_keyframe(state, config.keyframe_interval)]
 
 
 def find_frames(sources: Sequence[str | Path]) -> list[Path]:
@@ -159,20 +175,31 @@ def find_frames(sources: Sequence[str | Path]) -> list[Path]:
                 f"{path}: expected frames ({', '.join(SUFFIXES)}), found none; check the path."
             )
     if len(paths) == 1 and paths[0].is_dir():
-        folder = paths[0]
-        files = (path for path in listed(folder) if path.is_file() and suffix_of(path))
-        paths = sorted(files, key=lambda path: natural_key(path.name))
-        if not paths:
-            for file in listed(folder):
-                refuse_foreign(file)
-            raise ValueError(
-                f"{folder}: expected files whose names end in {', '.join(SUFFIXES)}, got none; "
-                "convert the frames."
-            )
+        paths = _frames_in(paths[0])
     if not paths:
         raise ValueError(
             "import_frames(): `sources` must be a folder or at least one file, got none."
         )
+    _check_formats(paths)
+    return paths
+
+
+def _frames_in(folder: Path) -> list[Path]:
+    """Return the files with Gaussians in a folder, at least one, by the numbers in their names."""
+    files = (path for path in listed(folder) if path.is_file() and suffix_of(path))
+    paths = sorted(files, key=lambda path: natural_key(path.name))
+    if not paths:
+        for file in listed(folder):
+            refuse_foreign(file)
+        raise ValueError(
+            f"{folder}: expected files whose names end in {', '.join(SUFFIXES)}, got none; "
+            "convert the frames."
+        )
+    return paths
+
+
+def _check_formats(paths: Sequence[Path]) -> None:
+    """Raise `ValueError` unless all files have one format, of those that are read."""
     first = {suffix_of(path): path for path in reversed(paths)}
     if None in first:
         refuse_foreign(first[None])
@@ -186,7 +213,6 @@ def find_frames(sources: Sequence[str | Path]) -> list[Path]:
             f"{paths[0].parent}: expected frames of one format, got {names}; name the files of "
             "one of them."
         )
-    return paths
 
 
 def same_gaussians(before: Gaussians, now: Gaussians) -> bool:
@@ -217,21 +243,39 @@ def matched_rows(before: Gaussians, now: Gaussians) -> np.ndarray | None:
     fewer = min(len(before), len(now))
     if before.sh_degree != now.sh_degree or not fewer:
         return None
+    nearest = _nearest_rows(before, now)
+    if nearest is None:
+        return None
+    survivors = _increasing(nearest)
+    if len(survivors) < _LEAST_SURVIVORS * fewer:
+        return None
+    return _rows_with_gaps(survivors, nearest[survivors], len(now), len(before))
+
+
+def _nearest_rows(before: Gaussians, now: Gaussians) -> np.ndarray | None:
+    """Return the most similar row of the frame before for each Gaussian; None where their features
+    cannot be compared.
+    """
     old, new = _scaled_features(before, now)
     if not old.shape[1] or not np.isfinite(new).all():
         return None
     # The search takes forever among many that are equal.
     distinct, first = np.unique(old, axis=0, return_index=True)
-    nearest = first[KDTree(distinct).query(new)[1]]
-    survivors = _increasing(nearest)
-    if len(survivors) < _LEAST_SURVIVORS * fewer:
-        return None
-    rows = np.full(len(now), -1)
-    rows[survivors] = nearest[survivors]
-    # Between two survivors with as many rows between them in both frames, those are the same ones,
-    # too.
+    return first[KDTree(distinct).query(new)[1]]
+
+
+def _rows_with_gaps(
+    survivors: np.ndarray, rows_before: np.ndarray, count: int, count_before: int
+) -> np.ndarray:
+    """Return the row in the frame before of all `count` Gaussians [M] from those of the survivors.
+
+    Between two survivors with as many rows between them in both frames, those are the same ones,
+    too; the others are births.
+    """
+    rows = np.full(count, -1)
+    rows[survivors] = rows_before
     ends = np.concatenate(
-        [[[-1, -1]], np.stack([survivors, nearest[survivors]], axis=1), [[len(now), len(before)]]]
+        [[[-1, -1]], np.stack([survivors, rows_before], axis=1), [[count, count_before]]]
     )
     gap, gap_before = np.diff(ends, axis=0).T
     for k in np.flatnonzero((gap == gap_before) & (gap > 1)):
@@ -262,9 +306,14 @@ def _increasing(numbers: np.ndarray) -> np.ndarray:
         previous[index] = lasts[length - 1] if length else -1
         ends[length : length + 1] = [number]
         lasts[length : length + 1] = [index]
-    indices = np.empty(len(ends), np.int64)
-    index = lasts[-1] if lasts else -1
-    for place in reversed(range(len(indices))):
+    return _chain(previous, lasts[-1] if lasts else -1, len(lasts))
+
+
+def _chain(previous: np.ndarray, last: int, length: int) -> np.ndarray:
+    """Return the `length` indices that end with `last`, each after its `previous` one."""
+    indices = np.empty(length, np.int64)
+    index = last
+    for place in reversed(range(length)):
         indices[place] = index
         index = previous[index]
     return indices

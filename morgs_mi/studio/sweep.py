@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from itertools import islice, product
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -71,18 +71,20 @@ def sweep(
     stage = Progress(progress, "Fitting and evaluating")
     for count, seed in ladder:
         stage(len(rows), len(ladder))
-        folder = Path(out) / f"epochs{count}-seed{seed}"
-        stream_capture(
-            capture, folder, replace(config, fit=replace(config.fit, epochs=count), seed=seed)
-        )
-        rows.append(
-            {"epochs": count, "seed": seed, **_scores(evaluate_stream(folder, capture.path))}
-        )
+        settings = replace(config, fit=replace(config.fit, epochs=count), seed=seed)
+        rows.append(_fitted_scores(capture, Path(out) / f"epochs{count}-seed{seed}", settings))
         write_json(
             Path(out) / "sweep.json", {"rows": rows, "machine": machine(), "versions": versions()}
         )
     stage(len(rows), len(ladder))
     return rows
+
+
+def _fitted_scores(capture: Capture, folder: Path, config: StreamConfig) -> Scores:
+    """Fit a capture into a folder, and return the row of the fit."""
+    stream_capture(capture, folder, config)
+    scores = _scores(evaluate_stream(folder, capture.path))
+    return {"epochs": config.fit.epochs, "seed": config.seed, **scores}
 
 
 def _compile_kernels(capture: Capture, config: StreamConfig) -> None:
@@ -127,15 +129,20 @@ def write_sweep_plot(path: Path, rows: Sequence[Scores]) -> None:
     panels = [name for name in [*SCORES][2:] if np.isfinite(means[0][name])]
     figure = Figure(figsize=(3.6 * len(panels), 3.2), layout="constrained")
     for axes, name in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
-        axes.plot([row["later_seconds"] for row in means], [row[name] for row in means])
-        axes.plot(
-            [row["later_seconds"] for row in rows], [row[name] for row in rows], "o", markersize=4
-        )
-        for row in means:
-            place = (row["later_seconds"], row[name])
-            axes.annotate(f"{row['epochs']:.0f}", place, xytext=(4, 4), textcoords="offset points")
-        axes.set(xlabel="seconds of a later frame", ylabel=SCORES[name][0])
-        axes.grid(color="0.9")
+        _draw_score(axes, name, rows, means)
     with atomic_path(path, "write_sweep_plot()") as partial:
         partial.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(partial, format=path.suffix[1:].lower())
+
+
+def _draw_score(axes: Any, name: str, rows: Sequence[Scores], means: Sequence[Scores]) -> None:
+    """Draw one score of the fits and its means."""
+    axes.plot([row["later_seconds"] for row in means], [row[name] for row in means])
+    axes.plot(
+        [row["later_seconds"] for row in rows], [row[name] for row in rows], "o", markersize=4
+    )
+    for row in means:
+        place = (row["later_seconds"], row[name])
+        axes.annotate(f"{row['epochs']:.0f}", place, xytext=(4, 4), textcoords="offset points")
+    axes.set(xlabel="seconds of a later frame", ylabel=SCORES[name][0])
+    axes.grid(color="0.9")

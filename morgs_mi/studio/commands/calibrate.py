@@ -6,14 +6,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from rich.box import SIMPLE_HEAD
-from rich.table import Table
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from morgs_mi.cli.console import print_result, print_table, print_warning, progress
 from morgs_mi.cli.settings import Flag, Without
-from morgs_mi.studio.calibration.calibrate import CalibrateConfig
-from morgs_mi.studio.commands.info import advice_lines, check_cells
+from morgs_mi.studio.calibration.calibrate import CalibrateConfig, CalibrationResult
+from morgs_mi.studio.commands.info import advice_lines, check_cells, check_table
 
 
 @dataclass(frozen=True)
@@ -41,19 +39,22 @@ class Calibrate:
                 lambda *stage: report(*stage),
                 self.without,
             )
-        table = Table(title=str(result.model), box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-        for column in ("camera", "points", "error, px", "pose"):
-            table.add_column(column, no_wrap=True)
+        table = check_table(str(result.model), ("camera", "points", "error, px", "pose"))
         for check in result.checks:
             table.add_row(check.name, *check_cells(check))
         print_table(table)
         for line in advice_lines(result.checks):
             print_warning(line)
-        how = f"{result.mapper} mapping" + (
-            ", with a principal point for each" if result.principal_points else ""
-        )
-        print_result(
-            f"{result.model}: {len(result.cameras)} cameras, {result.points} points, mean "
-            f"reprojection error {result.error:.2f} px, by {how}; scale and up direction of its "
-            "world are arbitrary."
-        )
+        print_result(_summary(result))
+
+
+def _summary(result: CalibrationResult) -> str:
+    """Return a summary of a calibration in one sentence."""
+    how = f"{result.mapper} mapping" + (
+        ", with a principal point for each" if result.principal_points else ""
+    )
+    return (
+        f"{result.model}: {len(result.cameras)} cameras, {result.points} points, mean "
+        f"reprojection error {result.error:.2f} px, by {how}; scale and up direction of its "
+        "world are arbitrary."
+    )

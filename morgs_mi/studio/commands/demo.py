@@ -12,9 +12,17 @@ from tyro.conf import DisallowNone, Positional
 from morgs_mi.cli.console import print_result, print_table, progress
 from morgs_mi.cli.settings import Settings, optional, setting
 from morgs_mi.evaluate.tables import figure
-from morgs_mi.studio.demo import DemoConfig
+from morgs_mi.studio.demo import DemoConfig, DemoReport
 
 _DEFAULT = DemoConfig()
+# Titles and digits of the compared scores, by name.
+_SCORES = {
+    "psnr": ("PSNR, dB", 2),
+    "ssim": ("SSIM", 4),
+    "motion_error": ("flow error, px", 2),
+    "motion_error_moving": ("moving, px", 2),
+    "motion_error_still": ("still, px", 2),
+}
 
 
 @dataclass(frozen=True)
@@ -51,42 +59,42 @@ class Demo:
         settings = Settings(config=self.config, seed=self.seed)
         stream = settings.stream_config(_DEFAULT.stream)
         settings.check_methods(stream)
-        clip = replace(
-            _DEFAULT.clip,
-            cameras=self.cameras,
-            frames=self.frames,
-            width=self.width,
-            height=self.height,
-            spp=self.spp,
-        )
+        names = ("cameras", "frames", "width", "height", "spp")
+        clip = replace(_DEFAULT.clip, **{name: getattr(self, name) for name in names})
         with progress() as report:
             result = run_demo(
                 self.out, replace(_DEFAULT, scene=self.scene, clip=clip, stream=stream), report
             )
-        full = result.full
-        frames = result.compared_frames
-        table = Table(
-            title=f"held-out view, frames {f'{frames[0]} to {frames[-1]}' if frames else 'none'}"
-        )
-        for column in ("", "PSNR, dB", "SSIM", "flow error, px", "moving, px", "still, px"):
-            table.add_column(column, justify="right" if column else "left")
-        for name, title in (("full", "with motion"), ("plain", "without")):
-            row = result.comparison[name]
-            motion = (
-                figure(row[key], 2)
-                for key in ("motion_error", "motion_error_moving", "motion_error_still")
-            )
-            table.add_row(title, figure(row["psnr"], 2), figure(row["ssim"], 4), *motion)
-        print_table(table)
-        print_result(
-            f"Held-out PSNR {figure(full.frames[0].scores.psnr, 2)} dB in the first frame, "
-            f"{figure(full.frames[-1].scores.psnr, 2)} dB in the last of {full.num_frames}; "
-            f"{figure(full.seconds.per_later_frame, 1)} s and "
-            f"{figure(full.sizes.per_residual / 1e6, 2)} MB per later frame; "
-            f"{result.seconds['total']:.0f} s in all."
-        )
+        print_table(_comparison_table(result))
+        print_result(_summary(result))
         print_result(
             f"Video and contact sheet: {self.out / 'side_by_side.mp4'}, "
             f"{self.out / 'contact_sheet.png'}"
         )
         print_result(f"All results: {self.out / 'report.json'}")
+
+
+def _comparison_table(result: DemoReport) -> Table:
+    """Return a row for each fit: its mean scores over the frames that both have."""
+    frames = result.compared_frames
+    table = Table(
+        title=f"held-out view, frames {f'{frames[0]} to {frames[-1]}' if frames else 'none'}"
+    )
+    for column in ("", *(title for title, _ in _SCORES.values())):
+        table.add_column(column, justify="right" if column else "left")
+    for name, title in (("full", "with motion"), ("plain", "without")):
+        row = result.comparison[name]
+        table.add_row(title, *(figure(row[key], digits) for key, (_, digits) in _SCORES.items()))
+    return table
+
+
+def _summary(result: DemoReport) -> str:
+    """Return the quality, time and size of the fit with motion in one sentence."""
+    full = result.full
+    return (
+        f"Held-out PSNR {figure(full.frames[0].scores.psnr, 2)} dB in the first frame, "
+        f"{figure(full.frames[-1].scores.psnr, 2)} dB in the last of {full.num_frames}; "
+        f"{figure(full.seconds.per_later_frame, 1)} s and "
+        f"{figure(full.sizes.per_residual / 1e6, 2)} MB per later frame; "
+        f"{result.seconds['total']:.0f} s in all."
+    )

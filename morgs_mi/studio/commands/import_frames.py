@@ -51,18 +51,12 @@ class Import:
                 "morgs-mi import: expected FRAMES and OUT, got fewer; see morgs-mi import --help."
             )
         *frames, out = self.paths
-        options = {
-            name: value
-            for name in ("quality", "target_size")
-            if (value := getattr(self, name)) is not None
-        }
-        config = replace(CodecConfig(), keyframe_interval=self.keyframe_interval, **options)
         with progress() as report:
             result = import_frames(
                 frames,
                 check_output(out),
                 self.fps,
-                config,
+                self._codec_config(),
                 self.axes,
                 lambda done, of: report("Importing", done, of),
                 most_invalid=1.0 if self.drop_invalid else 0.0,
@@ -72,3 +66,11 @@ class Import:
             f"{result.path}: {result.num_frames} frames, {sets} of Gaussians, "
             f"{result.num_bytes / 1e6:.2f} MB."
         )
+
+    def _codec_config(self) -> CodecConfig:
+        options = {
+            name: value
+            for name in ("quality", "target_size")
+            if (value := getattr(self, name)) is not None
+        }
+        return replace(CodecConfig(), keyframe_interval=self.keyframe_interval, **options)

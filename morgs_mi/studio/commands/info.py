@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, NamedTuple
 
+import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from tyro.conf import DisallowNone, Positional, arg
@@ -30,6 +31,17 @@ from morgs_mi.studio.calibration.checks.rig_check import CameraCheck, RigCheck, 
 from morgs_mi.studio.calibration.checks.signals import read_signals
 from morgs_mi.studio.calibration.timing import TimeOffsets, estimate_time_offsets
 
+# Columns of a camera, after its index and name.
+_COLUMNS = (
+    "size",
+    "focal, px",
+    "centre, px",
+    "seen",
+    "use",
+    "matches",
+    "error, px",
+    "pose",
+)
 # Standard errors in frames above which a time offset is uncertain, and from which it counts as not
 # found.
 _UNCERTAIN = 0.1
@@ -65,7 +77,34 @@ class Info:
     arguments: ClassVar[Mapping[str, str]] = {"max_frames": "morgs-mi fit --frames"}
 
     def run(self) -> None:
-        from morgs_mi.studio.calibration.checks.plots import check_plot, write_rig
+        self._check_options()
+        capture = load_capture(self.capture, reading=self.reading.read_config())
+        points = f"{len(capture.points)} points" if len(capture.points) else "without points"
+        checks = _Checks()
+        if self.check:
+            with progress() as report:
+                common = match_capture(
+                    capture, lambda done, total: report("Matching views", done, total)
+                )
+            rig_check = check_rig(capture, common)
+            if not len(capture.points):
+                capture = triangulate_points(capture, common)
+                points += f" ({len(capture.points)} can be triangulated)"
+            checks = _checks(capture, common, rig_check, self.deep)
+        print_table(_camera_table(capture, checks.rig))
+        _print_lines(_content_lines(capture, points, checks.rig))
+        if self.time:
+            with progress() as report:
+                offsets = estimate_time_offsets(
+                    capture, lambda done, total: report("Comparing clocks", done, total)
+                )
+            _print_lines(_time_lines(offsets))
+        _print_lines([finding.sentence for finding in checks.exposures])
+        _print_lines(_deep_lines(checks.deep))
+        self._write_files(capture, checks.deep)
+
+    def _check_options(self) -> None:
+        from morgs_mi.studio.calibration.checks.plots import check_plot
 
         if self.deep and not self.check:
             raise ValueError(
@@ -78,50 +117,50 @@ class Info:
                 check_output(output)
         if self.plot is not None:
             check_plot(self.plot)
-        capture = load_capture(self.capture, reading=self.reading.read_config())
-        rig_check = None
-        deep = None
-        exposures: Sequence[Finding] = ()
-        origin = "" if len(capture.points) else "without points"
-        if self.check:
-            with progress() as report:
-                common = match_capture(
-                    capture, lambda done, total: report("Matching views", done, total)
-                )
-            rig_check = check_rig(capture, common)
-            if origin:
-                capture = triangulate_points(capture, common)
-                origin += f" ({len(capture.points)} can be triangulated)"
-            if self.deep:
-                deep = _deep_check(capture, common, rig_check)
-            else:
-                exposures = check_exposures(capture, common)
-        print_table(_camera_table(capture, rig_check))
-        points = origin or f"{len(capture.points)} points"
-        truth = "with ground truth" if capture.truth else "without ground truth"
-        print_result(f"{capture.num_frames} frames at {capture.fps:g} fps, {points}, {truth}.")
-        for line in (
-            *capture.notes,
-            *_check_lines(rig_check),
-            *_color_lines(capture),
-            *_forecast_lines(capture),
-        ):
-            print_result(line)
-        if self.time:
-            with progress() as report:
-                offsets = estimate_time_offsets(
-                    capture, lambda done, total: report("Comparing clocks", done, total)
-                )
-            for line in _time_lines(offsets):
-                print_result(line)
-        for line in (*(finding.sentence for finding in exposures), *_deep_lines(deep)):
-            print_result(line)
+
+    def _write_files(self, capture: Capture, deep: DeepCheck | None) -> None:
+        from morgs_mi.studio.calibration.checks.plots import write_rig
+
         if self.json is not None and deep:
             write_json(self.json, deep.as_dict())
             print_result(f"All measurements: {self.json}")
         if self.plot is not None:
             write_rig(self.plot, capture, deep)
             print_result(f"Plot of the rig: {self.plot}")
+
+
+class _Checks(NamedTuple):
+    """Results of the checks, as far as they are made."""
+
+    rig: RigCheck | None = None
+    deep: DeepCheck | None = None
+    exposures: Sequence[Finding] = ()
+
+
+def _checks(
+    capture: Capture, shared: SharedFeatures, rig_check: RigCheck, many_frames: bool
+) -> _Checks:
+    """Return the checks of the images: of many frames, or the exposures in the first."""
+    if many_frames:
+        return _Checks(rig_check, _deep_check(capture, shared, rig_check))
+    return _Checks(rig_check, exposures=check_exposures(capture, shared))
+
+
+def _print_lines(lines: Iterable[str]) -> None:
+    for line in lines:
+        print_result(line)
+
+
+def _content_lines(capture: Capture, points: str, rig_check: RigCheck | None) -> list[str]:
+    """Return what the capture contains, its notes and what follows from its poses and colours."""
+    truth = "with ground truth" if capture.truth else "without ground truth"
+    return [
+        f"{capture.num_frames} frames at {capture.fps:g} fps, {points}, {truth}.",
+        *capture.notes,
+        *_check_lines(rig_check),
+        *_color_lines(capture),
+        *_forecast_lines(capture),
+    ]
 
 
 def _deep_check(capture: Capture, shared: SharedFeatures, rig_check: RigCheck) -> DeepCheck:
@@ -147,35 +186,29 @@ def _deep_lines(deep: DeepCheck | None) -> list[str]:
 
 def _camera_table(capture: Capture, rig_check: RigCheck | None) -> Table:
     """Return a row per camera: size, intrinsics, use, and how well its pose fits the matches."""
-    table = Table(title=f"{capture.path}: {capture.layout}", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for column in (
-        "",
-        "camera",
-        "size",
-        "focal, px",
-        "centre, px",
-        "seen",
-        "use",
-        "matches",
-        "error, px",
-        "pose",
-    ):
-        table.add_column(column, no_wrap=True)
-    for index, (camera, mask) in enumerate(zip(capture.cameras, capture.masks, strict=True)):
-        K = camera.K
+    table = check_table(f"{capture.path}: {capture.layout}", ("", "camera", *_COLUMNS))
+    for index, camera in enumerate(capture.cameras):
         table.add_row(
             str(index),
             camera.name,
             f"{camera.width}x{camera.height}",
-            f"{K[0, 0]:.1f}"
-            if f"{K[0, 0]:.1f}" == f"{K[1, 1]:.1f}"
-            else f"{K[0, 0]:.1f} {K[1, 1]:.1f}",
-            f"{K[0, 2]:.1f} {K[1, 2]:.1f}",
-            "100 %" if mask is None else f"{100 * mask.mean():.0f} %",
+            *_intrinsics_cells(camera.K),
+            _share_of_pixels(capture.masks[index]),
             "test" if index in capture.test_views else "train",
             *check_cells(rig_check.cameras[index] if rig_check else None),
         )
     return table
+
+
+def _intrinsics_cells(K: np.ndarray) -> tuple[str, str]:
+    """Return the focal length, or both if they differ, and the principal point as text."""
+    fx, fy = f"{K[0, 0]:.1f}", f"{K[1, 1]:.1f}"
+    return fx if fx == fy else f"{fx} {fy}", f"{K[0, 2]:.1f} {K[1, 2]:.1f}"
+
+
+def _share_of_pixels(mask: np.ndarray | None) -> str:
+    """Return the share of the pixels in a mask as text."""
+    return "100 %" if mask is None else f"{100 * mask.mean():.0f} %"
 
 
 def _check_lines(rig_check: RigCheck | None) -> list[str]:
@@ -194,20 +227,7 @@ def _time_lines(offsets: TimeOffsets) -> list[str]:
     """Return the time offsets as the options that align the clips, and how certain they are."""
     errors = {name: error for name, error in offsets.errors.items() if name != offsets.reference}
     measured_errors = {name: error for name, error in errors.items() if error < _NOT_FOUND}
-    lines = []
-    if measured_errors:
-        options = " ".join(f"{name} {offsets.offsets[name]:.2f}" for name in measured_errors)
-        worst = max(measured_errors, key=lambda name: measured_errors[name])
-        lines += [
-            f"Clocks: pass --offset {options} for the time of {offsets.reference}.",
-            f"Standard errors of these offsets: up to {measured_errors[worst]:.2f} frames "
-            f"({worst}).",
-        ]
-    doubts = [
-        f"{name} ({error:.2f})" for name, error in measured_errors.items() if error > _UNCERTAIN
-    ]
-    if doubts:
-        lines.append(f"Uncertain: {', '.join(doubts)}. {_UNCERTAIN_WHY}")
+    lines = _offset_lines(offsets, measured_errors)
     if len(measured_errors) < len(errors):
         names = ", ".join(name for name in errors if name not in measured_errors)
         lines.append(f"Clocks not found: {names}; keep what is known of them. {_UNCERTAIN_WHY}")
@@ -216,6 +236,22 @@ def _time_lines(offsets: TimeOffsets) -> list[str]:
             f"The offsets still change by {offsets.change:.2f} frames: the clips may not show "
             "enough."
         )
+    return lines
+
+
+def _offset_lines(offsets: TimeOffsets, errors: Mapping[str, float]) -> list[str]:
+    """Return the offsets of the cameras with these standard errors, and which are uncertain."""
+    if not errors:
+        return []
+    options = " ".join(f"{name} {offsets.offsets[name]:.2f}" for name in errors)
+    worst = max(errors, key=lambda name: errors[name])
+    lines = [
+        f"Clocks: pass --offset {options} for the time of {offsets.reference}.",
+        f"Standard errors of these offsets: up to {errors[worst]:.2f} frames ({worst}).",
+    ]
+    doubts = [f"{name} ({error:.2f})" for name, error in errors.items() if error > _UNCERTAIN]
+    if doubts:
+        lines.append(f"Uncertain: {', '.join(doubts)}. {_UNCERTAIN_WHY}")
     return lines
 
 
@@ -235,6 +271,14 @@ def _color_lines(capture: Capture) -> list[str]:
         f"{name} {a:.1f} -> {b:.1f} ({n} points)" if n else f"{name} -" for name, a, b, n in changes
     )
     return [f"Colours towards {capture.names[fit.reference]}, dE2000 before -> after: {errors}."]
+
+
+def check_table(title: str, columns: Sequence[str]) -> Table:
+    """Return a table without rows, whose cells are not wrapped."""
+    table = Table(title=title, box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for column in columns:
+        table.add_column(column, no_wrap=True)
+    return table
 
 
 def check_cells(check: CameraCheck | None) -> tuple[str, str, str]:

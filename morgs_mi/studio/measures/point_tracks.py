@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from morgs_mi.codec.frame_source import FrameSource
+from morgs_mi.codec.frame_source import FrameSource, FrameState
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import numbers
 from morgs_mi.core.gaussians import Gaussians
@@ -84,6 +84,33 @@ def track_points(
         ValueError: an argument has another shape, a point is not finite, the stream has no such
             frame, or a packet is broken.
     """
+    points, queries = _checked_queries(points, frame)
+    if num_gaussians < 1:
+        raise ValueError(
+            f"track_points(): `num_gaussians` must be at least 1, got {num_gaussians}."
+        )
+    ids, weights, local = _bindings(stream, points, queries, num_gaussians)
+    frames = []
+    positions = []
+    alive = []
+    for t, total, mean in _carried(stream, ids, weights, local):
+        positions.append(mean)
+        alive.append(total > 0)
+        frames.append(t)
+        if progress is not None:
+            progress(len(frames))
+    order = np.asarray(frames)
+    tracks = np.stack(positions, 1)
+    living = np.stack(alive, 1)
+    at_query = order == queries[:, None]
+    tracks[at_query] = points
+    return PointTracks(
+        order, _held(tracks, living | at_query, order >= queries[:, None]), living, ids, weights
+    )
+
+
+def _checked_queries(points: ArrayLike, frame: int | ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Return the query points [P, 3] and the frame of each [P]."""
     points = numbers("track_points()", "points", points).astype(np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise ValueError(
@@ -96,34 +123,7 @@ def track_points(
             f"track_points(): `frame` must be an integer or integers [{len(points)}], got "
             f"{queries.dtype} {queries.shape}; pass the frame of each query."
         )
-    if num_gaussians < 1:
-        raise ValueError(
-            f"track_points(): `num_gaussians` must be at least 1, got {num_gaussians}."
-        )
-    queries = np.broadcast_to(queries, len(points))
-    ids, weights, local = _bindings(stream, points, queries, num_gaussians)
-    frames = []
-    positions = []
-    alive = []
-    for t, living_mask, (means, axes) in _bound(stream, ids):
-        candidates = means + np.einsum("pkij,pkj->pki", axes, local)
-        weight = weights * living_mask
-        total = weight.sum(1, keepdims=True)
-        positions.append(
-            np.einsum("pk,pki->pi", weight / np.where(total > 0, total, 1), candidates)
-        )
-        alive.append(total[:, 0] > 0)
-        frames.append(t)
-        if progress is not None:
-            progress(len(frames))
-    order = np.asarray(frames)
-    tracks = np.stack(positions, 1)
-    living = np.stack(alive, 1)
-    at_query = order == queries[:, None]
-    tracks[at_query] = points
-    return PointTracks(
-        order, _held(tracks, living | at_query, order >= queries[:, None]), living, ids, weights
-    )
+    return points, np.broadcast_to(queries, len(points))
 
 
 def bind(
@@ -142,43 +142,68 @@ def bind(
     weights = np.zeros((len(points), count))
     if not count or not len(points):
         return rows, weights
-    raw = gaussians.numpy()
-    center = raw["means"].mean(0, dtype=np.float64)
-    means = raw["means"] - center
+    center = gaussians.numpy()["means"].mean(0, dtype=np.float64)
     points = points - center
-    size = max(np.abs(means).max(), np.abs(points).max(), 1e-30)
-    scales = np.maximum(np.exp(raw["log_scales"].astype(np.float64)), _FLATTEST * size)
-    axes = (
-        Rotation.from_quat(unit_quats(gaussians), scalar_first=True).as_matrix() / scales[:, None]
-    )
-    inverse = axes @ axes.transpose(0, 2, 1)
-    moment = np.einsum("nij,nj->ni", inverse, means)
-    log_opacity = -np.logaddexp(0, -raw["logit_opacities"].astype(np.float64))
-    # The logarithm of the response is a quadratic polynomial in x, hence all of them are one matrix
-    # product.
-    i, j = np.triu_indices(3)
-    double = np.where(i == j, -0.5, -1.0)
-    polynomial = np.vstack(
-        [
-            (double * inverse[:, i, j]).T,
-            moment.T,
-            log_opacity - 0.5 * np.einsum("ni,ni->n", moment, means),
-        ]
-    )
+    polynomial = _log_responses(gaussians, center, np.abs(points).max())
     step = max(1, _MOST_ENTRIES // len(gaussians))
     for start in range(0, len(points), step):
         part = slice(start, start + step)
-        x = points[part]
-        response = np.hstack([x[:, i] * x[:, j], x, np.ones((len(x), 1))]) @ polynomial
-        largest = np.zeros((len(x), count))
-        for k in range(count):  # several times faster than a partition of the rows
-            best = response.argmax(1)
-            rows[part, k] = best
-            largest[:, k] = response[np.arange(len(x)), best]
-            response[np.arange(len(x)), best] = -np.inf
+        rows[part], largest = _largest(_monomials(points[part]) @ polynomial, count)
         # Relative to the largest: far from all Gaussians every response underflows.
         weights[part] = np.exp(largest - largest[:, :1])
     return rows, weights / weights.sum(1, keepdims=True)
+
+
+def _log_responses(gaussians: Gaussians, center: np.ndarray, farthest: float) -> np.ndarray:
+    """Return the factors [10, N] of `_monomials` for the logarithm of each Gaussian's response.
+
+    It is a quadratic polynomial in x, hence all of them are one matrix product.
+
+    Args:
+        gaussians: N Gaussians.
+        center: origin [3] of the points.
+        farthest: largest coordinate of a point.
+    """
+    raw = gaussians.numpy()
+    means = raw["means"] - center
+    inverse = _inverse_covariances(gaussians, max(np.abs(means).max(), farthest, 1e-30))
+    moment = np.einsum("nij,nj->ni", inverse, means)
+    log_opacity = -np.logaddexp(0, -raw["logit_opacities"].astype(np.float64))
+    constant = log_opacity - 0.5 * np.einsum("ni,ni->n", moment, means)
+    i, j = np.triu_indices(3)
+    double = np.where(i == j, -0.5, -1.0)
+    return np.vstack([(double * inverse[:, i, j]).T, moment.T, constant])
+
+
+def _inverse_covariances(gaussians: Gaussians, size: float) -> np.ndarray:
+    """Return the inverse covariances [N, 3, 3] in a scene of some size."""
+    log_scales = gaussians.numpy()["log_scales"]
+    scales = np.maximum(np.exp(log_scales.astype(np.float64)), _FLATTEST * size)
+    axes = (
+        Rotation.from_quat(unit_quats(gaussians), scalar_first=True).as_matrix() / scales[:, None]
+    )
+    return axes @ axes.transpose(0, 2, 1)
+
+
+def _monomials(points: np.ndarray) -> np.ndarray:
+    """Return the products of two coordinates, the coordinates and 1 at each point [P, 10]."""
+    i, j = np.triu_indices(3)
+    return np.hstack([points[:, i] * points[:, j], points, np.ones((len(points), 1))])
+
+
+def _largest(values: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the columns and the values [P, K] of the K largest ones in each row of `values`, which
+    is overwritten.
+    """
+    every = np.arange(len(values))
+    columns = np.zeros((len(values), count), np.int64)
+    largest = np.zeros((len(values), count))
+    for k in range(count):  # several times faster than a partition of the rows
+        best = values.argmax(1)
+        columns[:, k] = best
+        largest[:, k] = values[every, best]
+        values[every, best] = -np.inf
+    return columns, largest
 
 
 def seen_in_depth(
@@ -202,14 +227,19 @@ def seen_in_depth(
     pixels = np.floor(camera.project(points[front])[0])
     mask = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(-1)
     front = front[mask]
-    column, row = pixels[mask].astype(int).T
-    surface = np.pad(np.where(alpha < 0.5, np.inf, depth), 1, mode="edge")
-    farthest = np.max(
-        [surface[row + dy, column + dx] for dy in range(3) for dx in range(3)], axis=0, initial=0
-    )
+    farthest = _farthest_around(np.where(alpha < 0.5, np.inf, depth), pixels[mask].astype(int))
     visible = np.zeros(len(points), bool)
     visible[front] = z[front] <= (1 + _DEPTH_TOLERANCE) * farthest
     return visible
+
+
+def _farthest_around(depth: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Return the largest depth [P] in the 3x3 pixels around each of `pixels` [P, 2]."""
+    column, row = pixels.T
+    surface = np.pad(depth, 1, mode="edge")
+    return np.max(
+        [surface[row + dy, column + dx] for dy in range(3) for dx in range(3)], axis=0, initial=0
+    )
 
 
 def _bindings(
@@ -226,16 +256,11 @@ def _bindings(
     rest = set(queries.tolist())
     for state in stream.states():
         rest.discard(state.frame)
-        rows_of_frame = np.flatnonzero(queries == state.frame)
-        if len(rows_of_frame):
-            rows, weight = bind(state.gaussians, points[rows_of_frame], num_gaussians)
-            means, axes = _means_and_axes(state.gaussians, rows)
-            columns = slice(rows.shape[1])
-            ids[rows_of_frame, columns] = state.lasting_ids[rows]
-            weights[rows_of_frame, columns] = weight
-            local[rows_of_frame, columns] = np.einsum(
-                "pkji,pkj->pki", axes, points[rows_of_frame][:, None] - means
-            )
+        rows = np.flatnonzero(queries == state.frame)
+        if len(rows):
+            parts = _binding(state, points[rows], num_gaussians)
+            for array, part in zip((ids, weights, local), parts, strict=True):
+                array[rows, : part.shape[1]] = part
         if state.frame >= last:
             break
     if rest:
@@ -246,6 +271,30 @@ def _bindings(
     return ids, weights, local
 
 
+def _binding(
+    state: FrameState, points: np.ndarray, num_gaussians: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the same as `_bindings` for points whose query is one frame; K as in `bind`."""
+    rows, weights = bind(state.gaussians, points, num_gaussians)
+    means, axes = _means_and_axes(state.gaussians, rows)
+    local = np.einsum("pkji,pkj->pki", axes, points[:, None] - means)
+    return state.lasting_ids[rows], weights, local
+
+
+def _carried(
+    stream: FrameSource, ids: np.ndarray, weights: np.ndarray, local: np.ndarray
+) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """Yield (frame, total weight of the living [P], mean of the positions to which they carry each
+    point [P, 3]); the other arguments are the results of `_bindings`.
+    """
+    for t, living_mask, (means, axes) in _bound(stream, ids):
+        candidates = means + np.einsum("pkij,pkj->pki", axes, local)
+        weight = weights * living_mask
+        total = weight.sum(1, keepdims=True)
+        share = weight / np.where(total > 0, total, 1)
+        yield t, total[:, 0], np.einsum("pk,pki->pi", share, candidates)
+
+
 def _bound(
     stream: FrameSource, ids: np.ndarray
 ) -> Iterator[tuple[int, np.ndarray, tuple[np.ndarray, np.ndarray]]]:
@@ -253,14 +302,19 @@ def _bound(
     bound Gaussians.
     """
     for state in stream.states():
-        present = state.lasting_ids
-        rows = np.searchsorted(present, ids)
-        mask = rows < len(present)
-        mask[mask] = present[rows[mask]] == ids[mask]
+        rows, mask = _rows_of_ids(state.lasting_ids, ids)
         means = np.zeros((*ids.shape, 3))
         axes = np.zeros((*ids.shape, 3, 3))
         means[mask], axes[mask] = _means_and_axes(state.gaussians, rows[mask])
         yield state.frame, mask, (means, axes)
+
+
+def _rows_of_ids(present: np.ndarray, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return where `ids` are among the ascending ids `present`, and the mask of those that are."""
+    rows = np.searchsorted(present, ids)
+    mask = rows < len(present)
+    mask[mask] = present[rows[mask]] == ids[mask]
+    return rows, mask
 
 
 def _means_and_axes(gaussians: Gaussians, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

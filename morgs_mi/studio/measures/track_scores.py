@@ -121,13 +121,7 @@ def score(
     if not num_tracks:
         return TrackScores()
     masks = [_evaluated(protocol, video) for video in videos]
-    counts = [
-        _counts(protocol, video, mask, meters_per_unit)
-        for video, mask in zip(videos, masks, strict=True)
-    ]
-    if protocol.per_view:
-        counts = [count.sum(1, keepdims=True) for count in counts]
-    shares = np.concatenate([_shares(count) for count in counts])
+    shares = _shares_of_videos(protocol, videos, masks, meters_per_unit)
     average_jaccard, delta_avg, accuracy = (known_mean(column) for column in shares.T)
     alive = np.concatenate([video.alive[mask] for video, mask in zip(videos, masks, strict=True)])
     scores = TrackScores(
@@ -149,6 +143,22 @@ def score(
         median_error_percent=float(100 * error / extent),
         survival=float(survival),
     )
+
+
+def _shares_of_videos(
+    protocol: Protocol,
+    videos: Sequence[Comparison],
+    masks: Sequence[np.ndarray],
+    meters_per_unit: float,
+) -> np.ndarray:
+    """Return AJ, delta_avg and OA [M, 3] of each track, or of each video where a view is one."""
+    counts = [
+        _counts(protocol, video, mask, meters_per_unit)
+        for video, mask in zip(videos, masks, strict=True)
+    ]
+    if protocol.per_view:
+        counts = [count.sum(1, keepdims=True) for count in counts]
+    return np.concatenate([_shares(count) for count in counts])
 
 
 def _evaluated(protocol: Protocol, video: Comparison) -> np.ndarray:

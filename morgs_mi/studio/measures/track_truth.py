@@ -78,21 +78,27 @@ def tapvid3d_tracks(capture: Capture) -> list[TrackTruth]:
     # The frames of the annotations are numbered like the frames of the clips.
     if capture.reading.aligns_clips or not (folder / "train_meta.json").is_file():
         return []
+    files = _annotations(folder)
+    rig = _annotated_rig(folder) if files else {}
+    return [read_annotation(file, rig[name]) for name, file in sorted(files.items()) if name in rig]
+
+
+def _annotations(folder: Path) -> dict[str, Path]:
+    """Return the files of a capture's annotations by the name of the view; those in the folder
+    precede those beside it.
+    """
     files = [
         file for place in (folder, folder.parent) for file in place.glob(f"{folder.name}_*.npz")
     ]
-    if not files:
-        return []
+    return {file.stem.removeprefix(f"{folder.name}_"): file for file in reversed(files)}
+
+
+def _annotated_rig(folder: Path) -> dict[str, Camera]:
+    """Return the cameras of a capture by name, those for tests too."""
     metas = [
         file for name in ("train_meta", "test_meta") if (file := folder / f"{name}.json").is_file()
     ]
-    rig = {view.camera.name: view.camera for meta in metas for view in read_meta(meta)}
-    file_by_name = {file.stem.removeprefix(f"{folder.name}_"): file for file in reversed(files)}
-    return [
-        read_annotation(file, rig[name])
-        for name, file in sorted(file_by_name.items())
-        if name in rig
-    ]
+    return {view.camera.name: view.camera for meta in metas for view in read_meta(meta)}
 
 
 def read_annotation(path: Path, camera: Camera) -> TrackTruth:
@@ -106,25 +112,39 @@ def read_annotation(path: Path, camera: Camera) -> TrackTruth:
         ValueError: the file is broken, its arrays do not have the shapes above, or its intrinsics
             are not the camera's.
     """
-    tracks = read_array(path, "tracks_XYZ")
-    visible = read_array(path, "visibility")
-    queries = read_array(path, "queries_xyt")
-    intrinsics = read_array(path, "fx_fy_cx_cy")
+    arrays = _annotation_arrays(path)
+    tracks = arrays["tracks_XYZ"]
+    frames = arrays["queries_xyt"][:, 2]
+    _check_intrinsics(path, camera, arrays["fx_fy_cx_cy"])
+    if not np.isfinite(tracks).all() or not ((frames >= 0) & (frames < len(tracks))).all():
+        raise ValueError(
+            f"{path}: `tracks_XYZ` must be finite and the frames in `queries_xyt` below "
+            f"{len(tracks)}; download it again."
+        )
+    V = np.asarray(camera.viewmat, np.float64)
+    points = (tracks.astype(np.float64) - V[:3, 3]) @ V[:3, :3]
+    visible = arrays["visibility"].T.astype(bool)
+    return TrackTruth((camera,), points.transpose(1, 0, 2), visible, frames.astype(int))
+
+
+def _annotation_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of an annotation by name, with the shapes above."""
+    names = ("tracks_XYZ", "visibility", "queries_xyt", "fx_fy_cx_cy")
+    arrays = {name: read_array(path, name) for name in names}
+    tracks = arrays["tracks_XYZ"]
     T, P = tracks.shape[:2] if tracks.ndim == 3 else (0, 0)
-    shapes = {
-        "tracks_XYZ": (T, P, 3),
-        "visibility": (T, P),
-        "queries_xyt": (P, 3),
-        "fx_fy_cx_cy": (4,),
-    }
-    for (name, shape), array in zip(
-        shapes.items(), (tracks, visible, queries, intrinsics), strict=True
-    ):
+    shapes = ((T, P, 3), (T, P), (P, 3), (4,))
+    for (name, array), shape in zip(arrays.items(), shapes, strict=True):
         if array.shape != shape or array.dtype.kind not in "fiub":
             raise ValueError(
                 f"{path}: expected `{name}` {[*shape]} with {T} frames and {P} points, got "
                 f"{array.dtype} {[*array.shape]}; download the annotation again."
             )
+    return arrays
+
+
+def _check_intrinsics(path: Path, camera: Camera, intrinsics: np.ndarray) -> None:
+    """Raise `ValueError` unless an annotation has the intrinsics [4] of its camera."""
     K = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]
     if not np.allclose(intrinsics, K, rtol=1e-3):
         raise ValueError(
@@ -132,13 +152,3 @@ def read_annotation(path: Path, camera: Camera) -> TrackTruth:
             f"{np.round(intrinsics.astype(float), 2).tolist()} in `fx_fy_cx_cy`; use the "
             "annotation of this capture."
         )
-    if not np.isfinite(tracks).all() or not ((queries[:, 2] >= 0) & (queries[:, 2] < T)).all():
-        raise ValueError(
-            f"{path}: `tracks_XYZ` must be finite and the frames in `queries_xyt` below {T}; "
-            "download it again."
-        )
-    V = np.asarray(camera.viewmat, np.float64)
-    points = (tracks.astype(np.float64) - V[:3, 3]) @ V[:3, :3]
-    return TrackTruth(
-        (camera,), points.transpose(1, 0, 2), visible.T.astype(bool), queries[:, 2].astype(int)
-    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.timeline import read_settings
 from morgs_mi.codec.frame_source import FrameSource, play
+from morgs_mi.core.camera import Camera
 from morgs_mi.core.fit_names import CAPTURE
 from morgs_mi.core.rig import scene_extent
 from morgs_mi.evaluate.comparison import ComparedClip
@@ -69,15 +70,22 @@ def evaluate_tracks(
     if len(frames) < 2 or not any(len(video.points) for video in videos):
         return ()
     comparisons = _compared(stream, videos, frames[0])
-    per_view = comparisons[: len(single)]
-    joint_comparisons = comparisons[len(single) :] or comparisons
+    return _scores(recording, comparisons[: len(single)], comparisons[len(single) :] or comparisons)
+
+
+def _scores(
+    recording: Capture, single: Sequence[Comparison], joint: Sequence[Comparison]
+) -> tuple[TrackingScores, ...]:
+    """Return the scores by each protocol.
+
+    Args:
+        recording: the capture.
+        single: the videos of single views.
+        joint: the videos in which several views see as one.
+    """
     scale = read_settings(recording.path / CAPTURE).get("meters_per_unit") or 1
     extent = scene_extent([recording.cameras[view] for view in recording.train_views])
-    protocols = (
-        (TAPVID3D, per_view),
-        (DYNAMIC_3D_GAUSSIANS, joint_comparisons),
-        (MVTRACKER, joint_comparisons),
-    )
+    protocols = ((TAPVID3D, single), (DYNAMIC_3D_GAUSSIANS, joint), (MVTRACKER, joint))
     return tuple(score_tracks(protocol, videos, scale, extent) for protocol, videos in protocols)
 
 
@@ -98,16 +106,7 @@ def _compared(stream: FrameSource, videos: Sequence[TrackTruth], start: int) -> 
     """Return the tracks of the stream beside the true ones of each video, which begins with the
     frame `start`.
     """
-    points = [video.points[np.arange(len(video.queries)), video.queries] for video in videos]
-    queries = np.concatenate([video.queries for video in videos]) + start
-    tracks = track_points(stream, np.concatenate(points), queries)
-    ends = np.cumsum([len(video.queries) for video in videos])
-    points = np.split(tracks.points, ends[:-1])
-    alive = np.split(tracks.alive, ends[:-1])
-    lengths = [video.points.shape[1] for video in videos]
-    pairs = [
-        (p[:, :length], a[:, :length]) for p, a, length in zip(points, alive, lengths, strict=True)
-    ]
+    pairs = _tracked(stream, videos, start)
     masks = _seen(stream, videos, [positions for positions, _ in pairs])
     return [
         Comparison(
@@ -117,24 +116,46 @@ def _compared(stream: FrameSource, videos: Sequence[TrackTruth], start: int) -> 
     ]
 
 
+def _tracked(
+    stream: FrameSource, videos: Sequence[TrackTruth], start: int
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return the positions [P, T, 3] and the mask of the living [P, T] of each video's points."""
+    points = [video.points[np.arange(len(video.queries)), video.queries] for video in videos]
+    queries = np.concatenate([video.queries for video in videos]) + start
+    tracks = track_points(stream, np.concatenate(points), queries)
+    ends = np.cumsum([len(video.queries) for video in videos])[:-1]
+    parts = zip(videos, np.split(tracks.points, ends), np.split(tracks.alive, ends), strict=True)
+    return [
+        (positions[:, :length], alive[:, :length])
+        for video, positions, alive in parts
+        for length in (video.points.shape[1],)
+    ]
+
+
 def _seen(
     stream: FrameSource, videos: Sequence[TrackTruth], tracks: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
     """Return the masks of the tracked points [P, T, 3] that a view of their video sees, [P, T]."""
     masks = [np.zeros(positions.shape[:2], bool) for positions in tracks]
-    config = render_config(stream)
     cameras = {
         camera.name: camera
         for video in videos
         if video.visible is not None
         for camera in video.cameras
     }
-    for t, (_, gaussians) in enumerate(play(stream) if cameras else ()):
-        for name, camera in cameras.items():
-            maps = render(gaussians, camera, ("depth", "alpha"), config)
-            for video, positions, mask in zip(videos, tracks, masks, strict=True):
-                if t < positions.shape[1] and name in [view.name for view in video.cameras]:
-                    mask[:, t] |= seen_in_depth(
-                        maps["depth"][..., 0], maps["alpha"][..., 0], camera, positions[:, t]
-                    )
+    for t, camera, depth, alpha in _depth_maps(stream, [*cameras.values()]):
+        for video, positions, mask in zip(videos, tracks, masks, strict=True):
+            if t < positions.shape[1] and camera.name in [view.name for view in video.cameras]:
+                mask[:, t] |= seen_in_depth(depth, alpha, camera, positions[:, t])
     return masks
+
+
+def _depth_maps(
+    stream: FrameSource, cameras: Sequence[Camera]
+) -> Iterator[tuple[int, Camera, np.ndarray, np.ndarray]]:
+    """Yield (place of the frame in the stream, camera, depth [H, W], alpha [H, W])."""
+    config = render_config(stream)
+    for t, (_, gaussians) in enumerate(play(stream) if cameras else ()):
+        for camera in cameras:
+            maps = render(gaussians, camera, ("depth", "alpha"), config)
+            yield t, camera, maps["depth"][..., 0], maps["alpha"][..., 0]

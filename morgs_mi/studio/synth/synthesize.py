@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -339,8 +340,13 @@ def _is_synthetic(folder: Path) -> bool:
     """Return whether a folder is a capture written by `synthesize`: recordings and fits have a
     `capture.json` too.
     """
+    return {"scene", "spp"} <= set(stored_settings(folder))
+
+
+def stored_settings(folder: Path) -> dict[str, Any]:
+    """Return the content of a folder's `capture.json`; empty if there is none, or a broken one."""
     try:
         settings = read_json(folder / CAPTURE)
     except (OSError, ValueError):
-        return False
-    return isinstance(settings, dict) and {"scene", "spp"} <= set(settings)
+        return {}
+    return settings if isinstance(settings, dict) else {}
