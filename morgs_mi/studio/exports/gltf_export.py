@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -78,33 +79,66 @@ def glb(gaussians: Gaussians, axes: np.ndarray | None = None) -> bytes:
             "use PLY."
         )
     head = struct.pack("<4sII", b"glTF", 2, size)
-    chunks = ((b"JSON", document), (b"BIN\0", binary))
-    return head + b"".join(struct.pack("<I4s", len(data), kind) + data for kind, data in chunks)
+    return head + _chunk(b"JSON", document) + _chunk(b"BIN\0", binary)
+
+
+def _chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack("<I4s", len(data), kind) + data
 
 
 def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
     raw = gaussians.numpy()
     opacities = np.asarray(gaussians.opacities, np.float32)
     diffuse = decode_light(np.clip(0.5 + SH_C0 * raw["sh_coeffs"][:, 0], 0, 1))
+    alpha = np.clip(opacities, 0, 1)[:, None]
     columns = {
         "POSITION": raw["means"],
         f"{_NAME}:ROTATION": np.roll(unit_quats(gaussians), -1, axis=1),
         f"{_NAME}:SCALE": np.exp(raw["log_scales"]),
-        f"{_NAME}:OPACITY": np.clip(opacities, 0, 1)[:, None],
+        f"{_NAME}:OPACITY": alpha,
+        **_harmonics(raw["sh_coeffs"], gaussians.sh_degree),
+        "COLOR_0": np.concatenate([diffuse, alpha], axis=1),
     }
-    for degree in range(gaussians.sh_degree + 1):
-        for n in range(2 * degree + 1):
-            columns[f"{_NAME}:SH_DEGREE_{degree}_COEF_{n}"] = raw["sh_coeffs"][
-                :, degree * degree + n
-            ]
-    columns["COLOR_0"] = np.concatenate([diffuse, np.clip(opacities, 0, 1)[:, None]], axis=1)
     return {name: np.ascontiguousarray(column, "<f4") for name, column in columns.items()}
 
 
+def _harmonics(coefficients: np.ndarray, max_degree: int) -> dict[str, np.ndarray]:
+    """Return the coefficients [N, (degree + 1)^2, 3] of the spherical harmonics by attribute."""
+    return {
+        f"{_NAME}:SH_DEGREE_{degree}_COEF_{n}": coefficients[:, degree * degree + n]
+        for degree in range(max_degree + 1)
+        for n in range(2 * degree + 1)
+    }
+
+
 def _document(columns: dict[str, np.ndarray], axes: np.ndarray | None) -> dict[str, Any]:
-    sizes = [column.nbytes for column in columns.values()]
-    starts = np.cumsum([0, *sizes])
-    accessors = [
+    node: dict[str, Any] = {"mesh": 0}
+    if axes is not None:
+        # Rotation back to the capture's axes: x_world = M x_gltf.
+        node["extras"] = {"world_from_gltf": np.asarray(axes, float).T.tolist()}
+    return {
+        "asset": {"version": "2.0", "generator": "morgs_mi"},
+        "extensionsUsed": [_NAME],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [node],
+        "meshes": [{"primitives": [_primitive(columns)]}],
+        "accessors": _accessors(columns),
+        **_buffers([column.nbytes for column in columns.values()]),
+    }
+
+
+def _primitive(names: Iterable[str]) -> dict[str, Any]:
+    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
+    return {
+        "mode": _POINTS,
+        "attributes": {name: i for i, name in enumerate(names)},
+        "extensions": {_NAME: {**splats, "sortingMethod": "cameraDistance"}},
+    }
+
+
+def _accessors(columns: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+    accessors: list[dict[str, Any]] = [
         {
             "bufferView": i,
             "componentType": _FLOAT,
@@ -115,27 +149,16 @@ def _document(columns: dict[str, np.ndarray], axes: np.ndarray | None) -> dict[s
     ]
     means = columns["POSITION"]
     accessors[0] |= {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
-    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
-    primitive = {
-        "mode": _POINTS,
-        "attributes": {name: i for i, name in enumerate(columns)},
-        "extensions": {_NAME: {**splats, "sortingMethod": "cameraDistance"}},
-    }
-    document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "morgs_mi"},
-        "extensionsUsed": [_NAME],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
-        "meshes": [{"primitives": [primitive]}],
-        "accessors": accessors,
+    return accessors
+
+
+def _buffers(sizes: Sequence[int]) -> dict[str, Any]:
+    """Return the buffer and a view of it for each array, from their sizes in bytes."""
+    starts = np.cumsum([0, *sizes])
+    return {
         "bufferViews": [
             {"buffer": 0, "byteOffset": int(start), "byteLength": size, "target": _ARRAY_BUFFER}
             for start, size in zip(starts[:-1], sizes, strict=True)
         ],
         "buffers": [{"byteLength": int(starts[-1])}],
     }
-    if axes is not None:
-        # Rotation back to the capture's axes: x_world = M x_gltf.
-        document["nodes"][0]["extras"] = {"world_from_gltf": np.asarray(axes, float).T.tolist()}
-    return document

@@ -65,37 +65,36 @@ def panorama(
         ValueError: `width` is not even and positive, `stereo` is negative, or a Gaussian is not
             finite.
     """
-    check_number("panorama()", "stereo", stereo, "[0, inf)")
-    if width < 2 or width % 2:
-        raise ValueError(
-            f"panorama(): `width` must be even and at least 2, got {width}; it is twice the height."
-        )
+    _check_size(width, stereo, samples)
     height = width // 2
     eyes = (-0.5, 0.5) if stereo else (0.0,)
-    strip = max(_MOST_RAYS, width * samples**2)
-    check_memory(
-        "panorama()",
-        _PIXEL_BYTES * len(eyes) * height * width + _RAY_BYTES * strip,
-        f"`width={width}`",
-        "make it smaller",
-    )
     if not len(gaussians):
         return np.zeros((len(eyes) * height, width, 3), np.float32)
     rays = SplatRays(gaussians, config)
     to_world = np.linalg.inv(np.asarray(camera.viewmat, np.float64))[:3]
     rows = max(1, _MOST_RAYS // (width * samples**2))
-    parts = [
-        _strip(
-            rays,
-            to_world,
-            eye * stereo,
-            (width, height, samples),
-            np.arange(start, min(start + rows, height)),
+    size = (width, height, samples)
+    strips = [np.arange(start, min(start + rows, height)) for start in range(0, height, rows)]
+    return np.concatenate(
+        [_strip(rays, to_world, eye * stereo, size, strip) for eye in eyes for strip in strips]
+    )
+
+
+def _check_size(width: int, stereo: float, samples: int) -> None:
+    """Raise `ValueError` if the size or the distance of the eyes is out of range."""
+    check_number("panorama()", "stereo", stereo, "[0, inf)")
+    if width < 2 or width % 2:
+        raise ValueError(
+            f"panorama(): `width` must be even and at least 2, got {width}; it is twice the height."
         )
-        for eye in eyes
-        for start in range(0, height, rows)
-    ]
-    return np.concatenate(parts)
+    pixels = (2 if stereo else 1) * (width // 2) * width
+    strip = max(_MOST_RAYS, width * samples**2)
+    check_memory(
+        "panorama()",
+        _PIXEL_BYTES * pixels + _RAY_BYTES * strip,
+        f"`width={width}`",
+        "make it smaller",
+    )
 
 
 def _strip(
@@ -106,25 +105,40 @@ def _strip(
     rows: np.ndarray,
 ) -> np.ndarray:
     """Return rows of a panorama [R, W, 3] of an eye that is `shift` to the right."""
-    width, height, samples = size
-    offsets = (np.arange(samples) + 0.5) / samples
-    longitude = 2 * np.pi * ((np.arange(width)[:, None] + offsets) / width - 0.5)
-    latitude = np.pi * (0.5 - (rows[:, None] + offsets) / height)
-    latitude, longitude = np.broadcast_arrays(
-        latitude[:, None, :, None], longitude[None, :, None, :]
-    )
-    level = np.stack([np.sin(longitude), np.zeros_like(longitude), np.cos(longitude)], axis=-1)
-    right = np.stack([np.cos(longitude), np.zeros_like(longitude), -np.sin(longitude)], axis=-1)
-    directions = np.cos(latitude)[..., None] * level - np.sin(latitude)[..., None] * np.array(
-        [0, 1, 0]
-    )
+    width, _, samples = size
+    longitude, latitude = _angles(size, rows)
+    origins, directions = _rays_of_eye(longitude, latitude, shift)
     directions = (directions @ to_world[:, :3].T).reshape(-1, 3)
-    origins = (shift * right @ to_world[:, :3].T + to_world[:, 3]).reshape(-1, 3)
+    origins = (origins @ to_world[:, :3].T + to_world[:, 3]).reshape(-1, 3)
     color, _ = rays.trace(
         mi.Ray3f(mi.Point3f(np.float32(origins.T)), mi.Vector3f(np.float32(directions.T)))
     )
     values = np.array(dr.ravel(color)).reshape(len(rows), width, samples**2, 3)
     return values.mean(axis=2)
+
+
+def _angles(size: tuple[int, int, int], rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the longitudes and the latitudes [R, W, S, S] of the samples of rows of a panorama."""
+    width, height, samples = size
+    offsets = (np.arange(samples) + 0.5) / samples
+    longitude = 2 * np.pi * ((np.arange(width)[:, None] + offsets) / width - 0.5)
+    latitude = np.pi * (0.5 - (rows[:, None] + offsets) / height)
+    longitude, latitude = np.broadcast_arrays(
+        longitude[None, :, None, :], latitude[:, None, :, None]
+    )
+    return longitude, latitude
+
+
+def _rays_of_eye(
+    longitude: np.ndarray, latitude: np.ndarray, shift: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the origins and the directions [..., 3] of rays in the axes of the camera."""
+    sine, cosine = np.sin(longitude), np.cos(longitude)
+    zero = np.zeros_like(longitude)
+    level = np.stack([sine, zero, cosine], axis=-1)
+    right = np.stack([cosine, zero, -sine], axis=-1)
+    down = np.array([0, 1, 0])
+    return shift * right, np.cos(latitude)[..., None] * level - np.sin(latitude)[..., None] * down
 
 
 def panoramas(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.files import atomic_path
+from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.playback.export.formats import TRACKS, choose_format
 
 
@@ -45,20 +46,15 @@ def extract_tracks(stream: FrameSource, progress: Callable[[int], None] | None =
     Raises:
         ValueError: a broken packet, or a stream without a frame.
     """
-    ids_of_frames = []
-    rows = []
     frames = []
+    ids_of_frames = []
+    means = []
+    confidence = []
     for state in stream.states():
-        gaussians = state.gaussians
-        has_confidence = gaussians.confidence is not None
-        confidence = (
-            np.asarray(gaussians.confidence)
-            if has_confidence
-            else np.full(len(state), np.nan, np.float32)
-        )
         frames.append(state.frame)
         ids_of_frames.append(state.lasting_ids)
-        rows.append((gaussians.numpy()["means"], confidence))
+        means.append(state.gaussians.numpy()["means"])
+        confidence.append(_confidence(state.gaussians))
         if progress is not None:
             progress(len(frames))
     if not frames:
@@ -67,13 +63,31 @@ def extract_tracks(stream: FrameSource, progress: Callable[[int], None] | None =
             "header."
         )
     ids = np.unique(np.concatenate(ids_of_frames))
-    positions = np.full((len(frames), len(ids), 3), np.nan, np.float32)
-    confidences = np.full((len(frames), len(ids)), np.nan, np.float32)
-    for t, (present, (means, confidence)) in enumerate(zip(ids_of_frames, rows, strict=True)):
-        columns = np.searchsorted(ids, present)
-        positions[t, columns] = means
-        confidences[t, columns] = confidence
-    return Tracks(ids.astype(np.uint32), np.asarray(frames), positions, confidences)
+    return Tracks(
+        ids.astype(np.uint32),
+        np.asarray(frames),
+        _by_id(ids, ids_of_frames, means),
+        _by_id(ids, ids_of_frames, confidence),
+    )
+
+
+def _confidence(gaussians: Gaussians) -> np.ndarray:
+    """Return the confidence of each Gaussian [N], NaN if there is none."""
+    if gaussians.confidence is None:
+        return np.full(len(gaussians), np.nan, np.float32)
+    return np.asarray(gaussians.confidence)
+
+
+def _by_id(
+    ids: np.ndarray, ids_of_frames: Sequence[np.ndarray], values: Sequence[np.ndarray]
+) -> np.ndarray:
+    """Return the values of T frames for all N ids, float32 [T, N, ...]; NaN where a frame has no
+    such Gaussian.
+    """
+    result = np.full((len(values), len(ids), *values[0].shape[1:]), np.nan, np.float32)
+    for t, (present, rows) in enumerate(zip(ids_of_frames, values, strict=True)):
+        result[t, np.searchsorted(ids, present)] = rows
+    return result
 
 
 def write_tracks(path: str | Path, tracks: Tracks) -> None:

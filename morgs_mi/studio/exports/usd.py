@@ -114,17 +114,12 @@ def _write_stage(
 ) -> None:
     """Write a file that is not a package; the arguments are the same as for `write_usd`."""
     axes = gltf_axes(stream.cameras)
-    selection = set(frames)
-    unsaved_bytes = 0
-
-    def selected() -> Iterator[FrameState]:
-        return (state for state in stream.states() if state.frame in selection)
-
-    sets = _sets(selected(), axes)
+    sets = _sets(_states(stream, frames), axes)
     stage = pxr.Usd.Stage.CreateNew(str(path))
     _describe(pxr, stage, stream, frames, axes)
     fields = _fields(pxr, stage, sets, frames, half)
-    for count, state in enumerate(selected(), start=1):
+    unsaved_bytes = 0
+    for count, state in enumerate(_states(stream, frames), start=1):
         unsaved_bytes += fields[state.first_id].put(state, axes)
         # A binary file is appended to, which bounds the memory; a text would be written again.
         if unsaved_bytes > UNSAVED_BYTES and path.suffix.lower() != ".usda":
@@ -133,6 +128,12 @@ def _write_stage(
         if progress is not None:
             progress(count, len(frames))
     stage.Save()
+
+
+def _states(stream: FrameSource, frames: Sequence[int]) -> Iterator[FrameState]:
+    """Return the states of some frames."""
+    selection = set(frames)
+    return (state for state in stream.states() if state.frame in selection)
 
 
 @dataclass
@@ -158,16 +159,17 @@ def _sets(states: Iterator[FrameState], axes: np.ndarray) -> dict[int, _Set]:
             parts.append(
                 (state.ids[births], _values(rotated(state.gaussians.select(births), axes)))
             )
-    return {
-        first_id: _Set(
-            *starts[first_id],
-            np.concatenate([np.zeros(0, np.uint32), *(ids for ids, _ in parts)]),
-            {name: np.concatenate([values[name] for _, values in parts]) for name in _TYPES}
-            if parts
-            else {},
-        )
-        for first_id, parts in parts_of.items()
-    }
+    return {first_id: _joined(*starts[first_id], parts) for first_id, parts in parts_of.items()}
+
+
+def _joined(
+    start: int, degree: int, parts: Sequence[tuple[np.ndarray, dict[str, np.ndarray]]]
+) -> _Set:
+    """Return the set of the Gaussians that several frames add, from their ids and attributes."""
+    ids = np.concatenate([np.zeros(0, np.uint32), *(ids for ids, _ in parts)])
+    names = _TYPES if parts else ()
+    births = {name: np.concatenate([values[name] for _, values in parts]) for name in names}
+    return _Set(start, degree, ids, births)
 
 
 def _values(gaussians: Gaussians) -> dict[str, np.ndarray]:
@@ -194,11 +196,7 @@ class _Field:
         self._samples = {
             "extent": _Samples(prim.GetAttribute("extent"), pxr.Vt.Vec3fArray, np.float32)
         }
-        for name, (full, small) in _TYPES.items():
-            as_half = half and small is not None
-            attribute = prim.GetAttribute(name + ("h" if as_half else ""))
-            array = getattr(pxr.Vt, small if as_half and small else full)
-            self._samples[name] = _Samples(attribute, array, np.float16 if as_half else np.float32)
+        self._samples |= {name: _samples(pxr, prim, name, half) for name in _TYPES}
 
     def put(self, state: FrameState, axes: np.ndarray) -> int:
         """Write a frame and return the number of bytes of its samples."""
@@ -245,6 +243,14 @@ class _Samples:
         self.attribute.Set(self.array.FromNumpy(np.ascontiguousarray(rows, self.dtype)), time)
 
 
+def _samples(pxr: Any, prim: Any, name: str, half: bool) -> _Samples:
+    """Return the time samples of an attribute, in half precision if it can have it."""
+    full, small = _TYPES[name]
+    if half and small is not None:
+        return _Samples(prim.GetAttribute(f"{name}h"), getattr(pxr.Vt, small), np.float16)
+    return _Samples(prim.GetAttribute(name), getattr(pxr.Vt, full), np.float32)
+
+
 def _extent(gaussians: Gaussians) -> np.ndarray:
     """Return the corners [2, 3] of the box around all Gaussians; zero if there are none."""
     if not len(gaussians):
@@ -278,25 +284,30 @@ def _fields(
     fields = {}
     ends = [*(gaussians.start for gaussians in sets.values()), None][1:]
     for number, ((first_id, gaussians), end) in enumerate(zip(sets.items(), ends, strict=True)):
-        splats = pxr.UsdVol.ParticleField3DGaussianSplat.Define(
-            stage, f"/Stream/Gaussians{number or ''}"
-        )
-        prim = splats.GetPrim()
-        prim.GetAttribute(_DEGREE).Set(gaussians.degree)
-        splats.CreateProjectionModeHintAttr("perspective")
-        splats.CreateSortingModeHintAttr("zDepth")
-        # As far as the schema goes: it does not state the space of the coefficients.
-        prim.GetAttribute(_COEFFICIENTS + ("h" if half else "")).SetColorSpace(
-            pxr.Gf.ColorSpaceNames.SRGBRec709
-        )
+        path = f"/Stream/Gaussians{number or ''}"
+        splats = pxr.UsdVol.ParticleField3DGaussianSplat.Define(stage, path)
+        _set_hints(pxr, splats, gaussians.degree, half)
+        visibility = splats.CreateVisibilityAttr
         if gaussians.start > frames[0]:
-            splats.CreateVisibilityAttr().Set("invisible", frames[0])
-            splats.CreateVisibilityAttr().Set("inherited", gaussians.start)
+            visibility().Set("invisible", frames[0])
+            visibility().Set("inherited", gaussians.start)
         if end is not None:
-            splats.CreateVisibilityAttr().Set("inherited", gaussians.start)
-            splats.CreateVisibilityAttr().Set("invisible", end)
-        fields[first_id] = _Field(pxr, prim, gaussians, half)
+            visibility().Set("inherited", gaussians.start)
+            visibility().Set("invisible", end)
+        fields[first_id] = _Field(pxr, splats.GetPrim(), gaussians, half)
     return fields
+
+
+def _set_hints(pxr: Any, splats: Any, degree: int, half: bool) -> None:
+    """Write how the Gaussians of a prim are to be drawn."""
+    prim = splats.GetPrim()
+    prim.GetAttribute(_DEGREE).Set(degree)
+    splats.CreateProjectionModeHintAttr("perspective")
+    splats.CreateSortingModeHintAttr("zDepth")
+    # As far as the schema goes: it does not state the space of the coefficients.
+    prim.GetAttribute(_COEFFICIENTS + ("h" if half else "")).SetColorSpace(
+        pxr.Gf.ColorSpaceNames.SRGBRec709
+    )
 
 
 @contextmanager

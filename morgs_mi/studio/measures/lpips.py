@@ -67,14 +67,17 @@ class Lpips:
             np.ascontiguousarray(2 * each.transpose(2, 0, 1)[None] - 1, np.float32) for each in pair
         )
         distance = next(iter(self._network.run(dict(zip(_INPUTS, blobs, strict=True))).values()))
-        if distance.size not in (1, H * W):
-            raise ValueError(
-                f"{self.path}: expected one distance, or one for each of {W}x{H} pixels, got "
-                f"{list(distance.shape)}; {_ADVICE}."
-            )
-        if not np.isfinite(distance).all():
-            raise ValueError(
-                f"{self.path}: expected finite distances, got NaN or infinity; export it in "
-                "float32."
-            )
+        _check_distances(self.path, distance, W, H)
         return distance.reshape((H, W) if distance.size > 1 else (1, 1))
+
+
+def _check_distances(path: Path, distance: np.ndarray, width: int, height: int) -> None:
+    if distance.size not in (1, height * width):
+        raise ValueError(
+            f"{path}: expected one distance, or one for each of {width}x{height} pixels, got "
+            f"{list(distance.shape)}; {_ADVICE}."
+        )
+    if not np.isfinite(distance).all():
+        raise ValueError(
+            f"{path}: expected finite distances, got NaN or infinity; export it in float32."
+        )

@@ -11,6 +11,7 @@ flow is resized back and scaled by the same factors.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -44,20 +45,7 @@ class FlowNetwork:
         self.low = low
         self.high = high
         self._net = OnnxNetwork(path, " or use its flow from files")
-        shapes = list(self._net.inputs.values())
-        images = all(len(s) == 4 and s[0] in (1, None) and s[1] in (3, None) for s in shapes)
-        if len(shapes) != 2 or not images or shapes[0] != shapes[1]:
-            raise ValueError(
-                f"{path}: expected a network with two images [1, 3, H, W] as its inputs, got "
-                f"{written_shapes(shapes)}; export it with one input per image."
-            )
-        height, width = shapes[0][2:]
-        if (height is None) != (width is None):
-            raise ValueError(
-                f"{path}: expected height and width both fixed or both open, got "
-                f"{written_shapes(shapes[:1])}."
-            )
-        self._size = None if height is None or width is None else (width, height)
+        self._size = _image_size(path, list(self._net.inputs.values()))
 
     def __call__(self, image: np.ndarray, other: np.ndarray) -> np.ndarray:
         """Return the flow [H, W, 2] in pixels, float32, from `image` to `other` on the grid of
@@ -70,18 +58,10 @@ class FlowNetwork:
         Raises:
             ValueError: the network cannot run at this size, or does not return a flow.
         """
-        height, width = image.shape[:2]
         if self._size is None:
             flow = self._padded(image, other)
         else:
-            image, other = (
-                cv2.resize(each, self._size, interpolation=cv2.INTER_AREA)
-                for each in (image, other)
-            )
-            flow = cv2.resize(
-                self._run(image, other), (width, height), interpolation=cv2.INTER_LINEAR
-            )
-            flow = flow * np.array((width / self._size[0], height / self._size[1]), np.float32)
+            flow = self._resized(image, other, self._size)
         if not np.isfinite(flow).all():
             raise ValueError(
                 f"{self.path}: expected a finite flow, got NaN or infinity; check the value range."
@@ -99,6 +79,12 @@ class FlowNetwork:
             for each in (image, other)
         )
         return self._run(*images)[top : top + height, left : left + width]
+
+    def _resized(self, image: np.ndarray, other: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        height, width = image.shape[:2]
+        images = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (image, other))
+        flow = cv2.resize(self._run(*images), (width, height), interpolation=cv2.INTER_LINEAR)
+        return flow * np.array((width / size[0], height / size[1]), np.float32)
 
     def _run(self, image: np.ndarray, other: np.ndarray) -> np.ndarray:
         height, width = image.shape[:2]
@@ -120,6 +106,25 @@ class FlowNetwork:
         return np.ascontiguousarray(
             np.moveaxis(self.low + (self.high - self.low) * unit, 2, 0)[None], np.float32
         )
+
+
+def _image_size(
+    path: str | Path, shapes: Sequence[tuple[int | None, ...]]
+) -> tuple[int, int] | None:
+    """Return the width and height of a network's two images, None if it takes any size."""
+    images = all(len(s) == 4 and s[0] in (1, None) and s[1] in (3, None) for s in shapes)
+    if len(shapes) != 2 or not images or shapes[0] != shapes[1]:
+        raise ValueError(
+            f"{path}: expected a network with two images [1, 3, H, W] as its inputs, got "
+            f"{written_shapes(shapes)}; export it with one input per image."
+        )
+    height, width = shapes[0][2:]
+    if (height is None) != (width is None):
+        raise ValueError(
+            f"{path}: expected height and width both fixed or both open, got "
+            f"{written_shapes(shapes[:1])}."
+        )
+    return None if height is None or width is None else (width, height)
 
 
 def onnx(path: str, config: FlowConfig) -> FlowSource:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -49,23 +50,10 @@ class OnnxNetwork:
         self._alternative = instead
         if not self.path.is_file():
             raise FileNotFoundError(f"{path}: expected an ONNX file, found none; check the path.")
-        try:
-            import onnxruntime
-        except ImportError:
-            raise ValueError(
-                f"{path}: running a network needs the package onnxruntime; pip install "
-                "'morgs-mi[networks]'."
-            ) from None
+        onnxruntime = _onnxruntime(path)
         self._runtime = f"onnxruntime {onnxruntime.__version__}"
-        options = onnxruntime.SessionOptions()
-        options.log_severity_level = _FATAL
-        # Which limits a worker to its share of the cores.
-        options.intra_op_num_threads = cv2.getNumThreads()
         try:
-            # A fallback would try the same again, and print.
-            self._session = onnxruntime.InferenceSession(
-                str(path), options, providers=["CPUExecutionProvider"], enable_fallback=0
-            )
+            self._session = _session(onnxruntime, str(path))
             self.inputs = {value.name: _shape(value.shape) for value in self._session.get_inputs()}
             self.outputs = tuple(value.name for value in self._session.get_outputs())
         except Exception as error:  # its errors have no class in common
@@ -109,6 +97,30 @@ class OnnxNetwork:
                 "export again."
             )
         return arrays
+
+
+def _onnxruntime(path: str | Path) -> Any:
+    """Return the module `onnxruntime`, with which the network at `path` is to be run."""
+    try:
+        import onnxruntime
+    except ImportError:
+        raise ValueError(
+            f"{path}: running a network needs the package onnxruntime; pip install "
+            "'morgs-mi[networks]'."
+        ) from None
+    return onnxruntime
+
+
+def _session(onnxruntime: Any, path: str) -> Any:
+    """Return `onnxruntime`'s session of a network."""
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = _FATAL
+    # Which limits a worker to its share of the cores.
+    options.intra_op_num_threads = cv2.getNumThreads()
+    # A fallback would try the same again, and print.
+    return onnxruntime.InferenceSession(
+        path, options, providers=["CPUExecutionProvider"], enable_fallback=0
+    )
 
 
 def imagenet_blob(image: np.ndarray, width: int, height: int) -> np.ndarray:

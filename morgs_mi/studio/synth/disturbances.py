@@ -89,31 +89,37 @@ def draw_disturbances(
     """
     check_ranges(disturbances, "draw_disturbances()")
     d = disturbances
-    shape = (num_cameras, num_frames)
-    offsets, gains, drifts, flicker, lenses = (
-        np.random.default_rng([seed, 3, kind]) for kind in range(5)
-    )
-    offset = d.time_offset * offsets.uniform(-1, 1, num_cameras)
-    log_gain = (np.log1p(d.exposure_gain) * gains.uniform(-1, 1, num_cameras))[:, None] + np.zeros(
-        num_frames
-    )
-    drift = np.log1p(d.exposure_drift) * drifts.uniform(-1, 1, num_cameras)
-    log_gain += drift[:, None] * np.linspace(
-        0, 1, num_frames
-    ) + d.exposure_flicker * flicker.standard_normal(shape)
+    offset = d.time_offset * _generator(seed, 0).uniform(-1, 1, num_cameras)
     offset[0] = 0
-    log_gain[0] = 0
-    k = d.distortion * lenses.uniform(-1, 1, num_cameras) + 0.0  # not -0
+    gains = np.exp(_log_gains(d, num_cameras, num_frames, seed))
+    k = d.distortion * _generator(seed, 4).uniform(-1, 1, num_cameras) + 0.0  # not -0
     return tuple(
         CameraDisturbance(
             float(offset[c]),
             float(d.rolling_shutter),
-            tuple(map(float, np.exp(log_gain[c]))),
+            tuple(map(float, gains[c])),
             float(k[c]),
             int(d.jpeg_quality),
         )
         for c in range(num_cameras)
     )
+
+
+def _generator(seed: int, kind: int) -> np.random.Generator:
+    """Return the generator of one kind of disturbances."""
+    return np.random.default_rng([seed, 3, kind])
+
+
+def _log_gains(d: Disturbances, num_cameras: int, num_frames: int, seed: int) -> np.ndarray:
+    """Return the logarithms of the gains [C, T] of all cameras."""
+    gain = np.log1p(d.exposure_gain) * _generator(seed, 1).uniform(-1, 1, num_cameras)
+    drift = np.log1p(d.exposure_drift) * _generator(seed, 2).uniform(-1, 1, num_cameras)
+    flicker = _generator(seed, 3).standard_normal((num_cameras, num_frames))
+    log_gain = gain[:, None] + (
+        drift[:, None] * np.linspace(0, 1, num_frames) + d.exposure_flicker * flicker
+    )
+    log_gain[0] = 0
+    return log_gain
 
 
 def undistorted(camera: Camera, lens: Lens | None, pixels: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import encode_light
 from morgs_mi.studio.synth.disturbances import undistorted
 from morgs_mi.studio.synth.ground_truth import SurfacePoints
-from morgs_mi.studio.synth.scene import Scene
+from morgs_mi.studio.synth.scene import Object, Scene
 
 # A hit within this share of a point's distance is its own surface: intersections are
 # single-precision.
@@ -56,6 +56,41 @@ def _load(name: str, content: dict[str, Any]) -> Any:
         ) from error
 
 
+def _scene_content(scene: Scene) -> tuple[dict[str, Any], dict[str, int]]:
+    """Return a scene as a Mitsuba dictionary, and the index of the object of each shape in it."""
+    content: dict[str, Any] = {
+        "type": "scene",
+        **{name: light.shape for name, light in scene.lights.items()},
+    }
+    owners: dict[str, int] = {}
+    for index, (name, item) in enumerate(scene.objects.items()):
+        shapes = _shapes(name, item)
+        if item.pose is not None:
+            content[f"{name}_group"] = {"type": "shapegroup", **item.shapes}
+        content |= shapes
+        owners |= dict.fromkeys(shapes, index)
+    return content, owners
+
+
+def _shapes(name: str, item: Object) -> dict[str, Any]:
+    """Return the shapes of an object in Mitsuba: one instance of a group if it moves."""
+    if item.pose is None:
+        return {f"{name}_{part}": shape for part, shape in item.shapes.items()}
+    return {name: {"type": "instance", "group": {"type": "ref", "id": f"{name}_group"}}}
+
+
+def _pixel_corners(width: int, rows: np.ndarray) -> np.ndarray:
+    """Return the upper left corners of the pixels of some rows of an image [R W, 2]."""
+    return np.stack(np.meshgrid(np.arange(width), rows), axis=-1).reshape(-1, 2)
+
+
+def _rays(kind: Any, origin: np.ndarray, directions: np.ndarray) -> Any:
+    """Return rays of a Mitsuba type from one point [3] in several directions [P, 3]."""
+    # An array, because a literal would compile a separate kernel for every camera.
+    origins = np.repeat(origin[:, None], len(directions), axis=1)
+    return kind(mi.Point3f(origins), mi.Vector3f(directions.T))
+
+
 class PathTracer:
     """Path tracer of a scene at one time.
 
@@ -70,32 +105,17 @@ class PathTracer:
             ValueError: Mitsuba cannot load it.
         """
         self.scene = scene
-        content: dict[str, Any] = {
-            "type": "scene",
-            **{name: light.shape for name, light in scene.lights.items()},
-        }
-        owners: dict[str, int] = {}
-        for index, (name, item) in enumerate(scene.objects.items()):
-            if item.pose is None:
-                shapes = {f"{name}_{part}": shape for part, shape in item.shapes.items()}
-            else:
-                content[f"{name}_group"] = {"type": "shapegroup", **item.shapes}
-                shapes = {
-                    name: {"type": "instance", "group": {"type": "ref", "id": f"{name}_group"}}
-                }
-            content |= shapes
-            owners |= dict.fromkeys(shapes, index)
+        content, owners = _scene_content(scene)
         # The optimisation would merge meshes that share a material, even meshes of different
         # objects.
         self._scene: Any = _load(scene.name, content)
         shapes = [shape for shape in self._scene.shapes() if shape.id() in owners]
         self._owners = [(mi.ShapePtr(shape), owners[shape.id()]) for shape in shapes]
         self._params: Any = mi.traverse(self._scene)
-        moving = {
-            name: light.pose for name, light in scene.lights.items() if light.pose is not None
-        }
         self._lamps = {
-            f"{name}.to_world": (pose, self._lamp_transform(name)) for name, pose in moving.items()
+            f"{name}.to_world": (light.pose, self._lamp_transform(name))
+            for name, light in scene.lights.items()
+            if light.pose is not None
         }
         self._exposure = 1.0
         # Only lamps are sampled: 16 samples have as little noise as 64 samples with a sky, and are
@@ -173,24 +193,18 @@ class PathTracer:
         sampler.set_samples_per_wavefront(spp)
         sampler.seed(seed, len(rows) * camera.width * spp)
         # The samples of a pixel follow one another.
-        corners = np.stack(np.meshgrid(np.arange(camera.width), rows), axis=-1).reshape(-1, 1, 2)
-        pixels = corners + np.array(sampler.next_2d()).T.reshape(len(corners), -1, 2)
+        corners = _pixel_corners(camera.width, rows)
+        pixels = corners[:, None] + np.array(sampler.next_2d()).T.reshape(len(corners), -1, 2)
         origin, directions = camera.rays(undistorted(camera, lens, pixels.reshape(-1, 2)))
-        # An array, because a literal would compile a separate kernel for every camera.
-        origins = np.repeat(origin[:, None], len(directions), axis=1)
-        ray: Any = mi.RayDifferential3f(mi.Point3f(origins), mi.Vector3f(directions.T))
+        ray = _rays(mi.RayDifferential3f, origin, directions)
         light = np.array(self._integrator.sample(self._scene, sampler, ray, None, mi.Bool(True))[0])
         return self._exposure * light.T.reshape(len(rows), camera.width, -1, 3).mean(axis=2)
 
     def surface_points(self, camera: Camera) -> SurfacePoints:
         """Return the surface points at the pixel centres [H, W]."""
-        pixels = (
-            np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1) + 0.5
-        )
-        position, directions = camera.rays(pixels.reshape(-1, 2))
-        origins = np.repeat(position[:, None], len(directions), axis=1)
-        ray = mi.Ray3f(mi.Point3f(origins), mi.Vector3f(directions.T))
-        hit: Any = self._scene.ray_intersect(ray)
+        pixels = _pixel_corners(camera.width, np.arange(camera.height)) + 0.5
+        position, directions = camera.rays(pixels)
+        hit: Any = self._scene.ray_intersect(_rays(mi.Ray3f, position, directions))
         dr.eval(hit)  # otherwise every array below would trace the rays again
         ids = np.full(len(directions), -1, np.int32)
         for pointer, index in self._owners:
@@ -203,15 +217,15 @@ class PathTracer:
         """Return the mask of the surface points [P, 3] that a camera sees: inside its image, with
         nothing in front.
         """
-        pixels, depth = camera.project(points)
-        mask = (
-            (depth > camera.near)[:, None]
-            & (pixels >= 0)
-            & (pixels < (camera.width, camera.height))
-        ).all(-1)
         offset = points - camera.position
         distance = np.linalg.norm(offset, axis=-1)
-        origins = np.repeat(camera.position[:, None], len(points), axis=1)
-        ray: Any = mi.Ray3f(mi.Point3f(origins), mi.Vector3f((offset / distance[:, None]).T))
+        ray = _rays(mi.Ray3f, camera.position, offset / distance[:, None])
         ray.maxt = mi.Float((1 - _OWN_SURFACE) * distance)
-        return mask & ~np.array(self._scene.ray_test(ray))
+        return _in_image(camera, points) & ~np.array(self._scene.ray_test(ray))
+
+
+def _in_image(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Return the mask of the points [P, 3] that lie in front of a camera and inside its image."""
+    pixels, depth = camera.project(points)
+    inside = (pixels >= 0) & (pixels < (camera.width, camera.height))
+    return (depth > camera.near) & np.all(inside, axis=-1)

@@ -10,12 +10,13 @@ from __future__ import annotations
 import importlib.util
 import inspect
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
 from traceback import extract_tb
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -60,20 +61,23 @@ class Rig:
         """Return `count` cameras: ``cam00`` at the centre of the cap, the others evenly distributed
         around it.
         """
+        origins = np.asarray(self.center) + self.distance * self._outward(count)
+        return [
+            Camera.look_at(origin, self.center, (0, 1, 0), self.fov, width, height, f"cam{i:02d}")
+            for i, origin in enumerate(origins)
+        ]
+
+    def _outward(self, count: int) -> np.ndarray:
+        """Return the directions [count, 3] from the centre to the cameras."""
         # A sunflower spiral covers the cap evenly for any count.
         radius = np.sqrt(np.arange(count) / max(count - 1, 1))
         angle = np.arange(count) * np.pi * (3 - np.sqrt(5))
         azimuth = np.deg2rad(self.spread[0] * radius * np.cos(angle))
         polar = np.deg2rad(self.elevation + self.spread[1] * radius * np.sin(angle))
-        outward = np.stack(
+        return np.stack(
             [np.sin(azimuth) * np.cos(polar), np.sin(polar), np.cos(azimuth) * np.cos(polar)],
             axis=1,
         )
-        origins = np.asarray(self.center) + self.distance * outward
-        return [
-            Camera.look_at(origin, self.center, (0, 1, 0), self.fov, width, height, f"cam{i:02d}")
-            for i, origin in enumerate(origins)
-        ]
 
 
 @dataclass(frozen=True)
@@ -107,22 +111,8 @@ def load_scene(scene: str | Path, seed: int = 0) -> Scene:
         ValueError: there is no such scene, its file has no ``build(seed) -> Scene``, or running the
             file fails; the message names the file and its line.
     """
-    files = _scene_files()
-    path = Path(scene) if Path(scene).suffix == ".py" else files.get(str(scene))
-    if path is None or not path.is_file():
-        raise ValueError(
-            f"load_scene(): no scene {str(scene)!r}; name one of {sorted(files)} or pass the path "
-            "of a .py file."
-        )
-    spec = importlib.util.spec_from_file_location(f"morgs_mi_scene_{path.stem}", path)
-    assert spec
-    assert spec.loader
-    module = importlib.util.module_from_spec(spec)
-    # Dataclasses look up the names of their postponed annotations in `sys.modules`.
-    sys.modules[spec.name] = module
-    with failures_in(path):
-        spec.loader.exec_module(module)
-    build = getattr(module, "build", None)
+    path = _scene_path(scene)
+    build = getattr(_module(path), "build", None)
     if not callable(build):
         raise ValueError(
             f"load_scene(): {path} must define `build(seed) -> Scene`; add that function."
@@ -137,6 +127,31 @@ def load_scene(scene: str | Path, seed: int = 0) -> Scene:
             "Scene(...)."
         )
     return result
+
+
+def _scene_path(scene: str | Path) -> Path:
+    """Return the Python file of a scene."""
+    files = _scene_files()
+    path = Path(scene) if Path(scene).suffix == ".py" else files.get(str(scene))
+    if path is None or not path.is_file():
+        raise ValueError(
+            f"load_scene(): no scene {str(scene)!r}; name one of {sorted(files)} or pass the path "
+            "of a .py file."
+        )
+    return path
+
+
+def _module(path: Path) -> ModuleType:
+    """Return the module of a Python file, after running it."""
+    spec = importlib.util.spec_from_file_location(f"morgs_mi_scene_{path.stem}", path)
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    # Dataclasses look up the names of their postponed annotations in `sys.modules`.
+    sys.modules[spec.name] = module
+    with failures_in(path):
+        spec.loader.exec_module(module)
+    return module
 
 
 @contextmanager
@@ -178,31 +193,40 @@ def check_scene(scene: Scene, times: Sequence[float]) -> None:
         ValueError: an object, a lamp or a pose is not as described, or a name is used twice.
         FileNotFoundError: the file of a mesh or a texture does not exist.
     """
-    place = f"scene {scene.name!r}"
     names: set[str] = set()
     for kind, expected, items in (
         ("object", Object, scene.objects),
         ("light", Light, scene.lights),
     ):
         for name, item in items.items():
-            where = f"{place}, {kind} {name!r}"
+            where = f"scene {scene.name!r}, {kind} {name!r}"
             if not isinstance(item, expected):
                 raise ValueError(
                     f"{where}: expected {expected.__name__}(...), got a value of type "
                     f"{type(item).__name__}; see {page('scenes')}."
                 )
-            for identifier in _ids(name, item):
-                if identifier in names:
-                    raise ValueError(
-                        f"{where}: the name {identifier!r} is used twice; rename one of the two."
-                    )
-                names.add(identifier)
-            shapes = item.shapes if isinstance(item, Object) else {"": item.shape}
-            for shape_name, shape in shapes.items():
-                _check_node(f"{where}, shape {shape_name!r}" if shape_name else where, shape)
+            ids = _ids(name, item)
+            _check_new(where, ids, names)
+            names.update(ids)
+            _check_shapes(where, item)
             if item.pose is not None:
                 for time in times:
                     _check_pose(where, item.pose, time)
+
+
+def _check_new(where: str, ids: Sequence[str], names: Collection[str]) -> None:
+    """Raise `ValueError` if an object or a lamp has a name in Mitsuba that another has already."""
+    for identifier in ids:
+        if identifier in names:
+            raise ValueError(
+                f"{where}: the name {identifier!r} is used twice; rename one of the two."
+            )
+
+
+def _check_shapes(where: str, item: Object | Light) -> None:
+    shapes = item.shapes if isinstance(item, Object) else {"": item.shape}
+    for name, shape in shapes.items():
+        _check_node(f"{where}, shape {name!r}" if name else where, shape)
 
 
 def _ids(name: str, item: Object | Light) -> list[str]:
@@ -226,34 +250,44 @@ def _check_node(where: str, node: Any) -> None:
     for key, value in node.items():
         if value is None:
             raise ValueError(f"{where}: `{key}` must have a value, got None; leave it out.")
-        if key == "filename" and not Path(value).is_file():
-            raise FileNotFoundError(
-                f"{where}: its file {value} does not exist; for a file beside the scene, write "
-                f"str(Path(__file__).parent / {Path(value).name!r})."
-            )
-        if key == "filename" and not isinstance(value, str):
-            raise ValueError(
-                f"{where}: `filename` must be text, got a {type(value).__name__}; wrap it in str()."
-            )
+        if key == "filename":
+            _check_file(where, value)
         if isinstance(value, Mapping):
             _check_node(f"{where}, {key}", value)
 
 
-def _check_pose(where: str, pose: Pose, time: float) -> None:
-    try:
-        matrix = np.asarray(pose(time), np.float64)
-    except Exception as error:
-        reason = f"{type(error).__name__}: {error}".rstrip(".")
+def _check_file(where: str, file: Any) -> None:
+    """Check the file name of a mesh or a texture."""
+    if not Path(file).is_file():
+        raise FileNotFoundError(
+            f"{where}: its file {file} does not exist; for a file beside the scene, write "
+            f"str(Path(__file__).parent / {Path(file).name!r})."
+        )
+    if not isinstance(file, str):
         raise ValueError(
-            f"{where}: its pose at {time:.4g} s fails with {reason}; correct the function."
-        ) from error
+            f"{where}: `filename` must be text, got a {type(file).__name__}; wrap it in str()."
+        )
+
+
+def _check_pose(where: str, pose: Pose, time: float) -> None:
+    where = f"{where}: its pose at {time:.4g} s"
+    matrix = _matrix(where, pose, time)
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         value = f"the shape {matrix.shape}" if matrix.shape != (4, 4) else "NaN or infinity"
         raise ValueError(
-            f"{where}: its pose at {time:.4g} s must be a finite matrix [4, 4], got {value}; "
-            "multiply translate() and rotate()."
+            f"{where} must be a finite matrix [4, 4], got {value}; multiply translate() and "
+            "rotate()."
         )
-    rigid(f"{where}: its pose at {time:.4g} s is not rigid", matrix)
+    rigid(f"{where} is not rigid", matrix)
+
+
+def _matrix(where: str, pose: Pose, time: float) -> np.ndarray:
+    """Return the result of a scene's function for a pose."""
+    try:
+        return np.asarray(pose(time), np.float64)
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}".rstrip(".")
+        raise ValueError(f"{where} fails with {reason}; correct the function.") from error
 
 
 def translate(x: float, y: float, z: float) -> np.ndarray:

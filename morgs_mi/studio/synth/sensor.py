@@ -35,6 +35,11 @@ def check_lenses(cameras: Sequence[Camera], disturbed: Sequence[CameraDisturbanc
                 )
 
 
+def mixed_seed(*numbers: int) -> int:
+    """Return a seed that depends on several numbers."""
+    return int(np.random.SeedSequence(numbers).generate_state(1)[0])
+
+
 def record_light(
     tracer: PathTracer, camera: Camera, own: CameraDisturbance, frame: int, config: SynthConfig
 ) -> np.ndarray:
@@ -52,13 +57,11 @@ def record_light(
     if not own.rolling_shutter and not own.distortion:
         tracer.set_time((frame + own.time_offset) / config.fps)
         return tracer.light(camera, config.spp, config.seed)
-    bands = np.arange(camera.height), own.row_times(frame, camera.height)
+    row_times = own.row_times(frame, camera.height)
     count = -(-camera.height // _BAND) if own.rolling_shutter else 1
     light = []
-    for band, (rows, times) in enumerate(
-        zip(*(np.array_split(values, count) for values in bands), strict=True)
-    ):
-        tracer.set_time(times.mean() / config.fps)
-        band_seed = int(np.random.SeedSequence([config.seed, band]).generate_state(1)[0])
-        light.append(tracer.light_of_rows(camera, rows, config.spp, band_seed, own.lens))
+    for band, rows in enumerate(np.array_split(np.arange(camera.height), count)):
+        tracer.set_time(row_times[rows].mean() / config.fps)
+        seed = mixed_seed(config.seed, band)
+        light.append(tracer.light_of_rows(camera, rows, config.spp, seed, own.lens))
     return np.concatenate(light)

@@ -19,9 +19,9 @@ import numpy as np
 
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
-from morgs_mi.capture.lens import undistortion
+from morgs_mi.capture.lens import Undistortion, undistortion
 from morgs_mi.capture.outputs import check_output
-from morgs_mi.capture.truth import Tracks, save_tracks, save_truth
+from morgs_mi.capture.truth import GroundTruth, Tracks, save_tracks, save_truth
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_path, write_json
 from morgs_mi.core.fit_names import CAPTURE
@@ -36,10 +36,14 @@ from morgs_mi.studio.synth.disturbances import (
     draw_disturbances,
     save_disturbances,
 )
-from morgs_mi.studio.synth.ground_truth import compute_ground_truth, move_with_objects
+from morgs_mi.studio.synth.ground_truth import (
+    SurfacePoints,
+    compute_ground_truth,
+    move_with_objects,
+)
 from morgs_mi.studio.synth.path_tracer import PathTracer, developed
 from morgs_mi.studio.synth.scene import Scene, check_scene, load_scene
-from morgs_mi.studio.synth.sensor import check_lenses, record_light
+from morgs_mi.studio.synth.sensor import check_lenses, mixed_seed, record_light
 from morgs_mi.studio.synth.synth_config import SynthConfig
 
 _LOG = logging.getLogger(__name__)
@@ -87,18 +91,8 @@ def synthesize(
             capture.
         OSError: a file cannot be written, or a mesh or texture of the scene does not exist.
     """
-    if not str(mi.variant()).startswith(("llvm", "cuda", "metal")):
-        raise ValueError(
-            f"synthesize(): a vectorised variant is needed, got {mi.variant()!r}; "
-            'call mitsuba.set_variant("llvm_ad_rgb") first.'
-        )
     config = config or SynthConfig()
-    config.check()
-    pixels = config.width * config.height
-    size = f"images of {config.width}x{config.height} pixels"
-    check_memory(
-        "synthesize()", _PIXEL_BYTES * pixels, size, "make them smaller (`width`, `height`)"
-    )
+    _check_resources(config)
     scene = scene if isinstance(scene, Scene) else load_scene(scene, config.seed)
     rig = _Rig.of(scene, config.completed(scene.recording))
     check_lenses(rig.cameras, rig.disturbed)
@@ -112,15 +106,34 @@ def synthesize(
         clips = _write_clips(tracer, rig, folder, progress)
         _write_truth(tracer, rig, folder / "truth")
         _write_calibration(tracer, rig, clips, folder)
-        settings = {
-            "scene": scene.name,
-            "test_view": 0,
-            **rig.config.as_dict(),
-            "objects": list(scene.objects),
-            "versions": {name: metadata.version(name) for name in ("morgs-mi", "mitsuba", "drjit")},
-        }
-        write_json(folder / CAPTURE, settings)
+        write_json(folder / CAPTURE, _settings(scene, rig.config))
     return Path(out)
+
+
+def _check_resources(config: SynthConfig) -> None:
+    """Raise `ValueError` if the variant, a setting or the size of the images does not fit."""
+    if not str(mi.variant()).startswith(("llvm", "cuda", "metal")):
+        raise ValueError(
+            f"synthesize(): a vectorised variant is needed, got {mi.variant()!r}; "
+            'call mitsuba.set_variant("llvm_ad_rgb") first.'
+        )
+    config.check()
+    pixels = config.width * config.height
+    size = f"images of {config.width}x{config.height} pixels"
+    check_memory(
+        "synthesize()", _PIXEL_BYTES * pixels, size, "make them smaller (`width`, `height`)"
+    )
+
+
+def _settings(scene: Scene, config: SynthConfig) -> dict[str, Any]:
+    """Return the content of `capture.json`."""
+    return {
+        "scene": scene.name,
+        "test_view": 0,
+        **config.as_dict(),
+        "objects": list(scene.objects),
+        "versions": {name: metadata.version(name) for name in ("morgs-mi", "mitsuba", "drjit")},
+    }
 
 
 @dataclass(frozen=True)
@@ -170,16 +183,22 @@ def _write_clips(
             if progress is not None:
                 progress(next(count), len(rig.cameras) * config.frames)
 
-    clips = []
-    for index, camera in enumerate(rig.cameras):
-        video = folder / f"{camera.name}.mp4"
-        png = folder / "frames" / camera.name
-        if config.lossless:
-            write_video(png, render_view(index), config.fps)
-        images = open_frames(png).frames() if config.lossless else render_view(index)
+    return [
+        _write_clip(folder, camera.name, render_view(index), config)
+        for index, camera in enumerate(rig.cameras)
+    ]
+
+
+def _write_clip(folder: Path, name: str, images: Iterator[np.ndarray], config: SynthConfig) -> Path:
+    """Write the images of one camera, and return the clip that `load_capture` reads."""
+    video = folder / f"{name}.mp4"
+    if not config.lossless:
         write_video(video, images, config.fps, PLAYABLE)
-        clips.append(png if config.lossless else video)
-    return clips
+        return video
+    png = folder / "frames" / name
+    write_video(png, images, config.fps)
+    write_video(video, open_frames(png).frames(), config.fps, PLAYABLE)
+    return png
 
 
 def _images(tracer: PathTracer, rig: _Rig, index: int) -> Iterator[np.ndarray]:
@@ -190,7 +209,7 @@ def _images(tracer: PathTracer, rig: _Rig, index: int) -> Iterator[np.ndarray]:
     for frame in range(config.frames):
         # The noise must differ between views and frames; otherwise it would look like a moving
         # texture.
-        seed = int(np.random.SeedSequence([config.seed, index, frame]).generate_state(1)[0])
+        seed = mixed_seed(config.seed, index, frame)
         light = record_light(
             tracer, rig.cameras[index], disturbance, frame, replace(config, seed=seed)
         )
@@ -230,17 +249,25 @@ def _write_truth(tracer: PathTracer, rig: _Rig, folder: Path) -> None:
     frames = np.arange(rig.config.frames)
     for camera, disturbance in zip(rig.cameras, rig.disturbed, strict=True):
         times = (frames + disturbance.time_offset) / fps
-        for frame, time in enumerate(times):
-            tracer.set_time(time)
-            surface = tracer.surface_points(camera)
-            old_poses = tracer.poses(times[frame - 1]) if frame else None
-            truth = compute_ground_truth(
-                camera, surface, tracer.poses(time), old_poses, tracer.poses(time + 1 / fps)
-            )
+        for frame, truth in enumerate(_truth_of_view(tracer, camera, times, fps)):
             save_truth(folder, camera.name, frame, truth)
     rng = np.random.default_rng([rig.config.seed, 1])
     save_tracks(folder, _sample_tracks(tracer, rig.cameras, frames / fps, rng))
     save_disturbances(folder, dict(zip((c.name for c in rig.cameras), rig.disturbed, strict=True)))
+
+
+def _truth_of_view(
+    tracer: PathTracer, camera: Camera, times: np.ndarray, fps: float
+) -> Iterator[GroundTruth]:
+    """Yield the ground truth of a camera's frames at their times in seconds."""
+    old_poses = None
+    for time in times:
+        tracer.set_time(time)
+        poses = tracer.poses(time)
+        yield compute_ground_truth(
+            camera, tracer.surface_points(camera), poses, old_poses, tracer.poses(time + 1 / fps)
+        )
+        old_poses = poses
 
 
 def _sample_tracks(
@@ -251,8 +278,6 @@ def _sample_tracks(
     Half of the points lie on moving objects.
     """
     starts = sorted({0, len(times) // 2, len(times) - 1})
-    objects = tracer.scene.objects.values()
-    can_move = np.array([item.pose is not None for item in objects])
     share = -(-_NUM_TRACKS // (2 * len(starts) * len(cameras)))
     points = []
     owners = []
@@ -260,24 +285,39 @@ def _sample_tracks(
     for start in starts:
         tracer.set_time(times[start])
         for camera in cameras:
-            visible = tracer.surface_points(camera)
-            for moving in (False, True):
-                pixels = np.flatnonzero((visible.ids >= 0) & (can_move[visible.ids] == moving))
-                pixels = rng.choice(pixels, min(share, len(pixels)), replace=False)
-                sample = visible.pick(pixels)
-                points.append(
-                    np.stack(
-                        [move_with_objects(sample, poses[start], pose) for pose in poses], axis=1
-                    )
-                )
+            for sample in _samples(tracer, camera, share, rng):
+                paths = [move_with_objects(sample, poses[start], pose) for pose in poses]
+                points.append(np.stack(paths, axis=1))
                 owners.append(sample.ids)
     tracks = np.concatenate(points)
+    visible = _visible(tracer, cameras, times, tracks)
+    return Tracks(tracks, np.concatenate(owners), visible)
+
+
+def _samples(
+    tracer: PathTracer, camera: Camera, most: int, rng: np.random.Generator
+) -> Iterator[SurfacePoints]:
+    """Yield random surface points that a camera sees, at most `most` [P]: on the objects that never
+    move, and on the others.
+    """
+    objects = tracer.scene.objects.values()
+    can_move = np.array([item.pose is not None for item in objects])
+    visible = tracer.surface_points(camera)
+    for moving in (False, True):
+        pixels = np.flatnonzero((visible.ids >= 0) & (can_move[visible.ids] == moving))
+        yield visible.pick(rng.choice(pixels, min(most, len(pixels)), replace=False))
+
+
+def _visible(
+    tracer: PathTracer, cameras: Sequence[Camera], times: np.ndarray, tracks: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return which points of the tracks [P, T, 3] each camera sees, [P, T] by its name."""
     visible = {camera.name: np.zeros(tracks.shape[:2], bool) for camera in cameras}
     for frame, time in enumerate(times):
         tracer.set_time(time)
         for camera in cameras:
             visible[camera.name][:, frame] = tracer.sees(camera, tracks[:, frame])
-    return Tracks(tracks, np.concatenate(owners), visible)
+    return visible
 
 
 def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], folder: Path) -> None:
@@ -287,37 +327,55 @@ def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], fol
     The points have the colours of the `clips`, one per camera.
     """
     cameras = rig.cameras
-    disturbed = rig.disturbed
+    lenses = [disturbance.lens for disturbance in rig.disturbed]
     rng = np.random.default_rng([rig.config.seed, 2])
     points = []
     colors = []
     bounds = []
-    for index, (camera, disturbance) in enumerate(zip(cameras, disturbed, strict=True)):
+    for index, (camera, disturbance) in enumerate(zip(cameras, rig.disturbed, strict=True)):
         tracer.set_time(disturbance.time_offset / rig.config.fps)
-        visible = tracer.surface_points(camera)
         lens = undistortion(camera, disturbance.lens)
-        pixels = np.flatnonzero((visible.ids >= 0) & (lens is None or lens.mask))
-        depths = camera.project(visible.pick(pixels).positions)[1]
+        pixels, positions, depths = _surface_pixels(tracer, camera, lens)
         # LLFF's percentiles, which readers of the file expect.
         bounds.append(np.percentile(depths, [0.1, 99.9]))
         if index == 0:
             continue  # the held-out view must not contribute points or colours
-        choice = rng.choice(
-            len(pixels), min(_NUM_SFM_POINTS // (len(cameras) - 1), len(pixels)), replace=False
-        )
-        # Structure from motion has an error of about half a pixel; here it is the same along the
-        # ray.
-        noise = rng.normal(size=(len(choice), 3)) * (0.5 * depths[choice, None] / camera.K[0, 0])
-        points.append(visible.pick(pixels[choice]).positions + noise)
-        image = next(open_frames(clips[index]).frames(0, 1))
-        image = image if lens is None else lens(image)
-        colors.append(image.reshape(-1, 3)[pixels[choice]] / 255)
-    if not any(disturbance.distortion for disturbance in disturbed):
+        most = _NUM_SFM_POINTS // (len(cameras) - 1)
+        choice = rng.choice(len(pixels), min(most, len(pixels)), replace=False)
+        points.append(_noisy(positions[choice], depths[choice] / camera.K[0, 0], rng))
+        colors.append(_colors(clips[index], lens, pixels[choice]))
+    if not any(disturbance.distortion for disturbance in rig.disturbed):
         write_poses_bounds(folder / "poses_bounds.npy", cameras, np.array(bounds))
-    lenses = [disturbance.lens for disturbance in disturbed]
     write_colmap(
         folder / "sparse" / "0", cameras, np.concatenate(points), np.concatenate(colors), lenses
     )
+
+
+def _surface_pixels(
+    tracer: PathTracer, camera: Camera, lens: Undistortion | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the pixels [P] with a surface that a lens shows, and their positions [P, 3] and depths
+    [P].
+    """
+    surface = tracer.surface_points(camera)
+    pixels = np.flatnonzero((surface.ids >= 0) & (lens is None or lens.mask))
+    positions = surface.pick(pixels).positions
+    return pixels, positions, camera.project(positions)[1]
+
+
+def _noisy(points: np.ndarray, pixel: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return points [P, 3] with noise for a width of a pixel at each of them [P].
+
+    Structure from motion has an error of about half a pixel; here it is the same along the ray.
+    """
+    return points + rng.normal(size=points.shape) * (0.5 * pixel[:, None])
+
+
+def _colors(clip: Path, lens: Undistortion | None, pixels: np.ndarray) -> np.ndarray:
+    """Return the colours [P, 3] from 0 to 1 of some pixels in the first image of a clip."""
+    image = next(open_frames(clip).frames(0, 1))
+    image = image if lens is None else lens(image)
+    return image.reshape(-1, 3)[pixels] / 255
 
 
 def _check_folder(out: Path, overwrite: bool) -> None:

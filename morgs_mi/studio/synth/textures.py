@@ -6,6 +6,7 @@ pixels. Unlike white noise, a 1/f spectrum has the same contrast at any distance
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -40,12 +41,16 @@ def pattern(seed: int, first: RGB, second: RGB, cells: int, finest: float) -> np
         finest: highest frequency of the noise in cycles across.
     """
     rng = np.random.default_rng(seed)
-    x = np.arange(_SIZE) * cells // _SIZE
-    checker = ((x[:, None] + x) % 2)[..., None]
     shade = fractal(rng, _SIZE, finest)[..., None]
     tint = np.stack([fractal(rng, _SIZE, finest) for _ in range(3)], axis=-1)
-    texture = np.where(checker == 1, first, second) * np.exp(0.35 * shade + 0.10 * tint)
+    texture = _checker(first, second, cells) * np.exp(0.35 * shade + 0.10 * tint)
     return np.clip(texture, 0.03, 0.85).astype(np.float32)
+
+
+def _checker(first: RGB, second: RGB, cells: int) -> np.ndarray:
+    """Return a checker of two colours [512, 512, 3]."""
+    x = np.arange(_SIZE) * cells // _SIZE
+    return np.where(((x[:, None] + x) % 2)[..., None] == 1, first, second)
 
 
 def textured(
@@ -79,33 +84,25 @@ def room(
     """Return a room's floor, back wall and side walls around the origin, open above and towards the
     cameras (+z).
     """
-    import mitsuba as mi
-
-    T = mi.ScalarTransform4f
     front = 2.2
     length = 0.5 * (front + depth)
     middle = 0.5 * (front - depth)
+    side = (length, 0.5 * height)
     walls = {
         "floor": (
-            T().translate([0, 0, middle]).rotate([1, 0, 0], -90).scale([half_width, length, 1]),
+            _wall((0, 0, middle), (1, 0, 0), -90, (half_width, length)),
             pattern(seed, (0.50, 0.42, 0.32), (0.20, 0.22, 0.26), 10, 60),
         ),
         "back": (
-            T().translate([0, 0.5 * height, -depth]).scale([half_width, 0.5 * height, 1]),
+            _wall((0, 0.5 * height, -depth), (0, 1, 0), 0, (half_width, 0.5 * height)),
             pattern(seed + 1, (0.30, 0.38, 0.46), (0.46, 0.48, 0.44), 8, 56),
         ),
         "left": (
-            T()
-            .translate([-half_width, 0.5 * height, middle])
-            .rotate([0, 1, 0], 90)
-            .scale([length, 0.5 * height, 1]),
+            _wall((-half_width, 0.5 * height, middle), (0, 1, 0), 90, side),
             pattern(seed + 2, (0.48, 0.26, 0.20), (0.52, 0.44, 0.34), 8, 56),
         ),
         "right": (
-            T()
-            .translate([half_width, 0.5 * height, middle])
-            .rotate([0, 1, 0], -90)
-            .scale([length, 0.5 * height, 1]),
+            _wall((half_width, 0.5 * height, middle), (0, 1, 0), -90, side),
             pattern(seed + 3, (0.22, 0.42, 0.26), (0.44, 0.50, 0.36), 8, 56),
         ),
     }
@@ -115,29 +112,40 @@ def room(
     }
 
 
+def _wall(
+    center: Sequence[float], axis: Sequence[float], angle: float, half_size: Sequence[float]
+) -> Any:
+    """Return the transform of a rectangle with a centre, a rotation in degrees and a half size."""
+    import mitsuba as mi
+
+    return mi.ScalarTransform4f().translate(center).rotate(axis, angle).scale([*half_size, 1])
+
+
 def lights() -> dict[str, Light]:
     """Return a lamp above the room and a weaker one beside the cameras, which brightens the
     shadows.
     """
+    return {
+        "lamp": _lamp((1.6, 5.0, 2.6), (0, 0.4, 0), (0, 0, 1), 0.6, [50.0, 46.0, 40.0]),
+        "fill": _lamp((-2.0, 3.6, 5.5), (0, 0.8, 0), (0, 1, 0), 0.8, [14.0, 15.0, 17.0]),
+    }
+
+
+def _lamp(
+    origin: Sequence[float],
+    target: Sequence[float],
+    up: Sequence[float],
+    half_size: float,
+    radiance: list[float],
+) -> Light:
+    """Return a square lamp that faces a point."""
     import mitsuba as mi
 
-    T = mi.ScalarTransform4f
-    lamp = (
-        T().look_at(origin=[1.6, 5.0, 2.6], target=[0, 0.4, 0], up=[0, 0, 1]).scale([0.6, 0.6, 1])
+    look = mi.ScalarTransform4f().look_at(origin=origin, target=target, up=up)
+    return Light(
+        {
+            "type": "rectangle",
+            "to_world": look.scale([half_size, half_size, 1]),
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}},
+        }
     )
-    fill = (
-        T().look_at(origin=[-2.0, 3.6, 5.5], target=[0, 0.8, 0], up=[0, 1, 0]).scale([0.8, 0.8, 1])
-    )
-    return {
-        name: Light(
-            {
-                "type": "rectangle",
-                "to_world": to_world,
-                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}},
-            }
-        )
-        for name, to_world, radiance in (
-            ("lamp", lamp, [50.0, 46.0, 40.0]),
-            ("fill", fill, [14.0, 15.0, 17.0]),
-        )
-    }
