@@ -83,6 +83,20 @@ def load_insert(path: str | Path) -> Build:
     if path.suffix == ".xml":
         entries = _xml_entries(path)
         return lambda frame, time: entries
+    build = _build_function(path)
+
+    def checked(frame: int, time: float) -> dict[str, Any]:
+        with failures_in(path):
+            entries = build(frame, time)
+            if not isinstance(entries, dict):
+                raise TypeError(f"`build` must return a dict, got a {type(entries).__name__}")
+            return entries
+
+    return checked
+
+
+def _build_function(path: Path) -> Callable[[int, float], Any]:
+    """Return the function `build` of a Python file."""
     spec = importlib.util.spec_from_file_location(f"morgs_mi_insert_{path.stem}", path)
     assert spec
     assert spec.loader
@@ -95,15 +109,7 @@ def load_insert(path: str | Path) -> Build:
             f"{path}: expected a function `build(frame, time)` that returns the entries of a "
             "Mitsuba scene, found none; add it."
         )
-
-    def checked(frame: int, time: float) -> dict[str, Any]:
-        with failures_in(path):
-            entries = build(frame, time)
-            if not isinstance(entries, dict):
-                raise TypeError(f"`build` must return a dict, got a {type(entries).__name__}")
-            return entries
-
-    return checked
+    return build
 
 
 def inserted_channels(stream: FrameSource) -> tuple[str, ...]:
@@ -250,18 +256,7 @@ def _render(
     nested = _integrator(entries.pop("integrator", None), config.light, clipped)
     ratio = np.ones(len(gaussians), np.float32)
     try:
-        surfaces = _inserted_scene(entries)
-        lit_scene = surfaces
-        if not surfaces.emitters():
-            lamp = captured_light(
-                gaussians, camera, np.array(surfaces.bbox().center()).ravel(), clipped
-            )
-            lit_scene = mi.load_dict({"type": "scene", **entries, "captured light": lamp})
-            surfaces = (
-                lit_scene
-                if config.light == "probe"
-                else _in_background_light(entries, gaussians, camera, clipped)
-            )
+        surfaces, lit_scene = _lit_scenes(entries, gaussians, camera, config.light, clipped)
         if config.shadows:
             ratio = shadow_ratio(gaussians, lit_scene, camera.position)
         dark = shadowed(gaussians, ratio)
@@ -276,6 +271,23 @@ def _render(
     if {"splats", "shadow"} & set(channels):
         images |= _splat_layers(gaussians, dark, camera)
     return {name: images[name].astype(np.float32) for name in channels}
+
+
+def _lit_scenes(
+    entries: dict[str, Any], gaussians: Gaussians, camera: Camera, light: Light, clipped: float
+) -> tuple[Any, Any]:
+    """Return the inserted scene with the lights of its surfaces, and with those that throw shadows
+    on the Gaussians.
+    """
+    scene = _inserted_scene(entries)
+    if scene.emitters():
+        return scene, scene
+    center = np.array(scene.bbox().center()).ravel()
+    lamp = captured_light(gaussians, camera, center, clipped)
+    lit_scene = mi.load_dict({"type": "scene", **entries, "captured light": lamp})
+    if light == "probe":
+        return lit_scene, lit_scene
+    return _in_background_light(entries, gaussians, camera, clipped), lit_scene
 
 
 def _inserted_scene(entries: dict[str, Any]) -> Any:

@@ -81,10 +81,7 @@ def light_probe(
     check_number(place, "height", height, "[4, 8192]")
     check_number(place, "clipped", clipped, "[1, inf)")
     center = numbers(place, "position", position).astype(np.float64)
-    if center.shape != (3,) or not np.isfinite(center).all():
-        raise ValueError(
-            f"{place}: `position` must be [3] and finite, got {center.tolist()}; pass x, y and z."
-        )
+    check_point(place, "position", center, "x, y and z")
     directions = _directions(int(height))
     # A face has as many pixels per degree as the map.
     size = max(int(height) // 2, 4)
@@ -92,6 +89,14 @@ def light_probe(
     color = from_numpy(mi.Float, _resampled(faces, directions))
     light = radiance(dr.unravel(mi.Color3f, color), clipped)
     return {"type": "envmap", "bitmap": mi.Bitmap(np.array(light).T.reshape(directions.shape))}
+
+
+def check_point(place: str, name: str, point: np.ndarray, instead: str) -> None:
+    """Raise `ValueError` unless an argument is a finite point [3]; `instead` is what to pass."""
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise ValueError(
+            f"{place}: `{name}` must be [3] and finite, got {point.tolist()}; pass {instead}."
+        )
 
 
 def _directions(height: int) -> np.ndarray:
@@ -129,13 +134,19 @@ def _resampled(faces: list[tuple[Camera, np.ndarray]], directions: np.ndarray) -
     face_of = 2 * axis + (largest < 0)
     result = np.zeros((*directions.shape[:2], 3), np.float32)
     for k, (camera, color) in enumerate(faces):
-        # What other faces show may be behind this camera.
         on_face = (face_of == k)[..., None]
+        # What other faces show may be behind this camera.
         forward = np.asarray(camera.viewmat)[2, :3]
-        pixels, _ = camera.project(camera.position + np.where(on_face, directions, forward))
-        x, y = (pixels[..., i].astype(np.float32) - 0.5 for i in range(2))
-        result = np.where(on_face, cv2.remap(color, x, y, cv2.INTER_LINEAR), result)
+        values = _interpolated(camera, color, np.where(on_face, directions, forward))
+        result = np.where(on_face, values, result)
     return result
+
+
+def _interpolated(camera: Camera, color: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Return the colour [H, W, 3] of a camera's image in directions [H, W, 3] in front of it."""
+    pixels, _ = camera.project(camera.position + directions)
+    x, y = (pixels[..., i].astype(np.float32) - 0.5 for i in range(2))
+    return cv2.remap(color, x, y, cv2.INTER_LINEAR)
 
 
 def radiance(color: Any, clipped: float, srgb: bool = True) -> Any:

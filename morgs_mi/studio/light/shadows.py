@@ -8,6 +8,7 @@ nothing is in the way.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -24,6 +25,7 @@ from morgs_mi.core.color_space import SH_C0, decode_light, encode_light
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, UInt32
+from morgs_mi.studio.light.light_probe import check_point
 from morgs_mi.surfaces.surface_view import shared_scene
 
 # Gaussians around one that determine the surface it lies on.
@@ -57,11 +59,7 @@ def shadow_ratio(
     check_type(place, "gaussians", gaussians, Gaussians)
     check_number(place, "samples", samples, "[1, 65536]")
     eye = numbers(place, "viewpoint", viewpoint)
-    if eye.shape != (3,) or not np.isfinite(eye).all():
-        raise ValueError(
-            f"{place}: `viewpoint` must be [3] and finite, got {eye.tolist()}; pass a camera's "
-            "position."
-        )
+    check_point(place, "viewpoint", eye, "a camera's position")
     emitters = scene.emitters()
     shapes = [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
     if not emitters:
@@ -72,13 +70,9 @@ def shadow_ratio(
     if not len(gaussians) or not shapes:
         return np.ones(len(gaussians), np.float32)
     with dr.suspend_grad():
-        receivers = _Receivers(gaussians, eye)
-        blockers = shared_scene(shapes, scene)
-        blocked, total = (mi.Float(0) for _ in range(2))
-        for emitter in emitters:
-            some, every = _irradiance(emitter, receivers, blockers, int(samples))
-            blocked = blocked + some
-            total = total + every
+        blocked, total = _irradiances(
+            emitters, _Receivers(gaussians, eye), shared_scene(shapes, scene), int(samples)
+        )
         return np.array(1 - dr.select(total > 0, blocked / total, 0))
 
 
@@ -92,12 +86,7 @@ def shadowed(gaussians: Gaussians, ratio: np.ndarray) -> Gaussians:
     Raises:
         ValueError: a ratio of another shape, or with numbers that are negative or not finite.
     """
-    ratio = numbers("shadowed()", "ratio", ratio).astype(np.float64)
-    if ratio.shape != (len(gaussians),) or not (np.isfinite(ratio) & (ratio >= 0)).all():
-        raise ValueError(
-            f"shadowed(): `ratio` must be [N] with N={len(gaussians)}, finite and not negative, "
-            f"got {list(ratio.shape)}; pass the result of shadow_ratio()."
-        )
+    ratio = _checked_ratio(ratio, len(gaussians))
     # The mean colours [N, 1, 3].
     mean = np.maximum(0.5 + SH_C0 * np.array(dr.detach(gaussians.sh_coeffs))[:, :1], 1e-6)
     factor = encode_light(ratio[:, None, None] * decode_light(mean)) / mean
@@ -110,6 +99,17 @@ def shadowed(gaussians: Gaussians, ratio: np.ndarray) -> Gaussians:
     )
 
 
+def _checked_ratio(ratio: np.ndarray, count: int) -> np.ndarray:
+    """Return the ratio as float64 [N]."""
+    ratio = numbers("shadowed()", "ratio", ratio).astype(np.float64)
+    if ratio.shape != (count,) or not (np.isfinite(ratio) & (ratio >= 0)).all():
+        raise ValueError(
+            f"shadowed(): `ratio` must be [N] with N={count}, finite and not negative, "
+            f"got {list(ratio.shape)}; pass the result of shadow_ratio()."
+        )
+    return ratio
+
+
 class _Receivers:
     """Centres and orientation of the Gaussians: `flat` is 0 in a round neighbourhood and 1 on a
     plane.
@@ -120,13 +120,18 @@ class _Receivers:
         normals, flat = _orientation(gaussians, means)
         is_back = np.sum(normals * (eye - means), axis=1) < 0
         front_normals = np.where(is_back[:, None], -normals, normals)
-        self.centers = mi.Point3f([from_numpy(mi.Float, means[:, k]) for k in range(3)])
-        self.normals = mi.Vector3f([from_numpy(mi.Float, front_normals[:, k]) for k in range(3)])
+        self.centers = mi.Point3f(_columns(means))
+        self.normals = mi.Vector3f(_columns(front_normals))
         self.flat = from_numpy(mi.Float, flat)
 
     def response(self, direction: Any) -> Float:
         """Return the received fraction of light from a direction."""
         return dr.lerp(0.5, dr.maximum(dr.dot(self.normals, direction), 0), self.flat)
+
+
+def _columns(rows: np.ndarray) -> list[Float]:
+    """Return the three columns of an array [N, 3]."""
+    return [from_numpy(mi.Float, rows[:, k]) for k in range(3)]
 
 
 def _orientation(gaussians: Gaussians, means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -135,27 +140,49 @@ def _orientation(gaussians: Gaussians, means: np.ndarray) -> tuple[np.ndarray, n
 
     Single Gaussians of a fitted surface lie in it, but are not all flat.
     """
-    scales = np.array(dr.detach(gaussians.scales))
-    quats = np.array(dr.detach(gaussians.quats), np.float64)
-    quats = np.where(np.linalg.norm(quats, axis=1, keepdims=True) > 0, quats, [1, 0, 0, 0])
-    axes = Rotation.from_quat(quats, scalar_first=True).as_matrix() * scales[:, None]
-    _, near = KDTree(means).query(means, min(_NEIGHBOURS, len(means)), workers=-1)
-    near = near.reshape(len(means), -1)
-    # An opacity may be 0 in float32.
-    weights = np.array(dr.detach(gaussians.opacities), np.float64)[near] + 1e-9
-    weights /= weights.sum(1, keepdims=True)
-    ends = np.arange(0, near.size + 1, near.shape[1])
-    mixture = csr_array((weights.ravel(), near.ravel(), ends), shape=(len(means), len(means)))
+    mixture = _mixture(means, np.array(dr.detach(gaussians.opacities), np.float64))
     # The covariance of the mixture: the mean of its second moments, minus the second moment of its
     # centre.
     centered = means - means.mean(0)
-    moments = axes @ axes.transpose(0, 2, 1) + centered[:, :, None] * centered[:, None, :]
+    moments = _covariances(gaussians) + centered[:, :, None] * centered[:, None, :]
     center = mixture @ centered
     covariance = (mixture @ moments.reshape(-1, 9)).reshape(-1, 3, 3) - center[:, :, None] * center[
         :, None, :
     ]
     variances, directions = np.linalg.eigh(covariance)
     return directions[:, :, 0], 1 - variances[:, 0] / np.maximum(variances[:, 1], 1e-30)
+
+
+def _covariances(gaussians: Gaussians) -> np.ndarray:
+    """Return the covariances [N, 3, 3], float64; quaternions of zero count as no rotation."""
+    scales = np.array(dr.detach(gaussians.scales))
+    quats = np.array(dr.detach(gaussians.quats), np.float64)
+    quats = np.where(np.linalg.norm(quats, axis=1, keepdims=True) > 0, quats, [1, 0, 0, 0])
+    axes = Rotation.from_quat(quats, scalar_first=True).as_matrix() * scales[:, None]
+    return axes @ axes.transpose(0, 2, 1)
+
+
+def _mixture(means: np.ndarray, opacities: np.ndarray) -> csr_array:
+    """Return the weights [N, N] of the Gaussians around each one, by their opacities [N]."""
+    _, near = KDTree(means).query(means, min(_NEIGHBOURS, len(means)), workers=-1)
+    near = near.reshape(len(means), -1)
+    # An opacity may be 0 in float32.
+    weights = opacities[near] + 1e-9
+    weights /= weights.sum(1, keepdims=True)
+    ends = np.arange(0, near.size + 1, near.shape[1])
+    return csr_array((weights.ravel(), near.ravel(), ends), shape=(len(means), len(means)))
+
+
+def _irradiances(
+    emitters: Iterable[Any], receivers: _Receivers, blockers: Any, samples: int
+) -> tuple[Float, Float]:
+    """Return the same as `_irradiance` for all lights together."""
+    blocked, total = (mi.Float(0) for _ in range(2))
+    for emitter in emitters:
+        some, every = _irradiance(emitter, receivers, blockers, samples)
+        blocked = blocked + some
+        total = total + every
+    return blocked, total
 
 
 def _irradiance(

@@ -12,7 +12,7 @@ from threading import Condition, Event, Thread
 
 import numpy as np
 
-from morgs_mi.studio.live.feed import Bundle, Shot, bundled
+from morgs_mi.studio.live.feed import Bundle, Shot, bundled, close_images
 
 # Images of a camera from which the one that agrees best with the others is chosen: networks deliver
 # them in bursts.
@@ -68,20 +68,9 @@ class CameraFeed:
             while True:
                 time_left = deadline - time.monotonic()
                 is_running = any(camera.reason is None for camera in self._cameras)
-                new = [
-                    camera.newer(after.numbers[k] if after else -1)
-                    for k, camera in enumerate(self._cameras)
-                ]
-                if after is not None and is_running:
-                    expected = self._expected(new, after, late=time_left <= 0)
-                else:  # the first images have to be complete, and so have the last ones
-                    expected = [
-                        after is None or after.images[k] is not None for k in range(len(new))
-                    ]
-                if shots := _nearest(new, expected):
-                    times = [shot.time for shot in shots if shot is not None]
-                    numbers = [camera.shots[-1].number for camera in self._cameras]
-                    return bundled(shots, numbers, max(times) - min(times), _dropped(shots, after))
+                bundle = self._bundle(after, is_running, late=time_left <= 0)
+                if bundle is not None:
+                    return bundle
                 if is_running and time_left > 0:
                     self._change.wait(time_left)
                 elif after is not None:
@@ -112,6 +101,25 @@ class CameraFeed:
         for camera in self._cameras:
             camera.join(max(0.0, deadline - time.monotonic()))
 
+    def _bundle(self, after: Bundle | None, is_running: bool, late: bool) -> Bundle | None:
+        """Return the bundle of the images that are there; None as long as an expected one is
+        missing.
+        """
+        new = [
+            camera.newer(after.numbers[k] if after else -1)
+            for k, camera in enumerate(self._cameras)
+        ]
+        if after is not None and is_running:
+            expected = self._expected(new, after, late)
+        else:  # the first images have to be complete, and so have the last ones
+            expected = [after is None or after.images[k] is not None for k in range(len(new))]
+        shots = _nearest(new, expected)
+        if shots is None:
+            return None
+        times = [shot.time for shot in shots if shot is not None]
+        numbers = [camera.shots[-1].number for camera in self._cameras]
+        return bundled(shots, numbers, max(times) - min(times), _dropped(shots, after))
+
     def _expected(self, new: Sequence[Sequence[Shot]], bundle: Bundle, late: bool) -> list[bool]:
         """Return for each camera whether the bundle has to have its image.
 
@@ -135,21 +143,26 @@ class CameraFeed:
         deadline = time.monotonic() + self._timeout
         while silent := [k for k, camera in enumerate(self._cameras) if not camera.shots]:
             time_left = deadline - time.monotonic()
-            for name, camera in ((self.names[k], self._cameras[k]) for k in silent):
-                if camera.error is not None:
-                    raise camera.error
-                if camera.reason is not None or time_left <= 0:
-                    raise ValueError(
-                        f"CameraFeed(): expected images of {name}, got none "
-                        f"({camera.reason or 'it is silent'}); check that it records, or wait for "
-                        f"it longer than {self._timeout:g} s (--timeout)."
-                    )
+            for k in silent:
+                self._check_silent(k, time_left)
             self._change.wait(time_left)
         end = time.monotonic() + self._warm_up
         while (time_left := end - time.monotonic()) > 0 and all(
             camera.reason is None for camera in self._cameras
         ):
             self._change.wait(time_left)
+
+    def _check_silent(self, k: int, time_left: float) -> None:
+        """Raise an error if a camera without an image has ended, or is not waited for any more."""
+        camera = self._cameras[k]
+        if camera.error is not None:
+            raise camera.error
+        if camera.reason is not None or time_left <= 0:
+            raise ValueError(
+                f"CameraFeed(): expected images of {self.names[k]}, got none "
+                f"({camera.reason or 'it is silent'}); check that it records, or wait for "
+                f"it longer than {self._timeout:g} s (--timeout)."
+            )
 
 
 class _Camera(Thread):
@@ -182,8 +195,7 @@ class _Camera(Thread):
         except Exception as error:
             self.error = error
         finally:
-            if (close := getattr(self._images, "close", None)) is not None:
-                close()
+            close_images(self._images)
             with self._change:
                 self.reason = str(self.error or self._end_text)
                 self._change.notify_all()

@@ -85,3 +85,9 @@ def bundled(
         skew,
         dropped,
     )
+
+
+def close_images(images: object) -> None:
+    """End an iterator of images, if it is one that can be ended."""
+    if (close := getattr(images, "close", None)) is not None:
+        close()

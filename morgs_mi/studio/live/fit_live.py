@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -83,11 +83,7 @@ def fit_live(
     live = live or LiveConfig()
     live.check("fit_live()")
     check_outputs(out)
-    if (out / "capture").exists():
-        raise FileExistsError(
-            f"{out / 'capture'}: expected no capture, got that of an earlier fit; choose another "
-            "folder for this one."
-        )
+    _check_no_capture(out / "capture")
     _check_outside(out, sources)
     calibration = live.calibration and read_calibration(live.calibration).without(
         live.calibration, live.without
@@ -95,17 +91,31 @@ def fit_live(
     names = calibration and [camera.name for camera in calibration.cameras]
     report = on_stage or (lambda *_: None)
     with locked_folder(out, "fit_live()"), closing(open_feed(sources, live, names)) as feed:
-        report("Waiting for the cameras", 0, 1)
-        first = feed.newest()
-        if first is None:
-            raise ValueError("fit_live(): expected images of the cameras, got none.")
-        report("Waiting for the cameras", 1, 1)
+        first = _first_images(feed, report)
         capture = begin_capture(
             out / "capture", feed.names, first.images, live, calibration, on_stage
         )
         return _fit(
             _LiveFrames(feed, capture, first, live), out, config or LIVE_STREAM, on_frame, report
         )
+
+
+def _check_no_capture(folder: Path) -> None:
+    if folder.exists():
+        raise FileExistsError(
+            f"{folder}: expected no capture, got that of an earlier fit; choose another "
+            "folder for this one."
+        )
+
+
+def _first_images(feed: Feed, report: Report) -> Bundle:
+    """Wait for the first images of the cameras and return them."""
+    report("Waiting for the cameras", 0, 1)
+    first = feed.newest()
+    if first is None:
+        raise ValueError("fit_live(): expected images of the cameras, got none.")
+    report("Waiting for the cameras", 1, 1)
+    return first
 
 
 def _check_outside(out: Path, sources: Sequence[Source]) -> None:
@@ -163,21 +173,26 @@ class _LiveFrames:
 
     def _processed(self, bundle: Bundle, frame: int) -> PartialFrame:
         """Return the processed images of a bundle; a camera that has none is logged once."""
-        problems = {k: self._problem(k, image) for k, image in enumerate(bundle.images)}
-        problems = {k: problem for k, problem in problems.items() if problem}
-        names = {self.capture.names[k]: problem for k, problem in problems.items()}
-        for name in names.keys() - self._missing_names:
-            _LOG.warning("frame %d: %s is left out: %s", frame, name, names[name].rstrip("."))
-        self._missing_names = set(names)
+        names = self.capture.names
+        problems = {names[k]: self._problem(k, image) for k, image in enumerate(bundle.images)}
+        problems = {name: problem for name, problem in problems.items() if problem}
+        self._warn(frame, problems)
 
         def process(view: int) -> np.ndarray | None:
             image = bundle.images[view]
-            return None if image is None or view in problems else self.capture.process(view, image)
+            if image is None or names[view] in problems:
+                return None
+            return self.capture.process(view, image)
 
         images = map_in_threads(process, range(len(bundle.images)))
-        return PartialFrame(
-            frame, tuple(images), tuple(f"{name}: {problem}" for name, problem in names.items())
-        )
+        sentences = tuple(f"{name}: {problem}" for name, problem in problems.items())
+        return PartialFrame(frame, tuple(images), sentences)
+
+    def _warn(self, frame: int, problems: Mapping[str, str]) -> None:
+        """Log the problems of the cameras that had none in the frame before."""
+        for name in problems.keys() - self._missing_names:
+            _LOG.warning("frame %d: %s is left out: %s", frame, name, problems[name].rstrip("."))
+        self._missing_names = set(problems)
 
     def _problem(self, view: int, image: np.ndarray | None) -> str:
         """Return why a camera has no image, or none of its size; empty if it has one."""

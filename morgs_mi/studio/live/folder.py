@@ -137,26 +137,24 @@ class FolderFeed:
         """Return the newest bundle of all cameras."""
         names = self.names or tuple(by_name)
         common = _common(by_name, names)
-        if not self.names and not late:
+        if not self.names and not late and by_name:
             # Which cameras there are is known when the next number begins.
-            common -= (
-                {max(number for images in by_name.values() for number in images.files)}
-                if by_name
-                else set()
-            )
+            common -= {max(number for images in by_name.values() for number in images.files)}
         bundle = _bundle([by_name.get(name, _NONE) for name in names], common)
-        if bundle is not None:
-            if (
-                not self.names
-                and not late
-                and set(self._found(-1, self._old_write_times)) - set(names)
-            ):
+        if bundle is None:
+            return None
+        if not self.names:
+            if not late and set(self._found(-1, self._old_write_times)) - set(names):
                 # The first image of a camera came while the folders were read.
                 return None
-            if silent := [name for name in self._cameras() if name not in names and not self.names]:
-                _LOG.warning("%s is left out: no image in %s", ", ".join(silent), self._folder)
+            self._warn_of_silent(names)
             self.names = names
         return bundle
+
+    def _warn_of_silent(self, names: Sequence[str]) -> None:
+        """Log the folders of cameras that are not among `names`."""
+        if silent := [name for name in self._cameras() if name not in names]:
+            _LOG.warning("%s is left out: no image in %s", ", ".join(silent), self._folder)
 
     def _next(self, by_name: _Found, last_bundle: Bundle, late: bool) -> Bundle | None:
         """Return the newest bundle of the cameras that are expected; if it is late, of those that
@@ -171,10 +169,8 @@ class FolderFeed:
             return _bundle(cameras, set.union(*numbers), last_bundle, partial=True)
         bundle = _bundle(cameras, set.intersection(*numbers), last_bundle)
         # A camera that has stopped during a fit has images that the others had, too, but long ago.
-        newest = max(
-            (camera.arrival(max(camera.files)) for camera in cameras if camera.files), default=0.0
-        )
-        return bundle if bundle is not None and newest - bundle.time <= self._timeout else None
+        is_current = bundle is not None and _newest(cameras) - bundle.time <= self._timeout
+        return bundle if is_current else None
 
     def _take(self, by_name: _Found, number: int, last_bundle: Bundle | None) -> None:
         """Store when the images of a number were written, and whether the count has begun again."""
@@ -234,11 +230,7 @@ class FolderFeed:
             write_times: by camera, when an image was written, s of the file; images written up to
                 `PAUSE` later are of the same time. Empty: no image is left out.
         """
-        by_name = {}
-        for name in self.names or self._cameras():
-            if files := files_of_camera(self._folder / name, limit):
-                self._compare_clocks(name, files[max(files)])
-                by_name[name] = _Images(files, self._leads.get(name, 0.0))
+        by_name = self._images(limit)
         if not write_times:
             return by_name
         begin = PAUSE + max(
@@ -246,6 +238,15 @@ class FolderFeed:
         )
         by_name = {name: images.since(begin) for name, images in by_name.items()}
         return {name: images for name, images in by_name.items() if images.files}
+
+    def _images(self, limit: int) -> dict[str, _Images]:
+        """Return the images of each camera with numbers larger than `limit`."""
+        by_name = {}
+        for name in self.names or self._cameras():
+            if files := files_of_camera(self._folder / name, limit):
+                self._compare_clocks(name, files[max(files)])
+                by_name[name] = _Images(files, self._leads.get(name, 0.0))
+        return by_name
 
     def _compare_clocks(self, name: str, file: Path) -> None:
         """Compare the clock of a camera's files with this machine's by one of its images.
@@ -270,6 +271,13 @@ def _common(by_name: _Found, names: Sequence[str]) -> set[int]:
         set.intersection(*(set(by_name.get(name, _NONE).files) for name in names))
         if names
         else set()
+    )
+
+
+def _newest(cameras: Sequence[_Images]) -> float:
+    """Return when the last of the newest images of all cameras arrived, s of `time.monotonic`."""
+    return max(
+        (camera.arrival(max(camera.files)) for camera in cameras if camera.files), default=0.0
     )
 
 

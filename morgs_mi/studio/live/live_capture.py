@@ -74,14 +74,7 @@ def begin_capture(
         if calibration is None:
             _calibrate(folder, on_stage)
         else:
-            model = folder / "sparse" / "0"
-            write_colmap(
-                model,
-                calibration.cameras,
-                calibration.points,
-                calibration.point_colors,
-                calibration.lenses,
-            )
+            _write_calibration(folder, calibration)
         return _opened(folder, config)
     except (OSError, ValueError) as error:
         # The fit can be started again; images that cannot be calibrated stay.
@@ -108,6 +101,16 @@ def write_images(
                 partial.write_bytes(png_bytes(image))
 
     map_in_threads(write, range(len(names)))
+
+
+def _write_calibration(folder: Path, calibration: Calibration) -> None:
+    write_colmap(
+        folder / "sparse" / "0",
+        calibration.cameras,
+        calibration.points,
+        calibration.point_colors,
+        calibration.lenses,
+    )
 
 
 def _calibrate(folder: Path, on_stage: Report | None) -> None:

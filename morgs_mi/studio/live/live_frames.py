@@ -21,6 +21,7 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.io.prefetch import prefetched
+from morgs_mi.studio.live.feed import close_images
 from morgs_mi.studio.live.playing import ClipClock, is_video, play
 from morgs_mi.studio.live.reading import raw_images, read_camera
 
@@ -66,22 +67,21 @@ def _frames(rig: Capture, streams: Sequence[Iterator[np.ndarray | None]]) -> Ite
             images = [next(stream, None) for stream in streams]
             if all(image is None for image in images):
                 return
-            problems = [
-                f"{n}: no image"
-                for n, image in zip(rig.names, images, strict=True)
-                if image is None
-            ]
-            for view, image in enumerate(images):
-                _check_size(rig, view, image)
-            processed = [
-                None if image is None else rig.process(view, image)
-                for view, image in enumerate(images)
-            ]
-            yield PartialFrame(index, tuple(processed), tuple(problems))
+            yield _frame(rig, index, images)
     finally:
         for stream in streams:
-            if (close := getattr(stream, "close", None)) is not None:
-                close()
+            close_images(stream)
+
+
+def _frame(rig: Capture, index: int, images: Sequence[np.ndarray | None]) -> PartialFrame:
+    """Return the frame of the images as they are recorded, one per camera."""
+    for view, image in enumerate(images):
+        _check_size(rig, view, image)
+    processed = (
+        None if image is None else rig.process(view, image) for view, image in enumerate(images)
+    )
+    names = (name for name, image in zip(rig.names, images, strict=True) if image is None)
+    return PartialFrame(index, tuple(processed), tuple(f"{name}: no image" for name in names))
 
 
 def _check_size(rig: Capture, view: int, image: np.ndarray | None) -> None:

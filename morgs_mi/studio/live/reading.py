@@ -64,16 +64,21 @@ def _until_end(
         if isinstance(source, int) and size is not None:
             stream.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
             stream.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
-        failures = 0
         try:
-            while failures < _FAILURES and not stop.is_set():
-                is_read, image = stream.read()
-                failures = 0 if is_read else failures + 1
-                yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if is_read else None
-                if not is_read:
-                    stop.wait(PAUSE)
+            yield from _images(stream, stop)
         finally:
             stream.release()
+
+
+def _images(stream: cv2.VideoCapture, stop: Event) -> Iterator[np.ndarray | None]:
+    """Yield the images of an open stream until several reads in succession have failed."""
+    failures = 0
+    while failures < _FAILURES and not stop.is_set():
+        is_read, image = stream.read()
+        failures = 0 if is_read else failures + 1
+        yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if is_read else None
+        if not is_read:
+            stop.wait(PAUSE)
 
 
 def open_stream(place: int | str, source: int | str | Path) -> cv2.VideoCapture:
@@ -112,23 +117,30 @@ def _place(source: int | str | Path, stop: Event) -> Iterator[int | str]:
     if isinstance(source, int) or not Path(source).is_fifo():
         yield source if isinstance(source, int) else str(source)
         return
+    with (
+        open(
+            source, "rb", 0, opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK)
+        ) as pipe,
+        _relayed(pipe, stop) as place,
+    ):
+        yield place
+
+
+@contextmanager
+def _relayed(pipe: FileIO, stop: Event) -> Iterator[str]:
+    """Yield the path of a pipe to which a thread copies another one, from its first bytes on."""
+    first = _next_bytes(pipe, False, stop.is_set)
     exit_event = Event()
-    with open(
-        source, "rb", 0, opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK)
-    ) as pipe:
-        first = _next_bytes(pipe, False, stop.is_set)
-        reader, writer = os.pipe()
-        has_ended = lambda: stop.is_set() or exit_event.is_set()  # noqa: E731
-        relay = Thread(
-            target=_relay, args=(pipe, first, writer, has_ended), daemon=True, name="pipe"
-        )
-        relay.start()
-        try:
-            yield f"/dev/fd/{reader}"
-        finally:
-            exit_event.set()
-            os.close(reader)  # so a relay that waits for its reader ends, too
-            relay.join()
+    reader, writer = os.pipe()
+    has_ended = lambda: stop.is_set() or exit_event.is_set()  # noqa: E731
+    relay = Thread(target=_relay, args=(pipe, first, writer, has_ended), daemon=True, name="pipe")
+    relay.start()
+    try:
+        yield f"/dev/fd/{reader}"
+    finally:
+        exit_event.set()
+        os.close(reader)  # so a relay that waits for its reader ends, too
+        relay.join()
 
 
 def _relay(pipe: FileIO, data: bytes, writer: int, has_ended: Callable[[], bool]) -> None:

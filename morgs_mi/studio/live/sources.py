@@ -37,15 +37,7 @@ def open_feed(
         ValueError: there is no source, one occurs twice, their number differs from the number of
             names, or the settings repeat videos and there is none.
     """
-    if not sources:
-        raise ValueError(
-            "open_feed(): `camera` must have a source per camera, or a folder, got none; name them."
-        )
-    if len(set(sources)) < len(sources):
-        raise ValueError(
-            f"open_feed(): `camera` must have different sources, got {_listed(sources)}; name "
-            "each once."
-        )
+    _check_different(sources)
     folders = [
         source for source in sources if isinstance(source, str | Path) and Path(source).is_dir()
     ]
@@ -63,6 +55,24 @@ def open_feed(
             f"open_feed(): `camera` must have a source for each of the {len(names)} calibrated "
             f"cameras ({', '.join(names)}), got {_listed(sources)}; name them in that order."
         )
+    return _camera_feed(sources, config, names)
+
+
+def _check_different(sources: Sequence[Source]) -> None:
+    """Raise `ValueError` without a source, or if one occurs twice."""
+    if not sources:
+        raise ValueError(
+            "open_feed(): `camera` must have a source per camera, or a folder, got none; name them."
+        )
+    if len(set(sources)) < len(sources):
+        raise ValueError(
+            f"open_feed(): `camera` must have different sources, got {_listed(sources)}; name "
+            "each once."
+        )
+
+
+def _camera_feed(sources: Sequence[Source], config: LiveConfig, names: Sequence[str]) -> CameraFeed:
+    """Return the feed of cameras, streams and videos."""
     stop = Event()
     videos = [source for source in sources if is_video(source)]
     if config.loop and not videos:
