@@ -21,7 +21,7 @@ from morgs_mi.core.fit_names import REPORT
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.figures import motion_scale
-from morgs_mi.evaluate.results import Evaluation
+from morgs_mi.evaluate.results import Evaluation, FrameScores
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.io.video_writer import PLAYABLE, write_video
 from morgs_mi.loop.stream_config import StreamConfig
@@ -234,16 +234,16 @@ def _compare(
     """
     count = min(result.num_frames for result in results.values())
     rows = {name: result.frames[1:count] for name, result in results.items()}
-
-    def mean(name: str, score: str) -> float | None:
-        return (
-            float(np.mean([getattr(row.scores, score) for row in rows[name]]))
-            if rows[name]
-            else None
-        )
-
-    means = {name: {score: mean(name, score) for score in _COMPARED} for name in rows}
+    means = {
+        name: {score: _mean_score(frames, score) for score in _COMPARED}
+        for name, frames in rows.items()
+    }
     return [row.frame for row in rows["full"]], means
+
+
+def _mean_score(frames: Sequence[FrameScores], score: str) -> float | None:
+    values = [getattr(frame.scores, score) for frame in frames]
+    return float(np.mean(values)) if values else None
 
 
 def _draw(out: Path, capture: Capture, report: Callable[[float, float], None]) -> None:
@@ -293,9 +293,7 @@ def _panels(
         truth = truth_for_camera(capture, camera, index)
         if truth is not None:
             panels["true motion"] = channel_image("motion", truth.motion, scale)
-        panels |= {
-            n: channel_image(n, images[n], scale) for n in ("motion", "confidence") if n in images
-        }
+        panels |= _maps(images, scale)
         labels = {
             "truth": f"truth, frame {index}",
             "error": f"error x{_ERROR_GAIN}",
@@ -305,6 +303,12 @@ def _panels(
             {name: label(panel, labels.get(name, name + note)) for name, panel in panels.items()}
         )
     return frames
+
+
+def _maps(images: Mapping[str, np.ndarray], scale: float) -> dict[str, np.ndarray]:
+    """Return the rendered motion and confidence as images, as far as there are any."""
+    names = [name for name in ("motion", "confidence") if name in images]
+    return {name: channel_image(name, images[name], scale) for name in names}
 
 
 def _compared_images(truth: np.ndarray, color: np.ndarray) -> dict[str, np.ndarray]:

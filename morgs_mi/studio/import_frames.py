@@ -18,6 +18,7 @@ from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -122,13 +123,18 @@ def _new_stream(out: str | Path) -> Path:
 
 def _rig_around(paths: Sequence[Path], axes: Axes, most_invalid: float) -> tuple[Camera, ...]:
     """Return the ring of cameras that sees the Gaussians of several frames."""
-    in_view = np.unique(np.linspace(0, len(paths) - 1, _FRAMES_IN_VIEW).astype(int))
     try:
-        return default_rig([read_splats(paths[t], most_invalid) for t in in_view], axes)
+        return default_rig([read_splats(path, most_invalid) for path in _in_view(paths)], axes)
     except ValueError as error:
         if any(str(error).startswith(f"{path}: ") for path in paths):
             raise
         raise ValueError(f"{paths[0].parent}: {error}") from None
+
+
+def _in_view(paths: Sequence[Path]) -> list[Path]:
+    """Return the files of the frames that the ring sees."""
+    frames = np.unique(np.linspace(0, len(paths) - 1, _FRAMES_IN_VIEW).astype(int))
+    return [paths[t] for t in frames]
 
 
 def _packets_of_frames(
@@ -149,12 +155,22 @@ def _packets_of_frames(
             state = decode(state, packet)
             yield [packet]
             continue
-        # Of the state, where births are last.
-        rows = np.where(rows < 0, -1, np.argsort(order)[rows])
-        order = np.argsort(np.where(rows < 0, len(state), rows), kind="stable")
+        rows, order = _in_state(rows, order)
         packet = residual_packet(state, gaussians.select(order), rows[order], cameras, config)
         state = decode(state, packet)
         yield [packet, *due_keyframe(state, config.keyframe_interval)]
+
+
+def _in_state(rows: np.ndarray, old_order: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows of Gaussians in the state, -1 for births, and their new order there, in which
+    births are last.
+
+    Args:
+        rows: rows in the frame before [M].
+        old_order: order of the frame before [N].
+    """
+    rows = np.where(rows < 0, -1, np.argsort(old_order)[rows])
+    return rows, np.argsort(np.where(rows < 0, len(old_order), rows), kind="stable")
 
 
 def find_frames(sources: Sequence[str | Path]) -> list[Path]:
@@ -169,11 +185,7 @@ def find_frames(sources: Sequence[str | Path]) -> list[Path]:
         ValueError: there are no such files, or they have several formats.
     """
     paths = [Path(source) for source in sources]
-    for path in paths:
-        if not path.exists():
-            raise FileNotFoundError(
-                f"{path}: expected frames ({', '.join(SUFFIXES)}), found none; check the path."
-            )
+    _check_exist(paths)
     if len(paths) == 1 and paths[0].is_dir():
         paths = _frames_in(paths[0])
     if not paths:
@@ -184,35 +196,53 @@ def find_frames(sources: Sequence[str | Path]) -> list[Path]:
     return paths
 
 
+def _check_exist(paths: Sequence[Path]) -> None:
+    for path in paths:
+        if not path.exists():
+            raise FileNotFoundError(
+                f"{path}: expected frames ({', '.join(SUFFIXES)}), found none; check the path."
+            )
+
+
 def _frames_in(folder: Path) -> list[Path]:
     """Return the files with Gaussians in a folder, at least one, by the numbers in their names."""
     files = (path for path in listed(folder) if path.is_file() and suffix_of(path))
     paths = sorted(files, key=lambda path: natural_key(path.name))
     if not paths:
-        for file in listed(folder):
-            refuse_foreign(file)
-        raise ValueError(
-            f"{folder}: expected files whose names end in {', '.join(SUFFIXES)}, got none; "
-            "convert the frames."
-        )
+        _refuse_folder(folder)
     return paths
+
+
+def _refuse_folder(folder: Path) -> NoReturn:
+    """Raise `ValueError` for a folder without frames."""
+    for file in listed(folder):
+        refuse_foreign(file)
+    raise ValueError(
+        f"{folder}: expected files whose names end in {', '.join(SUFFIXES)}, got none; "
+        "convert the frames."
+    )
 
 
 def _check_formats(paths: Sequence[Path]) -> None:
     """Raise `ValueError` unless all files have one format, of those that are read."""
     first = {suffix_of(path): path for path in reversed(paths)}
     if None in first:
-        refuse_foreign(first[None])
-        raise ValueError(
-            f"{first[None]}: expected one folder, or files whose names end in "
-            f"{', '.join(SUFFIXES)}, got another; convert it, or leave it out."
-        )
+        _refuse(first[None])
     if len(first) > 1:
         names = " and ".join(path.name for path in first.values())
         raise ValueError(
             f"{paths[0].parent}: expected frames of one format, got {names}; name the files of "
             "one of them."
         )
+
+
+def _refuse(path: Path) -> NoReturn:
+    """Raise `ValueError` for a file of another format."""
+    refuse_foreign(path)
+    raise ValueError(
+        f"{path}: expected one folder, or files whose names end in "
+        f"{', '.join(SUFFIXES)}, got another; convert it, or leave it out."
+    )
 
 
 def same_gaussians(before: Gaussians, now: Gaussians) -> bool:
@@ -222,9 +252,12 @@ def same_gaussians(before: Gaussians, now: Gaussians) -> bool:
     if len(before) != len(now) or before.sh_degree != now.sh_degree or not len(now):
         return False
     old, new = _scaled_features(before, now)
-    distances = np.square(new - old).sum(axis=1)
-    other_distances = np.square(new - np.roll(old, -1, axis=0)).sum(axis=1)
-    return bool(np.mean(distances <= other_distances) >= _LEAST_SHARE)
+    mask = _squared_norms(new - old) <= _squared_norms(new - np.roll(old, -1, axis=0))
+    return bool(np.mean(mask) >= _LEAST_SHARE)
+
+
+def _squared_norms(rows: np.ndarray) -> np.ndarray:
+    return np.square(rows).sum(axis=1)
 
 
 def matched_rows(before: Gaussians, now: Gaussians) -> np.ndarray | None:

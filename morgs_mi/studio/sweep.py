@@ -62,8 +62,7 @@ def sweep(
         ValueError: a number is below 1, or as `stream_capture`.
         OSError: as `stream_capture`.
     """
-    for name, value in (("seeds", seeds), *(("epochs", value) for value in epochs)):
-        check_value("sweep()", name, value, Annotated[int, AtLeast(1)])
+    _check_numbers(epochs, seeds)
     config = config or StreamConfig()
     _compile_kernels(capture, config)
     rows: list[Scores] = []
@@ -73,11 +72,15 @@ def sweep(
         stage(len(rows), len(ladder))
         settings = replace(config, fit=replace(config.fit, epochs=count), seed=seed)
         rows.append(_fitted_scores(capture, Path(out) / f"epochs{count}-seed{seed}", settings))
-        write_json(
-            Path(out) / "sweep.json", {"rows": rows, "machine": machine(), "versions": versions()}
-        )
+        results = {"rows": rows, "machine": machine(), "versions": versions()}
+        write_json(Path(out) / "sweep.json", results)
     stage(len(rows), len(ladder))
     return rows
+
+
+def _check_numbers(epochs: Sequence[int], seeds: int) -> None:
+    for name, value in (("seeds", seeds), *(("epochs", value) for value in epochs)):
+        check_value("sweep()", name, value, Annotated[int, AtLeast(1)])
 
 
 def _fitted_scores(capture: Capture, folder: Path, config: StreamConfig) -> Scores:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
+from rich.table import Table
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from morgs_mi.cli.console import print_result, print_table, print_warning, progress
@@ -39,13 +40,17 @@ class Calibrate:
                 lambda *stage: report(*stage),
                 self.without,
             )
-        table = check_table(str(result.model), ("camera", "points", "error, px", "pose"))
-        for check in result.checks:
-            table.add_row(check.name, *check_cells(check))
-        print_table(table)
+        print_table(_pose_table(result))
         for line in advice_lines(result.checks):
             print_warning(line)
         print_result(_summary(result))
+
+
+def _pose_table(result: CalibrationResult) -> Table:
+    table = check_table(str(result.model), ("camera", "points", "error, px", "pose"))
+    for check in result.checks:
+        table.add_row(check.name, *check_cells(check))
+    return table
 
 
 def _summary(result: CalibrationResult) -> str:

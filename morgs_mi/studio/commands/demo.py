@@ -61,10 +61,9 @@ class Demo:
         settings.check_methods(stream)
         names = ("cameras", "frames", "width", "height", "spp")
         clip = replace(_DEFAULT.clip, **{name: getattr(self, name) for name in names})
+        config = replace(_DEFAULT, scene=self.scene, clip=clip, stream=stream)
         with progress() as report:
-            result = run_demo(
-                self.out, replace(_DEFAULT, scene=self.scene, clip=clip, stream=stream), report
-            )
+            result = run_demo(self.out, config, report)
         print_table(_comparison_table(result))
         print_result(_summary(result))
         print_result(

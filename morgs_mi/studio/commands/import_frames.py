@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import DisallowNone, Positional, arg
 
@@ -14,6 +14,9 @@ from morgs_mi.cli.opening import DropInvalid
 from morgs_mi.cli.settings import setting
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.playback.default_rig import Axes
+
+if TYPE_CHECKING:
+    from morgs_mi.studio.import_frames import Imported
 
 _PATHS = (
     "Frames: a folder with a .ply, .compressed.ply or .splat file for each, or the files in the "
@@ -61,11 +64,7 @@ class Import:
                 lambda done, of: report("Importing", done, of),
                 most_invalid=1.0 if self.drop_invalid else 0.0,
             )
-        sets = "one set" if result.num_keyframes == 1 else f"{result.num_keyframes} sets"
-        print_result(
-            f"{result.path}: {result.num_frames} frames, {sets} of Gaussians, "
-            f"{result.num_bytes / 1e6:.2f} MB."
-        )
+        print_result(_summary(result))
 
     def _codec_config(self) -> CodecConfig:
         options = {
@@ -74,3 +73,12 @@ class Import:
             if (value := getattr(self, name)) is not None
         }
         return replace(CodecConfig(), keyframe_interval=self.keyframe_interval, **options)
+
+
+def _summary(result: Imported) -> str:
+    """Return a summary of an import in one sentence."""
+    sets = "one set" if result.num_keyframes == 1 else f"{result.num_keyframes} sets"
+    return (
+        f"{result.path}: {result.num_frames} frames, {sets} of Gaussians, "
+        f"{result.num_bytes / 1e6:.2f} MB."
+    )

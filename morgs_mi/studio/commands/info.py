@@ -83,9 +83,7 @@ class Info:
         checks = _Checks()
         if self.check:
             with progress() as report:
-                common = match_capture(
-                    capture, lambda done, total: report("Matching views", done, total)
-                )
+                common = match_capture(capture, partial(report, "Matching views"))
             rig_check = check_rig(capture, common)
             if not len(capture.points):
                 capture = triangulate_points(capture, common)
@@ -95,9 +93,7 @@ class Info:
         _print_lines(_content_lines(capture, points, checks.rig))
         if self.time:
             with progress() as report:
-                offsets = estimate_time_offsets(
-                    capture, lambda done, total: report("Comparing clocks", done, total)
-                )
+                offsets = estimate_time_offsets(capture, partial(report, "Comparing clocks"))
             _print_lines(_time_lines(offsets))
         _print_lines([finding.sentence for finding in checks.exposures])
         _print_lines(_deep_lines(checks.deep))
@@ -249,10 +245,13 @@ def _offset_lines(offsets: TimeOffsets, errors: Mapping[str, float]) -> list[str
         f"Clocks: pass --offset {options} for the time of {offsets.reference}.",
         f"Standard errors of these offsets: up to {errors[worst]:.2f} frames ({worst}).",
     ]
+    return lines + _doubt_lines(errors)
+
+
+def _doubt_lines(errors: Mapping[str, float]) -> list[str]:
+    """Return the cameras whose offsets are uncertain."""
     doubts = [f"{name} ({error:.2f})" for name, error in errors.items() if error > _UNCERTAIN]
-    if doubts:
-        lines.append(f"Uncertain: {', '.join(doubts)}. {_UNCERTAIN_WHY}")
-    return lines
+    return [f"Uncertain: {', '.join(doubts)}. {_UNCERTAIN_WHY}"] if doubts else []
 
 
 def _forecast_lines(capture: Capture) -> list[str]:

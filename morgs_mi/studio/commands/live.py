@@ -118,18 +118,20 @@ class _Lines:
 def _summary(out: Path, rows: Sequence[LiveFrame]) -> str:
     """Return a summary of a live fit in one sentence."""
     stream = out / STREAM
-    later_rows = rows[1:]
     drops = sum(row.dropped for row in rows)
     text = (
         f"{stream}: fitted {len(rows)} of {len(rows) + drops} frames ({drops} dropped) in "
         f"{rows[-1].time:.1f} s, "
     )
     text += f"{stream.stat().st_size / 1e6:.1f} MB, {rows[0].latency:.1f} s for the first one"
-    if not later_rows:
-        return f"{text}."
-    latency = np.mean([row.latency for row in later_rows])
+    return f"{text}{_delays(rows)}." if len(rows) > 1 else f"{text}."
+
+
+def _delays(rows: Sequence[LiveFrame]) -> str:
+    """Return the latency of the frames after the first one and the skew as text."""
+    latency = np.mean([row.latency for row in rows[1:]])
     skew = max(row.skew for row in rows)
-    return f"{text}, mean latency of the others {latency:.2f} s, largest skew {1e3 * skew:.0f} ms."
+    return f", mean latency of the others {latency:.2f} s, largest skew {1e3 * skew:.0f} ms"
 
 
 def start_viewer(out: Path, browser: bool) -> subprocess.Popen[bytes]:

@@ -32,16 +32,20 @@ class Synth:
     def run(self) -> None:
         from morgs_mi.studio.synth.synthesize import synthesize
 
-        config = self.config
         with progress() as report:
             synthesize(
                 self.scene,
                 self.out,
-                config,
+                self.config,
                 overwrite=self.overwrite,
                 progress=lambda done, total: report("Path-tracing", done, total),
             )
+        print_result(self._summary())
+
+    def _summary(self) -> str:
+        """Return the content of the capture in one sentence."""
+        config = self.config
         images = "PNG files and videos" if config.lossless else "videos"
         cameras = len(list((self.out / "truth").glob("cam*")))
         size = f"{config.frames} frames of {config.width}x{config.height}"
-        print_result(f"{self.out}: {cameras} cameras, {size} as {images}, with ground truth.")
+        return f"{self.out}: {cameras} cameras, {size} as {images}, with ground truth."

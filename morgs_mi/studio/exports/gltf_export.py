@@ -70,8 +70,7 @@ def glb(gaussians: Gaussians, axes: np.ndarray | None = None) -> bytes:
         )
     columns = _attributes(gaussians if axes is None else rotated(gaussians, axes))
     binary = b"".join(column.tobytes() for column in columns.values())
-    document = json.dumps(_document(columns, axes), separators=(",", ":"), allow_nan=False).encode()
-    document += b" " * (-len(document) % 4)
+    document = _padded_json(_document(columns, axes))
     size = 12 + 8 + len(document) + 8 + len(binary)
     if size >= 2**32:
         raise ValueError(
@@ -82,6 +81,12 @@ def glb(gaussians: Gaussians, axes: np.ndarray | None = None) -> bytes:
     return head + _chunk(b"JSON", document) + _chunk(b"BIN\0", binary)
 
 
+def _padded_json(document: dict[str, Any]) -> bytes:
+    """Return a document as JSON, with spaces up to a multiple of 4 bytes."""
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    return text + b" " * (-len(text) % 4)
+
+
 def _chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack("<I4s", len(data), kind) + data
 
@@ -89,7 +94,6 @@ def _chunk(kind: bytes, data: bytes) -> bytes:
 def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
     raw = gaussians.numpy()
     opacities = np.asarray(gaussians.opacities, np.float32)
-    diffuse = decode_light(np.clip(0.5 + SH_C0 * raw["sh_coeffs"][:, 0], 0, 1))
     alpha = np.clip(opacities, 0, 1)[:, None]
     columns = {
         "POSITION": raw["means"],
@@ -97,9 +101,14 @@ def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
         f"{_NAME}:SCALE": np.exp(raw["log_scales"]),
         f"{_NAME}:OPACITY": alpha,
         **_harmonics(raw["sh_coeffs"], gaussians.sh_degree),
-        "COLOR_0": np.concatenate([diffuse, alpha], axis=1),
+        "COLOR_0": np.concatenate([_linear_color(raw["sh_coeffs"]), alpha], axis=1),
     }
     return {name: np.ascontiguousarray(column, "<f4") for name, column in columns.items()}
+
+
+def _linear_color(coefficients: np.ndarray) -> np.ndarray:
+    """Return the mean colour [N, 3] in linear light."""
+    return decode_light(np.clip(0.5 + SH_C0 * coefficients[:, 0], 0, 1))
 
 
 def _harmonics(coefficients: np.ndarray, max_degree: int) -> dict[str, np.ndarray]:

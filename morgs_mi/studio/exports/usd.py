@@ -266,15 +266,19 @@ def _describe(
     """Write the metadata of the stage and its root prim."""
     pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.y)
     pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    stage.SetTimeCodesPerSecond(stream.fps)
-    stage.SetFramesPerSecond(stream.fps)
-    stage.SetStartTimeCode(frames[0])
-    stage.SetEndTimeCode(frames[-1])
+    _set_times(stage, stream.fps, frames)
     root = pxr.UsdGeom.Xform.Define(stage, "/Stream").GetPrim()
     pxr.Usd.ModelAPI(root).SetKind(pxr.Kind.Tokens.component)
     # Rotation back to the capture's axes, of row vectors: x_world = x_usd M.
     root.SetCustomDataByKey("world_from_usd", pxr.Gf.Matrix3d(np.asarray(axes, np.float64)))
     stage.SetDefaultPrim(root)
+
+
+def _set_times(stage: Any, fps: float, frames: Sequence[int]) -> None:
+    stage.SetTimeCodesPerSecond(fps)
+    stage.SetFramesPerSecond(fps)
+    stage.SetStartTimeCode(frames[0])
+    stage.SetEndTimeCode(frames[-1])
 
 
 def _fields(
@@ -287,15 +291,20 @@ def _fields(
         path = f"/Stream/Gaussians{number or ''}"
         splats = pxr.UsdVol.ParticleField3DGaussianSplat.Define(stage, path)
         _set_hints(pxr, splats, gaussians.degree, half)
-        visibility = splats.CreateVisibilityAttr
-        if gaussians.start > frames[0]:
-            visibility().Set("invisible", frames[0])
-            visibility().Set("inherited", gaussians.start)
-        if end is not None:
-            visibility().Set("inherited", gaussians.start)
-            visibility().Set("invisible", end)
+        _set_visibility(splats, frames[0], gaussians.start, end)
         fields[first_id] = _Field(pxr, splats.GetPrim(), gaussians, half)
     return fields
+
+
+def _set_visibility(splats: Any, first: int, start: int, end: int | None) -> None:
+    """Show a prim from the frame `start` on until `end`; `first` is the first frame of all."""
+    visibility = splats.CreateVisibilityAttr
+    if start > first:
+        visibility().Set("invisible", first)
+        visibility().Set("inherited", start)
+    if end is not None:
+        visibility().Set("inherited", start)
+        visibility().Set("invisible", end)
 
 
 def _set_hints(pxr: Any, splats: Any, degree: int, half: bool) -> None:
@@ -334,10 +343,14 @@ def _pxr() -> Any:
             "write_usd(): expected the package usd-core, found none; install it with pip install "
             "'morgs-mi[usd]'."
         ) from error
-    if not hasattr(modules.UsdVol, "ParticleField3DGaussianSplat"):
-        version = ".".join(map(str, modules.Usd.GetVersion()[1:]))
+    _check_schema(modules)
+    return modules
+
+
+def _check_schema(pxr: Any) -> None:
+    if not hasattr(pxr.UsdVol, "ParticleField3DGaussianSplat"):
+        version = ".".join(map(str, pxr.Usd.GetVersion()[1:]))
         raise ValueError(
             f"write_usd(): expected OpenUSD 26.3 or newer, got {version}; install it with pip "
             "install 'morgs-mi[usd]'."
         )
-    return modules

@@ -10,7 +10,6 @@ them. The time is in seconds. World space and its units are the stream's.
 
 from __future__ import annotations
 
-import importlib.util
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -35,7 +34,7 @@ from morgs_mi.render.channels import exr_names
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.studio.light.light_probe import CLIPPED, light_probe
 from morgs_mi.studio.light.shadows import shadow_ratio, shadowed
-from morgs_mi.studio.synth.scene import failures_in
+from morgs_mi.studio.synth.scene import failures_in, module_of
 from morgs_mi.surfaces.surface_view import lights, rays_for, traced
 
 LAYERS = ("splats", "surfaces", "shadow")
@@ -75,11 +74,7 @@ def load_insert(path: str | Path) -> Build:
             the file, and the line of a Python file.
     """
     path = Path(path)
-    if path.suffix not in (".xml", ".py") or not path.is_file():
-        kind = f"{path.suffix!r}" if path.is_file() else "none"
-        raise ValueError(
-            f"{path}: expected a scene to insert, FILE.xml or FILE.py, got {kind}; check the path."
-        )
+    _check_file(path)
     if path.suffix == ".xml":
         entries = _xml_entries(path)
         return lambda frame, time: entries
@@ -95,15 +90,17 @@ def load_insert(path: str | Path) -> Build:
     return checked
 
 
+def _check_file(path: Path) -> None:
+    if path.suffix not in (".xml", ".py") or not path.is_file():
+        kind = f"{path.suffix!r}" if path.is_file() else "none"
+        raise ValueError(
+            f"{path}: expected a scene to insert, FILE.xml or FILE.py, got {kind}; check the path."
+        )
+
+
 def _build_function(path: Path) -> Callable[[int, float], Any]:
     """Return the function `build` of a Python file."""
-    spec = importlib.util.spec_from_file_location(f"morgs_mi_insert_{path.stem}", path)
-    assert spec
-    assert spec.loader
-    module = importlib.util.module_from_spec(spec)
-    with failures_in(path):
-        spec.loader.exec_module(module)
-    build = getattr(module, "build", None)
+    build = getattr(module_of(path, "insert"), "build", None)
     if not callable(build):
         raise ValueError(
             f"{path}: expected a function `build(frame, time)` that returns the entries of a "
@@ -331,12 +328,13 @@ def _plugin_images(
 ) -> dict[str, np.ndarray]:
     """Return the colour, alpha and AOVs of `gaussian_splat` with an inserted scene."""
     aovs = [name for name in channels if name not in ("color", "alpha", *LAYERS)]
+    integrator = {"type": "gaussian_splat", "surfaces": nested, "aovs": ",".join(aovs)}
     scene = mi.load_dict(
         {
             "type": "scene",
             "gaussians": ellipsoids(gaussians),
             "sensor": _sensor(camera),
-            "integrator": {"type": "gaussian_splat", "surfaces": nested, "aovs": ",".join(aovs)},
+            "integrator": integrator,
             **{f"part{i}": part for i, part in enumerate(_parts(surfaces))},
         }
     )

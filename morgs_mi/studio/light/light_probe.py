@@ -129,9 +129,7 @@ def _face(
 
 def _resampled(faces: list[tuple[Camera, np.ndarray]], directions: np.ndarray) -> np.ndarray:
     """Return the colour [H, W, 3] in every direction, interpolated on the face that it meets."""
-    axis = np.abs(directions).argmax(-1)
-    largest = np.take_along_axis(directions, axis[..., None], axis=-1)[..., 0]
-    face_of = 2 * axis + (largest < 0)
+    face_of = _face_indices(directions)
     result = np.zeros((*directions.shape[:2], 3), np.float32)
     for k, (camera, color) in enumerate(faces):
         on_face = (face_of == k)[..., None]
@@ -140,6 +138,13 @@ def _resampled(faces: list[tuple[Camera, np.ndarray]], directions: np.ndarray) -
         values = _interpolated(camera, color, np.where(on_face, directions, forward))
         result = np.where(on_face, values, result)
     return result
+
+
+def _face_indices(directions: np.ndarray) -> np.ndarray:
+    """Return the index in `_FACES` of the face that each direction [H, W, 3] meets."""
+    axis = np.abs(directions).argmax(-1)
+    largest = np.take_along_axis(directions, axis[..., None], axis=-1)[..., 0]
+    return 2 * axis + (largest < 0)
 
 
 def _interpolated(camera: Camera, color: np.ndarray, directions: np.ndarray) -> np.ndarray:

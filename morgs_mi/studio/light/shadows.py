@@ -118,15 +118,19 @@ class _Receivers:
     def __init__(self, gaussians: Gaussians, eye: np.ndarray) -> None:
         means: np.ndarray = np.array(dr.detach(gaussians.means), np.float64)
         normals, flat = _orientation(gaussians, means)
-        is_back = np.sum(normals * (eye - means), axis=1) < 0
-        front_normals = np.where(is_back[:, None], -normals, normals)
         self.centers = mi.Point3f(_columns(means))
-        self.normals = mi.Vector3f(_columns(front_normals))
+        self.normals = mi.Vector3f(_columns(_facing(normals, eye - means)))
         self.flat = from_numpy(mi.Float, flat)
 
     def response(self, direction: Any) -> Float:
         """Return the received fraction of light from a direction."""
         return dr.lerp(0.5, dr.maximum(dr.dot(self.normals, direction), 0), self.flat)
+
+
+def _facing(normals: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Return the normals [N, 3], reversed where they point away from a direction [N, 3]."""
+    is_back = np.sum(normals * directions, axis=1) < 0
+    return np.where(is_back[:, None], -normals, normals)
 
 
 def _columns(rows: np.ndarray) -> list[Float]:
@@ -144,13 +148,16 @@ def _orientation(gaussians: Gaussians, means: np.ndarray) -> tuple[np.ndarray, n
     # The covariance of the mixture: the mean of its second moments, minus the second moment of its
     # centre.
     centered = means - means.mean(0)
-    moments = _covariances(gaussians) + centered[:, :, None] * centered[:, None, :]
-    center = mixture @ centered
-    covariance = (mixture @ moments.reshape(-1, 9)).reshape(-1, 3, 3) - center[:, :, None] * center[
-        :, None, :
-    ]
+    moments = _covariances(gaussians) + _outer_products(centered)
+    mean_moments = (mixture @ moments.reshape(-1, 9)).reshape(-1, 3, 3)
+    covariance = mean_moments - _outer_products(mixture @ centered)
     variances, directions = np.linalg.eigh(covariance)
     return directions[:, :, 0], 1 - variances[:, 0] / np.maximum(variances[:, 1], 1e-30)
+
+
+def _outer_products(vectors: np.ndarray) -> np.ndarray:
+    """Return the outer product of each vector [N, 3] with itself, [N, 3, 3]."""
+    return vectors[:, :, None] * vectors[:, None, :]
 
 
 def _covariances(gaussians: Gaussians) -> np.ndarray:

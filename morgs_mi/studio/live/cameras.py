@@ -116,9 +116,8 @@ class CameraFeed:
         shots = _nearest(new, expected)
         if shots is None:
             return None
-        times = [shot.time for shot in shots if shot is not None]
         numbers = [camera.shots[-1].number for camera in self._cameras]
-        return bundled(shots, numbers, max(times) - min(times), _dropped(shots, after))
+        return bundled(shots, numbers, _skew(shots), _dropped(shots, after))
 
     def _expected(self, new: Sequence[Sequence[Shot]], bundle: Bundle, late: bool) -> list[bool]:
         """Return for each camera whether the bundle has to have its image.
@@ -146,6 +145,10 @@ class CameraFeed:
             for k in silent:
                 self._check_silent(k, time_left)
             self._change.wait(time_left)
+        self._wait_for_exposure()
+
+    def _wait_for_exposure(self) -> None:
+        """Wait for the warm-up, unless a camera ends."""
         end = time.monotonic() + self._warm_up
         while (time_left := end - time.monotonic()) > 0 and all(
             camera.reason is None for camera in self._cameras
@@ -223,8 +226,13 @@ def _nearest(new: Sequence[Sequence[Shot]], expected: Sequence[bool]) -> list[Sh
         min(shots, key=lambda shot: abs(shot.time - time_of_slowest)) if is_expected else None
         for shots, is_expected in zip(new, expected, strict=True)
     ]
-    times = [shot.time for shot in choice if shot is not None]
-    return choice if max(times) - min(times) <= _MAX_SKEW else None
+    return choice if _skew(choice) <= _MAX_SKEW else None
+
+
+def _skew(shots: Sequence[Shot | None]) -> float:
+    """Return the largest difference in time between two shots, s."""
+    times = [shot.time for shot in shots if shot is not None]
+    return max(times) - min(times)
 
 
 def _dropped(shots: Sequence[Shot | None], bundle: Bundle | None) -> int:

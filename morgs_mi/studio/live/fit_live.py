@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.capture.capture import Capture, PartialFrame
+from morgs_mi.capture.layouts.calibration import Calibration
 from morgs_mi.core.files import locked_folder
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
@@ -85,9 +86,7 @@ def fit_live(
     check_outputs(out)
     _check_no_capture(out / "capture")
     _check_outside(out, sources)
-    calibration = live.calibration and read_calibration(live.calibration).without(
-        live.calibration, live.without
-    )
+    calibration = _calibration(live)
     names = calibration and [camera.name for camera in calibration.cameras]
     report = on_stage or (lambda *_: None)
     with locked_folder(out, "fit_live()"), closing(open_feed(sources, live, names)) as feed:
@@ -98,6 +97,12 @@ def fit_live(
         return _fit(
             _LiveFrames(feed, capture, first, live), out, config or LIVE_STREAM, on_frame, report
         )
+
+
+def _calibration(live: LiveConfig) -> Calibration | None:
+    """Return the calibration that is given, of the cameras that are used."""
+    folder = live.calibration
+    return folder and read_calibration(folder).without(folder, live.without)
 
 
 def _check_no_capture(folder: Path) -> None:

@@ -216,10 +216,7 @@ class FolderFeed:
         if common := _common(by_name, names):
             incomplete = [name for name in names if _shot(by_name[name], max(common)) is None]
             return f", but no complete image {max(common)} of {', '.join(incomplete)}"
-        numbers = ", ".join(
-            f"{min(i.files)} to {max(i.files)} of {name}" for name, i in by_name.items()
-        )
-        return f", with {numbers}" if numbers else ""
+        return f", with {_listed_numbers(by_name)}" if by_name else ""
 
     def _found(self, limit: int, write_times: Mapping[str, float]) -> dict[str, _Images]:
         """Return the images of each camera with numbers larger than `limit`, without images of the
@@ -265,6 +262,13 @@ class FolderFeed:
         return []
 
 
+def _listed_numbers(by_name: _Found) -> str:
+    """Return the first and last numbers of each camera as text."""
+    return ", ".join(
+        f"{min(images.files)} to {max(images.files)} of {name}" for name, images in by_name.items()
+    )
+
+
 def _common(by_name: _Found, names: Sequence[str]) -> set[int]:
     """Return the numbers that all cameras have."""
     return (
@@ -297,11 +301,8 @@ def _bundle(
         )
         if complete or (partial and any(shots)):
             bundle = bundled(shots, [number] * len(shots), 0.0)
-            return (
-                bundle
-                if last_bundle is None
-                else replace(bundle, dropped=_dropped(cameras, bundle, last_bundle))
-            )
+            dropped = _dropped(cameras, bundle, last_bundle) if last_bundle else 0
+            return replace(bundle, dropped=dropped)
     return None
 
 
@@ -320,12 +321,18 @@ def _dropped(cameras: Sequence[_Images], bundle: Bundle, last_bundle: Bundle) ->
 def files_of_camera(folder: Path, limit: int) -> dict[int, Path]:
     """Return the image files of a camera's folder by number, of numbers above `limit`."""
     files = {}
-    with suppress(FileNotFoundError, NotADirectoryError):
-        for name in os.listdir(folder):
-            if name.lower().endswith(_SUFFIXES) and is_listed(name):
-                with suppress(ValueError):
-                    files[image_number(Path(name))] = folder / name
+    for name in _image_names(folder):
+        with suppress(ValueError):
+            files[image_number(Path(name))] = folder / name
     return {number: file for number, file in files.items() if number > limit}
+
+
+def _image_names(folder: Path) -> list[str]:
+    """Return the names of the images in a folder, none if it does not exist."""
+    with suppress(FileNotFoundError, NotADirectoryError):
+        names = os.listdir(folder)
+        return [name for name in names if name.lower().endswith(_SUFFIXES) and is_listed(name)]
+    return []
 
 
 def _shot(images: _Images, number: int) -> Shot | None:

@@ -48,17 +48,21 @@ def live_frames(
         ValueError: the number of sources differs from the number of cameras, or an image from the
             size of the rig's.
     """
-    if len(sources) != len(rig.cameras):
-        raise ValueError(
-            f"live_frames(): `sources` must be one for each of {len(rig.cameras)} cameras "
-            f"({', '.join(rig.names)}), got {len(sources)}."
-        )
+    _check_count(rig, len(sources))
     stop = Event()
     streams = [
         _images(source, *size, stop)
         for source, size in zip(sources, rig.recorded_sizes, strict=True)
     ]
     return prefetched(_frames(rig, streams), newest=newest, closed=stop)
+
+
+def _check_count(rig: Capture, count: int) -> None:
+    if count != len(rig.cameras):
+        raise ValueError(
+            f"live_frames(): `sources` must be one for each of {len(rig.cameras)} cameras "
+            f"({', '.join(rig.names)}), got {count}."
+        )
 
 
 def _frames(rig: Capture, streams: Sequence[Iterator[np.ndarray | None]]) -> Iterator[PartialFrame]:

@@ -103,17 +103,20 @@ def play(
                 yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
                 end = at + interval
             else:  # it has ended, before the others
-                if not end:
-                    raise OSError(
-                        f"play(): expected images in {path}, found none; check that it is a whole "
-                        "video."
-                    )
+                _check_length(path, end)
                 if not loop:
                     return
                 clock.length = min(clock.length, end)
             begin += clock.length
     finally:
         clock.leave(clip)
+
+
+def _check_length(path: str | Path, length: float) -> None:
+    if not length:
+        raise OSError(
+            f"play(): expected images in {path}, found none; check that it is a whole video."
+        )
 
 
 def timed_images(path: str | Path) -> Iterator[tuple[np.ndarray, float, float]]:

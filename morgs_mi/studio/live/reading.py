@@ -87,23 +87,23 @@ def open_stream(place: int | str, source: int | str | Path) -> cv2.VideoCapture:
     Raises:
         OSError: it cannot be opened.
     """
-    if isinstance(place, int):
-        stream = cv2.VideoCapture(place)
-    else:
-        limits = (
-            (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC)
-            if "://" in place
-            else ()
-        )
-        stream = cv2.VideoCapture(
-            place, cv2.CAP_FFMPEG, [n for key in limits for n in (key, int(1000 * _SILENCE))]
-        )
+    stream = cv2.VideoCapture(place) if isinstance(place, int) else _ffmpeg_stream(place)
     if not stream.isOpened():
         raise OSError(
             f"open_stream(): cannot open the source {source}; check that it exists and is not in "
             "use."
         )
     return stream
+
+
+def _ffmpeg_stream(place: str) -> cv2.VideoCapture:
+    """Return OpenCV's reader of a path or URL, which waits only so long for a connection."""
+    limits = (
+        (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC) if "://" in place else ()
+    )
+    return cv2.VideoCapture(
+        place, cv2.CAP_FFMPEG, [n for key in limits for n in (key, int(1000 * _SILENCE))]
+    )
 
 
 @contextmanager

@@ -50,11 +50,7 @@ def open_feed(
         )
     if names is None:
         names = [f"cam{k}" for k in range(len(sources))]
-    if len(names) != len(sources):
-        raise ValueError(
-            f"open_feed(): `camera` must have a source for each of the {len(names)} calibrated "
-            f"cameras ({', '.join(names)}), got {_listed(sources)}; name them in that order."
-        )
+    _check_count(sources, names)
     return _camera_feed(sources, config, names)
 
 
@@ -71,14 +67,27 @@ def _check_different(sources: Sequence[Source]) -> None:
         )
 
 
+def _check_count(sources: Sequence[Source], names: Sequence[str]) -> None:
+    if len(names) != len(sources):
+        raise ValueError(
+            f"open_feed(): `camera` must have a source for each of the {len(names)} calibrated "
+            f"cameras ({', '.join(names)}), got {_listed(sources)}; name them in that order."
+        )
+
+
+def _check_videos(videos: Sequence[Source], sources: Sequence[Source]) -> None:
+    if not videos:
+        raise ValueError(
+            f"open_feed(): `loop` repeats videos, got none in {_listed(sources)}; leave it out."
+        )
+
+
 def _camera_feed(sources: Sequence[Source], config: LiveConfig, names: Sequence[str]) -> CameraFeed:
     """Return the feed of cameras, streams and videos."""
     stop = Event()
     videos = [source for source in sources if is_video(source)]
-    if config.loop and not videos:
-        raise ValueError(
-            f"open_feed(): `loop` repeats videos, got none in {_listed(sources)}; leave it out."
-        )
+    if config.loop:
+        _check_videos(videos, sources)
     clock = ClipClock(len(videos))
 
     def images(source: Source) -> Iterator[np.ndarray | None]:

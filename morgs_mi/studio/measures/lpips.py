@@ -63,12 +63,15 @@ class Lpips:
         """
         pair = unit_pair("Lpips", image, truth)
         H, W = pair[0].shape[:2]
-        blobs = (
-            np.ascontiguousarray(2 * each.transpose(2, 0, 1)[None] - 1, np.float32) for each in pair
-        )
-        distance = next(iter(self._network.run(dict(zip(_INPUTS, blobs, strict=True))).values()))
+        outputs = self._network.run(dict(zip(_INPUTS, map(_blob, pair), strict=True)))
+        distance = next(iter(outputs.values()))
         _check_distances(self.path, distance, W, H)
         return distance.reshape((H, W) if distance.size > 1 else (1, 1))
+
+
+def _blob(image: np.ndarray) -> np.ndarray:
+    """Return an image [H, W, 3] from 0 to 1 as the network's input [1, 3, H, W]."""
+    return np.ascontiguousarray(2 * image.transpose(2, 0, 1)[None] - 1, np.float32)
 
 
 def _check_distances(path: Path, distance: np.ndarray, width: int, height: int) -> None:

@@ -84,7 +84,8 @@ def track_points(
         ValueError: an argument has another shape, a point is not finite, the stream has no such
             frame, or a packet is broken.
     """
-    points, queries = _checked_queries(points, frame)
+    points = _checked_points(points)
+    queries = _checked_frames(frame, len(points))
     if num_gaussians < 1:
         raise ValueError(
             f"track_points(): `num_gaussians` must be at least 1, got {num_gaussians}."
@@ -109,21 +110,26 @@ def track_points(
     )
 
 
-def _checked_queries(points: ArrayLike, frame: int | ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-    """Return the query points [P, 3] and the frame of each [P]."""
+def _checked_points(points: ArrayLike) -> np.ndarray:
+    """Return the query points, float64 [P, 3]."""
     points = numbers("track_points()", "points", points).astype(np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise ValueError(
             f"track_points(): `points` must be [P, 3] and finite, got {points.shape}; pass world "
             "points."
         )
+    return points
+
+
+def _checked_frames(frame: int | ArrayLike, count: int) -> np.ndarray:
+    """Return the frame of each query [P]."""
     queries = np.asarray(frame)
-    if queries.shape not in ((), (len(points),)) or queries.dtype.kind not in "iu":
+    if queries.shape not in ((), (count,)) or queries.dtype.kind not in "iu":
         raise ValueError(
-            f"track_points(): `frame` must be an integer or integers [{len(points)}], got "
+            f"track_points(): `frame` must be an integer or integers [{count}], got "
             f"{queries.dtype} {queries.shape}; pass the frame of each query."
         )
-    return points, np.broadcast_to(queries, len(points))
+    return np.broadcast_to(queries, count)
 
 
 def bind(

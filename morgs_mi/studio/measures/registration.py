@@ -22,17 +22,8 @@ class Registration(Measure):
         self._has_begun = False
 
     def add_view(self, view: ComparedView) -> None:
-        clip = self._clip
-        if self._has_begun or view.index not in clip.recording.test_views:
-            return
-        image = view.recorded if view.light is None else encode_light(view.light)
-        target = View(clip.stream.cameras[view.index], image, view.valid)
-        extent = scene_extent([clip.stream.cameras[v] for v in clip.recording.train_views])
-        gaussians = view.frame.state.gaussians
-        registered_view = target._replace(
-            camera=register_camera(gaussians, target, extent, FitConfig(), clip.render)
-        )
-        self._psnr[view.camera.name] = mean_psnr(gaussians, [registered_view], clip.render)
+        if not self._has_begun and view.index in self._clip.recording.test_views:
+            self._psnr[view.camera.name] = _registered_psnr(self._clip, view)
 
     def add_frame(self, frame: ComparedFrame) -> dict[str, Any]:
         self._has_begun = True
@@ -40,3 +31,14 @@ class Registration(Measure):
 
     def result(self) -> dict[str, Any]:
         return {"registered": self._psnr}
+
+
+def _registered_psnr(clip: ComparedClip, view: ComparedView) -> float:
+    """Return the PSNR of a view from the camera that fits best."""
+    cameras = clip.stream.cameras
+    image = view.recorded if view.light is None else encode_light(view.light)
+    target = View(cameras[view.index], image, view.valid)
+    extent = scene_extent([cameras[v] for v in clip.recording.train_views])
+    gaussians = view.frame.state.gaussians
+    camera = register_camera(gaussians, target, extent, FitConfig(), clip.render)
+    return mean_psnr(gaussians, [target._replace(camera=camera)], clip.render)

@@ -175,10 +175,7 @@ def _counts(
     """Return numbers of points [6, P, D] for D thresholds: those that `_shares` needs."""
     visible, found_mask = (mask[..., None] for mask in _visibility(video))
     error = np.linalg.norm(video.found - video.truth, axis=-1)[..., None]
-    unit = np.array(_CENTIMETRE / meters_per_unit)
-    if protocol.per_view:
-        assert video.pixel is not None
-        unit = video.pixel[..., None]
+    unit = _threshold_unit(protocol, video, meters_per_unit)
     accurate = visible & (error < np.array(protocol.thresholds) * unit)
     hits = accurate & found_mask
     masks = (
@@ -192,6 +189,14 @@ def _counts(
     return np.stack(
         [(np.broadcast_to(mask, accurate.shape) & evaluated[..., None]).sum(1) for mask in masks]
     )
+
+
+def _threshold_unit(protocol: Protocol, video: Comparison, meters_per_unit: float) -> np.ndarray:
+    """Return the unit of a protocol's thresholds, world units, [] or [P, T, 1]."""
+    if not protocol.per_view:
+        return np.array(_CENTIMETRE / meters_per_unit)
+    assert video.pixel is not None
+    return video.pixel[..., None]
 
 
 def _shares(counts: np.ndarray) -> np.ndarray:
@@ -211,15 +216,17 @@ def _shares(counts: np.ndarray) -> np.ndarray:
 
 def _median_error_and_survival(video: Comparison, failure: float) -> np.ndarray:
     """Return the median error in world units and the survival of each track [P, 2]."""
-    num_frames = video.truth.shape[1]
-    queries = video.queries
     error = np.linalg.norm(video.found - video.truth, axis=-1)
-    failures = video.counts & (error > failure)
-    first = np.where(failures.any(1), failures.argmax(1), num_frames)
+    survival = _survival(video.counts & (error > failure), video.queries)
     median = [np.median(row[mask]) for row, mask in zip(error, video.counts, strict=True)]
-    return np.stack([np.array(median), (first - queries) / (num_frames - queries)], axis=1).reshape(
-        -1, 2
-    )
+    return np.stack([np.array(median), survival], axis=1).reshape(-1, 2)
+
+
+def _survival(failures: np.ndarray, queries: np.ndarray) -> np.ndarray:
+    """Return the share of each track's frames from the query on before its first failure [P]."""
+    num_frames = failures.shape[1]
+    first = np.where(failures.any(1), failures.argmax(1), num_frames)
+    return (first - queries) / (num_frames - queries)
 
 
 def _visibility(video: Comparison) -> tuple[np.ndarray, np.ndarray]:

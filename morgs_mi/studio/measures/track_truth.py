@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
-from morgs_mi.capture.truth import load_tracks
+from morgs_mi.capture.truth import Tracks, load_tracks
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.bounded import read_array
 from morgs_mi.studio.layouts.dynamic3dgs import read_meta
@@ -63,9 +63,14 @@ def synthetic_tracks(capture: Capture, views: Sequence[int]) -> list[TrackTruth]
     cameras = tuple(capture.cameras[view] for view in views)
     if not all(camera.name in tracks.visible for camera in cameras):
         return [TrackTruth(cameras, tracks.points, None, np.zeros(len(tracks.points), int))]
+    return [_from_first_sight(tracks, cameras)]
+
+
+def _from_first_sight(tracks: Tracks, cameras: tuple[Camera, ...]) -> TrackTruth:
+    """Return the tracks that one of the cameras sees, from the first frame in which it does."""
     visible = np.any([tracks.visible[camera.name] for camera in cameras], axis=0)
     mask = visible.any(1)
-    return [TrackTruth(cameras, tracks.points[mask], visible[mask], visible[mask].argmax(1))]
+    return TrackTruth(cameras, tracks.points[mask], visible[mask], visible[mask].argmax(1))
 
 
 def tapvid3d_tracks(capture: Capture) -> list[TrackTruth]:
@@ -121,10 +126,15 @@ def read_annotation(path: Path, camera: Camera) -> TrackTruth:
             f"{path}: `tracks_XYZ` must be finite and the frames in `queries_xyt` below "
             f"{len(tracks)}; download it again."
         )
-    V = np.asarray(camera.viewmat, np.float64)
-    points = (tracks.astype(np.float64) - V[:3, 3]) @ V[:3, :3]
+    points = _world_points(tracks, camera).transpose(1, 0, 2)
     visible = arrays["visibility"].T.astype(bool)
-    return TrackTruth((camera,), points.transpose(1, 0, 2), visible, frames.astype(int))
+    return TrackTruth((camera,), points, visible, frames.astype(int))
+
+
+def _world_points(points: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return points [..., 3] in the axes of a camera as points of the world."""
+    V = np.asarray(camera.viewmat, np.float64)
+    return (points.astype(np.float64) - V[:3, 3]) @ V[:3, :3]
 
 
 def _annotation_arrays(path: Path) -> dict[str, np.ndarray]:

@@ -60,17 +60,22 @@ def evaluate_tracks(
     Raises:
         ValueError: a packet, an annotation or the true tracks are broken.
     """
-    joint = synthetic_tracks(recording, recording.train_views)
-    single = [video for view in views for video in synthetic_tracks(recording, [view])]
-    single = single or tapvid3d_tracks(recording)
+    single = _videos(recording, views)
     if not single:
         return ()
+    joint = synthetic_tracks(recording, recording.train_views)
     frames = stream.frame_numbers()
     videos = [_during(video, frames) for video in (*single, *joint)]
     if len(frames) < 2 or not any(len(video.points) for video in videos):
         return ()
     comparisons = _compared(stream, videos, frames[0])
     return _scores(recording, comparisons[: len(single)], comparisons[len(single) :] or comparisons)
+
+
+def _videos(recording: Capture, views: Sequence[int]) -> list[TrackTruth]:
+    """Return the true tracks in single views."""
+    videos = [video for view in views for video in synthetic_tracks(recording, [view])]
+    return videos or tapvid3d_tracks(recording)
 
 
 def _scores(
@@ -120,9 +125,8 @@ def _tracked(
     stream: FrameSource, videos: Sequence[TrackTruth], start: int
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return the positions [P, T, 3] and the mask of the living [P, T] of each video's points."""
-    points = [video.points[np.arange(len(video.queries)), video.queries] for video in videos]
     queries = np.concatenate([video.queries for video in videos]) + start
-    tracks = track_points(stream, np.concatenate(points), queries)
+    tracks = track_points(stream, _query_points(videos), queries)
     ends = np.cumsum([len(video.queries) for video in videos])[:-1]
     parts = zip(videos, np.split(tracks.points, ends), np.split(tracks.alive, ends), strict=True)
     return [
@@ -132,22 +136,33 @@ def _tracked(
     ]
 
 
+def _query_points(videos: Sequence[TrackTruth]) -> np.ndarray:
+    """Return the true points [P, 3] of all videos at the frames of their queries."""
+    points = [video.points[np.arange(len(video.queries)), video.queries] for video in videos]
+    return np.concatenate(points)
+
+
 def _seen(
     stream: FrameSource, videos: Sequence[TrackTruth], tracks: Sequence[np.ndarray]
 ) -> list[np.ndarray]:
     """Return the masks of the tracked points [P, T, 3] that a view of their video sees, [P, T]."""
     masks = [np.zeros(positions.shape[:2], bool) for positions in tracks]
+    for t, camera, depth, alpha in _depth_maps(stream, _cameras(videos)):
+        for video, positions, mask in zip(videos, tracks, masks, strict=True):
+            if t < positions.shape[1] and camera.name in [view.name for view in video.cameras]:
+                mask[:, t] |= seen_in_depth(depth, alpha, camera, positions[:, t])
+    return masks
+
+
+def _cameras(videos: Sequence[TrackTruth]) -> list[Camera]:
+    """Return the cameras of the videos with visibility, each once."""
     cameras = {
         camera.name: camera
         for video in videos
         if video.visible is not None
         for camera in video.cameras
     }
-    for t, camera, depth, alpha in _depth_maps(stream, [*cameras.values()]):
-        for video, positions, mask in zip(videos, tracks, masks, strict=True):
-            if t < positions.shape[1] and camera.name in [view.name for view in video.cameras]:
-                mask[:, t] |= seen_in_depth(depth, alpha, camera, positions[:, t])
-    return masks
+    return [*cameras.values()]
 
 
 def _depth_maps(

@@ -58,10 +58,8 @@ class FlowNetwork:
         Raises:
             ValueError: the network cannot run at this size, or does not return a flow.
         """
-        if self._size is None:
-            flow = self._padded(image, other)
-        else:
-            flow = self._resized(image, other, self._size)
+        size = self._size
+        flow = self._padded(image, other) if size is None else self._resized(image, other, size)
         if not np.isfinite(flow).all():
             raise ValueError(
                 f"{self.path}: expected a finite flow, got NaN or infinity; check the value range."
@@ -90,15 +88,8 @@ class FlowNetwork:
         height, width = image.shape[:2]
         blobs = (self._blob(each) for each in (image, other))
         outputs = self._net.run(dict(zip(self._net.inputs, blobs, strict=True))).values()
-        # A network that returns the flow of each of its iterations returns the best one last.
-        flows = [output for output in outputs if output.shape == (1, 2, height, width)]
-        if not flows:
-            shapes = written_shapes([output.shape for output in outputs])
-            raise ValueError(
-                f"{self.path}: expected an output [1, 2, {height}, {width}], the flow, got "
-                f"{shapes}."
-            )
-        return np.ascontiguousarray(np.moveaxis(flows[-1][0], 0, 2), dtype=np.float32)
+        flow = _last_flow(self.path, list(outputs), (1, 2, height, width))
+        return np.ascontiguousarray(np.moveaxis(flow[0], 0, 2), dtype=np.float32)
 
     def _blob(self, image: np.ndarray) -> np.ndarray:
         """Return an image as the network's input, [1, 3, H, W] float32."""
@@ -108,12 +99,25 @@ class FlowNetwork:
         )
 
 
+def _last_flow(path: Path, outputs: Sequence[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
+    """Return the last output of a network that has the shape of a flow."""
+    # A network that returns the flow of each of its iterations returns the best one last.
+    flows = [output for output in outputs if output.shape == shape]
+    if not flows:
+        shapes = written_shapes([output.shape for output in outputs])
+        raise ValueError(f"{path}: expected an output {[*shape]}, the flow, got {shapes}.")
+    return flows[-1]
+
+
+def _is_image(shape: tuple[int | None, ...]) -> bool:
+    return len(shape) == 4 and shape[0] in (1, None) and shape[1] in (3, None)
+
+
 def _image_size(
     path: str | Path, shapes: Sequence[tuple[int | None, ...]]
 ) -> tuple[int, int] | None:
     """Return the width and height of a network's two images, None if it takes any size."""
-    images = all(len(s) == 4 and s[0] in (1, None) and s[1] in (3, None) for s in shapes)
-    if len(shapes) != 2 or not images or shapes[0] != shapes[1]:
+    if len(shapes) != 2 or not all(map(_is_image, shapes)) or shapes[0] != shapes[1]:
         raise ValueError(
             f"{path}: expected a network with two images [1, 3, H, W] as its inputs, got "
             f"{written_shapes(shapes)}; export it with one input per image."

@@ -61,13 +61,7 @@ class OnnxNetwork:
                 f"{path}: {self._runtime} cannot load this network ({_reason(error)}); export it "
                 f"again{instead}."
             ) from error
-        if large := [
-            s for s in self.inputs.values() if math.prod(size or 1 for size in s) > _MAX_VALUES
-        ]:
-            raise ValueError(
-                f"{path}: expected inputs of at most {_MAX_VALUES} values, got "
-                f"{written_shapes(large)}; export it for smaller images."
-            )
+        _check_sizes(path, self.inputs.values())
 
     def run(self, inputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return all outputs by name, in their order.
@@ -87,16 +81,32 @@ class OnnxNetwork:
                 f"{self.path}: {self._runtime} cannot run this network on {shapes} "
                 f"({_reason(error)}); export it for these sizes{self._alternative}."
             ) from error
-        pairs = zip(self.outputs, results, strict=True)
-        arrays = {
-            name: x for name, x in pairs if isinstance(x, np.ndarray) and x.dtype.kind in "biuf"
-        }
-        if others := [name for name in self.outputs if name not in arrays]:
-            raise ValueError(
-                f"{self.path}: expected arrays of numbers, got others from {', '.join(others)}; "
-                "export again."
-            )
-        return arrays
+        return _arrays(self.path, dict(zip(self.outputs, results, strict=True)))
+
+
+def _check_sizes(path: str | Path, shapes: Iterable[tuple[int | None, ...]]) -> None:
+    """Raise `ValueError` if an input of a network is too large."""
+    large = [shape for shape in shapes if math.prod(size or 1 for size in shape) > _MAX_VALUES]
+    if large:
+        raise ValueError(
+            f"{path}: expected inputs of at most {_MAX_VALUES} values, got "
+            f"{written_shapes(large)}; export it for smaller images."
+        )
+
+
+def _arrays(path: Path, results: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return a network's outputs, which are arrays of numbers."""
+    arrays = {
+        name: x
+        for name, x in results.items()
+        if isinstance(x, np.ndarray) and x.dtype.kind in "biuf"
+    }
+    if others := [name for name in results if name not in arrays]:
+        raise ValueError(
+            f"{path}: expected arrays of numbers, got others from {', '.join(others)}; "
+            "export again."
+        )
+    return arrays
 
 
 def _onnxruntime(path: str | Path) -> Any:

@@ -127,12 +127,8 @@ def _encoder_size(path: str | Path, shapes: Sequence[tuple[int | None, ...]]) ->
 def _check_decoder(path: str | Path, decoder: OnnxNetwork, features: Sequence[str]) -> None:
     """Raise `ValueError` if a network does not decode these features."""
     names = {*features, *_PROMPTS}
-    missing_names = {*_PROMPTS[:2]} - {*decoder.inputs}
-    if (
-        missing_names
-        or not set(decoder.inputs) <= names
-        or not set(_RESULTS) <= set(decoder.outputs)
-    ):
+    inputs = set(decoder.inputs)
+    if not set(_PROMPTS[:2]) <= inputs <= names or not set(_RESULTS) <= set(decoder.outputs):
         raise ValueError(
             f"{path}: expected a mask decoder with inputs among {', '.join(sorted(names))} "
             f"and outputs {' and '.join(_RESULTS)}, got {', '.join(decoder.inputs)} and "
@@ -171,14 +167,17 @@ def prompts(
         Coordinates [P, 2] in pixels of the image, float32, pixel centres at +0.5, and labels [P],
         float32; first the box's corners, then the points.
     """
-    rows = np.flatnonzero(component.any(1))
-    columns = np.flatnonzero(component.any(0))
-    upper_left = (columns[0], rows[0])
-    lower_right = (columns[-1] + 1, rows[-1] + 1)
+    upper_left, lower_right = _box(component)
     distance = max(np.subtract(lower_right, upper_left)) * spacing
     points = _deep_points(component, count, distance)
     labels = [_UPPER_LEFT, _LOWER_RIGHT] + [_ON_OBJECT] * len(points)
     return np.array([upper_left, lower_right, *points], np.float32), np.array(labels, np.float32)
+
+
+def _box(component: np.ndarray) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return the upper left and the lower right corner of a component's box, x and y."""
+    x, y = (np.flatnonzero(component.any(axis)) for axis in range(2))
+    return (x[0], y[0]), (x[-1] + 1, y[-1] + 1)
 
 
 def _deep_points(component: np.ndarray, count: int, distance: float) -> list[tuple[float, float]]:

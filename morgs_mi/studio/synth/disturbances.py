@@ -89,10 +89,10 @@ def draw_disturbances(
     """
     check_ranges(disturbances, "draw_disturbances()")
     d = disturbances
-    offset = d.time_offset * _generator(seed, 0).uniform(-1, 1, num_cameras)
+    offset = d.time_offset * _uniform(seed, 0, num_cameras)
     offset[0] = 0
     gains = np.exp(_log_gains(d, num_cameras, num_frames, seed))
-    k = d.distortion * _generator(seed, 4).uniform(-1, 1, num_cameras) + 0.0  # not -0
+    k = d.distortion * _uniform(seed, 4, num_cameras) + 0.0  # not -0
     return tuple(
         CameraDisturbance(
             float(offset[c]),
@@ -110,10 +110,15 @@ def _generator(seed: int, kind: int) -> np.random.Generator:
     return np.random.default_rng([seed, 3, kind])
 
 
+def _uniform(seed: int, kind: int, num_cameras: int) -> np.ndarray:
+    """Return a number from -1 to 1 for each camera."""
+    return _generator(seed, kind).uniform(-1, 1, num_cameras)
+
+
 def _log_gains(d: Disturbances, num_cameras: int, num_frames: int, seed: int) -> np.ndarray:
     """Return the logarithms of the gains [C, T] of all cameras."""
-    gain = np.log1p(d.exposure_gain) * _generator(seed, 1).uniform(-1, 1, num_cameras)
-    drift = np.log1p(d.exposure_drift) * _generator(seed, 2).uniform(-1, 1, num_cameras)
+    gain = np.log1p(d.exposure_gain) * _uniform(seed, 1, num_cameras)
+    drift = np.log1p(d.exposure_drift) * _uniform(seed, 2, num_cameras)
     flicker = _generator(seed, 3).standard_normal((num_cameras, num_frames))
     log_gain = gain[:, None] + (
         drift[:, None] * np.linspace(0, 1, num_frames) + d.exposure_flicker * flicker

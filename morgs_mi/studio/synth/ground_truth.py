@@ -72,12 +72,7 @@ def compute_ground_truth(
         before: the same in the previous frame; None in the first frame.
         after: the same in the next frame, which determines the mask of the first frame.
     """
-    hit = surface.ids >= 0
-    # Where there is no surface, a point in front of the camera avoids a division by zero; its
-    # values are not used.
-    points = np.where(
-        hit[..., None], surface.positions, camera.position + np.asarray(camera.viewmat)[2, :3]
-    )
+    points = _projectable(surface, camera)
     pixels, depth = camera.project(points)
     other = move_with_objects(
         replace(surface, positions=points), poses, after if before is None else before
@@ -87,7 +82,15 @@ def compute_ground_truth(
     mask = np.linalg.norm(other - points, axis=-1) > 1e-6 * np.abs(points).max()
     return GroundTruth(
         motion.astype(np.float32),
-        np.where(hit, depth, 0).astype(np.float32),
+        np.where(surface.ids >= 0, depth, 0).astype(np.float32),
         surface.ids.astype(np.int32),
         mask,
     )
+
+
+def _projectable(surface: SurfacePoints, camera: Camera) -> np.ndarray:
+    """Return the positions [..., 3] of surface points, and a point in front of the camera where
+    there is no surface: it avoids a division by zero, and its values are not used.
+    """
+    front = camera.position + np.asarray(camera.viewmat)[2, :3]
+    return np.where((surface.ids >= 0)[..., None], surface.positions, front)

@@ -14,7 +14,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import encode_light
 from morgs_mi.studio.synth.disturbances import undistorted
 from morgs_mi.studio.synth.ground_truth import SurfacePoints
-from morgs_mi.studio.synth.scene import Object, Scene
+from morgs_mi.studio.synth.scene import Object, Pose, Scene
 
 # A hit within this share of a point's distance is its own surface: intersections are
 # single-precision.
@@ -79,6 +79,15 @@ def _shapes(name: str, item: Object) -> dict[str, Any]:
     return {name: {"type": "instance", "group": {"type": "ref", "id": f"{name}_group"}}}
 
 
+def _sampler(spp: int, seed: int, num_pixels: int) -> Any:
+    """Return a sampler of all samples of some pixels at once."""
+    sampler: Any = mi.load_dict({"type": "multijitter", "sample_count": spp})
+    spp = sampler.sample_count()  # rounded up by the sampler
+    sampler.set_samples_per_wavefront(spp)
+    sampler.seed(seed, num_pixels * spp)
+    return sampler
+
+
 def _pixel_corners(width: int, rows: np.ndarray) -> np.ndarray:
     """Return the upper left corners of the pixels of some rows of an image [R W, 2]."""
     return np.stack(np.meshgrid(np.arange(width), rows), axis=-1).reshape(-1, 2)
@@ -112,11 +121,7 @@ class PathTracer:
         shapes = [shape for shape in self._scene.shapes() if shape.id() in owners]
         self._owners = [(mi.ShapePtr(shape), owners[shape.id()]) for shape in shapes]
         self._params: Any = mi.traverse(self._scene)
-        self._lamps = {
-            f"{name}.to_world": (light.pose, self._lamp_transform(name))
-            for name, light in scene.lights.items()
-            if light.pose is not None
-        }
+        self._lamps = self._moving_lamps()
         self._exposure = 1.0
         # Only lamps are sampled: 16 samples have as little noise as 64 samples with a sky, and are
         # seven times faster.
@@ -129,6 +134,14 @@ class PathTracer:
     def has_emitters(self) -> bool:
         """Whether the scene has an emitter."""
         return bool(self._scene.emitters())
+
+    def _moving_lamps(self) -> dict[str, tuple[Pose, np.ndarray]]:
+        """Return pose and transform of the lamps that have a pose, by parameter of the scene."""
+        return {
+            f"{name}.to_world": (light.pose, self._lamp_transform(name))
+            for name, light in self.scene.lights.items()
+            if light.pose is not None
+        }
 
     def _lamp_transform(self, light: str) -> np.ndarray:
         """Return the transform [4, 4] of a lamp's shape within the lamp's space."""
@@ -188,10 +201,7 @@ class PathTracer:
             seed: seed of the samples.
             lens: the distortion; None for a pinhole.
         """
-        sampler: Any = mi.load_dict({"type": "multijitter", "sample_count": spp})
-        spp = sampler.sample_count()  # rounded up by the sampler
-        sampler.set_samples_per_wavefront(spp)
-        sampler.seed(seed, len(rows) * camera.width * spp)
+        sampler = _sampler(spp, seed, len(rows) * camera.width)
         # The samples of a pixel follow one another.
         corners = _pixel_corners(camera.width, rows)
         pixels = corners[:, None] + np.array(sampler.next_2d()).T.reshape(len(corners), -1, 2)
@@ -206,12 +216,15 @@ class PathTracer:
         position, directions = camera.rays(pixels)
         hit: Any = self._scene.ray_intersect(_rays(mi.Ray3f, position, directions))
         dr.eval(hit)  # otherwise every array below would trace the rays again
-        ids = np.full(len(directions), -1, np.int32)
+        points = SurfacePoints(np.array(hit.p, float).T.copy(), self._object_ids(hit))
+        return points.reshaped(camera.height, camera.width)
+
+    def _object_ids(self, hit: Any) -> np.ndarray:
+        """Return the id of the object that each ray hits, -1 for none."""
+        ids = np.full(dr.width(hit.p), -1, np.int32)
         for pointer, index in self._owners:
             ids[np.array((hit.shape == pointer) | (hit.instance == pointer))] = index
-        return SurfacePoints(np.array(hit.p, float).T.copy(), ids).reshaped(
-            camera.height, camera.width
-        )
+        return ids
 
     def sees(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         """Return the mask of the surface points [P, 3] that a camera sees: inside its image, with

@@ -112,7 +112,7 @@ def load_scene(scene: str | Path, seed: int = 0) -> Scene:
             file fails; the message names the file and its line.
     """
     path = _scene_path(scene)
-    build = getattr(_module(path), "build", None)
+    build = getattr(module_of(path, "scene"), "build", None)
     if not callable(build):
         raise ValueError(
             f"load_scene(): {path} must define `build(seed) -> Scene`; add that function."
@@ -120,13 +120,18 @@ def load_scene(scene: str | Path, seed: int = 0) -> Scene:
     _check_signature(path, build)
     with failures_in(path):
         result = build(seed)
-    if not isinstance(result, Scene):
-        value_text = "None" if result is None else f"a {type(result).__name__}"
+    return _checked_scene(path, result)
+
+
+def _checked_scene(path: Path, scene: Any) -> Scene:
+    """Return the result of a file's `build`, which is a scene."""
+    if not isinstance(scene, Scene):
+        value_text = "None" if scene is None else f"a {type(scene).__name__}"
         raise ValueError(
             f"load_scene(): `build` in {path} must return a Scene, got {value_text}; return "
             "Scene(...)."
         )
-    return result
+    return scene
 
 
 def _scene_path(scene: str | Path) -> Path:
@@ -141,9 +146,9 @@ def _scene_path(scene: str | Path) -> Path:
     return path
 
 
-def _module(path: Path) -> ModuleType:
-    """Return the module of a Python file, after running it."""
-    spec = importlib.util.spec_from_file_location(f"morgs_mi_scene_{path.stem}", path)
+def module_of(path: Path, kind: str) -> ModuleType:
+    """Return the module of a Python file, after running it; its name begins with its kind."""
+    spec = importlib.util.spec_from_file_location(f"morgs_mi_{kind}_{path.stem}", path)
     assert spec
     assert spec.loader
     module = importlib.util.module_from_spec(spec)
@@ -160,18 +165,22 @@ def failures_in(path: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        # The file name of a frame is absolute.
-        frames = extract_tb(error.__traceback__)
-        lines = [
-            frame.lineno for frame in frames if Path(frame.filename).resolve() == path.resolve()
-        ]
-        # A syntax error has no frame in the file.
-        line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
+        line = _line_of(error, path)
         reason = error.msg if isinstance(error, SyntaxError) else str(error)
         place = f"{path}, line {line}" if line else str(path)
         raise ValueError(
             f"{place}: {type(error).__name__}: {reason.rstrip('.')}; correct the scene file."
         ) from error
+
+
+def _line_of(error: Exception, path: Path) -> int | None:
+    """Return the line of a file at which an error was raised, if it is known."""
+    if isinstance(error, SyntaxError):  # which has no frame in the file
+        return error.lineno
+    # The file name of a frame is absolute.
+    frames = extract_tb(error.__traceback__)
+    lines = [frame.lineno for frame in frames if Path(frame.filename).resolve() == path.resolve()]
+    return lines[-1] if lines else None
 
 
 def _check_signature(path: Path, build: Callable[..., Any]) -> None:
@@ -200,11 +209,7 @@ def check_scene(scene: Scene, times: Sequence[float]) -> None:
     ):
         for name, item in items.items():
             where = f"scene {scene.name!r}, {kind} {name!r}"
-            if not isinstance(item, expected):
-                raise ValueError(
-                    f"{where}: expected {expected.__name__}(...), got a value of type "
-                    f"{type(item).__name__}; see {page('scenes')}."
-                )
+            _check_type(where, item, expected)
             ids = _ids(name, item)
             _check_new(where, ids, names)
             names.update(ids)
@@ -212,6 +217,14 @@ def check_scene(scene: Scene, times: Sequence[float]) -> None:
             if item.pose is not None:
                 for time in times:
                     _check_pose(where, item.pose, time)
+
+
+def _check_type(where: str, item: Any, expected: type) -> None:
+    if not isinstance(item, expected):
+        raise ValueError(
+            f"{where}: expected {expected.__name__}(...), got a value of type "
+            f"{type(item).__name__}; see {page('scenes')}."
+        )
 
 
 def _check_new(where: str, ids: Sequence[str], names: Collection[str]) -> None:

@@ -101,13 +101,20 @@ def synthesize(
     check_output(Path(out).resolve().parent)
     with atomic_path(out, "synthesize()") as folder:
         folder.mkdir(parents=True)
-        tracer = PathTracer(scene)
-        _check_views(tracer, rig.cameras)
-        clips = _write_clips(tracer, rig, folder, progress)
-        _write_truth(tracer, rig, folder / "truth")
-        _write_calibration(tracer, rig, clips, folder)
-        write_json(folder / CAPTURE, _settings(scene, rig.config))
+        _write_capture(folder, scene, rig, progress)
     return Path(out)
+
+
+def _write_capture(
+    folder: Path, scene: Scene, rig: _Rig, progress: Callable[[int, int], None] | None
+) -> None:
+    """Write all files of a capture."""
+    tracer = PathTracer(scene)
+    _check_views(tracer, rig.cameras)
+    clips = _write_clips(tracer, rig, folder, progress)
+    _write_truth(tracer, rig, folder / "truth")
+    _write_calibration(tracer, rig, clips, folder)
+    write_json(folder / CAPTURE, _settings(scene, rig.config))
 
 
 def _check_resources(config: SynthConfig) -> None:
@@ -229,17 +236,21 @@ def _check_views(tracer: PathTracer, cameras: Sequence[Camera]) -> None:
             "it lights, e.g. `lights()` of morgs_mi.studio.synth.textures."
         )
     for camera in cameras:
-        if not (tracer.surface_points(camera).ids >= 0).any():
-            raise ValueError(
-                f"scene {tracer.scene.name!r}: {camera.name} sees no object at 0 s; move the "
-                "objects, or the centre and distance of the rig."
-            )
+        _check_view(tracer, camera)
     if not tracer.render(cameras[0], 1, 0).any():
         _LOG.warning(
             "scene %r: %s is black at 0 s: no lamp reaches the objects that it sees; check the "
             "sides to which lamps and surfaces face (a rectangle emits along its +z).",
             tracer.scene.name,
             cameras[0].name,
+        )
+
+
+def _check_view(tracer: PathTracer, camera: Camera) -> None:
+    if not (tracer.surface_points(camera).ids >= 0).any():
+        raise ValueError(
+            f"scene {tracer.scene.name!r}: {camera.name} sees no object at 0 s; move the "
+            "objects, or the centre and distance of the rig."
         )
 
 

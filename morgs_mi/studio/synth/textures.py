@@ -19,14 +19,17 @@ _SIZE = 512  # texels across
 
 def fractal(rng: np.random.Generator, size: int, finest: float) -> np.ndarray:
     """Return periodic 1/f noise [size, size] of unit variance, at most `finest` cycles across."""
-    frequency = np.hypot(
-        *np.meshgrid(np.fft.fftfreq(size, 1 / size), np.fft.rfftfreq(size, 1 / size), indexing="ij")
-    )
-    amplitude = np.where((frequency >= 1) & (frequency <= finest), 1 / np.maximum(frequency, 1), 0)
-    noise = np.fft.irfft2(
-        np.fft.rfft2(rng.standard_normal((size, size))) * amplitude, s=(size, size)
-    )
+    white = np.fft.rfft2(rng.standard_normal((size, size)))
+    noise = np.fft.irfft2(white * _amplitude(size, finest), s=(size, size))
     return noise / noise.std()
+
+
+def _amplitude(size: int, finest: float) -> np.ndarray:
+    """Return the 1/f spectrum of `np.fft.rfft2` [size, size / 2 + 1]."""
+    rows = np.fft.fftfreq(size, 1 / size)
+    columns = np.fft.rfftfreq(size, 1 / size)
+    frequency = np.hypot(rows[:, None], columns)
+    return np.where((frequency >= 1) & (frequency <= finest), 1 / np.maximum(frequency, 1), 0)
 
 
 def pattern(seed: int, first: RGB, second: RGB, cells: int, finest: float) -> np.ndarray:
