@@ -184,10 +184,15 @@ def _fit_plain(root: Path, config: DemoConfig, progress: Progress) -> None:
     capture = load_capture(
         root / "capture", max_frames=min(config.plain_frames, config.clip.frames)
     )
-    switches = {"learn_motion": False, "learn_offset": False, "learn_confidence": False}
-    plain = replace(config.stream, motion=replace(config.stream.motion, **switches))
+    plain = _without_motion(config.stream)
     _begin_with_first_frame(root / "stream_plain", root / "stream", capture, plain)
     _fit(capture, root / "stream_plain", plain, progress, resume=True)
+
+
+def _without_motion(config: StreamConfig) -> StreamConfig:
+    """Return the settings of a fit without motion, offset and confidence."""
+    switches = {"learn_motion": False, "learn_offset": False, "learn_confidence": False}
+    return replace(config, motion=replace(config.motion, **switches))
 
 
 def _synthesize_clip(
@@ -197,12 +202,16 @@ def _synthesize_clip(
     complete.
     """
     clip = replace(config.clip, seed=config.stream.seed)
-    settings = {"scene": config.scene, **clip.as_dict()}
-    set_values = {name: value for name, value in settings.items() if value is not None}
-    if set_values.items() <= stored_settings(folder).items():
+    if _clip_settings(config.scene, clip).items() <= stored_settings(folder).items():
         report(1, 1)
         return
     synthesize(config.scene, folder, clip, overwrite=True, progress=report)
+
+
+def _clip_settings(scene: str, clip: SynthConfig) -> dict[str, Any]:
+    """Return the scene of a clip and its settings that are not left open."""
+    settings = {"scene": scene, **clip.as_dict()}
+    return {name: value for name, value in settings.items() if value is not None}
 
 
 def _begin_with_first_frame(

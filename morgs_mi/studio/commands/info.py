@@ -170,14 +170,16 @@ def _deep_lines(deep: DeepCheck | None) -> list[str]:
     """Return the findings of the check of many frames, and what it could not measure."""
     if deep is None:
         return []
-    count = len(deep.findings)
-    result = "no findings" if not count else "1 finding" if count == 1 else f"{count} findings"
     sentences = [finding.sentence for finding in deep.findings]
     return [
-        f"Check of {deep.frames} frames: {result}.",
+        f"Check of {deep.frames} frames: {_number_of_findings(len(sentences))}.",
         *sentences,
         *filter(None, [deep.unmeasured]),
     ]
+
+
+def _number_of_findings(count: int) -> str:
+    return "no findings" if not count else "1 finding" if count == 1 else f"{count} findings"
 
 
 def _camera_table(capture: Capture, rig_check: RigCheck | None) -> Table:

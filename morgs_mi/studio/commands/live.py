@@ -107,12 +107,15 @@ class _Lines:
         self._drops += row.dropped
         if (time_now := time.monotonic()) - self._last < _PERIOD:
             return
-        print_warning(
+        print_warning(self._text(row))
+        self._last = time_now
+        self._drops = 0
+
+    def _text(self, row: LiveFrame) -> str:
+        return (
             f"Frame {row.frame}: {row.time:.1f} s after the first, latency {row.latency:.2f} s, "
             f"{self._drops} frames dropped, skew {1e3 * row.skew:.0f} ms."
         )
-        self._last = time_now
-        self._drops = 0
 
 
 def _summary(out: Path, rows: Sequence[LiveFrame]) -> str:

@@ -121,20 +121,23 @@ def _harmonics(coefficients: np.ndarray, max_degree: int) -> dict[str, np.ndarra
 
 
 def _document(columns: dict[str, np.ndarray], axes: np.ndarray | None) -> dict[str, Any]:
-    node: dict[str, Any] = {"mesh": 0}
-    if axes is not None:
-        # Rotation back to the capture's axes: x_world = M x_gltf.
-        node["extras"] = {"world_from_gltf": np.asarray(axes, float).T.tolist()}
     return {
         "asset": {"version": "2.0", "generator": "morgs_mi"},
         "extensionsUsed": [_NAME],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [node],
+        "nodes": [_node(axes)],
         "meshes": [{"primitives": [_primitive(columns)]}],
         "accessors": _accessors(columns),
         **_buffers([column.nbytes for column in columns.values()]),
     }
+
+
+def _node(axes: np.ndarray | None) -> dict[str, Any]:
+    if axes is None:
+        return {"mesh": 0}
+    # Rotation back to the capture's axes: x_world = M x_gltf.
+    return {"mesh": 0, "extras": {"world_from_gltf": np.asarray(axes, float).T.tolist()}}
 
 
 def _primitive(names: Iterable[str]) -> dict[str, Any]:
@@ -147,18 +150,19 @@ def _primitive(names: Iterable[str]) -> dict[str, Any]:
 
 
 def _accessors(columns: dict[str, np.ndarray]) -> list[dict[str, Any]]:
-    accessors: list[dict[str, Any]] = [
-        {
-            "bufferView": i,
-            "componentType": _FLOAT,
-            "count": len(column),
-            "type": _TYPES[column.shape[1]],
-        }
-        for i, column in enumerate(columns.values())
-    ]
+    accessors = [_accessor(i, column.shape) for i, column in enumerate(columns.values())]
     means = columns["POSITION"]
     accessors[0] |= {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
     return accessors
+
+
+def _accessor(index: int, shape: tuple[int, ...]) -> dict[str, Any]:
+    return {
+        "bufferView": index,
+        "componentType": _FLOAT,
+        "count": shape[0],
+        "type": _TYPES[shape[1]],
+    }
 
 
 def _buffers(sizes: Sequence[int]) -> dict[str, Any]:

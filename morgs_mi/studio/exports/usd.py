@@ -237,10 +237,15 @@ class _Samples:
         return values.nbytes
 
     def _set(self, time: int, values: np.ndarray) -> None:
-        rows = values.reshape(-1, values.shape[-1]) if values.ndim > 1 else values
-        if self.dtype is np.float16:
-            rows = np.clip(rows, -_LARGEST_HALF, _LARGEST_HALF)
-        self.attribute.Set(self.array.FromNumpy(np.ascontiguousarray(rows, self.dtype)), time)
+        self.attribute.Set(self.array.FromNumpy(_rows(values, self.dtype)), time)
+
+
+def _rows(values: np.ndarray, dtype: type) -> np.ndarray:
+    """Return the values of an attribute as rows of a type, within its range."""
+    rows = values.reshape(-1, values.shape[-1]) if values.ndim > 1 else values
+    if dtype is np.float16:
+        rows = np.clip(rows, -_LARGEST_HALF, _LARGEST_HALF)
+    return np.ascontiguousarray(rows, dtype)
 
 
 def _samples(pxr: Any, prim: Any, name: str, half: bool) -> _Samples:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 from xml.etree import ElementTree
@@ -78,16 +79,7 @@ def load_insert(path: str | Path) -> Build:
     if path.suffix == ".xml":
         entries = _xml_entries(path)
         return lambda frame, time: entries
-    build = _build_function(path)
-
-    def checked(frame: int, time: float) -> dict[str, Any]:
-        with failures_in(path):
-            entries = build(frame, time)
-            if not isinstance(entries, dict):
-                raise TypeError(f"`build` must return a dict, got a {type(entries).__name__}")
-            return entries
-
-    return checked
+    return partial(_built_entries, path, _build_function(path))
 
 
 def _check_file(path: Path) -> None:
@@ -107,6 +99,17 @@ def _build_function(path: Path) -> Callable[[int, float], Any]:
             "Mitsuba scene, found none; add it."
         )
     return build
+
+
+def _built_entries(
+    path: Path, build: Callable[[int, float], Any], frame: int, time: float
+) -> dict[str, Any]:
+    """Return the result of a file's `build`, which is a dict."""
+    with failures_in(path):
+        entries = build(frame, time)
+        if not isinstance(entries, dict):
+            raise TypeError(f"`build` must return a dict, got a {type(entries).__name__}")
+        return entries
 
 
 def inserted_channels(stream: FrameSource) -> tuple[str, ...]:
@@ -296,13 +299,18 @@ def _inserted_scene(entries: dict[str, Any]) -> Any:
     scene: Any = mi.load_dict({"type": "scene", **entries})
     if not (scene.shapes() or scene.emitters()):
         raise ValueError("The inserted scene: expected at least one shape, got none; add one.")
-    box = scene.bbox()
-    if scene.shapes() and not bounded(np.array([box.min, box.max])):
+    if scene.shapes():
+        _check_box(scene.bbox())
+    return scene
+
+
+def _check_box(box: Any) -> None:
+    """Raise `ValueError` unless the shapes in a box are finite and not too far away."""
+    if not bounded(np.array([box.min, box.max])):
         raise ValueError(
             f"The inserted scene: expected shapes within {LARGEST:g} world units, got {box.min} "
             f"to {box.max}; correct their places and sizes."
         )
-    return scene
 
 
 def _splat_layers(
@@ -354,14 +362,19 @@ def _sensor(camera: Camera) -> Any:
 
 def _xml_entries(path: Path) -> dict[str, Any]:
     """Return the shapes, lights and integrator of a scene file."""
-    try:
-        scene: Any = mi.load_file(str(path))
-    except RuntimeError as error:
-        raise ValueError(f"{path}: {_reason(error)}; correct the scene file.") from error
+    scene = _xml_scene(path)
     parts = {part.id() or f"part{i}": part for i, part in enumerate(_parts(scene))}
     # Mitsuba adds an integrator to files without one.
     has_integrator = ElementTree.parse(path).find("integrator") is not None
     return {**parts, "integrator": scene.integrator()} if has_integrator else parts
+
+
+def _xml_scene(path: Path) -> Any:
+    """Return the Mitsuba scene of a file."""
+    try:
+        return mi.load_file(str(path))
+    except RuntimeError as error:
+        raise ValueError(f"{path}: {_reason(error)}; correct the scene file.") from error
 
 
 def _reason(error: RuntimeError) -> str:

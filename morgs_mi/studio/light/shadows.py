@@ -162,11 +162,14 @@ def _outer_products(vectors: np.ndarray) -> np.ndarray:
 
 def _covariances(gaussians: Gaussians) -> np.ndarray:
     """Return the covariances [N, 3, 3], float64; quaternions of zero count as no rotation."""
-    scales = np.array(dr.detach(gaussians.scales))
+    axes = _rotations(gaussians) * np.array(dr.detach(gaussians.scales))[:, None]
+    return axes @ axes.transpose(0, 2, 1)
+
+
+def _rotations(gaussians: Gaussians) -> np.ndarray:
     quats = np.array(dr.detach(gaussians.quats), np.float64)
     quats = np.where(np.linalg.norm(quats, axis=1, keepdims=True) > 0, quats, [1, 0, 0, 0])
-    axes = Rotation.from_quat(quats, scalar_first=True).as_matrix() * scales[:, None]
-    return axes @ axes.transpose(0, 2, 1)
+    return Rotation.from_quat(quats, scalar_first=True).as_matrix()
 
 
 def _mixture(means: np.ndarray, opacities: np.ndarray) -> csr_array:

@@ -174,14 +174,18 @@ class FolderFeed:
 
     def _take(self, by_name: _Found, number: int, last_bundle: Bundle | None) -> None:
         """Store when the images of a number were written, and whether the count has begun again."""
-        if last_bundle is not None and number <= (last := max(last_bundle.numbers)):
-            if not self._old_write_times:
-                _LOG.warning("%s: the numbers go on with %d after %d", self._folder, number, last)
-            self._old_write_times = self._write_times
+        if last_bundle is not None and number <= max(last_bundle.numbers):
+            self._begin_count(number, max(last_bundle.numbers))
         images = {
             name: images.files[number] for name, images in by_name.items() if number in images.files
         }
         self._write_times = {name: _written(file) for name, file in images.items()}
+
+    def _begin_count(self, number: int, last: int) -> None:
+        """Store that the images are counted again from `number`, after `last`."""
+        if not self._old_write_times:
+            _LOG.warning("%s: the numbers go on with %d after %d", self._folder, number, last)
+        self._old_write_times = self._write_times
 
     def _arrived(self, bundle: Bundle, begin: float) -> Bundle:
         """Return a bundle that was not there at the time `begin`, by whatever clock."""
@@ -230,11 +234,17 @@ class FolderFeed:
         by_name = self._images(limit)
         if not write_times:
             return by_name
-        begin = PAUSE + max(
-            write_time + self._leads.get(name, 0.0) for name, write_time in write_times.items()
-        )
+        begin = self._end_of_pause(write_times)
         by_name = {name: images.since(begin) for name, images in by_name.items()}
         return {name: images for name, images in by_name.items() if images.files}
+
+    def _end_of_pause(self, write_times: Mapping[str, float]) -> float:
+        """Return when images are of another time than those written at `write_times`, s of
+        `time.monotonic`.
+        """
+        return PAUSE + max(
+            write_time + self._leads.get(name, 0.0) for name, write_time in write_times.items()
+        )
 
     def _images(self, limit: int) -> dict[str, _Images]:
         """Return the images of each camera with numbers larger than `limit`."""

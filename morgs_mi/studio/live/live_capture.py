@@ -95,12 +95,15 @@ def write_images(
     def write(view: int) -> None:
         image = images[view]
         if image is not None:
-            file = folder / names[view] / f"{frame:04d}.png"
-            file.parent.mkdir(parents=True, exist_ok=True)
-            with atomic_path(file, "fit_live()") as partial:
-                partial.write_bytes(png_bytes(image))
+            _write_image(folder / names[view] / f"{frame:04d}.png", image)
 
     map_in_threads(write, range(len(names)))
+
+
+def _write_image(file: Path, image: np.ndarray) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_path(file, "fit_live()") as partial:
+        partial.write_bytes(png_bytes(image))
 
 
 def _write_calibration(folder: Path, calibration: Calibration) -> None:

@@ -62,12 +62,16 @@ def _until_end(
             return
         stream = open_stream(place, source)
         if isinstance(source, int) and size is not None:
-            stream.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
-            stream.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
+            _request_size(stream, *size)
         try:
             yield from _images(stream, stop)
         finally:
             stream.release()
+
+
+def _request_size(stream: cv2.VideoCapture, width: int, height: int) -> None:
+    stream.set(cv2.CAP_PROP_FRAME_WIDTH, width)
+    stream.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
 
 
 def _images(stream: cv2.VideoCapture, stop: Event) -> Iterator[np.ndarray | None]:
@@ -117,13 +121,13 @@ def _place(source: int | str | Path, stop: Event) -> Iterator[int | str]:
     if isinstance(source, int) or not Path(source).is_fifo():
         yield source if isinstance(source, int) else str(source)
         return
-    with (
-        open(
-            source, "rb", 0, opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK)
-        ) as pipe,
-        _relayed(pipe, stop) as place,
-    ):
+    with _opened_pipe(source) as pipe, _relayed(pipe, stop) as place:
         yield place
+
+
+def _opened_pipe(path: str | Path) -> FileIO:
+    """Return a named pipe, which is opened without waiting for its writer."""
+    return open(path, "rb", 0, opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK))
 
 
 @contextmanager

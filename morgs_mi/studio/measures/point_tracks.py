@@ -185,9 +185,7 @@ def _inverse_covariances(gaussians: Gaussians, size: float) -> np.ndarray:
     """Return the inverse covariances [N, 3, 3] in a scene of some size."""
     log_scales = gaussians.numpy()["log_scales"]
     scales = np.maximum(np.exp(log_scales.astype(np.float64)), _FLATTEST * size)
-    axes = (
-        Rotation.from_quat(unit_quats(gaussians), scalar_first=True).as_matrix() / scales[:, None]
-    )
+    axes = _rotations(unit_quats(gaussians)) / scales[:, None]
     return axes @ axes.transpose(0, 2, 1)
 
 
@@ -327,9 +325,12 @@ def _means_and_axes(gaussians: Gaussians, rows: np.ndarray) -> tuple[np.ndarray,
     """Return means [..., 3] and axes [..., 3, 3] of the Gaussians at `rows` [...]."""
     means = gaussians.numpy()["means"].astype(np.float64)[rows]
     quats = unit_quats(gaussians)[rows].reshape(-1, 4)
-    return means, Rotation.from_quat(quats, scalar_first=True).as_matrix().reshape(
-        *rows.shape, 3, 3
-    )
+    return means, _rotations(quats).reshape(*rows.shape, 3, 3)
+
+
+def _rotations(quats: np.ndarray) -> np.ndarray:
+    """Return the rotations [N, 3, 3] of unit quaternions [N, 4]."""
+    return Rotation.from_quat(quats, scalar_first=True).as_matrix()
 
 
 def _held(tracks: np.ndarray, known_mask: np.ndarray, forward: np.ndarray) -> np.ndarray:

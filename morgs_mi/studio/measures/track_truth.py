@@ -42,12 +42,13 @@ class TrackTruth:
         if len(self.cameras) != 1:
             return None
         (camera,) = self.cameras
-        focal = (
-            np.sqrt(camera.K[0, 0] * camera.K[1, 1])
-            * _SHORT_SIDE
-            / min(camera.width, camera.height)
-        )
-        return camera.project(self.points)[1] / focal
+        return camera.project(self.points)[1] / _focal_length(camera)
+
+
+def _focal_length(camera: Camera) -> float:
+    """Return the focal length in pixels of an image with a shorter side of 256."""
+    focal = np.sqrt(camera.K[0, 0] * camera.K[1, 1])
+    return focal * _SHORT_SIDE / min(camera.width, camera.height)
 
 
 def synthetic_tracks(capture: Capture, views: Sequence[int]) -> list[TrackTruth]:

@@ -142,11 +142,8 @@ def imagenet_blob(image: np.ndarray, width: int, height: int) -> np.ndarray:
         width: of the input.
         height: of the input.
     """
-    unit = unit_values(image, np.float32)
-    shrinks = image.shape[1] > width
-    unit = cv2.resize(
-        unit, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-    )
+    method = cv2.INTER_AREA if image.shape[1] > width else cv2.INTER_LINEAR
+    unit = cv2.resize(unit_values(image, np.float32), (width, height), interpolation=method)
     return np.ascontiguousarray(np.moveaxis((unit - _MEAN) / _DEVIATION, 2, 0)[None])
 
 

@@ -139,15 +139,19 @@ def _check_decoder(path: str | Path, decoder: OnnxNetwork, features: Sequence[st
 
 def _best_mask(path: Path, masks: np.ndarray, quality: np.ndarray) -> np.ndarray:
     """Return the logits float32 [h, w] of the mask with the highest predicted IoU."""
+    _check_results(path, masks, quality)
+    logits = masks[0, np.argmax(quality[0])].astype(np.float32)
+    if not np.isfinite(logits).all():
+        raise ValueError(f"{path}: expected finite masks, got NaN or infinity; export in float32.")
+    return logits
+
+
+def _check_results(path: Path, masks: np.ndarray, quality: np.ndarray) -> None:
     if masks.ndim != 4 or quality.shape != masks.shape[:2] or len(masks) != 1:
         raise ValueError(
             f"{path}: expected masks [1, M, H, W] and iou_predictions [1, M], "
             f"got {list(masks.shape)} and {list(quality.shape)}."
         )
-    logits = masks[0, np.argmax(quality[0])].astype(np.float32)
-    if not np.isfinite(logits).all():
-        raise ValueError(f"{path}: expected finite masks, got NaN or infinity; export in float32.")
-    return logits
 
 
 def prompts(

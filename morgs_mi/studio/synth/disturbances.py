@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
@@ -176,15 +176,20 @@ def load_disturbances(folder: str | Path) -> dict[str, CameraDisturbance]:
         )
     content = read_json(path)
     try:
-        return {
-            name: CameraDisturbance(**{**entry, "gains": tuple(entry["gains"])})
-            for name, entry in content.items()
-        }
+        return _cameras(content)
     except (AttributeError, KeyError, TypeError) as error:
         raise ValueError(
             f"{path}: expected the disturbances of each camera, got a broken file ({error}); "
             "synthesise the capture again."
         ) from None
+
+
+def _cameras(content: Any) -> dict[str, CameraDisturbance]:
+    """Return the disturbance of each camera from the content of the file."""
+    return {
+        name: CameraDisturbance(**{**entry, "gains": tuple(entry["gains"])})
+        for name, entry in content.items()
+    }
 
 
 def _path(folder: str | Path) -> Path:

@@ -79,6 +79,11 @@ def _shapes(name: str, item: Object) -> dict[str, Any]:
     return {name: {"type": "instance", "group": {"type": "ref", "id": f"{name}_group"}}}
 
 
+def _sensor(camera: Camera, spp: int) -> Any:
+    sampler = {"type": "multijitter", "sample_count": spp}
+    return mi.load_dict({**camera.sensor(), "sampler": sampler})
+
+
 def _sampler(spp: int, seed: int, num_pixels: int) -> Any:
     """Return a sampler of all samples of some pixels at once."""
     sampler: Any = mi.load_dict({"type": "multijitter", "sample_count": spp})
@@ -182,8 +187,7 @@ class PathTracer:
 
     def light(self, camera: Camera, spp: int, seed: int) -> np.ndarray:
         """Return the exposed light of a view, linear [H, W, 3]."""
-        sampler = {"type": "multijitter", "sample_count": spp}
-        sensor: Any = mi.load_dict({**camera.sensor(), "sampler": sampler})
+        sensor = _sensor(camera, spp)
         render: Any = mi.render  # annotated with Dr.Jit's types, called with Python's
         linear = render(self._scene, sensor=sensor, integrator=self._integrator, spp=spp, seed=seed)
         return self._exposure * np.array(linear)[..., :3]

@@ -165,12 +165,15 @@ def failures_in(path: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        line = _line_of(error, path)
-        reason = error.msg if isinstance(error, SyntaxError) else str(error)
-        place = f"{path}, line {line}" if line else str(path)
-        raise ValueError(
-            f"{place}: {type(error).__name__}: {reason.rstrip('.')}; correct the scene file."
-        ) from error
+        raise ValueError(_error_text(error, path)) from error
+
+
+def _error_text(error: Exception, path: Path) -> str:
+    """Return a sentence about an error of the code in a file."""
+    line = _line_of(error, path)
+    reason = error.msg if isinstance(error, SyntaxError) else str(error)
+    place = f"{path}, line {line}" if line else str(path)
+    return f"{place}: {type(error).__name__}: {reason.rstrip('.')}; correct the scene file."
 
 
 def _line_of(error: Exception, path: Path) -> int | None:
@@ -324,6 +327,10 @@ def _scene_files() -> dict[str, Path]:
     checkout = Path(__file__).parents[3] / "scenes"
     if checkout.is_dir():
         return {path.stem: path for path in checkout.glob("*.py")}
+    return _installed_scene_files()
+
+
+def _installed_scene_files() -> dict[str, Path]:
     installed = metadata.files("morgs-mi") or []
     return {
         Path(f).stem: Path(str(f.locate())) for f in installed if f.match("morgs_mi/scenes/*.py")

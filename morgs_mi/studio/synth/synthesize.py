@@ -119,17 +119,21 @@ def _write_capture(
 
 def _check_resources(config: SynthConfig) -> None:
     """Raise `ValueError` if the variant, a setting or the size of the images does not fit."""
-    if not str(mi.variant()).startswith(("llvm", "cuda", "metal")):
-        raise ValueError(
-            f"synthesize(): a vectorised variant is needed, got {mi.variant()!r}; "
-            'call mitsuba.set_variant("llvm_ad_rgb") first.'
-        )
+    _check_variant()
     config.check()
     pixels = config.width * config.height
     size = f"images of {config.width}x{config.height} pixels"
     check_memory(
         "synthesize()", _PIXEL_BYTES * pixels, size, "make them smaller (`width`, `height`)"
     )
+
+
+def _check_variant() -> None:
+    if not str(mi.variant()).startswith(("llvm", "cuda", "metal")):
+        raise ValueError(
+            f"synthesize(): a vectorised variant is needed, got {mi.variant()!r}; "
+            'call mitsuba.set_variant("llvm_ad_rgb") first.'
+        )
 
 
 def _settings(scene: Scene, config: SynthConfig) -> dict[str, Any]:
