@@ -97,6 +97,7 @@ def import_frames(
     path.parent.mkdir(parents=True, exist_ok=True)
     metadata = {"num_frames": len(paths), DEFAULT_RIG: True, "config": {"codec": asdict(config)}}
     frames = (read_splats(source, most_invalid) for source in paths)
+    report = progress or (lambda *_: None)
     keyframes = 0
     with (
         atomic_path(path, "import_frames()") as partial,
@@ -106,8 +107,7 @@ def import_frames(
             keyframes += packets[0].kind == PacketKind.KEYFRAME
             for packet in packets:
                 writer.write(packet)
-            if progress is not None:
-                progress(done, len(paths))
+            report(done, len(paths))
     return Imported(path, len(paths), keyframes, path.stat().st_size)
 
 

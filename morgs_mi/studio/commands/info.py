@@ -82,19 +82,16 @@ class Info:
         points = f"{len(capture.points)} points" if len(capture.points) else "without points"
         checks = _Checks()
         if self.check:
-            with progress() as report:
-                common = match_capture(capture, partial(report, "Matching views"))
-            rig_check = check_rig(capture, common)
+            shared = _shared_features(capture)
+            rig_check = check_rig(capture, shared)
             if not len(capture.points):
-                capture = triangulate_points(capture, common)
+                capture = triangulate_points(capture, shared)
                 points += f" ({len(capture.points)} can be triangulated)"
-            checks = _checks(capture, common, rig_check, self.deep)
+            checks = _checks(capture, shared, rig_check, self.deep)
         print_table(_camera_table(capture, checks.rig))
         _print_lines(_content_lines(capture, points, checks.rig))
         if self.time:
-            with progress() as report:
-                offsets = estimate_time_offsets(capture, partial(report, "Comparing clocks"))
-            _print_lines(_time_lines(offsets))
+            _print_lines(_time_lines(_time_offsets(capture)))
         _print_lines([finding.sentence for finding in checks.exposures])
         _print_lines(_deep_lines(checks.deep))
         self._write_files(capture, checks.deep)
@@ -123,6 +120,16 @@ class Info:
         if self.plot is not None:
             write_rig(self.plot, capture, deep)
             print_result(f"Plot of the rig: {self.plot}")
+
+
+def _shared_features(capture: Capture) -> SharedFeatures:
+    with progress() as report:
+        return match_capture(capture, partial(report, "Matching views"))
+
+
+def _time_offsets(capture: Capture) -> TimeOffsets:
+    with progress() as report:
+        return estimate_time_offsets(capture, partial(report, "Comparing clocks"))
 
 
 class _Checks(NamedTuple):

@@ -262,15 +262,20 @@ def _render(
         dark = shadowed(gaussians, ratio)
         images = _plugin_images(dark, camera, surfaces, nested, channels, config.samples)
         if "surfaces" in channels:
-            with traced(nested, rays_for(nested, dark), srgb=True):
-                images["surfaces"] = np.asarray(
-                    nested.render(surfaces, _sensor(camera), spp=config.samples)
-                )
+            images["surfaces"] = _surface_layer(dark, camera, surfaces, nested, config.samples)
     except RuntimeError as error:
         raise ValueError(f"The inserted scene: {_reason(error)}; correct it.") from error
     if {"splats", "shadow"} & set(channels):
         images |= _splat_layers(gaussians, dark, camera)
     return {name: images[name].astype(np.float32) for name in channels}
+
+
+def _surface_layer(
+    gaussians: Gaussians, camera: Camera, surfaces: Any, nested: Any, samples: int
+) -> np.ndarray:
+    """Return the layer `surfaces` [H, W, 4], in linear light."""
+    with traced(nested, rays_for(nested, gaussians), srgb=True):
+        return np.asarray(nested.render(surfaces, _sensor(camera), spp=samples))
 
 
 def _lit_scenes(

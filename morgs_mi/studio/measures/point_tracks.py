@@ -144,14 +144,21 @@ def bind(
         num_gaussians: K is this number, but at most N.
     """
     count = min(num_gaussians, len(gaussians))
-    rows = np.zeros((len(points), count), np.int64)
-    weights = np.zeros((len(points), count))
     if not count or not len(points):
-        return rows, weights
+        return np.zeros((len(points), count), np.int64), np.zeros((len(points), count))
     center = gaussians.numpy()["means"].mean(0, dtype=np.float64)
     points = points - center
     polynomial = _log_responses(gaussians, center, np.abs(points).max())
-    step = max(1, _MOST_ENTRIES // len(gaussians))
+    return _strongest(points, polynomial, count)
+
+
+def _strongest(
+    points: np.ndarray, polynomial: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the same as `bind` from the result of `_log_responses`."""
+    rows = np.zeros((len(points), count), np.int64)
+    weights = np.zeros((len(points), count))
+    step = max(1, _MOST_ENTRIES // polynomial.shape[1])
     for start in range(0, len(points), step):
         part = slice(start, start + step)
         rows[part], largest = _largest(_monomials(points[part]) @ polynomial, count)
