@@ -207,7 +207,8 @@ def _camera_table(capture: Capture, rig_check: RigCheck | None) -> Table:
 
 def _intrinsics_cells(K: np.ndarray) -> tuple[str, str]:
     """Return the focal length, or both if they differ, and the principal point as text."""
-    fx, fy = f"{K[0, 0]:.1f}", f"{K[1, 1]:.1f}"
+    fx = f"{K[0, 0]:.1f}"
+    fy = f"{K[1, 1]:.1f}"
     return fx if fx == fy else f"{fx} {fy}", f"{K[0, 2]:.1f} {K[1, 2]:.1f}"
 
 

@@ -133,7 +133,8 @@ def _rays_of_eye(
     longitude: np.ndarray, latitude: np.ndarray, shift: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the origins and the directions [..., 3] of rays in the axes of the camera."""
-    sine, cosine = np.sin(longitude), np.cos(longitude)
+    sine = np.sin(longitude)
+    cosine = np.cos(longitude)
     zero = np.zeros_like(longitude)
     level = np.stack([sine, zero, cosine], axis=-1)
     right = np.stack([cosine, zero, -sine], axis=-1)

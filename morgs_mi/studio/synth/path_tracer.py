@@ -244,5 +244,5 @@ class PathTracer:
 def _in_image(camera: Camera, points: np.ndarray) -> np.ndarray:
     """Return the mask of the points [P, 3] that lie in front of a camera and inside its image."""
     pixels, depth = camera.project(points)
-    inside = (pixels >= 0) & (pixels < (camera.width, camera.height))
-    return (depth > camera.near) & np.all(inside, axis=-1)
+    mask = (pixels >= 0) & (pixels < (camera.width, camera.height))
+    return (depth > camera.near) & np.all(mask, axis=-1)
