@@ -54,17 +54,11 @@ def align_numbers(
         ValueError: numbers of cameras that count together differ and no option resolves it, or none
             are common.
     """
-    numbers = {
-        c: r.numbers
-        for c, r in enumerate(readers)
-        if isinstance(r, FolderReader) and r.numbers is not None
-    }
+    numbers = _numbers(readers)
     groups = counting_together(numbers)
     notes = _separate(names, numbers, groups)
     by_position = ImageNumbers(np.zeros(len(readers)), np.ones(len(readers)), notes=notes)
-    different = [
-        group for group in groups if len({(numbers[c][0], numbers[c].step) for c in group}) > 1
-    ]
+    different = [group for group in groups if _differ(numbers, group)]
     if not different:
         return by_position
     table = "; ".join(_table(names, numbers, group) for group in different)
@@ -73,20 +67,39 @@ def align_numbers(
         return ImageNumbers(by_position.offsets, by_position.rates, notes=(*notes, note))
     common = sorted(set.intersection(*(set(numbers[c]) for c in different[0])))
     if not trim or not common or len(different) > 1:
-        remedy = (
-            f"the {len(common)} common ones with --trim, " if common and len(different) == 1 else ""
-        )
-        raise ValueError(
-            f"{path}: images with the same number must be simultaneous and all cameras must have "
-            f"the same numbers, got {table}; use {remedy}all numbers with --gaps, which leaves "
-            "out the cameras that lack an image, or the positions of the images in place of "
-            f"their numbers with --offset {names[different[0][0]]} 0."
-        )
+        count = len(common) if len(different) == 1 else 0
+        raise _numbers_error(path, table, count, names[different[0][0]])
     note = (
         f"Images with the same number are simultaneous: {table}. Used are {_range(common)}, which "
         "all cameras have."
     )
     return _aligned(readers, {c: numbers[c] for c in different[0]}, common[0], (*notes, note))
+
+
+def _numbers(readers: Sequence[FrameReader]) -> dict[int, range]:
+    """Return the numbers of the images by the index of the clip, of clips with numbers."""
+    return {
+        c: r.numbers
+        for c, r in enumerate(readers)
+        if isinstance(r, FolderReader) and r.numbers is not None
+    }
+
+
+def _differ(numbers: _Numbers, group: Sequence[int]) -> bool:
+    return len({(numbers[c][0], numbers[c].step) for c in group}) > 1
+
+
+def _numbers_error(path: Path, table: str, common: int, name: str) -> ValueError:
+    """Return the error of cameras whose numbers differ; `common` ones could be used, and `name` is
+    the camera of the example.
+    """
+    remedy = f"the {common} common ones with --trim, " if common else ""
+    return ValueError(
+        f"{path}: images with the same number must be simultaneous and all cameras must have "
+        f"the same numbers, got {table}; use {remedy}all numbers with --gaps, which leaves "
+        "out the cameras that lack an image, or the positions of the images in place of "
+        f"their numbers with --offset {name} 0."
+    )
 
 
 def _aligned(

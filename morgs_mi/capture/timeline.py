@@ -15,7 +15,7 @@ Otherwise an image is interpolated between two frames (see `interpolation`).
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -124,74 +124,115 @@ def timeline(
             clip is cut off, the clips have no instant in common, or `config` names an unknown
             camera or has an offset that is not finite.
     """
-    if unknown := [name for name in config.offset if name not in names]:
-        raise ValueError(
-            f"{path}: `offset` must name cameras of {', '.join(names)}, got {', '.join(unknown)}."
-        )
-    for name, offset in config.offset.items():
-        check_number(str(path), f"offset of {name}", offset, "(-inf, inf)")
+    _check_offsets(path, names, config.offset)
     numbers = align_numbers(path, names, readers, config.trim, config.offset)
     for note in numbers.notes:
         _LOG.warning("%s: %s", path, note)
     exact = _clocks(names, readers, config, fps, numbers)
+    clocks, instants = _instants(path, names, readers, config, exact, max_frames)
+    positions = clocks.offsets[:, None] + clocks.rates[:, None] * instants
+    offsets = [config.offset.get(name, 0) for name in names]
+    clips = list(map(_clip_times, readers, positions, clocks.rates.tolist(), offsets))
+    if config.gaps:
+        clips = list(map(_without_far, readers, clips, positions))
+    _warn_apart(path, readers, clips, positions, exact)
+    return Timeline(
+        tuple(clips),
+        clocks.fps,
+        _is_unchanged(clips, config),
+        (*numbers.notes, *_notes(readers, clips)),
+    )
+
+
+def _check_offsets(path: Path, names: Sequence[str], offsets: Mapping[str, float]) -> None:
+    """Check that the offsets are finite, and of cameras in `names`."""
+    if unknown := [name for name in offsets if name not in names]:
+        raise ValueError(
+            f"{path}: `offset` must name cameras of {', '.join(names)}, got {', '.join(unknown)}."
+        )
+    for name, offset in offsets.items():
+        check_number(str(path), f"offset of {name}", offset, "(-inf, inf)")
+
+
+def _instants(
+    path: Path,
+    names: Sequence[str],
+    readers: Sequence[FrameReader],
+    config: ReadConfig,
+    exact: _Clocks,
+    max_frames: int | None,
+) -> tuple[_Clocks, np.ndarray]:
+    """Return the clocks by which frames are selected, and the instants [T]."""
     if config.aligns_clips:
         clocks = _without_drift(exact, readers, max_frames)
-        instants = _common_instants(path, names, readers, config, clocks)[:max_frames]
-    else:
-        instants = np.arange(_num_frames(path, readers, max_frames, config.gaps), dtype=float)
-        clocks = replace(exact, rates=np.ones(len(readers)))
-        _check_rates(path, readers, exact, instants)
-    positions = clocks.offsets[:, None] + clocks.rates[:, None] * instants
-    indices = [
-        nearest_frames(reader, places) for reader, places in zip(readers, positions, strict=True)
-    ]
-    image_places = np.array(
-        [_positions(reader, index) for reader, index in zip(readers, indices, strict=True)]
-    )
-    shares: list[np.ndarray | None] = [None] * len(readers)
-    delays = [0.0] * len(readers)
-    for c, (name, reader) in enumerate(zip(names, readers, strict=True)):
-        if (
-            reader.positions is not None
-            or reader.num_frames < 2
-            or config.offset.get(name, 0) % 1 == 0
-        ):
-            continue
-        if clocks.rates[c] % 1 == 0:
-            # The same for all of its frames.
-            delays[c] = float(np.floor(positions[c][0] + 0.5) - positions[c][0])
-            indices[c] = np.rint(positions[c] + delays[c]).astype(int)
-            image_places[c] = indices[c] - delays[c]
-        else:
-            indices[c] = np.clip(np.floor(positions[c]).astype(int), 0, reader.num_frames - 2)
-            shares[c] = positions[c] - indices[c]
-            image_places[c] = positions[c]
-    if config.gaps:
-        far = np.abs(image_places - positions) > _NEAR
-        indices = list(np.where(far, -1, indices))
-    _warn_apart(
-        path, (image_places - exact.offsets[:, None]) / exact.rates[:, None], indices, exact.fps
-    )
-    unchanged = all(np.array_equal(index, np.arange(len(instants))) for index in indices)
-    unchanged = unchanged and not any(config.offset.values())
-    notes = tuple(
-        _note(r, k) for r, k in zip(readers, indices, strict=True) if r.positions is not None
-    )
-    clips = tuple(map(ClipTimes, indices, shares, delays, clocks.rates.tolist()))
-    return Timeline(clips, clocks.fps, unchanged, (*numbers.notes, *notes))
+        return clocks, _common_instants(path, names, readers, config, clocks)[:max_frames]
+    instants = np.arange(_num_frames(path, readers, max_frames, config.gaps), dtype=float)
+    _check_rates(path, readers, exact, instants)
+    return replace(exact, rates=np.ones(len(readers))), instants
 
 
-def _warn_apart(path: Path, times: np.ndarray, indices: Sequence[np.ndarray], fps: float) -> None:
-    """Warn if images of one instant are apart; `times` [C, T] are theirs in instants, where
-    `indices` are not -1.
+def _clip_times(
+    reader: FrameReader, positions: np.ndarray, rate: float, offset: float
+) -> ClipTimes:
+    """Return the frames of a clip that show the instants at `positions` [T], by the clip's rate and
+    its offset in `ReadConfig`.
     """
-    times = np.where(np.stack(indices) < 0, np.nan, times)
-    images = times[:, np.isfinite(times).any(0)]
-    if not images.size:
-        return
-    spread = float((np.nanmax(images, axis=0) - np.nanmin(images, axis=0)).max()) / fps
+    if reader.positions is not None or reader.num_frames < 2 or offset % 1 == 0:
+        return ClipTimes(nearest_frames(reader, positions), None, 0.0, rate)
+    if rate % 1 == 0:
+        # The same for all of its frames.
+        delay = float(np.floor(positions[0] + 0.5) - positions[0])
+        return ClipTimes(np.rint(positions + delay).astype(int), None, delay, rate)
+    indices = np.clip(np.floor(positions).astype(int), 0, reader.num_frames - 2)
+    return ClipTimes(indices, positions - indices, 0.0, rate)
+
+
+def _image_positions(reader: FrameReader, clip: ClipTimes, positions: np.ndarray) -> np.ndarray:
+    """Return the positions of the images that show the instants at `positions` [T]."""
+    if clip.shares is not None:
+        return positions
+    if reader.positions is not None:
+        return reader.positions[clip.frame_indices]
+    return clip.frame_indices - clip.delay
+
+
+def _without_far(reader: FrameReader, clip: ClipTimes, positions: np.ndarray) -> ClipTimes:
+    """Return the frames without those that are far from the instants at `positions` [T]."""
+    far = np.abs(_image_positions(reader, clip, positions) - positions) > _NEAR
+    return replace(clip, frame_indices=np.where(far, -1, clip.frame_indices))
+
+
+def _is_unchanged(clips: Sequence[ClipTimes], config: ReadConfig) -> bool:
+    """Return whether instant t is frame t of every clip."""
+    return not any(config.offset.values()) and all(
+        np.array_equal(clip.frame_indices, np.arange(len(clip.frame_indices))) for clip in clips
+    )
+
+
+def _warn_apart(
+    path: Path,
+    readers: Sequence[FrameReader],
+    clips: Sequence[ClipTimes],
+    positions: np.ndarray,
+    clocks: _Clocks,
+) -> None:
+    """Warn if images of one instant are apart, by the clips' clocks; the instants are at
+    `positions` [C, T].
+    """
+    places = np.array(list(map(_image_positions, readers, clips, positions)))
+    times = (places - clocks.offsets[:, None]) / clocks.rates[:, None]
+    has_frame = np.stack([clip.frame_indices >= 0 for clip in clips])
+    spread = _spread(np.where(has_frame, times, np.nan)) / clocks.fps
     if spread > 1e-3:
         _LOG.warning("%s: images of one instant are up to %.1f ms apart.", path, 1e3 * spread)
+
+
+def _spread(times: np.ndarray) -> float:
+    """Return the largest distance of the times [C, T] of one instant, of which NaN are left out."""
+    images = times[:, np.isfinite(times).any(0)]
+    if not images.size:
+        return 0.0
+    return float((np.nanmax(images, axis=0) - np.nanmin(images, axis=0)).max())
 
 
 @dataclass(frozen=True)
@@ -253,17 +294,22 @@ def _common_instants(
     clocks: _Clocks,
 ) -> np.ndarray:
     """Return the instants that all clips cover [T]."""
-    offsets = clocks.offsets
-    rates = clocks.rates
     lengths = np.array([_usable_periods(reader, config) for reader in readers])
-    first = np.ceil(np.max(-offsets / rates))
-    last = np.floor(np.min((lengths - 1 - offsets) / rates))
-    if last >= first:
-        return np.arange(first, last + 1)
-    per_second = rates * clocks.fps
-    spans = zip(names, (0 - offsets) / per_second, (lengths - offsets) / per_second, strict=True)
-    table = ", ".join(f"{name} {start:.2f} to {stop:.2f} s" for name, start, stop in spans)
-    raise ValueError(f"{path}: the clips have no instant in common, {table}; check `offset`.")
+    first = np.ceil(np.max(-clocks.offsets / clocks.rates))
+    last = np.floor(np.min((lengths - 1 - clocks.offsets) / clocks.rates))
+    if last < first:
+        table = _spans(names, lengths, clocks)
+        raise ValueError(f"{path}: the clips have no instant in common, {table}; check `offset`.")
+    return np.arange(first, last + 1)
+
+
+def _spans(names: Sequence[str], lengths: np.ndarray, clocks: _Clocks) -> str:
+    """Return the times that the clips cover, for messages; `lengths` [C] in frames."""
+    per_second = clocks.rates * clocks.fps
+    starts = (0 - clocks.offsets) / per_second
+    stops = (lengths - clocks.offsets) / per_second
+    spans = zip(names, starts, stops, strict=True)
+    return ", ".join(f"{name} {start:.2f} to {stop:.2f} s" for name, start, stop in spans)
 
 
 def _position(reader: FrameReader, offset: float) -> float:
@@ -282,23 +328,33 @@ def nearest_frames(reader: FrameReader, positions: np.ndarray) -> np.ndarray:
     return np.searchsorted((reader.positions[1:] + reader.positions[:-1]) / 2, positions)
 
 
-def _positions(reader: FrameReader, indices: np.ndarray) -> np.ndarray:
-    """Return the positions of frames [T]."""
-    return indices.astype(float) if reader.positions is None else reader.positions[indices]
+def _notes(readers: Sequence[FrameReader], clips: Sequence[ClipTimes]) -> list[str]:
+    """Return a note on each clip of variable frame rate."""
+    return [
+        _note(reader, clip.frame_indices)
+        for reader, clip in zip(readers, clips, strict=True)
+        if reader.positions is not None
+    ]
 
 
 def _note(reader: FrameReader, indices: np.ndarray) -> str:
     """Return a note on the irregular times of a clip and the frames that show its instants."""
+    frames = indices[indices >= 0]
+    repeats = len(frames) - len(np.unique(frames))
+    missing = len(indices) - len(frames)
+    return (
+        f"{reader.path.name}: variable frame rate, {_irregular_times(reader)}; each instant has "
+        f"the frame nearest in time: {repeats} repeat one, {missing} have none."
+    )
+
+
+def _irregular_times(reader: FrameReader) -> str:
     assert reader.positions is not None
     assert reader.fps
     late = np.abs(reader.positions - np.rint(reader.positions)).max() / reader.fps
-    missing = int(np.sum(indices < 0))
-    frames = indices[indices >= 0]
-    repeats = len(frames) - len(np.unique(frames))
     return (
-        f"{reader.path.name}: variable frame rate, {len(reader.positions)} frames in "
-        f"{_periods(reader)} periods of {1e3 / reader.fps:.1f} ms, up to {1e3 * late:.1f} ms off; "
-        f"each instant has the frame nearest in time: {repeats} repeat one, {missing} have none."
+        f"{len(reader.positions)} frames in {_periods(reader)} periods of "
+        f"{1e3 / reader.fps:.1f} ms, up to {1e3 * late:.1f} ms off"
     )
 
 
@@ -338,38 +394,48 @@ def _check_even(reader: FrameReader, required: int) -> None:
         return
     late = reader.positions[:required] - np.arange(len(reader.positions[:required]))
     if np.abs(late).max() > _NEAR:
-        frame = int(np.argmax(np.abs(late) > _NEAR))
-        assert reader.fps
-        raise ValueError(
-            f"{reader.path}: expected a constant frame rate, got a variable one: frame {frame} is "
-            f"{1e3 * abs(late[frame]) / reader.fps:.0f} ms "
-            f"{'late' if late[frame] > 0 else 'early'}; use the frames nearest in time (--trim), "
-            "leave the camera out where it has none (--gaps), or convert the clip."
-        )
+        raise _rate_error(reader, late)
+
+
+def _rate_error(reader: FrameReader, late: np.ndarray) -> ValueError:
+    """Return the error of a clip whose frames are late by `late` periods [T]."""
+    frame = int(np.argmax(np.abs(late) > _NEAR))
+    assert reader.fps
+    return ValueError(
+        f"{reader.path}: expected a constant frame rate, got a variable one: frame {frame} is "
+        f"{1e3 * abs(late[frame]) / reader.fps:.0f} ms "
+        f"{'late' if late[frame] > 0 else 'early'}; use the frames nearest in time (--trim), "
+        "leave the camera out where it has none (--gaps), or convert the clip."
+    )
 
 
 def _num_frames(
     path: Path, readers: Sequence[FrameReader], max_frames: int | None, gaps: bool
 ) -> int:
+    """Return the number of instants of clips that are not aligned."""
     if gaps:
         longest = max(_periods(reader) for reader in readers)
         return min(longest, max_frames or longest)
-    lengths = [reader.num_frames for reader in readers]
-    for reader, length in zip(readers, lengths, strict=True):
-        required = min(length, max_frames or length)
+    for reader in readers:
+        required = min(reader.num_frames, max_frames or reader.num_frames)
         _check_complete(reader, required)
         _check_even(reader, required)
-    shortest = min(lengths)
+    shortest = min(reader.num_frames for reader in readers)
     if max_frames is not None and max_frames <= shortest:
         return max_frames
-    if shortest < max(lengths):
-        table = ", ".join(f"{r.path.name} {n}" for r, n in zip(readers, lengths, strict=True))
+    _check_lengths(path, readers, shortest)
+    return shortest
+
+
+def _check_lengths(path: Path, readers: Sequence[FrameReader], shortest: int) -> None:
+    """Check that all clips have the length of the shortest one."""
+    if any(reader.num_frames > shortest for reader in readers):
+        table = ", ".join(f"{reader.path.name} {reader.num_frames}" for reader in readers)
         raise ValueError(
             f"{path}: all cameras must have the same number of frames, got {table}; use the first "
             f"frames with `max_frames={shortest}`, the instants that all clips cover with --trim, "
             "align the clips with --offset, or leave cameras out with --without."
         )
-    return shortest
 
 
 def _check_rates(
@@ -408,17 +474,25 @@ def read_settings(path: Path) -> dict[str, Any]:
         )
     if "scene" not in settings:  # a synthetic capture describes itself
         warn_unread(path, settings.keys() - _SETTINGS)
-    view = settings.get("test_view")
+    _check_numbers(path, settings)
+    _check_test_view(path, settings.get("test_view"))
+    return settings
+
+
+def _check_numbers(path: Path, settings: Mapping[str, Any]) -> None:
+    """Check the settings that are numbers, and `readout`, which may be an object of numbers."""
     for name, interval in _INTERVALS.items():
         if (value := settings.get(name)) is not None:
             check_number(str(path), name, value, interval)
     readout = settings.get("readout", 0.0)
     for value in readout.values() if isinstance(readout, dict) else [readout]:
         check_number(str(path), "readout", value, "[-1, 1]")
+
+
+def _check_test_view(path: Path, view: Any) -> None:
     indices = view if isinstance(view, list) else [view]
     if view is not None and any(type(index) is not int for index in indices):
         raise ValueError(
             f"{path}: `test_view` must be a camera's index, a list of them, or null, got "
             f"{view!r}; correct it."
         )
-    return settings
