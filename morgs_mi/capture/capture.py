@@ -21,7 +21,7 @@ from morgs_mi.capture.held_out import TestViews, held_out_by, held_out_views
 from morgs_mi.capture.layouts.clips import EXAMPLE
 from morgs_mi.capture.layouts.layout_registry import find_layout
 from morgs_mi.capture.lens import Lens, undistortion
-from morgs_mi.capture.timeline import ReadConfig, read_settings, timeline
+from morgs_mi.capture.timeline import ClipTimes, ReadConfig, Timeline, read_settings, timeline
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_points
 from morgs_mi.core.color_space import display_stops
@@ -29,7 +29,7 @@ from morgs_mi.core.fit_names import CAPTURE
 from morgs_mi.core.rig import with_near_planes
 from morgs_mi.io.prefetch import prefetched
 from morgs_mi.io.remote import is_url, mirrored
-from morgs_mi.io.video import Clip, ImageOrError, open_clips
+from morgs_mi.io.video import Clip, FrameReader, ImageOrError, open_clips
 
 _LOG = logging.getLogger(__name__)
 # Pixels of the shorter side that a downscaled image needs.
@@ -144,10 +144,7 @@ class Capture:
         cameras = tuple(
             c.resized(*size) for c, size in zip(self.cameras, self.recorded_sizes, strict=True)
         )
-        masks = tuple(
-            source.mask(camera) for source, camera in zip(self._sources, cameras, strict=True)
-        )
-        return replace(self, cameras=cameras, masks=masks, downscale=1)
+        return replace(self, cameras=cameras, masks=_masks(self._sources, cameras), downscale=1)
 
     def displayed(self) -> Capture:
         """Return the capture with images of 8 bits: linear light as a display shows it."""
@@ -171,23 +168,23 @@ class Capture:
         rig = replace(self, cameras=tuple(cameras))
         if not np.any(distortions):
             return rig
-        sources = list(self._sources)
         radial_terms = tuple((float(k1), float(k2)) for k1, k2 in distortions)
         views = zip(
+            self._sources,
             self.at_recorded_size().cameras,
             rig.at_recorded_size().cameras,
             radial_terms,
             strict=True,
         )
-        for v, (calibrated_camera, refined, terms) in enumerate(views):
-            both = undistortion(
-                calibrated_camera, sources[v].lens, (refined, Lens("RADIAL", terms))
+        sources = tuple(
+            replace(
+                source,
+                undistortion=undistortion(camera, source.lens, (refined, Lens("RADIAL", terms))),
             )
-            sources[v] = replace(sources[v], undistortion=both)
-        masks = tuple(
-            source.mask(camera) for source, camera in zip(sources, rig.cameras, strict=True)
+            for source, camera, refined, terms in views
         )
-        return replace(rig, masks=masks, _sources=tuple(sources), distortions=radial_terms)
+        masks = _masks(sources, rig.cameras)
+        return replace(rig, masks=masks, _sources=sources, distortions=radial_terms)
 
     def holding_out(self, views: int | str | Sequence[int | str] | None) -> Capture:
         """Return the capture with other held-out cameras, by indices or names; None for none.
@@ -226,24 +223,7 @@ class Capture:
             "reading": {**asdict(self.reading), "without": list(self.reading.without)},
             "colors": colors,
             "notes": list(self.notes),
-            "cameras": [
-                {
-                    "name": camera.name,
-                    "first_frame": int(source.frame_indices[0]),
-                    "recorded_size": [source.reader.width, source.reader.height],
-                    "size": [camera.width, camera.height],
-                    "K": camera.K.tolist(),
-                    "lens": source.lens.model,
-                    "distortion": list(source.lens.distortion),
-                    "undistortion": "none"
-                    if source.undistortion is None
-                    else "cubic, same intrinsics",
-                    "valid_share": 1.0 if mask is None else float(mask.mean()),
-                    **({"delay": camera.delay} if camera.delay else {}),
-                    **({"readout": camera.readout} if camera.readout else {}),
-                }
-                for camera, source, mask in views
-            ],
+            "cameras": [_camera_metadata(*view) for view in views],
         }
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
@@ -291,11 +271,7 @@ class Capture:
         missing: set[str] = set()
         try:
             for index, results in enumerate(zip(*streams, strict=True), start=start):
-                errors = {
-                    n: f
-                    for n, f in zip(self.names, results, strict=True)
-                    if isinstance(f, Exception)
-                }
+                errors = _errors(self.names, results)
                 if strict and errors:
                     raise next(iter(errors.values()))
                 for name in errors.keys() - missing:
@@ -303,13 +279,16 @@ class Capture:
                 missing = set(errors)
                 images = tuple(None if isinstance(f, Exception) else f for f in results)
                 problems = tuple(f"{name}: {error}" for name, error in errors.items())
-                if index == 0 and any(source.delay for source in self._sources):
-                    yield PartialFrame(index, self._at_first_instant(images), problems, images)
-                else:
-                    yield PartialFrame(index, images, problems)
+                yield self._at_instant(PartialFrame(index, images, problems))
         finally:
             for stream in streams:
                 stream.close()
+
+    def _at_instant(self, frame: PartialFrame) -> PartialFrame:
+        """Return the frame, the first one with images at its instant."""
+        if frame.index or not any(source.delay for source in self._sources):
+            return frame
+        return replace(frame, images=self._at_first_instant(frame.images), recorded=frame.images)
 
     def _at_first_instant(
         self, images: Sequence[np.ndarray | None]
@@ -327,6 +306,37 @@ class Capture:
             image if isinstance(result, Exception) else result
             for image, result in zip(images, results, strict=True)
         )
+
+
+def _errors(names: Sequence[str], results: Sequence[ImageOrError]) -> dict[str, Exception]:
+    """Return the errors among the images of one frame, by their cameras' names."""
+    return {n: f for n, f in zip(names, results, strict=True) if isinstance(f, Exception)}
+
+
+def _masks(
+    sources: Sequence[CameraSource], cameras: Sequence[Camera]
+) -> tuple[np.ndarray | None, ...]:
+    """Return the masks of the valid pixels of cameras, None where all are valid."""
+    return tuple(source.mask(camera) for source, camera in zip(sources, cameras, strict=True))
+
+
+def _camera_metadata(
+    camera: Camera, source: CameraSource, mask: np.ndarray | None
+) -> dict[str, Any]:
+    """Return the reading of a camera's images in JSON types."""
+    return {
+        "name": camera.name,
+        "first_frame": int(source.frame_indices[0]),
+        "recorded_size": [source.reader.width, source.reader.height],
+        "size": [camera.width, camera.height],
+        "K": camera.K.tolist(),
+        "lens": source.lens.model,
+        "distortion": list(source.lens.distortion),
+        "undistortion": "none" if source.undistortion is None else "cubic, same intrinsics",
+        "valid_share": 1.0 if mask is None else float(mask.mean()),
+        **({"delay": camera.delay} if camera.delay else {}),
+        **({"readout": camera.readout} if camera.readout else {}),
+    }
 
 
 def load_capture(
@@ -360,6 +370,44 @@ def load_capture(
             broken, or an argument is out of range.
     """
     path = mirrored(str(path)) if is_url(path) else Path(path)
+    _check_arguments(path, downscale, max_frames)
+    reading = reading or ReadConfig()
+    settings = read_settings(path / CAPTURE)
+    layout = find_layout(path)
+    every = layout.read(path)
+    calibration = every.without(path, reading.without)
+    readers = open_clips(calibration.clips, reading.gaps)
+    recorded = _at_clip_sizes(path, calibration.cameras, readers)
+    names = [camera.name for camera in recorded]
+    common = timeline(path, names, readers, reading, max_frames, settings.get("fps"))
+    masks = calibration.masks or ((),) * len(readers)
+    clips = zip(readers, calibration.lenses, recorded, masks, common.clips, strict=True)
+    sources = tuple(CameraSource.of(*clip) for clip in clips)
+    readouts = _readouts(path, every.names, names, settings)
+    cameras = _downscaled_cameras(recorded, downscale, common.clips, readouts)
+    cameras = with_near_planes(cameras, calibration.points, reading.near)
+    capture = Capture(
+        path=path,
+        cameras=cameras,
+        num_frames=len(common.clips[0].frame_indices),
+        fps=common.fps,
+        points=calibration.points,
+        point_colors=calibration.point_colors,
+        masks=_masks(sources, cameras),
+        test_views=held_out_by(path, test_view, settings, every, calibration),
+        truth=_truth_folder(path, common),
+        _sources=sources,
+        downscale=downscale,
+        layout=layout.name,
+        reading=reading,
+        notes=_notes(common, sources, calibration.clips),
+    )
+    if any(reader.has_light for reader in readers):
+        capture = _with_exposure(capture, settings.get("display_exposure"))
+    return capture if reading.color == "none" else _color_corrected(capture, reading.color)
+
+
+def _check_arguments(path: Path, downscale: float, max_frames: int | None) -> None:
     if not path.is_dir():
         kind = "a file" if path.is_file() else "none"
         raise FileNotFoundError(f"{path}: expected a capture folder, found {kind}; check the path.")
@@ -367,15 +415,15 @@ def load_capture(
         raise ValueError(f"load_capture(): `downscale` must be at least 1, got {downscale}.")
     if max_frames is not None and max_frames < 1:
         raise ValueError(f"load_capture(): `max_frames` must be at least 1, got {max_frames}.")
-    reading = reading or ReadConfig()
-    settings = read_settings(path / CAPTURE)
-    layout = find_layout(path)
-    every = layout.read(path)
-    calibration = every.without(path, reading.without)
-    readers = open_clips(calibration.clips, reading.gaps)
-    recorded = [at_clip_size(c, r) for c, r in zip(calibration.cameras, readers, strict=True)]
+
+
+def _at_clip_sizes(
+    path: Path, cameras: Sequence[Camera], readers: Sequence[FrameReader]
+) -> list[Camera]:
+    """Return the cameras at the sizes of their clips, with a warning if a size differs."""
+    recorded = [at_clip_size(c, r) for c, r in zip(cameras, readers, strict=True)]
     if scaled_cameras := [
-        new for old, new in zip(calibration.cameras, recorded, strict=True) if new is not old
+        new for old, new in zip(cameras, recorded, strict=True) if new is not old
     ]:
         _LOG.warning(
             "%s: the clips of %s do not have the calibrated size (the first has %dx%d); the "
@@ -387,48 +435,15 @@ def load_capture(
                 scaled_cameras[0].height,
             ),
         )
-    names = [camera.name for camera in recorded]
-    common = timeline(path, names, readers, reading, max_frames, settings.get("fps"))
-    masks = calibration.masks or ((),) * len(readers)
-    clips = zip(readers, calibration.lenses, recorded, masks, common.clips, strict=True)
-    sources = tuple(CameraSource.of(*clip) for clip in clips)
-    readouts = _readouts(path, every.names, names, settings)
-    cameras = tuple(
-        replace(
-            _resized(camera, downscale),
-            delay=times.delay / times.rate,
-            readout=readout / times.rate,
-        )
-        for camera, times, readout in zip(recorded, common.clips, readouts, strict=True)
-    )
-    _check_downscale(downscale, cameras, recorded)
-    cameras = with_near_planes(cameras, calibration.points, reading.near)
-    capture = Capture(
-        path=path,
-        cameras=cameras,
-        num_frames=len(common.clips[0].frame_indices),
-        fps=common.fps,
-        points=calibration.points,
-        point_colors=calibration.point_colors,
-        masks=tuple(s.mask(c) for s, c in zip(sources, cameras, strict=True)),
-        test_views=held_out_by(path, test_view, settings, every, calibration),
-        # The frames of the ground truth are numbered like the frames of the clips.
-        truth=path / "truth" if common.unchanged and (path / "truth").is_dir() else None,
-        _sources=sources,
-        downscale=downscale,
-        layout=layout.name,
-        reading=reading,
-        notes=(
-            *common.notes,
-            *(note for source in sources for note in source.notes),
-            *_photos(calibration.clips),
-        ),
-    )
-    if any(reader.has_light for reader in readers):
-        stops = settings.get("display_exposure")
-        stops = display_stops(next(capture.partial_frames(0, 1)).images) if stops is None else stops
-        capture = replace(capture, display_exposure=stops)
-    return capture if reading.color == "none" else _color_corrected(capture, reading.color)
+    return recorded
+
+
+def _with_exposure(capture: Capture, stops: float | None) -> Capture:
+    """Return a capture of linear light that a display brightens by `stops`, None: by its first
+    images.
+    """
+    stops = display_stops(next(capture.partial_frames(0, 1)).images) if stops is None else stops
+    return replace(capture, display_exposure=stops)
 
 
 def _readouts(
@@ -450,6 +465,19 @@ def _readouts(
     return [readout.get(name, 0.0) for name in names]
 
 
+def _truth_folder(path: Path, common: Timeline) -> Path | None:
+    # The frames of the ground truth are numbered like the frames of the clips.
+    return path / "truth" if common.unchanged and (path / "truth").is_dir() else None
+
+
+def _notes(
+    common: Timeline, sources: Sequence[CameraSource], clips: Sequence[Clip]
+) -> tuple[str, ...]:
+    """Return the notes on the timeline, on the masks and on photos."""
+    masks = (note for source in sources for note in source.notes)
+    return (*common.notes, *masks, *_photos(clips))
+
+
 def _photos(clips: Sequence[Clip]) -> tuple[str, ...]:
     """Return a note if the clips are the photos in one folder."""
     files = [clip[0] for clip in clips if isinstance(clip, tuple) and len(clip) == 1]
@@ -458,11 +486,26 @@ def _photos(clips: Sequence[Clip]) -> tuple[str, ...]:
     return (f"{len(files)} photos of a static scene, one per camera; a recording has {EXAMPLE}",)
 
 
+def _downscaled_cameras(
+    recorded: Sequence[Camera],
+    downscale: float,
+    clips: Sequence[ClipTimes],
+    readouts: Sequence[float],
+) -> list[Camera]:
+    """Return the downscaled cameras of clips, with their delays and readouts."""
+    cameras = [
+        _resized(camera, downscale, times, readout)
+        for camera, times, readout in zip(recorded, clips, readouts, strict=True)
+    ]
+    _check_downscale(downscale, cameras, recorded)
+    return cameras
+
+
 def _check_downscale(
     downscale: float, cameras: Sequence[Camera], recorded: Sequence[Camera]
 ) -> None:
-    if downscale > 1 and min(min(camera.width, camera.height) for camera in cameras) < MIN_SIDE:
-        largest = min(min(camera.width, camera.height) for camera in recorded) / MIN_SIDE
+    if downscale > 1 and _shortest_side(cameras) < MIN_SIDE:
+        largest = _shortest_side(recorded) / MIN_SIDE
         remedy = f"use at most {np.floor(100 * largest) / 100:g}" if largest >= 1 else "use 1"
         raise ValueError(
             f"load_capture(): `downscale` must leave images of at least {MIN_SIDE} pixels on each "
@@ -470,16 +513,14 @@ def _check_downscale(
         )
 
 
+def _shortest_side(cameras: Sequence[Camera]) -> int:
+    return min(min(camera.width, camera.height) for camera in cameras)
+
+
 def _color_corrected(capture: Capture, color: str) -> Capture:
     """Return the capture with colours corrected between cameras; `color` as in `ReadConfig`."""
-    method, _, name = color.partition(":")
-    if method != "linear" or (name and name not in capture.names):
-        raise ValueError(
-            f"{capture.path}: `color` must be none, linear, or linear with a camera of "
-            f"{', '.join(capture.names)}, such as linear:{capture.names[0]}, got {color!r}."
-        )
+    reference = _color_reference(capture, color)
     images = next(capture.displayed().partial_frames(0, 1)).images
-    reference = capture.names.index(name) if name else None
     fit = fit_colors(capture.cameras, images, capture.masks, reference)
     sources = tuple(
         replace(s, color_correction=fit.correction(view)) for view, s in enumerate(capture._sources)
@@ -487,9 +528,23 @@ def _color_corrected(capture: Capture, color: str) -> Capture:
     return replace(capture, _sources=sources, colors=fit)
 
 
-def _resized(camera: Camera, downscale: float) -> Camera:
-    if downscale == 1:
-        return camera
-    return camera.resized(
-        max(1, round(camera.width / downscale)), max(1, round(camera.height / downscale))
-    )
+def _color_reference(capture: Capture, color: str) -> int | None:
+    """Return the index of the camera in `color`, None without one."""
+    method, _, name = color.partition(":")
+    if method != "linear" or (name and name not in capture.names):
+        raise ValueError(
+            f"{capture.path}: `color` must be none, linear, or linear with a camera of "
+            f"{', '.join(capture.names)}, such as linear:{capture.names[0]}, got {color!r}."
+        )
+    return capture.names.index(name) if name else None
+
+
+def _resized(camera: Camera, downscale: float, times: ClipTimes, readout: float) -> Camera:
+    """Return a clip's camera, downscaled; its delay and `readout` are in frames of the clip, the
+    result's in instants.
+    """
+    if downscale != 1:
+        camera = camera.resized(
+            max(1, round(camera.width / downscale)), max(1, round(camera.height / downscale))
+        )
+    return replace(camera, delay=times.delay / times.rate, readout=readout / times.rate)
