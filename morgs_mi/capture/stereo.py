@@ -78,14 +78,11 @@ class _View:
 
     @classmethod
     def of(cls, camera: Camera, image: np.ndarray, mask: np.ndarray | None) -> _View:
+        """Return the view of a camera with the mask of its valid pixels, None: all are valid."""
         scale = min(1.0, np.sqrt(_PIXELS / (camera.width * camera.height)))
         size = round(camera.width * scale), round(camera.height * scale)
-        valid = (
-            np.full(image.shape[:2], 255, np.uint8)
-            if mask is None
-            else np.uint8(255) * mask.astype(np.uint8)
-        )
-        valid = cv2.resize(valid, size, interpolation=cv2.INTER_NEAREST)
+        mask = np.ones(image.shape[:2], bool) if mask is None else mask
+        valid = cv2.resize(255 * mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
         small_image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         return cls(camera.resized(*size), small_image, cv2.blur(small_image, (3, 3)), valid)
 
@@ -93,14 +90,12 @@ class _View:
 def _neighbours(cameras: Sequence[Camera], scene_points: np.ndarray) -> list[tuple[int, int]]:
     """Return the pairs of cameras that are close enough."""
     pairs = set()
-    for i, (camera, depth) in enumerate(
-        zip(cameras, scene_depths(cameras, scene_points), strict=True)
-    ):
-        angles = angles_to(camera, depth, cameras)
+    for i, depth in enumerate(scene_depths(cameras, scene_points)):
+        angles = angles_to(cameras[i], depth, cameras)
         angles[i] = np.inf
-        for j in np.argsort(angles)[:_NEIGHBOURS]:
+        for j in np.argsort(angles)[:_NEIGHBOURS].tolist():
             if _MIN_ANGLE <= angles[j] <= _MAX_ANGLE:
-                pairs.add((min(i, int(j)), max(i, int(j))))
+                pairs.add((min(i, j), max(i, j)))
     return sorted(pairs)
 
 
@@ -114,6 +109,32 @@ def _depth_range(
         return _NEAR * float(near), _FAR * float(far)
     middle = scene_depths(cameras, scene_points)[view]
     return middle / _BLIND, middle * _BLIND
+
+
+def _plane_axes(a: Camera, b: Camera) -> np.ndarray:
+    """Return the axes of the plane that two views are rectified to, rows right, down and forward
+    [3, 3].
+    """
+    right = b.position - a.position
+    right = right / float(np.linalg.norm(right))
+    forward = a.viewmat[2, :3] + b.viewmat[2, :3]
+    forward = forward - forward @ right * right
+    forward /= max(float(np.linalg.norm(forward)), 1e-12)
+    return np.stack([right, np.cross(forward, right), forward])
+
+
+def _to_plane(camera: Camera, axes: np.ndarray, focal: float) -> np.ndarray:
+    """Return the homography [3, 3] from a view's pixels to a plane."""
+    return np.diag([focal, focal, 1]) @ axes @ camera.viewmat[:3, :3].T @ np.linalg.inv(camera.K)
+
+
+def _corners(camera: Camera) -> np.ndarray:
+    """Return the corners of an image in homogeneous pixels [4, 3]."""
+    return np.array([[x, y, 1] for x in (0, camera.width) for y in (0, camera.height)])
+
+
+def _box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return points.min(axis=0), points.max(axis=0)
 
 
 @dataclass(frozen=True)
@@ -134,43 +155,39 @@ class _Rectified:
         """Return the rectification of two views, None if no plane shows both, e.g. with one camera
         behind the other.
         """
-        right = b.position - a.position
-        baseline = float(np.linalg.norm(right))
-        right = right / baseline
-        forward = a.viewmat[2, :3] + b.viewmat[2, :3]
-        forward = forward - forward @ right * right
-        forward /= max(float(np.linalg.norm(forward)), 1e-12)
-        axes = np.stack([right, np.cross(forward, right), forward])
+        axes = _plane_axes(a, b)
         focal = float(a.K[0, 0] + b.K[0, 0]) / 2
-        homographies = []
-        boxes = []
-        for camera in (a, b):
-            H = (
-                np.diag([focal, focal, 1])
-                @ axes
-                @ camera.viewmat[:3, :3].T
-                @ np.linalg.inv(camera.K)
-            )
-            sides = (
-                np.array([[x, y, 1] for x in (0, camera.width) for y in (0, camera.height)]) @ H.T
-            )
-            if sides[:, 2].min() < _LEAST_DEPTH:
-                return None
-            homographies.append(H)
-            boxes.append(
-                [
-                    (sides[:, :2] / sides[:, 2:]).min(axis=0),
-                    (sides[:, :2] / sides[:, 2:]).max(axis=0),
-                ]
-            )
-        (a0, a1), (b0, b1) = boxes
+        to_plane = [_to_plane(camera, axes, focal) for camera in (a, b)]
+        corners = [_corners(camera) @ H.T for camera, H in zip((a, b), to_plane, strict=True)]
+        if any(rays[:, 2].min() < _LEAST_DEPTH for rays in corners):
+            return None
+        (a0, a1), (b0, b1) = (_box(rays[:, :2] / rays[:, 2:]) for rays in corners)
         top = max(a0[1], b0[1])
         bottom = min(a1[1], b1[1])
         size = int(np.ceil(max(a1[0] - a0[0], b1[0] - b0[0]))), int(np.ceil(bottom - top))
-        transforms = [
-            _shift(-box[0][0], -top) @ H for box, H in zip(boxes, homographies, strict=True)
-        ]
-        return cls(axes, focal, baseline, (transforms[0], transforms[1]), (a0[0], b0[0], top), size)
+        homographies = _shift(-a0[0], -top) @ to_plane[0], _shift(-b0[0], -top) @ to_plane[1]
+        baseline = float(np.linalg.norm(b.position - a.position))
+        return cls(axes, focal, baseline, homographies, (a0[0], b0[0], top), size)
+
+    @property
+    def shift(self) -> float:
+        """Disparity of infinitely distant points, px."""
+        return self.corners[1] - self.corners[0]
+
+    def disparity_range(self, depths: tuple[float, float]) -> tuple[int, int]:
+        """Return the lowest disparity and the number of disparities in a range of depths."""
+        product = self.focal * self.baseline
+        lowest = int(np.floor(product / depths[1] + self.shift))
+        steps = product / depths[0] + self.shift - lowest + 1
+        return lowest, 16 * max(1, int(np.ceil(steps / 16)))
+
+    def points(self, disparity: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        """Return the points [P, 3] relative to the first camera at the pixels in `mask` [H, W]."""
+        rows, columns = np.nonzero(mask)
+        depth = self.focal * self.baseline / (disparity[mask] - self.shift)
+        x = columns + 0.5 + self.corners[0]
+        y = rows + 0.5 + self.corners[2]
+        return np.stack([x * depth / self.focal, y * depth / self.focal, depth], axis=1) @ self.axes
 
     def warped(
         self, index: int, image: np.ndarray, interpolation: int = cv2.INTER_LINEAR
@@ -187,45 +204,37 @@ def _matched(a: _View, b: _View, depths: tuple[float, float]) -> np.ndarray:
     rig = _Rectified.of(a.camera, b.camera)
     if rig is None:
         return np.zeros((0, 6))
-    width, height = rig.size
-    product = rig.focal * rig.baseline
-    shift = rig.corners[1] - rig.corners[0]
-    lowest = int(np.floor(product / depths[1] + shift))
-    count = 16 * max(1, int(np.ceil((product / depths[0] + shift - lowest + 1) / 16)))
+    lowest, count = rig.disparity_range(depths)
     # Strongly converging cameras have no useful plane in common.
+    width, height = rig.size
     if min(rig.size) < 2 * _BLOCK or count > width or width * height > 4 * a.image[..., 0].size:
         return np.zeros((0, 6))
-    images, valid = (
-        [rig.warped(k, image, flag) for k, image in enumerate(pair)]
-        for pair, flag in (
-            ((a.image, b.image), cv2.INTER_LINEAR),
-            ((a.valid, b.valid), cv2.INTER_NEAREST),
-        )
-    )
-    left, right = images
+    left = rig.warped(0, a.image)
+    right = rig.warped(1, b.image)
     forth = _disparity(left, right, lowest, count)
     back = _disparity(right, left, 1 - lowest - count, count)
+    valid = [rig.warped(k, view.valid, cv2.INTER_NEAREST) > 0 for k, view in enumerate((a, b))]
+    mask = (
+        _consistency_mask(forth, back, valid[1])
+        & (forth >= lowest)
+        & (forth - rig.shift > 0)
+        & valid[0]
+    )
+    points = rig.points(forth, mask) + a.camera.position
+    return np.concatenate([points, left[mask] / 255.0], axis=1)
+
+
+def _consistency_mask(forth: np.ndarray, back: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """Return the mask [H, W] of the pixels whose partner in the other image is valid and has them
+    as its partner, from the disparities of both directions.
+    """
+    height, width = forth.shape
     rows, columns = np.mgrid[:height, :width]
     partner = np.round(columns - forth).astype(int)
     has_partner = (partner >= 0) & (partner < width)
     partner = np.clip(partner, 0, width - 1)
     agree = np.abs(forth + back[rows, partner]) <= _MAX_DIFFERENCE
-    mask = (
-        agree
-        & has_partner
-        & (forth >= lowest)
-        & (forth - shift > 0)
-        & (valid[0] > 0)
-        & (valid[1][rows, partner] > 0)
-    )
-    depth = product / (forth[mask] - shift)
-    x = columns[mask] + 0.5 + rig.corners[0]
-    y = rows[mask] + 0.5 + rig.corners[2]
-    points = (
-        np.stack([x * depth / rig.focal, y * depth / rig.focal, depth], axis=1) @ rig.axes
-        + a.camera.position
-    )
-    return np.concatenate([points, left[mask] / 255.0], axis=1)
+    return agree & has_partner & valid[rows, partner]
 
 
 def _disparity(left: np.ndarray, right: np.ndarray, lowest: int, count: int) -> np.ndarray:
@@ -258,15 +267,13 @@ def _some_confirmed(points: np.ndarray, others: Sequence[_View]) -> np.ndarray:
     """
     if not others:
         return points[:_POINTS]
-    parts = []
-    count = 0
+    confirmed = points[:0]
     for start in range(0, len(points), _POINTS):
         part = points[start : start + _POINTS]
-        parts.append(part[_confirmed(part, others)])
-        count += len(parts[-1])
-        if count >= _POINTS:
+        confirmed = np.concatenate([confirmed, part[_confirmed(part, others)]])
+        if len(confirmed) >= _POINTS:
             break
-    return np.concatenate([points[:0], *parts])[:_POINTS]
+    return confirmed[:_POINTS]
 
 
 def _confirmed(points: np.ndarray, others: Sequence[_View]) -> np.ndarray:
