@@ -86,17 +86,14 @@ def fit_colors(
     """
     features = [detect(image, mask) for image, mask in zip(images, masks, strict=True)]
     pairs, colors = matched_colors(cameras, images, features, match_views(features, cameras))
-    counts = np.zeros((len(cameras),) * 2, int)
-    for match in pairs:
-        counts[match.views] = counts[match.views[::-1]] = len(match.features)
+    counts = _shared_counts(pairs, len(cameras))
+    samples = tuple(counts.sum(1).tolist())
     start = int(counts.sum(1).argmax()) if reference is None else reference
     corrected: dict[int, np.ndarray] = {start: colors[start]}
     matrices: list[np.ndarray | None] = [None] * len(cameras)
     while len(corrected) < len(cameras):
-        shared_counts = counts[:, list(corrected)].sum(1)
-        shared_counts[list(corrected)] = -1
-        view = int(shared_counts.argmax())
-        if shared_counts[view] >= _MIN_SAMPLES:
+        view = _next_view(counts, list(corrected))
+        if counts[view, list(corrected)].sum() >= _MIN_SAMPLES:
             matrices[view] = matrix = _fit(*_shared_colors(view, pairs, colors, corrected))
             corrected[view] = _corrected(colors[view], matrix)
         else:
@@ -107,16 +104,23 @@ def fit_colors(
             corrected[view] = colors[view]
             counts[view] = counts[:, view] = 0  # no other view is corrected towards it
     final_colors = [corrected[view] for view in range(len(cameras))]
-    return ColorFit(
-        start,
-        tuple(matrices),
-        tuple(
-            sum(len(pair.features) for pair in pairs if view in pair.views)
-            for view in range(len(cameras))
-        ),
-        _differences(pairs, colors),
-        _differences(pairs, final_colors),
-    )
+    before = _differences(pairs, colors)
+    return ColorFit(start, tuple(matrices), samples, before, _differences(pairs, final_colors))
+
+
+def _shared_counts(pairs: Sequence[Match], count: int) -> np.ndarray:
+    """Return the numbers of points that two of `count` views share [C, C]."""
+    counts = np.zeros((count, count), int)
+    for match in pairs:
+        counts[match.views] = counts[match.views[::-1]] = len(match.features)
+    return counts
+
+
+def _next_view(counts: np.ndarray, corrected: list[int]) -> int:
+    """Return the view that shares most points with the corrected ones."""
+    shared_counts = counts[:, corrected].sum(1)
+    shared_counts[corrected] = -1
+    return int(shared_counts.argmax())
 
 
 def matched_colors(
@@ -218,9 +222,11 @@ def _differences(pairs: Sequence[Match], colors: Sequence[np.ndarray]) -> tuple[
         if len(a):
             for view in pair.views:
                 differences[view].append(delta_e(a, b))
-    return tuple(
-        float(np.mean(np.concatenate(values))) if values else float("nan") for values in differences
-    )
+    return tuple(map(_mean, differences))
+
+
+def _mean(batches: Sequence[np.ndarray]) -> float:
+    return float(np.mean(np.concatenate(batches))) if batches else float("nan")
 
 
 def _encode(light: np.ndarray) -> np.ndarray:

@@ -79,38 +79,50 @@ def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features
     """Return the SIFT features of an image uint8 [H, W, 3] where `mask` [H, W] is true; none
     without an image.
     """
-    none = Features(
-        np.zeros((0, 2)),
-        np.zeros((0, 128), np.float32),
-        np.zeros((0, 3), np.float32),
-        np.zeros((0, 2)),
-    )
     if image is None:
-        return none
+        return _no_features()
     height, width = image.shape[:2]
-    scale = min(1.0, np.sqrt(_DETECTION_PIXELS / (width * height)))
-    size = (round(width * scale), round(height * scale))
-    grey = cv2.cvtColor(cv2.resize(image, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
-    where = (
-        None
-        if mask is None
-        else cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    )
-    # Without precise upscaling OpenCV's features are off by a quarter of a pixel.
-    sift = cv2.SIFT.create(nfeatures=MAX_FEATURES, enable_precise_upscale=True)
-    keypoints, descriptors = sift.detectAndCompute(grey, where)
+    size = _detection_size(width, height)
+    keypoints, descriptors = _sift(image, mask, size)
     if descriptors is None:
-        return none
+        return _no_features()
     pixel_scale = width / size[0], height / size[1]
     points = (np.array([k.pt for k in keypoints]) + 0.5) * pixel_scale
-    angles = np.deg2rad([k.angle for k in keypoints])
-    sizes = np.array([k.size for k in keypoints])
-    axes = 0.5 * sizes[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1) * pixel_scale
     # RootSIFT: square roots of the normalised descriptors are easier to distinguish (Arandjelovic
     # 2012).
     descriptors = np.sqrt(descriptors / descriptors.sum(1, keepdims=True))
     columns, rows = np.clip(points.astype(int), 0, (width - 1, height - 1)).T
-    return Features(points, descriptors, image[rows, columns].astype(np.float32) / 255, axes)
+    colors = image[rows, columns].astype(np.float32) / 255
+    return Features(points, descriptors, colors, _patch_axes(keypoints) * pixel_scale)
+
+
+def _no_features() -> Features:
+    points = np.zeros((0, 2))
+    return Features(points, np.zeros((0, 128), np.float32), np.zeros((0, 3), np.float32), points)
+
+
+def _detection_size(width: int, height: int) -> tuple[int, int]:
+    scale = min(1.0, np.sqrt(_DETECTION_PIXELS / (width * height)))
+    return round(width * scale), round(height * scale)
+
+
+def _sift(
+    image: np.ndarray, mask: np.ndarray | None, size: tuple[int, int]
+) -> tuple[Sequence[cv2.KeyPoint], np.ndarray | None]:
+    """Return the keypoints of an image, in pixels of the reduced `size`, and their descriptors."""
+    grey = cv2.cvtColor(cv2.resize(image, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+    if mask is not None:
+        mask = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    # Without precise upscaling OpenCV's features are off by a quarter of a pixel.
+    sift = cv2.SIFT.create(nfeatures=MAX_FEATURES, enable_precise_upscale=True)
+    return sift.detectAndCompute(grey, mask)
+
+
+def _patch_axes(keypoints: Sequence[cv2.KeyPoint]) -> np.ndarray:
+    """Return the axes of the keypoints' patches [K, 2], as in `Features`."""
+    angles = np.deg2rad([k.angle for k in keypoints])
+    sizes = np.array([k.size for k in keypoints])
+    return 0.5 * sizes[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
 def match_views(features: Sequence[Features], cameras: Sequence[Camera]) -> list[Match]:
@@ -150,13 +162,17 @@ def _matches(a: Features, b: Features) -> np.ndarray:
     pairs = mutual_neighbours(descriptor_distances(a, b))
     if len(pairs) < _MIN_MATCHES:
         return none
-    points = a.points[pairs[:, 0]], b.points[pairs[:, 1]]
+    inliers = _epipolar_inliers(a.points[pairs[:, 0]], b.points[pairs[:, 1]])
+    return pairs[inliers] if np.count_nonzero(inliers) >= _MIN_MATCHES else none
+
+
+def _epipolar_inliers(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Return the mask [M] of the matched pixels [M, 2] that fit one epipolar geometry."""
     try:
-        _, inliers = cv2.findFundamentalMat(*points, cv2.USAC_MAGSAC, 2.0, 0.999, 5000)
+        _, inliers = cv2.findFundamentalMat(x, y, cv2.USAC_MAGSAC, 2.0, 0.999, 5000)
     except cv2.error:  # raised for some matches that fit no geometry
-        return none
-    inlier_pairs = pairs[inliers.ravel() > 0] if inliers is not None else none
-    return inlier_pairs if len(inlier_pairs) >= _MIN_MATCHES else none
+        inliers = None
+    return np.zeros(len(x), bool) if inliers is None else inliers.ravel() > 0
 
 
 def descriptor_distances(a: Features, b: Features) -> np.ndarray:
@@ -184,15 +200,13 @@ def reprojection_errors(
     A match is triangulated from its two features. Its error is the mean distance of the point's
     projections from the features; it is infinite for a point behind a camera.
     """
-    count = len(match.features)
-    tracks = np.tile(np.arange(count), 2)
-    views = np.repeat(match.views, count)
     pixels = np.concatenate(
         [features[v].points[match.features[:, k]] for k, v in enumerate(match.views)]
     )
-    points = intersect(tracks, views, pixels, cameras, count)
-    errors = _distances(points[tracks], views, pixels, cameras)
-    return errors.reshape(2, count).mean(0)
+    points = intersect_pairs(pixels, match.views, cameras)
+    views = np.repeat(match.views, len(points))
+    errors = _distances(np.tile(points, (2, 1)), views, pixels, cameras)
+    return errors.reshape(2, len(points)).mean(0)
 
 
 def triangulate(
@@ -212,53 +226,59 @@ def triangulate(
         max_error: largest distance of a point's projection from any of its features, px.
         min_angle: smallest accepted angle between the rays to a point, degrees.
     """
+    errors = [reprojection_errors(match, features, cameras) for match in matches]
     close = [
-        replace(
-            match,
-            features=match.features[reprojection_errors(match, features, cameras) <= max_error],
-        )
-        for match in matches
+        replace(match, features=match.features[error <= max_error])
+        for match, error in zip(matches, errors, strict=True)
     ]
     tracks = join_matches(close, features)
-    track = tracks.ids
-    views = tracks.views
-    pixels = tracks.pixels
-    count = tracks.count
-    if not count:
+    if not tracks.count:
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
-    points = intersect(track, views, pixels, cameras, count)
-    worst = np.zeros(count)
-    np.maximum.at(worst, track, _distances(points[track], views, pixels, cameras))
-    good = (worst <= max_error) & (_widest_angles(points, track, views, cameras) >= min_angle)
+    points = intersect(tracks.ids, tracks.views, tracks.pixels, cameras, tracks.count)
+    good = _largest_errors(points, tracks, cameras) <= max_error
+    good &= _widest_angles(points, tracks.ids, tracks.views, cameras) >= min_angle
     return points[good].astype(np.float32), tracks.mean_colors()[good].astype(np.float32)
+
+
+def _largest_errors(points: np.ndarray, tracks: Tracks, cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the largest distance of each point's projections from its features [P], px."""
+    worst = np.zeros(len(points))
+    distances = _distances(points[tracks.ids], tracks.views, tracks.pixels, cameras)
+    np.maximum.at(worst, tracks.ids, distances)
+    return worst
 
 
 def join_matches(matches: Sequence[Match], features: Sequence[Features]) -> Tracks:
     """Return the tracks of features that are matched directly or through other features, all in
     different views.
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     starts = np.concatenate([[0], np.cumsum([len(f.points) for f in features])]).astype(int)
     edges = np.concatenate(
         [np.zeros((0, 2), int), *(m.features + starts[list(m.views)] for m in matches)]
     )
-    graph = coo_array(
-        (np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(starts[-1], starts[-1])
-    )
-    _, track = connected_components(graph, directed=False)
+    track = _components(edges, starts[-1])
     views = np.repeat(np.arange(len(features)), np.diff(starts))
-    # A track is valid if it has at least two features, all in different views.
+    members = np.flatnonzero(_valid_tracks(track, views)[track])
+    _, track = np.unique(track[members], return_inverse=True)
+    pixels = np.concatenate([f.points for f in features])[members]
+    colors = np.concatenate([f.colors for f in features])[members]
+    return Tracks(track, views[members], pixels, colors)
+
+
+def _components(edges: np.ndarray, count: int) -> np.ndarray:
+    """Return the connected component of each of `count` nodes of a graph, int [count]."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
+    return connected_components(graph, directed=False)[1]
+
+
+def _valid_tracks(track: np.ndarray, views: np.ndarray) -> np.ndarray:
+    """Return the mask of tracks that have at least two features, all in different views."""
     sizes = np.bincount(track)
     distinct = np.bincount(np.unique(np.stack([track, views]), axis=1)[0], minlength=len(sizes))
-    members = np.flatnonzero(((sizes >= 2) & (distinct == sizes))[track])
-    _, track = np.unique(track[members], return_inverse=True)
-    pixels, colors = (
-        np.concatenate([getattr(f, name) for f in features])[members]
-        for name in ("points", "colors")
-    )
-    return Tracks(track, views[members], pixels, colors)
+    return (sizes >= 2) & (distinct == sizes)
 
 
 def intersect(
@@ -269,26 +289,47 @@ def intersect(
 
     Observation k is the pixel position `pixels[k]` of point `track[k]` in view `views[k]`.
     """
-    V = np.array([np.asarray(camera.viewmat, np.float64)[:3] for camera in cameras])
-    # Positions relative to the rig's centre and size make the system well conditioned.
-    positions = np.array([camera.position for camera in cameras])
-    middle = positions.mean(0)
-    scale = np.linalg.norm(positions - positions.mean(0), axis=1).max() or 1.0
-    V = np.concatenate(
-        [V[:, :, :3], ((V[:, :, :3] @ middle + V[:, :, 3]) / scale)[..., None]], axis=2
-    )[views]
-    # Image coordinates at depth 1, in each camera's own frame.
-    x = np.empty_like(pixels)
-    for view in np.unique(views):
-        of_view = views == view
-        local = replace(cameras[view], viewmat=np.eye(4))
-        x[of_view] = local.unproject(pixels[of_view], np.ones(np.count_nonzero(of_view)))[:, :2]
+    V, middle, scale = _relative_poses(cameras)
+    V = V[views]
+    x = _at_depth_one(pixels, views, cameras)
     rows = x[:, :, None] * V[:, 2:3] - V[:, :2]
     system = np.zeros((count, 4, 4))
     np.add.at(system, track, np.einsum("kri,krj->kij", rows, rows))
     solution = np.linalg.eigh(system)[1][:, :, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         return solution[:, :3] / solution[:, 3:] * scale + middle
+
+
+def _relative_poses(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the poses [C, 3, 4] relative to the rig's centre and size, which make a system of
+    equations well conditioned, the centre [3] and the size.
+    """
+    positions = np.array([camera.position for camera in cameras])
+    middle = positions.mean(0)
+    scale = np.linalg.norm(positions - middle, axis=1).max() or 1.0
+    V = np.array([np.asarray(camera.viewmat, np.float64)[:3] for camera in cameras])
+    V[:, :, 3] = (V[:, :, :3] @ middle + V[:, :, 3]) / scale
+    return V, middle, scale
+
+
+def intersect_pairs(
+    pixels: np.ndarray, views: tuple[int, int], cameras: Sequence[Camera]
+) -> np.ndarray:
+    """Return the points [M, 3] of `intersect` that each of two views sees once; `pixels` [2 M, 2]
+    are those of the first view, then those of the second one.
+    """
+    count = len(pixels) // 2
+    return intersect(np.tile(np.arange(count), 2), np.repeat(views, count), pixels, cameras, count)
+
+
+def _at_depth_one(pixels: np.ndarray, views: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the image coordinates of pixels at depth 1 [n, 2], each in its camera's frame."""
+    x = np.empty_like(pixels)
+    for view in np.unique(views):
+        of_view = views == view
+        local = replace(cameras[view], viewmat=np.eye(4))
+        x[of_view] = local.unproject(pixels[of_view], np.ones(np.count_nonzero(of_view)))[:, :2]
+    return x
 
 
 def _distances(
@@ -315,11 +356,13 @@ def _widest_angles(
     """
     positions = np.array([camera.position for camera in cameras])[views]
     with np.errstate(invalid="ignore"):
-        rays = points[track] - positions
-        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        mean = np.stack([np.bincount(track, axis) for axis in rays.T], axis=1)
-        mean /= np.linalg.norm(mean, axis=1, keepdims=True)
+        rays = _directions(points[track] - positions)
+        mean = _directions(np.stack([np.bincount(track, axis) for axis in rays.T], axis=1))
         angle = np.rad2deg(np.arccos(np.clip((rays * mean[track]).sum(1), -1, 1)))
     widest = np.zeros(len(points))
     np.maximum.at(widest, track, np.nan_to_num(angle))
     return 2 * widest
+
+
+def _directions(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

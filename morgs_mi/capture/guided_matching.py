@@ -16,7 +16,7 @@ from morgs_mi.capture.features import (
     Features,
     Match,
     descriptor_distances,
-    intersect,
+    intersect_pairs,
     mutual_neighbours,
 )
 from morgs_mi.core.camera import Camera
@@ -35,21 +35,20 @@ def match_guided(
     features: Sequence[Features], cameras: Sequence[Camera], pairs: Iterable[tuple[int, int]]
 ) -> list[Match]:
     """Return the matches of pairs of views, found with the poses of their cameras."""
-    matches = []
-    for i, j in pairs:
-        a = features[i]
-        b = features[j]
-        if min(len(a.points), len(b.points)) < 2:
-            continue
-        distances = descriptor_distances(a, b)
-        near = _line_distances(a.points, b.points, cameras[i], cameras[j]) <= _BAND
-        index_pairs = mutual_neighbours(
-            np.where(near & (distances <= _MAX_DISTANCE), distances, 2.0)
-        )
-        index_pairs = index_pairs[_patches_agree(a, b, index_pairs, cameras[i], cameras[j])]
-        if len(index_pairs):
-            matches.append(Match((i, j), index_pairs))
-    return matches
+    matches = (
+        Match((i, j), _matches(features[i], features[j], cameras[i], cameras[j])) for i, j in pairs
+    )
+    return [match for match in matches if len(match.features)]
+
+
+def _matches(a: Features, b: Features, first: Camera, second: Camera) -> np.ndarray:
+    """Return the matched features of two views [M, 2]."""
+    if min(len(a.points), len(b.points)) < 2:
+        return np.zeros((0, 2), int)
+    distances = descriptor_distances(a, b)
+    near = _line_distances(a.points, b.points, first, second) <= _BAND
+    pairs = mutual_neighbours(np.where(near & (distances <= _MAX_DISTANCE), distances, 2.0))
+    return pairs[_patches_agree(a, b, pairs, first, second)]
 
 
 def _line_distances(x: np.ndarray, y: np.ndarray, a: Camera, b: Camera) -> np.ndarray:
@@ -59,11 +58,7 @@ def _line_distances(x: np.ndarray, y: np.ndarray, a: Camera, b: Camera) -> np.nd
     centres = np.array([a.position, b.position], np.float64)
     if np.linalg.norm(centres[1] - centres[0]) <= _ROUNDING * np.linalg.norm(centres):
         return np.full((len(x), len(y)), np.inf)  # two cameras at one position have no lines
-    relative = np.asarray(b.viewmat, np.float64) @ np.linalg.inv(np.asarray(a.viewmat, np.float64))
-    tx, ty, tz = relative[:3, 3]
-    R = relative[:3, :3]
-    essential = np.array([[0, -tz, ty], [tz, 0, -tx], [-ty, tx, 0]]) @ R
-    fundamental = np.linalg.inv(b.K).T @ essential @ np.linalg.inv(a.K)
+    fundamental = _fundamental(a, b)
     x, y = (np.column_stack([v, np.ones(len(v))]) for v in (x, y))
     of_x = x @ fundamental.T
     of_y = y @ fundamental
@@ -72,15 +67,20 @@ def _line_distances(x: np.ndarray, y: np.ndarray, a: Camera, b: Camera) -> np.nd
         return np.abs(of_x @ y.T) / slopes
 
 
+def _fundamental(a: Camera, b: Camera) -> np.ndarray:
+    """Return the fundamental matrix [3, 3], by which a pixel of `a` has its line in `b`."""
+    relative = np.asarray(b.viewmat, np.float64) @ np.linalg.inv(np.asarray(a.viewmat, np.float64))
+    tx, ty, tz = relative[:3, 3]
+    essential = np.array([[0, -tz, ty], [tz, 0, -tx], [-ty, tx, 0]]) @ relative[:3, :3]
+    return np.linalg.inv(b.K).T @ essential @ np.linalg.inv(a.K)
+
+
 def _patches_agree(
     a: Features, b: Features, pairs: np.ndarray, first: Camera, second: Camera
 ) -> np.ndarray:
     """Return whether the patches of each pair [M, 2] agree in size and orientation, [M]."""
-    count = len(pairs)
     pixels = np.concatenate([a.points[pairs[:, 0]], b.points[pairs[:, 1]]])
-    tracks = np.tile(np.arange(count), 2)
-    views = np.repeat([0, 1], count)
-    points = intersect(tracks, views, pixels, (first, second), count)
+    points = intersect_pairs(pixels, (0, 1), (first, second))
     with np.errstate(divide="ignore", invalid="ignore"):
         expected = _carried(points, a.axes[pairs[:, 0]], first, second)
         axes = b.axes[pairs[:, 1]]

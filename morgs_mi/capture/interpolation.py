@@ -39,20 +39,22 @@ def image_between(first: np.ndarray, second: np.ndarray, share: float) -> np.nda
         first, second = (encode_light(image) for image in (first, second))
     pair = [np.clip(image, 0, 1) if has_light else image for image in (second, first)]
     backward, forward = flow_source("dis")(FramePair(pair[0], pair[1]))
-    both = (first, forward, backward, share), (second, backward, forward, 1 - share)
-    total = np.zeros(first.shape, np.float32)
-    weights = np.zeros((*first.shape[:2], 1), np.float32)
-    for image, flow, back, fraction in both:
-        places = _origins(flow, fraction)
-        reliable = _sampled(
-            consistency_mask(flow, back).astype(np.float32), places, cv2.INTER_LINEAR
-        )[..., None]
-        weight = np.float32(1 - fraction) * (reliable + np.float32(_LEAST_WEIGHT))
-        total += weight * _sampled(image.astype(np.float32), places, cv2.INTER_CUBIC)
-        weights += weight
+    first, first_weight = _contribution(first, forward, backward, share)
+    second, second_weight = _contribution(second, backward, forward, 1 - share)
+    mean = (first + second) / (first_weight + second_weight)
     if has_light:
-        return np.maximum(decode_light(total / weights), 0)
-    return np.clip(np.rint(total / weights), 0, 255).astype(np.uint8)
+        return np.maximum(decode_light(mean), 0)
+    return np.clip(np.rint(mean), 0, 255).astype(np.uint8)
+
+
+def _contribution(
+    image: np.ndarray, flow: np.ndarray, back: np.ndarray, share: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a frame moved by a share of its flow, multiplied by its weights, and the weights."""
+    places = _origins(flow, share)
+    reliable = _sampled(consistency_mask(flow, back).astype(np.float32), places, cv2.INTER_LINEAR)
+    weights = np.float32(1 - share) * (reliable[..., None] + np.float32(_LEAST_WEIGHT))
+    return weights * _sampled(image.astype(np.float32), places, cv2.INTER_CUBIC), weights
 
 
 def _origins(flow: np.ndarray, share: float) -> np.ndarray:
