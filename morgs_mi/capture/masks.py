@@ -45,8 +45,7 @@ def opaque_pixels(reader: FrameReader, name: str) -> tuple[np.ndarray | None, st
     """
     if not isinstance(reader, FolderReader):
         return None, ""
-    indices = sorted({0, reader.num_frames // 2, reader.num_frames - 1})
-    mask, *others = (_opaque(reader.files[i], (reader.height, reader.width)) for i in indices)
+    mask, *others = _opaque_masks(reader)
     if any(not np.array_equal(mask, other) for other in others):
         return None, f"{name}: the alpha channel of its images changes over time and is ignored."
     if mask.all():
@@ -55,10 +54,13 @@ def opaque_pixels(reader: FrameReader, name: str) -> tuple[np.ndarray | None, st
         raise ValueError(
             f"{reader.path}: expected opaque pixels, got an alpha channel without any; remove it."
         )
-    return (
-        mask,
-        f"{name}: {100 * (1 - mask.mean()):.1f} % of its pixels are transparent and masked out.",
-    )
+    return mask, f"{name}: {_unused(mask)} % of its pixels are transparent and masked out."
+
+
+def _opaque_masks(reader: FolderReader) -> list[np.ndarray]:
+    """Return the masks of the opaque pixels of the first, the middle and the last image."""
+    indices = sorted({0, reader.num_frames // 2, reader.num_frames - 1})
+    return [_opaque(reader.files[i], (reader.height, reader.width)) for i in indices]
 
 
 def used_pixels(
@@ -78,17 +80,10 @@ def used_pixels(
         ValueError: an image cannot be read or has another aspect ratio, or all pixels are masked
             out.
     """
-    combined_mask = np.ones((height, width), bool)
-    varies = False
-    for file in files:
-        mask = _at_size(file, _not_black(file), width, height)
-        varies = varies or (
-            file != files[0] and not np.array_equal(combined_mask & mask, combined_mask)
-        )
-        combined_mask &= mask
-    if combined_mask.all():
+    mask, varies = _intersection(files, width, height)
+    if mask.all():
         return None, ""
-    if not combined_mask.any():
+    if not mask.any():
         raise ValueError(
             f"{files[0]}: expected pixels that are used, got a black mask of {name}; correct it."
         )
@@ -97,10 +92,25 @@ def used_pixels(
         if varies
         else f" by {files[0].name}"
     )
-    return (
-        combined_mask,
-        f"{name}: {100 * (1 - combined_mask.mean()):.1f} % of its pixels are masked out{several}.",
-    )
+    return mask, f"{name}: {_unused(mask)} % of its pixels are masked out{several}."
+
+
+def _intersection(files: Sequence[Path], width: int, height: int) -> tuple[np.ndarray, bool]:
+    """Return the mask [H, W] of the pixels that are black in no image, and whether a later image
+    masks out more than those before it.
+    """
+    combined_mask = np.ones((height, width), bool)
+    varies = False
+    for file in files:
+        mask = _at_size(file, _not_black(file), width, height)
+        varies = varies or (file != files[0] and bool((combined_mask & ~mask).any()))
+        combined_mask &= mask
+    return combined_mask, varies
+
+
+def _unused(mask: np.ndarray) -> str:
+    """Return the percentage of pixels that a mask leaves out."""
+    return f"{100 * (1 - mask.mean()):.1f}"
 
 
 def _not_black(file: Path) -> np.ndarray:
@@ -120,9 +130,7 @@ def _opaque(file: Path, shape: tuple[int, int]) -> np.ndarray:
     not readable.
     """
     try:
-        with fetched(file).open("rb") as stream:
-            header = stream.read(26)
-        image = _decoded(file) if _may_be_transparent(header) else None
+        image = _decoded(file) if _may_be_transparent(file) else None
     except (ValueError, OSError):
         image = None
     if image is None or image.shape != (*shape, 4):
@@ -130,8 +138,10 @@ def _opaque(file: Path, shape: tuple[int, int]) -> np.ndarray:
     return image[..., 3] == np.iinfo(image.dtype).max
 
 
-def _may_be_transparent(header: bytes) -> bool:
-    """Return whether an image may have an alpha channel, from the first 26 bytes of its file."""
+def _may_be_transparent(file: Path) -> bool:
+    """Return whether an image may have an alpha channel, from the header of its file."""
+    with fetched(file).open("rb") as stream:
+        header = stream.read(26)
     if header.startswith(b"\x89PNG"):
         # With a palette, grey and alpha, or RGB and alpha.
         return header[25:] in (b"\3", b"\4", b"\6")
@@ -153,6 +163,5 @@ def _at_size(file: Path, mask: np.ndarray, width: int, height: int) -> np.ndarra
             f"{file}: expected a mask of {width}x{height} pixels as the clip has, or a scaled "
             f"version of it, got {columns}x{rows}; make it again."
         )
-    return np.greater(
-        cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA), 1 - 1e-4
-    )
+    size = (width, height)
+    return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 1 - 1e-4

@@ -50,10 +50,7 @@ def clips_by_camera(path: Path) -> dict[str, Path]:
     Raises:
         ValueError: two videos in one folder differ only in their suffixes.
     """
-    inner = [f for f in listed(path) if f.is_dir() and f.name not in {*_NOT_CLIPS, "frames"}]
-    if (path / "images").is_dir():
-        inner = [f for f in inner if not _COPIES.fullmatch(f.name)]
-    inner.sort(key=lambda f: f.name in _USUAL)
+    inner = _places(path)
     # The last clip of a camera takes precedence.
     clips = (
         _merged(path, map(_folders, inner))
@@ -63,7 +60,15 @@ def clips_by_camera(path: Path) -> dict[str, Path]:
     )
     if (path / "frames").is_dir():
         clips |= _videos(path / "frames") | _folders(path / "frames")
-    return {name: clips[name] for name in sorted(clips, key=natural_key)}
+    return _in_order(clips)
+
+
+def _places(path: Path) -> list[Path]:
+    """Return the folders in a capture in which clips are looked for, the usual ones last."""
+    inner = [f for f in listed(path) if f.is_dir() and f.name not in {*_NOT_CLIPS, "frames"}]
+    if (path / "images").is_dir():
+        inner = [f for f in inner if not _COPIES.fullmatch(f.name)]
+    return sorted(inner, key=lambda f: f.name in _USUAL)
 
 
 def photos(path: Path) -> dict[str, tuple[Path]]:
@@ -74,8 +79,8 @@ def photos(path: Path) -> dict[str, tuple[Path]]:
         ValueError: two images differ only in their suffixes.
     """
     folder = _image_folder(path)
-    images = _by_stem(images_in(folder)) if folder else {}
-    return {name: (images[name],) for name in sorted(images, key=natural_key)}
+    images = _in_order(_by_stem(images_in(folder))) if folder else {}
+    return {name: (image,) for name, image in images.items()}
 
 
 def clips_by_frame(path: Path) -> dict[str, tuple[Path, ...]]:
@@ -87,11 +92,13 @@ def clips_by_frame(path: Path) -> dict[str, tuple[Path, ...]]:
     frames = sorted(_folders(path).values(), key=lambda f: natural_key(str(f)))
     if not frames:
         return {}
-    images = _by_stem(images_in(frames[0]))
-    return {
-        name: tuple(f / images[name].name for f in frames)
-        for name in sorted(images, key=natural_key)
-    }
+    images = _in_order(_by_stem(images_in(frames[0])))
+    return {name: tuple(f / image.name for f in frames) for name, image in images.items()}
+
+
+def _in_order(files: Mapping[str, Path]) -> dict[str, Path]:
+    """Return the files in the numerical order of their names."""
+    return {name: files[name] for name in sorted(files, key=natural_key)}
 
 
 def check_frames(path: Path, clips: Mapping[str, Sequence[Path]]) -> None:
@@ -195,14 +202,18 @@ class ImageSizes:
 def _clip_size(clip: Clip) -> tuple[int, int]:
     """Return the width and height of a clip or an image."""
     if isinstance(clip, Path) and _is_image(clip):
-        size = (
-            image_size(np.memmap(clip, np.uint8, "r")) if fetched(clip).stat().st_size else (0, 0)
-        )
-        if all(size):
+        if all(size := _header_size(clip)):
             return size
         clip = (clip,)
     reader = open_frames(clip)
     return reader.width, reader.height
+
+
+def _header_size(image: Path) -> tuple[int, int]:
+    """Return the width and height of an image by its header, 0 if it does not show them."""
+    if not fetched(image).stat().st_size:
+        return 0, 0
+    return image_size(np.memmap(image, np.uint8, "r"))
 
 
 def _folders(folder: Path) -> dict[str, Path]:
@@ -240,10 +251,7 @@ def _merged(path: Path, places: Iterable[Mapping[str, Path]]) -> dict[str, Path]
             first, last = (paths[repeats[0]].relative_to(path) for paths in (result, clips))
             _LOG.warning(
                 "%s: %s have two clips, such as %s and %s: the latter is used.",
-                path,
-                ", ".join(repeats),
-                first,
-                last,
+                *(path, ", ".join(repeats), first, last),
             )
         result |= clips
     return result

@@ -12,11 +12,11 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -81,12 +81,16 @@ def _models(folder: Path) -> list[Path]:
             return [place]
         if inner:
             return _largest_first(inner)
-    # In the capture folder itself all three files are required: a single name may have another
-    # meaning.
-    has_model = any(
+    return [folder] if _is_model(folder) else []
+
+
+def _is_model(folder: Path) -> bool:
+    """Return whether a capture folder has all three files: a single name may have another meaning
+    there.
+    """
+    return any(
         all((folder / f"{name}.{kind}").exists() for name in _FILES) for kind in ("bin", "txt")
     )
-    return [folder] if has_model else []
 
 
 def _largest_first(models: Sequence[Path]) -> list[Path]:
@@ -108,55 +112,83 @@ def read_colmap(folder: str | Path) -> ColmapModel:
     """
     folder = Path(folder)
     kind = "bin" if (folder / "cameras.bin").exists() else "txt"
+    _check_complete(folder, kind)
+    cameras_path, images_path, points_path = (folder / f"{name}.{kind}" for name in _FILES)
+    views = _views(images_path, cameras_path, _intrinsics(cameras_path))
+    if not views:
+        raise ValueError(
+            f"{images_path}: expected at least one image, got none; register the images."
+        )
+    cameras, lenses = zip(*views, strict=True)
+    points = _points(points_path)
+    return ColmapModel(
+        cameras,
+        lenses,
+        points[:, :3].astype(np.float32),
+        (points[:, 3:] / 255).astype(np.float32),
+    )
+
+
+def _check_complete(folder: Path, kind: str) -> None:
     for name in _FILES:
         if not (folder / f"{name}.{kind}").exists():
             raise FileNotFoundError(
                 f"{folder}: a COLMAP model needs cameras, images and points3D (.txt or .bin), "
                 f"{name}.{kind} is missing; export the whole model."
             )
-    cameras_path, images_path, points_path = (folder / f"{name}.{kind}" for name in _FILES)
-    text = kind == "txt"
-    intrinsics = {}
-    for camera_id, model, width, height, params in (text_cameras if text else binary_cameras)(
-        cameras_path
-    ):
+
+
+class _Intrinsics(NamedTuple):
+    lens: Lens
+    K: np.ndarray
+    width: int
+    height: int
+
+
+def _intrinsics(path: Path) -> dict[int, _Intrinsics]:
+    """Return the cameras of a model by their ids."""
+    intrinsics: dict[int, _Intrinsics] = {}
+    rows = (binary_cameras if path.suffix == ".bin" else text_cameras)(path)
+    for camera_id, model, width, height, params in rows:
         try:
-            intrinsics[camera_id] = (*lens_and_intrinsics(model, params), width, height)
+            lens, K = lens_and_intrinsics(model, params)
         except ValueError as error:
-            raise ValueError(f"{cameras_path}: camera {camera_id}: {error}") from None
-        check_claim(cameras_path, _CAMERA_BYTES * len(intrinsics), f"{len(intrinsics)} cameras")
-    cameras = []
-    lenses = []
-    for name, camera_id, pose in (text_images if text else binary_images)(images_path):
+            raise ValueError(f"{path}: camera {camera_id}: {error}") from None
+        intrinsics[camera_id] = _Intrinsics(lens, K, width, height)
+        check_claim(path, _CAMERA_BYTES * len(intrinsics), f"{len(intrinsics)} cameras")
+    return intrinsics
+
+
+def _views(
+    path: Path, cameras_path: Path, intrinsics: Mapping[int, _Intrinsics]
+) -> list[tuple[Camera, Lens]]:
+    """Return the camera and the lens of each image of a model."""
+    views: list[tuple[Camera, Lens]] = []
+    for name, camera_id, pose in (binary_images if path.suffix == ".bin" else text_images)(path):
         if camera_id not in intrinsics:
             raise ValueError(
-                f"{images_path}: image {name!r} refers to camera {camera_id}, {cameras_path.name} "
+                f"{path}: image {name!r} refers to camera {camera_id}, {cameras_path.name} "
                 f"has {sorted(intrinsics)}; export both files from the same model."
             )
         lens, K, width, height = intrinsics[camera_id]
         try:
-            cameras.append(Camera(K, _viewmat(pose), width, height, name))
+            views.append((Camera(K, _viewmat(pose), width, height, name), lens))
         except ValueError as error:
-            raise ValueError(f"{images_path}, image {name!r}: {error}") from None
-        lenses.append(lens)
-        check_claim(images_path, _CAMERA_BYTES * len(cameras), f"{len(cameras)} images")
-    if not cameras:
-        raise ValueError(
-            f"{images_path}: expected at least one image, got none; register the images."
-        )
-    rows = (text_points if text else binary_points)(points_path)
+            raise ValueError(f"{path}, image {name!r}: {error}") from None
+        check_claim(path, _CAMERA_BYTES * len(views), f"{len(views)} images")
+    return views
+
+
+def _points(path: Path) -> np.ndarray:
+    """Return the positions and the colours, 0 to 255, of the points of a model [P, 6]."""
+    rows = (binary_points if path.suffix == ".bin" else text_points)(path)
     points = np.asarray(np.fromiter(rows, np.dtype((np.float64, 6))), np.float64)
     if not bounded(points):
         raise ValueError(
-            f"{points_path}: the points must be finite and at most {LARGEST:g}, got others; "
+            f"{path}: the points must be finite and at most {LARGEST:g}, got others; "
             "export the model again."
         )
-    return ColmapModel(
-        tuple(cameras),
-        tuple(lenses),
-        points[:, :3].astype(np.float32),
-        (points[:, 3:] / 255).astype(np.float32),
-    )
+    return points
 
 
 def write_colmap(
@@ -184,27 +216,40 @@ def write_colmap(
     model = pycolmap.Reconstruction()
     lenses = [Lens()] * len(cameras) if lenses is None else lenses
     for i, (camera, lens) in enumerate(zip(cameras, lenses, strict=True), start=1):
-        K = camera.K
-        one_focal = lens.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-        focals = [K[0, 0]] if one_focal else [K[0, 0], K[1, 1]]
         model.add_camera_with_trivial_rig(
             pycolmap.Camera(
                 camera_id=i,
                 model=lens.model,
                 width=camera.width,
                 height=camera.height,
-                params=[*focals, K[0, 2], K[1, 2], *lens.distortion],
+                params=_parameters(camera, lens),
             )
         )
-        name = camera.name if Path(camera.name).suffix else f"{camera.name}.png"
+        image = pycolmap.Image(image_id=i, camera_id=i, name=_image_name(camera))
         pose = pycolmap.Rigid3d(np.asarray(camera.viewmat, dtype=np.float64)[:3])
-        model.add_image_with_trivial_frame(pycolmap.Image(image_id=i, camera_id=i, name=name), pose)
+        model.add_image_with_trivial_frame(image, pose)
     points = np.zeros((0, 3)) if points is None else np.asarray(points)
-    colors = np.full(points.shape, 0.5) if point_colors is None else np.asarray(point_colors)
-    bytes_ = np.rint(np.clip(colors, 0, 1) * 255).astype(np.uint8)
-    for xyz, rgb in zip(points, bytes_, strict=True):
+    for xyz, rgb in zip(points, _color_bytes(points, point_colors), strict=True):
         model.add_point3D(xyz.astype(np.float64), pycolmap.Track(), rgb)
     write_reconstruction(model, folder)
+
+
+def _color_bytes(points: np.ndarray, colors: np.ndarray | None) -> np.ndarray:
+    """Return the colours of points [P, 3] as bytes, grey if None."""
+    colors = np.full(points.shape, 0.5) if colors is None else np.asarray(colors)
+    return np.rint(np.clip(colors, 0, 1) * 255).astype(np.uint8)
+
+
+def _image_name(camera: Camera) -> str:
+    return camera.name if Path(camera.name).suffix else f"{camera.name}.png"
+
+
+def _parameters(camera: Camera, lens: Lens) -> list[float]:
+    """Return the parameters of COLMAP's camera model."""
+    K = camera.K
+    one_focal = lens.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+    focals = [K[0, 0]] if one_focal else [K[0, 0], K[1, 1]]
+    return [*focals, K[0, 2], K[1, 2], *lens.distortion]
 
 
 def write_reconstruction(model: pycolmap.Reconstruction, folder: str | Path) -> None:
@@ -214,28 +259,32 @@ def write_reconstruction(model: pycolmap.Reconstruction, folder: str | Path) -> 
         OSError: a file could not be written.
     """
     folder = Path(folder)
-    images = model.num_reg_images()
-    frames = model.num_reg_frames()
-    lines = {
-        "rigs": model.num_rigs(),
-        "frames": frames,
-        "images": 2 * images,
-        "points3D": model.num_points3D(),
-    }
-    # The last one that is renamed, because readers look for it.
-    lines["cameras"] = model.num_cameras()
+    lines = _line_counts(model)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=".partial-", dir=folder) as partial:
             model.write_text(partial)
-            for name, count in lines.items():
-                _check_written(Path(partial) / f"{name}.txt", count)
-            for name in lines:
-                (Path(partial) / f"{name}.txt").replace(folder / f"{name}.txt")
+            files = [Path(partial) / f"{name}.txt" for name in lines]
+            for file, count in zip(files, lines.values(), strict=True):
+                _check_written(file, count)
+            for file in files:
+                file.replace(folder / file.name)
     except (OSError, RuntimeError, ValueError) as error:
         raise write_error(
             f"{folder}: the COLMAP model could not be written", error, folder
         ) from error
+
+
+def _line_counts(model: pycolmap.Reconstruction) -> dict[str, int]:
+    """Return the number of lines of each text file of a model."""
+    return {
+        "rigs": model.num_rigs(),
+        "frames": model.num_reg_frames(),
+        "images": 2 * model.num_reg_images(),
+        "points3D": model.num_points3D(),
+        # The last one that is renamed, because readers look for it.
+        "cameras": model.num_cameras(),
+    }
 
 
 def _check_written(file: Path, expected: int) -> None:
@@ -254,31 +303,39 @@ def _check_written(file: Path, expected: int) -> None:
 
 def _viewmat(pose: Sequence[float]) -> np.ndarray:
     """Return the world-to-camera matrix [4, 4] of a wxyz quaternion and a translation."""
-    quat = np.array(pose[:4])
-    t = np.array(pose[4:])
     if not np.isfinite(pose).all():
         raise ValueError(f"the pose must be finite, got {[*pose]}; export the model again.")
-    # COLMAP writes unit quaternions.
+    quat = np.array(pose[:4])
+    _check_unit(quat)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = Rotation.from_quat(quat[[1, 2, 3, 0]]).as_matrix()
+    viewmat[:3, 3] = pose[4:]
+    return viewmat
+
+
+def _check_unit(quat: np.ndarray) -> None:
+    """Check that a quaternion has length 1, as COLMAP writes them."""
     if not abs(np.linalg.norm(quat) - 1) <= 1e-2:
         raise ValueError(
             f"its quaternion must have length 1, got {quat.tolist()}; check the order of the "
             "columns."
         )
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = Rotation.from_quat(quat[[1, 2, 3, 0]]).as_matrix()
-    viewmat[:3, 3] = t
-    return viewmat
+
+
+def _warn_several(folder: Path, others: Sequence[Path]) -> None:
+    """Warn that a capture has other models than the one that is used."""
+    counts = ", ".join(f"{model.name} has {count_images(model)}" for model in others)
+    _LOG.warning(
+        "%s: the largest of %d models, %s with %d images, is used; %s.",
+        *(folder.parent, 1 + len(others), folder.name, count_images(folder), counts),
+    )
 
 
 def _read_calibration(path: Path) -> Calibration:
     clips = required_clips(path)
     folder, *others = _models(path)
     if others:
-        counts = ", ".join(f"{model.name} has {count_images(model)}" for model in others)
-        _LOG.warning(
-            "%s: the largest of %d models, %s with %d images, is used; %s.",
-            *(folder.parent, 1 + len(others), folder.name, count_images(folder), counts),
-        )
+        _warn_several(folder, others)
     model = read_colmap(folder)
     match = match_clips(path, folder, clips, model.cameras, model.lenses)
     return replace(match.calibration, points=model.points, point_colors=model.point_colors)

@@ -64,9 +64,7 @@ def text_cameras(path: Path) -> Iterator[tuple[int, str, int, int, list[float]]]
     for number, line in _lines(path):
         if fields := line.split(maxsplit=_MAX_CAMERA_FIELDS):
             try:
-                camera_id = int(fields[0])
-                width = int(fields[2])
-                height = int(fields[3])
+                camera_id, width, height = (int(fields[k]) for k in (0, 2, 3))
                 yield camera_id, fields[1], width, height, [float(f) for f in fields[4:]]
             except (ValueError, IndexError):
                 raise _broken(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", line) from None
@@ -77,11 +75,8 @@ def text_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
     for number, line in lines:
         if not line.strip():
             continue
-        fields = line.split(maxsplit=9)
         try:
-            camera_id = int(fields[8])
-            pose = [float(f) for f in fields[1:8]]
-            name = _BEFORE_NAME.sub("", line, count=1).rstrip() if fields[9] else ""
+            image = _text_image(line)
         except (ValueError, IndexError):
             raise _broken(
                 path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line
@@ -89,7 +84,14 @@ def text_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
         number, line = next(lines, (number, ""))
         if _count_words(line) % 3:
             raise _broken(path, number, "POINTS2D[] as (X, Y, POINT3D_ID), or a blank line", line)
-        yield name, camera_id, pose
+        yield image
+
+
+def _text_image(line: str) -> tuple[str, int, list[float]]:
+    fields = line.split(maxsplit=9)
+    camera_id = int(fields[8])
+    pose = [float(f) for f in fields[1:8]]
+    return _BEFORE_NAME.sub("", line, count=1).rstrip() if fields[9] else "", camera_id, pose
 
 
 def _count_words(line: str) -> int:

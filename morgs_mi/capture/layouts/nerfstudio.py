@@ -129,30 +129,44 @@ def read_transforms(path: Path, clips: Mapping[str, Clip] | None = None) -> Tran
         raise ValueError(
             f"{path}: expected an object with a list of `frames`, got none; export it again."
         )
-    unread = {key for values in (meta, *frames) for key in values} - _KEYS - _HARMLESS
     sizes = ImageSizes(path.parent, clips or {})
     cameras = []
     lenses = []
     masks = []
     for index, frame in enumerate(frames):
-        where = f"{path}, frame {index}"
-        name = frame.get("file_path")
-        if not isinstance(name, str) or not name:
-            raise ValueError(
-                f"{where}: `file_path` must name a file, got {name!r}; export it again."
-            )
-        where += f" ({name})"
+        name = _image_name(f"{path}, frame {index}", frame)
+        where = f"{path}, frame {index} ({name})"
         values = meta | frame
         if not {"w", "h"} <= values.keys():
             values |= _size(sizes, name, frames)
         cameras.append(_camera(where, values, name))
         lenses.append(_lens(where, values))
-        if lenses[-1].model == "OPENCV_FISHEYE":  # it has k1 to k4 alone
-            unread |= {f"{key} of a fisheye" for key in ("p1", "p2") if values.get(key)}
-        mask = _file_name(where, values, "mask_path")
-        masks.append(path.parent / mask if mask else None)
-    points = _file_name(str(path), meta, "ply_file_path")
-    warn_unread(path, unread)
+        masks.append(_file(path, where, values, "mask_path"))
+    points = _file(path, str(path), meta, "ply_file_path")
+    warn_unread(path, _unread(meta, frames, lenses))
+    return Transforms(cameras, lenses, masks, points, _splits(path, meta))
+
+
+def _image_name(where: str, frame: Mapping[str, Any]) -> str:
+    name = frame.get("file_path")
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"{where}: `file_path` must name a file, got {name!r}; export it again.")
+    return name
+
+
+def _unread(
+    meta: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], lenses: Sequence[Lens]
+) -> set[str]:
+    """Return the keys that are not read but may matter."""
+    unread = {key for values in (meta, *frames) for key in values} - _KEYS - _HARMLESS
+    for frame, lens in zip(frames, lenses, strict=True):
+        if lens.model == "OPENCV_FISHEYE":  # it has k1 to k4 alone
+            unread |= {f"{key} of a fisheye" for key in ("p1", "p2") if {**meta, **frame}.get(key)}
+    return unread
+
+
+def _splits(path: Path, meta: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Return the names of images by split."""
     splits = {split: meta[split] for split in _SPLITS if meta.get(split) is not None}
     for split, names in splits.items():
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
@@ -160,7 +174,7 @@ def read_transforms(path: Path, clips: Mapping[str, Clip] | None = None) -> Tran
                 f"{path}: `{split}` must be a list of names of images, got another value; correct "
                 "it."
             )
-    return Transforms(cameras, lenses, masks, path.parent / points if points else None, splits)
+    return splits
 
 
 def _size(sizes: ImageSizes, name: str, frames: Sequence[Mapping[str, Any]]) -> dict[str, int]:
@@ -172,13 +186,14 @@ def _size(sizes: ImageSizes, name: str, frames: Sequence[Mapping[str, Any]]) -> 
     return dict(zip(("w", "h"), size, strict=False))
 
 
-def _file_name(where: str, values: Mapping[str, Any], key: str) -> str | None:
+def _file(path: Path, where: str, values: Mapping[str, Any], key: str) -> Path | None:
+    """Return the file that a value names, relative to the file `path`, or None."""
     name = values.get(key)
     if name is not None and not isinstance(name, str):
         raise ValueError(
             f"{where}: `{key}` must name a file, got {repr(name)[:80]}; export it again."
         )
-    return name.replace("\\", "/") if name else None
+    return path.parent / name.replace("\\", "/") if name else None
 
 
 def _camera(where: str, values: Mapping[str, Any], name: str) -> Camera:
@@ -188,22 +203,21 @@ def _camera(where: str, values: Mapping[str, Any], name: str) -> Camera:
     fy = _focal_length(where, values, "y", height, fx)
     cx = _number(where, values, "cx", width / 2)
     cy = _number(where, values, "cy", height / 2)
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    viewmat = _viewmat(where, values)
+    try:
+        return Camera(K, viewmat, round(width), round(height), name)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def _viewmat(where: str, values: Mapping[str, Any]) -> np.ndarray:
+    """Return the world-to-camera matrix [4, 4]."""
     try:
         matrix = np.array(values.get("transform_matrix"), dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
-    to_world = rigid(where, matrix)
-    viewmat = np.linalg.inv(to_world @ _OPENGL_FROM_OPENCV)
-    try:
-        return Camera(
-            np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]),
-            viewmat,
-            round(width),
-            round(height),
-            name,
-        )
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
+    return np.linalg.inv(rigid(where, matrix) @ _OPENGL_FROM_OPENCV)
 
 
 def _focal_length(
@@ -222,12 +236,7 @@ def _focal_length(
 def _lens(where: str, values: Mapping[str, Any]) -> Lens:
     model = values.get("camera_model", "OPENCV")
     k1, k2, k3, k4, p1, p2 = (_number(where, values, key, 0.0) for key in _DISTORTION)
-    fisheye = values.get("is_fisheye", False)
-    if fisheye not in (True, False):
-        raise ValueError(
-            f"{where}: `is_fisheye` must be true or false, got {repr(fisheye)[:80]}; correct it."
-        )
-    if fisheye or model == "OPENCV_FISHEYE":
+    if _is_fisheye(where, values) or model == "OPENCV_FISHEYE":
         return Lens("OPENCV_FISHEYE", (k1, k2, k3, k4))
     if model not in _PERSPECTIVE:
         raise ValueError(
@@ -242,6 +251,15 @@ def _lens(where: str, values: Mapping[str, Any]) -> Lens:
             "first."
         )
     return opencv_lens((k1, k2, p1, p2, k3))
+
+
+def _is_fisheye(where: str, values: Mapping[str, Any]) -> bool:
+    fisheye = values.get("is_fisheye", False)
+    if fisheye not in (True, False):
+        raise ValueError(
+            f"{where}: `is_fisheye` must be true or false, got {repr(fisheye)[:80]}; correct it."
+        )
+    return fisheye
 
 
 def _number(where: str, values: Mapping[str, Any], key: str, default: float | None = None) -> float:
@@ -268,6 +286,16 @@ def read_points_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
             f"{path}: expected the points' PLY file, found none; copy it or drop `ply_file_path`."
         )
     vertices = read_vertices(path)
+    points = _positions(path, vertices)
+    if not {"red", "green", "blue"} <= vertices.keys():
+        return points, np.full(points.shape, 0.5, np.float32)
+    colors = np.stack([vertices[band] for band in ("red", "green", "blue")], axis=1)
+    scale = 255 if colors.dtype.kind in "iu" else 1
+    return points, colors.astype(np.float32) / np.float32(scale)
+
+
+def _positions(path: Path, vertices: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the positions of vertices [P, 3]."""
     if missing := {"x", "y", "z"} - vertices.keys():
         raise ValueError(
             f"{path}: expected a PLY file with vertices x, y, z, got vertices without "
@@ -279,11 +307,7 @@ def read_points_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
             f"{path}: the points must be finite and at most {LARGEST:g}, got others; export them "
             "again."
         )
-    if not {"red", "green", "blue"} <= vertices.keys():
-        return points, np.full(points.shape, 0.5, np.float32)
-    colors = np.stack([vertices[band] for band in ("red", "green", "blue")], axis=1)
-    scale = 255 if colors.dtype.kind in "iu" else 1
-    return points, colors.astype(np.float32) / np.float32(scale)
+    return points
 
 
 def _read_calibration(path: Path) -> Calibration:
@@ -319,13 +343,7 @@ def _split(
     Raises:
         ValueError: no camera is left for training.
     """
-    names = [camera.name for camera in content.cameras]
-    splits = {
-        split: _images_named(source, split, split_names, names)
-        for split, split_names in content.splits.items()
-    }
-    held_out = splits.get("val_filenames", set()) | splits.get("test_filenames", set())
-    training = splits.get("train_filenames", set(range(len(names))) - held_out)
+    training, held_out = _split_images(source, content)
     views = tuple(view for view, indices in enumerate(images) if training.isdisjoint(indices))
     if len(views) == len(images):
         raise ValueError(
@@ -338,20 +356,24 @@ def _split(
     return calibration.without(path, extras)
 
 
+def _split_images(source: Path, content: Transforms) -> tuple[set[int], set[int]]:
+    """Return the indices of the images for training and of the held-out ones."""
+    names = [camera.name for camera in content.cameras]
+    splits = {
+        split: _images_named(source, split, split_names, names)
+        for split, split_names in content.splits.items()
+    }
+    held_out = splits.get("val_filenames", set()) | splits.get("test_filenames", set())
+    return splits.get("train_filenames", set(range(len(names))) - held_out), held_out
+
+
 def _images_named(
     source: Path, split: str, split_names: Sequence[str], names: Sequence[str]
 ) -> set[int]:
     """Return the indices of the images `names` that a split names, in full or by the end of one
     path alone.
     """
-    places = [_parts(name) for name in names]
-    whole: dict[tuple[str, ...], set[int]] = {}
-    ends: dict[tuple[str, ...], set[int]] = {}
-    for index, parts in enumerate(places):
-        whole.setdefault(parts, set()).add(index)
-        for start in range(1, len(parts)):
-            ends.setdefault(parts[start:], set()).add(index)
-    ends = {parts: indices for parts, indices in ends.items() if len(indices) == 1} | whole
+    ends = _indices_by_end(names)
     if unknown := [name for name in split_names if _parts(name) not in ends]:
         _LOG.warning(
             "%s: `%s` names %d images without a frame, such as %s.",
@@ -361,6 +383,17 @@ def _images_named(
             unknown[0],
         )
     return set().union(*(ends.get(_parts(name), set()) for name in split_names))
+
+
+def _indices_by_end(names: Sequence[str]) -> dict[tuple[str, ...], set[int]]:
+    """Return the indices of images by their paths, and by the ends that one path alone has."""
+    whole: dict[tuple[str, ...], set[int]] = {}
+    ends: dict[tuple[str, ...], set[int]] = {}
+    for index, parts in enumerate(map(_parts, names)):
+        whole.setdefault(parts, set()).add(index)
+        for start in range(1, len(parts)):
+            ends.setdefault(parts[start:], set()).add(index)
+    return {parts: indices for parts, indices in ends.items() if len(indices) == 1} | whole
 
 
 def _parts(name: str) -> tuple[str, ...]:
