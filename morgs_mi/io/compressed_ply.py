@@ -33,7 +33,7 @@ from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import unit_quats
 from morgs_mi.io.invalid import without_invalid
-from morgs_mi.io.ply import read_elements
+from morgs_mi.io.ply import SH_DEGREES, read_elements, rest_names
 
 _CHUNK = 256
 _BOUNDS = {
@@ -66,38 +66,45 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
         OSError: the file cannot be written.
     """
     raw = gaussians.numpy()
-    N, K = raw["sh_coeffs"].shape[:2]
+    chunks, fractions = _chunks(raw)
+    opacities = expit(raw["logit_opacities"].astype(np.float64))[:, None]
+    colors = np.concatenate([fractions["color"], opacities], axis=1)
+    vertices = np.empty(len(colors), [(name, "<u4") for name in _PACKED])
+    vertices["packed_position"] = _packed(fractions["position"], _XYZ_BITS)
+    vertices["packed_rotation"] = _packed_rotations(unit_quats(gaussians))
+    vertices["packed_scale"] = _packed(fractions["scale"], _XYZ_BITS)
+    vertices["packed_color"] = _packed(colors, _COLOR_BITS)
+    elements = [PlyElement.describe(chunks, "chunk"), PlyElement.describe(vertices, "vertex")]
+    if raw["sh_coeffs"].shape[1] > 1:
+        elements.append(PlyElement.describe(_packed_rest(raw["sh_coeffs"][:, 1:]), "sh"))
+    with atomic_path(path, "write_compressed_ply()") as partial:
+        PlyData(elements, byte_order="<").write(str(partial))
+
+
+def _chunks(raw: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Return the rows of the chunks, and the values [N, 3] as fractions between their bounds."""
     values = {
         "position": raw["means"],
         "scale": np.clip(raw["log_scales"], -_MOST_LOG_SCALE, _MOST_LOG_SCALE),
         "color": 0.5 + SH_C0 * raw["sh_coeffs"][:, 0],
     }
-    chunks = np.empty(
-        -(-N // _CHUNK),
-        [(name, "<f4") for ends in _BOUNDS.values() for names in ends for name in names],
-    )
+    names = [name for ends in _BOUNDS.values() for names in ends for name in names]
+    chunks = np.empty(-(-len(raw["means"]) // _CHUNK), [(name, "<f4") for name in names])
     fractions = {}
     for key, value in values.items():
         low, high, fractions[key] = _within_chunks(value.astype(np.float32))
         for names, ends in zip(_BOUNDS[key], (low, high), strict=True):
             for name, column in zip(names, ends.T, strict=True):
                 chunks[name] = column
-    opacities = expit(raw["logit_opacities"].astype(np.float64))[:, None]
-    vertices = np.empty(N, [(name, "<u4") for name in _PACKED])
-    vertices["packed_position"] = _packed(fractions["position"], _XYZ_BITS)
-    vertices["packed_rotation"] = _packed_rotations(unit_quats(gaussians))
-    vertices["packed_scale"] = _packed(fractions["scale"], _XYZ_BITS)
-    vertices["packed_color"] = _packed(
-        np.concatenate([fractions["color"], opacities], axis=1), _COLOR_BITS
-    )
-    elements = [PlyElement.describe(chunks, "chunk"), PlyElement.describe(vertices, "vertex")]
-    if K > 1:
-        rest = raw["sh_coeffs"][:, 1:].transpose(0, 2, 1).reshape(N, 3 * (K - 1))
-        steps = np.clip(np.floor((rest / (2 * _SH_RANGE) + 0.5) * 256), 0, 255).astype("u1")
-        names = [(f"f_rest_{i}", "u1") for i in range(steps.shape[1])]
-        elements.append(PlyElement.describe(steps.view(names)[:, 0], "sh"))
-    with atomic_path(path, "write_compressed_ply()") as partial:
-        PlyData(elements, byte_order="<").write(str(partial))
+    return chunks, fractions
+
+
+def _packed_rest(coeffs: np.ndarray) -> np.ndarray:
+    """Return SH coefficients of degree 1 and higher [N, K - 1, 3] as rows of bytes [N]."""
+    rest = coeffs.transpose(0, 2, 1).reshape(len(coeffs), 3 * coeffs.shape[1])
+    steps = np.clip(np.floor((rest / (2 * _SH_RANGE) + 0.5) * 256), 0, 255).astype("u1")
+    names = [(f"f_rest_{i}", "u1") for i in range(steps.shape[1])]
+    return steps.view(names)[:, 0]
 
 
 def read_compressed_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
@@ -120,43 +127,53 @@ def read_compressed_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussian
     vertices = elements["vertex"]
     rest = elements.get("sh", {})
     _check_columns(path, "vertex", vertices, _PACKED, "<u4")
-    N = len(vertices["packed_position"])
-    num_chunks = len(next(iter(chunks.values()), ()))
-    if num_chunks != -(-N // _CHUNK):
-        raise ValueError(
-            f"{path}: expected {-(-N // _CHUNK)} chunks of {_CHUNK} for {N} Gaussians, got "
-            f"{num_chunks}; the file is broken, export it again."
-        )
-    degree = {0: 0, 9: 1, 24: 2, 45: 3}.get(len(rest))
-    if degree is None or any(len(column) != N for column in rest.values()):
-        raise ValueError(
-            f"{path}: expected {N} rows of f_rest_0 to f_rest_8, 23 or 44 (SH of degree 1 to 3) "
-            f"or none, got {len(next(iter(rest.values()), ()))} rows of {len(rest)} properties; "
-            "the file is broken, export it again."
-        )
-    names = [f"f_rest_{i}" for i in range(len(rest))]
-    _check_columns(path, "sh", rest, names, "u1")
+    _check_count(path, chunks, len(vertices["packed_position"]))
+    degree = _degree(path, rest, len(vertices["packed_position"]))
+    _check_columns(path, "sh", rest, rest_names((degree + 1) ** 2), "u1")
     position, scale = (
         _between(path, chunks, key, _unpacked(vertices[f"packed_{key}"], _XYZ_BITS))
         for key in ("position", "scale")
     )
     color = _unpacked(vertices["packed_color"], _COLOR_BITS)
     base = color[:, :3] if "min_r" not in chunks else _between(path, chunks, "color", color[:, :3])
-    coeffs = np.empty((N, (degree + 1) ** 2, 3), np.float32)
+    coeffs = np.empty((len(color), (degree + 1) ** 2, 3), np.float32)
     coeffs[:, 0] = (base - 0.5) / SH_C0
     if degree:
-        steps = (
-            np.stack([rest[name] for name in names], axis=1)
-            .reshape(N, 3, len(names) // 3)
-            .transpose(0, 2, 1)
-        )
-        coeffs[:, 1:] = (
-            np.where(steps == 0, 0, np.where(steps == 255, 256, steps + 0.5)) / 128 - 1
-        ) * _SH_RANGE
+        coeffs[:, 1:] = _unpacked_rest(rest)
     quats = _unpacked_rotations(vertices["packed_rotation"])
     with np.errstate(over="ignore"):  # infinite, and therefore invalid
         gaussians = Gaussians.from_activated(position, np.exp(scale), quats, color[:, 3], coeffs)
     return without_invalid(path, gaussians, most_invalid)
+
+
+def _check_count(path: str | Path, chunks: dict[str, np.ndarray], N: int) -> None:
+    """Check the number of chunks of N Gaussians."""
+    num_chunks = len(next(iter(chunks.values()), ()))
+    if num_chunks != -(-N // _CHUNK):
+        raise ValueError(
+            f"{path}: expected {-(-N // _CHUNK)} chunks of {_CHUNK} for {N} Gaussians, got "
+            f"{num_chunks}; the file is broken, export it again."
+        )
+
+
+def _degree(path: str | Path, rest: dict[str, np.ndarray], N: int) -> int:
+    """Return the degree of the SH of N Gaussians with these columns."""
+    degree = SH_DEGREES.get(len(rest))
+    if degree is None or any(len(column) != N for column in rest.values()):
+        raise ValueError(
+            f"{path}: expected {N} rows of f_rest_0 to f_rest_8, 23 or 44 (SH of degree 1 to 3) "
+            f"or none, got {len(next(iter(rest.values()), ()))} rows of {len(rest)} properties; "
+            "the file is broken, export it again."
+        )
+    return degree
+
+
+def _unpacked_rest(rest: dict[str, np.ndarray]) -> np.ndarray:
+    """Return SH coefficients of degree 1 and higher, the inverse of `_packed_rest`."""
+    K = 1 + len(rest) // 3
+    steps = np.stack([rest[name] for name in rest_names(K)], axis=1)
+    steps = steps.reshape(len(steps), 3, K - 1).transpose(0, 2, 1)
+    return (np.where(steps == 0, 0, np.where(steps == 255, 256, steps + 0.5)) / 128 - 1) * _SH_RANGE
 
 
 def _within_chunks(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -181,26 +198,22 @@ def _between(
     """
     names = [name for ends in _BOUNDS[key] for name in ends]
     _check_columns(path, "chunk", chunks, names, "<f4")
+    N = len(fractions)
     low, high = (
-        np.stack([np.asarray(chunks[name], np.float64) for name in ends], axis=1).repeat(
-            _CHUNK, axis=0
-        )
+        np.stack([np.asarray(chunks[name], np.float64) for name in ends], axis=1)
         for ends in _BOUNDS[key]
     )
-    N = len(fractions)
+    low, high = (bound.repeat(_CHUNK, axis=0)[:N] for bound in (low, high))
     # NaN where a bound is infinite: the Gaussians of the chunk are invalid.
     with np.errstate(invalid="ignore"):
-        return low[:N] * (1 - fractions) + high[:N] * fractions
+        return low * (1 - fractions) + high * fractions
 
 
 def _check_columns(
     path: str | Path, element: str, columns: dict[str, np.ndarray], names: Sequence[str], dtype: str
 ) -> None:
-    if faults := [
-        name
-        for name in names
-        if name not in columns or columns[name].dtype.newbyteorder("<") != dtype
-    ]:
+    types = {name: values.dtype.newbyteorder("<") for name, values in columns.items()}
+    if faults := [name for name in names if types.get(name) != dtype]:
         raise ValueError(
             f"{path}: expected a compressed PLY, got an element {element} without "
             f"{', '.join(faults)} as {np.dtype(dtype).name}; export it again."

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -39,32 +40,13 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
     """
     raw = gaussians.numpy()
     N = len(gaussians)
-    zero = np.flatnonzero(~raw["quats"].any(axis=1))
-    if len(zero):
-        _log.warning(
-            "%s: %d of %d Gaussians have a rotation of 0 and are not rotated: %s.",
-            path,
-            len(zero),
-            N,
-            _few(zero),
-        )
-    limits = {name: np.log(LARGEST) if name == "log_scales" else LARGEST for name in raw}
-    # Small sizes have negative logarithms without a bound.
-    valid = {
-        name: ((values <= limits[name]) & (values >= -LARGEST)).all(
-            axis=tuple(range(1, values.ndim))
-        )
-        for name, values in raw.items()
-    }
+    _warn_zero(path, raw["quats"])
+    valid = {name: _valid(name, values) for name, values in raw.items()}
     every = np.all([*valid.values()], axis=0)
     count = int(N - every.sum())
     if not count:
         return gaussians
-    details = "; ".join(
-        f"{_WORDS.get(name, name)} of {_few(np.flatnonzero(~rows))}"
-        for name, rows in valid.items()
-        if not rows.all()
-    )
+    details = _details(valid)
     if count > most_invalid * N:
         raise ValueError(
             f"{path}: expected finite numbers of at most {LARGEST:g}, others in {count} of {N} "
@@ -73,13 +55,36 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
         )
     _log.warning(
         "%s: %d of %d Gaussians are left out, whose numbers are not finite or above %g: %s.",
-        path,
-        count,
-        N,
-        LARGEST,
-        details,
+        *(path, count, N, LARGEST, details),
     )
     return gaussians.select(every)
+
+
+def _warn_zero(path: str | Path, quats: np.ndarray) -> None:
+    """Warn of rotations [N, 4] of length 0."""
+    zero = np.flatnonzero(~quats.any(axis=1))
+    if len(zero):
+        _log.warning(
+            "%s: %d of %d Gaussians have a rotation of 0 and are not rotated: %s.",
+            *(path, len(zero), len(quats), _few(zero)),
+        )
+
+
+def _valid(name: str, values: np.ndarray) -> np.ndarray:
+    """Return the mask [N] of valid values of an attribute."""
+    # Small sizes have negative logarithms without a bound.
+    limit = np.log(LARGEST) if name == "log_scales" else LARGEST
+    within = (values <= limit) & (values >= -LARGEST)
+    return np.logical_and.reduce(within, axis=tuple(range(1, values.ndim)))
+
+
+def _details(valid: Mapping[str, np.ndarray]) -> str:
+    """Return the invalid attributes and the first Gaussians that have them."""
+    return "; ".join(
+        f"{_WORDS.get(name, name)} of {_few(np.flatnonzero(~rows))}"
+        for name, rows in valid.items()
+        if not rows.all()
+    )
 
 
 def _few(rows: np.ndarray) -> str:

@@ -16,6 +16,11 @@ from morgs_mi.core.gaussians import Gaussians
 
 # Properties of the layout that hold no attribute of this form.
 _GEOMETRY = ("means", "scales", "quats")
+# Properties that have the same names in the layout of 3D Gaussian Splatting.
+_COLUMNS = {
+    name: name
+    for name in ("x", "y", "z", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4)))
+}
 
 
 def mitsuba_columns(gaussians: Gaussians) -> dict[tuple[str, ...], np.ndarray]:
@@ -26,8 +31,9 @@ def mitsuba_columns(gaussians: Gaussians) -> dict[tuple[str, ...], np.ndarray]:
     for name in ("sh_coeffs", *BY_ACTIVATED_NAME):
         values = None if name in _GEOMETRY else getattr(gaussians, name)
         if values is not None:
-            table = np.array(values).reshape(len(gaussians), int(np.prod(values.shape[1:])))
-            columns[tuple(f"{name}_{i}" for i in range(table.shape[1]))] = table
+            width = int(np.prod(values.shape[1:]))
+            names = tuple(f"{name}_{i}" for i in range(width))
+            columns[names] = np.array(values).reshape(len(gaussians), width)
     return columns
 
 
@@ -42,23 +48,30 @@ def from_mitsuba(
     """
     if not vertices.keys() >= {"sh_coeffs_0", "opacities_0"}:
         return vertices, {}
-    more: dict[str, np.ndarray] = {}
-    for name, attribute in BY_ACTIVATED_NAME.items():
-        names = [f"{name}_{i}" for i in range(attribute.width)]
-        if name not in (*_GEOMETRY, "opacities") and vertices.keys() >= {*names}:
-            table = np.stack([vertices[column] for column in names], axis=1)
-            more[attribute.name] = attribute.activation.inverse(
-                table.reshape(len(table), *attribute.shape)
-            )
     K = sum(name.startswith("sh_coeffs_") for name in vertices) // 3
+    places = {**_COLUMNS, **_sh_places(K)}
+    columns = {places[name]: values for name, values in vertices.items() if name in places}
+    columns["opacity"] = SIGMOID.inverse(vertices["opacities_0"])
+    return columns, _raw_attributes(vertices)
+
+
+def _sh_places(K: int) -> dict[str, str]:
+    """Return the names of K SH coefficients in 3D Gaussian Splatting, by their names here."""
     places = {f"sh_coeffs_{i}": f"f_dc_{i}" for i in range(3)}
-    places |= {
+    return places | {
         f"sh_coeffs_{3 * k + c}": f"f_rest_{c * (K - 1) + k - 1}"
         for k in range(1, K)
         for c in range(3)
     }
-    geometry = ("x", "y", "z", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4)))
-    places |= {name: name for name in geometry}
-    columns = {places[name]: values for name, values in vertices.items() if name in places}
-    columns["opacity"] = SIGMOID.inverse(vertices["opacities_0"])
-    return columns, more
+
+
+def _raw_attributes(vertices: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the raw attributes that 3D Gaussian Splatting does not have."""
+    attributes: dict[str, np.ndarray] = {}
+    for name, attribute in BY_ACTIVATED_NAME.items():
+        names = [f"{name}_{i}" for i in range(attribute.width)]
+        if name not in (*_GEOMETRY, "opacities") and vertices.keys() >= {*names}:
+            table = np.stack([vertices[column] for column in names], axis=1)
+            values = table.reshape(len(table), *attribute.shape)
+            attributes[attribute.name] = attribute.activation.inverse(values)
+    return attributes

@@ -11,6 +11,7 @@ Mitsuba's shape `ellipsoids` reads this layout, and one with further attributes,
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -47,6 +48,9 @@ _TYPES = {
 _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 # Beyond these, an opacity is 0 or 1 and a size is 0, which other tools store as infinite numbers.
 _BOUNDS = {"opacity": (-99, 99), **dict.fromkeys(_SCALE, (-69, None))}
+SH_DEGREES = {0: 0, 9: 1, 24: 2, 45: 3}
+"""Degrees of SH by the number of properties ``f_rest_*``."""
+
 _NORMAL = ("nx", "ny", "nz")
 _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 
@@ -72,20 +76,25 @@ def write_ply(
     if layout not in ("3dgs", "mitsuba"):
         raise ValueError(f"write_ply(): `layout` must be 3dgs or mitsuba, got {layout!r}.")
     raw = gaussians.numpy()
-    lengths = np.linalg.norm(raw["quats"], axis=1, keepdims=True)
     columns = {
         _MEAN: raw["means"],
         _NORMAL: np.zeros_like(raw["means"]),
         **(mitsuba_columns(gaussians) if layout == "mitsuba" else _columns(raw)),
         _SCALE: raw["log_scales"],
-        # A zero quaternion is no rotation.
-        _ROTATION: np.where(lengths > 0, raw["quats"] / np.maximum(lengths, 1e-30), (1, 0, 0, 0)),
+        _ROTATION: _rotations(raw["quats"]),
     }
     names = [name for names in columns for name in names]
     table = np.concatenate([*columns.values()], axis=1, dtype=np.float32, casting="same_kind")
     vertices = table.astype("<f4").view([(name, "<f4") for name in names])[:, 0]
     with atomic_path(path, "write_ply()") as partial:
         PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(partial))
+
+
+def _rotations(quats: np.ndarray) -> np.ndarray:
+    """Return unit quaternions [N, 4]."""
+    lengths = np.linalg.norm(quats, axis=1, keepdims=True)
+    # A zero quaternion is no rotation.
+    return np.where(lengths > 0, quats / np.maximum(lengths, 1e-30), (1, 0, 0, 0))
 
 
 def _columns(raw: dict[str, np.ndarray]) -> dict[tuple[str, ...], np.ndarray]:
@@ -96,7 +105,7 @@ def _columns(raw: dict[str, np.ndarray]) -> dict[tuple[str, ...], np.ndarray]:
     rest = raw["sh_coeffs"][:, 1:].transpose(0, 2, 1).reshape(N, 3 * (K - 1))
     return {
         _DC: raw["sh_coeffs"][:, 0],
-        _rest(K): rest,
+        rest_names(K): rest,
         ("opacity",): raw["logit_opacities"][:, None],
     }
 
@@ -128,6 +137,20 @@ def read_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
         )
     vertices, more = from_mitsuba(vertices)
     vertices = as_3dgs(path, vertices)
+    _check_names(path, vertices)
+    K = (_degree(path, vertices) + 1) ** 2
+    gaussians = Gaussians(
+        _table(vertices, _MEAN),
+        _table(vertices, _SCALE),
+        _table(vertices, _ROTATION),
+        _table(vertices, ("opacity",))[:, 0],
+        _coefficients(vertices, K),
+        **more,
+    )
+    return without_invalid(path, gaussians, most_invalid)
+
+
+def _check_names(path: str | Path, vertices: dict[str, np.ndarray]) -> None:
     missing = [
         name for name in (*_MEAN, *_DC, "opacity", *_SCALE, *_ROTATION) if name not in vertices
     ]
@@ -136,35 +159,36 @@ def read_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
             f"{path}: expected Gaussians in the layout of 3D Gaussian Splatting, got vertices "
             f"without {', '.join(missing)}, as of a mesh or a point cloud; export the Gaussians."
         )
+
+
+def _degree(path: str | Path, vertices: dict[str, np.ndarray]) -> int:
+    """Return the degree of the SH."""
     count = sum(name.startswith("f_rest_") for name in vertices)
-    degree = {0: 0, 9: 1, 24: 2, 45: 3}.get(count)
-    if degree is None or not vertices.keys() >= {*_rest((degree + 1) ** 2)}:
+    degree = SH_DEGREES.get(count)
+    if degree is None or not vertices.keys() >= {*rest_names((degree + 1) ** 2)}:
         raise ValueError(
             f"{path}: expected f_rest_0 to f_rest_8, 23 or 44 (SH of degree 1 to 3) or none, got "
             f"{count} of them; export the Gaussians with SH of degree 3 or less."
         )
-    N = len(vertices["x"])
-    K = (degree + 1) ** 2
+    return degree
 
-    def columns(names: tuple[str, ...]) -> np.ndarray:
-        values = np.empty((N, len(names)), np.float32)
-        with np.errstate(over="ignore"):  # infinite, and therefore invalid
-            for i, name in enumerate(names):
-                values[:, i] = np.clip(vertices[name], *_BOUNDS.get(name, (None, None)))
-        return values
 
-    coeffs = np.empty((N, K, 3), np.float32)
-    coeffs[:, 0] = columns(_DC)
-    coeffs[:, 1:] = columns(_rest(K)).reshape(N, 3, K - 1).transpose(0, 2, 1)
-    gaussians = Gaussians(
-        columns(_MEAN),
-        columns(_SCALE),
-        columns(_ROTATION),
-        columns(("opacity",))[:, 0],
-        coeffs,
-        **more,
-    )
-    return without_invalid(path, gaussians, most_invalid)
+def _table(vertices: dict[str, np.ndarray], names: Sequence[str]) -> np.ndarray:
+    """Return properties as a table [N, names], float32, within their bounds."""
+    values = np.empty((len(vertices["x"]), len(names)), np.float32)
+    with np.errstate(over="ignore"):  # infinite, and therefore invalid
+        for i, name in enumerate(names):
+            values[:, i] = np.clip(vertices[name], *_BOUNDS.get(name, (None, None)))
+    return values
+
+
+def _coefficients(vertices: dict[str, np.ndarray], K: int) -> np.ndarray:
+    """Return the SH coefficients [N, K, 3]."""
+    coeffs = np.empty((len(vertices["x"]), K, 3), np.float32)
+    coeffs[:, 0] = _table(vertices, _DC)
+    rest = _table(vertices, rest_names(K)).reshape(len(coeffs), 3, K - 1)
+    coeffs[:, 1:] = rest.transpose(0, 2, 1)
+    return coeffs
 
 
 def read_vertices(path: str | Path) -> dict[str, np.ndarray]:
@@ -205,33 +229,10 @@ def read_elements(
     try:
         with path.open("rb") as file:
             order, elements = _read_header(file)
-            element_names = {element.name for element in elements}.intersection(
-                (*required, *optional)
-            )
-            if missing_names := [name for name in required if name not in element_names]:
+            names = {element.name for element in elements}.intersection((*required, *optional))
+            if missing_names := [name for name in required if name not in names]:
                 raise ValueError(f"it has no element {missing_names[0]}")
-            properties: dict[str, dict[str, np.ndarray]] = {}
-            for element in elements:
-                if properties.keys() == element_names:
-                    break
-                dtype = element.dtype(order)
-                num_bytes = path.stat().st_size - file.tell()
-                # A number in a text takes a digit and a separator.
-                size = element.count * (
-                    dtype.itemsize if order else 2 * len(element.properties)
-                ) - (not order)
-                if element.count < 0 or size > num_bytes:
-                    raise ValueError(
-                        f"{element.count} {element.name} need at least {size} bytes, {num_bytes} "
-                        "follow"
-                    )
-                if element.name in element_names:
-                    properties[element.name] = _read_rows(file, element, dtype, text=not order)
-                elif order:
-                    file.seek(element.count * dtype.itemsize, 1)
-                else:
-                    next(islice(file, element.count, element.count), None)
-            return properties
+            return _read_properties(file, order, elements, names)
     except (ValueError, KeyError, IndexError, OverflowError) as error:
         raise ValueError(
             f"{path}: expected a complete PLY file, got one that cannot be read: {error}."
@@ -280,6 +281,39 @@ def _read_header(file: BinaryIO) -> tuple[str, list[_Element]]:
     raise ValueError("its header does not end")
 
 
+def _read_properties(
+    file: BinaryIO, order: str, elements: Sequence[_Element], names: set[str]
+) -> dict[str, dict[str, np.ndarray]]:
+    """Return the properties of the elements in `names`; those after the last of these are not
+    read.
+    """
+    properties: dict[str, dict[str, np.ndarray]] = {}
+    for element in elements:
+        if properties.keys() == names:
+            break
+        dtype = element.dtype(order)
+        _check_length(file, order, element, dtype)
+        if element.name in names:
+            properties[element.name] = _read_rows(file, element, dtype, text=not order)
+        elif order:
+            file.seek(element.count * dtype.itemsize, 1)
+        else:
+            next(islice(file, element.count, element.count), None)
+    return properties
+
+
+def _check_length(file: BinaryIO, order: str, element: _Element, dtype: np.dtype) -> None:
+    """Check that the rest of the file can hold the rows of an element."""
+    num_bytes = os.fstat(file.fileno()).st_size - file.tell()
+    # A number in a text takes a digit and a separator.
+    row = dtype.itemsize if order else 2 * len(element.properties)
+    size = element.count * row - (not order)
+    if element.count < 0 or size > num_bytes:
+        raise ValueError(
+            f"{element.count} {element.name} need at least {size} bytes, {num_bytes} follow"
+        )
+
+
 def _read_rows(
     file: BinaryIO, element: _Element, dtype: np.dtype, text: bool
 ) -> dict[str, np.ndarray]:
@@ -294,5 +328,6 @@ def _read_rows(
     return {name: table[name] for name in table.dtype.names or ()}
 
 
-def _rest(K: int) -> tuple[str, ...]:
+def rest_names(K: int) -> tuple[str, ...]:
+    """Return the names of the properties of K SH coefficients of degree 1 and higher."""
     return tuple(f"f_rest_{i}" for i in range(3 * (K - 1)))

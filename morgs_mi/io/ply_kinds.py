@@ -59,40 +59,48 @@ def as_3dgs(path: str | Path, vertices: Vertices) -> Vertices:
     if not names & _GAUSSIAN:
         return vertices
     _refuse_instants(path, vertices)
+    _refuse_anchors(path, names)
+    _refuse_integers(path, vertices)
+    _name_unread(Path(path), names)
+    return _with_third_axis(path, _with_filter(vertices))
+
+
+def _refuse_anchors(path: str | Path, names: Iterable[str]) -> None:
     if anchors := _matching(names, _ANCHOR):
         raise ValueError(
             f"{path}: expected Gaussians, got anchors of Scaffold-GS ({_listed(anchors)}), of "
             "which a network makes the Gaussians of a view; export Gaussians with the program "
             "that trained them."
         )
-    if integers := [name for name in _matching(names, _READ) if vertices[name].dtype.kind != "f"]:
+
+
+def _refuse_integers(path: str | Path, vertices: Vertices) -> None:
+    if integers := [
+        name for name in _matching(vertices, _READ) if vertices[name].dtype.kind != "f"
+    ]:
         raise ValueError(
             f"{path}: expected Gaussians with floats, got integers in {_listed(integers)}, which "
             "stand for entries of a codebook; export the Gaussians uncompressed."
         )
-    _name_unread(Path(path), names)
-    return _with_third_axis(path, _with_filter(vertices))
 
 
 def _refuse_instants(path: str | Path, vertices: Vertices) -> None:
     """Raise an error if the Gaussians of several instants are in one file: all of them are never in
     one image.
     """
-    time_names = [
-        name
-        for name, values in vertices.items()
-        if _TIME.fullmatch(name) and (values != values[:1]).any()
-    ]
-    moving = [
-        name for name, values in vertices.items() if _MOTION.fullmatch(name) and (values != 0).any()
-    ]
-    if evidence := [*time_names, *moving, *_matching(vertices, _FOURTH)]:
+    times = [name for name in _matching(vertices, _TIME) if _varies(vertices[name])]
+    motions = [name for name in _matching(vertices, _MOTION) if (vertices[name] != 0).any()]
+    if evidence := [*times, *motions, *_matching(vertices, _FOURTH)]:
         raise ValueError(
             f"{path}: expected the Gaussians of one instant, got several instants, as of "
             f"Spacetime Gaussians or 4D Gaussian Splatting ({_listed(evidence)}); export a .ply "
             "of each instant with the program that trained them, which `morgs-mi import` turns "
             "into a stream."
         )
+
+
+def _varies(values: np.ndarray) -> bool:
+    return bool((values != values[:1]).any())
 
 
 def _with_third_axis(path: str | Path, vertices: Vertices) -> Vertices:
@@ -125,11 +133,18 @@ def _with_filter(vertices: Vertices) -> Vertices:
         sizes = {name: 2 * vertices[name].astype(np.float64) for name in names[:3]}
         wider = {name: np.logaddexp(size, np.log(squares)) for name, size in sizes.items()}
         ratio = np.exp(0.5 * sum(sizes[name] - wider[name] for name in sizes))
-        opacity = ratio / (1 + np.exp(-vertices["opacity"].astype(np.float64)))
-        logit = np.log(opacity) - np.log1p(-opacity)
+        columns = {name: 0.5 * size for name, size in wider.items()}
+        columns["opacity"] = _scaled_logit(vertices["opacity"].astype(np.float64), ratio)
     unfiltered = squares == 0
-    wide = {name: np.where(unfiltered, vertices[name], 0.5 * size) for name, size in wider.items()}
-    return {**vertices, **wide, "opacity": np.where(unfiltered, vertices["opacity"], logit)}
+    return vertices | {
+        name: np.where(unfiltered, vertices[name], values) for name, values in columns.items()
+    }
+
+
+def _scaled_logit(logit: np.ndarray, factor: np.ndarray) -> np.ndarray:
+    """Return the logit of an opacity multiplied by a factor."""
+    opacity = factor / (1 + np.exp(-logit))
+    return np.log(opacity) - np.log1p(-opacity)
 
 
 def _matching(names: Iterable[str], pattern: re.Pattern[str]) -> list[str]:

@@ -75,13 +75,18 @@ def _is_compressed(path: Path) -> bool:
         return b"packed_position" in file.read(4096).partition(b"end_header")[0]
 
 
-def _read_splat(path: Path, most_invalid: float) -> Gaussians:
+def _check_multiple(path: Path) -> None:
+    """Check that a `.splat` file has whole records."""
     size = path.stat().st_size
     if size % _RECORD.itemsize:
         raise ValueError(
             f"{path}: expected {_RECORD.itemsize} bytes for each Gaussian, got {size} bytes, "
             "which is no multiple; the file is truncated or no .splat, export it again."
         )
+
+
+def _read_splat(path: Path, most_invalid: float) -> Gaussians:
+    _check_multiple(path)
     records = np.fromfile(path, _RECORD)
     scales = np.where(records["scales"] >= 0, records["scales"], np.nan)
     quats = (records["quats"] - 128.0) / 128
