@@ -51,19 +51,10 @@ def read_header(path: Path) -> VideoHeader:
         FileNotFoundError: there is no such file.
         ValueError: it is empty, or OpenCV cannot decode it.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a video file, found none; check the path.")
-    if fetched(path).stat().st_size == 0:
-        raise ValueError(f"{path}: expected a video, got an empty file; copy or record it again.")
+    _check_file(path)
     stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
-        ok, first = stream.read()
-        if not ok:
-            raise ValueError(
-                f"{path}: expected a video, got {path.stat().st_size} bytes of which OpenCV "
-                "cannot decode one frame: the file is truncated or no video; copy or convert it "
-                "again."
-            )
+        height, width = _first_frame(path, stream).shape[:2]
         num_frames = int(stream.get(cv2.CAP_PROP_FRAME_COUNT))
         frames_before = int(stream.get(cv2.CAP_PROP_PTS))
         fps = stream.get(cv2.CAP_PROP_FPS)
@@ -80,13 +71,29 @@ def read_header(path: Path) -> VideoHeader:
     if movie is None and has_times:
         # The header has the end of the file, also where the sound begins first.
         num_frames -= frames_before
-    height, width = first.shape[:2]
     if has_times and (np.diff(times) > 0).all():
         return VideoHeader(width, height, num_frames, len(times), fps, times)
     # The decoder skips packets without a time.
-    return VideoHeader(
-        width, height, num_frames, min(len(times), num_frames or len(times)), fps, None
-    )
+    num_held = min(len(times), num_frames or len(times))
+    return VideoHeader(width, height, num_frames, num_held, fps, None)
+
+
+def _check_file(path: Path) -> None:
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a video file, found none; check the path.")
+    if fetched(path).stat().st_size == 0:
+        raise ValueError(f"{path}: expected a video, got an empty file; copy or record it again.")
+
+
+def _first_frame(path: Path, stream: cv2.VideoCapture) -> np.ndarray:
+    ok, frame = stream.read()
+    if not ok:
+        raise ValueError(
+            f"{path}: expected a video, got {path.stat().st_size} bytes of which OpenCV "
+            "cannot decode one frame: the file is truncated or no video; copy or convert it "
+            "again."
+        )
+    return frame
 
 
 def seconds(stream: cv2.VideoCapture) -> float:
@@ -131,7 +138,11 @@ def packet_times(path: Path) -> np.ndarray:
     decoding, which differs from the order of presentation where frames are predicted from later
     ones.
     """
-    stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
+    return _remaining_times(cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1]))
+
+
+def _remaining_times(stream: cv2.VideoCapture) -> np.ndarray:
+    """Return the times of the frames or packets that follow, s, and release the decoder."""
     times = []
     while stream.grab():
         times.append(seconds(stream))
@@ -158,9 +169,13 @@ def _shown(
     if (np.diff(times) <= 0).any():
         return times  # a packet without a time repeats another time
     times = times[times >= first - SAME_TIME]
-    if len(times) < 2 or not parts or not parts[0]:
+    return times if not parts or not parts[0] else _before(path, first + parts[0], times)
+
+
+def _before(path: Path, end: float, times: np.ndarray) -> np.ndarray:
+    """Return the times of frames of which a video shows those before `end`, s."""
+    if len(times) < 2:
         return times
-    end = first + parts[0]
     period = float(np.median(np.diff(times)))
     if times[-1] < end - period / 2:
         return times
@@ -186,8 +201,4 @@ def _decoded_times(path: Path, begin: float) -> np.ndarray:
     stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if begin > 0:
         stream.set(cv2.CAP_PROP_POS_MSEC, 1000 * begin)
-    times = []
-    while stream.grab():
-        times.append(seconds(stream))
-    stream.release()
-    return np.array(times)
+    return _remaining_times(stream)

@@ -53,17 +53,20 @@ def read_movie(path: Path) -> Movie | None:
 def _parts(file: BinaryIO, movie: _Box) -> tuple[float, ...]:
     """Return the `Movie.parts` of the first track of images, none without an edit list."""
     header = _first(file, movie, b"mvhd")
+    track = _image_track(file, movie)
+    edits = None if track is None else _first(file, track, b"edts", b"elst")
+    if header is None or edits is None:
+        return ()
+    return _durations(file, edits, _time_scale(file, header))
+
+
+def _image_track(file: BinaryIO, movie: _Box) -> _Box | None:
+    """Return the first track of images."""
     for track in (box for box in _boxes(file, movie.start, movie.stop) if box.kind == b"trak"):
         handler = _first(file, track, b"mdia", b"hdlr")
-        if handler is None or _bytes(file, handler, 12)[8:] != b"vide":
-            continue
-        edits = _first(file, track, b"edts", b"elst")
-        return (
-            ()
-            if header is None or edits is None
-            else _durations(file, edits, _time_scale(file, header))
-        )
-    return ()
+        if handler is not None and _bytes(file, handler, 12)[8:] == b"vide":
+            return track
+    return None
 
 
 def _durations(file: BinaryIO, edits: _Box, per_second: int) -> tuple[float, ...]:
@@ -71,14 +74,12 @@ def _durations(file: BinaryIO, edits: _Box, per_second: int) -> tuple[float, ...
     data = _bytes(file, edits, _MAX_EDITS)
     # An entry has the length of the part, its start in the track, -1 for a pause, and its speed.
     width = 8 if data[:1] == b"\1" else 4
-    entries = [
-        data[at : at + 2 * width] for at in range(8, len(data) - 2 * width - 3, 2 * width + 4)
-    ]
-    visible_entries = [
-        entry for entry in entries if int.from_bytes(entry[width:], "big", signed=True) >= 0
-    ]
+    places = range(8, len(data) - 2 * width - 3, 2 * width + 4)
+    entries = [data[at : at + 2 * width] for at in places]
     return tuple(
-        int.from_bytes(entry[:width], "big") / max(per_second, 1) for entry in visible_entries
+        int.from_bytes(entry[:width], "big") / max(per_second, 1)
+        for entry in entries
+        if int.from_bytes(entry[width:], "big", signed=True) >= 0
     )
 
 

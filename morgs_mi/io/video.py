@@ -50,10 +50,13 @@ def numbering_gap(names: Sequence[str]) -> int | None:
     None.
     """
     numbers = [int((re.findall(r"[0-9]+", name) or ["-1"])[-1]) for name in names]
-    steps = np.diff(numbers)
-    if len(names) < 2 or (min(numbers) >= 0 and steps.min() >= 1 and steps.min() == steps.max()):
+    if len(names) < 2:
         return None
-    return 1 + int(np.argmax(steps != steps.min()) if steps.min() > 0 else np.argmin(steps))
+    steps = np.diff(numbers)
+    least = steps.min()
+    if min(numbers) >= 0 and least >= 1 and least == steps.max():
+        return None
+    return 1 + int(np.argmax(steps != least) if least > 0 else np.argmin(steps))
 
 
 @dataclass(frozen=True)
@@ -99,27 +102,15 @@ class VideoReader:
             if (regular := clock(times)) is not None:
                 positions, rate = regular
                 periods = float(positions[-1] - positions[0])
-                if positions[-1] > 10 * num_held + _MAX_PAUSE:
-                    raise ValueError(
-                        f"{path}: expected {num_held} frames at about {rate:.3g} per second, got "
-                        f"time stamps that span {times[-1]:.3g} s; they are broken, convert the "
-                        "clip."
-                    )
+                _check_span(path, positions, rate, times)
                 # Where the number is not stored, it is the duration times the mean rate; a clip of
                 # this length is complete.
                 if fps > 0 and num_frames / fps <= times[-1] + 1.5 / rate:
                     num_frames = num_held
             fps = true_rate(fps, periods, float(times[-1] - times[0]))
-        return cls(
-            path,
-            num_frames,
-            fps if fps > 0 else None,
-            header.width,
-            header.height,
-            num_held,
-            positions,
-            times,
-        )
+        shown_fps = fps if fps > 0 else None
+        size = header.width, header.height
+        return cls(path, num_frames, shown_fps, *size, num_held, positions, times)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
         """Yield frames start..stop-1, by default up to `num_frames`.
@@ -167,14 +158,8 @@ class VideoReader:
             return self._opened(), 0
         stream = self._opened()
         stream.set(cv2.CAP_PROP_POS_MSEC, 1000 * self.times[index - _BEFORE])
-        if stream.grab():
-            at = int(np.argmin(np.abs(self.times - seconds(stream))))
-            while at <= index and abs(self.times[at] - seconds(stream)) < SAME_TIME:
-                if at == index:
-                    return stream, index + 1
-                at += 1
-                if not stream.grab():
-                    break
+        if _passes(stream, self.times, index):
+            return stream, index + 1
         stream.release()
         return self._opened(), 0
 
@@ -240,12 +225,7 @@ class FolderReader:
             )
         if not gaps and (missing := next((f for f in files if not f.is_file()), None)):
             raise _no_image(missing)
-        readable = (
-            (f for f in files if not isinstance(_image_or_error(f), Exception))
-            if gaps
-            else iter(files)
-        )
-        first = _read_image(next(readable, files[0]))
+        first = _read_image(_first_readable(files) if gaps else files[0])
         return cls(files[0].parent, tuple(files), first.shape[1], first.shape[0])
 
     @property
@@ -272,20 +252,50 @@ class FolderReader:
         """Yield the frames `indices`, with an error in place of each that is missing, broken or of
         another size.
         """
-        for index in indices:
-            if index >= self.num_frames:
-                yield ValueError(
-                    f"{self.path}: it has ended after {self.num_frames} images; record longer."
-                )
-                continue
-            frame = _image_or_error(self.files[index])
-            if isinstance(frame, np.ndarray) and frame.shape[:2] != (self.height, self.width):
-                frame = ValueError(
-                    f"{self.files[index]}: expected {self.width}x{self.height} as in "
-                    f"{self.files[0].name}, got {frame.shape[1]}x{frame.shape[0]}; extract the "
-                    "frames again."
-                )
-            yield frame
+        yield from map(self._frame, indices)
+
+    def _frame(self, index: int) -> ImageOrError:
+        if index >= self.num_frames:
+            return ValueError(
+                f"{self.path}: it has ended after {self.num_frames} images; record longer."
+            )
+        frame = _image_or_error(self.files[index])
+        if isinstance(frame, np.ndarray) and frame.shape[:2] != (self.height, self.width):
+            return ValueError(
+                f"{self.files[index]}: expected {self.width}x{self.height} as in "
+                f"{self.files[0].name}, got {frame.shape[1]}x{frame.shape[0]}; extract the "
+                "frames again."
+            )
+        return frame
+
+
+def _first_readable(files: Sequence[Path]) -> Path:
+    """Return the first image that is readable, or the first file if none is."""
+    readable = (file for file in files if not isinstance(_image_or_error(file), Exception))
+    return next(readable, files[0])
+
+
+def _passes(stream: cv2.VideoCapture, times: np.ndarray, index: int) -> bool:
+    """Decode up to frame `index`, and return whether the frames on the way have their `times`."""
+    if not stream.grab():
+        return False
+    at = int(np.argmin(np.abs(times - seconds(stream))))
+    while at <= index and abs(times[at] - seconds(stream)) < SAME_TIME:
+        if at == index:
+            return True
+        at += 1
+        if not stream.grab():
+            break
+    return False
+
+
+def _check_span(path: Path, positions: np.ndarray, rate: float, times: np.ndarray) -> None:
+    """Check that a clip does not pause for more frames than could be listed."""
+    if positions[-1] > 10 * len(times) + _MAX_PAUSE:
+        raise ValueError(
+            f"{path}: expected {len(times)} frames at about {rate:.3g} per second, got time stamps "
+            f"that span {times[-1]:.3g} s; they are broken, convert the clip."
+        )
 
 
 FrameReader = VideoReader | FolderReader
@@ -306,19 +316,24 @@ def open_clips(clips: Sequence[Clip], gaps: bool = False) -> list[FrameReader]:
         ValueError: as `VideoReader.open` and `FolderReader.open`.
     """
     folders = [clip for clip in clips if gaps and isinstance(clip, Path) and clip.is_dir()]
+    readers = _aligned_folders(folders)
+    return [readers[clip] if clip in readers else open_frames(clip, gaps) for clip in clips]
+
+
+def _aligned_folders(folders: Sequence[Path]) -> dict[Clip, FrameReader]:
+    """Return the readers of folders of images, aligned by the numbers of their images."""
     folder_files = {
         folder: {image_number(file): file for file in _images(folder)} for folder in folders
     }
+    ascending = {folder: sorted(files) for folder, files in folder_files.items()}
     readers: dict[Clip, FrameReader] = {}
-    for group in counting_together(
-        {folder: sorted(files) for folder, files in folder_files.items()}
-    ):
+    for group in counting_together(ascending):
         numbers = _instants([folder_files[folder] for folder in group])
         for folder in group:
             files = folder_files[folder]
             images = [files.get(number, _missing_name(folder, files, number)) for number in numbers]
-            readers[folder] = replace(FolderReader.of_files(images, gaps), numbers=numbers)
-    return [readers[clip] if clip in readers else open_frames(clip, gaps) for clip in clips]
+            readers[folder] = replace(FolderReader.of_files(images, gaps=True), numbers=numbers)
+    return readers
 
 
 def _instants(group: Sequence[Mapping[int, Path]]) -> range:
@@ -331,13 +346,18 @@ def _instants(group: Sequence[Mapping[int, Path]]) -> range:
     numbers = sorted(set().union(*group))
     step = int(np.gcd.reduce(np.diff(numbers))) if len(numbers) > 1 else 1
     if (numbers[-1] - numbers[0]) // step > 10 * len(numbers) + 1000:
-        gap = int(np.argmax(np.diff(numbers)))
-        file = next(files[numbers[gap + 1]] for files in group if numbers[gap + 1] in files)
-        raise ValueError(
-            f"{file}: expected images numbered without large gaps, got this after "
-            f"number {numbers[gap]} among {len(numbers)} images; rename or remove it."
-        )
+        raise _gap_error(group, numbers)
     return range(numbers[0], numbers[-1] + 1, step)
+
+
+def _gap_error(group: Sequence[Mapping[int, Path]], numbers: Sequence[int]) -> ValueError:
+    """Return the error of the largest gap in the numbers of images."""
+    gap = int(np.argmax(np.diff(numbers)))
+    file = next(files[numbers[gap + 1]] for files in group if numbers[gap + 1] in files)
+    return ValueError(
+        f"{file}: expected images numbered without large gaps, got this after "
+        f"number {numbers[gap]} among {len(numbers)} images; rename or remove it."
+    )
 
 
 def open_frames(path: str | Path | tuple[Path, ...], gaps: bool = False) -> FrameReader:
@@ -421,13 +441,17 @@ def _read_image(file: Path) -> np.ndarray:
     if not file.is_file():
         raise _no_image(file)
     if file.suffix.lower() == EXR_SUFFIX:
-        try:
-            return read_light(fetched(file))
-        except OSError as error:
-            raise ValueError(str(error)) from None
+        return _read_light(file)
     # The stored pixels, without EXIF's rotation: calibrations refer to them.
     image = decode_image(file, np.fromfile(fetched(file), np.uint8), cv2.IMREAD_COLOR)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def _read_light(file: Path) -> np.ndarray:
+    try:
+        return read_light(fetched(file))
+    except OSError as error:
+        raise ValueError(str(error)) from None
 
 
 def decode_image(file: Path, data: np.ndarray, mode: int) -> np.ndarray:

@@ -58,37 +58,47 @@ def _write_file(
         for frame in _checked(path, frames):
             if encoder is None:
                 height, width = frame.shape[:2]
-                if width % 2 or height % 2:
-                    raise ValueError(
-                        f"write_video({path}): the width and height must be even, because OpenCV "
-                        f"drops an odd column or row, got {width}x{height}; crop, or write a "
-                        "folder of PNGs."
-                    )
-                encoder = cv2.VideoWriter(
-                    str(partial),
-                    cv2.CAP_FFMPEG,
-                    cv2.VideoWriter.fourcc(*codec),
-                    fps,
-                    (width, height),
-                )
-                if not encoder.isOpened():
-                    raise OSError(
-                        f"OpenCV could not open it with the encoder {codec!r}; try the codec FFV1 "
-                        "or mp4v"
-                    )
+                _check_even(path, width, height)
+                encoder = _encoder(partial, width, height, fps, codec)
             encoder.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
             count += 1
     finally:
         if encoder is not None:
             encoder.release()
     # OpenCV's writer reports no failure, not even a full disk, so the decodable frames are counted.
-    stream = cv2.VideoCapture(str(partial), cv2.CAP_FFMPEG)
-    readable = 0
-    while stream.grab():
-        readable += 1
-    stream.release()
+    readable = _count_frames(partial)
     if readable != count:
         raise OSError(f"{count} frames were written but {readable} can be read back")
+
+
+def _check_even(path: Path, width: int, height: int) -> None:
+    if width % 2 or height % 2:
+        raise ValueError(
+            f"write_video({path}): the width and height must be even, because OpenCV "
+            f"drops an odd column or row, got {width}x{height}; crop, or write a "
+            "folder of PNGs."
+        )
+
+
+def _encoder(partial: Path, width: int, height: int, fps: float, codec: str) -> cv2.VideoWriter:
+    fourcc = cv2.VideoWriter.fourcc(*codec)
+    encoder = cv2.VideoWriter(str(partial), cv2.CAP_FFMPEG, fourcc, fps, (width, height))
+    if not encoder.isOpened():
+        encoder.release()
+        raise OSError(
+            f"OpenCV could not open it with the encoder {codec!r}; try the codec FFV1 or mp4v"
+        )
+    return encoder
+
+
+def _count_frames(path: Path) -> int:
+    """Return the number of frames of a video that can be decoded."""
+    stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    count = 0
+    while stream.grab():
+        count += 1
+    stream.release()
+    return count
 
 
 def _checked(path: Path, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
