@@ -145,18 +145,24 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         ValueError: the file is broken, too large, nested too deeply, or has too many tables.
     """
     text = read_text(path, MAX_TOML)
-    structure = _TOKEN.sub(lambda token: "" if token["comment"] else "s", text)
-    words = [(word.count("."), end) for word, end in _WORD.findall(structure)]
-    tables = sum(dots for dots, end in words if end) + sum(map(structure.count, "[{"))
+    tables, most_dots = _toml_claim(text)
     check_claim(path, _TABLE_BYTES * tables, f"{tables} tables")
     try:
-        if max((dots for dots, _ in words), default=0) >= _MAX_PARTS:
+        if most_dots >= _MAX_PARTS:
             raise ValueError(f"a key has more than {_MAX_PARTS} parts")
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise ValueError(
             f"{path}: expected TOML, got a broken file ({error}); write it again."
         ) from None
+
+
+def _toml_claim(text: str) -> tuple[int, int]:
+    """Return the number of tables of a TOML text at most, and the most dots in a key."""
+    structure = _TOKEN.sub(lambda token: "" if token["comment"] else "s", text)
+    words = [(word.count("."), end) for word, end in _WORD.findall(structure)]
+    tables = sum(dots for dots, end in words if end) + sum(map(structure.count, "[{"))
+    return tables, max((dots for dots, _ in words), default=0)
 
 
 def read_json(path: str | Path) -> Any:
@@ -194,29 +200,33 @@ def read_array(path: str | Path, name: str | None = None) -> np.ndarray:
         ValueError: the file is broken, claims more numbers than it holds, or holds Python objects.
     """
     try:
-        data = read_bytes(path) if name is None else _member(path, f"{name}.npy")
-        stream = BytesIO(data)
-        version = np.lib.format.read_magic(stream)
-        read_header = (
-            np.lib.format.read_array_header_1_0
-            if version == (1, 0)
-            else np.lib.format.read_array_header_2_0
-        )
-        shape, in_columns, dtype = read_header(stream)
-        # NumPy would execute what such a file contains.
-        if dtype.hasobject:
-            raise ValueError("it holds Python objects, not numbers")
-        count = math.prod(shape)
-        num_bytes = len(data) - stream.tell()
-        if min(shape, default=0) < 0 or count * dtype.itemsize != num_bytes:
-            raise ValueError(f"its header claims {dtype} {shape}, but {num_bytes} bytes follow")
-        flat = np.frombuffer(data, dtype, count, stream.tell())
-        return flat.reshape(shape, order="F" if in_columns else "C")
+        return _parsed_array(read_bytes(path) if name is None else _member(path, f"{name}.npy"))
     except _BROKEN as error:
         what = "a NumPy array" if name is None else f"an array `{name}` in a NumPy archive"
         raise ValueError(
             f"{path}: expected {what}, got a broken file ({error}); export it again."
         ) from None
+
+
+def _parsed_array(data: bytes) -> np.ndarray:
+    """Return the array in the bytes of a NumPy file."""
+    stream = BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    read_header = (
+        np.lib.format.read_array_header_1_0
+        if version == (1, 0)
+        else np.lib.format.read_array_header_2_0
+    )
+    shape, in_columns, dtype = read_header(stream)
+    # NumPy would execute what such a file contains.
+    if dtype.hasobject:
+        raise ValueError("it holds Python objects, not numbers")
+    count = math.prod(shape)
+    num_bytes = len(data) - stream.tell()
+    if min(shape, default=0) < 0 or count * dtype.itemsize != num_bytes:
+        raise ValueError(f"its header claims {dtype} {shape}, but {num_bytes} bytes follow")
+    flat = np.frombuffer(data, dtype, count, stream.tell())
+    return flat.reshape(shape, order="F" if in_columns else "C")
 
 
 def array_names(path: str | Path) -> list[str]:

@@ -31,12 +31,7 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
         ValueError: there is no channel, or the channels differ in shape.
         OSError: the file cannot be written.
     """
-    shapes = {name: np.shape(channel) for name, channel in channels.items()}
-    if len(set(shapes.values())) != 1 or any(len(shape) != 2 for shape in shapes.values()):
-        raise ValueError(
-            f"write_exr(): `channels` must share one shape [H, W], got {shapes}; pass one image "
-            "each."
-        )
+    _check_shapes(channels)
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     pixels = {name: np.ascontiguousarray(channel, np.float32) for name, channel in channels.items()}
     with atomic_path(path, "write_exr()") as partial:
@@ -44,6 +39,15 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
             OpenEXR.File(header, pixels).write(str(partial))
         except RuntimeError as error:
             raise OSError(str(error)) from error
+
+
+def _check_shapes(channels: Mapping[str, np.ndarray]) -> None:
+    shapes = {name: np.shape(channel) for name, channel in channels.items()}
+    if len(set(shapes.values())) != 1 or any(len(shape) != 2 for shape in shapes.values()):
+        raise ValueError(
+            f"write_exr(): `channels` must share one shape [H, W], got {shapes}; pass one image "
+            "each."
+        )
 
 
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:
@@ -69,15 +73,20 @@ def read_light(path: str | Path) -> np.ndarray:
         ValueError: it has other channels, or values that are not finite.
     """
     channels, primaries = _read(path)
+    light = np.stack([channels[name] for name in _color_names(path, channels)], axis=-1)
+    if np.abs(np.subtract(primaries, _REC_709)).max() > _SAME:
+        light = light @ _to_rec_709(primaries).T
+    return positive_light(light, f"{path}: its image")
+
+
+def _color_names(path: str | Path, channels: Mapping[str, np.ndarray]) -> str:
+    """Return the names of the channels of red, green and blue."""
     names = "RGB" if {"R", "G", "B"} <= channels.keys() else "YYY"
     if not set(names) <= channels.keys():
         raise ValueError(
             f"{path}: expected the channels R, G, B, or Y, got {', '.join(channels)}; rename them."
         )
-    light = np.stack([channels[name] for name in names], axis=-1)
-    if np.abs(np.subtract(primaries, _REC_709)).max() > _SAME:
-        light = light @ _to_rec_709(primaries).T
-    return positive_light(light, f"{path}: its image")
+    return names
 
 
 def _to_rec_709(primaries: Sequence[float]) -> np.ndarray:
@@ -117,25 +126,31 @@ def _check_size(path: str | Path) -> None:
     headers alone.
     """
     with Path(path).open("rb") as file:
-        magic, version = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
-        if magic != _MAGIC:
-            raise ValueError("it does not begin with the number of an EXR file")
-        parts = [_header(file)]
-        # Headers of several parts end with an empty one.
-        while version & _MULTIPART and (header := _header(file)):
-            parts.append(header)
-    sizes = []
-    for part in parts:
-        left, top, right, bottom = struct.unpack("<4i", part[b"dataWindow"])
-        sizes.append(
-            (max(0, right - left + 1), max(0, bottom - top + 1), _count_channels(part[b"channels"]))
-        )
-        if part.get(b"type", b"").startswith(b"deep"):
-            raise ValueError("it has deep pixels, which are not supported")
+        sizes = list(map(_part_size, _headers(file)))
     numbers = sum(width * height * channels for width, height, channels in sizes)
-    check_claim(
-        path, 4 * numbers, " and ".join(f"{w}x{h} pixels of {n} channels" for w, h, n in sizes)
-    )
+    content = " and ".join(f"{w}x{h} pixels of {n} channels" for w, h, n in sizes)
+    check_claim(path, 4 * numbers, content)
+
+
+def _headers(file: BinaryIO) -> list[dict[bytes, bytes]]:
+    """Return the attributes of all parts."""
+    magic, version = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
+    if magic != _MAGIC:
+        raise ValueError("it does not begin with the number of an EXR file")
+    parts = [_header(file)]
+    # Headers of several parts end with an empty one.
+    while version & _MULTIPART and (header := _header(file)):
+        parts.append(header)
+    return parts
+
+
+def _part_size(part: Mapping[bytes, bytes]) -> tuple[int, int, int]:
+    """Return the width, the height and the number of channels of a part."""
+    left, top, right, bottom = struct.unpack("<4i", part[b"dataWindow"])
+    channels = _count_channels(part[b"channels"])
+    if part.get(b"type", b"").startswith(b"deep"):
+        raise ValueError("it has deep pixels, which are not supported")
+    return max(0, right - left + 1), max(0, bottom - top + 1), channels
 
 
 def _header(file: BinaryIO) -> dict[bytes, bytes]:

@@ -70,13 +70,17 @@ def _format(path: Path) -> _Format | None:
     """Return the format of a file that is not read, by its first bytes or else by its name; None:
     no such format.
     """
-    head = b""
-    if path.is_file():
-        with path.open("rb") as file:
-            head = file.read(_HEAD)
     name = path.name.lower()
     name_format = next((kind for kind in _FORMATS if name.endswith(kind.endings)), None)
-    return _by_content(head, name_format, name) or name_format
+    return _by_content(_head(path), name_format, name) or name_format
+
+
+def _head(path: Path) -> bytes:
+    """Return the first bytes of a file, none if it is missing."""
+    if not path.is_file():
+        return b""
+    with path.open("rb") as file:
+        return file.read(_HEAD)
 
 
 def _by_content(head: bytes, name_format: _Format | None, name: str) -> _Format | None:

@@ -36,27 +36,25 @@ def model_cameras(path: Path) -> tuple[Path | None, tuple[Camera, ...]]:
     """
     folders = path.resolve().parents[:3]
     for file in (folder / _FILE for folder in folders):
-        if file.is_file():
-            rows = read_json(file)
-            if (
-                isinstance(rows, list)
-                and rows
-                and all(isinstance(row, dict) and row.keys() >= _KEYS for row in rows)
-            ):
-                warn_unread(file, {key for row in rows for key in row} - _KEYS - _HARMLESS)
-                return file, tuple(
-                    _camera(file, i, rows[i]) for i in range(0, len(rows), -(-len(rows) // _MOST))
-                )
+        if file.is_file() and _are_cameras(rows := read_json(file)):
+            warn_unread(file, {key for row in rows for key in row} - _KEYS - _HARMLESS)
+            indices = range(0, len(rows), -(-len(rows) // _MOST))
+            return file, tuple(_camera(file, i, rows[i]) for i in indices)
     return None, ()
+
+
+def _are_cameras(rows: Any) -> bool:
+    """Return whether the content of a file is a list of cameras."""
+    return (
+        isinstance(rows, list)
+        and len(rows) > 0
+        and all(isinstance(row, dict) and row.keys() >= _KEYS for row in rows)
+    )
 
 
 def _camera(file: Path, index: int, row: dict[str, Any]) -> Camera:
     try:
-        R = np.asarray(row["rotation"], np.float64)
-        position = np.asarray(row["position"], np.float64)
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = R.T
-        viewmat[:3, 3] = -R.T @ position
+        viewmat = _viewmat(row)
         width, height, fx, fy = (float(row[key]) for key in ("width", "height", "fx", "fy"))
         K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
         return Camera(K, viewmat, round(width), round(height), str(row.get("img_name", index)))
@@ -64,3 +62,12 @@ def _camera(file: Path, index: int, row: dict[str, Any]) -> Camera:
         raise ValueError(
             f"{file}: entry {index}: expected a camera, got a broken one: {error}"
         ) from None
+
+
+def _viewmat(row: dict[str, Any]) -> np.ndarray:
+    """Return the world-to-camera matrix [4, 4]."""
+    R = np.asarray(row["rotation"], np.float64)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = R.T
+    viewmat[:3, 3] = -R.T @ np.asarray(row["position"], np.float64)
+    return viewmat

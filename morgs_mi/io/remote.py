@@ -36,6 +36,8 @@ _VERSION = (
 )
 _PAGE = (b"<!doctype html", b"<html")
 _IGNORED = "truth"
+# Files that are fetched when they are read.
+_LATER = (*VIDEO_SUFFIXES, *IMAGE_SUFFIXES, EXR_SUFFIX)
 _INDEX = ".remote.json"  # file in a mirrored folder: its URL, and the sizes of the files
 # Seconds to wait for a connection and for each further piece of a file, and requests at a time.
 PATIENCE = 60
@@ -58,33 +60,17 @@ def mirrored(url: str) -> Path:
     """
     system, root = _file_system(url)
     base = root.rstrip("/")
-    with _failures(url):
-        system.invalidate_cache()
-        files = {
-            path.removeprefix(base).lstrip("/"): entry
-            for path, entry in _listing(system, base).items()
-        }
-    # A name with a query is a link of a server's listing, by which it is sorted.
-    files = {name: files[name] for name in sorted(files) if name and "?" not in name}
-    if not files:
-        raise FileNotFoundError(f"{url}: expected a capture folder, found no files; check the URL.")
-    if outside := next((name for name in files if ".." in name.split("/")), None):
-        raise ValueError(f"{url}: expected files in the folder, got {outside}; rename it.")
+    files = _files(system, url, base)
     if not all(map(_versions, files.values())):
         with _failures(url), ThreadPoolExecutor(_REQUESTS) as requests:
-            files = dict(
-                zip(
-                    files,
-                    requests.map(lambda name: system.info(f"{base}/{name}"), files),
-                    strict=True,
-                )
-            )
+            entries = requests.map(lambda name: system.info(f"{base}/{name}"), files)
+            files = dict(zip(files, entries, strict=True))
     folder = _folder(url, files) / base.rpartition("/")[2]
     sizes = {name: entry.get("size") for name, entry in files.items()}
     for name, size in sizes.items():
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)
-        if file.suffix.lower() in (*VIDEO_SUFFIXES, *IMAGE_SUFFIXES, EXR_SUFFIX):
+        if file.suffix.lower() in _LATER:
             file.touch()
         elif not file.exists():
             _fetch(system, url, f"{base}/{name}", file, size)
@@ -113,6 +99,21 @@ def url_of(folder: Path) -> str | None:
 
 def _cache() -> Path:
     return (cache_folder() / "captures").resolve()
+
+
+def _files(system: Any, url: str, base: str) -> dict[str, Mapping[str, Any]]:
+    """Return the entries of the files in a folder at a URL, by their names there, in order."""
+    with _failures(url):
+        system.invalidate_cache()
+        paths = _listing(system, base)
+    files = {path.removeprefix(base).lstrip("/"): entry for path, entry in paths.items()}
+    # A name with a query is a link of a server's listing, by which it is sorted.
+    files = {name: files[name] for name in sorted(files) if name and "?" not in name}
+    if not files:
+        raise FileNotFoundError(f"{url}: expected a capture folder, found no files; check the URL.")
+    if outside := next((name for name in files if ".." in name.split("/")), None):
+        raise ValueError(f"{url}: expected files in the folder, got {outside}; rename it.")
+    return files
 
 
 def _listing(system: Any, base: str) -> dict[str, Mapping[str, Any]]:
