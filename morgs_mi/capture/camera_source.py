@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,7 +12,7 @@ import numpy as np
 from morgs_mi.capture.color_correction import ColorCorrection
 from morgs_mi.capture.interpolation import image_between
 from morgs_mi.capture.lens import Lens, Undistortion, undistortion
-from morgs_mi.capture.masks import used_in_clip
+from morgs_mi.capture.masks import scaled_mask, used_in_clip
 from morgs_mi.capture.timeline import ClipTimes
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import decode_light, display_image, encode_light
@@ -63,13 +63,11 @@ class CameraSource:
             ValueError: a mask cannot be read, or no pixel is left.
         """
         mask, notes = used_in_clip(reader, masks, camera.name)
-        maps = undistortion(camera, lens)
-        indices = times.frame_indices
         return cls(
             reader,
             lens,
-            maps,
-            indices,
+            undistortion(camera, lens),
+            times.frame_indices,
             times.shares,
             recorded_mask=mask,
             delay=times.delay,
@@ -93,15 +91,18 @@ class CameraSource:
                 camera, self.frame_indices[start:stop], self.shares[start:stop]
             )
             return
+        for image in self._recorded(start, stop):
+            yield self.process(image, camera) if isinstance(image, np.ndarray) else image
+
+    def _recorded(self, start: int, stop: int) -> Iterator[ImageOrError]:
+        """Yield the recorded images of the instants start..stop-1, or errors."""
         indices = self.frame_indices[start:stop]
         frames = self.reader.pick(indices[indices >= 0].tolist())
         for instant, index in enumerate(indices, start):
-            image = (
-                next(frames)
-                if index >= 0
-                else ValueError(f"{self.reader.path}: no frame at instant {instant}.")
-            )
-            yield self.process(image, camera) if isinstance(image, np.ndarray) else image
+            if index >= 0:
+                yield next(frames)
+            else:
+                yield ValueError(f"{self.reader.path}: no frame at instant {instant}.")
 
     def _interpolated(
         self, camera: Camera, indices: np.ndarray, shares: np.ndarray
@@ -122,11 +123,7 @@ class CameraSource:
         colour-corrected.
         """
         if self.undistortion:
-            # The cubic filter rings less in encoded values, in which lamps are less far from their
-            # surroundings.
-            has_light = image.dtype != np.uint8
-            image = self.undistortion(encode_light(image) if has_light else image)
-            image = np.maximum(decode_light(image), 0) if has_light else image
+            image = _undistorted(image, self.undistortion)
         image = _downscaled(image, camera)
         image = self.color_correction(image) if self.color_correction else image
         return (
@@ -135,18 +132,18 @@ class CameraSource:
 
     def mask(self, camera: Camera) -> np.ndarray | None:
         """Return the mask of the valid pixels of `camera` [H, W] bool, or None if all are valid."""
-        valid = self.recorded_mask
-        if self.undistortion is not None:
-            valid = self.undistortion.mask
-            if self.recorded_mask is not None:
-                # Other pixels must not contribute; cubic weights can also be negative.
-                valid = valid & (
-                    np.abs(self.undistortion(self.recorded_mask.astype(np.float32)) - 1) < 1e-3
-                )
+        valid = self._valid_pixels()
         if valid is None or valid.all():
             return None
-        # A downscaled pixel is valid if all pixels that it averages are.
-        return _downscaled(valid.astype(np.float32), camera) > 1 - 1e-4
+        return scaled_mask(valid, camera.width, camera.height)
+
+    def _valid_pixels(self) -> np.ndarray | None:
+        """Return the mask of the valid pixels after the undistortion."""
+        if self.undistortion is None or self.recorded_mask is None:
+            return self.recorded_mask if self.undistortion is None else self.undistortion.mask
+        # Other pixels must not contribute; cubic weights can also be negative.
+        weights = self.undistortion(self.recorded_mask.astype(np.float32))
+        return self.undistortion.mask & (np.abs(weights - 1) < 1e-3)
 
 
 def at_clip_size(camera: Camera, reader: FrameReader) -> Camera:
@@ -167,6 +164,14 @@ def at_clip_size(camera: Camera, reader: FrameReader) -> Camera:
             "calibrate at the recorded size."
         )
     return camera.resized(reader.width, reader.height)
+
+
+def _undistorted(image: np.ndarray, maps: Undistortion) -> np.ndarray:
+    if image.dtype == np.uint8:
+        return maps(image)
+    # The cubic filter rings less in encoded values, in which lamps are less far from their
+    # surroundings.
+    return np.maximum(decode_light(maps(encode_light(image))), 0)
 
 
 def _downscaled(image: np.ndarray, camera: Camera) -> np.ndarray:

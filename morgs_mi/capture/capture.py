@@ -8,7 +8,7 @@ each camera's clip. An optional ``capture.json`` has settings (see `timeline.rea
 from __future__ import annotations
 
 import logging
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
@@ -18,7 +18,7 @@ import numpy as np
 from morgs_mi.capture.camera_source import CameraSource, at_clip_size
 from morgs_mi.capture.color_correction import ColorFit, fit_colors
 from morgs_mi.capture.held_out import TestViews, held_out_by, held_out_views
-from morgs_mi.capture.layouts.clips import EXAMPLE
+from morgs_mi.capture.layouts.clips import EXAMPLE, check_names
 from morgs_mi.capture.layouts.layout_registry import find_layout
 from morgs_mi.capture.lens import Lens, undistortion
 from morgs_mi.capture.timeline import ClipTimes, ReadConfig, Timeline, read_settings, timeline
@@ -176,13 +176,7 @@ class Capture:
             radial_terms,
             strict=True,
         )
-        sources = tuple(
-            replace(
-                source,
-                undistortion=undistortion(camera, source.lens, (refined, Lens("RADIAL", terms))),
-            )
-            for source, camera, refined, terms in views
-        )
+        sources = tuple(_refined_source(*view) for view in views)
         masks = _masks(sources, rig.cameras)
         return replace(rig, masks=masks, _sources=sources, distortions=radial_terms)
 
@@ -205,12 +199,6 @@ class Capture:
         stream.
         """
         views = zip(self.cameras, self._sources, self.masks, strict=True)
-        fit = self.colors
-        colors = fit and {
-            "reference": self.names[fit.reference],
-            "delta_e_before": fit.before,
-            "delta_e": fit.after,
-        }
         return {
             "capture": str(self.path),
             "layout": self.layout,
@@ -221,7 +209,7 @@ class Capture:
             "test_view": list(self.test_views),
             "points": len(self.points),
             "reading": {**asdict(self.reading), "without": list(self.reading.without)},
-            "colors": colors,
+            "colors": self.colors and _color_metadata(self.colors, self.names),
             "notes": list(self.notes),
             "cameras": [_camera_metadata(*view) for view in views],
         }
@@ -248,8 +236,11 @@ class Capture:
         """Yield the images of one camera at the frames start..stop-1, with an error in place of a
         missing image.
         """
-        stop = self.num_frames if stop is None else min(stop, self.num_frames)
-        return self._sources[view].images(self.cameras[view], start, stop)
+        return self._sources[view].images(self.cameras[view], start, self._stop(stop))
+
+    def _stop(self, stop: int | None) -> int:
+        """Return the end of a range of frames, by default of all."""
+        return self.num_frames if stop is None else min(stop, self.num_frames)
 
     def with_delays(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
         """Return the cameras of a stream of this capture with the delays and readouts of the
@@ -264,7 +255,7 @@ class Capture:
     def _decoded(
         self, start: int, stop: int | None, strict: bool
     ) -> Generator[PartialFrame, None, None]:
-        stop = self.num_frames if stop is None else min(stop, self.num_frames)
+        stop = self._stop(stop)
         streams = [
             s.images(c, start, stop) for s, c in zip(self._sources, self.cameras, strict=True)
         ]
@@ -277,9 +268,7 @@ class Capture:
                 for name in errors.keys() - missing:
                     _LOG.warning("frame %d: %s is left out: %s", index, name, errors[name])
                 missing = set(errors)
-                images = tuple(None if isinstance(f, Exception) else f for f in results)
-                problems = tuple(f"{name}: {error}" for name, error in errors.items())
-                yield self._at_instant(PartialFrame(index, images, problems))
+                yield self._at_instant(_partial_frame(index, results, errors))
         finally:
             for stream in streams:
                 stream.close()
@@ -298,14 +287,15 @@ class Capture:
         The motion in the first frame is unknown, so delays cannot be rendered.
         """
         views = zip(images, self._sources, self.cameras, strict=True)
-        results = (
-            next(s.at_instants().images(c, 0, 1)) if s.delay and i is not None else i
-            for i, s, c in views
-        )
-        return tuple(
-            image if isinstance(result, Exception) else result
-            for image, result in zip(images, results, strict=True)
-        )
+        return tuple(_first_image(*view) for view in views)
+
+
+def _refined_source(
+    source: CameraSource, camera: Camera, refined: Camera, terms: tuple[float, float]
+) -> CameraSource:
+    """Return the source of a calibrated camera with the undistortion of a refined one."""
+    stage = (refined, Lens("RADIAL", terms))
+    return replace(source, undistortion=undistortion(camera, source.lens, stage))
 
 
 def _errors(names: Sequence[str], results: Sequence[ImageOrError]) -> dict[str, Exception]:
@@ -313,11 +303,36 @@ def _errors(names: Sequence[str], results: Sequence[ImageOrError]) -> dict[str, 
     return {n: f for n, f in zip(names, results, strict=True) if isinstance(f, Exception)}
 
 
+def _first_image(
+    image: np.ndarray | None, source: CameraSource, camera: Camera
+) -> np.ndarray | None:
+    """Return the first image of a camera at its instant, `image` if it cannot be interpolated."""
+    if image is None or not source.delay:
+        return image
+    result = next(source.at_instants().images(camera, 0, 1))
+    return image if isinstance(result, Exception) else result
+
+
+def _partial_frame(
+    index: int, results: Sequence[ImageOrError], errors: Mapping[str, Exception]
+) -> PartialFrame:
+    images = tuple(None if isinstance(f, Exception) else f for f in results)
+    return PartialFrame(index, images, tuple(f"{name}: {error}" for name, error in errors.items()))
+
+
 def _masks(
     sources: Sequence[CameraSource], cameras: Sequence[Camera]
 ) -> tuple[np.ndarray | None, ...]:
     """Return the masks of the valid pixels of cameras, None where all are valid."""
     return tuple(source.mask(camera) for source, camera in zip(sources, cameras, strict=True))
+
+
+def _color_metadata(fit: ColorFit, names: Sequence[str]) -> dict[str, Any]:
+    return {
+        "reference": names[fit.reference],
+        "delta_e_before": fit.before,
+        "delta_e": fit.after,
+    }
 
 
 def _camera_metadata(
@@ -457,11 +472,7 @@ def _readouts(
     readout = settings.get("readout", 0.0)
     if not isinstance(readout, dict):
         return [readout] * len(names)
-    if unknown := [name for name in readout if name not in every]:
-        where = path / CAPTURE
-        raise ValueError(
-            f"{where}: `readout` must name cameras of {', '.join(every)}, got {', '.join(unknown)}."
-        )
+    check_names(path / CAPTURE, "readout", readout, every)
     return [readout.get(name, 0.0) for name in names]
 
 

@@ -16,7 +16,14 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from morgs_mi.capture.features import Features, Match, detect, match_views, reprojection_errors
+from morgs_mi.capture.features import (
+    Features,
+    Match,
+    detect,
+    match_views,
+    reprojection_errors,
+    values_at,
+)
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import decode_light, encode_light
 
@@ -153,8 +160,7 @@ def _colors_at(image: np.ndarray, points: np.ndarray) -> np.ndarray:
     includes the background.
     """
     light = cv2.GaussianBlur(_LINEAR[image], (0, 0), max(1.0, _BLUR * image.shape[1]))
-    columns, rows = np.clip(points.astype(int), 0, (image.shape[1] - 1, image.shape[0] - 1)).T
-    return light[rows, columns].astype(np.float64)
+    return values_at(light, points).astype(np.float64)
 
 
 def _reliable(
@@ -166,9 +172,13 @@ def _reliable(
     """Return the features of a match that fit the poses and are well exposed in both views."""
     good = reprojection_errors(match, features, cameras) <= _MAX_ERROR
     for k, view in enumerate(match.views):
-        feature_colors = colors[view][match.features[:, k]]
-        good &= ((feature_colors > _LINEAR[_DARK]) & (feature_colors < _LINEAR[_BRIGHT])).all(1)
+        good &= _well_exposed(colors[view][match.features[:, k]])
     return Match(match.views, match.features[good])
+
+
+def _well_exposed(colors: np.ndarray) -> np.ndarray:
+    """Return the mask of linear colours [M, 3] that are neither nearly black nor nearly white."""
+    return ((colors > _LINEAR[_DARK]) & (colors < _LINEAR[_BRIGHT])).all(1)
 
 
 def _shared_colors(

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from morgs_mi.capture.lens import image_coordinates
 from morgs_mi.core.camera import Camera
 
 # Larger images add no corners that other views also see, and SIFT is slow.
@@ -82,7 +83,7 @@ def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features
     if image is None:
         return _no_features()
     height, width = image.shape[:2]
-    size = _detection_size(width, height)
+    size = reduced_size(width, height, _DETECTION_PIXELS)
     keypoints, descriptors = _sift(image, mask, size)
     if descriptors is None:
         return _no_features()
@@ -91,8 +92,7 @@ def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features
     # RootSIFT: square roots of the normalised descriptors are easier to distinguish (Arandjelovic
     # 2012).
     descriptors = np.sqrt(descriptors / descriptors.sum(1, keepdims=True))
-    columns, rows = np.clip(points.astype(int), 0, (width - 1, height - 1)).T
-    colors = image[rows, columns].astype(np.float32) / 255
+    colors = values_at(image, points).astype(np.float32) / 255
     return Features(points, descriptors, colors, _patch_axes(keypoints) * pixel_scale)
 
 
@@ -101,8 +101,15 @@ def _no_features() -> Features:
     return Features(points, np.zeros((0, 128), np.float32), np.zeros((0, 3), np.float32), points)
 
 
-def _detection_size(width: int, height: int) -> tuple[int, int]:
-    scale = min(1.0, np.sqrt(_DETECTION_PIXELS / (width * height)))
+def values_at(image: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the values of the pixels of an image in which points [K, 2] lie."""
+    columns, rows = np.clip(points.astype(int), 0, (image.shape[1] - 1, image.shape[0] - 1)).T
+    return image[rows, columns]
+
+
+def reduced_size(width: int, height: int, pixels: float) -> tuple[int, int]:
+    """Return the width and height of an image reduced to a number of pixels."""
+    scale = min(1.0, np.sqrt(pixels / (width * height)))
     return round(width * scale), round(height * scale)
 
 
@@ -121,8 +128,8 @@ def _sift(
 def _patch_axes(keypoints: Sequence[cv2.KeyPoint]) -> np.ndarray:
     """Return the axes of the keypoints' patches [K, 2], as in `Features`."""
     angles = np.deg2rad([k.angle for k in keypoints])
-    sizes = np.array([k.size for k in keypoints])
-    return 0.5 * sizes[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    sizes = np.array([[k.size] for k in keypoints])
+    return 0.5 * sizes * np.column_stack([np.cos(angles), np.sin(angles)])
 
 
 def match_views(features: Sequence[Features], cameras: Sequence[Camera]) -> list[Match]:
@@ -327,8 +334,7 @@ def _at_depth_one(pixels: np.ndarray, views: np.ndarray, cameras: Sequence[Camer
     x = np.empty_like(pixels)
     for view in np.unique(views):
         of_view = views == view
-        local = replace(cameras[view], viewmat=np.eye(4))
-        x[of_view] = local.unproject(pixels[of_view], np.ones(np.count_nonzero(of_view)))[:, :2]
+        x[of_view] = image_coordinates(cameras[view], pixels[of_view])
     return x
 
 

@@ -37,12 +37,11 @@ def held_out_by(
     """
     if requested != "auto":
         return held_out_views(path, requested, subset.names)
+    views = every.test_views or ()
     if "test_view" in settings:
         views = _indices(path / CAPTURE, settings["test_view"], every.names)
         if not views:
             return ()
-    else:
-        views = every.test_views or ()
     names = [every.names[view] for view in views if every.names[view] in subset.names]
     if not names and every.test_views != () and len(subset.names) >= _MANY:
         return (0,)

@@ -8,7 +8,7 @@ are simultaneous.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import lcm
 from pathlib import Path
 
@@ -64,11 +64,10 @@ def align_numbers(
     table = "; ".join(_table(names, numbers, group) for group in different)
     if offset and not trim:
         note = f"Images are aligned by their positions and --offset, not by their numbers: {table}."
-        return ImageNumbers(by_position.offsets, by_position.rates, notes=(*notes, note))
-    common = sorted(set.intersection(*(set(numbers[c]) for c in different[0])))
-    if not trim or not common or len(different) > 1:
-        count = len(common) if len(different) == 1 else 0
-        raise _numbers_error(path, table, count, names[different[0][0]])
+        return replace(by_position, notes=(*notes, note))
+    common = _common(numbers, different)
+    if not trim or not common:
+        raise _numbers_error(path, table, len(common), names[different[0][0]])
     note = (
         f"Images with the same number are simultaneous: {table}. Used are {_range(common)}, which "
         "all cameras have."
@@ -87,6 +86,13 @@ def _numbers(readers: Sequence[FrameReader]) -> dict[int, range]:
 
 def _differ(numbers: _Numbers, group: Sequence[int]) -> bool:
     return len({(numbers[c][0], numbers[c].step) for c in group}) > 1
+
+
+def _common(numbers: _Numbers, groups: Sequence[Sequence[int]]) -> list[int]:
+    """Return the numbers that all cameras of a group have, none of several groups."""
+    if len(groups) > 1:
+        return []
+    return sorted(set.intersection(*(set(numbers[c]) for c in groups[0])))
 
 
 def _numbers_error(path: Path, table: str, common: int, name: str) -> ValueError:
@@ -136,6 +142,8 @@ def _table(names: Sequence[str], numbers: _Numbers, group: Sequence[int]) -> str
 
 
 def _range(numbers: Sequence[int]) -> str:
-    step = numbers[1] - numbers[0] if len(numbers) > 1 else 1
-    text = f"{numbers[0]} to {numbers[-1]}" if len(numbers) > 1 else f"{numbers[0]}"
+    if len(numbers) == 1:
+        return str(numbers[0])
+    text = f"{numbers[0]} to {numbers[-1]}"
+    step = numbers[1] - numbers[0]
     return text if step == 1 else f"{text} by {step}"

@@ -188,9 +188,13 @@ def _folded(x: np.ndarray, y: np.ndarray, camera: Camera) -> np.ndarray:
 def _radius(camera: Camera) -> np.ndarray:
     """Return the distance of each pixel from the optical axis at depth 1 [H, W]."""
     # x depends on the column only, y on the row only.
-    local = replace(camera, viewmat=np.eye(4))
-    columns = np.arange(camera.width) + 0.5
-    rows = np.arange(camera.height) + 0.5
-    across = local.unproject(np.stack([columns, columns], axis=1), np.ones_like(columns))[:, 0]
-    down = local.unproject(np.stack([rows, rows], axis=1), np.ones_like(rows))[:, 1]
+    columns, rows = (np.arange(n) + 0.5 for n in (camera.width, camera.height))
+    across = image_coordinates(camera, np.stack([columns, columns], axis=1))[:, 0]
+    down = image_coordinates(camera, np.stack([rows, rows], axis=1))[:, 1]
     return np.hypot(across, down[:, None])
+
+
+def image_coordinates(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """Return the image coordinates x / z, y / z [n, 2] of pixels, in the camera's axes."""
+    local = replace(camera, viewmat=np.eye(4))
+    return local.unproject(pixels, np.ones(len(pixels)))[:, :2]

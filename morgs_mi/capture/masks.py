@@ -102,7 +102,9 @@ def _intersection(files: Sequence[Path], width: int, height: int) -> tuple[np.nd
     combined_mask = np.ones((height, width), bool)
     varies = False
     for file in files:
-        mask = _at_size(file, _not_black(file), width, height)
+        mask = _not_black(file)
+        _check_aspect(file, mask, width, height)
+        mask = scaled_mask(mask, width, height)
         varies = varies or (file != files[0] and bool((combined_mask & ~mask).any()))
         combined_mask &= mask
     return combined_mask, varies
@@ -119,10 +121,8 @@ def _not_black(file: Path) -> np.ndarray:
         raise FileNotFoundError(
             f"{file}: expected a mask, found none; copy it, or drop `mask_path`."
         )
-    image = _decoded(file)
-    if image.ndim == 2:
-        return image > 0
-    return np.any(image[..., :3] > 0, axis=2) & np.all(image[..., 3:] > 0, axis=2)
+    image = np.atleast_3d(_decoded(file)) > 0
+    return np.any(image[..., :3], axis=2) & np.all(image[..., 3:], axis=2)
 
 
 def _opaque(file: Path, shape: tuple[int, int]) -> np.ndarray:
@@ -153,15 +153,19 @@ def _decoded(file: Path) -> np.ndarray:
     return decode_image(file, np.fromfile(fetched(file), np.uint8), cv2.IMREAD_UNCHANGED)
 
 
-def _at_size(file: Path, mask: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Return a mask at another size, where a pixel is used if all that it shows is."""
+def _check_aspect(file: Path, mask: np.ndarray, width: int, height: int) -> None:
+    """Check that a mask has the size of its clip or is a scaled version."""
     rows, columns = mask.shape
-    if (columns, rows) == (width, height):
-        return mask
     if abs(columns * height - rows * width) > min(columns, rows, width, height):
         raise ValueError(
             f"{file}: expected a mask of {width}x{height} pixels as the clip has, or a scaled "
             f"version of it, got {columns}x{rows}; make it again."
         )
+
+
+def scaled_mask(mask: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Return a mask at another size [H, W], where a pixel is used if all that it shows are."""
+    if mask.shape == (height, width):
+        return mask
     size = (width, height)
     return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 1 - 1e-4

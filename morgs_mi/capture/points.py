@@ -50,15 +50,18 @@ def match_capture(
     capture = capture.displayed().at_recorded_size()
     images = next(capture.partial_frames(0, 1)).images
     count = len(capture.cameras)
+    progress = progress or _no_progress
     features = []
     for done, (image, mask) in enumerate(zip(images, capture.masks, strict=True)):
-        if progress is not None:
-            progress(done, count)
+        progress(done, count)
         features.append(detect(image, mask))
     matches = match_views(features, capture.cameras)
-    if progress is not None:
-        progress(count, count)
+    progress(count, count)
     return SharedFeatures(tuple(features), tuple(matches))
+
+
+def _no_progress(done: int, count: int) -> None:
+    pass
 
 
 def triangulate_points(capture: Capture, shared: SharedFeatures) -> Capture:

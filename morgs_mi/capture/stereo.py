@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from morgs_mi.capture.features import reduced_size
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.rig import angles_to, scene_depths, seen_points
 
@@ -79,8 +80,7 @@ class _View:
     @classmethod
     def of(cls, camera: Camera, image: np.ndarray, mask: np.ndarray | None) -> _View:
         """Return the view of a camera with the mask of its valid pixels, None: all are valid."""
-        scale = min(1.0, np.sqrt(_PIXELS / (camera.width * camera.height)))
-        size = round(camera.width * scale), round(camera.height * scale)
+        size = reduced_size(camera.width, camera.height, _PIXELS)
         mask = np.ones(image.shape[:2], bool) if mask is None else mask
         valid = cv2.resize(255 * mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
         small_image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
@@ -283,11 +283,15 @@ def _confirmed(points: np.ndarray, others: Sequence[_View]) -> np.ndarray:
     confirmed = np.zeros(len(points), bool)
     for view in others:
         visible, pixels, _ = seen_points(view.camera, points[:, :3])
-        columns, rows = pixels.astype(int).T
-        view_colors = view.blurred[rows, columns] / 255.0
-        same = np.abs(view_colors - points[visible, 3:]).max(axis=1) < _MAX_COLOR
-        confirmed[visible] |= same & (view.valid[rows, columns] > 0)
+        confirmed[visible] |= _has_colors(view, pixels.astype(int), points[visible, 3:])
     return confirmed
+
+
+def _has_colors(view: _View, pixels: np.ndarray, colors: np.ndarray) -> np.ndarray:
+    """Return the mask of the pixels [P, 2] of a view that are valid and have the colours [P, 3]."""
+    columns, rows = pixels.T
+    same = np.abs(view.blurred[rows, columns] / 255.0 - colors).max(axis=1) < _MAX_COLOR
+    return same & (view.valid[rows, columns] > 0)
 
 
 def _shift(x: float, y: float) -> np.ndarray:

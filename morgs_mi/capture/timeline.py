@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from morgs_mi.capture.image_numbers import ImageNumbers, align_numbers
+from morgs_mi.capture.layouts.clips import check_names
 from morgs_mi.core.checks import check_number
 from morgs_mi.io.bounded import read_json
 from morgs_mi.io.unread import warn_unread
@@ -124,7 +125,9 @@ def timeline(
             clip is cut off, the clips have no instant in common, or `config` names an unknown
             camera or has an offset that is not finite.
     """
-    _check_offsets(path, names, config.offset)
+    check_names(path, "offset", config.offset, names)
+    for name, offset in config.offset.items():
+        check_number(str(path), f"offset of {name}", offset, "(-inf, inf)")
     numbers = align_numbers(path, names, readers, config.trim, config.offset)
     for note in numbers.notes:
         _LOG.warning("%s: %s", path, note)
@@ -142,16 +145,6 @@ def timeline(
         _is_unchanged(clips, config),
         (*numbers.notes, *_notes(readers, clips)),
     )
-
-
-def _check_offsets(path: Path, names: Sequence[str], offsets: Mapping[str, float]) -> None:
-    """Check that the offsets are finite, and of cameras in `names`."""
-    if unknown := [name for name in offsets if name not in names]:
-        raise ValueError(
-            f"{path}: `offset` must name cameras of {', '.join(names)}, got {', '.join(unknown)}."
-        )
-    for name, offset in offsets.items():
-        check_number(str(path), f"offset of {name}", offset, "(-inf, inf)")
 
 
 def _instants(
@@ -259,14 +252,12 @@ def _clocks(
     clip_fps = [fps or reader.fps for reader in readers]
     lowest = min((rate for rate in clip_fps if rate), default=fps or _DEFAULT_FPS)
     rates = np.array([(rate or lowest) / lowest for rate in clip_fps])
-    offsets = [
-        _position(r, config.offset.get(name, 0)) for name, r in zip(names, readers, strict=True)
-    ]
-    return _Clocks(
-        np.array(offsets, float) + numbers.offsets * rates,
-        rates * numbers.rates,
-        lowest / numbers.interval,
+    offsets = np.array(
+        [_position(r, config.offset.get(name, 0)) for name, r in zip(names, readers, strict=True)],
+        float,
     )
+    fps = lowest / numbers.interval
+    return _Clocks(offsets + numbers.offsets * rates, rates * numbers.rates, fps)
 
 
 def _without_drift(

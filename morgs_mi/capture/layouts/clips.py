@@ -52,12 +52,8 @@ def clips_by_camera(path: Path) -> dict[str, Path]:
     """
     inner = _places(path)
     # The last clip of a camera takes precedence.
-    clips = (
-        _merged(path, map(_folders, inner))
-        | _merged(path, map(_videos, inner))
-        | _folders(path)
-        | _videos(path)
-    )
+    clips = _merged(path, map(_folders, inner)) | _merged(path, map(_videos, inner))
+    clips |= _folders(path) | _videos(path)
     if (path / "frames").is_dir():
         clips |= _videos(path / "frames") | _folders(path / "frames")
     return _in_order(clips)
@@ -121,16 +117,26 @@ def names_without(path: Path, names: Collection[str], without: Collection[str]) 
     Raises:
         ValueError: a camera that is left out does not exist, or all are left out.
     """
-    if unknown := [name for name in without if name not in names]:
-        raise ValueError(
-            f"{path}: `without` must name cameras of {', '.join(names)}, got {', '.join(unknown)}."
-        )
+    check_names(path, "without", without, names)
     rest = [name for name in names if name not in without]
     if without and not rest:
         raise ValueError(
             f"{path}: `without` must leave at least one camera, got all: {', '.join(names)}."
         )
     return rest
+
+
+def check_names(place: Path, setting: str, names: Iterable[str], cameras: Collection[str]) -> None:
+    """Check that the names in a setting are those of cameras; `place` is where it was set.
+
+    Raises:
+        ValueError: there is no such camera.
+    """
+    if unknown := [name for name in names if name not in cameras]:
+        raise ValueError(
+            f"{place}: `{setting}` must name cameras of {', '.join(cameras)}, got "
+            f"{', '.join(unknown)}."
+        )
 
 
 def view_of_image(views: Collection[str], image: str, by_folder: bool = False) -> str | None:

@@ -216,22 +216,27 @@ def write_colmap(
     model = pycolmap.Reconstruction()
     lenses = [Lens()] * len(cameras) if lenses is None else lenses
     for i, (camera, lens) in enumerate(zip(cameras, lenses, strict=True), start=1):
-        model.add_camera_with_trivial_rig(
-            pycolmap.Camera(
-                camera_id=i,
-                model=lens.model,
-                width=camera.width,
-                height=camera.height,
-                params=_parameters(camera, lens),
-            )
-        )
-        image = pycolmap.Image(image_id=i, camera_id=i, name=_image_name(camera))
-        pose = pycolmap.Rigid3d(np.asarray(camera.viewmat, dtype=np.float64)[:3])
-        model.add_image_with_trivial_frame(image, pose)
+        _add_view(model, i, camera, lens)
     points = np.zeros((0, 3)) if points is None else np.asarray(points)
     for xyz, rgb in zip(points, _color_bytes(points, point_colors), strict=True):
         model.add_point3D(xyz.astype(np.float64), pycolmap.Track(), rgb)
     write_reconstruction(model, folder)
+
+
+def _add_view(model: pycolmap.Reconstruction, index: int, camera: Camera, lens: Lens) -> None:
+    pycolmap = import_pycolmap()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(
+            camera_id=index,
+            model=lens.model,
+            width=camera.width,
+            height=camera.height,
+            params=_parameters(camera, lens),
+        )
+    )
+    image = pycolmap.Image(image_id=index, camera_id=index, name=_image_name(camera))
+    pose = pycolmap.Rigid3d(np.asarray(camera.viewmat, dtype=np.float64)[:3])
+    model.add_image_with_trivial_frame(image, pose)
 
 
 def _color_bytes(points: np.ndarray, colors: np.ndarray | None) -> np.ndarray:

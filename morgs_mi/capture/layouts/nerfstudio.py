@@ -124,11 +124,7 @@ def read_transforms(path: Path, clips: Mapping[str, Clip] | None = None) -> Tran
             the camera model is not supported.
     """
     meta = read_json(path)
-    frames = meta.get("frames") if isinstance(meta, dict) else None
-    if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
-        raise ValueError(
-            f"{path}: expected an object with a list of `frames`, got none; export it again."
-        )
+    frames = _frames(path, meta)
     sizes = ImageSizes(path.parent, clips or {})
     cameras = []
     lenses = []
@@ -145,6 +141,15 @@ def read_transforms(path: Path, clips: Mapping[str, Clip] | None = None) -> Tran
     points = _file(path, str(path), meta, "ply_file_path")
     warn_unread(path, _unread(meta, frames, lenses))
     return Transforms(cameras, lenses, masks, points, _splits(path, meta))
+
+
+def _frames(path: Path, meta: Any) -> list[dict[str, Any]]:
+    frames = meta.get("frames") if isinstance(meta, dict) else None
+    if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
+        raise ValueError(
+            f"{path}: expected an object with a list of `frames`, got none; export it again."
+        )
+    return frames
 
 
 def _image_name(where: str, frame: Mapping[str, Any]) -> str:
@@ -238,6 +243,11 @@ def _lens(where: str, values: Mapping[str, Any]) -> Lens:
     k1, k2, k3, k4, p1, p2 = (_number(where, values, key, 0.0) for key in _DISTORTION)
     if _is_fisheye(where, values) or model == "OPENCV_FISHEYE":
         return Lens("OPENCV_FISHEYE", (k1, k2, k3, k4))
+    _check_perspective(where, model, k4)
+    return opencv_lens((k1, k2, p1, p2, k3))
+
+
+def _check_perspective(where: str, model: Any, k4: float) -> None:
     if model not in _PERSPECTIVE:
         raise ValueError(
             f"{where}: `camera_model` must be OPENCV_FISHEYE or one of {', '.join(_PERSPECTIVE)}, "
@@ -250,7 +260,6 @@ def _lens(where: str, values: Mapping[str, Any]) -> Lens:
             f"{where}: `k4` must be 0 in a perspective camera, got {k4}; undistort the images "
             "first."
         )
-    return opencv_lens((k1, k2, p1, p2, k3))
 
 
 def _is_fisheye(where: str, values: Mapping[str, Any]) -> bool:
@@ -287,11 +296,21 @@ def read_points_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
         )
     vertices = read_vertices(path)
     points = _positions(path, vertices)
+    if not bounded(points):
+        raise ValueError(
+            f"{path}: the points must be finite and at most {LARGEST:g}, got others; export them "
+            "again."
+        )
+    return points, _colors(vertices)
+
+
+def _colors(vertices: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the colours of vertices [P, 3] in [0, 1], grey if they have none."""
     if not {"red", "green", "blue"} <= vertices.keys():
-        return points, np.full(points.shape, 0.5, np.float32)
+        return np.full((len(vertices["x"]), 3), 0.5, np.float32)
     colors = np.stack([vertices[band] for band in ("red", "green", "blue")], axis=1)
     scale = 255 if colors.dtype.kind in "iu" else 1
-    return points, colors.astype(np.float32) / np.float32(scale)
+    return colors.astype(np.float32) / np.float32(scale)
 
 
 def _positions(path: Path, vertices: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -301,13 +320,7 @@ def _positions(path: Path, vertices: Mapping[str, np.ndarray]) -> np.ndarray:
             f"{path}: expected a PLY file with vertices x, y, z, got vertices without "
             f"{', '.join(sorted(missing))}; export it again."
         )
-    points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float32)
-    if not bounded(points):
-        raise ValueError(
-            f"{path}: the points must be finite and at most {LARGEST:g}, got others; export them "
-            "again."
-        )
-    return points
+    return np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float32)
 
 
 def _read_calibration(path: Path) -> Calibration:

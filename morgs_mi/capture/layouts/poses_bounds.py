@@ -120,18 +120,20 @@ def _pose_row(camera: Camera) -> np.ndarray:
     Raises:
         ValueError: the camera has two focal lengths or an off-centre principal point.
     """
+    _check_intrinsics(camera)
+    right, down, forward = np.asarray(camera.viewmat, dtype=np.float64)[:3, :3]
+    hwf = [camera.height, camera.width, camera.K[0, 0]]
+    return np.stack([down, right, -forward, camera.position, hwf], axis=1).ravel()
+
+
+def _check_intrinsics(camera: Camera) -> None:
     K = camera.K
-    size = np.array([camera.width, camera.height])
-    if not np.allclose(K[0, 0], K[1, 1], rtol=1e-6) or not np.allclose(
-        K[:2, 2], size / 2, atol=1e-3
-    ):
+    middle = np.array([camera.width, camera.height]) / 2
+    if not np.allclose(K[0, 0], K[1, 1], rtol=1e-6) or not np.allclose(K[:2, 2], middle, atol=1e-3):
         raise ValueError(
             f"write_poses_bounds(): camera {camera.name!r} must have one focal length and a "
             f"centred principal point, got K={K.tolist()}; use write_colmap()."
         )
-    right, down, forward = np.asarray(camera.viewmat, dtype=np.float64)[:3, :3]
-    hwf = [camera.height, camera.width, K[0, 0]]
-    return np.stack([down, right, -forward, camera.position, hwf], axis=1).ravel()
 
 
 def _read_calibration(path: Path) -> Calibration:
