@@ -91,10 +91,10 @@ class CameraSource:
                 camera, self.frame_indices[start:stop], self.shares[start:stop]
             )
             return
-        for image in self._recorded(start, stop):
+        for image in self._recorded_images(start, stop):
             yield self.process(image, camera) if isinstance(image, np.ndarray) else image
 
-    def _recorded(self, start: int, stop: int) -> Iterator[ImageOrError]:
+    def _recorded_images(self, start: int, stop: int) -> Iterator[ImageOrError]:
         """Yield the recorded images of the instants start..stop-1, or errors."""
         indices = self.frame_indices[start:stop]
         frames = self.reader.pick(indices[indices >= 0].tolist())
@@ -123,7 +123,7 @@ class CameraSource:
         colour-corrected.
         """
         if self.undistortion:
-            image = _undistorted(image, self.undistortion)
+            image = _pinhole_image(image, self.undistortion)
         image = _downscaled(image, camera)
         image = self.color_correction(image) if self.color_correction else image
         return (
@@ -166,7 +166,7 @@ def at_clip_size(camera: Camera, reader: FrameReader) -> Camera:
     return camera.resized(reader.width, reader.height)
 
 
-def _undistorted(image: np.ndarray, maps: Undistortion) -> np.ndarray:
+def _pinhole_image(image: np.ndarray, maps: Undistortion) -> np.ndarray:
     if image.dtype == np.uint8:
         return maps(image)
     # The cubic filter rings less in encoded values, in which lamps are less far from their

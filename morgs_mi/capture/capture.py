@@ -385,7 +385,8 @@ def load_capture(
             broken, or an argument is out of range.
     """
     path = mirrored(str(path)) if is_url(path) else Path(path)
-    _check_arguments(path, downscale, max_frames)
+    _check_folder(path)
+    _check_arguments(downscale, max_frames)
     reading = reading or ReadConfig()
     settings = read_settings(path / CAPTURE)
     layout = find_layout(path)
@@ -422,10 +423,13 @@ def load_capture(
     return capture if reading.color == "none" else _color_corrected(capture, reading.color)
 
 
-def _check_arguments(path: Path, downscale: float, max_frames: int | None) -> None:
+def _check_folder(path: Path) -> None:
     if not path.is_dir():
         kind = "a file" if path.is_file() else "none"
         raise FileNotFoundError(f"{path}: expected a capture folder, found {kind}; check the path.")
+
+
+def _check_arguments(downscale: float, max_frames: int | None) -> None:
     if not downscale >= 1:
         raise ValueError(f"load_capture(): `downscale` must be at least 1, got {downscale}.")
     if max_frames is not None and max_frames < 1:

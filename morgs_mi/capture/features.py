@@ -127,9 +127,8 @@ def _sift(
 
 def _patch_axes(keypoints: Sequence[cv2.KeyPoint]) -> np.ndarray:
     """Return the axes of the keypoints' patches [K, 2], as in `Features`."""
-    angles = np.deg2rad([k.angle for k in keypoints])
-    sizes = np.array([[k.size] for k in keypoints])
-    return 0.5 * sizes * np.column_stack([np.cos(angles), np.sin(angles)])
+    angles, sizes = np.array([(np.deg2rad(k.angle), k.size) for k in keypoints]).T
+    return 0.5 * sizes[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
 def match_views(features: Sequence[Features], cameras: Sequence[Camera]) -> list[Match]:

@@ -15,7 +15,7 @@ Otherwise an image is interpolated between two frames (see `interpolation`).
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -458,24 +458,27 @@ def read_settings(path: Path) -> dict[str, Any]:
     """
     if not path.exists():
         return {}
-    settings = read_json(path)
-    if not isinstance(settings, dict):
-        raise ValueError(
-            f"{path}: expected a JSON object, got {type(settings).__name__}; correct it."
-        )
+    settings = _json_object(path)
     if "scene" not in settings:  # a synthetic capture describes itself
         warn_unread(path, settings.keys() - _SETTINGS)
-    _check_numbers(path, settings)
+    for name, interval in _INTERVALS.items():
+        if (value := settings.get(name)) is not None:
+            check_number(str(path), name, value, interval)
+    _check_readout(path, settings.get("readout", 0.0))
     _check_test_view(path, settings.get("test_view"))
     return settings
 
 
-def _check_numbers(path: Path, settings: Mapping[str, Any]) -> None:
-    """Check the settings that are numbers, and `readout`, which may be an object of numbers."""
-    for name, interval in _INTERVALS.items():
-        if (value := settings.get(name)) is not None:
-            check_number(str(path), name, value, interval)
-    readout = settings.get("readout", 0.0)
+def _json_object(path: Path) -> dict[str, Any]:
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise ValueError(
+            f"{path}: expected a JSON object, got {type(content).__name__}; correct it."
+        )
+    return content
+
+
+def _check_readout(path: Path, readout: Any) -> None:
     for value in readout.values() if isinstance(readout, dict) else [readout]:
         check_number(str(path), "readout", value, "[-1, 1]")
 

@@ -251,10 +251,9 @@ def _image_name(camera: Camera) -> str:
 
 def _parameters(camera: Camera, lens: Lens) -> list[float]:
     """Return the parameters of COLMAP's camera model."""
-    K = camera.K
     one_focal = lens.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-    focals = [K[0, 0]] if one_focal else [K[0, 0], K[1, 1]]
-    return [*focals, K[0, 2], K[1, 2], *lens.distortion]
+    focals = np.diag(camera.K)[: 1 if one_focal else 2]
+    return [*focals, *camera.K[:2, 2], *lens.distortion]
 
 
 def write_reconstruction(model: pycolmap.Reconstruction, folder: str | Path) -> None:

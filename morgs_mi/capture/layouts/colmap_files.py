@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 
@@ -64,10 +64,15 @@ def text_cameras(path: Path) -> Iterator[tuple[int, str, int, int, list[float]]]
     for number, line in _lines(path):
         if fields := line.split(maxsplit=_MAX_CAMERA_FIELDS):
             try:
-                camera_id, width, height = (int(fields[k]) for k in (0, 2, 3))
-                yield camera_id, fields[1], width, height, [float(f) for f in fields[4:]]
+                camera = _text_camera(fields)
             except (ValueError, IndexError):
                 raise _broken(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", line) from None
+            yield camera
+
+
+def _text_camera(fields: Sequence[str]) -> tuple[int, str, int, int, list[float]]:
+    camera_id, width, height = (int(fields[k]) for k in (0, 2, 3))
+    return camera_id, fields[1], width, height, [float(f) for f in fields[4:]]
 
 
 def text_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
@@ -106,11 +111,17 @@ def text_points(path: Path) -> Iterator[list[float]]:
     for number, line in _lines(path):
         if fields := line.split(maxsplit=8):
             try:
-                xyz_rgb = [float(f) for f in fields[1:7]]
-                float(fields[7])
+                point = _text_point(fields)
             except (ValueError, IndexError):
                 raise _broken(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK[]", line) from None
-            yield xyz_rgb
+            yield point
+
+
+def _text_point(fields: Sequence[str]) -> list[float]:
+    """Return the position and the colour of a point; its error is checked to be a number."""
+    xyz_rgb = [float(f) for f in fields[1:7]]
+    float(fields[7])
+    return xyz_rgb
 
 
 # ---- binary

@@ -145,11 +145,15 @@ def read_transforms(path: Path, clips: Mapping[str, Clip] | None = None) -> Tran
 
 def _frames(path: Path, meta: Any) -> list[dict[str, Any]]:
     frames = meta.get("frames") if isinstance(meta, dict) else None
-    if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
+    if not frames or not _is_list(frames, dict):
         raise ValueError(
             f"{path}: expected an object with a list of `frames`, got none; export it again."
         )
     return frames
+
+
+def _is_list(value: Any, kind: type) -> bool:
+    return isinstance(value, list) and all(isinstance(entry, kind) for entry in value)
 
 
 def _image_name(where: str, frame: Mapping[str, Any]) -> str:
@@ -166,7 +170,9 @@ def _unread(
     unread = {key for values in (meta, *frames) for key in values} - _KEYS - _HARMLESS
     for frame, lens in zip(frames, lenses, strict=True):
         if lens.model == "OPENCV_FISHEYE":  # it has k1 to k4 alone
-            unread |= {f"{key} of a fisheye" for key in ("p1", "p2") if {**meta, **frame}.get(key)}
+            unread |= {
+                f"{key} of a fisheye" for key in ("p1", "p2") if frame.get(key, meta.get(key))
+            }
     return unread
 
 
@@ -174,7 +180,7 @@ def _splits(path: Path, meta: Mapping[str, Any]) -> dict[str, list[str]]:
     """Return the names of images by split."""
     splits = {split: meta[split] for split in _SPLITS if meta.get(split) is not None}
     for split, names in splits.items():
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        if not _is_list(names, str):
             raise ValueError(
                 f"{path}: `{split}` must be a list of names of images, got another value; correct "
                 "it."
@@ -274,12 +280,16 @@ def _is_fisheye(where: str, values: Mapping[str, Any]) -> bool:
 def _number(where: str, values: Mapping[str, Any], key: str, default: float | None = None) -> float:
     value = values.get(key, default)
     if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) <= LARGEST:
-        got = "none" if value is None else repr(value)[:80]
-        raise ValueError(
-            f"{where}: `{key}` must be a finite number of at most {LARGEST:g}, here or at the top "
-            f"of the file, got {got}."
-        )
+        raise _number_error(where, key, value)
     return float(value)
+
+
+def _number_error(where: str, key: str, value: Any) -> ValueError:
+    got = "none" if value is None else repr(value)[:80]
+    return ValueError(
+        f"{where}: `{key}` must be a finite number of at most {LARGEST:g}, here or at the top "
+        f"of the file, got {got}."
+    )
 
 
 def read_points_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
