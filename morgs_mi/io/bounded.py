@@ -16,6 +16,8 @@ import tokenize
 import tomllib
 import zipfile
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from io import BytesIO
 from operator import mul
 from pathlib import Path
@@ -147,14 +149,10 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     text = read_text(path, MAX_TOML)
     tables, most_dots = _toml_claim(text)
     check_claim(path, _TABLE_BYTES * tables, f"{tables} tables")
-    try:
+    with _syntax_errors(path, "TOML"):
         if most_dots >= _MAX_PARTS:
             raise ValueError(f"a key has more than {_MAX_PARTS} parts")
         return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(
-            f"{path}: expected TOML, got a broken file ({error}); write it again."
-        ) from None
 
 
 def _toml_claim(text: str) -> tuple[int, int]:
@@ -178,11 +176,18 @@ def read_json(path: str | Path) -> Any:
     if claim > _ALLOWANCE:  # the punctuation of texts takes no memory
         claim, values = _json_claim(_TEXT.sub("", text))
     check_claim(path, claim, f"{values} values")
-    try:
+    with _syntax_errors(path, "JSON"):
         return json.loads(text)
+
+
+@contextmanager
+def _syntax_errors(path: str | Path, language: str) -> Iterator[None]:
+    """Raise the errors of a parser as errors of the file."""
+    try:
+        yield
     except (ValueError, RecursionError) as error:
         raise ValueError(
-            f"{path}: expected JSON, got a broken file ({error}); write it again."
+            f"{path}: expected {language}, got a broken file ({error}); write it again."
         ) from None
 
 

@@ -184,9 +184,7 @@ def _within_chunks(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarr
     if not len(starts):
         return values, values, values
     low, high = (bound.reduceat(values, starts, axis=0) for bound in (np.minimum, np.maximum))
-    first, last = (
-        np.repeat(bound, _CHUNK, axis=0)[: len(values)].astype(np.float64) for bound in (low, high)
-    )
+    first, last = (_by_row(bound, len(values)).astype(np.float64) for bound in (low, high))
     return low, high, (values - first) / np.where(last > first, last - first, 1)
 
 
@@ -203,10 +201,15 @@ def _between(
         np.stack([np.asarray(chunks[name], np.float64) for name in ends], axis=1)
         for ends in _BOUNDS[key]
     )
-    low, high = (bound.repeat(_CHUNK, axis=0)[:N] for bound in (low, high))
+    low, high = (_by_row(bound, N) for bound in (low, high))
     # NaN where a bound is infinite: the Gaussians of the chunk are invalid.
     with np.errstate(invalid="ignore"):
         return low * (1 - fractions) + high * fractions
+
+
+def _by_row(bounds: np.ndarray, N: int) -> np.ndarray:
+    """Return the bounds [N, 3] of each Gaussian's chunk, from those of the chunks [chunks, 3]."""
+    return bounds.repeat(_CHUNK, axis=0)[:N]
 
 
 def _check_columns(

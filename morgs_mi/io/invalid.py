@@ -41,7 +41,7 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
     raw = gaussians.numpy()
     N = len(gaussians)
     _warn_zero(path, raw["quats"])
-    valid = {name: _valid(name, values) for name, values in raw.items()}
+    valid = {name: _valid_rows(name, values) for name, values in raw.items()}
     every = np.all([*valid.values()], axis=0)
     count = int(N - every.sum())
     if not count:
@@ -70,7 +70,7 @@ def _warn_zero(path: str | Path, quats: np.ndarray) -> None:
         )
 
 
-def _valid(name: str, values: np.ndarray) -> np.ndarray:
+def _valid_rows(name: str, values: np.ndarray) -> np.ndarray:
     """Return the mask [N] of valid values of an attribute."""
     # Small sizes have negative logarithms without a bound.
     limit = np.log(LARGEST) if name == "log_scales" else LARGEST

@@ -317,15 +317,16 @@ def _check_length(file: BinaryIO, order: str, element: _Element, dtype: np.dtype
 def _read_rows(
     file: BinaryIO, element: _Element, dtype: np.dtype, text: bool
 ) -> dict[str, np.ndarray]:
-    if not text:
-        table = np.fromfile(file, dtype, element.count)
-    elif element.count == 0:
-        table = np.empty(0, dtype)
-    else:
-        table = np.loadtxt(islice(file, element.count), dtype, ndmin=1)
+    table = (
+        _read_text(file, element.count, dtype) if text else np.fromfile(file, dtype, element.count)
+    )
     if len(table) < element.count:
         raise ValueError(f"expected {element.count} rows of {element.name}, got {len(table)}")
     return {name: table[name] for name in table.dtype.names or ()}
+
+
+def _read_text(file: BinaryIO, count: int, dtype: np.dtype) -> np.ndarray:
+    return np.loadtxt(islice(file, count), dtype, ndmin=1) if count else np.empty(0, dtype)
 
 
 def rest_names(K: int) -> tuple[str, ...]:

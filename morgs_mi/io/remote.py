@@ -15,7 +15,7 @@ import os
 import shutil
 import threading
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from hashlib import blake2b
@@ -62,20 +62,23 @@ def mirrored(url: str) -> Path:
     base = root.rstrip("/")
     files = _files(system, url, base)
     if not all(map(_versions, files.values())):
-        with _failures(url), ThreadPoolExecutor(_REQUESTS) as requests:
-            entries = requests.map(lambda name: system.info(f"{base}/{name}"), files)
-            files = dict(zip(files, entries, strict=True))
+        with _failures(url):
+            files = _entries(system, base, files)
     folder = _folder(url, files) / base.rpartition("/")[2]
     sizes = {name: entry.get("size") for name, entry in files.items()}
     for name, size in sizes.items():
-        file = folder / name
-        file.parent.mkdir(parents=True, exist_ok=True)
-        if file.suffix.lower() in _LATER:
-            file.touch()
-        elif not file.exists():
-            _fetch(system, url, f"{base}/{name}", file, size)
+        _mirror_file(system, url, f"{base}/{name}", folder / name, size)
     write_json(folder / _INDEX, {"url": url, "sizes": sizes})
     return folder
+
+
+def _mirror_file(system: Any, url: str, remote: str, file: Path, size: int | None) -> None:
+    """Fetch a remote file, or create an empty one if it is fetched when it is read."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    if file.suffix.lower() in _LATER:
+        file.touch()
+    elif not file.exists():
+        _fetch(system, url, remote, file, size)
 
 
 def fetched(file: Path) -> Path:
@@ -114,6 +117,13 @@ def _files(system: Any, url: str, base: str) -> dict[str, Mapping[str, Any]]:
     if outside := next((name for name in files if ".." in name.split("/")), None):
         raise ValueError(f"{url}: expected files in the folder, got {outside}; rename it.")
     return files
+
+
+def _entries(system: Any, base: str, names: Collection[str]) -> dict[str, Mapping[str, Any]]:
+    """Return what the file system states of each file alone, which may be more than its listing."""
+    with ThreadPoolExecutor(_REQUESTS) as requests:
+        entries = requests.map(lambda name: system.info(f"{base}/{name}"), names)
+        return dict(zip(names, entries, strict=True))
 
 
 def _listing(system: Any, base: str) -> dict[str, Mapping[str, Any]]:
@@ -213,10 +223,8 @@ def _check_content(place: str, file: Path, size: int | None) -> None:
     """Raise `ConnectionError` if a fetched file has another size, or is a page of HTML, such as one
     to log in.
     """
-    with file.open("rb") as stream:
-        head = stream.read(512).lower()
     got = file.stat().st_size
-    if any(mark in head for mark in _PAGE):
+    if _is_page(file):
         raise ConnectionError(
             f"{place}: expected a file, got a page of HTML; check the URL, or log in, and try "
             "again."
@@ -226,6 +234,12 @@ def _check_content(place: str, file: Path, size: int | None) -> None:
             f"{place}: expected {size} bytes, got {got}; it has changed or was cut short, try "
             "again."
         )
+
+
+def _is_page(file: Path) -> bool:
+    with file.open("rb") as stream:
+        head = stream.read(512).lower()
+    return any(mark in head for mark in _PAGE)
 
 
 @contextmanager

@@ -58,16 +58,21 @@ def read_splats(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
             f"{path}: expected a file with Gaussians, found none; check the path."
         )
     refuse_foreign(path)
+    suffix = _suffix(path)
+    if suffix == ".splat":
+        return _read_splat(Path(path), most_invalid)
+    is_compressed = suffix == ".compressed.ply" or _is_compressed(Path(path))
+    return (read_compressed_ply if is_compressed else read_ply)(path, most_invalid)
+
+
+def _suffix(path: str | Path) -> str:
     suffix = suffix_of(path)
     if suffix is None:
         raise ValueError(
             f"{path}: expected a file whose name ends in {', '.join(SUFFIXES)}, got "
             f"{Path(path).suffix!r}; convert it."
         )
-    if suffix == ".splat":
-        return _read_splat(Path(path), most_invalid)
-    is_compressed = suffix == ".compressed.ply" or _is_compressed(Path(path))
-    return (read_compressed_ply if is_compressed else read_ply)(path, most_invalid)
+    return suffix
 
 
 def _is_compressed(path: Path) -> bool:

@@ -202,12 +202,7 @@ class FolderReader:
         """
         path = Path(path)
         files = _images(path)
-        if gap := numbering_gap([f.stem for f in files]):
-            raise ValueError(
-                f"{path}: the images must be numbered without gaps, got {files[gap - 1].name} "
-                f"followed by {files[gap].name}; extract the frames again, or go on without the "
-                "missing ones (--gaps)."
-            )
+        _check_gaps(path, files)
         return replace(cls.of_files(files), numbers=_numbers(files))
 
     @classmethod
@@ -261,12 +256,24 @@ class FolderReader:
             )
         frame = _image_or_error(self.files[index])
         if isinstance(frame, np.ndarray) and frame.shape[:2] != (self.height, self.width):
-            return ValueError(
-                f"{self.files[index]}: expected {self.width}x{self.height} as in "
-                f"{self.files[0].name}, got {frame.shape[1]}x{frame.shape[0]}; extract the "
-                "frames again."
-            )
+            return self._size_error(index, frame)
         return frame
+
+    def _size_error(self, index: int, frame: np.ndarray) -> ValueError:
+        return ValueError(
+            f"{self.files[index]}: expected {self.width}x{self.height} as in "
+            f"{self.files[0].name}, got {frame.shape[1]}x{frame.shape[0]}; extract the "
+            "frames again."
+        )
+
+
+def _check_gaps(path: Path, files: Sequence[Path]) -> None:
+    if gap := numbering_gap([f.stem for f in files]):
+        raise ValueError(
+            f"{path}: the images must be numbered without gaps, got {files[gap - 1].name} "
+            f"followed by {files[gap].name}; extract the frames again, or go on without the "
+            "missing ones (--gaps)."
+        )
 
 
 def _first_readable(files: Sequence[Path]) -> Path:

@@ -44,9 +44,13 @@ def write_video(
         return
     with atomic_folder(path, "write_video()") as folder:
         for i, frame in enumerate(_checked(path, frames)):
-            # Not cv2.imwrite, which does not report why it failed.
-            png = cv2.imencode(".png", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))[1]
-            (folder / f"{i:04d}.png").write_bytes(png.tobytes())
+            _write_png(folder / f"{i:04d}.png", frame)
+
+
+def _write_png(path: Path, frame: np.ndarray) -> None:
+    # Not cv2.imwrite, which does not report why it failed.
+    png = cv2.imencode(".png", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))[1]
+    path.write_bytes(png.tobytes())
 
 
 def _write_file(
@@ -105,12 +109,7 @@ def _checked(path: Path, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
     shape = None
     for i, frame in enumerate(frames):
         shape = frame.shape if shape is None else shape
-        if (
-            frame.dtype != np.uint8
-            or frame.ndim != 3
-            or frame.shape[2] != 3
-            or frame.shape != shape
-        ):
+        if not _is_image(frame) or frame.shape != shape:
             raise ValueError(
                 f"write_video({path}): frame {i} must be uint8 [H, W, 3] of the first frame's size "
                 f"{shape[:2]}, got {frame.dtype} {frame.shape}; convert it first."
@@ -120,3 +119,7 @@ def _checked(path: Path, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
         raise ValueError(
             f"write_video({path}): at least one frame was expected, got none; pass frames."
         )
+
+
+def _is_image(frame: np.ndarray) -> bool:
+    return frame.dtype == np.uint8 and frame.ndim == 3 and frame.shape[2] == 3
