@@ -155,6 +155,11 @@ def at_clip_size(camera: Camera, reader: FrameReader) -> Camera:
     """
     if (reader.width, reader.height) == (camera.width, camera.height):
         return camera
+    _check_aspect(camera, reader)
+    return camera.resized(reader.width, reader.height)
+
+
+def _check_aspect(camera: Camera, reader: FrameReader) -> None:
     # Both sides were rounded to whole pixels.
     difference = abs(camera.width * reader.height - camera.height * reader.width)
     if difference > min(camera.width, camera.height):
@@ -163,7 +168,6 @@ def at_clip_size(camera: Camera, reader: FrameReader) -> Camera:
             f"{camera.name}, or a scaled version of it, got {reader.width}x{reader.height}; "
             "calibrate at the recorded size."
         )
-    return camera.resized(reader.width, reader.height)
 
 
 def _pinhole_image(image: np.ndarray, maps: Undistortion) -> np.ndarray:

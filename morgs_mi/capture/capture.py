@@ -441,18 +441,12 @@ def _at_clip_sizes(
 ) -> list[Camera]:
     """Return the cameras at the sizes of their clips, with a warning if a size differs."""
     recorded = [at_clip_size(c, r) for c, r in zip(cameras, readers, strict=True)]
-    if scaled_cameras := [
-        new for old, new in zip(cameras, recorded, strict=True) if new is not old
-    ]:
+    if scaled := [new for old, new in zip(cameras, recorded, strict=True) if new is not old]:
+        names = ", ".join(camera.name for camera in scaled)
         _LOG.warning(
             "%s: the clips of %s do not have the calibrated size (the first has %dx%d); the "
             "intrinsics are scaled.",
-            *(
-                path,
-                ", ".join(c.name for c in scaled_cameras),
-                scaled_cameras[0].width,
-                scaled_cameras[0].height,
-            ),
+            *(path, names, scaled[0].width, scaled[0].height),
         )
     return recorded
 
@@ -546,12 +540,18 @@ def _color_corrected(capture: Capture, color: str) -> Capture:
 def _color_reference(capture: Capture, color: str) -> int | None:
     """Return the index of the camera in `color`, None without one."""
     method, _, name = color.partition(":")
-    if method != "linear" or (name and name not in capture.names):
-        raise ValueError(
-            f"{capture.path}: `color` must be none, linear, or linear with a camera of "
-            f"{', '.join(capture.names)}, such as linear:{capture.names[0]}, got {color!r}."
-        )
-    return capture.names.index(name) if name else None
+    if method == "linear" and not name:
+        return None
+    if method != "linear" or name not in capture.names:
+        raise _color_error(capture, color)
+    return capture.names.index(name)
+
+
+def _color_error(capture: Capture, color: str) -> ValueError:
+    return ValueError(
+        f"{capture.path}: `color` must be none, linear, or linear with a camera of "
+        f"{', '.join(capture.names)}, such as linear:{capture.names[0]}, got {color!r}."
+    )
 
 
 def _resized(camera: Camera, downscale: float, times: ClipTimes, readout: float) -> Camera:

@@ -94,8 +94,8 @@ def fit_colors(
     features = [detect(image, mask) for image, mask in zip(images, masks, strict=True)]
     pairs, colors = matched_colors(cameras, images, features, match_views(features, cameras))
     counts = _shared_counts(pairs, len(cameras))
-    samples = tuple(counts.sum(1).tolist())
-    start = int(counts.sum(1).argmax()) if reference is None else reference
+    samples = counts.sum(1)
+    start = int(samples.argmax()) if reference is None else reference
     corrected: dict[int, np.ndarray] = {start: colors[start]}
     matrices: list[np.ndarray | None] = [None] * len(cameras)
     while len(corrected) < len(cameras):
@@ -104,15 +104,13 @@ def fit_colors(
             matrices[view] = matrix = _fit(*_shared_colors(view, pairs, colors, corrected))
             corrected[view] = _corrected(colors[view], matrix)
         else:
-            _LOG.warning(
-                "%s keeps its colours: too few points in common with the others.",
-                cameras[view].name,
-            )
+            name = cameras[view].name
+            _LOG.warning("%s keeps its colours: too few points in common with the others.", name)
             corrected[view] = colors[view]
             counts[view] = counts[:, view] = 0  # no other view is corrected towards it
-    final_colors = [corrected[view] for view in range(len(cameras))]
     before = _differences(pairs, colors)
-    return ColorFit(start, tuple(matrices), samples, before, _differences(pairs, final_colors))
+    after = _differences(pairs, [corrected[view] for view in range(len(cameras))])
+    return ColorFit(start, tuple(matrices), tuple(samples.tolist()), before, after)
 
 
 def _shared_counts(pairs: Sequence[Match], count: int) -> np.ndarray:

@@ -82,9 +82,10 @@ def _indices(
 
 def _index(place: Path, view: int | str, names: Sequence[str]) -> int:
     """Return the index of a camera given by index or name."""
-    index = names.index(view) if view in names else view
-    if str(index).isdecimal() and int(index) < len(names):
-        return int(index)
+    if view in names:
+        return names.index(view)
+    if str(view).isdecimal() and int(view) < len(names):
+        return int(view)
     raise ValueError(
         f"{place}: `test_view` must be an index in 0..{len(names) - 1}, one of "
         f"{', '.join(names)}, or none for no held-out camera, got {view}."

@@ -70,11 +70,11 @@ def _check_parameters(model: str, params: Sequence[float]) -> None:
             f"the camera model must be one of {', '.join(MODELS)}, got {model}; "
             "undistort the images with COLMAP's image_undistorter first."
         )
-    focals, coefficients = MODELS[model]
-    if len(params) != focals + 2 + coefficients:
+    count = 2 + sum(MODELS[model])
+    if len(params) != count:
         raise ValueError(
-            f"the camera model {model} takes {focals + 2 + coefficients} parameters, "
-            f"got {len(params)}; write the model again."
+            f"the camera model {model} takes {count} parameters, got {len(params)}; write the "
+            "model again."
         )
     if not bounded(params):
         raise ValueError(

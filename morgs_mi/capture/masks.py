@@ -26,13 +26,20 @@ def used_in_clip(
     """
     opaque, *notes = opaque_pixels(reader, name)
     mask, note = used_pixels(masks, reader.width, reader.height, name)
-    both = opaque if mask is None else mask if opaque is None else mask & opaque
+    both = _both(mask, opaque)
     if both is not None and not both.any():
         raise ValueError(
             f"{masks[0]}: expected pixels that are used, got a mask of transparent ones; correct "
             "it."
         )
     return both, [text for text in (*notes, note) if text]
+
+
+def _both(a: np.ndarray | None, b: np.ndarray | None) -> np.ndarray | None:
+    """Return the mask of the pixels that are in two masks, None for a mask of all pixels."""
+    if a is None or b is None:
+        return b if a is None else a
+    return a & b
 
 
 def opaque_pixels(reader: FrameReader, name: str) -> tuple[np.ndarray | None, str]:
@@ -87,12 +94,9 @@ def used_pixels(
         raise ValueError(
             f"{files[0]}: expected pixels that are used, got a black mask of {name}; correct it."
         )
-    several = (
-        f": all that any of {len(files)} different masks has black"
-        if varies
-        else f" by {files[0].name}"
-    )
-    return mask, f"{name}: {_unused(mask)} % of its pixels are masked out{several}."
+    several = f": all that any of {len(files)} different masks has black"
+    origin = several if varies else f" by {files[0].name}"
+    return mask, f"{name}: {_unused(mask)} % of its pixels are masked out{origin}."
 
 
 def _intersection(files: Sequence[Path], width: int, height: int) -> tuple[np.ndarray, bool]:

@@ -133,8 +133,15 @@ def _corners(camera: Camera) -> np.ndarray:
     return np.array([[x, y, 1] for x in (0, camera.width) for y in (0, camera.height)])
 
 
-def _box(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return points.min(axis=0), points.max(axis=0)
+def _overlap(a: np.ndarray, b: np.ndarray) -> tuple[tuple[float, float, float], tuple[int, int]]:
+    """Return the corners and the size, as in `_Rectified`, of images with the rows that both views
+    have, from the corners of the views on the plane [4, 2].
+    """
+    top = max(a[:, 1].min(), b[:, 1].min())
+    bottom = min(a[:, 1].max(), b[:, 1].max())
+    width = max(np.ptp(a[:, 0]), np.ptp(b[:, 0]))
+    size = int(np.ceil(width)), int(np.ceil(bottom - top))
+    return (a[:, 0].min(), b[:, 0].min(), top), size
 
 
 @dataclass(frozen=True)
@@ -161,13 +168,10 @@ class _Rectified:
         corners = [_corners(camera) @ H.T for camera, H in zip((a, b), to_plane, strict=True)]
         if any(rays[:, 2].min() < _LEAST_DEPTH for rays in corners):
             return None
-        (a0, a1), (b0, b1) = (_box(rays[:, :2] / rays[:, 2:]) for rays in corners)
-        top = max(a0[1], b0[1])
-        bottom = min(a1[1], b1[1])
-        size = int(np.ceil(max(a1[0] - a0[0], b1[0] - b0[0]))), int(np.ceil(bottom - top))
-        homographies = _shift(-a0[0], -top) @ to_plane[0], _shift(-b0[0], -top) @ to_plane[1]
+        (left, right, top), size = _overlap(*(rays[:, :2] / rays[:, 2:] for rays in corners))
+        homographies = _shift(-left, -top) @ to_plane[0], _shift(-right, -top) @ to_plane[1]
         baseline = float(np.linalg.norm(b.position - a.position))
-        return cls(axes, focal, baseline, homographies, (a0[0], b0[0], top), size)
+        return cls(axes, focal, baseline, homographies, (left, right, top), size)
 
     @property
     def shift(self) -> float:
@@ -180,6 +184,13 @@ class _Rectified:
         lowest = int(np.floor(product / depths[1] + self.shift))
         steps = product / depths[0] + self.shift - lowest + 1
         return lowest, 16 * max(1, int(np.ceil(steps / 16)))
+
+    def is_useful(self, count: int, pixels: int) -> bool:
+        """Return whether `count` disparities can be searched, given the pixels of a view: strongly
+        converging cameras have no useful plane in common.
+        """
+        width, height = self.size
+        return min(width, height) >= 2 * _BLOCK and count <= width and width * height <= 4 * pixels
 
     def points(self, disparity: np.ndarray, mask: np.ndarray) -> np.ndarray:
         """Return the points [P, 3] relative to the first camera at the pixels in `mask` [H, W]."""
@@ -205,9 +216,7 @@ def _matched(a: _View, b: _View, depths: tuple[float, float]) -> np.ndarray:
     if rig is None:
         return np.zeros((0, 6))
     lowest, count = rig.disparity_range(depths)
-    # Strongly converging cameras have no useful plane in common.
-    width, height = rig.size
-    if min(rig.size) < 2 * _BLOCK or count > width or width * height > 4 * a.image[..., 0].size:
+    if not rig.is_useful(count, a.valid.size):
         return np.zeros((0, 6))
     left = rig.warped(0, a.image)
     right = rig.warped(1, b.image)

@@ -383,7 +383,8 @@ def _check_even(reader: FrameReader, required: int) -> None:
     """Check that frame t of a clip shows instant t, for the first `required` frames."""
     if reader.positions is None:
         return
-    late = reader.positions[:required] - np.arange(len(reader.positions[:required]))
+    positions = reader.positions[:required]
+    late = positions - np.arange(len(positions))
     if np.abs(late).max() > _NEAR:
         raise _rate_error(reader, late)
 
@@ -435,7 +436,7 @@ def _check_rates(
     """Check that frames with the same index are simultaneous, for `instants` of clips with equal
     offsets.
     """
-    drift = (clocks.rates.max() - clocks.rates.min()) * (len(instants) - 1)
+    drift = np.ptp(clocks.rates) * (len(instants) - 1)
     if drift > _NEAR:
         table = ", ".join(f"{r.path.name} {r.fps:.6g}" for r in readers if r.fps)
         raise ValueError(

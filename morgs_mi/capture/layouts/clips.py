@@ -159,8 +159,8 @@ def clip_of_camera(clips: Collection[str], camera: str) -> str | None:
     if camera in clips:
         return camera
     word = re.compile(rf"(?<![A-Za-z0-9]){re.escape(camera)}(?![A-Za-z0-9])")
-    matches = [clip for clip in dict.fromkeys(clips) if word.search(clip)]
-    return matches[0] if len(matches) == 1 else None
+    matches = set(filter(word.search, clips))
+    return matches.pop() if len(matches) == 1 else None
 
 
 class ImageSizes:
@@ -253,14 +253,19 @@ def _merged(path: Path, places: Iterable[Mapping[str, Path]]) -> dict[str, Path]
     """
     result: dict[str, Path] = {}
     for clips in places:
-        if repeats := [name for name in clips if name in result]:
-            first, last = (paths[repeats[0]].relative_to(path) for paths in (result, clips))
-            _LOG.warning(
-                "%s: %s have two clips, such as %s and %s: the latter is used.",
-                *(path, ", ".join(repeats), first, last),
-            )
+        _warn_repeats(path, result, clips)
         result |= clips
     return result
+
+
+def _warn_repeats(path: Path, clips: Mapping[str, Path], later: Mapping[str, Path]) -> None:
+    """Warn if cameras have a clip among both."""
+    if repeats := [name for name in later if name in clips]:
+        first, last = (paths[repeats[0]].relative_to(path) for paths in (clips, later))
+        _LOG.warning(
+            "%s: %s have two clips, such as %s and %s: the latter is used.",
+            *(path, ", ".join(repeats), first, last),
+        )
 
 
 def _image_folder(folder: Path) -> Path | None:

@@ -298,11 +298,16 @@ def _check_written(file: Path, expected: int) -> None:
     Raises:
         OSError: it did not.
     """
-    with file.open("rb") as stream:
-        os.fsync(stream.fileno())
-        lines = [line for line in stream if not line.startswith(b"#")]
+    lines = _lines_on_disk(file)
     if len(lines) != expected or (lines and not lines[-1].endswith(b"\n")):
         raise OSError(f"{file.name} was cut off after {len(lines)} of {expected} lines")
+
+
+def _lines_on_disk(file: Path) -> list[bytes]:
+    """Return the lines of a file that are not comments, after it is written to the disk."""
+    with file.open("rb") as stream:
+        os.fsync(stream.fileno())
+        return [line for line in stream if not line.startswith(b"#")]
 
 
 def _viewmat(pose: Sequence[float]) -> np.ndarray:

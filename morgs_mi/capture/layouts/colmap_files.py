@@ -143,11 +143,10 @@ class _Bytes:
         return struct.unpack_from(layout, self.data, self.at - struct.calcsize(layout))
 
     def skip(self, count: int) -> None:
-        if count > len(self.data) - self.at:
+        if count > (rest := len(self.data) - self.at):
             raise ValueError(
-                f"{self.path}: expected {count} more bytes at byte {self.at}, got "
-                f"{len(self.data) - self.at}: the file is truncated or broken; export the model "
-                "again."
+                f"{self.path}: expected {count} more bytes at byte {self.at}, got {rest}: the file "
+                "is truncated or broken; export the model again."
             )
         self.at += count
 
@@ -176,8 +175,8 @@ def binary_cameras(path: Path) -> Iterator[tuple[int, str, int, int, tuple[float
             # lens_and_intrinsics rejects this name; the rest of the file cannot be read.
             yield camera_id, f"number {model}", width, height, ()
             return
-        focals, coefficients = MODELS[names[model]]
-        yield camera_id, names[model], width, height, file.take(f"{focals + 2 + coefficients}d")
+        params = file.take(f"{2 + sum(MODELS[names[model]])}d")
+        yield camera_id, names[model], width, height, params
     file.end(count, "cameras")
 
 

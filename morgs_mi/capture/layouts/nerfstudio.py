@@ -325,7 +325,7 @@ def _colors(vertices: Mapping[str, np.ndarray]) -> np.ndarray:
 
 def _positions(path: Path, vertices: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return the positions of vertices [P, 3]."""
-    if missing := {"x", "y", "z"} - vertices.keys():
+    if missing := set("xyz") - vertices.keys():
         raise ValueError(
             f"{path}: expected a PLY file with vertices x, y, z, got vertices without "
             f"{', '.join(sorted(missing))}; export it again."

@@ -61,7 +61,7 @@ def count_rows(path: Path) -> int:
 
 def _rows(path: Path) -> np.ndarray:
     rows = read_array(path)
-    if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f":
+    if rows.shape[1:] != (17,) or rows.dtype.kind != "f":
         raise ValueError(
             f"{path}: expected a float array [C, 17], got {rows.dtype} {rows.shape}; export it "
             "again."
