@@ -128,18 +128,13 @@ def read_compressed_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussian
     rest = elements.get("sh", {})
     _check_columns(path, "vertex", vertices, _PACKED, "<u4")
     _check_count(path, chunks, len(vertices["packed_position"]))
-    degree = _degree(path, rest, len(vertices["packed_position"]))
-    _check_columns(path, "sh", rest, rest_names((degree + 1) ** 2), "u1")
+    _check_rest(path, rest, len(vertices["packed_position"]))
     position, scale = (
         _between(path, chunks, key, _unpacked(vertices[f"packed_{key}"], _XYZ_BITS))
         for key in ("position", "scale")
     )
     color = _unpacked(vertices["packed_color"], _COLOR_BITS)
-    base = color[:, :3] if "min_r" not in chunks else _between(path, chunks, "color", color[:, :3])
-    coeffs = np.empty((len(color), (degree + 1) ** 2, 3), np.float32)
-    coeffs[:, 0] = (base - 0.5) / SH_C0
-    if degree:
-        coeffs[:, 1:] = _unpacked_rest(rest)
+    coeffs = _coefficients(path, chunks, color[:, :3], rest)
     quats = _unpacked_rotations(vertices["packed_rotation"])
     with np.errstate(over="ignore"):  # infinite, and therefore invalid
         gaussians = Gaussians.from_activated(position, np.exp(scale), quats, color[:, 3], coeffs)
@@ -156,16 +151,32 @@ def _check_count(path: str | Path, chunks: dict[str, np.ndarray], N: int) -> Non
         )
 
 
-def _degree(path: str | Path, rest: dict[str, np.ndarray], N: int) -> int:
-    """Return the degree of the SH of N Gaussians with these columns."""
-    degree = SH_DEGREES.get(len(rest))
-    if degree is None or any(len(column) != N for column in rest.values()):
+def _coefficients(
+    path: str | Path,
+    chunks: dict[str, np.ndarray],
+    fractions: np.ndarray,
+    rest: dict[str, np.ndarray],
+) -> np.ndarray:
+    """Return the SH coefficients [N, K, 3] of colours, fractions between bounds if chunks have
+    them, and of the element `sh`.
+    """
+    base = fractions if "min_r" not in chunks else _between(path, chunks, "color", fractions)
+    coeffs = np.empty((len(base), 1 + len(rest) // 3, 3), np.float32)
+    coeffs[:, 0] = (base - 0.5) / SH_C0
+    if rest:
+        coeffs[:, 1:] = _unpacked_rest(rest)
+    return coeffs
+
+
+def _check_rest(path: str | Path, rest: dict[str, np.ndarray], N: int) -> None:
+    """Check the columns of the element `sh` of N Gaussians."""
+    if len(rest) not in SH_DEGREES or any(len(column) != N for column in rest.values()):
         raise ValueError(
             f"{path}: expected {N} rows of f_rest_0 to f_rest_8, 23 or 44 (SH of degree 1 to 3) "
             f"or none, got {len(next(iter(rest.values()), ()))} rows of {len(rest)} properties; "
             "the file is broken, export it again."
         )
-    return degree
+    _check_columns(path, "sh", rest, rest_names(1 + len(rest) // 3), "u1")
 
 
 def _unpacked_rest(rest: dict[str, np.ndarray]) -> np.ndarray:

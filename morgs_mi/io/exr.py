@@ -32,13 +32,17 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
         OSError: the file cannot be written.
     """
     _check_shapes(channels)
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     pixels = {name: np.ascontiguousarray(channel, np.float32) for name, channel in channels.items()}
     with atomic_path(path, "write_exr()") as partial:
-        try:
-            OpenEXR.File(header, pixels).write(str(partial))
-        except RuntimeError as error:
-            raise OSError(str(error)) from error
+        _write(partial, pixels)
+
+
+def _write(path: Path, pixels: dict[str, np.ndarray]) -> None:
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    try:
+        OpenEXR.File(header, pixels).write(str(path))
+    except RuntimeError as error:
+        raise OSError(str(error)) from error
 
 
 def _check_shapes(channels: Mapping[str, np.ndarray]) -> None:

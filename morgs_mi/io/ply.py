@@ -305,13 +305,18 @@ def _read_properties(
 def _check_length(file: BinaryIO, order: str, element: _Element, dtype: np.dtype) -> None:
     """Check that the rest of the file can hold the rows of an element."""
     num_bytes = os.fstat(file.fileno()).st_size - file.tell()
-    # A number in a text takes a digit and a separator.
-    row = dtype.itemsize if order else 2 * len(element.properties)
-    size = element.count * row - (not order)
+    size = _least_size(order, element, dtype)
     if element.count < 0 or size > num_bytes:
         raise ValueError(
             f"{element.count} {element.name} need at least {size} bytes, {num_bytes} follow"
         )
+
+
+def _least_size(order: str, element: _Element, dtype: np.dtype) -> int:
+    """Return the bytes that the rows of an element take at least."""
+    # A number in a text takes a digit and a separator.
+    row = dtype.itemsize if order else 2 * len(element.properties)
+    return element.count * row - (not order)
 
 
 def _read_rows(

@@ -55,13 +55,12 @@ def as_3dgs(path: str | Path, vertices: Vertices) -> Vertices:
     Raises:
         ValueError: the kind cannot be drawn, or is none.
     """
-    names = set(vertices)
-    if not names & _GAUSSIAN:
+    if vertices.keys().isdisjoint(_GAUSSIAN):
         return vertices
     _refuse_instants(path, vertices)
-    _refuse_anchors(path, names)
+    _refuse_anchors(path, vertices)
     _refuse_integers(path, vertices)
-    _name_unread(Path(path), names)
+    _name_unread(Path(path), vertices)
     return _with_third_axis(path, _with_filter(vertices))
 
 

@@ -214,12 +214,7 @@ class FolderReader:
             FileNotFoundError: a file is missing.
             ValueError: there are none, or the first cannot be decoded.
         """
-        if not files:
-            raise ValueError(
-                "FolderReader.of_files(): expected at least one image, got none; list the frames."
-            )
-        if not gaps and (missing := next((f for f in files if not f.is_file()), None)):
-            raise _no_image(missing)
+        _check_files(files, gaps)
         first = _read_image(_first_readable(files) if gaps else files[0])
         return cls(files[0].parent, tuple(files), first.shape[1], first.shape[0])
 
@@ -265,6 +260,15 @@ class FolderReader:
             f"{self.files[0].name}, got {frame.shape[1]}x{frame.shape[0]}; extract the "
             "frames again."
         )
+
+
+def _check_files(files: Sequence[Path], gaps: bool) -> None:
+    if not files:
+        raise ValueError(
+            "FolderReader.of_files(): expected at least one image, got none; list the frames."
+        )
+    if not gaps and (missing := next((f for f in files if not f.is_file()), None)):
+        raise _no_image(missing)
 
 
 def _check_gaps(path: Path, files: Sequence[Path]) -> None:
@@ -322,8 +326,9 @@ def open_clips(clips: Sequence[Clip], gaps: bool = False) -> list[FrameReader]:
         FileNotFoundError: a clip is missing, or one of its images.
         ValueError: as `VideoReader.open` and `FolderReader.open`.
     """
-    folders = [clip for clip in clips if gaps and isinstance(clip, Path) and clip.is_dir()]
-    readers = _aligned_folders(folders)
+    readers = _aligned_folders(
+        [clip for clip in clips if gaps and isinstance(clip, Path) and clip.is_dir()]
+    )
     return [readers[clip] if clip in readers else open_frames(clip, gaps) for clip in clips]
 
 
