@@ -226,10 +226,11 @@ def _differences(pairs: Sequence[Match], colors: Sequence[np.ndarray]) -> tuple[
     """Return per view the mean dE2000 of its points against their colours in the other views."""
     differences: list[list[np.ndarray]] = [[] for _ in colors]
     for pair in pairs:
-        a, b = (colors[view][pair.features[:, k]] for k, view in enumerate(pair.views))
-        if len(a):
+        if len(pair.features):
+            a, b = (colors[view][pair.features[:, k]] for k, view in enumerate(pair.views))
+            difference = delta_e(a, b)
             for view in pair.views:
-                differences[view].append(delta_e(a, b))
+                differences[view].append(difference)
     return tuple(map(_mean, differences))
 
 

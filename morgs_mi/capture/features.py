@@ -193,9 +193,14 @@ def mutual_neighbours(distances: np.ndarray) -> np.ndarray:
     forth = distances.argmin(1)
     back = distances.argmin(0)
     rows = np.arange(len(forth))
-    first, second = np.partition(distances, 1, axis=1)[:, :2].T
-    good = (back[forth] == rows) & (first < _RATIO * second)
+    good = (back[forth] == rows) & _are_distinct(distances)
     return np.stack([rows, forth], axis=1)[good]
+
+
+def _are_distinct(distances: np.ndarray) -> np.ndarray:
+    """Return the mask of rows [K] whose nearest neighbour passes Lowe's ratio test."""
+    first, second = np.partition(distances, 1, axis=1)[:, :2].T
+    return first < _RATIO * second
 
 
 def reprojection_errors(
@@ -248,10 +253,15 @@ def triangulate(
 
 def _largest_errors(points: np.ndarray, tracks: Tracks, cameras: Sequence[Camera]) -> np.ndarray:
     """Return the largest distance of each point's projections from its features [P], px."""
-    worst = np.zeros(len(points))
     distances = _distances(points[tracks.ids], tracks.views, tracks.pixels, cameras)
-    np.maximum.at(worst, tracks.ids, distances)
-    return worst
+    return _largest(distances, tracks.ids, len(points))
+
+
+def _largest(values: np.ndarray, track: np.ndarray, count: int) -> np.ndarray:
+    """Return the largest of the values [n] of each of `count` tracks, at least 0."""
+    largest = np.zeros(count)
+    np.maximum.at(largest, track, values)
+    return largest
 
 
 def join_matches(matches: Sequence[Match], features: Sequence[Features]) -> Tracks:
@@ -259,10 +269,8 @@ def join_matches(matches: Sequence[Match], features: Sequence[Features]) -> Trac
     different views.
     """
     starts = np.concatenate([[0], np.cumsum([len(f.points) for f in features])]).astype(int)
-    edges = np.concatenate(
-        [np.zeros((0, 2), int), *(m.features + starts[list(m.views)] for m in matches)]
-    )
-    track = _components(edges, starts[-1])
+    edges = [match.features + starts[list(match.views)] for match in matches]
+    track = _components(np.concatenate([np.zeros((0, 2), int), *edges]), starts[-1])
     views = np.repeat(np.arange(len(features)), np.diff(starts))
     members = np.flatnonzero(_valid_tracks(track, views)[track])
     _, track = np.unique(track[members], return_inverse=True)
@@ -364,9 +372,7 @@ def _widest_angles(
         rays = _directions(points[track] - positions)
         mean = _directions(np.stack([np.bincount(track, axis) for axis in rays.T], axis=1))
         angle = np.rad2deg(np.arccos(np.clip((rays * mean[track]).sum(1), -1, 1)))
-    widest = np.zeros(len(points))
-    np.maximum.at(widest, track, np.nan_to_num(angle))
-    return 2 * widest
+    return 2 * _largest(np.nan_to_num(angle), track, len(points))
 
 
 def _directions(vectors: np.ndarray) -> np.ndarray:

@@ -133,13 +133,18 @@ def _opaque(file: Path, shape: tuple[int, int]) -> np.ndarray:
     """Return the mask of an image's opaque pixels [H, W]: all without an alpha channel, or if it is
     not readable.
     """
-    try:
-        image = _decoded(file) if _may_be_transparent(file) else None
-    except (ValueError, OSError):
-        image = None
+    image = _transparent_image(file)
     if image is None or image.shape != (*shape, 4):
         return np.ones(shape, bool)
     return image[..., 3] == np.iinfo(image.dtype).max
+
+
+def _transparent_image(file: Path) -> np.ndarray | None:
+    """Return an image that may have an alpha channel, None if it has none or is not readable."""
+    try:
+        return _decoded(file) if _may_be_transparent(file) else None
+    except (ValueError, OSError):
+        return None
 
 
 def _may_be_transparent(file: Path) -> bool:

@@ -278,10 +278,9 @@ def _some_confirmed(points: np.ndarray, others: Sequence[_View]) -> np.ndarray:
         return points[:_POINTS]
     confirmed = points[:0]
     for start in range(0, len(points), _POINTS):
-        part = points[start : start + _POINTS]
-        confirmed = np.concatenate([confirmed, part[_confirmed(part, others)]])
-        if len(confirmed) >= _POINTS:
-            break
+        if len(confirmed) < _POINTS:
+            part = points[start : start + _POINTS]
+            confirmed = np.concatenate([confirmed, part[_confirmed(part, others)]])
     return confirmed[:_POINTS]
 
 

@@ -438,9 +438,9 @@ def _check_rates(
     """
     drift = np.ptp(clocks.rates) * (len(instants) - 1)
     if drift > _NEAR:
-        table = ", ".join(f"{r.path.name} {r.fps:.6g}" for r in readers if r.fps)
+        rates = ", ".join(f"{r.path.name} {r.fps:.6g}" for r in readers if r.fps)
         raise ValueError(
-            f"{path}: all cameras must have the same frame rate, got {table}; images of one index "
+            f"{path}: all cameras must have the same frame rate, got {rates}; images of one index "
             f"are up to {drift:.1f} frames apart; use the lowest rate with --trim, or set the "
             "true one as `fps` in capture.json."
         )

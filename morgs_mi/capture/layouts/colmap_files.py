@@ -31,11 +31,15 @@ def count_images(folder: Path) -> int:
     """Return the number of images in the COLMAP model in `folder`; 0 if it cannot be read."""
     with suppress(OSError, ValueError):
         if (folder / "cameras.bin").exists():
-            file = _Bytes(folder / "images.bin")
-            (count,) = file.take("Q")
-            return min(count, len(file.data) // _IMAGE_BYTES)
+            return _count_binary_images(folder / "images.bin")
         return sum(1 for _ in text_images(folder / "images.txt"))
     return 0
+
+
+def _count_binary_images(path: Path) -> int:
+    file = _Bytes(path)
+    (count,) = file.take("Q")
+    return min(count, len(file.data) // _IMAGE_BYTES)
 
 
 # ---- text
