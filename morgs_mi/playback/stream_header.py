@@ -73,16 +73,24 @@ def truth_for_camera(capture: Capture, camera: Camera, frame: int) -> GroundTrut
     """
     if capture.truth is None or not (capture.truth / camera.name / f"{frame:04d}.exr").is_file():
         return None
-    truth = load_truth(capture.truth, camera.name, frame)
+    return _resampled(load_truth(capture.truth, camera.name, frame), camera)
+
+
+def _resampled(truth: GroundTruth, camera: Camera) -> GroundTruth:
+    """Return ground truth on the pixel grid of a camera, by the nearest neighbour."""
     H, W = truth.mask.shape
-    rows = ((np.arange(camera.height) + 0.5) * H / camera.height).astype(int)[:, None]
-    columns = ((np.arange(camera.width) + 0.5) * W / camera.width).astype(int)
-    motion = truth.motion[rows, columns] * np.array(
-        [camera.width / W, camera.height / H], np.float32
-    )
+    rows = _nearest(camera.height, H)[:, None]
+    columns = _nearest(camera.width, W)
+    stretch = np.array([camera.width / W, camera.height / H], np.float32)
+    motion = truth.motion[rows, columns] * stretch
     return GroundTruth(
-        motion, truth.depth[rows, columns], truth.ids[rows, columns], truth.mask[rows, columns]
+        motion, *(values[rows, columns] for values in (truth.depth, truth.ids, truth.mask))
     )
+
+
+def _nearest(count: int, length: int) -> np.ndarray:
+    """Return the indices [count] of the nearest of `length` pixels."""
+    return ((np.arange(count) + 0.5) * length / count).astype(int)
 
 
 def render_config(stream: FrameSource) -> RenderConfig:
@@ -137,12 +145,12 @@ def metadata_entry(stream: FrameSource, key: str, default: Any, *kinds: type) ->
         if isinstance(value, dict) and name not in value:
             return default
         value = value[name] if isinstance(value, dict) else None
-    if type(value) not in kinds:
-        names = " or ".join(_JSON_TYPES[kind] for kind in kinds)
-        raise ValueError(
-            f"{_place(stream, key)} must be {names}, got {shortened(value)}; fit the capture again."
-        )
-    return value
+    if type(value) in kinds:
+        return value
+    names = " or ".join(_JSON_TYPES[kind] for kind in kinds)
+    raise ValueError(
+        f"{_place(stream, key)} must be {names}, got {shortened(value)}; fit the capture again."
+    )
 
 
 def _place(stream: FrameSource, key: str) -> str:
@@ -170,9 +178,22 @@ def open_stream_capture(
             capture is not the one that was fitted, or there are no frames.
     """
     path = capture or fitted_capture(stream)
-    reading = apply_values(
-        ReadConfig(), metadata_entry(stream, "reading", {}, dict), _place(stream, "reading")
-    )
+    recording = _recording(stream, path, frames)
+    _check_frames(stream, path, recording, frames)
+    if not any_recording:
+        _check_recording(stream, recording)
+    # Other refined cameras change no image, and ground truth refers to the recording's cameras.
+    if recording.display_exposure is not None:
+        recording = replace(recording, display_exposure=stream_exposure(stream))
+    return as_fitted(recording, stream) if "distortions" in stream.metadata else recording
+
+
+def _recording(stream: FrameSource, path: str | Path, frames: Sequence[int]) -> Capture:
+    """Return the capture in a folder up to the last of the frames, read as for the fit of a stream;
+    its cameras are those of the stream.
+    """
+    values = metadata_entry(stream, "reading", {}, dict)
+    reading = apply_values(ReadConfig(), values, _place(stream, "reading"))
     downscale = metadata_entry(stream, "downscale", 1, int, float)
     test_view = metadata_entry(stream, "test_view", "auto", list, int, str, NoneType)
     if not frames:
@@ -180,9 +201,23 @@ def open_stream_capture(
             f"{stream.path}: expected at least one frame, got a header alone; fit the capture "
             "again."
         )
-    recording = load_capture(
-        path, downscale, "auto" if test_view == "auto" else None, frames[-1] + 1, reading
-    )
+    view = "auto" if test_view == "auto" else None
+    recording = load_capture(path, downscale, view, frames[-1] + 1, reading)
+    _check_sizes(stream, path, recording)
+    return recording if test_view == "auto" else recording.holding_out(test_view)
+
+
+def _check_frames(
+    stream: FrameSource, path: str | Path, recording: Capture, frames: Sequence[int]
+) -> None:
+    if frames != list(range(frames[0], frames[-1] + 1)) or recording.num_frames <= frames[-1]:
+        raise ValueError(
+            f"{stream.path}: expected consecutive frames out of the {recording.num_frames} of "
+            f"{path}, got {frames}; pass the capture that was fitted (--capture)."
+        )
+
+
+def _check_sizes(stream: FrameSource, path: str | Path, recording: Capture) -> None:
     sizes = _sizes(stream.cameras)
     recorded_sizes = _sizes(recording.cameras)
     if recorded_sizes != sizes:
@@ -190,19 +225,6 @@ def open_stream_capture(
             f"{path}: expected the cameras that {stream.path} was fitted to, {sizes}, got "
             f"{recorded_sizes}; pass that capture (--capture)."
         )
-    if test_view != "auto":
-        recording = recording.holding_out(test_view)
-    if frames != list(range(frames[0], frames[-1] + 1)) or recording.num_frames <= frames[-1]:
-        raise ValueError(
-            f"{stream.path}: expected consecutive frames out of the {recording.num_frames} of "
-            f"{path}, got {frames}; pass the capture that was fitted (--capture)."
-        )
-    if not any_recording:
-        _check_recording(stream, recording)
-    # Other refined cameras change no image, and ground truth refers to the recording's cameras.
-    if recording.display_exposure is not None:
-        recording = replace(recording, display_exposure=stream_exposure(stream))
-    return as_fitted(recording, stream) if "distortions" in stream.metadata else recording
 
 
 def _check_recording(stream: FrameSource, recording: Capture) -> None:
@@ -213,10 +235,8 @@ def _check_recording(stream: FrameSource, recording: Capture) -> None:
     if stream_fingerprint is None:
         return
     refines = metadata_entry(stream, "config.fit.refine_cameras", "off", str) != "off"
-    if (
-        fingerprint(recording, next(recording.partial_frames(0, 1)).images, refines)
-        != stream_fingerprint
-    ):
+    images = next(recording.partial_frames(0, 1)).images
+    if fingerprint(recording, images, refines) != stream_fingerprint:
         raise ValueError(
             f"{recording.path}: expected the recording that {stream.path} was fitted to, got "
             "other images in its first frame, or other points; pass that capture (--capture), or "
@@ -232,15 +252,7 @@ def fitted_capture(stream: FrameSource) -> str:
         FileNotFoundError: it is not there any more.
         ValueError: no path is stored.
     """
-    capture_file = None
-    with suppress(OSError, ValueError):
-        capture_file = read_json(stream.path.with_name(CAPTURE))
-    entries = [
-        fields.get("capture")
-        for fields in (stream.metadata, capture_file)
-        if isinstance(fields, dict)
-    ]
-    paths = [path for path in entries if isinstance(path, str)]
+    paths = _capture_paths(stream)
     remedy = "name its folder with --capture"
     if not paths:
         raise ValueError(
@@ -252,6 +264,19 @@ def fitted_capture(stream: FrameSource) -> str:
     raise FileNotFoundError(
         f"{paths[0]}: expected the capture of {stream.path}, found none; if it has moved, {remedy}."
     )
+
+
+def _capture_paths(stream: FrameSource) -> list[str]:
+    """Return the paths of a stream's capture, in its header and in the file beside it."""
+    capture_file = None
+    with suppress(OSError, ValueError):
+        capture_file = read_json(stream.path.with_name(CAPTURE))
+    entries = [
+        fields.get("capture")
+        for fields in (stream.metadata, capture_file)
+        if isinstance(fields, dict)
+    ]
+    return [path for path in entries if isinstance(path, str)]
 
 
 def _sizes(cameras: Sequence[Camera]) -> dict[str, tuple[int, int]]:

@@ -15,6 +15,7 @@ from morgs_mi.codec.frame_source import FrameSource, FrameState
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.fit_names import PROVISIONAL, STREAM
+from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.listing import listed
 from morgs_mi.io.splats import read_splats, suffix_of
@@ -65,8 +66,7 @@ class SplatFile(FrameSource):
             self.cameras = trained or default_rig([gaussians])
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
-        still = replace(gaussians, motion=np.zeros((len(gaussians), 3), np.float32))
-        self._state = FrameState(0, np.arange(len(gaussians), dtype=np.uint32), still)
+        self._state = _still(gaussians)
 
     def frame_numbers(self) -> list[int]:
         return [0]
@@ -81,6 +81,13 @@ class SplatFile(FrameSource):
         return stream_html(self)
 
 
+def _still(gaussians: Gaussians) -> FrameState:
+    """Return Gaussians as a first frame without motion."""
+    motion = np.zeros((len(gaussians), 3), np.float32)
+    ids = np.arange(len(gaussians), dtype=np.uint32)
+    return FrameState(0, ids, replace(gaussians, motion=motion))
+
+
 def stream_path(out: str | Path) -> Path:
     """Return the path of a stream file or of a file with Gaussians; in the folder of a fit, of its
     ``stream.morgs``.
@@ -91,24 +98,31 @@ def stream_path(out: str | Path) -> Path:
     """
     path = Path(out)
     if path.is_dir() and not (path / STREAM).exists():
-        if (path / "meta.json").is_file():
-            refuse_foreign(path / "meta.json")
-        if frames := [file.name for file in listed(path) if suffix_of(file)]:
-            raise ValueError(
-                f"{path}: got a folder with {len(frames)} files of Gaussians, not a stream; name "
-                f"one of them, such as {path / frames[0]}, or turn all into a stream with "
-                "`morgs-mi import`."
-            )
+        _refuse_other_folders(path)
     path = path / STREAM if path.is_dir() else path
     if not path.is_file():
         raise FileNotFoundError(
             f"{path}: expected a stream, found none; check the path or fit a capture first."
         )
-    with path.open("rb") as file:
-        content = file.read(len(MAGIC))
-    if content != MAGIC:
+    if _start(path) != MAGIC:
         refuse_foreign(path)
     return path
+
+
+def _start(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(len(MAGIC))
+
+
+def _refuse_other_folders(path: Path) -> None:
+    if (path / "meta.json").is_file():
+        refuse_foreign(path / "meta.json")
+    if frames := [file.name for file in listed(path) if suffix_of(file)]:
+        raise ValueError(
+            f"{path}: got a folder with {len(frames)} files of Gaussians, not a stream; name "
+            f"one of them, such as {path / frames[0]}, or turn all into a stream with "
+            "`morgs-mi import`."
+        )
 
 
 def open_stream(
@@ -171,10 +185,9 @@ def _warn_of_damage(stream: StreamReader) -> None:
 
 def _spans(numbers: Sequence[int]) -> str:
     """Return ascending numbers as text, such as ``0 to 3, 7``."""
-    spans = [
-        [n for _, n in span]
-        for _, span in groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])
-    ]
-    return ", ".join(
-        f"{span[0]} to {span[-1]}" if len(span) > 1 else f"{span[0]}" for span in spans
-    )
+    groups = groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])
+    return ", ".join(_span([number for _, number in group]) for _, group in groups)
+
+
+def _span(numbers: Sequence[int]) -> str:
+    return f"{numbers[0]} to {numbers[-1]}" if len(numbers) > 1 else f"{numbers[0]}"

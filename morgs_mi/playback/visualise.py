@@ -21,6 +21,7 @@ BACKGROUND = 255
 """Grey level of that space."""
 UNDEFINED = (128, 128, 128)
 """Colour of pixels with a value that is not finite, or a depth that is not positive."""
+_FONT = cv2.FONT_HERSHEY_SIMPLEX
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:
@@ -39,11 +40,14 @@ def to_uint8(image: np.ndarray) -> np.ndarray:
         raise ValueError(
             f"to_uint8(): `image` must be [H, W], [H, W, 1] or [H, W, 3], got {image.shape}."
         )
-    if image.dtype != np.uint8:
-        image = (np.clip(np.nan_to_num(image, posinf=0, neginf=0), 0, 1) * 255 + 0.5).astype(
-            np.uint8
-        )
-    return np.broadcast_to(image, (*image.shape[:2], 3)).copy()
+    levels = image if image.dtype == np.uint8 else _levels(image)
+    return np.broadcast_to(levels, (*image.shape[:2], 3)).copy()
+
+
+def _levels(values: np.ndarray) -> np.ndarray:
+    """Return values in [0, 1] as 0 to 255, rounded."""
+    unit = np.clip(np.nan_to_num(values, posinf=0, neginf=0), 0, 1)
+    return (unit * 255 + 0.5).astype(np.uint8)
 
 
 def grey_image(values: np.ndarray) -> np.ndarray:
@@ -72,13 +76,18 @@ def motion_image(motion: np.ndarray, scale_px: float) -> np.ndarray:
     if not scale_px > 0:
         raise ValueError(f"motion_image(): `scale_px` must be positive, got {scale_px}.")
     valid = np.asarray(np.isfinite(motion).all(-1))
-    x, y = np.moveaxis(np.where(valid[..., None], motion, 0), -1, 0)
-    hue = np.rad2deg(np.arctan2(y, x)) % 360
-    saturation = np.minimum(np.hypot(x, y) / scale_px, 1)
-    hsv = np.stack([hue, saturation, np.ones_like(hue)], -1).astype(np.float32)
+    hsv = _hue_and_saturation(np.where(valid[..., None], motion, 0), scale_px)
     image = to_uint8(cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB))
     image[~valid] = UNDEFINED
     return image
+
+
+def _hue_and_saturation(motion: np.ndarray, scale_px: float) -> np.ndarray:
+    """Return the colours of finite motion as hue in degrees, saturation and value [H, W, 3]."""
+    x, y = np.moveaxis(motion, -1, 0)
+    hue = np.rad2deg(np.arctan2(y, x)) % 360
+    saturation = np.minimum(np.hypot(x, y) / scale_px, 1)
+    return np.stack([hue, saturation, np.ones_like(hue)], -1).astype(np.float32)
 
 
 def motion_legend(scale_px: float, size: int = 96) -> np.ndarray:
@@ -106,9 +115,16 @@ def confidence_legend(size: int = 96) -> np.ndarray:
     image = np.full((size, size, 3), BACKGROUND, np.uint8)
     image[:, : ramp.shape[1]] = confidence_image(ramp)
     for text, row in (("1 moving", 0.0), ("0.5", 0.5), ("0 static", 1.0)):
-        origin = (ramp.shape[1] + 4, round(12 + row * (size - 16)))
-        cv2.putText(image, text, origin, cv2.FONT_HERSHEY_SIMPLEX, 0.35, (0, 0, 0), 1, cv2.LINE_AA)
+        _write(image, text, (ramp.shape[1] + 4, round(12 + row * (size - 16))), 0.35, 0)
     return image
+
+
+def _write(
+    image: np.ndarray, text: str, origin: tuple[int, int], scale: float, grey: int, width: int = 1
+) -> None:
+    """Draw text into an image, with its lower left corner at `origin`."""
+    color = (grey, grey, grey)
+    cv2.putText(image, text, origin, _FONT, scale, color, width, cv2.LINE_AA)
 
 
 def time_slice(columns: Sequence[np.ndarray], least_width: int = 320) -> np.ndarray:
@@ -141,13 +157,17 @@ def depth_image(
     if not valid.any():
         return np.full((*depth.shape, 3), UNDEFINED, np.uint8)
     low, high = depth_range(depth)
-    near = near or low
     far = far or high
-    inverse = 1 / np.where(valid, depth, far)
-    span = max(1 / near - 1 / far, 1e-12)
-    image = _apply_colour_map((inverse - 1 / far) / span, cv2.COLORMAP_TURBO)
+    nearness = _nearness(np.where(valid, depth, far), near or low, far)
+    image = _apply_colour_map(nearness, cv2.COLORMAP_TURBO)
     image[~valid] = UNDEFINED
     return image
+
+
+def _nearness(depth: np.ndarray, near: float, far: float) -> np.ndarray:
+    """Return 1 at the depth `near` and 0 at `far`, linear in 1 / depth."""
+    span = max(1 / near - 1 / far, 1e-12)
+    return (1 / depth - 1 / far) / span
 
 
 def depth_range(depth: np.ndarray) -> tuple[float, float]:
@@ -163,12 +183,10 @@ def label(image: np.ndarray, text: str) -> np.ndarray:
     """Return the image with `text` (ASCII) in its top left corner, white on a dark strip."""
     image = to_uint8(image)
     scale = np.clip(image.shape[1] / 640, 0.35, 1.0)
-    font = cv2.FONT_HERSHEY_SIMPLEX
     thickness = 2 if scale > 0.8 else 1
-    (width, height), base = cv2.getTextSize(text, font, scale, thickness)
-    strip = image[: height + base + 4, : width + 8]
-    strip[:] = strip // 4
-    cv2.putText(image, text, (4, height + 3), font, scale, (255, 255, 255), thickness, cv2.LINE_AA)
+    (width, height), base = cv2.getTextSize(text, _FONT, scale, thickness)
+    image[: height + base + 4, : width + 8] //= 4
+    _write(image, text, (4, height + 3), scale, 255, thickness)
     return image
 
 
@@ -214,12 +232,17 @@ def _apply_colour_map(values: np.ndarray, colour_map: int) -> np.ndarray:
 def _concatenate(images: list[np.ndarray], axis: int) -> np.ndarray:
     if not images:
         raise ValueError("side_by_side(), contact_sheet(): expected at least one image, got none.")
-    across = 1 - axis
-    largest = max(image.shape[across] for image in images)
-    parts = []
-    for image in images:
-        border = [(0, 0)] * 3
-        border[across] = (0, largest - image.shape[across])
-        border[axis] = (GAP if parts else 0, 0)
-        parts.append(np.pad(image, border, constant_values=BACKGROUND))
+    largest = max(image.shape[1 - axis] for image in images)
+    first, *others = images
+    parts = [_padded(first, axis, 0, largest), *(_padded(i, axis, GAP, largest) for i in others)]
     return np.concatenate(parts, axis)
+
+
+def _padded(image: np.ndarray, axis: int, gap: int, across: int) -> np.ndarray:
+    """Return an image with a gap before it along an axis, and of the size `across` along the other
+    one.
+    """
+    border = [(0, 0)] * 3
+    border[axis] = (gap, 0)
+    border[1 - axis] = (0, across - image.shape[1 - axis])
+    return np.pad(image, border, constant_values=BACKGROUND)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -48,28 +49,37 @@ def select_frames(stream: FrameSource, span: str | None) -> list[int]:
     numbers = frame_numbers(stream)
     if span is None:
         return numbers
-    try:
-        start, stop, step = (
-            *(int(part) if part.strip() else None for part in span.split(":")),
-            *([None] * 2),
-        )[:3]
-        if span.count(":") > 2 or (step is not None and step < 1):
-            raise ValueError
-    except ValueError:
-        raise ValueError(
-            f"select_frames(): `span` must be like 12, 10:20 or 0:100:5, got {span!r}."
-        ) from None
-    if ":" not in span:
-        stop = None if start is None else start + 1
-    low = numbers[0] if start is None else start
-    high = numbers[-1] + 1 if stop is None else stop
-    indices = range(low, high, step or 1)
+    indices = _indices(span, numbers[0], numbers[-1])
     if not (frames := [number for number in numbers if number in indices]):
         raise ValueError(
             f"select_frames(): `span` must select frames of {stream.path}, {numbers[0]} to "
             f"{numbers[-1]}, got {span!r}."
         )
     return frames
+
+
+def _indices(span: str, first: int, last: int) -> range:
+    """Return the indices that a span selects in a stream with the frames `first` to `last`."""
+    start, stop, step = _numbers(span)
+    if ":" not in span:
+        stop = None if start is None else start + 1
+    low = first if start is None else start
+    high = last + 1 if stop is None else stop
+    return range(low, high, step or 1)
+
+
+def _numbers(span: str) -> tuple[int | None, ...]:
+    """Return start, stop and step of a span, None for each that is not given."""
+    try:
+        parts = [int(part) if part.strip() else None for part in span.split(":")]
+        start, stop, step = (*parts, None, None)[:3]
+        if len(parts) > 3 or (step is not None and step < 1):
+            raise ValueError
+    except ValueError:
+        raise ValueError(
+            f"select_frames(): `span` must be like 12, 10:20 or 0:100:5, got {span!r}."
+        ) from None
+    return start, stop, step
 
 
 def write_each(
@@ -97,7 +107,6 @@ def write_each(
         OSError: the folder exists, or a file cannot be written.
     """
     selection = set(frames)
-    count = 0
     is_file = Path(output).name.lower().endswith(suffix)
     if is_file and len(selection) > 1:
         raise ValueError(
@@ -105,14 +114,17 @@ def write_each(
             "(--frames), or name a folder."
         )
     with (atomic_path if is_file else atomic_folder)(output, "write_each()") as partial:
-        for frame, gaussians in clip:
-            if frame in selection:
-                write(partial if is_file else partial / f"{frame:04d}{suffix}", gaussians)
-                count += 1
-                if progress is not None:
-                    progress(count, len(selection))
-            if count == len(selection):
-                break
+        for count, (frame, gaussians) in enumerate(_selected(clip, selection), start=1):
+            write(partial if is_file else partial / f"{frame:04d}{suffix}", gaussians)
+            if progress is not None:
+                progress(count, len(selection))
+
+
+def _selected(
+    clip: Iterable[tuple[int, Gaussians]], selection: set[int]
+) -> Iterator[tuple[int, Gaussians]]:
+    """Return the frames of a clip that are selected; it is read up to the last of them."""
+    return islice((frame for frame in clip if frame[0] in selection), len(selection))
 
 
 def flight(
@@ -179,11 +191,16 @@ def named_path(
     if name == "between":
         return through_cameras(stream.cameras, clip)
     if name == "orbit":
-        if degrees is None and stream.metadata.get(DEFAULT_RIG) is True:
-            degrees = _SWING
-        means = next(gaussians for _, gaussians in play(stream)).numpy()["means"]
-        return orbit(stream.cameras, focus(stream.cameras, means), degrees, clip)
+        return _orbit(stream, degrees, clip)
     return load_path(name, stream.cameras)
+
+
+def _orbit(stream: FrameSource, degrees: float | None, seconds: float) -> CameraPath:
+    """Return the orbit around the point that the rig of a stream looks at."""
+    if degrees is None and stream.metadata.get(DEFAULT_RIG) is True:
+        degrees = _SWING
+    means = next(gaussians for _, gaussians in play(stream)).numpy()["means"]
+    return orbit(stream.cameras, focus(stream.cameras, means), degrees, seconds)
 
 
 def repeated_seconds(clip: float, least: float) -> float:
@@ -227,11 +244,17 @@ def _frames_backwards(stream: FrameSource) -> Iterator[Gaussians]:
     """
     inner_frames = frame_numbers(stream)[1:-1]
     while inner_frames:
-        block: list[FrameState] = []
-        for state in stream.states(inner_frames[-1]):
-            block = [*(earlier for earlier in block if earlier.frame < state.frame), state]
-            if state.frame == inner_frames[-1]:
-                break
+        block = _block(stream, inner_frames[-1])
         # A keyframe has no motion of its own: it follows from the residual, in the block before.
         yield from (state.gaussians for state in block[:0:-1])
         inner_frames = [frame for frame in inner_frames if frame <= block[0].frame]
+
+
+def _block(stream: FrameSource, last: int) -> list[FrameState]:
+    """Return the frames from which a stream decodes the frame `last`, and that one."""
+    block: list[FrameState] = []
+    for state in stream.states(last):
+        block = [*(earlier for earlier in block if earlier.frame < state.frame), state]
+        if state.frame == last:
+            break
+    return block

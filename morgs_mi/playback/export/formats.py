@@ -76,17 +76,20 @@ def choose_format(
         )
     if output is None or (name is not None and choices[0].folder):
         return choices[0]
-    file_name = Path(output).name.lower()
-    if matches := [
-        choice for choice in choices if choice.ending and file_name.endswith(choice.ending)
-    ]:
+    return _format_of_name(choices, output)
+
+
+def _format_of_name(choices: Sequence[Format], output: str | Path) -> Format:
+    """Return the format with the longest ending that the output's name has."""
+    name = Path(output).name.lower()
+    if matches := [choice for choice in choices if choice.ending and name.endswith(choice.ending)]:
         return max(matches, key=lambda choice: len(choice.ending))
-    suffix = re.search(r"\.[a-z]\w*$", file_name)
+    suffix = re.search(r"\.[a-z]\w*$", name)
     if suffix is None and (folders := [choice for choice in choices if choice.folder]):
         return folders[0]
     outputs = _listed(list(dict.fromkeys(text for choice in choices for text in choice.outputs)))
     raise ValueError(
-        f"{output}: the output must be {outputs}, got {suffix[0] if suffix else file_name!r}."
+        f"{output}: the output must be {outputs}, got {suffix[0] if suffix else name!r}."
     )
 
 

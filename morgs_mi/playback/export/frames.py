@@ -19,6 +19,9 @@ from morgs_mi.playback.player import channel_image, render_stream
 from morgs_mi.playback.stream_header import stream_exposure
 from morgs_mi.playback.visualise import side_by_side, write_png
 
+# Index and channels [H, W, C] by name.
+_Frame = tuple[int, Mapping[str, np.ndarray]]
+
 
 def write_frames(
     stream: FrameSource,
@@ -72,36 +75,43 @@ def write_images(
         OSError: the folder exists, or a file cannot be written.
     """
     kind = choose_format(IMAGES, output, format).name
-
-    def frames() -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:
-        for count, (frame, images) in enumerate(rendered, start=1):
-            shows = display_exposure and kind != "exr" and "color" in images
-            yield (
-                frame,
-                {**images, "color": exposed(images["color"], display_exposure)}
-                if shows
-                else images,
-            )
-            if progress is not None:
-                progress(count)
-
+    frames = _displayed(rendered, 0.0 if kind == "exr" else display_exposure, progress)
     if kind == "mp4":
-        movie = (pad_to_even(_combined_image(images)) for _, images in frames())
+        movie = (pad_to_even(_combined_image(images)) for _, images in frames)
         write_video(output, movie, fps, PLAYABLE)
-        return
-    write = _write_png if kind == "png" else _write_exr
-    if Path(output).name.lower().endswith(f".{kind}"):
-        with atomic_path(output, "write_frames()") as partial:
-            for count, (_, images) in enumerate(frames()):
-                if count:
-                    raise ValueError(
-                        f"{output}: expected one frame for one file, got several; name a folder."
-                    )
-                write(partial, images)
-        return
-    with atomic_folder(output, "write_frames()") as folder:
-        for frame, images in frames():
-            write(folder / f"{frame:04d}.{kind}", images)
+    elif Path(output).name.lower().endswith(f".{kind}"):
+        _write_file(frames, output, _WRITERS[kind])
+    else:
+        with atomic_folder(output, "write_frames()") as folder:
+            for frame, images in frames:
+                _WRITERS[kind](folder / f"{frame:04d}.{kind}", images)
+
+
+def _displayed(
+    rendered: Iterable[_Frame], exposure: float, progress: Callable[[int], None] | None
+) -> Iterator[_Frame]:
+    """Yield rendered frames with colours that are brightened by an exposure, in stops."""
+    for count, (frame, images) in enumerate(rendered, start=1):
+        if exposure and "color" in images:
+            images = {**images, "color": exposed(images["color"], exposure)}
+        yield frame, images
+        if progress is not None:
+            progress(count)
+
+
+def _write_file(
+    frames: Iterable[_Frame],
+    output: str | Path,
+    write: Callable[[Path, Mapping[str, np.ndarray]], None],
+) -> None:
+    """Write the only frame into a file."""
+    with atomic_path(output, "write_frames()") as partial:
+        for count, (_, images) in enumerate(frames):
+            if count:
+                raise ValueError(
+                    f"{output}: expected one frame for one file, got several; name a folder."
+                )
+            write(partial, images)
 
 
 def _write_png(path: Path, images: Mapping[str, np.ndarray]) -> None:
@@ -110,6 +120,9 @@ def _write_png(path: Path, images: Mapping[str, np.ndarray]) -> None:
 
 def _write_exr(path: Path, images: Mapping[str, np.ndarray]) -> None:
     write_exr(path, exr_channels(images))
+
+
+_WRITERS = {"png": _write_png, "exr": _write_exr}
 
 
 def exr_channels(images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -135,14 +148,13 @@ def _exr_names(channel: str, components: int) -> list[str]:
         return ["A"]
     if channel in ("splats", "surfaces", "shadow"):  # layers of an inserted scene, see `insert`
         return [f"{channel}.{letter}" for letter in "RGBA"[:components]]
-    suffixes = (
-        "Y"
-        if components == 1
-        else "XYZW"[:components]
-        if components <= 4
-        else map(str, range(components))
-    )
-    return [f"{channel}.{suffix}" for suffix in suffixes]
+    return [f"{channel}.{suffix}" for suffix in _suffixes(components)]
+
+
+def _suffixes(components: int) -> Iterable[str]:
+    if components == 1:
+        return "Y"
+    return "XYZW"[:components] if components <= 4 else map(str, range(components))
 
 
 def pad_to_even(image: np.ndarray) -> np.ndarray:

@@ -17,6 +17,7 @@ from importlib.metadata import version
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -141,7 +142,9 @@ def published_bytes(stream: FrameSource, progress: Progress | None = None) -> by
     """Return the stream with the metadata that the page reads, after decoding it once; errors as
     `write_web_page`.
     """
-    render = metadata_entry(stream, "config.render", {}, dict)
+    metadata: dict[str, Any] = {
+        "config": {"render": metadata_entry(stream, "config.render", {}, dict)}
+    }
     packets = list(stream)
     speeds = []
     for coded in coded_frames(packets):
@@ -150,16 +153,23 @@ def published_bytes(stream: FrameSource, progress: Progress | None = None) -> by
             progress(len(speeds))
     if not speeds:
         raise ValueError(f"{stream.path}: expected at least one frame to show, got none.")
+    metadata["motion_scale"] = _motion_scale(*np.hstack(speeds))
     sink = io.BytesIO()
-    metadata = {"config": {"render": render}, "motion_scale": _motion_scale(*np.hstack(speeds))}
-    if stream.metadata.get(DEFAULT_RIG) is True:
-        metadata[DEFAULT_RIG] = True
-    if stops := stream_exposure(stream):
-        metadata["transfer"] = {"name": TRANSFER, "display_exposure": stops}
+    metadata |= _display_metadata(stream)
     with StreamWriter(sink, stream.cameras, stream.fps, metadata) as writer:
         for packet in packets:
             writer.write(packet)
     return sink.getvalue()
+
+
+def _display_metadata(stream: FrameSource) -> dict[str, Any]:
+    """Return what the page reads about made-up cameras and the display's exposure."""
+    metadata: dict[str, Any] = {}
+    if stream.metadata.get(DEFAULT_RIG) is True:
+        metadata[DEFAULT_RIG] = True
+    if stops := stream_exposure(stream):
+        metadata["transfer"] = {"name": TRANSFER, "display_exposure": stops}
+    return metadata
 
 
 def _motion_scale(speeds: np.ndarray, weights: np.ndarray) -> float:
@@ -188,24 +198,31 @@ def _speeds(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarray:
     motion = np.asarray(gaussians.motion)
     rows = np.flatnonzero(motion.any(axis=1))
     rows = rows[:: len(rows) // _SAMPLES + 1]
-    motion = motion[rows]
-    raw = gaussians.numpy()
-    means = raw["means"][rows]
-    log_sizes = raw["log_scales"][rows].mean(axis=1)
+    means = gaussians.numpy()["means"][rows]
+    weights = _weights(gaussians, rows)
+    return np.hstack([_view_speeds(camera, means, motion[rows], weights) for camera in cameras])
+
+
+def _weights(gaussians: Gaussians, rows: np.ndarray) -> np.ndarray:
+    """Return the opacities of some Gaussians times their areas."""
+    log_sizes = gaussians.numpy()["log_scales"][rows].mean(axis=1)
     # A stream may contain any scale; the bound keeps the weights finite.
-    weights = np.asarray(gaussians.opacities)[rows] * np.exp(2 * np.minimum(log_sizes, 20))
-    columns = []
-    for camera in cameras:
-        pixels, depths = camera.project(means)
-        visible = (depths > camera.near) & (
-            (pixels > 0) & (pixels < (camera.width, camera.height))
-        ).all(axis=1)
-        motions = np.einsum(
-            "nij,nj->ni", camera.projection_jacobian(means[visible]), motion[visible]
-        )
-        speeds = np.linalg.norm(motions, axis=1) / camera.width
-        columns.append([speeds, weights[visible] / depths[visible] ** 2])
-    return np.hstack(columns)
+    return np.asarray(gaussians.opacities)[rows] * np.exp(2 * np.minimum(log_sizes, 20))
+
+
+def _view_speeds(
+    camera: Camera, means: np.ndarray, motion: np.ndarray, weights: np.ndarray
+) -> np.ndarray:
+    """Return the speeds of the Gaussians that a camera sees, and their weights on the screen
+    [2, S].
+    """
+    pixels, depths = camera.project(means)
+    in_image = (pixels > 0) & (pixels < (camera.width, camera.height))
+    visible = (depths > camera.near) & in_image.all(axis=1)
+    jacobians = camera.projection_jacobian(means[visible])
+    motions = np.einsum("nij,nj->ni", jacobians, motion[visible])
+    speeds = np.linalg.norm(motions, axis=1) / camera.width
+    return np.stack([speeds, weights[visible] / depths[visible] ** 2])
 
 
 def _player() -> Traversable:
@@ -223,8 +240,12 @@ def _page(title: str, data: str, connect: str) -> bytes:
         "{notice}": (player / "NOTICE").read_text(encoding="utf-8").replace("--", "- "),
         "{data}": data + "\n" + _script("code", code),
     }
-    page = re.sub("|".join(map(re.escape, values)), lambda match: values[match[0]], page)
-    return page.encode(errors="replace")
+    return _filled(page, values).encode(errors="replace")
+
+
+def _filled(page: str, values: dict[str, str]) -> str:
+    """Return a page with values in place of their names."""
+    return re.sub("|".join(map(re.escape, values)), lambda match: values[match[0]], page)
 
 
 def _script(name: str, data: bytes) -> str:

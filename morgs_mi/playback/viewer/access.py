@@ -60,12 +60,8 @@ class Access:
         self._prefix = f"/{token}" if token else ""
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        start = len(self._prefix)
-        path = scope["path"]
         reason = refusal(Headers(scope=scope), self._name)
-        if reason is None and not secrets.compare_digest(
-            path[: start + 1].encode(), f"{self._prefix}/".encode()
-        ):
+        if reason is None and not self._has_token(scope["path"]):
             reason = "expected the token of the printed link in the address"
 
         async def secured(message: Message) -> None:
@@ -74,7 +70,11 @@ class Access:
             await send(message)
 
         app = self._app if reason is None else PlainTextResponse(f"morgs-mi view: {reason}.\n", 403)
-        await app({**scope, "path": path[start:]}, receive, secured)
+        await app({**scope, "path": scope["path"][len(self._prefix) :]}, receive, secured)
+
+    def _has_token(self, path: str) -> bool:
+        start = path[: len(self._prefix) + 1]
+        return secrets.compare_digest(start.encode(), f"{self._prefix}/".encode())
 
 
 def _is_address(name: str) -> bool:

@@ -42,12 +42,7 @@ class ExactImages:
             OSError, ValueError: the stream is broken, or has no such frame or channel, or the image
                 is too large.
         """
-        size = camera.width * camera.height
-        if not 0 < motion_scale < float("inf") or size > _MOST_PIXELS:
-            raise ValueError(
-                f"expected a motion above 0, at most {_MOST_PIXELS} pixels, got {motion_scale}, "
-                f"{size}."
-            )
+        _check_image(camera, motion_scale)
         self._newest += 1
         number = self._newest
         async with self._lock:
@@ -74,3 +69,11 @@ class ExactImages:
         if self._decoded is None or self._decoded[0] != key:
             self._decoded = (key, stream.seek(frame).gaussians)
         return self._decoded[1]
+
+
+def _check_image(camera: Camera, motion_scale: float) -> None:
+    size = camera.width * camera.height
+    if not 0 < motion_scale < float("inf") or size > _MOST_PIXELS:
+        raise ValueError(
+            f"expected a motion above 0, at most {_MOST_PIXELS} pixels, got {motion_scale}, {size}."
+        )

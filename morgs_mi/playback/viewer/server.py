@@ -15,6 +15,7 @@ import socket
 from ipaddress import ip_address
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import cv2
 import uvicorn
@@ -37,6 +38,13 @@ from morgs_mi.playback.viewer.stream_bytes import stream_response
 
 _GRACE = 1  # seconds for answers that are under way at the end
 _MOST_CAMERA_BYTES = 4096
+_OPTIONS: dict[str, Any] = {
+    "log_level": "warning",
+    "lifespan": "off",
+    "ws": "none",
+    "proxy_headers": False,
+    "timeout_graceful_shutdown": _GRACE,
+}
 
 
 class Viewer:
@@ -73,31 +81,13 @@ class Viewer:
             self._path.write_bytes(published_bytes(stream))
         self._recorded = RecordedImages(capture)
         self._exact = ExactImages(self._opened)
-        try:
-            family = socket.AF_INET6 if ":" in host else socket.AF_INET
-            self._socket = socket.create_server((host, port), family=family)
-        except (OSError, OverflowError) as error:
-            raise ValueError(
-                f"{host}:{port}: cannot serve the page there ({error}); choose another --port."
-            ) from None
+        self._socket = _listening_socket(host, port)
         address, port = self._socket.getsockname()[:2]
         self.is_public = not ip_address(address).is_loopback
         token = secrets.token_urlsafe() if self.is_public else ""
-        name = (
-            "localhost"
-            if ip_address(address).is_unspecified
-            else f"[{host}]"
-            if ":" in host
-            else host
-        )
+        name = "localhost" if ip_address(address).is_unspecified else _name_in_link(host)
         self.url = f"http://{name}:{port}/{token and token + '/'}"
-        options = {
-            "lifespan": "off",
-            "ws": "none",
-            "proxy_headers": False,
-            "timeout_graceful_shutdown": _GRACE,
-        }
-        config = uvicorn.Config(Access(self._app(), host, token), log_level="warning", **options)
+        config = uvicorn.Config(Access(self._app(), host, token), **_OPTIONS)
         self._server = uvicorn.Server(config)
 
     def run(self) -> None:
@@ -162,6 +152,20 @@ class Viewer:
             **request.path_params, camera=camera, motion_scale=float(query.get("scale", "nan"))
         )
         return Response(status_code=204) if png is None else Response(png, media_type="image/png")
+
+
+def _listening_socket(host: str, port: int) -> socket.socket:
+    try:
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        return socket.create_server((host, port), family=family)
+    except (OSError, OverflowError) as error:
+        raise ValueError(
+            f"{host}:{port}: cannot serve the page there ({error}); choose another --port."
+        ) from None
+
+
+def _name_in_link(host: str) -> str:
+    return f"[{host}]" if ":" in host else host
 
 
 async def _failed(_: Request, error: Exception) -> Response:

@@ -31,18 +31,25 @@ def stream_response(path: Path, request: Request) -> Response:
     size = os.fstat(file.fileno()).st_size
     etag = _etag(file, size)
     headers = {"ETag": etag, "Accept-Ranges": "bytes", "Content-Location": path.name}
-    match = _RANGE.fullmatch(request.headers.get("range", ""))
-    part = range(size)
-    status = 200
-    if match is not None and request.headers.get("if-range", etag) == etag:
-        part = part[int(match[1]) : int(match[2]) + 1 if match[2] else None]
-        status = 206
-        headers["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{size}"
-    if status == 206 and not part:
+    part = _requested_bytes(request, etag, size)
+    if part is not None and not part:
         file.close()
         return PlainTextResponse("", 416, {"Content-Range": f"bytes */{size}"})
+    status = 200 if part is None else 206
+    if part is None:
+        part = range(size)
+    else:
+        headers["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{size}"
     headers["Content-Length"] = str(len(part))
     return StreamingResponse(_chunks(file, part), status, headers, "application/octet-stream")
+
+
+def _requested_bytes(request: Request, etag: str, size: int) -> range | None:
+    """Return the range that a request names, None if it is for the whole file."""
+    match = _RANGE.fullmatch(request.headers.get("range", ""))
+    if match is None or request.headers.get("if-range", etag) != etag:
+        return None
+    return range(size)[int(match[1]) : int(match[2]) + 1 if match[2] else None]
 
 
 def _etag(file: BinaryIO, size: int) -> str:
