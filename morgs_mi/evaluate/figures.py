@@ -4,13 +4,15 @@ legends.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
+from morgs_mi.capture.truth import GroundTruth
+from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import exposed
 from morgs_mi.playback.player import (
@@ -70,59 +72,76 @@ def draw_stream(
     """
     stream = open_stream(out)
     frames = stream.frame_numbers()
-    recording = open_stream_capture(stream, capture, frames, any_recording)
-    recording = recording.displayed()
+    recording = open_stream_capture(stream, capture, frames, any_recording).displayed()
     stops = stream_exposure(stream)
     view = recording.reference_view
     camera = recording.with_delays(stream.cameras)[view]
-    # Nothing moves up to the first frame.
-    later_frames = frames[1:] or frames
-    row_frames = {
-        later_frames[i]
-        for i in np.linspace(0, len(later_frames) - 1, min(_ROWS, len(later_frames))).astype(int)
-    }
     scale = motion_scale(recording, camera)
     column, still = _busiest_column(recording, view, frames)
     renders = []
     recorded = []
-    motions = []
-    confidences = []
-    offsets = []
-    with_confidence = has_confidence(stream)
-    with_offset = has_offset(stream)
-    maps = (*(("confidence",) if with_confidence else ()), *(("offset",) if with_offset else ()))
-    playback = render_stream(stream, camera, ("color", "motion", *maps))
-    for (index, images), frame in zip(
-        playback, recording.partial_frames(frames[0], frames[-1] + 1), strict=False
-    ):
+    rows: dict[str, list[list[np.ndarray]]] = {"motion": []}
+    row_frames = _row_frames(frames)
+    playback = render_stream(stream, camera, ("color", "motion", *_learned_maps(stream)))
+    recorded_frames = recording.partial_frames(frames[0], frames[-1] + 1)
+    for (index, images), frame in zip(playback, recorded_frames, strict=False):
         # Copies: views would keep all images of a long clip in memory.
         renders.append(to_uint8(exposed(images["color"], stops))[:, column].copy())
         pixels = frame.images[view]
         recorded.append(np.zeros_like(renders[-1]) if pixels is None else pixels[:, column].copy())
         if index in row_frames:
             truth = truth_for_camera(recording, camera, index)
-            true_motion, mask = (None, None) if truth is None else (truth.motion, truth.mask)
-            motion_maps = {"true motion": true_motion, "motion": images["motion"]}
-            motions.append(_row(index, partial(motion_image, scale_px=scale), motion_maps))
-            if with_confidence:
-                confidence_maps = {"true mask": mask, "confidence": images["confidence"]}
-                confidences.append(_row(index, confidence_image, confidence_maps))
-            if with_offset:
-                whole = channel_image("motion", images["motion"], scale)
-                offset = channel_image("offset", images["offset"], scale)
-                offsets.append(_row(index, to_uint8, {"motion": whole, "its offset": offset}))
+            for name, row in _rows(index, images, truth, scale).items():
+                rows.setdefault(name, []).append(row)
         if progress is not None:
             progress(len(renders), len(frames))
-    sheets = {
-        "slice": _slices(still, column, recorded, renders),
-        "motion": _with_legend(motions, motion_legend(scale)),
-    }
-    if confidences:
-        sheets["confidence"] = _with_legend(confidences, confidence_legend())
-    if offsets:
-        legends = [motion_legend(scale), motion_legend(OFFSET_SCALE * scale)]
-        sheets["offset"] = _with_legend(offsets, side_by_side(legends))
-    paths = [Path(folder) / f"{name}.png" for name in sheets]
+    sheets = {"slice": _slices(still, column, recorded, renders)}
+    sheets |= {name: _with_legend(rows[name], _legend(name, scale)) for name in rows}
+    return _write_sheets(Path(folder), sheets)
+
+
+def _row_frames(frames: Sequence[int]) -> set[int]:
+    """Return the frames that are drawn as rows."""
+    # Nothing moves up to the first frame.
+    later_frames = frames[1:] or frames
+    last = len(later_frames) - 1
+    return {later_frames[i] for i in np.linspace(0, last, min(_ROWS, last + 1)).astype(int)}
+
+
+def _learned_maps(stream: FrameSource) -> list[str]:
+    """Return the channels of the stream that are drawn beside colour and motion."""
+    maps = {"confidence": has_confidence(stream), "offset": has_offset(stream)}
+    return [name for name, stored in maps.items() if stored]
+
+
+def _rows(
+    frame: int, images: Mapping[str, np.ndarray], truth: GroundTruth | None, scale: float
+) -> dict[str, list[np.ndarray]]:
+    """Return the rows of a frame in the sheets of motion, confidence and offset."""
+    true_motion, mask = (None, None) if truth is None else (truth.motion, truth.mask)
+    maps = {"true motion": true_motion, "motion": images["motion"]}
+    rows = {"motion": _row(frame, partial(motion_image, scale_px=scale), maps)}
+    if "confidence" in images:
+        maps = {"true mask": mask, "confidence": images["confidence"]}
+        rows["confidence"] = _row(frame, confidence_image, maps)
+    if "offset" in images:
+        whole = channel_image("motion", images["motion"], scale)
+        offset = channel_image("offset", images["offset"], scale)
+        rows["offset"] = _row(frame, to_uint8, {"motion": whole, "its offset": offset})
+    return rows
+
+
+def _legend(sheet: str, scale: float) -> np.ndarray:
+    if sheet == "confidence":
+        return confidence_legend()
+    if sheet == "offset":
+        return side_by_side([motion_legend(scale), motion_legend(OFFSET_SCALE * scale)])
+    return motion_legend(scale)
+
+
+def _write_sheets(folder: Path, sheets: Mapping[str, np.ndarray]) -> list[Path]:
+    """Write images as PNG files and return their paths."""
+    paths = [folder / f"{name}.png" for name in sheets]
     for path, sheet in zip(paths, sheets.values(), strict=True):
         write_png(path, sheet)
     return paths
@@ -133,11 +152,8 @@ def motion_scale(capture: Capture, camera: Camera) -> float:
     camera's width.
     """
     truths = [truth_for_camera(capture, camera, frame) for frame in range(capture.num_frames)]
-    speeds = [
-        np.linalg.norm(truth.motion[truth.mask], axis=-1)
-        for truth in truths[1:]
-        if truth is not None
-    ]
+    motions = [truth.motion[truth.mask] for truth in truths[1:] if truth is not None]
+    speeds = [np.linalg.norm(motion, axis=-1) for motion in motions]
     moving = np.concatenate(speeds) if speeds else np.zeros(0)
     return float(np.percentile(moving, 95)) if moving.size else 0.03 * camera.width
 
@@ -146,15 +162,19 @@ def _busiest_column(recording: Capture, view: int, frames: Sequence[int]) -> tup
     """Return the column of a view in which the recording changes most, and its last image."""
     change = np.zeros(recording.cameras[view].width)
     last = None
-    for frame in recording.partial_frames(frames[0], frames[-1] + 1):
-        if (pixels := frame.images[view]) is None:
-            continue
-        image = pixels.astype(float)
+    for image in _recorded_images(recording, view, frames):
         if last is not None:
             change += np.abs(image - last).sum((0, 2))
         last = image
     assert last is not None
     return int(change.argmax()), last.astype(np.uint8)
+
+
+def _recorded_images(recording: Capture, view: int, frames: Sequence[int]) -> Iterator[np.ndarray]:
+    """Yield the images of a view [H, W, 3] as floats, without those that were not recorded."""
+    for frame in recording.partial_frames(frames[0], frames[-1] + 1):
+        if (pixels := frame.images[view]) is not None:
+            yield pixels.astype(float)
 
 
 def _slices(

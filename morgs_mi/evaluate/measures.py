@@ -11,7 +11,8 @@ until the next. Otherwise it is the pixels in which the recording changed by mor
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,6 +21,7 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.truth import GroundTruth, load_tracks, load_truth
 from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.frame_source import FrameState
+from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import decode_light
 from morgs_mi.evaluate.comparison import ComparedClip, ComparedFrame, ComparedView
 from morgs_mi.evaluate.metrics import (
@@ -148,10 +150,7 @@ class Motion3D(Measure):
         tracks = self._tracks
         if tracks is None or self._truth is None or frame >= tracks.points.shape[1]:
             return None
-        views = []
-        for camera in self._cameras:
-            truth = load_truth(self._truth, camera.name, frame - 1)
-            views.append((camera.resized(*truth.mask.shape[::-1]), truth))
+        views = list(_true_views(self._cameras, self._truth, frame - 1))
         _, last_rows, rows = np.intersect1d(last_state.ids, state.ids, return_indices=True)
         old = last_state.gaussians.numpy()["means"][last_rows].astype(float)
         new = state.gaussians.numpy()["means"][rows].astype(float)
@@ -159,6 +158,15 @@ class Motion3D(Measure):
         return evaluate_motion(
             old, new - old, np.asarray(last_state.gaussians.opacities)[last_rows], points, views
         )
+
+
+def _true_views(
+    cameras: Sequence[Camera], folder: Path, frame: int
+) -> Iterator[tuple[Camera, GroundTruth]]:
+    """Yield the cameras, on the pixel grid of their ground truth, and that."""
+    for camera in cameras:
+        truth = load_truth(folder, camera.name, frame)
+        yield camera.resized(*truth.mask.shape[::-1]), truth
 
 
 class Speed(Measure):
@@ -196,37 +204,40 @@ class Forecast(Measure):
 def _image_scores(view: ComparedView, lpips: ImageDistance | None) -> dict[str, float]:
     """Return the scores of a rendered image by metric and region."""
     rendered = view.rendered
-    moving = view.moving
-    whole = np.ones(rendered.shape[:2], bool) if view.valid is None else view.valid
-    no_pixels = np.zeros_like(whole)
-    regions = (
-        whole,
-        *((no_pixels, no_pixels) if moving is None else (whole & moving, whole & ~moving)),
-    )
+    regions = _regions(view, rendered.shape[:2])
     a, b = unit_pair("evaluate_stream", rendered, view.recorded)
-    maps = {"psnr": np.square(a - b), "delta_e": delta_e_map(a, b)}
-    if min(whole.shape) >= WINDOW:
-        maps["ssim"] = ssim_map(a, b)
     exposure_image = follow_exposure(rendered, view.recorded, view.valid)(a).clip(0, 1)
-    scores = {"psnr_matched": psnr_of(mean_over(np.square(exposure_image - b), whole))}
+    scores = {"psnr_matched": psnr_of(mean_over(np.square(exposure_image - b), regions[""]))}
     if view.light is not None:
         scores["psnr_mu"] = psnr_mu(decode_light(view.maps["color"]), view.light, view.valid)
-    for name, values in maps.items():
-        finish = psnr_of if name == "psnr" else float
-        scores |= {
-            name + r: finish(mean_over(values, mask))
-            for r, mask in zip(REGIONS, regions, strict=True)
-        }
+    errors = _by_region("psnr", np.square(a - b), regions)
+    scores |= {name: psnr_of(error) for name, error in errors.items()}
+    scores |= _by_region("delta_e", delta_e_map(a, b), regions)
+    if min(a.shape[:2]) >= WINDOW:
+        scores |= _by_region("ssim", ssim_map(a, b), regions)
     if lpips is not None:
         distance = lpips.distance_map(rendered, view.recorded)
-        if distance.shape == whole.shape:
-            scores |= {
-                f"lpips{r}": mean_over(distance, mask)
-                for r, mask in zip(REGIONS, regions, strict=True)
-            }
-        else:
-            scores["lpips"] = mean_over(distance)
+        of_image = distance.shape != a.shape[:2]
+        scores |= _by_region("lpips", distance, {"": None} if of_image else regions)
     return scores
+
+
+def _regions(view: ComparedView, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+    """Return the masks [H, W] of `REGIONS`."""
+    whole = np.ones(shape, bool) if view.valid is None else view.valid
+    if view.moving is None:
+        moving = still = np.zeros_like(whole)
+    else:
+        moving = whole & view.moving
+        still = whole & ~view.moving
+    return dict(zip(REGIONS, (whole, moving, still), strict=True))
+
+
+def _by_region(
+    name: str, values: np.ndarray, regions: Mapping[str, np.ndarray | None]
+) -> dict[str, float]:
+    """Return the mean of a map over each region, which is all of it for None."""
+    return {name + region: mean_over(values, mask) for region, mask in regions.items()}
 
 
 def _motion_scores(maps: Mapping[str, np.ndarray], truth: GroundTruth) -> dict[str, float]:

@@ -46,11 +46,12 @@ def psnr_mu(light: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None
     2017). Arguments, apart from their encoding, and errors are as for `psnr`.
     """
     most = max(float(truth.max()), 1e-12)
-    tones = (
-        np.log1p(_MU * np.clip(x.astype(np.float64) / most, 0, 1)) / np.log1p(_MU)
-        for x in (light, truth)
-    )
-    return psnr(*tones, mask=mask)
+    return psnr(_mu_law(light, most), _mu_law(truth, most), mask)
+
+
+def _mu_law(light: np.ndarray, most: float) -> np.ndarray:
+    """Return the tones [0, 1] of light relative to the value `most`."""
+    return np.log1p(_MU * np.clip(light.astype(np.float64) / most, 0, 1)) / np.log1p(_MU)
 
 
 def psnr_of(error: float) -> float:
@@ -88,15 +89,18 @@ def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
         raise ValueError(
             f"ssim(): images must be at least {WINDOW}x{WINDOW} pixels, got {image.shape[:2]}."
         )
+    similarity = _similarity(image, truth)
+    return similarity.reshape(*similarity.shape[:2], -1).mean(-1)
+
+
+def _similarity(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Return the similarity of the windows, [H - 10, W - 10, ...]."""
     x = _blur(image)
     y = _blur(truth)
     var_x = _blur(image**2) - x**2
     var_y = _blur(truth**2) - y**2
     covariance = _blur(image * truth) - x * y
-    similarity = (
-        (2 * x * y + C1) * (2 * covariance + C2) / ((x**2 + y**2 + C1) * (var_x + var_y + C2))
-    )
-    return similarity.reshape(*similarity.shape[:2], -1).mean(-1)
+    return (2 * x * y + C1) * (2 * covariance + C2) / ((x**2 + y**2 + C1) * (var_x + var_y + C2))
 
 
 def delta_e_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -168,21 +172,30 @@ def mean_over(values: np.ndarray, mask: np.ndarray | None = None) -> float:
     A map that is smaller than the mask is centred in it, like the map of `ssim_map`.
     """
     if mask is not None:
-        rows, columns = (
-            slice((n - m) // 2, (n - m) // 2 + m)
-            for n, m in zip(mask.shape, values.shape, strict=False)
-        )
+        rows, columns = map(_middle, mask.shape, values.shape)
         values = values[mask[rows, columns]]
     return float(values.mean()) if values.size else float("nan")
+
+
+def _middle(length: int, count: int) -> slice:
+    """Return the middle `count` of a number of rows or columns."""
+    start = (length - count) // 2
+    return slice(start, start + count)
 
 
 def _blur(image: np.ndarray) -> np.ndarray:
     """Return the average over the Gaussian window wherever it fits, [H - 10, W - 10, ...]."""
     half = WINDOW // 2
-    weights = np.exp(-0.5 * (np.arange(-half, half + 1) / SIGMA) ** 2)
-    weights /= weights.sum()
+    weights = _window()
     rows = correlate1d(image, weights, axis=0)[half:-half]
     return correlate1d(rows, weights, axis=1)[:, half:-half]
+
+
+def _window() -> np.ndarray:
+    """Return the weights of the window along one axis [11]."""
+    half = WINDOW // 2
+    weights = np.exp(-0.5 * (np.arange(-half, half + 1) / SIGMA) ** 2)
+    return weights / weights.sum()
 
 
 def unit_pair(

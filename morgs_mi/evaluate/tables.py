@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from morgs_mi.evaluate.measures import REGIONS
-from morgs_mi.evaluate.results import Evaluation
+from morgs_mi.evaluate.results import (
+    Evaluation,
+    Motion3DScores,
+    Sizes,
+    TrackScores,
+    ViewScores,
+)
+
+# Title, name of the score and decimals.
+_Column = tuple[str, str, int]
 
 _METRICS = (("PSNR, dB", "psnr", 2), ("SSIM", "ssim", 4), ("dE2000", "delta_e", 2))
 _METRICS += (("LPIPS", "lpips", 4), ("flow error, px", "motion_error", 2))
@@ -35,65 +44,90 @@ def evaluation_tables(result: Evaluation) -> Iterator[Table]:
     """Yield tables of the frames, of several views, of the regions and, with true tracks, of the
     point tracks.
     """
-    frames = _table("frame by frame", "frame", *(title for title, *_ in _FRAME), "kB", "s")
-    for row in result.frames:
-        scores = (figure(getattr(row.scores, name), digits) for _, name, digits in _FRAME)
-        frames.add_row(
-            str(row.frame), *scores, figure(row.num_bytes / 1e3, 1), figure(row.seconds, 1)
-        )
-    yield frames
+    yield _frame_table(result)
     if len(result.views) > 1:
         yield _view_table(result)
-    views = ("held-out " if result.held_out else "training ") + (
-        "views" if len(result.views) > 1 else "view"
-    )
-    names = "" if len(result.views) > 1 else " " + ", ".join(result.views)
-    regions = _table(
-        f"{views}{names}: means, regions from {result.regions}", "", "whole", "moving", "still"
-    )
-    mean = result.scores
-    for title, name, digits in _METRICS:
-        values = [getattr(mean, name + region) for region in REGIONS]
-        if any(value == value for value in values):
-            regions.add_row(title, *(figure(value, digits) for value in values))
-        if name == "psnr" and mean.psnr_matched == mean.psnr_matched:
-            regions.add_row("PSNR, colours matched", figure(mean.psnr_matched, digits), "", "")
-    if mean.psnr_mu == mean.psnr_mu:
-        regions.add_row("PSNR of the light, mu-law", figure(mean.psnr_mu, 2), "", "")
-    if result.variation.render == result.variation.render:
-        regions.add_row("mTV x100", "", "", figure(result.variation.render, 3))
-        regions.add_row("mTV x100 of the recording", "", "", figure(result.variation.input, 3))
-    yield regions
+    yield _region_table(result)
     if result.tracking:
         yield _tracking_table(result)
 
 
-def sweep_table(rows: Sequence[Mapping[str, float]]) -> Table:
-    """Return the scores of fits with several numbers of epochs, without unknown columns."""
-    columns = [column for column in _SWEEP if any(figure(row[column[1]], 0) != "-" for row in rows)]
-    table = _table(
-        "seconds and bytes of a frame, scores of all", "epochs", *(title for title, *_ in columns)
-    )
-    for row in rows:
+def _frame_table(result: Evaluation) -> Table:
+    """Return the scores, the size and the time of each frame."""
+    table = _table("frame by frame", "frame", *(title for title, *_ in _FRAME), "kB", "s")
+    for row in result.frames:
+        scores = (figure(getattr(row.scores, name), digits) for _, name, digits in _FRAME)
         table.add_row(
-            figure(row["epochs"], 0), *(figure(row[name], digits) for _, name, digits in columns)
+            str(row.frame), *scores, figure(row.num_bytes / 1e3, 1), figure(row.seconds, 1)
         )
     return table
 
 
+def _region_table(result: Evaluation) -> Table:
+    """Return the mean scores of the whole images and of their regions, without unknown rows."""
+    title = f"{_views(result)}: means, regions from {result.regions}"
+    table = _table(title, "", "whole", "moving", "still")
+    for row in _region_rows(result.scores):
+        table.add_row(*row)
+    if result.variation.render == result.variation.render:
+        table.add_row("mTV x100", "", "", figure(result.variation.render, 3))
+        table.add_row("mTV x100 of the recording", "", "", figure(result.variation.input, 3))
+    return table
+
+
+def _views(result: Evaluation) -> str:
+    """Return which views were evaluated, a single one by its name."""
+    kind = "held-out" if result.held_out else "training"
+    if len(result.views) > 1:
+        return f"{kind} views"
+    return f"{kind} view " + ", ".join(result.views)
+
+
+def _region_rows(mean: ViewScores) -> Iterator[tuple[str, ...]]:
+    for title, name, digits in _METRICS:
+        values = [getattr(mean, name + region) for region in REGIONS]
+        if any(value == value for value in values):
+            yield (title, *(figure(value, digits) for value in values))
+        if name == "psnr" and mean.psnr_matched == mean.psnr_matched:
+            yield "PSNR, colours matched", figure(mean.psnr_matched, digits), "", ""
+    if mean.psnr_mu == mean.psnr_mu:
+        yield "PSNR of the light, mu-law", figure(mean.psnr_mu, 2), "", ""
+
+
+def sweep_table(rows: Sequence[Mapping[str, float]]) -> Table:
+    """Return the scores of fits with several numbers of epochs, without unknown columns."""
+    columns = _known_columns(_SWEEP, rows)
+    table = _table(
+        "seconds and bytes of a frame, scores of all", "epochs", *(title for title, *_ in columns)
+    )
+    for row in rows:
+        table.add_row(figure(row["epochs"], 0), *_cells(row, columns))
+    return table
+
+
+def _known_columns(
+    columns: Sequence[_Column], rows: Collection[Mapping[str, float | None]]
+) -> list[_Column]:
+    """Return the columns in which a row has a value."""
+    return [column for column in columns if any(figure(row[column[1]], 0) != "-" for row in rows)]
+
+
+def _cells(row: Mapping[str, float | None], columns: Sequence[_Column]) -> list[str]:
+    return [figure(row[name], digits) for _, name, digits in columns]
+
+
 def _view_table(result: Evaluation) -> Table:
     """Return the scores of each view, and their means, without columns that have none."""
-    rows = {name: {**asdict(scores), "registered": None} for name, scores in result.views.items()}
-    rows["mean"] = {**asdict(result.scores), "registered": None}
-    for name, psnr in (*result.registered.items(), ("mean", result.registered_psnr)):
-        rows[name]["registered"] = psnr
-    columns = [
-        column for column in _VIEW if any(figure(row[column[1]], 0) != "-" for row in rows.values())
-    ]
-    title = "held-out views" if result.held_out else "training views"
-    table = _table(f"{title}, means over the frames", "", *(title for title, *_ in columns))
+    psnrs = {**result.registered, "mean": result.registered_psnr}
+    rows = {
+        name: {**asdict(scores), "registered": psnrs.get(name)}
+        for name, scores in (*result.views.items(), ("mean", result.scores))
+    }
+    columns = _known_columns(_VIEW, rows.values())
+    title = f"{_views(result)}, means over the frames"
+    table = _table(title, "", *(title for title, *_ in columns))
     for name, row in rows.items():
-        table.add_row(name, *(figure(row[key], digits) for _, key, digits in columns))
+        table.add_row(name, *_cells(row, columns))
     return table
 
 
@@ -102,59 +136,73 @@ def _tracking_table(result: Evaluation) -> Table:
     title = "3D point tracks: shares in %, MTE in world units and in % of the extent"
     table = _table(title, "", "tracks", "AJ", "<d avg", "OA", "MTE", "MTE, %", "survival")
     for row in result.tracking:
-        for name, scores in ((row.protocol, row.all), ("  moving", row.moving)):
-            shares = (scores.average_jaccard, scores.delta_avg, scores.occlusion_accuracy)
-            errors = figure(scores.median_error, 4), figure(scores.median_error_percent, 2)
-            survival = figure(100 * scores.survival, 1)
-            table.add_row(
-                name,
-                str(scores.num_tracks),
-                *(figure(100 * s, 1) for s in shares),
-                *errors,
-                survival,
-            )
+        table.add_row(row.protocol, *_tracking_cells(row.all))
+        table.add_row("  moving", *_tracking_cells(row.moving))
     return table
+
+
+def _tracking_cells(scores: TrackScores) -> Iterator[str]:
+    yield str(scores.num_tracks)
+    for share in (scores.average_jaccard, scores.delta_avg, scores.occlusion_accuracy):
+        yield figure(100 * share, 1)
+    yield figure(scores.median_error, 4)
+    yield figure(scores.median_error_percent, 2)
+    yield figure(100 * scores.survival, 1)
 
 
 def evaluation_summary(result: Evaluation) -> Iterator[str]:
     """Yield sentences on other views, time, size, drift and 3D motion."""
-    sizes = result.sizes
-    seconds = result.seconds
-    play = result.playback
-    mean = result.scores
     first, last = (result.frames[k].scores.psnr for k in (0, -1))
     yield (
         f"Drift: PSNR {figure(first, 2)} dB in the first frame, {figure(last, 2)} dB in the last, "
         f"{figure(result.psnr_slope, 4)} dB per frame."
     )
     if result.held_out:  # a measurement, beside which a forecast would only confuse
-        held_out = "Held-out views" if len(result.views) > 1 else "Held-out view"
-        yield (
-            f"{held_out} in the first frame: {figure(first, 2)} dB as calibrated, "
-            f"{figure(result.registered_psnr, 2)} dB registered, from the camera that fits each "
-            "image best."
-        )
-        yield (
-            f"{held_out} in all frames: {figure(mean.psnr, 2)} dB as recorded, "
-            f"{figure(mean.psnr_matched, 2)} dB after the gain and bias per channel that fit best."
-        )
+        yield from _held_out_sentences(result)
     elif result.expected:
         yield result.expected
-    motion = result.motion_3d
-    if motion is not None and motion.num_gaussians:
-        yield (
-            f"3D motion of {motion.num_gaussians:.0f} Gaussians on moving objects: error "
-            f"{motion.error:.4f} of {motion.true_length:.4f} units "
-            f"({100 * motion.relative_error:.0f} %), angle {motion.angle:.1f} degrees, length "
-            f"ratio {motion.length_ratio:.2f}."
-        )
-    if mean.confidence_iou == mean.confidence_iou:
-        yield f"Confidence over the true mask: IoU {mean.confidence_iou:.2f}."
+    if result.motion_3d is not None and result.motion_3d.num_gaussians:
+        yield _motion_sentence(result.motion_3d)
+    if (iou := result.scores.confidence_iou) == iou:
+        yield f"Confidence over the true mask: IoU {iou:.2f}."
+    yield _size_sentence(result.sizes)
+    yield _time_sentence(result)
+
+
+def _held_out_sentences(result: Evaluation) -> Iterator[str]:
+    held_out = "Held-out views" if len(result.views) > 1 else "Held-out view"
+    mean = result.scores
     yield (
+        f"{held_out} in the first frame: {figure(result.frames[0].scores.psnr, 2)} dB as "
+        f"calibrated, {figure(result.registered_psnr, 2)} dB registered, from the camera that fits "
+        "each image best."
+    )
+    yield (
+        f"{held_out} in all frames: {figure(mean.psnr, 2)} dB as recorded, "
+        f"{figure(mean.psnr_matched, 2)} dB after the gain and bias per channel that fit best."
+    )
+
+
+def _motion_sentence(motion: Motion3DScores) -> str:
+    return (
+        f"3D motion of {motion.num_gaussians:.0f} Gaussians on moving objects: error "
+        f"{motion.error:.4f} of {motion.true_length:.4f} units "
+        f"({100 * motion.relative_error:.0f} %), angle {motion.angle:.1f} degrees, length "
+        f"ratio {motion.length_ratio:.2f}."
+    )
+
+
+def _size_sentence(sizes: Sizes) -> str:
+    return (
         f"Size: {sizes.file / 1e6:.2f} MB, {figure(sizes.per_keyframe / 1e3, 1)} kB per keyframe, "
         f"{figure(sizes.per_residual / 1e3, 1)} kB per residual."
     )
-    yield (
+
+
+def _time_sentence(result: Evaluation) -> str:
+    seconds = result.seconds
+    play = result.playback
+    return (
         f"Time: {figure(seconds.first, 1)} s for the first frame, "
         f"{figure(seconds.per_later_frame, 1)} s per later one, from images to packet; played at "
         f"{figure(play.fps, 0)} frames per second ({figure(play.decode_ms, 1)} ms to decode, "
