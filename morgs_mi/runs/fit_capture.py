@@ -92,27 +92,35 @@ def _stream(
     if earlier is None:
         prepared = Prepared.of(capture, config, progress)
         loop = StreamLoop.of(prepared.capture, config)
-        frames = (
-            chain((first,), frames)
-            if prepared.refinement is None
-            else prepared.capture.partial_frames()
-        )
+        frames = chain((first,), frames)
+        if prepared.refinement is not None:
+            frames = prepared.capture.partial_frames()
     else:
         prepared = Prepared(as_fitted(capture, earlier.stream))
         loop = StreamLoop.of(prepared.capture, config)
         frames = _resumed(loop, prepared.capture, earlier, progress)
-    last = capture.num_frames - 1
-    train = capture.train_views
     with Recording(files, prepared.capture, metadata | prepared.metadata, earlier) as recording:
-        for frame, upcoming in with_next(frames):
-            stage = (
-                progress.of("Later frames").part(frame.index - 1, last) if frame.index else progress
-            )
-            packet, report = push_frame(loop, frame, train, stage.report, upcoming, recording.show)
-            recording.push(
-                packet, prepared.completed(report, loop.gaussians, frame, config), loop.state.coded
-            )
+        _fit_frames(loop, frames, prepared, recording, config, progress)
     return recording.reports
+
+
+def _fit_frames(
+    loop: StreamLoop,
+    frames: Iterable[PartialFrame],
+    prepared: Prepared,
+    recording: Recording,
+    config: StreamConfig,
+    progress: Progress,
+) -> None:
+    """Fit frames and add them to a recording."""
+    train = prepared.capture.train_views
+    last = prepared.capture.num_frames - 1
+    later_frames = progress.of("Later frames")
+    for frame, upcoming in with_next(frames):
+        stage = later_frames.part(frame.index - 1, last) if frame.index else progress
+        packet, report = push_frame(loop, frame, train, stage.report, upcoming, recording.show)
+        report = prepared.completed(report, loop.gaussians, frame, config)
+        recording.push(packet, report, loop.state.coded)
 
 
 def _resumed(
@@ -127,9 +135,8 @@ def _resumed(
     frames = capture.partial_frames(start)
     count = last_frame + 1 - start
     past = _counted(islice(frames, count), progress.of("Reading the fitted frames"), count)
-    loop.resume(
-        earlier.coded, (frame.comparable(train) for frame in past), earlier.reports[0].exposures
-    )
+    images = (frame.comparable(train) for frame in past)
+    loop.resume(earlier.coded, images, earlier.reports[0].exposures)
     return frames
 
 
@@ -211,14 +218,17 @@ def push_frame(
     """Fit the next frame of a loop on the views `train`; the report's status names the images that
     are missing.
     """
-    images, ahead = (None if f is None else [f.images[v] for v in train] for f in (frame, upcoming))
-    assert images is not None
+    images = [frame.images[view] for view in train]
+    ahead = None if upcoming is None else [upcoming.images[view] for view in train]
     recorded = None if frame.recorded is None else frame.comparable(train)
     packet, report = loop.push(images, progress, ahead, recorded, on_provisional)
-    status = (
-        "; ".join([*([report.status] if report.status != "ok" else []), *frame.problems]) or "ok"
-    )
-    return packet, replace(report, status=status)
+    return packet, replace(report, status=_status(report, frame))
+
+
+def _status(report: FrameReport, frame: PartialFrame) -> str:
+    """Return the status of a fitted frame with the problems of its images."""
+    problems = [report.status] if report.status != "ok" else []
+    return "; ".join([*problems, *frame.problems]) or "ok"
 
 
 def with_next(frames: Iterable[PartialFrame]) -> Iterator[tuple[PartialFrame, PartialFrame | None]]:

@@ -49,6 +49,7 @@ from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.exposure import Exposure
 
 _LOG = logging.getLogger(__name__)
+_REMEDY = "start again without --resume"
 
 FILES = (STREAM, CAPTURE, REPORT)
 """Names of the files that a fit writes into its folder."""
@@ -103,9 +104,9 @@ class FitFiles(NamedTuple):
             OSError: a file cannot be renamed.
         """
         has_begun = not self.next.stream.exists()
-        for path, successor in reversed([*zip(self, self.next, strict=True)]):
-            if path is None or successor is None:
-                continue
+        paths = [path for path in self if path is not None]
+        for path, successor in reversed([*zip(paths, self.next, strict=False)]):
+            assert successor is not None
             if has_begun and successor.exists():
                 successor.replace(path)
             successor.unlink(missing_ok=True)
@@ -153,15 +154,11 @@ class Recording:
         has_predecessor = earlier is None and files.stream.exists()
         self._written_files = files.next if has_predecessor else files
         if earlier is None:
-            self._writer = StreamWriter(
-                self._written_files.stream, capture.cameras, capture.fps, metadata
-            )
+            stream = self._written_files.stream
+            self._writer = StreamWriter(stream, capture.cameras, capture.fps, metadata)
         else:
             self.reports += earlier.reports
-            self._writer = StreamWriter.continued(files.stream, earlier.index, earlier.end)
-            if earlier.index[-1][0] == PacketKind.RESIDUAL:
-                for packet in due_keyframe(earlier.coded, self._interval):
-                    self._writer.write(packet)
+            self._writer = _continued_writer(files.stream, earlier, self._interval)
         self._written = os.stat(self._written_files.stream)
         if self._written_files.description is not None:
             description = described_capture(capture, files.description if earlier else None)
@@ -247,6 +244,15 @@ class Recording:
             )
 
 
+def _continued_writer(stream: Path, earlier: Interrupted, interval: int) -> StreamWriter:
+    """Return a writer after the packets of an interrupted fit and a keyframe that is due."""
+    writer = StreamWriter.continued(stream, earlier.index, earlier.end)
+    if earlier.index[-1][0] == PacketKind.RESIDUAL:
+        for packet in due_keyframe(earlier.coded, interval):
+            writer.write(packet)
+    return writer
+
+
 @dataclass(frozen=True, eq=False)
 class Interrupted:
     """An interrupted fit, up to its last complete packet."""
@@ -290,6 +296,13 @@ def interrupted_fit(
     if not index:
         return None
     frame = index[-1][1]
+    states = _last_states(stream, frame)
+    reports = read_reports(files.report, range(first, frame + 1))
+    return Interrupted(stream, index, end, *states, reports)
+
+
+def _last_states(stream: StreamReader, frame: int) -> tuple[CodedFrame, CodedFrame | None, Packet]:
+    """Return the states after and before a frame, and the first packet of the frame."""
     coded = None
     previous_state = None
     last = None
@@ -301,15 +314,7 @@ def interrupted_fit(
                 last = packet
     assert coded is not None
     assert last is not None
-    return Interrupted(
-        stream,
-        index,
-        end,
-        coded,
-        previous_state,
-        last,
-        read_reports(files.report, range(first, frame + 1)),
-    )
+    return coded, previous_state, last
 
 
 def restart_of(previous_state: CodedFrame | None, last: Packet) -> tuple[bytes, ...]:
@@ -332,18 +337,11 @@ def check_same_fit(stream: StreamReader, capture: Capture, metadata: Mapping[str
     Raises:
         ValueError: it belongs to another capture or other settings.
     """
-    # Streams of earlier versions have paths in their headers.
-    excluded_names = ("capture", "distortions")
-    recorded = _without_folders(
-        {name: value for name, value in stream.metadata.items() if name not in excluded_names}
-    )
     # Refined cameras differ from the calibrated ones, which are part of the fingerprint then.
     refined = metadata["config"]["fit"]["refine_cameras"] != "off"
     cameras = stream.cameras if refined else capture.cameras
-    old, new = (
-        json.loads(header_json(*parts))
-        for parts in ((stream.cameras, stream.fps, recorded), (cameras, capture.fps, metadata))
-    )
+    old = json.loads(header_json(stream.cameras, stream.fps, _metadata_of_fit(stream)))
+    new = json.loads(header_json(cameras, capture.fps, metadata))
     if difference := _difference(old, new):
         name, old_value, new_value = difference
         raise ValueError(
@@ -351,6 +349,15 @@ def check_same_fit(stream: StreamReader, capture: Capture, metadata: Mapping[str
             f"{shortened(new_value)}; give the same capture and settings, or start again without "
             "--resume."
         )
+
+
+def _metadata_of_fit(stream: StreamReader) -> dict[str, Any]:
+    """Return the metadata of a stream as `stream_metadata` returned them to its fit."""
+    # Streams of earlier versions have paths in their headers.
+    excluded_names = ("capture", "distortions")
+    return _without_folders(
+        {name: value for name, value in stream.metadata.items() if name not in excluded_names}
+    )
 
 
 def stream_metadata(capture: Capture, first: PartialFrame, config: StreamConfig) -> dict[str, Any]:
@@ -434,32 +441,36 @@ def _difference(old: Any, new: Any, name: str = "") -> tuple[str, Any, Any] | No
 
 def read_reports(path: Path, frames: range) -> list[FrameReport]:
     """Return the reports of the first frames of a file, which are `frames`."""
-    remedy = "start again without --resume"
-    document = read_json(path) if path.exists() else {}
-    try:
-        reports = [_report(row) for row in document["frames"][: len(frames)]]
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        description = f"a broken one ({error})" if path.exists() else "none"
-        raise ValueError(
-            f"{path}: expected the report of the fit, got {description}; {remedy}."
-        ) from None
+    reports = _first_reports(path, len(frames))
     if [report.frame for report in reports] != list(frames):
         raise ValueError(
-            f"{path}: expected the rows of {len(frames)} frames, got {len(reports)}; {remedy}."
+            f"{path}: expected the rows of {len(frames)} frames, got {len(reports)}; {_REMEDY}."
         )
     return reports
 
 
+def _first_reports(path: Path, count: int) -> list[FrameReport]:
+    document = read_json(path) if path.exists() else {}
+    try:
+        return [_report(row) for row in document["frames"][:count]]
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        description = f"a broken one ({error})" if path.exists() else "none"
+        raise ValueError(
+            f"{path}: expected the report of the fit, got {description}; {_REMEDY}."
+        ) from None
+
+
 def _report(row: Mapping[str, Any]) -> FrameReport:
-    exposures = tuple(
-        Exposure(tuple(e["gain"]), tuple(e["bias"])) for e in row.get("exposures", ())
-    )
     values = {
         "seconds": float(row["seconds"]),
         "missing_views": tuple(row["missing_views"]),
-        "exposures": exposures,
+        "exposures": tuple(map(_exposure, row.get("exposures", ()))),
     }
     return FrameReport(**{**row, **values})
+
+
+def _exposure(entry: Mapping[str, Any]) -> Exposure:
+    return Exposure(tuple(entry["gain"]), tuple(entry["bias"]))
 
 
 def due_keyframe(coded: CodedFrame | None, interval: int) -> list[Packet]:

@@ -61,15 +61,12 @@ class SegmentConfig:
 
     def fit_config(self, config: StreamConfig, number: int) -> StreamConfig:
         """Return the settings of one of these fits."""
-        rates = replace(
-            config.fit.rates, **{n: _RATES * rate for n, rate in asdict(config.fit.rates).items()}
-        )
-        density = replace(config.fit.density, births=_BIRTHS)
+        rates = {name: _RATES * rate for name, rate in asdict(config.fit.rates).items()}
         fit = replace(
             config.fit,
             epochs=self.epochs,
-            rates=rates,
-            density=density,
+            rates=replace(config.fit.rates, **rates),
+            density=replace(config.fit.density, births=_BIRTHS),
             early_stopping_tolerance=0.0,
         )
         return replace(config, fit=fit, seed=config.seed + number)

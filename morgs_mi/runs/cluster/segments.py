@@ -13,6 +13,7 @@ import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, replace
+from functools import partial
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -94,6 +95,12 @@ def _starts(num_frames: int, segments: int) -> list[int]:
     return np.linspace(0, num_frames, segments + 1).round().astype(int).tolist()
 
 
+def _finished(start: int, index: Sequence[Entry], end: int) -> tuple[Sequence[Entry], int]:
+    """Return the packets, and the end of the last one, from which a segment can continue."""
+    # After the first frame of a segment alone, a fit would continue without its displacements.
+    return ([], 0) if start and index and index[-1][1] == start else (index, end)
+
+
 class SegmentedRun:
     """A fit of a capture in segments, side by side, into the files that `stream_capture` writes.
 
@@ -168,12 +175,7 @@ class SegmentedRun:
         stop = min(COMMON_FRAMES, first.stop)
         prepared = None
         if not first.frame:
-            prepared = Prepared.of(self.capture, self.task.config, progress)
-            if prepared.capture is not self.capture:
-                self.task = replace(
-                    self.task, points=(prepared.capture.points, prepared.capture.point_colors)
-                )
-            self._use(prepared.capture)
+            prepared = self._prepared(progress)
         else:
             self._use(as_fitted(self.capture, StreamReader(self._files(0).stream)))
         self._show_progress()
@@ -182,11 +184,22 @@ class SegmentedRun:
             self.add_part(part if prepared is None else self._completed(part, prepared))
             first = replace(part.segment, stop=first.stop)
         self.task = replace(self.task, points=None, balance=self.recordings[0].reports[0].exposures)
-        states = StreamReader(self._files(0).stream).states(stop - 1)
-        common = reemitted_keyframe(
-            next(state for state in states if state.frame == stop - 1)
-        ).encoded
+        common = self._common_model(stop - 1)
         return [first, *(s if s.restart else replace(s, restart=(common,)) for s in segments[1:])]
+
+    def _prepared(self, progress: Progress) -> Prepared:
+        """Return the capture as it is to be fitted, and fit with its points and cameras."""
+        prepared = Prepared.of(self.capture, self.task.config, progress)
+        if prepared.capture is not self.capture:
+            points = (prepared.capture.points, prepared.capture.point_colors)
+            self.task = replace(self.task, points=points)
+        self._use(prepared.capture)
+        return prepared
+
+    def _common_model(self, frame: int) -> bytes:
+        """Return a frame of the first segment as an encoded keyframe."""
+        states = StreamReader(self._files(0).stream).states(frame)
+        return reemitted_keyframe(next(state for state in states if state.frame == frame)).encoded
 
     def _fit_side_by_side(self, segments: Iterable[Segment]) -> None:
         """Fit what is missing of segments. Each worker continues the loop of one of them, until it
@@ -229,22 +242,13 @@ class SegmentedRun:
 
     def _earlier(self, start: int, stop: int) -> Segment:
         """Return a segment as an interrupted fit left it."""
-
-        def finished(index: Sequence[Entry], end: int) -> tuple[Sequence[Entry], int]:
-            # After the first frame of a segment alone, a fit would continue without its
-            # displacements.
-            return ([], 0) if start and index and index[-1][1] == start else (index, end)
-
+        finished = partial(_finished, start)
         earlier = interrupted_fit(self._files(start), self.capture, self.metadata, finished, start)
         if earlier is None:
             return Segment(start, stop, start)
         self._open(start, earlier)
-        return Segment(
-            start,
-            stop,
-            start + len(earlier.reports),
-            restart_of(earlier.previous_state, earlier.last),
-        )
+        restart = restart_of(earlier.previous_state, earlier.last)
+        return Segment(start, stop, start + len(earlier.reports), restart)
 
     def _open(self, start: int, earlier: Interrupted | None) -> None:
         """Open the files of a segment."""
@@ -267,10 +271,14 @@ class SegmentedRun:
             self._open(start, None)
         self.recordings[start].extend(map(decode_packet, part.packets), part.reports)
         self.peaks[part.worker] = max(part.peak_bytes, self.peaks.get(part.worker, 0))
-        for message in {*part.messages} - self.messages:
-            _LOG.warning(message)
-        self.messages |= {*part.messages}
+        self._warn({*part.messages})
         self._show_progress()
+
+    def _warn(self, messages: set[str]) -> None:
+        """Log the messages that have not been logged before."""
+        for message in messages - self.messages:
+            _LOG.warning(message)
+        self.messages |= messages
 
     def _show_progress(self) -> None:
         num_fitted = sum(len(recording.reports) for recording in self.recordings.values())
@@ -296,20 +304,21 @@ class SegmentedRun:
         assert new.description is not None
         files.settle()
         try:
-            with StreamWriter(
-                new.stream, self.capture.cameras, self.capture.fps, self.metadata
-            ) as writer:
-                for start in starts:
-                    for packet in StreamReader(self._files(start).stream):
-                        writer.write(packet)
+            self._write_stream(new.stream)
+            rows = [asdict(report) for report in reports]
             workers = {"workers": self.peaks} if len(starts) > 1 else {}
-            write_json(
-                new.report,
-                {**self.metadata, "frames": [asdict(report) for report in reports], **workers},
-            )
+            write_json(new.report, {**self.metadata, "frames": rows, **workers})
             write_json(new.description, described_capture(self.capture, None))
             files.replace_by_next()
         finally:
             files.settle()
         _remove(self.out / FOLDER)
         return reports
+
+    def _write_stream(self, path: Path) -> None:
+        """Write the packets of all segments into one stream."""
+        capture = self.capture
+        with StreamWriter(path, capture.cameras, capture.fps, self.metadata) as writer:
+            for start in self.starts[:-1]:
+                for packet in StreamReader(self._files(start).stream):
+                    writer.write(packet)

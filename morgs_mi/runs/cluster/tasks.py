@@ -136,9 +136,14 @@ def fit_frames(fit: Fit, segment: Segment, stop: int) -> Part:
             restart = restart_of(last_state, packet)
         segment = replace(segment, frame=stop, restart=restart)
         _OPEN[repr(fit), segment] = loop, capture, recorded
-        peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         contents = tuple(packet.encoded for packet in packets)
-        return Part(segment, contents, tuple(reports), worker_name(), peak, tuple(messages))
+        return Part(
+            segment, contents, tuple(reports), worker_name(), _peak_bytes(), tuple(messages)
+        )
+
+
+def _peak_bytes() -> int:
+    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
 def _first_frame(fit: Fit, segment: Segment) -> tuple[Packet, FrameReport]:
@@ -178,10 +183,8 @@ def _opened(fit: Fit, segment: Segment) -> tuple[StreamLoop, Capture, Iterator[P
     if coded is not None:
         # Exposures are relative to the first frame of the recording.
         first = _images(capture, 0, 1) if segment.start else []
-        past = (
-            frame.comparable(capture.train_views)
-            for frame in islice(recorded, segment.frame - segment.start)
-        )
+        frames = islice(recorded, segment.frame - segment.start)
+        past = (frame.comparable(capture.train_views) for frame in frames)
         loop.resume(coded, chain(first, past), fit.balance)
     return loop, capture, recorded
 
