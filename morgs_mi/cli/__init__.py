@@ -100,8 +100,7 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
     try:
         if options_type is Options and args == ["--version"]:
             print_result(f"{prog} {version('morgs-mi')}")
-            with naming_output():
-                sys.stdout.flush()
+            _flush_output()
             return 0
         with naming_output(), suggesting_command(options_type, prog, args):  # the help goes there
             options = _parse(options_type, prog, args)
@@ -109,26 +108,36 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
         _set_up(options)
         with interruptible():
             command.run()
-            with naming_output():
-                sys.stdout.flush()
+            _flush_output()
         return 0
     except (KeyboardInterrupt, Exception) as error:
-        interrupted = is_interruption(error)
-        place = str(getattr(command, "capture", None) or "")
-        sentence = (
-            "Interrupted." if interrupted else sentence_of(error, _option_names(command), place)
-        )
-        command_line = shlex.join([prog, *args, *([] if "--resume" in args else ["--resume"])])
-        notes = [
-            note.replace("`--resume`", f"`{command_line}`")
-            for note in getattr(error, "__notes__", [])
-        ]
-        print_warning(" ".join([sentence, *notes]))
+        print_warning(" ".join([_sentence(error, command), *_notes(error, [prog, *args])]))
         # The error may come from parsing, before `options` exist.
         if "--debug" in args:
             ERR.print_exception()
         _drop_output()
-        return INTERRUPTED if interrupted else 1
+        return INTERRUPTED if is_interruption(error) else 1
+
+
+def _flush_output() -> None:
+    with naming_output():
+        sys.stdout.flush()
+
+
+def _sentence(error: BaseException, command: Any) -> str:
+    """Return the message of an error of a command, which is None while it is not parsed."""
+    if is_interruption(error):
+        return "Interrupted."
+    place = str(getattr(command, "capture", None) or "")
+    return sentence_of(error, _option_names(command), place)
+
+
+def _notes(error: BaseException, words: list[str]) -> list[str]:
+    """Return the notes of an error, in which `--resume` is the command line that continues."""
+    resume = [] if "--resume" in words else ["--resume"]
+    command_line = shlex.join([*words, *resume])
+    notes = getattr(error, "__notes__", [])
+    return [note.replace("`--resume`", f"`{command_line}`") for note in notes]
 
 
 def _parse(options_type: type[Common], prog: str, args: Sequence[str]) -> Any:

@@ -15,6 +15,7 @@ from rich.measure import Measurement
 from rich.progress import (
     BarColumn,
     Progress,
+    ProgressColumn,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
@@ -68,6 +69,11 @@ def naming_output() -> Iterator[None]:
         raise OSError(error.errno, error.strerror, "standard output") from error
 
 
+def quantity(count: int, noun: str) -> str:
+    """Return a number of things in words, such as ``2 frames``."""
+    return f"{count} {noun if count == 1 else noun + 's'}"
+
+
 def print_result(text: str) -> None:
     """Print to standard output.
 
@@ -106,10 +112,7 @@ def sentence_of(error: BaseException, names: Mapping[str, str], place: str = "")
 
     Arguments are those of `with_option_names`.
     """
-    text = str(error)
-    if isinstance(error, OSError) and error.errno is not None and error.strerror:
-        text = f"{f'{error.filename}: ' if error.filename else ''}{error.strerror.rstrip('.')}."
-    text = with_option_names(" ".join(text.split()), names, place)
+    text = with_option_names(" ".join(_message(error).split()), names, place)
     if not isinstance(error, _EXPECTED):
         text = (
             f"Unexpected {type(error).__name__}: {text.rstrip('.')}; run the command with --debug "
@@ -120,6 +123,13 @@ def sentence_of(error: BaseException, names: Mapping[str, str], place: str = "")
     if isinstance(error, MemoryError):
         text = text or "Out of memory; process smaller images, or fewer frames or Gaussians."
     return text or f"{type(error).__name__}."
+
+
+def _message(error: BaseException) -> str:
+    """Return the message of an error, of a system error without its number."""
+    if isinstance(error, OSError) and error.errno is not None and error.strerror:
+        return f"{f'{error.filename}: ' if error.filename else ''}{error.strerror.rstrip('.')}."
+    return str(error)
 
 
 def with_option_names(sentence: str, names: Mapping[str, str], place: str = "") -> str:
@@ -136,11 +146,7 @@ def with_option_names(sentence: str, names: Mapping[str, str], place: str = "") 
         place: a path from the command line that a message may start with; it stays.
     """
     function = re.match(r"[\w.]+\(\): ", sentence)
-    start = function or (
-        re.match(rf"{re.escape(place)}(?:/.*?)?(?<!\.json)(?<!\.toml): ", sentence)
-        if place
-        else None
-    )
+    start = function or _file_of_place(sentence, place)
     if start is None:
         return sentence
     text = sentence[start.end() :]
@@ -148,6 +154,12 @@ def with_option_names(sentence: str, names: Mapping[str, str], place: str = "") 
     if new_text == text:
         return sentence
     return new_text if function else start[0] + new_text
+
+
+def _file_of_place(sentence: str, place: str) -> re.Match[str] | None:
+    """Return the start of a sentence that names a place, or a file in it that has no such keys."""
+    pattern = rf"{re.escape(place)}(?:/.*?)?(?<!\.json)(?<!\.toml): "
+    return re.match(pattern, sentence) if place else None
 
 
 def _option(names: Mapping[str, str], name: str, value: str | None) -> str | None:
@@ -164,23 +176,31 @@ def progress() -> Iterator[Report]:
     if not ERR.is_terminal:
         yield _line_report()
         return
-    columns = (
+    with Progress(*_columns(), console=ERR) as bars:
+        yield _bar_report(bars)
+
+
+def _columns() -> tuple[ProgressColumn, ...]:
+    return (
         TextColumn("{task.description}"),
         BarColumn(),
         TextColumn("{task.fields[count]}/{task.total:.0f}"),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
+
+
+def _bar_report(bars: Progress) -> Report:
+    """Return a function that shows the progress of each stage as a bar."""
     tasks: dict[str, TaskID] = {}
-    with Progress(*columns, console=ERR) as bars:
 
-        def report(stage: str, done: float, total: float) -> None:
-            if stage not in tasks:  # what was done before is not part of its pace
-                tasks[stage] = bars.add_task(stage, count=0)
-                bars.tasks[-1].completed = done
-            bars.update(tasks[stage], completed=done, total=total, count=int(done))
+    def report(stage: str, done: float, total: float) -> None:
+        if stage not in tasks:  # what was done before is not part of its pace
+            tasks[stage] = bars.add_task(stage, count=0)
+            bars.tasks[-1].completed = done
+        bars.update(tasks[stage], completed=done, total=total, count=int(done))
 
-        yield report
+    return report
 
 
 def _line_report() -> Report:
@@ -197,14 +217,15 @@ def _line_report() -> Report:
         start, base = begin[stage]
         last = moment
         seconds = moment - start
-        estimate = (
-            f", about {_clock(seconds * (total - done) / (done - base))} left"
-            if done > base
-            else ""
-        )
+        estimate = _estimate(seconds, done - base, total - done)
         print_warning(f"{stage}: {int(done)}/{total:.0f}, {_clock(seconds)} elapsed{estimate}.")
 
     return report
+
+
+def _estimate(seconds: float, done: float, missing: float) -> str:
+    """Return the time that the missing steps take at the pace of the steps that are done."""
+    return f", about {_clock(seconds * missing / done)} left" if done > 0 else ""
 
 
 def _clock(seconds: float) -> str:

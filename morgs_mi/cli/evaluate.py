@@ -40,24 +40,13 @@ class Eval:
     """
 
     def run(self) -> None:
-        from morgs_mi.core.entries import studio_entry
         from morgs_mi.core.environment import machine, versions
         from morgs_mi.core.files import json_finite, write_json
-        from morgs_mi.evaluate.evaluate import evaluate_stream
-        from morgs_mi.evaluate.figures import draw_stream
 
         for output in (self.figures, self.json):
             if output not in (None, Path("-")):
                 _check_not_of_fit(self.out, check_output(output))
-        network = (
-            None if self.lpips is None else studio_entry("image distances", "lpips")(self.lpips)
-        )
-        with progress() as report:
-            frames = partial(report, "Evaluating frames")
-            result = evaluate_stream(self.out, self.capture, frames, network, self.any_recording)
-            if self.figures is not None:
-                drawing = partial(report, "Drawing frames")
-                draw_stream(self.out, self.figures, self.capture, drawing, self.any_recording)
+        result = self._evaluation()
         scores = {**result.as_dict(), "machine": machine(), "versions": versions()}
         if self.json == Path("-"):
             print_result(json.dumps(json_finite(scores), indent=2))
@@ -69,11 +58,29 @@ class Eval:
         if self.figures is not None:
             print_result(f"Figures: {self.figures}")
 
+    def _evaluation(self) -> Evaluation:
+        """Return the evaluation, and draw the figures."""
+        from morgs_mi.core.entries import studio_entry
+        from morgs_mi.evaluate.evaluate import evaluate_stream
+        from morgs_mi.evaluate.figures import draw_stream
+
+        network = (
+            None if self.lpips is None else studio_entry("image distances", "lpips")(self.lpips)
+        )
+        with progress() as report:
+            frames = partial(report, "Evaluating frames")
+            result = evaluate_stream(self.out, self.capture, frames, network, self.any_recording)
+            if self.figures is not None:
+                drawing = partial(report, "Drawing frames")
+                draw_stream(self.out, self.figures, self.capture, drawing, self.any_recording)
+        return result
+
 
 def _check_not_of_fit(out: Path, output: Path) -> None:
     """Raise `ValueError` if an output would replace a file that a fit needs."""
     folder = out if out.is_dir() else out.parent
-    if output.resolve() in [path.resolve() for path in (out, *(folder / name for name in FILES))]:
+    paths = [out, *(folder / name for name in FILES)]
+    if output.resolve() in [path.resolve() for path in paths]:
         raise ValueError(
             f"{output}: expected a new file, got one that the fit has written; choose another name."
         )

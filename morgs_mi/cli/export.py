@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tyro.conf import DisallowNone, Positional, arg
 
+from morgs_mi.cli.console import quantity
 from morgs_mi.cli.export_kind import FRAMES, ExportKind
-from morgs_mi.cli.opening import DropInvalid, opened
+from morgs_mi.cli.opening import DropInvalid, opened, shown_exposure
 from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, one_of, optional, place
 from morgs_mi.cli.suggestion import one_command
 from morgs_mi.core.documentation import page
@@ -21,6 +22,7 @@ from morgs_mi.playback.export.formats import PLY, VIDEO, WEB, Format
 
 if TYPE_CHECKING:
     from morgs_mi.codec.frame_source import FrameSource
+    from morgs_mi.playback.export.paths import CameraPath
 
 _PATH = (
     "Camera path: between (through the rig's cameras), orbit (around the scene), or a JSON file "
@@ -62,7 +64,7 @@ class Ply(ExportKind):
         )
         frames = select_frames(stream, self.frames)
         write_each(clip(stream), output, chosen.ending, write, frames, partial(report, "Writing"))
-        return f"{len(frames)} PLY {'file' if len(frames) == 1 else 'files'}"
+        return quantity(len(frames), "PLY file")
 
 
 @dataclass(frozen=True)
@@ -97,31 +99,28 @@ class Flight(ExportKind):
     drawn = True
 
     def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
-        from morgs_mi.playback.export.clips import (
-            flight,
-            frame_numbers,
-            named_path,
-            num_images,
-            repeated_frames,
-        )
+        from morgs_mi.playback.export.clips import flight, num_images, repeated_frames
         from morgs_mi.playback.export.frames import write_images
-        from morgs_mi.playback.stream_header import stream_exposure
+
+        path = self._camera_path(stream)
+        count = num_images(stream, path)
+        frames = repeated_frames(stream, self.freeze, self.back_and_forth)
+        images = flight(stream, path, self.channels, frames)
+        stops = shown_exposure(stream, self.display_exposure)
+        write_images(
+            images, stream.fps, output, lambda done: report("Rendering", done, count), None, stops
+        )
+        return f"{path.seconds:.1f} s, {path.keys[0].width}x{path.keys[0].height}"
+
+    def _camera_path(self, stream: FrameSource) -> CameraPath:
+        from morgs_mi.playback.export.clips import frame_numbers, named_path
 
         frames = frame_numbers(stream)
         if self.freeze is not None and self.freeze not in frames:
             raise ValueError(f"--freeze must be in {frames[0]} to {frames[-1]}, got {self.freeze}.")
         path = named_path(stream, self.path, self.degrees, self.least_seconds)
         path = path if self.width is None else path.with_width(self.width)
-        path = path if self.seconds is None else path.with_duration(self.seconds)
-        count = num_images(stream, path)
-        images = flight(
-            stream, path, self.channels, repeated_frames(stream, self.freeze, self.back_and_forth)
-        )
-        stops = stream_exposure(stream) if self.display_exposure is None else self.display_exposure
-        write_images(
-            images, stream.fps, output, lambda done: report("Rendering", done, count), None, stops
-        )
-        return f"{path.seconds:.1f} s, {path.keys[0].width}x{path.keys[0].height}"
+        return path if self.seconds is None else path.with_duration(self.seconds)
 
 
 @dataclass(frozen=True)
@@ -148,7 +147,7 @@ class Web(ExportKind):
         total = len(frame_numbers(stream))
         write = write_web_folder if chosen.folder else write_web_page
         size = write(stream, output, self.title, lambda done: report("Checking", done, total))
-        return f"{total} {'frame' if total == 1 else 'frames'}, {size / 1e6:.2f} MB"
+        return f"{quantity(total, 'frame')}, {size / 1e6:.2f} MB"
 
 
 # The class of each kind, in the order of the help.

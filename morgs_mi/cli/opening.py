@@ -42,3 +42,12 @@ def opened(
     if drawn and isinstance(stream, SplatFile) and stream.cameras_file is not None:
         print_warning(f"Cameras: {stream.cameras_file}.")
     return stream
+
+
+def shown_exposure(stream: FrameSource, stops: float | None) -> float:
+    """Return the stops by which images of a stream are brightened: the given ones, or where they
+    are None, the stream's.
+    """
+    from morgs_mi.playback.stream_header import stream_exposure
+
+    return stream_exposure(stream) if stops is None else stops

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import DisallowNone, Positional, arg
 
-from morgs_mi.cli.console import print_result, progress
-from morgs_mi.cli.opening import DropInvalid, opened
+from morgs_mi.cli.console import print_result, progress, quantity
+from morgs_mi.cli.opening import DropInvalid, opened, shown_exposure
 from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, one_of, optional
 from morgs_mi.core.documentation import page
 from morgs_mi.core.entries import studio_entry
@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from morgs_mi.codec.frame_source import FrameSource
     from morgs_mi.core.camera import Camera
     from morgs_mi.playback.export.paths import CameraPath
+
+# Index and channels of each image.
+_Images = Iterator[tuple[int, dict[str, Any]]]
 
 _CHANNELS = (
     "Channels to render, side by side: color, motion, confidence, depth, alpha. By default color, "
@@ -101,60 +104,40 @@ class Render:
     """Skip damaged frames of a stream, and those after them up to the next intact keyframe."""
 
     def run(self) -> None:
-        from morgs_mi.playback.export.clips import frame_numbers, named_path, num_images
         from morgs_mi.playback.export.frames import write_images
-        from morgs_mi.playback.stream_header import find_camera, stream_exposure
+        from morgs_mi.playback.stream_header import find_camera
 
         self._check()
         stream = opened(self.out, self.drop_invalid, skip_damaged=self.skip_damaged)
         view = find_camera(stream, 0 if self.camera is None else self.camera)
-        stem = (
-            Path(self.path or "orbit").stem
-            if self.camera is None and self.insert is None
-            else view.name
-        )
+        is_path = self.camera is None and self.insert is None
+        stem = Path(self.path or "orbit").stem if is_path else view.name
         output, chosen = destination(stream.path, self.output, IMAGES, self.format, stem)
         single = chosen.folder and chosen.is_file(output)
         if self.insert is not None:
             images, count = self._inserted(stream, view, chosen.name)
         elif self.camera is not None or (self.path is None and single):
-            images = self._seen(stream, view, chosen.name)
-            count = len(frame_numbers(stream))
+            images, count = self._fixed(stream, view, chosen.name)
         else:
-            path = named_path(stream, self.path or "orbit", self.degrees)
-            images = self._seen(stream, path, chosen.name)
-            count = num_images(stream, path)
+            images, count = self._moving(stream, chosen.name)
         if single and count > 1:
             raise ValueError(
                 f"{output}: expected one image for one file, got {count}; name a folder."
             )
         with progress() as report:
-            stops = (
-                stream_exposure(stream) if self.display_exposure is None else self.display_exposure
-            )
             write_images(
                 images,
                 stream.fps,
                 output,
                 lambda done: report("Rendering", done, count),
                 chosen.name,
-                stops,
+                shown_exposure(stream, self.display_exposure),
             )
-        print_result(f"{output}: {count} {'image' if count == 1 else 'images'}.")
+        print_result(f"{output}: {quantity(count, 'image')}.")
 
     def _check(self) -> None:
         """Refuse options that exclude each other."""
-        if self.camera is not None and self.path is not None:
-            raise ValueError(
-                f"expected --camera or --path, got both, {self.camera} and {self.path}; leave out "
-                "one."
-            )
-        if self.insert is None and self.at is not None:
-            raise ValueError(
-                "--at selects frames of an inserted scene, got no scene; add --insert FILE."
-            )
-        if self.insert is not None and self.camera is None:
-            raise ValueError("--insert renders for one camera, got none; add --camera CAMERA.")
+        self._check_camera()
         if self.projection == "perspective":
             if self.stereo:
                 raise ValueError(
@@ -166,9 +149,33 @@ class Render:
                 "others."
             )
 
-    def _seen(
-        self, stream: FrameSource, view: Camera | CameraPath, format: str
-    ) -> Iterator[tuple[int, dict[str, Any]]]:
+    def _check_camera(self) -> None:
+        if self.camera is not None and self.path is not None:
+            raise ValueError(
+                f"expected --camera or --path, got both, {self.camera} and {self.path}; leave out "
+                "one."
+            )
+        if self.insert is None and self.at is not None:
+            raise ValueError(
+                "--at selects frames of an inserted scene, got no scene; add --insert FILE."
+            )
+        if self.insert is not None and self.camera is None:
+            raise ValueError("--insert renders for one camera, got none; add --camera CAMERA.")
+
+    def _fixed(self, stream: FrameSource, view: Camera, format: str) -> tuple[_Images, int]:
+        """Return the rendered images of a camera, and their number."""
+        from morgs_mi.playback.export.clips import frame_numbers
+
+        return self._seen(stream, view, format), len(frame_numbers(stream))
+
+    def _moving(self, stream: FrameSource, format: str) -> tuple[_Images, int]:
+        """Return the rendered images along the path, and their number."""
+        from morgs_mi.playback.export.clips import named_path, num_images
+
+        path = named_path(stream, self.path or "orbit", self.degrees)
+        return self._seen(stream, path, format), num_images(stream, path)
+
+    def _seen(self, stream: FrameSource, view: Camera | CameraPath, format: str) -> _Images:
         """Return the rendered images of a camera or along a path."""
         from morgs_mi.core.camera import Camera
         from morgs_mi.playback.export.clips import flight
@@ -184,9 +191,7 @@ class Render:
             return render_stream(stream, view, channels)
         return flight(stream, view, channels)
 
-    def _inserted(
-        self, stream: FrameSource, view: Camera, format: str
-    ) -> tuple[Iterator[tuple[int, dict[str, Any]]], int]:
+    def _inserted(self, stream: FrameSource, view: Camera, format: str) -> tuple[_Images, int]:
         """Return the rendered frames with the inserted scene, and their number."""
         from morgs_mi.playback.export.clips import frame_numbers
 
@@ -194,10 +199,9 @@ class Render:
         insert = studio_entry("renderings", "insert")
         view = view if self.width is None else view.with_width(self.width)
         frames = frame_numbers(stream) if self.at is None else insert.selected(stream, self.at)
-        channels = self.channels or (
-            insert.inserted_channels(stream) if format == "exr" else ("color",)
-        )
+        channels = self.channels or ("color",)
+        if not self.channels and format == "exr":
+            channels = insert.inserted_channels(stream)
         config = insert.InsertConfig(self.samples, self.shadows, self.light)
-        return insert.render_inserted(
-            stream, view, insert.load_insert(self.insert), frames, channels, config
-        ), len(frames)
+        scene = insert.load_insert(self.insert)
+        return insert.render_inserted(stream, view, scene, frames, channels, config), len(frames)

@@ -22,6 +22,7 @@ from morgs_mi.loop.stream_config import (
     read_config,
     relocated,
 )
+from morgs_mi.method.motion_config import MotionConfig
 
 # The setting of every option. All others are set in a file.
 SETTINGS = {
@@ -107,30 +108,36 @@ def setting(option: str, config: StreamConfig | None = None, text: str | None = 
     )
 
 
+def _flag(option: str) -> str:
+    return f"--{option.replace('_', '-')}"
+
+
 def _offsets(words: list[str]) -> dict[str, float]:
     """Return the offset of each camera from the words of --offset, a camera and a number in turn.
 
     Raises:
         ValueError: a word is missing, is no number, or names a camera a second time.
     """
-    names = words[::2]
-    numbers = words[1::2]
-    if not words or len(names) > len(numbers):
+    if not words or len(words) % 2:
         last = f"{words[-1]!r} without one" if words else "nothing"
         raise ValueError(
             f"expected pairs of a camera and a number, such as cam01 -0.5, got {last}."
         )
     offsets: dict[str, float] = {}
-    for name, number in zip(names, numbers, strict=True):
+    for name, number in zip(words[::2], words[1::2], strict=True):
         if name in offsets:
             raise ValueError(f"expected each camera once, got {name} twice.")
-        try:
-            offsets[name] = float(number)
-        except ValueError:
-            raise ValueError(
-                f"the offset of {name} must be a number of frames, got {number!r}."
-            ) from None
+        offsets[name] = _offset(name, number)
     return offsets
+
+
+def _offset(name: str, number: str) -> float:
+    try:
+        return float(number)
+    except ValueError:
+        raise ValueError(
+            f"the offset of {name} must be a number of frames, got {number!r}."
+        ) from None
 
 
 _OFFSETS = PrimitiveConstructorSpec(
@@ -233,11 +240,8 @@ class Settings:
 
     def option_names(self) -> dict[str, str]:
         """Return the options that were given, by their settings' keys and names."""
-        options = {
-            key: f"--{option.replace('_', '-')}"
-            for option, key in SETTINGS.items()
-            if key in self.given()
-        }
+        values = self.given()
+        options = {key: _flag(option) for option, key in SETTINGS.items() if key in values}
         return options | {key.rpartition(".")[2]: option for key, option in options.items()}
 
     def stream_config(self, base: StreamConfig | None = None) -> StreamConfig:
@@ -262,23 +266,26 @@ class Settings:
             FileNotFoundError: one of them names a missing file or folder.
             ValueError: one of them is unknown, or its network does not fit.
         """
-        from morgs_mi.method.flow_sources.flow_registry import flow_source
-        from morgs_mi.method.mask_refiners.mask_registry import mask_refiner
-        from morgs_mi.method.motion_model import motion_model
-
-        motion = config.motion
-        checks: dict[str, Callable[[], Any]] = {
-            "flow_method": lambda: flow_source(motion.flow_method, motion.flow),
-            "mask_method": lambda: mask_refiner(motion.mask_method, motion.masks),
-            "model": lambda: motion_model(motion),
-        }
-        for name, check in checks.items():
+        for name, check in _method_checks(config.motion).items():
             try:
                 check()
             except ValueError as error:
                 if self.config is None or f"motion.{name}" in self.given():
                     raise
                 raise relocated(error, str(self.config), "motion.", [name]) from None
+
+
+def _method_checks(motion: MotionConfig) -> dict[str, Callable[[], Any]]:
+    """Return functions that open the methods, by the names of their settings."""
+    from morgs_mi.method.flow_sources.flow_registry import flow_source
+    from morgs_mi.method.mask_refiners.mask_registry import mask_refiner
+    from morgs_mi.method.motion_model import motion_model
+
+    return {
+        "flow_method": lambda: flow_source(motion.flow_method, motion.flow),
+        "mask_method": lambda: mask_refiner(motion.mask_method, motion.masks),
+        "model": lambda: motion_model(motion),
+    }
 
 
 def _nested(values: dict[str, Any]) -> dict[str, Any]:
