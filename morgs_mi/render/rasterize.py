@@ -83,27 +83,19 @@ class Image:
         """
         if self.color is None or len(self.color.shape) != 3:
             return None
-        return png_bytes(
-            np.rint(255 * np.clip(np.nan_to_num(np.array(dr.detach(self.color))), 0, 1)).astype(
-                np.uint8
-            )
-        )
+        color = np.clip(np.nan_to_num(np.array(dr.detach(self.color))), 0, 1)
+        return png_bytes(np.rint(255 * color).astype(np.uint8))
 
     def _tensors(self) -> dict[str, Tensor]:
         tensors = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "others"}
-        return {
-            name: tensor
-            for name, tensor in {**tensors, **self.others}.items()
-            if tensor is not None
-        }
+        tensors |= self.others
+        return {name: tensor for name, tensor in tensors.items() if tensor is not None}
 
     @staticmethod
     def _of(tensors: Mapping[str, Tensor]) -> Image:
-        names = [f.name for f in fields(Image)]
-        others = {name: tensor for name, tensor in tensors.items() if name not in names}
-        return Image(
-            **{name: tensor for name, tensor in tensors.items() if name in names}, others=others
-        )
+        others = dict(tensors)
+        channels = {f.name: others.pop(f.name) for f in fields(Image) if f.name in others}
+        return Image(**channels, others=others)
 
 
 @with_render_lock
@@ -175,15 +167,20 @@ def rasterize(
     refuse_freezing("rasterize()")
     config = RenderConfig() if config is None else config
     cameras = tuple(camera) if isinstance(camera, Sequence) else (camera,)
-    _check_types(
-        gaussians, cameras, config, {"channels": channels, "detach_weights": detach_weights}
-    )
+    _check_gaussians(gaussians)
+    _check_cameras(cameras)
+    check_type("rasterize()", "config", config, RenderConfig)
+    _check_names({"channels": channels, "detach_weights": detach_weights})
     for name, value, kind in (("region", region, Region), ("static_splats", static_splats, Splats)):
         if value is not None:
             check_type("rasterize()", name, value, kind)
     channels = tuple(dict.fromkeys(channels))
     sizes = {**channel_sizes(), "alpha": 1}
-    _check(gaussians, cameras, channels, background, detach_weights)
+    _check_variant()
+    _check_channels(channels, detach_weights)
+    _check_attributes(gaussians, channels)
+    _check_background(background)
+    _check_size(cameras)
     if isinstance(camera, Sequence):
         _check_alone({"region": region, "static_splats": static_splats, "depth_limit": depth_limit})
     view = cameras[0]
@@ -382,17 +379,16 @@ def _check_alone(arguments: Mapping[str, object]) -> None:
             )
 
 
-def _check_types(
-    gaussians: ActivatedGaussians,
-    cameras: Sequence[Camera],
-    config: RenderConfig,
-    names: Mapping[str, Sequence[str]],
-) -> None:
+def _check_gaussians(gaussians: ActivatedGaussians) -> None:
     if not hasattr(gaussians, "means"):
         raise ValueError(
             f"rasterize(): `gaussians` must be Gaussians, got a {type(gaussians).__name__}; pass "
             "some."
         )
+
+
+def _check_cameras(cameras: Sequence[Camera]) -> None:
+    """Raise an error if these are not one or more cameras of the same size."""
     if not cameras:
         raise ValueError(
             "rasterize(): `camera` must be one or more cameras, got an empty sequence; pass one."
@@ -406,7 +402,9 @@ def _check_types(
             f"rasterize(): `camera` must be cameras of the same size, got {sizes_text}; render "
             "one camera at a time."
         )
-    check_type("rasterize()", "config", config, RenderConfig)
+
+
+def _check_names(names: Mapping[str, Sequence[str]]) -> None:
     for name, sequence in names.items():
         if isinstance(sequence, str) or not isinstance(sequence, Sequence):
             raise ValueError(
@@ -415,33 +413,36 @@ def _check_types(
             )
 
 
-def _check(
-    gaussians: ActivatedGaussians,
-    cameras: Sequence[Camera],
-    channels: tuple[str, ...],
-    background: Sequence[float] | Jit | None,
-    detach_weights: Sequence[str],
-) -> None:
+def _check_variant() -> None:
     if mi.variant() is None or not dr.is_jit_v(mi.Float) or not dr.is_diff_v(mi.Float):
         raise ValueError(
             f"rasterize(): expected a Mitsuba variant such as 'llvm_ad_rgb' or 'cuda_ad_rgb', "
             f"got {mi.variant()!r}; call mi.set_variant() first."
         )
-    attributes = attribute_channels()
-    choices = ("color", "alpha", "depth", "motion", "guided_motion", *attributes)
+
+
+def _check_channels(channels: tuple[str, ...], detach_weights: Sequence[str]) -> None:
+    choices = ("color", "alpha", "depth", "motion", "guided_motion", *attribute_channels())
     for name in (*channels, *detach_weights):
         if name not in choices and not (name == "features" and name not in channels):
             raise ValueError(
                 f"rasterize(): `channels` must be out of {', '.join(choices)}, got {name!r}; use "
                 "one of these, or pass other values as `features`."
             )
+
+
+def _check_attributes(gaussians: ActivatedGaussians, channels: tuple[str, ...]) -> None:
+    """Raise an error if the Gaussians lack an attribute of a channel."""
     motions = dict.fromkeys(("motion", "guided_motion"), BY_ACTIVATED_NAME["motion"])
-    for name, attribute in {**motions, **attributes}.items():
+    for name, attribute in {**motions, **attribute_channels()}.items():
         if name in channels and getattr(gaussians, attribute.activated_name, None) is None:
             raise ValueError(
                 f"rasterize(): channel {name!r} requires Gaussians with `{attribute.name}`, got "
                 "none; set it or remove the channel."
             )
+
+
+def _check_background(background: Sequence[float] | Jit | None) -> None:
     behind = np.asarray(dr.detach(background)).ravel() if dr.is_array_v(background) else background
     if behind is not None and not (
         np.shape(behind) == (3,)
@@ -451,6 +452,10 @@ def _check(
             "rasterize(): `background` must be three finite numbers of at most 1e18, got "
             f"{background!r}; pass a colour or None."
         )
+
+
+def _check_size(cameras: Sequence[Camera]) -> None:
+    """Raise an error if the images have too many pixels, or do not fit in memory."""
     V = len(cameras)
     W = cameras[0].width
     H = cameras[0].height
@@ -498,6 +503,12 @@ def _checked_limits(
             f"rasterize(): `depth_limit` must be one depth per pixel, {list(expected)}, got "
             f"{problem}; use inf where there is no surface."
         )
+    _check_combination(limits, static_splats)
+    return dr.clip(limits.array, -FARTHEST, FARTHEST)
+
+
+def _check_combination(limits: Tensor, static_splats: Splats | None) -> None:
+    """Raise an error if depth limits are given with static splats, or have gradients enabled."""
     if static_splats is not None:
         raise ValueError(
             "rasterize(): `depth_limit` must be None where `static_splats` are given, got both; "
@@ -508,7 +519,6 @@ def _checked_limits(
             "rasterize(): `depth_limit` must not be attached to a gradient graph, because it gets "
             "no gradient, got one with gradients enabled; pass dr.detach(depth_limit)."
         )
-    return dr.clip(limits.array, -FARTHEST, FARTHEST)
 
 
 def _check_finite(
@@ -537,15 +547,19 @@ def _check_finite(
         is_bounded = name in (*blend_names, "features")
         bad = np.argwhere(~(np.abs(array) <= FARTHEST) if is_bounded else ~np.isfinite(array))
         if len(bad):
-            worst = array[tuple(bad[0])]
-            index = ", ".join(map(str, bad[0]))
-            remedy = (
-                "lower the learning rate"
-                if name == "camera.viewmat"
-                else "remove these Gaussians or lower the learning rate"
-            )
-            raise ValueError(
-                f"rasterize(): `{name}` must be "
-                f"{'at most 1e18' if np.isfinite(worst) else 'finite'}, got {worst:g} at "
-                f"[{index}] ({len(bad)} such values); {remedy}."
-            )
+            raise _number_error(name, array, bad)
+
+
+def _number_error(name: str, array: np.ndarray, bad: np.ndarray) -> ValueError:
+    """Return the error about the numbers of an attribute at the indices `bad` [B, ndim]."""
+    worst = array[tuple(bad[0])]
+    index = ", ".join(map(str, bad[0]))
+    remedy = (
+        "lower the learning rate"
+        if name == "camera.viewmat"
+        else "remove these Gaussians or lower the learning rate"
+    )
+    return ValueError(
+        f"rasterize(): `{name}` must be {'at most 1e18' if np.isfinite(worst) else 'finite'}, got "
+        f"{worst:g} at [{index}] ({len(bad)} such values); {remedy}."
+    )

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from math import gcd
+from typing import Any
 
 import cv2
 import drjit as dr
@@ -109,14 +110,7 @@ class Region:
 
     def __init__(self, mask: np.ndarray, config: RenderConfig | None = None) -> None:
         check_type("Region()", "mask", mask, np.ndarray)
-        if mask.ndim != 2 or mask.dtype != bool or not mask.any():
-            description = (
-                f"{mask.dtype} {mask.shape}" if mask.ndim != 2 or mask.dtype != bool else "none"
-            )
-            raise ValueError(
-                "Region(): `mask` must be bool [H, W] with at least one pixel set, got "
-                f"{description}; skip a view in which nothing is drawn."
-            )
+        _check_mask(mask)
         grid = BlockGrid.of(mask.shape[1], mask.shape[0], config or RenderConfig())
         self._build(grid, grid.covering(mask))
 
@@ -171,40 +165,21 @@ class Region:
         of tiles.
         """
         bw, bh = self.block
-        W = self.width
-        whole = self.whole
-        active = blocks.reshape(-1, DOWN, self.across, ACROSS).transpose(0, 2, 1, 3)
-        active = active.reshape(-1, ACROSS * DOWN)  # [tiles, blocks of a tile]
+        active = _in_tiles(blocks, self.across)
         tiles = np.flatnonzero(active.any(1))
         tile, bit = np.nonzero(active[tiles])
         column = tiles[tile] % self.across * ACROSS + bit % ACROSS
         row = tiles[tile] // self.across * DOWN + bit // ACROSS
-        view, row_in_view = np.divmod(row, self.down * DOWN)
-        x = column * bw
-        y = row_in_view * bh
         self.drawn = blocks
         self._blocks = (row, column)
-        slot_of = np.full(len(active), NO_SLOT, np.uint32)
-        slot_of[tiles] = np.arange(len(tiles))
-        pitch = -(-W // bw) * bw if whole else bw
-        H = self.grid.height if whole else 0
-        place = (view * H + y) * pitch + x if whole else np.arange(len(x)) * (bw * bh)
-
-        self.num_blocks = len(x)
+        self.num_blocks = len(row)
         self.num_tiles = len(tiles)
-        self.row = pitch
-        self.num_pixels = pitch * self.height if whole else len(x) * bw * bh
-        # Pixels are read and written in packets of 4 floats: places and pitch count packets.
         arrays = {
             "tile": tile,
             "bit": bit,
-            "x": x,
-            "y": y,
-            "place": place // 4,
-            "pitch": [pitch // 4],
-            "rows": np.minimum(H - y, bh) if whole else np.full(len(y), bh),
+            **self._pixels(row, column),
             "tile_grid": [self.across, self.down],
-            "slot_of": slot_of,
+            "slot_of": _slots(len(active), tiles),
             "block_table": summed_area(blocks),
             "tile_table": summed_area(active.any(1).reshape(-1, self.across)),
         }
@@ -212,6 +187,26 @@ class Region:
             setattr(self, name, from_numpy(mi.UInt32, values))
         self.corner_x = from_numpy(mi.Float, tiles % self.across * (ACROSS * bw))
         self.corner_y = from_numpy(mi.Float, tiles // self.across % self.down * (DOWN * bh))
+
+    def _pixels(self, row: np.ndarray, column: np.ndarray) -> dict[str, Any]:
+        """Return where the pixels of each block are, in its view and in memory."""
+        bw, bh = self.block
+        view, row_in_view = np.divmod(row, self.down * DOWN)
+        x = column * bw
+        y = row_in_view * bh
+        if self.whole:
+            H = self.grid.height
+            self.row = -(-self.width // bw) * bw
+            self.num_pixels = self.row * self.height
+            place = (view * H + y) * self.row + x
+            rows = np.minimum(H - y, bh)
+        else:
+            self.row = bw
+            self.num_pixels = len(x) * bw * bh
+            place = np.arange(len(x)) * (bw * bh)
+            rows = np.full(len(y), bh)
+        # Pixels are read and written in packets of 4 floats: places and pitch count packets.
+        return {"x": x, "y": y, "place": place // 4, "pitch": [self.row // 4], "rows": rows}
 
     def shape(self, channels: int) -> tuple[int, ...]:
         """Return the shape of an image with `channels` floats per pixel on this region."""
@@ -247,14 +242,8 @@ class Region:
             )
         row, column = self._blocks
         width, height = self.block
-        rows = image.shape[0] // height
-        columns = image.shape[1] // width
-        (down, across, *rest) = image.strides
-        shape = (rows, height, columns, width, *image.shape[2:])
-        # A view of the blocks that lie in the image as a whole: a copy of large images would take
-        # most of the time.
-        blocks = as_strided(image, shape, (height * down, down, width * across, across, *rest))
-        is_whole = (row < rows) & (column < columns)
+        blocks = _whole_blocks(image, self.block)
+        is_whole = (row < blocks.shape[0]) & (column < blocks.shape[2])
         if is_whole.all():
             return blocks[row, :, column]
         pixels = np.zeros((len(row), height, width, *image.shape[2:]), image.dtype)
@@ -297,6 +286,38 @@ class Region:
         if any(end for _, end in missing):
             image = np.pad(image, missing + [(0, 0)] * (image.ndim - 2))
         return image.reshape(rows, height, columns, width, *image.shape[2:])
+
+
+def _check_mask(mask: np.ndarray) -> None:
+    is_mask = mask.ndim == 2 and mask.dtype == bool
+    if not is_mask or not mask.any():
+        description = "none" if is_mask else f"{mask.dtype} {mask.shape}"
+        raise ValueError(
+            "Region(): `mask` must be bool [H, W] with at least one pixel set, got "
+            f"{description}; skip a view in which nothing is drawn."
+        )
+
+
+def _in_tiles(blocks: np.ndarray, across: int) -> np.ndarray:
+    """Return a grid of blocks as [tiles, blocks of a tile]."""
+    tiles = blocks.reshape(-1, DOWN, across, ACROSS).transpose(0, 2, 1, 3)
+    return tiles.reshape(-1, ACROSS * DOWN)
+
+
+def _slots(count: int, tiles: np.ndarray) -> np.ndarray:
+    """Return the slot of each of `count` tiles, the place in `tiles` of those that are drawn."""
+    slots = np.full(count, NO_SLOT, np.uint32)
+    slots[tiles] = np.arange(len(tiles))
+    return slots
+
+
+def _whole_blocks(image: np.ndarray, block: tuple[int, int]) -> np.ndarray:
+    """Return the blocks that lie in an image as a whole, [rows, height, columns, width, ...]."""
+    width, height = block
+    (down, across, *rest) = image.strides
+    shape = (image.shape[0] // height, height, image.shape[1] // width, width, *image.shape[2:])
+    # A view: a copy of large images would take most of the time.
+    return as_strided(image, shape, (height * down, down, width * across, across, *rest))
 
 
 def joined(regions: Sequence[Region]) -> Region:

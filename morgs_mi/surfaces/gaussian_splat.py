@@ -62,14 +62,9 @@ def _scene_gaussians(scene: Any, attributes: list[str], with_surfaces: bool) -> 
     """Return the Gaussians of all shapes, padded with zeros to the largest number of SH
     coefficients.
     """
-    shapes = [shape for shape in scene.shapes() if shape.is_ellipsoids()]
-    for shape in scene.shapes():
-        if not (with_surfaces or shape.is_ellipsoids()):
-            raise ValueError(
-                f"gaussian_splat: expected `ellipsoids` shapes only, got {shape.class_name()} "
-                f"{shape.id()!r}; remove it from the scene, or set `surfaces` to an integrator "
-                "that renders it, such as `path`."
-            )
+    shapes = _ellipsoids(scene)
+    if not with_surfaces:
+        _refuse_surfaces(scene)
     if not shapes:
         raise ValueError(
             "gaussian_splat: expected a scene with an `ellipsoids` shape, got none; add one."
@@ -89,6 +84,21 @@ def _scene_gaussians(scene: Any, attributes: list[str], with_surfaces: bool) -> 
     )
 
 
+def _ellipsoids(scene: Any) -> list[Any]:
+    """Return the shapes of a scene that are Gaussians."""
+    return [shape for shape in scene.shapes() if shape.is_ellipsoids()]
+
+
+def _refuse_surfaces(scene: Any) -> None:
+    for shape in scene.shapes():
+        if not shape.is_ellipsoids():
+            raise ValueError(
+                f"gaussian_splat: expected `ellipsoids` shapes only, got {shape.class_name()} "
+                f"{shape.id()!r}; remove it from the scene, or set `surfaces` to an integrator "
+                "that renders it, such as `path`."
+            )
+
+
 def _shape_gaussians(shape: Any, attributes: list[str]) -> dict[str, Tensor]:
     """Return a shape's attributes by the rasteriser's names, attached to its parameters."""
     params: Any = mi.traverse(shape)
@@ -97,19 +107,27 @@ def _shape_gaussians(shape: Any, attributes: list[str]) -> dict[str, Tensor]:
     part = {"means": data[:, :3], "scales": data[:, 3:6], "quats": data[:, mi.UInt32(9, 6, 7, 8)]}
     all_widths = attribute_widths()
     for name in attributes:
-        widths = all_widths[name]
         size = dr.width(params[name]) if name in params else 0
-        if size not in [N * width for width in widths]:
-            expected = " or ".join(map(str, widths))
-            content = f"{size} values" if name in params else f"only {sorted(params.keys())}"
-            raise ValueError(
-                f"gaussian_splat: the {shape.class_name()} {shape.id()!r} must have `{name}` [N, "
-                f"{expected}] with N={N}, got {content}; set it where the shape is defined, or "
-                "write its file by morgs_mi.write_ply(path, gaussians, layout='mitsuba')."
-            )
+        if size not in [N * width for width in all_widths[name]]:
+            raise _attribute_error(shape, name, N)
         tail = (size // N // 3, 3) if name == "sh_coeffs" else BY_ACTIVATED_NAME[name].shape
         part[name] = mi.TensorXf(params[name], (N, *tail))
     return part
+
+
+def _attribute_error(shape: Any, name: str, N: int) -> ValueError:
+    """Return the error about an attribute of N Gaussians that is missing or of another size."""
+    params: Any = mi.traverse(shape)
+    expected = " or ".join(map(str, attribute_widths()[name]))
+    has_attribute = name in params
+    content = (
+        f"{dr.width(params[name])} values" if has_attribute else f"only {sorted(params.keys())}"
+    )
+    return ValueError(
+        f"gaussian_splat: the {shape.class_name()} {shape.id()!r} must have `{name}` [N, "
+        f"{expected}] with N={N}, got {content}; set it where the shape is defined, or "
+        "write its file by morgs_mi.write_ply(path, gaussians, layout='mitsuba')."
+    )
 
 
 class _ForwardPass(NamedTuple):
@@ -192,6 +210,67 @@ def _render_config(props: Any) -> RenderConfig:
         raise ValueError(f"gaussian_splat: {error}") from None
 
 
+def _color(values: Any) -> Any:
+    """Return one number or three as a colour."""
+    return mi.Color3f(np.broadcast_to(np.array(values, float), 3))
+
+
+def _check_integrator(surfaces: Any) -> None:
+    if not (surfaces is None or isinstance(surfaces, mi.Integrator)):
+        raise ValueError(
+            f"gaussian_splat: `surfaces` must be an integrator, got {surfaces!r}; pass one such as "
+            "{'type': 'path'}."
+        )
+    if surfaces is not None and not mi.is_rgb:
+        raise ValueError(
+            "gaussian_splat: with `surfaces`, expected a variant such as 'llvm_ad_rgb', got "
+            f"{mi.variant()!r}; call mi.set_variant() before the scene is loaded, because "
+            "Gaussians have RGB colours."
+        )
+
+
+def _check_aovs(aovs: list[str]) -> None:
+    names = aov_attributes()
+    for name in aovs:
+        if name not in names:
+            raise ValueError(
+                f"gaussian_splat: `aovs` must be out of {', '.join(names)}, got {name!r}; "
+                "separate them by commas."
+            )
+
+
+def _sensor_of(scene: Any, sensor: Any) -> Any:
+    """Return a sensor, which may be given by its number in the scene."""
+    return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+
+
+def _checked_film(sensor: Any) -> Any:
+    film = sensor.film()
+    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+        raise ValueError(
+            f"gaussian_splat: expected an `hdrfilm`, got {film.class_name()}; replace it, "
+            "because only RGB is drawn."
+        )
+    return film
+
+
+def _check_batch(border: int, has_surfaces: bool) -> None:
+    """Raise an error if several sensors have a border around their film, or surfaces."""
+    if border or has_surfaces:
+        reason = "`sample_border` in its film" if border else "`surfaces`"
+        raise ValueError(
+            f"gaussian_splat: expected a `batch` sensor without {reason}; render its sensors "
+            "one by one."
+        )
+
+
+def _crop(film: Any, border: int) -> tuple[int, int, int, int]:
+    """Return the pixels of a film's crop and the border around it, (x, y, width, height)."""
+    x, y = film.crop_offset()
+    width, height = film.crop_size() + 2 * border
+    return int(x), int(y), int(width), int(height)
+
+
 class GaussianSplatIntegrator(mi.CppADIntegrator):
     r"""Gaussian splatting integrator (:monosp:`gaussian_splat`).
 
@@ -258,34 +337,14 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         self.srgb_primitives = bool(props.get("srgb_primitives", True))
         self.config = _render_config(props)
         background = props.get("background", None)
-        self.background = (
-            None
-            if background is None
-            else mi.Color3f(np.broadcast_to(np.array(background, float), 3))
-        )
+        self.background = None if background is None else _color(background)
         names = (name.strip() for name in props.get("aovs", "").split(","))
         self.aovs = list(dict.fromkeys(name for name in names if name))
         self.surfaces = props.get("surfaces", None)
-        if not (self.surfaces is None or isinstance(self.surfaces, mi.Integrator)):
-            raise ValueError(
-                f"gaussian_splat: `surfaces` must be an integrator, got {self.surfaces!r}; pass "
-                "one such as {'type': 'path'}."
-            )
-        if self.surfaces is not None and not mi.is_rgb:
-            raise ValueError(
-                "gaussian_splat: with `surfaces`, expected a variant such as 'llvm_ad_rgb', got "
-                f"{mi.variant()!r}; call mi.set_variant() before the scene is loaded, because "
-                "Gaussians have RGB colours."
-            )
+        _check_integrator(self.surfaces)
         self.warnings: set[str] = set()
         self.forward_pass: _ForwardPass | None = None
-        names = aov_attributes()
-        for name in self.aovs:
-            if name not in names:
-                raise ValueError(
-                    f"gaussian_splat: `aovs` must be out of {', '.join(names)}, got {name!r}; "
-                    "separate them by commas."
-                )
+        _check_aovs(self.aovs)
 
     def traverse(self, callback: Any) -> None:
         if self.background is not None:
@@ -365,9 +424,8 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
 
     def _inputs(self, scene: Any, sensor: Any) -> list[Any]:
         """Return all values that an image depends on, but for the integrator's fixed settings."""
-        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-        shapes = [shape for shape in scene.shapes() if shape.is_ellipsoids()]
-        tables: list[Any] = [mi.traverse(part) for part in (sensor, *shapes)]
+        parts = (_sensor_of(scene, sensor), *_ellipsoids(scene))
+        tables: list[Any] = [mi.traverse(part) for part in parts]
         values = [value for table in tables for _, value in table]
         return [leaf for value in [*values, self.background] for leaf in _leaves(value)]
 
@@ -377,32 +435,19 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         """Render the scene to the sensor's film and return the film, and the surfaces if there are
         any.
         """
-        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-        film = sensor.film()
-        if mi.has_flag(film.flags(), mi.FilmFlags.Special):
-            raise ValueError(
-                f"gaussian_splat: expected an `hdrfilm`, got {film.class_name()}; replace it, "
-                "because only RGB is drawn."
-            )
+        sensor = _sensor_of(scene, sensor)
+        film = _checked_film(sensor)
         border = film.rfilter().border_size() if film.sample_border() else 0
         views = _views(sensor)
-        if len(views) > 1 and (border or self.surfaces is not None):
-            reason = "`sample_border` in its film" if border else "`surfaces`"
-            raise ValueError(
-                f"gaussian_splat: expected a `batch` sensor without {reason}; render its sensors "
-                "one by one."
-            )
+        if len(views) > 1:
+            _check_batch(border, self.surfaces is not None)
         cameras = [_sensor_camera(view, border) for view in views]
         has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
-        required = (aov_attributes()[name] for name in self.aovs)
-        attributes = ["opacities", "sh_coeffs", *(name for name in required if name)]
-        gaussians = _scene_gaussians(scene, attributes, self.surfaces is not None)
+        gaussians = _scene_gaussians(scene, self._attributes(), self.surfaces is not None)
         channels = ("color", *(["alpha"] if has_alpha else []), *self.aovs)
         # Cropped after rendering: the projection's linearisation depends on the extent of the whole
         # view.
-        x0, y0 = film.crop_offset()
-        w, h = film.crop_size() + 2 * border
-        crop = (int(x0), int(y0), int(w), int(h))
+        crop = _crop(film, border)
 
         self._warn(scene, gaussians)
         surfaces = None
@@ -421,11 +466,18 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
 
         film.prepare(self.aov_names())
         block = film.create_block()
-        index = dr.arange(mi.UInt32, w * h)
+        x, y, width, height = crop
+        index = dr.arange(mi.UInt32, width * height)
+        place = mi.Point2f(index % width, index // width)
         block.set_coalesce(False)  # useful for many samples per pixel only
-        block.put(mi.Point2f(index % w, index // w) + mi.Point2f(x0, y0) + (0.5 - border), values)
+        block.put(place + mi.Point2f(x, y) + (0.5 - border), values)
         film.put_block(block)
         return film, surfaces
+
+    def _attributes(self) -> list[str]:
+        """Return the attributes of Gaussians that the channels need."""
+        required = (aov_attributes()[name] for name in self.aovs)
+        return ["opacities", "sh_coeffs", *(name for name in required if name)]
 
     def _splats(
         self,

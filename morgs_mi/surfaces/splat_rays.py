@@ -57,29 +57,12 @@ class _Tree:
             centers: centres of the boxes [N, 3].
             halves: half their sizes [N, 3].
         """
-        N = len(centers)
-        depth = max(N - 1, 0).bit_length()
-        order = np.arange(1 << depth)
-        flips = [0, 0, 0]
-        # Leaves without a box are at the end of every axis.
-        places = np.concatenate([centers, np.full((len(order) - N, 3), np.inf)])
-        for level in range(depth):
-            order = order.reshape(1 << level, -1)
-            axis = _longest_axis(places[order])
-            flips[axis] |= 1 << (depth - 1 - level)
-            order = np.take_along_axis(
-                order, places[order, axis].argpartition(order.shape[1] // 2 - 1, axis=1), axis=1
-            )
-        order = np.minimum(order.ravel(), N)
+        depth = max(len(centers) - 1, 0).bit_length()
+        order, flips = _leaf_order(centers, depth)
         # Rounding must not make a box smaller.
         halves = halves * (1 + 1e-5) + 1e-6 * np.abs(centers)
-        lows = [np.concatenate([centers - halves, [[np.inf] * 3]])[order]]
-        highs = [np.concatenate([centers + halves, [[-np.inf] * 3]])[order]]
-        while len(lows[-1]) > 1:
-            lows.append(lows[-1].reshape(-1, 2, 3).min(1))
-            highs.append(highs[-1].reshape(-1, 2, 3).max(1))
-        # From the root down; node 0 does not exist.
-        low, high = (np.concatenate([levels[-1], *levels[::-1]]) for levels in (lows, highs))
+        low = _node_corners(np.concatenate([centers - halves, [[np.inf] * 3]])[order], np.min)
+        high = _node_corners(np.concatenate([centers + halves, [[-np.inf] * 3]])[order], np.max)
         rows = np.zeros((len(low), 8))
         # An empty box is a point at infinity, which no ray reaches.
         rows[:, :3] = low
@@ -137,6 +120,34 @@ class _Tree:
         )[2]
 
 
+def _leaf_order(centers: np.ndarray, depth: int) -> tuple[np.ndarray, list[int]]:
+    """Return the box of each leaf [2^depth], N where there is none, and for each axis the bits of a
+    leaf's number that choose a side along it.
+    """
+    N = len(centers)
+    order = np.arange(1 << depth)
+    flips = [0, 0, 0]
+    # Leaves without a box are at the end of every axis.
+    places = np.concatenate([centers, np.full((len(order) - N, 3), np.inf)])
+    for level in range(depth):
+        order = order.reshape(1 << level, -1)
+        axis = _longest_axis(places[order])
+        flips[axis] |= 1 << (depth - 1 - level)
+        partition = places[order, axis].argpartition(order.shape[1] // 2 - 1, axis=1)
+        order = np.take_along_axis(order, partition, axis=1)
+    return np.minimum(order.ravel(), N), flips
+
+
+def _node_corners(leaves: np.ndarray, extreme: Callable[..., np.ndarray]) -> np.ndarray:
+    """Return a corner of the box of every node from the root down, given that of the leaves; node 0
+    does not exist.
+    """
+    levels = [leaves]
+    while len(levels[-1]) > 1:
+        levels.append(extreme(levels[-1].reshape(-1, 2, 3), axis=1))
+    return np.concatenate([levels[-1], *levels[::-1]])
+
+
 class SplatRays:
     """N Gaussians, prepared for rays; detached from the gradient graph.
 
@@ -159,28 +170,20 @@ class SplatRays:
                 f"{type(gaussians).__name__} without any; pass some."
             )
         self._config = config or RenderConfig()
-        values = {
-            name: _finite(gaussians, name)
-            for name in ("means", "scales", "quats", "opacities", "sh_coeffs")
-        }
-        means, scales, quats, opacities, coeffs = values.values()
+        names = ("means", "scales", "quats", "opacities", "sh_coeffs")
+        means, scales, quats, opacities, coeffs = (_finite(gaussians, name) for name in names)
         scales = np.maximum(scales, np.maximum(_THINNEST * scales.max(1, keepdims=True), 1e-30))
-        quats = np.where(np.linalg.norm(quats, axis=1, keepdims=True) > 0, quats, [1, 0, 0, 0])
-        axes = Rotation.from_quat(quats, scalar_first=True).as_matrix()
+        axes = _axes(quats)
         reach = np.sqrt(2 * np.log(np.maximum(opacities.ravel() / self._config.alpha_min, 1)))
         indices = np.flatnonzero(reach > 0)
         halves = reach[:, None] * np.linalg.norm(axes * scales[:, None], axis=2)
         self._tree, order = _Tree.of(means[indices], halves[indices])
         index = np.concatenate([indices, [0]])[order]
-        # Four floats each, which are read as one packet.
-        rows = np.zeros((len(index), 4, 4))
-        rows[:, :3, :3] = (axes / scales[:, None]).transpose(0, 2, 1)[index]
-        rows[:, :3, 3] = means[index]
-        rows[:, 3, 0] = np.where(order < len(indices), opacities.ravel()[index], 0)
-        packets = np.zeros((*coeffs.shape[:2], 4))
-        packets[..., :3] = coeffs
+        matrices = (axes / scales[:, None]).transpose(0, 2, 1)
+        opacities = np.where(order < len(indices), opacities.ravel()[index], 0)
+        rows = _packed_rows(matrices[index], means[index], opacities)
         self._rows = from_numpy(mi.Float, rows)
-        self._coeffs = from_numpy(mi.Float, packets[index])
+        self._coeffs = from_numpy(mi.Float, _packed_colors(coeffs)[index])
         self._degree = round(sqrt(coeffs.shape[1])) - 1
 
     def transmittance(self, ray: Any, active: Bool = True) -> Float:
@@ -326,6 +329,28 @@ def _finite(gaussians: ActivatedGaussians, name: str) -> np.ndarray:
             f"{bad[0].tolist()} ({len(bad)} such values); remove these Gaussians."
         )
     return values
+
+
+def _axes(quats: np.ndarray) -> np.ndarray:
+    """Return the rotations [N, 3, 3] of quaternions; of one of length 0, the identity."""
+    quats = np.where(np.linalg.norm(quats, axis=1, keepdims=True) > 0, quats, [1, 0, 0, 0])
+    return Rotation.from_quat(quats, scalar_first=True).as_matrix()
+
+
+def _packed_rows(matrices: np.ndarray, means: np.ndarray, opacities: np.ndarray) -> np.ndarray:
+    """Return Gaussians as rows [L, 4, 4] of four floats each, which are read as one packet."""
+    rows = np.zeros((len(means), 4, 4))
+    rows[:, :3, :3] = matrices
+    rows[:, :3, 3] = means
+    rows[:, 3, 0] = opacities
+    return rows
+
+
+def _packed_colors(coeffs: np.ndarray) -> np.ndarray:
+    """Return SH coefficients as packets of four floats [N, K, 4]."""
+    packets = np.zeros((*coeffs.shape[:2], 4))
+    packets[..., :3] = coeffs
+    return packets
 
 
 def _longest_axis(points: np.ndarray) -> int:

@@ -77,18 +77,23 @@ def surface_scene(scene: Any) -> Any:
             "the scene, such as an `envmap` of morgs_mi.light_probe()."
         )
     for shape in surfaces:
-        if shape.is_medium_transition():
-            raise ValueError(
-                f"gaussian_splat: expected surfaces, got {shape.class_name()} {shape.id()!r}, the "
-                "boundary of a medium; remove the medium, because splats have no place in the "
-                "order of a volume's light."
-            )
-        if shape.bsdf() is None:
-            raise ValueError(
-                f"gaussian_splat: the {shape.class_name()} {shape.id()!r} must have a BSDF, got "
-                "none; set `bsdf` where the shape is defined."
-            )
+        _check_surface(shape)
     return shared_scene([*surfaces, *lights(scene)], scene)
+
+
+def _check_surface(shape: Any) -> None:
+    """Raise an error if a shape is the boundary of a medium, or has no BSDF."""
+    if shape.is_medium_transition():
+        raise ValueError(
+            f"gaussian_splat: expected surfaces, got {shape.class_name()} {shape.id()!r}, the "
+            "boundary of a medium; remove the medium, because splats have no place in the "
+            "order of a volume's light."
+        )
+    if shape.bsdf() is None:
+        raise ValueError(
+            f"gaussian_splat: the {shape.class_name()} {shape.id()!r} must have a BSDF, got "
+            "none; set `bsdf` where the shape is defined."
+        )
 
 
 def lights(scene: Any) -> list[Any]:
@@ -123,6 +128,12 @@ def _attached(thing: Any) -> list[str]:
     return [key for key in params.keys() if dr.grad_enabled(params[key])]  # noqa: SIM118
 
 
+def _attached_parameters(shape: Any) -> list[tuple[Any, str, Any]]:
+    """Return the parameters of a shape that are attached: the table, the key and the value."""
+    params: Any = mi.traverse(shape)
+    return [(params, key, params[key]) for key in _attached(shape)]
+
+
 @contextmanager
 def _detached(shapes: list[Any]) -> Iterator[None]:
     """Detach the parameters of shapes inside the context.
@@ -130,10 +141,7 @@ def _detached(shapes: list[Any]) -> Iterator[None]:
     Calls of Mitsuba's virtual functions are traced for all shapes that exist, of any scene. In
     forward mode `prb` would depend on shapes that its scene does not have, and fail.
     """
-    attached = []
-    for shape in shapes:
-        params: Any = mi.traverse(shape)
-        attached += [(params, key, params[key]) for key in _attached(shape)]
+    attached = [parameter for shape in shapes for parameter in _attached_parameters(shape)]
     for params, key, value in attached:
         params[key] = dr.detach(value)
     try:
@@ -158,14 +166,8 @@ class SampledPixels:
         names = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
         params: Any = mi.traverse(self.template)
         more = {"far_clip": float(params["far_clip"]), "sampler": self.template.sampler()}
-        return mi.load_dict(
-            {
-                **self.camera.sensor(
-                    pixel_format="rgba", **dict(zip(names, self.crop, strict=True))
-                ),
-                **more,
-            }
-        )
+        crop = dict(zip(names, self.crop, strict=True))
+        return mi.load_dict({**self.camera.sensor(pixel_format="rgba", **crop), **more})
 
     def samples(self) -> int:
         """Return the samples per pixel, which some samplers round up."""
@@ -230,10 +232,7 @@ class SurfaceView:
                 integrator.render(scene, sensor, seed=pixels.seed, spp=pixels.samples())
             )
             coverage, depth = coverage_and_depth(scene, sensor, pixels.camera, pixels.crop)
-            has_environment = scene.environment() is not None and not getattr(
-                integrator, "hide_emitters", False
-            )
-            behind = _environment(scene, sensor) if has_environment else None
+            behind = _environment(scene, sensor) if _is_behind(scene, integrator) else None
         dr.enable_grad(image, behind)
         return SurfaceView(
             scene, gaussians, integrator, pixels, sensor, image, coverage, depth, behind, rays, srgb
@@ -248,9 +247,8 @@ class SurfaceView:
                 self.scene, params, self.sensor, **self._samples(self.pixels.seed)
             )
         dr.set_grad(self.image, tangent)
-        if self.behind is not None and dr.grad_enabled(
-            values := _environment(self.scene, self.sensor)
-        ):
+        values = self._attached_environment()
+        if values is not None:
             dr.set_grad(self.behind, dr.forward_to(values))
 
     def backward(self, params: Any) -> None:
@@ -268,23 +266,24 @@ class SurfaceView:
             self.integrator.render_backward(
                 self.scene, params, grad, self.sensor, **self._samples(seed)
             )
-        if self.behind is not None and dr.grad_enabled(
-            values := _environment(self.scene, self.sensor)
-        ):
+        values = self._attached_environment()
+        if values is not None:
             # `values` may be a parameter itself: its gradient is added to.
             dr.backward(dr.sum(dr.dot(values, dr.grad(self.behind))))
 
+    def _attached_environment(self) -> Any:
+        """Return the radiance of the environment that the parameters give; None if there is none,
+        or it is not differentiated.
+        """
+        if self.behind is None:
+            return None
+        values = _environment(self.scene, self.sensor)
+        return values if dr.grad_enabled(values) else None
+
     def _differentiates(self) -> bool:
         """Return whether any parameter of the surfaces is differentiated."""
-        params = mi.traverse(self.scene)
         attached = _attached(self.scene)
-        moving = [key for key in attached if params.flags(key) & mi.ParamFlags.Discontinuous]
-        if moving:
-            _log.warning(
-                "gaussian_splat: gradients of the surfaces' positions lack what changes with "
-                "their silhouettes and depth; do not optimise `%s` with it.",
-                "`, `".join(moving),
-            )
+        self._warn_of_positions(attached)
         if self.splats is not None and any(_attached(shape) for shape in self.gaussians):
             _log.warning(
                 "splat_path: gradients of the Gaussians are those of the splats that the camera "
@@ -292,6 +291,16 @@ class SurfaceView:
                 "light."
             )
         return bool(attached)
+
+    def _warn_of_positions(self, names: list[str]) -> None:
+        params = mi.traverse(self.scene)
+        moving = [name for name in names if params.flags(name) & mi.ParamFlags.Discontinuous]
+        if moving:
+            _log.warning(
+                "gaussian_splat: gradients of the surfaces' positions lack what changes with "
+                "their silhouettes and depth; do not optimise `%s` with it.",
+                "`, `".join(moving),
+            )
 
     def _samples(self, seed: Any) -> dict[str, Any]:
         return {"seed": seed, "spp": self.pixels.samples()}
@@ -385,11 +394,7 @@ def _rectangle(
     """
     if not box.valid():  # no surface
         return np.zeros(2, int), [0, 0]
-    ends = np.stack([np.ravel(box.min), np.ravel(box.max)])
-    corners = np.array(
-        [[ends[i, 0], ends[j, 1], ends[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-    )
-    pixels, depth = camera.project(corners)
+    pixels, depth = camera.project(_corners(box))
     low = np.zeros(2)
     high = np.array(crop[2:])
     if (depth >= camera.near).all():
@@ -398,6 +403,17 @@ def _rectangle(
             for end in (np.floor(pixels.min(0)) - 1, np.ceil(pixels.max(0)) + 1)
         )
     return low.astype(int), (high - low).astype(int).tolist()
+
+
+def _corners(box: Any) -> np.ndarray:
+    """Return the corners [8, 3] of a bounding box."""
+    ends = np.stack([np.ravel(box.min), np.ravel(box.max)])
+    return np.array([[x, y, z] for x in ends[:, 0] for y in ends[:, 1] for z in ends[:, 2]])
+
+
+def _is_behind(scene: Any, integrator: Any) -> bool:
+    """Return whether a scene has an environment, and an integrator shows it."""
+    return scene.environment() is not None and not getattr(integrator, "hide_emitters", False)
 
 
 def _environment(scene: Any, sensor: Any) -> Any:
