@@ -71,15 +71,19 @@ def motion_image(motion: np.ndarray, scale_px: float) -> np.ndarray:
         ValueError: `motion` is not [H, W, 2], or the scale is not positive.
     """
     motion = np.asarray(motion, np.float32)
-    if motion.ndim != 3 or motion.shape[2] != 2:
-        raise ValueError(f"motion_image(): `motion` must be [H, W, 2], got {motion.shape}.")
-    if not scale_px > 0:
-        raise ValueError(f"motion_image(): `scale_px` must be positive, got {scale_px}.")
+    _check_motion(motion, scale_px)
     valid = np.asarray(np.isfinite(motion).all(-1))
     hsv = _hue_and_saturation(np.where(valid[..., None], motion, 0), scale_px)
     image = to_uint8(cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB))
     image[~valid] = UNDEFINED
     return image
+
+
+def _check_motion(motion: np.ndarray, scale_px: float) -> None:
+    if motion.ndim != 3 or motion.shape[2] != 2:
+        raise ValueError(f"motion_image(): `motion` must be [H, W, 2], got {motion.shape}.")
+    if not scale_px > 0:
+        raise ValueError(f"motion_image(): `scale_px` must be positive, got {scale_px}.")
 
 
 def _hue_and_saturation(motion: np.ndarray, scale_px: float) -> np.ndarray:

@@ -342,24 +342,15 @@ def _numbers(kind: type[Jit], values: tuple[float, ...]) -> tuple[Jit, ...]:
 
 def _numbers_of(camera: Camera) -> list[float]:
     """Return the numbers that `_intrinsics` describes."""
-    K = camera.K
-    bounds = []
-    for axis, size in enumerate((camera.width, camera.height)):
-        f = K[axis, axis]
-        c = K[axis, 2]
-        margin = 0.15 * size / f  # 30 % of the half view on every side
-        bounds += [-c / f - margin, (size - c) / f + margin]
-    return [
-        K[0, 0],
-        K[1, 1],
-        K[0, 2],
-        K[1, 2],
-        camera.near,
-        *bounds,
-        camera.delay,
-        camera.readout,
-        camera.height,
-    ]
+    (fx, _, cx), (_, fy, cy) = camera.K[:2]
+    bounds = [*_bounds(fx, cx, camera.width), *_bounds(fy, cy, camera.height)]
+    return [fx, fy, cx, cy, camera.near, *bounds, camera.delay, camera.readout, camera.height]
+
+
+def _bounds(f: float, c: float, size: int) -> tuple[float, float]:
+    """Return the bounds of x/z or y/z up to which the projection is linearised."""
+    margin = 0.15 * size / f  # 30 % of the half view on every side
+    return -c / f - margin, (size - c) / f + margin
 
 
 def _rotation(quats: Jit) -> list[Jit]:

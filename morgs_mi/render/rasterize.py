@@ -192,11 +192,8 @@ def rasterize(
         region = full_view(view.width, view.height, config, len(cameras))
     else:
         _check_region(region, view, config)
-    stack = (
-        (len(cameras), view.height, view.width)
-        if isinstance(camera, Sequence)
-        else region.shape(0)[:-1]
-    )
+    is_stack = isinstance(camera, Sequence)
+    stack = (len(cameras), view.height, view.width) if is_stack else region.shape(0)[:-1]
     blended = tuple(c for c in channels if c != "alpha")
     if dr.prod(gaussians.means.shape[:1]) == 0:
         return _empty(channels, sizes, background, region, stack)
@@ -224,15 +221,21 @@ def rasterize(
     images = dict(zip((*blended, "alpha", "coverage"), outputs, strict=False))
     coverage = images.pop("coverage", None)
     for name in blended:
-        if name in NORMALISED or (name == "color" and background is not None):
-            weight = repeat_each(
-                dr.detach(coverage) if name in detach_weights else coverage, sizes[name]
-            )
+        if _reads_weight(name, background):
+            weight = dr.detach(coverage) if name in detach_weights else coverage
+            weight = repeat_each(weight, sizes[name])
             finish = _normalised if name in NORMALISED else _over(background)
             images[name] = finish(images[name], weight)
     return Image._of(
         {name: _tensor(images[name], region, (*stack, sizes[name])) for name in channels}
     )
+
+
+def _reads_weight(channel: str, background: Sequence[float] | Jit | None) -> bool:
+    """Return whether a channel is divided by the sum of the weights, or composited by it over the
+    background.
+    """
+    return channel in NORMALISED or (channel == "color" and background is not None)
 
 
 def _normalised(values: Float, weight: Float) -> Float:
@@ -316,23 +319,12 @@ def _layout(
     cut: bool,
 ) -> Layout:
     """Return the layout of the blend: its channels, and where their gradients go."""
-    # Alpha itself, the channels that are divided by it, and the colour that is composited over the
-    # background.
-    read_alpha = [
-        name
-        for name in channels
-        if name == "alpha" or name in NORMALISED or (name == "color" and background is not None)
-    ]
+    read_alpha = [name for name in channels if name == "alpha" or _reads_weight(name, background)]
     blended = tuple(
         Channel(sizes[name], name not in detach_weights) for name in channels if name != "alpha"
     )
-    return Layout(
-        blended,
-        bool(read_alpha),
-        any(name not in detach_weights for name in read_alpha),
-        config,
-        cut,
-    )
+    attached = any(name not in detach_weights for name in read_alpha)
+    return Layout(blended, bool(read_alpha), attached, config, cut)
 
 
 def _tensor(values: Float, region: Region, shape: tuple[int, ...]) -> Tensor:
@@ -395,6 +387,10 @@ def _check_cameras(cameras: Sequence[Camera]) -> None:
         )
     for camera in cameras:
         check_type("rasterize()", "camera", camera, Camera)
+    _check_same_size(cameras)
+
+
+def _check_same_size(cameras: Sequence[Camera]) -> None:
     sizes = list(dict.fromkeys((camera.width, camera.height) for camera in cameras))
     if len(sizes) > 1:
         sizes_text = " and ".join(f"{width}x{height}" for width, height in sizes[:2])
@@ -457,23 +453,17 @@ def _check_background(background: Sequence[float] | Jit | None) -> None:
 def _check_size(cameras: Sequence[Camera]) -> None:
     """Raise an error if the images have too many pixels, or do not fit in memory."""
     V = len(cameras)
-    W = cameras[0].width
-    H = cameras[0].height
-    pixels = V * W * H
+    size = f"{cameras[0].width}x{cameras[0].height}"
+    pixels = V * cameras[0].width * cameras[0].height
     if pixels > 2**28:
-        size = f"{W}x{H}" if V == 1 else f"{V} times {W}x{H}"
         raise ValueError(
-            f"rasterize(): the image must have at most 2^28 pixels, got {size}; render it in "
-            "tiles, one camera each."
+            f"rasterize(): the image must have at most 2^28 pixels, got "
+            f"{size if V == 1 else f'{V} times {size}'}; render it in tiles, one camera each."
         )
     if pixels >= _LARGE:
-        size = f"an image of {W}x{H} pixels" if V == 1 else f"{V} images of {W}x{H} pixels"
-        check_memory(
-            "rasterize()",
-            _PIXEL_BYTES * pixels,
-            size,
-            "render a smaller one, or tiles, one camera each",
-        )
+        images = f"an image of {size} pixels" if V == 1 else f"{V} images of {size} pixels"
+        remedy = "render a smaller one, or tiles, one camera each"
+        check_memory("rasterize()", _PIXEL_BYTES * pixels, images, remedy)
 
 
 def _checked_features(
@@ -532,22 +522,21 @@ def _check_finite(
     """
     if dr.all(finite):
         return
-    blend_names = [
-        "sh_coeffs",
-        "motion",
-        *(attribute.activated_name for attribute in attribute_channels().values()),
-    ]
+    blend_names = ["sh_coeffs", "motion"]
+    blend_names += [attribute.activated_name for attribute in attribute_channels().values()]
     names = ["means", "scales", "quats", "opacities", *blend_names]
     poses = [("camera.viewmat", camera.viewmat) for camera in cameras]
     attributes = [(name, getattr(gaussians, name, None)) for name in names]
     for name, value in [*poses, *attributes, ("features", features)]:
-        if value is None:
-            continue
-        array = np.asarray(dr.detach(value))
-        is_bounded = name in (*blend_names, "features")
-        bad = np.argwhere(~(np.abs(array) <= FARTHEST) if is_bounded else ~np.isfinite(array))
-        if len(bad):
-            raise _number_error(name, array, bad)
+        if value is not None:
+            _check_numbers(name, value, name in (*blend_names, "features"))
+
+
+def _check_numbers(name: str, value: Tensor, is_blended: bool) -> None:
+    array = np.asarray(dr.detach(value))
+    bad = np.argwhere(~(np.abs(array) <= FARTHEST) if is_blended else ~np.isfinite(array))
+    if len(bad):
+        raise _number_error(name, array, bad)
 
 
 def _number_error(name: str, array: np.ndarray, bad: np.ndarray) -> ValueError:

@@ -249,9 +249,7 @@ class Region:
         pixels = np.zeros((len(row), height, width, *image.shape[2:]), image.dtype)
         pixels[is_whole] = blocks[row[is_whole], :, column[is_whole]]
         for k in np.flatnonzero(~is_whole):
-            y = row[k] * height
-            x = column[k] * width
-            part = image[y : y + height, x : x + width]
+            part = _block_of(image, row[k], column[k], self.block)
             pixels[k, : part.shape[0], : part.shape[1]] = part
         return pixels
 
@@ -282,9 +280,9 @@ class Region:
         """
         rows, columns = self.drawn.shape
         width, height = self.block
-        missing = [(0, rows * height - image.shape[0]), (0, columns * width - image.shape[1])]
-        if any(end for _, end in missing):
-            image = np.pad(image, missing + [(0, 0)] * (image.ndim - 2))
+        size = (rows * height, columns * width)
+        if image.shape[:2] != size:
+            image = _padded(image, *size)
         return image.reshape(rows, height, columns, width, *image.shape[2:])
 
 
@@ -320,6 +318,14 @@ def _whole_blocks(image: np.ndarray, block: tuple[int, int]) -> np.ndarray:
     return as_strided(image, shape, (height * down, down, width * across, across, *rest))
 
 
+def _block_of(image: np.ndarray, row: int, column: int, block: tuple[int, int]) -> np.ndarray:
+    """Return the part of a block that lies in an image."""
+    width, height = block
+    y = row * height
+    x = column * width
+    return image[y : y + height, x : x + width]
+
+
 def joined(regions: Sequence[Region]) -> Region:
     """Return the blocks of regions of several views as one region, of the views one below the
     other.
@@ -337,11 +343,17 @@ def joined(regions: Sequence[Region]) -> Region:
     columns = region.across * ACROSS
     region.width = columns * region.block[0]
     region.height = len(regions) * rows * region.block[1]
-    blocks = [np.pad(grid, ((0, rows - len(grid)), (0, columns - grid.shape[1]))) for grid in grids]
+    blocks = [_padded(grid, rows, columns) for grid in grids]
     region._lay_out(np.concatenate(blocks))
     mask = np.concatenate([part.inside() for part in regions])
     region.weights = None if mask.all() else from_numpy(mi.Float, mask)
     return region
+
+
+def _padded(grid: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """Return an array with zeros up to a number of rows and columns."""
+    missing = [(0, rows - grid.shape[0]), (0, columns - grid.shape[1])]
+    return np.pad(grid, missing + [(0, 0)] * (grid.ndim - 2))
 
 
 def summed_area(grid: np.ndarray) -> np.ndarray:

@@ -99,12 +99,7 @@ class ViewGroup:
         splats: Splats | None = None
         for index, view in enumerate(self.views):
             if view.static_splats is not None:
-                view_splats = replace(
-                    view.static_splats, view=dr.full(mi.UInt32, index, len(view.static_splats))
-                )
-                view_splats = replace(
-                    view_splats, channels={"color": view_splats.channels["color"]}
-                )
+                view_splats = _of_view(view.static_splats, index)
                 splats = view_splats if splats is None else splats.concatenated_with(view_splats)
         if splats is None:
             return None
@@ -231,6 +226,12 @@ def _num_channels(image: np.ndarray, size: tuple[int, ...]) -> int:
 def _everything(view: ActiveView) -> Region:
     """Return the region of all blocks of a view, block by block."""
     return Region(np.ones((view.camera.height, view.camera.width), bool), view.config)
+
+
+def _of_view(splats: Splats, index: int) -> Splats:
+    """Return the colour of splats, as those of one of several views."""
+    view = dr.full(mi.UInt32, index, len(splats))
+    return replace(splats, view=view, channels={"color": splats.channels["color"]})
 
 
 def _selected(splats: Splats, rows: UInt32) -> Splats:

@@ -72,16 +72,20 @@ def _scene_gaussians(scene: Any, attributes: list[str], with_surfaces: bool) -> 
     parts = [_shape_gaussians(shape, attributes) for shape in shapes]
     K = max(part["sh_coeffs"].shape[1] for part in parts)
     for part in parts:
-        N, present, _ = part["sh_coeffs"].shape
-        if present < K:
-            part["sh_coeffs"] = dr.concat(
-                [part["sh_coeffs"], dr.zeros(mi.TensorXf, (N, K - present, 3))], axis=1
-            )
+        part["sh_coeffs"] = _padded(part["sh_coeffs"], K)
     if len(parts) == 1:
         return _SceneGaussians(parts[0])
     return _SceneGaussians(
         {name: dr.concat([part[name] for part in parts], axis=0) for name in parts[0]}
     )
+
+
+def _padded(coeffs: Tensor, K: int) -> Tensor:
+    """Return SH coefficients [N, k, 3] padded with zeros to [N, K, 3]."""
+    N, present, _ = coeffs.shape
+    if present == K:
+        return coeffs
+    return dr.concat([coeffs, dr.zeros(mi.TensorXf, (N, K - present, 3))], axis=1)
 
 
 def _ellipsoids(scene: Any) -> list[Any]:
@@ -168,21 +172,22 @@ def _views(sensor: Any) -> list[Any]:
     if sensor.class_name() != "BatchSensor":
         return [sensor]
     parts: Any = mi.traverse(sensor).hierarchy
-    return [
-        part
-        for part, (parent, _) in parts.items()
-        if isinstance(part, mi.Sensor) and parent is sensor
-    ]
+    children = [part for part, (parent, _) in parts.items() if parent is sensor]
+    return [part for part in children if isinstance(part, mi.Sensor)]
 
 
-def _sensor_camera(sensor: Any, border: int) -> Camera:
-    """Return the camera of the sensor's whole film with a margin of `border` pixels."""
+def _check_pinhole(sensor: Any) -> None:
     if sensor.class_name() != "PerspectiveCamera":
         raise ValueError(
             "gaussian_splat: expected a `perspective` sensor or a `batch` of them, got "
             f"{sensor.class_name()}; splats are drawn only by pinhole cameras without lens "
             "distortion."
         )
+
+
+def _sensor_camera(sensor: Any, border: int) -> Camera:
+    """Return the camera of the sensor's whole film with a margin of `border` pixels."""
+    _check_pinhole(sensor)
     view = Camera.from_sensor(sensor)
     params: Any = mi.traverse(sensor)
     W = view.width
@@ -450,12 +455,8 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         crop = _crop(film, border)
 
         self._warn(scene, gaussians)
-        surfaces = None
-        if self.surfaces is not None:
-            pixels = SampledPixels(cameras[0], crop, sensor, seed, spp)
-            surfaces = SurfaceView.of(
-                scene, self.surfaces, pixels, gaussians, self.srgb_primitives, self.config
-            )
+        pixels = SampledPixels(cameras[0], crop, sensor, seed, spp)
+        surfaces = self._surface_view(scene, pixels, gaussians)
         if surfaces is None:
             columns = self._splats(gaussians, cameras, channels, crop)
         else:
@@ -473,6 +474,15 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         block.put(place + mi.Point2f(x, y) + (0.5 - border), values)
         film.put_block(block)
         return film, surfaces
+
+    def _surface_view(
+        self, scene: Any, pixels: SampledPixels, gaussians: Any
+    ) -> SurfaceView | None:
+        """Return the rendered surfaces; None if there are none."""
+        if self.surfaces is None:
+            return None
+        srgb = self.srgb_primitives
+        return SurfaceView.of(scene, self.surfaces, pixels, gaussians, srgb, self.config)
 
     def _attributes(self) -> list[str]:
         """Return the attributes of Gaussians that the channels need."""

@@ -164,17 +164,13 @@ class SplatRays:
     """
 
     def __init__(self, gaussians: ActivatedGaussians, config: RenderConfig | None = None) -> None:
-        if not hasattr(gaussians, "means") or not int(gaussians.means.shape[0]):
-            raise ValueError(
-                "SplatRays(): `gaussians` must be at least one Gaussian, got a "
-                f"{type(gaussians).__name__} without any; pass some."
-            )
+        _check_gaussians(gaussians)
         self._config = config or RenderConfig()
         names = ("means", "scales", "quats", "opacities", "sh_coeffs")
         means, scales, quats, opacities, coeffs = (_finite(gaussians, name) for name in names)
         scales = np.maximum(scales, np.maximum(_THINNEST * scales.max(1, keepdims=True), 1e-30))
         axes = _axes(quats)
-        reach = np.sqrt(2 * np.log(np.maximum(opacities.ravel() / self._config.alpha_min, 1)))
+        reach = _reach(opacities.ravel(), self._config.alpha_min)
         indices = np.flatnonzero(reach > 0)
         halves = reach[:, None] * np.linalg.norm(axes * scales[:, None], axis=2)
         self._tree, order = _Tree.of(means[indices], halves[indices])
@@ -317,6 +313,14 @@ class SplatRays:
         return dr.maximum(total, 0)
 
 
+def _check_gaussians(gaussians: ActivatedGaussians) -> None:
+    if not hasattr(gaussians, "means") or not int(gaussians.means.shape[0]):
+        raise ValueError(
+            "SplatRays(): `gaussians` must be at least one Gaussian, got a "
+            f"{type(gaussians).__name__} without any; pass some."
+        )
+
+
 def _finite(gaussians: ActivatedGaussians, name: str) -> np.ndarray:
     """Return an attribute in float64, detached."""
     values = np.array(dr.detach(getattr(gaussians, name)), np.float64)
@@ -329,6 +333,11 @@ def _finite(gaussians: ActivatedGaussians, name: str) -> np.ndarray:
             f"{bad[0].tolist()} ({len(bad)} such values); remove these Gaussians."
         )
     return values
+
+
+def _reach(opacities: np.ndarray, alpha_min: float) -> np.ndarray:
+    """Return the distances from the centre, in standard deviations, at which alpha is too small."""
+    return np.sqrt(2 * np.log(np.maximum(opacities / alpha_min, 1)))
 
 
 def _axes(quats: np.ndarray) -> np.ndarray:

@@ -398,10 +398,8 @@ def _rectangle(
     low = np.zeros(2)
     high = np.array(crop[2:])
     if (depth >= camera.near).all():
-        low, high = (
-            np.clip(end - np.array(crop[:2]), 0, high)
-            for end in (np.floor(pixels.min(0)) - 1, np.ceil(pixels.max(0)) + 1)
-        )
+        ends = np.stack([np.floor(pixels.min(0)) - 1, np.ceil(pixels.max(0)) + 1])
+        low, high = np.clip(ends - np.array(crop[:2]), 0, high)
     return low.astype(int), (high - low).astype(int).tolist()
 
 

@@ -50,12 +50,12 @@ def select_frames(stream: FrameSource, span: str | None) -> list[int]:
     if span is None:
         return numbers
     indices = _indices(span, numbers[0], numbers[-1])
-    if not (frames := [number for number in numbers if number in indices]):
-        raise ValueError(
-            f"select_frames(): `span` must select frames of {stream.path}, {numbers[0]} to "
-            f"{numbers[-1]}, got {span!r}."
-        )
-    return frames
+    if frames := [number for number in numbers if number in indices]:
+        return frames
+    raise ValueError(
+        f"select_frames(): `span` must select frames of {stream.path}, {numbers[0]} to "
+        f"{numbers[-1]}, got {span!r}."
+    )
 
 
 def _indices(span: str, first: int, last: int) -> range:
@@ -108,16 +108,21 @@ def write_each(
     """
     selection = set(frames)
     is_file = Path(output).name.lower().endswith(suffix)
-    if is_file and len(selection) > 1:
-        raise ValueError(
-            f"{output}: expected one frame for one file, got {len(selection)}; select one "
-            "(--frames), or name a folder."
-        )
+    if is_file:
+        _check_single(output, len(selection))
     with (atomic_path if is_file else atomic_folder)(output, "write_each()") as partial:
         for count, (frame, gaussians) in enumerate(_selected(clip, selection), start=1):
             write(partial if is_file else partial / f"{frame:04d}{suffix}", gaussians)
             if progress is not None:
                 progress(count, len(selection))
+
+
+def _check_single(output: str | Path, count: int) -> None:
+    if count > 1:
+        raise ValueError(
+            f"{output}: expected one frame for one file, got {count}; select one "
+            "(--frames), or name a folder."
+        )
 
 
 def _selected(

@@ -87,10 +87,13 @@ def _format_of_name(choices: Sequence[Format], output: str | Path) -> Format:
     suffix = re.search(r"\.[a-z]\w*$", name)
     if suffix is None and (folders := [choice for choice in choices if choice.folder]):
         return folders[0]
-    outputs = _listed(list(dict.fromkeys(text for choice in choices for text in choice.outputs)))
     raise ValueError(
-        f"{output}: the output must be {outputs}, got {suffix[0] if suffix else name!r}."
+        f"{output}: the output must be {_outputs(choices)}, got {suffix[0] if suffix else name!r}."
     )
+
+
+def _outputs(formats: Sequence[Format]) -> str:
+    return _listed(list(dict.fromkeys(text for choice in formats for text in choice.outputs)))
 
 
 def destination(
@@ -117,12 +120,16 @@ def destination(
     path = check_output(output or stream.with_name(choice.default.format(stem)))
     if choice.is_file(path) and path.is_dir():
         raise ValueError(f"{path}: expected a file to write, got a folder; choose another name.")
-    if path.exists() and stream.exists() and path.samefile(stream):
-        raise ValueError(
-            f"{path}: expected an output beside its source, got the source itself; choose another "
-            "name."
-        )
+    _check_not_source(path, stream)
     return path, choice
+
+
+def _check_not_source(output: Path, stream: Path) -> None:
+    if output.exists() and stream.exists() and output.samefile(stream):
+        raise ValueError(
+            f"{output}: expected an output beside its source, got the source itself; choose "
+            "another name."
+        )
 
 
 def _listed(names: Sequence[str]) -> str:

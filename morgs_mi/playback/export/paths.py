@@ -203,10 +203,15 @@ def through_cameras(cameras: Sequence[Camera], seconds: float = 1) -> CameraPath
             f"{len(cameras)}; use the path `orbit`."
         )
     keys = _chain([camera.resized(cameras[0].width, cameras[0].height) for camera in cameras])
+    times = np.concatenate([[0], np.cumsum(_steps(keys))])
+    return CameraPath(times, tuple(keys)).with_duration(seconds)
+
+
+def _steps(keys: Sequence[Camera]) -> np.ndarray:
+    """Return the times [K - 1] from each key view to the next one, at a speed of 1."""
     steps = np.linalg.norm(np.diff([key.position for key in keys], axis=0), axis=-1)
     # A rotation between cameras at the same position takes time too.
-    steps = np.maximum(steps, 0.1 * steps.mean() if steps.any() else 1)
-    return CameraPath(np.concatenate([[0], np.cumsum(steps)]), tuple(keys)).with_duration(seconds)
+    return np.maximum(steps, 0.1 * steps.mean() if steps.any() else 1)
 
 
 def _chain(cameras: list[Camera]) -> list[Camera]:
@@ -267,9 +272,9 @@ def _described(document: Any) -> str:
     """Return what a JSON document that is no camera path contains."""
     if not isinstance(document, dict):
         return "a list" if isinstance(document, list) else repr(document)[:80]
-    program = next((program for key, program in _OTHER_FILES.items() if key in document), None)
+    programs = [f", {program}" for key, program in _OTHER_FILES.items() if key in document]
     names = ", ".join(f"`{name}`"[:40] for name in list(document)[:6]) or "nothing"
-    return f"an object with {names}" + (f", {program}" if program else "")
+    return f"an object with {names}" + "".join(programs[:1])
 
 
 def _key_view(key: Mapping[str, Any], cameras: Sequence[Camera]) -> Camera:
