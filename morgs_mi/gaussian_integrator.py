@@ -74,15 +74,19 @@ def ellipsoids(gaussians: ActivatedGaussians) -> dict[str, Any]:
     values = {
         name: np.array(dr.detach(value)) for name, value in values.items() if value is not None
     }
-    means, scales, quats = (values.pop(name) for name in names[:3])
-    # Mitsuba expects unit quaternions.
-    quats = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-30)
-    data = np.concatenate([means, scales, np.roll(quats, -1, axis=1)], axis=1)
+    data = _rows(*(values.pop(name) for name in names[:3]))
     attributes = {
         name: from_numpy(mi.TensorXf, value.reshape(len(data), -1))
         for name, value in values.items()
     }
     return {"type": "ellipsoids", "data": from_numpy(mi.TensorXf, data), **attributes}
+
+
+def _rows(means: np.ndarray, scales: np.ndarray, quats: np.ndarray) -> np.ndarray:
+    """Return the rows [N, 10] of an `ellipsoids` shape."""
+    # Mitsuba expects unit quaternions.
+    quats = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-30)
+    return np.concatenate([means, scales, np.roll(quats, -1, axis=1)], axis=1)
 
 
 def integrator(plugin: str, props: Any) -> Any:

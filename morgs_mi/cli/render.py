@@ -117,9 +117,9 @@ class Render:
         if self.insert is not None:
             images, count = self._inserted(stream, view, chosen.name)
         elif self.camera is not None or (self.path is None and single):
-            images, count = self._fixed(stream, view, chosen.name)
+            images, count = self._camera_images(stream, view, chosen.name)
         else:
-            images, count = self._moving(stream, chosen.name)
+            images, count = self._path_images(stream, chosen.name)
         if single and count > 1:
             raise ValueError(
                 f"{output}: expected one image for one file, got {count}; name a folder."
@@ -162,13 +162,13 @@ class Render:
         if self.insert is not None and self.camera is None:
             raise ValueError("--insert renders for one camera, got none; add --camera CAMERA.")
 
-    def _fixed(self, stream: FrameSource, view: Camera, format: str) -> tuple[_Images, int]:
+    def _camera_images(self, stream: FrameSource, view: Camera, format: str) -> tuple[_Images, int]:
         """Return the rendered images of a camera, and their number."""
         from morgs_mi.playback.export.clips import frame_numbers
 
         return self._seen(stream, view, format), len(frame_numbers(stream))
 
-    def _moving(self, stream: FrameSource, format: str) -> tuple[_Images, int]:
+    def _path_images(self, stream: FrameSource, format: str) -> tuple[_Images, int]:
         """Return the rendered images along the path, and their number."""
         from morgs_mi.playback.export.clips import named_path, num_images
 

@@ -118,18 +118,18 @@ def _extent(frames: Sequence[Gaussians]) -> tuple[np.ndarray, np.ndarray, float]
     size of a Gaussian.
     """
     raw = [gaussians.numpy() for gaussians in frames]
-    means = _joined(raw, "means")
+    means = _column(raw, "means")
     if not len(means):
         raise ValueError(
             "expected at least one Gaussian, got none; leave out files that are empty."
         )
-    logits = _joined(raw, "logit_opacities")
+    logits = _column(raw, "logit_opacities")
     low, high = _corners(means, 0.5 + 0.5 * np.tanh(0.5 * logits))
     sizes = np.concatenate([values["log_scales"].max(axis=1, initial=-69) for values in raw])
     return low, high, float(np.exp(np.median(sizes)))
 
 
-def _joined(raw: list[dict[str, np.ndarray]], name: str) -> np.ndarray:
+def _column(raw: list[dict[str, np.ndarray]], name: str) -> np.ndarray:
     return np.concatenate([values[name] for values in raw], dtype=np.float64)
 
 

@@ -73,14 +73,14 @@ def truth_for_camera(capture: Capture, camera: Camera, frame: int) -> GroundTrut
     """
     if capture.truth is None or not (capture.truth / camera.name / f"{frame:04d}.exr").is_file():
         return None
-    return _resampled(load_truth(capture.truth, camera.name, frame), camera)
+    return _truth_on_grid(load_truth(capture.truth, camera.name, frame), camera)
 
 
-def _resampled(truth: GroundTruth, camera: Camera) -> GroundTruth:
+def _truth_on_grid(truth: GroundTruth, camera: Camera) -> GroundTruth:
     """Return ground truth on the pixel grid of a camera, by the nearest neighbour."""
     H, W = truth.mask.shape
-    rows = _nearest(camera.height, H)[:, None]
-    columns = _nearest(camera.width, W)
+    rows = _nearest_pixels(camera.height, H)[:, None]
+    columns = _nearest_pixels(camera.width, W)
     stretch = np.array([camera.width / W, camera.height / H], np.float32)
     motion = truth.motion[rows, columns] * stretch
     return GroundTruth(
@@ -88,7 +88,7 @@ def _resampled(truth: GroundTruth, camera: Camera) -> GroundTruth:
     )
 
 
-def _nearest(count: int, length: int) -> np.ndarray:
+def _nearest_pixels(count: int, length: int) -> np.ndarray:
     """Return the indices [count] of the nearest of `length` pixels."""
     return ((np.arange(count) + 0.5) * length / count).astype(int)
 

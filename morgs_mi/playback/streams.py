@@ -66,7 +66,7 @@ class SplatFile(FrameSource):
             self.cameras = trained or default_rig([gaussians])
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
-        self._state = _still(gaussians)
+        self._state = _still_frame(gaussians)
 
     def frame_numbers(self) -> list[int]:
         return [0]
@@ -81,7 +81,7 @@ class SplatFile(FrameSource):
         return stream_html(self)
 
 
-def _still(gaussians: Gaussians) -> FrameState:
+def _still_frame(gaussians: Gaussians) -> FrameState:
     """Return Gaussians as a first frame without motion."""
     motion = np.zeros((len(gaussians), 3), np.float32)
     ids = np.arange(len(gaussians), dtype=np.uint32)

@@ -522,19 +522,22 @@ def _check_finite(
     """
     if dr.all(finite):
         return
-    blend_names = ["sh_coeffs", "motion"]
-    blend_names += [attribute.activated_name for attribute in attribute_channels().values()]
-    names = ["means", "scales", "quats", "opacities", *blend_names]
-    poses = [("camera.viewmat", camera.viewmat) for camera in cameras]
-    attributes = [(name, getattr(gaussians, name, None)) for name in names]
-    for name, value in [*poses, *attributes, ("features", features)]:
-        if value is not None:
-            _check_numbers(name, value, name in (*blend_names, "features"))
+    for camera in cameras:
+        _check_numbers("camera.viewmat", camera.viewmat)
+    for name in ("means", "scales", "quats", "opacities"):
+        _check_numbers(name, getattr(gaussians, name, None))
+    others = [attribute.activated_name for attribute in attribute_channels().values()]
+    for name in ("sh_coeffs", "motion", *others):
+        _check_numbers(name, getattr(gaussians, name, None), FARTHEST)
+    _check_numbers("features", features, FARTHEST)
 
 
-def _check_numbers(name: str, value: Tensor, is_blended: bool) -> None:
+def _check_numbers(name: str, value: Tensor | None, most: float = np.inf) -> None:
+    """Raise an error if a value is not finite, or above `most`."""
+    if value is None:
+        return
     array = np.asarray(dr.detach(value))
-    bad = np.argwhere(~(np.abs(array) <= FARTHEST) if is_blended else ~np.isfinite(array))
+    bad = np.argwhere(~(np.isfinite(array) & (np.abs(array) <= most)))
     if len(bad):
         raise _number_error(name, array, bad)
 

@@ -168,8 +168,7 @@ class Region:
         active = _in_tiles(blocks, self.across)
         tiles = np.flatnonzero(active.any(1))
         tile, bit = np.nonzero(active[tiles])
-        column = tiles[tile] % self.across * ACROSS + bit % ACROSS
-        row = tiles[tile] // self.across * DOWN + bit // ACROSS
+        row, column = _blocks_at(tiles[tile], bit, self.across)
         self.drawn = blocks
         self._blocks = (row, column)
         self.num_blocks = len(row)
@@ -189,7 +188,9 @@ class Region:
         self.corner_y = from_numpy(mi.Float, tiles // self.across % self.down * (DOWN * bh))
 
     def _pixels(self, row: np.ndarray, column: np.ndarray) -> dict[str, Any]:
-        """Return where the pixels of each block are, in its view and in memory."""
+        """Return where the pixels of each block are, in its view and in memory; set the pitch `row`
+        and the number of pixels.
+        """
         bw, bh = self.block
         view, row_in_view = np.divmod(row, self.down * DOWN)
         x = column * bw
@@ -260,19 +261,16 @@ class Region:
         row, column = self._blocks
         (_, height, width, *rest) = values.shape
         rows, columns = self.drawn.shape
-        dtype = values.dtype
-        blocks = np.zeros((rows, height, columns, width, *rest), dtype)
+        blocks = np.zeros((rows, height, columns, width, *rest), values.dtype)
         blocks[row, :, column] = values
-        return blocks.reshape(rows * height, columns * width, *rest)
+        return _as_image(blocks)
 
     def paste(self, values: np.ndarray, image: np.ndarray) -> np.ndarray:
         """Return a copy of an image [H, W, ...] with this region's pixels replaced by `values`."""
         row, column = self._blocks
         blocks = self._in_blocks(image).copy()
         blocks[row, :, column] = values
-        rows, height, columns, width = blocks.shape[:4]
-        rest = blocks.shape[4:]
-        return blocks.reshape(rows * height, columns * width, *rest)[: self.height, : self.width]
+        return _as_image(blocks)[: self.height, : self.width]
 
     def _in_blocks(self, image: np.ndarray) -> np.ndarray:
         """Return an image [H, W, ...] as [rows, block_height, columns, block_width, ...], padded by
@@ -282,7 +280,7 @@ class Region:
         width, height = self.block
         size = (rows * height, columns * width)
         if image.shape[:2] != size:
-            image = _padded(image, *size)
+            image = _with_zeros(image, *size)
         return image.reshape(rows, height, columns, width, *image.shape[2:])
 
 
@@ -302,6 +300,11 @@ def _in_tiles(blocks: np.ndarray, across: int) -> np.ndarray:
     return tiles.reshape(-1, ACROSS * DOWN)
 
 
+def _blocks_at(tile: np.ndarray, bit: np.ndarray, across: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the row and the column of blocks in the grid, from their tiles and bits there."""
+    return tile // across * DOWN + bit // ACROSS, tile % across * ACROSS + bit % ACROSS
+
+
 def _slots(count: int, tiles: np.ndarray) -> np.ndarray:
     """Return the slot of each of `count` tiles, the place in `tiles` of those that are drawn."""
     slots = np.full(count, NO_SLOT, np.uint32)
@@ -316,6 +319,12 @@ def _whole_blocks(image: np.ndarray, block: tuple[int, int]) -> np.ndarray:
     shape = (image.shape[0] // height, height, image.shape[1] // width, width, *image.shape[2:])
     # A view: a copy of large images would take most of the time.
     return as_strided(image, shape, (height * down, down, width * across, across, *rest))
+
+
+def _as_image(blocks: np.ndarray) -> np.ndarray:
+    """Return blocks [rows, height, columns, width, ...] as an image."""
+    rows, height, columns, width, *rest = blocks.shape
+    return blocks.reshape(rows * height, columns * width, *rest)
 
 
 def _block_of(image: np.ndarray, row: int, column: int, block: tuple[int, int]) -> np.ndarray:
@@ -343,14 +352,14 @@ def joined(regions: Sequence[Region]) -> Region:
     columns = region.across * ACROSS
     region.width = columns * region.block[0]
     region.height = len(regions) * rows * region.block[1]
-    blocks = [_padded(grid, rows, columns) for grid in grids]
+    blocks = [_with_zeros(grid, rows, columns) for grid in grids]
     region._lay_out(np.concatenate(blocks))
     mask = np.concatenate([part.inside() for part in regions])
     region.weights = None if mask.all() else from_numpy(mi.Float, mask)
     return region
 
 
-def _padded(grid: np.ndarray, rows: int, columns: int) -> np.ndarray:
+def _with_zeros(grid: np.ndarray, rows: int, columns: int) -> np.ndarray:
     """Return an array with zeros up to a number of rows and columns."""
     missing = [(0, rows - grid.shape[0]), (0, columns - grid.shape[1])]
     return np.pad(grid, missing + [(0, 0)] * (grid.ndim - 2))

@@ -99,7 +99,7 @@ class ViewGroup:
         splats: Splats | None = None
         for index, view in enumerate(self.views):
             if view.static_splats is not None:
-                view_splats = _of_view(view.static_splats, index)
+                view_splats = _colors_of_view(view.static_splats, index)
                 splats = view_splats if splats is None else splats.concatenated_with(view_splats)
         if splats is None:
             return None
@@ -228,7 +228,7 @@ def _everything(view: ActiveView) -> Region:
     return Region(np.ones((view.camera.height, view.camera.width), bool), view.config)
 
 
-def _of_view(splats: Splats, index: int) -> Splats:
+def _colors_of_view(splats: Splats, index: int) -> Splats:
     """Return the colour of splats, as those of one of several views."""
     view = dr.full(mi.UInt32, index, len(splats))
     return replace(splats, view=view, channels={"color": splats.channels["color"]})

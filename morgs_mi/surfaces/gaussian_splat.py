@@ -72,7 +72,7 @@ def _scene_gaussians(scene: Any, attributes: list[str], with_surfaces: bool) -> 
     parts = [_shape_gaussians(shape, attributes) for shape in shapes]
     K = max(part["sh_coeffs"].shape[1] for part in parts)
     for part in parts:
-        part["sh_coeffs"] = _padded(part["sh_coeffs"], K)
+        part["sh_coeffs"] = _with_zeros(part["sh_coeffs"], K)
     if len(parts) == 1:
         return _SceneGaussians(parts[0])
     return _SceneGaussians(
@@ -80,7 +80,7 @@ def _scene_gaussians(scene: Any, attributes: list[str], with_surfaces: bool) -> 
     )
 
 
-def _padded(coeffs: Tensor, K: int) -> Tensor:
+def _with_zeros(coeffs: Tensor, K: int) -> Tensor:
     """Return SH coefficients [N, k, 3] padded with zeros to [N, K, 3]."""
     N, present, _ = coeffs.shape
     if present == K:
@@ -249,7 +249,7 @@ def _sensor_of(scene: Any, sensor: Any) -> Any:
     return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
 
 
-def _checked_film(sensor: Any) -> Any:
+def _film(sensor: Any) -> Any:
     film = sensor.film()
     if mi.has_flag(film.flags(), mi.FilmFlags.Special):
         raise ValueError(
@@ -441,7 +441,7 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         any.
         """
         sensor = _sensor_of(scene, sensor)
-        film = _checked_film(sensor)
+        film = _film(sensor)
         border = film.rfilter().border_size() if film.sample_border() else 0
         views = _views(sensor)
         if len(views) > 1:

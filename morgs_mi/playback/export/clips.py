@@ -111,7 +111,7 @@ def write_each(
     if is_file:
         _check_single(output, len(selection))
     with (atomic_path if is_file else atomic_folder)(output, "write_each()") as partial:
-        for count, (frame, gaussians) in enumerate(_selected(clip, selection), start=1):
+        for count, (frame, gaussians) in enumerate(_selection(clip, selection), start=1):
             write(partial if is_file else partial / f"{frame:04d}{suffix}", gaussians)
             if progress is not None:
                 progress(count, len(selection))
@@ -125,7 +125,7 @@ def _check_single(output: str | Path, count: int) -> None:
         )
 
 
-def _selected(
+def _selection(
     clip: Iterable[tuple[int, Gaussians]], selection: set[int]
 ) -> Iterator[tuple[int, Gaussians]]:
     """Return the frames of a clip that are selected; it is read up to the last of them."""

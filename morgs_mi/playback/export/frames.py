@@ -75,7 +75,7 @@ def write_images(
         OSError: the folder exists, or a file cannot be written.
     """
     kind = choose_format(IMAGES, output, format).name
-    frames = _displayed(rendered, 0.0 if kind == "exr" else display_exposure, progress)
+    frames = _display_frames(rendered, 0.0 if kind == "exr" else display_exposure, progress)
     if kind == "mp4":
         movie = (pad_to_even(_combined_image(images)) for _, images in frames)
         write_video(output, movie, fps, PLAYABLE)
@@ -87,7 +87,7 @@ def write_images(
                 _WRITERS[kind](folder / f"{frame:04d}.{kind}", images)
 
 
-def _displayed(
+def _display_frames(
     rendered: Iterable[_Frame], exposure: float, progress: Callable[[int], None] | None
 ) -> Iterator[_Frame]:
     """Yield rendered frames with colours that are brightened by an exposure, in stops."""

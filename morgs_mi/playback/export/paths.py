@@ -307,7 +307,7 @@ def _view_of_target(key: Mapping[str, Any], cameras: Sequence[Camera], like: Cam
     """Return the view of a key with `position` and `target`."""
     position, target = (np.asarray(key[name], np.float64) for name in ("position", "target"))
     up = np.asarray(key["up"], np.float64) if "up" in key else up_direction(cameras)
-    if not _determine_view(position, target, up):
+    if not _is_view(position, target, up):
         raise ValueError(
             "`position`, `target` and `up` must have 3 numbers each, and the view must not be "
             "along `up`."
@@ -315,7 +315,7 @@ def _view_of_target(key: Mapping[str, Any], cameras: Sequence[Camera], like: Cam
     return _look_at(position, target, up, like)
 
 
-def _determine_view(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> bool:
+def _is_view(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> bool:
     vectors = (position, target, up)
     return all(v.shape == (3,) for v in vectors) and bool(np.cross(target - position, up).any())
 

@@ -198,9 +198,10 @@ def _speeds(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarray:
     motion = np.asarray(gaussians.motion)
     rows = np.flatnonzero(motion.any(axis=1))
     rows = rows[:: len(rows) // _SAMPLES + 1]
+    motion = motion[rows]
     means = gaussians.numpy()["means"][rows]
     weights = _weights(gaussians, rows)
-    return np.hstack([_view_speeds(camera, means, motion[rows], weights) for camera in cameras])
+    return np.hstack([_view_speeds(camera, means, motion, weights) for camera in cameras])
 
 
 def _weights(gaussians: Gaussians, rows: np.ndarray) -> np.ndarray:
@@ -240,10 +241,10 @@ def _page(title: str, data: str, connect: str) -> bytes:
         "{notice}": (player / "NOTICE").read_text(encoding="utf-8").replace("--", "- "),
         "{data}": data + "\n" + _script("code", code),
     }
-    return _filled(page, values).encode(errors="replace")
+    return _page_text(page, values).encode(errors="replace")
 
 
-def _filled(page: str, values: dict[str, str]) -> str:
+def _page_text(page: str, values: dict[str, str]) -> str:
     """Return a page with values in place of their names."""
     return re.sub("|".join(map(re.escape, values)), lambda match: values[match[0]], page)
 

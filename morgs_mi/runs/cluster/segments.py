@@ -95,7 +95,7 @@ def _starts(num_frames: int, segments: int) -> list[int]:
     return np.linspace(0, num_frames, segments + 1).round().astype(int).tolist()
 
 
-def _finished(start: int, index: Sequence[Entry], end: int) -> tuple[Sequence[Entry], int]:
+def _complete_part(start: int, index: Sequence[Entry], end: int) -> tuple[Sequence[Entry], int]:
     """Return the packets, and the end of the last one, from which a segment can continue."""
     # After the first frame of a segment alone, a fit would continue without its displacements.
     return ([], 0) if start and index and index[-1][1] == start else (index, end)
@@ -175,7 +175,7 @@ class SegmentedRun:
         stop = min(COMMON_FRAMES, first.stop)
         prepared = None
         if not first.frame:
-            prepared = self._prepared(progress)
+            prepared = self._preparation(progress)
         else:
             self._use(as_fitted(self.capture, StreamReader(self._files(0).stream)))
         self._show_progress()
@@ -187,7 +187,7 @@ class SegmentedRun:
         common = self._common_model(stop - 1)
         return [first, *(s if s.restart else replace(s, restart=(common,)) for s in segments[1:])]
 
-    def _prepared(self, progress: Progress) -> Prepared:
+    def _preparation(self, progress: Progress) -> Prepared:
         """Return the capture as it is to be fitted, and fit with its points and cameras."""
         prepared = Prepared.of(self.capture, self.task.config, progress)
         if prepared.capture is not self.capture:
@@ -242,7 +242,7 @@ class SegmentedRun:
 
     def _earlier(self, start: int, stop: int) -> Segment:
         """Return a segment as an interrupted fit left it."""
-        finished = partial(_finished, start)
+        finished = partial(_complete_part, start)
         earlier = interrupted_fit(self._files(start), self.capture, self.metadata, finished, start)
         if earlier is None:
             return Segment(start, stop, start)
