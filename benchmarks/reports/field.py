@@ -25,10 +25,11 @@ from benchmarks.reports.cells import OnWorkers, run_cells
 from benchmarks.reports.fits import DEFAULT, Clip, random_capture
 from benchmarks.reports.plots import Column, blank_figure, means_over, save_figure, scores_table
 from benchmarks.speed.output import Output
+from morgs_mi.core.config_values import apply_values
 from morgs_mi.core.files import json_finite
 from morgs_mi.evaluate.results import Evaluation, known_mean
 from morgs_mi.loop.frame_report import FrameReport
-from morgs_mi.loop.stream_config import StreamConfig, apply_preset, apply_values
+from morgs_mi.loop.stream_config import StreamConfig, apply_preset
 from morgs_mi.runs.cluster.tasks import Source
 
 _FAST = {"fit": {"rates": {"means": 2e-3}}}

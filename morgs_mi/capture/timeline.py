@@ -24,8 +24,8 @@ import numpy as np
 
 from morgs_mi.capture.image_numbers import ImageNumbers, align_numbers
 from morgs_mi.capture.layouts.clips import check_names
+from morgs_mi.core.bounded import read_json
 from morgs_mi.core.checks import check_number
-from morgs_mi.io.bounded import read_json
 from morgs_mi.io.unread import warn_unread
 from morgs_mi.io.video import FrameReader
 

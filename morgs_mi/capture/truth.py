@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from morgs_mi.io.bounded import array_names, read_array
+from morgs_mi.core.bounded import array_names, read_array
 from morgs_mi.io.exr import read_exr, write_exr
 
 

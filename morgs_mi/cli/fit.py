@@ -22,10 +22,11 @@ from morgs_mi.cli.settings import (
     held_out,
     optional,
 )
+from morgs_mi.core.config_values import config_toml
 from morgs_mi.core.documentation import page
 from morgs_mi.core.fit_names import STREAM
 from morgs_mi.core.ranges import AtLeast, check_value
-from morgs_mi.loop.stream_config import StreamConfig, config_toml
+from morgs_mi.loop.stream_config import StreamConfig
 
 if TYPE_CHECKING:
     from morgs_mi.capture.capture import Capture

@@ -13,15 +13,9 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from morgs_mi.capture.held_out import TestViews
 from morgs_mi.capture.timeline import ReadConfig
+from morgs_mi.core.config_values import apply_values, read_config, relocated
 from morgs_mi.core.documentation import page
-from morgs_mi.loop.stream_config import (
-    PresetName,
-    StreamConfig,
-    apply_preset,
-    apply_values,
-    read_config,
-    relocated,
-)
+from morgs_mi.loop.stream_config import PresetName, StreamConfig, apply_preset
 from morgs_mi.method.motion_config import MotionConfig
 
 # The setting of every option. All others are set in a file.

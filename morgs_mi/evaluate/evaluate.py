@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+from morgs_mi.core.bounded import read_json
 from morgs_mi.core.entries import STUDIO, studio_entry
 from morgs_mi.core.fit_names import REPORT
 from morgs_mi.core.interrupts import interrupts_raised
@@ -22,7 +23,6 @@ from morgs_mi.evaluate.measures import (
     Variation,
 )
 from morgs_mi.evaluate.results import Evaluation, FrameScores, Sizes, known_mean
-from morgs_mi.io.bounded import read_json
 from morgs_mi.playback.streams import open_stream
 
 

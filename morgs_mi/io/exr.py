@@ -12,9 +12,9 @@ from typing import BinaryIO
 import numpy as np
 import OpenEXR
 
+from morgs_mi.core.bounded import check_claim
 from morgs_mi.core.color_space import positive_light
 from morgs_mi.core.files import atomic_path
-from morgs_mi.io.bounded import check_claim
 
 _MAGIC = 20000630
 _MULTIPART = 1 << 12

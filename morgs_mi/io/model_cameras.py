@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera
-from morgs_mi.io.bounded import read_json
 from morgs_mi.io.unread import warn_unread
 
 _FILE = "cameras.json"

@@ -19,7 +19,7 @@ from typing import ClassVar
 import cv2
 import numpy as np
 
-from morgs_mi.io.bounded import check_claim
+from morgs_mi.core.bounded import check_claim
 from morgs_mi.io.exr import read_light
 from morgs_mi.io.frame_times import SAME_TIME, clock, read_header, seconds, true_rate
 from morgs_mi.io.image_size import image_size

@@ -18,11 +18,11 @@ from morgs_mi.capture.fingerprint import fingerprint
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.capture.truth import GroundTruth, load_truth
 from morgs_mi.codec.frame_source import FrameSource
+from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_number
+from morgs_mi.core.config_values import apply_values
 from morgs_mi.core.fit_names import CAPTURE, STREAM
-from morgs_mi.io.bounded import read_json
-from morgs_mi.loop.stream_config import apply_values
 from morgs_mi.playback.source import as_fitted
 from morgs_mi.render.render_config import RenderConfig
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.files import atomic_path
-from morgs_mi.io.png import png_bytes
+from morgs_mi.core.png import png_bytes
 
 GAP = 4
 """Space between the images of a row or sheet, in pixels."""

@@ -16,8 +16,8 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_type, numbers
 from morgs_mi.core.gaussians import ActivatedGaussians, repeat_each
 from morgs_mi.core.memory import check_memory, float_tensor, from_numpy, refuse_freezing
+from morgs_mi.core.png import png_bytes
 from morgs_mi.core.types import Bool, Float, Jit, Tensor
-from morgs_mi.io.png import png_bytes
 from morgs_mi.render.backend import block_shape
 from morgs_mi.render.blocks import build_lists, touches
 from morgs_mi.render.channels import NORMALISED, attribute_channels, channel_sizes

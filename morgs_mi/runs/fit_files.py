@@ -39,11 +39,11 @@ from morgs_mi.codec.container import (
 )
 from morgs_mi.codec.packets import CodedFrame, decode, reemitted_keyframe
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.bounded import read_json
 from morgs_mi.core.color_space import TRANSFER
 from morgs_mi.core.files import atomic_path, is_same_file, write_json
 from morgs_mi.core.fit_names import CAPTURE, PROVISIONAL, REPORT, STREAM
 from morgs_mi.core.rig import choose_key_views
-from morgs_mi.io.bounded import read_json
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.exposure import Exposure

@@ -12,9 +12,10 @@ from typing import Any
 import pytest
 
 from morgs_mi.core import documentation
+from morgs_mi.core.config_values import config_toml
 from morgs_mi.core.documentation import documented, field_docs, page, with_pages
 from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.loop.stream_config import StreamConfig, config_toml
+from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.motion_config import MotionConfig
 
 ROOT = Path(__file__).parents[2]

@@ -15,7 +15,7 @@ from threading import Event, Thread
 import numpy as np
 
 from morgs_mi.capture.layouts.colmap import write_colmap
-from morgs_mi.io.png import png_bytes
+from morgs_mi.core.png import png_bytes
 from morgs_mi.io.video_writer import write_video
 from tests.quick import quick
 from tests.scenes import filmed, textured

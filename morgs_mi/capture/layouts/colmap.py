@@ -32,11 +32,11 @@ from morgs_mi.capture.layouts.colmap_files import (
     text_points,
 )
 from morgs_mi.capture.lens import Lens, lens_and_intrinsics
+from morgs_mi.core.bounded import check_claim
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import LARGEST, bounded
 from morgs_mi.core.colmap_library import import_pycolmap
 from morgs_mi.core.files import write_error
-from morgs_mi.io.bounded import check_claim
 from morgs_mi.io.listing import listed
 from morgs_mi.io.video import natural_key
 

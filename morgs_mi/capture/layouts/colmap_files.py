@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.capture.lens import MODELS
-from morgs_mi.io.bounded import encoding_of, read_bytes, regular
+from morgs_mi.core.bounded import encoding_of, read_bytes, regular
 
 # The least bytes of an image in a binary model.
 _IMAGE_BYTES = 73

@@ -11,9 +11,9 @@ from pathlib import Path
 from morgs_mi.capture.layouts import colmap, nerfstudio, poses_bounds
 from morgs_mi.capture.layouts.calibration import Layout, required_clips
 from morgs_mi.capture.layouts.clips import EXAMPLE
+from morgs_mi.core.bounded import read_json
 from morgs_mi.core.entries import STUDIO, studio_entry
 from morgs_mi.core.fit_names import CAPTURE, STREAM
-from morgs_mi.io.bounded import read_json
 
 LAYOUTS: list[Layout] = [
     colmap.LAYOUT,

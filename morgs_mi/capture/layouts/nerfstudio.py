@@ -28,9 +28,9 @@ from morgs_mi.capture.layouts.calibration import (
 )
 from morgs_mi.capture.layouts.clips import ImageSizes
 from morgs_mi.capture.lens import Lens, opencv_lens
+from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.core.checks import LARGEST, bounded
-from morgs_mi.io.bounded import read_json
 from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, VIDEO_SUFFIXES
 from morgs_mi.io.ply import read_vertices
 from morgs_mi.io.unread import warn_unread

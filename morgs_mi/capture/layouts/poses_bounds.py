@@ -17,9 +17,9 @@ import numpy as np
 from morgs_mi.capture.layouts.calibration import Calibration, Layout, required_clips
 from morgs_mi.capture.layouts.clips import check_frames, clips_by_frame
 from morgs_mi.capture.lens import Lens
+from morgs_mi.core.bounded import read_array
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.core.files import atomic_path
-from morgs_mi.io.bounded import read_array
 from morgs_mi.io.video import Clip
 
 

@@ -9,7 +9,7 @@ import html
 
 from morgs_mi.codec.frame_source import FrameSource, play
 from morgs_mi.core.color_space import exposed
-from morgs_mi.io.png import png_bytes
+from morgs_mi.core.png import png_bytes
 from morgs_mi.playback.export.web import web_page
 from morgs_mi.playback.player import channel_image, render
 from morgs_mi.playback.stream_header import render_config, stream_exposure, stream_name

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.core.rig import up_direction
-from morgs_mi.io.bounded import read_json
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline

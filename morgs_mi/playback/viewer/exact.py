@@ -11,7 +11,7 @@ from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import exposed
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.io.png import png_bytes
+from morgs_mi.core.png import png_bytes
 from morgs_mi.playback.player import available_channels, channel_image, render
 from morgs_mi.playback.stream_header import render_config, stream_exposure
 

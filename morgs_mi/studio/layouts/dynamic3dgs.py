@@ -19,9 +19,9 @@ import numpy as np
 
 from morgs_mi.capture.layouts.calibration import NO_POINTS, Calibration, Layout
 from morgs_mi.capture.lens import Lens
+from morgs_mi.core.bounded import read_array, read_json
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.core.checks import bounded
-from morgs_mi.io.bounded import read_array, read_json
 from morgs_mi.io.unread import warn_unread
 from morgs_mi.io.video import natural_key
 

@@ -33,9 +33,9 @@ from morgs_mi.capture.layouts.calibration import (
     required_clips,
 )
 from morgs_mi.capture.lens import Lens, opencv_lens
+from morgs_mi.core.bounded import check_claim, encoding_of, read_bytes
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.core.checks import LARGEST, bounded
-from morgs_mi.io.bounded import check_claim, encoding_of, read_bytes
 from morgs_mi.io.unread import warn_unread
 
 _LOG = logging.getLogger(__name__)

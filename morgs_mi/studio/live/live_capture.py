@@ -19,9 +19,9 @@ from morgs_mi.capture.layouts.layout_registry import find_layout
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.files import atomic_path, write_json
 from morgs_mi.core.fit_names import CAPTURE
+from morgs_mi.core.png import png_bytes
 from morgs_mi.core.progress import Report
 from morgs_mi.core.threads import map_in_threads
-from morgs_mi.io.png import png_bytes
 from morgs_mi.studio.calibration.calibrate import calibrate
 from morgs_mi.studio.live.live_config import LiveConfig
 

@@ -17,8 +17,8 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.truth import Tracks, load_tracks
+from morgs_mi.core.bounded import read_array
 from morgs_mi.core.camera import Camera
-from morgs_mi.io.bounded import read_array
 from morgs_mi.studio.layouts.dynamic3dgs import read_meta
 
 _SHORT_SIDE = 256

@@ -20,10 +20,10 @@ import cv2
 import numpy as np
 
 from morgs_mi.capture.lens import Lens
+from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import write_json
 from morgs_mi.core.ranges import AtLeast, AtMost, check_ranges
-from morgs_mi.io.bounded import read_json
 
 
 @dataclass(frozen=True)

@@ -22,11 +22,11 @@ from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.capture.lens import Undistortion, undistortion
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.capture.truth import GroundTruth, Tracks, save_tracks, save_truth
+from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_path, write_json
 from morgs_mi.core.fit_names import CAPTURE
 from morgs_mi.core.memory import check_memory
-from morgs_mi.io.bounded import read_json
 from morgs_mi.io.listing import is_added
 from morgs_mi.io.video import open_frames
 from morgs_mi.io.video_writer import PLAYABLE, write_video

@@ -19,9 +19,9 @@ import pytest
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.png import png_bytes
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.metrics import psnr_of
-from morgs_mi.io.png import png_bytes
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.runs.fit_capture import stream_capture
 from morgs_mi.studio.live.fit_live import fit_live

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.io.bounded import MAX_TOML, array_names, read_array, read_json, read_toml
+from morgs_mi.core.bounded import MAX_TOML, array_names, read_array, read_json, read_toml
 from morgs_mi.io.exr import read_exr, write_exr
 from morgs_mi.io.ply import read_vertices
 from morgs_mi.io.splats import read_splats
