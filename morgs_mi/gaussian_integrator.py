@@ -37,10 +37,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.attributes import shape_attribute_widths
 from morgs_mi.core.entries import place_of
 from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.memory import from_numpy
-from morgs_mi.render.channels import attribute_widths
 
 # The class of each plugin, MODULE:NAME. The base classes exist once per variant.
 _PLUGINS = {
@@ -69,7 +69,7 @@ def ellipsoids(gaussians: ActivatedGaussians) -> dict[str, Any]:
             "ellipsoids(): `gaussians` must be at least one Gaussian, got a "
             f"{type(gaussians).__name__} without any; leave the shape out of the scene."
         )
-    names = ("means", "scales", "quats", *attribute_widths())
+    names = ("means", "scales", "quats", *shape_attribute_widths())
     values = {name: getattr(gaussians, name, None) for name in names}
     values = {
         name: np.array(dr.detach(value)) for name, value in values.items() if value is not None

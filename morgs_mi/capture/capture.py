@@ -28,7 +28,7 @@ from morgs_mi.core.color_space import display_stops
 from morgs_mi.core.fit_names import CAPTURE
 from morgs_mi.core.rig import with_near_planes
 from morgs_mi.io.prefetch import prefetched
-from morgs_mi.io.remote import is_url, mirrored
+from morgs_mi.io.remote import is_url, mirrored, url_of
 from morgs_mi.io.video import Clip, FrameReader, ImageOrError, open_clips
 
 _LOG = logging.getLogger(__name__)
@@ -114,6 +114,11 @@ class Capture:
             f"{len(self.cameras)} cameras, {self.num_frames} frames, {self.fps:g} frames per second"
         )
         return f"Capture('{self.path}', {self.layout}, {size}, held out: {held_out})"
+
+    @property
+    def location(self) -> str:
+        """URL of the capture, or the absolute path of its folder: both open it again."""
+        return url_of(self.path) or str(self.path.resolve())
 
     @property
     def names(self) -> tuple[str, ...]:

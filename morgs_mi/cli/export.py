@@ -51,19 +51,10 @@ class Ply(ExportKind):
     formats = PLY
 
     def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
-        from morgs_mi.codec.frame_source import play
-        from morgs_mi.io.compressed_ply import write_compressed_ply
-        from morgs_mi.io.ply import write_ply
-        from morgs_mi.playback.export.clips import select_frames, write_each
-        from morgs_mi.playback.export.order import by_place
+        from morgs_mi.playback.export.clips import select_frames, write_ply_files
 
-        clip, write = (
-            (by_place, write_compressed_ply)
-            if chosen.name == "compressed.ply"
-            else (play, write_ply)
-        )
         frames = select_frames(stream, self.frames)
-        write_each(clip(stream), output, chosen.ending, write, frames, partial(report, "Writing"))
+        write_ply_files(stream, output, chosen, frames, partial(report, "Writing"))
         return quantity(len(frames), "PLY file")
 
 

@@ -175,3 +175,15 @@ ATTRIBUTES: tuple[Attribute, ...] = (
 
 BY_NAME = {attribute.name: attribute for attribute in ATTRIBUTES}
 BY_ACTIVATED_NAME = {a.activated_name: a for a in ATTRIBUTES if a.activated_name != "sh_coeffs"}
+
+
+def shape_attribute_widths() -> dict[str, tuple[int, ...]]:
+    """Return the admissible numbers of floats per Gaussian of every attribute of a Mitsuba shape
+    beside its `data`, by name.
+    """
+    channels = {
+        attribute.activated_name: (attribute.width,)
+        for attribute in BY_ACTIVATED_NAME.values()
+        if attribute.channel
+    }
+    return {"opacities": (1,), "sh_coeffs": (3, 12, 27, 48), "motion": (3,), **channels}

@@ -58,15 +58,3 @@ def aov_attributes() -> dict[str, str | None]:
         channel: attribute.activated_name for channel, attribute in attribute_channels().items()
     }
     return {"motion": "motion", **names, "depth": None}
-
-
-def attribute_widths() -> dict[str, tuple[int, ...]]:
-    """Return the admissible numbers of floats per Gaussian of every shape attribute beside `data`,
-    by name.
-    """
-    names = [name for name in aov_attributes().values() if name]
-    return {
-        "opacities": (1,),
-        "sh_coeffs": (3, 12, 27, 48),
-        **{name: (BY_ACTIVATED_NAME[name].width,) for name in names},
-    }

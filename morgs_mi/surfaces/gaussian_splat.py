@@ -12,13 +12,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.core.attributes import BY_ACTIVATED_NAME
+from morgs_mi.core.attributes import BY_ACTIVATED_NAME, shape_attribute_widths
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import decode_traced
 from morgs_mi.core.gaussians import tensor_rows
 from morgs_mi.core.memory import refuse_freezing
 from morgs_mi.core.types import Float, Tensor, UInt32
-from morgs_mi.render.channels import aov_attributes, attribute_widths, exr_names
+from morgs_mi.render.channels import aov_attributes, exr_names
 from morgs_mi.render.kernel_recording import render_lock
 from morgs_mi.render.projection import AttachedCamera
 from morgs_mi.render.rasterize import rasterize
@@ -109,7 +109,7 @@ def _shape_gaussians(shape: Any, attributes: list[str]) -> dict[str, Tensor]:
     data = mi.TensorXf(params["data"], (dr.width(params["data"]) // 10, 10))
     N = data.shape[0]
     part = {"means": data[:, :3], "scales": data[:, 3:6], "quats": data[:, mi.UInt32(9, 6, 7, 8)]}
-    all_widths = attribute_widths()
+    all_widths = shape_attribute_widths()
     for name in attributes:
         size = dr.width(params[name]) if name in params else 0
         if size not in [N * width for width in all_widths[name]]:
@@ -122,7 +122,7 @@ def _shape_gaussians(shape: Any, attributes: list[str]) -> dict[str, Tensor]:
 def _attribute_error(shape: Any, name: str, N: int) -> ValueError:
     """Return the error about an attribute of N Gaussians that is missing or of another size."""
     params: Any = mi.traverse(shape)
-    expected = " or ".join(map(str, attribute_widths()[name]))
+    expected = " or ".join(map(str, shape_attribute_widths()[name]))
     has_attribute = name in params
     content = (
         f"{dr.width(params[name])} values" if has_attribute else f"only {sorted(params.keys())}"

@@ -13,7 +13,11 @@ from morgs_mi.codec.frame_source import FrameSource, FrameState, play
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.io.compressed_ply import write_compressed_ply
+from morgs_mi.io.ply import write_ply
 from morgs_mi.playback.default_rig import DEFAULT_RIG
+from morgs_mi.playback.export.formats import Format
+from morgs_mi.playback.export.order import by_place
 from morgs_mi.playback.export.paths import CameraPath, focus, load_path, orbit, through_cameras
 from morgs_mi.playback.player import available_channels, render
 from morgs_mi.playback.stream_header import render_config
@@ -80,6 +84,21 @@ def _numbers(span: str) -> tuple[int | None, ...]:
             f"select_frames(): `span` must be like 12, 10:20 or 0:100:5, got {span!r}."
         ) from None
     return start, stop, step
+
+
+def write_ply_files(
+    stream: FrameSource,
+    output: str | Path,
+    kind: Format,
+    frames: Sequence[int],
+    progress: Progress = None,
+) -> None:
+    """Write frames of a stream as PLY files of a format in `PLY`, see `write_each`."""
+    if kind.name == "compressed.ply":
+        clip, write = by_place(stream), write_compressed_ply
+    else:
+        clip, write = play(stream), write_ply
+    write_each(clip, output, kind.ending, write, frames, progress)
 
 
 def write_each(

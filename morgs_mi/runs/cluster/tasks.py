@@ -19,7 +19,6 @@ from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.codec.container import Packet, decode_packet
 from morgs_mi.codec.packets import CodedFrame, decode, reemitted_keyframe
 from morgs_mi.core.camera import Camera
-from morgs_mi.io.remote import url_of
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.exposure import Exposure
@@ -43,7 +42,7 @@ class Source:
     @classmethod
     def of(cls, capture: Capture) -> Source:
         """Return the source of an open capture."""
-        path = url_of(capture.path) or str(capture.path.resolve())
+        path = capture.location
         return cls(path, capture.downscale, capture.test_views, capture.num_frames, capture.reading)
 
     def open(self) -> Capture:
