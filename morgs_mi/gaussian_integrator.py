@@ -1,29 +1,30 @@
-"""The Mitsuba integrator `gaussian_splat`, which renders the Gaussians of a scene by rasterisation.
+"""The Mitsuba integrators of this package: `gaussian_splat`, which renders the Gaussians of a scene
+by rasterisation, and `splat_path` (see `studio.light`).
 
     "integrator": {"type": "gaussian_splat", "aovs": "motion,depth"}
 
-It draws every `ellipsoids` (and `ellipsoidsmesh`) shape of a scene and reads the attributes that
-Mitsuba's own `volprim_rf_basic` reads: one scene file renders with both. N is the number of
-Gaussians of a shape, K = (degree + 1)^2:
+`gaussian_splat` draws every `ellipsoids` (and `ellipsoidsmesh`) shape of a scene. It reads the
+attributes that Mitsuba's `volprim_rf_basic` reads, so one scene file renders with both, though that
+one traces rays and its images differ. N is the number of Gaussians of a shape, K = (degree + 1)^2:
 
-    data [N, 10]          centre, standard deviations, quaternion xyzw
+    data [N, 10]          centre, standard deviations, unit quaternion xyzw
     opacities [N, 1]      in [0, 1]
-    sh_coeffs [N, 3 K]    colour = max(0.5 + SH, 0), coefficient k of colour component j at 3 k + j
+    sh_coeffs [N, 3 K]    sRGB colour = max(0.5 + SH, 0), coefficient k of component j at 3 k + j
     motion [N, 3]         world units per frame; only for the AOV `motion`
     confidence [N, 1]     in [0, 1]; only for the AOV `confidence`
 
-Every attribute of the table of attributes with a `channel` is rendered in the same way as
-`confidence`.
+Every attribute with a `channel` in `core.attributes` is an AOV like `confidence`.
 
 With an integrator for `surfaces`, the other shapes of the scene are drawn among the Gaussians:
 
     "integrator": {"type": "gaussian_splat", "surfaces": {"type": "path"}}
 
-`mi.render(scene, params)` is differentiable, in both modes, in these attributes and in the sensor's
-`to_world`, `x_fov` and `principal_point_offset_x`, `_y`; with surfaces rendered by `prb` or similar
-also in their materials and lights.
+`mi.render(scene, params)` is differentiable, in forward and reverse mode, in these attributes, in
+the `background`, and in the sensor's `to_world`, `x_fov` and `principal_point_offset_x`, `_y`; with
+surfaces rendered by `prb` or similar also in their materials and lights.
 
-Importing this module registers the plugin with the active variant and with every variant set later.
+Importing this module registers the plugins with the active variant and with every variant set
+later.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from morgs_mi.core.entries import place_of
 from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.memory import from_numpy
 
-# The class of each plugin, MODULE:NAME. The base classes exist once per variant.
+# The class of each plugin, MODULE:NAME.
 _PLUGINS = {
     "gaussian_splat": "morgs_mi.surfaces.gaussian_splat:GaussianSplatIntegrator",
     "splat_path": place_of("integrators", "splat_path"),
@@ -62,7 +63,7 @@ def ellipsoids(gaussians: ActivatedGaussians) -> dict[str, Any]:
         >>> image = mi.render(scene)
 
     Raises:
-        ValueError: there are no Gaussians; Mitsuba ends the process then.
+        ValueError: there are no Gaussians. (Mitsuba would end the process.)
     """
     if not hasattr(gaussians, "means") or not int(gaussians.means.shape[0]):
         raise ValueError(
@@ -95,15 +96,16 @@ def integrator(plugin: str, props: Any) -> Any:
     In a variant without derivatives, such as `scalar_rgb`, it refuses to render.
     """
     if not dr.is_diff_v(mi.Float):
-        return _refusal(plugin, props)
+        return _refusing_integrator(plugin, props)
     return resolve_name(_PLUGINS[plugin])(props)
 
 
-def _refusal(plugin: str, props: Any) -> Any:
+def _refusing_integrator(plugin: str, props: Any) -> Any:
     """Return an integrator whose `render` raises a ValueError.
 
     Mitsuba would report an error of a constructor as a traceback inside another one.
     """
+    variant = mi.variant()
 
     class Refusal(mi.CppADIntegrator):
         def __init__(self, props: Any) -> None:
@@ -117,13 +119,13 @@ def _refusal(plugin: str, props: Any) -> Any:
                 f"{variant!r}; call mi.set_variant() before the scene is loaded."
             )
 
-    variant = mi.variant()
     return Refusal(props)
 
 
 def _register(*_arguments: Any) -> None:
     """Register the plugins with the active variant."""
     for plugin, place in _PLUGINS.items():
+        # Its class is defined again, with the base class of this variant, when it is next used.
         sys.modules.pop(place.partition(":")[0], None)
         mi.register_integrator(plugin, partial(integrator, plugin))
 
