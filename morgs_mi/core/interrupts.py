@@ -73,6 +73,8 @@ def interruptible() -> Iterator[None]:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         sys.unraisablehook = _repeating_hook(hook, timers)
         yield
+        if any(timer.is_alive() for timer in timers):  # the block ended before it was raised again
+            raise KeyboardInterrupt
     finally:
         sys.unraisablehook = hook
         for timer in timers:

@@ -121,6 +121,11 @@ def test_interruptible__raises_once_for_each_signal(
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
 
 
+def test_interruptible__raises_what_was_swallowed_at_the_end(heeds_interrupts: None) -> None:
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        in_a_destructor()
+
+
 def test_interruptible__lets_a_background_process_ignore_ctrl_c() -> None:
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
