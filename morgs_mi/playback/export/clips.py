@@ -94,10 +94,9 @@ def write_ply_files(
     progress: Progress = None,
 ) -> None:
     """Write frames of a stream as PLY files of a format in `PLY`, see `write_each`."""
-    if kind.name == "compressed.ply":
-        clip, write = by_place(stream), write_compressed_ply
-    else:
-        clip, write = play(stream), write_ply
+    is_compressed = kind.name == "compressed.ply"
+    clip = by_place(stream) if is_compressed else play(stream)
+    write = write_compressed_ply if is_compressed else write_ply
     write_each(clip, output, kind.ending, write, frames, progress)
 
 
