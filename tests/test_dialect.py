@@ -14,8 +14,13 @@ TOOL = Path(__file__).parents[1] / "tools/check_dialect.py"
 def checked(folder: Path, source: str) -> tuple[int, str]:
     """Return the status of the check of a module, and what it prints."""
     (folder / "module.py").write_text(source, encoding="utf-8")
+    return status_and_text(folder, ".")
+
+
+def status_and_text(folder: Path, *places: str) -> tuple[int, str]:
+    """Return the status of the check of some places in a folder, and what it prints."""
     process = subprocess.run(
-        [sys.executable, TOOL, "."], cwd=folder, capture_output=True, text=True
+        [sys.executable, TOOL, *places], cwd=folder, capture_output=True, text=True
     )
     return process.returncode, process.stderr
 
@@ -66,3 +71,12 @@ def test_check_dialect__names_a_violation(
 )
 def test_check_dialect__accepts_other_code(tmp_path: Path, source: str) -> None:
     assert checked(tmp_path, source) == (0, "")
+
+
+def test_check_dialect__takes_modules_and_refuses_to_check_none(tmp_path: Path) -> None:
+    checked(tmp_path, "A = B = 1\n")
+    assert "one constant" in status_and_text(tmp_path, "module.py")[1]
+    for places in ((), ("nowhere",)):
+        status, text = status_and_text(tmp_path, *places)
+        assert status == 1
+        assert "found none" in text

@@ -109,12 +109,20 @@ def violations(tree: ast.Module, exceptions: set[str]) -> Iterator[tuple[int, st
             )
 
 
-def check(folders: Sequence[str]) -> list[str]:
-    """Return a line for each violation in the modules of some folders, in the order of files and
-    lines.
+def modules(place: Path) -> list[Path]:
+    """Return a module, or all modules in a folder."""
+    return [place] if place.is_file() else list(place.rglob("*.py"))
+
+
+def check(places: Sequence[str]) -> list[str]:
+    """Return a line for each violation in modules and folders of modules, in the order of files
+    and lines.
     """
     lines = []
-    for path in sorted(path for folder in folders for path in Path(folder).rglob("*.py")):
+    paths = sorted(path for place in places for path in modules(Path(place)))
+    if not paths:
+        return [f"expected modules to check, found none in {' '.join(places) or 'no arguments'}."]
+    for path in paths:
         tree = ast.parse(path.read_text(encoding="utf-8"))
         rows = sorted(violations(tree, EXCEPTIONS.get(path.as_posix(), set())))
         lines += [f"{path}:{number}: {sentence}" for number, sentence in rows]
