@@ -276,8 +276,8 @@ class StreamLoop:
             progress: as for `step`.
             upcoming: images of the frame after it, if they are there already: their optical flow is
                 computed while this frame is fitted. They change nothing else.
-            recorded: images with which those of the next frame are compared for flow and changes;
-                None: `images`. They differ in a first frame whose `images` are interpolated to one
+            recorded: images with which the next frame is compared for flow and changes; None:
+                `images`. They differ in a first frame whose `images` are interpolated to one
                 instant, because cameras have delays.
             on_provisional: as for `step`.
         """

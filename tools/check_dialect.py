@@ -39,7 +39,6 @@ EXCEPTIONS = {
     "benchmarks/reports/method.py": {"found"},
     "benchmarks/reports/plots.py": {"about"},
     "benchmarks/reports/timing.py": {"apart"},
-    "morgs_mi/capture/color_correction.py": {"before", "after"},
     "morgs_mi/fit/balance.py": {"taken"},
     "morgs_mi/studio/calibration/checks/deep.py": {"given"},
     "morgs_mi/studio/calibration/offset_equations.py": {"own"},

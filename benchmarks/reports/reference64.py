@@ -111,7 +111,7 @@ class Reference64:
             yield chunk, (dx, dy), light * alpha, light, alpha, visible & free
 
     def _to_attributes(self, gradients: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the gradients of the attributes from those of splats and colours [N, 9]."""
+        """Return the gradients of the attributes, given the ones of splats and colours [N, 9]."""
         raw = self._float64()
         grads = {}
         for name in _GEOMETRY:

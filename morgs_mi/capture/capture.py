@@ -335,8 +335,8 @@ def _masks(
 def _color_metadata(fit: ColorFit, names: Sequence[str]) -> dict[str, Any]:
     return {
         "reference": names[fit.reference],
-        "delta_e_before": fit.before,
-        "delta_e": fit.after,
+        "delta_e_before": fit.recorded_delta_e,
+        "delta_e": fit.delta_e,
     }
 
 

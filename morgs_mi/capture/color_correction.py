@@ -52,8 +52,8 @@ class ColorFit:
     matrices: tuple[np.ndarray | None, ...]
     samples: tuple[int, ...]  #: Per camera, number of points shared with others.
     #: Per camera, mean dE2000 of its points against the other views' colours; NaN without points.
-    before: tuple[float, ...]
-    after: tuple[float, ...]  #: The same after the correction.
+    recorded_delta_e: tuple[float, ...]
+    delta_e: tuple[float, ...]  #: The same after the correction.
 
     def correction(self, view: int) -> ColorCorrection | None:
         """Return the correction of a view, None if it is not changed."""
@@ -108,9 +108,13 @@ def fit_colors(
             _LOG.warning("%s keeps its colours: too few points in common with the others.", name)
             corrected[view] = colors[view]
             counts[view] = counts[:, view] = 0  # no other view is corrected towards it
-    before = _differences(pairs, colors)
-    after = _differences(pairs, [corrected[view] for view in range(len(cameras))])
-    return ColorFit(start, tuple(matrices), tuple(samples.tolist()), before, after)
+    return ColorFit(
+        reference=start,
+        matrices=tuple(matrices),
+        samples=tuple(samples.tolist()),
+        recorded_delta_e=_differences(pairs, colors),
+        delta_e=_differences(pairs, [corrected[view] for view in range(len(cameras))]),
+    )
 
 
 def _shared_counts(pairs: Sequence[Match], count: int) -> np.ndarray:

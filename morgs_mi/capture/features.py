@@ -329,8 +329,8 @@ def _relative_poses(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, 
 def intersect_pairs(
     pixels: np.ndarray, views: tuple[int, int], cameras: Sequence[Camera]
 ) -> np.ndarray:
-    """Return the points [M, 3] of `intersect` that each of two views sees once; `pixels` [2 M, 2]
-    are those of the first view, then those of the second one.
+    """Return the points [M, 3] that two views see, as `intersect` does. The first M rows of
+    `pixels` [2 M, 2] are their positions in the first view, the others in the second view.
     """
     count = len(pixels) // 2
     return intersect(np.tile(np.arange(count), 2), np.repeat(views, count), pixels, cameras, count)

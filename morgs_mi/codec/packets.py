@@ -404,7 +404,7 @@ def _taken_largest(reader: ColumnReader, N: int, shift: int) -> np.ndarray:
 def _fill(
     columns: np.ndarray, reader: ColumnReader, shifts: np.ndarray, limit: int, what: str
 ) -> None:
-    """Fill columns [N, C] with those of a reader, each of which is increased by a shift."""
+    """Read values into the columns [N, C], and add the shift of each column."""
     for column, shift in zip(columns.T, shifts, strict=True):
         column[:] = bounded(reader.take(len(columns)) + shift, limit, what)
 

@@ -175,7 +175,7 @@ def _nearest_distances(positions: np.ndarray) -> np.ndarray:
 def choose_key_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:
     """Return the indices of `count` views spread over the rig, or of all if there are fewer.
 
-    The first is the most central one; each further one is the farthest from those chosen.
+    The first is the most central one; each further one is the farthest from the earlier ones.
     """
     if not cameras:
         return ()
@@ -187,7 +187,7 @@ def choose_key_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:
 
 
 def _farthest(positions: np.ndarray, views: Sequence[int]) -> int:
-    """Return the index of the position [V, 3] that is farthest from those of some views."""
+    """Return the index of the position [V, 3] that is farthest from the positions of some views."""
     distance = np.linalg.norm(positions[:, None] - positions[views], axis=-1).min(1)
     return int(np.argmax(distance))
 

@@ -240,8 +240,8 @@ def fill_points(
 def _free_pixels(
     view: View, point_pixels: np.ndarray, count: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Return those of `count` random pixel positions [n, 2] that are valid, in cells without a
-    point; `point_pixels` [P, 2] are the positions of the points.
+    """Return valid pixel positions [n, 2] in cells without a point, out of `count` random ones;
+    `point_pixels` [P, 2] are the positions of the points.
     """
     camera = view.camera
     pixels = rng.uniform(0, (camera.width, camera.height), (count, 2))

@@ -219,7 +219,7 @@ def _between(
 
 
 def _by_row(bounds: np.ndarray, N: int) -> np.ndarray:
-    """Return the bounds [N, 3] of each Gaussian's chunk, from those of the chunks [chunks, 3]."""
+    """Return the bounds [N, 3] of each Gaussian's chunk, given the `bounds` [C, 3] of C chunks."""
     return bounds.repeat(_CHUNK, axis=0)[:N]
 
 

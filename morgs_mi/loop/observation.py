@@ -326,9 +326,7 @@ def _pairs(
     images: Images,
     changes: Mapping[int, np.ndarray] | None,
 ) -> dict[int, FramePair]:
-    """Return the images of the key views that changed, with those of the frame before, by view
-    index.
-    """
+    """Return the key views that changed as pairs of the last image and this one, by view index."""
     pairs = {}
     for v in _frame_key_views(setup, previous, images):
         box = None if changes is None else box_around(changes[v])

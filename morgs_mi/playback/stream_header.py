@@ -190,7 +190,7 @@ def open_stream_capture(
 
 def _recording(stream: FrameSource, path: str | Path, frames: Sequence[int]) -> Capture:
     """Return the capture in a folder up to the last of the frames, read as for the fit of a stream;
-    its cameras are those of the stream.
+    its cameras are the cameras of the stream.
     """
     values = metadata_entry(stream, "reading", {}, dict)
     reading = apply_values(ReadConfig(), values, _place(stream, "reading"))

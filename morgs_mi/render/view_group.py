@@ -229,7 +229,7 @@ def _everything(view: ActiveView) -> Region:
 
 
 def _colors_of_view(splats: Splats, index: int) -> Splats:
-    """Return the colour of splats, as those of one of several views."""
+    """Return splats with their colour alone, in the view `index`."""
     view = dr.full(mi.UInt32, index, len(splats))
     return replace(splats, view=view, channels={"color": splats.channels["color"]})
 

@@ -300,7 +300,7 @@ def _nearest_rows(before: Gaussians, now: Gaussians) -> np.ndarray | None:
 def _rows_with_gaps(
     survivors: np.ndarray, rows_before: np.ndarray, count: int, count_before: int
 ) -> np.ndarray:
-    """Return the row in the frame before of all `count` Gaussians [M] from those of the survivors.
+    """Return the row in the frame before of all `count` Gaussians [M]; -1 for births.
 
     Between two survivors with as many rows between them in both frames, those are the same ones,
     too; the others are births.

@@ -139,8 +139,8 @@ def _leaf_order(centers: np.ndarray, depth: int) -> tuple[np.ndarray, list[int]]
 
 
 def _node_corners(leaves: np.ndarray, extreme: Callable[..., np.ndarray]) -> np.ndarray:
-    """Return a corner of the box of every node from the root down, given that of the leaves; node 0
-    does not exist.
+    """Return a corner of the box of every node [nodes, 3] from the root down, given the corners of
+    the leaves [leaves, 3]; node 0 does not exist.
     """
     levels = [leaves]
     while len(levels[-1]) > 1:

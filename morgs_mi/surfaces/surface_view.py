@@ -239,7 +239,7 @@ class SurfaceView:
         )
 
     def forward(self, params: Any) -> None:
-        """Set the tangents of `image` and `behind` from those of the surfaces' parameters."""
+        """Set the tangents of `image` and `behind`; the surfaces' parameters have theirs."""
         if not self._differentiates():
             return
         with _detached(self.gaussians), traced(self.integrator, self.splats, self.srgb):

@@ -75,7 +75,7 @@ def test_fit_colors__removes_differences_between_sensors(views) -> None:
     assert min(fit.samples) > 100
     assert all(
         new_error < 0.5 * old_error
-        for old_error, new_error in zip(fit.before, fit.after, strict=True)
+        for old_error, new_error in zip(fit.recorded_delta_e, fit.delta_e, strict=True)
     )
     for view in (1, 2, 3):
         old_error = error(recorded[view], true[view])
@@ -93,7 +93,7 @@ def test_fit_colors__leaves_matching_cameras_unchanged(views) -> None:
         assert error(corrected(fit, view, true[view]), true[view]) < 0.5
     assert all(
         new_error <= old_error + 0.1
-        for old_error, new_error in zip(fit.before, fit.after, strict=True)
+        for old_error, new_error in zip(fit.recorded_delta_e, fit.delta_e, strict=True)
     )
 
 
@@ -104,7 +104,7 @@ def test_fit_colors__leaves_a_camera_without_shared_points_unchanged(views, capl
         fit = fit_colors(cameras, [*recorded[:3], image], [None] * 4)
         assert fit.matrices[3] is None
         assert fit.samples[3] == 0
-        assert np.isnan(fit.after[3])
+        assert np.isnan(fit.delta_e[3])
     assert "cam3 keeps its colours: too few points" in caplog.text
 
 

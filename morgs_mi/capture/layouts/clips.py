@@ -127,7 +127,7 @@ def names_without(path: Path, names: Collection[str], without: Collection[str]) 
 
 
 def check_names(place: Path, setting: str, names: Iterable[str], cameras: Collection[str]) -> None:
-    """Check that the names in a setting are those of cameras; `place` is where it was set.
+    """Raise an error unless a setting names cameras; `place` is where it was set.
 
     Raises:
         ValueError: there is no such camera.

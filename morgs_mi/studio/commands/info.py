@@ -275,7 +275,7 @@ def _color_lines(capture: Capture) -> list[str]:
     fit = capture.colors
     if fit is None:
         return []
-    changes = zip(capture.names, fit.before, fit.after, fit.samples, strict=True)
+    changes = zip(capture.names, fit.recorded_delta_e, fit.delta_e, fit.samples, strict=True)
     errors = ", ".join(
         f"{name} {a:.1f} -> {b:.1f} ({n} points)" if n else f"{name} -" for name, a, b, n in changes
     )
