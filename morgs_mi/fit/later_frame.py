@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import drjit as dr
 import mitsuba as mi
@@ -148,7 +149,7 @@ class _LaterFrameFit:
         self._order = [self._views[k] for k in view_order(count, config.epochs * count, rng)]
         self._observations = _cropped_observations(problem)
         self._previous = problem.active.select(problem.previous)
-        self._optimizer = self._residual_optimizer(problem.start)
+        self._start = problem.start
         self.source = np.arange(len(problem.active.indices))
         self._neighbours: Neighbours | None = None
         # The round of density control is still to come, and the scores of the last epoch, which it
@@ -189,8 +190,7 @@ class _LaterFrameFit:
         epochs = max(1, round(self._motion.model_share * self._config.epochs))
         steps = self._steps_of(self._next_epoch(epochs))
         weight = self._config.objective.dssim_weight
-        start, self.losses = fit_motion(motion_problem, model, problem.start, steps, weight)
-        self._optimizer = self._residual_optimizer(start)
+        self._start, self.losses = fit_motion(motion_problem, model, self._start, steps, weight)
         return epochs
 
     def run_epoch(self, number: int) -> None:
@@ -230,9 +230,12 @@ class _LaterFrameFit:
         self._awaits_density_round = False
         self._scores = None
 
-    def _residual_optimizer(self, start: MotionStart | None) -> Adam:
-        """Return the optimiser of the residual of the active Gaussians, at its start."""
-        parameters = residual_parameters(self._previous, self._motion, start)
+    @cached_property
+    def _optimizer(self) -> Adam:
+        """Optimiser of the residual of the active Gaussians, which begins at the start of their
+        motion.
+        """
+        parameters = residual_parameters(self._previous, self._motion, self._start)
         return adam(parameters, self._config.momentum)
 
     def _next_epoch(self, count: int = 1) -> Epoch:
