@@ -70,6 +70,12 @@ def test_readme__names_commands_that_exist():
         assert f"\n{target}:" in makefile
 
 
+def test_readme__names_the_two_commands_of_a_new_machine_of_which_ci_runs_the_tests():
+    commands = "\n    make demo    # [^\n]+\n    make test    # [^\n]+\n"
+    assert re.search(commands, README)
+    assert "\nmake test\n" in (ROOT / ".ci/run").read_text(encoding="utf-8")
+
+
 def test_readme__is_short():
     assert len(README.splitlines()) <= 120
 

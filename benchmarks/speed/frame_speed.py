@@ -70,6 +70,8 @@ class Options(Output):
     """
     seed: int = 0
     """Seed of scene and noise."""
+    variant: str = "llvm_ad_rgb"
+    """Mitsuba variant."""
 
 
 class Scene:
@@ -211,8 +213,8 @@ def settings(options: Options, name: str) -> dict[str, StreamConfig]:
 
 def main(options: Options) -> None:
     """Run the benchmark."""
-    mi.set_variant("llvm_ad_rgb")
-    result: dict[str, Any] = {"seed": options.seed, "noise": NOISE}
+    mi.set_variant(options.variant)
+    result: dict[str, Any] = {"seed": options.seed, "noise": NOISE, "variant": options.variant}
     for name in options.sizes:
         scene = Scene(SIZES[name], options.seed)
         rows = {}

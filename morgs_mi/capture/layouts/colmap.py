@@ -11,12 +11,11 @@ and silently drops every second image of a text model without blank lines.
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -35,13 +34,9 @@ from morgs_mi.capture.lens import Lens, lens_and_intrinsics
 from morgs_mi.core.bounded import check_claim
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import LARGEST, bounded
-from morgs_mi.core.colmap_library import import_pycolmap
 from morgs_mi.core.files import write_error
 from morgs_mi.io.listing import listed
 from morgs_mi.io.video import natural_key
-
-if TYPE_CHECKING:
-    import pycolmap
 
 _LOG = logging.getLogger(__name__)
 
@@ -211,103 +206,61 @@ def write_colmap(
     Raises:
         OSError: a file could not be written.
     """
-    pycolmap = import_pycolmap()  # takes 0.3 s to import, and only the writer needs it
-
-    model = pycolmap.Reconstruction()
-    lenses = [Lens()] * len(cameras) if lenses is None else lenses
-    for i, (camera, lens) in enumerate(zip(cameras, lenses, strict=True), start=1):
-        _add_view(model, i, camera, lens)
-    points = np.zeros((0, 3)) if points is None else np.asarray(points)
-    for xyz, rgb in zip(points, _color_bytes(points, point_colors), strict=True):
-        model.add_point3D(xyz.astype(np.float64), pycolmap.Track(), rgb)
-    write_reconstruction(model, folder)
-
-
-def _add_view(model: pycolmap.Reconstruction, index: int, camera: Camera, lens: Lens) -> None:
-    pycolmap = import_pycolmap()
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(
-            camera_id=index,
-            model=lens.model,
-            width=camera.width,
-            height=camera.height,
-            params=_parameters(camera, lens),
-        )
-    )
-    image = pycolmap.Image(image_id=index, camera_id=index, name=_image_name(camera))
-    pose = pycolmap.Rigid3d(np.asarray(camera.viewmat, dtype=np.float64)[:3])
-    model.add_image_with_trivial_frame(image, pose)
-
-
-def _color_bytes(points: np.ndarray, colors: np.ndarray | None) -> np.ndarray:
-    """Return the colours of points [P, 3] as bytes, grey if None."""
-    colors = np.full(points.shape, 0.5) if colors is None else np.asarray(colors)
-    return np.rint(np.clip(colors, 0, 1) * 255).astype(np.uint8)
-
-
-def _image_name(camera: Camera) -> str:
-    return camera.name if Path(camera.name).suffix else f"{camera.name}.png"
-
-
-def _parameters(camera: Camera, lens: Lens) -> list[float]:
-    """Return the parameters of COLMAP's camera model."""
-    one_focal = lens.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-    focals = np.diag(camera.K)[: 1 if one_focal else 2]
-    return [*focals, *camera.K[:2, 2], *lens.distortion]
-
-
-def write_reconstruction(model: pycolmap.Reconstruction, folder: str | Path) -> None:
-    """Write all files of a model as text, or none; the folder is created if it is missing.
-
-    Raises:
-        OSError: a file could not be written.
-    """
     folder = Path(folder)
-    lines = _line_counts(model)
+    lenses = [Lens()] * len(cameras) if lenses is None else lenses
+    points = np.zeros((0, 3)) if points is None else np.asarray(points, np.float64)
+    colors = np.full(points.shape, 0.5) if point_colors is None else np.asarray(point_colors)
+    colors = np.rint(np.clip(colors, 0, 1) * 255).astype(int)
+    views = list(enumerate(zip(cameras, lenses, strict=True), start=1))
+    texts = {
+        "images": [
+            "# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and a line of points\n",
+            *(_image_lines(i, camera) for i, (camera, _) in views),
+        ],
+        "points3D": [
+            "# POINT3D_ID X Y Z R G B ERROR TRACK[]\n",
+            # The error of a point is not known, and its track is empty.
+            *(
+                _line(i, *xyz.tolist(), *rgb.tolist(), 0.0)
+                for i, (xyz, rgb) in enumerate(zip(points, colors, strict=True), start=1)
+            ),
+        ],
+        # The last one that is renamed, because readers look for it.
+        "cameras": [
+            "# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n",
+            *(_camera_line(i, camera, lens) for i, (camera, lens) in views),
+        ],
+    }
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=".partial-", dir=folder) as partial:
-            model.write_text(partial)
-            files = [Path(partial) / f"{name}.txt" for name in lines]
-            for file, count in zip(files, lines.values(), strict=True):
-                _check_written(file, count)
-            for file in files:
-                file.replace(folder / file.name)
-    except (OSError, RuntimeError, ValueError) as error:
+            for name, lines in texts.items():
+                (Path(partial) / f"{name}.txt").write_text("".join(lines), encoding="utf-8")
+            for name in texts:
+                (Path(partial) / f"{name}.txt").replace(folder / f"{name}.txt")
+    except OSError as error:
         raise write_error(
             f"{folder}: the COLMAP model could not be written", error, folder
         ) from error
 
 
-def _line_counts(model: pycolmap.Reconstruction) -> dict[str, int]:
-    """Return the number of lines of each text file of a model."""
-    return {
-        "rigs": model.num_rigs(),
-        "frames": model.num_reg_frames(),
-        "images": 2 * model.num_reg_images(),
-        "points3D": model.num_points3D(),
-        # The last one that is renamed, because readers look for it.
-        "cameras": model.num_cameras(),
-    }
+def _line(*fields: object) -> str:
+    return " ".join(map(str, fields)) + "\n"
 
 
-def _check_written(file: Path, expected: int) -> None:
-    """Check that a text file reached the disk with all its lines: pycolmap does not report a full
-    disk.
-
-    Raises:
-        OSError: it did not.
-    """
-    lines = _lines_on_disk(file)
-    if len(lines) != expected or (lines and not lines[-1].endswith(b"\n")):
-        raise OSError(f"{file.name} was cut off after {len(lines)} of {expected} lines")
+def _camera_line(index: int, camera: Camera, lens: Lens) -> str:
+    one_focal = lens.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+    focals = np.diag(camera.K)[: 1 if one_focal else 2].tolist()
+    center = camera.K[:2, 2].tolist()
+    return _line(index, lens.model, camera.width, camera.height, *focals, *center, *lens.distortion)
 
 
-def _lines_on_disk(file: Path) -> list[bytes]:
-    """Return the lines of a file that are not comments, after it is written to the disk."""
-    with file.open("rb") as stream:
-        os.fsync(stream.fileno())
-        return [line for line in stream if not line.startswith(b"#")]
+def _image_lines(index: int, camera: Camera) -> str:
+    """Return the two lines of an image, whose second one has no points."""
+    viewmat = np.asarray(camera.viewmat, np.float64)
+    x, y, z, w = Rotation.from_matrix(viewmat[:3, :3]).as_quat(canonical=True).tolist()
+    name = camera.name if Path(camera.name).suffix else f"{camera.name}.png"
+    return _line(index, w, x, y, z, *viewmat[:3, 3].tolist(), index, name) + "\n"
 
 
 def _viewmat(pose: Sequence[float]) -> np.ndarray:

@@ -10,6 +10,7 @@ The scale and the up direction of the model's world are arbitrary: images do not
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
@@ -21,19 +22,18 @@ import cv2
 import numpy as np
 
 from morgs_mi.capture.layouts.clips import EXAMPLE, clips_by_camera, names_without, photos
-from morgs_mi.capture.layouts.colmap import write_reconstruction
 from morgs_mi.capture.masks import opaque_pixels
 from morgs_mi.capture.points import MAX_ERROR
 from morgs_mi.capture.timeline import nearest_frames
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_number
-from morgs_mi.core.colmap_library import import_pycolmap
 from morgs_mi.core.color_space import display_image, display_stops
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.ranges import check_ranges
 from morgs_mi.io.video import FrameReader, open_frames
 from morgs_mi.studio.calibration.checks.mistakes import same_poses
 from morgs_mi.studio.calibration.checks.rig_check import CameraCheck
+from morgs_mi.studio.calibration.colmap_library import import_pycolmap
 
 Mapper = Literal["incremental", "global"]
 
@@ -171,7 +171,7 @@ def calibrate(
             raise _incomplete(path, result)
         _name_photos(best.model, path)
         with atomic_path(path / "sparse", "calibrate()") as folder:
-            write_reconstruction(best.model, folder / "0")
+            _write_model(best.model, folder / "0")
     return result
 
 
@@ -244,6 +244,29 @@ def _name_photos(model: Any, path: Path) -> None:
     for image in map(model.image, model.reg_image_ids()):
         if (name := Path(image.name).stem) in files:
             image.name = files[name][0].name
+
+
+def _write_model(model: Any, folder: Path) -> None:
+    """Write a model as text, and check its files: pycolmap does not report a full disk.
+
+    Raises:
+        OSError: a file was cut off.
+    """
+    folder.mkdir(parents=True)
+    model.write_text(folder)
+    line_counts = {
+        "rigs": model.num_rigs(),
+        "frames": model.num_reg_frames(),
+        "images": 2 * model.num_reg_images(),
+        "points3D": model.num_points3D(),
+        "cameras": model.num_cameras(),
+    }
+    for name, count in line_counts.items():
+        with (folder / f"{name}.txt").open("rb") as file:
+            os.fsync(file.fileno())
+            lines = [line for line in file if not line.startswith(b"#")]
+        if len(lines) != count or (lines and not lines[-1].endswith(b"\n")):
+            raise OSError(f"{name}.txt was cut off after {len(lines)} of {count} lines")
 
 
 def _check(name: str, image: Any | None, model: Any) -> CameraCheck:
