@@ -262,24 +262,12 @@ def test_push__replaces_too_few_points_and_reports_it(clip):
 
 @pytest.mark.slow
 def test_push__forecasts_other_views(clip):
-    ticks = []
-    _, report = new_loop(SHORT).push(clip[0][:4], lambda *tick: ticks.append(tick))
+    _, report = new_loop(SHORT).push(clip[0][:4])
     validation = report.validation
     assert validation["sentence"].startswith(
         f"Views between the cameras will be {validation['quality']}"
     )
-    assert 0 < validation["training_psnr"] < 60
-    steps = [tick for tick in ticks if tick[0] != "Balancing cameras"]
-    assert steps == [("First frame", done, 20) for done in range(1, 21)], "there is no second fit"
-    assert {
-        "quality",
-        "expected_psnr",
-        "interval",
-        "loss",
-        "margin",
-        "is_outside",
-        "rig",
-    } < validation.keys()
+    assert {"spacing", "overlap", "reach"} < validation.keys()
 
 
 @pytest.mark.slow

@@ -6,8 +6,6 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from benchmarks.pages.results import committed
 from benchmarks.reports import (
     cameras,
@@ -20,9 +18,7 @@ from benchmarks.reports import (
     timing,
 )
 from benchmarks.reports.method_tables import best_rows
-from benchmarks.reports.plots import grouped, markdown
-from benchmarks.reports.unseen import out_of_capture
-from morgs_mi.fit.unseen_views import WIDEST
+from benchmarks.reports.plots import markdown
 
 
 def study_table(report: Any, *names: str) -> str:
@@ -122,23 +118,6 @@ def frame_times() -> str:
         rows.append((name, f"{short['seconds']:.1f}", f"{run['seconds']:.1f}", *scores, *shares))
     titles = "1 epoch, s", "2 epochs, s", "PSNR, dB", "kB", "active Gaussians", "drawn pixels"
     return markdown(("Gaussians", *titles), rows)
-
-
-def unseen_groups() -> str:
-    """Return coverage of the intervals by kind of capture, and their median width in the fits with
-    a number.
-    """
-    rows = []
-    fits = list(out_of_capture(committed("unseen")["fits"]))
-    for kind, group in [
-        *((kind, group) for (kind,), group in grouped(fits, "kind").items()),
-        ("all", fits),
-    ]:
-        widths = [row["width"] for row in group if row["width"] <= WIDEST]
-        share = f"{sum(row['within'] for row in group)} of {len(group)}"
-        rows.append((kind, f"{len(grouped(group, 'set'))}", share, f"{np.median(widths):.1f}"))
-    titles = "fits in the interval", "median width of those with a number, dB"
-    return markdown(("kind", "captures", *titles), rows)
 
 
 def splat_files() -> str:
@@ -266,6 +245,5 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "plugin_step": plugin_step,
     "steps": steps,
     "unseen": partial(study_table, random_scenes, "random_scenes"),
-    "unseen_groups": unseen_groups,
     "workers": workers,
 }

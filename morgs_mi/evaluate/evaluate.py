@@ -14,7 +14,6 @@ from morgs_mi.core.fit_names import REPORT
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.evaluate.comparison import ComparedClip
 from morgs_mi.evaluate.measures import (
-    Forecast,
     ImageDistance,
     Measure,
     Motion3D,
@@ -38,8 +37,7 @@ def evaluate_stream(
     training views.
 
     Args:
-        out: stream file or its folder; seconds, and the forecast of other views, come from the
-            ``report.json`` beside it.
+        out: stream file or its folder; seconds come from the ``report.json`` beside it.
         capture: recording; default is the capture that the stream was fitted to.
         progress: called with (frames done, frames in all).
         lpips: network for LPIPS; without one there is no LPIPS.
@@ -57,9 +55,8 @@ def evaluate_stream(
     stream = open_stream(out)
     clip = ComparedClip.of(stream, capture, any_recording)
     recording = clip.recording
-    seconds, of_fit = _of_fit(stream.path)
+    seconds = _seconds(stream.path)
     measures: list[Measure] = [Quality(lpips), Variation(clip), Motion3D(clip), Speed(clip)]
-    measures.append(Forecast(recording, of_fit))
     measures += [studio_entry("measures", name)(clip) for name in STUDIO["measures"]]
     rows: list[FrameScores] = []
     for frame in clip.frames():
@@ -102,35 +99,15 @@ def _sizes(num_bytes: int, rows: list[FrameScores]) -> Sizes:
     return Sizes(num_bytes, overhead, num_bytes / len(rows), mean("keyframe"), mean("residual"))
 
 
-def _of_fit(stream: Path) -> tuple[dict[int, float], dict[str, Any]]:
-    """Return seconds by frame, and the forecast of other views as fields of `Evaluation`.
-
-    They come from the report beside the stream. Without one they are empty.
-    """
+def _seconds(stream: Path) -> dict[int, float]:
+    """Return seconds by frame from the report beside the stream; empty without one."""
     path = stream.with_name(REPORT)
     if not path.is_file():
-        return {}, {}
+        return {}
     report = read_json(path)
     try:
-        seconds = {row["frame"]: float(row["seconds"]) for row in report["frames"]}
-        forecast = next(
-            (
-                row["validation"]
-                for row in report["frames"]
-                if "sentence" in row.get("validation", {})
-            ),
-            {},
-        )
-        psnr = (
-            float("nan")
-            if forecast.get("expected_psnr") is None
-            else float(forecast["expected_psnr"])
-        )
-        return seconds, {
-            "expected": str(forecast["sentence"]),
-            "expected_psnr": psnr,
-        } if forecast else {}
-    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
+        return {row["frame"]: float(row["seconds"]) for row in report["frames"]}
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(
             f"{path}: expected a fit's report, got a broken one ({error!r}); remove it."
         ) from None

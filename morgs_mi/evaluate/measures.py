@@ -17,7 +17,6 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.truth import GroundTruth, load_tracks, load_truth
 from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.frame_source import FrameState
@@ -38,7 +37,6 @@ from morgs_mi.evaluate.metrics import (
 from morgs_mi.evaluate.motion3d import evaluate_motion
 from morgs_mi.evaluate.results import Motion3DScores, PlaybackTimes, VariationScores, ViewScores
 from morgs_mi.evaluate.temporal import StillVariation, slope
-from morgs_mi.fit.forecast import forecast
 from morgs_mi.method.exposure import follow_exposure
 from morgs_mi.playback.player import playback_speed
 
@@ -179,26 +177,6 @@ class Speed(Measure):
         clip = self._clip
         camera = clip.stream.cameras[clip.views[0]]
         return {"playback": PlaybackTimes(**playback_speed(clip.stream, camera, clip.render))}
-
-
-class Forecast(Measure):
-    """Expected quality of views between the training cameras.
-
-    Args:
-        recording: the capture.
-        of_fit: forecast of the fit, as fields of `Evaluation`; empty: it follows from the cameras.
-    """
-
-    def __init__(self, recording: Capture, of_fit: dict[str, Any]) -> None:
-        self._recording = recording
-        self._of_fit = of_fit
-
-    def result(self) -> dict[str, Any]:
-        recording = self._recording
-        cameras = [recording.cameras[v] for v in recording.train_views]
-        if self._of_fit or len(cameras) < 2:
-            return self._of_fit
-        return {"expected": forecast(cameras, recording.points).sentence}
 
 
 def _image_scores(view: ComparedView, lpips: ImageDistance | None) -> dict[str, float]:

@@ -192,10 +192,6 @@ class Evaluation:
     #: PSNR of each held-out view in the first frame, seen from the camera that fits its image best,
     #: dB, by camera name. The scores of the frames are those as calibrated.
     registered: Mapping[str, float] = field(default_factory=dict)
-    #: Expected quality of views between the cameras, a sentence from the report of the fit; without
-    #: one, a forecast from the rig; empty with a single training view.
-    expected: str = ""
-    expected_psnr: float = _NAN  #: Their PSNR as the fit forecasts it, dB; NaN where it does not.
 
     @property
     def num_frames(self) -> int:
@@ -242,7 +238,7 @@ class Evaluation:
             means[name] = {"mean": means[name], "first": first, "last": last}
         views = self.views.items()
         names = ("stream", "capture", "held_out", "num_frames", "complete", "regions")
-        figures = ("psnr_slope", "registered_psnr", "expected", "expected_psnr")
+        figures = ("psnr_slope", "registered_psnr")
         return {
             **{name: getattr(self, name) for name in names},
             **means,

@@ -157,10 +157,8 @@ def evaluation_summary(result: Evaluation) -> Iterator[str]:
         f"Drift: PSNR {figure(first, 2)} dB in the first frame, {figure(last, 2)} dB in the last, "
         f"{figure(result.psnr_slope, 4)} dB per frame."
     )
-    if result.held_out:  # a measurement, beside which a forecast would only confuse
+    if result.held_out:
         yield from _held_out_sentences(result)
-    elif result.expected:
-        yield result.expected
     if result.motion_3d is not None and result.motion_3d.num_gaussians:
         yield _motion_sentence(result.motion_3d)
     if (iou := result.scores.confidence_iou) == iou:

@@ -5,7 +5,9 @@ overlap alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from math import ceil
+from typing import Any
 
 import numpy as np
 
@@ -18,14 +20,10 @@ from morgs_mi.core.rig import (
     surface_of,
 )
 
-_WORDS = ("good", "fair", "poor")
-# Limits of good and of fair views between the cameras (`docs/experiments/first-frame.md`). Loss
-# against the training views, dB.
-_LOSSES = (4.0, 8.0)
-# PSNR, dB.
-_LEAST_PSNR = (22.0, 16.0)
-# `Forecast.reach` at which the loss is about as large, degrees.
-_ANGLES = (9.5, 18.0)
+# Largest `Forecast.reach` of good and of fair views between the cameras, degrees
+# (`docs/experiments/first-frame.md`).
+_GOOD = 9.5
+_FAIR = 18.0
 # Angle that stands for a point that no other camera sees, degrees.
 _UNSEEN = 90.0
 
@@ -44,31 +42,30 @@ class Forecast:
     @property
     def quality(self) -> str:
         """Quality to expect of views between the cameras: good, fair or poor."""
-        return _WORDS[sum(self.reach > limit for limit in _ANGLES)]
-
-    @property
-    def description(self) -> str:
-        """Number, angles and overlap of the cameras, in words."""
-        share = f"neighbours share {100 * self.overlap:.0f} % of what they see"
-        return f"{self.cameras} cameras, {self.spacing:.0f} degrees apart, {share}"
+        return "good" if self.reach <= _GOOD else "fair" if self.reach <= _FAIR else "poor"
 
     @property
     def sentence(self) -> str:
-        """Sentence on the expected quality of views between the cameras."""
-        return f"Views between the cameras will be {self.quality}: {self.description}."
+        """The quality, its reasons, and what would make such views good."""
+        reasons = (
+            f"{self.cameras} cameras, {self.spacing:.0f} degrees apart, neighbours share "
+            f"{100 * self.overlap:.0f} % of what they see"
+        )
+        sentence = f"Views between the cameras will be {self.quality}: {reasons}."
+        if self.quality == "good":
+            return sentence
+        if self.spacing <= _GOOD:
+            return f"{sentence} They would be good if neighbours shared more."
+        more = ceil((self.cameras - 1) * (self.spacing / _GOOD - 1))
+        return (
+            f"{sentence} Cameras at most {int(_GOOD)} degrees apart would make them good: {more} "
+            "more on an arc."
+        )
 
-
-def quality_of(psnr: float, loss: float) -> str:
-    """Return the quality of views between the cameras: the worse that their PSNR and their loss
-    allow.
-
-    Args:
-        psnr: of these views, dB.
-        loss: difference from the training views, dB.
-    """
-    by_psnr = sum(psnr < limit for limit in _LEAST_PSNR)
-    by_loss = sum(loss > limit for limit in _LOSSES)
-    return _WORDS[max(by_psnr, by_loss)]
+    @property
+    def entries(self) -> dict[str, Any]:
+        """Entries of the first frame's report: the attributes and the properties."""
+        return {"sentence": self.sentence, "quality": self.quality, **asdict(self)}
 
 
 def forecast(cameras: Sequence[Camera], points: np.ndarray) -> Forecast:

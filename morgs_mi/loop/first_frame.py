@@ -16,9 +16,9 @@ from morgs_mi.fit.budget import plan_first_frame
 from morgs_mi.fit.dropping import adapted_to_images
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
 from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.fit.forecast import forecast
 from morgs_mi.fit.initialise import MIN_POINTS
 from morgs_mi.fit.problem import FirstFrameProblem
-from morgs_mi.fit.unseen_views import unseen_views
 from morgs_mi.loop.correction import estimate_correction
 from morgs_mi.loop.frame_report import FittedFrame
 from morgs_mi.loop.observation import FrameObservation, Images, Setup, views_of
@@ -55,15 +55,15 @@ def fitted_first_frame(
         if on_provisional is None
         else lambda gaussians: on_provisional(_packet(setup, gaussians))
     )
+    expected = forecast(problem.cameras, problem.points).entries if len(views) > 1 else {}
     fitted = fit_first_frame(problem, fit_config, rng, progress.of(plan.stage), on_round)
-    forecast = unseen_views(problem, fitted.gaussians).entries if len(views) > 1 else {}
     return FittedFrame(
         packet=_packet(setup, fitted.gaussians),
         correction=correction,
         losses=fitted.losses,
         steps=fitted.steps,
         status=_start_status(setup, plan.config),
-        validation=forecast | correction_entry,
+        validation=expected | correction_entry,
     )
 
 

@@ -25,7 +25,7 @@ class FrameReport:
         missing_views: names of the views without an image.
         active: fractions that took part, by name: gaussians, views, pixels, epochs.
         validation: of the first frame, a `sentence` on views between the cameras, with the fields
-            of `UnseenViews` (see `fit.unseen_views`); empty with a single view.
+            of `Forecast` (see `fit.forecast`); empty with a single view.
         steps: number of optimisation steps.
         exposures: gain and bias of each view; empty if they are not estimated.
     """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +20,6 @@ from morgs_mi.evaluate.measures import IMAGE_SCORES, REGIONS
 from morgs_mi.evaluate.metrics import psnr, psnr_mu
 from morgs_mi.evaluate.results import known_mean
 from morgs_mi.evaluate.tables import evaluation_summary
-from morgs_mi.fit.forecast import forecast
 from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.render.rasterize import rasterize
@@ -142,40 +140,6 @@ def test_evaluate_stream__scores_the_held_out_view_registered_too(
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
     assert result.registered_psnr > result.scores.psnr + 10
     assert f"{result.registered_psnr:.2f} dB registered" in " ".join(evaluation_summary(result))
-
-
-@pytest.mark.parametrize("test_view", [None, 0])
-def test_evaluate_stream__repeats_the_forecast_of_the_fit_without_a_held_out_view(
-    fitted_clip: Path, tmp_path: Path, test_view: int | None
-) -> None:
-    write_stream(tmp_path / "stream.morgs", {"test_view": test_view})
-    validation = {"sentence": "Views between the cameras will be fine.", "expected_psnr": 33.5}
-    rows = [
-        {"frame": 0, "seconds": 1.0, "validation": validation},
-        {"frame": 1, "seconds": 1.0, "validation": {}},
-    ]
-    (tmp_path / "report.json").write_text(json.dumps({"frames": rows}))
-    result = evaluate_stream(tmp_path, fitted_clip / "capture")
-    assert (result.expected, result.expected_psnr) == tuple(validation.values())
-    assert result.as_dict()["expected_psnr"] == 33.5
-    assert (result.expected in evaluation_summary(result)) == (test_view is None)
-
-
-def test_evaluate_stream__forecasts_other_views_without_a_report(
-    fitted_clip: Path, tmp_path: Path
-) -> None:
-    write_stream(tmp_path / "s.morgs", {"test_view": None})
-    result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
-    assert (
-        result.expected == forecast(CAMERAS, load_capture(fitted_clip / "capture").points).sentence
-    )
-    assert np.isnan(result.expected_psnr)
-
-
-def test_evaluate_stream__expects_nothing_of_other_views_from_a_single_camera(
-    fitted_clip: Path,
-) -> None:
-    assert evaluate_stream(fitted_clip).expected == ""
 
 
 def test_evaluate_stream__scores_the_held_out_view_with_matched_colours_too(

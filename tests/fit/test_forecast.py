@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.core.rig import overlaps
-from morgs_mi.fit.forecast import forecast, quality_of
+from morgs_mi.fit.forecast import forecast
 from tests.scenes.cameras import arc, look_at_cameras
 
 NO_POINTS = np.zeros((0, 3))
@@ -20,14 +20,24 @@ def test_forecast__is_good_for_a_ring_of_many_cameras():
     result = forecast(ring(40), NO_POINTS)
     assert result.spacing == pytest.approx(9)
     assert result.overlap > 0.95
-    assert "will be good: 40 cameras, 9 degrees apart" in result.sentence
+    start = "Views between the cameras will be good: 40 cameras, 9 degrees apart, "
+    assert result.sentence.startswith(start)
+    assert result.sentence.endswith("of what they see.")
 
 
-def test_forecast__is_poor_for_four_cameras_60_degrees_apart():
-    cameras = look_at_cameras(arc(np.deg2rad([-90, -30, 30, 90]), 4), 40)
-    result = forecast(cameras, NO_POINTS)
-    assert result.spacing == pytest.approx(60)
-    assert "Views between the cameras will be poor: 4 cameras, 60 degrees apart" in result.sentence
+@pytest.mark.parametrize(
+    ("count", "degrees", "quality", "more"),
+    [(4, 58, "poor", 16), (8, 28, "poor", 14), (8, 15, "fair", 5)],
+)
+def test_forecast__names_the_cameras_that_would_help(count, degrees, quality, more):
+    angles = np.deg2rad(degrees * (np.arange(count) - (count - 1) / 2))
+    result = forecast(look_at_cameras(arc(angles, 4), 40), NO_POINTS)
+    assert result.spacing == pytest.approx(degrees)
+    assert result.sentence.startswith(
+        f"Views between the cameras will be {quality}: {count} cameras, {degrees} degrees apart,"
+    )
+    advice = f"Cameras at most 9 degrees apart would make them good: {more} more on an arc."
+    assert result.sentence.endswith(advice)
 
 
 def test_forecast__measures_two_cameras_side_by_side_at_the_depth_of_the_points():
@@ -48,6 +58,18 @@ def test_forecast__sees_that_cameras_share_nothing():
     assert "will be poor" in result.sentence
 
 
+def test_forecast__sees_that_neighbours_share_little():
+    cameras = look_at_cameras(arc(np.deg2rad([-6, -2, 2, 6]), 4), 4)
+    spread = [
+        look_at_cameras([camera.position], 4, target=(0.5 * i, 0, 0))[0]
+        for i, camera in enumerate(cameras)
+    ]
+    result = forecast(spread, NO_POINTS)
+    assert result.spacing < 5
+    assert result.quality == "poor"
+    assert result.sentence.endswith("They would be good if neighbours shared more.")
+
+
 def test_overlaps__are_the_shares_of_an_image_that_each_camera_sees():
     wide, narrow = (look_at_cameras([(0, 0, -4)], fov)[0] for fov in (53.13, 28.07))
     away = look_at_cameras([(0, 0, -4)], 40, target=(0, 0, -8))[0]
@@ -56,17 +78,3 @@ def test_overlaps__are_the_shares_of_an_image_that_each_camera_sees():
     np.testing.assert_allclose(
         overlaps([wide, narrow, away], np.zeros((1, 3))), expected, atol=0.01
     )
-
-
-@pytest.mark.parametrize(
-    ("psnr", "loss", "quality"),
-    [
-        (40.0, 3.9, "good"),
-        (40.0, 4.1, "fair"),
-        (40.0, 8.1, "poor"),
-        (21.9, 0.0, "fair"),
-        (15.9, 0.0, "poor"),
-    ],
-)
-def test_quality_of__is_the_worse_that_psnr_and_loss_allow(psnr: float, loss: float, quality: str):
-    assert quality_of(psnr, loss) == quality

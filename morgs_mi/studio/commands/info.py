@@ -160,9 +160,9 @@ def _content_lines(capture: Capture, points: str, rig_check: RigCheck | None) ->
     return [
         f"{capture.num_frames} frames at {capture.fps:g} fps, {points}, {truth}.",
         *capture.notes,
+        *_forecast_lines(capture),
         *_check_lines(rig_check),
         *_color_lines(capture),
-        *_forecast_lines(capture),
     ]
 
 

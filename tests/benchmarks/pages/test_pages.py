@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +12,6 @@ from benchmarks.pages.__main__ import PAGES, with_tables
 from benchmarks.pages.plots import PLOTS
 from benchmarks.pages.results import committed
 from benchmarks.pages.tables import TABLES
-from benchmarks.reports.unseen import out_of_capture
-from morgs_mi.fit.forecast import quality_of
-from morgs_mi.fit.unseen_views import REGRESSION, WIDEST
 
 TEXTS = {path.name: path.read_text(encoding="utf-8") for path in PAGES.glob("*.md")}
 WORDS = {name: " ".join(text.split()) for name, text in TEXTS.items()}
@@ -45,7 +42,7 @@ def test_plots__are_drawn_and_shown(tmp_path: Path):
 
 
 def test_claims__have_a_table_or_figure_a_command_and_committed_results():
-    assert len(CLAIMS) == 13
+    assert len(CLAIMS) == 12
     result = r"\]\(\.\./\.\./benchmarks/results/\w+\.json\)"
     parts = (
         r"<!-- table: |!\[",
@@ -135,55 +132,6 @@ def test_index__quotes_the_field_and_the_drift():
             f"{drift['slope_moving_db_a_frame']:+.2f} dB a frame",
         ],
     )
-
-
-def test_pages__quote_the_forecasts_of_unseen_views():
-    fits = list(out_of_capture(committed("unseen")["fits"]))
-    narrow = [fit for fit in fits if fit["width"] <= WIDEST]
-    fresh = [
-        fit
-        for fit in fits
-        if fit["set"] in ("flame_steak", "kitchen", "spheres", "random-406", "random-407")
-    ]
-    in_all, in_narrow, in_fresh = (
-        sum(fit["within"] for fit in some) for some in (fits, narrow, fresh)
-    )
-
-    def word(fit: Mapping[str, float], name: str) -> str:
-        return quality_of(fit[name], fit["training"] - fit[name])
-
-    right = sum(word(fit, "forecast") == word(fit, "mean") for fit in fits)
-    off = [abs(fit["forecast"] - fit["mean"]) for fit in fits]
-    single = np.mean(
-        [
-            abs(psnr - fit["forecast"]) <= fit["width"] / 2
-            for fit in fits
-            for psnr in fit["held_out"]
-        ]
-    )
-    counts = f"{in_all} of {len(fits)}"
-    assert not missing(
-        "index.md",
-        [
-            f"{counts} are within their interval, and the word (good, fair, poor) is right for "
-            f"{right}. `fit` prints a number for {len(narrow)} of them, of which {in_narrow} are "
-            "within the interval",
-            f"{in_fresh} of {len(fresh)} fits within their interval",
-        ],
-    )
-    assert not missing(
-        "real.md",
-        [
-            f"{np.mean(off):.1f} dB in the mean of all fits, to {max(off):.1f} dB at worst",
-            f"within the interval of the mean in {100 * single:.0f} % of all cases",
-            f"by the forecast {right}.",
-            f"loss = {REGRESSION.intercept:.2f} + {REGRESSION.slopes[0]:.3f} d - "
-            f"{-REGRESSION.slopes[1]:.3f} t",
-            f"in nine fits of ten within {REGRESSION.spread:.2f} (1 + loss)",
-        ],
-    )
-    checks = " ".join((PAGES.parent / "checks.md").read_text(encoding="utf-8").split())
-    assert f"{counts} fits were within their interval, and the word was right for {right}" in checks
 
 
 def test_index__quotes_the_clocks():

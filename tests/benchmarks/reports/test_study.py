@@ -18,7 +18,6 @@ from benchmarks.reports import (
     real,
     study,
     timing,
-    unseen,
 )
 from benchmarks.reports.cells import run_cells
 from benchmarks.reports.study import Scene, Study, Variant, method_version, rounded
@@ -40,7 +39,6 @@ SMALL = {"frames": 3, "width": 64, "gaussians": 60, "steps": 3, "epochs": 1, "fi
 # Options of a tiny run, and the number of its rows.
 STUDIES = {
     random_scenes: ({"seeds": (1,), "frames": 2}, 1),
-    unseen: ({"width": 64, "steps": 3, "gaussians": 60}, 5),
     cameras: ({**FIRST, "degrees": (0.0, 0.5), "disturbances": (0,), "lens": 0.1}, 3),
     real: ({"width": 64, "gaussians": 60, "steps": 3}, 5),
     drift: ({**SMALL, "scenes": ("spheres",)}, 2),
@@ -87,7 +85,7 @@ def test_study_options__of_workers_write_the_rows_of_one_process(
     for name in ("random-1", "random-2", "random-1-lens-0.1", "spheres-3x64"):
         (tmp_path / name).symlink_to(clip)
     study_options, num_rows = STUDIES[report]
-    place = {"captures": (clip,)} if report in (real, unseen) else {"clips": tmp_path}
+    place = {"captures": (clip,)} if report is real else {"clips": tmp_path}
     tables = {}
     monkeypatch.setattr(fits, "StreamLoop", tiny_loop)
     # Needs larger images.
