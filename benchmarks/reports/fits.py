@@ -18,7 +18,6 @@ from morgs_mi import StreamLoop
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.codec.container import Packet, StreamWriter
 from morgs_mi.codec.packets import coded_frames
-from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.results import Evaluation
 from morgs_mi.fit.fit_config import FitConfig
@@ -80,16 +79,6 @@ def random_capture(clips: Path, seed: int, downscale: float = 1) -> Capture:
     return synthetic(
         "random", clips / f"random-{seed}", SynthConfig(frames=8, seed=seed), downscale
     )
-
-
-def spread_views(cameras: Sequence[Camera], count: int, among: Sequence[int]) -> tuple[int, ...]:
-    """Return the indices of `count` of the cameras `among` all that are far from each other."""
-    positions = np.array([cameras[v].position for v in among])
-    selection = [int(np.argmax(np.linalg.norm(positions - positions.mean(axis=0), axis=1)))]
-    while len(selection) < count:
-        distance = np.linalg.norm(positions[:, None] - positions[selection], axis=-1).min(axis=1)
-        selection.append(int(np.argmax(distance)))
-    return tuple(sorted(among[k] for k in selection))
 
 
 def new_loop(

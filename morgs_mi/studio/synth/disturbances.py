@@ -1,5 +1,4 @@
-"""Disturbances of a recording: time offsets, rolling shutters, changes of exposure, lens
-distortion, and compression.
+"""Disturbances of a recording: time offsets, rolling shutters and lens distortion.
 
 Frame k of a camera with the time offset o is exposed at (k + o) / fps, and its row r of H at (k + o
 + s ((r + 0.5) / H - 0.5)) / fps, with s the rolling shutter: the time of a frame is the time of its
@@ -14,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -30,7 +29,7 @@ from morgs_mi.core.ranges import AtLeast, AtMost, check_ranges
 class Disturbances:
     """Strength of the disturbances of a recording; by default there are none.
 
-    The held-out camera is the reference: it has no time offset and the correct exposure.
+    The held-out camera is the reference: it has no time offset.
     """
 
     time_offset: Annotated[float, AtLeast(0)] = 0.0
@@ -39,22 +38,11 @@ class Disturbances:
     """Time in which all cameras read their rows, as a share of a frame; a rolling shutter has about
     0.5.
     """
-    exposure_gain: Annotated[float, AtLeast(0), AtMost(10)] = 0.0
-    """Largest deviation of a camera's exposure, drawn per camera: 0.2 for factors from 1 / 1.2 to
-    1.2.
-    """
-    exposure_drift: Annotated[float, AtLeast(0), AtMost(10)] = 0.0
-    """Largest change of a camera's exposure from its first frame to its last, as for exposure-gain.
-    """
-    exposure_flicker: Annotated[float, AtLeast(0), AtMost(1)] = 0.0
-    """Standard deviation of the exposure from frame to frame, drawn per camera and frame."""
     # Beyond, the corners of a wide view fold.
     distortion: Annotated[float, AtLeast(0), AtMost(0.5)] = 0.0
     """Largest radial distortion of the lenses, COLMAP's SIMPLE_RADIAL k, drawn per camera; 0.1 is
     moderate.
     """
-    jpeg_quality: Annotated[int, AtLeast(0), AtMost(100)] = 0
-    """Quality from 1 to 100 of the JPEG compression of every image; 0: none."""
 
 
 @dataclass(frozen=True)
@@ -64,9 +52,7 @@ class CameraDisturbance:
     #: Frame k shows the time of frame k + time_offset of the reference, at its middle row.
     time_offset: float
     rolling_shutter: float  #: Time from the first row to the last, frames.
-    gains: tuple[float, ...]  #: Factor on the linear light of each frame [T].
     distortion: float  #: k of COLMAP's SIMPLE_RADIAL lens.
-    jpeg_quality: int  #: Quality of the compression; 0 for none.
 
     @property
     def lens(self) -> Lens:
@@ -80,7 +66,7 @@ class CameraDisturbance:
 
 
 def draw_disturbances(
-    disturbances: Disturbances, num_cameras: int, num_frames: int, seed: int
+    disturbances: Disturbances, num_cameras: int, seed: int
 ) -> tuple[CameraDisturbance, ...]:
     """Return the disturbance of each camera; a setting affects only its own draws.
 
@@ -91,40 +77,16 @@ def draw_disturbances(
     d = disturbances
     offset = d.time_offset * _uniform(seed, 0, num_cameras)
     offset[0] = 0
-    gains = np.exp(_log_gains(d, num_cameras, num_frames, seed))
     k = d.distortion * _uniform(seed, 4, num_cameras) + 0.0  # not -0
     return tuple(
-        CameraDisturbance(
-            float(offset[c]),
-            float(d.rolling_shutter),
-            tuple(map(float, gains[c])),
-            float(k[c]),
-            int(d.jpeg_quality),
-        )
+        CameraDisturbance(float(offset[c]), float(d.rolling_shutter), float(k[c]))
         for c in range(num_cameras)
     )
 
 
-def _generator(seed: int, kind: int) -> np.random.Generator:
-    """Return the generator of one kind of disturbances."""
-    return np.random.default_rng([seed, 3, kind])
-
-
 def _uniform(seed: int, kind: int, num_cameras: int) -> np.ndarray:
-    """Return a number from -1 to 1 for each camera."""
-    return _generator(seed, kind).uniform(-1, 1, num_cameras)
-
-
-def _log_gains(d: Disturbances, num_cameras: int, num_frames: int, seed: int) -> np.ndarray:
-    """Return the logarithms of the gains [C, T] of all cameras."""
-    gain = np.log1p(d.exposure_gain) * _uniform(seed, 1, num_cameras)
-    drift = np.log1p(d.exposure_drift) * _uniform(seed, 2, num_cameras)
-    flicker = _generator(seed, 3).standard_normal((num_cameras, num_frames))
-    log_gain = gain[:, None] + (
-        drift[:, None] * np.linspace(0, 1, num_frames) + d.exposure_flicker * flicker
-    )
-    log_gain[0] = 0
-    return log_gain
+    """Return a number from -1 to 1 for each camera, for one kind of disturbances."""
+    return np.random.default_rng([seed, 3, kind]).uniform(-1, 1, num_cameras)
 
 
 def undistorted(camera: Camera, lens: Lens | None, pixels: np.ndarray) -> np.ndarray:
@@ -138,18 +100,6 @@ def undistorted(camera: Camera, lens: Lens | None, pixels: np.ndarray) -> np.nda
     return cv2.undistortPoints(
         points, camera.K, lens.opencv_coefficients, None, np.eye(3), camera.K, precise
     )[:, 0]
-
-
-def compressed(image: np.ndarray, quality: int) -> np.ndarray:
-    """Return an image, uint8 RGB [H, W, 3], after JPEG compression; unchanged for the quality 0."""
-    if not quality:
-        return image
-    data = cv2.imencode(
-        ".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality]
-    )[1]
-    result = cv2.imdecode(data, cv2.IMREAD_COLOR)
-    assert result is not None
-    return cv2.cvtColor(result, cv2.COLOR_BGR2RGB)
 
 
 def save_disturbances(folder: str | Path, cameras: Mapping[str, CameraDisturbance]) -> None:
@@ -176,20 +126,12 @@ def load_disturbances(folder: str | Path) -> dict[str, CameraDisturbance]:
         )
     content = read_json(path)
     try:
-        return _cameras(content)
+        return {name: CameraDisturbance(**entry) for name, entry in content.items()}
     except (AttributeError, KeyError, TypeError) as error:
         raise ValueError(
             f"{path}: expected the disturbances of each camera, got a broken file ({error}); "
             "synthesise the capture again."
         ) from None
-
-
-def _cameras(content: Any) -> dict[str, CameraDisturbance]:
-    """Return the disturbance of each camera from the content of the file."""
-    return {
-        name: CameraDisturbance(**{**entry, "gains": tuple(entry["gains"])})
-        for name, entry in content.items()
-    }
 
 
 def _path(folder: str | Path) -> Path:

@@ -49,7 +49,7 @@ def record_light(
     Args:
         tracer: the scene; its time is changed.
         camera: the view without distortion.
-        own: the camera's disturbance; its exposure and compression are not applied.
+        own: the camera's disturbance.
         frame: index of the frame.
         config: samples per pixel, their seed and the frame rate.
     """

@@ -32,7 +32,6 @@ from morgs_mi.io.video import open_frames
 from morgs_mi.io.video_writer import PLAYABLE, write_video
 from morgs_mi.studio.synth.disturbances import (
     CameraDisturbance,
-    compressed,
     draw_disturbances,
     save_disturbances,
 )
@@ -161,7 +160,7 @@ class _Rig:
         cameras = scene.rig.cameras(config.cameras, config.width, config.height)
         return cls(
             cameras,
-            draw_disturbances(config.disturbances, config.cameras, config.frames, config.seed),
+            draw_disturbances(config.disturbances, config.cameras, config.seed),
             config,
         )
 
@@ -224,10 +223,7 @@ def _images(tracer: PathTracer, rig: _Rig, index: int) -> Iterator[np.ndarray]:
         light = record_light(
             tracer, rig.cameras[index], disturbance, frame, replace(config, seed=seed)
         )
-        yield compressed(
-            developed(disturbance.gains[frame] * light, config.noise, seed),
-            disturbance.jpeg_quality,
-        )
+        yield developed(light, config.noise, seed)
 
 
 def _check_views(tracer: PathTracer, cameras: Sequence[Camera]) -> None:

@@ -14,12 +14,10 @@ import pytest
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.lens import Lens
 from morgs_mi.capture.truth import load_tracks, load_truth
-from morgs_mi.core.color_space import decode_light
 from morgs_mi.io.video import open_frames
 from morgs_mi.studio.synth.disturbances import (
     CameraDisturbance,
     Disturbances,
-    compressed,
     draw_disturbances,
     load_disturbances,
     save_disturbances,
@@ -33,14 +31,8 @@ from morgs_mi.studio.synth.synthesize import synthesize
 from tests.assertions import assert_close
 from tests.studio.synth.frames import FPS, psnr
 
-ALL = Disturbances(0.5, 0.4, 0.2, 0.1, 0.02, 0.1, 80)
+ALL = Disturbances(0.5, 0.4, 0.1)
 SIZE = SynthConfig(cameras=2, frames=2, width=64, height=48, spp=4)
-
-
-@pytest.fixture(scope="module")
-def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The scene `spheres` without disturbances."""
-    return synthesize("spheres", tmp_path_factory.mktemp("synth") / "clip", SIZE)
 
 
 def frame_of(clip: Path, camera: str, frame: int) -> np.ndarray:
@@ -48,52 +40,41 @@ def frame_of(clip: Path, camera: str, frame: int) -> np.ndarray:
 
 
 def test_draw_disturbances__stays_within_its_bounds_and_leaves_the_reference_alone() -> None:
-    drawn = draw_disturbances(ALL, 200, 5, seed=1)
+    drawn = draw_disturbances(ALL, 200, seed=1)
     first, *others = drawn
     assert first.time_offset == 0
-    assert first.gains == (1.0,) * 5
     offsets = np.array([d.time_offset for d in others])
-    gains = np.array([d.gains for d in others])
     lenses = np.array([d.distortion for d in drawn])
     assert 0.4 < np.abs(offsets).max() <= 0.5
     assert offsets.min() < 0 < offsets.max()
     assert 0.08 < np.abs(lenses).max() <= 0.1
-    assert 0.1 < np.log(gains[:, 0]).max() < np.log(1.2) + 4 * 0.02
-    second = np.log(gains[:, 2:] * gains[:, :-2] / gains[:, 1:-1] ** 2)  # without gain and drift
-    assert abs(second.std() / (0.02 * np.sqrt(6)) - 1) < 0.15
-    assert {(d.rolling_shutter, d.jpeg_quality) for d in drawn} == {(0.4, 80)}
+    assert {d.rolling_shutter for d in drawn} == {0.4}
 
 
 @pytest.mark.parametrize("name", [field.name for field in fields(Disturbances)])
 def test_draw_disturbances__a_setting_acts_and_changes_nothing_else(name: str) -> None:
-    field_of_setting = {
-        "time_offset": "time_offset",
-        "rolling_shutter": "rolling_shutter",
-        "distortion": "distortion",
-        "jpeg_quality": "jpeg_quality",
-    }.get(name, "gains")
     none, one, every = (
-        draw_disturbances(d, 3, 4, 0)
+        draw_disturbances(d, 3, 0)
         for d in (Disturbances(), Disturbances(**{name: getattr(ALL, name)}), ALL)
     )
     for field in fields(CameraDisturbance):
         zeros, values, expected = (
             [getattr(d, field.name) for d in drawn] for drawn in (none, one, every)
         )
-        assert (values != zeros) == (field.name == field_of_setting)
-        if field.name == field_of_setting != "gains":
+        assert (values != zeros) == (field.name == name)
+        if field.name == name:
             assert values == expected
 
 
 def test_row_times__surround_the_time_of_the_frame() -> None:
-    camera = CameraDisturbance(0.25, 0.5, (1.0,), 0.0, 0)
+    camera = CameraDisturbance(0.25, 0.5, 0.0)
     times = camera.row_times(3, 48)
     assert_close(times.mean(), 3.25, atol=1e-12)
     assert_close(np.diff(times), np.full(47, 0.5 / 48), atol=1e-12)
 
 
 def test_load_disturbances__reads_back_what_was_saved(tmp_path: Path) -> None:
-    drawn = dict(zip(("cam00", "cam01"), draw_disturbances(ALL, 2, 3, 0), strict=True))
+    drawn = dict(zip(("cam00", "cam01"), draw_disturbances(ALL, 2, 0), strict=True))
     save_disturbances(tmp_path, drawn)
     assert load_disturbances(tmp_path) == drawn
 
@@ -105,9 +86,8 @@ def test_load_disturbances__names_a_missing_or_broken_file(tmp_path: Path) -> No
         load_disturbances(tmp_path)
     for text in (
         '{"cam00": {}}',
-        '{"cam00": {"gains": 3}}',
         "[]",
-        '{"cam00": {"gains": [], "x": 1}}',
+        '{"cam00": {"time_offset": 0, "rolling_shutter": 0, "distortion": 0, "x": 1}}',
     ):
         (tmp_path / "disturbances.json").write_text(text)
         with pytest.raises(
@@ -121,12 +101,11 @@ def test_draw_disturbances__refuses_values_out_of_range() -> None:
         ("time_offset", -1),
         ("rolling_shutter", 1.5),
         ("distortion", 2),
-        ("jpeg_quality", 101),
     ):
         with pytest.raises(
             ValueError, match=rf"draw_disturbances\(\): `{name}` must be at least 0.*, got {value}"
         ):
-            draw_disturbances(Disturbances(**{name: value}), 2, 1, 0)
+            draw_disturbances(Disturbances(**{name: value}), 2, 0)
 
 
 @pytest.mark.parametrize("k", [-0.3, 0.4])
@@ -240,40 +219,6 @@ def test_synthesize__refuses_a_lens_that_folds_its_corners(tmp_path: Path) -> No
             tmp_path / "clip",
             replace(SIZE, cameras=8, disturbances=Disturbances(distortion=0.5)),
         )
-
-
-@pytest.mark.slow
-def test_synthesize__exposes_frames_with_the_gains_of_the_truth(
-    clean: Path, tmp_path: Path
-) -> None:
-    hard = Disturbances(exposure_gain=0.3, exposure_drift=0.2, exposure_flicker=0.1)
-    dimmed = synthesize("spheres", tmp_path / "clip", replace(SIZE, disturbances=hard))
-    gains = load_disturbances(dimmed / "truth")
-    for camera in ("cam00", "cam01"):
-        for frame in (0, 1):
-            light, dimmed_light = (
-                decode_light(frame_of(c, camera, frame) / 255.0) for c in (clean, dimmed)
-            )
-            usable = (light > 0.1) & (dimmed_light > 0.1) & (light < 0.8) & (dimmed_light < 0.95)
-            assert_close(
-                np.median(dimmed_light[usable] / light[usable]),
-                gains[camera].gains[frame],
-                rtol=0.01,
-            )
-    assert gains["cam00"].gains == (1.0, 1.0)
-    assert gains["cam01"].gains[0] != gains["cam01"].gains[1]
-
-
-@pytest.mark.slow
-def test_synthesize__compresses_every_image(clean: Path, tmp_path: Path) -> None:
-    lossy = synthesize(
-        "spheres", tmp_path / "clip", replace(SIZE, disturbances=Disturbances(jpeg_quality=30))
-    )
-    whole = frame_of(clean, "cam01", 1)
-    pixels = frame_of(lossy, "cam01", 1)
-    np.testing.assert_array_equal(pixels, compressed(whole, 30))
-    assert 18 < psnr(pixels, whole) < 40
-    np.testing.assert_array_equal(compressed(whole, 0), whole)
 
 
 @pytest.mark.slow
