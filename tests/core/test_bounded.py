@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.core.bounded import MAX_TOML, array_names, read_array, read_json, read_toml
+from morgs_mi.core.bounded import MAX_JSON, MAX_TOML, array_names, read_array, read_json, read_toml
 from morgs_mi.io.exr import read_exr, write_exr
 from morgs_mi.io.ply import read_vertices
 from morgs_mi.io.splats import read_splats
@@ -151,44 +151,13 @@ CASES = {
     "deep JSON": (read_json, b"[" * 100_000, "expected JSON, got a broken file"),
     "JSON of empty lists": (
         read_json,
-        b"[" + b"[]," * 3_000_000 + b"0]",
-        "got a claim of 6000001 values",
+        b"[" + b"[]," * (MAX_JSON // 3) + b"0]",
+        "expected at most 64000000 bytes, got 64000002",
     ),
     "JSON of long number": (read_json, b"9" * 5000, "expected JSON, got a broken file"),
-    "TOML of a long key": (
-        read_toml,
-        b"x." + b"a." * 20_000 + b"b = 1",
-        r"broken file \(a key has more than 32 parts",
-    ),
-    "TOML of a long table": (
-        read_toml,
-        b"[a" + b" .\t'b'" * 99 + b"]",
-        r"broken file \(a key has more than 32 parts",
-    ),
-    "TOML of signs": (
-        read_toml,
-        b'"#".' * 20_000 + b"b = 1",
-        r"broken file \(a key has more than 32 parts",
-    ),
-    "TOML of equals signs": (
-        read_toml,
-        b"'='." * 20_000 + b"b = 1",
-        r"broken file \(a key has more than 32 parts",
-    ),
-    "TOML of escapes": (
-        read_toml,
-        rb'"\"".' * 20_000 + b"b = 1",
-        r"broken file \(a key has more than 32 parts",
-    ),
-    "TOML of a long inline key": (
-        read_toml,
-        b"x = {" + b"'{'." * 99 + b"b = 1}",
-        "a key has more than 32 parts",
-    ),
-    "TOML of a key alone": (read_toml, b"a." * 400_000, "a key has more than 32 parts"),
     "TOML of open strings": (
         read_toml,
-        b'a = """' + b'\\"""' * 100_000,
+        b'a = """' + b'\\"""' * 60_000,
         "expected TOML, got a broken file",
     ),
     "TOML in Latin-1": (
@@ -206,11 +175,10 @@ CASES = {
         npy("(5,)"),
         r"its header claims float64 \(5,\), but 48 bytes follow",
     ),
-    "TOML of many tables": (read_toml, b"[a.b.c]\n" * 90_000, "got a claim of 270000 tables"),
     "TOML of many rows": (
         read_toml,
         b"x = [" + b"1," * MAX_TOML + b"]",
-        "expected at most 1000000 bytes, got 2000006",
+        "expected at most 256000 bytes, got 512006",
     ),
     "deep TOML": (read_toml, b"x = " + b"[" * 5000, "expected TOML, got a broken file"),
     "PLY of many vertices": (
@@ -298,29 +266,10 @@ def test_readers__refuse_pipes_and_folders(tmp_path: Path, read) -> None:
             read(path)
 
 
-@pytest.mark.slow
-def test_read_toml__counts_keys_and_not_texts(tmp_path: Path) -> None:
-    """Dots and brackets in comments and texts, and the points of numbers, take nothing."""
-    dots = "a." * 100_000
-    text = (
-        f"# {dots} \"'\n# it's [[\nx = {[0.5] * 20_000}\na.b.c.d = "
-        f"'{dots}'\n\"{dots[:99]}\".'{dots[:99]}' = 1\n"
-    )
-    (tmp_path / "a.toml").write_text(text)
-    content = {"x": [0.5] * 20_000, "a": {"b": {"c": {"d": dots}}}, dots[:99]: {dots[:99]: 1}}
-    assert read_toml(tmp_path / "a.toml") == content
-
-
-def test_read_json__does_not_count_the_punctuation_of_texts(tmp_path: Path) -> None:
-    text = "[{,\\" * 400_000 + '"'
-    (tmp_path / "a.json").write_text(json.dumps([text]))
-    assert read_json(tmp_path / "a.json") == [text]
-
-
-@pytest.mark.parametrize(
-    "encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32"]
-)
-def test_readers__read_every_encoding_of_unicode(tmp_path: Path, encoding: str) -> None:
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+def test_readers__read_utf_8_with_and_without_a_byte_order_mark(
+    tmp_path: Path, encoding: str
+) -> None:
     (tmp_path / "a").write_bytes('a = "é"\r\n[b]\r\n'.encode(encoding))
     assert read_toml(tmp_path / "a") == {"a": "é", "b": {}}
     (tmp_path / "a").write_bytes('{"a":\r\n"é"}'.encode(encoding))

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.capture.lens import MODELS
-from morgs_mi.core.bounded import encoding_of, read_bytes, regular
+from morgs_mi.core.bounded import read_bytes, regular
 
 # The least bytes of an image in a binary model.
 _IMAGE_BYTES = 73
@@ -50,9 +50,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Yield the number, from 1, and the text of all lines that are not comments, including blank
     ones.
     """
-    with regular(path).open("rb") as file:
-        encoding = encoding_of(file.read(4))
-    with path.open(encoding=encoding, errors="replace") as file:
+    with regular(path).open(encoding="utf-8-sig", errors="replace") as file:
         for i, line in enumerate(file, start=1):
             if not line.startswith("#"):
                 yield i, line.rstrip("\n")

@@ -33,7 +33,7 @@ from morgs_mi.capture.layouts.calibration import (
     required_clips,
 )
 from morgs_mi.capture.lens import Lens, opencv_lens
-from morgs_mi.core.bounded import check_claim, encoding_of, read_bytes
+from morgs_mi.core.bounded import check_claim, read_bytes
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.core.checks import LARGEST, bounded
 from morgs_mi.io.unread import warn_unread
@@ -84,11 +84,7 @@ def read_qualisys(path: Path) -> tuple[list[Camera], list[Lens]]:
     values = data.count(b"<") + data.count(b"=")
     check_claim(path, _VALUE_BYTES * values, f"{values} elements and attributes")
     try:
-        encoding = encoding_of(data)  # of which a byte order mark knows better than a declaration
-        root = ElementTree.fromstring(
-            data if encoding == "utf-8" else data.decode(encoding),
-            ElementTree.XMLParser(target=_Plain()),
-        )
+        root = ElementTree.fromstring(data, ElementTree.XMLParser(target=_Plain()))
     except (ElementTree.ParseError, ValueError) as error:
         raise ValueError(
             f"{path}: expected XML, got a broken file ({error}); export it again."

@@ -487,13 +487,12 @@ def test_load_capture__ignores_what_systems_add(
     assert "__MACOSX" not in caplog.text
 
 
-@pytest.mark.parametrize("mark", ["utf-8-sig", "utf-16"])
 @pytest.mark.parametrize(
     "build",
     [layouts.colmap, layouts.nerfstudio, layouts.dynamic3dgs, layouts.anipose, layouts.qualisys],
 )
 def test_load_capture__reads_texts_of_windows(
-    tmp_path: Path, mark: str, build: Callable[[Path], Path]
+    tmp_path: Path, build: Callable[[Path], Path]
 ) -> None:
     path = build(tmp_path / "a")
     (path / "capture.json").write_text('{"fps": 12}')
@@ -502,7 +501,7 @@ def test_load_capture__reads_texts_of_windows(
         declared = (
             "<?xml version='1.0' encoding='utf-8'?>\n" if file.name.endswith(".qca.txt") else ""
         )
-        file.write_bytes((declared + file.read_text()).replace("\n", "\r\n").encode(mark))
+        file.write_bytes((declared + file.read_text()).replace("\n", "\r\n").encode("utf-8-sig"))
     result = load_capture(path)
     assert (result.names, result.fps) == (unix_capture.names, 12)
     for camera, expected in zip(result.cameras, unix_capture.cameras, strict=True):
