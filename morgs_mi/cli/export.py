@@ -13,7 +13,7 @@ from tyro.conf import DisallowNone, Positional, arg
 from morgs_mi.cli.console import quantity
 from morgs_mi.cli.export_kind import FRAMES, ExportKind
 from morgs_mi.cli.opening import DropInvalid, opened, shown_exposure
-from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, one_of, optional, place
+from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, optional, place
 from morgs_mi.cli.suggestion import one_command
 from morgs_mi.core.documentation import page
 from morgs_mi.core.entries import studio_entry
@@ -37,14 +37,8 @@ class Ply(ExportKind):
     """
 
     output: Annotated[Positional[Path | None], DisallowNone, place("FOLDER")] = None
-    """New folder for 0000.ply, ..., or FILE.ply for one frame; by default OUT/ply or
-    OUT/compressed-ply.
-    """
-    format: Annotated[
-        str | None, DisallowNone, optional("NAME"), one_of(tuple(f.name for f in PLY))
-    ] = None
-    """Format: ply, or compressed.ply, PlayCanvas' layout, whose sequence SuperSplat plays. By
-    default by the name.
+    """New folder for 0000.ply, ..., or FILE.ply for one frame, by default OUT/ply; a folder whose
+    name ends in compressed-ply, or FILE.compressed.ply, for PlayCanvas' layout.
     """
     frames: Annotated[str | None, DisallowNone, FRAMES] = None
 
@@ -99,7 +93,7 @@ class Flight(ExportKind):
         images = flight(stream, path, self.channels, frames)
         stops = shown_exposure(stream, self.display_exposure)
         write_images(
-            images, stream.fps, output, lambda done: report("Rendering", done, count), None, stops
+            images, stream.fps, output, lambda done: report("Rendering", done, count), stops
         )
         return f"{path.seconds:.1f} s, {path.keys[0].width}x{path.keys[0].height}"
 
@@ -121,10 +115,6 @@ class Web(ExportKind):
     output: Annotated[Positional[Path | None], DisallowNone, place("FILE.html")] = None
     """FILE.html, or a new folder with the page, the stream and a module for three.js, for hosting;
     by default OUT/player.html or OUT/web."""
-    format: Annotated[
-        str | None, DisallowNone, optional("NAME"), one_of(tuple(f.name for f in WEB))
-    ] = None
-    """Format: html or folder; by default by the name."""
     title: Annotated[str | None, DisallowNone, optional("TEXT")] = None
     """Title of the page; by default the name of the stream's folder or file."""
 

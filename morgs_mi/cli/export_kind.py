@@ -36,9 +36,7 @@ class ExportKind:
     def run(self, stream: FrameSource) -> None:
         options: Mapping[str, Any] = vars(self)
         stem = Path(options.get("path", "")).stem
-        output, chosen = destination(
-            stream.path, options["output"], self.formats, options.get("format"), stem
-        )
+        output, chosen = destination(stream.path, options["output"], self.formats, stem)
         with progress() as report:
             summary = self.write(stream, output, chosen, report)
         print_result(f"{output}: {summary}.")

@@ -11,7 +11,7 @@ from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress, quantity
 from morgs_mi.cli.opening import DropInvalid, opened, shown_exposure
-from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, one_of, optional
+from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, optional
 from morgs_mi.core.documentation import page
 from morgs_mi.core.entries import studio_entry
 from morgs_mi.playback.export.formats import IMAGES, destination
@@ -31,8 +31,8 @@ _CHANNELS = (
 _OUTPUT = (
     "FILE.mp4; a new folder whose name ends in png, for PNG files; another new folder, for "
     "multichannel EXR files (R, G, B in linear light, motion.X and motion.Y in pixels, "
-    "confidence.Y, depth.Y); FILE.png or FILE.exr for one image. By default OUT/CAMERA.mp4, "
-    "OUT/CAMERA-png or OUT/CAMERA-exr, with the name of the camera or the path."
+    "confidence.Y, depth.Y); FILE.png or FILE.exr for one image. By default OUT/CAMERA.mp4, with "
+    "the name of the camera or the path."
 )
 _CAMERA = (
     "Camera of the stream, by index or name; `morgs-mi info` lists the cameras of a capture. A "
@@ -78,10 +78,6 @@ class Render:
     """Distance of two eyes in world units, for equirectangular images, the left one above the
     right; 0: one eye.
     """
-    format: Annotated[str | None, DisallowNone, optional("NAME"), one_of(("mp4", "png", "exr"))] = (
-        None
-    )
-    """Format: mp4, png or exr; by default by the name of the output."""
     channels: Annotated[
         tuple[ChannelName, ...] | None, DisallowNone, optional("NAME ...", text=_CHANNELS)
     ] = None
@@ -112,7 +108,7 @@ class Render:
         view = find_camera(stream, 0 if self.camera is None else self.camera)
         is_path = self.camera is None and self.insert is None
         stem = Path(self.path or "orbit").stem if is_path else view.name
-        output, chosen = destination(stream.path, self.output, IMAGES, self.format, stem)
+        output, chosen = destination(stream.path, self.output, IMAGES, stem)
         single = chosen.folder and chosen.is_file(output)
         if self.insert is not None:
             images, count = self._inserted(stream, view, chosen.name)
@@ -130,7 +126,6 @@ class Render:
                 stream.fps,
                 output,
                 lambda done: report("Rendering", done, count),
-                chosen.name,
                 shown_exposure(stream, self.display_exposure),
             )
         print_result(f"{output}: {quantity(count, 'image')}.")

@@ -57,9 +57,8 @@ def held_out(names: Sequence[str]) -> TestViews:
     """Return held-out cameras, given by name or index, or as `none` or `auto`, as `load_capture`
     takes them.
     """
-    if len(names) == 1 and names[0].lower() in ("none", "auto"):
-        return None if names[0].lower() == "none" else "auto"
-    return tuple(names)
+    keywords: dict[tuple[str, ...], TestViews] = {("none",): None, ("auto",): "auto"}
+    return keywords.get(tuple(names), tuple(names))
 
 
 def optional(metavar: str, hint: str = "", text: str | None = None) -> Any:

@@ -327,10 +327,8 @@ def test_import__reads_what_export_writes(clip, tmp_path, capsys):
     assert (
         run("import", *sorted(clip.iterdir()), tmp_path / "a", "--fps", 24, "--quality", 4)[0] == 0
     )
-    assert run("export", "ply", tmp_path / "a", "--format", "compressed.ply")[0] == 0
-    status, output, _ = run(
-        "import", tmp_path / "a/compressed-ply", tmp_path / "b", "--axes", "z-up"
-    )
+    assert run("export", "ply", tmp_path / "a", tmp_path / "compressed-ply")[0] == 0
+    status, output, _ = run("import", tmp_path / "compressed-ply", tmp_path / "b", "--axes", "z-up")
     assert (
         status,
         output.startswith(f"{tmp_path}/b/stream.morgs: 5 frames, one set of Gaussians, "),

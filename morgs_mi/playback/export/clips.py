@@ -97,7 +97,7 @@ def write_ply_files(
     is_compressed = kind.name == "compressed.ply"
     clip = by_place(stream) if is_compressed else play(stream)
     write = write_compressed_ply if is_compressed else write_ply
-    write_each(clip, output, kind.ending, write, frames, progress)
+    write_each(clip, output, f".{kind.name}", write, frames, progress)
 
 
 def write_each(

@@ -29,7 +29,6 @@ def write_frames(
     output: str | Path,
     channels: Sequence[str] | None = None,
     progress: Callable[[int], None] | None = None,
-    format: str | None = None,
 ) -> None:
     """Render a stream for one camera into files, which are written atomically.
 
@@ -42,7 +41,6 @@ def write_frames(
         channels: out of `CHANNELS`; default: the colour, for EXR files all channels that the stream
             stores.
         progress: called with the number of frames done.
-        format: mp4, png or exr; None: by the output's name.
 
     Raises:
         ValueError: an unknown channel, a channel that the stream does not store, another type of
@@ -50,10 +48,10 @@ def write_frames(
         OSError: the folder exists, or a file cannot be written.
     """
     frame_numbers(stream)  # refuses a stream without frames
-    kind = choose_format(IMAGES, output, format).name
+    kind = choose_format(IMAGES, output).name
     channels = channels or (None if kind == "exr" else ("color",))
     images = render_stream(stream, camera, channels)
-    write_images(images, stream.fps, output, progress, kind, stream_exposure(stream))
+    write_images(images, stream.fps, output, progress, stream_exposure(stream))
 
 
 def write_images(
@@ -61,7 +59,6 @@ def write_images(
     fps: float,
     output: str | Path,
     progress: Callable[[int], None] | None = None,
-    format: str | None = None,
     display_exposure: float = 0.0,
 ) -> None:
     """Write rendered frames, pairs of index and channels [H, W, C] by name, into files as
@@ -74,7 +71,7 @@ def write_images(
         ValueError: another type of video.
         OSError: the folder exists, or a file cannot be written.
     """
-    kind = choose_format(IMAGES, output, format).name
+    kind = choose_format(IMAGES, output).name
     frames = _display_frames(rendered, 0.0 if kind == "exr" else display_exposure, progress)
     if kind == "mp4":
         movie = (pad_to_even(_combined_image(images)) for _, images in frames)

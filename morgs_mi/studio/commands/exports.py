@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import DisallowNone, Positional
 
 from morgs_mi.cli.export_kind import FRAMES, ExportKind
-from morgs_mi.cli.settings import Flag, one_of, optional, place
+from morgs_mi.cli.settings import Flag, place
 from morgs_mi.core.progress import Report
 from morgs_mi.playback.export.formats import GLTF, TRACKS, USD, Format
 
@@ -36,7 +36,9 @@ class Gltf(ExportKind):
 
         frames = select_frames(stream, self.frames)
         write = partial(write_gltf, axes=gltf_axes(stream.cameras))
-        write_each(play(stream), output, chosen.ending, write, frames, partial(report, "Writing"))
+        write_each(
+            play(stream), output, f".{chosen.name}", write, frames, partial(report, "Writing")
+        )
         return f"{len(frames)} glTF {'file' if len(frames) == 1 else 'files'}"
 
 
@@ -48,10 +50,6 @@ class Usd(ExportKind):
 
     output: Annotated[Positional[Path | None], DisallowNone, place("FILE")] = None
     """FILE.usd, .usdc (binary), .usda (text) or .usdz (package); by default OUT/stream.usdc."""
-    format: Annotated[
-        str | None, DisallowNone, optional("NAME"), one_of(tuple(f.name for f in USD))
-    ] = None
-    """Format: usdc, usd, usda or usdz; by default by the name."""
     frames: Annotated[str | None, DisallowNone, FRAMES] = None
     half: Flag = False
     """Half precision of all attributes but the positions."""

@@ -52,7 +52,7 @@ def test_export_ply__writes_every_frame(stream, tmp_path):
 
 
 def test_export_ply__writes_compressed_files(stream, tmp_path):
-    assert run("export", "ply", tmp_path, "--format", "compressed.ply", "--frames", "2:") == 0
+    assert run("export", "ply", tmp_path, tmp_path / "compressed-ply", "--frames", "2:") == 0
     files = sorted((tmp_path / "compressed-ply").iterdir())
     assert [path.name for path in files] == ["0002.compressed.ply", "0003.compressed.ply"]
     for path, state in zip(files, stream[2:], strict=True):
@@ -69,48 +69,36 @@ def test_export__writes_one_frame_into_a_file(stream, tmp_path, capsys, kind, na
     suffix = name.removeprefix("a")
     assert run("export", kind, tmp_path, tmp_path / name, "--frames", 2) == 0
     assert capsys.readouterr().out.rstrip().endswith(" file.")
-    assert run("export", kind, tmp_path, tmp_path / "folder", "--frames", 2, *format_of(name)) == 0
-    assert (tmp_path / name).read_bytes() == (tmp_path / "folder" / f"0002{suffix}").read_bytes()
-
-
-def format_of(name: str) -> tuple[str, ...]:
-    return ("--format", "compressed.ply") if "compressed" in name else ()
+    folder = tmp_path / ("compressed-ply" if "compressed" in name else "folder")
+    assert run("export", kind, tmp_path, folder, "--frames", 2) == 0
+    assert (tmp_path / name).read_bytes() == (folder / f"0002{suffix}").read_bytes()
 
 
 @pytest.mark.parametrize(
-    ("formats", "output", "name", "expected"),
+    ("formats", "output", "expected"),
     [
-        (WEB, None, None, "html"),
-        (WEB, None, "folder", "folder"),
-        (WEB, "a/site", None, "folder"),
-        (WEB, "a/Page.HTML", None, "html"),
-        (WEB, "a/page.html", "folder", "folder"),
-        (PLY, "a/v1.2", None, "ply"),
-        (PLY, "a/v1.2", "compressed.ply", "compressed.ply"),
-        (PLY, "a/b.compressed.ply", None, "compressed.ply"),
-        (IMAGES, "a/b", None, "exr"),
-        (IMAGES, "a/frames-png", None, "png"),
-        (IMAGES, "a/b", "png", "png"),
-        (IMAGES, "b.mp4", None, "mp4"),
-        (USD, "b.usda", "usda", "usda"),
+        (WEB, None, "html"),
+        (WEB, "a/site", ""),
+        (WEB, "a/Page.HTML", "html"),
+        (PLY, "a/v1.2", "ply"),
+        (PLY, "a/frames-compressed-ply", "compressed.ply"),
+        (PLY, "a/b.compressed.ply", "compressed.ply"),
+        (PLY, "a/b-compressed.ply", "ply"),
+        (IMAGES, "a/b", "exr"),
+        (IMAGES, "a/frames-png", "png"),
+        (IMAGES, "b.mp4", "mp4"),
+        (USD, "b.usda", "usda"),
     ],
 )
-def test_choose_format__follows_the_name_of_the_format_or_of_the_output(
-    formats, output, name, expected
-):
-    assert choose_format(formats, output, name).name == expected
-
-
-def test_choose_format__names_the_formats():
-    with pytest.raises(ValueError, match="`format` must be mp4, exr or png, got 'gif'"):
-        choose_format(IMAGES, "a", "gif")
+def test_choose_format__follows_the_name_of_the_output(formats, output, expected):
+    assert choose_format(formats, output).name == expected
 
 
 def test_export__refuses_a_folder_in_place_of_a_file_before_it_begins(stream, tmp_path, capsys):
     (tmp_path / "page.html").mkdir()
     for args in (
         ("web", tmp_path, tmp_path / "page.html"),
-        ("web", tmp_path, "--format", "folder"),
+        ("web", tmp_path, tmp_path / "web"),
     ):
         (tmp_path / "web").mkdir(exist_ok=True)
         assert run("export", *args) == 1
@@ -224,8 +212,8 @@ def test_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
         (("tracks", "folder"), "folder: the output must be FILE.npz, got 'folder'."),
         (
             ("ply", "a.glb"),
-            "must be a folder, FILE.ply for one frame or FILE.compressed.ply for one frame, got "
-            "'.glb'.",
+            "must be a folder, FILE.ply for one frame, a folder ending in compressed-ply or "
+            "FILE.compressed.ply for one frame, got '.glb'.",
         ),
         (
             ("ply", "a.ply"),
@@ -237,10 +225,6 @@ def test_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
             "a.usd: the output must be a folder or FILE.glb for one frame, got '.usd'.",
         ),
         (("web", "a.htm"), "a.htm: the output must be FILE.html or a folder, got '.htm'."),
-        (
-            ("usd", "a.usdz", "--format", "usda"),
-            "a.usdz: the output must be FILE.usda, got '.usdz'.",
-        ),
         (("video", "--freeze", "7"), "--freeze must be in 0 to 3, got 7"),
         (("video", "--width", "0"), "--width must be a number in [1, inf), got 0"),
         (("video", "--seconds", "-1"), "--seconds must be positive"),

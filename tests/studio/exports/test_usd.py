@@ -64,7 +64,7 @@ def expected(gaussians: Gaussians) -> dict[str, np.ndarray]:
     }
 
 
-@pytest.mark.parametrize("suffix", [usd.ending for usd in USD])
+@pytest.mark.parametrize("suffix", [f".{usd.name}" for usd in USD])
 def test_write_usd__attributes_are_read_back(tmp_path, suffix):
     states, stage = written(tmp_path / f"a{suffix}")
     prim = stage.GetPrimAtPath("/Stream/Gaussians")
@@ -92,7 +92,7 @@ def test_write_usd__describes_the_stage(tmp_path):
     assert_close((gltf_axes(rig()) @ point) @ back, point, atol=1e-12)
 
 
-@pytest.mark.parametrize("suffix", [usd.ending for usd in USD])
+@pytest.mark.parametrize("suffix", [f".{usd.name}" for usd in USD])
 @pytest.mark.parametrize("half", [False, True])
 def test_write_usd__passes_the_validators_of_openusd(tmp_path, suffix, half):
     _, stage = written(tmp_path / f"a{suffix}", half=half)
@@ -224,7 +224,7 @@ def test_export_usd__names_an_output_that_does_not_fit(tmp_path, capfd, output, 
     assert [path.name for path in tmp_path.iterdir()] == ["stream.morgs"]
 
 
-@pytest.mark.parametrize("suffix", [usd.ending for usd in USD])
+@pytest.mark.parametrize("suffix", [f".{usd.name}" for usd in USD])
 def test_export_usd__removes_its_output_on_a_full_disk(tmp_path, capfd, suffix):
     write_stream(tmp_path / "stream.morgs")
     with files_end_at(3000):
