@@ -28,7 +28,6 @@ from morgs_mi.core.color_space import display_stops
 from morgs_mi.core.fit_names import CAPTURE
 from morgs_mi.core.rig import with_near_planes
 from morgs_mi.io.prefetch import prefetched
-from morgs_mi.io.remote import is_url, mirrored, url_of
 from morgs_mi.io.video import Clip, FrameReader, ImageOrError, open_clips
 
 _LOG = logging.getLogger(__name__)
@@ -114,11 +113,6 @@ class Capture:
             f"{len(self.cameras)} cameras, {self.num_frames} frames, {self.fps:g} frames per second"
         )
         return f"Capture('{self.path}', {self.layout}, {size}, held out: {held_out})"
-
-    @property
-    def location(self) -> str:
-        """URL of the capture, or the absolute path of its folder: both open it again."""
-        return url_of(self.path) or str(self.path.resolve())
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -369,8 +363,7 @@ def load_capture(
     """Open a capture folder: read the calibration and the header of every clip.
 
     Args:
-        path: the folder, or its URL (see `io.remote`); `layouts/layout_registry.py` lists the
-            supported layouts.
+        path: the folder; `layouts/layout_registry.py` lists the supported layouts.
         downscale: factor by which images are downscaled (area averages, rounded to the nearest
             whole size).
         test_view: index or name of the held-out camera, several of them, or None for none; "auto"
@@ -389,7 +382,7 @@ def load_capture(
         ValueError: calibration and clips disagree (number, size, length, frame rate), a file is
             broken, or an argument is out of range.
     """
-    path = mirrored(str(path)) if is_url(path) else Path(path)
+    path = Path(path)
     _check_folder(path)
     _check_arguments(downscale, max_frames)
     reading = reading or ReadConfig()

@@ -10,7 +10,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from morgs_mi.io.remote import fetched
 from morgs_mi.io.video import FolderReader, FrameReader, decode_image
 
 
@@ -149,7 +148,7 @@ def _transparent_image(file: Path) -> np.ndarray | None:
 
 def _may_be_transparent(file: Path) -> bool:
     """Return whether an image may have an alpha channel, from the header of its file."""
-    with fetched(file).open("rb") as stream:
+    with file.open("rb") as stream:
         header = stream.read(26)
     if header.startswith(b"\x89PNG"):
         # With a palette, grey and alpha, or RGB and alpha.
@@ -159,7 +158,7 @@ def _may_be_transparent(file: Path) -> bool:
 
 
 def _decoded(file: Path) -> np.ndarray:
-    return decode_image(file, np.fromfile(fetched(file), np.uint8), cv2.IMREAD_UNCHANGED)
+    return decode_image(file, np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED)
 
 
 def _check_aspect(file: Path, mask: np.ndarray, width: int, height: int) -> None:

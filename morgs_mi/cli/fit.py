@@ -44,14 +44,8 @@ class Fit:
     preset; options override both.
     """
 
-    capture: Annotated[
-        Positional[str | None],
-        arg(
-            help_behavior_hint="",
-            metavar="[CAPTURE]",
-            help=f"Folder of the capture, or its URL ({page('cluster')}).",
-        ),
-    ] = None
+    capture: Annotated[Positional[Path | None], arg(help_behavior_hint="")] = None
+    """Folder of the capture."""
     out: Annotated[Positional[Path | None], arg(help_behavior_hint="")] = None
     """Folder for stream.morgs, capture.json and report.json; an earlier stream there is replaced
     without --resume.

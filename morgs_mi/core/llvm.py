@@ -64,22 +64,15 @@ def find_llvm(folders: Iterable[Path] | None = None) -> list[Path]:
     return sorted(libraries, key=lambda path: llvm_major(path) or 0, reverse=True)
 
 
-def cache_folder() -> Path:
-    """Return the folder of the package's caches; it is a temporary one for a user without a home
-    folder.
-    """
-    home = os.path.expanduser("~/.cache")
-    usual = tempfile.gettempdir() if home.startswith("~") else home
-    return Path(os.environ.get("XDG_CACHE_HOME") or usual, "morgs_mi")
-
-
 def works(path: Path) -> bool:
     """Return whether Dr.Jit compiles a kernel with this library, tested in a separate process.
 
     Success is cached per file and machine in ``~/.cache/morgs_mi``; failure is not, because an
     update of Dr.Jit may change it.
     """
-    cache = cache_folder() / "llvm.txt"
+    home = os.path.expanduser("~/.cache")  # a temporary folder for a user without a home folder
+    usual = tempfile.gettempdir() if home.startswith("~") else home
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or usual, "morgs_mi", "llvm.txt")
     key = f"{os.uname().nodename} {sys.executable} {path.resolve()} {path.stat().st_mtime_ns}"
     with suppress(OSError):
         if key in cache.read_text().splitlines():

@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 
 from morgs_mi.io.movie import Movie, read_movie
-from morgs_mi.io.remote import fetched
 
 SAME_TIME = 1e-6
 """Difference in s up to which two times are the same."""
@@ -81,7 +80,7 @@ def read_header(path: Path) -> VideoHeader:
 def _check_file(path: Path) -> None:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a video file, found none; check the path.")
-    if fetched(path).stat().st_size == 0:
+    if path.stat().st_size == 0:
         raise ValueError(f"{path}: expected a video, got an empty file; copy or record it again.")
 
 

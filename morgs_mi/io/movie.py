@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
-from morgs_mi.io.remote import fetched
-
 # The boxes with which a file of this kind begins.
 _FIRST = {b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip"}
 # Bytes of an edit list that are read; it has a few entries.
@@ -40,7 +38,7 @@ class _Box:
 
 def read_movie(path: Path) -> Movie | None:
     """Return the structure of an MP4 or QuickTime file, None for any other file."""
-    size = fetched(path).stat().st_size
+    size = path.stat().st_size
     with path.open("rb") as file:
         if file.read(8)[4:] not in _FIRST:
             return None

@@ -25,7 +25,6 @@ from morgs_mi.io.frame_times import SAME_TIME, clock, read_header, seconds, true
 from morgs_mi.io.image_size import image_size
 from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, images_in
 from morgs_mi.io.numbering import counting_together
-from morgs_mi.io.remote import fetched
 
 # Bytes of memory that a pixel takes, in BGR and RGB.
 _BYTES_PER_PIXEL = 6
@@ -455,13 +454,13 @@ def _read_image(file: Path) -> np.ndarray:
     if file.suffix.lower() == EXR_SUFFIX:
         return _read_light(file)
     # The stored pixels, without EXIF's rotation: calibrations refer to them.
-    image = decode_image(file, np.fromfile(fetched(file), np.uint8), cv2.IMREAD_COLOR)
+    image = decode_image(file, np.fromfile(file, np.uint8), cv2.IMREAD_COLOR)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def _read_light(file: Path) -> np.ndarray:
     try:
-        return read_light(fetched(file))
+        return read_light(file)
     except OSError as error:
         raise ValueError(str(error)) from None
 

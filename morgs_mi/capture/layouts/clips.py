@@ -25,7 +25,6 @@ import numpy as np
 
 from morgs_mi.io.image_size import image_size
 from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, VIDEO_SUFFIXES, images_in, listed
-from morgs_mi.io.remote import fetched
 from morgs_mi.io.video import Clip, natural_key, numbering_gap, open_frames
 
 _LOG = logging.getLogger(__name__)
@@ -217,7 +216,7 @@ def _clip_size(clip: Clip) -> tuple[int, int]:
 
 def _header_size(image: Path) -> tuple[int, int]:
     """Return the width and height of an image by its header, 0 if it does not show them."""
-    if not fetched(image).stat().st_size:
+    if not image.stat().st_size:
         return 0, 0
     return image_size(np.memmap(image, np.uint8, "r"))
 

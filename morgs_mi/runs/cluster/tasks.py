@@ -33,7 +33,7 @@ from morgs_mi.stream_loop import StreamLoop
 class Source:
     """A capture as every worker opens it; the other fields are as `load_capture` takes them."""
 
-    path: str  #: Its folder, absolute, or its URL.
+    path: str  #: Its folder, absolute.
     downscale: float
     test_views: tuple[int, ...]
     num_frames: int
@@ -42,7 +42,7 @@ class Source:
     @classmethod
     def of(cls, capture: Capture) -> Source:
         """Return the source of an open capture."""
-        path = capture.location
+        path = str(capture.path.resolve())
         return cls(path, capture.downscale, capture.test_views, capture.num_frames, capture.reading)
 
     def open(self) -> Capture:

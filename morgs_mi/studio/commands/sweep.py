@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 class Sweep:
     """Fit and score a capture with several numbers of epochs: error against run time."""
 
-    capture: Positional[str]
+    capture: Positional[Path]
     """Folder of the capture."""
     out: Positional[Path]
     """Folder for the streams and sweep.json."""

@@ -195,22 +195,6 @@ def test_SegmentedRun__resumes_after_the_beginning_of_a_segment(
 
 
 @pytest.mark.slow
-def test_SegmentedRun__of_a_url_is_the_same(
-    capture: Capture, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("fsspec", reason="comes with the extra `cluster`")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "worker"))
-    with open_client(count=1) as client:  # it has a cache of its own
-        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "client"))
-        fit(load_capture(f"file://{capture.path}"), tmp_path / "out", client)
-    assert len(list((tmp_path / "worker").rglob("cam1"))) == 1
-    packets = (
-        [p.encoded for p in StreamReader(out / "stream.morgs")] for out in (tmp_path / "out", whole)
-    )
-    assert next(packets) == next(packets)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 4])
 def test_SegmentedRun__with_a_killed_process_is_the_same(
     capture: Capture, client: Client, whole: Path, tmp_path: Path, count: int

@@ -65,14 +65,3 @@ def test_source__opens_the_capture_as_it_is(tmp_path: Path) -> None:
     capture = load_capture(write_recording(tmp_path, 5), 1.0, "cam1", 4)
     again = Source.of(capture).open()
     assert (again.num_frames, again.test_views, again.names) == (4, (1,), capture.names)
-
-
-def test_source__of_a_url_is_opened_by_its_url(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("fsspec", reason="comes with the extra `cluster`")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    url = f"file://{write_recording(tmp_path / 'clip', 2)}"
-    source = Source.of(load_capture(url))
-    assert source.path == url
-    assert source.open().num_frames == 2
