@@ -124,7 +124,7 @@ def _not_black(file: Path) -> np.ndarray:
         raise FileNotFoundError(
             f"{file}: expected a mask, found none; copy it, or drop `mask_path`."
         )
-    image = np.atleast_3d(_decoded(file)) > 0
+    image = np.atleast_3d(decode_image(file, cv2.IMREAD_UNCHANGED)) > 0
     return np.any(image[..., :3], axis=2) & np.all(image[..., 3:], axis=2)
 
 
@@ -141,7 +141,7 @@ def _opaque(file: Path, shape: tuple[int, int]) -> np.ndarray:
 def _transparent_image(file: Path) -> np.ndarray | None:
     """Return an image that may have an alpha channel, None if it has none or is not readable."""
     try:
-        return _decoded(file) if _may_be_transparent(file) else None
+        return decode_image(file, cv2.IMREAD_UNCHANGED) if _may_be_transparent(file) else None
     except (ValueError, OSError):
         return None
 
@@ -155,10 +155,6 @@ def _may_be_transparent(file: Path) -> bool:
         return header[25:] in (b"\3", b"\4", b"\6")
     # JPEG has none, and the alpha channel of BMP and EXR files is not a mask.
     return not header.startswith((b"\xff\xd8", b"BM", b"\x76\x2f\x31\x01"))
-
-
-def _decoded(file: Path) -> np.ndarray:
-    return decode_image(file, np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED)
 
 
 def _check_aspect(file: Path, mask: np.ndarray, width: int, height: int) -> None:

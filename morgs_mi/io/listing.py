@@ -24,11 +24,6 @@ def is_added(name: str) -> bool:
     return name.startswith("._") or name.lower() in _ADDED
 
 
-def is_listed(name: str) -> bool:
-    """Return whether a file or folder of this name is neither hidden nor added by a system."""
-    return not (name.startswith(".") or is_added(name))
-
-
 def listed(folder: str | Path) -> list[Path]:
     """Return the files and folders in a folder that are neither hidden nor added by a system, by
     name.
@@ -36,7 +31,8 @@ def listed(folder: str | Path) -> list[Path]:
     Raises:
         OSError: there is no such folder, or it cannot be read.
     """
-    return sorted(file for file in Path(folder).iterdir() if is_listed(file.name))
+    files = Path(folder).iterdir()
+    return sorted(f for f in files if not (f.name.startswith(".") or is_added(f.name)))
 
 
 def images_in(folder: str | Path) -> list[Path]:

@@ -454,7 +454,7 @@ def _read_image(file: Path) -> np.ndarray:
     if file.suffix.lower() == EXR_SUFFIX:
         return _read_light(file)
     # The stored pixels, without EXIF's rotation: calibrations refer to them.
-    image = decode_image(file, np.fromfile(file, np.uint8), cv2.IMREAD_COLOR)
+    image = decode_image(file, cv2.IMREAD_COLOR)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
@@ -465,17 +465,17 @@ def _read_light(file: Path) -> np.ndarray:
         raise ValueError(str(error)) from None
 
 
-def decode_image(file: Path, data: np.ndarray, mode: int) -> np.ndarray:
-    """Return the image in the bytes of a file, or of a part of it, decoded by OpenCV with `mode`.
+def decode_image(file: Path, mode: int) -> np.ndarray:
+    """Return the image in a file, decoded by OpenCV with `mode`.
 
     Args:
-        file: the file, for messages and its size.
-        data: uint8 [N].
+        file: the file.
         mode: of `cv2.imdecode`.
 
     Raises:
-        ValueError: the bytes are no image, or claim more pixels than the file may hold.
+        ValueError: it is no image, or claims more pixels than the file may hold.
     """
+    data = np.fromfile(file, np.uint8)
     width, height = image_size(data)
     check_claim(file, _BYTES_PER_PIXEL * width * height, f"{width}x{height} pixels")
     image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None

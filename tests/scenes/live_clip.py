@@ -1,16 +1,9 @@
-"""A clip of `filmed` that is played in a loop at its own speed: into a folder, or as a video
-through a pipe.
-"""
+"""A clip of `filmed` as videos that are played in a loop, and its calibration."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
 from functools import cache
-from itertools import count
 from pathlib import Path
-from threading import Event, Thread
 
 import numpy as np
 
@@ -43,59 +36,9 @@ def write_calibration(path: Path) -> Path:
     return path
 
 
-@contextmanager
-def in_background(work) -> Iterator[None]:
-    """Run `work(stopped)` in a thread until the body ends."""
-    stopped = Event()
-    thread = Thread(target=work, args=(stopped,), daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        stopped.set()
-        thread.join(timeout=10)
-
-
-def filling(folder: Path):
-    """Return work that writes the clip into a folder again and again, in real time."""
-
-    def fill(stopped: Event) -> None:
-        start = time.monotonic()
-        for t in count():
-            for name, clip in zip(NAMES, clips(), strict=True):
-                file = folder / name / f"{t:04d}.png"
-                file.parent.mkdir(parents=True, exist_ok=True)
-                data = png_bytes(clip[t % len(clip)])
-                # In two parts, as a program that is slow to write it.
-                with file.open("wb") as opened:
-                    opened.write(data[:5000])
-                    opened.flush()
-                    time.sleep(0.001)
-                    opened.write(data[5000:])
-            if stopped.wait(max(0.0, start + (t + 1) / FPS - time.monotonic())):
-                return
-
-    return fill
-
-
-def piping(pipe: Path, data: bytes, seconds: float):
-    """Return work that writes the bytes of a video into a pipe at the speed at which it was
-    recorded.
-    """
-
-    def write(stopped: Event) -> None:
-        start = time.monotonic()
-        parts = max(100, int(15 * seconds))
-        with suppress(BrokenPipeError), pipe.open("wb", buffering=0) as opened:
-            for k in range(parts):
-                opened.write(data[len(data) * k // parts : len(data) * (k + 1) // parts])
-                if stopped.wait(max(0.0, start + seconds * (k + 1) / parts - time.monotonic())):
-                    return
-
-    return write
-
-
-def write_loop(path: Path, clip: Sequence[np.ndarray], repeats: int) -> bytes:
-    """Return a video that repeats a clip."""
-    write_video(path, [image for _ in range(repeats) for image in clip], FPS, "mp4v")
-    return path.read_bytes()
+def write_videos(folder: Path) -> list[Path]:
+    """Write the clip of each camera as a video and return their paths."""
+    paths = [folder / f"{name}.mkv" for name in NAMES]
+    for path, clip in zip(paths, clips(), strict=True):
+        write_video(path, clip, FPS)
+    return paths

@@ -51,9 +51,7 @@ class Live:
     folder capture.
     """
     camera: Annotated[tuple[str, ...], arg(metavar="SOURCE ...", help_behavior_hint="")] = ()
-    """Per camera its number, a URL, a named pipe or a video; or one folder that another program
-    fills.
-    """
+    """Per camera its number, a URL or a video."""
     live: Annotated[LiveConfig, arg(name=""), DisallowNone] = field(default_factory=LiveConfig)
     view: Flag = False
     """Show the stream in the viewer, which follows it."""

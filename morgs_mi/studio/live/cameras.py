@@ -1,5 +1,5 @@
-"""Live images of cameras, streams and pipes: a thread for each of them reads all images and stores
-the newest.
+"""Live images of cameras and streams: a thread for each of them reads all images and stores the
+newest.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from threading import Condition, Event, Thread
 
 import numpy as np
 
-from morgs_mi.studio.live.feed import Bundle, Shot, bundled, close_images
+from morgs_mi.studio.live.feed import Bundle, Shot, close_images
 
 # Images of a camera from which the one that agrees best with the others is chosen: networks deliver
 # them in bursts.
@@ -23,7 +23,7 @@ _CLOSING = 12.0  # longest wait for the threads, s; a connection or a driver may
 
 
 class CameraFeed:
-    """Live images of cameras that are read side by side; it has the methods of `Feed`.
+    """Live images of cameras that are read side by side.
 
     Images are bundled by the times of their arrival: the newest one of the slowest camera, and of
     each other camera the one that is nearest in time.
@@ -60,7 +60,16 @@ class CameraFeed:
             camera.start()
 
     def newest(self, after: Bundle | None = None) -> Bundle | None:
-        """Wait for the newest bundle and return it; None if no camera delivers images any more."""
+        """Wait for the newest bundle and return it; None if no camera delivers images any more.
+
+        The first bundle has an image of every camera.
+
+        Args:
+            after: the bundle before; all images of the new one are newer.
+
+        Raises:
+            OSError, ValueError: a camera cannot be opened, or has no first image.
+        """
         with self._change:
             if after is None:
                 self._wait_for_first()
@@ -116,8 +125,14 @@ class CameraFeed:
         shots = _nearest(new, expected)
         if shots is None:
             return None
-        numbers = [camera.shots[-1].number for camera in self._cameras]
-        return bundled(shots, numbers, _skew(shots), _dropped(shots, after))
+        pairs = zip(shots, self._cameras, strict=True)
+        return Bundle(
+            tuple(shot and shot.image for shot in shots),
+            tuple((shot or camera.shots[-1]).number for shot, camera in pairs),
+            max(shot.time for shot in shots if shot is not None),
+            _skew(shots),
+            _dropped(shots, after),
+        )
 
     def _expected(self, new: Sequence[Sequence[Shot]], bundle: Bundle, late: bool) -> list[bool]:
         """Return for each camera whether the bundle has to have its image.

@@ -28,7 +28,8 @@ from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.fit_capture import Prepared, push_frame
 from morgs_mi.runs.fit_files import FitFiles, Recording, check_outputs, stream_metadata
 from morgs_mi.stream_loop import StreamLoop
-from morgs_mi.studio.live.feed import Bundle, Feed
+from morgs_mi.studio.live.cameras import CameraFeed
+from morgs_mi.studio.live.feed import Bundle
 from morgs_mi.studio.live.live_capture import begin_capture, read_calibration, write_images
 from morgs_mi.studio.live.live_config import LIVE_STREAM, LiveConfig
 from morgs_mi.studio.live.sources import Source, open_feed
@@ -75,8 +76,8 @@ def fit_live(
 
     Raises:
         FileExistsError: OUT has the capture of an earlier fit.
-        OSError: a source cannot be opened, the folder of the images is removed, or the output
-            cannot be written; the stream ends with a complete frame.
+        OSError: a source cannot be opened, or the output cannot be written; the stream ends with a
+            complete frame.
         ValueError: a setting is out of range, a camera has no first image, or the cameras cannot be
             calibrated or do not have the calibrated sizes.
     """
@@ -85,7 +86,6 @@ def fit_live(
     live.check("fit_live()")
     check_outputs(out)
     _check_no_capture(out / "capture")
-    _check_outside(out, sources)
     calibration = _calibration(live)
     names = calibration and [camera.name for camera in calibration.cameras]
     report = on_stage or (lambda *_: None)
@@ -113,7 +113,7 @@ def _check_no_capture(folder: Path) -> None:
         )
 
 
-def _first_images(feed: Feed, report: Report) -> Bundle:
+def _first_images(feed: CameraFeed, report: Report) -> Bundle:
     """Wait for the first images of the cameras and return them."""
     report("Waiting for the cameras", 0, 1)
     first = feed.newest()
@@ -121,20 +121,6 @@ def _first_images(feed: Feed, report: Report) -> Bundle:
         raise ValueError("fit_live(): expected images of the cameras, got none.")
     report("Waiting for the cameras", 1, 1)
     return first
-
-
-def _check_outside(out: Path, sources: Sequence[Source]) -> None:
-    """Check that an output is in no folder of images: its folders would count as cameras.
-
-    Raises:
-        ValueError: it is.
-    """
-    for folder in (Path(source) for source in sources if isinstance(source, str | Path)):
-        if folder.is_dir() and out.resolve().is_relative_to(folder.resolve()):
-            raise ValueError(
-                f"{out}: expected a folder outside of {folder}, into which another program writes "
-                "images; choose a different one."
-            )
 
 
 class _LiveFrames:
@@ -147,7 +133,9 @@ class _LiveFrames:
         config: settings.
     """
 
-    def __init__(self, feed: Feed, capture: Capture, first: Bundle, config: LiveConfig) -> None:
+    def __init__(
+        self, feed: CameraFeed, capture: Capture, first: Bundle, config: LiveConfig
+    ) -> None:
         self.capture = capture
         self.config = config
         self._feed = feed

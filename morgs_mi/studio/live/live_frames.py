@@ -3,9 +3,7 @@
 A source yields the images of one camera, at the size of its recorded clip:
 
 - an int: a camera of this machine, by OpenCV's index;
-- a path or URL: anything that FFmpeg opens, e.g. a named pipe, ``/dev/video0`` or ``rtsp://...``;
-- a binary file, e.g. the end of a pipe: raw RGB images, 8 bits per channel (``ffmpeg ... -f
-  rawvideo -pix_fmt rgb24 -``);
+- a path or URL: anything that FFmpeg opens, e.g. ``/dev/video0`` or ``rtsp://...``;
 - an iterable of arrays uint8 [H, W, 3], RGB, with None for a missed instant.
 """
 
@@ -15,7 +13,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import count
 from pathlib import Path
 from threading import Event
-from typing import BinaryIO, cast
 
 import numpy as np
 
@@ -23,9 +20,9 @@ from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.io.prefetch import prefetched
 from morgs_mi.studio.live.feed import close_images
 from morgs_mi.studio.live.playing import ClipClock, is_video, play
-from morgs_mi.studio.live.reading import raw_images, read_camera
+from morgs_mi.studio.live.reading import read_camera
 
-Source = int | str | Path | BinaryIO | Iterable[np.ndarray | None]
+Source = int | str | Path | Iterable[np.ndarray | None]
 
 
 def live_frames(
@@ -50,10 +47,7 @@ def live_frames(
     """
     _check_count(rig, len(sources))
     stop = Event()
-    streams = [
-        _images(source, *size, stop)
-        for source, size in zip(sources, rig.recorded_sizes, strict=True)
-    ]
+    streams = [_images(source, stop) for source in sources]
     return prefetched(_frames(rig, streams), newest=newest, closed=stop)
 
 
@@ -97,11 +91,9 @@ def _check_size(rig: Capture, view: int, image: np.ndarray | None) -> None:
         )
 
 
-def _images(source: Source, width: int, height: int, stop: Event) -> Iterator[np.ndarray | None]:
+def _images(source: Source, stop: Event) -> Iterator[np.ndarray | None]:
     if isinstance(source, int | str | Path):
         if is_video(source):
             return play(source, ClipClock(), stop)
         return read_camera(source, stop, reconnect=False)  # the other cameras would wait for it
-    if hasattr(source, "read"):
-        return raw_images(cast(BinaryIO, source), width, height)
-    return iter(cast(Iterable[np.ndarray | None], source))
+    return iter(source)

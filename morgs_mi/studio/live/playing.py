@@ -126,7 +126,7 @@ def timed_images(path: str | Path) -> Iterator[tuple[np.ndarray, float, float]]:
     Raises:
         OSError: the video cannot be opened.
     """
-    stream = open_stream(str(path), path)
+    stream = open_stream(path)
     try:
         interval = 1 / (stream.get(cv2.CAP_PROP_FPS) or _RATE)
         last = -inf

@@ -9,56 +9,56 @@ from threading import Event
 import numpy as np
 
 from morgs_mi.studio.live.cameras import CameraFeed
-from morgs_mi.studio.live.feed import Feed
-from morgs_mi.studio.live.folder import FolderFeed
 from morgs_mi.studio.live.live_config import LiveConfig
 from morgs_mi.studio.live.playing import ClipClock, is_video, play
 from morgs_mi.studio.live.reading import read_camera
 
 Source = int | str | Path
-"""A camera of this machine, by OpenCV's index; a path or URL that FFmpeg opens; or a folder with
-images of all.
-"""
+"""A camera of this machine, by OpenCV's index; or a path or URL that FFmpeg opens."""
 
 
 def open_feed(
     sources: Sequence[Source], config: LiveConfig, names: Sequence[str] | None = None
-) -> Feed:
-    """Return the feed of a folder with the images of all cameras, or of one source per camera.
+) -> CameraFeed:
+    """Return the feed of one source per camera.
 
     Args:
-        sources: the folder alone, or one source per camera, in the order of `names`.
+        sources: one per camera, in the order of `names`.
         config: settings.
-        names: names of the cameras; by default the names of the folders in a folder, otherwise
-            cam0, cam1, ...
+        names: names of the cameras; by default cam0, cam1, ...
 
     Raises:
-        FileNotFoundError: there is no such folder.
         ValueError: there is no source, one occurs twice, their number differs from the number of
             names, or the settings repeat videos and there is none.
     """
     _check_different(sources)
-    folders = [
-        source for source in sources if isinstance(source, str | Path) and Path(source).is_dir()
-    ]
-    if folders and len(sources) == 1:
-        return FolderFeed(Path(folders[0]), config.timeout, names)
-    if folders:
-        raise ValueError(
-            "open_feed(): `camera` must be one folder with the images of all cameras, or one "
-            f"source per camera, got {_listed(sources)}; name one folder."
-        )
     if names is None:
         names = [f"cam{k}" for k in range(len(sources))]
     _check_count(sources, names)
-    return _camera_feed(sources, config, names)
+    stop = Event()
+    videos = [source for source in sources if is_video(source)]
+    if config.loop:
+        _check_videos(videos, sources)
+    clock = ClipClock(len(videos))
+
+    def images(source: Source) -> Iterator[np.ndarray | None]:
+        if is_video(source):
+            return play(source, clock, stop, videos.index(source), config.loop)
+        return read_camera(source, stop, config.size)
+
+    end_text = (
+        "it has ended; --loop repeats videos" if videos and not config.loop else "it has ended"
+    )
+    cameras = {name: images(source) for name, source in zip(names, sources, strict=True)}
+    warm_up = 0.0 if len(videos) == len(sources) else config.warm_up
+    return CameraFeed(cameras, config.timeout, warm_up, stop, end_text)
 
 
 def _check_different(sources: Sequence[Source]) -> None:
     """Raise `ValueError` without a source, or if one occurs twice."""
     if not sources:
         raise ValueError(
-            "open_feed(): `camera` must have a source per camera, or a folder, got none; name them."
+            "open_feed(): `camera` must have a source per camera, got none; name them."
         )
     if len(set(sources)) < len(sources):
         raise ValueError(
@@ -80,27 +80,6 @@ def _check_videos(videos: Sequence[Source], sources: Sequence[Source]) -> None:
         raise ValueError(
             f"open_feed(): `loop` repeats videos, got none in {_listed(sources)}; leave it out."
         )
-
-
-def _camera_feed(sources: Sequence[Source], config: LiveConfig, names: Sequence[str]) -> CameraFeed:
-    """Return the feed of cameras, streams and videos."""
-    stop = Event()
-    videos = [source for source in sources if is_video(source)]
-    if config.loop:
-        _check_videos(videos, sources)
-    clock = ClipClock(len(videos))
-
-    def images(source: Source) -> Iterator[np.ndarray | None]:
-        if is_video(source):
-            return play(source, clock, stop, videos.index(source), config.loop)
-        return read_camera(source, stop, config.size)
-
-    end_text = (
-        "it has ended; --loop repeats videos" if videos and not config.loop else "it has ended"
-    )
-    cameras = {name: images(source) for name, source in zip(names, sources, strict=True)}
-    warm_up = 0.0 if len(videos) == len(sources) else config.warm_up
-    return CameraFeed(cameras, config.timeout, warm_up, stop, end_text)
 
 
 def _listed(sources: Sequence[Source]) -> str:

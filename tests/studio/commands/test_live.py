@@ -118,7 +118,7 @@ def test_Live__ends_with_a_summary_on_ctrl_c(
 @pytest.mark.parametrize(
     ("args", "parts"),
     [
-        ((), ("--camera must have a source per camera, or a folder, got none",)),
+        ((), ("--camera must have a source per camera, got none",)),
         (("--camera", 60, 61, 61), ("--camera must have different sources, got 3 (60, 61, 61)",)),
         (
             ("--camera", 61, 62),

@@ -4,6 +4,8 @@ faults do.
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from queue import SimpleQueue
@@ -192,3 +194,25 @@ def test_CameraFeed__refuses_images_of_different_times(opened) -> None:
         ValueError, match=r"simultaneous images of cam0, cam1, got none that arrived within 0.5 s"
     ):
         feed.newest()
+
+
+@pytest.mark.slow
+def test_CameraFeed__is_closed_when_the_interpreter_ends() -> None:
+    """A thread that executes library code after the end of the interpreter aborts the process."""
+    script = """
+from threading import Event
+import numpy as np
+from morgs_mi.studio.live.cameras import CameraFeed
+
+def images():
+    yield np.zeros((4, 6, 3), np.uint8)
+    closed.wait()
+    print("closed")
+
+closed = Event()
+CameraFeed({"cam0": images()}, 5, closed=closed).newest()
+"""
+    result = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert result.stdout == "closed\n"

@@ -1,17 +1,14 @@
-"""Live sources: iterators, pipes and anything that FFmpeg opens, processed like the rig's clips, in
-a loop.
+"""Live sources: iterators and anything that FFmpeg opens, processed like the rig's clips, in a
+loop.
 """
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
-import threading
 from itertools import islice
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -47,24 +44,8 @@ def assert_as_recorded(rig: Capture, frames) -> None:
             np.testing.assert_array_equal(a, b)
 
 
-def test_live_frames__process_iterators_pipes_and_files_like_clips(
-    rig: Capture, tmp_path: Path
-) -> None:
-    np.array(clip()).tofile(tmp_path / "raw")
-    program = f"import sys; sys.stdout.buffer.write(open({str(tmp_path / 'raw')!r}, 'rb').read())"
-    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) as process:
-        assert_as_recorded(
-            rig, live_frames(rig, [iter(clip()), process.stdout, rig.path / "cam3.mkv"])
-        )
-
-
-def test_live_frames__read_a_named_pipe_while_it_is_written(rig: Capture, tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "pipe")
-    data = (rig.path / "cam1.mkv").read_bytes()
-    writer = threading.Thread(target=(tmp_path / "pipe").write_bytes, args=(data,), daemon=True)
-    writer.start()
-    assert_as_recorded(rig, live_frames(rig, [tmp_path / "pipe", clip(), clip()]))
-    writer.join(timeout=5)
+def test_live_frames__process_iterators_and_files_like_clips(rig: Capture) -> None:
+    assert_as_recorded(rig, live_frames(rig, [iter(clip()), clip(), rig.path / "cam3.mkv"]))
 
 
 def test_live_frames__leave_out_a_source_that_misses_an_instant_or_ends(rig: Capture) -> None:
@@ -113,20 +94,25 @@ def test_live_frames__refuse_bad_sources(rig: Capture, sources, error, message: 
 
 
 def test_live_page__loop_runs(rig: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The loop over live frames in docs/live.md, with raw pipes in place of FFmpeg's."""
+    """The loop over live frames in docs/live.md, with clips in place of connections."""
     text = (Path(__file__).parents[3] / "docs" / "live.md").read_text(encoding="utf-8")
     *_, example = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    reads = iter(NAMES)
+    opened = []
     pushed = []
 
-    def popen(command, stdout):
-        assert command[0] == "ffmpeg"
-        read, write = os.pipe()
-        next(reads)
-        threading.Thread(
-            target=lambda: os.fdopen(write, "wb").write(np.array(clip()).tobytes()), daemon=True
-        ).start()
-        return type("Process", (), {"stdout": os.fdopen(read, "rb")})
+    class Connection:
+        def __init__(self, address: str, *_: object) -> None:
+            opened.append(address)
+            self.images = clip()
+
+        def isOpened(self) -> bool:
+            return True
+
+        def read(self):
+            image = self.images.pop(0) if self.images else None
+            return image is not None, image
+
+        def release(self) -> None: ...
 
     class Loop:
         def __init__(self, cameras, points, colors, config=None, masks=None):
@@ -138,10 +124,11 @@ def test_live_page__loop_runs(rig: Capture, monkeypatch: pytest.MonkeyPatch) -> 
                 "Report", (), {"frame": len(pushed) - 1, "missing_views": (), "seconds": 0.0}
             )
 
-    monkeypatch.setattr("subprocess.Popen", popen)
+    monkeypatch.setattr(cv2, "VideoCapture", Connection)
     monkeypatch.setattr("morgs_mi.StreamLoop", Loop)
     monkeypatch.setattr("morgs_mi.load_capture", lambda path, downscale: rig)
     monkeypatch.setattr("mitsuba.set_variant", lambda name: None)
     exec(compile(example, "live.md", "exec"), {})
+    assert opened == [f"rtsp://10.0.0.{k}/live" for k in (10, 11, 12)]
     assert len(pushed) == 3
     assert all(image.shape == (23, 31, 3) for image in pushed[0])
