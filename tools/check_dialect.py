@@ -40,7 +40,6 @@ EXCEPTIONS = {
     "benchmarks/reports/plots.py": {"about"},
     "benchmarks/reports/timing.py": {"apart"},
     "morgs_mi/fit/balance.py": {"taken"},
-    "morgs_mi/studio/calibration/checks/deep.py": {"given"},
     "morgs_mi/studio/calibration/offset_equations.py": {"own"},
     "morgs_mi/studio/calibration/refine.py": {"taken"},
     "morgs_mi/studio/import_frames.py": {"before", "now"},

@@ -9,7 +9,7 @@
 | a stream with known motion; with births and deaths; with the range of the codec | `moving_splats`, `changing_splats`, `coded_clip` |
 | a stream to damage | `short_clip` |
 | a capture in each layout | `captures` |
-| a capture for the command line; with matches and true poses; with a true motion | `noise_capture`, `textured`, `filmed` |
-| a fit that is killed; cameras that record meanwhile | `recording`, `live_clip` |
+| a capture for the command line; with matches and true poses | `noise_capture`, `textured` |
+| a fit that is killed; clips of moving planes; cameras that record meanwhile | `recording`, `filmed`, `live_clip` |
 | clips that are cut, true tracks, networks, a full disk | `edit_lists`, `annotations`, `tiny_network`, `full_disk` |
 """  # noqa: E501

@@ -22,8 +22,8 @@ CONFIG = quick(num_gaussians=1500, first_frame_steps=150, epochs=2)
 @cache
 def clips() -> list[list[np.ndarray]]:
     """Return the clip of each camera: 16 frames that swing to and fro and can be repeated."""
-    forth = filmed.film(frames=9)
-    return [[image for image in (*clip, *clip[-2:0:-1]) if image is not None] for clip in forth]
+    forth = filmed.film(9)
+    return [[*clip, *clip[-2:0:-1]] for clip in forth]
 
 
 def write_calibration(path: Path) -> Path:

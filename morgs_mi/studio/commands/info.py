@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated, ClassVar, NamedTuple
+from typing import Annotated, ClassVar
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -18,17 +18,9 @@ from morgs_mi.capture.outputs import check_output
 from morgs_mi.capture.points import SharedFeatures, match_capture, triangulate_points
 from morgs_mi.cli.console import print_result, print_table, progress
 from morgs_mi.cli.settings import Flag, GivenReading, Reading, optional
-from morgs_mi.core.files import write_json
 from morgs_mi.fit.forecast import forecast
-from morgs_mi.studio.calibration.checks.deep import (
-    MAX_FRAMES,
-    DeepCheck,
-    Finding,
-    check_deep,
-    check_exposures,
-)
+from morgs_mi.studio.calibration.checks.plots import check_plot, write_rig
 from morgs_mi.studio.calibration.checks.rig_check import CameraCheck, RigCheck, check_rig
-from morgs_mi.studio.calibration.checks.signals import read_signals
 from morgs_mi.studio.calibration.timing import TimeOffsets, estimate_time_offsets
 
 # Columns of a camera, after its index and name.
@@ -66,59 +58,29 @@ class Info:
     """Check the poses against feature matches between the views of the first frame."""
     time: Flag = False
     """Estimate the time offsets of the cameras from what moves in the first frames."""
-    deep: Flag = False
-    """Also check synchronisation, exposure, sharpness, lost frames, flicker and overlap, which
-    reads many frames.
-    """
-    json: Annotated[Path | None, DisallowNone, optional("FILE.json")] = None
-    """File for all measurements of --deep."""
     reading: GivenReading = field(default_factory=Reading)
 
     arguments: ClassVar[Mapping[str, str]] = {"max_frames": "morgs-mi fit --frames"}
 
     def run(self) -> None:
-        self._check_options()
+        if self.plot is not None:
+            check_output(self.plot)
+            check_plot(self.plot)
         capture = load_capture(self.capture, reading=self.reading.read_config())
         points = f"{len(capture.points)} points" if len(capture.points) else "without points"
-        checks = _Checks()
+        rig_check = None
         if self.check:
             shared = _shared_features(capture)
             rig_check = check_rig(capture, shared)
             if not len(capture.points):
                 capture = triangulate_points(capture, shared)
                 points += f" ({len(capture.points)} can be triangulated)"
-            checks = _checks(capture, shared, rig_check, self.deep)
-        print_table(_camera_table(capture, checks.rig))
-        _print_lines(_content_lines(capture, points, checks.rig))
+        print_table(_camera_table(capture, rig_check))
+        _print_lines(_content_lines(capture, points, rig_check))
         if self.time:
             _print_lines(_time_lines(_time_offsets(capture)))
-        _print_lines([finding.sentence for finding in checks.exposures])
-        _print_lines(_deep_lines(checks.deep))
-        self._write_files(capture, checks.deep)
-
-    def _check_options(self) -> None:
-        from morgs_mi.studio.calibration.checks.plots import check_plot
-
-        if self.deep and not self.check:
-            raise ValueError(
-                "--deep: expected the check of the poses, on which it builds; leave out --no-check."
-            )
-        if self.json is not None and not self.deep:
-            raise ValueError("--json: expected --deep, whose measurements it holds; add --deep.")
-        for output in (self.plot, self.json):
-            if output is not None:
-                check_output(output)
         if self.plot is not None:
-            check_plot(self.plot)
-
-    def _write_files(self, capture: Capture, deep: DeepCheck | None) -> None:
-        from morgs_mi.studio.calibration.checks.plots import write_rig
-
-        if self.json is not None and deep:
-            write_json(self.json, deep.as_dict())
-            print_result(f"All measurements: {self.json}")
-        if self.plot is not None:
-            write_rig(self.plot, capture, deep)
+            write_rig(self.plot, capture)
             print_result(f"Plot of the rig: {self.plot}")
 
 
@@ -130,23 +92,6 @@ def _shared_features(capture: Capture) -> SharedFeatures:
 def _time_offsets(capture: Capture) -> TimeOffsets:
     with progress() as report:
         return estimate_time_offsets(capture, partial(report, "Comparing clocks"))
-
-
-class _Checks(NamedTuple):
-    """Results of the checks, as far as they are made."""
-
-    rig: RigCheck | None = None
-    deep: DeepCheck | None = None
-    exposures: Sequence[Finding] = ()
-
-
-def _checks(
-    capture: Capture, shared: SharedFeatures, rig_check: RigCheck, many_frames: bool
-) -> _Checks:
-    """Return the checks of the images: of many frames, or the exposures in the first."""
-    if many_frames:
-        return _Checks(rig_check, _deep_check(capture, shared, rig_check))
-    return _Checks(rig_check, exposures=check_exposures(capture, shared))
 
 
 def _print_lines(lines: Iterable[str]) -> None:
@@ -164,29 +109,6 @@ def _content_lines(capture: Capture, points: str, rig_check: RigCheck | None) ->
         *_check_lines(rig_check),
         *_color_lines(capture),
     ]
-
-
-def _deep_check(capture: Capture, shared: SharedFeatures, rig_check: RigCheck) -> DeepCheck:
-    """Return the check of the first frames."""
-    with progress() as report:
-        signals = read_signals(capture, MAX_FRAMES, partial(report, "Reading frames"))
-    return check_deep(capture, shared, rig_check, signals)
-
-
-def _deep_lines(deep: DeepCheck | None) -> list[str]:
-    """Return the findings of the check of many frames, and what it could not measure."""
-    if deep is None:
-        return []
-    sentences = [finding.sentence for finding in deep.findings]
-    return [
-        f"Check of {deep.frames} frames: {_number_of_findings(len(sentences))}.",
-        *sentences,
-        *filter(None, [deep.unmeasured]),
-    ]
-
-
-def _number_of_findings(count: int) -> str:
-    return "no findings" if not count else "1 finding" if count == 1 else f"{count} findings"
 
 
 def _camera_table(capture: Capture, rig_check: RigCheck | None) -> Table:

@@ -1,4 +1,4 @@
-"""The capture of textured planes, by short names, and clips of moving ones."""
+"""The capture of textured planes, by short names."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import pytest
 
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.points import SharedFeatures
-from tests.scenes.filmed import Clips, film
 
 
 @pytest.fixture(scope="session")
@@ -17,8 +16,3 @@ def capture(textured_capture: Capture) -> Capture:
 @pytest.fixture(scope="session")
 def shared(textured_features: SharedFeatures) -> SharedFeatures:
     return textured_features
-
-
-@pytest.fixture(scope="session")
-def clips() -> Clips:
-    return film()

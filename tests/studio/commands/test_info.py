@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 import subprocess
@@ -101,40 +100,3 @@ def test_info__prints_the_time_offsets_as_options(
     assert f"Uncertain: {NAMES[2]} (0.41). Their images hardly depend on the clocks" in out
     assert "Clocks not found: other; keep what is known of them." in out
     assert "The offsets still change by 0.30 frames" in out
-
-
-@pytest.mark.slow
-def test_info__checks_a_whole_recording(textured_capture: Capture, tmp_path: Path, run) -> None:
-    plot = tmp_path / "rig.png"
-    measured = tmp_path / "deep.json"
-    status, out, _ = run(
-        "info", textured_capture.path, "--deep", "--plot", plot, "--json", measured
-    )
-    assert status == 0
-    assert "Check of 1 frames: no findings." in out
-    assert (
-        "Not measured, without enough common motion or matches: time offsets of all cameras." in out
-    )
-    assert cv2.imread(str(plot)).shape == (760 + 560, 1440, 3)
-    content = json.loads(measured.read_text())
-    assert content["offsets"] == [None] * 6
-    np.testing.assert_allclose(content["gains"], np.zeros((6, 3)), atol=0.02)
-
-
-@pytest.mark.parametrize(
-    ("options", "sentence"),
-    [
-        (
-            ["--json", "deep.json"],
-            "--json: expected --deep, whose measurements it holds; add --deep.",
-        ),
-        (
-            ["--deep", "--no-check"],
-            "--deep: expected the check of the poses, on which it builds; leave out --no-check.",
-        ),
-    ],
-)
-def test_info__refuses_options_that_contradict_each_other(
-    textured_capture: Capture, options: list[str], sentence: str, run
-) -> None:
-    assert_refused(run("info", textured_capture.path, *options), sentence)

@@ -1,1 +1,1 @@
-"""Checks of recordings: poses, signals, synchrony and typical mistakes."""
+"""Checks of the poses of a recording, and the plot of its rig."""

@@ -1,4 +1,4 @@
-"""Plots of a capture: its rig seen from above and from the side, and the check of a recording."""
+"""Plot of a capture's rig, seen from above and from the side."""
 
 from __future__ import annotations
 
@@ -14,25 +14,21 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.rig import up_direction
-from morgs_mi.studio.calibration.checks.deep import DeepCheck
 
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".svg", ".pdf")
 # Inches.
 _WIDTH = 14.4
-_RIG_HEIGHT = 7.6
-_DEEP_HEIGHT = 5.6
+_HEIGHT = 7.6
 # Dots per inch.
 _DPI = 100
-# Colour of a camera, and of one with a finding.
+# Colour of a camera, and of a held-out one.
 _USUAL = "tab:blue"
 _MARKED = "tab:red"
-# Colours of the channels of an image, and of the axes of the world.
-_THREE_COLORS = ("indianred", "seagreen", "royalblue")
+# Colours of the axes of the world.
+_AXIS_COLORS = ("indianred", "seagreen", "royalblue")
 _MAX_POINTS = 20_000
 # The edges of a frustum as one line through its centre 0 and its corners 1 to 4.
 _EDGES = [0, 1, 2, 3, 4, 1, 0, 2, 0, 3, 0, 4]
-# Width of a group of bars, as a share of its slot.
-_BAR = 0.7
 
 
 def check_plot(path: Path) -> None:
@@ -55,42 +51,36 @@ def check_plot(path: Path) -> None:
         ) from None
 
 
-def write_rig(path: Path, capture: Capture, deep: DeepCheck | None = None) -> None:
-    """Write the plot of a capture's rig, and below it the plot of a check; the file is written
-    atomically.
+def write_rig(path: Path, capture: Capture) -> None:
+    """Write the plot of a capture's rig; the file is written atomically.
 
     Args:
         path: .png, .jpg, .svg or .pdf.
         capture: the capture.
-        deep: check of its frames.
 
     Raises:
         ValueError: as `check_plot`.
         OSError: the file cannot be written.
     """
     check_plot(path)
-    data = _plot(path.suffix[1:].lower(), capture, deep)
+    data = _plot(path.suffix[1:].lower(), capture)
     with atomic_path(path, "write_rig()") as partial:
         partial.parent.mkdir(parents=True, exist_ok=True)
         partial.write_bytes(data)
 
 
-def _plot(suffix: str, capture: Capture, deep: DeepCheck | None) -> bytes:
-    """Return the file of the plot of a capture's rig, and of a check, if there is one."""
+def _plot(suffix: str, capture: Capture) -> bytes:
+    """Return the file of the plot of a capture's rig."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    heights = [_RIG_HEIGHT, _DEEP_HEIGHT] if deep else [_RIG_HEIGHT]
     data = BytesIO()
     # Names may contain dollars, and letters that the font lacks and draws as boxes.
     with rc_context({"text.parse_math": False}), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
-        figure = Figure(figsize=(_WIDTH, sum(heights)), layout="constrained")
-        rows = figure.subfigures(len(heights), height_ratios=heights, squeeze=False)[:, 0]
+        figure = Figure(figsize=(_WIDTH, _HEIGHT), layout="constrained")
         points = (capture.points, capture.point_colors)
-        draw_rig(rows[0], capture.cameras, points, capture.test_views)
-        if deep:
-            draw_deep(rows[1], deep)
+        draw_rig(figure, capture.cameras, points, capture.test_views)
         figure.savefig(data, format=suffix, dpi=_DPI)
     return data.getvalue()
 
@@ -108,7 +98,7 @@ def draw_rig(
     to the right.
 
     Args:
-        figure: an empty figure or subfigure of matplotlib.
+        figure: an empty figure of matplotlib.
         cameras: the rig.
         points: positions [P, 3] in world units and colours [P, 3] in [0, 1]; distant ones are cut
             off.
@@ -121,8 +111,8 @@ def draw_rig(
         for view, camera in enumerate(cameras)
     ]
     above, side = figure.subplots(1, 2)
-    _label(above, "From above", "right, world units", ylabel="forward, world units")
-    _label(side, "From the right", "forward, world units", ylabel="up, world units")
+    _label(above, "From above", "right, world units", "forward, world units")
+    _label(side, "From the right", "forward, world units", "up, world units")
     for axes, plane in ((above, np.stack([right, forward])), (side, np.stack([forward, up]))):
         _draw_projection(axes, plane, frusta, labels, *cloud)
         _draw_world_axes(axes, plane)
@@ -181,7 +171,7 @@ def _square(corners: np.ndarray) -> np.ndarray:
 
 def _draw_world_axes(axes: Any, plane: np.ndarray) -> None:
     """Draw the world's axes in the corner of a panel that shows a plane [2, 3]."""
-    for name, color, direction in zip("xyz", _THREE_COLORS, plane.T, strict=True):
+    for name, color, direction in zip("xyz", _AXIS_COLORS, plane.T, strict=True):
         if np.linalg.norm(direction) > 0.4:
             axes.annotate(
                 name,
@@ -216,120 +206,7 @@ def _frustum(camera: Camera, depth: float) -> np.ndarray:
     return np.vstack([camera.position, camera.unproject(corners, np.full(4, depth))])
 
 
-def draw_deep(figure: Any, check: DeepCheck) -> None:
-    """Plot a check: a panel per question.
-
-    The panels show reprojection error, time offset, exposure per channel, brightness and sharpness
-    over time, repeated frames and overlap. Cameras with a finding are red; a question mark stands
-    for a missing measurement.
-
-    Args:
-        figure: an empty figure or subfigure of matplotlib.
-        check: result of `check_deep`.
-    """
-    panels = figure.subplot_mosaic(
-        [["error", "time", "exposure", "overlap"], ["variation", "blur", *2 * ["repeats"]]]
-    )
-    _draw_measures(panels, check)
-    brightness = 100 * np.expm1(check.brightness)
-    _curves(panels["variation"], brightness, check.names, _colors(check, "variation", "flicker"))
-    _label(panels["variation"], "Brightness over time, %", "frame", least=(-5, 5))
-    _curves(panels["blur"], check.sharpness, check.names, _colors(check, "blur"))
-    _label(panels["blur"], "Sharpness over time, octaves", "frame", least=(-1, 1))
-    _events(panels["repeats"], check)
-    _label(panels["repeats"], "Repeated frames (red) and missing ones (grey)", "frame")
-
-
-def _draw_measures(panels: dict[str, Any], check: DeepCheck) -> None:
-    """Plot what a check measures once for each camera."""
-    for question, values, title, least in (
-        ("error", check.errors[:, None], "Reprojection error, px", (0, 1)),
-        ("time", check.offsets[:, None], "Time offset, frames", (-1, 1)),
-        ("exposure", 100 * np.expm1(check.gains), "Exposure of R, G, B, %", (-10, 10)),
-        ("overlap", 100 * check.largest_overlaps[:, None], "Largest overlap, %", (0, 100)),
-    ):
-        _bars(panels[question], values, check.names, _colors(check, question))
-        _label(panels[question], title, least=least)
-
-
-def _label(
-    axes: Any,
-    title: str,
-    xlabel: str = "",
-    ylabel: str = "",
-    least: tuple[float, float] | None = None,
-) -> None:
-    """Set the title and the labels of a panel, and the least range of its vertical axis, where
-    values look small.
-    """
+def _label(axes: Any, title: str, xlabel: str, ylabel: str) -> None:
+    """Set the title and the labels of a panel."""
     axes.set_title(title, fontsize=11, loc="left")
     axes.set(xlabel=xlabel, ylabel=ylabel)
-    if least is not None:
-        low, high = axes.get_ylim()
-        axes.set_ylim(min(low, least[0]), max(high, least[1]))
-
-
-def _bars(axes: Any, values: np.ndarray, names: Sequence[str], colors: Sequence[str]) -> None:
-    """Draw a group of bars per camera, for values [C, K]."""
-    count = values.shape[1]
-    for k, column in enumerate(values.T):
-        places = np.arange(len(values)) + _BAR * ((k + 0.5) / count - 0.5)
-        color = _THREE_COLORS[k] if count > 1 else colors
-        axes.bar(places, np.nan_to_num(column), _BAR / count, color=color)
-        _mark_missing(axes, places[~np.isfinite(column)])
-    axes.axhline(0, color="black", linewidth=0.8)
-    _name_cameras(axes.xaxis, names, colors, rotation=90 if len(values) > 6 else 0)
-
-
-def _mark_missing(axes: Any, places: np.ndarray) -> None:
-    """Draw a question mark at each place along the horizontal axis."""
-    for place in places:
-        axes.annotate("?", (place, 0), ha="center", va="bottom", color="0.5")
-
-
-def _curves(axes: Any, values: np.ndarray, names: Sequence[str], colors: Sequence[str]) -> None:
-    """Draw a curve per camera, for values [T, C]; cameras with a finding are drawn last and named
-    in a legend.
-    """
-    for name, color, curve in zip(names, colors, values.T, strict=True):
-        emphasis = {"zorder": 3, "label": name} if color == _MARKED else {"zorder": 2, "label": "_"}
-        axes.plot(curve, color=color, linewidth=1, **emphasis)
-    if _MARKED in colors:
-        axes.legend(fontsize=8)
-    axes.set_xlim(-0.5, len(values) - 0.5)
-    axes.xaxis.get_major_locator().set_params(integer=True)
-
-
-def _events(axes: Any, check: DeepCheck) -> None:
-    """Draw a row per camera with the frames that repeat another or are missing."""
-    colors = np.array([(255, 255, 255), (190, 190, 190), (214, 39, 40)], np.uint8)
-    axes.imshow(colors[_states(check)], aspect="auto", interpolation="none")
-    _name_cameras(axes.yaxis, check.names, _colors(check, "repeats"))
-
-
-def _states(check: DeepCheck) -> np.ndarray:
-    """Return 0 for each image [C, T], 1 for a missing one, and 2 for one that repeats another."""
-    states = np.isnan(check.sharpness.T).astype(int)
-    for row, frames in zip(states, check.repeated, strict=True):
-        row[list(frames)] = 2
-    return states
-
-
-def _name_cameras(
-    axis: Any, names: Sequence[str], colors: Sequence[str], rotation: float = 0
-) -> None:
-    """Label the positions along an axis with the cameras' names, red with a finding."""
-    axis.set_ticks(np.arange(len(names)), names, fontsize=8, rotation=rotation)
-    for color, label in zip(colors, axis.get_ticklabels(), strict=True):
-        label.set_color(_MARKED if color == _MARKED else "black")
-
-
-def _colors(check: DeepCheck, *questions: str) -> list[str]:
-    """Return the colour of each camera, red with a finding about one of the questions."""
-    names = {
-        name
-        for finding in check.findings
-        if finding.question in questions
-        for name in finding.cameras
-    }
-    return [_MARKED if name in names else _USUAL for name in check.names]
