@@ -75,8 +75,8 @@ class Info:
             if not len(capture.points):
                 capture = triangulate_points(capture, shared)
                 points += f" ({len(capture.points)} can be triangulated)"
-        print_table(_camera_table(capture, rig_check))
         _print_lines(_content_lines(capture, points, rig_check))
+        print_table(_camera_table(capture, rig_check))
         if self.time:
             _print_lines(_time_lines(_time_offsets(capture)))
         if self.plot is not None:
@@ -100,13 +100,13 @@ def _print_lines(lines: Iterable[str]) -> None:
 
 
 def _content_lines(capture: Capture, points: str, rig_check: RigCheck | None) -> list[str]:
-    """Return what the capture contains, its notes and what follows from its poses and colours."""
+    """Return what follows from the capture's poses, what it contains, its notes and colours."""
     truth = "with ground truth" if capture.truth else "without ground truth"
     return [
-        f"{capture.num_frames} frames at {capture.fps:g} fps, {points}, {truth}.",
-        *capture.notes,
         *_forecast_lines(capture),
         *_check_lines(rig_check),
+        f"{capture.num_frames} frames at {capture.fps:g} fps, {points}, {truth}.",
+        *capture.notes,
         *_color_lines(capture),
     ]
 
