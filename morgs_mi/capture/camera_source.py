@@ -9,7 +9,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from morgs_mi.capture.color_correction import ColorCorrection
 from morgs_mi.capture.interpolation import image_between
 from morgs_mi.capture.lens import Lens, Undistortion, undistortion
 from morgs_mi.capture.masks import scaled_mask, used_in_clip
@@ -31,7 +30,6 @@ class CameraSource:
     #: The share of the time to the clip's next frame that has passed at each instant [T]; None:
     #: none has.
     shares: np.ndarray | None = None
-    color_correction: ColorCorrection | None = None  #: The colour correction, or None.
     #: The mask of the recorded pixels that are neither transparent nor masked out [H, W], or None
     #: if all are.
     recorded_mask: np.ndarray | None = None
@@ -125,7 +123,6 @@ class CameraSource:
         if self.undistortion:
             image = _pinhole_image(image, self.undistortion)
         image = _downscaled(image, camera)
-        image = self.color_correction(image) if self.color_correction else image
         return (
             image if self.display_exposure is None else display_image(image, self.display_exposure)
         )

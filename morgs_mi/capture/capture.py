@@ -16,7 +16,6 @@ from typing import Any, cast
 import numpy as np
 
 from morgs_mi.capture.camera_source import CameraSource, at_clip_size
-from morgs_mi.capture.color_correction import ColorFit, fit_colors
 from morgs_mi.capture.held_out import TestViews, held_out_by, held_out_views
 from morgs_mi.capture.layouts.clips import EXAMPLE, check_names
 from morgs_mi.capture.layouts.layout_registry import find_layout
@@ -78,7 +77,6 @@ class Capture:
         downscale: the downscaling factor.
         layout: name of the folder's layout, e.g. ``COLMAP``.
         reading: how clips that do not match are read.
-        colors: the colour correction of the cameras, or None.
         notes: a sentence for each unexpected property of the clips, e.g. a variable frame rate.
         distortions: per camera the radial terms k1, k2 of the distortion left in the images, which
             is removed as well; empty if there is none.
@@ -99,7 +97,6 @@ class Capture:
     downscale: float = 1
     layout: str = ""
     reading: ReadConfig = field(default_factory=ReadConfig)
-    colors: ColorFit | None = None
     notes: tuple[str, ...] = ()
     distortions: tuple[tuple[float, float], ...] = ()
     display_exposure: float | None = None
@@ -208,7 +205,6 @@ class Capture:
             "test_view": list(self.test_views),
             "points": len(self.points),
             "reading": {**asdict(self.reading), "without": list(self.reading.without)},
-            "colors": self.colors and _color_metadata(self.colors, self.names),
             "notes": list(self.notes),
             "cameras": [_camera_metadata(*view) for view in views],
         }
@@ -326,14 +322,6 @@ def _masks(
     return tuple(source.mask(camera) for source, camera in zip(sources, cameras, strict=True))
 
 
-def _color_metadata(fit: ColorFit, names: Sequence[str]) -> dict[str, Any]:
-    return {
-        "reference": names[fit.reference],
-        "delta_e_before": fit.recorded_delta_e,
-        "delta_e": fit.delta_e,
-    }
-
-
 def _camera_metadata(
     camera: Camera, source: CameraSource, mask: np.ndarray | None
 ) -> dict[str, Any]:
@@ -418,7 +406,7 @@ def load_capture(
     )
     if any(reader.has_light for reader in readers):
         capture = _with_exposure(capture, settings.get("display_exposure"))
-    return capture if reading.color == "none" else _color_corrected(capture, reading.color)
+    return capture
 
 
 def _check_folder(path: Path) -> None:
@@ -522,34 +510,6 @@ def _check_downscale(
 
 def _shortest_side(cameras: Sequence[Camera]) -> int:
     return min(min(camera.width, camera.height) for camera in cameras)
-
-
-def _color_corrected(capture: Capture, color: str) -> Capture:
-    """Return the capture with colours corrected between cameras; `color` as in `ReadConfig`."""
-    reference = _color_reference(capture, color)
-    images = next(capture.displayed().partial_frames(0, 1)).images
-    fit = fit_colors(capture.cameras, images, capture.masks, reference)
-    sources = tuple(
-        replace(s, color_correction=fit.correction(view)) for view, s in enumerate(capture._sources)
-    )
-    return replace(capture, _sources=sources, colors=fit)
-
-
-def _color_reference(capture: Capture, color: str) -> int | None:
-    """Return the index of the camera in `color`, None without one."""
-    method, _, name = color.partition(":")
-    if method == "linear" and not name:
-        return None
-    if method != "linear" or name not in capture.names:
-        raise _color_error(capture, color)
-    return capture.names.index(name)
-
-
-def _color_error(capture: Capture, color: str) -> ValueError:
-    return ValueError(
-        f"{capture.path}: `color` must be none, linear, or linear with a camera of "
-        f"{', '.join(capture.names)}, such as linear:{capture.names[0]}, got {color!r}."
-    )
 
 
 def _resized(camera: Camera, downscale: float, times: ClipTimes, readout: float) -> Camera:

@@ -56,22 +56,11 @@ class ReadConfig:
     images are interpolated between two frames."""
     gaps: bool = False
     """Whether images may be missing; a camera is left out of the frames that it lacks."""
-    color: str = "none"
-    """Method that matches each camera's colours to a reference camera: linear, a matrix in linear
-    light which is fitted to points that both see, or none. linear:cam03 also names the reference
-    camera; by default it is the one that shares most points with the others."""
     without: tuple[str, ...] = ()
     """Names of the cameras that are left out."""
     near: float | None = None
     """Depth of the cameras' near planes, world units; None: a fifth of the smallest reliable depth
     (see `with_near_planes`)."""
-
-    def __post_init__(self) -> None:
-        if isinstance(self.color, str) and self.color.partition(":")[0] not in ("none", "linear"):
-            raise ValueError(
-                "ReadConfig(): `color` must be none, linear, or linear with a camera, such as "
-                f"linear:cam00, got {self.color!r}."
-            )
 
     @property
     def aligns_clips(self) -> bool:

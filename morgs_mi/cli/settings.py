@@ -170,8 +170,6 @@ class Reading:
     """
     gaps: Flag = False
     """Continue where images are missing, without their cameras."""
-    color: Annotated[str, arg(metavar="NAME")] = "none"
-    """Colour correction: none, linear, or with a reference camera linear:CAMERA."""
     without: Without = ()
     """Cameras that are left out, by name."""
     near: Annotated[

@@ -193,6 +193,9 @@ def _recording(stream: FrameSource, path: str | Path, frames: Sequence[int]) -> 
     its cameras are the cameras of the stream.
     """
     values = metadata_entry(stream, "reading", {}, dict)
+    # Older streams have settings that went.
+    names = ReadConfig.__dataclass_fields__.keys() & values
+    values = {name: values[name] for name in names}
     reading = apply_values(ReadConfig(), values, _place(stream, "reading"))
     downscale = metadata_entry(stream, "downscale", 1, int, float)
     test_view = metadata_entry(stream, "test_view", "auto", list, int, str, NoneType)

@@ -206,12 +206,6 @@ POSES_BOUNDS = {
         "no instant in common, cam00 0.00 to 0.16 s, cam02 -0.36 to -0.20",
         *("--offset", "cam02", "9"),
     ),
-    "unknown reference": (
-        none,
-        "--color must be none, linear, .* with a camera of cam00, cam02, cam11, .*got "
-        "'linear:cam01'",
-        *("--color", "linear:cam01"),
-    ),
     "gaps and no clip": (
         empty("cam00.mkv"),
         "cam00.mkv: expected a video, got an empty file",

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.capture.color_correction import ColorCorrection
 from morgs_mi.capture.interpolation import image_between
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.lens import Lens
@@ -89,12 +88,6 @@ def test_process__keeps_light_positive_through_undistortion(tmp_path: Path) -> N
     image = next(load_capture(recorded(tmp_path, lenses=[lens] * 2)).frames()).images[0]
     assert image.min() >= 0
     assert image.max() > 4
-
-
-def test_color_correction__multiplies_light() -> None:
-    image = light(0, 0)
-    corrected = ColorCorrection(np.diag([2.0, 1, 0.5]))(image)
-    np.testing.assert_allclose(corrected, image * np.float32([2, 1, 0.5]), rtol=1e-6)
 
 
 def test_image_between__of_equal_images_is_the_image() -> None:

@@ -223,7 +223,6 @@ def test_fit__rejects_arguments_that_cannot_be_parsed(
         (("2",), (2,)),
         (("cam2", "0"), (0, 2)),
         (("none",), ()),
-        (("None",), ()),
         (("auto",), ()),
     ],
 )

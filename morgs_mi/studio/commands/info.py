@@ -100,14 +100,13 @@ def _print_lines(lines: Iterable[str]) -> None:
 
 
 def _content_lines(capture: Capture, points: str, rig_check: RigCheck | None) -> list[str]:
-    """Return what follows from the capture's poses, what it contains, its notes and colours."""
+    """Return what follows from the capture's poses, what it contains and its notes."""
     truth = "with ground truth" if capture.truth else "without ground truth"
     return [
         *_forecast_lines(capture),
         *_check_lines(rig_check),
         f"{capture.num_frames} frames at {capture.fps:g} fps, {points}, {truth}.",
         *capture.notes,
-        *_color_lines(capture),
     ]
 
 
@@ -190,18 +189,6 @@ def _forecast_lines(capture: Capture) -> list[str]:
     """Return the expected quality of views between the training cameras, if there are several."""
     cameras = [capture.cameras[v] for v in capture.train_views]
     return [forecast(cameras, capture.points).sentence] if len(cameras) > 1 else []
-
-
-def _color_lines(capture: Capture) -> list[str]:
-    """Return the colour differences before and after the colour correction, if there is one."""
-    fit = capture.colors
-    if fit is None:
-        return []
-    changes = zip(capture.names, fit.recorded_delta_e, fit.delta_e, fit.samples, strict=True)
-    errors = ", ".join(
-        f"{name} {a:.1f} -> {b:.1f} ({n} points)" if n else f"{name} -" for name, a, b, n in changes
-    )
-    return [f"Colours towards {capture.names[fit.reference]}, dE2000 before -> after: {errors}."]
 
 
 def check_table(title: str, columns: Sequence[str]) -> Table:
