@@ -25,7 +25,6 @@ from .render.rasterize import Image, rasterize
 from .render.render_config import RenderConfig
 from .runs.fit_capture import stream_capture
 from .stream_loop import StreamLoop
-from .studio.exports.tracks import extract_tracks
 from .studio.light.light_probe import light_probe
 from .studio.light.shadows import shadow_ratio, shadowed
 from .studio.live.live_frames import live_frames
@@ -57,7 +56,6 @@ __all__ = [
     "depth_image",
     "ellipsoids",
     "evaluate_stream",
-    "extract_tracks",
     "light_probe",
     "live_frames",
     "load_capture",

@@ -137,7 +137,6 @@ EXPORTS: Mapping[str, type[ExportKind]] = {
     "gltf": studio_entry("exports", "gltf"),
     "usd": studio_entry("exports", "usd"),
     "video": Flight,
-    "tracks": studio_entry("exports", "tracks"),
     "web": Web,
 }
 

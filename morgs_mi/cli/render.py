@@ -71,13 +71,7 @@ class Render:
     Gaussians.
     """
     width: Annotated[int | None, DisallowNone, optional("INT")] = None
-    """Width of the images; by default that of the camera, and 2048 for equirectangular ones."""
-    projection: Literal["perspective", "equirectangular"] = "perspective"
-    """Projection: perspective, or equirectangular, all around the camera with a level horizon."""
-    stereo: float = 0.0
-    """Distance of two eyes in world units, for equirectangular images, the left one above the
-    right; 0: one eye.
-    """
+    """Width of the images; by default that of the camera."""
     channels: Annotated[
         tuple[ChannelName, ...] | None, DisallowNone, optional("NAME ...", text=_CHANNELS)
     ] = None
@@ -132,19 +126,6 @@ class Render:
 
     def _check(self) -> None:
         """Refuse options that exclude each other."""
-        self._check_camera()
-        if self.projection == "perspective":
-            if self.stereo:
-                raise ValueError(
-                    "--stereo is for equirectangular images; add --projection equirectangular."
-                )
-        elif self.insert is not None or self.channels not in (None, ("color",)):
-            raise ValueError(
-                "--projection equirectangular renders the colour of a stream alone; leave out the "
-                "others."
-            )
-
-    def _check_camera(self) -> None:
         if self.camera is not None and self.path is not None:
             raise ValueError(
                 f"expected --camera or --path, got both, {self.camera} and {self.path}; leave out "
@@ -176,10 +157,6 @@ class Render:
         from morgs_mi.playback.export.clips import flight
         from morgs_mi.playback.player import render_stream
 
-        if self.projection == "equirectangular":
-            return studio_entry("renderings", "panorama").panoramas(
-                stream, view, 2048 if self.width is None else self.width, self.stereo
-            )
         view = view if self.width is None else view.with_width(self.width)
         channels = self.channels or (None if format == "exr" else ("color",))
         if isinstance(view, Camera):

@@ -22,13 +22,9 @@ STUDIO: Mapping[str, Mapping[str, str]] = {
         "sweep": "commands.sweep:Sweep",
         "synth": "commands.synth:Synth",
     },
-    "exports": {
-        "gltf": "commands.exports:Gltf",
-        "usd": "commands.exports:Usd",
-        "tracks": "commands.exports:Tracks",
-    },
+    "exports": {"gltf": "commands.exports:Gltf", "usd": "commands.exports:Usd"},
     "integrators": {"splat_path": "light.splat_path:SplatPathIntegrator"},
-    "renderings": {"insert": "light.insert", "panorama": "exports.panorama"},
+    "renderings": {"insert": "light.insert"},
     "layouts": {
         "dynamic3dgs": "layouts.dynamic3dgs:LAYOUT",
         "qualisys": "layouts.qualisys:LAYOUT",

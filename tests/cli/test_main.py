@@ -118,7 +118,7 @@ def test_main__names_options_not_arguments(tmp_path: Path, run, args, parts) -> 
 
 
 COMMANDS = ("synth", "info", "calibrate", "fit", "render", "import", "view", "eval", "demo")
-EXPORTS = ("ply", "gltf", "usd", "video", "tracks", "web")
+EXPORTS = ("ply", "gltf", "usd", "video", "web")
 
 
 @pytest.mark.parametrize(
@@ -159,7 +159,6 @@ def test_main__names_an_output_that_cannot_be_written(
             ("render", stream, folder / "a.mp4", "--camera", 0),
             ("render", stream, folder / "exr", "--camera", 0),
             ("export", "ply", stream, folder / "ply"),
-            ("export", "tracks", stream, folder / "a.npz"),
             ("export", "web", stream, folder / "page.html"),
             ("info", capture, "--no-check", "--plot", folder / "rig.png"),
             ("demo", folder / "out"),
@@ -198,7 +197,6 @@ def test_main__writes_nothing_into_a_capture(
         ("export", "usd", stream, place / "a.usda"),
         ("import", tmp_path, place / "new.morgs"),
         ("export", "video", stream, place / "cam0.mp4"),
-        ("export", "tracks", stream, place / "a.npz"),
         ("export", "web", stream, place / "page.html"),
         ("export", "web", stream, place / "page"),
         ("eval", stream, "--capture", capture, "--json", place / "capture.json"),

@@ -12,7 +12,6 @@ import pytest
 
 from morgs_mi import Camera, FitConfig, StreamConfig, StreamLoop, cli, rasterize
 from morgs_mi.core.memory import check_memory, from_numpy, owned_copy
-from morgs_mi.studio.exports.panorama import panorama
 from tests.scenes.changing_splats import splats
 
 
@@ -87,7 +86,6 @@ def wide(width: int) -> Camera:
 
 DOORS = {
     "image": (lambda: rasterize(splats(), wide(16000)), "an image of 16000x16000 pixels"),
-    "panorama": (lambda: panorama(splats(), wide(8), 1_000_000_000), "`width=1000000000`"),
     "gaussians": (
         lambda: StreamLoop([wide(8)], (), (), StreamConfig(fit=FitConfig(num_gaussians=10**9))),
         "`num_gaussians=1000000000`",

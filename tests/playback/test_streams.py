@@ -224,22 +224,6 @@ def test_commands__name_what_is_no_file_of_gaussians(tmp_path, run, content, mes
         (("--camera", "0", "--path", "orbit"), "expected --camera or --path, got both"),
         (("--degrees", "0"), "--degrees must be 1 to 360, got 0"),
         (("--width", "0"), "--width must be a number in [1, inf), got 0"),
-        (
-            ("--stereo", "0.1"),
-            "--stereo is for equirectangular images; add --projection equirectangular",
-        ),
-        (
-            ("--projection", "equirectangular", "--width", "63"),
-            "--width must be even and at least 2, got 63",
-        ),
-        (
-            ("--projection", "equirectangular", "--channels", "depth"),
-            "renders the colour of a stream alone",
-        ),
-        (
-            ("--projection", "equirectangular", "--stereo", "-1"),
-            "--stereo must be a number in [0, inf), got -1",
-        ),
         (("--insert", "no.py"), "--insert renders for one camera, got none; add --camera CAMERA"),
     ],
 )
@@ -328,7 +312,7 @@ def with_nan(path: Path, rows: int) -> Path:
 
 
 DRAWING = [("render",), ("export", "video"), ("export", "web")]
-WRITING = [("export", kind) for kind in ("ply", "gltf", "usd", "tracks")]
+WRITING = [("export", kind) for kind in ("ply", "gltf", "usd")]
 
 
 @pytest.mark.slow

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.codec.frame_source import FrameSource, FrameState, play
-from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.compressed_ply import write_compressed_ply
@@ -171,21 +170,11 @@ def flight(
         ValueError: an unknown channel, or a broken packet.
     """
     config = render_config(stream)
-    for i, gaussians, camera in flight_views(stream, path, clip):
-        yield i, render(gaussians, camera, channels or available_channels(gaussians), config)
-
-
-def flight_views(
-    stream: FrameSource, path: CameraPath, clip: Iterator[Gaussians] | None = None
-) -> Iterator[tuple[int, Gaussians, Camera]]:
-    """Yield the number, the Gaussians and the camera of each image of `flight`.
-
-    Raises:
-        ValueError: the stream has no frame, or a packet is broken.
-    """
-    frame_numbers(stream)
+    frame_numbers(stream)  # refuses a stream without frames
     frames = zip(range(num_images(stream, path)), clip or repeated_frames(stream), strict=False)
-    return ((i, gaussians, path.at(i / stream.fps)) for i, gaussians in frames)
+    for i, gaussians in frames:
+        camera = path.at(i / stream.fps)
+        yield i, render(gaussians, camera, channels or available_channels(gaussians), config)
 
 
 def num_images(stream: FrameSource, path: CameraPath) -> int:

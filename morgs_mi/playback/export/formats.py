@@ -49,7 +49,6 @@ PLY = (
 GLTF = (Format("glb", "gltf", folder=True),)
 USD = tuple(Format(name, f"stream.{name}") for name in ("usdc", "usd", "usda", "usdz"))
 VIDEO = (Format("mp4", "{}.mp4"),)
-TRACKS = (Format("npz", "tracks.npz"),)
 WEB = (Format("html", "player.html"), Format("", "web", folder=True))
 IMAGES = (
     *VIDEO,

@@ -1,4 +1,4 @@
-"""`morgs-mi export gltf`, `usd` and `tracks`."""
+"""`morgs-mi export gltf` and `usd`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tyro.conf import DisallowNone, Positional
 from morgs_mi.cli.export_kind import FRAMES, ExportKind
 from morgs_mi.cli.settings import Flag, place
 from morgs_mi.core.progress import Report
-from morgs_mi.playback.export.formats import GLTF, TRACKS, USD, Format
+from morgs_mi.playback.export.formats import GLTF, USD, Format
 
 if TYPE_CHECKING:
     from morgs_mi.codec.frame_source import FrameSource
@@ -63,23 +63,3 @@ class Usd(ExportKind):
         frames = select_frames(stream, self.frames)
         write_usd(stream, output, frames, self.half, partial(report, "Writing"))
         return f"{len(frames)} frames, {output.stat().st_size / 1e6:.2f} MB"
-
-
-@dataclass(frozen=True)
-class Tracks(ExportKind):
-    """Write the track of every Gaussian as NumPy arrays: ids, frames, positions, confidence."""
-
-    output: Annotated[Positional[Path | None], DisallowNone, place("FILE.npz")] = None
-    """File for the tracks; by default OUT/tracks.npz."""
-
-    formats = TRACKS
-
-    def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
-        from morgs_mi.playback.export.clips import frame_numbers
-        from morgs_mi.studio.exports.tracks import extract_tracks, write_tracks
-
-        total = len(frame_numbers(stream))
-        tracks = extract_tracks(stream, lambda done: report("Following", done, total))
-        write_tracks(output, tracks)
-        T, N = tracks.positions.shape[:2]
-        return f"{N} Gaussians through {T} frames"

@@ -1,1 +1,1 @@
-"""Exports to OpenUSD and glTF, tracks and panoramas."""
+"""Exports to OpenUSD and glTF."""

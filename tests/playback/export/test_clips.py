@@ -120,11 +120,6 @@ def test_export_gltf__writes_selected_frames(stream, tmp_path):
     assert [path.name for path in sorted((tmp_path / "g").iterdir())] == ["0001.glb", "0003.glb"]
 
 
-def test_export_tracks__writes_all_ids(stream, tmp_path):
-    assert run("export", "tracks", tmp_path) == 0
-    assert np.load(tmp_path / "tracks.npz")["positions"].shape == (4, 42, 3)
-
-
 def test_flight__shows_rendered_images_and_restarts_the_clip(stream, tmp_path):
     keys = [{"time": 0, "camera": "middle"}, {"time": 0.6, "camera": "middle"}]
     (tmp_path / "still.json").write_text(json.dumps({"keys": keys}))
@@ -208,8 +203,7 @@ def test_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
         (("ply", "--frames", "9"), "stream.morgs, 0 to 3, got '9'"),
         (("ply", "--frames", "a:b"), "--frames must be like 12, 10:20 or 0:100:5, got 'a:b'"),
         (("video", "x.avi"), "x.avi: the output must be FILE.mp4, got '.avi'."),
-        (("tracks", "stream.morgs"), "stream.morgs: the output must be FILE.npz, got '.morgs'."),
-        (("tracks", "folder"), "folder: the output must be FILE.npz, got 'folder'."),
+        (("video", "folder"), "folder: the output must be FILE.mp4, got 'folder'."),
         (
             ("ply", "a.glb"),
             "must be a folder, FILE.ply for one frame, a folder ending in compressed-ply or "

@@ -128,7 +128,7 @@ def test_SegmentedRun__reports_frames_and_workers(whole: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", [("eval",), ("export", "tracks"), ("render", "--camera", "0")])
+@pytest.mark.parametrize("command", [("eval",), ("export", "ply"), ("render", "--camera", "0")])
 def test_SegmentedRun__is_read_by_the_commands(
     whole: Path, tmp_path: Path, command: tuple[str, ...]
 ) -> None:
