@@ -28,7 +28,6 @@ from .stream_loop import StreamLoop
 from .studio.light.light_probe import light_probe
 from .studio.light.shadows import shadow_ratio, shadowed
 from .studio.live.live_frames import live_frames
-from .studio.measures.point_tracks import PointTracks, track_points
 from .studio.synth.synth_config import SynthConfig
 from .studio.synth.synthesize import synthesize
 from .surfaces.splat_rays import SplatRays
@@ -44,7 +43,6 @@ __all__ = [
     "Image",
     "MotionConfig",
     "ObjectiveConfig",
-    "PointTracks",
     "ProgressBar",
     "RenderConfig",
     "SplatRays",
@@ -72,7 +70,6 @@ __all__ = [
     "shadowed",
     "stream_capture",
     "synthesize",
-    "track_points",
     "with_near_planes",
     "write_ply",
 ]

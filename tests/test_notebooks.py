@@ -20,7 +20,6 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 LONG_CALLS = {
     "Fitting": "morgs_mi.stream_capture(capture, out, CONFIG, progress=Bar('Fitting').report)",
     "Evaluating": "morgs_mi.evaluate_stream(out, progress=Bar('Evaluating'))",
-    "Tracking": "morgs_mi.track_points(stream(), [(0, 0, 0)], 0, progress=Bar('Tracking', 2))",
     "Writing": "write_web_page(stream(), out / 'page.html', progress=Bar('Writing', 2))",
     "Exporting": (
         "write_each(play(stream()), out / 'ply', '.ply', write_ply, [0, 1], Bar('Exporting'))"

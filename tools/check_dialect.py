@@ -44,7 +44,6 @@ EXCEPTIONS = {
     "morgs_mi/studio/calibration/refine.py": {"taken"},
     "morgs_mi/studio/import_frames.py": {"before", "now"},
     "morgs_mi/studio/live/cameras.py": {"after"},
-    "morgs_mi/studio/measures/track_scores.py": {"found"},
     "morgs_mi/studio/synth/ground_truth.py": {"before", "after"},
     "morgs_mi/studio/synth/sensor.py": {"own"},
 }

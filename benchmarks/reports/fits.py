@@ -129,6 +129,7 @@ class Clip:
         (state,) = coded_frames([keyframe])
         loop = self.loop(config)
         loop.resume(state, self.images[:1])
+        packets = [keyframe]
         reports = []
         seconds = []
         with TemporaryDirectory() as folder:
@@ -140,8 +141,10 @@ class Clip:
                     packet, report = loop.push(images)
                     seconds.append(time.process_time() - start)
                     writer.write(packet)
+                    packets.append(packet)
                     reports.append(report)
-            return Continuation(evaluate_stream(path, self.capture.path), reports, seconds)
+            evaluation = evaluate_stream(path, self.capture.path)
+            return Continuation(evaluation, packets, reports, seconds)
 
 
 class Continuation(NamedTuple):
@@ -149,10 +152,12 @@ class Continuation(NamedTuple):
 
     Attributes:
         evaluation: scores of the whole stream.
+        packets: of all frames.
         reports: of the later frames.
         seconds: processor times of the later frames, s.
     """
 
     evaluation: Evaluation
+    packets: list[Packet]
     reports: list[FrameReport]
     seconds: list[float]

@@ -33,7 +33,6 @@ _LOG = logging.getLogger(__name__)
 _DEFAULT_FPS = 30.0
 _INTERVALS = {
     "fps": "[1e-6, 1e6]",
-    "meters_per_unit": "[1e-12, 1e12]",
     "display_exposure": "[-100, 100]",
 }
 _SETTINGS = {*_INTERVALS, "test_view", "readout"}
@@ -61,11 +60,6 @@ class ReadConfig:
     near: float | None = None
     """Depth of the cameras' near planes, world units; None: a fifth of the smallest reliable depth
     (see `with_near_planes`)."""
-
-    @property
-    def aligns_clips(self) -> bool:
-        """Whether clips of different lengths and frame rates are aligned."""
-        return self.trim or bool(self.offset)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +139,7 @@ def _instants(
     max_frames: int | None,
 ) -> tuple[_Clocks, np.ndarray]:
     """Return the clocks by which frames are selected, and the instants [T]."""
-    if config.aligns_clips:
+    if config.trim or config.offset:
         clocks = _without_drift(exact, readers, max_frames)
         return clocks, _common_instants(path, names, readers, config, clocks)[:max_frames]
     instants = np.arange(_num_frames(path, readers, max_frames, config.gaps), dtype=float)
@@ -438,10 +432,9 @@ def _check_rates(
 def read_settings(path: Path) -> dict[str, Any]:
     """Return the settings in a capture's `capture.json`, or {} without such a file.
 
-    They are ``fps``, ``test_view``, ``meters_per_unit``, the length of a world unit in metres, and
-    ``readout``, the frames from the exposure of an image's first row to the exposure of its last
-    row: a number for all cameras, or an object with the numbers that are not 0, by the cameras'
-    names; and ``display_exposure`` in stops, see `Capture`.
+    They are ``fps``, ``test_view`` and ``readout``, the frames from the exposure of an image's
+    first row to the exposure of its last row: a number for all cameras, or an object with the
+    numbers that are not 0, by the cameras' names; and ``display_exposure`` in stops, see `Capture`.
 
     Raises:
         ValueError: the file is not a JSON object, or a setting is not valid.

@@ -37,10 +37,6 @@ STUDIO: Mapping[str, Mapping[str, str]] = {
         "onnx-signed": "networks.flow_network:onnx_signed",
     },
     "mask refiners": {"sam2": "networks.sam2:sam2"},
-    "measures": {
-        "registration": "measures.registration:Registration",
-        "tracking": "measures.tracking:Tracking",
-    },
     "image distances": {"lpips": "measures.lpips:Lpips"},
 }
 """Entries by registry and name, as MODULE or MODULE:NAME inside `morgs_mi.studio`."""

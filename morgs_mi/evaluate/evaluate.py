@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from morgs_mi.core.bounded import read_json
-from morgs_mi.core.entries import STUDIO, studio_entry
 from morgs_mi.core.fit_names import REPORT
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.evaluate.comparison import ComparedClip
@@ -57,7 +56,6 @@ def evaluate_stream(
     recording = clip.recording
     seconds = _seconds(stream.path)
     measures: list[Measure] = [Quality(lpips), Variation(clip), Motion3D(clip), Speed(clip)]
-    measures += [studio_entry("measures", name)(clip) for name in STUDIO["measures"]]
     rows: list[FrameScores] = []
     for frame in clip.frames():
         for view in frame.views():

@@ -9,7 +9,7 @@ NaN stands for an unknown score. A name with ``_moving`` or ``_still`` is the sc
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Self
 
 import numpy as np
@@ -85,39 +85,6 @@ class Motion3DScores(_Scores):
 
 
 @dataclass(frozen=True)
-class TrackScores:
-    """Scores of 3D point tracks by one protocol (see `track_scores`); NaN where the protocol does
-    not define one.
-    """
-
-    num_tracks: int = 0  #: Number of tracks that are compared.
-    #: AJ: Jaccard index of positions and visibility, mean over the thresholds, in [0, 1].
-    average_jaccard: float = _NAN
-    #: Share of the visible points that are within a threshold, mean over the thresholds, in [0, 1].
-    delta_avg: float = _NAN
-    #: OA: share of the points with the right visibility, in [0, 1].
-    occlusion_accuracy: float = _NAN
-    #: MTE: median over the visible points of a track of the distance, mean over the tracks, world
-    #: units.
-    median_error: float = _NAN
-    median_error_percent: float = _NAN  #: The same in percent of the scene extent.
-    #: Share of a track before its first failure, mean over the tracks, in [0, 1].
-    survival: float = _NAN
-    #: Share of the points and frames for which a Gaussian of the point is alive, in [0, 1].
-    bound: float = _NAN
-
-
-@dataclass(frozen=True)
-class TrackingScores:
-    """Scores of 3D point tracks by one protocol."""
-
-    protocol: str  #: Name of the protocol.
-    thresholds: str  #: Its thresholds with their units.
-    all: TrackScores  #: Scores of all tracks.
-    moving: TrackScores  #: Scores of the tracks with true paths longer than 10 cm.
-
-
-@dataclass(frozen=True)
 class VariationScores(_Scores):
     """Masked total variation (mTV, x100) of the static pixels of a view (see `StillVariation`)."""
 
@@ -187,11 +154,6 @@ class Evaluation:
     playback: PlaybackTimes
     psnr_slope: float  #: Slope of the PSNR, dB per frame.
     frames: tuple[FrameScores, ...]
-    #: 3D point tracks against the true ones, a row per protocol; empty without true tracks.
-    tracking: tuple[TrackingScores, ...] = ()
-    #: PSNR of each held-out view in the first frame, seen from the camera that fits its image best,
-    #: dB, by camera name. The scores of the frames are those as calibrated.
-    registered: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def num_frames(self) -> int:
@@ -210,11 +172,6 @@ class Evaluation:
         return {
             name: ViewScores.mean([frame.views[name] for frame in self.frames]) for name in names
         }
-
-    @property
-    def registered_psnr(self) -> float:
-        """Mean of the PSNR of the registered held-out views, dB; NaN without a held-out view."""
-        return known_mean(list(self.registered.values()))
 
     @property
     def motion_3d(self) -> Motion3DScores | None:
@@ -236,22 +193,16 @@ class Evaluation:
                 getattr(frame.scores, name) for frame in (self.frames[0], self.frames[-1])
             )
             means[name] = {"mean": means[name], "first": first, "last": last}
-        views = self.views.items()
         names = ("stream", "capture", "held_out", "num_frames", "complete", "regions")
-        figures = ("psnr_slope", "registered_psnr")
         return {
             **{name: getattr(self, name) for name in names},
             **means,
-            **{name: getattr(self, name) for name in figures},
+            "psnr_slope": self.psnr_slope,
             "motion_3d": {} if self.motion_3d is None else asdict(self.motion_3d),
-            "tracking": [asdict(row) for row in self.tracking],
             "seconds": {**asdict(self.seconds), "definition": _SECONDS},
             "bytes": asdict(self.sizes),
             "mtv": asdict(self.variation),
             "playback": asdict(self.playback),
-            "views": {
-                n: {**asdict(scores), "registered_psnr": self.registered.get(n, _NAN)}
-                for n, scores in views
-            },
+            "views": {name: asdict(scores) for name, scores in self.views.items()},
             "frames": [frame.as_dict() for frame in self.frames],
         }

@@ -9,13 +9,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from morgs_mi.evaluate.measures import REGIONS
-from morgs_mi.evaluate.results import (
-    Evaluation,
-    Motion3DScores,
-    Sizes,
-    TrackScores,
-    ViewScores,
-)
+from morgs_mi.evaluate.results import Evaluation, Motion3DScores, Sizes, ViewScores
 
 # Title, name of the score and decimals.
 _Column = tuple[str, str, int]
@@ -25,7 +19,7 @@ _METRICS += (("LPIPS", "lpips", 4), ("flow error, px", "motion_error", 2))
 _FRAME = (("PSNR, dB", "psnr", 2), ("moving", "psnr_moving", 2), ("SSIM", "ssim", 4))
 _FRAME += (("flow error", "motion_error", 2), ("moving", "motion_error_moving", 2))
 _VIEW = (("PSNR, dB", "psnr", 2), ("colours matched", "psnr_matched", 2), ("SSIM", "ssim", 4))
-_VIEW += (("flow error", "motion_error", 2), ("registered", "registered", 2))
+_VIEW += (("flow error", "motion_error", 2),)
 _SWEEP = (
     ("first, s", "first_seconds", 1),
     ("later, s", "later_seconds", 2),
@@ -41,15 +35,11 @@ def figure(value: float | None, digits: int) -> str:
 
 
 def evaluation_tables(result: Evaluation) -> Iterator[Table]:
-    """Yield tables of the frames, of several views, of the regions and, with true tracks, of the
-    point tracks.
-    """
+    """Yield tables of the frames, of several views and of the regions."""
     yield _frame_table(result)
     if len(result.views) > 1:
         yield _view_table(result)
     yield _region_table(result)
-    if result.tracking:
-        yield _tracking_table(result)
 
 
 def _frame_table(result: Evaluation) -> Table:
@@ -118,10 +108,8 @@ def _cells(row: Mapping[str, float | None], columns: Sequence[_Column]) -> list[
 
 def _view_table(result: Evaluation) -> Table:
     """Return the scores of each view, and their means, without columns that have none."""
-    psnrs = {**result.registered, "mean": result.registered_psnr}
     rows = {
-        name: {**asdict(scores), "registered": psnrs.get(name)}
-        for name, scores in (*result.views.items(), ("mean", result.scores))
+        name: asdict(scores) for name, scores in (*result.views.items(), ("mean", result.scores))
     }
     columns = _known_columns(_VIEW, rows.values())
     title = f"{_views(result)}, means over the frames"
@@ -129,25 +117,6 @@ def _view_table(result: Evaluation) -> Table:
     for name, row in rows.items():
         table.add_row(name, *_cells(row, columns))
     return table
-
-
-def _tracking_table(result: Evaluation) -> Table:
-    """Return the scores of 3D point tracks in the units of the papers: shares in percent."""
-    title = "3D point tracks: shares in %, MTE in world units and in % of the extent"
-    table = _table(title, "", "tracks", "AJ", "<d avg", "OA", "MTE", "MTE, %", "survival")
-    for row in result.tracking:
-        table.add_row(row.protocol, *_tracking_cells(row.all))
-        table.add_row("  moving", *_tracking_cells(row.moving))
-    return table
-
-
-def _tracking_cells(scores: TrackScores) -> Iterator[str]:
-    yield str(scores.num_tracks)
-    for share in (scores.average_jaccard, scores.delta_avg, scores.occlusion_accuracy):
-        yield figure(100 * share, 1)
-    yield figure(scores.median_error, 4)
-    yield figure(scores.median_error_percent, 2)
-    yield figure(100 * scores.survival, 1)
 
 
 def evaluation_summary(result: Evaluation) -> Iterator[str]:
@@ -158,27 +127,18 @@ def evaluation_summary(result: Evaluation) -> Iterator[str]:
         f"{figure(result.psnr_slope, 4)} dB per frame."
     )
     if result.held_out:
-        yield from _held_out_sentences(result)
+        yield (
+            f"Held-out {'views' if len(result.views) > 1 else 'view'} in all frames: "
+            f"{figure(result.scores.psnr, 2)} dB as recorded, "
+            f"{figure(result.scores.psnr_matched, 2)} dB after the gain and bias per channel that "
+            "fit best."
+        )
     if result.motion_3d is not None and result.motion_3d.num_gaussians:
         yield _motion_sentence(result.motion_3d)
     if (iou := result.scores.confidence_iou) == iou:
         yield f"Confidence over the true mask: IoU {iou:.2f}."
     yield _size_sentence(result.sizes)
     yield _time_sentence(result)
-
-
-def _held_out_sentences(result: Evaluation) -> Iterator[str]:
-    held_out = "Held-out views" if len(result.views) > 1 else "Held-out view"
-    mean = result.scores
-    yield (
-        f"{held_out} in the first frame: {figure(result.frames[0].scores.psnr, 2)} dB as "
-        f"calibrated, {figure(result.registered_psnr, 2)} dB registered, from the camera that fits "
-        "each image best."
-    )
-    yield (
-        f"{held_out} in all frames: {figure(mean.psnr, 2)} dB as recorded, "
-        f"{figure(mean.psnr_matched, 2)} dB after the gain and bias per channel that fit best."
-    )
 
 
 def _motion_sentence(motion: Motion3DScores) -> str:

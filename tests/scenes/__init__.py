@@ -11,5 +11,5 @@
 | a capture in each layout | `captures` |
 | a capture for the command line; with matches and true poses | `noise_capture`, `textured` |
 | a fit that is killed; clips of moving planes; cameras that record meanwhile | `recording`, `filmed`, `live_clip` |
-| clips that are cut, true tracks, networks, a full disk | `edit_lists`, `annotations`, `tiny_network`, `full_disk` |
+| clips that are cut, networks, a full disk | `edit_lists`, `tiny_network`, `full_disk` |
 """  # noqa: E501

@@ -1,1 +1,1 @@
-"""Measures of an evaluation that need a network or marked points."""
+"""Measures of an evaluation that need a network."""

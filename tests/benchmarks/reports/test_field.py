@@ -48,6 +48,6 @@ def test_main__measures_a_tiny_clip(tmp_path: Path) -> None:
     for scores in cells["3/0"].values():
         assert scores["num_bytes"] > 0
         assert len(scores["by_frame"]["psnr"]) == 2
-        assert "TAPVid-3D delta_avg" in scores
+        assert "Dynamic 3D Gaussians delta_avg" in scores
     assert field_table(cells).count("\n") == 4
     assert (tmp_path / "out.png").stat().st_size > 1000

@@ -11,15 +11,9 @@ import pytest
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.truth import Tracks, load_tracks, load_truth, save_tracks
-from morgs_mi.codec.codec_config import CodecConfig
-from morgs_mi.codec.container import StreamWriter
-from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
-from morgs_mi.codec.reader import StreamReader
-from morgs_mi.studio.measures.tracking import evaluate_tracks
 from morgs_mi.studio.synth.path_tracer import PathTracer
 from morgs_mi.studio.synth.scene import Object, Scene, translate
 from morgs_mi.studio.synth.shapes import ball
-from tests.scenes.gaussians import isotropic
 
 
 @pytest.mark.slow
@@ -83,26 +77,3 @@ def test_save_tracks__load_tracks_reads_them_back(tmp_path: Path) -> None:
         assert {name: mask.tolist() for name, mask in tracks_of_file.visible.items()} == {
             n: m.tolist() for n, m in visible.items()
         }
-
-
-def test_synthesize__tracks_score_a_stream_that_moves_like_them(clip: Path, tmp_path: Path) -> None:
-    """The splats lie on the tracked points; the surface that they render decides which points are
-    visible.
-    """
-    capture = load_capture(clip, test_view=0)
-    tracks = load_tracks(clip / "truth")
-    states = [isotropic(tracks.points[:, t], 0.05, 0.95) for t in range(capture.num_frames)]
-    config = CodecConfig(quality=1e3)
-    with StreamWriter(tmp_path / "s.morgs", capture.cameras, 30, {"test_view": 0}) as writer:
-        writer.write(packet := keyframe_packet(states[0], 0, capture.cameras, config))
-        coded = decode(None, packet)
-        for state in states[1:]:
-            writer.write(packet := residual_packet(coded, state, None, capture.cameras, config))
-            coded = decode(coded, packet)
-    rows = evaluate_tracks(StreamReader(tmp_path / "s.morgs"), capture, [0])
-    for row in rows:
-        for scores in (row.all, row.moving):
-            assert scores.num_tracks > 300
-            assert scores.delta_avg > 0.99
-            assert scores.occlusion_accuracy > 0.9
-            assert scores.average_jaccard > 0.9
