@@ -20,13 +20,6 @@ _FRAME = (("PSNR, dB", "psnr", 2), ("moving", "psnr_moving", 2), ("SSIM", "ssim"
 _FRAME += (("flow error", "motion_error", 2), ("moving", "motion_error_moving", 2))
 _VIEW = (("PSNR, dB", "psnr", 2), ("colours matched", "psnr_matched", 2), ("SSIM", "ssim", 4))
 _VIEW += (("flow error", "motion_error", 2),)
-_SWEEP = (
-    ("first, s", "first_seconds", 1),
-    ("later, s", "later_seconds", 2),
-    ("bytes", "bytes_per_frame", 0),
-)
-_SWEEP += (("PSNR, dB", "psnr", 2), ("moving", "psnr_moving", 2))
-_SWEEP += (("flow error, moving", "motion_error_moving", 2), ("IoU", "confidence_iou", 2))
 
 
 def figure(value: float | None, digits: int) -> str:
@@ -82,17 +75,6 @@ def _region_rows(mean: ViewScores) -> Iterator[tuple[str, ...]]:
             yield "PSNR, colours matched", figure(mean.psnr_matched, digits), "", ""
     if mean.psnr_mu == mean.psnr_mu:
         yield "PSNR of the light, mu-law", figure(mean.psnr_mu, 2), "", ""
-
-
-def sweep_table(rows: Sequence[Mapping[str, float]]) -> Table:
-    """Return the scores of fits with several numbers of epochs, without unknown columns."""
-    columns = _known_columns(_SWEEP, rows)
-    table = _table(
-        "seconds and bytes of a frame, scores of all", "epochs", *(title for title, *_ in columns)
-    )
-    for row in rows:
-        table.add_row(figure(row["epochs"], 0), *_cells(row, columns))
-    return table
 
 
 def _known_columns(

@@ -63,11 +63,6 @@ class DensityPlan:
         """Which of them are births, bool [M]."""
         return self.source < 0
 
-    @property
-    def num_births(self) -> int:
-        """Number of births."""
-        return int(self.is_birth.sum())
-
 
 class Room(NamedTuple):
     """Largest number of births of a round, and of Gaussians after it."""

@@ -125,9 +125,6 @@ class CameraPriors:
     """Position along each axis, in scene extents."""
     focal: Annotated[float, Above(0)] = 0.01
     """Focal lengths, relative."""
-    principal_point: Annotated[float, Above(0)] = 2e-4
-    """Principal point along each axis, in image widths. It follows the calibration closely, because
-    its displacement is nearly indistinguishable from a rotation."""
     distortion: Annotated[float, Above(0)] = 0.1
     """First term of radial distortion that the calibrated lens leaves; the second has a fifth of
     this deviation.

@@ -46,6 +46,8 @@ _MOST_CHANGED = 0.5
 # Half side of the box, as a fraction of the Gaussian's extent: two standard deviations of an opaque
 # one. Its extent reaches the alpha cut-off at three and a third.
 _CORE = 0.6
+# Overlap above which a Gaussian is active: walls behind moving objects have less, what moves more.
+_MIN_OVERLAP = 0.35
 # Responsibility below which an active Gaussian is rendered in `quiet_views` only.
 QUIET = 0.2
 
@@ -57,10 +59,6 @@ class ActiveSetConfig:
 
     min_responsibility: Annotated[float, AtLeast(0)] = 0.05
     """Responsibility above which a Gaussian is active."""
-    min_overlap: Annotated[float, AtLeast(0)] = 0.35
-    """Overlap above which a Gaussian is active: walls behind moving objects have less, and what
-    moves has more.
-    """
     min_weight: Annotated[float, AtLeast(0)] = 0.2
     """Blend weight in changed blocks, summed over all views in px, below which a Gaussian counts as
     hidden. One inside an object that moves is nearly hidden: it would stay behind, and be uncovered
@@ -184,9 +182,7 @@ def _active(
     config: ActiveSetConfig,
 ) -> np.ndarray:
     """Return the active Gaussians by their responsibilities [N], bool [N]."""
-    active = (shares > config.min_responsibility) & (
-        overlap(len(gaussians), views) > config.min_overlap
-    )
+    active = (shares > config.min_responsibility) & (overlap(len(gaussians), views) > _MIN_OVERLAP)
     if gaussians.logit_confidence is not None:
         active |= np.asarray(gaussians.logit_confidence) > 0
     for view in views:

@@ -27,6 +27,7 @@ import numpy as np
 from morgs_mi.core.documentation import documented
 from morgs_mi.core.ranges import AtLeast, check_ranges
 
+# Of 1; also the least threshold, and the bound of the noise of the whole image.
 _GREY_LEVEL = 1 / 255
 # Standard deviations of normal noise in a median absolute deviation.
 _NORMAL = 1.4826
@@ -53,8 +54,6 @@ class ChangeConfig:
     """Threshold in standard deviations of the noise: normal noise exceeds 5 at less than one of 1.4
     million pixels.
     """
-    min_change: Annotated[float, AtLeast(0)] = _GREY_LEVEL
-    """Least threshold and bound of the noise of the whole image, of 1: a grey level."""
     min_peak: Annotated[float, AtLeast(0)] = 4 * _GREY_LEVEL
     """Change that a connected change must exceed in one of its pixels, of 1: four grey levels; 0:
     none. Blocks of compressed video change by less."""
@@ -115,9 +114,9 @@ def _levels(change: np.ndarray, scale: int, config: ChangeConfig) -> np.ndarray:
     window = max(_WINDOW // scale, 1) | 1
     # Zero padding: reflection would double the noise at the border.
     average = cv2.blur(change, (window, window), borderType=cv2.BORDER_CONSTANT)
-    everywhere = min(_noise(average), config.min_change)
+    everywhere = min(_noise(average), _GREY_LEVEL)
     noise = np.maximum(_noise_of_surroundings(change, _NOISE_STEP // scale) / window, everywhere)
-    threshold = np.maximum(config.sigmas * noise, config.min_change).astype(np.float32)
+    threshold = np.maximum(config.sigmas * noise, _GREY_LEVEL).astype(np.float32)
     size = np.abs(average)
     exceeds = size > cv2.resize(threshold, change.shape[::-1])
     return exceeds * np.where(size > config.min_peak, np.uint8(2), np.uint8(1))

@@ -32,16 +32,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.documentation import documented
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
-from morgs_mi.core.ranges import Above, AtLeast, check_ranges
 from morgs_mi.method.confidence import motion_floor
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.mask_refiners.mask_config import MaskConfig
@@ -60,27 +57,14 @@ _NOISE_FRACTION = 0.2
 _ROUNDS = 4
 # Covered pixels at which a view's evidence counts half.
 _HALF_WEIGHT_PIXELS = 1.0
-# Logit of the confidence per unit of evidence above `min_evidence`.
+# Scale s of the robust cost for a Gaussian that does not move, px: the noise of the flow.
+_NOISE_PX = 0.2
+# Evidence e_i above which a Gaussian moves.
+_MIN_EVIDENCE = 0.5
+# Logit of the confidence per unit of evidence above `_MIN_EVIDENCE`.
 _CONFIDENCE_SLOPE = 4.0
-
-
-@documented
-@dataclass(frozen=True)
-class LiftConfig:
-    """Settings of the lifted flow."""
-
-    noise_px: Annotated[float, Above(0)] = 0.2
-    """Scale s of the robust cost for a Gaussian that does not move, in px: the noise of the flow.
-    """
-    min_evidence: float = 0.5
-    """Evidence e_i above which a Gaussian moves."""
-    max_logit: Annotated[float, AtLeast(0)] = 2.0
-    """Bound of the logit of the confidence: from 0.12 to 0.88, soft enough for the images to
-    correct it.
-    """
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
+MAX_LOGIT = 2.0
+"""Bound of the logit of the confidence: 0.12 to 0.88, soft enough for the images to correct it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +76,6 @@ class _LiftView:
     variance: np.ndarray  # of the flow over the pixels of the Gaussian [N], px^2
     jacobian: np.ndarray  # J [N, 2, 3], px per world unit
     floor: float  # of the motion, px
-    noise_px: float  # scale s of the cost without motion, px
 
     def project(self, d: np.ndarray) -> np.ndarray:
         """Return J d [N, 2] in px."""
@@ -102,7 +85,7 @@ class _LiftView:
         """Return r(u - J d) [N] (see the module), with the scale s that belongs to a motion [N, 2]
         in px.
         """
-        scale = self.noise_px + _NOISE_FRACTION * np.linalg.norm(motion, axis=1)
+        scale = _NOISE_PX + _NOISE_FRACTION * np.linalg.norm(motion, axis=1)
         return np.log1p(
             (np.sum((self.flow - self.project(d)) ** 2, axis=1) + self.variance) / scale**2
         )
@@ -112,7 +95,6 @@ def lift_flow(
     gaussians: Gaussians,
     views: Mapping[int, ActiveView],
     observations: Mapping[int, FlowObservation],
-    config: LiftConfig | None = None,
     masks: MaskConfig | None = None,
 ) -> MotionStart:
     """Return the displacements that explain the flow of the key views best, and the confidence that
@@ -123,25 +105,23 @@ def lift_flow(
         views: active views, by view index.
         observations: flow of the key views, by view index; those without an active view are not
             used.
-        config: settings.
         masks: settings of the motion masks; their floor is the noise of the flow.
     """
-    config = config or LiftConfig()
     indices = sorted(observations.keys() & views.keys())
     if not indices:
         N = len(gaussians)
-        logit = np.full(N, -config.max_logit, np.float32)
+        logit = np.full(N, -MAX_LOGIT, np.float32)
         return MotionStart(np.zeros((N, 3), np.float32), logit)
     key_views = [views[v] for v in indices]
     cameras = [view.camera for view in key_views]
     sums = _flow_sums(gaussians, key_views, [observations[v] for v in indices])
     means = gaussians.numpy()["means"].astype(np.float64)
     view_motions = [
-        _lift_view(view_sums, means, camera, motion_floor(camera.width, masks), config.noise_px)
+        _lift_view(view_sums, means, camera, motion_floor(camera.width, masks))
         for view_sums, camera in zip(sums, cameras, strict=True)
     ]
     d = _robust_displacement(view_motions, len(means))
-    logit = _logits(view_motions, d, config)
+    logit = _logits(view_motions, d)
     return MotionStart(
         np.where(logit[:, None] > 0, d, 0).astype(np.float32), logit.astype(np.float32)
     )
@@ -166,11 +146,10 @@ def _robust_displacement(views: list[_LiftView], N: int) -> np.ndarray:
     return d
 
 
-def _logits(views: list[_LiftView], d: np.ndarray, config: LiftConfig) -> np.ndarray:
+def _logits(views: list[_LiftView], d: np.ndarray) -> np.ndarray:
     """Return the logits [N] of the confidence that Gaussians move by d [N, 3]."""
-    top = config.max_logit
-    logit = np.clip(_CONFIDENCE_SLOPE * (_evidence(views, d) - config.min_evidence), -top, top)
-    return np.where(_moves(views, d), logit, -top)
+    logit = _CONFIDENCE_SLOPE * (_evidence(views, d) - _MIN_EVIDENCE)
+    return np.where(_moves(views, d), np.clip(logit, -MAX_LOGIT, MAX_LOGIT), -MAX_LOGIT)
 
 
 def _moves(views: list[_LiftView], d: np.ndarray) -> np.ndarray:
@@ -199,14 +178,12 @@ def _flow_maps(flow: np.ndarray, reliable: np.ndarray) -> np.ndarray:
     return maps * reliable[..., None]
 
 
-def _lift_view(
-    sums: np.ndarray, means: np.ndarray, camera: Camera, floor: float, noise_px: float
-) -> _LiftView:
+def _lift_view(sums: np.ndarray, means: np.ndarray, camera: Camera, floor: float) -> _LiftView:
     """Return the flow of a view at every Gaussian, from the sums of `_flow_maps` [N, 4]."""
     average = sums[:, :3] / np.maximum(sums[:, 3:], 1e-6)
     variance = np.maximum(average[:, 2] - np.sum(average[:, :2] ** 2, axis=1), 0)
     jacobian = camera.projection_jacobian(means)
-    return _LiftView(sums[:, 3], average[:, :2], variance, jacobian, floor, noise_px)
+    return _LiftView(sums[:, 3], average[:, :2], variance, jacobian, floor)
 
 
 def _solve(views: list[_LiftView], trust: list[np.ndarray]) -> np.ndarray:

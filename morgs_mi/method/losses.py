@@ -28,10 +28,9 @@ def recon_loss(
         image: rendered image [H, W, 3], or an image on the region.
         target: image to match.
         dssim_weight: lambda.
-        region: the only pixels that have changed since `Target.set_surroundings` was called;
-            without that call, the target itself surrounds the region. The derivative equals the
-            whole view's. The value omits pixels outside the region and SSIM windows without pixels
-            inside, because they cannot have changed.
+        region: the only pixels that are compared; the target itself surrounds them. The derivative
+            equals the whole view's. The value omits pixels outside the region and SSIM windows
+            without pixels inside, because they cannot have changed.
 
     Raises:
         ValueError: image and target differ in size.

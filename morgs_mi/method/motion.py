@@ -16,7 +16,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.method.active_set import ActiveSet
 from morgs_mi.method.cohesion import share_confidence
 from morgs_mi.method.flow import FlowObservation
-from morgs_mi.method.lift import lift_flow
+from morgs_mi.method.lift import MAX_LOGIT, lift_flow
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.neighbours import NeighbourIndex
@@ -38,9 +38,7 @@ class Stage:
 STAGES: tuple[Stage, ...] = (
     Stage(
         lambda config: config.lift_flow,
-        lambda p, start, config: lift_flow(
-            p.gaussians, p.views, p.flows, config.lift, config.masks
-        ),
+        lambda p, start, config: lift_flow(p.gaussians, p.views, p.flows, config.masks),
     ),
     Stage(
         lambda config: config.propagate_motion,
@@ -94,7 +92,7 @@ def initial_motion(
     )
     logit = _carried_confidence(start, gaussians)
     shared = share_confidence(
-        previous, active.indices, logit, -config.lift.max_logit, config.cohesion_weight, neighbours
+        previous, active.indices, logit, -MAX_LOGIT, config.cohesion_weight, neighbours
     )
     return replace(start, logit_confidence=shared)
 

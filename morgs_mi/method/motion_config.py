@@ -11,7 +11,6 @@ from morgs_mi.method.active_set import ActiveSetConfig
 from morgs_mi.method.change import ChangeConfig
 from morgs_mi.method.flow_sources.flow_config import FlowConfig
 from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES
-from morgs_mi.method.lift import LiftConfig
 from morgs_mi.method.mask_refiners.mask_config import MaskConfig
 from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS
 from morgs_mi.method.motion_model import MOTION_MODELS
@@ -79,8 +78,6 @@ class MotionConfig:
     """Optical flow and its forward-backward check."""
     masks: MaskConfig = field(default_factory=MaskConfig)
     """Motion masks."""
-    lift: LiftConfig = field(default_factory=LiftConfig)
-    """Lifted flow."""
     search: SearchConfig = field(default_factory=SearchConfig)
     """Coarse search."""
     active_set: ActiveSetConfig = field(default_factory=ActiveSetConfig)

@@ -119,12 +119,10 @@ class Target:
             self._image.flags.writeable = False
         return self._image
 
-    def difference(self, image: Tensor, region: Region | None = None) -> np.ndarray:
-        """Return the target minus an image, [H, W, 3] or on a region of it; 0 where masked."""
-        if region is None or region.whole:
-            error = self.pixels - self.masked(self.planes.of(owned_copy(dr.detach(image).array)))
-            return np.asarray(self.planes.image(error)).reshape(self.shape)
-        return np.asarray(self.minus(dr.detach(image).array, region)).reshape(region.shape(3))
+    def difference(self, image: Tensor) -> np.ndarray:
+        """Return the target minus an image, [H, W, 3]; 0 where masked."""
+        error = self.pixels - self.masked(self.planes.of(owned_copy(dr.detach(image).array)))
+        return np.asarray(self.planes.image(error)).reshape(self.shape)
 
     def minus(self, image: Float, region: Region | None) -> Float:
         """Return the target minus an image, both flat on a region or the whole view; 0 where
@@ -169,13 +167,6 @@ class Target:
             )
             self._windows[region] = _Windows(windows, pixels, mean, variance)
         return self._windows[region]
-
-    def set_surroundings(self, image: Tensor) -> None:
-        """Store a rendered image [H, W, 3] as the surroundings of the regions that are compared
-        from now on.
-        """
-        self.surroundings = self.masked(self.planes.of(owned_copy(dr.detach(image).array)))
-        dr.eval(self.surroundings)
 
     def masked(self, values: Float, places: UInt32 | None = None) -> Float:
         """Return planes, or their numbers at `places`, set to 0 where the mask is False."""

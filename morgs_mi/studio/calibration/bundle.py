@@ -48,6 +48,9 @@ _LARGE_ERROR = 1.7
 # px, the least scale of the reprojection errors. Cauchy's loss halves the weight of an error of 2.4
 # deviations.
 _LEAST_SCALE = 0.05
+# Standard deviation of the principal point along each axis, in image widths. It follows the
+# calibration closely, because its displacement is nearly indistinguishable from a rotation.
+_PRINCIPAL_POINT = 2e-4
 _CAUCHY = 2.4
 
 
@@ -161,7 +164,7 @@ def prior_deviations(extent: float, priors: CameraPriors) -> np.ndarray:
     """
     of_pose = np.deg2rad(priors.rotation), priors.position * extent
     terms = priors.distortion, 0.2 * priors.distortion
-    return np.repeat((*of_pose, priors.focal, priors.principal_point, *terms), (3, 3, 1, 2, 1, 1))
+    return np.repeat((*of_pose, priors.focal, _PRINCIPAL_POINT, *terms), (3, 3, 1, 2, 1, 1))
 
 
 def distorted(camera: Camera, pixels: np.ndarray, distortion: np.ndarray) -> np.ndarray:
