@@ -147,9 +147,8 @@ def test_coming_from__commands_run_on_the_folders_of_the_tools(
     assert frames == {
         f"out/{name}": FRAMES for name in ("dynerf", "multipleview", "dynamic3dgs", "3dgstream")
     }
-    assert "Views between the cameras" in outputs["info"]
+    assert outputs["info"].startswith("Views between the cameras will be ")
 
 
 def test_coming_from__names_a_command_for_each_tool():
     assert len([command for command in COMMANDS if command.startswith("morgs-mi fit")]) == 6
-    assert "Views between the cameras will be poor: 4 cameras" in PAGE

@@ -3,7 +3,7 @@ other pages.
 
 The page and the module are built from `web/` and part of the package. The page contains its script,
 compressed, and in a single file the stream as well. Both are stored as text with 7 bits per
-character, see "In a web page" in docs/stream-format.md.
+character (`text_of_bytes`).
 """
 
 from __future__ import annotations

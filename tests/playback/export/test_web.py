@@ -47,7 +47,7 @@ FRAMES = 4
 
 
 def bytes_of_text(text: str, count: int) -> bytes:
-    """Return the bytes as docs/stream-format.md specifies them."""
+    """Return the bytes as a reader of the page does."""
     bits = "".join(f"{ord(character) & 127:07b}" for character in text)
     return bytes(int(bits[8 * i : 8 * i + 8], 2) for i in range(count))
 
