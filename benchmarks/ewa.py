@@ -10,56 +10,36 @@ two images.
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import mitsuba as mi
 import numpy as np
-import tyro
 
 import morgs_mi
 from morgs_mi.core.color_space import encode_light
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.playback.visualise import to_uint8
 
+_OUT = Path("docs/pictures/ewa.jpg")
+_RAYS = 64  # per pixel
 _ERROR_GAIN = 10
 _JPEG_QUALITY = 90
 
 
-@dataclass(frozen=True)
-class Options:
-    """Draw the same Gaussians by splatting and by ray tracing."""
-
-    out: Path = Path("docs/pictures/ewa.jpg")
-    """The picture."""
-    gaussians: int = 6000
-    """Number of Gaussians."""
-    steps: int = 600
-    """Steps of their fit."""
-    width: int = 320
-    """Width of the images, px."""
-    spp: int = 64
-    """Rays per pixel."""
-    variant: str = "llvm_ad_rgb"
-    """Variant of Mitsuba."""
-
-
-def main(options: Options) -> None:
+def main() -> None:
     """Fit the Gaussians and write the picture."""
-    mi.set_variant(options.variant)
+    mi.set_variant("llvm_ad_rgb")
     with tempfile.TemporaryDirectory() as folder:
-        clip = morgs_mi.SynthConfig(
-            cameras=9, frames=2, width=options.width, height=3 * options.width // 4
-        )
+        clip = morgs_mi.SynthConfig(cameras=9, frames=2, width=320, height=240)
         morgs_mi.synthesize("spheres", Path(folder, "clip"), clip)
         capture = morgs_mi.load_capture(Path(folder, "clip"))
-        fit = morgs_mi.FitConfig(num_gaussians=options.gaussians, first_frame_steps=options.steps)
+        fit = morgs_mi.FitConfig(num_gaussians=6000, first_frame_steps=600)
         loop = morgs_mi.StreamLoop.of(capture, morgs_mi.StreamConfig(fit=fit))
         loop.push([next(capture.frames()).images[v] for v in capture.train_views])
     assert loop.gaussians is not None
-    images = rendered(loop.gaussians, capture.cameras[capture.reference_view], options.spp)
-    print(f"{options.out}: {write_picture(options.out, images):.1f} dB")
+    images = rendered(loop.gaussians, capture.cameras[capture.reference_view], _RAYS)
+    print(f"{_OUT}: {write_picture(_OUT, images):.1f} dB")
 
 
 def write_picture(path: Path, images: dict[str, np.ndarray]) -> float:
@@ -97,4 +77,4 @@ def labelled(image: np.ndarray, text: str) -> np.ndarray:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    main()

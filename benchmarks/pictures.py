@@ -9,13 +9,12 @@ key view.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import mitsuba as mi
 import numpy as np
-import tyro
 
 import morgs_mi
 from morgs_mi.codec.packets import CodedFrame
@@ -29,44 +28,30 @@ from morgs_mi.stream_loop import StreamLoop
 from morgs_mi.studio.demo import DemoConfig
 from morgs_mi.studio.synth.synthesize import synthesize
 
+_CAPTURE = Path("out/demo/capture")
+_OUT = Path("docs/how-it-works")
+_FRAME = 5  # a multiple of `mask_interval`, at which motion masks are computed
 _ERROR_GAIN = 10
 _JPEG_QUALITY = 90
 
 
-@dataclass(frozen=True)
-class Options:
-    """Draw the stages of one frame of the demo's clip."""
-
-    capture: Path = Path("out/demo/capture")
-    """Capture of the demo; made if missing."""
-    out: Path = Path("docs/how-it-works")
-    """Folder of the images."""
-    frame: int = 5
-    """The frame; a multiple of `mask_interval`, at which motion masks are computed."""
-    variant: str = "llvm_ad_rgb"
-    """Variant of Mitsuba."""
-
-
-def main(options: Options) -> None:
+def main() -> None:
     """Fit the clip up to the frame and write a JPEG file per stage."""
-    mi.set_variant(options.variant)
+    mi.set_variant("llvm_ad_rgb")
     config = DemoConfig()
-    if not options.capture.exists():
-        synthesize(config.scene, options.capture, replace(config.clip, seed=config.stream.seed))
-    capture = morgs_mi.load_capture(options.capture)
+    if not _CAPTURE.exists():
+        synthesize(config.scene, _CAPTURE, replace(config.clip, seed=config.stream.seed))
+    capture = morgs_mi.load_capture(_CAPTURE)
     loop = StreamLoop.of(capture, config.stream)
     frames = [
-        [frame.images[v] for v in capture.train_views]
-        for frame in capture.frames(0, options.frame + 1)
+        [frame.images[v] for v in capture.train_views] for frame in capture.frames(0, _FRAME + 1)
     ]
     for images in frames[:-1]:
         loop.push(images)
-    options.out.mkdir(parents=True, exist_ok=True)
+    _OUT.mkdir(parents=True, exist_ok=True)
     for name, picture in draw(loop, frames[-1]).items():
         bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
-        cv2.imwrite(
-            str(options.out / f"{name}.jpg"), bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-        )
+        cv2.imwrite(str(_OUT / f"{name}.jpg"), bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
 
 
 def draw(loop: StreamLoop, images: Sequence[np.ndarray | None]) -> dict[str, np.ndarray]:
@@ -136,4 +121,4 @@ def _changed_share(old_state: CodedFrame, new_state: CodedFrame, camera: Camera)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    main()

@@ -44,23 +44,6 @@ def demo() -> str:
     return markdown(("", "PSNR", "motion error, moving", "still"), rows)
 
 
-def hdr() -> str:
-    """Return the error of the light that an inserted sphere receives, of fits of an HDR recording
-    and one of 8 bits.
-    """
-    titles = {
-        "hdr": "HDR",
-        "8-bit": "8 bits, as recorded",
-        "8-bit, guessed": "8 bits, clipped light taken as 4",
-    }
-    light = committed("hdr")["light"]
-    rows = (
-        (title, f"{100 * light[name]['error']:.1f} %", f"{100 * light[name]['mean']:.1f} %")
-        for name, title in titles.items()
-    )
-    return markdown(("recording", "error of the light", "mean light"), rows)
-
-
 def gains() -> str:
     """Return the gains of the default over the tuned baseline, and over the paper's scheme."""
     rows = []
@@ -146,31 +129,6 @@ def splat_files() -> str:
     return markdown(titles, rows, left=0)
 
 
-def plugin_step() -> str:
-    """Return the times of a step through `mi.render`, and of several cameras, by number of
-    Gaussians.
-    """
-    rows = []
-    for row in committed("plugin_step")["rows"]:
-        times = (f"{row[name]:.0f} ms" for name in ("rasterize", "plugin", "update"))
-        ratios = (
-            row["plugin"] / row["rasterize"],
-            row["cameras_together"] / row["cameras_one_by_one"],
-        )
-        size = f"{row['width']}x{row['height']}"
-        rows.append((f"{row['gaussians']:,}", size, *times, *(f"{ratio:.2f}" for ratio in ratios)))
-    titles = (
-        "Gaussians",
-        "film",
-        "`rasterize`",
-        "`mi.render`",
-        "`params.update()`",
-        "ratio",
-        "four cameras together",
-    )
-    return markdown(titles, rows, left=0)
-
-
 def fuzz() -> str:
     """Return the number of damaged streams by fuzzer."""
     changes = {
@@ -184,23 +142,6 @@ def fuzz() -> str:
         for name, counts in committed("fuzz")["fuzzers"].items()
     )
     return markdown(("fuzzer", "what is changed", "streams"), rows, left=2)
-
-
-def workers() -> str:
-    """Return wall time and efficiency by number of workers."""
-    result = committed("scaling")
-    rows = (
-        (
-            f"{run['workers']}",
-            f"{run['seconds']:.0f} s",
-            f"{share['frames']:.2f}",
-            f"{share['whole']:.2f}",
-        )
-        for run, share in zip(result["runs"], result["efficiency"], strict=True)
-    )
-    return markdown(
-        ("workers", "whole fit", "efficiency, later frames", "efficiency, whole fit"), rows
-    )
 
 
 def accuracy() -> str:
@@ -237,13 +178,10 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "frame_times": frame_times,
     "fuzz": fuzz,
     "gains": gains,
-    "hdr": hdr,
     "held_out_views": lambda: held_out.first_frames(committed("held_out")["fits"]),
     "held_out_views_over_time": lambda: held_out.later_frames(committed("held_out")["fits"]),
     "parts": parts,
     "splat_files": splat_files,
-    "plugin_step": plugin_step,
     "steps": steps,
     "unseen": partial(study_table, random_scenes, "random_scenes"),
-    "workers": workers,
 }

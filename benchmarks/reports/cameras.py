@@ -38,7 +38,7 @@ from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.view import View, mean_psnr
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.cluster.tasks import Source
-from morgs_mi.studio.calibration.bundle import changed_camera, distorted
+from morgs_mi.studio.calibration.bundle import changed_camera
 from morgs_mi.studio.calibration.refine import refine_cameras, register_camera
 from morgs_mi.studio.synth.disturbances import Disturbances, load_disturbances
 from morgs_mi.studio.synth.synth_config import SynthConfig
@@ -133,41 +133,24 @@ def disturbed(cameras: Sequence[Camera], degrees: float, seed: int) -> tuple[Cam
 
 
 def pose_errors(cameras: Sequence[Camera], true: Sequence[Camera]) -> dict[str, float]:
-    """Return the errors of cameras after the best common rotation, displacement and scale: degrees,
-    extents, ratio.
-    """
-    centres, goals = (np.array([camera.position for camera in rig]) for rig in (cameras, true))
-    centres = centres - centres.mean(axis=0)
-    goals = goals - goals.mean(axis=0)
+    """Return the mean error of the rotations after the best common one, degrees."""
     pairs = list(zip(cameras, true, strict=True))
     U, _, Vt = np.linalg.svd(sum(a.viewmat[:3, :3].T @ b.viewmat[:3, :3] for a, b in pairs))
-    centres = centres @ (U @ Vt)
-    centres *= (centres * goals).sum() / (centres**2).sum()
     turns = [cv2.Rodrigues(a.viewmat[:3, :3] @ U @ Vt @ b.viewmat[:3, :3].T)[0] for a, b in pairs]
-    degrees = np.rad2deg([np.linalg.norm(turn) for turn in turns])
-    return {
-        "rotation": float(degrees.mean()),
-        "worst_rotation": float(degrees.max()),
-        "position": float(np.linalg.norm(centres - goals, axis=1).mean() / scene_extent(true)),
-        "focal": float(np.mean([abs(a.K[0, 0] / b.K[0, 0] - 1) for a, b in pairs])),
-    }
+    return {"rotation": float(np.rad2deg([np.linalg.norm(turn) for turn in turns]).mean())}
 
 
 def scores(capture: Capture, config: StreamConfig) -> dict[str, float]:
-    """Fit the first frame; return the PSNR of the training views, and of the held-out one in both
-    ways.
-    """
+    """Fit the first frame; return the PSNR of the held-out view in both ways."""
     loop = new_loop(capture, config)
     images = next(capture.frames(0, 1)).images
-    train = capture.train_views
-    loop.push([images[v] for v in train])
+    loop.push([images[v] for v in capture.train_views])
     gaussians = loop.gaussians
     test = capture.reference_view
     assert gaussians is not None
     view = View(capture.cameras[test], images[test], capture.masks[test])
     camera = register_camera(gaussians, view, loop.setup.extent, config.fit, config.render)
     views = {
-        "training": [View(capture.cameras[v], images[v], capture.masks[v]) for v in train],
         "calibrated": [view],
         "registered": [view._replace(camera=camera)],
     }
@@ -200,20 +183,9 @@ def measure(
 
 
 def camera_errors(given: Capture, capture: Capture) -> dict[str, float]:
-    """Return the errors of the training cameras, and by how much their lenses shift a corner of the
-    image, px.
-    """
-    truth = load_disturbances(capture.path / "truth")
-    zeros = [(0.0, 0.0)] * len(capture.cameras)
-    terms = given.distortions or zeros
+    """Return the errors of the training cameras."""
     train = capture.train_views
-    corners = [
-        _at_corner(given.cameras[v], terms[v])
-        - _at_corner(capture.cameras[v], (truth[capture.names[v]].distortion, 0))
-        for v in train
-    ]
-    errors = pose_errors([given.cameras[v] for v in train], [capture.cameras[v] for v in train])
-    return {**errors, "corner": float(np.mean(np.linalg.norm(corners, axis=1)))}
+    return pose_errors([given.cameras[v] for v in train], [capture.cameras[v] for v in train])
 
 
 def lens_clips(options: Options, seed: int) -> tuple[Path, Path]:
@@ -235,12 +207,6 @@ def lens_clips(options: Options, seed: int) -> tuple[Path, Path]:
             denied / "sparse" / "0", capture.cameras, capture.points, capture.point_colors, lenses
         )
     return path, denied
-
-
-def _at_corner(camera: Camera, terms: Sequence[float]) -> np.ndarray:
-    """Return by how much distortion shifts the first corner of an image, px."""
-    corner = np.zeros((1, 2))
-    return (distorted(camera, corner, np.asarray(terms)) - corner)[0]
 
 
 def recovered(row: Mapping[str, Any]) -> float:

@@ -6,12 +6,11 @@ residuals.
 Each setting fits the clip again, because the next frame starts from what the codec has quantised.
 Fits of one setting differ by some hundredths of a dB; smaller differences are not significant.
 
-A clip of the JSON has one row per `quality`, the reference last: the PSNR of the `first` and of the
-`later` frames in dB; the bytes of the `file`, of the `first` and of a `later` frame, and of the
-float32 residual of a later frame, `raw` and with `lzma`; the median times to encode and decode a
-later frame, and of lzma, in ms; and the `loss` of PSNR against the reference in dB. Figures of
-later frames are means. `raw` and `lzma` lead to the same frames, so lzma benefits from values that
-were rounded to zero; in the reference stream there are none.
+A clip of the JSON has one row per `quality`, the reference last: the PSNR of the `later` frames in
+dB; the bytes of a `later` frame, and of its float32 residual with `lzma`; the median times to
+encode a later frame, and of lzma, in ms; and the `loss` of PSNR against the reference in dB.
+Figures of later frames are means. lzma benefits from values that were rounded to zero; in the
+reference stream there are none.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from benchmarks.reports.plots import Column, blank_figure, label_points, save_fi
 from benchmarks.reports.study import Row
 from benchmarks.speed.output import Output
 from morgs_mi.capture.capture import Capture, load_capture
-from morgs_mi.codec.packets import CodedFrame, coded_frames, decode, residual_packet
+from morgs_mi.codec.packets import CodedFrame, coded_frames, residual_packet
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.streams import open_stream
@@ -43,6 +42,8 @@ if TYPE_CHECKING:
 
 # The best preset of lzma takes several times as long and saves a few percent.
 _LZMA_PRESET = 6
+# Quality of the stream that serves as the uncompressed reference.
+_REFERENCE = 1000
 COLUMNS = (
     Column("PSNR, dB", lambda row: row["psnr"]["later"], spread=False),
     Column("loss, dB", lambda row: round(row["loss"], 2) + 0.0, spread=False),
@@ -63,14 +64,8 @@ class Options(Output, OnWorkers):
     """Plot of quality and time over bytes, .png or .svg; needs matplotlib."""
     qualities: tuple[float, ...] = (0.5, 1, 2, 4)
     """Values of `codec.quality`."""
-    reference: float = 1000
-    """Quality of the stream that serves as the uncompressed reference."""
-    frames: int | None = None
-    """Maximum number of frames from the start."""
     stream: StreamConfig = field(default_factory=StreamConfig)
     """Settings of the fit."""
-    resume: bool = False
-    """Reuse streams of an earlier report with the same settings, and continue incomplete ones."""
 
     def run(self) -> None:
         """Fit every capture with every quality, measure the streams, print the tables, and write
@@ -78,14 +73,13 @@ class Options(Output, OnWorkers):
         """
         if not self.captures:
             raise ValueError("codec: `captures` must name at least one folder, got none.")
-        recordings = [load_capture(path, max_frames=self.frames) for path in self.captures]
+        recordings = [load_capture(path) for path in self.captures]
         with self.opened() as client:
             clips = [measure(recording, self, client) for recording in recordings]
         print(quality_table(clips))
         if self.plot is not None:
             plot_codec(clips, self.plot)
-        names = "qualities", "reference", "frames", "resume"
-        settings = {**{name: getattr(self, name) for name in names}, "stream": asdict(self.stream)}
+        settings = {"qualities": self.qualities, "stream": asdict(self.stream)}
         self.write({"clips": clips, "settings": settings}, unprinted=["clips", "settings"])
 
 
@@ -101,7 +95,7 @@ def measure(capture: Capture, options: Options, client: Client | None) -> dict[s
         raise ValueError(
             f"{capture.path}: expected a capture of two frames or more, got {capture.num_frames}."
         )
-    qualities = (*options.qualities, options.reference)
+    qualities = (*options.qualities, _REFERENCE)
     codec = options.stream.codec
     settings = {
         quality: replace(options.stream, codec=replace(codec, quality=quality))
@@ -109,7 +103,7 @@ def measure(capture: Capture, options: Options, client: Client | None) -> dict[s
     }
     folders = {quality: options.out / name / f"{quality:g}" for quality in qualities}
     source = Source.of(capture)
-    cells = {q: (source, folders[q].resolve(), settings[q], options.resume) for q in qualities}
+    cells = {q: (source, folders[q].resolve(), settings[q]) for q in qualities}
     run_cells(
         _fit, cells, client, lambda quality, _: print(f"{name} at quality {quality:g}", flush=True)
     )
@@ -167,22 +161,17 @@ def plot_codec(clips: Sequence[Row], path: Path) -> None:
     save_figure(figure, path)
 
 
-def _fit(source: Source, folder: Path, config: StreamConfig, resume: bool) -> None:
+def _fit(source: Source, folder: Path, config: StreamConfig) -> None:
     """Fit a capture into a folder, which workers share with this process."""
-    stream_capture(source.open(), folder, config, resume)
+    stream_capture(source.open(), folder, config)
 
 
 def _evaluated(folder: Path, capture: Capture) -> dict[str, Any]:
     """Return the quality and the bytes of the decoded stream."""
     evaluation = evaluate_stream(folder, capture.path)
-    first, *later_frames = evaluation.frames
+    later_frames = evaluation.frames[1:]
     return {
-        "psnr": {
-            "first": first.scores.psnr,
-            "later": float(np.mean([row.scores.psnr for row in later_frames])),
-        },
-        "file": evaluation.sizes.file,
-        "first": first.num_bytes,
+        "psnr": {"later": float(np.mean([row.scores.psnr for row in later_frames]))},
         "later": float(np.mean([row.num_bytes for row in later_frames])),
     }
 
@@ -197,12 +186,10 @@ def _measured(folder: Path, settings: StreamConfig) -> dict[str, Any]:
         if old_state is not None:
             rows.append(_frame(old_state, state, cameras, settings))
         old_state = state
-    means = {name: float(np.mean([row[name] for row in rows])) for name in ("raw", "lzma")}
     medians = {
-        name: float(np.median([row[name] for row in rows]))
-        for name in ("encode_ms", "decode_ms", "lzma_ms")
+        name: float(np.median([row[name] for row in rows])) for name in ("encode_ms", "lzma_ms")
     }
-    return means | medians
+    return {"lzma": float(np.mean([row["lzma"] for row in rows])), **medians}
 
 
 def _frame(
@@ -213,10 +200,8 @@ def _frame(
     born = new_state.ids >= old_state.next_id
     source[born] = -1
     start = time.perf_counter()
-    packet = residual_packet(old_state, new_state.gaussians, source, cameras, settings.codec)
+    residual_packet(old_state, new_state.gaussians, source, cameras, settings.codec)
     encode_end = time.perf_counter()
-    decode(old_state, packet)
-    decode_end = time.perf_counter()
     survivors = source[~born]
     old = old_state.gaussians.numpy()
     new = new_state.gaussians.numpy()
@@ -229,8 +214,6 @@ def _frame(
     archive = lzma.compress(raw, preset=_LZMA_PRESET)
     return {
         "encode_ms": 1e3 * (encode_end - start),
-        "decode_ms": 1e3 * (decode_end - encode_end),
         "lzma_ms": 1e3 * (time.perf_counter() - lzma_start),
-        "raw": len(raw),
         "lzma": len(archive),
     }

@@ -12,7 +12,7 @@ whole clip, all against the exact ground truth.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +52,6 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "default + grid": (DEFAULT, {"motion": {"model": "grid-slow", "model_share": 0.25}}),
     "default + rigidity": (DEFAULT, {"fit": {"objective": _RIGID}}),
 }
-_IMAGES = ("psnr", "psnr_moving", "motion_error_moving", "motion_error_still")
 # Protocol of the scores of tracks.
 _PROTOCOL = "Dynamic 3D Gaussians"
 # Scores that are plotted: name and axis.
@@ -60,7 +59,7 @@ _PLOTTED = (
     ("psnr_moving", "PSNR where things move, dB"),
     ("motion_error_moving", "motion error where things move, px"),
 )
-_OVER_TIME = ("psnr", "psnr_moving", "motion_error_moving")
+_SCORES = ("psnr", "psnr_moving", "motion_error_moving")
 COLUMNS = (
     Column("PSNR, dB", "psnr", spread=False),
     Column("moving, dB", "psnr_moving"),
@@ -80,8 +79,6 @@ class Options(Output, OnWorkers):
     """Seeds of the scenes."""
     fit_seeds: tuple[int, ...] = (0,)
     """Seeds of the fits of each scene."""
-    methods: tuple[str, ...] = tuple(METHODS)
-    """Names of the methods."""
     clips: Path = Path("out/random")
     """Folder of the clips."""
     downscale: float = 1
@@ -105,9 +102,7 @@ class Options(Output, OnWorkers):
             source = replace(Source.of(capture), num_frames=min(self.frames, capture.num_frames))
             for fit_seed in self.fit_seeds:
                 methods = {
-                    f"{m}/{e}": self.settings(m, e, fit_seed)
-                    for e in self.epochs
-                    for m in self.methods
+                    f"{m}/{e}": self.settings(m, e, fit_seed) for e in self.epochs for m in METHODS
                 }
                 cells[f"{seed}/{fit_seed}"] = source, methods
         return cells
@@ -146,25 +141,19 @@ def scores_of(
 ) -> dict[str, Any]:
     """Return the scores of a stream as JSON."""
     later_frames = found.frames[1:]
-    motion = [asdict(row.motion_3d) for row in later_frames if row.motion_3d is not None]
     scores = {
         **{
             name: known_mean([getattr(row.scores, name) for row in later_frames])
-            for name in _IMAGES
-        },
-        **{
-            f"motion_3d_{name}": known_mean([row[name] for row in motion])
-            for name in ("error", "relative_error")
+            for name in _SCORES
         },
         **{f"{_PROTOCOL} {name}": value for name, value in tracks.items()},
         "num_bytes": known_mean([report.num_bytes for report in reports]),
         "cpu_s": known_mean(seconds),
-        "steps": known_mean([report.steps for report in reports]),
     }
     figures = {name: float(f"{value:.4g}") for name, value in scores.items()}
     series = {
         name: [float(f"{getattr(row.scores, name):.4g}") for row in later_frames]
-        for name in _OVER_TIME
+        for name in _SCORES
     }
     return json_finite({**figures, "by_frame": series})
 

@@ -20,7 +20,6 @@ import tyro
 
 from benchmarks.reports.plots import markdown
 from benchmarks.speed.output import Output
-from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.bounded import read_json
 
 # Frames of a table over time at equal distances, besides the first residual.
@@ -48,19 +47,15 @@ def scores_of(out: Path) -> dict[str, Any]:
     """
     result = read_json(out / "eval.json")
     report = read_json(out / "report.json")
-    stream = StreamReader(out / "stream.morgs")
     first = report["frames"][0]
     frames = result["frames"]
     return {
         "recording": out.name,
         "training_views": len(report["train_views"]),
         "gaussians": first["num_gaussians"],
-        "steps": first["steps"],
         "is_balanced": bool(first["validation"].get("exposure", {}).get("taken", False)),
-        "forecast": first["validation"].get("sentence", ""),
-        "epochs": stream.metadata["config"]["fit"]["epochs"],
         "views": {
-            name: {key: round(scores[key], 3) for key in ("psnr", "psnr_matched", "ssim")}
+            name: {key: round(scores[key], 3) for key in ("psnr", "psnr_matched")}
             for name, scores in frames[0]["views"].items()
         },
         "frames": [

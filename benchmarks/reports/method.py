@@ -8,8 +8,6 @@ rates. It is measured with several seeds. Each seed has its own first frame, whi
 of these: it is fitted once, stored as a keyframe, and all settings continue from it. Tuned presets
 are run at several rates with the first seed. The rate with the best mean PSNR of the held-out view
 over the later frames is selected, and the other seeds are run at that rate only.
-
-docs/experiments/method.md explains the JSON.
 """
 
 from __future__ import annotations
@@ -27,7 +25,7 @@ from tyro.conf import Positional
 
 from benchmarks.reports.cells import OnWorkers
 from benchmarks.reports.fits import DEFAULT, Clip
-from benchmarks.reports.method_tables import method_page, plot_method
+from benchmarks.reports.method_tables import gains_table, plot_method
 from benchmarks.reports.plots import grouped
 from benchmarks.reports.study import Row, Scene, Study, Variant, method_version
 from benchmarks.speed.output import Output
@@ -70,7 +68,7 @@ class Options(OnWorkers):
     captures: Positional[tuple[Path, ...]]
     """Folders of captures."""
     out: Path = Path("out/method")
-    """Output folder for method.md, method.json, finished fits and, with matplotlib, method.png."""
+    """Output folder for method.json, finished fits and, with matplotlib, method.png."""
     presets: tuple[str, ...] = ("baseline", "ml", "ml-mo", "ml-mo-mc", "paper", DEFAULT)
     """Presets of morgs-mi fit; default means none."""
     epochs: tuple[int, ...] = (1, 2, 3, 5, 8, 12)
@@ -87,10 +85,6 @@ class Options(OnWorkers):
     """Maximum number of frames from the start."""
     num_gaussians: int = 10_000
     """Number of Gaussians of the first frame; overrides stream.fit."""
-    version: str | None = None
-    """Version of the method, default a digest of its sources; stored results of the same version
-    are reused.
-    """
     stream: StreamConfig = field(default_factory=StreamConfig)
     """Settings of the fit; presets, epochs, key views, rates and seeds override them."""
 
@@ -130,17 +124,15 @@ class Options(OnWorkers):
             )
         clips = []
         settings = {n: v for n, v in asdict(self).items() if n not in _WORK}
-        metadata = {"table_epochs": self.table_epochs, "version": self.version or method_version()}
+        metadata = {"table_epochs": self.table_epochs, "version": method_version()}
         with self.opened() as client:
             for path in self.captures:
                 clips.append(measure(path, self, client))
-                page = method_page(clips, self.table_epochs)
-                (self.out / "method.md").write_text(page, encoding="utf-8")
                 result = {"clips": clips, **metadata, "settings": settings}
                 Output(self.out / "method.json").write(result, unprinted=["clips", "settings"])
                 if find_spec("matplotlib"):
                     plot_method(clips, self.out / "method.png")
-        print(f"{page}\nAll figures: {self.out / 'method.json'}")
+        print(f"{gains_table(clips)}\nAll figures: {self.out / 'method.json'}")
 
 
 def measure(path: Path, options: Options, client: Client | None) -> dict[str, Any]:
@@ -220,7 +212,7 @@ def fitted(
         [Scene({"frame": 0}, (replace(source, num_frames=1),))],
         [Variant({}, options.base)],
     )
-    start = replace(start, seeds=range(options.seeds), version=options.version)
+    start = replace(start, seeds=range(options.seeds))
     firsts = {row["fit_seed"]: row["packet"] for row in start.run(client, options.out)}
     # Seed by seed: after an interruption, a report with fewer seeds is complete.
     for seed in range(options.seeds):
@@ -232,9 +224,7 @@ def fitted(
         else:
             choice = variants
         scenes = [Scene({}, (source, firsts[seed]))]
-        rows += Study(later_frames, scenes, choice, (seed,), version=options.version).run(
-            client, options.out
-        )
+        rows += Study(later_frames, scenes, choice, (seed,)).run(client, options.out)
     return rows
 
 

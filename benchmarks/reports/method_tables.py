@@ -59,16 +59,6 @@ def ablation_table(clip: Row, epochs: int) -> str:
     )
 
 
-def epochs_table(clip: Row) -> str:
-    """Return quality and run time: one row per preset and number of epochs."""
-    titles = ("preset", "epochs", "rates")
-    return _table(
-        titles,
-        best_rows(clip),
-        lambda row: (f"`{row['preset']}`", str(row["epochs"]), f"{row['rates']:g}x"),
-    )
-
-
 def key_views_rows(clip: Row) -> list[Row]:
     """Return the rows that compare numbers of key views, by preset and number."""
     return sorted(clip["key_view_rows"], key=lambda row: (row["preset"], row["key_views"]))
@@ -101,26 +91,6 @@ def gains_table(clips: Sequence[Row]) -> str:
                 cells.append(" / ".join(f"{gain:+.2f}" if _known(gain) else "-" for gain in gains))
             table.append((clip["name"], str(epochs), *cells))
     return markdown(("clip", "epochs", *(title for title, *_ in _GAINS)), table, 2)
-
-
-def method_page(clips: Sequence[Row], epochs: int) -> str:
-    """Return all tables of all clips in Markdown; the page on the method explains them.
-
-    Args:
-        clips: results of the clips.
-        epochs: number of epochs of the tables on parts and on key views.
-    """
-    parts = [f"## What the parts add\n\n{gains_table(clips)}"]
-    for clip in clips:
-        size = "{views} views of {width}x{height}, {frames} frames".format(**clip)
-        seeds = best_rows(clip)[0]["runs"]
-        spread = "one run" if seeds == 1 else f"mean ± standard deviation of {seeds} runs"
-        parts.append(f"## {clip['name']}\n\n{size}; {spread}. {_references(clip)}{_edges(clip)}")
-        parts.append(f"### Parts of the method, {epochs} epochs\n\n{ablation_table(clip, epochs)}")
-        if clip["key_view_rows"]:
-            parts.append(f"### Key views, {epochs} epochs\n\n{key_views_table(clip)}")
-        parts.append(f"### Quality against run time\n\n{epochs_table(clip)}")
-    return "\n".join(parts)
 
 
 def plot_method(clips: Sequence[Row], path: Path) -> None:
@@ -189,35 +159,6 @@ def _table(titles: Sequence[str], rows: Sequence[Row], name: Any) -> str:
         for row in rows
     ]
     return markdown((*titles, *(column[0] for column in columns)), cells, len(titles))
-
-
-def _references(clip: Row) -> str:
-    """Return a sentence on the figures of the recording and of the flow."""
-    mean = clip["rows"][0]["mean"]
-    clauses = [f"The recording's own mTV is {figure(mean['mtv_input'], 3)}"]
-    if clip["cue"] is not None:
-        clauses.append(f"motion is {figure(mean['true_motion_moving'], 1)} px where things move")
-        clauses.append(
-            f"the flow that guides it is off by {figure(clip['cue']['error'], 2)} px there"
-        )
-    return ", ".join(clauses) + ".\n"
-
-
-def _edges(clip: Row) -> str:
-    """Return a warning about presets with their best rate at the largest one measured, empty if
-    there are none.
-    """
-    rates_by_preset: dict[str, set[float]] = {row["preset"]: set() for row in clip["rows"]}
-    for row in clip["rows"]:
-        rates_by_preset[row["preset"]].add(row["rates"])
-    edges = [
-        row
-        for row in best_rows(clip)
-        if len(rates_by_preset[row["preset"]]) > 1
-        and row["rates"] == max(rates_by_preset[row["preset"]])
-    ]
-    names = ", ".join(f"`{row['preset']}` at {row['epochs']} epochs" for row in edges)
-    return f"Larger rates than were tried may be better for {names}.\n" if names else ""
 
 
 def _spread(row: Row, name: str, digits: int, unit: float) -> str:

@@ -23,30 +23,22 @@ class Column(NamedTuple):
         score: name of the score, or a function of a row.
         decimals: number of decimals.
         factor: factor on the score.
-        unit: text after the figure.
         spread: whether the standard deviation follows the mean.
-        only: keys and values of the rows that count; None: all.
     """
 
     title: str
     score: str | Callable[[Mapping[str, Any]], Any]
     decimals: int = 2
     factor: float = 1
-    unit: str = ""
     spread: bool = True
-    only: Mapping[str, Any] | None = None
 
     def of(self, rows: Sequence[Mapping[str, Any]]) -> str:
         """Return the figure of some rows."""
-        rows = [row for row in rows if self.only is None or self.only.items() <= row.items()]
         values = [self.score(row) if callable(self.score) else row[self.score] for row in rows]
         values = [self.factor * float("nan" if value is None else value) for value in values]
-        text = (
-            plus_minus(values, self.decimals)
-            if self.spread
-            else figure(float(np.mean(values)), self.decimals)
-        )
-        return text + self.unit
+        if self.spread:
+            return plus_minus(values, self.decimals)
+        return figure(float(np.mean(values)), self.decimals)
 
 
 def scores_table(

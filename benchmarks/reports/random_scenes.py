@@ -112,7 +112,6 @@ def scores_of(
         "psnr_moving": psnr(color[truth.mask], target[truth.mask]) if truth.mask.any() else np.nan,
         "confidence_iou": iou(confidence > 0.5, truth.mask),
         "motion_error_moving": float(error[truth.mask].mean()) if truth.mask.any() else np.nan,
-        "motion_error_still": float(error[~truth.mask].mean()),
     }
 
 

@@ -6,13 +6,12 @@ images best.
     out.json
 
 Each capture is a folder of photos with the model of `morgs-mi calibrate`, or a recording. Views 5,
-13, 21 and so on are held out together; of six views and fewer, each one in turn. A capture with few
-points starts from those that `morgs-mi fit` finds in its training views.
+13, 21 and so on are held out. A capture with few points starts from those that `morgs-mi fit` finds
+in its training views.
 """
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ import numpy as np
 import tyro
 
 from benchmarks.reports.fits import new_loop
-from benchmarks.reports.plots import Column, markdown, scores_table
+from benchmarks.reports.plots import Column, scores_table
 from benchmarks.reports.study import Row, Scene, Study, StudyOptions, Variant
 from morgs_mi import Gaussians, rasterize
 from morgs_mi.capture.capture import load_capture
@@ -44,7 +43,6 @@ COLUMNS = (
 )
 _FIRST = 4
 _EVERY = 8
-_FEW = 6
 
 
 @dataclass(frozen=True)
@@ -75,10 +73,9 @@ class Options(StudyOptions):
                 "set": path.name.partition("-")[0],
                 "principal_points": principal_points(capture.cameras),
             }
-            scenes += [
-                Scene(keys | {"test": test}, (Source.of(capture.holding_out(test)), self.pictures))
-                for test in held_out(len(full.cameras))
-            ]
+            test = list(range(_FIRST, len(full.cameras), _EVERY))
+            source = Source.of(capture.holding_out(test))
+            scenes.append(Scene(keys | {"test": test}, (source, self.pictures)))
         settings = FitConfig(num_gaussians=self.gaussians, first_frame_steps=self.steps)
         fits = {seconds: FitConfig(first_frame_seconds=seconds) for seconds in self.seconds} or {
             None: settings
@@ -89,35 +86,9 @@ class Options(StudyOptions):
         return Study(measure, scenes, variants, self.fit_seeds)
 
     def table(self, rows: Sequence[Row]) -> str:
-        """Return the scores by set, and by the time of the first frame or by the calibration."""
-        if rows[0].get("seconds"):
-            return over_time_table(rows)
-        return scores_table(
-            rows, {"photos": "set", "principal points": "principal_points"}, COLUMNS, left=2
-        )
-
-
-def over_time_table(rows: Sequence[Row]) -> str:
-    """Return the quality and the work of first frames by the time that they may take."""
-    lines = (
-        (
-            row["set"],
-            f"{row['seconds']:.0f}",
-            f"{row['cpu_s'] / 2:.0f}",
-            f"{row['gaussians']:,}",
-            *(f"{row[score]:.2f}" for score in ("training", "held_out", "registered")),
-        )
-        for row in rows
-    )
-    titles = (
-        "may take, s",
-        "time of two cores, s",
-        "Gaussians",
-        "training views, dB",
-        "held out",
-        "registered",
-    )
-    return markdown(("photos", *titles), lines)
+        """Return the scores by set, calibration and time of the first frame."""
+        keys = {"photos": "set", "principal points": "principal_points", "may take, s": "seconds"}
+        return scores_table(rows, keys, COLUMNS, left=2)
 
 
 def principal_points(cameras: Sequence[Camera]) -> str:
@@ -126,11 +97,6 @@ def principal_points(cameras: Sequence[Camera]) -> str:
     """
     points = {(round(c.K[0, 2] / c.width, 6), round(c.K[1, 2] / c.height, 6)) for c in cameras}
     return "own" if len(points) > 1 else "shared"
-
-
-def held_out(count: int) -> list[list[int]]:
-    """Return which of `count` views are held out in each fit."""
-    return [[v] for v in range(count)] if count <= _FEW else [[*range(_FIRST, count, _EVERY)]]
 
 
 def measure(source: Source, pictures: Path | None, config: StreamConfig) -> dict[str, Any]:
@@ -142,10 +108,9 @@ def measure(source: Source, pictures: Path | None, config: StreamConfig) -> dict
     views = [View(*view) for view in zip(capture.cameras, images, capture.masks, strict=True)]
     train = [views[v] for v in capture.train_views]
     test = [views[v] for v in capture.test_views]
-    stages: list[str] = []
     loop = new_loop(capture, config)
     start = time.process_time()
-    _, report = loop.push([view.image for view in train], lambda stage, *_: stages.append(stage))
+    _, report = loop.push([view.image for view in train])
     seconds = time.process_time() - start
     gaussians = loop.gaussians
     assert gaussians is not None
@@ -161,13 +126,11 @@ def measure(source: Source, pictures: Path | None, config: StreamConfig) -> dict
     if pictures is not None:
         _write_picture(pictures / f"{capture.path.name}.jpg", gaussians, test[0])
     scores = {name: mean_psnr(gaussians, group, config.render) for name, group in groups.items()}
-    announcement = re.search(r"about (\d+) s", stages[-1])
     return scores | {
         "views": len(train),
         "held_out_views": len(test),
         "gaussians": len(gaussians),
         "steps": report.steps,
-        "announced_s": float(announcement[1]) if announcement else None,
         "cpu_s": seconds,
     }
 

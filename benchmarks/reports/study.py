@@ -79,8 +79,6 @@ class Study:
         variants: settings.
         seeds: seeds of the fits of each scene and variant.
         seed_key: key of the seed in the rows.
-        version: version of the method, of which stored scores are used; None: a digest of the
-            sources.
     """
 
     measure: Callable[..., Row | Sequence[Row]]
@@ -88,7 +86,6 @@ class Study:
     variants: Sequence[Variant] = (Variant({}, StreamConfig()),)
     seeds: Sequence[int] = (0,)
     seed_key: str = "fit_seed"
-    version: str | None = None
 
     def run(self, client: Client | None, store: Path | None = None) -> list[Row]:
         """Return the rows of all cells, in the order of scenes, variants and seeds.
@@ -150,7 +147,7 @@ class Study:
             for state in _files(Path(path))
         ]
         name = f"{self.measure.__module__}.{self.measure.__qualname__}"
-        parts = self.version or method_version(), name, args, files
+        parts = method_version(), name, args, files
         return store / f"{name}-{hashlib.sha256(repr(parts).encode()).hexdigest()[:16]}.json"
 
 

@@ -4,111 +4,77 @@
     [--baselines]
 
 The whole step is: projection, lists, forward, L1 loss against a constant, adjoint, the projection's
-adjoint, and the gradients of all attributes in memory; the optimised step has Adam's step, too. All
-programs run in turn: background load affects them equally, so compare ratios.
+adjoint, and the gradients of all attributes in memory. All programs run in turn: background load
+affects them equally, so compare ratios.
 """
 
 from __future__ import annotations
 
-import json
-import platform
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 import tyro
 
-import morgs_mi
 from benchmarks import workloads
 from benchmarks.speed import timing
+from benchmarks.speed.output import Output
 from morgs_mi import Camera, Gaussians
-from morgs_mi.core.environment import machine, versions
+
+# Timed repetitions per round; medians are reported.
+_REPEATS = 9
+# Rounds, in each of which the renderer, the yardstick and the baselines run in turn.
+_ROUNDS = 3
 
 
-@dataclass(frozen=True)
-class Options:
+@dataclass(frozen=True, kw_only=True)
+class Options(Output):
     """Workload, programs and output."""
 
     workload: Path
     """Workload file, .npz."""
-    json: Path | None = None
-    """JSON file for the figures, which are also printed."""
     yardstick: Path | None = None
     """Program to compare with on the same workload."""
-    repeats: int = 9
-    """Timed repetitions per round; medians are reported."""
-    rounds: int = 3
-    """Number of rounds, in each of which the renderer, the yardstick and the baselines run in turn.
-    """
-    variant: str = "llvm_ad_rgb"
-    """Mitsuba variant."""
     baselines: bool = False
-    """Whether to also time Mitsuba's volprim_rf_basic."""
-    seed: int = 1
-    """Seed of the pixels for measuring the error."""
+    """Whether to also time volprim_rf_basic, which is slow for more than 20,000 Gaussians."""
 
 
 def figures(gaussians: Gaussians, camera: Camera, options: Options) -> dict[str, Any]:
-    """Return medians over the rounds, their ratios, memory and error."""
+    """Return medians over the rounds, and their ratios."""
     ours = timing.stages(gaussians, camera)
-    memory = timing.peak_megabytes(ours["step"])  # before the other stages allocate memory
-    others, left_out = timing.baselines(gaussians, camera) if options.baselines else ({}, {})
+    others = timing.volprim_stages(gaussians, camera) if options.baselines else {}
     yardstick = timing.Yardstick(options.yardstick) if options.yardstick else None
     rounds: list[dict[str, float]] = []
-    for _ in range(options.rounds):
-        row = timing.measure(ours, options.repeats)
+    for _ in range(_ROUNDS):
+        row = timing.measure(ours, _REPEATS)
         if yardstick:
-            row["yardstick_step"] = yardstick.step(gaussians, camera, options.repeats)
+            row["yardstick_step"] = yardstick.step(gaussians, camera, _REPEATS)
         # The baselines take a hundred times longer; one run is precise enough.
-        row |= timing.measure(others, options.repeats, patience=0.5)
+        row |= timing.measure(others, _REPEATS, patience=0.5)
         rounds.append(row)
 
     result: dict[str, Any] = {
         f"{key}_ms": round(median(r[key] for r in rounds), 3) for key in rounds[0]
     }
-    for key in ("yardstick_step", "volprim_step"):
-        if key in rounds[0]:
-            ratios = [r["step"] / r[key] for r in rounds]
-            # Ratios to the slow baselines need four decimals.
-            result[f"ratio_to_{key.removesuffix('_step')}"] = round(
-                median(ratios), 3 if key == "yardstick_step" else 4
-            )
-            if key == "yardstick_step":
-                result["ratio_per_round"] = [round(r, 3) for r in ratios]
-    for key, share, whole in (
-        ("tenth_share", "tenth_step", "step"),
-        ("loss_share", "loss", "forward"),
-    ):
-        if share in rounds[0]:
-            result[key] = round(median(r[share] / r[whole] for r in rounds), 3)
-    if left_out:
-        result["left_out"] = left_out
-    result["peak_megabytes"] = memory
-    result |= timing.extent(gaussians, camera)
-    return result | timing.error(gaussians, camera, options.seed)
+    if yardstick:
+        ratios = [r["step"] / r["yardstick_step"] for r in rounds]
+        result["ratio_to_yardstick"] = round(median(ratios), 3)
+    result["tenth_share"] = round(median(r["tenth_step"] / r["step"] for r in rounds), 3)
+    return result
 
 
 def main(options: Options) -> None:
     """Run the benchmark."""
-    mi.set_variant(options.variant)
+    mi.set_variant("llvm_ad_rgb")
     gaussians, camera = workloads.load(options.workload)
-    result = figures(gaussians, camera, options) | {
+    workload = {
         "workload": options.workload.name,
         "gaussians": len(gaussians),
         "size": [camera.width, camera.height],
-        "threads": dr.thread_count(),
-        "machine": f"{platform.machine()}, {machine()['processor']}",
-        "versions": versions(),
-        "variant": options.variant,
-        "package": morgs_mi.__name__,
     }
-    text = json.dumps(result, indent=2)
-    if options.json:
-        options.json.write_text(text + "\n")
-    print(text)
+    options.write(figures(gaussians, camera, options) | workload)
 
 
 if __name__ == "__main__":

@@ -24,15 +24,15 @@ from morgs_mi import open_stream, render_stream
 from morgs_mi.io.ply import write_ply
 from morgs_mi.playback.export.web import write_web_page
 
+# Numbers of Gaussians.
+SIZES = (100_000, 300_000, 1_000_000)
+# Number of runs; the shortest time is reported, because others may use the machine.
+_REPEATS = 5
+
 
 @dataclass(frozen=True)
 class Options(Output):
     """Time the commands for files of Gaussians."""
-
-    sizes: tuple[int, ...] = (100_000, 300_000, 1_000_000)
-    """Numbers of Gaussians."""
-    repeats: int = 5
-    """Number of runs; the shortest time is reported, because others may use the machine."""
 
 
 def seconds(work: Callable[[], Any], repeats: int = 1) -> float:
@@ -45,7 +45,7 @@ def seconds(work: Callable[[], Any], repeats: int = 1) -> float:
     return round(min(times), 3)
 
 
-def measure(count: int, repeats: int, width: int = 1280) -> dict[str, Any]:
+def measure(count: int, width: int = 1280) -> dict[str, Any]:
     """Return the figures of one size."""
     # Sizes that fill the ball alike, as a fit with more Gaussians does.
     gaussians, _ = ball(0, count, 64, 64, 0.4 * count ** (-1 / 3), sh_degree=3)
@@ -63,9 +63,9 @@ def measure(count: int, repeats: int, width: int = 1280) -> dict[str, Any]:
             "width": camera.width,
             "height": camera.height,
             "file_megabytes": round(1e-6 * path.stat().st_size, 1),
-            "open_seconds": seconds(lambda: open_stream(path), repeats),
+            "open_seconds": seconds(lambda: open_stream(path), _REPEATS),
             "first_image_seconds": seconds(image),
-            "image_seconds": seconds(image, repeats),
+            "image_seconds": seconds(image, _REPEATS),
             "page_seconds": seconds(lambda: write_web_page(stream, path.with_suffix(".html"))),
             "page_megabytes": round(1e-6 * path.with_suffix(".html").stat().st_size, 1),
         }
@@ -75,7 +75,7 @@ def main() -> None:
     """Run the benchmark."""
     options = tyro.cli(Options)
     mi.set_variant("llvm_ad_rgb")
-    options.write({"rows": [measure(count, options.repeats) for count in options.sizes], "seed": 0})
+    options.write({"rows": [measure(count) for count in SIZES], "seed": 0})
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ def test_plots__are_drawn_and_shown(tmp_path: Path):
 
 
 def test_claims__have_a_table_or_figure_a_command_and_committed_results():
-    assert len(CLAIMS) == 12
+    assert len(CLAIMS) == 10
     result = r"\]\(\.\./\.\./benchmarks/results/\w+\.json\)"
     parts = (
         r"<!-- table: |!\[",

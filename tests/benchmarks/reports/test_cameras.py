@@ -35,7 +35,7 @@ def test_disturbed__turns_and_displaces_every_camera_as_far_as_it_should():
         assert abs(wrong_camera.K[0, 0] / true_camera.K[0, 0] - 1) == pytest.approx(0.01)
 
 
-def test_pose_errors__are_those_after_the_best_similarity():
+def test_pose_errors__are_those_after_the_best_rotation():
     true = rig()
     assert max(pose_errors([moved(camera) for camera in true], true).values()) < 1e-4
     assert pose_errors(disturbed(true, 0.5, 0), true)["rotation"] == pytest.approx(0.5, rel=0.3)

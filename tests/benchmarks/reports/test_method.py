@@ -15,11 +15,9 @@ from benchmarks.reports.method import Options, aggregate, settings_of, variants_
 from benchmarks.reports.method_tables import (
     ablation_table,
     best_rows,
-    epochs_table,
     gains_table,
     key_views_rows,
     key_views_table,
-    method_page,
 )
 from benchmarks.reports.study import Variant
 from morgs_mi.fit.fit_config import FitConfig
@@ -42,7 +40,7 @@ ARGS = [
     "1",
     "2",
 ]
-ARGS += ["--tuned", "baseline", "--seeds", "1", "--num-gaussians", "200", "--version", "test"]
+ARGS += ["--tuned", "baseline", "--seeds", "1", "--num-gaussians", "200"]
 ARGS += [
     "--stream.fit.sh-degree",
     "0",
@@ -66,7 +64,6 @@ def tiny(clip: Path, out: Path) -> Options:
         tuned=("baseline",),
         seeds=1,
         num_gaussians=200,
-        version="test",
         stream=StreamConfig(fit=fit),
     )
 
@@ -145,9 +142,6 @@ def test_method_command__continues_an_interrupted_report(interrupted):
     ]
     order = [(row["preset"], row["key_views"]) for row in key_views_rows(clip)]
     assert order == [(preset, views) for preset in ("ml", "ml-mo") for views in (1, 2, 4)]
-    text = (out / "method.md").read_text()
-    for table in (ablation_table(clip, 2), epochs_table(clip)):
-        assert table in text
     pytest.importorskip("matplotlib")
     assert (out / "method.png").stat().st_size > 10_000
 
@@ -171,31 +165,12 @@ def test_method_tables__are_complete(interrupted):
     (clip,) = interrupted[0]["clips"]
     for table, rows in (
         (ablation_table(clip, 2), 2),
-        (epochs_table(clip), 4),
         (key_views_table(clip), 6),
     ):
         lines = table.splitlines()
         assert len(lines) == 2 + rows
         assert len({line.count("|") for line in lines}) == 1
         assert "nan" not in table
-
-
-@pytest.mark.slow
-def test_method_page__warns_of_a_best_rate_that_is_the_largest_one(interrupted):
-    def warns(best: float) -> bool:
-        rows = [
-            {**row, "best": row["rates"] == best or row["preset"] == "default"}
-            for row in clip["rows"]
-        ]
-        page = method_page([{**clip, "rows": rows}], 2)
-        return (
-            "Larger rates than were tried may be better for `baseline` at 1 epochs, `baseline` at "
-            "2 epochs." in page
-        )
-
-    (clip,) = interrupted[0]["clips"]
-    assert warns(2.0)
-    assert not warns(1.0)
 
 
 def test_gains_table__has_the_best_rates():
@@ -345,15 +320,17 @@ def test_options__refuse_bad_settings_and_captures(clip, tmp_path):
         replace(tiny(clip, tmp_path), frames=1).run()
 
 
-def test_method_page__has_no_other_figures_than_the_report():
+def test_method_report__has_the_figures_of_its_page():
     for name, section in (("method_report", "Four clips"), ("method_parts", "Parts")):
         result = json.loads((ROOT / f"benchmarks/results/{name}.json").read_text(encoding="utf-8"))
         (section_text,) = re.findall(
             rf"^## {section}\n(.*?)^##", page("method.md"), re.DOTALL | re.MULTILINE
         )
-        tables = method_page(result["clips"], result["table_epochs"])
-        figures = set(re.findall(r"\d+\.\d+", tables))
+        figures = set(re.findall(r"\d+\.\d+", gains_table(result["clips"])))
         for clip in result["clips"]:
+            rows = [row for row in best_rows(clip) for row in (row["mean"], row["std"])]
+            rounded = (f"{v:.2f}" for row in rows for v in row.values() if v is not None)
+            figures |= {*rounded, f"{clip['cue']['error']:.2f}"}
             figures |= {f"{row['psnr']:.2f}" for row in clip["scratch"]}
             figures |= {f"{row['by_frame']['psnr'][-1]:.2f}" for row in best_rows(clip)}
             errors = (row["mean"]["motion_error_moving"] for row in best_rows(clip))

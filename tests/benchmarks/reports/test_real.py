@@ -1,4 +1,4 @@
-"""Real images: which views are held out, and photos from their folder to the committed figures.
+"""Real images: photos from their folder to the committed figures.
 
 The photos are not in the repository (docs/experiments/real.md says where they are); a variable
 names their folder, with a folder for each set:
@@ -31,12 +31,6 @@ SETS = {
     "kitchen": (25, "shared"),
     "sceaux": (11, "shared"),
 }
-
-
-def test_held_out__is_every_eighth_view_or_each_of_a_few_in_turn():
-    assert real.held_out(20) == [[4, 12]]
-    assert real.held_out(7) == [[4]]
-    assert real.held_out(3) == [[0], [1], [2]]
 
 
 @pytest.mark.slow

@@ -11,8 +11,7 @@ from benchmarks.reports import __main__ as cli
 from benchmarks.workloads import ball
 from tests import tolerances as tol
 
-SMALL = ["--gaussians", "400", "--width", "48", "--height", "32", "--median-scale", "0.1"]
-SMALL += ["--pixels", "200", "--repeats", "1"]
+SMALL = ["--gaussians", "400", "--width", "48", "--height", "32", "--repeats", "1"]
 
 
 def test_ball__depends_on_the_seed_and_is_in_view():
@@ -43,7 +42,7 @@ def test_renderer__has_the_default_once_per_option(reported):
     knobs = [row["knob"] for row in reported]
     assert set(knobs) == {"alpha_min", "stop_transmittance", "block", "reproducible"}
     assert sorted(row["knob"] for row in reported if row["default"]) == sorted(set(knobs))
-    assert all(min(row["forward_ms"], row["step_ms"], row["step_ratio"]) > 0 for row in reported)
+    assert all(min(row["step_ms"], row["step_ratio"]) > 0 for row in reported)
 
 
 @pytest.mark.slow
@@ -62,4 +61,3 @@ def test_renderer__errors_are_those_of_the_cut_offs(reported):
         )
     no_stop = rows["stop_transmittance", "0"]["rounding"]["gradients"]
     assert max(error["relative_l2"] for error in no_stop.values()) < tol.GRADIENT_REL
-    assert min(error["cosine"] for error in no_stop.values()) > 1 - 1e-6
