@@ -36,9 +36,7 @@ NO_NOUNS = (
 EXCEPTIONS = {
     "benchmarks/reports/cameras.py": {"given"},
     "benchmarks/reports/field.py": {"found"},
-    "benchmarks/reports/method.py": {"found"},
     "benchmarks/reports/plots.py": {"about"},
-    "benchmarks/reports/timing.py": {"apart"},
     "morgs_mi/fit/balance.py": {"taken"},
     "morgs_mi/studio/calibration/offset_equations.py": {"own"},
     "morgs_mi/studio/calibration/refine.py": {"taken"},

@@ -2,7 +2,7 @@
 
     python -m benchmarks.reports renderer --json out.json
     python -m benchmarks.reports codec CAPTURE... --out out/codec
-    python -m benchmarks.reports method CAPTURE... --out out/method --workers 2
+    python -m benchmarks.reports method CAPTURE... --out out/method
 
 `morgs-mi synth` writes captures with ground truth. The other modules of this folder are reports of
 their own: `python -m benchmarks.reports.random_scenes`.

@@ -37,7 +37,6 @@ from morgs_mi.core.rig import scene_extent
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.view import View, mean_psnr
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.runs.cluster.tasks import Source
 from morgs_mi.studio.calibration.bundle import changed_camera
 from morgs_mi.studio.calibration.refine import refine_cameras, register_camera
 from morgs_mi.studio.synth.disturbances import Disturbances, load_disturbances
@@ -72,14 +71,12 @@ class Options(StudyOptions):
         """Return the study of the disturbances."""
         scenes = []
         for seed in self.seeds:
-            source = Source.of(random_capture(self.clips, seed, self.downscale))
+            capture = random_capture(self.clips, seed, self.downscale)
             for disturbance, degrees in product(self.disturbances, self.degrees):
                 keys = {"seed": seed, "degrees": degrees, "disturbance": disturbance, "lens": 0.0}
-                scenes.append(Scene(keys, (source, source, degrees, disturbance)))
+                scenes.append(Scene(keys, (capture, capture, degrees, disturbance)))
             if self.lens:
-                true, denied = (
-                    Source.of(load_capture(c, self.downscale)) for c in lens_clips(self, seed)
-                )
+                true, denied = (load_capture(c, self.downscale) for c in lens_clips(self, seed))
                 keys = {"seed": seed, "degrees": 0.0, "disturbance": 0, "lens": self.lens}
                 scenes.append(Scene(keys, (true, denied, 0.0, 0)))
         fit = FitConfig(
@@ -158,19 +155,17 @@ def scores(capture: Capture, config: StreamConfig) -> dict[str, float]:
 
 
 def measure(
-    source: Source, calibrated: Source, degrees: float, disturbance: int, config: StreamConfig
+    capture: Capture, wrong: Capture, degrees: float, disturbance: int, config: StreamConfig
 ) -> dict[str, Any]:
     """Return the scores with true, wrong and refined cameras, and the errors of the cameras.
 
     Args:
-        source: the recording with its true cameras.
-        calibrated: the same with the lenses of a calibration.
+        capture: the recording with its true cameras.
+        wrong: the same with the lenses of a calibration.
         degrees: rotation of the cameras.
         disturbance: seed of the disturbance.
         config: settings.
     """
-    capture = source.open()
-    wrong = calibrated.open()
     if degrees:
         wrong = replace(wrong, cameras=disturbed(wrong.cameras, degrees, disturbance))
     better, refinement = refine_cameras(wrong, config.fit, config.render, config.seed)

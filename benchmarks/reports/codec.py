@@ -20,12 +20,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from tyro.conf import Positional
 
-from benchmarks.reports.cells import OnWorkers, run_cells
 from benchmarks.reports.plots import Column, blank_figure, label_points, save_figure, scores_table
 from benchmarks.reports.study import Row
 from benchmarks.speed.output import Output
@@ -34,11 +33,7 @@ from morgs_mi.codec.packets import CodedFrame, coded_frames, residual_packet
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.streams import open_stream
-from morgs_mi.runs.cluster.tasks import Source
 from morgs_mi.runs.fit_capture import stream_capture
-
-if TYPE_CHECKING:
-    from distributed import Client
 
 # The best preset of lzma takes several times as long and saves a few percent.
 _LZMA_PRESET = 6
@@ -53,7 +48,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(Output, OnWorkers):
+class Options(Output):
     """Measure bytes, quality and time of the codec, compared with lzma over raw residuals."""
 
     captures: Positional[tuple[Path, ...]]
@@ -73,9 +68,7 @@ class Options(Output, OnWorkers):
         """
         if not self.captures:
             raise ValueError("codec: `captures` must name at least one folder, got none.")
-        recordings = [load_capture(path) for path in self.captures]
-        with self.opened() as client:
-            clips = [measure(recording, self, client) for recording in recordings]
+        clips = [measure(load_capture(path), self) for path in self.captures]
         print(quality_table(clips))
         if self.plot is not None:
             plot_codec(clips, self.plot)
@@ -83,39 +76,21 @@ class Options(Output, OnWorkers):
         self.write({"clips": clips, "settings": settings}, unprinted=["clips", "settings"])
 
 
-def measure(capture: Capture, options: Options, client: Client | None) -> dict[str, Any]:
-    """Fit a capture with every quality, side by side on workers, and return the figures of the
-    streams.
+def measure(capture: Capture, options: Options) -> dict[str, Any]:
+    """Fit a capture with every quality, and return the figures of the streams.
 
     Raises:
-        ValueError: the capture has a single frame, or as `stream_capture` and `evaluate_stream`.
+        ValueError: as `stream_capture` and `evaluate_stream`.
     """
     name = capture.path.resolve().name
-    if capture.num_frames < 2:
-        raise ValueError(
-            f"{capture.path}: expected a capture of two frames or more, got {capture.num_frames}."
-        )
-    qualities = (*options.qualities, _REFERENCE)
-    codec = options.stream.codec
-    settings = {
-        quality: replace(options.stream, codec=replace(codec, quality=quality))
-        for quality in qualities
-    }
-    folders = {quality: options.out / name / f"{quality:g}" for quality in qualities}
-    source = Source.of(capture)
-    cells = {q: (source, folders[q].resolve(), settings[q]) for q in qualities}
-    run_cells(
-        _fit, cells, client, lambda quality, _: print(f"{name} at quality {quality:g}", flush=True)
-    )
     rows = []
-    for quality, folder in folders.items():
-        rows.append(
-            {
-                "quality": quality,
-                **_evaluated(folder, capture),
-                **_measured(folder, settings[quality]),
-            }
-        )
+    for quality in (*options.qualities, _REFERENCE):
+        config = replace(options.stream, codec=replace(options.stream.codec, quality=quality))
+        folder = options.out / name / f"{quality:g}"
+        stream_capture(capture, folder, config)
+        print(f"{name} at quality {quality:g}", flush=True)
+        figures = _evaluated(folder, capture) | _measured(folder, config)
+        rows.append({"quality": quality, **figures})
     best = rows[-1]["psnr"]["later"]
     return {"name": name, "rows": [{**row, "loss": best - row["psnr"]["later"]} for row in rows]}
 
@@ -159,11 +134,6 @@ def plot_codec(clips: Sequence[Row], path: Path) -> None:
         left.ticklabel_format(axis="y", useOffset=False)
         left.legend(fontsize=8)
     save_figure(figure, path)
-
-
-def _fit(source: Source, folder: Path, config: StreamConfig) -> None:
-    """Fit a capture into a folder, which workers share with this process."""
-    stream_capture(source.open(), folder, config)
 
 
 def _evaluated(folder: Path, capture: Capture) -> dict[str, Any]:

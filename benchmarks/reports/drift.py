@@ -20,8 +20,8 @@ from benchmarks.reports.fits import ClipOptions, new_loop
 from benchmarks.reports.plots import Column, scores_table
 from benchmarks.reports.random_scenes import fitted_frames
 from benchmarks.reports.study import Row, Scene, Study, Variant
+from morgs_mi.capture.capture import Capture
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.runs.cluster.tasks import Source
 
 
 def known(row: Row, score: str) -> np.ndarray:
@@ -56,8 +56,8 @@ class Options(ClipOptions):
 
     def study(self) -> Study:
         """Return the study of the clips."""
-        clips = {name: Source.of(self.named_clip(name)) for name in self.scenes}
-        scenes = [Scene({"clip": name}, (source, self.frames)) for name, source in clips.items()]
+        clips = {name: self.named_clip(name) for name in self.scenes}
+        scenes = [Scene({"clip": name}, (clip, self.frames)) for name, clip in clips.items()]
         return Study(measure, scenes, [Variant({}, self.config())], self.fit_seeds)
 
     def table(self, rows: Sequence[Row]) -> str:
@@ -65,11 +65,10 @@ class Options(ClipOptions):
         return scores_table(rows, {"clip": lambda row: f"`{row['clip']}`"}, COLUMNS)
 
 
-def measure(source: Source, num_frames: int, config: StreamConfig) -> dict[str, Any]:
+def measure(capture: Capture, num_frames: int, config: StreamConfig) -> dict[str, Any]:
     """Fit a clip and return its scores per later frame, and the slope of PSNR where things move, in
     dB a frame.
     """
-    capture = source.open()
     loop = new_loop(capture, config)
     frames = capture.partial_frames(0, num_frames)
     images = next(frames).images

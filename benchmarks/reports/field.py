@@ -21,18 +21,17 @@ import numpy as np
 import tyro
 
 from benchmarks.field import anchors, hicom, motion_grid, transformation_cache  # noqa: F401, they register models
-from benchmarks.reports.cells import OnWorkers, run_cells
 from benchmarks.reports.fits import DEFAULT, Clip, random_capture
 from benchmarks.reports.plots import Column, blank_figure, means_over, save_figure, scores_table
 from benchmarks.reports.tracks import track_scores
 from benchmarks.speed.output import Output
+from morgs_mi.capture.capture import Capture
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.core.config_values import apply_values
 from morgs_mi.core.files import json_finite
 from morgs_mi.evaluate.results import Evaluation, known_mean
 from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import StreamConfig, apply_preset
-from morgs_mi.runs.cluster.tasks import Source
 
 _FAST = {"fit": {"rates": {"means": 2e-3}}}
 _RIGID = {"rigid_weight": 0.4, "rotation_weight": 0.4, "isometry_weight": 0.2}
@@ -72,7 +71,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True)
-class Options(Output, OnWorkers):
+class Options(Output):
     """Clips, work and output."""
 
     seeds: tuple[int, ...] = (16, 17, 18)
@@ -94,17 +93,17 @@ class Options(Output, OnWorkers):
     plot: Path | None = None
     """Plot of the errors over time and over bytes, .png or .svg; needs matplotlib."""
 
-    def cells(self) -> dict[str, tuple[Source, dict[str, StreamConfig]]]:
+    def cells(self) -> dict[str, tuple[Capture, dict[str, StreamConfig]]]:
         """Return the clip, and the settings of each method and number of epochs, of each cell."""
         cells = {}
         for seed in self.seeds:
             capture = random_capture(self.clips, seed, self.downscale)
-            source = replace(Source.of(capture), num_frames=min(self.frames, capture.num_frames))
+            capture = replace(capture, num_frames=min(self.frames, capture.num_frames))
             for fit_seed in self.fit_seeds:
                 methods = {
                     f"{m}/{e}": self.settings(m, e, fit_seed) for e in self.epochs for m in METHODS
                 }
-                cells[f"{seed}/{fit_seed}"] = source, methods
+                cells[f"{seed}/{fit_seed}"] = capture, methods
         return cells
 
     def settings(self, method: str, epochs: int, seed: int) -> StreamConfig:
@@ -120,9 +119,9 @@ class Options(Output, OnWorkers):
         return replace(config, fit=replace(config.fit, **work), seed=seed)
 
 
-def measure(source: Source, methods: Mapping[str, StreamConfig]) -> dict[str, dict[str, Any]]:
+def measure(capture: Capture, methods: Mapping[str, StreamConfig]) -> dict[str, dict[str, Any]]:
     """Fit a clip by each method after the same first frame and return the scores by method."""
-    clip = Clip.read(source.open())
+    clip = Clip.read(capture)
     loop = clip.loop(next(iter(methods.values())))
     keyframe, _ = loop.push(clip.images[0])
     scores = {}
@@ -227,10 +226,10 @@ def plot_field(cells: Cells, path: Path) -> None:
 def main(options: Options) -> None:
     """Run the report."""
     mi.set_variant("llvm_ad_rgb")
-    with options.opened() as client:
-        cells = run_cells(
-            measure, options.cells(), client, lambda name, _: print(f"{name} is done", flush=True)
-        )
+    cells = {}
+    for name, args in options.cells().items():
+        cells[name] = measure(*args)
+        print(f"{name} is done", flush=True)
     print(field_table(cells))
     if options.plot is not None:
         plot_field(cells, options.plot)

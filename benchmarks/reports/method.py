@@ -1,55 +1,48 @@
 """Contribution of the method's parts: presets by epochs, and key views with and without offset,
 over several seeds.
 
-    python -m benchmarks.reports method CAPTURE... --out out/method --workers 2
+    python -m benchmarks.reports method CAPTURE... --out out/method
 
 A *setting* is a preset, a number of epochs, a number of key views and a factor on the learning
 rates. It is measured with several seeds. Each seed has its own first frame, which depends on none
-of these: it is fitted once, stored as a keyframe, and all settings continue from it. Tuned presets
-are run at several rates with the first seed. The rate with the best mean PSNR of the held-out view
-over the later frames is selected, and the other seeds are run at that rate only.
+of these: it is fitted once, and all settings continue from it. Tuned presets are run at several
+rates with the first seed. The rate with the best mean PSNR of the held-out view over the later
+frames is selected, and the other seeds are run at that rate only.
 """
 
 from __future__ import annotations
 
-from base64 import b64decode, b64encode
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from tyro.conf import Positional
 
-from benchmarks.reports.cells import OnWorkers
 from benchmarks.reports.fits import DEFAULT, Clip
 from benchmarks.reports.method_tables import gains_table, plot_method
 from benchmarks.reports.plots import grouped
-from benchmarks.reports.study import Row, Scene, Study, Variant, method_version
+from benchmarks.reports.study import Row, Scene, Study, Variant
 from benchmarks.speed.output import Output
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.truth import load_truth
-from morgs_mi.codec.container import decode_packet, encode_packet
+from morgs_mi.codec.container import Packet
 from morgs_mi.core.files import json_finite
 from morgs_mi.core.rig import choose_key_views
-from morgs_mi.evaluate.results import Evaluation, known_mean
+from morgs_mi.evaluate.results import known_mean
 from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.loop.frame_report import FrameReport
 from morgs_mi.loop.stream_config import PRESETS, StreamConfig, apply_preset
 from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FramePair
-from morgs_mi.runs.cluster.tasks import Source
-
-if TYPE_CHECKING:
-    from distributed import Client
 
 # Rows of the paper's table of key views.
 _WITHOUT_OFFSET = "ml"
 _WITH_OFFSET = "ml-mo"
 _PAPER_EPOCHS = 8
-_WORK = "captures", "out", "workers", "scheduler"  # options on which no figure depends
+_PATHS = "captures", "out"  # options on which no figure depends
 _SETTING = "preset", "epochs", "key_views", "rates"
 # Scores that are averaged over the later frames; `by_frame` has those that are plotted over time.
 _MEANS = ("psnr", "psnr_moving", "psnr_still", "ssim", "motion_error_moving", "motion_error_still")
@@ -59,16 +52,13 @@ _MOTION_3D = ("error", "relative_error", "length_ratio", "angle")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(OnWorkers):
-    """Measure the method's parts, key views, and quality over run time, with several seeds.
-
-    Results stored in OUT are reused: an interrupted report continues.
-    """
+class Options:
+    """Measure the method's parts, key views, and quality over run time, with several seeds."""
 
     captures: Positional[tuple[Path, ...]]
     """Folders of captures."""
     out: Path = Path("out/method")
-    """Output folder for method.json, finished fits and, with matplotlib, method.png."""
+    """Output folder for method.json and, with matplotlib, method.png."""
     presets: tuple[str, ...] = ("baseline", "ml", "ml-mo", "ml-mo-mc", "paper", DEFAULT)
     """Presets of morgs-mi fit; default means none."""
     epochs: tuple[int, ...] = (1, 2, 3, 5, 8, 12)
@@ -123,19 +113,17 @@ class Options(OnWorkers):
                 f"{', '.join(names)}."
             )
         clips = []
-        settings = {n: v for n, v in asdict(self).items() if n not in _WORK}
-        metadata = {"table_epochs": self.table_epochs, "version": method_version()}
-        with self.opened() as client:
-            for path in self.captures:
-                clips.append(measure(path, self, client))
-                result = {"clips": clips, **metadata, "settings": settings}
-                Output(self.out / "method.json").write(result, unprinted=["clips", "settings"])
-                if find_spec("matplotlib"):
-                    plot_method(clips, self.out / "method.png")
+        settings = {n: v for n, v in asdict(self).items() if n not in _PATHS}
+        for path in self.captures:
+            clips.append(measure(path, self))
+            result = {"clips": clips, "table_epochs": self.table_epochs, "settings": settings}
+            Output(self.out / "method.json").write(result, unprinted=["clips", "settings"])
+            if find_spec("matplotlib"):
+                plot_method(clips, self.out / "method.png")
         print(f"{gains_table(clips)}\nAll figures: {self.out / 'method.json'}")
 
 
-def measure(path: Path, options: Options, client: Client | None) -> dict[str, Any]:
+def measure(path: Path, options: Options) -> dict[str, Any]:
     """Return the results of one clip."""
     capture = load_capture(path, max_frames=options.frames)
     if capture.num_frames < 2:
@@ -143,9 +131,8 @@ def measure(path: Path, options: Options, client: Client | None) -> dict[str, An
             f"{capture.path}: expected a capture of two frames or more, got {capture.num_frames}."
         )
     presets, key_views = variants_of(options, len(capture.train_views))
-    rows = fitted(
-        capture, [*presets, *(v for v in key_views if v not in presets)], presets, options, client
-    )
+    variants = [*presets, *(v for v in key_views if v not in presets)]
+    rows = fitted(capture, variants, presets, options)
     camera = capture.cameras[0]
     return {
         "name": capture.path.resolve().name,
@@ -196,26 +183,15 @@ def settings_of(
 
 
 def fitted(
-    capture: Capture,
-    variants: Sequence[Variant],
-    presets: Sequence[Variant],
-    options: Options,
-    client: Client | None,
+    capture: Capture, variants: Sequence[Variant], presets: Sequence[Variant], options: Options
 ) -> list[Row]:
     """Return the rows of all variants with the first seed, and of the others at the best rates and
     all key views.
     """
-    source = Source.of(capture)
+    clip = Clip.read(capture)
     rows = list[Row]()
-    start = Study(
-        first_frame,
-        [Scene({"frame": 0}, (replace(source, num_frames=1),))],
-        [Variant({}, options.base)],
-    )
-    start = replace(start, seeds=range(options.seeds))
-    firsts = {row["fit_seed"]: row["packet"] for row in start.run(client, options.out)}
-    # Seed by seed: after an interruption, a report with fewer seeds is complete.
     for seed in range(options.seeds):
+        keyframe, _ = clip.loop(replace(options.base, seed=seed)).push(clip.images[0])
         if seed:
             best = [row for row in aggregate(rows, presets) if row["best"]]
             choice = [
@@ -223,8 +199,7 @@ def fitted(
             ]
         else:
             choice = variants
-        scenes = [Scene({}, (source, firsts[seed]))]
-        rows += Study(later_frames, scenes, choice, (seed,)).run(client, options.out)
+        rows += Study(later_frames, [Scene({}, (clip, keyframe))], choice, (seed,)).run()
     return rows
 
 
@@ -266,15 +241,8 @@ def _setting(row: Row) -> dict[str, Any]:
     return {name: row[name] for name in _SETTING}
 
 
-def first_frame(source: Source, config: StreamConfig) -> dict[str, str]:
-    """Fit the first frame and return its `packet`, base64."""
-    clip = Clip.read(source.open())
-    packet, _ = clip.loop(config).push(clip.images[0])
-    return {"packet": b64encode(encode_packet(packet)).decode()}
-
-
-def later_frames(source: Source, first: str, config: StreamConfig) -> dict[str, Any]:
-    """Fit all later frames after the packet `first`, base64, and return their scores.
+def later_frames(clip: Clip, keyframe: Packet, config: StreamConfig) -> dict[str, Any]:
+    """Fit all later frames after the packet of the first one, and return their scores.
 
     Returns:
         Means over the later frames in the held-out view (or all training views): ``psnr``,
@@ -285,14 +253,8 @@ def later_frames(source: Source, first: str, config: StreamConfig) -> dict[str, 
         ``seconds``, the median of a later frame; ``by_frame``, lists of some of them. None if
         unknown.
     """
-    clip = Clip.read(source.open())
-    continuation = clip.continued(decode_packet(b64decode(first)), config)
-    return summary(continuation.evaluation, continuation.reports)
-
-
-def summary(found: Evaluation, reports: Sequence[FrameReport]) -> dict[str, Any]:
-    """Return the scores of a stream, see `later_frames`."""
-    evaluations = found.frames[1:]
+    fit = clip.continued(keyframe, config)
+    evaluations = fit.evaluation.frames[1:]
     motion = [row.motion_3d for row in evaluations if row.motion_3d is not None]
     return {
         **{name: known_mean([getattr(row.scores, name) for row in evaluations]) for name in _MEANS},
@@ -301,10 +263,10 @@ def summary(found: Evaluation, reports: Sequence[FrameReport]) -> dict[str, Any]
             f"motion_3d_{name}": known_mean([getattr(scores, name) for scores in motion])
             for name in _MOTION_3D
         },
-        "mtv": found.variation.render,
-        "mtv_input": found.variation.input,
-        "psnr_slope": found.psnr_slope,
-        "seconds": float(np.median([report.seconds for report in reports])),
+        "mtv": fit.evaluation.variation.render,
+        "mtv_input": fit.evaluation.variation.input,
+        "psnr_slope": fit.evaluation.psnr_slope,
+        "seconds": float(np.median([report.seconds for report in fit.reports])),
         "by_frame": {
             name: [getattr(row.scores, name) for row in evaluations] for name in _BY_FRAME
         },

@@ -26,7 +26,6 @@ from morgs_mi.capture.truth import load_truth
 from morgs_mi.evaluate.metrics import iou, psnr
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.runs.cluster.tasks import Source
 
 COLUMNS = (
     Column("PSNR, dB", "psnr", spread=False),
@@ -51,8 +50,8 @@ class Options(StudyOptions):
 
     def study(self) -> Study:
         """Return the study of the clips."""
-        sources = {seed: Source.of(random_capture(self.clips, seed)) for seed in self.seeds}
-        scenes = [Scene({"seed": seed}, (source, self.frames)) for seed, source in sources.items()]
+        captures = {seed: random_capture(self.clips, seed) for seed in self.seeds}
+        scenes = [Scene({"seed": seed}, (clip, self.frames)) for seed, clip in captures.items()]
         return Study(
             measure,
             scenes,
@@ -67,9 +66,8 @@ class Options(StudyOptions):
         )
 
 
-def measure(source: Source, num_frames: int, config: StreamConfig) -> dict[str, float]:
+def measure(capture: Capture, num_frames: int, config: StreamConfig) -> dict[str, float]:
     """Fit a clip and return the means of the scores of its later frames."""
-    capture = source.open()
     first, *later_frames = capture.partial_frames(0, num_frames)
     loop = new_loop(capture, config)
     loop.push([first.images[v] for v in capture.train_views])

@@ -26,14 +26,13 @@ from benchmarks.reports.fits import new_loop
 from benchmarks.reports.plots import Column, scores_table
 from benchmarks.reports.study import Row, Scene, Study, StudyOptions, Variant
 from morgs_mi import Gaussians, rasterize
-from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.progress import Progress
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.view import View, mean_psnr
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.visualise import label, side_by_side
-from morgs_mi.runs.cluster.tasks import Source
 from morgs_mi.runs.fit_capture import with_points
 from morgs_mi.studio.calibration.refine import register_camera
 
@@ -74,8 +73,8 @@ class Options(StudyOptions):
                 "principal_points": principal_points(capture.cameras),
             }
             test = list(range(_FIRST, len(full.cameras), _EVERY))
-            source = Source.of(capture.holding_out(test))
-            scenes.append(Scene(keys | {"test": test}, (source, self.pictures)))
+            args = capture.holding_out(test), self.pictures
+            scenes.append(Scene(keys | {"test": test}, args))
         settings = FitConfig(num_gaussians=self.gaussians, first_frame_steps=self.steps)
         fits = {seconds: FitConfig(first_frame_seconds=seconds) for seconds in self.seconds} or {
             None: settings
@@ -99,11 +98,11 @@ def principal_points(cameras: Sequence[Camera]) -> str:
     return "own" if len(points) > 1 else "shared"
 
 
-def measure(source: Source, pictures: Path | None, config: StreamConfig) -> dict[str, Any]:
+def measure(capture: Capture, pictures: Path | None, config: StreamConfig) -> dict[str, Any]:
     """Fit the views that are not held out; return the mean PSNR of both, of the held-out ones in
     both ways.
     """
-    capture = with_points(source.open(), config.seed, Progress())
+    capture = with_points(capture, config.seed, Progress())
     images = next(capture.frames(0, 1)).images
     views = [View(*view) for view in zip(capture.cameras, images, capture.masks, strict=True)]
     train = [views[v] for v in capture.train_views]

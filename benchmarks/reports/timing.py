@@ -25,7 +25,6 @@ from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.truth import load_truth
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.runs.cluster.tasks import Source
 from morgs_mi.runs.fit_capture import push_frame
 from morgs_mi.studio.calibration.timing import estimate_time_offsets
 from morgs_mi.studio.synth.disturbances import Disturbances, load_disturbances
@@ -62,14 +61,11 @@ class Options(ClipOptions):
         rigs = {"one-clock": Disturbances(), "apart": Disturbances(time_offset=self.time_offset)}
         scenes = []
         for seed in self.seeds:
-            clips = (
+            clips = tuple(
                 self.clip("random", f"random-{seed}-{n}", disturbances=d, seed=seed)
                 for n, d in rigs.items()
             )
-            sources = tuple(map(Source.of, clips))
-            scenes.append(
-                Scene({"scene": f"random {seed}"}, (*sources, self.fitted, self.fit_seeds))
-            )
+            scenes.append(Scene({"scene": f"random {seed}"}, (*clips, self.fitted, self.fit_seeds)))
         return Study(measure, scenes, [Variant({}, self.config(dropping=0.0))])
 
     def table(self, rows: Sequence[Row]) -> str:
@@ -78,13 +74,15 @@ class Options(ClipOptions):
 
 
 def measure(
-    clock: Source, apart: Source, num_frames: int, seeds: Sequence[int], config: StreamConfig
+    synchronised: Capture,
+    recording: Capture,
+    num_frames: int,
+    seeds: Sequence[int],
+    config: StreamConfig,
 ) -> list[dict[str, float]]:
     """Return the errors of a scene's offsets, and the scores of its fits by the way in which it is
     read, by seed.
     """
-    synchronised = clock.open()
-    recording = apart.open()
     errors, offsets, reference = offset_errors(recording)
     aligned_capture = load_capture(
         recording.path, reading=replace(recording.reading, offset=offsets)

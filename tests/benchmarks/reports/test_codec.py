@@ -11,8 +11,6 @@ import pytest
 
 from benchmarks.reports.codec import Options, measure, quality_table
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.render.render_config import RenderConfig
-from tests.benchmarks.reports.here import client_here
 from tests.quick import quick
 
 QUICK = Options(
@@ -26,7 +24,7 @@ QUICK = Options(
 def reported(fitted_clip: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Options, dict]:
     """Return the options and the figures of a report."""
     options = replace(QUICK, out=tmp_path_factory.mktemp("codec"))
-    return options, measure(load_capture(fitted_clip / "capture"), options, None)
+    return options, measure(load_capture(fitted_clip / "capture"), options)
 
 
 @pytest.mark.slow
@@ -54,22 +52,6 @@ def test_options__write_tables_json_and_plot(fitted_clip, tmp_path, capsys) -> N
     assert {"settings", "machine", "versions", "commit"} <= result.keys()
     assert quality_table([again]) in capsys.readouterr().out
     assert plot.stat().st_size > 10_000
-
-
-@pytest.mark.slow
-def test_measure__of_workers_is_that_of_one_process(fitted_clip: Path, tmp_path: Path) -> None:
-    stream = replace(QUICK.stream, render=RenderConfig(reproducible=True))
-    capture = load_capture(fitted_clip / "capture", max_frames=2)
-    with client_here() as here:
-        for name, client in (("alone", None), ("workers", here)):
-            measure(
-                capture, replace(QUICK, qualities=(4,), stream=stream, out=tmp_path / name), client
-            )
-    alone, streams = (
-        {path.relative_to(folder): path.read_bytes() for path in folder.rglob("stream.morgs")}
-        for folder in (tmp_path / "alone", tmp_path / "workers")
-    )
-    assert streams == alone
 
 
 def test_options__refuse_no_captures() -> None:

@@ -1,4 +1,4 @@
-"""Report on the method: stored fits are reused, and every figure results from the fits."""
+"""Report on the method: every figure results from the fits."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ from benchmarks.reports.method_tables import (
 from benchmarks.reports.study import Variant
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
-from tests.benchmarks.reports.here import client_here
 from tests.benchmarks.reports.pages import ROOT, page
 
 ARGS = [
@@ -68,15 +67,8 @@ def tiny(clip: Path, out: Path) -> Options:
     )
 
 
-MANY = 1000
-LEFT = [MANY]  # calls of `made_up` up to the one that fails
-
-
-def made_up(source, first, config):
+def made_up(clip, keyframe, config):
     """Return scores in place of a fit's; more epochs and key views are better."""
-    LEFT[0] -= 1
-    if not LEFT[0]:
-        raise ChildProcessError("it died.")
     score = 20.0 + config.fit.epochs + 0.1 * config.motion.key_views + 100 * config.fit.rates.means
     names = (
         "psnr",
@@ -103,38 +95,28 @@ def made_up(source, first, config):
 
 
 @pytest.fixture(scope="module", params=["made up", pytest.param("fitted", marks=pytest.mark.slow)])
-def interrupted(request, clip, tmp_path_factory):
-    """A report that was interrupted in its third cell and run again: its JSON, its folder and the
-    number of fits.
-    """
+def reported(request, clip, tmp_path_factory):
+    """A report: its JSON, its folder and the number of fits."""
     out = tmp_path_factory.mktemp("report")
     fits = []
     fit = made_up if request.param == "made up" else method.later_frames
 
-    def counted(source, first, config):
+    def counted(clip, keyframe, config):
         fits.append(config)
-        if len(fits) == 3:
-            raise KeyboardInterrupt
-        return fit(source, first, config)
+        return fit(clip, keyframe, config)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(method, "later_frames", counted)
-        with pytest.raises(KeyboardInterrupt):
-            tiny(clip, out).run()
-        tiny(clip, out).run()
-        complete = len(fits)
-        capture = str(clip)
-        assert cli.main(["method", capture, "--out", str(out), *ARGS]) == 0
-        assert len(fits) == complete, "a finished report is repeated without a fit"
-    return json.loads((out / "method.json").read_text()), out, complete
+        assert cli.main(["method", str(clip), "--out", str(out), *ARGS]) == 0
+    return json.loads((out / "method.json").read_text()), out, len(fits)
 
 
 @pytest.mark.slow
-def test_method_command__continues_an_interrupted_report(interrupted):
-    result, out, fits = interrupted
+def test_method_command__fits_every_setting(reported):
+    result, out, fits = reported
     # 2 epochs of a default and a baseline at 2 rates; 2 presets with 1, 2 and all 4 views at 2
     # epochs.
-    assert fits == 6 + 6 + 1
+    assert fits == 6 + 6
     (clip,) = result["clips"]
     assert [(row["preset"], row["epochs"], row["rates"]) for row in best_rows(clip)[2:]] == [
         ("default", 1, 1.0),
@@ -147,8 +129,8 @@ def test_method_command__continues_an_interrupted_report(interrupted):
 
 
 @pytest.mark.slow
-def test_method_command__scores_are_those_of_the_held_out_view(interrupted):
-    (clip,) = interrupted[0]["clips"]
+def test_method_command__scores_are_those_of_the_held_out_view(reported):
+    (clip,) = reported[0]["clips"]
     for row in clip["rows"] + clip["key_view_rows"]:
         mean = row["mean"]
         assert mean["psnr"] == pytest.approx(sum(row["by_frame"]["psnr"]) / 2, rel=1e-4)
@@ -161,8 +143,8 @@ def test_method_command__scores_are_those_of_the_held_out_view(interrupted):
 
 
 @pytest.mark.slow
-def test_method_tables__are_complete(interrupted):
-    (clip,) = interrupted[0]["clips"]
+def test_method_tables__are_complete(reported):
+    (clip,) = reported[0]["clips"]
     for table, rows in (
         (ablation_table(clip, 2), 2),
         (key_views_table(clip), 6),
@@ -198,36 +180,15 @@ def test_gains_table__has_the_best_rates():
 
 @pytest.mark.slow
 def test_later_frames__has_the_scores_of_a_fit(clip, tmp_path):
-    """One genuine fit; the fixture `interrupted` makes up its scores unless slow tests run."""
+    """One genuine fit; the fixture `reported` makes up its scores unless slow tests run."""
     options = replace(tiny(clip, tmp_path), presets=("default",), epochs=(1,), key_views=())
-    (row,) = method.measure(clip, options, None)["rows"]
+    (row,) = method.measure(clip, options)["rows"]
     mean = row["mean"]
     assert mean["psnr"] == pytest.approx(sum(row["by_frame"]["psnr"]) / 2, rel=1e-4)
     assert 5 < mean["psnr"] < 40
     assert mean["seconds"] > 0
     assert 0 < mean["motion_error_moving"] < 5 * mean["true_motion_moving"]
     assert mean.keys() | {"by_frame"} == made_up(None, None, options.base).keys()
-
-
-@pytest.mark.slow
-def test_measure__of_workers_is_that_of_one_process(clip, tmp_path, monkeypatch):
-    """Also if a worker dies, and the report is started again."""
-    monkeypatch.setattr(method, "later_frames", made_up)
-    options = replace(tiny(clip, tmp_path / "alone"), seeds=2)
-    alone = method.measure(clip, options, None)
-    options = replace(options, out=tmp_path / "workers")
-    LEFT[0] = 3
-    with client_here() as client, pytest.raises(ChildProcessError):
-        method.measure(clip, options, client)
-    LEFT[0] = MANY
-    old_count = len(list((tmp_path / "workers").glob("*made_up-*.json")))
-    assert old_count > 1
-    with client_here() as client:
-        result = method.measure(clip, options, client)
-    new_count = len(list((tmp_path / "workers").glob("*made_up-*.json")))
-    assert MANY - LEFT[0] == new_count - old_count
-    assert len(list((tmp_path / "alone").glob("*made_up-*.json"))) == new_count
-    assert all(result[name] == alone[name] for name in ("rows", "key_view_rows"))
 
 
 def test_settings_of__changes_its_own_settings_only():
@@ -282,7 +243,7 @@ def test_variants_of__tunes_the_given_presets_and_limits_the_key_views():
 def test_fitted__runs_later_seeds_at_the_best_rate_only(clip, tmp_path, monkeypatch):
     ran = []
 
-    def scores(source, first, config):
+    def scores(clip, keyframe, config):
         rates = round(config.fit.rates.means / FitConfig().rates.means)
         preset = "default" if config.motion.learn_motion else "baseline"
         ran.append((config.seed, preset, config.fit.epochs, rates))
@@ -290,9 +251,8 @@ def test_fitted__runs_later_seeds_at_the_best_rate_only(clip, tmp_path, monkeypa
         return {"psnr": psnr + 10 * config.seed, "by_frame": {}}
 
     monkeypatch.setattr(method, "later_frames", scores)
-    monkeypatch.setattr(method, "first_frame", no_packet)
     options = replace(tiny(clip, tmp_path), rates=(1, 2, 4), seeds=3, key_views=())
-    result = method.measure(clip, options, None)
+    result = method.measure(clip, options)
     assert [seed for seed, *_ in ran] == 8 * [0] + 4 * [1] + 4 * [2]
     expected = {("baseline", 1, 1), ("baseline", 2, 2), ("default", 1, 1), ("default", 2, 1)}
     assert {tuple(cell) for seed, *cell in ran if seed == 1} == expected
@@ -300,10 +260,6 @@ def test_fitted__runs_later_seeds_at_the_best_rate_only(clip, tmp_path, monkeypa
     for epochs, rates, psnr in ((1, 1, 39), (2, 2, 43)):
         row = best["baseline", epochs]
         assert (row["rates"], row["runs"], row["mean"]["psnr"]) == (rates, 3, psnr)
-
-
-def no_packet(source, config):
-    return {"packet": ""}
 
 
 def test_options__refuse_bad_settings_and_captures(clip, tmp_path):

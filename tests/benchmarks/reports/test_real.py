@@ -21,7 +21,6 @@ from benchmarks.reports import real
 from morgs_mi import cli
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.runs.cluster.tasks import Source
 
 FOLDER = os.environ.get("MORGS_MI_PHOTOS")
 # Number of photos, and whether each has a principal point of its own.
@@ -41,9 +40,9 @@ def test_measure__starts_from_points_of_the_training_views(
         raise InterruptedError(str(capture.test_views))
 
     monkeypatch.setattr(real, "with_points", stop)
-    source = Source.of(load_capture(clip, test_view=None).holding_out([1]))
+    capture = load_capture(clip, test_view=None).holding_out([1])
     with pytest.raises(InterruptedError, match=r"\(1,\)"):
-        real.measure(source, None, StreamConfig())
+        real.measure(capture, None, StreamConfig())
 
 
 @pytest.mark.slow

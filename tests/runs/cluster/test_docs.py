@@ -13,7 +13,6 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.reports import __main__ as reports
 from morgs_mi import cli
 from morgs_mi.codec.reader import StreamReader
 from tests.quick import OPTIONS
@@ -23,14 +22,6 @@ ROOT = Path(__file__).parents[3]
 TEXT = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"<!-- (run|start) -->\n```\w+\n(.*?)```", TEXT, re.DOTALL)
 FRAMES = 4
-REPORT = (
-    "--stream.fit.num-gaussians",
-    "80",
-    "--stream.fit.first-frame-steps",
-    "8",
-    "--stream.fit.epochs",
-    "1",
-)
 
 
 def started(command: str) -> subprocess.Popen[str]:
@@ -69,16 +60,12 @@ def test_cluster_page__commands_run(workplace: Path) -> None:
                 stack.callback(process.terminate)
             else:
                 program, *args = shlex.split(command)
-                if program == "python":
-                    assert reports.main([*args[2:], *REPORT]) == 0, command
-                    continue
                 assert program == "morgs-mi"
                 assert cli.main([*args, *(OPTIONS if args[0] == "fit" else [])]) == 0, command
     streams = sorted(
         str(path.parent.relative_to("out")) for path in Path("out").rglob("stream.morgs")
     )
-    qualities = [f"codec/capture/{quality}" for quality in (1, 1000)]
-    assert streams == ["cluster", *qualities, "segments"]
+    assert streams == ["cluster", "segments"]
     for name in streams:
         assert {frame for _, frame, _ in StreamReader(f"out/{name}/stream.morgs").index()} == set(
             range(FRAMES)
@@ -86,5 +73,5 @@ def test_cluster_page__commands_run(workplace: Path) -> None:
 
 
 def test_cluster_page__has_commands() -> None:
-    kinds = ["run", "start", "start", "run", "run"]
+    kinds = ["run", "start", "start", "run"]
     assert [kind for kind, _ in BLOCKS] == kinds
