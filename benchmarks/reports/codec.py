@@ -66,8 +66,6 @@ class Options(Output):
         """Fit every capture with every quality, measure the streams, print the tables, and write
         the figures.
         """
-        if not self.captures:
-            raise ValueError("codec: `captures` must name at least one folder, got none.")
         clips = [measure(load_capture(path), self) for path in self.captures]
         print(quality_table(clips))
         if self.plot is not None:

@@ -34,7 +34,7 @@ from morgs_mi.core.files import json_finite
 from morgs_mi.core.rig import choose_key_views
 from morgs_mi.evaluate.results import known_mean
 from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.loop.stream_config import PRESETS, StreamConfig, apply_preset
+from morgs_mi.loop.stream_config import StreamConfig, apply_preset
 from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FramePair
 
@@ -78,15 +78,6 @@ class Options:
     stream: StreamConfig = field(default_factory=StreamConfig)
     """Settings of the fit; presets, epochs, key views, rates and seeds override them."""
 
-    def __post_init__(self) -> None:
-        names = [name for name in (*self.presets, *self.tuned) if name not in (DEFAULT, *PRESETS)]
-        if names or not self.presets or not self.epochs or self.seeds < 1:
-            raise ValueError(
-                f"method: `presets` and `tuned` must be among {', '.join((DEFAULT, *PRESETS))}, "
-                "with one preset, one number of epochs and one seed or more, got "
-                f"{', '.join(names) or 'none'}."
-            )
-
     @property
     def base(self) -> StreamConfig:
         """Settings of the fit that all cells share."""
@@ -103,15 +94,8 @@ class Options:
 
         Raises:
             OSError: a capture cannot be read, or a result cannot be written.
-            ValueError: there is no capture, two captures have the same name, a capture has a single
-                frame, or a setting is incompatible with a preset.
+            ValueError: a setting is incompatible with a preset.
         """
-        names = [Path(path).resolve().name for path in self.captures]
-        if not names or len(set(names)) < len(names):
-            raise ValueError(
-                "method: `captures` must be one folder or more with distinct names, got "
-                f"{', '.join(names)}."
-            )
         clips = []
         settings = {n: v for n, v in asdict(self).items() if n not in _PATHS}
         for path in self.captures:
@@ -126,10 +110,6 @@ class Options:
 def measure(path: Path, options: Options) -> dict[str, Any]:
     """Return the results of one clip."""
     capture = load_capture(path, max_frames=options.frames)
-    if capture.num_frames < 2:
-        raise ValueError(
-            f"{capture.path}: expected a capture of two frames or more, got {capture.num_frames}."
-        )
     presets, key_views = variants_of(options, len(capture.train_views))
     variants = [*presets, *(v for v in key_views if v not in presets)]
     rows = fitted(capture, variants, presets, options)

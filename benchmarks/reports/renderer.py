@@ -42,6 +42,7 @@ _SEED = 1  # of the scene, the sample of pixels and their weights
 _MEDIAN_SCALE = 0.02  # of the standard deviations; the ball's radius is 1
 _SH_DEGREE = 1
 _PIXELS = 1024  # compared with the reference; with 20,000 Gaussians they take 2 s
+_REPEATS = 9  # timed steps per setting, interleaved; medians are reported
 _EXACT_ALPHA_MIN = 1e-12  # smaller values do not change a float32 image
 Values = tuple[np.ndarray, dict[str, np.ndarray]]  # of the image, and gradients by attribute
 
@@ -58,8 +59,6 @@ class Options(Output):
     """Width of the image, px."""
     height: int = 384
     """Height of the image, px."""
-    repeats: int = 9
-    """Timed steps per setting, interleaved; medians are reported."""
 
     def run(self) -> None:
         """Measure every setting, print the table, and write the figures."""
@@ -137,9 +136,7 @@ def measure(options: Options) -> list[dict[str, Any]]:
     target = np.zeros((options.height, options.width, 3), np.float32)
     target[pixels[:, 1], pixels[:, 0]] = weights
     rows = []
-    for setting, times in zip(
-        settings, _times(gaussians, camera, settings, options.repeats), strict=True
-    ):
+    for setting, times in zip(settings, _times(gaussians, camera, settings), strict=True):
         image, gradients = _rendered(gaussians, camera, setting.config, mi.TensorXf(target))
         result = image[pixels[:, 1], pixels[:, 0]], gradients
         exact, same = (
@@ -248,7 +245,6 @@ def _times(
     gaussians: Gaussians,
     camera: Camera,
     settings: Sequence[Setting],
-    repeats: int,
 ) -> list[dict[str, float]]:
     """Return ms of a step and its ratio to the default: medians, measured in shuffled rounds."""
     target = mi.TensorXf(np.full((camera.height, camera.width, 3), 0.5, np.float32))
@@ -269,11 +265,11 @@ def _times(
     default = configs.index(RenderConfig())
     for config in configs:  # compiles
         step(config)
-    times = np.zeros((repeats, len(configs)))
+    times = np.zeros((_REPEATS, len(configs)))
     rng = np.random.default_rng(0)
     collecting = gc.isenabled()
     gc.disable()  # like `timeit`: a collection would fall on the same setting in every round
-    for done in range(repeats):
+    for done in range(_REPEATS):
         for k in rng.permutation(len(configs)):
             times[done, k] = step(configs[k])
         gc.collect()

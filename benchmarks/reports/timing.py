@@ -4,7 +4,7 @@ these times gains.
     python -m benchmarks.reports.timing --seeds 3 6 --json out.json
 
 Each scene is `morgs-mi synth random --seed SEED`, recorded twice: by cameras of one clock, and by
-cameras that are up to `--time-offset` frames apart. The second clip is fitted as it is and with the
+cameras that are up to 1.5 frames apart. The second clip is fitted as it is and with the
 offsets that are found, over the same instants as the first. Scores are means over the later frames
 of the held-out view. Its clock is the reference.
 """
@@ -29,6 +29,7 @@ from morgs_mi.runs.fit_capture import push_frame
 from morgs_mi.studio.calibration.timing import estimate_time_offsets
 from morgs_mi.studio.synth.disturbances import Disturbances, load_disturbances
 
+_TIME_OFFSET = 1.5  # largest one, in frames
 COLUMNS = (
     Column("mean error", "mean_error", 3, spread=False),
     Column("synchronised, dB", "synchronised_moving", spread=False),
@@ -49,8 +50,6 @@ class Options(ClipOptions):
     """Number of frames of a clip."""
     fitted: int = 4
     """Number of frames that are fitted, the first included."""
-    time_offset: float = 1.5
-    """Largest time offset in frames."""
     steps: int | None = 500
     """Steps of the first frame."""
 
@@ -58,7 +57,7 @@ class Options(ClipOptions):
         """Return the study of the scenes, each recorded by both rigs; a cell has the rows of all
         seeds.
         """
-        rigs = {"one-clock": Disturbances(), "apart": Disturbances(time_offset=self.time_offset)}
+        rigs = {"one-clock": Disturbances(), "apart": Disturbances(time_offset=_TIME_OFFSET)}
         scenes = []
         for seed in self.seeds:
             clips = tuple(

@@ -1,9 +1,9 @@
-"""Real images: photos from their folder to the committed figures.
+"""Photos from their folder to the committed figures.
 
 The photos are not in the repository (docs/experiments/real.md says where they are); a variable
 names their folder, with a folder for each set:
 
-MORGS_MI_PHOTOS=FOLDER pytest -m slow tests/benchmarks/reports/test_real.py
+MORGS_MI_PHOTOS=FOLDER pytest -m slow tests/runs/test_photos.py
 """
 
 from __future__ import annotations
@@ -19,8 +19,6 @@ import pytest
 from benchmarks.pages.results import committed
 from benchmarks.reports import real
 from morgs_mi import cli
-from morgs_mi.capture.capture import load_capture
-from morgs_mi.loop.stream_config import StreamConfig
 
 FOLDER = os.environ.get("MORGS_MI_PHOTOS")
 # Number of photos, and whether each has a principal point of its own.
@@ -30,19 +28,6 @@ SETS = {
     "kitchen": (25, "shared"),
     "sceaux": (11, "shared"),
 }
-
-
-@pytest.mark.slow
-def test_measure__starts_from_points_of_the_training_views(
-    clip: Path, monkeypatch: pytest.MonkeyPatch
-):
-    def stop(capture, seed, progress):
-        raise InterruptedError(str(capture.test_views))
-
-    monkeypatch.setattr(real, "with_points", stop)
-    capture = load_capture(clip, test_view=None).holding_out([1])
-    with pytest.raises(InterruptedError, match=r"\(1,\)"):
-        real.measure(capture, None, StreamConfig())
 
 
 @pytest.mark.slow

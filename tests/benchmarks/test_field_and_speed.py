@@ -1,0 +1,63 @@
+"""Motion models of other publications, times, and pictures, at a tiny size."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import ewa, pictures, workloads
+from benchmarks.field import anchors, hicom, motion_grid, transformation_cache  # noqa: F401, they register models
+from benchmarks.speed import frame_speed, render_speed, splat_files
+from morgs_mi.stream_loop import StreamLoop
+from tests.scenes.cameras import make_sensor_camera
+from tests.scenes.gaussians import make_unit_scene, to_gaussians
+from tests.scenes.recording import CONFIG, recording
+from tests.scenes.shifted_ball import PLAIN, SHIFT, fit_shifted
+
+
+@pytest.mark.parametrize("name", ["hicom", "cache", "grid", "grid-slow", "anchors"])
+def test_motion_models__move_gaussians_like_their_images(name):
+    motion = np.asarray(fit_shifted(replace(PLAIN, model=name)).gaussians.motion)
+    assert motion.mean(axis=0) @ SHIFT > 0.35 * SHIFT @ SHIFT  # free Gaussians: 0.13
+
+
+@pytest.mark.slow
+def test_frame_speed__measures_a_tiny_scene(tmp_path, monkeypatch):
+    monkeypatch.setattr(frame_speed, "SIZES", {"tiny": frame_speed.Size(64, 48, 3, 600, 2)})
+    out = tmp_path / "out.json"
+    frame_speed.main(frame_speed.Options(json=out, sizes=("tiny",), epochs=(1,), full=()))
+    for run in json.loads(out.read_text())["tiny"]["runs"].values():
+        assert min(run["seconds"], run["bytes"], run["pixels"], run["psnr"] - 10) > 0
+
+
+@pytest.mark.slow
+def test_render_speed__compares_with_other_programs(tmp_path):
+    program = tmp_path / "yardstick"
+    program.write_text('#!/bin/sh\n[ -s "$1" ] && echo "fwd+bwd ms: median 0.5"')
+    program.chmod(0o755)
+    options = render_speed.Options(workload=tmp_path, yardstick=program, baselines=True)
+    result = render_speed.figures(*workloads.ball(0, 60, 40, 24, 0.1), options)
+    assert result["ratio_to_yardstick"] == pytest.approx(result["step_ms"] / 0.5, rel=1e-2)
+    assert min(result["tenth_share"], result["volprim_step_ms"]) > 0
+
+
+def test_splat_files__reports_times_and_sizes():
+    assert min(splat_files.measure(200, width=64).values()) > 0
+
+
+@pytest.mark.slow
+def test_pictures__are_drawn(tmp_path):
+    loop = StreamLoop.of(recording(), CONFIG)
+    frames = recording().partial_frames(0, CONFIG.motion.mask_interval + 1)
+    *others, last = [frame.images for frame in frames]
+    for images in others:
+        loop.push(images)
+    page = (Path(__file__).parents[2] / "docs/how-it-works.md").read_text(encoding="utf-8")
+    assert set(pictures.draw(loop, last)) == set(re.findall(r"\(how-it-works/(\w+)\.jpg\)", page))
+    images = ewa.rendered(to_gaussians(make_unit_scene()), make_sensor_camera(), 16)
+    assert ewa.write_picture(tmp_path / "ewa.jpg", images) > 25

@@ -1,0 +1,126 @@
+"""Pages of experiments: tables, claims, commands and figures agree with the committed results."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from importlib import import_module
+from importlib.util import find_spec
+
+import numpy as np
+import tyro
+
+from benchmarks.pages.__main__ import PAGES, with_tables
+from benchmarks.pages.plots import PLOTS
+from benchmarks.pages.results import RESULTS, committed
+from benchmarks.pages.tables import TABLES
+from benchmarks.reports import __main__ as reports
+from benchmarks.reports.method_tables import best_rows
+from benchmarks.reports.plots import span
+
+TEXTS = {path.stem: path.read_text(encoding="utf-8") for path in PAGES.glob("*.md")}
+EVERYTHING = "\n".join(TEXTS.values())
+# "22 November 2026, commit `c41387b`", also of several days or commits.
+SETUP = r"\d+ (?:and \d+ )?[A-Z][a-z]+ \d{4},\s+commits?\s+`[0-9a-f]{7}`"
+RESULT = r"\]\(\.\./\.\./benchmarks/results/(\w+\.json)\)"
+MOTION = "motion_error_moving"
+JACCARD = "Dynamic 3D Gaussians average_jaccard"
+
+
+def test_with_tables__leaves_every_page_as_it_is():
+    assert [name for name, text in TEXTS.items() if with_tables(text) != text] == []
+    assert sorted(re.findall(r"<!-- table: (\w+) -->", EVERYTHING)) == sorted(TABLES)
+
+
+def test_index__shows_every_plot_and_lists_every_page(tmp_path):
+    for name, plot in PLOTS.items():
+        assert f"({name}.png)" in TEXTS["index"]
+        plot().savefig(tmp_path / f"{name}.png")
+    pages = re.findall(r"\[[^]]+\]\(([\w-]+)\.md\)", TEXTS["index"].partition("## Pages")[2])
+    assert sorted(pages) == sorted(TEXTS.keys() - {"index"})
+
+
+def test_claims__have_a_table_or_figure_a_command_and_committed_results():
+    command = r"`(?:make demo|python\s+-m\s+(?:benchmarks|tests)\.[^`]+)`"
+    claims = TEXTS["index"].partition("## What is not shown")[0].split("\n### ")[1:]
+    assert len(claims) == 10
+    for claim in claims:
+        for part in (r"<!-- table: |!\[", command, SETUP, RESULT):
+            assert re.search(part, claim), (claim.partition("\n")[0], part)
+    assert set(re.findall(RESULT, EVERYTHING)) == {path.name for path in RESULTS.iterdir()}
+
+
+def test_commands__follow_date_and_commit_and_have_options_that_exist():
+    for name, text in TEXTS.items():
+        setups = rf"^{SETUP}[^.\n]*(?:\n[^.\n]+)?\bby\n\n    python -m "
+        commands = re.findall(r"^\n    python -m ", text, re.MULTILINE)
+        assert len(re.findall(setups, text, re.MULTILINE)) == len(commands), name
+    block = r"^ {4}.*python -m (benchmarks\.(?:reports|speed)\S*.*)$"
+    commands = re.findall(block, EVERYTHING.replace("\\\n", " "), re.MULTILINE)
+    assert len(commands) > 12
+    for command in commands:
+        name, *args = shlex.split(command)
+        module = reports if name == "benchmarks.reports" else import_module(name)
+        assert tyro.cli(module.Options, args=args)
+    assert all(find_spec(name) for name in re.findall(r"`python\s+-m\s+([\w.]+)", EVERYTHING))
+
+
+def means(rows, *names):
+    return [float(np.mean([row[name] for row in rows])) for name in names]
+
+
+def test_pages__quote_the_committed_results():
+    recordings = committed("demo")["full"], committed("arm")
+    demo, arm = ([frame["psnr"] for frame in result["frames"]] for result in recordings)
+    four, (thin,) = (committed(name)["clips"] for name in ("method_report", "method_parts"))
+    rows = [row for clip in four for row in best_rows(clip) if row["epochs"] == 2]
+
+    def best(preset, name):
+        return np.array([row["mean"][name] for row in rows if row["preset"] == preset])
+
+    names = "psnr", "psnr_moving"
+    gains = [span(best("default", name) - best("baseline", name)) for name in names]
+    errors = span(best("default", MOTION) / best("baseline", MOTION))
+    parts = {row["preset"]: row["mean"]["psnr"] for row in best_rows(thin) if row["epochs"] == 2}
+    cells = committed("field")["cells"].values()
+    ours, grid, rigid = (
+        means([cell[f"{method}/8"] for cell in cells], "psnr_moving", JACCARD)
+        for method in ("default", "grid", "default + rigidity")
+    )
+    drift = [fit for fit in committed("drift")["fits"] if fit["clip"] == "random-15"]
+    drift_psnr, slope = means(drift, "psnr", "slope_moving_db_a_frame")
+    unseen = [fit for fit in committed("random_scenes")["fits"] if fit["seed"] != 4]
+    unseen_psnr, unseen_moving = means(unseen, "psnr", "psnr_moving")
+    clocks = (f"{name}_moving" for name in ("synchronised", "recorded", "aligned"))
+    one_clock, recorded, aligned = means(committed("timing")["fits"], *clocks)
+    small, large, twice = (committed(f"render_speed_{name}") for name in ("W1", "W2b", "W2"))
+    streams = {name: row["streams"] for name, row in committed("fuzz")["fuzzers"].items()}
+    ratios = {row["value"]: row["step_ratio"] for row in committed("renderer_report")["rows"]}
+    walk = committed("walk4")
+    quotes = f"""
+index: PSNR goes from {demo[0]:.2f} dB to {demo[-1]:.2f} dB.
+index: from {arm[0]:.2f} dB to {arm[-1]:.2f} dB over {len(arm)} frames
+index: the means are {unseen_psnr:.2f} dB and {unseen_moving:.2f} dB where things move
+index: {gains[0]} dB above residuals alone at their best rates ({gains[1]} dB where things move)
+index: with {errors} of their motion error
+index: PSNR falls by {-min(best("default", "psnr_slope")):.3f} dB a frame at most
+index: has {ours[0]:.1f} dB where things move, the next method {grid[0]:.1f} dB
+index: {100 * ours[1]:.1f} % for the default and {100 * rigid[1]:.1f} % with their terms added
+index: Random scene 15 has {drift_psnr:.2f} dB, with a slope of {slope:+.2f} dB a frame
+index: PSNR is {one_clock:.1f}, {recorded:.1f} and {aligned:.1f} dB in the mean.
+index: {small["ratio_to_yardstick"]:.2f} to {twice["ratio_to_yardstick"]:.2f} of the time of tuned
+index: {small["plain_step_ms"]:.0f} ms in the first row and {large["plain_step_ms"]:.0f} ms in the
+index: a step of the second row takes {100 * large["tenth_share"]:.0f} % of the time
+index: in {streams["damage"]:,} damaged streams and {streams["bytes"]:,} with changed bytes
+method: Motion gains {parts["ml"] - parts["baseline"]:.2f} dB at 2 epochs
+method: additions to the paper gain {parts["ml-mo-mc"] - parts["paper"]:.2f} dB
+renderer: Blocks of 4x4 and 8x8 pixels take {ratios["4x4"]:.2f} and {ratios["8x8"]:.2f} of the time
+renderer: `reproducible` takes {ratios["true"]:.2f}
+captures: {walk["psnr"]["first"]:.2f} dB in the first frame and {walk["psnr"]["last"]:.2f} dB in the
+captures: {walk["psnr_moving"]:.2f} dB where things move
+captures: A later frame takes {walk["seconds"]["per_later_frame"]:.1f} s
+captures: and {walk["bytes"]["per_residual"] / 1000:.0f} kB
+"""
+    words = {name: " ".join(text.split()) for name, text in TEXTS.items()}
+    pairs = [line.split(": ", 1) for line in quotes.strip().splitlines()]
+    assert [quote for name, quote in pairs if quote not in words[name]] == []
