@@ -1,6 +1,6 @@
 """Time a later frame of the loop at two sizes, and report bytes and PSNR.
 
-    python -m benchmarks.speed.frame_speed --json out.json [--sizes small n3dv]
+    python -m benchmarks.speed.frame_speed --json out.json [--sizes small n3dv] [--frames 3]
 
 The scene consists of Gaussians: a wall, a floor and 40 balls, of which some move and turn. Its
 images are rendered from them, with camera noise. The loop starts from the scene at frame 0 with
@@ -31,7 +31,6 @@ from morgs_mi.loop.stream_config import StreamConfig, apply_preset
 from morgs_mi.stream_loop import StreamLoop
 
 NOISE = 2.0  # grey levels
-_FRAMES = 3  # later frames; the first is warm-up, medians of the others are reported
 _SEED = 0
 
 
@@ -63,11 +62,15 @@ class Options(Output):
 
     sizes: tuple[str, ...] = ("small", "n3dv")
     """Sizes to run, among small and n3dv."""
+    frames: int = 3
+    """Number of later frames; the first is warm-up, medians of the others are reported."""
     epochs: tuple[int, ...] = (1, 2, 4, 8)
     """Numbers of epochs of the default settings."""
     full: tuple[str, ...] = ("small",)
     """Sizes at which the paper's scheme and a fit without skipping are also run; they take minutes.
     """
+    variant: str = "llvm_ad_rgb"
+    """Mitsuba variant."""
 
 
 class Scene:
@@ -209,12 +212,12 @@ def settings(options: Options, name: str) -> dict[str, StreamConfig]:
 
 def main(options: Options) -> None:
     """Run the benchmark."""
-    mi.set_variant("llvm_ad_rgb")
-    result: dict[str, Any] = {"seed": _SEED, "noise": NOISE}
+    mi.set_variant(options.variant)
+    result: dict[str, Any] = {"seed": _SEED, "noise": NOISE, "variant": options.variant}
     for name in options.sizes:
         scene = Scene(SIZES[name], _SEED)
         rows = {}
-        images = scene.recorded(_FRAMES + 2, _SEED)
+        images = scene.recorded(options.frames + 2, _SEED)
         for label, config in settings(options, name).items():
             for live in (False, True) if label.startswith("default") else (True,):
                 row = f"{label}, live" if live and label.startswith("default") else label

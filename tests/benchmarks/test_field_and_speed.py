@@ -30,7 +30,7 @@ def test_motion_models__move_gaussians_like_their_images(name):
 def test_frame_speed__measures_a_tiny_scene(tmp_path, monkeypatch):
     monkeypatch.setattr(frame_speed, "SIZES", {"tiny": frame_speed.Size(64, 48, 3, 600, 2)})
     out = tmp_path / "out.json"
-    frame_speed.main(frame_speed.Options(json=out, sizes=("tiny",), epochs=(1,), full=()))
+    frame_speed.main(frame_speed.Options(out, ("tiny",), epochs=(1,), full=()))
     for run in json.loads(out.read_text())["tiny"]["runs"].values():
         assert min(run["seconds"], run["bytes"], run["pixels"], run["psnr"] - 10) > 0
 
