@@ -41,7 +41,6 @@ from morgs_mi.method.exposure import follow_exposure
 from morgs_mi.playback.player import playback_speed
 
 REGIONS = ("", "_moving", "_still")
-IMAGE_SCORES = ("psnr", "ssim", "delta_e", "lpips")
 # Compression flickers: after a hundred frames half the pixels of a real recording have changed
 # once.
 _FALSE_ALARMS = 0.02

@@ -59,35 +59,24 @@ def psnr_of(error: float) -> float:
     return float(-10 * np.log10(error)) if error != 0 else float("inf")
 
 
-def ssim(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Return the mean structural similarity, in [-1, 1] and 1 for equal images (Wang et al. 2004).
+def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Return the structural similarity (Wang et al. 2004) of the window around each pixel for which
+    it fits, [H - 10, W - 10], in [-1, 1] and 1 for equal windows.
 
-    The window is an 11x11 Gaussian of sigma 1.5, the moments are the population's, and only windows
-    inside the image count. Channels are averaged.
+    The window is an 11x11 Gaussian of sigma 1.5, the moments are the population's, and channels are
+    averaged.
 
     Args:
         image: [H, W, 3] or [H, W], both sides at least 11 pixels.
         truth: likewise.
-        mask: [H, W] bool, the window centres that count; the result is NaN if there are none.
 
     Raises:
         ValueError: the sizes differ or are smaller than the window.
     """
-    _check("ssim", image, truth, mask)
-    return mean_over(ssim_map(image, truth), mask)
-
-
-def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Return the similarity (see `ssim`) of the window around each pixel for which it fits,
-    [H - 10, W - 10].
-
-    Raises:
-        ValueError: the sizes differ or are smaller than the window.
-    """
-    image, truth = unit_pair("ssim", image, truth)
+    image, truth = unit_pair("ssim_map", image, truth)
     if min(image.shape[:2]) < WINDOW:
         raise ValueError(
-            f"ssim(): images must be at least {WINDOW}x{WINDOW} pixels, got {image.shape[:2]}."
+            f"ssim_map(): images must be at least {WINDOW}x{WINDOW} pixels, got {image.shape[:2]}."
         )
     similarity = _similarity(image, truth)
     return similarity.reshape(*similarity.shape[:2], -1).mean(-1)

@@ -80,10 +80,6 @@ class FirstFrameProblem:
         """Return the problem with views of half the size, see `half_sized`."""
         return replace(self, views=tuple(half_sized(self.views)))
 
-    def only(self, indices: Sequence[int]) -> FirstFrameProblem:
-        """Return the problem of some of the views."""
-        return replace(self, views=tuple(self.views[index] for index in indices))
-
     def psnr(self, gaussians: Gaussians) -> float:
         """Return the mean PSNR of the views in dB, of their valid pixels."""
         return mean_psnr(gaussians, self.views, self.render)

@@ -44,21 +44,11 @@ def test_first_frame_problem__starts_from_the_points_with_the_settings_of_the_fi
     assert [camera.name for camera in result.cameras] == [camera.name for camera in views()]
 
 
-def test_first_frame_problem__only_takes_some_of_the_views():
-    whole = problem(bytes_of(images_of(opaque_ball())))
-    some = whole.only([2, 0])
-    assert some.views == (whole.views[2], whole.views[0])
-    assert (some.start, some.extent) == (whole.start, whole.extent)
-
-
 def test_first_frame_problem__psnr_is_the_mean_over_its_views():
     images = bytes_of(images_of(opaque_ball()))
     shown = [rendered(ball(80), camera, RenderConfig()) for camera in views()]
     expected = np.mean([psnr(a, image / 255) for a, image in zip(shown, images, strict=True)])
     assert problem(images).psnr(ball(80)) == pytest.approx(expected, abs=1e-4)
-    assert problem(images).only([1]).psnr(ball(80)) == pytest.approx(
-        psnr(shown[1], images[1] / 255), abs=1e-4
-    )
 
 
 def test_first_frame_problem__psnr_does_not_count_masked_pixels():

@@ -16,7 +16,7 @@ from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.core.color_space import SH_C0, TRANSFER, decode_light, display_image
 from morgs_mi.io.exr import read_light
-from morgs_mi.playback.export.frames import write_frames, write_images
+from morgs_mi.playback.export.frames import write_images
 from morgs_mi.playback.player import render_stream
 from morgs_mi.playback.stream_header import stream_exposure
 from morgs_mi.studio.light.insert import InsertConfig, render_inserted
@@ -47,28 +47,30 @@ def rendered(stream):
     return dict(render_stream(stream, camera(), ("color",)))[0]["color"]
 
 
-def test_write_frames__exr_files_have_the_light_of_the_curve(stream, tmp_path):
-    write_frames(stream, camera(), tmp_path / "a.exr")
+def write(stream, path, stops=0.0):
+    write_images(render_stream(stream, camera(), ("color",)), 10, path, display_exposure=stops)
+
+
+def test_write_images__exr_files_have_the_light_of_the_curve(stream, tmp_path):
+    write(stream, tmp_path / "a.exr")
     light = read_light(tmp_path / "a.exr")
     np.testing.assert_allclose(light, decode_light(rendered(stream)), rtol=1e-5)
     assert light.max() > 4
 
 
-def test_write_frames__png_files_show_the_streams_exposure(stream, tmp_path):
-    write_frames(stream, camera(), tmp_path / "a.png")
+def test_write_images__png_files_show_the_exposure(stream, tmp_path):
+    write(stream, tmp_path / "a.png", stream_exposure(stream))
     shown = cv2.imread(str(tmp_path / "a.png"))[..., ::-1]
     expected = display_image(decode_light(rendered(stream)), STOPS)
     assert np.abs(shown.astype(int) - expected).max() <= 1
-    write_images(
-        render_stream(stream, camera(), ("color",)), 10, tmp_path / "b.png", display_exposure=-20
-    )
+    write(stream, tmp_path / "b.png", -20)
     assert cv2.imread(str(tmp_path / "b.png")).max() == 0
 
 
-def test_write_frames__streams_of_8_bits_are_clipped_as_they_are(tmp_path):
+def test_write_images__streams_of_8_bits_are_clipped_as_they_are(tmp_path):
     stream = open_stream(written(tmp_path / "s.morgs", {}))
     assert stream_exposure(stream) == 0
-    write_frames(stream, camera(), tmp_path / "a.png")
+    write(stream, tmp_path / "a.png", stream_exposure(stream))
     expected = (np.clip(rendered(stream), 0, 1) * 255 + 0.5).astype(np.uint8)
     np.testing.assert_array_equal(cv2.imread(str(tmp_path / "a.png"))[..., ::-1], expected)
 

@@ -25,8 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.core.files import atomic_path
-from morgs_mi.io.exr import read_exr, write_exr
+from morgs_mi.io.exr import read_exr
 from morgs_mi.io.listing import listed
 from morgs_mi.method.flow_sources.flow_config import FlowConfig
 from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FlowSource, FramePair
@@ -128,10 +127,14 @@ def read_flow(path: str | Path) -> np.ndarray:
             or pixels without flow.
     """
     path = Path(path)
-    reader = _read_flo if _suffix("read_flow()", path) == ".flo" else _read_exr
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise ValueError(
+            f"read_flow(): `path` must end in {' or '.join(SUFFIXES)}, got {path.name!r}."
+        )
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a flow file, found none; check the path.")
-    flow = reader(path)
+    flow = _read_flo(path) if suffix == ".flo" else _read_exr(path)
     _check_dense(path, flow)
     return flow
 
@@ -144,31 +147,6 @@ def _check_dense(path: Path, flow: np.ndarray) -> None:
             f"{path}: expected a flow at every pixel, got none at {unknown.sum()} of "
             f"{unknown.size}, the first at x={x}, y={y}; use a method that returns dense flow."
         )
-
-
-def write_flow(path: str | Path, flow: np.ndarray) -> None:
-    """Write a flow [H, W, 2] in pixels as a `.flo` or EXR file, atomically.
-
-    Raises:
-        ValueError: the suffix is neither `.flo` nor `.exr`, or the flow has another shape.
-        OSError: the file cannot be written.
-    """
-    path = Path(path)
-    flow = np.asarray(flow)
-    suffix = _suffix("write_flow()", path)
-    if flow.ndim != 3 or flow.shape[2] != 2 or not flow.size:
-        raise ValueError(f"write_flow(): `flow` must be [H, W, 2], got {flow.shape}.")
-    if suffix == ".exr":
-        write_exr(path, dict(zip(_CHANNELS[0], np.moveaxis(flow, 2, 0), strict=True)))
-    else:
-        with atomic_path(path, "write_flow()") as partial:
-            partial.write_bytes(_flo_bytes(flow))
-
-
-def _flo_bytes(flow: np.ndarray) -> bytes:
-    height, width = flow.shape[:2]
-    header = np.array([(_MAGIC, width, height)], _HEADER)
-    return header.tobytes() + flow.astype("<f4").tobytes()
 
 
 def _read_flo(path: Path) -> np.ndarray:
@@ -215,9 +193,3 @@ def _make(folder: str, config: FlowConfig) -> FlowSource:
 def _from_folder(folder: FlowFolder, pair: FramePair) -> tuple[np.ndarray, np.ndarray]:
     height, width = pair.image.shape[:2]
     return folder.flows(pair.camera, pair.frame, (height, width))
-
-
-def _suffix(place: str, path: Path) -> str:
-    if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"{place}: `path` must end in {' or '.join(SUFFIXES)}, got {path.name!r}.")
-    return path.suffix.lower()

@@ -2,56 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.codec.frame_source import FrameSource
-from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import decode_light, exposed
 from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import PLAYABLE, write_video
-from morgs_mi.playback.export.clips import frame_numbers
 from morgs_mi.playback.export.formats import IMAGES, choose_format
-from morgs_mi.playback.player import channel_image, render_stream
-from morgs_mi.playback.stream_header import stream_exposure
+from morgs_mi.playback.player import channel_image
 from morgs_mi.playback.visualise import side_by_side, write_png
 
 # Index and channels [H, W, C] by name.
 _Frame = tuple[int, Mapping[str, np.ndarray]]
-
-
-def write_frames(
-    stream: FrameSource,
-    camera: Camera,
-    output: str | Path,
-    channels: Sequence[str] | None = None,
-    progress: Callable[[int], None] | None = None,
-) -> None:
-    """Render a stream for one camera into files, which are written atomically.
-
-    Args:
-        stream: the file.
-        camera: any view.
-        output: ``FILE.mp4`` for a video of the channels side by side, a folder ending in ``png``
-            for the same images as ``0000.png`` ..., any other folder for multichannel ``0000.exr``
-            ... (see `exr_channels`), or ``FILE.png`` or ``FILE.exr`` for a single frame.
-        channels: out of `CHANNELS`; default: the colour, for EXR files all channels that the stream
-            stores.
-        progress: called with the number of frames done.
-
-    Raises:
-        ValueError: an unknown channel, a channel that the stream does not store, another type of
-            video, or a stream that is truncated, broken or has no frame.
-        OSError: the folder exists, or a file cannot be written.
-    """
-    frame_numbers(stream)  # refuses a stream without frames
-    kind = choose_format(IMAGES, output).name
-    channels = channels or (None if kind == "exr" else ("color",))
-    images = render_stream(stream, camera, channels)
-    write_images(images, stream.fps, output, progress, stream_exposure(stream))
 
 
 def write_images(
@@ -61,11 +26,17 @@ def write_images(
     progress: Callable[[int], None] | None = None,
     display_exposure: float = 0.0,
 ) -> None:
-    """Write rendered frames, pairs of index and channels [H, W, C] by name, into files as
-    `write_frames` does.
+    """Write rendered frames, pairs of index and channels [H, W, C] by name, into files, atomically.
 
-    Videos and PNG files show colours that are brightened by the display exposure, in stops, and
-    clipped at white.
+    Args:
+        rendered: the frames, as `render_stream` yields them.
+        fps: frames per second.
+        output: ``FILE.mp4`` for a video of the channels side by side, a folder ending in ``png``
+            for the same images as ``0000.png`` ..., any other folder for multichannel ``0000.exr``
+            ... (see `exr_channels`), or ``FILE.png`` or ``FILE.exr`` for a single frame.
+        progress: called with the number of frames done.
+        display_exposure: stops by which videos and PNG files are brightened before they are
+            clipped at white.
 
     Raises:
         ValueError: another type of video.
@@ -79,7 +50,7 @@ def write_images(
     elif Path(output).name.lower().endswith(f".{kind}"):
         _write_file(frames, output, _WRITERS[kind])
     else:
-        with atomic_folder(output, "write_frames()") as folder:
+        with atomic_folder(output, "write_images()") as folder:
             for frame, images in frames:
                 _WRITERS[kind](folder / f"{frame:04d}.{kind}", images)
 
@@ -102,7 +73,7 @@ def _write_file(
     write: Callable[[Path, Mapping[str, np.ndarray]], None],
 ) -> None:
     """Write the only frame into a file."""
-    with atomic_path(output, "write_frames()") as partial:
+    with atomic_path(output, "write_images()") as partial:
         for count, (_, images) in enumerate(frames):
             if count:
                 raise ValueError(

@@ -16,7 +16,7 @@ from morgs_mi.io.ply import read_ply
 from morgs_mi.io.splats import read_splats
 from morgs_mi.playback.export.clips import _frames_backwards, repeated_seconds, select_frames
 from morgs_mi.playback.export.formats import IMAGES, PLY, USD, WEB, choose_format
-from morgs_mi.playback.export.frames import exr_channels, pad_to_even, write_frames
+from morgs_mi.playback.export.frames import exr_channels, pad_to_even
 from morgs_mi.render.rasterize import rasterize
 from tests.assertions import assert_close
 from tests.codec.forge import forged_streams
@@ -168,9 +168,8 @@ def test_frames_backwards__are_those_of_the_clip_if_a_keyframe_is_forged(tmp_pat
         np.testing.assert_array_equal(gaussians.means, clip.states[frame].gaussians.means)
 
 
-def test_write_frames__writes_videos_that_browsers_play(stream, tmp_path):
-    reader = StreamReader(tmp_path / "stream.morgs")
-    write_frames(reader, reader.cameras[0], tmp_path / "a.mp4")
+def test_render__writes_videos_that_browsers_play(stream, tmp_path):
+    assert run("render", tmp_path, tmp_path / "a.mp4", "--camera", 0) == 0
     code = int(cv2.VideoCapture(str(tmp_path / "a.mp4")).get(cv2.CAP_PROP_FOURCC))
     assert code.to_bytes(4, "little") in (b"vp09", b"VP90")
 
