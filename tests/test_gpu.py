@@ -132,15 +132,18 @@ def test_rasterize__agrees_between_cuda_and_llvm_on_a_region():
     camera = make_wide_camera()
     raw = make_wide_scene()
     y, x = np.mgrid[: camera.height, : camera.width]
-    mask = (x - 30) ** 2 + (y - 20) ** 2 < 12**2
+    mask = np.float32((x - 30) ** 2 + (y - 20) ** 2 < 12**2)[..., None]
 
     def run():
         gaussians = Gaussians(**raw)
-        region = Region(mask)
+        region = Region(mask[..., 0] > 0)
         dr.enable_grad(*gaussians.items().values())
         image = rasterize(gaussians, camera, CHANNELS, region=region)
-        dr.backward(dr.sum(dr.square(image.color), axis=None) + dr.sum(image.confidence, axis=None))
-        colors = {"color": dr.detach(image.color)}
+        # Blocks have another shape on CUDA and thus reach further beyond the mask.
+        inside = mi.TensorXf(region.crop(mask))
+        color, confidence = image.color * inside, image.confidence * inside
+        dr.backward(dr.sum(dr.square(color), axis=None) + dr.sum(confidence, axis=None))
+        colors = {"color": region.paste(np.array(dr.detach(color)), np.zeros((*mask.shape[:2], 3)))}
         return colors | {f"gradient of {name}": dr.grad(getattr(gaussians, name)) for name in RAW}
 
     assert_variants_agree(run)
@@ -150,17 +153,19 @@ def test_rasterize__repeats_gradients_to_the_bit_in_reproducible_mode_on_cuda():
     camera = make_camera(70, 45)
     raw = make_scene(n=300)
 
-    def run():
+    def run(reproducible=True):
         gaussians = to_gaussians(raw, grad=True)
-        image = rasterize(gaussians, camera, ("color",), config=RenderConfig(reproducible=True))
+        config = RenderConfig(reproducible=reproducible)
+        image = rasterize(gaussians, camera, ("color",), config=config)
         dr.backward(dr.sum(dr.square(image.color), axis=None))
         return {name: dr.grad(getattr(gaussians, name)) for name in RAW}
 
     one = on("cuda_ad_rgb", run)
     other = on("cuda_ad_rgb", run)
+    fast = on("cuda_ad_rgb", lambda: run(reproducible=False))
     for name in one:
         np.testing.assert_array_equal(one[name], other[name], err_msg=name)
-    assert_variants_agree(run)
+        assert_close(one[name], fast[name], rtol=tol.SUM_ORDER_REL, name=name)
 
 
 def test_gaussian_splat__agrees_between_cuda_and_llvm_among_surfaces():

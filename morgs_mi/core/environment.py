@@ -25,8 +25,9 @@ def machine() -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Return the versions of this package, of Python and of the libraries that the figures depend
-    on.
+    on; a library that is on Python's path without being installed has none.
     """
+    installed = {package.name: package.version for package in metadata.distributions()}
     packages = (
         "morgs-mi",
         "mitsuba",
@@ -36,7 +37,7 @@ def versions() -> dict[str, str]:
         "colour-science",
     )
     return {"python": platform.python_version()} | {
-        name: metadata.version(name) for name in packages
+        name: installed.get(name, "not installed") for name in packages
     }
 
 
