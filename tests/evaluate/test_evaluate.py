@@ -24,7 +24,6 @@ from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.studio.measures.lpips import Lpips
-from tests.evaluate.tiny_onnx import squared_difference
 from tests.scenes.moving_splats import (
     CAMERAS,
     EXACT,
@@ -36,6 +35,7 @@ from tests.scenes.moving_splats import (
     moved,
     write_stream,
 )
+from tests.scenes.tiny_network import squared_difference
 
 
 def test_evaluate_stream__finds_no_error_in_the_stream_of_the_recording(fitted_clip: Path) -> None:

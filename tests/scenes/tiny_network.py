@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import onnx
-from onnx import TensorProto, helper, numpy_helper
+import onnx.parser
+from onnx import helper, numpy_helper
 
 # Weights of red, green and blue per flow component. They all differ: any swap shows.
 OF_IMAGE = np.array([[0.1, 0.2, 0.3], [0.02, 0.05, 0.01]], np.float32)
@@ -29,28 +31,24 @@ def export(
     """
     names = [f"image{k}" for k in range(1, inputs + 1)]
     weights = dict(zip(names, (OF_IMAGE, OF_OTHER, OF_OTHER), strict=False))
-    constants = {f"{name}.weight": w[:channels, :, None, None] for name, w in weights.items()}
-    constants |= {
-        "ones": np.ones((channels, 1, 8, 8), np.float32),
-        "nothing": np.zeros(1, np.float32),
-    }
-    nodes = [helper.make_node("Conv", [name, f"{name}.weight"], [f"{name}.part"]) for name in names]
-    nodes += [
-        helper.make_node("Sum", [f"{name}.part" for name in names], ["sum"]),
-        helper.make_node("AveragePool", ["sum"], ["flow_low"], kernel_shape=[8, 8], strides=[8, 8]),
-        helper.make_node(
-            "ConvTranspose", ["flow_low", "ones"], ["large"], strides=[8, 8], group=channels
-        ),
-        helper.make_node("Mul", ["large", "nothing"], ["no_flow"]),
-        helper.make_node("Add", ["sum", "no_flow"], ["flow_up"]),
-    ]
-    sizes = (1, 3, height, width), (1, channels, None, None)
+    size = f"float[1, 3, {height}, {width}]"
+    flow = f"float[1, {channels}, ?, ?]"
+    convolutions = "\n".join(f"{name}_part = Conv({name}, {name}_weight)" for name in names)
+    graph = f"""raft ({", ".join(f"{size} {name}" for name in names)})
+        => ({flow} flow_low, {flow} flow_up) {{
+      {convolutions}
+      sum = Sum({", ".join(f"{name}_part" for name in names)})
+      flow_low = AveragePool <kernel_shape = [8, 8], strides = [8, 8]> (sum)
+      large = ConvTranspose <strides = [8, 8], group = {channels}> (flow_low, ones)
+      no_flow = Mul(large, nothing)
+      flow_up = Add(sum, no_flow)
+    }}"""
     return write(
         path,
-        nodes,
-        dict.fromkeys(names, sizes[0]),
-        dict.fromkeys(("flow_low", "flow_up"), sizes[1]),
-        constants,
+        graph,
+        **{f"{name}_weight": w[:channels, :, None, None] for name, w in weights.items()},
+        ones=np.ones((channels, 1, 8, 8), np.float32),
+        nothing=np.zeros(1, np.float32),
     )
 
 
@@ -58,35 +56,43 @@ def export_lookup(path: Path, height: int, width: int) -> Path:
     """Write a network that looks up the second image in the first one's grid turned by 180 degrees,
     as RAFT looks up correlations: the flow is the difference of red and of green, at half weight.
     """
-    y = np.linspace(1, -1, height)
-    x = np.linspace(1, -1, width)
-    weights = np.array([[0.5, 0, 0], [0, 0.5, 0]], np.float32)[:, :, None, None]
-    grid = np.stack(np.meshgrid(x, y), axis=-1)[None].astype(np.float32)
-    nodes = [
-        helper.make_node("GridSample", ["image2", "grid"], ["turned"], align_corners=1),
-        helper.make_node("Sub", ["turned", "image1"], ["difference"]),
-        helper.make_node("Conv", ["difference", "weights"], ["flow"]),
-    ]
-    inputs = dict.fromkeys(("image1", "image2"), (1, 3, height, width))
-    return write(
-        path, nodes, inputs, {"flow": [1, 2, height, width]}, {"weights": weights, "grid": grid}
-    )
+    image = f"float[1, 3, {height}, {width}]"
+    graph = f"""lookup ({image} image1, {image} image2)
+        => (float[1, 2, {height}, {width}] flow) {{
+      turned = GridSample <align_corners = 1> (image2, grid)
+      difference = Sub(turned, image1)
+      flow = Conv(difference, weights)
+    }}"""
+    grid = np.stack(np.meshgrid(np.linspace(1, -1, width), np.linspace(1, -1, height)), axis=-1)
+    weights = 0.5 * np.eye(2, 3, dtype=np.float32)[:, :, None, None]
+    return write(path, graph, grid=grid[None].astype(np.float32), weights=weights)
 
 
-def write(
-    path: Path, nodes: list, inputs: dict, outputs: dict, constants: dict[str, np.ndarray]
+def squared_difference(
+    path: Path,
+    height: int,
+    width: int,
+    spatial: bool = True,
+    inputs: Sequence[str] = ("in0", "in1"),
 ) -> Path:
-    """Write nodes as a network; inputs and outputs are float32, their shapes by name."""
-    ends = (
-        [
-            helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
-            for name, shape in values.items()
-        ]
-        for values in (inputs, outputs)
-    )
-    weights = [numpy_helper.from_array(value, name) for name, value in constants.items()]
-    graph = helper.make_graph(nodes, "tiny", *ends, weights)
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 16)], ir_version=8)
+    """Write the network mean((in0 - in1)^2) over the channels, or over all, with the signature of
+    LPIPS; inputs [1, 3, height, width].
+    """
+    size = f"float[1, 3, {height}, {width}]"
+    axes, shape = ([1], [1, 1, height, width]) if spatial else ([1, 2, 3], [1, 1, 1, 1])
+    graph = f"""lpips ({size} {inputs[0]}, {size} {inputs[1]}) => (float{shape} out) {{
+      difference = Sub({", ".join(inputs)})
+      square = Mul(difference, difference)
+      out = ReduceMean <axes = {axes}, keepdims = 1> (square)
+    }}"""
+    return write(path, graph)
+
+
+def write(path: Path, graph: str, **constants: np.ndarray) -> Path:
+    """Write the network of a graph in ONNX's text format, with constants by their names."""
+    parsed = onnx.parser.parse_graph(graph)
+    parsed.initializer.extend(numpy_helper.from_array(v, name) for name, v in constants.items())
+    model = helper.make_model(parsed, opset_imports=[helper.make_opsetid("", 16)], ir_version=8)
     onnx.checker.check_model(model)
     onnx.save(model, path)
     return path

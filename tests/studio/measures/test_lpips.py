@@ -7,7 +7,7 @@ import pytest
 
 from morgs_mi.studio.measures.lpips import Lpips
 from tests.assertions import assert_close
-from tests.evaluate.tiny_onnx import squared_difference
+from tests.scenes.tiny_network import squared_difference
 
 H = 12
 W = 17

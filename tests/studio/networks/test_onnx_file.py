@@ -8,7 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import onnx
+import onnx.parser
 import pytest
 from onnx import TensorProto, helper
 
@@ -49,10 +49,10 @@ def with_weights_at(path: Path, location: str) -> Path:
     )
     for key, value in (("location", location), ("offset", "0"), ("length", str(4 * VALUES))):
         weights.external_data.add(key=key, value=value)
-    ends = (helper.make_tensor_value_info(name, TensorProto.FLOAT, [VALUES]) for name in "xy")
-    graph = helper.make_graph(
-        [helper.make_node("Add", ["x", "w"], ["y"])], "sum", *([end] for end in ends), [weights]
+    graph = onnx.parser.parse_graph(
+        f"sum (float[{VALUES}] x) => (float[{VALUES}] y) {{ y = Add(x, w) }}"
     )
+    graph.initializer.append(weights)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 16)], ir_version=8)
     path.write_bytes(model.SerializeToString())
     return path
@@ -130,17 +130,11 @@ def test_onnx_network__refuses_damaged_files_with_one_sentence(tmp_path, capfd):
 
 
 def test_onnx_network__refuses_results_that_are_not_numbers(tmp_path):
-    nodes = [helper.make_node("Cast", ["image"], ["text"], to=TensorProto.STRING)]
-    path = write(tmp_path / "a.onnx", nodes, {"image": (1, 3, 2, 2)}, {}, {})
-    model = onnx.load(path)
-    model.graph.output.append(
-        helper.make_tensor_value_info("text", TensorProto.STRING, (1, 3, 2, 2))
-    )
-    path.write_bytes(model.SerializeToString())
+    graph = "text (float[1, 2] image) => (string[1, 2] text) { text = Cast <to = 8> (image) }"
     with pytest.raises(
         ValueError, match=r"a\.onnx: expected arrays of numbers, got others from text"
     ):
-        OnnxNetwork(path).run({"image": np.zeros((1, 3, 2, 2), np.float32)})
+        OnnxNetwork(write(tmp_path / "a.onnx", graph)).run({"image": np.zeros((1, 2), np.float32)})
 
 
 def test_imagenet_blob__is_normalised_and_channels_come_first():

@@ -7,7 +7,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from onnx import helper
 
 from tests.scenes.tiny_network import write
 
@@ -16,8 +15,6 @@ CELL = 4
 # Radius around a point on the object within which pixels are segmented, in pixels of the network's
 # image.
 REACH = 300.0
-# Index of the decoder's mask with the highest predicted IoU, of three.
-BEST = 1
 MEAN = np.array([0.485, 0.456, 0.406])
 DEVIATION = np.array([0.229, 0.224, 0.225])
 
@@ -26,17 +23,18 @@ def export_encoder(path: Path, open_size: bool = False) -> Path:
     """Write an encoder with the image itself as features, at a quarter, an eighth and a sixteenth
     of its side.
     """
-    names = {"high_res_feats_0": 4, "high_res_feats_1": 8, "image_embed": 16}
-    nodes = [
-        helper.make_node("AveragePool", ["image"], [name], kernel_shape=[k, k], strides=[k, k])
-        for name, k in names.items()
-    ]
-    sides = ("h", "w") if open_size else (SIZE, SIZE)
-    outputs = {
-        name: (1, 3, None, None) if open_size else (1, 3, SIZE // k, SIZE // k)
-        for name, k in names.items()
-    }
-    return write(path, nodes, {"image": (1, 3, *sides)}, outputs, {})
+    sides = ["h, w", "?, ?", "?, ?", "?, ?"]
+    if not open_size:
+        sides = [f"{SIZE // k}, {SIZE // k}" for k in (1, 4, 8, 16)]
+    image, quarter, eighth, sixteenth = (f"float[1, 3, {side}]" for side in sides)
+    graph = f"""encoder ({image} image) => (
+      {quarter} high_res_feats_0, {eighth} high_res_feats_1, {sixteenth} image_embed
+    ) {{
+      high_res_feats_0 = AveragePool <kernel_shape = [4, 4], strides = [4, 4]> (image)
+      high_res_feats_1 = AveragePool <kernel_shape = [8, 8], strides = [8, 8]> (image)
+      image_embed = AveragePool <kernel_shape = [16, 16], strides = [16, 16]> (image)
+    }}"""
+    return write(path, graph)
 
 
 def export_decoder(path: Path, extra: str = "", scale: float = 1.0) -> Path:
@@ -52,88 +50,74 @@ def export_decoder(path: Path, extra: str = "", scale: float = 1.0) -> Path:
     y = np.broadcast_to(centres[:, None], (1, 1, cells, cells))
     # Of normalised colours, R - B - 0.2 of the colours themselves.
     color = np.array([DEVIATION[0], 0, -DEVIATION[2]], np.float32)[None, :, None, None]
-    constants = {
-        "color": color,
-        "bias": np.array([MEAN[0] - MEAN[2] - 0.2], np.float32),
-        "x": x.copy(),
-        "y": y.copy(),
-        "zero": np.array([0]),
-        "one": np.array([1]),
-        "two": np.array([2]),
-        "last": np.array([2**31]),
-        "axis1": np.array([1]),
-        "axis2": np.array([2]),
-        "column": np.array([1, -1, 1, 1]),
-        "on_object": np.float32(1),
-        "far": np.float32(1e9),
-        "reach": np.float32(REACH**2),
-        "corners": np.array([[2, 3]], np.float32),
-        "scale": np.float32(scale),
-        "quality": np.array([[0.3, 0.9, 0.5]], np.float32),
-        "flat": np.zeros((1, 1, cells, cells), np.float32) + 1,
-    }
-
-    def node(kind: str, inputs: str, output: str, **settings: int) -> object:
-        return helper.make_node(kind, inputs.split(), [output], **settings)
-
-    nodes = [
-        node("Conv", "high_res_feats_0 color bias", "redness"),
-        node("Slice", "point_coords zero one axis1", "upper_left"),
-        node("Slice", "point_coords one two axis1", "lower_right"),
-        node("Slice", "upper_left zero one axis2", "left"),
-        node("Slice", "upper_left one two axis2", "upper"),
-        node("Slice", "lower_right zero one axis2", "right"),
-        node("Slice", "lower_right one two axis2", "lower"),
-        node("Sub", "x left", "inside_left"),
-        node("Sub", "right x", "inside_right"),
-        node("Sub", "y upper", "inside_upper"),
-        node("Sub", "lower y", "inside_lower"),
-        # Squared distance to the nearest point of label 1: [1, P, cells, cells].
-        node("Slice", "point_coords zero one axis2", "points_x"),
-        node("Slice", "point_coords one two axis2", "points_y"),
-        node("Reshape", "points_x column", "column_x"),
-        node("Reshape", "points_y column", "column_y"),
-        node("Sub", "x column_x", "dx"),
-        node("Sub", "y column_y", "dy"),
-        node("Mul", "dx dx", "dx2"),
-        node("Mul", "dy dy", "dy2"),
-        node("Sub", "point_labels on_object", "label_difference"),
-        node("Abs", "label_difference", "label_distance"),
-        node("Mul", "label_distance far", "labels_apart"),
-        node("Reshape", "labels_apart column", "column_apart"),
-        node("Sum", "dx2 dy2 column_apart", "distances"),
-        node("ReduceMin", "distances", "distance", axes=[1], keepdims=1),
-        node("Sub", "reach distance", "near"),
-        # 0 if labels and mask inputs are as expected, and otherwise far below.
-        node("Slice", "point_labels zero two axis1", "corner_labels"),
-        node("Sub", "corner_labels corners", "corners_off"),
-        node("Abs", "corners_off", "corners_wrong"),
-        node("ReduceSum", "corners_wrong", "wrong_labels", keepdims=0),
-        node("ReduceMax", "mask_input", "mask_given", keepdims=0),
-        node("ReduceSum", "has_mask_input", "mask_flag", keepdims=0),
-        node("Sum", "wrong_labels mask_given mask_flag", "wrong"),
-        node("Mul", "wrong far", "penalty"),
-        node("Mul", "redness far", "sharp_redness"),
-        node(
-            "Min", "sharp_redness inside_left inside_right inside_upper inside_lower near", "bare"
-        ),
-        node("Sub", "bare penalty", "right_mask"),
-        node("Neg", "right_mask", "inverse"),
-        node("Concat", "flat right_mask inverse", "all", axis=1),
-        node("Mul", "all scale", "masks"),
-        node("Identity", "quality", "iou_predictions"),
-    ]
-    inputs = {
-        "image_embed": (1, 3, 64, 64),
-        "high_res_feats_0": (1, 3, cells, cells),
-        "high_res_feats_1": (1, 3, 128, 128),
-        "point_coords": (1, "points", 2),
-        "point_labels": (1, "points"),
-        "mask_input": (1, 1, cells, cells),
-        "has_mask_input": (1,),
-    }
-    if extra:
-        inputs[extra] = (1,)
+    graph = f"""decoder (
+      float[1, 3, 64, 64] image_embed, float[1, 3, {cells}, {cells}] high_res_feats_0,
+      float[1, 3, 128, 128] high_res_feats_1, float[1, points, 2] point_coords,
+      float[1, points] point_labels, float[1, 1, {cells}, {cells}] mask_input,
+      float[1] has_mask_input{extra and f", float[1] {extra}"}
+    ) => (float[1, 3, {cells}, {cells}] masks, float[1, 3] iou_predictions) {{
+      redness = Conv(high_res_feats_0, color, bias)
+      upper_left = Slice(point_coords, zero, one, axis1)
+      lower_right = Slice(point_coords, one, two, axis1)
+      left = Slice(upper_left, zero, one, axis2)
+      upper = Slice(upper_left, one, two, axis2)
+      right = Slice(lower_right, zero, one, axis2)
+      lower = Slice(lower_right, one, two, axis2)
+      inside_left = Sub(x, left)
+      inside_right = Sub(right, x)
+      inside_upper = Sub(y, upper)
+      inside_lower = Sub(lower, y)
+      # Squared distance to the nearest point of label 1: [1, P, cells, cells].
+      points_x = Slice(point_coords, zero, one, axis2)
+      points_y = Slice(point_coords, one, two, axis2)
+      column_x = Reshape(points_x, column)
+      column_y = Reshape(points_y, column)
+      dx = Sub(x, column_x)
+      dy = Sub(y, column_y)
+      dx2 = Mul(dx, dx)
+      dy2 = Mul(dy, dy)
+      label_difference = Sub(point_labels, on_object)
+      label_distance = Abs(label_difference)
+      labels_apart = Mul(label_distance, far)
+      column_apart = Reshape(labels_apart, column)
+      distances = Sum(dx2, dy2, column_apart)
+      distance = ReduceMin <axes = [1], keepdims = 1> (distances)
+      near = Sub(reach, distance)
+      # 0 if labels and mask inputs are as expected, and otherwise far below.
+      corner_labels = Slice(point_labels, zero, two, axis1)
+      corners_off = Sub(corner_labels, corners)
+      corners_wrong = Abs(corners_off)
+      wrong_labels = ReduceSum <keepdims = 0> (corners_wrong)
+      mask_given = ReduceMax <keepdims = 0> (mask_input)
+      mask_flag = ReduceSum <keepdims = 0> (has_mask_input)
+      wrong = Sum(wrong_labels, mask_given, mask_flag)
+      penalty = Mul(wrong, far)
+      sharp_redness = Mul(redness, far)
+      bare = Min(sharp_redness, inside_left, inside_right, inside_upper, inside_lower, near)
+      right_mask = Sub(bare, penalty)
+      inverse = Neg(right_mask)
+      all = Concat <axis = 1> (flat, right_mask, inverse)
+      masks = Mul(all, scale)
+      iou_predictions = Identity(quality)
+    }}"""
     return write(
-        path, nodes, inputs, {"masks": (1, 3, cells, cells), "iou_predictions": (1, 3)}, constants
+        path,
+        graph,
+        color=color,
+        bias=np.array([MEAN[0] - MEAN[2] - 0.2], np.float32),
+        x=x.copy(),
+        y=y.copy(),
+        zero=np.array([0]),
+        one=np.array([1]),
+        two=np.array([2]),
+        axis1=np.array([1]),
+        axis2=np.array([2]),
+        column=np.array([1, -1, 1, 1]),
+        on_object=np.float32(1),
+        far=np.float32(1e9),
+        reach=np.float32(REACH**2),
+        corners=np.array([[2, 3]], np.float32),
+        scale=np.float32(scale),
+        quality=np.array([[0.3, 0.9, 0.5]], np.float32),
+        flat=np.ones((1, 1, cells, cells), np.float32),
     )
