@@ -10,10 +10,11 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.io.numbering import counting_together
 from morgs_mi.io.video_writer import write_video
+from tests.capture.test_timeline import frame_numbers
 from tests.scenes import captures as layouts
 
 TRIM = ReadConfig(trim=True)
@@ -31,14 +32,6 @@ def capture_of(path: Path, **cameras: Iterable[int]) -> Path:
     return path
 
 
-def colors(capture: Capture) -> list[list[int | None]]:
-    frames = capture.partial_frames()
-    return [
-        [None if image is None else int(image[0, 0, 0]) for image in frame.images]
-        for frame in frames
-    ]
-
-
 DIFFERENT = [
     # numbers of a and b, the common ones, and the interval of the instants in numbers
     (range(4), range(2, 6), [2, 3], 1),
@@ -54,13 +47,13 @@ def test_align_numbers__are_times(tmp_path: Path, caplog, a, b, common, interval
     path = capture_of(tmp_path / "c", a=a, b=b, c=a)
     with caplog.at_level(logging.WARNING):
         capture = load_capture(path, reading=TRIM)
-    assert colors(capture) == [[number] * 3 for number in common]
+    assert frame_numbers(capture) == [[number] * 3 for number in common]
     (note,) = capture.notes
     assert note in caplog.text
     assert f"Images with the same number are simultaneous: a {a[0]} to {a[-1]}" in note
     finest = min(a[1] - a[0], b[1] - b[0])
     assert capture.fps == pytest.approx(30 * finest / interval)
-    instants = colors(load_capture(path, reading=GAPS))
+    instants = frame_numbers(load_capture(path, reading=GAPS))
     assert all(len({number for number in row if number is not None}) <= 1 for row in instants)
     for camera, numbers in enumerate((a, b, a)):
         assert [row[camera] for row in instants if row[camera] is not None] == list(numbers)
@@ -80,7 +73,7 @@ def test_align_numbers__are_refused_without_an_option_and_replaced_by_offsets(
     ):
         load_capture(path)
     capture = load_capture(path, reading=ReadConfig(offset={"a": 0}))
-    assert colors(capture) == [list(pair) for pair in zip(a, b, strict=False)]
+    assert frame_numbers(capture) == [list(pair) for pair in zip(a, b, strict=False)]
     assert "aligned by their positions and --offset" in capture.notes[0]
 
 
@@ -100,7 +93,7 @@ def test_align_numbers__that_do_not_overlap_count_separately(
     path = capture_of(tmp_path / "c", a=range(100, 105), b=range(40, 45), c=range(40, 45))
     with caplog.at_level(logging.WARNING):
         capture = load_capture(path, reading=reading)
-    assert colors(capture) == [[100 + t, 40 + t, 40 + t] for t in range(5)]
+    assert frame_numbers(capture) == [[100 + t, 40 + t, 40 + t] for t in range(5)]
     assert "The numbers of the images do not overlap: b 40 to 44; a 100 to 104" in caplog.text
     assert capture.notes[0] in caplog.text
 
@@ -128,13 +121,13 @@ def test_align_numbers__shifts_videos_beside_them(tmp_path: Path) -> None:
     )
     images = [np.full((layouts.HEIGHT, layouts.WIDTH, 3), t, np.uint8) for t in range(8)]
     write_video(path / "v.mkv", images, 30)
-    assert colors(load_capture(path, reading=TRIM)) == [[t, t, t] for t in range(2, 6)]
+    assert frame_numbers(load_capture(path, reading=TRIM)) == [[t, t, t] for t in range(2, 6)]
 
 
 def test_align_numbers__with_trim_are_the_base_of_offsets(tmp_path: Path) -> None:
     path = capture_of(tmp_path / "c", a=range(6), b=range(2, 8))
     capture = load_capture(path, reading=ReadConfig(trim=True, offset={"b": 1}))
-    assert colors(capture) == [[t, t + 1] for t in range(1, 6)]
+    assert frame_numbers(capture) == [[t, t + 1] for t in range(1, 6)]
 
 
 def test_counting_together__groups_overlapping_numbers() -> None:

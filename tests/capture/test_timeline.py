@@ -269,7 +269,6 @@ def timed(path: Path, **times: list[int]) -> Path:
             ReadConfig(offset={"b": 1}),
             [[0, 1], [1, 2], [2, 2], [3, 3], [4, 3], [5, 4]],
         ),
-        ({"a": REGULAR[:2], "b": LATE}, ReadConfig(offset={"b": 3}), [[0, 3], [1, 4]]),
         # a has twice the rate: the instants are b's.
         (
             {"a": [25 * t for t in range(9)], "b": LATE},
@@ -277,7 +276,6 @@ def timed(path: Path, **times: list[int]) -> Path:
             [[0, 0], [2, 1], [4, 2], [6, 2], [8, 3]],
         ),
         ({"a": REGULAR, "b": JITTER}, ReadConfig(), [[t, t] for t in range(7)]),
-        ({"a": REGULAR, "b": JITTER}, ReadConfig(trim=True), [[t, t] for t in range(7)]),
     ],
 )
 def test_timeline__synchronises_variable_frame_rates_by_time(

@@ -85,14 +85,9 @@ def n3dv(
     return path
 
 
-def folder_per_camera(path: Path, names: tuple[str, ...]) -> None:
+def folder_per_camera(path: Path, names: tuple[str, ...], inner: str = "") -> None:
     for i, name in enumerate(names):
-        write_video(path / name, frames(i), FPS)
-
-
-def images_in_folder_per_camera(path: Path, names: tuple[str, ...]) -> None:
-    for i, name in enumerate(names):
-        write_video(path / name / "images", frames(i), FPS)
+        write_video(path / name / inner, frames(i), FPS)
 
 
 def folder_per_frame(path: Path, names: tuple[str, ...], inner: str = "") -> None:
@@ -250,10 +245,14 @@ def qualisys(path: Path, distortions: tuple[float, ...] = (0, 0, 0, 0)) -> Path:
 
 
 def dot_clips(
-    path: Path, names: tuple[str, ...], point: np.ndarray, lens: tuple[float, ...]
+    path: Path,
+    names: tuple[str, ...],
+    point: np.ndarray,
+    lens: tuple[float, ...],
+    deviation: float = 1.5,
 ) -> None:
-    """Write clips of a bright dot at `point`, recorded through OpenCV's lens by the rig with
-    principal points off by 3.
+    """Write clips of a bright dot at `point`, `deviation` px wide, recorded through OpenCV's lens
+    by the rig with principal points off by 3.
 
     The cameras of the clips are sorted by `names`.
     """
@@ -262,7 +261,7 @@ def dot_clips(
         V = np.asarray(camera.viewmat)
         K = camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
         u, v = cv2.projectPoints(point[None], V[:3, :3], V[:3, 3], K, np.array(lens))[0].ravel()
-        dot = 255 * np.exp(-0.5 * ((x - u) ** 2 + (y - v) ** 2) / 1.5**2)
+        dot = 255 * np.exp(-0.5 * ((x - u) ** 2 + (y - v) ** 2) / deviation**2)
         write_video(path / name, [np.repeat(dot[..., None], 3, -1).astype(np.uint8)] * COUNT, FPS)
 
 

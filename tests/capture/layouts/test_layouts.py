@@ -57,24 +57,10 @@ def assert_holds(
 
 def test_poses_bounds__reads_n3dv_with_missing_camera_numbers(tmp_path: Path) -> None:
     capture = load_capture(layouts.n3dv(tmp_path / "a"))
-    assert (capture.layout, capture.fps) == ("poses_bounds", FPS)
+    assert (capture.layout, capture.fps, capture.truth) == ("poses_bounds", FPS, None)
+    assert capture.points.shape == capture.point_colors.shape == (0, 3)
     assert_holds(capture, ("cam00", "cam02", "cam11"), (0, 1, 2))
-
-
-@pytest.mark.slow
-def test_poses_bounds__halves_n3dv_at_its_own_size(tmp_path: Path) -> None:
-    camera = rig(("cam00",))[0].resized(2704, 2028)
-    K = np.array([[1460.0, 0, 1352], [0, 1460, 1014], [0, 0, 1]])
-    camera = type(camera)(K, camera.viewmat, 2704, 2028, "cam00")
-    write_poses_bounds(tmp_path / "poses_bounds.npy", [camera], [[1, 9]])
-    image = np.zeros((2028, 2704, 3), np.uint8)
-    image[::2] = 200  # area averages are 100, nearest-neighbour sampling would give 0 or 200
-    write_video(tmp_path / "cam00.mp4", [image], 30)
-    capture = load_capture(tmp_path, downscale=2)
-    half = capture.cameras[0]
-    assert (half.width, half.height) == (1352, 1014)
-    np.testing.assert_allclose(half.K, [[730, 0, 676], [0, 730, 507], [0, 0, 1]])
-    assert (next(capture.frames()).images[0] == 100).all()
+    assert [frame.index for frame in capture.frames(1, 2)] == [1]
 
 
 @pytest.mark.parametrize(
@@ -84,7 +70,7 @@ def test_poses_bounds__halves_n3dv_at_its_own_size(tmp_path: Path) -> None:
         lambda path, names: layouts.videos(path / "videos", names),
         folder_per_camera,
         lambda path, names: folder_per_camera(path / "images", names),
-        layouts.images_in_folder_per_camera,
+        lambda path, names: folder_per_camera(path, names, "images"),
         folder_per_frame,
         lambda path, names: folder_per_frame(path, names, "images"),
     ],
@@ -136,6 +122,7 @@ def test_colmap__reads_all_models(tmp_path: Path, model: str, shared: bool, kind
     np.testing.assert_allclose(metadata["cameras"][0]["distortion"], lens)
     np.testing.assert_allclose(capture.points, [[0.1, 0.2, 0.3]], rtol=1e-6)
     assert_close(capture.point_colors, [[1, 0, 0.2]], atol=1e-6)
+    assert [image[0, 0, 0] for image in next(capture.frames()).images] == [2, 1, 0]
 
 
 @pytest.mark.parametrize("place", ["sparse", "colmap/sparse/0", "."])
@@ -169,19 +156,6 @@ def test_find_layout__follows_the_order_of_precedence(tmp_path: Path) -> None:
     assert load_capture(meta).layout == "Nerfstudio"
 
 
-def removed_clip(path: Path) -> None:
-    (path / "cam2.mkv").unlink()
-
-
-def removed_images(path: Path) -> None:
-    shutil.rmtree(path / "ims" / "2")
-
-
-def removed_in_every_frame(path: Path) -> None:
-    for file in path.glob("frame*/cam2.png"):
-        file.unlink()
-
-
 def colmap_by_frame(path: Path) -> Path:
     layouts.colmap(path)
     for file in path.glob("*.mkv"):
@@ -191,21 +165,21 @@ def colmap_by_frame(path: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("build", "remove", "camera", "left"),
+    ("build", "clip", "camera", "left"),
     [
-        (layouts.colmap, removed_clip, "cam2.png", ("cam1", "cam10")),
-        (colmap_by_frame, removed_in_every_frame, "cam2.png", ("cam1", "cam10")),
-        (layouts.nerfstudio, removed_clip, "./images/cam2.png", ("cam1", "cam10")),
-        (layouts.dynamic3dgs, removed_images, "2", ("1", "10")),
+        (layouts.colmap, "cam2.mkv", "cam2.png", ("cam1", "cam10")),
+        (colmap_by_frame, "frame*/cam2.png", "cam2.png", ("cam1", "cam10")),
+        (layouts.nerfstudio, "cam2.mkv", "./images/cam2.png", ("cam1", "cam10")),
+        (layouts.dynamic3dgs, "ims/2/*", "2", ("1", "10")),
         (
             layouts.anipose,
-            lambda path: (path / "trial_1-camB.mkv").unlink(),
+            "trial_1-camB.mkv",
             "camB",
             ("trial_1-camA", "trial_1-camC"),
         ),
         (
             layouts.qualisys,
-            lambda path: (path / "trial_Miqus_1_28984.mkv").unlink(),
+            "trial_Miqus_1_28984.mkv",
             "28984, 31111",
             ("trial_Miqus_0_26580", "trial_Miqus_2_29005"),
         ),
@@ -215,12 +189,13 @@ def test_load_capture__leaves_out_cameras_without_clips_with_a_warning(
     tmp_path: Path,
     caplog: pytest.LogCaptureFixture,
     build,
-    remove,
+    clip: str,
     camera: str,
     left: tuple[str, ...],
 ) -> None:
     path = build(tmp_path / "a")
-    remove(path)
+    for file in path.glob(clip):
+        file.unlink()
     with caplog.at_level(logging.WARNING):
         capture = load_capture(path)
     (warning,) = caplog.messages
@@ -294,13 +269,6 @@ def test_find_layout__finds_a_layout_that_is_added(
     assert load_capture(path).layout == "poses_bounds"
 
 
-def test_layout_called__returns_every_layout_by_its_name() -> None:
-    assert [
-        layout_registry.layout_called(layout.name) for layout in layout_registry.LAYOUTS
-    ] == list(layout_registry.LAYOUTS)
-    assert layout_registry.layout_called("toy") is None
-
-
 def test_clips_by_camera__ignores_folders_without_clips(tmp_path: Path) -> None:
     path = layouts.n3dv(tmp_path / "a")
     for place in (
@@ -314,28 +282,12 @@ def test_clips_by_camera__ignores_folders_without_clips(tmp_path: Path) -> None:
     assert load_capture(path).names == ("cam00", "cam02", "cam11")
 
 
-def test_timeline__accepts_frame_rates_that_differ_by_one_percent(tmp_path: Path) -> None:
-    path = layouts.n3dv(tmp_path / "a")
-    write_video(path / "cam02.mkv", layouts.frames(1), 1.005 * FPS)
-    assert load_capture(path).fps == FPS
-
-
 def test_nerfstudio__reads_cameras(tmp_path: Path) -> None:
     path = layouts.nerfstudio(tmp_path / "a")
     capture = load_capture(path)
     assert (capture.layout, len(capture.points)) == ("Nerfstudio", 0)
     assert_holds(capture, ("cam1", "cam2", "cam10"), (0, 1, 2), shift=3)
     assert capture.metadata()["cameras"][0]["distortion"] == [0.01, 0, 0, 0]
-
-
-def test_nerfstudio__has_opengl_axes(tmp_path: Path) -> None:
-    path = layouts.nerfstudio(tmp_path / "a")
-    # A camera at (5, 6, 7) that looks along world +y with world +x to its right and world +z up.
-    pose = [[1, 0, 0, 5], [0, 0, -1, 6], [0, 1, 0, 7], [0, 0, 0, 1]]
-    edit(path, lambda meta: meta["frames"][0].update(transform_matrix=pose))
-    camera = load_capture(path).cameras[0]
-    assert_close(camera.position, (5, 6, 7), atol=1e-12)
-    assert_close((camera.viewmat @ [5 + 1, 6 + 10, 7 + 2, 1])[:3], (1, -2, 10), atol=1e-12)
 
 
 def edit(path: Path, change, name: str = "transforms.json") -> None:
@@ -366,18 +318,17 @@ def test_nerfstudio__frames_override_the_keys_of_the_file(tmp_path: Path) -> Non
     )
 
 
-def test_nerfstudio__reads_a_field_of_view_all_frames_and_points(tmp_path: Path) -> None:
+def test_nerfstudio__reads_all_frames_and_points(tmp_path: Path) -> None:
     path = layouts.nerfstudio(tmp_path / "a")
     for file in path.glob("*.mkv"):
         file.unlink()
     folder_per_camera(path / "images", ("cam1", "cam2", "cam10"))
 
     def change(meta: dict) -> None:
-        meta.update(camera_angle_x=np.pi / 2, ply_file_path="cloud.ply")
+        meta.update(ply_file_path="cloud.ply")
         single = meta["frames"]
         meta["frames"] = []
         for frame in single:
-            del frame["fl_x"], frame["fl_y"]
             folder = frame["file_path"].removesuffix(".png")
             meta["frames"] += [frame | {"file_path": f"{folder}/{t:04d}.png"} for t in range(COUNT)]
 
@@ -389,24 +340,9 @@ def test_nerfstudio__reads_a_field_of_view_all_frames_and_points(tmp_path: Path)
     PlyData([PlyElement.describe(vertex, "vertex")]).write(str(path / "cloud.ply"))
     capture = load_capture(path)
     assert capture.names == ("cam1", "cam2", "cam10")
-    np.testing.assert_allclose(capture.cameras[0].K[0, 0], WIDTH / 2)
     np.testing.assert_array_equal(capture.points, [[1, 2, 3]])
     np.testing.assert_allclose(capture.point_colors, [[1, 0, 0.2]])
     assert [image[20, 30, 0] for image in next(capture.frames()).images] == [0, 1, 2]
-
-
-def test_nerfstudio__reads_a_folder_per_frame(tmp_path: Path) -> None:
-    path = layouts.nerfstudio(tmp_path / "a")
-    for file in path.glob("*.mkv"):
-        file.unlink()
-    folder_per_frame(path, ("cam1", "cam2", "cam10"))
-    edit(
-        path,
-        lambda meta: [
-            f.update(file_path="frame000000/" + Path(f["file_path"]).name) for f in meta["frames"]
-        ],
-    )
-    assert_holds(load_capture(path), ("cam1", "cam2", "cam10"), (0, 1, 2), shift=3)
 
 
 def test_dynamic3dgs__reads_cameras(tmp_path: Path) -> None:

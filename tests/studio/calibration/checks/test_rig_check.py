@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.features import detect, match_views
-from morgs_mi.capture.layouts.colmap import write_colmap
-from morgs_mi.capture.lens import Lens, undistortion
 from morgs_mi.capture.points import SharedFeatures, match_capture, triangulate_points
-from morgs_mi.io.video_writer import write_video
 from morgs_mi.studio.calibration.checks.rig_check import check_rig
-from tests.scenes import textured
 from tests.scenes.textured import turned, with_cameras
 
 
@@ -153,34 +147,3 @@ def test_triangulate_points__matches_distant_views_with_their_poses(
         ends, lambda i, c: replace(c, viewmat=np.diag([1.0, -1, -1, 1]) @ c.viewmat) if i else c
     )
     assert len(triangulate_points(wrong, unmatched).points) < 0.2 * len(points.points)
-
-
-@pytest.mark.slow
-def test_check_rig__fits_with_undistortion_only(tmp_path: Path) -> None:
-    """The recorded images are distorted by OpenCV's own model; the poses fit only if the lens is
-    read.
-    """
-    planes = textured.textures()
-    k1 = -0.25
-    cameras = textured.rig(4)
-    for camera in cameras:
-        rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float64)
-        K = camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-        pixels = np.stack([columns, rows], -1).reshape(-1, 1, 2)
-        straight = (
-            cv2.undistortPoints(pixels, K, np.array([k1, 0, 0, 0]), P=K)
-            .reshape(*rows.shape, 2)
-            .astype(np.float32)
-        )
-        image = cv2.remap(
-            textured.render(camera, planes), straight[..., 0], straight[..., 1], cv2.INTER_CUBIC
-        )
-        write_video(tmp_path / f"{camera.name}.mkv", [image], 30)
-    errors = []
-    for lens in (Lens("SIMPLE_RADIAL", (k1,)), Lens()):
-        write_colmap(tmp_path / "sparse", cameras, lenses=[lens] * 4)
-        capture = load_capture(tmp_path)
-        errors.append(check_rig(capture, match_capture(capture)).error)
-    assert undistortion(cameras[0], Lens("SIMPLE_RADIAL", (k1,))) is not None
-    assert errors[0] < 0.1
-    assert errors[1] > 5 * errors[0]
