@@ -23,7 +23,7 @@ from morgs_mi.studio.synth.disturbances import (
     save_disturbances,
     undistorted,
 )
-from morgs_mi.studio.synth.path_tracer import PathTracer, srgb_bytes
+from morgs_mi.studio.synth.path_tracer import PathTracer
 from morgs_mi.studio.synth.scene import Light, Object, Rig, Scene, load_scene, translate
 from morgs_mi.studio.synth.shapes import box
 from morgs_mi.studio.synth.synth_config import SynthConfig
@@ -219,19 +219,6 @@ def test_synthesize__refuses_a_lens_that_folds_its_corners(tmp_path: Path) -> No
             tmp_path / "clip",
             replace(SIZE, cameras=8, disturbances=Disturbances(distortion=0.5)),
         )
-
-
-@pytest.mark.slow
-def test_light_of_rows__agrees_with_the_image_of_the_sensor() -> None:
-    """All rows without a lens are the image of Mitsuba's sensor up to sampling noise."""
-    scene = load_scene("spheres")
-    tracer = PathTracer(scene)
-    camera = scene.rig.cameras(2, 64, 48)[1]
-    expected = tracer.render(camera, 100, 1)
-    pixels = srgb_bytes(tracer.light_of_rows(camera, np.arange(48), 100, 2, None))
-    assert psnr(pixels, expected) > 38
-    some = srgb_bytes(tracer.light_of_rows(camera, np.arange(10, 20), 100, 3, None))
-    assert psnr(some, expected[10:20]) > 38
 
 
 def test_synthesize__checks_a_scene_at_all_times_that_are_recorded(tmp_path: Path) -> None:

@@ -49,16 +49,6 @@ def surface(body: Body, times: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_draw_scene__is_determined_by_the_seed(scenes):
-    for seed in (0, 7):
-        again = draw_scene(seed)
-        assert (again.rig, again.recording) == (scenes[seed].rig, scenes[seed].recording)
-        assert list(again.bodies) == list(scenes[seed].bodies)
-        for name, body in again.bodies.items():
-            np.testing.assert_array_equal(body.pose(0.3), scenes[seed].bodies[name].pose(0.3))
-
-
-@pytest.mark.slow
 def test_draw_scene__differs_between_seeds(scenes):
     assert len({scene.rig for scene in scenes}) == NUM_SEEDS
     assert len({tuple(scene.bodies) for scene in scenes}) > 0.9 * NUM_SEEDS
@@ -162,12 +152,6 @@ def test_synthesize__records_a_random_scene_as_its_seed_determines(clip):
         recording.spp,
     ]
     assert_close(settings["noise"], recording.noise, rtol=1e-9)
-    for index in range(recording.num_cameras):
-        truth = load_truth(clip / "truth", f"cam{index:02d}", 1)
-        assert (truth.ids >= 0).all()
-        assert 0.005 < truth.mask.mean() < 0.4
-        assert (np.linalg.norm(truth.motion, axis=-1)[truth.mask] > 0).any()
-        assert (truth.motion[~truth.mask] == 0).all()
 
 
 @pytest.mark.slow

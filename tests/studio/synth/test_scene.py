@@ -94,14 +94,6 @@ def test_rig__test_view_is_at_the_centre():
         assert_close(camera.project(np.array([0, 0.8, 0]))[0], [160, 120], atol=1e-9)
 
 
-def test_load_scene__accepts_any_file_path(tmp_path):
-    (tmp_path / "mine.py").write_text(
-        "from morgs_mi.studio.synth.scene import Scene\n\n\ndef build(seed):\n    return "
-        "Scene('mine', {}, {})\n"
-    )
-    assert load_scene(tmp_path / "mine.py").name == "mine"
-
-
 @pytest.mark.parametrize(
     ("code", "message"),
     [
