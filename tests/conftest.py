@@ -5,6 +5,8 @@ textured planes.
 from __future__ import annotations
 
 import json
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import mitsuba as mi
@@ -33,6 +35,16 @@ def llvm_variant():
     mi.set_variant("llvm_ad_rgb")
     yield
     mi.set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture
+def heeds_interrupts() -> Iterator[None]:
+    """Python's handler of SIGINT, which a shell ignores for the processes that it starts in the
+    background.
+    """
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, handler)
 
 
 @pytest.fixture

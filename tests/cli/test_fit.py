@@ -7,7 +7,7 @@ import shlex
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import astuple
 from pathlib import Path
 
@@ -270,16 +270,6 @@ def test_fit__refuses_to_leave_fewer_than_32_pixels(
         .height
         == 32
     )
-
-
-@pytest.fixture
-def heeds_interrupts() -> Iterator[None]:
-    """Python's handler of SIGINT, which a shell ignores for the processes that it starts in the
-    background.
-    """
-    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, handler)
 
 
 @pytest.mark.slow

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import struct
 import tracemalloc
@@ -72,13 +71,6 @@ def png(width: int, height: int) -> bytes:
     )
 
 
-def jpeg(width: int, height: int) -> bytes:
-    data = bytearray(cv2.imencode(".jpg", np.zeros((16, 16, 3), np.uint8))[1].tobytes())
-    at = data.index(b"\xff\xc0")
-    data[at + 5 : at + 9] = struct.pack(">HH", height, width)
-    return bytes(data)
-
-
 def large_exr(path: Path) -> None:
     write_exr(path, {"a": np.zeros((5, 7))})
     window = b"box2i\0" + struct.pack("<I4i", 16, 0, 0, 6, 4)
@@ -127,11 +119,6 @@ CASES = {
         npy("(6,)", "'<,4'"),
         "expected a NumPy array, got a broken file",
     ),
-    "npy of no bytes and many": (
-        read_array,
-        npy(f"({10**30},)", "'|V0'"),
-        "expected a NumPy array, got a broken file",
-    ),
     "npz in place of npy": (
         read_array,
         npz(npy("(6,)")),
@@ -169,11 +156,6 @@ CASES = {
         read_json,
         '"é"'.encode("latin-1"),
         "expected text in UTF-8, got other bytes",
-    ),
-    "npy of more numbers": (
-        read_array,
-        npy("(5,)"),
-        r"its header claims float64 \(5,\), but 48 bytes follow",
     ),
     "TOML of many rows": (
         read_toml,
@@ -236,11 +218,6 @@ CASES = {
         png(30000, 30000),
         "0.png: expected content .* got a claim of 30000x30000 pixels",
     ),
-    "JPEG of many pixels": (
-        image,
-        jpeg(30000, 30000),
-        "0.png: expected content .* got a claim of 30000x30000 pixels",
-    ),
 }
 
 
@@ -292,12 +269,6 @@ def test_array_names__lists_an_archive_or_names_a_broken_one(tmp_path: Path) -> 
     (tmp_path / "a.npz").write_bytes(b"PK")
     with pytest.raises(ValueError, match=r"a.npz: expected a NumPy archive, got a broken file"):
         array_names(tmp_path / "a.npz")
-
-
-def test_read_json__inverts_dumps(tmp_path: Path) -> None:
-    value = {"a": [1, 2.5, None, {"é": [[]]}]}
-    (tmp_path / "a.json").write_text(json.dumps(value))
-    assert read_json(tmp_path / "a.json") == value
 
 
 def test_readers__accept_images_of_one_colour(tmp_path: Path) -> None:

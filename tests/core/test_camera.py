@@ -134,9 +134,7 @@ def test_camera__copies_its_matrices():
     ("change", "message"),
     [
         ({"near": np.nan}, r"`near` must be a number in \[1e-30, inf\), got nan"),
-        ({"near": np.inf}, "`near` must be a number"),
         ({"near": 0}, "`near` must be a number"),
-        ({"near": "1"}, "`near` must be a number"),
         ({"delay": 1.5}, r"`delay` must be a number in \[-1, 1\], got 1.5"),
         ({"readout": np.nan}, r"`readout` must be a number in \[-1, 1\], got nan"),
         ({"width": 8.5}, "at least 1x1 in integers, got 8.5x16"),
@@ -153,10 +151,6 @@ def test_camera__copies_its_matrices():
             "the pose must be finite, with numbers of at most 1e\\+12",
         ),
         ({"viewmat": np.zeros((4, 4))}, "the axes must be a right-handed orthonormal frame, got"),
-        (
-            {"viewmat": np.diag([0.0, 0, 0, 1])},
-            "the axes must be a right-handed orthonormal frame, got",
-        ),
         ({"viewmat": np.diag([2.0, 2, 2, 1]) @ VIEWMAT}, "undo any scaling or mirroring"),
         ({"viewmat": np.diag([-1.0, 1, 1, 1]) @ VIEWMAT}, "undo any scaling or mirroring"),
         (

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import inspect
 import re
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,7 @@ import pytest
 from morgs_mi.core import documentation
 from morgs_mi.core.config_values import config_toml
 from morgs_mi.core.documentation import documented, field_docs, page, with_pages
-from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.method.motion_config import MotionConfig
 
 ROOT = Path(__file__).parents[2]
 SOURCES = sorted((ROOT / "morgs_mi").rglob("*.py"))
@@ -74,15 +72,6 @@ Fields:
     assert Plant.__doc__ == inspect.getdoc(Plant) == Plant(roots=1).__doc__ == expected
 
 
-@pytest.mark.parametrize(
-    "config_type", [StreamConfig, FitConfig, MotionConfig, type(FitConfig().density)]
-)
-def test_documented__lists_every_setting(config_type: type) -> None:
-    text = inspect.getdoc(config_type) or ""
-    for setting in fields(config_type):
-        assert re.search(rf"^    {setting.name} = .+: .*\w", text, re.MULTILINE), setting.name
-
-
 def test_page__is_a_path_in_the_checkout() -> None:
     assert page("flow") == "docs/flow.md"
 
@@ -129,12 +118,7 @@ def test_page__gives_every_page_that_a_message_names(
 
 @pytest.mark.slow
 def test_page__exists_for_every_call() -> None:
-    calls = [
-        node.args[0]
-        for path in SOURCES
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "page"
-    ]
-    names = {arg.value for arg in calls if isinstance(arg, ast.Constant)}
+    text = "\n".join(path.read_text(encoding="utf-8") for path in SOURCES)
+    names = set(re.findall(r"\bpage\(['\"]([\w/]+)", text))
     assert len(names) > 4
     assert [name for name in sorted(names) if not (ROOT / "docs" / f"{name}.md").is_file()] == []

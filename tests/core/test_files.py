@@ -14,12 +14,12 @@ from morgs_mi.core.files import atomic_folder, atomic_path, locked_folder, write
 from tests.scenes.full_disk import files_end_at
 
 
-def tree(path: Path) -> dict[str, str | None]:
-    """Return the text of every file below `path` by its name, hidden ones too, and None for
+def tree(path: Path) -> dict[str, bytes | None]:
+    """Return the content of every file below `path` by its name, hidden ones too, and None for
     folders.
     """
     return {
-        str(p.relative_to(path)): p.read_text() if p.is_file() else None
+        str(p.relative_to(path)): p.read_bytes() if p.is_file() else None
         for p in sorted(path.rglob("*"))
     }
 
@@ -44,7 +44,7 @@ def test_atomic_path__appears_at_the_end_and_replaces_the_old(
         assert {
             name: text for name, text in tree(tmp_path).items() if not name.startswith(".")
         } == old_tree
-    assert tree(tmp_path) == ({"x": "new"} if kind == "file" else {"x": None, "x/a": "new"})
+    assert tree(tmp_path) == ({"x": b"new"} if kind == "file" else {"x": None, "x/a": b"new"})
 
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
@@ -130,12 +130,12 @@ def test_atomic_folder__removes_partial_output_of_killed_processes(tmp_path: Pat
     gone.wait()
     for number in (os.getpid(), gone.pid):
         write(tmp_path / f".partial-{number}-x", "folder", "half")
-    others = {f".partial-{os.getppid()}-x": "", f".partial-{os.getpid()}-y-x": ""}
+    others = {f".partial-{os.getppid()}-x": b"", f".partial-{os.getpid()}-y-x": b""}
     for name in others:
         (tmp_path / name).touch()
     with atomic_folder(tmp_path / "x", "test()") as partial:
         (partial / "b").touch()
-    assert tree(tmp_path) == others | {"x": None, "x/b": ""}
+    assert tree(tmp_path) == others | {"x": None, "x/b": b""}
 
 
 def test_write_json__follows_a_link(tmp_path: Path) -> None:
@@ -158,7 +158,7 @@ def test_atomic_folder__replaces_nothing_not_even_a_folder_created_meanwhile(
         pass
     with pytest.raises(OSError, match=r"y, .*not empty"), atomic_folder(tmp_path / "y", "test()"):
         write(tmp_path / "y", "folder", "theirs")
-    assert tree(tmp_path) == {"x": None, "x/a": "old", "y": None, "y/a": "theirs"}
+    assert tree(tmp_path) == {"x": None, "x/a": b"old", "y": None, "y/a": b"theirs"}
 
 
 def test_atomic_folder__reports_a_failed_file_in_one_sentence(tmp_path: Path) -> None:
@@ -196,7 +196,7 @@ def test_locked_folder__refuses_a_second_writer_until_the_first_has_ended(tmp_pa
         (out / "a").write_text("whole")
     with locked_folder(out, "test()"):
         pass
-    assert tree(tmp_path / "new") == {"out": None, "out/a": "whole"}
+    assert tree(tmp_path / "new") == {"out": None, "out/a": b"whole"}
 
 
 def test_locked_folder__is_free_after_its_writer_was_killed(tmp_path: Path) -> None:
@@ -238,4 +238,4 @@ def test_locked_folder__reports_a_folder_that_cannot_be_written(
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match=sentence):
         locked_folder(tmp_path / folder, "test()").__enter__()
-    assert tree(tmp_path) == {"file": ""}
+    assert tree(tmp_path) == {"file": b""}

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import pytest
 
@@ -76,16 +76,6 @@ def test_interrupts_raised__leaves_other_errors_as_they_are() -> None:
     with pytest.raises(ValueError, match="other") as caught, interrupts_raised():
         raise error
     assert caught.value is error
-
-
-@pytest.fixture
-def heeds_interrupts() -> Iterator[None]:
-    """Python's handler of SIGINT, which a shell ignores for the processes that it starts in the
-    background.
-    """
-    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, handler)
 
 
 class Swallowing:

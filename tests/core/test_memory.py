@@ -1,4 +1,4 @@
-"""Copies of NumPy memory for Dr.Jit: types, alignment, and later writes. Memory that is free."""
+"""Copies of NumPy memory for Dr.Jit: types and alignment. Memory that is free."""
 
 from __future__ import annotations
 
@@ -23,18 +23,6 @@ def test_from_numpy__converts_to_the_type_in_aligned_memory(kind):
     expected = values if dr.is_tensor_v(kind) else values.ravel()
     np.testing.assert_array_equal(array, expected.astype(array.dtype))
     assert array.__array_interface__["data"][0] % 64 == 0
-
-
-def test_from_numpy__copies_before_kernels_read():
-    values = np.zeros(1_000_000, np.float32)
-    array = from_numpy(mi.Float, values)
-    busy = dr.sin(dr.arange(mi.Float, 4_000_000))
-    dr.eval(busy)  # the kernels after it wait
-    doubled = 2 * array
-    dr.eval(doubled)
-    values[:] = 7
-    del array
-    assert not np.asarray(doubled).any()
 
 
 def test_from_numpy__accepts_empty_arrays_and_lists():

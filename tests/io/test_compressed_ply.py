@@ -10,7 +10,6 @@ from plyfile import PlyData, PlyElement
 
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.compressed_ply import read_compressed_ply, write_compressed_ply
-from morgs_mi.io.ply import write_ply
 from tests.assertions import assert_close
 from tests.scenes.changing_splats import splats
 
@@ -161,9 +160,3 @@ def test_read_compressed_ply__names_a_truncated_file(tmp_path, size):
     path.write_bytes(path.read_bytes()[:size])
     with pytest.raises(ValueError, match=r"g\.compressed\.ply: expected a complete PLY file"):
         read_compressed_ply(path)
-
-
-def test_read_compressed_ply__names_an_uncompressed_file(tmp_path):
-    write_ply(tmp_path / "g.ply", splats())
-    with pytest.raises(ValueError, match="it has no element chunk"):
-        read_compressed_ply(tmp_path / "g.ply")
