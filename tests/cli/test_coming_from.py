@@ -9,6 +9,7 @@ import os
 import re
 import shlex
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from morgs_mi.playback.visualise import write_png
 from morgs_mi.studio.synth.synth_config import SynthConfig
 from morgs_mi.studio.synth.synthesize import synthesize
 from tests.quick import SHORT_FITS
+from tests.scenes.captures import transforms
 from tests.scenes.changing_splats import splats
 
 PAGE = (Path(__file__).parents[2] / "docs/coming-from.md").read_text(encoding="utf-8")
@@ -97,18 +99,12 @@ def stream3dgs(recording: Capture) -> None:
 
 def nerfstudio(recording: Capture) -> None:
     first = next(iter(recording.frames()))
-    entries = []
+    cameras = []
     for i, (camera, image) in enumerate(zip(recording.cameras, first.images, strict=True), start=1):
         for folder in ("images", "images_2"):
             write_png(Path(f"nerfstudio/SCENE/{folder}/frame_{i:05d}.png"), image)
-        pose = np.linalg.inv(np.asarray(camera.viewmat)) @ np.diag([1, -1, -1, 1])
-        entries.append(
-            {"file_path": f"images/frame_{i:05d}.png", "transform_matrix": pose.tolist()}
-        )
-    (fx, _, cx), (_, fy, cy), _ = recording.cameras[0].K.tolist()
-    intrinsics = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": 320, "h": 240}
-    meta = {"camera_model": "OPENCV", **intrinsics, "frames": entries}
-    Path("nerfstudio/SCENE/transforms.json").write_text(json.dumps(meta))
+        cameras.append(replace(camera, name=f"images/frame_{i:05d}.png"))
+    transforms(Path("nerfstudio/SCENE"), cameras)
 
 
 def vggt(recording: Capture) -> None:

@@ -16,33 +16,16 @@ import pytest
 
 from morgs_mi import cli
 from morgs_mi.codec.container import StreamWriter
-from morgs_mi.io.exr import read_exr
 from tests.cli.commands import assert_one_sentence, assert_refused
+from tests.core.test_files import tree
 from tests.quick import OPTIONS
 from tests.scenes.noise_capture import lengthen_clip, rig
 
 
-# Each breaks the capture and returns parts of the expected message.
-def no_capture(path: Path) -> tuple[str, ...]:
-    path.rename(path.with_name("elsewhere"))
-    return "expected a capture folder", str(path)
-
-
-def no_video(path: Path) -> tuple[str, ...]:
-    (path / "cam1.mkv").write_bytes(b"no video" * 100)
-    return "cam1.mkv", "truncated or no video"
-
-
-def broken_json(path: Path) -> tuple[str, ...]:
-    (path / "capture.json").write_text("{")
-    return ("capture.json: expected JSON",)
-
-
-@pytest.mark.parametrize("spoil", [no_capture, no_video, broken_json])
-def test_main__names_what_is_broken_in_a_capture(capture: Path, tmp_path: Path, run, spoil) -> None:
-    parts = spoil(capture)
-    for args in (("info", capture), ("fit", capture, tmp_path / "out", *OPTIONS)):
-        assert_refused(run(*args), *parts)
+def test_main__names_a_missing_capture(tmp_path: Path, run) -> None:
+    path = tmp_path / "nowhere"
+    for args in (("info", path), ("fit", path, tmp_path / "out", *OPTIONS)):
+        assert_refused(run(*args), "expected a capture folder", str(path))
     assert not (tmp_path / "out").exists()
 
 
@@ -62,9 +45,10 @@ def test_main__leaves_cameras_out(capture: Path, tmp_path: Path, run) -> None:
     assert run("fit", capture, tmp_path / "out", *OPTIONS, "--without", "cam2", "--resume")[0] == 0
     status, out, _ = run("eval", tmp_path / "out", "--json", "-")
     assert (status, list(json.loads(out)["views"])) == (0, ["cam0", "cam1"])
-    refused = "--without must name cameras of cam0, cam1, cam2, got cam7."
-    for args in (("info", capture), ("fit", capture, tmp_path / "other", *OPTIONS)):
-        assert_refused(run(*args, "--without", "cam7", "cam2"), refused)
+    assert_refused(
+        run("info", capture, "--without", "cam7"),
+        "--without must name cameras of cam0, cam1, cam2, got cam7.",
+    )
 
 
 @pytest.mark.slow
@@ -83,8 +67,6 @@ def test_main__leaves_out_a_camera_without_a_clip(
 @pytest.mark.parametrize(
     ("args", "parts"),
     [
-        (("synth", "spheres", "OUT", "--cameras", 1), ("--cameras must be at least 2, got 1",)),
-        (("synth", "spheres", "OUT", "--frames", 0), ("--frames must be at least 1, got 0",)),
         (
             ("synth", "spheres", "OUT", "--width", 3),
             ("--width must be at least 2 and a multiple of 2, got 3",),
@@ -93,16 +75,7 @@ def test_main__leaves_out_a_camera_without_a_clip(
             ("synth", "spheres", "OUT", "--fps", 1e9),
             ("--fps must be a number in (0, 1000], got 1000000000.0",),
         ),
-        (
-            ("synth", "spheres", "OUT", "--spp", 9_000_000_000),
-            ("--spp must be a number in [1, 1e6], got 9000000000",),
-        ),
-        (
-            ("synth", "spheres", "OUT", "--noise", 2),
-            ("--noise must be at least 0 and below 1, got 2",),
-        ),
         (("demo", "OUT", "--cameras", 1), ("--cameras must be at least 2, got 1",)),
-        (("demo", "OUT", "--seed", -1), ("--seed must be at least 0, got -1",)),
         (
             ("demo", "OUT", "--config", "nowhere.toml"),
             ("nowhere.toml: expected a TOML file with settings",),
@@ -213,37 +186,23 @@ def test_main__writes_nothing_into_a_capture(
     assert tree(capture) == old_tree
 
 
-def tree(path: Path) -> dict[str, bytes | None]:
-    """Return the content of every file below `path` by its name, None for folders."""
-    return {
-        str(p.relative_to(path)): p.read_bytes() if p.is_file() else None
-        for p in sorted(path.rglob("*"))
-    }
-
-
-def test_main__reports_a_full_standard_output_in_one_sentence(
-    run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with open("/dev/full", "w") as full:
-        monkeypatch.setattr(sys, "stdout", full)
-        assert run("fit", "--print-config")[::2] == (
-            1,
-            "standard output: No space left on device.\n",
-        )
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("args", [("info", "--no-check"), ("fit", *OPTIONS)])
 def test_main__prints_any_path_to_an_ascii_or_a_closed_standard_output(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, args: tuple[str, ...]
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    name, *options = args
-    places = [str(capture.rename(tmp_path / "撮影")), *([] if name == "info" else ["出力"])]
-    command = [sys.executable, "-m", "morgs_mi", name, *places, *options]
+    command = [
+        sys.executable,
+        "-m",
+        "morgs_mi",
+        "fit",
+        str(capture.rename(tmp_path / "撮影")),
+        "出力",
+    ]
+    command += OPTIONS
     monkeypatch.setenv("PYTHONIOENCODING", "ascii")
     result = subprocess.run(command, capture_output=True, cwd=tmp_path, check=False)
     assert (result.returncode, result.stderr) == (0, b"")
-    assert (rb"\u64ae\u5f71" if args[0] == "info" else rb"\u51fa\u529b") in result.stdout
+    assert rb"\u51fa\u529b" in result.stdout
     closed = subprocess.run(
         command, stderr=-1, preexec_fn=lambda: os.close(1), cwd=tmp_path, check=False
     )
@@ -287,12 +246,10 @@ def test_main__reports_an_unexpected_error_in_one_sentence(capture: Path, run, m
     ("damage", "parts"),
     [
         (lambda data: b"", ("the header is missing",)),
-        (lambda data: b"not a stream", ("expected a stream that starts with",)),
         (
             lambda data: data[:-75],
             ("truncated or still written", "packet 2", "2 packets before it are intact"),
         ),
-        (lambda data: data[:-5] + b"\1" * 5, ("the bytes are damaged",)),
     ],
 )
 def test_main__names_what_is_broken_in_a_stream(
@@ -351,23 +308,10 @@ def test_main__goes_from_a_scene_to_an_evaluation(tmp_path: Path, run) -> None:
     status, output, _ = run("eval", out, *more)
     assert status == 0
     assert "held-out view cam00" in output
-    assert {path.name for path in (tmp_path / "figures").iterdir()} == {
-        "slice.png",
-        "motion.png",
-        "confidence.png",
-    }
-    assert 0 < result["motion_3d"]["num_gaussians"] <= 600
-    status, _, error = run("eval", out, "--lpips", tmp_path / "none.onnx")
-    assert (status, "expected an ONNX file, found none" in error) == (1, True)
+    assert len(list((tmp_path / "figures").iterdir())) == 3
     assert json.loads((tmp_path / "eval.json").read_text())["psnr"] == result["psnr"]
 
     assert run("render", out, "--camera", "cam02")[0] == 0
     video = cv2.VideoCapture(str(out / "cam02.mp4"))
     assert [video.read()[1].shape for _ in range(3)] == [(48, 64, 3)] * 3
     assert not video.read()[0]
-    assert run("render", out, tmp_path / "exr", "--camera", 0)[0] == 0
-    channels = read_exr(tmp_path / "exr" / "0002.exr")
-    assert set(channels) == {"R", "G", "B", "motion.X", "motion.Y", "depth.Y", "confidence.Y"}
-    both = ("--channels", "color", "depth")
-    assert run("render", out, tmp_path / "png", "--camera", 0, *both)[0] == 0
-    assert cv2.imread(str(tmp_path / "png" / "0002.png")).shape == (48, 132, 3)

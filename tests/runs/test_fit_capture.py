@@ -12,7 +12,6 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 from math import ceil
 from pathlib import Path
 from typing import Any
@@ -39,7 +38,7 @@ from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, wi
 from tests.scenes.captures import colmap
 from tests.scenes.coded_clip import history
 from tests.scenes.recording import CONFIG, FRAMES, Recording, recording, write_recording
-from tests.scenes.short_clip import Clip, Piece
+from tests.scenes.short_clip import Clip, pieces_of
 
 # About what the fit takes here; on a slower machine all kills come early.
 SECONDS = 0.8
@@ -116,10 +115,15 @@ def test_stream_capture__shows_a_provisional_first_frame(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A stream beside the one that is written has a frame for each round of density control, and is
-    removed.
+    removed before the result is written.
     """
     shown = []
     show = Files.show
+    write = StreamWriter.write
+
+    def written(writer: StreamWriter, packet: Packet) -> int:
+        assert "provisional" in writer.path.name or not (tmp_path / PROVISIONAL).exists()
+        return write(writer, packet)
 
     def spy(files: Files, keyframe: Packet) -> None:
         show(files, keyframe)
@@ -129,6 +133,7 @@ def test_stream_capture__shows_a_provisional_first_frame(
         assert not StreamReader(tmp_path / "stream.morgs").index()
 
     monkeypatch.setattr(Files, "show", spy)
+    monkeypatch.setattr(StreamWriter, "write", written)
     fit = replace(
         CONFIG.fit, num_gaussians=80, first_frame_steps=20, density=DensityConfig(rounds=3)
     )
@@ -158,25 +163,6 @@ def test_stream_capture__goes_on_without_a_provisional_first_frame_that_has_no_r
     assert message.startswith(
         f"{tmp_path / PROVISIONAL}: a provisional first frame cannot be written"
     )
-
-
-@pytest.mark.slow
-def test_stream_capture__removes_the_provisional_first_frame_before_it_writes_the_result(
-    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write = StreamWriter.write
-    shown = []
-
-    def spy(writer: StreamWriter, packet: Packet) -> int:
-        is_provisional = "provisional" in writer.path.name
-        assert is_provisional or not (tmp_path / PROVISIONAL).exists()
-        shown.append(is_provisional)
-        return write(writer, packet)
-
-    monkeypatch.setattr(StreamWriter, "write", spy)
-    stream_capture(recording(), tmp_path, CONFIG)
-    assert shown[0]
-    assert_same(tmp_path, whole)
 
 
 def other_fit(out: Path, push: Callable[..., Any] | None = None) -> None:
@@ -403,17 +389,12 @@ def test_stream_capture__does_not_resume_another_fit(
 
 def test_stream_capture__does_not_resume_a_damaged_fit(whole: Path, tmp_path: Path) -> None:
     out = interrupted(whole, tmp_path / "out", len(stream_of(whole)))
-    (out / "report.json").write_text("{")
-    with pytest.raises(ValueError, match=r"report\.json: expected JSON, got a broken file"):
-        stream_capture(recording(), out, CONFIG, resume=True)
-    (out / "report.json").unlink()
+    report = (out / "report.json").rename(out / "moved")
     with pytest.raises(
         ValueError, match=r"report\.json: expected the report of the fit, got none; start again"
     ):
         stream_capture(recording(), out, CONFIG, resume=True)
-    (out / "report.json").write_text('{"frames": []}')
-    with pytest.raises(ValueError, match=r"report\.json: expected the rows of 6 frames, got 0"):
-        stream_capture(recording(), out, CONFIG, resume=True)
+    report.rename(out / "report.json")
     damaged = bytearray(stream_of(whole))
     damaged[len(damaged) // 2] ^= 1
     (out / "stream.morgs").write_bytes(damaged)
@@ -521,12 +502,9 @@ def test_stream_capture__resumes_a_stream_whose_header_has_a_path(
     assert json.loads((out / "capture.json").read_text())["capture"] == str(Path("noise").resolve())
 
 
-@pytest.mark.parametrize("text", ["[]", "[" * 100_000])
-def test_stream_capture__resumes_beside_a_hostile_description(
-    whole: Path, tmp_path: Path, text: str
-) -> None:
+def test_stream_capture__resumes_beside_a_hostile_description(whole: Path, tmp_path: Path) -> None:
     out = interrupted(whole, tmp_path / "out", len(stream_of(whole)) * 3 // 4)
-    (out / "capture.json").write_text(text)
+    (out / "capture.json").write_text("[]")
     stream_capture(recording(), out, CONFIG, resume=True)
     assert_same(out, whole)
 
@@ -534,7 +512,8 @@ def test_stream_capture__resumes_beside_a_hostile_description(
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[" * 100_000, "expected JSON, got a broken file"),
+        ("{", "expected JSON, got a broken file"),
+        ('{"frames": []}', "expected the rows of 6 frames, got 0"),
         ("[]", "expected the report of the fit, got a broken one"),
         ('{"frames": [{"seconds": "many"}]}', "expected the report of the fit, got a broken one"),
         (
@@ -556,16 +535,7 @@ def test_stream_capture__refuses_a_hostile_report(
 def test_stream_capture__resumes_hostile_streams_or_refuses_them_in_one_sentence(
     whole: Path, tmp_path: Path
 ) -> None:
-    data = stream_of(whole)
-    index = TRAILER.unpack(data[-TRAILER.size :])[0]
-    ends = [*(offset for *_, offset in StreamReader(whole / "stream.morgs").index()), index]
-    packets = list(StreamReader(whole / "stream.morgs"))
-    pieces = [Piece(-1, 0, 0, 12), Piece(0, 0, 12, ends[0])]
-    pieces += [
-        Piece(p.kind, p.frame, a, b) for p, (a, b) in zip(packets, pairwise(ends), strict=True)
-    ]
-    pieces.append(Piece(3, 0, index, len(data)))
-    clip = Clip(data, pieces, {})
+    clip = Clip(stream_of(whole), pieces_of(stream_of(whole)), {})
     out = tmp_path / "out"
     for case in range(12):
         forge = (damaged, with_forged_bytes, with_forged_packets, with_forged_header)[case % 4]
@@ -581,24 +551,16 @@ def test_stream_capture__resumes_hostile_streams_or_refuses_them_in_one_sentence
         assert refusal.startswith(f"{out}/") or StreamReader(out / "stream.morgs").seek(FRAMES - 1)
 
 
-@pytest.mark.parametrize("link", ["", "folder", "file"])
-def test_stream_capture__does_not_write_into_a_capture(tmp_path: Path, link: str) -> None:
+def test_stream_capture__does_not_write_through_a_link_into_a_capture(tmp_path: Path) -> None:
     capture = colmap(tmp_path / "clip")
-    out = tmp_path / "clip"
     (capture / "capture.json").write_text("{}")
-    old_files = sorted(capture.rglob("*"))
-    if link == "folder":
-        out = tmp_path / "out"
-        out.symlink_to(capture / "videos")
-    elif link == "file":
-        out = tmp_path / "out"
-        out.mkdir()
-        (out / "capture.json").symlink_to(capture / "capture.json")
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "capture.json").symlink_to(capture / "capture.json")
     with pytest.raises(
         ValueError, match=rf"an output outside of captures, .* in the capture {capture}; choose"
     ):
         stream_capture(recording(), out, CONFIG)
-    assert sorted(capture.rglob("*")) == old_files
     assert (capture / "capture.json").read_text() == "{}"
 
 
@@ -653,23 +615,6 @@ def test_stream_capture__stores_refined_cameras_and_resumes_with_them(tmp_path_f
     assert stream_of(tmp_path) == whole
 
 
-@pytest.mark.slow
-def test_stream_capture__resumes_where_cameras_have_delays(tmp_path):
-    reading = ReadConfig(offset={"cam1": 0.25, "cam2": -0.5})
-    capture = load_capture(write_recording(tmp_path / "capture"), reading=reading)
-    assert [camera.delay for camera in capture.cameras] == [0, -0.25, 0.5]
-    out = tmp_path / "out"
-    stream_capture(capture, out, CONFIG)
-    stream = StreamReader(out / "stream.morgs")
-    whole = stream_of(out)
-    for frame in (1, 3):
-        end = next(offset for _, index, offset in stream.index() if index == frame)
-        (out / "stream.morgs").write_bytes(whole[:end])
-        stream_capture(capture, out, CONFIG, resume=True)
-        assert stream_of(out) == whole
-    assert [c.delay for c in open_stream_capture(stream, None, [0, 1]).cameras] == [0, -0.25, 0.5]
-
-
 @pytest.mark.parametrize(
     "distortion", [[1, 2], {"cam1": [0.1]}, {"cam1": ["x", "y"]}, {"cam1": None}]
 )
@@ -686,31 +631,35 @@ def test_as_fitted__refuses_broken_distortions(tmp_path, distortion):
 
 
 @pytest.mark.slow
-def test_stream_capture__resumes_with_the_exposures_of_the_report(tmp_path):
+def test_stream_capture__resumes_with_delays_of_cameras_and_the_exposures_of_the_report(tmp_path):
     how = ShortFitConfig(gaussians=40, steps=4, rounds=1)
-    capture = recording(num_frames=3)
+    reading = ReadConfig(offset={"cam1": 0.25, "cam2": -0.5})
+    capture = load_capture(write_recording(tmp_path / "capture"), reading=reading)
+    delays = [0, -0.25, 0.5]
+    assert [camera.delay for camera in capture.cameras] == delays
     config = replace(CONFIG, fit=replace(CONFIG.fit, exposure="on", short_fits=how))
-    stream_capture(capture, tmp_path, config)
-    stream = StreamReader(tmp_path / "stream.morgs")
-    whole = stream_of(tmp_path)
-    report = report_of(tmp_path)
+    out = tmp_path / "out"
+    stream_capture(capture, out, config)
+    stream = StreamReader(out / "stream.morgs")
+    assert [c.delay for c in open_stream_capture(stream, None, [0, 1]).cameras] == delays
+    whole = stream_of(out)
+    report = report_of(out)
     assert all(len(row["exposures"]) == len(capture.train_views) for row in report["frames"])
-    (tmp_path / "stream.morgs").write_bytes(whole[: stream.index()[-1][2]])
-    stream_capture(capture, tmp_path, config, resume=True)
-    assert stream_of(tmp_path) == whole
-    assert [row["exposures"] for row in report_of(tmp_path)["frames"]] == [
-        r["exposures"] for r in report["frames"]
-    ]
+    for frame in (1, 3):
+        end = next(offset for _, index, offset in stream.index() if index == frame)
+        (out / "stream.morgs").write_bytes(whole[:end])
+        stream_capture(capture, out, config, resume=True)
+        assert stream_of(out) == whole
+        assert report_of(out)["frames"] == report["frames"]
 
 
 def test_stream_metadata__names_the_calibration_that_cameras_are_refined_from():
     capture = recording()
-    other = replace(
-        capture.cameras[0],
-        K=capture.cameras[0].K * np.array([[1.01, 1, 1], [1, 1.01, 1], [1, 1, 1]]),
+    first, *others = capture.cameras
+    wider = replace(first, K=np.diag([1.01, 1.01, 1]) @ first.K)
+    frame = next(capture.partial_frames())
+    same, different = (
+        stream_metadata(c, frame, refined_config())["fingerprint"]
+        for c in (capture, replace(capture, cameras=(wider, *others)))
     )
-    others = replace(capture, cameras=(other, *capture.cameras[1:]))
-    first = next(capture.partial_frames())
-    config = refined_config()
-    same, different = (stream_metadata(c, first, config)["fingerprint"] for c in (capture, others))
     assert same != different

@@ -136,7 +136,8 @@ def transforms(path: Path, cameras: list[Camera], k1: float = 0.0) -> None:
         K = camera.K
         focal = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
         entries.append({"file_path": camera.name, "transform_matrix": to_world.tolist(), **focal})
-    meta = {"camera_model": "OPENCV", "w": WIDTH, "h": HEIGHT, "k1": k1, "frames": entries}
+    size = {"w": cameras[0].width, "h": cameras[0].height}
+    meta = {"camera_model": "OPENCV", **size, "k1": k1, "frames": entries}
     (path / "transforms.json").write_text(json.dumps(meta))
 
 

@@ -29,7 +29,7 @@ EVERY = 3
 METADATA = {
     "num_frames": FRAMES,
     "config": {"render": {"eps2d": 0.3, "block_width": None}, "motion": {"learn_confidence": True}},
-    "reading": {"trim": False, "offset": {"cam00": 1}, "color": "none"},
+    "reading": {"trim": False, "offset": {"cam00": 1}},
     "downscale": 1,
     "test_view": 0,
     "train_views": [0],
@@ -76,13 +76,16 @@ def short_clip() -> Clip:
             if frame % EVERY == 0:
                 writer.write(reemitted_keyframe(states[-1]))
     data = file.getvalue()
+    return Clip(data, pieces_of(data), {state.frame: state for state in states})
+
+
+def pieces_of(data: bytes) -> list[Piece]:
+    """Return the places of the preamble and the packets of a stream."""
     pieces = [Piece(-1, 0, 0, 12)]
-    at = 12
-    while at < len(data):
+    while (at := pieces[-1].stop) < len(data):
         kind, frame, length = struct.unpack_from("<IIQ", data, at)
         pieces.append(Piece(kind, frame, at, at + PAYLOAD + length))
-        at = pieces[-1].stop
-    return Clip(data, pieces, {state.frame: state for state in states})
+    return pieces
 
 
 def sealed(payload: bytes, kind: int = 2, frame: int = 0) -> bytes:
