@@ -10,7 +10,6 @@ from io import BytesIO
 
 import pytest
 
-from morgs_mi import cli
 from morgs_mi.io.splats import read_splats
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.studio.import_frames import import_frames
@@ -58,20 +57,6 @@ def test_refuse_foreign__names_format_and_remedy_at_every_door(tmp_path, name):
             ValueError, match=rf"{name}: expected Gaussians as \.ply.*, got {kind}.*{remedy}"
         ):
             door(tmp_path / name)
-
-
-@pytest.mark.parametrize(
-    "command",
-    [("render",), ("export", "ply"), ("export", "web"), ("view", "--no-browser")],
-    ids=" ".join,
-)
-def test_commands__name_a_compressed_format(tmp_path, capsys, command):
-    (tmp_path / "a.spz").write_bytes(SPZ)
-    assert cli.main([*command, str(tmp_path / "a.spz")]) == 1
-    assert (
-        "got SPZ (Niantic's compressed format), which is not read; convert it to .ply"
-        in capsys.readouterr().err
-    )
 
 
 def test_open_stream__names_what_to_do_with_a_folder_of_gaussians(tmp_path):

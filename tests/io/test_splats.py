@@ -56,7 +56,8 @@ def test_read_splats__reads_an_uncompressed_ply(tmp_path):
             RECORD.pack(*(0,) * 3, -1, *(0,) * 10),
             "others in 1 of 1 Gaussians .size of 0.",
         ),
-        ("a.ply", b"", "expected a complete PLY file"),
+        ("a.ply", b"", "expected a complete PLY file, .* it does not begin with `ply`"),
+        ("a.ply", b"ply\nformat ascii 1.0\n", "its header does not end"),
         ("a.xyz", b"", r"name ends in .compressed.ply, .ply, .splat, got '.xyz'"),
     ],
 )

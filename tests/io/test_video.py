@@ -54,12 +54,12 @@ def test_write_video__lossy_codecs_preserve_the_rgb_order_and_most_of_the_image(
     assert 10 * np.log10(255**2 / np.mean((got - smooth_clip()) ** 2)) > 30
 
 
-def long_video(path: Path, codec: str, count: int = 160) -> Path:
+def long_video(path: Path, codec: str) -> Path:
     """Write a clip in which every frame differs; with the codec mpg2 it has frames that refer to
     later ones.
     """
     y, x = np.mgrid[:HEIGHT, :WIDTH]
-    red = (np.uint8(120 + 80 * np.sin((x + 3 * t) / 9)) for t in range(count))
+    red = (np.uint8(120 + 80 * np.sin((x + 3 * t) / 9)) for t in range(160))
     write_video(
         path, (np.stack([r, 100 + 2 * y, 90 + x], -1).astype(np.uint8) for r in red), 29.97, codec
     )

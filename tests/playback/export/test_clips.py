@@ -113,13 +113,6 @@ def test_export__refuses_a_folder_in_place_of_a_file_before_it_begins(stream, tm
     )
 
 
-def test_export_gltf__writes_selected_frames(stream, tmp_path):
-    assert (
-        run("export", "gltf", tmp_path / "stream.morgs", tmp_path / "g", "--frames", "1:4:2") == 0
-    )
-    assert [path.name for path in sorted((tmp_path / "g").iterdir())] == ["0001.glb", "0003.glb"]
-
-
 def test_flight__shows_rendered_images_and_restarts_the_clip(stream, tmp_path):
     keys = [{"time": 0, "camera": "middle"}, {"time": 0.6, "camera": "middle"}]
     (tmp_path / "still.json").write_text(json.dumps({"keys": keys}))

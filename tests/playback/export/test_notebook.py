@@ -6,7 +6,6 @@ import base64
 import html
 import re
 
-import cv2
 import numpy as np
 import pytest
 
@@ -18,13 +17,8 @@ from morgs_mi.playback.player import channel_image, render
 from morgs_mi.playback.stream_header import render_config
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.render.rasterize import rasterize
+from tests.playback.viewer.serving import decoded
 from tests.scenes.changing_splats import rig, splats, write_stream
-
-
-def decoded(png: bytes) -> np.ndarray:
-    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
-    assert image is not None
-    return image[..., ::-1]
 
 
 def test_stream_html__is_the_player_in_a_frame_without_access_to_the_notebook(tmp_path):

@@ -35,14 +35,6 @@ def test_camera_path__interpolates_its_keys_smoothly():
     assert_close(right - middle, middle - left, atol=1e-7)
 
 
-def test_camera_path__rotations_are_orthonormal():
-    path = through_cameras(ring(7), 3)
-    for time in np.linspace(0, 3, 40):
-        R = path.at(time).viewmat[:3, :3]
-        assert_close(R @ R.T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(R) > 0
-
-
 def test_through_cameras__visits_the_nearest_next_at_constant_speed():
     cameras = rig()
     path = through_cameras((cameras[0], cameras[2], cameras[1]), 2)

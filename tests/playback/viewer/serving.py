@@ -11,6 +11,9 @@ from pathlib import Path
 from threading import Thread
 from urllib.parse import urlencode, urlsplit
 
+import cv2
+import numpy as np
+
 from morgs_mi.codec.header import header_json
 from morgs_mi.core.camera import Camera
 from morgs_mi.playback.streams import open_stream
@@ -59,3 +62,10 @@ def exact(frame: int, channel: str, camera: Camera, scale: float = 10) -> str:
     """Return the path of an exact image."""
     fields = json.loads(header_json([camera], 25, {}))["cameras"][0]
     return f"exact/{frame}/{channel}?{urlencode({'camera': json.dumps(fields), 'scale': scale})}"
+
+
+def decoded(content: bytes) -> np.ndarray:
+    """Return the RGB image in a file."""
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), 1)
+    assert image is not None
+    return image[..., ::-1]

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 
-import cv2
 import numpy as np
 import pytest
 
@@ -18,7 +17,7 @@ from morgs_mi.playback.player import channel_image
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.render.rasterize import rasterize
 from tests.playback.export.pages import HEIGHT, WIDTH, Page
-from tests.playback.viewer.serving import viewing
+from tests.playback.viewer.serving import decoded, viewing
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.changing_splats import NAMES, rig, splats, write_stream
 
@@ -55,9 +54,7 @@ class Viewed(Page):
             "fetch(document.getElementById('rendering').src).then((answer) => answer.arrayBuffer())"
         )
         data = self.page.evaluate(f"{code}.then((data) => [...new Uint8Array(data)])")
-        image = cv2.imdecode(np.array(data, np.uint8), 1)
-        assert image is not None
-        return image[..., ::-1]
+        return decoded(bytes(data))
 
 
 @pytest.fixture(scope="module")

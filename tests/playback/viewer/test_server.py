@@ -36,7 +36,7 @@ from morgs_mi.playback.viewer.server import Viewer
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.studio.live.live_capture import write_images
 from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, with_forged_packets
-from tests.playback.viewer.serving import exact, get, raw, viewing
+from tests.playback.viewer.serving import decoded, exact, get, raw, viewing
 from tests.scenes import noise_capture
 from tests.scenes.changing_splats import rig, splats, write_stream
 from tests.scenes.gaussians import isotropic
@@ -97,10 +97,8 @@ def test_refusal__accepts_the_viewers_own_page(host, origin):
             "got the host 'evil.example'",
         ),
         ({"host": "localhost.evil.example"}, "got the host 'localhost.evil.example'"),
-        ({"host": "127.0.0.1.evil.example"}, "got the host"),
         ({"host": "user@localhost@evil.example"}, "got the host 'evil.example'"),
         ({}, "got the host ''"),
-        ({"host": "[evil"}, "expected a host and an origin, got '[evil'"),
         ({"host": "localhost", "origin": "http://[evil"}, "expected a host and an origin"),
         (
             {"host": "localhost", "sec-fetch-site": "cross-site", "sec-fetch-mode": "no-cors"},
@@ -296,12 +294,6 @@ def test_viewer__serves_a_provisional_first_frame_until_the_stream_has_one(tmp_p
 # --------------------------------------------------------------------------------------------------
 
 
-def decoded(content: bytes) -> np.ndarray:
-    image = cv2.imdecode(np.frombuffer(content, np.uint8), 1)
-    assert image is not None
-    return image[..., ::-1]
-
-
 def assert_image(content: bytes, gaussians, camera, channel: str) -> None:
     image = rasterize(gaussians, camera, (channel,))[channel]
     np.testing.assert_array_equal(decoded(content), channel_image(channel, np.array(image), 10))
@@ -323,38 +315,26 @@ def test_exact_images__of_a_file_of_gaussians_are_not_quantised(tmp_path):
         assert_image(get(url, exact(0, "color", rig()[0]))[1], splats(), rig()[0], "color")
 
 
+VIEW = exact(1, "color", rig()[0]).partition("?")[2]
+
+
 @pytest.mark.parametrize(
     ("path", "message"),
     [
-        ("exact/9/color", "expected a frame of the stream, got 9"),
-        ("exact/1/quats", "expected a channel of the stream, got 'quats'"),
-        (f"exact/{'9' * 5000}/color", "Exceeds the limit"),
+        (f"9/color?{VIEW}", "expected a frame of the stream, got 9"),
+        (f"1/quats?{VIEW}", "expected a channel of the stream, got 'quats'"),
+        (f"{'9' * 5000}/color?{VIEW}", "Exceeds the limit"),
+        ("1/color?", "the JSON is broken"),
+        ("1/color?camera={}", "`camera.name` is missing"),
+        ("1/color?camera=" + "9" * 5000, "the JSON must have at most 4096 bytes"),
+        ("1/color?camera=[[[[NaN]]]]", "numbers must be finite, got NaN"),
+        (exact(1, "color", rig(4096, 4097)[0])[6:], "at most 16777216 pixels"),
+        (exact(1, "color", rig()[0], float("nan"))[6:], "expected a motion above 0"),
+        (f"1/color?{VIEW.replace('near', 'far')}", "`camera.near` is missing"),
     ],
 )
-def test_exact_images__refuse_what_the_stream_has_not(url, path, message):
-    _, _, query = exact(1, "color", rig()[0]).partition("?")
-    response, content = get(url, f"{path}?{query}")
-    assert response.status == 400
-    assert message in content.decode()
-
-
-@pytest.mark.parametrize(
-    ("query", "message"),
-    [
-        ("", "the JSON is broken"),
-        ("camera={}", "`camera.name` is missing"),
-        ("camera=" + "9" * 5000, "the JSON must have at most 4096 bytes"),
-        ("camera=[[[[NaN]]]]", "numbers must be finite, got NaN"),
-        (exact(1, "color", rig(4096, 4097)[0]).partition("?")[2], "at most 16777216 pixels"),
-        (exact(1, "color", rig()[0], float("nan")).partition("?")[2], "expected a motion above 0"),
-        (
-            exact(1, "color", rig()[0]).partition("?")[2].replace("near", "far"),
-            "`camera.near` is missing",
-        ),
-    ],
-)
-def test_exact_images__refuse_a_broken_view(url, query, message):
-    response, content = get(url, f"exact/1/color?{query}")
+def test_exact_images__refuse_what_the_stream_has_not_and_a_broken_view(url, path, message):
+    response, content = get(url, f"exact/{path}")
     assert response.status == 400
     assert message in content.decode()
 
