@@ -33,7 +33,8 @@ from tests.scenes.captures import (
 )
 
 
-def colmap(path: Path, names: tuple[str, ...] = ("cam01", "cam02"), **kwargs) -> Path:
+def colmap(path: Path, **kwargs) -> Path:
+    names = ("cam01", "cam02")
     write_colmap(path / "sparse" / "0", rig(names, shift=3.0), **kwargs)
     videos(path, names, ".mp4")
     return path

@@ -33,13 +33,13 @@ def dots(centres: np.ndarray) -> np.ndarray:
     return np.repeat((250 * np.clip(image, 0, 1))[..., None], 3, -1).astype(np.uint8)
 
 
-def project(model: str, lens: Lens, points: np.ndarray) -> np.ndarray:
-    """Return the positions [N, 2] of points in the frame of `camera`, seen through the lens, with
-    centres at +0.5.
+def project(lens: Lens, points: np.ndarray, cam: Camera | None = None) -> np.ndarray:
+    """Return the positions [N, 2] of points in the frame of `camera`, or of `cam`, seen through the
+    lens, with centres at +0.5.
     """
-    K = camera().K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    K = (cam or camera()).K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
     zero = np.zeros(3)
-    through = cv2.fisheye.projectPoints if model == "OPENCV_FISHEYE" else cv2.projectPoints
+    through = cv2.fisheye.projectPoints if lens.model == "OPENCV_FISHEYE" else cv2.projectPoints
     return through(points[:, None], zero, zero, K, lens.opencv_coefficients)[0].reshape(-1, 2) + 0.5
 
 
@@ -58,7 +58,7 @@ def test_undistortion__moves_points_to_their_pinhole_projections(model: str) -> 
     cam = camera()
     lens = Lens(model, LENSES[model])
     points = np.array([[x, y, 2.0] for x in (-0.9, -0.1, 0.8) for y in (-0.7, 0.05, 0.6)])
-    distorted = project(model, lens, points)
+    distorted = project(lens, points)
     expected, _ = cam.project(points)
     assert np.abs(distorted - expected).max() > 1, "the case must bend rays by more than a pixel"
 
@@ -72,24 +72,14 @@ def test_undistortion__removes_what_a_refined_lens_leaves(model: str) -> None:
     cam = camera()
     lens = Lens(model, LENSES.get(model, ()))
     refined = camera(112.0)
-    remainder = (0.06, -0.01)
+    remainder = Lens("RADIAL", (0.06, -0.01))
     points = np.array([[x, y, 2.0] for x in (-0.8, -0.1, 0.7) for y in (-0.6, 0.05, 0.5)])
-    expected, _ = refined.project(points)
-    x, y = ((expected - refined.K[:2, 2]) / refined.K[[0, 1], [0, 1]]).T
-    square = x**2 + y**2
-    # Where the refined lens, and then the calibrated one, shows the points.
-    rays = (
-        np.stack([x, y], axis=1) * (1 + remainder[0] * square + remainder[1] * square**2)[:, None]
-    )
-    positions = (rays * refined.K[[0, 1], [0, 1]] + refined.K[:2, 2] - cam.K[:2, 2]) / cam.K[
-        [0, 1], [0, 1]
-    ]
-    distorted = project(
-        model, lens, np.concatenate([positions, np.ones((len(positions), 1))], axis=1)
-    )
-    lens_map = undistortion(cam, lens, (refined, Lens("RADIAL", remainder)))
+    # The refined lens shows the points on rays of the calibrated camera, whose lens bends them.
+    rays = cam.unproject(project(remainder, points, refined), np.ones(len(points)))
+    lens_map = undistortion(cam, lens, (refined, remainder))
     assert lens_map is not None
-    assert_centred(lens_map(dots(distorted)).astype(float)[..., 0], expected)
+    image = lens_map(dots(project(lens, rays))).astype(float)[..., 0]
+    assert_centred(image, refined.project(points)[0])
 
 
 def test_undistortion__is_none_without_distortion() -> None:

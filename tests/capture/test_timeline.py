@@ -182,9 +182,12 @@ def test_timeline__keeps_a_constant_delay_where_rates_hardly_differ(tmp_path: Pa
 
 def test_timeline__keeps_truth_only_for_unshifted_clips(tmp_path: Path) -> None:
     path = capture_of(tmp_path / "c", {"a": (4, 25), "b": (6, 25)})
-    (path / "truth").mkdir()
+    late = timed(tmp_path / "d", a=REGULAR, b=LATE)
+    for folder in (path, late):
+        (folder / "truth").mkdir()
     assert load_capture(path, reading=ReadConfig(trim=True)).truth == path / "truth"
     assert load_capture(path, reading=ReadConfig(offset={"b": 1})).truth is None
+    assert load_capture(late, reading=ReadConfig(trim=True)).truth is None
 
 
 @pytest.mark.parametrize(
@@ -318,12 +321,6 @@ def test_info_command__reports_a_variable_frame_rate(
     path = timed(tmp_path / "c", a=REGULAR, b=LATE)
     assert cli.main(["info", str(path), "--no-check", "--trim"]) == 0
     assert "b.mp4: variable frame rate, 5 frames in 7 periods" in capsys.readouterr().out
-
-
-def test_timeline__does_not_use_truth_at_other_times(tmp_path: Path) -> None:
-    path = timed(tmp_path / "c", a=REGULAR, b=LATE)
-    (path / "truth").mkdir()
-    assert load_capture(path, reading=ReadConfig(trim=True)).truth is None
 
 
 def images(path: Path, names: Sequence[str] = ("cam_0", "cam_2", "cam_10")) -> Path:

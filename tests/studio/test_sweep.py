@@ -45,10 +45,8 @@ def test_sweep__scores_every_number_of_epochs_with_every_seed(tmp_path, monkeypa
         == (tmp_path / "out/epochs1-seed1/stream.morgs").stat().st_size / 2
     )
     assert rows[3]["later_seconds"] == result.seconds.per_later_frame
-    assert (
-        json.loads((tmp_path / "out/sweep.json").read_text())["rows"][1]["psnr"] == rows[1]["psnr"]
-    )
-    assert mean_scores(rows)[1]["psnr"] == pytest.approx((rows[2]["psnr"] + rows[3]["psnr"]) / 2)
+    written = json.loads((tmp_path / "out/sweep.json").read_text())["rows"]
+    assert [row["psnr"] for row in written] == [row["psnr"] for row in rows]
 
 
 @pytest.mark.slow

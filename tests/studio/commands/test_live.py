@@ -88,18 +88,6 @@ def test_Live__starts_the_viewer_at_a_provisional_first_frame(
     assert PROVISIONAL in states[0]
 
 
-@pytest.mark.slow
-def test_Live__repeats_videos(
-    capture: Path, tmp_path: Path, videos: list[Path], run, caplog
-) -> None:
-    args = ("--camera", *videos, "--calibration", capture, "--loop", "--seconds", 1, *OPTIONS)
-    status, printed, _ = run("live", tmp_path / "out", *args)
-    assert status == 0
-    frames = int(re.findall(r"fitted \d+ of (\d+) frames", printed)[0])
-    assert frames > 14, "the videos have 10"
-    assert not caplog.messages, "it is ended by the time"
-
-
 def test_Live__ends_with_a_summary_on_ctrl_c(
     capture: Path, tmp_path: Path, videos, run, monkeypatch
 ) -> None:

@@ -20,7 +20,6 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.png import png_bytes
 from morgs_mi.evaluate.evaluate import evaluate_stream
-from morgs_mi.evaluate.metrics import psnr_of
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.runs.fit_capture import stream_capture
 from morgs_mi.studio.live import sources as module
@@ -94,15 +93,6 @@ def test_fit_live__follows_videos_at_their_speed(
     assert capture.num_frames == 4
     stream_capture(capture, tmp_path / "again", CONFIG)
     assert packets(out) == packets(tmp_path / "again")
-    scores = evaluate_stream(out)
-    assert scores.complete
-    for row, frame in zip(scores.frames, capture.frames(), strict=True):
-        assert row.scores.psnr > np.mean([grey_psnr(image) for image in frame.images]) + 4
-
-
-def grey_psnr(image: np.ndarray) -> float:
-    values = image / 255
-    return psnr_of(((values - values.mean((0, 1))) ** 2).mean())
 
 
 def deliver(

@@ -36,9 +36,6 @@ def test_lpips__bytes_and_floats_agree(tmp_path):
 def test_lpips__refuses_unsuitable_networks(tmp_path):
     with pytest.raises(FileNotFoundError, match="expected an ONNX file, found none"):
         Lpips(tmp_path / "none.onnx")
-    (tmp_path / "bad.onnx").write_bytes(b"rubbish")
-    with pytest.raises(ValueError, match=r"bad\.onnx: onnxruntime .* cannot load this network"):
-        Lpips(tmp_path / "bad.onnx")
     with pytest.raises(
         ValueError, match="inputs in0 and in1, got left, right; export the network as"
     ):
