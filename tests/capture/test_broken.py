@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -14,6 +13,7 @@ import pytest
 
 from morgs_mi import cli
 from morgs_mi.io.video_writer import write_video
+from tests.capture.layouts.test_layouts import edit
 from tests.scenes import captures as layouts
 
 Damage = Callable[[Path], object]
@@ -81,12 +81,7 @@ def meta(change: Callable[[dict], object]) -> Damage:
 
 
 def in_json(name: str, change: Callable[[dict], object]) -> Damage:
-    def damage(path: Path) -> None:
-        values = json.loads((path / name).read_text())
-        change(values)
-        (path / name).write_text(json.dumps(values))
-
-    return damage
+    return lambda path: edit(path, change, name)
 
 
 def pose(index: int, scale: float) -> Callable[[dict], None]:

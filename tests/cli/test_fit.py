@@ -101,18 +101,6 @@ def before_frame_2(monkeypatch: pytest.MonkeyPatch, action: Callable[[], None]) 
     monkeypatch.setattr(StreamLoop, "push", acting_push)
 
 
-@pytest.mark.slow
-def test_fit__leaves_a_stream_marked_as_unfinished_when_interrupted(
-    capture: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    before_frame_2(monkeypatch, interrupt)
-    assert run("fit", capture, tmp_path / "out", *OPTIONS)[0] == 130
-    status, _, error = run("eval", tmp_path / "out", "--json", tmp_path / "eval.json")
-    assert status == 0
-    assert "the fit was not finished" in error
-    assert not json.loads((tmp_path / "eval.json").read_text())["complete"]
-
-
 @pytest.mark.parametrize(
     ("args", "parts"),
     [
@@ -266,6 +254,9 @@ def test_fit__names_what_stands_and_how_to_go_on_when_interrupted(
     )
     assert status == 130
     assert error.splitlines()[-1] == stands  # after lines of progress, on a slow machine
+    status, _, error = run("eval", tmp_path / "my out", "--json", tmp_path / "eval.json")
+    assert (status, "the fit was not finished" in error) == (0, True)
+    assert not json.loads((tmp_path / "eval.json").read_text())["complete"]
 
 
 @pytest.mark.slow
@@ -374,31 +365,12 @@ def test_fit__resumes_a_stream_to_the_same_bytes(capture: Path, tmp_path: Path, 
 
 
 @pytest.mark.slow
-def test_fit__fits_segments_side_by_side(
+def test_fit__fits_segments_side_by_side_and_names_what_stands_when_interrupted(
     tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     pytest.importorskip("distributed", reason="comes with the extra `cluster`")
     short = SegmentConfig(passes=1, epochs=1)
     monkeypatch.setattr(SegmentConfig.__init__, "__defaults__", astuple(short))
-    clip = write_recording(tmp_path / "clip", 4)
-    out = tmp_path / "out"
-    status, output, _ = run("fit", clip, out, *OPTIONS, "--segments", 2)
-    assert status == 0
-    assert "stream.morgs: 4 frames" in output
-    assert not any(record.name.startswith("distributed") for record in caplog.records)
-    assert len({frame for _, frame, _ in StreamReader(out / "stream.morgs").index()}) == 4
-    assert_refused(
-        run("fit", clip, out, *OPTIONS, "--segments", 3),
-        "--segments must be 1 to 2 for 4 frames",
-        "got 3",
-    )
-
-
-@pytest.mark.slow
-def test_fit__names_what_segments_stand_when_interrupted(
-    tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("distributed", reason="comes with the extra `cluster`")
     clip = write_recording(tmp_path / "clip", 4)
     out = tmp_path / "out"
     add = SegmentedRun.add_part
@@ -407,12 +379,18 @@ def test_fit__names_what_segments_stand_when_interrupted(
         add(fit, part)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(SegmentedRun, "add_part", add_and_stop)
     args = ["fit", str(clip), str(out), *OPTIONS, "--segments", "2"]
-    status, _, error = run(*args)
+    with monkeypatch.context() as patch:
+        patch.setattr(SegmentedRun, "add_part", add_and_stop)
+        status, _, error = run(*args)
     again = shlex.join(["morgs-mi", *args, "--resume"])
     assert status == 130
     assert (
         error.splitlines()[-1]
         == f"Interrupted. {out / 'segments'} holds 2 frames; continue with `{again}`."
     )
+    status, output, _ = run(*args, "--resume")
+    assert (status, "stream.morgs: 4 frames" in output) == (0, True)
+    assert not any(record.name.startswith("distributed") for record in caplog.records)
+    assert len({frame for _, frame, _ in StreamReader(out / "stream.morgs").index()}) == 4
+    assert_refused(run(*args, "--segments", 3), "--segments must be 1 to 2 for 4 frames", "got 3")

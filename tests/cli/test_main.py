@@ -51,19 +51,6 @@ def test_main__leaves_cameras_out(capture: Path, tmp_path: Path, run) -> None:
     )
 
 
-@pytest.mark.slow
-def test_main__leaves_out_a_camera_without_a_clip(
-    capture: Path, tmp_path: Path, run, caplog
-) -> None:
-    (capture / "cam1.mkv").unlink()
-    status, out, _ = run("info", capture)
-    assert (status, "cam1" in out) == (0, False)
-    assert run("fit", capture, tmp_path / "out", *OPTIONS)[0] == 0
-    assert [
-        m.endswith("sparse/0: no clip is named after cam1.png: left out.") for m in caplog.messages
-    ] == [True] * 2
-
-
 @pytest.mark.parametrize(
     ("args", "parts"),
     [

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.lib.recfunctions import rename_fields
 from plyfile import PlyData, PlyElement
 
 from morgs_mi.core.gaussians import Gaussians
@@ -107,12 +108,6 @@ def changed(path, change) -> None:
     PlyData(elements, byte_order="<").write(str(path))
 
 
-def renamed(tables, element: str, old: str, new: str) -> None:
-    names = tables[element].dtype.names
-    tables[element] = tables[element].copy()
-    tables[element].dtype.names = tuple(new if name == old else name for name in names)
-
-
 def infinite(tables) -> None:
     tables["chunk"]["max_x"][0] = np.inf
 
@@ -130,15 +125,15 @@ def infinite(tables) -> None:
             "expected 300 rows of f_rest_0 .* got 9 rows of 9 properties",
         ),
         (
-            lambda t: renamed(t, "sh", "f_rest_8", "f_rest_9"),
+            lambda t: t.update(sh=rename_fields(t["sh"], {"f_rest_8": "f_rest_9"})),
             "an element sh without f_rest_8 as uint8",
         ),
         (
-            lambda t: renamed(t, "vertex", "packed_scale", "scale"),
+            lambda t: t.update(vertex=rename_fields(t["vertex"], {"packed_scale": "scale"})),
             "an element vertex without packed_scale as uint32",
         ),
         (
-            lambda t: renamed(t, "chunk", "max_scale_x", "x"),
+            lambda t: t.update(chunk=rename_fields(t["chunk"], {"max_scale_x": "x"})),
             "an element chunk without max_scale_x as float32",
         ),
         (infinite, "others in 256 of 300 Gaussians .centre of 0, 1, 2 and 253 more."),

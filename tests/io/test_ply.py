@@ -7,7 +7,7 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 import pytest
-from numpy.lib.recfunctions import repack_fields
+from numpy.lib.recfunctions import repack_fields, unstructured_to_structured
 from plyfile import PlyData, PlyElement
 
 from morgs_mi import ellipsoids
@@ -28,22 +28,17 @@ def random_gaussians(n: int = 20, degree: int = 3) -> Gaussians:
 def table(gaussians: Gaussians) -> np.ndarray:
     """Return one record per Gaussian in the layout of other tools."""
     raw = gaussians.numpy()
-    columns = {"x": raw["means"][:, 0], "y": raw["means"][:, 1], "z": raw["means"][:, 2]}
-    columns |= {f"f_dc_{c}": raw["sh_coeffs"][:, 0, c] for c in range(3)}
-    bands = raw["sh_coeffs"].shape[1] - 1
-    columns |= {
-        f"f_rest_{c * bands + k}": raw["sh_coeffs"][:, 1 + k, c]
-        for c in range(3)
-        for k in range(bands)
-    }
-    columns |= {"opacity": raw["logit_opacities"]} | {
-        f"scale_{i}": raw["log_scales"][:, i] for i in range(3)
-    }
-    columns |= {f"rot_{i}": raw["quats"][:, i] for i in range(4)}
-    records = np.empty(len(gaussians), [(name, "f4") for name in columns])
-    for name, column in columns.items():
-        records[name] = column
-    return records
+    harmonics = raw["sh_coeffs"].transpose(0, 2, 1)  # by colour
+    rest = harmonics[..., 1:].reshape(len(gaussians), -1)
+    opacities = raw["logit_opacities"][:, None]
+    columns = [raw["means"], harmonics[..., 0], rest, opacities, raw["log_scales"], raw["quats"]]
+    names = [
+        *["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2"],
+        *(f"f_rest_{i}" for i in range(rest.shape[1])),
+        *["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"],
+    ]
+    values = np.concatenate(columns, axis=1)
+    return unstructured_to_structured(values, np.dtype([(name, "f4") for name in names]))
 
 
 def assert_same(a: Gaussians, b: Gaussians, **tolerance: float) -> None:

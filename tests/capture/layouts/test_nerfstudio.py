@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +13,7 @@ import pytest
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.layouts.nerfstudio import LAYOUT
 from tests.assertions import assert_close
+from tests.capture.layouts.test_layouts import edit
 from tests.scenes import captures as layouts
 from tests.scenes.captures import HEIGHT, WIDTH
 
@@ -29,12 +29,14 @@ def photos(
     for i, name in enumerate(NAMES):
         (path / f"{name}.mkv").unlink()
         layouts.write_image(path / folder / f"{name}{suffix}", i, 0)
-    meta = json.loads((path / "transforms.json").read_text())
-    for frame, name in zip(meta["frames"], NAMES, strict=True):
-        frame["file_path"] = f"{folder}/{name}{suffix}"
-    meta["k1"] = 0
-    change(meta)
-    (path / "transforms.json").write_text(json.dumps(meta))
+
+    def name_photos(meta: dict) -> None:
+        for frame, name in zip(meta["frames"], NAMES, strict=True):
+            frame["file_path"] = f"{folder}/{name}{suffix}"
+        meta["k1"] = 0
+        change(meta)
+
+    edit(path, name_photos)
     return path
 
 
@@ -115,12 +117,14 @@ def test_nerfstudio__combines_masks_with_alpha_lens_and_downscaling(tmp_path: Pa
 
 def test_nerfstudio__masks_what_any_mask_of_a_camera_has_black(tmp_path: Path) -> None:
     path = layouts.nerfstudio(tmp_path / "a")
-    meta = json.loads((path / "transforms.json").read_text())
-    first = meta["frames"][0] | {"file_path": "cam1/0000.png", "mask_path": "masks/a.png"}
-    meta["frames"][0] = first
-    meta["frames"].append(first | {"file_path": "cam1/0001.png", "mask_path": "masks/b.png"})
-    meta["k1"] = 0
-    (path / "transforms.json").write_text(json.dumps(meta))
+
+    def change(meta: dict) -> None:
+        first = meta["frames"][0] | {"file_path": "cam1/0000.png", "mask_path": "masks/a.png"}
+        meta["frames"][0] = first
+        meta["frames"].append(first | {"file_path": "cam1/0001.png", "mask_path": "masks/b.png"})
+        meta["k1"] = 0
+
+    edit(path, change)
     write_mask(path / "masks/a.png", left_half())
     write_mask(path / "masks/b.png", 255 - left_half())
     with pytest.raises(ValueError, match="expected pixels that are used, got a black mask of cam1"):
@@ -225,9 +229,7 @@ def test_nerfstudio__takes_missing_sizes_from_clips_and_leaves_out_missing_ones(
     tmp_path: Path,
 ) -> None:
     path = layouts.nerfstudio(tmp_path / "a")
-    meta = json.loads((path / "transforms.json").read_text())
-    del meta["w"], meta["h"]
-    (path / "transforms.json").write_text(json.dumps(meta))
+    edit(path, lambda meta: [meta.pop(side) for side in "wh"])
     (path / "cam1.mkv").unlink()
     capture = load_capture(path)
     assert [(camera.name, camera.width) for camera in capture.cameras] == [

@@ -43,6 +43,12 @@ def film(path: Path, cameras: list[Camera], suffix: str = ".mkv") -> Path:
     return path
 
 
+def noise(seed: int, width: int, height: int) -> np.ndarray:
+    """Return an image of smooth noise."""
+    grains = np.random.default_rng(seed).integers(0, 255, (height // 2, width // 2, 3), np.uint8)
+    return cv2.resize(grains, (width, height), interpolation=cv2.INTER_CUBIC)
+
+
 def aligned(estimate: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return `estimate` [n, 3] aligned to `true` by translation, rotation and scale, and the
     rotation.
@@ -56,7 +62,7 @@ def aligned(estimate: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 @pytest.mark.slow
 def test_calibrate__recovers_a_rig(tmp_path: Path, capsys) -> None:
-    cameras = [camera.resized(240, 180) for camera in textured.rig()]
+    cameras = textured.rig(6, 240, 180)
     film(tmp_path, cameras)
     assert cli.main(["calibrate", str(tmp_path), "--shared-intrinsics"]) == 0
     assert "sparse/0: 6 cameras, " in capsys.readouterr().out
@@ -79,7 +85,7 @@ def test_calibrate__recovers_a_rig(tmp_path: Path, capsys) -> None:
 
 @pytest.mark.slow
 def test_calibrate__finds_the_same_poses_on_every_run(tmp_path: Path) -> None:
-    film(tmp_path, [camera.resized(240, 180) for camera in textured.rig()])
+    film(tmp_path, textured.rig(6, 240, 180))
     config = CalibrateConfig(shared_intrinsics=True)
     images, _ = _frames(tmp_path, config, ())
     (scratch := tmp_path / "scratch").mkdir()
@@ -104,8 +110,8 @@ def test_calibrate__finds_the_same_poses_on_every_run(tmp_path: Path) -> None:
 )
 def test_calibrate__names_images_after_photos(tmp_path: Path, names: tuple[str, ...]) -> None:
     planes = textured.textures()
-    for name, camera in zip(names, textured.rig(4), strict=True):
-        image = textured.render(camera.resized(240, 180), planes)[..., ::-1]
+    for name, camera in zip(names, textured.rig(4, 240, 180), strict=True):
+        image = textured.render(camera, planes)[..., ::-1]
         options = [cv2.IMWRITE_JPEG_QUALITY, 98] if name.endswith("JPG") else []
         (tmp_path / name).write_bytes(
             cv2.imencode(Path(name).suffix.lower(), image, options)[1].tobytes()
@@ -130,7 +136,7 @@ def test_calibrate__shares_intrinsics_among_clips_of_a_size(tmp_path: Path) -> N
 
 @pytest.mark.slow
 def test_calibrate__moves_principal_points_that_differ(tmp_path: Path, capsys) -> None:
-    cameras = [camera.resized(240, 180) for camera in textured.rig()]
+    cameras = textured.rig(6, 240, 180)
     for camera, shift in zip(cameras, np.random.default_rng(0).uniform(-6, 6, (6, 2)), strict=True):
         camera.K[:2, 2] += shift
     film(tmp_path, cameras)
@@ -147,7 +153,7 @@ def test_calibrate__moves_principal_points_that_differ(tmp_path: Path, capsys) -
 def test_calibrate__takes_global_mapping_where_incremental_mapping_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
-    film(tmp_path, [camera.resized(240, 180) for camera in textured.rig()])
+    film(tmp_path, textured.rig(6, 240, 180))
     monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *_: {})
     assert cli.main(["calibrate", str(tmp_path), "--shared-intrinsics"]) == 0
     assert re.search(r"6 cameras, .* by\s+global\s+mapping", capsys.readouterr().out)
@@ -187,13 +193,8 @@ def test_check__of_a_camera_without_points_does_not_fit() -> None:
 
 @pytest.mark.slow
 def test_calibrate__names_a_camera_with_another_scene(tmp_path: Path) -> None:
-    film(tmp_path, [camera.resized(240, 180) for camera in textured.rig()[1:5]])
-    noise = np.random.default_rng(1).integers(0, 255, (90, 120, 3), np.uint8)
-    write_video(
-        tmp_path / "other.mkv",
-        [cv2.resize(noise, (240, 180), interpolation=cv2.INTER_CUBIC)] * 2,
-        30,
-    )
+    film(tmp_path, textured.rig(6, 240, 180)[1:5])
+    write_video(tmp_path / "other.mkv", [noise(1, 240, 180)] * 2, 30)
     with pytest.raises(
         ValueError,
         match=r"to register all 5 cameras, got 4, without other: .* or accept the partial model",
@@ -213,15 +214,10 @@ def test_calibrate__names_a_camera_with_another_scene(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_calibrate__prints_a_verdict_per_camera(tmp_path: Path, capsys) -> None:
-    cameras = [camera.resized(240, 180) for camera in textured.rig(4)]
+    cameras = textured.rig(4, 240, 180)
     film(tmp_path, cameras)
     shutil.copy(tmp_path / "cam1.mkv", tmp_path / "cam9.mkv")
-    noise = np.random.default_rng(1).integers(0, 255, (90, 120, 3), np.uint8)
-    write_video(
-        tmp_path / "other.mkv",
-        [cv2.resize(noise, (240, 180), interpolation=cv2.INTER_CUBIC)] * 2,
-        30,
-    )
+    write_video(tmp_path / "other.mkv", [noise(1, 240, 180)] * 2, 30)
     assert cli.main(["calibrate", str(tmp_path), "--shared-intrinsics", "--partial"]) == 0
     printed = capsys.readouterr()
     rows = {name: rest for name, rest in re.findall(r"^ (\w+)  +(.*)$", printed.out, re.MULTILINE)}
@@ -259,7 +255,7 @@ def test_calibrate__of_a_full_disk_leaves_no_model(
 
 def test_calibrate__finds_no_features_in_transparent_pixels(tmp_path: Path) -> None:
     planes = textured.textures()
-    for camera in (camera.resized(240, 180) for camera in textured.rig(2)):
+    for camera in textured.rig(2, 240, 180):
         image = cv2.cvtColor(textured.render(camera, planes), cv2.COLOR_RGB2BGRA)
         image[:, 10:, 3] = 0
         (tmp_path / camera.name).mkdir()
@@ -283,10 +279,7 @@ def test_frames__are_the_nearest_in_time_at_a_variable_frame_rate(tmp_path: Path
 
 def noise_clips(path: Path) -> None:
     for name in ("a", "b", "c"):
-        noise = np.random.default_rng(ord(name)).integers(0, 255, (60, 80, 3), np.uint8)
-        write_video(
-            path / f"{name}.mkv", [cv2.resize(noise, (160, 120), interpolation=cv2.INTER_CUBIC)], 30
-        )
+        write_video(path / f"{name}.mkv", [noise(ord(name), 160, 120)], 30)
 
 
 @pytest.mark.parametrize(
