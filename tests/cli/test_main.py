@@ -106,23 +106,28 @@ def test_main__runs_as_a_module() -> None:
     assert_one_sentence(result.stderr, "expected the folders CAPTURE and OUT")
 
 
+def writing_commands(capture: Path, stream: Path, place: Path) -> list[tuple]:
+    """Return commands that write into a folder."""
+    size = ("--cameras", 2, "--frames", 1, "--width", 16, "--height", 16)
+    return [
+        ("fit", capture, place / "new" / "out", *OPTIONS),
+        ("synth", "spheres", place / "clip", *size),
+        ("render", stream, place / "a.mp4", "--camera", 0),
+        ("render", stream, place / "exr", "--camera", 0),
+        ("export", "ply", stream, place / "ply"),
+        ("export", "web", stream, place / "page.html"),
+        ("info", capture, "--no-check", "--plot", place / "rig.png"),
+        ("demo", place / "out"),
+    ]
+
+
 @pytest.mark.slow
 def test_main__names_an_output_that_cannot_be_written(
     capture: Path, stream: Path, tmp_path: Path, run
 ) -> None:
     (tmp_path / "file").write_text("")
-    size = ("--cameras", 2, "--frames", 1, "--width", 16, "--height", 16)
     for folder in (tmp_path / "file", Path("/sys")):  # /sys accepts no new files, even from root
-        for args in (
-            ("fit", capture, folder / "out", *OPTIONS),
-            ("synth", "spheres", folder / "out", *size),
-            ("render", stream, folder / "a.mp4", "--camera", 0),
-            ("render", stream, folder / "exr", "--camera", 0),
-            ("export", "ply", stream, folder / "ply"),
-            ("export", "web", stream, folder / "page.html"),
-            ("info", capture, "--no-check", "--plot", folder / "rig.png"),
-            ("demo", folder / "out"),
-        ):
+        for args in writing_commands(capture, stream, folder):
             status, _, error = run(*args)
             assert status == 1
             assert_one_sentence(
@@ -145,23 +150,17 @@ def test_main__writes_nothing_into_a_capture(
     place.symlink_to(capture)
     old_tree = tree(capture)
     for args in (
+        *writing_commands(capture, stream, place),
         ("fit", capture, capture, *OPTIONS),
         ("fit", capture, place, *OPTIONS, "--resume"),
-        ("fit", capture, capture / "new" / "out", *OPTIONS),
-        ("demo", place),
-        ("synth", "spheres", place / "clip"),
-        ("render", stream, place / "cam0.mkv.mp4", "--camera", 0),
         ("render", stream, place / "cam0", "--camera", 0),
-        ("export", "ply", stream, place / "ply"),
         ("export", "gltf", stream, place / "gltf"),
         ("export", "usd", stream, place / "a.usda"),
         ("import", tmp_path, place / "new.morgs"),
         ("export", "video", stream, place / "cam0.mp4"),
-        ("export", "web", stream, place / "page.html"),
         ("export", "web", stream, place / "page"),
         ("eval", stream, "--capture", capture, "--json", place / "capture.json"),
         ("eval", stream, "--capture", capture, "--figures", place / "figures"),
-        ("info", capture, "--plot", place / "cam0.png"),
     ):
         assert_refused(
             run(*args),

@@ -37,20 +37,25 @@ def test_parameters__are_those_of_the_table_and_with_parameters_inverts_them(deg
     assert gaussians.with_parameters({"sh_dc": parameters["sh_dc"]}).sh_degree == 0
 
 
-def test_gaussians__refuse_shapes_that_disagree_and_unknown_attributes():
-    raw = cloud(1).numpy()
-    with pytest.raises(ValueError, match=r"`quats` must be \[N, 4\] with N=5, got \(4, 4\)"):
-        Gaussians(**{**raw, "quats": raw["quats"][:4]})
-    with pytest.raises(ValueError, match="K in 1, 4, 9, 16"):
-        Gaussians(**{**raw, "sh_coeffs": raw["sh_coeffs"][:, :2]})
-    for means in (np.zeros(3), 0.0):
-        with pytest.raises(ValueError, match=r"`means` must be \[N, 3\]"):
-            Gaussians(**{**raw, "means": means})
-    for means in (None, "abc", [[1, 2], [3]], np.zeros((5, 3), complex)):
-        with pytest.raises(ValueError, match="`means` must be an array of real numbers"):
-            Gaussians(**{**raw, "means": means})
-    with pytest.raises(ValueError, match="must be a NumPy array or a drjit"):
-        Gaussians(**{**raw, "logit_opacities": mi.Float(np.zeros(5))})
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("quats", np.zeros((4, 4)), r"`quats` must be \[N, 4\] with N=5, got \(4, 4\)"),
+        ("sh_coeffs", np.zeros((5, 2, 3)), "K in 1, 4, 9, 16"),
+        ("means", np.zeros(3), r"`means` must be \[N, 3\]"),
+        ("means", 0.0, r"`means` must be \[N, 3\]"),
+        ("means", None, "`means` must be an array of real numbers"),
+        ("means", [[1, 2], [3]], "`means` must be an array of real numbers"),
+        ("means", np.zeros((5, 3), complex), "`means` must be an array of real numbers"),
+        ("logit_opacities", mi.Float(np.zeros(5)), "must be a NumPy array or a drjit"),
+    ],
+)
+def test_gaussians__refuse_shapes_that_disagree(name, value, message):
+    with pytest.raises(ValueError, match=message):
+        Gaussians(**{**cloud(1).numpy(), name: value})
+
+
+def test_gaussians__have_no_unknown_attributes_and_are_at_least_one_to_concatenate():
     with pytest.raises(ValueError, match="must hold at least one"):
         Gaussians.concatenate([])
     with pytest.raises(AttributeError, match="no attribute 'roughness'"):

@@ -27,24 +27,20 @@ def archive(*names: str) -> bytes:
 
 FILES = {
     "a.spz": (SPZ, "SPZ", "splat-transform"),
-    "b.spz": (b"?" * 99, "SPZ", "splat-transform"),
     "c.ply": (SPZ, "SPZ", "splat-transform"),
     "d.bin": (b"NGSP" + bytes(60), "SPZ", "splat-transform"),
     "a.ksplat": (bytes(99), "KSPLAT", "SuperSplat"),
     "a.SOG": (bytes(99), "SOG", "SuperSplat"),
-    "b.zip": (archive("meta.json", "means_l.webp"), "SOG", "SuperSplat"),
     "b.ply": (archive("meta.json", "means_l.webp"), "SOG", "SuperSplat"),
     "meta.json": (b"{}", "SOG", "SuperSplat"),
     "e.ply.gz": (gzip.compress(b"ply\n"), "an archive", "unpack it"),
     "a.glb": (b"glTF" + bytes(20), "glTF", "export it as .ply"),
     "a.gltf": (b'{"extensionsUsed": ["KHR_gaussian_splatting"]}', "glTF", "export it as .ply"),
-    "f.splat": (b"glTF" + bytes(28), "glTF", "export it as .ply"),
     "g.splat": (b"ply\nformat ascii 1.0\n", "PLY", "rename it to .ply"),
     "a.usdz": (archive("a.usdc"), "OpenUSD", "export it as .ply"),
     "a.splatv": (bytes(40), "SPLATV", "export it as .ply"),
     "params.npz": (archive("means.npy"), "an archive of NumPy", "export it as .ply"),
     "chkpnt30000.pth": (archive("data.pkl"), "a checkpoint", "export it as .ply"),
-    "a.gsz": (bytes(10), "a compressed format", "export it as .ply"),
 }
 
 

@@ -59,8 +59,6 @@ INSTANTS = {
     "four axes": columns("t", "scale_3", "rot_4", "rot_5", "rot_6", "rot_7"),
     "time": columns("time"),
     "frame": {"frame": np.arange(N, dtype="i4")},
-    "timestamp": columns("timestamp"),
-    "motion alone": columns(*(f"motion_{i}" for i in range(9))),
     "velocity": columns("velocity_0", "velocity_1", "velocity_2"),
     "one instant that moves": {"trbf_center": same(0.5), **columns("omega_0")},
     "not a number": {"t": same(np.nan)},

@@ -18,6 +18,7 @@ from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.video_writer import write_video
 from tests.scenes.cameras import circle, look_at_cameras, shift_principal_point
+from tests.scenes.edit_lists import with_list
 
 WIDTH = 62
 HEIGHT = 46
@@ -60,20 +61,16 @@ def write_timed_video(path: Path, images: list[np.ndarray], times: list[int]) ->
     """Write an .mp4 that shows its frames at `times`, in ascending milliseconds from 0."""
     write_video(path, images, 1000)
     data = path.read_bytes()
-    # The box `stts` is a list of (number of frames, duration in units of the track); OpenCV's has
-    # one entry.
-    start = data.index(b"stts") - 4
-    (millisecond,) = struct.unpack(">I", data[start + 20 : start + 24])
+    # The list `stts` has (number of frames, duration in units of the track); OpenCV's has one
+    # entry.
+    at = data.index(b"stts") + 16
+    (millisecond,) = struct.unpack(">I", data[at : at + 4])
     durations = np.diff([*times, 2 * times[-1] - times[-2]]) * millisecond
     entries = b"".join(struct.pack(">II", 1, duration) for duration in durations)
-    box = struct.pack(">I4sII", 16 + len(entries), b"stts", 0, len(durations)) + entries
-    grown = bytearray(data[:start] + box + data[start + 24 :])
-    for parent in (b"moov", b"trak", b"mdia", b"minf", b"stbl"):
-        at = grown.index(parent) - 4
-        (size,) = struct.unpack(">I", grown[at : at + 4])
-        grown[at : at + 4] = struct.pack(">I", size + len(box) - 24)
+    parents = (b"moov", b"trak", b"mdia", b"minf", b"stbl")
+    timed = with_list(data, b"stts", len(durations), entries, parents)
     # The edit list cuts the clip at its former end.
-    path.write_bytes(grown.replace(b"edts", b"free"))
+    path.write_bytes(timed.replace(b"edts", b"free"))
 
 
 def n3dv(

@@ -16,11 +16,10 @@ def show_parts(path: Path, parts: Sequence[tuple[float, float]]) -> Path:
 
     A part with a negative start is a pause.
     """
-    data = bytearray(path.read_bytes())
+    data = path.read_bytes()
     scale = _number(data, data.index(b"mdhd") + 16)
-    box = data.index(b"elst") - 4
     # Time of the first frame in the track: it has later frames before it.
-    first = _number(data, box + 20)
+    first = _number(data, data.index(b"elst") + 16)
     entries = b"".join(
         struct.pack(
             ">IiI",
@@ -30,16 +29,25 @@ def show_parts(path: Path, parts: Sequence[tuple[float, float]]) -> Path:
         )
         for start, length in parts
     )
-    grown = 16 + len(entries) - _number(data, box)
-    data[box : box + _number(data, box)] = (
-        struct.pack(">I4sII", 16 + len(entries), b"elst", 0, len(parts)) + entries
-    )
-    for parent in (b"moov", b"trak", b"edts"):
-        at = data.index(parent) - 4
-        data[at : at + 4] = struct.pack(">I", _number(data, at) + grown)
-    path.write_bytes(data)
+    path.write_bytes(with_list(data, b"elst", len(parts), entries, (b"moov", b"trak", b"edts")))
     return path
 
 
-def _number(data: bytearray, at: int) -> int:
+def with_list(
+    data: bytes, name: bytes, count: int, entries: bytes, parents: Sequence[bytes]
+) -> bytes:
+    """Return an .mp4 with other entries in the box of a list, which changes the sizes of its
+    parents.
+    """
+    start = data.index(name) - 4
+    size = _number(data, start)
+    box = struct.pack(">I4sII", 16 + len(entries), name, 0, count) + entries
+    grown = bytearray(data[:start] + box + data[start + size :])
+    for parent in parents:
+        at = grown.index(parent) - 4
+        grown[at : at + 4] = struct.pack(">I", _number(grown, at) + len(box) - size)
+    return bytes(grown)
+
+
+def _number(data: bytes | bytearray, at: int) -> int:
     return struct.unpack(">I", data[at : at + 4])[0]

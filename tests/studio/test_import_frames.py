@@ -20,7 +20,10 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.ply import write_ply
 from morgs_mi.studio.import_frames import find_frames, import_frames, matched_rows, same_gaussians
 from tests.assertions import assert_close
+from tests.cli.conftest import run
 from tests.scenes.changing_splats import splats
+
+__all__ = ["run"]
 
 T = 5
 N = 300
@@ -278,11 +281,7 @@ def test_import_frames__refuses_frames_without_gaussians(tmp_path):
         import_frames([clip], tmp_path / "s.morgs")
 
 
-def test_import__reads_what_export_writes(clip, tmp_path, capsys):
-    def run(*args: object) -> tuple[int, str, str]:
-        status = cli.main([str(arg) for arg in args])
-        return status, *capsys.readouterr()
-
+def test_import__reads_what_export_writes(clip, tmp_path, run):
     assert (
         run("import", *sorted(clip.iterdir()), tmp_path / "a", "--fps", 24, "--quality", 4)[0] == 0
     )

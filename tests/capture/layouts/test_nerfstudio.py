@@ -198,7 +198,9 @@ def test_nerfstudio__leaves_out_views_of_no_split(
 def test_nerfstudio__takes_missing_sizes_from_the_images(
     tmp_path: Path, file_names, suffix: str, named: bool
 ) -> None:
-    angles = {
+    values = {
+        "fl_x": 50.0,
+        "fl_y": 50.0,
         "camera_angle_x": 2 * np.arctan(WIDTH / 100),
         "camera_angle_y": 2 * np.arctan(HEIGHT / 100),
     }
@@ -208,13 +210,7 @@ def test_nerfstudio__takes_missing_sizes_from_the_images(
         for frame in meta["frames"]:
             for key in ("fl_x", "fl_y", "cx", "cy"):
                 del frame[key]
-            frame.update(
-                {
-                    key: value
-                    for key, value in {"fl_x": 50.0, "fl_y": 50.0, **angles}.items()
-                    if key in file_names
-                }
-            )
+            frame.update({name: values[name] for name in file_names})
             if not named:
                 frame["file_path"] = "./" + frame["file_path"].removesuffix(suffix)
 

@@ -14,6 +14,7 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.color_space import decode_light
 from morgs_mi.io.ply import read_ply
 from morgs_mi.io.splats import read_splats
+from morgs_mi.io.video import open_frames
 from morgs_mi.playback.export.clips import _frames_backwards, repeated_seconds, select_frames
 from morgs_mi.playback.export.formats import IMAGES, PLY, USD, WEB, choose_format
 from morgs_mi.playback.export.frames import exr_channels, pad_to_even
@@ -31,14 +32,6 @@ def stream(tmp_path):
 
 def run(*args: object) -> int:
     return cli.main([str(arg) for arg in args])
-
-
-def video(path) -> list[np.ndarray]:
-    file = cv2.VideoCapture(str(path))
-    frames = []
-    while (result := file.read())[0]:
-        frames.append(cv2.cvtColor(result[1], cv2.COLOR_BGR2RGB))
-    return frames
 
 
 def test_export_ply__writes_every_frame(stream, tmp_path):
@@ -131,7 +124,7 @@ def test_flight__shows_rendered_images_again_or_back_and_forth(
     ]
     errors = [
         [np.abs(frame / 255 - image).mean() for image in expected]
-        for frame in video(tmp_path / "still.mp4")
+        for frame in open_frames(tmp_path / "still.mp4").frames()
     ]
     assert np.argmin(errors, axis=1).tolist() == shown
     assert np.min(errors, axis=1).max() < 0.03  # of the lossy codec on such a small image
@@ -171,15 +164,17 @@ def test_repeated_seconds__plays_whole_clips():
 def test_export_video__repeats_a_short_clip(stream, tmp_path):
     assert run("export", "video", tmp_path, "--least-seconds", 1, "--width", 32) == 0
     # Three plays of 4 frames at 10 frames per second.
-    assert len(video(tmp_path / "between.mp4")) == 12
+    assert open_frames(tmp_path / "between.mp4").num_frames == 12
     assert run("export", "video", tmp_path, "--least-seconds", 0, "--width", 32) == 0
-    assert len(video(tmp_path / "between.mp4")) == 4
+    assert open_frames(tmp_path / "between.mp4").num_frames == 4
 
 
 def test_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
     more = ("--freeze", 2, "--seconds", 0.5, "--width", 32, "--channels", "color", "depth")
     assert run("export", "video", tmp_path, "--path", "orbit", *more) == 0
-    assert [frame.shape for frame in video(tmp_path / "orbit.mp4")] == [(24, 68, 3)] * 5
+    assert [frame.shape for frame in open_frames(tmp_path / "orbit.mp4").frames()] == [
+        (24, 68, 3)
+    ] * 5
 
 
 @pytest.mark.parametrize(

@@ -9,23 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.capture import Capture
 from morgs_mi.runs.cluster.segments import SegmentedRun
 from morgs_mi.runs.cluster.workers import open_client
-from tests.runs.cluster.test_segments import FRAMES, SEGMENTS, SETTINGS, stream_of, when_fitted
-from tests.scenes.recording import write_recording
+from tests.runs.cluster import test_segments
+from tests.runs.cluster.test_segments import SEGMENTS, SETTINGS, stream_of, when_fitted
 
 pytest.importorskip("distributed", reason="comes with the extra `cluster`")
 
 
-@pytest.fixture(autouse=True)
-def short_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("morgs_mi.runs.cluster.segments.TASK_FRAMES", 2)
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    return load_capture(write_recording(tmp_path_factory.mktemp("capture"), FRAMES))
+capture = test_segments.capture
+short_tasks = test_segments.short_tasks
 
 
 @pytest.fixture(scope="module")

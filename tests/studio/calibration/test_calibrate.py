@@ -7,6 +7,7 @@ import re
 import shutil
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -165,13 +166,10 @@ def test_calibrate__takes_global_mapping_where_incremental_mapping_fails(
 
 
 def test_candidate__ranks_fitting_cameras_then_poses_then_the_error() -> None:
-    class Model:
-        def __init__(self, error: float) -> None:
-            self.compute_mean_reprojection_error = lambda: error
-
     def rank(error: float, *fits: bool | None) -> tuple[int, int, float]:
+        model = SimpleNamespace(compute_mean_reprojection_error=lambda: error)
         return Candidate(
-            "global", Model(error), tuple(CameraCheck("", 0, 0.0, each) for each in fits)
+            "global", model, tuple(CameraCheck("", 0, 0.0, each) for each in fits)
         ).rank
 
     ordered = [

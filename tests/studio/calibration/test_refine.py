@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.progress import Progress
 from morgs_mi.core.rig import scene_extent
 from morgs_mi.fit.fit_config import CameraPriors, FitConfig, ShortFitConfig
@@ -64,16 +67,25 @@ def relative_turns(cameras) -> np.ndarray:
     return np.rad2deg(np.arccos(np.clip(rays @ rays.T, -1, 1)))[np.triu_indices(len(rays), 1)]
 
 
+def capture_of(
+    path: Path, gaussians: Gaussians, cameras: list[Camera], test_view: int, noise: float = 0.0
+) -> Capture:
+    """Return a capture of Gaussians with noisy images; `noise` is a deviation in grey levels."""
+    rng = np.random.default_rng(0)
+    means = np.asarray(gaussians.means)
+    write_colmap(path / "sparse", cameras, means, np.full(means.shape, 0.5))
+    for camera in cameras:
+        image = rendered(gaussians, camera, RenderConfig())
+        image = image + rng.normal(scale=noise / 255, size=image.shape)
+        write_png(path / camera.name / "0000.png", to_uint8(image))
+    return load_capture(path, test_view=test_view)
+
+
 @pytest.fixture(scope="module")
 def splat_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     """A capture of the splats in five views, the first of which is held out."""
-    path = tmp_path_factory.mktemp("splats")
     cameras = look_at_cameras([(0, 0, -4), *PLACES], 60, 64, 48)
-    gaussians = splats()
-    write_colmap(path / "sparse", cameras, np.asarray(gaussians.means), np.full((60, 3), 0.5))
-    for camera in cameras:
-        write_png(path / camera.name / "0000.png", image_of(camera))
-    return load_capture(path, test_view=0)
+    return capture_of(tmp_path_factory.mktemp("splats"), splats(), cameras, test_view=0)
 
 
 @pytest.fixture(scope="module")
@@ -81,20 +93,13 @@ def far_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     """A capture of distant splats in nine noisy views on a plane, the middle one of which is held
     out.
     """
-    path = tmp_path_factory.mktemp("far")
     rng = np.random.default_rng(0)
     means = rng.uniform((-3, -2.2, 6), (3, 2.2, 12), (150, 3))
     sh = rng.uniform(-1, 1.5, (150, 1, 3))
     gaussians = isotropic(means.astype(np.float32), 0.35, 0.9, sh.astype(np.float32))
     places = [(x, y, 0) for y in (-0.5, 0, 0.5) for x in (-1, 0, 1)]
     cameras = look_at_cameras(places, 45, 96, 72, target=(0, 0, 10))
-    write_colmap(path / "sparse", cameras, means, np.full((150, 3), 0.5))
-    for camera in cameras:
-        image = 255 * rendered(gaussians, camera, RenderConfig()) + rng.normal(
-            scale=5, size=(72, 96, 3)
-        )
-        write_png(path / camera.name / "0000.png", to_uint8(image / 255))
-    return load_capture(path, test_view=4)
+    return capture_of(tmp_path_factory.mktemp("far"), gaussians, cameras, test_view=4, noise=5)
 
 
 def shift_of_splats(capture: Capture, true: Capture) -> float:
@@ -142,18 +147,13 @@ def test_joint_step__turns_cameras_to_where_the_images_were_taken():
     assert abs(changes[:, 6].mean()) < 1e-6, "a camera that takes no part keeps its focal length"
 
 
-@pytest.mark.parametrize("scale", [0.5, 1.0])
+@pytest.mark.parametrize("scale", [0.0, 0.5, 1.0])
 def test_register_camera__finds_the_camera_of_an_image(scale):
     start = disturbed(CAMERAS[:1], scale)[0]
     image = image_of(CAMERAS[0])
     camera = register_camera(splats(), View(start, image), 1.0, FitConfig())
     error = np.square(rendered(splats(), camera, RenderConfig()) - image / 255).mean()
     assert error < 1e-5, "the rounding to 8 bits alone has 1e-6"
-
-
-def test_register_camera__keeps_a_camera_that_fits():
-    camera = register_camera(splats(), View(CAMERAS[0], image_of(CAMERAS[0])), 1.0, FitConfig())
-    assert_close(camera.viewmat, CAMERAS[0].viewmat, rtol=0, atol=1e-3)
 
 
 def test_moved__keeps_the_projections_of_points():

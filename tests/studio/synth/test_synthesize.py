@@ -124,11 +124,7 @@ def test_synthesize__removes_its_output_after_a_failure(tmp_path, monkeypatch):
     ("settings", "message"),
     [
         ({"cameras": 1}, "`cameras` must be at least 2, got 1"),
-        ({"frames": 0}, "`frames` must be at least 1, got 0"),
-        ({"spp": 0}, "`spp` must be at least 1, got 0"),
-        ({"seed": -1}, "`seed` must be at least 0, got -1"),
         ({"width": 63}, "`width` must be at least 2 and a multiple of 2, got 63"),
-        ({"fps": 0}, "`fps` must be above 0, got 0"),
         ({"noise": -0.1}, "`noise` must be at least 0 and below 1, got -0.1"),
     ],
 )
@@ -270,9 +266,6 @@ def test_synthesize__writes_videos_that_browsers_play_beside_the_lossless_frames
     )
     assert played.shape == stored.shape
     assert psnr(played, stored) > 25
-    np.testing.assert_array_equal(
-        np.array([f.images[1] for f in load_capture(clip).frames()]), stored
-    )
 
 
 @pytest.mark.slow
