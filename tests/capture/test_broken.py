@@ -232,6 +232,10 @@ NERFSTUDIO = {
         transforms(pose(0, 1.5)),
         "frame 0 .*cam1.png.: the axes must be a right-handed orthonormal frame",
     ),
+    "long pose": (
+        transforms(lambda m: m["frames"][0]["transform_matrix"][0].__setitem__(0, 10**400)),
+        "the pose must be a matrix",
+    ),
     "no pose": (
         transforms(lambda m: m["frames"][0].pop("transform_matrix")),
         "the pose must be a matrix",

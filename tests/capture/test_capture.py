@@ -71,10 +71,10 @@ def test_load_capture__downscaling_moves_projections_with_the_pixels(
 
 @pytest.mark.usefixtures("small_images")
 def test_load_capture__downscales_by_averages(tmp_path: Path) -> None:
-    path = layouts.n3dv(tmp_path / "a", ("cam00",))
+    path = layouts.n3dv(tmp_path / "a", ("cam00",), lambda *_: None)
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     image[::2] = 200
-    write_video(path / "cam00.mkv", [image], FPS)
+    write_video(path / "cam00.mp4", [image], FPS)
     assert (next(load_capture(path, downscale=2).frames()).images[0] == 100).all()
 
 

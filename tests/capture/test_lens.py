@@ -100,13 +100,13 @@ def test_undistortion__masks_the_empty_corners_of_a_pincushion() -> None:
 
 
 @pytest.mark.parametrize(
-    ("model", "fold"), [("SIMPLE_RADIAL", (3 * 0.5) ** -0.5), ("OPENCV_FISHEYE", None)]
+    ("model", "radius"),
+    [("SIMPLE_RADIAL", 1.5**-0.5), ("OPENCV_FISHEYE", np.tan(1.5**-0.5))],
 )
-def test_undistortion__mask_ends_where_the_polynomial_folds(model: str, fold: float | None) -> None:
+def test_undistortion__mask_ends_where_the_polynomial_folds(model: str, radius: float) -> None:
     """R (1 - 0.5 r^2) decreases beyond r = 0.816; theta (1 - 0.5 theta^2) beyond that angle, of
     tangent 1.066.
     """
-    radius = fold or np.tan((3 * 0.5) ** -0.5)
     cam = camera(focal=60.0)
     lens_map = undistortion(cam, Lens(model, (-0.5,)))
     assert lens_map is not None

@@ -16,13 +16,14 @@ from morgs_mi.io.video_writer import write_video
 from tests.scenes import captures as layouts
 
 
-def capture_of(path: Path, clips: dict[str, tuple[int, float]]) -> Path:
+def capture_of(path: Path, clips: dict[str, tuple[int, float]], levels: int = 1) -> Path:
     """Write clips given by number of frames and frame rate; frame t of camera i is filled with (i,
-    t, 0).
+    t, 0) times `levels`.
     """
     layouts.n3dv(path, tuple(clips), lambda *_: None)
     for i, (name, (count, fps)) in enumerate(clips.items()):
-        write_video(path / f"{name}.mkv", layouts.frames(i, count), fps)
+        images = [levels * image for image in layouts.frames(i, count)]
+        write_video(path / f"{name}.mkv", images, fps)
     return path
 
 
@@ -63,40 +64,31 @@ def test_timeline__aligns_clips(tmp_path: Path, clips, config, fps, instants) ->
     assert [frame.index for frame in capture.partial_frames(1)] == list(range(1, len(instants)))
 
 
-def brightening(path: Path, fps: dict[str, float]) -> Path:
-    """Write a capture of clips with frames t of the colour 40 t."""
-    layouts.n3dv(path, tuple(fps), lambda *_: None)
-    for name, rate in fps.items():
-        images = [np.full((layouts.HEIGHT, layouts.WIDTH, 3), 40 * t, np.uint8) for t in range(5)]
-        write_video(path / f"{name}.mkv", images, rate)
-    return path
-
-
 def test_timeline__gives_clips_whose_offset_is_not_whole_a_delay(tmp_path: Path) -> None:
-    path = brightening(tmp_path / "c", {"a": 25, "b": 25})
+    path = capture_of(tmp_path / "c", {"a": (5, 25), "b": (5, 25)}, 40)
     capture = load_capture(path, reading=ReadConfig(offset={"b": -1.25}))
     # At frames 2, 3 and 4 of a, b would show its frames 0.75, 1.75 and 2.75. Only the first image
     # is interpolated.
     assert frame_numbers(capture) == [[80, 30], [120, 80], [160, 120]]
     assert [camera.delay for camera in capture.cameras] == [0, 0.25]
     first, second = list(capture.partial_frames())[:2]
-    assert [int(image[0, 0, 0]) for image in first.comparable((0, 1))] == [80, 40]
-    assert [int(image[0, 0, 0]) for image in second.comparable((1,))] == [80]
-    assert [int(image[0, 0, 0]) for image in capture.images(1)] == [40, 80, 120]
+    assert [int(image[0, 0, 1]) for image in first.comparable((0, 1))] == [80, 40]
+    assert [int(image[0, 0, 1]) for image in second.comparable((1,))] == [80]
+    assert [int(image[0, 0, 1]) for image in capture.images(1)] == [40, 80, 120]
     capture = load_capture(path, reading=ReadConfig(offset={"a": 1.5, "b": 2}))
     assert frame_numbers(capture) == [[20, 40], [80, 80], [120, 120], [160, 160]]
     assert [camera.delay for camera in capture.cameras] == [0.5, 0]
 
 
 def test_timeline__gives_faster_clips_a_delay_in_instants(tmp_path: Path) -> None:
-    path = brightening(tmp_path / "c", {"a": 25, "b": 50})
+    path = capture_of(tmp_path / "c", {"a": (5, 25), "b": (5, 50)}, 40)
     capture = load_capture(path, reading=ReadConfig(offset={"b": 0.5}))
     assert frame_numbers(capture) == [[0, 20], [40, 120]]
     assert [camera.delay for camera in capture.cameras] == [0, 0.25]
 
 
 def test_timeline__interpolates_images_where_the_delay_would_vary(tmp_path: Path) -> None:
-    path = brightening(tmp_path / "c", {"a": 20, "b": 30})
+    path = capture_of(tmp_path / "c", {"a": (5, 20), "b": (5, 30)}, 40)
     capture = load_capture(path, reading=ReadConfig(offset={"b": 0.25}))
     # a's frames 0, 1 and 2 are b's 0.25, 1.75 and 3.25.
     assert frame_numbers(capture) == [[0, 10], [40, 70], [80, 130]]

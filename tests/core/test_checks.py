@@ -22,7 +22,6 @@ from tests.scenes.recording import recording
         (np.nan, "[0, inf)", False),
         (True, "[0, 1]", False),
         ("0", "[0, 1]", False),
-        (None, "[0, 1]", False),
     ],
 )
 def test_check_number__accepts_the_numbers_of_the_interval(value, interval, good):

@@ -15,21 +15,14 @@ from tests.scenes.cameras import arc, circle, look_at_cameras
 NO_POINTS = np.zeros((0, 3))
 
 
-def slab(count: int = 500) -> np.ndarray:
-    """Return points [count, 3] at depths 2 to 3 of a camera at z = -3 that looks along +z."""
+def slab() -> np.ndarray:
+    """Return points [500, 3] at depths 2 to 3 of a camera at z = -3 that looks along +z."""
     rng = np.random.default_rng(0)
-    return rng.uniform((-0.5, -0.4, -1), (0.5, 0.4, 0), (count, 3))
+    return rng.uniform((-0.5, -0.4, -1), (0.5, 0.4, 0), (500, 3))
 
 
 def nears(cameras: list[Camera], points: np.ndarray = NO_POINTS) -> np.ndarray:
     return np.array([camera.near for camera in with_near_planes(cameras, points)])
-
-
-def at_scale(camera: Camera, scale: float) -> Camera:
-    """Return the camera in a world whose unit is 1 / scale as long."""
-    V = np.array(camera.viewmat)
-    V[:3, 3] *= scale
-    return replace(camera, viewmat=V)
 
 
 def test_with_near_planes__are_a_fifth_of_the_smallest_depth_of_the_points() -> None:
@@ -47,7 +40,9 @@ def test_with_near_planes__ignores_a_few_wrong_points_before_the_camera() -> Non
 @pytest.mark.parametrize("points", [NO_POINTS, slab()], ids=["rig", "points"])
 def test_with_near_planes__scale_with_the_world(scale: float, points: np.ndarray) -> None:
     cameras = look_at_cameras(arc((-0.3, 0, 0.3), 3.0))
-    scaled = nears([at_scale(camera, scale) for camera in cameras], scale * points)
+    units = np.ones((4, 4))
+    units[:3, 3] = scale
+    scaled = nears([replace(c, viewmat=c.viewmat * units) for c in cameras], scale * points)
     assert_close(scaled, scale * nears(cameras, points), rtol=1e-6)
 
 

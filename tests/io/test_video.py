@@ -25,11 +25,11 @@ def clip(height: int = HEIGHT, width: int = WIDTH, count: int = COUNT) -> list[n
     )
 
 
-def smooth_clip() -> list[np.ndarray]:
+def smooth_clip(count: int = COUNT, speed: int = 1) -> list[np.ndarray]:
     y, x = np.mgrid[:HEIGHT, :WIDTH]
     return [
-        np.stack([120 + 80 * np.sin((x + t) / 9), 100 + 2 * y, 90 + x], -1).astype(np.uint8)
-        for t in range(COUNT)
+        np.stack([120 + 80 * np.sin((x + speed * t) / 9), 100 + 2 * y, 90 + x], -1).astype(np.uint8)
+        for t in range(count)
     ]
 
 
@@ -58,11 +58,7 @@ def long_video(path: Path, codec: str) -> Path:
     """Write a clip in which every frame differs; with the codec mpg2 it has frames that refer to
     later ones.
     """
-    y, x = np.mgrid[:HEIGHT, :WIDTH]
-    red = (np.uint8(120 + 80 * np.sin((x + 3 * t) / 9)) for t in range(160))
-    write_video(
-        path, (np.stack([r, 100 + 2 * y, 90 + x], -1).astype(np.uint8) for r in red), 29.97, codec
-    )
+    write_video(path, smooth_clip(160, 3), 29.97, codec)
     return path
 
 

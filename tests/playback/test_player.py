@@ -83,11 +83,6 @@ def test_render_stream__renders_the_available_channels(fitted_clip: Path, tmp_pa
             r"`config.render` of the header's metadata: `x` is unknown",
         ),
         (
-            {"config": {"render": {"block_width": 5}}},
-            render_config,
-            r"metadata: `block_width` must be at least 4, at most 16 and a multiple of 4",
-        ),
-        (
             {"config": {"motion": 1}},
             has_confidence,
             r"`config.motion.learn_confidence` of .* must be true or false",

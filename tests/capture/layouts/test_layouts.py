@@ -446,43 +446,30 @@ def test_load_capture__reads_texts_of_windows(
 
 
 @pytest.mark.parametrize(
-    ("place", "image"),
+    ("file", "image"),
     [
-        ("images/{}", "{}/1.png"),
-        ("images/{}", "images/{}/1.png"),
-        ("{}", "{}/3.png"),
-        ("{}/images", "{}/images/2.png"),
-        ("frames/{}", "./{}/1.png"),
+        ("images/{camera}/{number}.png", "{}/1.png"),
+        ("images/{camera}/{number}.png", "images/{}/1.png"),
+        ("{camera}/{number}.png", "{}/3.png"),
+        ("{camera}/images/{number}.png", "{}/images/2.png"),
+        ("frames/{camera}/{number}.png", "./{}/1.png"),
+        ("{frame}/{camera}.png", "0/{}.png"),
+        ("{frame}/images/{camera}.png", "0/images/{}.png"),
     ],
 )
 @pytest.mark.parametrize("layout", ["COLMAP", "Nerfstudio"])
 def test_match_clips__reads_cameras_and_frames_numbered_alike(
-    tmp_path: Path, layout: str, place: str, image: str
+    tmp_path: Path, layout: str, file: str, image: str
 ) -> None:
     names = ("1", "2", "3")
     for i, name in enumerate(names):
         for t in range(COUNT):
-            layouts.write_image(tmp_path / place.format(name) / f"{t + 1}.png", i, t)
+            layouts.write_image(tmp_path / file.format(camera=name, number=t + 1, frame=t), i, t)
     views = [replace(camera, name=image.format(camera.name)) for camera in rig(names)]
     if layout == "COLMAP":
         write_colmap(tmp_path / "sparse/0", views)
     else:
         layouts.transforms(tmp_path, views)
-    assert_holds(load_capture(tmp_path), names, (0, 1, 2))
-
-
-@pytest.mark.parametrize("image", ["0/{}.png", "0/images/{}.png"])
-def test_match_clips__reads_a_folder_per_frame_numbered_like_cameras(
-    tmp_path: Path, image: str
-) -> None:
-    names = ("0", "1", "2")
-    for i, name in enumerate(names):
-        for t in range(COUNT):
-            layouts.write_image(tmp_path / image.format(name).replace("0/", f"{t}/", 1), i, t)
-    write_colmap(
-        tmp_path / "sparse/0",
-        [replace(camera, name=image.format(camera.name)) for camera in rig(names)],
-    )
     assert_holds(load_capture(tmp_path), names, (0, 1, 2))
 
 

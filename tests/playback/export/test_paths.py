@@ -100,17 +100,14 @@ def test_load_path__accepts_cameras_matrices_and_positions(tmp_path):
     ("text", "message"),
     [
         ("[", "expected JSON, got a broken file"),
-        ("[" * 100_000, "expected JSON, got a broken file"),
         (
             '{"keys": [{"time": 0, "camera": "left", "width": 1e999}]}',
             "key 0: cannot convert float infinity",
         ),
-        ("[]", "expected a JSON object with a list `keys`"),
         (
             '{"cameras": []}',
             "a list `keys` of objects, got an object with `cameras`; write the views of",
         ),
-        ('{"keys": {"time": 0}}', "a list `keys` of objects, got an object with `keys`; write"),
         (
             '{"fps": 24, "camera_path": []}',
             "with `fps`, `camera_path`, a camera path of Nerfstudio; write",

@@ -20,20 +20,20 @@ def test_demo__passes_its_options_on(tmp_path: Path, run, monkeypatch: pytest.Mo
     monkeypatch.setattr("morgs_mi.studio.demo.run_demo", stop)
     (tmp_path / "a.toml").write_text("seed = 7\n[fit]\nepochs = 2\n")
     assert run("demo", tmp_path)[0] == 130
-    options = (
+    options = [
         "--scene",
         "arm",
         "--cameras",
-        4,
+        "4",
         "--frames",
-        5,
+        "5",
         "--width",
-        64,
+        "64",
         "--height",
-        48,
+        "48",
         "--spp",
-        2,
-    )
+        "2",
+    ]
     assert run("demo", tmp_path, *options, "--config", tmp_path / "a.toml")[0] == 130
     assert run("demo", tmp_path, "--config", tmp_path / "a.toml", "--seed", 1)[0] == 130
     default, small, seeded = calls

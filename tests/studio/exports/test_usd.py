@@ -208,18 +208,11 @@ def test_export_usd__writes_selected_frames(tmp_path, capsys):
     assert (tmp_path / "stream.usdc").is_file()
 
 
-@pytest.mark.parametrize(
-    ("output", "message"),
-    [
-        ("a.txt", "the output must be FILE.usdc, FILE.usd, FILE.usda or FILE.usdz, got '.txt'."),
-        ("/sys/a.usdc", "Cannot write /sys/a.usdc"),
-    ],
-)
-def test_export_usd__names_an_output_that_does_not_fit(tmp_path, capfd, output, message):
+def test_export_usd__names_an_output_that_cannot_be_written(tmp_path, capfd):
     write_stream(tmp_path / "stream.morgs", 1)
-    assert cli.main(["export", "usd", str(tmp_path), str(tmp_path / output)]) == 1
+    assert cli.main(["export", "usd", str(tmp_path), "/sys/a.usdc"]) == 1
     error = capfd.readouterr().err
-    assert message in error
+    assert "Cannot write /sys/a.usdc" in error
     assert "Traceback" not in error
     assert [path.name for path in tmp_path.iterdir()] == ["stream.morgs"]
 

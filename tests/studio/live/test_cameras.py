@@ -14,7 +14,7 @@ from threading import Timer
 import numpy as np
 import pytest
 
-from morgs_mi.studio.live.cameras import CameraFeed, _nearest
+from morgs_mi.studio.live.cameras import CameraFeed, _nearest, _simultaneous
 from morgs_mi.studio.live.feed import Shot
 
 IMAGE = np.zeros((4, 6, 3), np.uint8)
@@ -82,6 +82,10 @@ def test_nearest__is_the_newest_shot_of_the_slowest_camera_and_those_nearest_to_
     assert _nearest([fast, []], [True, True]) is None
     assert _nearest([fast, []], [True, False]) == [fast[2], None]
     assert _nearest([fast, [shot(9.0)]], [True, True]) is None, "not of one time"
+
+
+def test_simultaneous__leaves_out_what_stopped_long_before_the_others() -> None:
+    assert _simultaneous([[shot(5.0)], [shot(5.4)], [], [shot(1.0)]]) == [True, True, False, False]
 
 
 def test_CameraFeed__skips_what_arrived_during_a_fit(opened) -> None:

@@ -19,7 +19,6 @@ import pytest
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.png import png_bytes
-from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.runs.fit_capture import stream_capture
 from morgs_mi.studio.live import sources as module
@@ -125,8 +124,6 @@ def test_fit_live__leaves_out_a_camera_that_stops(
     assert [record.message for record in caplog.records if "left out" in record.message] == [
         "frame 1: cam1 is left out: no image for 0.5 s"
     ]
-    views = evaluate_stream(tmp_path / "out").frames[1].views
-    assert [np.isnan(views[name].psnr) for name in NAMES] == [False, True, False, False]
 
 
 @pytest.mark.slow

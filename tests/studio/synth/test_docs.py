@@ -43,7 +43,10 @@ def test_scenes_page__commands_run(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "out").mkdir()
     assert cli.main([*command, *SMALL]) == 0
-    assert load_disturbances(Path(command[2]) / "truth")
+    drawn = load_disturbances(Path(command[2]) / "truth").values()
+    for field in fields(Disturbances):
+        acts = any(getattr(disturbance, field.name) for disturbance in drawn)
+        assert acts == (f"--{field.name.replace('_', '-')}" in command)
 
 
 def test_scenes_page__lists_every_disturbance() -> None:

@@ -273,7 +273,4 @@ def test_synthesize__without_lossless_frames_records_the_videos(tmp_path):
     config = SynthConfig(cameras=2, frames=2, width=32, height=32, spp=1, lossless=False)
     out = synthesize("spheres", tmp_path / "clip", config)
     assert not (out / "frames").exists()
-    played = np.array(list(open_frames(out / "cam01.mp4").frames()))
-    np.testing.assert_array_equal(
-        np.array([f.images[1] for f in load_capture(out).frames()]), played
-    )
+    assert load_capture(out).num_frames == open_frames(out / "cam01.mp4").num_frames == 2
