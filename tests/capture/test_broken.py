@@ -270,6 +270,10 @@ DYNAMIC3DGS = {
         meta(lambda m: m["cam_id"][1].__setitem__(0, 7)),
         "frame 1: `cam_id` must name each camera of",
     ),
+    "long pose": (
+        meta(lambda m: m["w2c"][1][0][0].__setitem__(0, 10**400)),
+        r"`w2c` \[4, 4\] in every frame",
+    ),
     "NaN pose": (
         meta(lambda m: m["w2c"][1][0][0].__setitem__(0, NAN)),
         "frame 1: the pose must be finite",
@@ -303,6 +307,10 @@ ANIPOSE = {
     "no pose": (
         replace("calibration.toml", "translation", "translate"),
         r"\[cam_0\]: `translation` must be .* got none",
+    ),
+    "word": (
+        replace("calibration.toml", "rotation = [", 'rotation = ["a", '),
+        r"`rotation` must be finite numbers \[3\]",
     ),
     "NaN pose": (
         replace("calibration.toml", "rotation = [", "rotation = [nan, 0.0, 0.0]#"),
