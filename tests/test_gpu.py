@@ -140,8 +140,9 @@ def test_rasterize__agrees_between_cuda_and_llvm_on_a_region():
         dr.enable_grad(*gaussians.items().values())
         image = rasterize(gaussians, camera, CHANNELS, region=region)
         # Blocks have another shape on CUDA and thus reach further beyond the mask.
-        inside = mi.TensorXf(region.crop(mask))
-        color, confidence = image.color * inside, image.confidence * inside
+        weight = mi.TensorXf(region.crop(mask))
+        color = image.color * weight
+        confidence = image.confidence * weight
         dr.backward(dr.sum(dr.square(color), axis=None) + dr.sum(confidence, axis=None))
         colors = {"color": region.paste(np.array(dr.detach(color)), np.zeros((*mask.shape[:2], 3)))}
         return colors | {f"gradient of {name}": dr.grad(getattr(gaussians, name)) for name in RAW}
