@@ -11,21 +11,29 @@ lie.
 from __future__ import annotations
 
 import re
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import ClassVar
+from sys import maxsize
+from typing import TYPE_CHECKING, ClassVar, TypeVar
 
 import cv2
 import numpy as np
 
 from morgs_mi.core.bounded import check_claim
 from morgs_mi.io.exr import read_light
-from morgs_mi.io.frame_times import SAME_TIME, clock, read_header, seconds, true_rate
+from morgs_mi.io.frame_times import clock, true_rate
 from morgs_mi.io.image_size import image_size
 from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, images_in
 from morgs_mi.io.numbering import counting_together
 
+if TYPE_CHECKING:
+    import av  # imported where a video is opened, as it takes 80 ms
+    import av.container
+
+_Item = TypeVar("_Item")
 # Bytes of memory that a pixel takes, in BGR and RGB.
 _BYTES_PER_PIXEL = 6
 # First frame that is worth a search, and the frames before it at which the search aims: those shown
@@ -62,54 +70,73 @@ def numbering_gap(names: Sequence[str]) -> int | None:
 class VideoReader:
     """Reader of a video file.
 
-    Each call of `frames` or `pick` decodes from the start, or far from there from the last keyframe
-    before, see `pick`.
+    Each call of `frames` or `pick` decodes from the start, or far from there from a keyframe.
     """
 
     path: Path  #: The file.
     num_frames: int  #: Number of frames according to the file's header.
     fps: float | None  #: Frames per second, None if unknown.
-    width: int  #: In pixels.
+    width: int  #: In pixels, after the rotation that the file asks for.
     height: int  #: In pixels.
     num_held: int  #: Number of frames in the file; less than `num_frames` if it was truncated.
     #: Times of the frames in the file, in frames of a regular clock of rate `fps`, which shows
     #: position k at the time of frame k of a clip of constant rate [num_held]; None at a constant
     #: rate.
     positions: np.ndarray | None = field(default=None, compare=False)
-    #: Times of the frames in the file, ascending, s [num_held]; None if it does not store them.
+    #: Times of the frames in the file, ascending, in units of the file [num_held]; None if it does
+    #: not store them.
+    stamps: np.ndarray | None = field(default=None, compare=False, repr=False)
+    #: Times of the frames after the first, s [num_held]; None if the file does not store them.
     times: np.ndarray | None = field(default=None, compare=False, repr=False)
     has_light: ClassVar[bool] = False
 
     @classmethod
     def open(cls, path: str | Path) -> VideoReader:
-        """Return the reader of a video; the first frame is decoded.
+        """Return the reader of a video; the first frame is decoded, and the packets are read.
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: it is empty, OpenCV cannot decode it, or its time stamps are broken.
+            ValueError: it is empty, FFmpeg cannot decode it, or its time stamps are broken.
         """
         path = Path(path)
-        header = read_header(path)
-        num_held = header.num_held
-        fps = header.fps
-        times = header.times
-        positions = None
-        # Some containers do not store the number, and a frame takes more than a byte.
-        num_frames = header.num_frames if 0 < header.num_frames <= path.stat().st_size else num_held
-        if times is not None and len(times) > 1:
-            periods = len(times) - 1.0
+        with _opened(path) as (container, stream):
+            num_indexed = len(stream.index_entries)
+            hidden = sum(entry.is_discard for entry in stream.index_entries)
+            first = None
+            packets = []
+            for packet in _unbroken(partial(container.demux, stream)):
+                if first is None:
+                    first = next(_unbroken(packet.decode), None)
+                if packet.size:
+                    packets.append((packet.pts, packet.is_discard, packet.is_corrupt))
+            if first is None:
+                raise _unreadable(path, "no frame can be decoded")
+            is_upright = first.rotation % 180 == 0
+            width, height = (first.width, first.height)[:: 1 if is_upright else -1]
+            fps = float(stream.guessed_rate or 0)
+            shown = [time for time, is_hidden, is_cut in packets if not (is_hidden or is_cut)]
+            stamps = _stamps(shown, first)
+            num_held = len(shown if stamps is None else stamps)
+            num_frames = stream.frames - hidden if stream.frames else 0
+            if num_indexed == len(packets) and not any(is_cut for *_, is_cut in packets):
+                num_frames = num_held  # headers also count what edit lists and null frames hide
+            length = _length(container, stream, first)
+            unit = float(stream.time_base or 0)
+        positions = times = None
+        if stamps is not None and num_held > 1:
+            times = (stamps - stamps[0]) * unit
+            periods = num_held - 1.0
             if (regular := clock(times)) is not None:
                 positions, rate = regular
                 periods = float(positions[-1] - positions[0])
                 _check_span(path, positions, rate, times)
-                # Where the number is not stored, it is the duration times the mean rate; a clip of
-                # this length is complete.
-                if fps > 0 and num_frames / fps <= times[-1] + 1.5 / rate:
-                    num_frames = num_held
-            fps = true_rate(fps, periods, float(times[-1] - times[0]))
-        shown_fps = fps if fps > 0 else None
-        size = header.width, header.height
-        return cls(path, num_frames, shown_fps, *size, num_held, positions, times)
+            fps = true_rate(fps, periods, float(times[-1]))
+            # A header may have the length of another stream's last packet.
+            if not num_frames and length * fps > periods + 1.5:
+                num_frames = round(length * fps)
+        if not num_held <= num_frames <= path.stat().st_size:  # a frame takes more than a byte
+            num_frames = num_held
+        return cls(path, num_frames, fps or None, width, height, num_held, positions, stamps, times)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
         """Yield frames start..stop-1, by default up to `num_frames`.
@@ -125,42 +152,56 @@ class VideoReader:
         """Yield the frames of ascending `indices`, with an error in place of each that cannot be
         decoded.
 
-        The frames between are decoded too. Those before the first are skipped if the time stamps of
-        the frames that are decoded instead prove which ones they are. The pixels are the same as
-        after decoding from the start, except in streams that refresh their images gradually instead
-        of with keyframes.
+        The pixels are the same as after decoding from the start, except in streams that refresh
+        their images gradually instead of with keyframes.
         """
-        stream, done = self._opened_before(indices[0]) if len(indices) else (self._opened(), 0)
-        ok = True
-        try:
-            for index in indices:
-                while ok and done <= index:
-                    ok = stream.grab()
-                    done += ok
-                frame = stream.retrieve()[1] if ok else None
+        from av.video.reformatter import VideoReformatter
+
+        numbered = self._numbered(indices[0] if len(indices) else 0)
+        converter = VideoReformatter()
+        last = index = -1
+        frame = None
+        with closing(numbered):
+            for target in indices:
+                while index < target:
+                    last = index
+                    index, frame = next(numbered, (maxsize, None))
+                if frame is None or index > target:
+                    yield self._missing(last + 1 if frame is None else target)
+                    continue
+                # Of 10 bits, BGR has half the error of RGB. Starting threads takes 1 ms a frame.
+                bgr = converter.reformat(
+                    frame, format="bgr24", interpolation="BICUBIC", threads=1
+                ).to_ndarray()
+                image = cv2.cvtColor(np.rot90(bgr, frame.rotation // 90), cv2.COLOR_BGR2RGB)
                 yield (
-                    self._missing(index if ok else done)
-                    if frame is None
-                    else cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
+                    image
+                    if image.shape[:2] == (self.height, self.width)
+                    else ValueError(
+                        f"{self.path}: frame {target}: expected {self.width}x{self.height}, "
+                        f"got {image.shape[1]}x{image.shape[0]}; convert the clip to one size."
+                    )
                 )
-        finally:
-            stream.release()
 
-    def _opened(self) -> cv2.VideoCapture:
-        return cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
-
-    def _opened_before(self, index: int) -> tuple[cv2.VideoCapture, int]:
-        """Return the decoder of the file, and the number of frames that it has passed: none, or all
-        up to `index`.
-        """
-        if self.times is None or not FAR <= index < len(self.times):
-            return self._opened(), 0
-        stream = self._opened()
-        stream.set(cv2.CAP_PROP_POS_MSEC, 1000 * self.times[index - _BEFORE])
-        if _passes(stream, self.times, index):
-            return stream, index + 1
-        stream.release()
-        return self._opened(), 0
+    def _numbered(self, first: int) -> Generator[tuple[int, av.VideoFrame], None, None]:
+        """Yield the frames with their indices, from `first` or earlier."""
+        stamps = self.stamps
+        far = stamps is not None and FAR <= first < len(stamps)
+        for begin in (first - _BEFORE, 0) if far else (0,):
+            # All frames are missing if the file has vanished since it was opened.
+            with suppress(FileNotFoundError, ValueError), _opened(self.path) as (container, stream):
+                if stamps is not None and begin:
+                    container.seek(int(stamps[begin]), stream=stream)
+                packets = _unbroken(partial(container.demux, stream))
+                frames = (frame for packet in packets for frame in _unbroken(packet.decode))
+                numbered = enumerate(frames)
+                if stamps is not None:
+                    numbered = ((int(np.searchsorted(stamps, f.pts or 0)), f) for f in frames)
+                head = next(numbered, None)
+                if head is not None and (head[0] <= first or not begin):
+                    yield head
+                    yield from numbered
+                    return
 
     def _missing(self, index: int) -> ValueError:
         if index >= self.num_frames:
@@ -171,6 +212,71 @@ class VideoReader:
             f"{self.path}: frame {index} of {self.num_frames} cannot be decoded: the file is "
             f"truncated or broken; copy it again or use the first {index} frames (`max_frames`)."
         )
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[av.container.InputContainer, av.VideoStream]]:
+    """Open a video file for reading, and find its stream of images."""
+    import av
+    from av.error import FFmpegError
+
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a video file, found none; check the path.")
+    if path.stat().st_size == 0:
+        raise ValueError(f"{path}: expected a video, got an empty file; copy or record it again.")
+    try:
+        container = av.open(f"file:{path}")  # a colon in the path would name a protocol
+    except FFmpegError as error:
+        raise _unreadable(path, str(error.strerror)) from None
+    with container:
+        stream = container.streams.best("video")
+        if not isinstance(stream, av.VideoStream):
+            raise _unreadable(path, "it has no images")
+        if stream.codec_context is None:
+            raise _unreadable(path, "FFmpeg has no decoder for its codec")
+        stream.thread_type = "AUTO"
+        yield container, stream
+
+
+def _unbroken(read: Callable[[], Iterable[_Item]]) -> Iterator[_Item]:
+    """Yield what FFmpeg reads up to the first error: what cannot be decoded is missing."""
+    from av.error import FFmpegError
+
+    with suppress(FFmpegError):
+        yield from read()
+
+
+def _stamps(times: list[int | None], first: av.VideoFrame) -> np.ndarray | None:
+    """Return the ascending times of packets from the first frame that is shown; None if a packet
+    has none, or two have the same.
+    """
+    present = [time for time in times if time is not None]
+    if first.pts is None or len({*present}) < len(times):
+        return None
+    return np.array(sorted(time for time in present if time >= first.pts), np.int64)
+
+
+def _length(
+    container: av.container.InputContainer, stream: av.VideoStream, first: av.VideoFrame
+) -> float:
+    """Return the time from the first frame to the end that a file states, s; 0 without one."""
+    if stream.duration:
+        return float(stream.duration * (stream.time_base or 0))
+    end = 0.0
+    if text := stream.metadata.get("DURATION"):  # Matroska: hours:minutes:seconds
+        with suppress(ValueError):
+            end = float(np.dot([3600, 60, 1], [float(part) for part in text.split(":")]))
+    elif container.duration and len(container.streams) == 1:  # otherwise of the sound
+        end = container.duration / 1e6
+    return end - (first.time or 0) if np.isfinite(end) else 0
+
+
+def _unreadable(path: Path, reason: str) -> ValueError:
+    return ValueError(
+        f"{path}: expected a video, got {path.stat().st_size} bytes that FFmpeg cannot read "
+        f"({reason}): the file is truncated, no video, or in a rare codec; copy it again, or "
+        "convert it to H.264."
+    )
 
 
 @dataclass(frozen=True)
@@ -283,20 +389,6 @@ def _first_readable(files: Sequence[Path]) -> Path:
     """Return the first image that is readable, or the first file if none is."""
     readable = (file for file in files if not isinstance(_image_or_error(file), Exception))
     return next(readable, files[0])
-
-
-def _passes(stream: cv2.VideoCapture, times: np.ndarray, index: int) -> bool:
-    """Decode up to frame `index`, and return whether the frames on the way have their `times`."""
-    if not stream.grab():
-        return False
-    at = int(np.argmin(np.abs(times - seconds(stream))))
-    while at <= index and abs(times[at] - seconds(stream)) < SAME_TIME:
-        if at == index:
-            return True
-        at += 1
-        if not stream.grab():
-            break
-    return False
 
 
 def _check_span(path: Path, positions: np.ndarray, rate: float, times: np.ndarray) -> None:

@@ -86,7 +86,7 @@ def _check_even(path: Path, width: int, height: int) -> None:
 
 def _encoder(partial: Path, width: int, height: int, fps: float, codec: str) -> cv2.VideoWriter:
     fourcc = cv2.VideoWriter.fourcc(*codec)
-    encoder = cv2.VideoWriter(str(partial), cv2.CAP_FFMPEG, fourcc, fps, (width, height))
+    encoder = cv2.VideoWriter(f"file:{partial}", cv2.CAP_FFMPEG, fourcc, fps, (width, height))
     if not encoder.isOpened():
         encoder.release()
         raise OSError(
@@ -97,7 +97,7 @@ def _encoder(partial: Path, width: int, height: int, fps: float, codec: str) -> 
 
 def _count_frames(path: Path) -> int:
     """Return the number of frames of a video that can be decoded."""
-    stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    stream = cv2.VideoCapture(f"file:{path}", cv2.CAP_FFMPEG)
     count = 0
     while stream.grab():
         count += 1

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.color_space import decode_light, encode_light
+from morgs_mi.io.video import VideoReader
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.visualise import write_png
 from morgs_mi.runs.cluster.seams import SegmentConfig
@@ -37,8 +39,13 @@ from tests.scenes.recording import write_recording
 def test_fit__continues_without_a_camera_whose_clip_is_cut_off_meanwhile(
     capture: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    whole = shutil.copy(capture / "cam1.mkv", tmp_path / "whole.mkv")
     truncate_clip(capture)
-    monkeypatch.setattr("morgs_mi.io.frame_times.packet_times", lambda path: np.arange(FRAMES) / 25)
+    opened = VideoReader.open
+    copies = {str(capture / "cam1.mkv"): whole}
+    monkeypatch.setattr(
+        VideoReader, "open", lambda path: replace(opened(copies.get(str(path), path)), path=path)
+    )
     assert run("fit", capture, tmp_path / "out", *OPTIONS)[0] == 0
     frames = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
     assert [frame["missing_views"] for frame in frames] == [[], ["cam1"], ["cam1"]]

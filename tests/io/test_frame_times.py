@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from morgs_mi.io.frame_times import true_rate
-from morgs_mi.io.movie import Movie, read_movie
 from morgs_mi.io.video import VideoReader
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.studio.live.playing import ClipClock, play
@@ -87,41 +86,10 @@ def test_play__shows_the_frames_of_the_reader(tmp_path: Path) -> None:
 
 def test_video_reader__has_the_positions_of_shown_frames_at_a_variable_rate(tmp_path: Path) -> None:
     write_timed_video(tmp_path / "a.mp4", clip(8), [0, 50, 100, 150, 300, 350, 400, 450])
-    data = (tmp_path / "a.mp4").read_bytes()
-    at = data.rindex(b"free", 0, data.index(b"elst"))  # `write_timed_video` disables the edit list
-    (tmp_path / "a.mp4").write_bytes(data[:at] + b"edts" + data[at + 4 :])
     reader = VideoReader.open(show_parts(tmp_path / "a.mp4", [(0.1, 0.3)]))
     assert [number(image) for image in reader.frames()] == [2, 3, 4, 5]
     assert reader.positions is not None
     np.testing.assert_allclose(reader.positions, [0, 1, 4, 5], atol=0.05)
-
-
-def test_read_movie__reads_parts_and_notices_a_truncated_file(tmp_path: Path) -> None:
-    write_video(tmp_path / "a.mp4", clip(20), FPS, "mpg2")
-    assert read_movie(tmp_path / "a.mp4") == Movie(True, (1.0,))
-    show_parts(tmp_path / "a.mp4", [(-1, 0.25), (0.1, 0.5), (0.7, 0.2)])
-    assert read_movie(tmp_path / "a.mp4") == Movie(True, (0.5, 0.2))
-    data = (tmp_path / "a.mp4").read_bytes()
-    (tmp_path / "a.mp4").write_bytes(data[:-100])
-    movie = read_movie(tmp_path / "a.mp4")
-    assert movie is not None
-    assert not movie.complete
-    write_video(tmp_path / "a.mkv", clip(20), FPS)
-    assert read_movie(tmp_path / "a.mkv") is None
-
-
-@pytest.mark.parametrize("length", [0, 7, 8, 20, 60])
-def test_read_movie__survives_broken_boxes(tmp_path: Path, length: int) -> None:
-    boxes = (
-        b"\0\0\0\x40ftypisom"
-        + b"\0\0\0\x09moov"
-        + b"\xff\xff\xff\xfftrak"
-        + b"\0\0\0\1mdia"
-        + bytes(80)
-    )
-    (tmp_path / "a.mp4").write_bytes(boxes[:length])
-    movie = read_movie(tmp_path / "a.mp4")
-    assert movie is None or movie.parts == ()
 
 
 def test_true_rate__is_that_of_the_times_where_the_header_contradicts_them() -> None:

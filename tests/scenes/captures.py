@@ -5,11 +5,12 @@ with (i, t, 0).
 from __future__ import annotations
 
 import json
-import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,7 +19,6 @@ from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.video_writer import write_video
 from tests.scenes.cameras import circle, look_at_cameras, shift_principal_point
-from tests.scenes.edit_lists import with_list
 
 WIDTH = 62
 HEIGHT = 46
@@ -57,20 +57,36 @@ def videos(path: Path, names: tuple[str, ...], suffix: str = ".mkv") -> None:
         write_video(path / f"{name}{suffix}", frames(i), FPS)
 
 
-def write_timed_video(path: Path, images: list[np.ndarray], times: list[int]) -> None:
-    """Write an .mp4 that shows its frames at `times`, in ascending milliseconds from 0."""
-    write_video(path, images, 1000)
-    data = path.read_bytes()
-    # The list `stts` has (number of frames, duration in units of the track); OpenCV's has one
-    # entry.
-    at = data.index(b"stts") + 16
-    (millisecond,) = struct.unpack(">I", data[at : at + 4])
-    durations = np.diff([*times, 2 * times[-1] - times[-2]]) * millisecond
-    entries = b"".join(struct.pack(">II", 1, duration) for duration in durations)
-    parents = (b"moov", b"trak", b"mdia", b"minf", b"stbl")
-    timed = with_list(data, b"stts", len(durations), entries, parents)
-    # The edit list cuts the clip at its former end.
-    path.write_bytes(timed.replace(b"edts", b"free"))
+def write_timed_video(
+    path: Path,
+    images: list[np.ndarray],
+    times: Sequence[int],
+    codec: str = "ffv1",
+    rotation: int = 0,
+) -> None:
+    """Write a video that shows its frames at `times`, in ascending milliseconds from 0.
+
+    Args:
+        path: the file.
+        images: the frames, uint8 [H, W, 3].
+        times: of the frames.
+        codec: FFmpeg's name of it; only `ffv1` is lossless.
+        rotation: angle that players turn the images by, degrees.
+    """
+    with av.open(str(path), "w") as container:
+        period = int(np.gcd.reduce(times)) or 40
+        stream = container.add_stream(codec, rate=Fraction(1000, period))
+        stream.height, stream.width = images[0].shape[:2]
+        stream.pix_fmt = {"ffv1": "bgr0", "mjpeg": "yuvj420p"}.get(codec, "yuv420p")
+        stream.codec_context.time_base = Fraction(period, 1000)
+        if rotation:
+            stream.set_display_rotation(rotation)
+        for image, time in zip(images, times, strict=True):
+            frame = av.VideoFrame.from_ndarray(image, "rgb24")
+            frame.pts = time // period
+            frame.time_base = Fraction(period, 1000)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
 
 
 def n3dv(

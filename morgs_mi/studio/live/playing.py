@@ -9,10 +9,9 @@ from pathlib import Path
 from threading import Condition, Event
 from typing import TypeGuard
 
-import cv2
 import numpy as np
 
-from morgs_mi.studio.live.reading import open_stream
+from morgs_mi.io.video import VideoReader
 
 _POLL = 0.1  # interval at which a clip that waits for others looks whether it is to end, s
 _RATE = 30.0  # frames per second of a clip that does not state it
@@ -88,7 +87,7 @@ def play(
         loop: whether to begin again, together with the others, when the shortest clip has ended.
 
     Raises:
-        OSError: the video cannot be opened, or has no image.
+        OSError: the video cannot be opened.
     """
     begin = 0.0
     try:
@@ -100,10 +99,9 @@ def play(
                     return
                 if at > clock.length - interval / 2:
                     break
-                yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+                yield image
                 end = at + interval
             else:  # it has ended, before the others
-                _check_length(path, end)
                 if not loop:
                     return
                 clock.length = min(clock.length, end)
@@ -112,27 +110,19 @@ def play(
         clock.leave(clip)
 
 
-def _check_length(path: str | Path, length: float) -> None:
-    if not length:
-        raise OSError(
-            f"play(): expected images in {path}, found none; check that it is a whole video."
-        )
-
-
 def timed_images(path: str | Path) -> Iterator[tuple[np.ndarray, float, float]]:
-    """Yield each image [H, W, 3] of a video, BGR uint8, its time from the beginning of the video,
+    """Yield each image of a video, RGB uint8 [H, W, 3], its time from the beginning of the video,
     and the interval between two images, s.
 
     Raises:
         OSError: the video cannot be opened.
     """
-    stream = open_stream(path)
     try:
-        interval = 1 / (stream.get(cv2.CAP_PROP_FPS) or _RATE)
-        last = -inf
-        while (result := stream.read())[0]:
-            at = stream.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            last = at if at > last else last + interval  # not all containers have times
-            yield result[1], last, interval
-    finally:
-        stream.release()
+        reader = VideoReader.open(path)
+    except ValueError as error:
+        raise OSError(str(error)) from None
+    interval = 1 / (reader.fps or _RATE)
+    for index, image in enumerate(reader.pick(range(reader.num_held))):
+        if isinstance(image, np.ndarray):
+            at = index * interval if reader.times is None else float(reader.times[index])
+            yield image, at, interval

@@ -109,13 +109,10 @@ def test_play__ends_when_it_is_closed(tmp_path: Path) -> None:
     assert not reader.is_alive()
 
 
-def test_play__refuses_what_has_no_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_play__refuses_what_has_no_image(tmp_path: Path) -> None:
     (tmp_path / "text.mkv").write_text("no video")
-    with pytest.raises(OSError, match=r"cannot open the source .*text.mkv; check"):
+    with pytest.raises(OSError, match=r"text.mkv: expected a video, got 8 bytes"):
         next(play(tmp_path / "text.mkv", ClipClock(), Event()))
-    monkeypatch.setattr(module, "timed_images", lambda _: iter(()))
-    with pytest.raises(OSError, match=r"expected images in empty.mkv, found none; check"):
-        next(play("empty.mkv", ClipClock(), Event(), loop=True))
 
 
 def test_is_video__is_not_the_description_of_a_stream(tmp_path: Path) -> None:
