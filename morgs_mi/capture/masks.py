@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from morgs_mi.io.exr import opaque_light
 from morgs_mi.io.video import FolderReader, FrameReader, decode_image
 
 
@@ -132,29 +133,28 @@ def _opaque(file: Path, shape: tuple[int, int]) -> np.ndarray:
     """Return the mask of an image's opaque pixels [H, W]: all without an alpha channel, or if it is
     not readable.
     """
-    image = _transparent_image(file)
-    if image is None or image.shape != (*shape, 4):
-        return np.ones(shape, bool)
-    return image[..., 3] == np.iinfo(image.dtype).max
-
-
-def _transparent_image(file: Path) -> np.ndarray | None:
-    """Return an image that may have an alpha channel, None if it has none or is not readable."""
     try:
-        return decode_image(file, cv2.IMREAD_UNCHANGED) if _may_be_transparent(file) else None
+        mask = _opaque_in_file(file)
     except (ValueError, OSError):
-        return None
+        mask = None
+    return np.ones(shape, bool) if mask is None or mask.shape != shape else mask
 
 
-def _may_be_transparent(file: Path) -> bool:
-    """Return whether an image may have an alpha channel, from the header of its file."""
+def _opaque_in_file(file: Path) -> np.ndarray | None:
+    """Return the mask of an image's opaque pixels [H, W], None without an alpha channel."""
     with file.open("rb") as stream:
         header = stream.read(26)
-    if header.startswith(b"\x89PNG"):
-        # With a palette, grey and alpha, or RGB and alpha.
-        return header[25:] in (b"\3", b"\4", b"\6")
-    # JPEG has none, and the alpha channel of BMP and EXR files is not a mask.
-    return not header.startswith((b"\xff\xd8", b"BM", b"\x76\x2f\x31\x01"))
+    if header.startswith(b"\x76\x2f\x31\x01"):
+        return opaque_light(file)
+    # JPEG has no alpha channel, and that of BMP files is not a mask. PNG has one with a palette,
+    # grey and alpha, or RGB and alpha.
+    is_png = header.startswith(b"\x89PNG")
+    if header.startswith((b"\xff\xd8", b"BM")) or (
+        is_png and header[25:] not in (b"\3", b"\4", b"\6")
+    ):
+        return None
+    image = decode_image(file, cv2.IMREAD_UNCHANGED)
+    return image[..., 3] == np.iinfo(image.dtype).max if image.shape[2:] == (4,) else None
 
 
 def _check_aspect(file: Path, mask: np.ndarray, width: int, height: int) -> None:

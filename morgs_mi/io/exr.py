@@ -7,8 +7,9 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
+import cv2
 import numpy as np
 import OpenEXR
 
@@ -20,8 +21,12 @@ _MAGIC = 20000630
 _MULTIPART = 1 << 12
 # Chromaticities of Rec. 709, the default of EXR files: x and y of red, green, blue and white.
 _REC_709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)
-# Largest difference of chromaticities that counts as equal.
+# Largest difference of chromaticities, pixel aspects and alpha that counts as equal; that of half
+# floats at 1 is 5e-4.
 _SAME = 1e-3
+# Attributes of a header, of which files have tens: a larger number takes seconds.
+_MOST_ATTRIBUTES = 1000
+_REQUIRED = {b"channels", b"dataWindow", b"displayWindow"}
 
 
 def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
@@ -55,7 +60,8 @@ def _check_shapes(channels: Mapping[str, np.ndarray]) -> None:
 
 
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:
-    """Return the channels of an EXR file by name, each [H, W] as float32.
+    """Return the channels of an EXR file by name, each [H, W] as float32: its display window, with
+    0 where no pixel is stored.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -68,29 +74,52 @@ def read_light(path: str | Path) -> np.ndarray:
     """Return the image of an EXR file [H, W, 3], float32 in linear light with Rec. 709 primaries,
     not negative.
 
-    Its channels are R, G, B, or Y alone. Other primaries, which the attribute `chromaticities`
-    names, are converted by colour-science, with Bradford's adaptation to another white.
+    Its channels are R, G, B, those of its only layer with such channels, or Y alone. Other
+    primaries, which the attribute `chromaticities` names, are converted by colour-science, with
+    Bradford's adaptation to another white.
 
     Raises:
         FileNotFoundError: there is no such file.
         OSError: as for `read_exr`.
-        ValueError: it has other channels, or values that are not finite.
+        ValueError: it has other channels, pixels that are not square, or values that are not
+            finite.
     """
-    channels, primaries = _read(path)
+    channels, header, _ = _read(path)
+    if abs((aspect := header.get("pixelAspectRatio", 1)) - 1) > _SAME:
+        raise ValueError(
+            f"{path}: expected square pixels, got the pixel aspect {aspect:g}; resample the image."
+        )
     light = np.stack([channels[name] for name in _color_names(path, channels)], axis=-1)
+    primaries = header.get("chromaticities", _REC_709)
     if np.abs(np.subtract(primaries, _REC_709)).max() > _SAME:
         light = light @ _to_rec_709(primaries).T
     return positive_light(light, f"{path}: its image")
 
 
-def _color_names(path: str | Path, channels: Mapping[str, np.ndarray]) -> str:
+def opaque_light(path: str | Path) -> np.ndarray:
+    """Return the mask [H, W] of the pixels of `read_light` that are stored and opaque; its errors
+    are those of `read_light`.
+    """
+    channels, _, stored = _read(path)
+    alpha = channels.get(f"{_color_names(path, channels)[0][:-1]}A", stored)
+    return alpha * stored > 1 - _SAME
+
+
+def _color_names(path: str | Path, channels: Mapping[str, np.ndarray]) -> list[str]:
     """Return the names of the channels of red, green and blue."""
-    names = "RGB" if {"R", "G", "B"} <= channels.keys() else "YYY"
-    if not set(names) <= channels.keys():
-        raise ValueError(
-            f"{path}: expected the channels R, G, B, or Y, got {', '.join(channels)}; rename them."
-        )
-    return names
+    layers = {
+        name[:-1]
+        for name in channels
+        if name[-2:-1] in ("", ".") and {name[:-1] + color for color in "RGB"} <= channels.keys()
+    }
+    if len(layers) == 1 or "" in layers:
+        return [min(layers) + color for color in "RGB"]
+    if not layers and "Y" in channels:
+        return ["Y"] * 3
+    raise ValueError(
+        f"{path}: expected the channels R, G, B, or Y, or one layer with R, G, B, got "
+        f"{', '.join(channels)}; rename them."
+    )
 
 
 def _to_rec_709(primaries: Sequence[float]) -> np.ndarray:
@@ -107,22 +136,35 @@ def _to_rec_709(primaries: Sequence[float]) -> np.ndarray:
     return matrix_RGB_to_RGB(*spaces, chromatic_adaptation_transform="Bradford").astype(np.float32)
 
 
-def _read(path: str | Path) -> tuple[dict[str, np.ndarray], Sequence[float]]:
-    """Return the channels of an EXR file by name, and its primaries and white, see `_REC_709`."""
+def _read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any], np.ndarray]:
+    """Return the channels of an EXR file by name, its header, and the mask of the stored pixels."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"read_exr(): there is no file {path}; check the path.")
     try:
         _check_size(path)
         with OpenEXR.File(str(path), separate_channels=True) as file:
+            header = dict(file.header())  # the file clears its own
             channels = {
-                name: np.asarray(channel.pixels, np.float32)
+                name: _displayed(np.asarray(channel.pixels, np.float32), header)
                 for name, channel in file.channels().items()
             }
-            return channels, file.header().get("chromaticities", _REC_709)
-    except (RuntimeError, ValueError, KeyError, struct.error) as error:
+            stored = _displayed(np.ones((file.parts[0].height(), file.parts[0].width())), header)
+            return channels, header, stored > 0
+    except (RuntimeError, ValueError, struct.error) as error:
         raise OSError(
-            f"read_exr(): cannot read {path}: {error}; the file may be truncated."
+            f"read_exr(): cannot read {path}: {error}; the file may be truncated, write it again."
         ) from error
+
+
+def _displayed(pixels: np.ndarray, header: Mapping[str, Any]) -> np.ndarray:
+    """Return the display window [H, W] of the pixels in the data window, 0 where there are none."""
+    shift = header["dataWindow"][0] - header["displayWindow"][0]
+    width, height = header["displayWindow"][1] - header["displayWindow"][0] + 1
+    if not shift.any() and pixels.shape == (height, width):
+        return pixels
+    return cv2.warpAffine(
+        pixels, np.c_[np.eye(2), shift], (int(width), int(height)), flags=cv2.INTER_NEAREST
+    )
 
 
 def _check_size(path: str | Path) -> None:
@@ -149,31 +191,44 @@ def _headers(file: BinaryIO) -> list[dict[bytes, bytes]]:
 
 
 def _part_size(part: Mapping[bytes, bytes]) -> tuple[int, int, int]:
-    """Return the width, the height and the number of channels of a part."""
-    left, top, right, bottom = struct.unpack("<4i", part[b"dataWindow"])
-    channels = _count_channels(part[b"channels"])
+    """Return the largest width and height of the windows and the number of channels of a part."""
+    if missing := _REQUIRED - part.keys():
+        raise ValueError(f"its header lacks {b', '.join(sorted(missing)).decode()}")
+    windows = [struct.unpack("<4i", part[name]) for name in (b"dataWindow", b"displayWindow")]
     if part.get(b"type", b"").startswith(b"deep"):
         raise ValueError("it has deep pixels, which are not supported")
-    return max(0, right - left + 1), max(0, bottom - top + 1), channels
+    width, height = (max(window[i + 2] - window[i] + 1 for window in windows) for i in range(2))
+    return width, height, _count_channels(part[b"channels"])
 
 
 def _header(file: BinaryIO) -> dict[bytes, bytes]:
     """Return the attributes of one part."""
     attributes = {}
-    while name := _string(file):
+    for _ in range(_MOST_ATTRIBUTES):
+        if not (name := _string(file)):
+            return attributes
         _string(file)
         (size,) = struct.unpack("<I", file.read(4).ljust(4, b"\0"))
         attributes[name] = file.read(size)
-    return attributes
+    raise ValueError(f"its header has {_MOST_ATTRIBUTES} attributes or more")
 
 
 def _count_channels(data: bytes) -> int:
+    """Return the number of channels in a list of channels."""
     count = at = 0
     while at < len(data) - 1:
-        at = data.index(b"\0", at) + 17  # a name that ends in 0, and 16 bytes
+        end = data.index(b"\0", at)  # of the name; the last 8 of 16 bytes are the sampling
+        if data[end + 9 : end + 17] != b"\1\0\0\0" * 2:
+            raise ValueError(
+                f"it has fewer numbers than pixels in the channel {data[at:end].decode()}"
+            )
+        at = end + 17
         count += 1
     return count
 
 
 def _string(file: BinaryIO) -> bytes:
-    return b"".join(iter(lambda: file.read(1).strip(b"\0"), b""))
+    """Return a text that ends in 0, or 256 bytes of a longer one, which is none."""
+    text, _, rest = file.read(256).partition(b"\0")
+    file.seek(-len(rest), 1)
+    return text

@@ -33,15 +33,15 @@ def light(camera: int, frame: int) -> np.ndarray:
     return image
 
 
-def recorded(path: Path, **kwargs) -> Path:
+def recorded(path: Path, alpha: np.ndarray | None = None, **kwargs) -> Path:
     write_colmap(path / "sparse" / "0", rig(NAMES, shift=3.0), **kwargs)
     for camera, name in enumerate(NAMES):
         (path / name).mkdir(parents=True)
         for frame in range(2):
             image = light(camera, frame)
-            write_exr(
-                path / name / f"{frame:04d}.exr", {c: image[..., k] for k, c in enumerate("RGB")}
-            )
+            channels = {c: image[..., k] for k, c in enumerate("RGB")}
+            channels |= {} if alpha is None else {"A": alpha}
+            write_exr(path / name / f"{frame:04d}.exr", channels)
     return path
 
 
@@ -54,6 +54,15 @@ def test_load_capture__reads_sequences_of_exr_files(tmp_path: Path) -> None:
     assert capture.display_exposure == pytest.approx(-np.log2(white))
     shown = next(capture.displayed().frames()).images[0]
     np.testing.assert_array_equal(shown, display_image(light(0, 0), capture.display_exposure))
+
+
+def test_load_capture__masks_transparent_pixels_of_exr_files(tmp_path: Path) -> None:
+    alpha = np.ones((HEIGHT, WIDTH))
+    alpha[:, : WIDTH // 2] = 0.9
+    capture = load_capture(recorded(tmp_path, alpha))
+    for mask in capture.masks:
+        np.testing.assert_array_equal(mask, alpha == 1)
+    assert "cam01: 50.0 % of its pixels are transparent and masked out." in capture.notes
 
 
 def test_load_capture__takes_the_display_exposure_of_its_settings(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from morgs_mi.io.exr import read_exr, read_light, write_exr
+from morgs_mi.io.exr import opaque_light, read_exr, read_light, write_exr
 
 
 def test_read_exr__inverts_write_exr_exactly(tmp_path):
@@ -89,11 +89,67 @@ def test_read_light__converts_other_primaries(tmp_path):
     np.testing.assert_allclose(read_light(tmp_path / "a.exr"), LIGHT, atol=0.01)
 
 
+def write(path, channels, **header):
+    OpenEXR.File({"type": OpenEXR.scanlineimage, **header}, channels).write(str(path))
+    return path
+
+
+def window(left, top, right, bottom):
+    return np.array([left, top], np.int32), np.array([right, bottom], np.int32)
+
+
+def test_read_light__returns_the_display_window_and_opaque_light_its_stored_pixels(tmp_path):
+    """A window that is moved, smaller, larger, and elsewhere."""
+    for data in ((1, 2, 5, 5), (1, 1, 2, 2), (-3, -1, 9, 7), (20, 20, 24, 23)):
+        y, x = np.mgrid[data[1] : data[3] + 1, data[0] : data[2] + 1]
+        place = channels_of(np.stack([x, y, x + y], axis=-1).astype(np.float32) + 20)
+        windows = {"dataWindow": window(*data), "displayWindow": window(0, 0, 4, 3)}
+        path = write(tmp_path / "a.exr", place, **windows)
+        y, x = np.mgrid[:4, :5]
+        stored = (x >= data[0]) & (x <= data[2]) & (y >= data[1]) & (y <= data[3])
+        expected = stored[..., None] * (np.stack([x, y, x + y], axis=-1) + 20)
+        np.testing.assert_array_equal(read_light(path), expected)
+        np.testing.assert_array_equal(opaque_light(path), stored)
+
+
+def test_read_light__reads_the_only_layer_with_its_alpha(tmp_path):
+    alpha = np.linspace(0, 1.1, 20, dtype=np.float32).reshape(4, 5)
+    for layer in ("", "beauty.", "ViewLayer.Combined."):
+        layers = {f"{layer}{name}": channel for name, channel in channels_of(LIGHT).items()}
+        path = write(tmp_path / "a.exr", {**layers, f"{layer}A": alpha, "depth.Y": LIGHT[..., 1]})
+        np.testing.assert_array_equal(read_light(path), LIGHT)
+        np.testing.assert_array_equal(opaque_light(path), alpha >= 1)
+
+
+def test_read_light__refuses_layers_that_it_cannot_choose_from_and_other_pixels(tmp_path):
+    layers = {f"{v}.{name}": LIGHT[..., 0] for v in ("left", "right") for name in "RGB"}
+    with pytest.raises(
+        ValueError, match=r"or one layer with R, G, B, got left\.B, .*; rename them"
+    ):
+        read_light(write(tmp_path / "a.exr", layers))
+    with pytest.raises(ValueError, match=r"square pixels, got the pixel aspect 2; resample"):
+        read_light(write(tmp_path / "a.exr", channels_of(LIGHT), pixelAspectRatio=2.0))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b"dataWindow", b"dataWindox", "its header lacks dataWindow"),
+        (b"compression\0", b"a\0int\0\4\0\0\0\0\0\0\0" * 1000, "has 1000 attributes or more"),
+        (b"B\0\2\0\0\0\0\0\0\0\1", b"B\0\2\0\0\0\0\0\0\0\2", "fewer numbers .* channel B"),
+    ],
+    ids=["no window", "many attributes", "subsampled"],
+)
+def test_read_exr__names_the_defect_of_a_header(tmp_path, old, new, message):
+    path = write(tmp_path / "a.exr", channels_of(LIGHT))
+    path.write_bytes(path.read_bytes().replace(old, new, 1))
+    with pytest.raises(OSError, match=rf"cannot read {path}: .*{message}.*; the file may be"):
+        read_exr(path)
+
+
 def test_read_light__refuses_other_channels_and_infinity(tmp_path):
     write_exr(tmp_path / "a.exr", {"depth.Y": LIGHT[..., 0]})
-    with pytest.raises(
-        ValueError, match=r"expected the channels R, G, B, or Y, got depth\.Y; rename"
-    ):
+    with pytest.raises(ValueError, match=r"or one layer with R, G, B, got depth\.Y; rename"):
         read_light(tmp_path / "a.exr")
     write_exr(tmp_path / "a.exr", channels_of(LIGHT + np.inf))
     with pytest.raises(
