@@ -1,9 +1,16 @@
-"""Numbers of the images in folders: which cameras count together."""
+"""Numbers of the images in folders: which number of a name is the frame's, and which cameras count
+together.
+"""
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TypeVar
+
+import numpy as np
 
 Key = TypeVar("Key")
 
@@ -23,3 +30,50 @@ def counting_together(numbers: Mapping[Key, Sequence[int]]) -> list[list[Key]]:
         groups[-1].append(key)
         last = max(last, numbers[key][-1])
     return groups
+
+
+def frame_numbers(folder: Path, names: Sequence[str]) -> list[int]:
+    """Return the number in the name of each frame of one clip: the one that changes from name to
+    name, or the last one, as in ``cam1_0000``, ``0000_cam1`` and ``0000``.
+
+    Of several that change, it is the one with the most values, then with the fewest gaps, then the
+    last one. A single name without a number has the number 0.
+
+    Args:
+        folder: the folder of the frames, for messages.
+        names: names without suffixes.
+
+    Raises:
+        ValueError: a name has no number, or two have the same.
+    """
+    numbers = [list(map(int, reversed(re.findall(r"[0-9]+", name)))) for name in names]
+    columns = list(zip(*numbers, strict=False)) if len(names) > 1 or any(numbers) else [(0,)]
+    if not columns:
+        name = names[numbers.index([])]
+        raise ValueError(f"{folder}: expected a number in each name, got {name}; rename it.")
+    best = min(
+        columns,
+        key=lambda column: (
+            -len({*column}),
+            (max(column) - min(column)) // (math.gcd(*(n - column[0] for n in column)) or 1),
+        ),
+    )
+    last = dict(zip(best, names, strict=True))
+    for number, name in zip(best, names, strict=True):
+        if last[number] != name:
+            raise ValueError(
+                f"{folder}: expected one file with the number {number}, got {name} and "
+                f"{last[number]}; remove or rename one."
+            )
+    return list(best)
+
+
+def numbering_gap(numbers: Sequence[int]) -> int | None:
+    """Return the index of the first number that does not continue the sequence, or None."""
+    if len(numbers) < 2:
+        return None
+    steps = np.diff(numbers)
+    least = steps.min()
+    if least >= 1 and least == steps.max():
+        return None
+    return 1 + int(np.argmax(steps != least) if least > 0 else np.argmin(steps))

@@ -19,7 +19,6 @@ and y of every pixel row by row as float32, all little-endian. An EXR file holds
 
 from __future__ import annotations
 
-import re
 from functools import partial
 from pathlib import Path
 
@@ -27,6 +26,7 @@ import numpy as np
 
 from morgs_mi.io.exr import read_exr
 from morgs_mi.io.listing import listed
+from morgs_mi.io.numbering import frame_numbers
 from morgs_mi.method.flow_sources.flow_config import FlowConfig
 from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FlowSource, FramePair
 
@@ -99,21 +99,15 @@ class FlowFolder:
                 f"{folder}: expected a .flo or .exr file of frame {frame}, found {content}; name "
                 "each file after the frame on whose grid its flow lives, counting from 0."
             )
-        path, *others = files[frame]
-        if others:
-            names = ", ".join(path.name for path in files[frame])
-            raise ValueError(
-                f"{folder}: expected one file of frame {frame}, got {names}; keep one."
-            )
-        return path
+        return files[frame]
 
 
-def _files_by_frame(folder: Path) -> dict[int, list[Path]]:
-    paths: dict[int, list[Path]] = {}
-    for path in listed(folder) if folder.is_dir() else ():
-        if path.suffix.lower() in SUFFIXES and (digits := re.findall(r"\d+", path.stem)):
-            paths.setdefault(int(digits[-1]), []).append(path)
-    return paths
+def _files_by_frame(folder: Path) -> dict[int, Path]:
+    """Return the flow files of a folder by their frames."""
+    content = listed(folder) if folder.is_dir() else ()
+    files = [path for path in content if path.suffix.lower() in SUFFIXES]
+    numbers = frame_numbers(folder, [path.stem for path in files]) if files else ()
+    return dict(zip(numbers, files, strict=True))
 
 
 def read_flow(path: str | Path) -> np.ndarray:
