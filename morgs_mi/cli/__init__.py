@@ -27,6 +27,7 @@ from tyro.conf import arg
 
 from morgs_mi.cli.console import (
     ERR,
+    STDOUT,
     LogHandler,
     naming_output,
     print_result,
@@ -38,6 +39,8 @@ from morgs_mi.cli.suggestion import one_command, suggesting_command
 from morgs_mi.core.entries import place_of
 from morgs_mi.core.interrupts import INTERRUPTED, interruptible, is_interruption
 
+# Exit status of a shell for a program whose reader has ended, such as `head`.
+_CLOSED = 141
 # The class of each command, in the order of the help: a dataclass of its options, with `run`.
 COMMANDS: Mapping[str, type] = {
     name: resolve_name(place)
@@ -111,6 +114,9 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
             _flush_output()
         return 0
     except (KeyboardInterrupt, Exception) as error:
+        if isinstance(error, BrokenPipeError) and error.filename == STDOUT:
+            _drop_output()
+            return _CLOSED
         print_warning(" ".join([_sentence(error, command), *_notes(error, [prog, *args])]))
         # The error may come from parsing, before `options` exist.
         if "--debug" in args:

@@ -52,6 +52,8 @@ class _Console(Console):
         return super().render_str(printable(text), **{**options, "markup": False})
 
 
+STDOUT = "standard output"
+"""Name of standard output in errors."""
 OUT = _Console(soft_wrap=True)
 ERR = _Console(stderr=True, soft_wrap=True)
 
@@ -66,7 +68,7 @@ def naming_output() -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise OSError(error.errno, error.strerror, "standard output") from error
+        raise OSError(error.errno, error.strerror, STDOUT) from error
 
 
 def quantity(count: int, noun: str) -> str:

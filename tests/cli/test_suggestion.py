@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from importlib.metadata import version
 from pathlib import Path
 from typing import get_args
@@ -23,6 +26,15 @@ def test_main__names_standard_output_if_the_version_does_not_fit(
     with open("/dev/full", "w") as full:
         monkeypatch.setattr("sys.stdout", full)
         assert run("--version")[::2] == (1, "standard output: No space left on device.\n")
+
+
+def test_main__ends_silently_if_the_reader_of_its_output_has() -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    command = [sys.executable, "-m", "morgs_mi", "--help"]
+    result = subprocess.run(command, stdout=writer, stderr=subprocess.PIPE, check=False)
+    os.close(writer)
+    assert (result.returncode, result.stderr) == (141, b"")
 
 
 def test_main__writes_the_completion_of_a_shell(tmp_path: Path) -> None:

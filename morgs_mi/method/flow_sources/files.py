@@ -55,7 +55,7 @@ class FlowFolder:
             raise FileNotFoundError(
                 f"{folder}: expected a folder of flow files, found none; check the path."
             )
-        self._listed: dict[Path, dict[int, list[Path]]] = {}
+        self._listed: dict[Path, dict[int, Path]] = {}
 
     def flows(
         self, camera: str, frame: int, size: tuple[int, int]

@@ -9,6 +9,7 @@ from typing import Any
 
 from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import LARGEST
 from morgs_mi.core.color_space import exposed
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.png import png_bytes
@@ -73,7 +74,8 @@ class ExactImages:
 
 def _check_image(camera: Camera, motion_scale: float) -> None:
     size = camera.width * camera.height
-    if not 0 < motion_scale < float("inf") or size > _MOST_PIXELS:
+    if not 1 / LARGEST <= motion_scale <= LARGEST or size > _MOST_PIXELS:
         raise ValueError(
-            f"expected a motion above 0, at most {_MOST_PIXELS} pixels, got {motion_scale}, {size}."
+            f"expected a motion from {1 / LARGEST:g} to {LARGEST:g}, at most {_MOST_PIXELS} "
+            f"pixels, got {motion_scale}, {size}."
         )

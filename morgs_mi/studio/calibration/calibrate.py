@@ -318,6 +318,11 @@ def _clips(path: Path, without: Sequence[str]) -> dict[str, Path | tuple[Path]]:
     """Return the files of at least two cameras by name, except of those to leave out."""
     clips = clips_by_camera(path) or photos(path)
     clips = {name: clips[name] for name in names_without(path, clips, without)}
+    if broken := [name for name in clips if "\n" in name]:
+        raise ValueError(
+            f"{path}: expected names without line feeds, as COLMAP has one image a line, got "
+            f"{broken[0]!r}; rename it."
+        )
     if len(clips) < 2:
         names = ", ".join(clips) or "none"
         raise ValueError(

@@ -326,7 +326,9 @@ VIEW = exact(1, "color", rig()[0]).partition("?")[2]
         ("1/color?camera=" + "9" * 5000, "the JSON must have at most 4096 bytes"),
         ("1/color?camera=[[[[NaN]]]]", "numbers must be finite, got NaN"),
         (exact(1, "color", rig(4096, 4097)[0])[6:], "at most 16777216 pixels"),
-        (exact(1, "color", rig()[0], float("nan"))[6:], "expected a motion above 0"),
+        (exact(1, "color", rig()[0], float("nan"))[6:], "expected a motion from 1e-12 to 1e+12"),
+        (exact(1, "motion", rig()[0], 1e-320)[6:], "expected a motion from 1e-12 to 1e+12"),
+        (exact(1, "motion", rig()[0], 1e300)[6:], "expected a motion from 1e-12 to 1e+12"),
         (f"1/color?{VIEW.replace('near', 'far')}", "`camera.near` is missing"),
     ],
 )

@@ -291,6 +291,12 @@ def noise_clips(path: Path) -> None:
             "the clips of at least two cameras, found none",
         ),
         (
+            lambda path: (path / "a.mkv").rename(path / "a\n.mkv"),
+            {},
+            ValueError,
+            r"names without line feeds, .* got 'a\\n'; rename it",
+        ),
+        (
             lambda path: (path / "c.mkv").write_bytes(b""),
             {},
             ValueError,
