@@ -84,7 +84,7 @@ def read_light(path: str | Path) -> np.ndarray:
         ValueError: it has other channels, pixels that are not square, or values that are not
             finite.
     """
-    channels, header, _ = _read(path)
+    channels, header = _read(path)
     if abs((aspect := header.get("pixelAspectRatio", 1)) - 1) > _SAME:
         raise ValueError(
             f"{path}: expected square pixels, got the pixel aspect {aspect:g}; resample the image."
@@ -100,9 +100,10 @@ def opaque_light(path: str | Path) -> np.ndarray:
     """Return the mask [H, W] of the pixels of `read_light` that are stored and opaque; its errors
     are those of `read_light`.
     """
-    channels, _, stored = _read(path)
-    alpha = channels.get(f"{_color_names(path, channels)[0][:-1]}A", stored)
-    return alpha * stored > 1 - _SAME
+    channels, header = _read(path)
+    left_top, right_bottom = header["dataWindow"]
+    stored = _displayed(np.ones((right_bottom - left_top + 1)[::-1]), header)
+    return channels.get(f"{_color_names(path, channels)[0][:-1]}A", stored) > 1 - _SAME
 
 
 def _color_names(path: str | Path, channels: Mapping[str, np.ndarray]) -> list[str]:
@@ -136,8 +137,8 @@ def _to_rec_709(primaries: Sequence[float]) -> np.ndarray:
     return matrix_RGB_to_RGB(*spaces, chromatic_adaptation_transform="Bradford").astype(np.float32)
 
 
-def _read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any], np.ndarray]:
-    """Return the channels of an EXR file by name, its header, and the mask of the stored pixels."""
+def _read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Return the channels of an EXR file by name, and its header."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"read_exr(): there is no file {path}; check the path.")
     try:
@@ -148,8 +149,7 @@ def _read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any], np.n
                 name: _displayed(np.asarray(channel.pixels, np.float32), header)
                 for name, channel in file.channels().items()
             }
-            stored = _displayed(np.ones((file.parts[0].height(), file.parts[0].width())), header)
-            return channels, header, stored > 0
+            return channels, header
     except (RuntimeError, ValueError, struct.error) as error:
         raise OSError(
             f"read_exr(): cannot read {path}: {error}; the file may be truncated, write it again."
@@ -158,13 +158,12 @@ def _read(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any], np.n
 
 def _displayed(pixels: np.ndarray, header: Mapping[str, Any]) -> np.ndarray:
     """Return the display window [H, W] of the pixels in the data window, 0 where there are none."""
-    shift = header["dataWindow"][0] - header["displayWindow"][0]
-    width, height = header["displayWindow"][1] - header["displayWindow"][0] + 1
-    if not shift.any() and pixels.shape == (height, width):
+    left_top, right_bottom = header["displayWindow"]
+    shift = header["dataWindow"][0] - left_top
+    size = (right_bottom - left_top + 1).tolist()
+    if not shift.any() and pixels.shape[::-1] == tuple(size):
         return pixels
-    return cv2.warpAffine(
-        pixels, np.c_[np.eye(2), shift], (int(width), int(height)), flags=cv2.INTER_NEAREST
-    )
+    return cv2.warpAffine(pixels, np.c_[np.eye(2), shift], size, flags=cv2.INTER_NEAREST)
 
 
 def _check_size(path: str | Path) -> None:
