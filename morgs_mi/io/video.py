@@ -10,6 +10,7 @@ lie.
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
@@ -27,7 +28,7 @@ from morgs_mi.io.exr import read_light
 from morgs_mi.io.frame_times import clock, true_rate
 from morgs_mi.io.image_size import image_size
 from morgs_mi.io.listing import EXR_SUFFIX, IMAGE_SUFFIXES, images_in
-from morgs_mi.io.numbering import counting_together
+from morgs_mi.io.numbering import counting_together, frame_numbers, numbering_gap
 
 if TYPE_CHECKING:
     import av  # imported where a video is opened, as it takes 80 ms
@@ -36,6 +37,10 @@ if TYPE_CHECKING:
 _Item = TypeVar("_Item")
 # Bytes of memory that a pixel takes, in BGR and RGB.
 _BYTES_PER_PIXEL = 6
+# White of images of 16 bits, and the bits of cameras that are stored in them.
+_WHITE = 2**16 - 1
+_BITS = (8, 10, 12, 14)
+_LOG = logging.getLogger(__name__)
 # First frame that is worth a search, and the frames before it at which the search aims: those shown
 # right after a keyframe may refer to frames before it, and a file may be indexed by the times of
 # decoding.
@@ -50,20 +55,6 @@ def natural_key(name: str) -> list[str | int]:
     # split() with a group alternates text and digits, so keys compare text with text and int with
     # int.
     return [int(piece) if i % 2 else piece for i, piece in enumerate(re.split(r"([0-9]+)", name))]
-
-
-def numbering_gap(names: Sequence[str]) -> int | None:
-    """Return the index of the first name with a last number that does not continue the sequence, or
-    None.
-    """
-    numbers = [int((re.findall(r"[0-9]+", name) or ["-1"])[-1]) for name in names]
-    if len(names) < 2:
-        return None
-    steps = np.diff(numbers)
-    least = steps.min()
-    if min(numbers) >= 0 and least >= 1 and least == steps.max():
-        return None
-    return 1 + int(np.argmax(steps != least) if least > 0 else np.argmin(steps))
 
 
 @dataclass(frozen=True)
@@ -293,8 +284,11 @@ class FolderReader:
     height: int
     fps: float | None = None
     positions: np.ndarray | None = None
-    #: Numbers of the images, None of a list of files and of a single image without a number.
+    #: Numbers of the images, None of a list of files.
     numbers: range | None = None
+    #: Largest value of the first image if it has 16 bits, otherwise None.
+    most: int | None = None
+    white: int = _WHITE  #: Value of white in images of 16 bits.
 
     @classmethod
     def open(cls, path: str | Path) -> FolderReader:
@@ -306,9 +300,17 @@ class FolderReader:
             ValueError: a number is missing or occurs twice, or the first image cannot be decoded.
         """
         path = Path(path)
-        files = _images(path)
-        _check_gaps(path, files)
-        return replace(cls.of_files(files), numbers=_numbers(files))
+        images = _images(path)
+        files = list(images.values())
+        numbers = list(images)
+        if gap := numbering_gap(numbers):
+            raise ValueError(
+                f"{path}: the images must be numbered without gaps, got {files[gap - 1].name} "
+                f"followed by {files[gap].name}; extract the frames again, or go on without the "
+                "missing ones (--gaps)."
+            )
+        step = numbers[1] - numbers[0] if len(numbers) > 1 else 1
+        return replace(cls.of_files(files), numbers=range(numbers[0], numbers[-1] + step, step))
 
     @classmethod
     def of_files(cls, files: Sequence[Path], gaps: bool = False) -> FolderReader:
@@ -321,7 +323,8 @@ class FolderReader:
         """
         _check_files(files, gaps)
         first = _read_image(_first_readable(files) if gaps else files[0])
-        return cls(files[0].parent, tuple(files), first.shape[1], first.shape[0])
+        most = int(first.max()) if first.dtype == np.uint16 else None
+        return cls(files[0].parent, tuple(files), first.shape[1], first.shape[0], most=most)
 
     @property
     def num_frames(self) -> int:
@@ -357,7 +360,14 @@ class FolderReader:
         frame = _image_or_error(self.files[index])
         if isinstance(frame, np.ndarray) and frame.shape[:2] != (self.height, self.width):
             return self._size_error(index, frame)
-        return frame
+        if not isinstance(frame, np.ndarray) or frame.dtype != np.uint16:
+            return frame
+        if frame.max() > self.white:
+            return ValueError(
+                f"{self.files[index]}: expected values up to {self.white} as in the first images, "
+                f"got {frame.max()}; convert the images to 8 bits."
+            )
+        return cv2.convertScaleAbs(frame, alpha=255 / self.white)
 
     def _size_error(self, index: int, frame: np.ndarray) -> ValueError:
         return ValueError(
@@ -374,15 +384,6 @@ def _check_files(files: Sequence[Path], gaps: bool) -> None:
         )
     if not gaps and (missing := next((f for f in files if not f.is_file()), None)):
         raise _no_image(missing)
-
-
-def _check_gaps(path: Path, files: Sequence[Path]) -> None:
-    if gap := numbering_gap([f.stem for f in files]):
-        raise ValueError(
-            f"{path}: the images must be numbered without gaps, got {files[gap - 1].name} "
-            f"followed by {files[gap].name}; extract the frames again, or go on without the "
-            "missing ones (--gaps)."
-        )
 
 
 def _first_readable(files: Sequence[Path]) -> Path:
@@ -413,6 +414,8 @@ def open_clips(clips: Sequence[Clip], gaps: bool = False) -> list[FrameReader]:
     Folders that count together (see `counting_together`) are then aligned by the numbers of their
     images: a number that only others have is a missing image.
 
+    Images of 16 bits may hold the values of fewer, see `_with_white`.
+
     Raises:
         FileNotFoundError: a clip is missing, or one of its images.
         ValueError: as `VideoReader.open` and `FolderReader.open`.
@@ -420,21 +423,51 @@ def open_clips(clips: Sequence[Clip], gaps: bool = False) -> list[FrameReader]:
     readers = _aligned_folders(
         [clip for clip in clips if gaps and isinstance(clip, Path) and clip.is_dir()]
     )
-    return [readers[clip] if clip in readers else open_frames(clip, gaps) for clip in clips]
+    return _with_white(
+        [readers[clip] if clip in readers else open_frames(clip, gaps) for clip in clips]
+    )
+
+
+def _with_white(readers: list[FrameReader]) -> list[FrameReader]:
+    """Return readers with the white of images of 16 bits, which may hold the 8, 10, 12 or 14 bits
+    of cameras.
+
+    They do if the first images have no larger value, and the brightest camera nearly the largest.
+    A dark image of 16 bits has it by chance only. Cameras that disagree, or no such value, are
+    reported: a dark image cannot be distinguished.
+    """
+    folders = [r for r in readers if isinstance(r, FolderReader) and r.most is not None]
+    values = [folder.most or 0 for folder in folders]
+    most = max(values, default=_WHITE)
+    if most >= 2 ** max(_BITS):
+        return readers
+    # The upper sixteenth of the values, as highlights are.
+    bits = [b for b in _BITS if any(15 * 2**b <= 16 * value < 16 * 2**b for value in values)]
+    place = f"{folders[0].path} and the other cameras: images of 16 bits have values up to {most}"
+    if len(bits) != 1 or most >= 2 ** bits[0]:
+        _LOG.warning(
+            "%s of %d and are nearly black; if white is less, multiply them.", place, _WHITE
+        )
+        return readers
+    white = 2 ** bits[0] - 1
+    _LOG.warning(
+        "%s and are read as %d bits; if white is %d, convert them to 8 bits.",
+        *(place, bits[0], _WHITE),
+    )
+    return [replace(r, white=white) if isinstance(r, FolderReader) else r for r in readers]
 
 
 def _aligned_folders(folders: Sequence[Path]) -> dict[Clip, FrameReader]:
     """Return the readers of folders of images, aligned by the numbers of their images."""
-    folder_files = {
-        folder: {image_number(file): file for file in _images(folder)} for folder in folders
-    }
+    folder_files = {folder: _images(folder) for folder in folders}
     ascending = {folder: sorted(files) for folder, files in folder_files.items()}
     readers: dict[Clip, FrameReader] = {}
     for group in counting_together(ascending):
         numbers = _instants([folder_files[folder] for folder in group])
         for folder in group:
             files = folder_files[folder]
-            images = [files.get(number, _missing_name(folder, files, number)) for number in numbers]
+            suffix = next(iter(files.values())).suffix
+            images = [files.get(n, folder / f"{n:04d}{suffix}") for n in numbers]
             readers[folder] = replace(FolderReader.of_files(images, gaps=True), numbers=numbers)
     return readers
 
@@ -481,8 +514,8 @@ def _raising(images: Iterator[ImageOrError]) -> Iterator[np.ndarray]:
         yield image
 
 
-def _images(path: Path) -> list[Path]:
-    """Return a folder's images in the order of their numbers."""
+def _images(path: Path) -> dict[int, Path]:
+    """Return a folder's images by their numbers, in natural order."""
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: expected a folder of images, found none; check the path.")
     files = sorted(images_in(path), key=lambda f: natural_key(f.stem))
@@ -491,39 +524,7 @@ def _images(path: Path) -> list[Path]:
             f"{path}: expected images ({', '.join((*IMAGE_SUFFIXES, EXR_SUFFIX))}), found none; "
             "extract the frames."
         )
-    return files
-
-
-def _numbers(files: Sequence[Path]) -> range | None:
-    """Return the numbers of images without gaps, None of a single image without a number."""
-    if len(files) == 1 and not re.search(r"[0-9]", files[0].stem):
-        return None
-    first = image_number(files[0])
-    step = image_number(files[1]) - first if len(files) > 1 else 1
-    return range(first, first + step * len(files), step)
-
-
-def image_number(file: Path) -> int:
-    """Return the last number in the name of an image.
-
-    Raises:
-        ValueError: there is none.
-    """
-    numbers = re.findall(r"[0-9]+", file.stem)
-    if not numbers:
-        raise ValueError(
-            f"{file}: expected an image whose name ends in a number, got none; extract the frames "
-            "again."
-        )
-    return int(numbers[-1])
-
-
-def _missing_name(folder: Path, files: Mapping[int, Path], number: int) -> Path:
-    """Return the path that a missing image would have."""
-    other = next(iter(files.values()))
-    return folder / re.sub(
-        r"[0-9]+(?=[^0-9]*\.)", lambda old: str(number).zfill(len(old[0])), other.name, count=1
-    )
+    return dict(zip(frame_numbers(path, [file.stem for file in files]), files, strict=True))
 
 
 def _no_image(file: Path) -> FileNotFoundError:
@@ -546,7 +547,12 @@ def _read_image(file: Path) -> np.ndarray:
     if file.suffix.lower() == EXR_SUFFIX:
         return _read_light(file)
     # The stored pixels, without EXIF's rotation: calibrations refer to them.
-    image = decode_image(file, cv2.IMREAD_COLOR)
+    image = decode_image(file, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    if image.dtype not in (np.uint8, np.uint16):
+        raise ValueError(
+            f"{file}: expected an image of 8 or 16 bits, got {image.dtype}; convert it to one, or "
+            "to EXR."
+        )
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 

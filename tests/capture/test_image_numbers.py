@@ -113,6 +113,20 @@ def test_align_numbers__says_nothing_on_equal_numbers_and_photos(tmp_path: Path)
     assert load_capture(path).num_frames == 1
 
 
+@pytest.mark.parametrize("reading", [ReadConfig(), GAPS])
+def test_align_numbers__are_those_that_change(tmp_path: Path, reading: ReadConfig) -> None:
+    path = capture_of(tmp_path / "c", a1=range(3), a2=range(3))
+    for file in [*path.glob("a*/*.png")]:
+        file.rename(file.with_stem(f"{file.stem}_{file.parent.name}"))
+    assert frame_numbers(load_capture(path, reading=reading)) == [[t, t] for t in range(3)]
+    (path / "a2" / "0001_a2.png").unlink()
+    rows = frame_numbers(load_capture(path, reading=GAPS))
+    assert rows == [[0, 0], [1, None], [2, 2]]
+    (path / "a2" / "0002_a2.png").rename(path / "a2" / "0000_b2.png")
+    with pytest.raises(ValueError, match=r"a2: expected one file .* got 0000_a2 and 0000_b2"):
+        load_capture(path, reading=reading)
+
+
 def test_align_numbers__shifts_videos_beside_them(tmp_path: Path) -> None:
     """A video begins with the first number."""
     path = capture_of(tmp_path / "c", a=range(6), b=range(2, 8))

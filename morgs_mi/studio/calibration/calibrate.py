@@ -30,7 +30,7 @@ from morgs_mi.core.checks import check_number
 from morgs_mi.core.color_space import display_image, display_stops
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.ranges import check_ranges
-from morgs_mi.io.video import FrameReader, open_frames
+from morgs_mi.io.video import FrameReader, open_clips
 from morgs_mi.studio.calibration.checks.mistakes import same_poses
 from morgs_mi.studio.calibration.checks.rig_check import CameraCheck
 from morgs_mi.studio.calibration.colmap_library import import_pycolmap
@@ -300,7 +300,8 @@ def _frames(
     """Return one image per camera by its name, and the masks of opaque pixels of images with
     transparent ones.
     """
-    readers = {name: open_frames(clip) for name, clip in _clips(path, without).items()}
+    clips = _clips(path, without)
+    readers = dict(zip(clips, open_clips([*clips.values()]), strict=True))
     _check_lengths(path, readers, config.frame)
     frames = {name: _frame(reader, config.frame) for name, reader in readers.items()}
     stops = display_stops(frames.values())
