@@ -82,6 +82,8 @@ class Capture:
             is removed as well; empty if there is none.
         display_exposure: of EXR files, stops by which a display brightens them; None: the images
             have 8 bits.
+        origin: point [3] of the calibration's world, to which `cameras` and `points` are relative;
+            other than 0 if the rig is too far from 0 for float32.
     """
 
     path: Path
@@ -100,6 +102,7 @@ class Capture:
     notes: tuple[str, ...] = ()
     distortions: tuple[tuple[float, float], ...] = ()
     display_exposure: float | None = None
+    origin: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         check_points(str(self.path), self.points, self.point_colors)
@@ -206,6 +209,7 @@ class Capture:
             "points": len(self.points),
             "reading": {**asdict(self.reading), "without": list(self.reading.without)},
             "notes": list(self.notes),
+            "origin": list(self.origin),
             "cameras": [_camera_metadata(*view) for view in views],
         }
 
@@ -376,7 +380,7 @@ def load_capture(
     reading = reading or ReadConfig()
     settings = read_settings(path / CAPTURE)
     layout = find_layout(path)
-    every = layout.read(path)
+    every = layout.read(path).centred(path)
     calibration = every.without(path, reading.without)
     readers = open_clips(calibration.clips, reading.gaps)
     recorded = _at_clip_sizes(path, calibration.cameras, readers)
@@ -403,6 +407,7 @@ def load_capture(
         layout=layout.name,
         reading=reading,
         notes=_notes(common, sources, calibration.clips),
+        origin=calibration.origin,
     )
     if any(reader.has_light for reader in readers):
         capture = _with_exposure(capture, settings.get("display_exposure"))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import quantity
-from morgs_mi.cli.export_kind import FRAMES, ExportKind
+from morgs_mi.cli.export_kind import FRAMES, ExportKind, relative_to
 from morgs_mi.cli.opening import DropInvalid, opened, shown_exposure
 from morgs_mi.cli.settings import ChannelName, DisplayExposure, Flag, optional, place
 from morgs_mi.cli.suggestion import one_command
@@ -49,7 +49,7 @@ class Ply(ExportKind):
 
         frames = select_frames(stream, self.frames)
         write_ply_files(stream, output, chosen, frames, partial(report, "Writing"))
-        return quantity(len(frames), "PLY file")
+        return quantity(len(frames), "PLY file") + relative_to(stream)
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,14 @@ FRAMES = optional(
 )
 
 
+def relative_to(stream: FrameSource) -> str:
+    """Return the origin of the centres in files of float32 in words, empty if it is 0."""
+    from morgs_mi.playback.stream_header import stream_origin
+
+    x, y, z = stream_origin(stream)
+    return f", relative to the origin ({x:.10g}, {y:.10g}, {z:.10g})" if x or y or z else ""
+
+
 @dataclass(frozen=True)
 class ExportKind:
     """A kind of export: options, with `formats` and the method `write` of their writer."""

@@ -22,6 +22,8 @@ _RELIABLE_QUANTILE = 0.01
 _RELIABLE_POINTS = 20
 # Before the near planes are known, every point in front of a camera counts.
 _IN_FRONT = 1e-30
+# Sizes of a rig from the origin beyond which float32 costs hundredths of a pixel.
+_FAR = 100
 
 
 def scene_extent(cameras: Sequence[Camera]) -> float:
@@ -42,6 +44,27 @@ def _positions(cameras: Sequence[Camera]) -> np.ndarray:
 def _central_distances(positions: np.ndarray) -> np.ndarray:
     """Return the distance of each of the positions [V, 3] from their mean [V]."""
     return np.linalg.norm(positions - positions.mean(0), axis=1)
+
+
+def far_origin(positions: np.ndarray) -> np.ndarray:
+    """Return the median [3] of positions [N, 3] that are too far from 0 for float32, rounded to the
+    power of ten below their mean distance from it; zeros if they are not.
+    """
+    middle = np.median(positions, axis=0)
+    distance = np.linalg.norm(middle)
+    size = max(np.linalg.norm(positions - middle, axis=1).mean() or 1.0, 1e-9 * distance)
+    far = distance > _FAR * size
+    return np.round(middle, -int(np.floor(np.log10(size)))) if far else np.zeros(3)
+
+
+def moved(cameras: Sequence[Camera], origin: np.ndarray) -> tuple[Camera, ...]:
+    """Return the cameras relative to a point `origin` [3] of the world."""
+    shift = np.eye(4)
+    shift[:3, 3] = origin
+    return tuple(
+        replace(camera, viewmat=np.asarray(camera.viewmat, np.float64) @ shift)
+        for camera in cameras
+    )
 
 
 def up_direction(cameras: Sequence[Camera]) -> np.ndarray:

@@ -20,7 +20,7 @@ from morgs_mi.capture.truth import GroundTruth, load_truth
 from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import check_number
+from morgs_mi.core.checks import bounded, check_number
 from morgs_mi.core.config_values import apply_values
 from morgs_mi.core.fit_names import CAPTURE, STREAM
 from morgs_mi.playback.source import as_fitted
@@ -124,6 +124,21 @@ def num_frames(stream: FrameSource) -> int:
         ValueError: the header states something else.
     """
     return metadata_entry(stream, "num_frames", 0, int)
+
+
+def stream_origin(stream: FrameSource) -> np.ndarray:
+    """Return the point [3] of the capture's world to which a stream is relative, float64.
+
+    Raises:
+        ValueError: the stream's header states something else.
+    """
+    values = metadata_entry(stream, "origin", [0.0, 0.0, 0.0], list)
+    if len(values) != 3 or {*map(type, values)} - {int, float} or not bounded(values):
+        raise ValueError(
+            f"{_place(stream, 'origin')} must be three numbers, got {shortened(values)}; fit the "
+            "capture again."
+        )
+    return np.array(values, np.float64)
 
 
 def metadata_entry(stream: FrameSource, key: str, default: Any, *kinds: type) -> Any:

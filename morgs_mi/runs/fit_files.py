@@ -378,6 +378,8 @@ def stream_metadata(capture: Capture, first: PartialFrame, config: StreamConfig)
         "versions": {"mitsuba": mi.__version__},
         "variant": mi.variant(),
     }
+    if any(capture.origin):
+        metadata["origin"] = list(capture.origin)
     if capture.display_exposure is not None:
         metadata["transfer"] = {"name": TRANSFER, "display_exposure": capture.display_exposure}
     return _without_folders(metadata)

@@ -26,6 +26,7 @@ from morgs_mi.capture.layouts.clips import (
 )
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.rig import far_origin, moved, scene_extent
 from morgs_mi.io.listing import VIDEO_SUFFIXES, listed
 from morgs_mi.io.video import Clip, natural_key
 
@@ -44,7 +45,7 @@ class Calibration:
     cameras: tuple[Camera, ...]  #: In numerical order of their names.
     lenses: tuple[Lens, ...]  #: One per camera.
     clips: tuple[Clip, ...]  #: One per camera: its video, folder of images or list of images.
-    #: [P, 3] float32, world units; P = 0 if the layout has none.
+    #: [P, 3], world units, in the file's precision; P = 0 if the layout has none.
     points: np.ndarray = field(default_factory=lambda: NO_POINTS)
     #: [P, 3] float32 in [0, 1].
     point_colors: np.ndarray = field(default_factory=lambda: NO_POINTS)
@@ -54,11 +55,40 @@ class Calibration:
     #: Per camera images of its clip's size or scaled versions, whose black pixels are not used; no
     #: images: all pixels are used.
     masks: tuple[tuple[Path, ...], ...] = ()
+    #: Point of the file's world that cameras and points are relative to.
+    origin: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the cameras."""
         return tuple(camera.name for camera in self.cameras)
+
+    def centred(self, path: Path) -> Calibration:
+        """Return the calibration relative to the `far_origin` of its cameras, with float32 points;
+        `path` is the capture, for messages.
+
+        Points that the file has rounded are left out.
+        """
+        origin = far_origin(np.array([camera.position for camera in self.cameras]))
+        result = replace(
+            self,
+            cameras=moved(self.cameras, origin),
+            points=(self.points - origin).astype(np.float32),
+            origin=tuple(origin.tolist()),
+        )
+        if not origin.any():
+            return result
+        rounding = np.spacing(
+            np.abs(origin).max().astype(np.promote_types(self.points.dtype, "f4"))
+        )
+        coarse = len(self.points) and rounding > 1e-3 * scene_extent(self.cameras)
+        _LOG.warning(
+            "%s: its cameras are too far from 0 for float32; coordinates are relative to the origin"
+            " (%.10g, %.10g, %.10g)%s.",
+            *(path, *origin),
+            f", and its points, which are rounded to {rounding:g}, are not used" if coarse else "",
+        )
+        return replace(result, points=NO_POINTS, point_colors=NO_POINTS) if coarse else result
 
     def without(self, path: Path, names: Collection[str]) -> Calibration:
         """Return the calibration without the cameras called `names`; `path` is the capture, for
@@ -177,7 +207,9 @@ def match_clips(
         ValueError: two images of one clip have different poses or lenses, or a frame folder is
             missing.
     """
-    match = _best_match(path, source, clips, cameras, lenses)
+    # Tolerances of poses are relative to their coordinates.
+    origin = far_origin(np.array([camera.position for camera in cameras]))
+    match = _best_match(path, source, clips, moved(cameras, origin), lenses)
     clips = match.clips
     if match.without:
         names = ", ".join(match.without[:_MAX_LISTED])

@@ -52,7 +52,7 @@ class ColmapModel:
     #: One camera per image in the order of the file; `name` is the name of the image.
     cameras: tuple[Camera, ...]
     lenses: tuple[Lens, ...]  #: One lens per camera.
-    points: np.ndarray  #: [P, 3] float32, world units.
+    points: np.ndarray  #: [P, 3] float64, world units.
     point_colors: np.ndarray  #: [P, 3] float32 in [0, 1], display-referred.
 
 
@@ -119,7 +119,7 @@ def read_colmap(folder: str | Path) -> ColmapModel:
     return ColmapModel(
         cameras,
         lenses,
-        points[:, :3].astype(np.float32),
+        points[:, :3],
         (points[:, 3:] / 255).astype(np.float32),
     )
 

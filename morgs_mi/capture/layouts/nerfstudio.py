@@ -330,7 +330,7 @@ def _positions(path: Path, vertices: Mapping[str, np.ndarray]) -> np.ndarray:
             f"{path}: expected a PLY file with vertices x, y, z, got vertices without "
             f"{', '.join(sorted(missing))}; export it again."
         )
-    return np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float32)
+    return np.stack([vertices[axis] for axis in "xyz"], axis=1)
 
 
 def _read_calibration(path: Path) -> Calibration:

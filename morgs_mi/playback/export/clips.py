@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import numpy as np
 from morgs_mi.codec.frame_source import FrameSource, FrameState, play
 from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.rig import moved
 from morgs_mi.io.compressed_ply import write_compressed_ply
 from morgs_mi.io.ply import write_ply
 from morgs_mi.playback.default_rig import DEFAULT_RIG
@@ -19,7 +21,7 @@ from morgs_mi.playback.export.formats import Format
 from morgs_mi.playback.export.order import by_place
 from morgs_mi.playback.export.paths import CameraPath, focus, load_path, orbit, through_cameras
 from morgs_mi.playback.player import available_channels, render
-from morgs_mi.playback.stream_header import render_config
+from morgs_mi.playback.stream_header import render_config, stream_origin
 
 Progress = Callable[[int, int], None] | None
 # Angle of an orbit around Gaussians without a recording. Scenes fall apart from behind, and may be
@@ -204,7 +206,9 @@ def named_path(
         return through_cameras(stream.cameras, clip)
     if name == "orbit":
         return _orbit(stream, degrees, clip)
-    return load_path(name, stream.cameras)
+    origin = stream_origin(stream)
+    path = load_path(name, moved(stream.cameras, -origin))
+    return replace(path, keys=moved(path.keys, origin))
 
 
 def _orbit(stream: FrameSource, degrees: float | None, seconds: float) -> CameraPath:

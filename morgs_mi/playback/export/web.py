@@ -31,7 +31,12 @@ from morgs_mi.core.fit_names import STREAM
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.playback.default_rig import DEFAULT_RIG
 from morgs_mi.playback.player import MOTION_SCALE
-from morgs_mi.playback.stream_header import metadata_entry, stream_exposure, stream_name
+from morgs_mi.playback.stream_header import (
+    metadata_entry,
+    stream_exposure,
+    stream_name,
+    stream_origin,
+)
 
 Progress = Callable[[int], None]
 
@@ -163,10 +168,12 @@ def published_bytes(stream: FrameSource, progress: Progress | None = None) -> by
 
 
 def _display_metadata(stream: FrameSource) -> dict[str, Any]:
-    """Return what the page reads about made-up cameras and the display's exposure."""
+    """Return what the page reads about made-up cameras, the origin and the display's exposure."""
     metadata: dict[str, Any] = {}
     if stream.metadata.get(DEFAULT_RIG) is True:
         metadata[DEFAULT_RIG] = True
+    if (origin := stream_origin(stream)).any():
+        metadata["origin"] = origin.tolist()
     if stops := stream_exposure(stream):
         metadata["transfer"] = {"name": TRANSFER, "display_exposure": stops}
     return metadata

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import DisallowNone, Positional
 
-from morgs_mi.cli.export_kind import FRAMES, ExportKind
+from morgs_mi.cli.console import quantity
+from morgs_mi.cli.export_kind import FRAMES, ExportKind, relative_to
 from morgs_mi.cli.settings import Flag, place
 from morgs_mi.core.progress import Report
 from morgs_mi.playback.export.formats import GLTF, USD, Format
@@ -39,7 +40,7 @@ class Gltf(ExportKind):
         write_each(
             play(stream), output, f".{chosen.name}", write, frames, partial(report, "Writing")
         )
-        return f"{len(frames)} glTF {'file' if len(frames) == 1 else 'files'}"
+        return quantity(len(frames), "glTF file") + relative_to(stream)
 
 
 @dataclass(frozen=True)

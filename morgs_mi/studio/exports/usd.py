@@ -47,6 +47,7 @@ from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import covariances, rotated, unit_quats
 from morgs_mi.playback.export.formats import USD, choose_format
+from morgs_mi.playback.stream_header import stream_origin
 from morgs_mi.studio.exports.axes import gltf_axes
 
 _COEFFICIENTS = "radiance:sphericalHarmonicsCoefficients"
@@ -272,7 +273,10 @@ def _describe(
     pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.y)
     pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
     _set_times(stage, stream.fps, frames)
-    root = pxr.UsdGeom.Xform.Define(stage, "/Stream").GetPrim()
+    xform = pxr.UsdGeom.Xform.Define(stage, "/Stream")
+    if (origin := stream_origin(stream)).any():
+        xform.AddTranslateOp().Set(pxr.Gf.Vec3d(*(axes @ origin)))
+    root = xform.GetPrim()
     pxr.Usd.ModelAPI(root).SetKind(pxr.Kind.Tokens.component)
     # Rotation back to the capture's axes, of row vectors: x_world = x_usd M.
     root.SetCustomDataByKey("world_from_usd", pxr.Gf.Matrix3d(np.asarray(axes, np.float64)))

@@ -151,7 +151,7 @@ def read_point_cloud(path: Path) -> tuple[np.ndarray, np.ndarray]:
             f"{path}: `data` must be [P, 7], finite, got {rows.dtype} {rows.shape}; export it "
             "again."
         )
-    return rows[:, :3].astype(np.float32), rows[:, 3:6].astype(np.float32)
+    return rows[:, :3], rows[:, 3:6].astype(np.float32)
 
 
 def _read_calibration(path: Path) -> Calibration:

@@ -5,7 +5,7 @@ A scene is an XML file, which is the same in all frames, or a Python file with a
     build(frame: int, time: float) -> dict
 
 that returns the entries of a Mitsuba scene: shapes, emitters, and optionally an `integrator` for
-them. The time is in seconds. World space and its units are the stream's.
+them. The time is in seconds. World space, its origin and its units are the stream's.
 """
 
 from __future__ import annotations

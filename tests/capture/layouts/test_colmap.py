@@ -55,7 +55,7 @@ def test_read_colmap__reads_what_write_colmap_writes(tmp_path: Path, kind: str) 
         assert_close(camera.viewmat, expected.viewmat, atol=1e-12)
     assert [model.lenses[i].model for i in order] == ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"]
     assert model.lenses[order[1]].distortion == (0.1, -0.02, 0.003, 0.004)
-    assert model.points.dtype == np.float32
+    assert model.points.dtype == np.float64
     rows = np.lexsort(model.points.T), np.lexsort(POINTS.T)
     np.testing.assert_allclose(model.points[rows[0]], POINTS[rows[1]], rtol=1e-6)
     assert_close(model.point_colors[rows[0]], COLORS[rows[1]], atol=1e-6)

@@ -23,6 +23,7 @@ from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.capture.lens import MODELS, Lens
 from morgs_mi.capture.timeline import ReadConfig
+from morgs_mi.core.rig import moved
 from morgs_mi.io.video_writer import write_video
 from tests.assertions import assert_close
 from tests.scenes import captures as layouts
@@ -502,6 +503,55 @@ def test_clips_by_camera__names_clips_in_several_folders(
         in caplog.text
     )
     assert "images_2" not in caplog.text
+
+
+# Easting, northing and height of a rig, m.
+FAR = np.array([500000.0, 5300000.0, 120.0])
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        layouts.anipose,
+        layouts.colmap,
+        layouts.dynamic3dgs,
+        layouts.n3dv,
+        layouts.nerfstudio,
+        layouts.qualisys,
+    ],
+)
+def test_load_capture__of_a_far_rig_is_relative_to_an_origin(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, build
+) -> None:
+    near = load_capture(build(tmp_path / "near"))
+    assert near.origin == (0, 0, 0)
+    monkeypatch.setattr(
+        layouts, "rig", lambda *args, **shift: list(moved(rig(*args, **shift), -FAR))
+    )
+    far = load_capture(build(tmp_path / "far"))
+    shift = np.array(far.origin) - FAR
+    assert (np.abs(shift) < 10).all()
+    for camera, expected in zip(far.cameras, moved(near.cameras, shift), strict=True):
+        assert_close(camera.viewmat, expected.viewmat, atol=1e-6)
+        assert_close(camera.near, expected.near, rtol=1e-6)
+    assert "coordinates are relative to the origin (" in caplog.text
+
+
+@pytest.mark.parametrize(("kind", "count"), [(np.float64, 1), (np.float32, 0)])
+def test_centred__keeps_points_that_are_exact(tmp_path: Path, kind: type, count: int) -> None:
+    cameras = moved(rig(("cam1", "cam2", "cam3")), -FAR)
+    points = (FAR[None] + 0.1).astype(kind)
+    calibration = Calibration(cameras, (), (), points, points).centred(tmp_path)
+    assert_close(calibration.points, (points - calibration.origin)[:count], atol=1e-6)
+    assert calibration.points.dtype == np.float32
+
+
+def test_match_clips__refuses_far_cameras_that_move(tmp_path: Path) -> None:
+    path = layouts.nerfstudio(tmp_path / "a")
+    cameras = rig(("cam1", "cam2"))
+    layouts.transforms(path, [*moved(cameras, -FAR), *moved(cameras, 0.1 - FAR)])
+    with pytest.raises(ValueError, match="cameras must not move"):
+        load_capture(path)
 
 
 UNREAD = {

@@ -15,9 +15,16 @@ from morgs_mi.core.color_space import decode_light
 from morgs_mi.io.ply import read_ply
 from morgs_mi.io.splats import read_splats
 from morgs_mi.io.video import open_frames
-from morgs_mi.playback.export.clips import _frames_backwards, repeated_seconds, select_frames
+from morgs_mi.playback.export.clips import (
+    _frames_backwards,
+    named_path,
+    repeated_seconds,
+    select_frames,
+)
 from morgs_mi.playback.export.formats import IMAGES, PLY, USD, WEB, choose_format
 from morgs_mi.playback.export.frames import exr_channels, pad_to_even
+from morgs_mi.playback.export.web import write_web_folder
+from morgs_mi.playback.stream_header import stream_origin
 from morgs_mi.render.rasterize import rasterize
 from tests.assertions import assert_close
 from tests.codec.forge import forged_streams
@@ -42,6 +49,30 @@ def test_export_ply__writes_every_frame(stream, tmp_path):
     for t, state in enumerate(stream):
         read = read_ply(tmp_path / "ply" / f"{t:04d}.ply")
         np.testing.assert_array_equal(read.numpy()["means"], state.gaussians.numpy()["means"])
+
+
+def test_export__uses_the_origin_of_the_header(tmp_path, capsys):
+    metadata = {"origin": [500000.0, 5300000.0, 0]}
+    write_stream(tmp_path / "stream.morgs", metadata=metadata)
+    stream = StreamReader(tmp_path / "stream.morgs")
+    keys = [{"camera": stream.cameras[0].name}, {"position": [500000, 5300009, 0]}]
+    common = {"target": [500000, 5300000, 0], "up": [0, 0, 1]}
+    keys = [{"time": t, **common, **key} for t, key in enumerate(keys)]
+    (tmp_path / "path.json").write_text(json.dumps({"keys": keys}))
+    first, last = named_path(stream, str(tmp_path / "path.json")).keys
+    assert_close(first.viewmat, stream.cameras[0].viewmat, atol=1e-6)
+    assert_close(last.position, [0, 9, 0], atol=1e-6)
+    assert run("export", "ply", tmp_path, "--frames", "0") == 0
+    assert "relative to the origin (500000, 5300000, 0)" in capsys.readouterr().out
+    write_web_folder(stream, tmp_path / "web")
+    assert StreamReader(tmp_path / "web/stream.morgs").metadata["origin"] == metadata["origin"]
+
+
+@pytest.mark.parametrize("origin", [[1, 2], [1, 2, "3"], [1, 2, 1e13]])
+def test_stream_origin__refuses_others_than_three_numbers(tmp_path, origin):
+    write_stream(tmp_path / "stream.morgs", metadata={"origin": origin})
+    with pytest.raises(ValueError, match=r"`origin` of the header's metadata must be three num"):
+        stream_origin(StreamReader(tmp_path / "stream.morgs"))
 
 
 def test_export_ply__writes_compressed_files(stream, tmp_path):

@@ -64,6 +64,17 @@ def expected(gaussians: Gaussians) -> dict[str, np.ndarray]:
     }
 
 
+def test_write_usd__adds_the_origin_of_the_header(tmp_path):
+    origin = [500000.0, 5300000.0, 120.0]
+    write_stream(tmp_path / "s.morgs", 1, metadata={"origin": origin})
+    write_usd(StreamReader(tmp_path / "s.morgs"), tmp_path / "a.usda", [0])
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    prim = stage.GetDefaultPrim()
+    (place,) = UsdGeom.Xformable(prim).GetOrderedXformOps()
+    turn = np.array(prim.GetCustomDataByKey("world_from_usd"))
+    assert_close(np.array(place.Get()) @ turn, origin, atol=1e-6)
+
+
 @pytest.mark.parametrize("suffix", [f".{usd.name}" for usd in USD])
 def test_write_usd__attributes_are_read_back(tmp_path, suffix):
     states, stage = written(tmp_path / f"a{suffix}")
