@@ -20,14 +20,16 @@ from morgs_mi.capture.layouts.clips import (
     clip_of_camera,
     clips_by_camera,
     clips_by_frame,
+    clips_by_rig,
     names_without,
     photos,
+    photos_by_rig,
     view_of_image,
 )
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.rig import far_origin, moved, scene_extent
-from morgs_mi.io.listing import VIDEO_SUFFIXES, listed
+from morgs_mi.io.listing import VIDEO_SUFFIXES, images_in, listed
 from morgs_mi.io.video import Clip, natural_key
 
 _LOG = logging.getLogger(__name__)
@@ -226,8 +228,32 @@ def match_clips(
         ),
         tuple(lenses[index[0]] for index in images),
         tuple(clips[name] for name in names),
+        masks=tuple(
+            _masks(path, name, clips[name], [cameras[i].name for i in index])
+            for name, index in zip(names, images, strict=True)
+        ),
     )
+    if (path / "masks").is_dir() and not any(calibration.masks):
+        _LOG.warning("%s: no mask is named after an image, such as %s.png.png.", path, names[0])
     return Match(calibration, images)
+
+
+def _masks(path: Path, camera: str, clip: Clip, images: Sequence[str]) -> tuple[Path, ...]:
+    """Return the masks of a clip as COLMAP names them, ``masks/IMAGE.png``, of its first, middle
+    and last file and of those `images` of the calibration.
+    """
+    files = images_in(clip) if isinstance(clip, Path) and clip.is_dir() else clip
+    places = [file.relative_to(path) for file in ([files] if isinstance(files, Path) else files)]
+    inner = [Path(*place.parts[1:]) for place in places]
+    inner = [place for place in inner if view_of_image([camera], str(place))]
+    names = [
+        path / "masks" / group[i]
+        for group in (images, places, inner, [camera])
+        for i in (0, len(group) // 2, -1)
+        if group
+    ]
+    masks = [mask for name in names for mask in (Path(f"{name}.png"), name.with_suffix(".png"))]
+    return tuple(dict.fromkeys(filter(Path.is_file, masks)))
 
 
 @dataclass(frozen=True)
@@ -258,6 +284,8 @@ def _best_match(
         (photos, False),
         (clips_by_frame, False),
         (lambda path: _named_photos(path, cameras), False),
+        (clips_by_rig, True),
+        (photos_by_rig, False),
     )
     for find, by_folder in attempts:
         try:

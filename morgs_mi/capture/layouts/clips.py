@@ -9,7 +9,10 @@ are stored per camera or per frame; cameras are ordered numerically, cam_2 befor
   itself take precedence over those in a folder, and those in the folder ``images`` or ``videos``
   over those in others. Files that differ in their suffixes are refused;
 - per frame: ``0000/cam01.png`` or ``0000/images/cam01.png``, with the same cameras in every folder;
-- photos: ``cam01.png`` or ``images/cam01.png``, one image per camera.
+- photos: ``cam01.png`` or ``images/cam01.png``, one image per camera;
+- in folders of folders: ``images/rig1/cam01/0000.png`` or photos ``images/day/1.png``, where
+  cameras of one name in two folders are called ``rig1_cam01``, and ``cam01/GX010042.MP4``, the only
+  video of its folder, as on memory cards.
 
 Images are files of 8 bits, or EXR files, which have linear light, where a folder has no others.
 """
@@ -18,7 +21,8 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -51,12 +55,48 @@ def clips_by_camera(path: Path) -> dict[str, Path]:
         ValueError: two videos in one folder differ only in their suffixes.
     """
     inner = _places(path)
+    videos = [_videos(place) for place in inner]
+    cards = [
+        clips
+        for place, clips in zip(inner, videos, strict=True)
+        if len(clips) == 1 and place.name not in _USUAL
+    ]
+    # Memory cards count from the same number.
+    are_cards = len(set().union(*cards)) < len(cards)
     # The last clip of a camera takes precedence.
-    clips = _merged(path, map(_folders, inner)) | _merged(path, map(_videos, inner))
+    clips = _merged(path, map(_folders, inner))
+    clips |= clips_by_rig(path) if are_cards else _merged(path, videos)
     clips |= _folders(path) | _videos(path)
     if (path / "frames").is_dir():
         clips |= _videos(path / "frames") | _folders(path / "frames")
-    return _in_order(clips)
+    return _in_order(clips or clips_by_rig(path))
+
+
+def clips_by_rig(path: Path) -> dict[str, Path]:
+    """Return the clips in folders of folders by their names, with the name of the folder where two
+    have the same, and the only videos of folders by the folders' names.
+    """
+
+    def clips(folder: Path) -> dict[str, Path]:
+        videos = _videos(folder)
+        only = len(videos) == 1
+        return _folders(folder) | ({folder.name: videos.popitem()[1]} if only else videos)
+
+    return _by_rig(path, clips)
+
+
+def photos_by_rig(path: Path) -> dict[str, tuple[Path]]:
+    """Return the photos in folders of folders as `clips_by_rig`, each as a clip of one frame."""
+    images = _by_rig(path, lambda folder: _by_stem(images_in(folder)))
+    return {name: (image,) for name, image in images.items()}
+
+
+def _by_rig(path: Path, clips: Callable[[Path], dict[str, Path]]) -> dict[str, Path]:
+    """Return the `clips` of the folders in a capture and in its folders."""
+    rigs = [rig for place in (path, *_places(path)) for rig in _places(place)]
+    clips_of_rigs = [(rig.name, *clip) for rig in rigs for clip in clips(rig).items()]
+    unique = len({name for _, name, _ in clips_of_rigs}) == len(clips_of_rigs)
+    return {name if unique else f"{rig}_{name}": clip for rig, name, clip in clips_of_rigs}
 
 
 def _places(path: Path) -> list[Path]:
@@ -143,12 +183,15 @@ def view_of_image(views: Collection[str], image: str, by_folder: bool = False) -
     """Return the camera in `views` to which an image of a calibration belongs, or None.
 
     It is cam01 for ``cam01.png``, ``cam01.mp4``, ``cam01``, ``cam01/0000.png`` and
-    ``cam01/images/0000.png``. Of ``1/2.png`` it is 2, or with `by_folder` 1, if there are both.
+    ``cam01/images/0000.png``. Of ``1/2.png`` it is 1_2 if that is a view, otherwise 2, or with
+    `by_folder` 1, if there are both.
     """
     place = PurePosixPath(image.replace("\\", "/"))
     folders = place.parts[-2::-1]
     file_names = (place.stem, place.name)
+    pairs = pairwise((*place.parts[:-1], place.stem))
     names = (*folders, *file_names) if by_folder else (*file_names, *folders)
+    names = (*map("_".join, pairs), *names)
     return next((name for text in names for name in (text, text.strip()) if name in views), None)
 
 

@@ -20,7 +20,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from morgs_mi.capture.layouts.calibration import Calibration, Layout, match_clips, required_clips
+from morgs_mi.capture.layouts.calibration import (
+    NO_POINTS,
+    Calibration,
+    Layout,
+    match_clips,
+    required_clips,
+)
 from morgs_mi.capture.layouts.colmap_files import (
     binary_cameras,
     binary_images,
@@ -30,6 +36,7 @@ from morgs_mi.capture.layouts.colmap_files import (
     text_images,
     text_points,
 )
+from morgs_mi.capture.layouts.nerfstudio import read_points_ply
 from morgs_mi.capture.lens import Lens, lens_and_intrinsics
 from morgs_mi.core.bounded import check_claim
 from morgs_mi.core.camera import Camera
@@ -40,7 +47,7 @@ from morgs_mi.io.video import natural_key
 
 _LOG = logging.getLogger(__name__)
 
-_FILES = ("cameras", "images", "points3D")
+_FILES = ("cameras", "images")
 # Memory of a `Camera`, which a line of a few characters may describe.
 _CAMERA_BYTES = 500
 
@@ -52,7 +59,7 @@ class ColmapModel:
     #: One camera per image in the order of the file; `name` is the name of the image.
     cameras: tuple[Camera, ...]
     lenses: tuple[Lens, ...]  #: One lens per camera.
-    points: np.ndarray  #: [P, 3] float64, world units.
+    points: np.ndarray  #: [P, 3], world units; P = 0 if there are none.
     point_colors: np.ndarray  #: [P, 3] float32 in [0, 1], display-referred.
 
 
@@ -80,7 +87,7 @@ def _models(folder: Path) -> list[Path]:
 
 
 def _is_model(folder: Path) -> bool:
-    """Return whether a capture folder has all three files: a single name may have another meaning
+    """Return whether a capture folder has both files: a single name may have another meaning
     there.
     """
     return any(
@@ -98,39 +105,33 @@ def _holds_model(folder: Path) -> bool:
 
 
 def read_colmap(folder: str | Path) -> ColmapModel:
-    """Read the COLMAP model in `folder`, binary if present, otherwise text.
+    """Read the COLMAP model in `folder`, binary if present, otherwise text; its points may be in
+    `points3D.ply`, or missing.
 
     Raises:
-        FileNotFoundError: one of the three files is missing.
+        FileNotFoundError: the cameras or the images are missing.
         ValueError: a file is broken, refers to a missing camera, or holds an invalid pose or an
             unsupported lens.
     """
     folder = Path(folder)
     kind = "bin" if (folder / "cameras.bin").exists() else "txt"
-    _check_complete(folder, kind)
-    cameras_path, images_path, points_path = (folder / f"{name}.{kind}" for name in _FILES)
+    cameras_path, images_path = (folder / f"{name}.{kind}" for name in _FILES)
+    for path in (cameras_path, images_path):
+        if not path.exists():
+            raise FileNotFoundError(
+                f"{folder}: a COLMAP model needs cameras and images (.txt or .bin), {path.name} is "
+                "missing; export the whole model."
+            )
     views = _views(images_path, cameras_path, _intrinsics(cameras_path))
     if not views:
         raise ValueError(
             f"{images_path}: expected at least one image, got none; register the images."
         )
     cameras, lenses = zip(*views, strict=True)
-    points = _points(points_path)
-    return ColmapModel(
-        cameras,
-        lenses,
-        points[:, :3],
-        (points[:, 3:] / 255).astype(np.float32),
-    )
-
-
-def _check_complete(folder: Path, kind: str) -> None:
-    for name in _FILES:
-        if not (folder / f"{name}.{kind}").exists():
-            raise FileNotFoundError(
-                f"{folder}: a COLMAP model needs cameras, images and points3D (.txt or .bin), "
-                f"{name}.{kind} is missing; export the whole model."
-            )
+    paths = (folder / f"points3D.{suffix}" for suffix in (kind, "bin", "txt", "ply"))
+    points_path = next((path for path in paths if path.exists()), None)
+    points = (NO_POINTS, NO_POINTS) if points_path is None else _points(points_path)
+    return ColmapModel(cameras, lenses, *points)
 
 
 class _Intrinsics(NamedTuple):
@@ -174,8 +175,10 @@ def _views(
     return views
 
 
-def _points(path: Path) -> np.ndarray:
-    """Return the positions and the colours, 0 to 255, of the points of a model [P, 6]."""
+def _points(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Return the positions and the colours of the points of a model [P, 3]."""
+    if path.suffix == ".ply":
+        return read_points_ply(path)
     rows = (binary_points if path.suffix == ".bin" else text_points)(path)
     points = np.asarray(np.fromiter(rows, np.dtype((np.float64, 6))), np.float64)
     if not bounded(points):
@@ -183,7 +186,7 @@ def _points(path: Path) -> np.ndarray:
             f"{path}: the points must be finite and at most {LARGEST:g}, got others; "
             "export the model again."
         )
-    return points
+    return points[:, :3], (points[:, 3:] / 255).astype(np.float32)
 
 
 def write_colmap(

@@ -340,6 +340,7 @@ def _read_calibration(path: Path) -> Calibration:
     points, colors = read_points_ply(content.points) if content.points else (NO_POINTS, NO_POINTS)
     match = match_clips(path, source, clips, content.cameras, content.lenses)
     masks = tuple(_distinct(content.masks[index] for index in images) for images in match.images)
+    masks = masks if any(masks) else match.calibration.masks
     calibration = replace(match.calibration, points=points, point_colors=colors, masks=masks)
     return (
         _split(path, source, calibration, content, match.images) if content.splits else calibration

@@ -61,6 +61,8 @@ _HARMLESS = {
     ),
     *("save_tracked_points_video", "fps_recording", "fps_sync_stream_processing", "version"),
 }
+# Pose2Sim names a camera after the folder of its checkerboard images, int_cam01_img.
+_FOLDER = re.compile(r"^int_(.+)_img$")
 # Recognises a calibration without parsing it; a broken one is then reported as a broken
 # calibration.
 _MARKS = [re.compile(rf"^[ \t]*{key}[ \t]*=", re.MULTILINE) for key in ("matrix", "rotation")]
@@ -118,7 +120,8 @@ def _camera(path: Path, key: str, entry: Mapping[str, Any]) -> tuple[Camera, Len
         rotation = Rotation.from_rotvec(rotation).as_matrix()
     viewmat = rigid(where, np.column_stack([rotation, _array(where, entry, "translation", (3,))]))
     try:
-        return Camera(K, viewmat, int(width), int(height), str(name)), _lens(where, entry)
+        clip = _FOLDER.sub(r"\1", str(name))
+        return Camera(K, viewmat, int(width), int(height), clip), _lens(where, entry)
     except ValueError as error:
         message = str(error)
         raise ValueError(message if message.startswith(where) else f"{where}: {message}") from None

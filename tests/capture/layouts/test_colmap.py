@@ -197,8 +197,8 @@ def test_read_colmap__refuses_a_binary_file_of_another_number_of_entries(
 
 
 def test_read_colmap__names_a_missing_file(tmp_path: Path) -> None:
-    (write(tmp_path) / "points3D.txt").unlink()
-    with pytest.raises(FileNotFoundError, match=r"points3D.txt is missing"):
+    (write(tmp_path) / "images.txt").unlink()
+    with pytest.raises(FileNotFoundError, match=r"images.txt is missing"):
         read_colmap(tmp_path)
 
 

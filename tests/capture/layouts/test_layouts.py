@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -503,6 +504,108 @@ def test_clips_by_camera__names_clips_in_several_folders(
         in caplog.text
     )
     assert "images_2" not in caplog.text
+
+
+# Clips and photos in folders of folders, the images that a calibration names, and the cameras.
+RIGS = {
+    "rigs": (
+        ("images/rig1/cam01/0000.png", "images/rig1/cam02/0000.png", "images/rig2/cam01/0000.png"),
+        ("rig1_cam01", "rig1_cam02", "rig2_cam01"),
+    ),
+    "rigs in the capture": (
+        ("rig1/cam01/0000.png", "rig1/cam02/0000.png", "rig2/cam01/0000.png"),
+        ("rig1_cam01", "rig1_cam02", "rig2_cam01"),
+    ),
+    "one rig": (
+        ("images/rig/a/0.png", "images/rig/b/0.png", "images/rig/c/0.png"),
+        ("a", "b", "c"),
+    ),
+    "photos": (
+        ("images/day/1.png", "images/day/2.png", "images/night/1.png"),
+        ("day_1", "day_2", "night_1"),
+    ),
+    "memory cards": (
+        ("cam01/GX010042.mkv", "cam02/GX010042.mkv", "cam03/GX010042.mkv"),
+        ("cam01", "cam02", "cam03"),
+    ),
+    "memory cards that count on": (
+        ("videos/cam01/GX010042.mkv", "videos/cam02/GX010043.mkv", "videos/cam03/GX010044.mkv"),
+        ("cam01", "cam02", "cam03"),
+    ),
+}
+
+
+@pytest.mark.parametrize(("files", "names"), RIGS.values(), ids=RIGS)
+def test_match_clips__reads_folders_of_folders(
+    tmp_path: Path, files: tuple[str, ...], names: tuple[str, ...]
+) -> None:
+    for i, file in enumerate(files):
+        if file.endswith(".png"):
+            layouts.write_image(tmp_path / file, i, 0)
+        else:
+            write_video(tmp_path / file, layouts.frames(i), FPS)
+    images = (name.removeprefix("images/").removeprefix("videos/") for name in files)
+    write_colmap(tmp_path / "sparse/0", rig(tuple(images)))
+    capture = load_capture(tmp_path)
+    assert capture.names == names
+    assert [image[20, 30, 0] for image in next(capture.frames()).images] == [0, 1, 2]
+
+
+def test_clips_by_camera__names_the_videos_of_memory_cards_by_their_folders(tmp_path: Path) -> None:
+    for name in ("cam02", "cam10", "cam01"):
+        layouts.videos(tmp_path / name, ("GX010042",))
+    assert [*clips_by_camera(tmp_path)] == ["cam01", "cam02", "cam10"]
+
+
+def test_anipose__reads_the_names_of_pose2sim(tmp_path: Path) -> None:
+    path = layouts.anipose(
+        tmp_path / "a", clips=lambda path, _: layouts.videos(path, ("A", "B", "C"))
+    )
+    file = path / "calibration.toml"
+    file.write_text(re.sub('"cam(.)"', r'"int_\1_img"', file.read_text()))
+    assert_holds(load_capture(path), ("A", "B", "C"), (0, 1, 2), shift=3)
+
+
+@pytest.mark.parametrize("kind", ["txt", "ply", None])
+def test_colmap__reads_points_of_several_files_or_none(tmp_path: Path, kind: str | None) -> None:
+    path = layouts.colmap(tmp_path / "a")
+    file = path / "sparse/0/points3D.txt"
+    if kind != "txt":
+        file.unlink()
+    if kind == "ply":
+        vertex = np.array([(0.1, 0.2, 0.3)], [(axis, "f8") for axis in "xyz"])
+        PlyData([PlyElement.describe(vertex, "vertex")]).write(str(file.with_suffix(".ply")))
+    points = load_capture(path).points
+    assert_close(points, [[0.1, 0.2, 0.3]] if kind else np.zeros((0, 3)), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "mask",
+    [
+        "frames/cam2/0000.png.png",
+        "cam2/0000.png.png",
+        "cam2/0003.png",
+        "cam2.png.png",
+        "cam2.png",
+    ],
+)
+def test_colmap__uses_its_masks(tmp_path: Path, mask: str) -> None:
+    path = layouts.colmap(tmp_path / "a")
+    folder_per_camera(path / "frames", ("cam1", "cam2", "cam10"))
+    left = np.zeros((HEIGHT, WIDTH), np.uint8)
+    left[:, : WIDTH // 2] = 255
+    (path / "masks" / mask).parent.mkdir(parents=True)
+    cv2.imwrite(str(path / "masks" / mask), left)
+    capture = load_capture(path)
+    assert capture.masks[::2] == (None, None)
+    np.testing.assert_array_equal(capture.masks[1], left > 0)
+
+
+def test_colmap__names_masks_of_no_image(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = layouts.colmap(tmp_path / "a")
+    layouts.write_image(path / "masks/cam3.png", 0, 0)
+    load_capture(path)
+    assert "no mask is named after an image, such as cam1.png.png" in caplog.text
 
 
 # Easting, northing and height of a rig, m.
