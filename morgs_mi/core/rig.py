@@ -46,10 +46,11 @@ def _central_distances(positions: np.ndarray) -> np.ndarray:
     return np.linalg.norm(positions - positions.mean(0), axis=1)
 
 
-def far_origin(positions: np.ndarray) -> np.ndarray:
-    """Return the median [3] of positions [N, 3] that are too far from 0 for float32, rounded to the
+def far_origin(cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the median position [3] of cameras that are too far from 0 for float32, rounded to the
     power of ten below their mean distance from it; zeros if they are not.
     """
+    positions = _positions(cameras)
     middle = np.median(positions, axis=0)
     distance = np.linalg.norm(middle)
     size = max(np.linalg.norm(positions - middle, axis=1).mean() or 1.0, 1e-9 * distance)

@@ -44,6 +44,7 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
     valid = {name: _valid_rows(name, values) for name, values in raw.items()}
     every = np.all([*valid.values()], axis=0)
     count = int(N - every.sum())
+    _warn_far(path, raw["means"][every], raw["log_scales"][every])
     if not count:
         return gaussians
     details = _details(valid)
@@ -58,6 +59,19 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
         *(path, count, N, LARGEST, details),
     )
     return gaussians.select(every)
+
+
+def _warn_far(path: str | Path, means: np.ndarray, log_scales: np.ndarray) -> None:
+    """Warn of means [N, 3] that float32 rounds by a tenth of the Gaussians' sizes or more."""
+    if not len(means):
+        return
+    middle = np.median(means, axis=0)
+    if 10 * np.spacing(np.abs(middle)).max() > np.exp(np.median(log_scales)):
+        _log.warning(
+            "%s: the centres, around (%g, %g, %g), are so far from 0 that float32 rounds them by a "
+            "tenth of the Gaussians' sizes or more; subtract an origin before they are exported.",
+            *(path, *middle),
+        )
 
 
 def _warn_zero(path: str | Path, quats: np.ndarray) -> None:

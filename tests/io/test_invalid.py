@@ -68,6 +68,14 @@ def test_without_invalid__names_rotations_of_zero(caplog):
     assert "f.ply: 1 of 40 Gaussians have a rotation of 0 and are not rotated: 7." in caplog.text
 
 
+def test_without_invalid__names_centres_that_are_rounded(caplog):
+    means = splats(N).numpy()["means"] + np.float32(5.3e6)
+    without_invalid("f.ply", replace(splats(N), means=means), 0)
+    assert (
+        "f.ply: the centres, around (5.3e+06, 5.3e+06, 5.3e+06), are so far from 0" in caplog.text
+    )
+
+
 def test_read_splats__accepts_sizes_of_zero_and_opacities_of_one(tmp_path, caplog):
     raw = splats(N).numpy()
     raw["log_scales"][0] = -np.inf

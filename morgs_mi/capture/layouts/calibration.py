@@ -71,7 +71,7 @@ class Calibration:
 
         Points that the file has rounded are left out.
         """
-        origin = far_origin(np.array([camera.position for camera in self.cameras]))
+        origin = far_origin(self.cameras)
         result = replace(
             self,
             cameras=moved(self.cameras, origin),
@@ -168,7 +168,7 @@ def required_clips(path: Path) -> Mapping[str, Clip]:
     Raises:
         FileNotFoundError: the capture folder has none.
     """
-    if clips := clips_by_camera(path) or photos(path):
+    if clips := clips_by_camera(path) or photos(path) or clips_by_rig(path):
         return clips
     raise FileNotFoundError(
         f"{path}: expected videos ({', '.join(VIDEO_SUFFIXES)}) or folders of frames, found none; "
@@ -197,8 +197,8 @@ def match_clips(
     Cameras without a clip, and clips without a camera, are left out with a warning.
 
     Args:
-        path: the capture folder; its photos, its frame folders or the photos in the folder that the
-            cameras' names state are used if they match more cameras than `clips`.
+        path: the capture folder; its photos, its frame folders, and clips or photos in folders of
+            folders, are used if they match more cameras than `clips`.
         source: file or folder of the calibration, for messages.
         clips: from `required_clips`.
         cameras: one or more per fixed camera, named as the calibration's images.
@@ -210,8 +210,8 @@ def match_clips(
             missing.
     """
     # Tolerances of poses are relative to their coordinates.
-    origin = far_origin(np.array([camera.position for camera in cameras]))
-    match = _best_match(path, source, clips, moved(cameras, origin), lenses)
+    local = moved(cameras, far_origin(cameras))
+    match = _best_match(path, source, clips, local, lenses)
     clips = match.clips
     if match.without:
         names = ", ".join(match.without[:_MAX_LISTED])
@@ -283,7 +283,6 @@ def _best_match(
         (lambda _: {} if _in_folders(clips, cameras) else clips, False),
         (photos, False),
         (clips_by_frame, False),
-        (lambda path: _named_photos(path, cameras), False),
         (clips_by_rig, True),
         (photos_by_rig, False),
     )
@@ -318,12 +317,6 @@ def _in_folders(clips: Mapping[str, Clip], cameras: Sequence[Camera]) -> bool:
         for part in PurePosixPath(camera.name.replace("\\", "/")).parts[:-1]
     }
     return any(isinstance(clip, Path) and clip.is_dir() for clip in map(clips.get, names))
-
-
-def _named_photos(path: Path, cameras: Sequence[Camera]) -> Mapping[str, Clip]:
-    """Return the photos in the folder that the names of all cameras state, if there is one."""
-    folders = {path / PurePosixPath(camera.name.replace("\\", "/")).parent for camera in cameras}
-    return photos(folder) if len(folders) == 1 and (folder := folders.pop()).is_dir() else {}
 
 
 def _matched(

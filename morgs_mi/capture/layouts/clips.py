@@ -69,7 +69,7 @@ def clips_by_camera(path: Path) -> dict[str, Path]:
     clips |= _folders(path) | _videos(path)
     if (path / "frames").is_dir():
         clips |= _videos(path / "frames") | _folders(path / "frames")
-    return _in_order(clips or clips_by_rig(path))
+    return _in_order(clips)
 
 
 def clips_by_rig(path: Path) -> dict[str, Path]:
@@ -96,7 +96,9 @@ def _by_rig(path: Path, clips: Callable[[Path], dict[str, Path]]) -> dict[str, P
     rigs = [rig for place in (path, *_places(path)) for rig in _places(place)]
     clips_of_rigs = [(rig.name, *clip) for rig in rigs for clip in clips(rig).items()]
     unique = len({name for _, name, _ in clips_of_rigs}) == len(clips_of_rigs)
-    return {name if unique else f"{rig}_{name}": clip for rig, name, clip in clips_of_rigs}
+    return _in_order(
+        {name if unique else f"{rig}_{name}": clip for rig, name, clip in clips_of_rigs}
+    )
 
 
 def _places(path: Path) -> list[Path]:

@@ -21,7 +21,13 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from morgs_mi.capture.layouts.clips import EXAMPLE, clips_by_camera, names_without, photos
+from morgs_mi.capture.layouts.clips import (
+    EXAMPLE,
+    clips_by_camera,
+    clips_by_rig,
+    names_without,
+    photos,
+)
 from morgs_mi.capture.masks import opaque_pixels
 from morgs_mi.capture.points import MAX_ERROR
 from morgs_mi.capture.timeline import nearest_frames
@@ -317,7 +323,7 @@ def _masks(readers: dict[str, FrameReader]) -> dict[str, np.ndarray]:
 
 def _clips(path: Path, without: Sequence[str]) -> dict[str, Path | tuple[Path]]:
     """Return the files of at least two cameras by name, except of those to leave out."""
-    clips = clips_by_camera(path) or photos(path)
+    clips = clips_by_camera(path) or photos(path) or clips_by_rig(path)
     clips = {name: clips[name] for name in names_without(path, clips, without)}
     if broken := [name for name in clips if "\n" in name]:
         raise ValueError(
