@@ -48,14 +48,14 @@ def _central_distances(positions: np.ndarray) -> np.ndarray:
 
 def far_origin(cameras: Sequence[Camera]) -> np.ndarray:
     """Return the median position [3] of cameras that are too far from 0 for float32, rounded to the
-    power of ten below their mean distance from it; zeros if they are not.
+    power of ten below ten times their mean distance from it; zeros if they are not.
     """
     positions = _positions(cameras)
     middle = np.median(positions, axis=0)
     distance = np.linalg.norm(middle)
     size = max(np.linalg.norm(positions - middle, axis=1).mean() or 1.0, 1e-9 * distance)
     far = distance > _FAR * size
-    return np.round(middle, -int(np.floor(np.log10(size)))) if far else np.zeros(3)
+    return np.round(middle, -int(np.floor(np.log10(10 * size)))) if far else np.zeros(3)
 
 
 def moved(cameras: Sequence[Camera], origin: np.ndarray) -> tuple[Camera, ...]:
