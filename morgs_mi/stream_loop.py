@@ -20,6 +20,7 @@ import numpy as np
 from morgs_mi.codec.container import Packet
 from morgs_mi.codec.packets import CodedFrame, decode, residual_packet
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.entries import STUDIO, studio_entry
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
@@ -30,7 +31,7 @@ from morgs_mi.loop.correction import Correction
 from morgs_mi.loop.first_frame import fitted_first_frame, with_first_confidence
 from morgs_mi.loop.frame_report import FittedFrame, FrameReport
 from morgs_mi.loop.image_status import image_status
-from morgs_mi.loop.input_images import InputImage, as_array
+from morgs_mi.loop.input_images import Frame, as_array, in_order
 from morgs_mi.loop.observation import (
     FrameObservation,
     ImageHistory,
@@ -40,6 +41,7 @@ from morgs_mi.loop.observation import (
     extended_history,
     observe_frame,
     prepare,
+    views_of,
 )
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.active_set import ActiveSet, find_active_set, full_active_set
@@ -76,7 +78,7 @@ class StreamState:
 def step(
     setup: Setup,
     state: StreamState,
-    images: Sequence[InputImage | None] | FrameObservation,
+    images: Frame | FrameObservation,
     progress: Report | None = None,
     on_provisional: Callable[[Packet], None] | None = None,
 ) -> tuple[StreamState, Packet, FrameReport]:
@@ -88,14 +90,15 @@ def step(
         state: as returned for the last frame; `StreamState()` before the first.
         images: per training view an image [H, W, 3], RGB, or None where the view has none: uint8 in
             sRGB, linear light as a float array or a `mi.TensorXf`, or a `mi.Bitmap`, whose flag
-            `srgb_gamma` counts. They are copied. Alternatively, the result of `observe_frame` for
-            them.
+            `srgb_gamma` counts. They are copied. A dict has them by the cameras' names.
+            Alternatively, the result of `observe_frame` for them.
         progress: called with (stage, done, total): the stages of the first frame, or the steps of a
             later one.
         on_provisional: called with provisional keyframes while the first frame is fitted.
 
     Raises:
-        ValueError: an image has another size or type than its camera, or the first frame has no
+        ValueError: an image has another size or type than its camera, or other numbers than the
+            images before it (uint8 or floats), floats have 255 for white, or the first frame has no
             image at all.
     """
     start_time = time.perf_counter()
@@ -104,12 +107,13 @@ def step(
     observation = images
     if not isinstance(observation, FrameObservation):
         observation = observe_frame(setup, frame, state.history, observation)
+    present = observation.history.images
+    problems = _image_problems(setup, state, present)
     if state.coded is None:
         fitted = fitted_first_frame(setup, observation, frame_progress, on_provisional)
     else:
         fitted = _fit_later_frame(setup, state, observation, frame_progress)
     coded = decode(state.coded, fitted.packet)
-    present = observation.history.images
     missing = [camera.name for v, camera in enumerate(setup.cameras) if v not in present]
     report = FrameReport(
         frame=frame,
@@ -117,7 +121,7 @@ def step(
         num_bytes=fitted.packet.num_bytes,
         losses=fitted.losses,
         num_gaussians=len(coded),
-        status=_status(setup, state, present, fitted.status),
+        status="; ".join([*([] if fitted.status == "ok" else [fitted.status]), *problems]) or "ok",
         missing_views=tuple(missing),
         active=fitted.active,
         validation=fitted.validation,
@@ -128,13 +132,18 @@ def step(
     return next_state, fitted.packet, report
 
 
-def _status(setup: Setup, state: StreamState, images: Images, status: str) -> str:
-    """Return the status of a frame with the problems of its images, which are logged in frame 0."""
-    problems = image_status([camera.name for camera in setup.cameras], state.history.images, images)
+def _image_problems(setup: Setup, state: StreamState, images: Images) -> list[str]:
+    """Return a sentence for each problem of a frame's images; those of frame 0 are logged, and
+    include poses that do not fit the images.
+    """
+    names = [camera.name for camera in setup.cameras]
+    problems = [*image_status(names, state.history.images, images)]
     if state.coded is None:
+        for name in STUDIO["image checks"]:
+            problems += studio_entry("image checks", name)(views_of(setup, images))
         for problem in problems:
             _LOG.warning("frame 0: %s", problem)
-    return "; ".join([*([] if status == "ok" else [status]), *problems]) or "ok"
+    return problems
 
 
 def _fit_later_frame(
@@ -263,10 +272,10 @@ class StreamLoop:
     @interrupts_raised()
     def push(
         self,
-        images: Sequence[InputImage | None],
+        images: Frame,
         progress: Report | None = None,
-        upcoming: Sequence[InputImage | None] | None = None,
-        recorded: Sequence[InputImage | None] | None = None,
+        upcoming: Frame | None = None,
+        recorded: Frame | None = None,
         on_provisional: Callable[[Packet], None] | None = None,
     ) -> tuple[Packet, FrameReport]:
         """Fit the next frame and return its packet for the stream, and its report; see `step`.
@@ -291,14 +300,15 @@ class StreamLoop:
         if recorded is not None:
             history = extended_history(self.setup, frame, previous, recorded)
         if upcoming is not None:  # beside the fit, which starts below
-            copies = [None if image is None else np.array(as_array(image)) for image in upcoming]
+            ahead = in_order(self.setup.cameras, upcoming, frame + 1)
+            copies = [None if image is None else np.array(as_array(image)) for image in ahead]
             observe_next = partial(observe_frame, self.setup, frame + 1, history, copies)
             self._next_observation = frame + 1, in_background(observe_next)
         state, packet, report = step(self.setup, self.state, observation, progress, on_provisional)
         self.state = replace(state, history=history)
         return packet, replace(report, seconds=time.perf_counter() - start_time)
 
-    def _observation_ahead(self, images: Sequence[InputImage | None]) -> FrameObservation | None:
+    def _observation_ahead(self, images: Frame) -> FrameObservation | None:
         """Return the observation that was made ahead of time if its images are the same; it is used
         once.
         """
@@ -307,7 +317,8 @@ class StreamLoop:
         if task is None or task[0] != self.state.frame:
             return None
         observation = task[1].result()
-        present = {v: as_array(image) for v, image in enumerate(images) if image is not None}
+        ordered = enumerate(in_order(self.setup.cameras, images, self.state.frame))
+        present = {v: as_array(image) for v, image in ordered if image is not None}
         same_views = present.keys() == observation.recorded.keys()
         same_images = same_views and all(
             np.array_equal(image, observation.recorded[v]) for v, image in present.items()
@@ -317,7 +328,7 @@ class StreamLoop:
     def resume(
         self,
         coded: CodedFrame,
-        frames: Iterable[Sequence[InputImage | None]],
+        frames: Iterable[Frame],
         exposures: Sequence[Exposure] = (),
     ) -> None:
         """Continue after a frame of a stream, as if it had just been pushed.

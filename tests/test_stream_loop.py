@@ -29,6 +29,7 @@ from morgs_mi.stream_loop import StreamLoop
 from tests.quick import NO_DENSITY, quick
 from tests.scenes.cameras import QUAD, look_at_cameras
 from tests.scenes.gaussians import isotropic
+from tests.scenes.textured import render, rig, textures
 
 SHIFT = np.array([0.06, 0.02, 0.0])  # about 3 px a frame
 QUICK = quick(  # from all points, as the images were made of them
@@ -220,8 +221,8 @@ def test_push__fits_views_at_their_own_times(clip):
         [shown(scene(t + d)[0], c) for c, d in zip(views, delays, strict=True)] for t in range(3)
     ]
     quality = []
-    for rig, first in ((views, clip[0][:4]), (cameras()[:4], frames[0])):
-        loop = StreamLoop(rig, *points_and_colors(), QUICK)
+    for assumption, first in ((views, clip[0][:4]), (cameras()[:4], frames[0])):
+        loop = StreamLoop(assumption, *points_and_colors(), QUICK)
         loop.push(first, recorded=frames[0])
         for images in frames[1:]:
             loop.push(images)
@@ -395,6 +396,10 @@ def masked(masks):
     ("call", "message"),
     [
         (lambda clip: StreamLoop([], np.zeros((0, 3)), np.zeros((0, 3))), "at least one view"),
+        (
+            lambda clip: StreamLoop([mi.load_dict(cameras()[0].sensor())], [], []),
+            r"got a ProjectiveCamera; convert a Mitsuba sensor by Camera.from_sensor\(\)",
+        ),
         (lambda clip: new_loop().push(clip[0][:3]), "one image or None for each of 4 views, got 3"),
         (
             lambda clip: new_loop().push([None] * 4),
@@ -751,6 +756,19 @@ def test_push__reports_a_black_first_frame_and_a_cut(clip):
         "ok",
         "the images show another scene than in the frame before",
     ]
+
+
+def test_push__reports_cameras_in_another_order():
+    views = rig()
+    images = [render(view, textures()) for view in views]
+    order = [0, 4, 2, 3, 1, 5]
+    loop = StreamLoop(views, np.zeros((0, 3)), np.zeros((0, 3)), quick())
+    status = loop.push([images[view] for view in order])[1].status
+    assert "the clips of cam1 and cam4, or their poses, seem to be swapped" in status
+    loop = StreamLoop([views[view] for view in order], np.zeros((0, 3)), np.zeros((0, 3)), quick())
+    named = dict(zip((view.name for view in views), images, strict=True))
+    assert "pose" not in loop.push(named, upcoming=named)[1].status
+    assert loop.push(named)[1].missing_views == ()
 
 
 @pytest.mark.slow

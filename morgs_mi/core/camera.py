@@ -19,6 +19,8 @@ from morgs_mi.core.types import Tensor
 
 # Mitsuba's camera looks along +z with x to the left and y up; OpenCV's has x right and y down.
 _OPENCV_FROM_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])
+OF_SENSOR = "convert a Mitsuba sensor by Camera.from_sensor()"
+"""Remedy where another value than a camera is passed."""
 
 
 @dataclass(frozen=True)

@@ -43,8 +43,17 @@ def _lies_in(x: Any, interval: str) -> bool:
     return above and (x <= high if interval[-1] == "]" else x < high)
 
 
-def check_type(place: str, name: str, value: Any, kind: type) -> None:
+def check_type(
+    place: str, name: str, value: Any, kind: type, remedy: str = "pass another value"
+) -> None:
     """Raise an error unless an argument is an instance of a class.
+
+    Args:
+        place: where the error's sentence begins.
+        name: of the argument.
+        value: of the argument.
+        kind: the class.
+        remedy: end of the sentence.
 
     Raises:
         ValueError: it is not.
@@ -52,8 +61,7 @@ def check_type(place: str, name: str, value: Any, kind: type) -> None:
     if not isinstance(value, kind):
         expected = f"{kind.__module__}.{kind.__qualname__}"
         raise ValueError(
-            f"{place}: `{name}` must be a {expected}, got a {type(value).__name__}; pass another "
-            "value."
+            f"{place}: `{name}` must be a {expected}, got a {type(value).__name__}; {remedy}."
         )
 
 

@@ -30,6 +30,7 @@ STUDIO: Mapping[str, Mapping[str, str]] = {
         "qualisys": "layouts.qualisys:LAYOUT",
         "anipose": "layouts.anipose:LAYOUT",
     },
+    "image checks": {"poses": "calibration.checks.rig_check:pose_problems"},
     "camera refinement": {"first frame": "calibration.refine:refine_cameras"},
     "flow sources": {
         "onnx": "networks.flow_network:onnx",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
 
 import drjit as dr
@@ -16,6 +16,9 @@ from morgs_mi.core.color_space import positive_light
 InputImage: TypeAlias = Any
 """An image [H, W, 3]: a uint8 array in sRGB; linear light as a float array or a `mi.TensorXf`; or a
 `mi.Bitmap`, whose flag `srgb_gamma` counts."""
+
+Frame: TypeAlias = "Sequence[InputImage | None] | Mapping[str, InputImage | None]"
+"""One image or None for each view in the cameras' order, or the images by the cameras' names."""
 
 
 def as_array(image: Any) -> Any:
@@ -32,38 +35,62 @@ def as_array(image: Any) -> Any:
 
 
 def copied_images(
-    cameras: Sequence[Camera], images: Sequence[InputImage | None], frame: int
+    cameras: Sequence[Camera], images: Frame, frame: int, kind: str = ""
 ) -> dict[int, np.ndarray]:
     """Return copies of the images of those views that have one, by view index, negative light set
     to 0.
 
+    Args:
+        cameras: the views.
+        images: of the frame.
+        frame: its index.
+        kind: numbers of the images of earlier frames, uint8 or float32; empty: there are none.
+
     Raises:
-        ValueError: their number is not that of the cameras, an image has another size or type than
-            its camera, or light that is not finite, or the first frame has no image at all.
+        ValueError: as for `in_order`, an image has another size or type than its camera, light that
+            is not finite or has 255 for white, or other numbers than the images before it, or the
+            first frame has no image at all.
     """
-    _check_count(images, len(cameras), frame)
+    images = in_order(cameras, images, frame)
     if not frame and all(image is None for image in images):
         raise ValueError(
-            "step(): frame 0 must have an image of at least one view, got none; begin with one "
+            "push(): frame 0 must have an image of at least one view, got none; begin with one "
             "that has."
         )
     views = enumerate(zip(cameras, images, strict=True))
-    return {
-        view: _copy(image, camera, f"step(): frame {frame} of view {camera.name or view!r}")
+    copies = {
+        view: _copy(image, camera, f"push(): frame {frame} of view {camera.name or view!r}")
         for view, (camera, image) in views
         if image is not None
     }
-
-
-def _check_count(images: Any, count: int, frame: int) -> None:
-    """Raise an error unless there are as many images as views."""
-    is_sequence = isinstance(images, (Sequence, np.ndarray))
-    image_count = len(images) if is_sequence else f"a {type(images).__name__}"
-    if image_count != count:
+    kinds = {kind, *(image.dtype.name for image in copies.values())} - {""}
+    if len(kinds) > 1:
         raise ValueError(
-            f"step(): frame {frame} must have one image or None for each of {count} views, "
-            f"got {image_count}."
+            f"push(): frame {frame} must be uint8 (sRGB) for all views, or floats (linear light), "
+            f"like the frames before it, got {' and '.join(sorted(kinds))}; convert one of them."
         )
+    return copies
+
+
+def in_order(cameras: Sequence[Camera], images: Any, frame: int) -> list[InputImage | None]:
+    """Return the images of a frame in the cameras' order.
+
+    Raises:
+        ValueError: their number is not that of the cameras, or a name is not that of one camera.
+    """
+    names = [camera.name for camera in cameras]
+    if isinstance(images, Mapping) and all(names.count(name) == 1 for name in images):
+        return [images.get(name) for name in names]
+    is_sequence = isinstance(images, (Sequence, np.ndarray))
+    if not is_sequence or len(images) != len(names):
+        content = len(images) if is_sequence else f"a {type(images).__name__}"
+        if isinstance(images, Mapping):
+            content = f"a dict with {[*images]}; name one camera each of {names}"
+        raise ValueError(
+            f"push(): frame {frame} must have one image or None for each of {len(names)} views, "
+            f"got {content}."
+        )
+    return list(images)
 
 
 def _copy(image: InputImage, camera: Camera, place: str) -> np.ndarray:
@@ -73,7 +100,14 @@ def _copy(image: InputImage, camera: Camera, place: str) -> np.ndarray:
     if is_image and array.dtype == np.uint8:
         return array.copy()
     if is_image and array.dtype.kind == "f":
-        return positive_light(array, place)
+        light = positive_light(array, place)
+        most = light.max()
+        if most == 255 or (most > 2 and (light == np.rint(light)).all()):
+            raise ValueError(
+                f"{place} must be linear light with 1 for white where it is floats, got values up "
+                f"to {most:g}, as integers have; pass uint8 in sRGB, or divide linear light by 255."
+            )
+        return light
     raise ValueError(
         f"{place} must be uint8 {list(shape)}, or linear light in floats, got {kind_of(array)}; "
         "convert it."

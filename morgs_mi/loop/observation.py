@@ -12,7 +12,7 @@ from typing import Protocol
 
 import numpy as np
 
-from morgs_mi.core.camera import Camera
+from morgs_mi.core.camera import OF_SENSOR, Camera
 from morgs_mi.core.checks import check_mask, check_number, check_points, check_type
 from morgs_mi.core.color_space import BRIGHTEST, display_image, display_stops, encode_light
 from morgs_mi.core.rig import check_near_planes, choose_key_views, scene_extent
@@ -20,7 +20,7 @@ from morgs_mi.core.threads import map_in_threads
 from morgs_mi.fit.capacity import check_capacity
 from morgs_mi.fit.initialise import Points
 from morgs_mi.fit.view import View
-from morgs_mi.loop.input_images import InputImage, copied_images
+from morgs_mi.loop.input_images import Frame, copied_images
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.change import box_around, change_mask, moving_region, update_reference
 from morgs_mi.method.exposure import LEAST_CHANGE, Exposure, common_change, follow_exposure
@@ -84,6 +84,7 @@ class ImageHistory:
     exposures: Mapping[int, Exposure] = field(default_factory=dict)
     #: Stops by which linear light is brightened for them; None before the first frame.
     display_exposure: float | None = None
+    kind: str = ""  #: Numbers of the images, uint8 or float32; empty before the first.
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,7 +166,7 @@ def _check_cameras(cameras: Sequence[Camera]) -> None:
             "list."
         )
     for camera in cameras:
-        check_type("StreamLoop()", "cameras", camera, Camera)
+        check_type("StreamLoop()", "cameras", camera, Camera, OF_SENSOR)
 
 
 def _check_masks(cameras: Sequence[Camera], masks: Sequence[np.ndarray | None]) -> None:
@@ -186,7 +187,7 @@ def views_of(setup: Setup, images: Images) -> list[View]:
 
 
 def observe_frame(
-    setup: Setup, frame: int, history: ImageHistory, images: Sequence[InputImage | None]
+    setup: Setup, frame: int, history: ImageHistory, images: Frame
 ) -> FrameObservation:
     """Return the observations of a frame: changes, flow (eq. 4) and masks (eqs. 9, 10).
 
@@ -194,14 +195,13 @@ def observe_frame(
         setup: data that all frames share.
         frame: its index.
         history: images up to the frame before; `ImageHistory()` for the first.
-        images: per training view uint8 [H, W, 3], RGB, or linear light (see `InputImage`), or None
+        images: per training view uint8 [H, W, 3], RGB, or linear light (see `Frame`), or None
             where the view has no image. They are copied.
 
     Raises:
-        ValueError: an image has another size or type than its camera, or the first frame has no
-            image at all.
+        ValueError: as for `copied_images`.
     """
-    recorded = copied_images(setup.cameras, images, frame)
+    recorded = copied_images(setup.cameras, images, frame, history.kind)
     new_history, changes = _extended(setup, history, recorded)
     flows, key_views = _flows(setup, frame, history.images, new_history.images, changes)
     return FrameObservation(
@@ -210,10 +210,11 @@ def observe_frame(
 
 
 def extended_history(
-    setup: Setup, frame: int, history: ImageHistory, images: Sequence[InputImage | None]
+    setup: Setup, frame: int, history: ImageHistory, images: Frame
 ) -> ImageHistory:
     """Return the images up to a frame, without flow; arguments and errors of `observe_frame`."""
-    return _extended(setup, history, copied_images(setup.cameras, images, frame))[0]
+    recorded = copied_images(setup.cameras, images, frame, history.kind)
+    return _extended(setup, history, recorded)[0]
 
 
 def _extended(
@@ -226,15 +227,16 @@ def _extended(
     follow = setup.config.fit.exposure != "off"
     stops = _display_exposure(setup, history, recorded)
     images = {v: display_image(image, stops) for v, image in recorded.items()}
+    kind = next((image.dtype.name for image in recorded.values()), history.kind)
     if not (skip or follow):
-        return ImageHistory(images, display_exposure=stops), None
+        return ImageHistory(images, display_exposure=stops, kind=kind), None
     exposures = _exposures(setup, history, images) if follow else {}
     images = {
         v: exposures[v].corrected(image) if v in exposures else image for v, image in images.items()
     }
     changes = _changes(setup, history.references, images)
     references = {**history.references, **_references(history.references, images, changes)}
-    return ImageHistory(images, references, exposures, stops), changes if skip else None
+    return ImageHistory(images, references, exposures, stops, kind), changes if skip else None
 
 
 def _display_exposure(setup: Setup, history: ImageHistory, recorded: Images) -> float:

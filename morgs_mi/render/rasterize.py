@@ -12,7 +12,7 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME
-from morgs_mi.core.camera import Camera
+from morgs_mi.core.camera import OF_SENSOR, Camera
 from morgs_mi.core.checks import check_type, numbers
 from morgs_mi.core.gaussians import ActivatedGaussians, repeat_each
 from morgs_mi.core.memory import check_memory, float_tensor, from_numpy, refuse_freezing
@@ -386,7 +386,7 @@ def _check_cameras(cameras: Sequence[Camera]) -> None:
             "rasterize(): `camera` must be one or more cameras, got an empty sequence; pass one."
         )
     for camera in cameras:
-        check_type("rasterize()", "camera", camera, Camera)
+        check_type("rasterize()", "camera", camera, Camera, OF_SENSOR)
     _check_same_size(cameras)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import mitsuba as mi
 import numpy as np
@@ -75,8 +76,38 @@ def test_copied_images__warns_once_of_negative_light(caplog):
     ],
 )
 def test_copied_images__refuses_others(image, message):
-    with pytest.raises(ValueError, match=rf"step\(\): frame 0 of view 'cam' .*{message}"):
+    with pytest.raises(ValueError, match=rf"push\(\): frame 0 of view 'cam' .*{message}"):
         copied(image)
+
+
+RIG = [replace(CAMERA, name=name) for name in "ab"]
+
+
+@pytest.mark.parametrize(
+    ("images", "message"),
+    [
+        (2 * [np.float32(GREY)], "linear light with 1 for white .*, got values up to .*by 255"),
+        ([LIGHT, np.float16(GREY // 64)], "view 'b' .*, got values up to 3"),
+        ([LIGHT, np.minimum(LIGHT * 100, 255)], "got values up to 255"),
+        ([GREY, LIGHT], "must be uint8 .* for all views, or floats .*, got float32 and uint8"),
+        ({"c": GREY}, r"got a dict with \['c'\]; name one camera each of \['a', 'b'\]"),
+        (iter([GREY]), "one image or None for each of 2 views, got a list_iterator"),
+    ],
+)
+def test_copied_images__refuses_frames(images, message):
+    with pytest.raises(ValueError, match=rf"^push\(\): .*{message}"):
+        copied_images(RIG, images, 0)
+
+
+def test_copied_images__takes_images_by_name():
+    result = copied_images(RIG, {"b": GREY}, 0)
+    assert result.keys() == {1}
+
+
+def test_observe_frame__refuses_other_numbers_than_the_frame_before():
+    history = observed([LIGHT]).history
+    with pytest.raises(ValueError, match="like the frames before it, got float32 and uint8"):
+        observed([GREY], history)
 
 
 def observed(images, history=None, **kwargs):

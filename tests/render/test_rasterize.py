@@ -219,7 +219,7 @@ def test_rasterize__refuses_bad_arguments(scene):
     ("arguments", "message"),
     [
         ({"gaussians": None}, "`gaussians` must be Gaussians, got a NoneType"),
-        ({"camera": None}, "`camera` must be a .*Camera, got a NoneType"),
+        ({"camera": None}, "`camera` must be a .*Camera, got a NoneType; convert a Mitsuba sensor"),
         ({"channels": "color"}, "`channels` must be a sequence of names, got 'color'"),
         ({"detach_weights": "color"}, "`detach_weights` must be a sequence of names"),
         ({"region": "all"}, "`region` must be a .*Region, got a str"),

@@ -10,13 +10,16 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
+import cv2
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
-from morgs_mi.capture.features import Match, reprojection_errors
+from morgs_mi.capture.features import Match, detect, match_views, reprojection_errors
 from morgs_mi.capture.points import MAX_ERROR, SharedFeatures
 from morgs_mi.core.camera import Camera
+from morgs_mi.fit.view import View
 from morgs_mi.studio.calibration.checks.mistakes import (
     camera_candidates,
     focal_candidates,
@@ -38,6 +41,8 @@ _GOOD_ERROR = 0.5
 # more accurate.
 _SAMPLE = 40
 _FACTOR_PAIRS = 8
+# px. Width at which the first frame of a fit is checked, in about a second for 20 views.
+_WIDTH = 480
 _NO_OVERLAP = (
     "check that the clip is of this scene and not mirrored, compare the camera's place in the "
     "plot of the rig (--plot) with the real one, or add cameras in between and textured objects"
@@ -94,6 +99,26 @@ def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
     return RigCheck(
         len(errors), len(shared.matches), _median(errors), tuple(checks), _all_fit(checks), advice
     )
+
+
+def pose_problems(views: Sequence[View]) -> list[str]:
+    """Return a sentence if poses are known not to fit the images of views, otherwise none."""
+    # Large errors, such as another order of the cameras, show in small images.
+    cameras = [
+        replace(
+            view.camera.with_width(min(_WIDTH, view.camera.width)),
+            name=view.camera.name or f"view {index}",
+        )
+        for index, view in enumerate(views)
+    ]
+    features = tuple(
+        detect(cv2.resize(view.image, (c.width, c.height), interpolation=cv2.INTER_AREA), view.mask)
+        for view, c in zip(views, cameras, strict=True)
+    )
+    none = np.zeros((0, 3))
+    capture = Capture(Path(), tuple(cameras), 1, 1.0, none, none, (), (), None, ())
+    check = check_rig(capture, SharedFeatures(features, tuple(match_views(features, cameras))))
+    return [check.advice] if check.fits is False else []
 
 
 def _checks_of_mistake(pairs: _Pairs, corrected: Sequence[Camera]) -> list[CameraCheck]:
