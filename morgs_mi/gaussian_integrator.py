@@ -41,7 +41,7 @@ import numpy as np
 from morgs_mi.core.attributes import shape_attribute_widths
 from morgs_mi.core.entries import place_of
 from morgs_mi.core.gaussians import ActivatedGaussians
-from morgs_mi.core.memory import from_numpy
+from morgs_mi.core.memory import from_numpy, owned_copy
 
 # The class of each plugin, MODULE:NAME.
 _PLUGINS = {
@@ -76,11 +76,14 @@ def ellipsoids(gaussians: ActivatedGaussians) -> dict[str, Any]:
         name: np.array(dr.detach(value)) for name, value in values.items() if value is not None
     }
     data = _rows(*(values.pop(name) for name in names[:3]))
-    attributes = {
-        name: from_numpy(mi.TensorXf, value.reshape(len(data), -1))
-        for name, value in values.items()
+    # Memory of Dr.Jit: a parameter that is borrowed from NumPy cannot be replaced in a function
+    # under `dr.freeze`.
+    return {"type": "ellipsoids"} | {
+        name: mi.TensorXf(
+            owned_copy(from_numpy(mi.Float, value)), (len(data), value.size // len(data))
+        )
+        for name, value in {"data": data, **values}.items()
     }
-    return {"type": "ellipsoids", "data": from_numpy(mi.TensorXf, data), **attributes}
 
 
 def _rows(means: np.ndarray, scales: np.ndarray, quats: np.ndarray) -> np.ndarray:

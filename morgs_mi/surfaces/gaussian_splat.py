@@ -14,9 +14,11 @@ import numpy as np
 
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME, shape_attribute_widths
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import bounded
 from morgs_mi.core.color_space import decode_traced
 from morgs_mi.core.gaussians import tensor_rows
 from morgs_mi.core.memory import refuse_freezing
+from morgs_mi.core.ranges import check_value
 from morgs_mi.core.types import Float, Tensor, UInt32
 from morgs_mi.render.channels import aov_attributes, exr_names
 from morgs_mi.render.kernel_recording import render_lock
@@ -176,18 +178,8 @@ def _views(sensor: Any) -> list[Any]:
     return [part for part in children if isinstance(part, mi.Sensor)]
 
 
-def _check_pinhole(sensor: Any) -> None:
-    if sensor.class_name() != "PerspectiveCamera":
-        raise ValueError(
-            "gaussian_splat: expected a `perspective` sensor or a `batch` of them, got "
-            f"{sensor.class_name()}; splats are drawn only by pinhole cameras without lens "
-            "distortion."
-        )
-
-
 def _sensor_camera(sensor: Any, border: int) -> Camera:
     """Return the camera of the sensor's whole film with a margin of `border` pixels."""
-    _check_pinhole(sensor)
     view = Camera.from_sensor(sensor)
     params: Any = mi.traverse(sensor)
     W = view.width
@@ -215,18 +207,27 @@ def _render_config(props: Any) -> RenderConfig:
         raise ValueError(f"gaussian_splat: {error}") from None
 
 
-def _color(values: Any) -> Any:
+def _color(value: Any) -> Any:
     """Return one number or three as a colour."""
-    return mi.Color3f(np.broadcast_to(np.array(values, float), 3))
+    values = np.ravel(value)
+    if values.size not in (1, 3) or values.dtype.kind not in "fiu" or not bounded(values):
+        raise ValueError(
+            "gaussian_splat: `background` must be one or three finite numbers, got a "
+            f"{type(value).__name__}, {str(value)[:20]!r}; pass a colour such as "
+            "{'type': 'rgb', 'value': 1}."
+        )
+    return mi.Color3f(np.broadcast_to(values.astype(float), 3))
 
 
 def _check_integrator(surfaces: Any) -> None:
-    if not (surfaces is None or isinstance(surfaces, mi.Integrator)):
+    if surfaces is None:
+        return
+    if not isinstance(surfaces, mi.Integrator) or isinstance(surfaces, GaussianSplatIntegrator):
         raise ValueError(
-            f"gaussian_splat: `surfaces` must be an integrator, got {surfaces!r}; pass one such as "
-            "{'type': 'path'}."
+            "gaussian_splat: `surfaces` must be an integrator of surfaces such as {'type': "
+            f"'path'}}, got {surfaces!r}; pass another one."
         )
-    if surfaces is not None and not mi.is_rgb:
+    if not mi.is_rgb:
         raise ValueError(
             "gaussian_splat: with `surfaces`, expected a variant such as 'llvm_ad_rgb', got "
             f"{mi.variant()!r}; call mi.set_variant() before the scene is loaded, because "
@@ -288,14 +289,16 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
 
      * - background
        - |rgb|, |exposed|, |differentiable|
-       - Colour behind all Gaussians, encoded like the primitives. (Default: black)
+       - Colour behind all Gaussians, encoded like the primitives. Layers are composited in this
+         encoding, so encode the colours of an `rgba` film before compositing them. (Default: black)
 
      * - aovs
        - |string|
        - Further channels, a comma-separated list of `motion` (`motion.X`, `motion.Y`:
          displacement since the last frame, px), `depth` (`depth.Y`: expected z, world units) and
-         the channels of attributes such as `confidence` (`confidence.Y`). Channels that are not
-         listed are not computed. (Default: none)
+         the channels of attributes such as `confidence` (`confidence.Y`). Depth and motion are
+         divided by the coverage, the channels of attributes are not. Channels that are not listed
+         are not computed. (Default: none)
 
      * - eps2d, alpha_min, stop_transmittance
        - |float|
@@ -339,7 +342,10 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
 
     def __init__(self, props: Any) -> None:
         super().__init__(props)
-        self.srgb_primitives = bool(props.get("srgb_primitives", True))
+        for name, kind in (("srgb_primitives", bool), ("aovs", str)):
+            if name in props:
+                check_value("gaussian_splat", name, props[name], kind)
+        self.srgb_primitives = props.get("srgb_primitives", True)
         self.config = _render_config(props)
         background = props.get("background", None)
         self.background = None if background is None else _color(background)

@@ -231,6 +231,11 @@ class SurfaceView:
             image = mi.TensorXf(
                 integrator.render(scene, sensor, seed=pixels.seed, spp=pixels.samples())
             )
+            if image.shape[2] < 3:
+                raise ValueError(
+                    "gaussian_splat: `surfaces` must be an integrator of colours, got one of "
+                    f"{integrator.aov_names()} alone; put a `path` into it."
+                )
             coverage, depth = coverage_and_depth(scene, sensor, pixels.camera, pixels.crop)
             behind = _environment(scene, sensor) if _is_behind(scene, integrator) else None
         dr.enable_grad(image, behind)

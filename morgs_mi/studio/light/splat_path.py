@@ -19,15 +19,22 @@ Mitsuba has a base class for every variant, so this module is imported again aft
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import drjit as dr
 import mitsuba as mi
 from mitsuba.ad.integrators.common import RBIntegrator, mis_weight  # pyright: ignore
 
+from morgs_mi.core.ranges import AtLeast, check_value
 from morgs_mi.core.types import Bool, Float, Jit
 from morgs_mi.studio.light.light_probe import CLIPPED, radiance
 from morgs_mi.surfaces.splat_rays import SplatRays
+
+_PROPERTIES = {
+    "max_depth": Annotated[int, AtLeast(-1)],
+    "rr_depth": Annotated[int, AtLeast(1)],
+    "clipped": Annotated[float, AtLeast(1)],
+}
 
 
 class SplatPathIntegrator(RBIntegrator):
@@ -57,6 +64,9 @@ class SplatPathIntegrator(RBIntegrator):
     """
 
     def __init__(self, props: Any) -> None:
+        for name, kind in _PROPERTIES.items():
+            if name in props:
+                check_value("splat_path", name, props[name], kind)
         super().__init__(props)
         if not mi.is_rgb:
             raise ValueError(
@@ -65,11 +75,6 @@ class SplatPathIntegrator(RBIntegrator):
                 "colours."
             )
         self.clipped = float(props.get("clipped", CLIPPED))
-        if not 1 <= self.clipped < float("inf"):
-            raise ValueError(
-                f"splat_path: `clipped` must be a number in [1, inf), got {self.clipped}; set "
-                "another."
-            )
         self.splats: SplatRays | None = None
         self.srgb = True
 
