@@ -27,7 +27,6 @@ from morgs_mi.method.exposure import LEAST_CHANGE, Exposure, common_change, foll
 from morgs_mi.method.flow import FlowObservation, observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FramePair, flow_source
 from morgs_mi.method.mask_refiners.mask_registry import mask_refiner
-from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import motion_model
 from morgs_mi.method.objective import KeyView
 
@@ -141,7 +140,10 @@ def prepare(
     _check_masks(cameras, masks)
     check_near_planes("StreamLoop()", cameras, points)
     check_capacity("StreamLoop()", cameras, config.fit)
-    _check_methods(config.motion)
+    # An error now, not at the second frame, if a file that a method names is missing.
+    flow_source(config.motion.flow_method, config.motion.flow)
+    mask_refiner(config.motion.mask_method, config.motion.masks)
+    motion_model(config.motion)
     copies = tuple(None if mask is None else mask.copy() for mask in masks)
     key_views = choose_key_views(cameras, config.motion.key_views)
     extent = scene_extent(cameras)
@@ -149,13 +151,6 @@ def prepare(
         check_number("StreamLoop()", "display_exposure", display_exposure, "[-100, 100]")
     cloud = points.copy(), point_colors.copy()
     return Setup(tuple(cameras), copies, *cloud, key_views, extent, config, display_exposure)
-
-
-def _check_methods(motion: MotionConfig) -> None:
-    """Raise an error now, not at the second frame, if a file that a method names is missing."""
-    flow_source(motion.flow_method, motion.flow)
-    mask_refiner(motion.mask_method, motion.masks)
-    motion_model(motion)
 
 
 def _check_cameras(cameras: Sequence[Camera]) -> None:
@@ -204,9 +199,13 @@ def observe_frame(
     recorded = copied_images(setup.cameras, images, frame, history.kind)
     new_history, changes = _extended(setup, history, recorded)
     flows, key_views = _flows(setup, frame, history.images, new_history.images, changes)
-    return FrameObservation(
-        new_history, changes, flows, key_views, _encoded(recorded, new_history), recorded
-    )
+    encoded = {
+        v: new_history.images[v]
+        if image.dtype == np.uint8
+        else new_history.exposures.get(v, Exposure()).corrected(encode_light(image))
+        for v, image in recorded.items()
+    }
+    return FrameObservation(new_history, changes, flows, key_views, encoded, recorded)
 
 
 def extended_history(
@@ -225,7 +224,8 @@ def _extended(
     """
     skip = setup.config.fit.skip_static
     follow = setup.config.fit.exposure != "off"
-    stops = _display_exposure(setup, history, recorded)
+    stops = history.display_exposure if setup.display_exposure is None else setup.display_exposure
+    stops = display_stops(recorded.values()) if stops is None else stops
     images = {v: display_image(image, stops) for v, image in recorded.items()}
     kind = next((image.dtype.name for image in recorded.values()), history.kind)
     if not (skip or follow):
@@ -235,14 +235,15 @@ def _extended(
         v: exposures[v].corrected(image) if v in exposures else image for v, image in images.items()
     }
     changes = _changes(setup, history.references, images)
-    references = {**history.references, **_references(history.references, images, changes)}
+    old = history.references
+    references = {
+        **old,
+        **{
+            v: update_reference(old[v], image, changes[v]) if v in old else image
+            for v, image in images.items()
+        },
+    }
     return ImageHistory(images, references, exposures, stops, kind), changes if skip else None
-
-
-def _display_exposure(setup: Setup, history: ImageHistory, recorded: Images) -> float:
-    """Return the stops by which linear light is brightened; the first frame may determine them."""
-    stops = history.display_exposure if setup.display_exposure is None else setup.display_exposure
-    return display_stops(recorded.values()) if stops is None else stops
 
 
 def _changes(setup: Setup, references: Images, images: Images) -> dict[int, np.ndarray]:
@@ -258,26 +259,6 @@ def _changes(setup: Setup, references: Images, images: Images) -> dict[int, np.n
     return changes | dict(zip(views, masks, strict=True))
 
 
-def _references(
-    references: Images, images: Images, changes: Mapping[int, np.ndarray]
-) -> dict[int, np.ndarray]:
-    """Return the references of the next frame, by view index, of the views with an image."""
-    return {
-        v: update_reference(references[v], image, changes[v]) if v in references else image
-        for v, image in images.items()
-    }
-
-
-def _encoded(recorded: Images, history: ImageHistory) -> dict[int, np.ndarray]:
-    """Return the images that the fit compares, see `FrameObservation`."""
-    return {
-        v: history.images[v]
-        if image.dtype == np.uint8
-        else history.exposures.get(v, Exposure()).corrected(encode_light(image))
-        for v, image in recorded.items()
-    }
-
-
 def _exposures(setup: Setup, history: ImageHistory, recorded: Images) -> dict[int, Exposure]:
     """Return the exposures relative to the views' first images, without the change of light that
     all views show.
@@ -290,13 +271,10 @@ def _exposures(setup: Setup, history: ImageHistory, recorded: Images) -> dict[in
         views,
     )
     light = common_change(view_exposures)
-    exposures = (_visible(exposure.without(light)) for exposure in view_exposures)
-    return {**history.exposures, **dict(zip(views, exposures, strict=True))}
-
-
-def _visible(exposure: Exposure) -> Exposure:
-    """Return an exposure, or the identity if it hardly changes an image."""
-    return exposure if exposure.change > LEAST_CHANGE else Exposure()
+    exposures = [exposure.without(light) for exposure in view_exposures]
+    # The identity where an exposure hardly changes an image.
+    visible = [e if e.change > LEAST_CHANGE else Exposure() for e in exposures]
+    return {**history.exposures, **dict(zip(views, visible, strict=True))}
 
 
 def _flows(

@@ -65,8 +65,13 @@ def _scene_gaussians(scene: Any, attributes: list[str], with_surfaces: bool) -> 
     coefficients.
     """
     shapes = _ellipsoids(scene)
-    if not with_surfaces:
-        _refuse_surfaces(scene)
+    for shape in scene.shapes():
+        if not (with_surfaces or shape.is_ellipsoids()):
+            raise ValueError(
+                f"gaussian_splat: expected `ellipsoids` shapes only, got {shape.class_name()} "
+                f"{shape.id()!r}; remove it from the scene, or set `surfaces` to an integrator "
+                "that renders it, such as `path`."
+            )
     if not shapes:
         raise ValueError(
             "gaussian_splat: expected a scene with an `ellipsoids` shape, got none; add one."
@@ -74,7 +79,10 @@ def _scene_gaussians(scene: Any, attributes: list[str], with_surfaces: bool) -> 
     parts = [_shape_gaussians(shape, attributes) for shape in shapes]
     K = max(part["sh_coeffs"].shape[1] for part in parts)
     for part in parts:
-        part["sh_coeffs"] = _with_zeros(part["sh_coeffs"], K)
+        N, present, _ = part["sh_coeffs"].shape
+        if present < K:
+            zeros = dr.zeros(mi.TensorXf, (N, K - present, 3))
+            part["sh_coeffs"] = dr.concat([part["sh_coeffs"], zeros], axis=1)
     if len(parts) == 1:
         return _SceneGaussians(parts[0])
     return _SceneGaussians(
@@ -82,27 +90,9 @@ def _scene_gaussians(scene: Any, attributes: list[str], with_surfaces: bool) -> 
     )
 
 
-def _with_zeros(coeffs: Tensor, K: int) -> Tensor:
-    """Return SH coefficients [N, k, 3] padded with zeros to [N, K, 3]."""
-    N, present, _ = coeffs.shape
-    if present == K:
-        return coeffs
-    return dr.concat([coeffs, dr.zeros(mi.TensorXf, (N, K - present, 3))], axis=1)
-
-
 def _ellipsoids(scene: Any) -> list[Any]:
     """Return the shapes of a scene that are Gaussians."""
     return [shape for shape in scene.shapes() if shape.is_ellipsoids()]
-
-
-def _refuse_surfaces(scene: Any) -> None:
-    for shape in scene.shapes():
-        if not shape.is_ellipsoids():
-            raise ValueError(
-                f"gaussian_splat: expected `ellipsoids` shapes only, got {shape.class_name()} "
-                f"{shape.id()!r}; remove it from the scene, or set `surfaces` to an integrator "
-                "that renders it, such as `path`."
-            )
 
 
 def _shape_gaussians(shape: Any, attributes: list[str]) -> dict[str, Tensor]:
@@ -235,16 +225,6 @@ def _check_integrator(surfaces: Any) -> None:
         )
 
 
-def _check_aovs(aovs: list[str]) -> None:
-    names = aov_attributes()
-    for name in aovs:
-        if name not in names:
-            raise ValueError(
-                f"gaussian_splat: `aovs` must be out of {', '.join(names)}, got {name!r}; "
-                "separate them by commas."
-            )
-
-
 def _sensor_of(scene: Any, sensor: Any) -> Any:
     """Return a sensor, which may be given by its number in the scene."""
     return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
@@ -258,16 +238,6 @@ def _film(sensor: Any) -> Any:
             "because only RGB is drawn."
         )
     return film
-
-
-def _check_batch(border: int, has_surfaces: bool) -> None:
-    """Raise an error if several sensors have a border around their film, or surfaces."""
-    if border or has_surfaces:
-        reason = "`sample_border` in its film" if border else "`surfaces`"
-        raise ValueError(
-            f"gaussian_splat: expected a `batch` sensor without {reason}; render its sensors "
-            "one by one."
-        )
 
 
 def _crop(film: Any, border: int) -> tuple[int, int, int, int]:
@@ -355,7 +325,13 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         _check_integrator(self.surfaces)
         self.warnings: set[str] = set()
         self.forward_pass: _ForwardPass | None = None
-        _check_aovs(self.aovs)
+        names = aov_attributes()
+        for name in self.aovs:
+            if name not in names:
+                raise ValueError(
+                    f"gaussian_splat: `aovs` must be out of {', '.join(names)}, got {name!r}; "
+                    "separate them by commas."
+                )
 
     def traverse(self, callback: Any) -> None:
         if self.background is not None:
@@ -450,8 +426,12 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         film = _film(sensor)
         border = film.rfilter().border_size() if film.sample_border() else 0
         views = _views(sensor)
-        if len(views) > 1:
-            _check_batch(border, self.surfaces is not None)
+        if len(views) > 1 and (border or self.surfaces is not None):
+            reason = "`sample_border` in its film" if border else "`surfaces`"
+            raise ValueError(
+                f"gaussian_splat: expected a `batch` sensor without {reason}; render its sensors "
+                "one by one."
+            )
         cameras = [_sensor_camera(view, border) for view in views]
         has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
         gaussians = _scene_gaussians(scene, self._attributes(), self.surfaces is not None)

@@ -312,7 +312,7 @@ def test_surfaces__refuse_bad_scenes(case):
 def test_surfaces__refuse_sensors_without_a_pinhole():
     bad = scene(cloud(), ball={"type": "sphere"}, lamp=LAMP)
     sensor = mi.load_dict({"type": "thinlens", "aperture_radius": 0.1})
-    with pytest.raises(ValueError, match="expected a `perspective` sensor"):
+    with pytest.raises(ValueError, match="must be a `perspective` sensor"):
         bad.integrator().render(bad, sensor)
 
 

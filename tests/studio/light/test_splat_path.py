@@ -270,5 +270,5 @@ def test_splat_path__refuses_scenes_without_a_gaussian_splat_integrator():
 
 
 def test_splat_path__refuses_a_radiance_below_white():
-    with pytest.raises(RuntimeError, match="`clipped` must be a number in"):
+    with pytest.raises(RuntimeError, match="`clipped` must be at least 1"):
         mi.load_dict({"type": "splat_path", "clipped": 0.5})

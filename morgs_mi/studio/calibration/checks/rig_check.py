@@ -7,7 +7,7 @@ explains the matches. Pixels refer to the recorded size, as in `capture.points`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -96,9 +96,9 @@ def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
     else:
         checks = _with_reasons(_with_copies(checks, pairs), pairs, group)
         advice = _summary(checks)
-    return RigCheck(
-        len(errors), len(shared.matches), _median(errors), tuple(checks), _all_fit(checks), advice
-    )
+    verdicts = [check.fits for check in checks]
+    fits = False if False in verdicts else None if None in verdicts else True
+    return RigCheck(len(errors), len(shared.matches), _median(errors), tuple(checks), fits, advice)
 
 
 def pose_problems(views: Sequence[View]) -> list[str]:
@@ -152,12 +152,6 @@ def _with_reasons(
         else check
         for view, check in enumerate(checks)
     ]
-
-
-def _all_fit(checks: Sequence[CameraCheck]) -> bool | None:
-    """Return whether all poses fit, as in `RigCheck.fits`."""
-    verdicts = [check.fits for check in checks]
-    return False if False in verdicts else None if None in verdicts else True
 
 
 @dataclass(frozen=True)
@@ -313,25 +307,17 @@ def _clip_copies(
     and those that do not fit.
     """
     reasons: dict[int, str] = {}
-    for match in filter(partial(_shows_one_clip, shared), shared.matches):
-        for view in match.views:
+    for match in shared.matches:
+        a, b = (
+            shared.features[view].points[rows]
+            for view, rows in zip(match.views, match.features.T, strict=True)
+        )
+        is_copy = np.median(np.linalg.norm(a - b, axis=1)) < _SAME_IMAGE
+        for view in match.views if is_copy else ():
             if view in suspects or not checks[view].fits:
                 other = _other(checks, match.views, view)
                 reasons[view] = f"its clip is a copy of the clip of {other}; replace one of them"
     return reasons
-
-
-def _shows_one_clip(shared: SharedFeatures, match: Match) -> bool:
-    """Return whether the features of two views are at the same pixels."""
-    a, b = (_pixels(shared, match, k) for k in (0, 1))
-    return bool(np.median(np.linalg.norm(a - b, axis=1)) < _SAME_IMAGE)
-
-
-def _pixels(shared: SharedFeatures, match: Match, k: int) -> np.ndarray:
-    """Return the pixels [M, 2] of matching features in the first or the second view, `k` = 0 or
-    1.
-    """
-    return shared.features[match.views[k]].points[match.features[:, k]]
 
 
 def _explain_camera(view: int, check: CameraCheck, pairs: _Pairs, group: set[int]) -> str:
@@ -339,9 +325,15 @@ def _explain_camera(view: int, check: CameraCheck, pairs: _Pairs, group: set[int
     # Without views that agree, a correction can only be compared with all others.
     partners = group or set(range(len(pairs.cameras)))
     error_of = partial(pairs.of_replaced, view, partners=partners)
-    candidates = _camera_mistakes(pairs.cameras[view], error_of)
+    camera = pairs.cameras[view]
+    factors = focal_candidates(
+        "its focal length seems", lambda factor: with_focal_factor(camera, factor), error_of
+    )
+    candidates = [*camera_candidates(camera), *factors]
     errors = [error_of(camera) for camera, _ in candidates]
-    if min(errors) <= min(check.error / _GAIN, MAX_ERROR, _good_error(pairs, group)):
+    of_group = [_median(pairs.of_view(view, group)) for view in group]
+    good = max(_GOOD_ERROR, 2 * max(of_group, default=MAX_ERROR))
+    if min(errors) <= min(check.error / _GAIN, MAX_ERROR, good):
         return candidates[int(np.argmin(errors))][1]
     cause = "no common mistake explains it"
     if np.isinf(check.error):
@@ -350,22 +342,6 @@ def _explain_camera(view: int, check: CameraCheck, pairs: _Pairs, group: set[int
         f"{cause}: check its place in the order of the cameras, its axes and the image size of "
         "the calibration, or calibrate again (morgs-mi calibrate)"
     )
-
-
-def _good_error(pairs: _Pairs, group: set[int]) -> float:
-    """Return the largest error of a view that is as good as the errors in a group of views, px."""
-    of_group = [_median(pairs.of_view(view, group)) for view in group]
-    return max(_GOOD_ERROR, 2 * max(of_group, default=MAX_ERROR))
-
-
-def _camera_mistakes(
-    camera: Camera, error_of: Callable[[Camera], float]
-) -> list[tuple[Camera, str]]:
-    """Return the corrected camera for each mistake of a single pose or focal length."""
-    factors = focal_candidates(
-        "its focal length seems", lambda factor: with_focal_factor(camera, factor), error_of
-    )
-    return [*camera_candidates(camera), *factors]
 
 
 def _summary(checks: Sequence[CameraCheck]) -> str:
