@@ -8,6 +8,7 @@ each camera's clip. An optional ``capture.json`` has settings (see `timeline.rea
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -52,9 +53,25 @@ class PartialFrame:
     problems: tuple[str, ...] = ()  #: One sentence per missing image.
     #: Reference images for the next frame's images; None if these are `images`.
     recorded: tuple[np.ndarray | None, ...] | None = None
+    #: Whether an image is missing that the recording should have.
+    unread: bool = False
+
+    def check_images(self, views: Sequence[int]) -> None:
+        """Raise `OSError` if images of this instant could not be read, and none of some views is
+        left: the recording may have disappeared.
+        """
+        if self.unread and all(self.images[view] is None for view in views):
+            raise OSError(
+                f"frame {self.index}: expected an image of at least one fitted camera, got none "
+                f"({self.problems[0].rstrip('.')}); bring the recording back, or end the fit "
+                f"before this frame (--frames {self.index})."
+            )
 
     def comparable(self, views: Sequence[int]) -> list[np.ndarray | None]:
-        """Return the reference images of some views for the images of the next frame."""
+        """Return the reference images of some views for the images of the next frame; errors of
+        `check_images`.
+        """
+        self.check_images(views)
         images = self.images if self.recorded is None else self.recorded
         return [images[view] for view in views]
 
@@ -267,7 +284,11 @@ class Capture:
                 for name in errors.keys() - missing:
                     _LOG.warning("frame %d: %s is left out: %s", index, name, errors[name])
                 missing = set(errors)
-                yield self._at_instant(_partial_frame(index, results, errors))
+                # With gaps, instants without an image are part of the recording.
+                unread = bool(errors) and not (
+                    self.reading.gaps and os.path.exists(self._sources[0].reader.path)
+                )
+                yield self._at_instant(_partial_frame(index, results, errors, unread))
         finally:
             for stream in streams:
                 stream.close()
@@ -313,10 +334,11 @@ def _first_image(
 
 
 def _partial_frame(
-    index: int, results: Sequence[ImageOrError], errors: Mapping[str, Exception]
+    index: int, results: Sequence[ImageOrError], errors: Mapping[str, Exception], unread: bool
 ) -> PartialFrame:
     images = tuple(None if isinstance(f, Exception) else f for f in results)
-    return PartialFrame(index, images, tuple(f"{name}: {error}" for name, error in errors.items()))
+    problems = tuple(f"{name}: {error}" for name, error in errors.items())
+    return PartialFrame(index, images, problems, unread=unread)
 
 
 def _masks(

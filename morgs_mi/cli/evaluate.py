@@ -88,10 +88,17 @@ def _check_not_of_fit(out: Path, output: Path) -> None:
 
 def _print_evaluation(result: Evaluation) -> None:
     """Print an evaluation."""
+    from morgs_mi.playback.streams import spans
+
     for table in evaluation_tables(result):
         print_table(table)
     for sentence in evaluation_summary(result):
         print_result(sentence)
+    if result.without_images:
+        print_warning(
+            f"{result.stream}: frames {spans(result.without_images)} were fitted without any "
+            "image, or have none to compare with; fit them again."
+        )
     if not result.complete:
         print_warning(
             f"{result.stream}: the fit was not finished, its stream holds {result.num_frames} "

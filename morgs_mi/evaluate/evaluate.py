@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.fit_names import REPORT
 from morgs_mi.core.interrupts import interrupts_raised
@@ -54,7 +56,7 @@ def evaluate_stream(
     stream = open_stream(out)
     clip = ComparedClip.of(stream, capture, any_recording)
     recording = clip.recording
-    seconds = _seconds(stream.path)
+    seconds, num_missing = _fitted(stream.path)
     measures: list[Measure] = [Quality(lpips), Variation(clip), Motion3D(clip), Speed(clip)]
     rows: list[FrameScores] = []
     for frame in clip.frames():
@@ -70,11 +72,17 @@ def evaluate_stream(
         )
         if progress is not None:
             progress(len(rows), len(clip.packets))
+    num_fitted = len(recording.train_views)
     return Evaluation(
         stream=str(stream.path.resolve()),
         capture=str(recording.path.resolve()),
         held_out=bool(recording.test_views),
         complete=len(rows) == stream.metadata.get("num_frames", len(rows)),
+        without_images=tuple(
+            row.frame
+            for row in rows
+            if np.isnan(row.scores.psnr) or num_missing.get(row.frame, 0) == num_fitted
+        ),
         regions="recorded change" if recording.truth is None else "true masks",
         sizes=_sizes(stream.path.stat().st_size, rows),
         frames=tuple(rows),
@@ -97,15 +105,19 @@ def _sizes(num_bytes: int, rows: list[FrameScores]) -> Sizes:
     return Sizes(num_bytes, overhead, num_bytes / len(rows), mean("keyframe"), mean("residual"))
 
 
-def _seconds(stream: Path) -> dict[int, float]:
-    """Return seconds by frame from the report beside the stream; empty without one."""
+def _fitted(stream: Path) -> tuple[dict[int, float], dict[int, int]]:
+    """Return seconds and numbers of views without an image, by frame, from the report beside the
+    stream; empty without one.
+    """
     path = stream.with_name(REPORT)
     if not path.is_file():
-        return {}
+        return {}, {}
     report = read_json(path)
     try:
-        return {row["frame"]: float(row["seconds"]) for row in report["frames"]}
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        rows = {row["frame"]: row for row in report["frames"]}
+        seconds = {frame: float(row["seconds"]) for frame, row in rows.items()}
+        return seconds, {frame: len(row.get("missing_views", ())) for frame, row in rows.items()}
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(
             f"{path}: expected a fit's report, got a broken one ({error!r}); remove it."
         ) from None

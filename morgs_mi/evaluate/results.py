@@ -148,6 +148,8 @@ class Evaluation:
     capture: str  #: Path of the capture.
     held_out: bool  #: Whether held-out views are scored; otherwise all training views.
     complete: bool  #: Whether the stream holds all frames that were to be fitted.
+    #: Frames that were fitted without any image, or have none of the evaluated views.
+    without_images: tuple[int, ...]
     regions: str  #: Source of the regions, ``true masks`` or ``recorded change``.
     sizes: Sizes
     variation: VariationScores  #: Mean over the views.
@@ -193,9 +195,9 @@ class Evaluation:
                 getattr(frame.scores, name) for frame in (self.frames[0], self.frames[-1])
             )
             means[name] = {"mean": means[name], "first": first, "last": last}
-        names = ("stream", "capture", "held_out", "num_frames", "complete", "regions")
+        names = ("stream", "capture", "held_out", "num_frames", "complete", "without_images")
         return {
-            **{name: getattr(self, name) for name in names},
+            **{name: getattr(self, name) for name in (*names, "regions")},
             **means,
             "psnr_slope": self.psnr_slope,
             "motion_3d": {} if self.motion_3d is None else asdict(self.motion_3d),

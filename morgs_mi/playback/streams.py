@@ -173,7 +173,7 @@ def _warn_of_damage(stream: StreamReader) -> None:
     """
     problems = []
     if stream.skipped:
-        problems.append(f"the damaged frames {_spans(stream.skipped)} are skipped")
+        problems.append(f"the damaged frames {spans(stream.skipped)} are skipped")
     if not stream.closed():
         problems.append(
             f"it ends after {len(stream.index())} packets without an index, and may lack later "
@@ -183,7 +183,7 @@ def _warn_of_damage(stream: StreamReader) -> None:
         _LOG.warning("%s: %s.", stream.path, "; ".join(problems))
 
 
-def _spans(numbers: Sequence[int]) -> str:
+def spans(numbers: Sequence[int]) -> str:
     """Return ascending numbers as text, such as ``0 to 3, 7``."""
     groups = groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])
     return ", ".join(_span([number for _, number in group]) for _, group in groups)

@@ -63,9 +63,9 @@ def stream_capture(
         The reports of all frames, including those before an interruption.
 
     Raises:
-        OSError: the disk is full or not writable, another fit writes into OUT, or the stream was
-            removed, moved or
-        replaced meanwhile; the stream is complete up to the last frame.
+        OSError: the disk is full or not writable, another fit writes into OUT, no image of a frame
+            can be read, or the stream was removed, moved or replaced meanwhile; the stream is
+            complete up to the last frame.
         ValueError: as `StreamLoop`; OUT lies in a capture; or the stream to resume is damaged, or
             belongs to another
         capture or other settings; or images, Gaussians or steps that do not fit in memory.
@@ -217,7 +217,12 @@ def push_frame(
 ) -> tuple[Packet, FrameReport]:
     """Fit the next frame of a loop on the views `train`; the report's status names the images that
     are missing.
+
+    Raises:
+        OSError: none of them could be read.
+        ValueError: as `StreamLoop.push`.
     """
+    frame.check_images(train)
     images = [frame.images[view] for view in train]
     ahead = None if upcoming is None else [upcoming.images[view] for view in train]
     recorded = None if frame.recorded is None else frame.comparable(train)

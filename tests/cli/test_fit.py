@@ -108,6 +108,28 @@ def before_frame_2(monkeypatch: pytest.MonkeyPatch, action: Callable[[], None]) 
     monkeypatch.setattr(StreamLoop, "push", acting_push)
 
 
+@pytest.mark.slow
+def test_fit__ends_when_its_recording_disappears_and_resumes_when_it_is_back(
+    tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clip = write_recording(tmp_path / "clip", 12)
+    out = tmp_path / "out"
+    fit = ("fit", clip, out, *OPTIONS, "--reproducible")
+    with monkeypatch.context() as patch:
+        before_frame_2(patch, lambda: clip.rename(tmp_path / "away"))
+        status, _, error = run(*fit)
+    last = StreamReader(out / "stream.morgs").index()[-1][1]
+    assert 2 <= last < 11
+    assert status == 1
+    sentence = error.splitlines()[-1]
+    assert sentence.startswith(f"frame {last + 1}: expected an image of at least one fitted camera")
+    assert f"holds frames 0 to {last} of 12; continue with `morgs-mi fit" in sentence
+    (tmp_path / "away").rename(clip)
+    assert run(*fit, "--resume")[0] == 0
+    assert run("fit", clip, tmp_path / "whole", *fit[3:])[0] == 0
+    assert (out / "stream.morgs").read_bytes() == (tmp_path / "whole/stream.morgs").read_bytes()
+
+
 @pytest.mark.parametrize(
     ("args", "parts"),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from morgs_mi import cli
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.codec.container import StreamWriter
@@ -61,6 +63,19 @@ def test_evaluate_stream__reports_the_bytes_of_the_file(fitted_clip: Path) -> No
     assert result.sizes.overhead + sum(packets) == result.sizes.file
     assert result.sizes.per_keyframe == packets[0]
     assert result.sizes.per_residual == np.mean(packets[1:])
+
+
+def test_evaluate_stream__names_frames_that_were_fitted_without_images(fitted_clip, capsys) -> None:
+    report = fitted_clip / "report.json"
+    text = report.read_text()
+    rows = json.loads(text)["frames"]
+    rows[1]["missing_views"] = ["cam1"]
+    report.write_text(json.dumps({"frames": rows}))
+    try:
+        assert cli.main(["eval", str(fitted_clip)]) == 0
+    finally:
+        report.write_text(text)
+    assert "frames 1 were fitted without any image" in capsys.readouterr().err
 
 
 def test_evaluate_stream__uses_all_training_views_without_a_held_out_view(
