@@ -29,6 +29,7 @@ from morgs_mi.codec.container import (
 from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.codec.header import header_fields
 from morgs_mi.codec.packets import CodedFrame, coded_frames
+from morgs_mi.core.bounded import open_regular
 
 _CHUNK = 2**20
 
@@ -46,6 +47,7 @@ class StreamReader(FrameSource):
         skip_damaged: leave out damaged packets of a file, and all that follow one up to the next
             intact keyframe. A damaged length hides the packets after it, unless the file ends with
             an intact index.
+        follow: whether the path may be a link.
 
     Attributes:
         path: the file.
@@ -58,12 +60,16 @@ class StreamReader(FrameSource):
         FileNotFoundError: there is no such file.
         TruncatedStreamError: the stream ends inside a packet (while iterating: after the complete
             ones).
-        ValueError: it is not a stream, has another version, or a packet is broken. The message
-            names the file, the packet's number and byte offset, the number of intact packets before
-            it and the frame of the last of them; or damage is to be skipped in a pipe.
+        ValueError: it is not a stream, is no regular file, has another version, or a packet is
+            broken. The message names the file, the packet's number and byte offset, the number of
+            intact packets before it and the frame of the last of them; or damage is to be skipped
+            in a pipe.
     """
 
-    def __init__(self, source: str | Path | BinaryIO, skip_damaged: bool = False) -> None:
+    def __init__(
+        self, source: str | Path | BinaryIO, skip_damaged: bool = False, follow: bool = True
+    ) -> None:
+        self._follow = follow
         self._pipe = None if isinstance(source, str | Path) else source
         self.path = Path(
             source if isinstance(source, str | Path) else str(getattr(source, "name", "stream"))
@@ -162,7 +168,7 @@ class StreamReader(FrameSource):
         Raises:
             TruncatedStreamError: as `index`.
         """
-        with open(self.path, "rb") as file:
+        with open_regular(self.path, self._follow) as file:
             return self._last_index(file) is not None
 
     def index(self) -> list[_Entry]:
@@ -176,7 +182,7 @@ class StreamReader(FrameSource):
         """
         if self._playable_entries is not None:
             return list(self._playable_entries)
-        with open(self.path, "rb") as file:
+        with open_regular(self.path, self._follow) as file:
             if (entries := self._last_index(file)) is not None:
                 return entries
             return self._complete_entries(file)
@@ -189,6 +195,8 @@ class StreamReader(FrameSource):
         while at + PAYLOAD <= size:
             file.seek(at)
             kind, frame, length = HEAD.unpack(file.read(HEAD.size))
+            if kind not in (PacketKind.KEYFRAME, PacketKind.RESIDUAL, PacketKind.INDEX):
+                break  # such as a tail of zeros that a crash of the system leaves
             if at + PAYLOAD + length <= size and kind != PacketKind.INDEX:
                 entries.append((kind, frame, at))
             at += PAYLOAD + length
@@ -206,7 +214,7 @@ class StreamReader(FrameSource):
         entries = list[_Entry]()
         frames = [-1]
         plays = False
-        with open(self.path, "rb") as file:
+        with open_regular(self.path, self._follow) as file:
             for number, (kind, frame, offset) in enumerate(self.index(), start=1):
                 if self._is_intact(file, number, offset):
                     frames.append(frame)
@@ -294,7 +302,7 @@ class StreamReader(FrameSource):
 
     def _undamaged(self, number: int, at: int) -> Iterator[tuple[int, bytes]]:
         """Yield (offset, bytes) of the packets that are not left out, from byte `at` on."""
-        with open(self.path, "rb") as file:
+        with open_regular(self.path, self._follow) as file:
             for *_, offset in self.index():
                 if offset >= at:
                     file.seek(offset)
@@ -343,7 +351,7 @@ class StreamReader(FrameSource):
         if self._pipe is not None:
             yield self._pipe
         else:
-            with open(self.path, "rb") as file:
+            with open_regular(self.path, self._follow) as file:
                 yield file
 
     @contextlib.contextmanager

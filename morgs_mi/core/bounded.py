@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import stat
 import tokenize
 import tomllib
 import zipfile
@@ -19,7 +21,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -75,6 +77,33 @@ def regular(path: str | Path) -> Path:
     if path.exists() and not path.is_file():
         raise ValueError(f"{path}: expected a file, got a folder, a pipe or a device; remove it.")
     return path
+
+
+def open_regular(path: str | Path, follow: bool = True) -> BinaryIO:
+    """Open a regular file to read it; the file is the one that was checked, even if the path is
+    replaced meanwhile.
+
+    Args:
+        path: the file.
+        follow: whether `path` may be a link to it.
+
+    Raises:
+        OSError: there is no such file, or it cannot be read.
+        ValueError: it is a pipe or a device, or a link that is not followed.
+    """
+    # Opening a pipe would wait for its writer.
+    extra = getattr(os, "O_NONBLOCK", 0)
+    if not follow:
+        if os.path.islink(path):  # Windows has no such flag
+            raise ValueError(f"{path}: expected a file, got a link; open the file that it names.")
+        extra |= getattr(os, "O_NOFOLLOW", 0)
+    file = open(  # noqa: SIM115 (the caller closes it)
+        path, "rb", opener=lambda name, flags: os.open(name, flags | extra)
+    )
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise ValueError(f"{path}: expected a file, got a pipe or a device; remove it.")
+    return file
 
 
 def read_bytes(path: str | Path, most: int | None = None) -> bytes:

@@ -27,7 +27,10 @@ def test_seek__equals_playing_with_and_without_an_index(tmp_path: Path) -> None:
     path = tmp_path / "s"
     write(path, packets, states)
     whole = path.read_bytes()
-    for data in (whole, whole[: -(20 + 16 + 16 * (14 + 3))]):
+    packets_alone = whole[: -(20 + 16 + 16 * (14 + 3))]
+    path.write_bytes(packets_alone + bytes(1000))  # as a crash of the system leaves it
+    assert len(StreamReader(path).index()) == 14 + 3
+    for data in (whole, packets_alone):
         path.write_bytes(data)
         reader = StreamReader(path)
         assert len(reader.index()) == 14 + 3

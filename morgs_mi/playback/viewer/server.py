@@ -10,6 +10,7 @@ images of this machine.
 
 from __future__ import annotations
 
+import logging
 import secrets
 import socket
 from ipaddress import ip_address
@@ -32,6 +33,7 @@ from morgs_mi.playback.export.web import published_bytes, served_page
 from morgs_mi.playback.stream_header import stream_name
 from morgs_mi.playback.streams import SplatFile
 from morgs_mi.playback.viewer.access import Access
+from morgs_mi.playback.viewer.connections import MOST, Connection, log_limit_once
 from morgs_mi.playback.viewer.exact import ExactImages
 from morgs_mi.playback.viewer.recorded import RecordedImages
 from morgs_mi.playback.viewer.stream_bytes import stream_response
@@ -39,7 +41,9 @@ from morgs_mi.playback.viewer.stream_bytes import stream_response
 _GRACE = 1  # seconds for answers that are under way at the end
 _MOST_CAMERA_BYTES = 4096
 _OPTIONS: dict[str, Any] = {
-    "log_level": "warning",
+    "log_level": "error",
+    "http": Connection,
+    "backlog": MOST,
     "lifespan": "off",
     "ws": "none",
     "proxy_headers": False,
@@ -74,7 +78,7 @@ class Viewer:
         capture: Path | None = None,
     ) -> None:
         self._stream = stream
-        self._path = stream.path
+        self._path = stream.path.resolve()  # a link may be named, but not replace the file later
         if isinstance(stream, SplatFile):
             self._folder = TemporaryDirectory()
             self._path = Path(self._folder.name) / STREAM
@@ -94,6 +98,7 @@ class Viewer:
         """Serve the page until `stop` is called, or a signal, which is raised again after the
         server has ended.
         """
+        logging.getLogger("asyncio").addFilter(log_limit_once)
         with self._socket:
             self._server.run(sockets=[self._socket])
 
@@ -121,13 +126,17 @@ class Viewer:
         provisional = self._path.with_name(PROVISIONAL)
         return (
             provisional
-            if provisional.is_file() and not StreamReader(self._path).index()
+            if provisional.is_file() and not StreamReader(self._path, follow=False).index()
             else self._path
         )
 
     def _opened(self) -> FrameSource:
         """Return the stream as it is now; a file of Gaussians stays as it was opened."""
-        return self._stream if isinstance(self._stream, SplatFile) else StreamReader(self._newest())
+        return (
+            self._stream
+            if isinstance(self._stream, SplatFile)
+            else StreamReader(self._newest(), follow=False)
+        )
 
     def _send_page(self, _: Request) -> Response:
         return HTMLResponse(
@@ -138,7 +147,7 @@ class Viewer:
         return stream_response(self._newest(), request)
 
     def _send_recorded(self, request: Request) -> Response:
-        image = self._recorded.at(StreamReader(self._path), **request.path_params)
+        image = self._recorded.at(StreamReader(self._path, follow=False), **request.path_params)
         return Response(
             cv2.imencode(".jpg", image[..., ::-1])[1].tobytes(), media_type="image/jpeg"
         )
@@ -169,4 +178,5 @@ def _name_in_link(host: str) -> str:
 
 
 async def _failed(_: Request, error: Exception) -> Response:
-    return PlainTextResponse(str(error), 404 if isinstance(error, FileNotFoundError) else 400)
+    text = str(error).encode(errors="replace")  # a name may have bytes that are not UTF-8
+    return PlainTextResponse(text, 404 if isinstance(error, FileNotFoundError) else 400)

@@ -7,11 +7,13 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
+from urllib.parse import quote
 
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response, StreamingResponse
 
-from morgs_mi.codec.container import HEAD, PAYLOAD, PREAMBLE
+from morgs_mi.codec.container import HEAD, MAGIC, PAYLOAD, PREAMBLE
+from morgs_mi.core.bounded import open_regular
 
 _CHUNK = 2**20
 # One range of bytes; others are ignored, as HTTP allows. 15 digits: more than any file has bytes.
@@ -26,11 +28,17 @@ def stream_response(path: Path, request: Request) -> Response:
 
     Raises:
         OSError: the file cannot be read.
+        ValueError: it is no stream, or no regular file.
     """
-    file = open(path, "rb")  # noqa: SIM115 (`_chunks` closes it)
+    file = open_regular(path, follow=False)  # `_chunks` closes it
     size = os.fstat(file.fileno()).st_size
-    etag = _etag(file, size)
-    headers = {"ETag": etag, "Accept-Ranges": "bytes", "Content-Location": path.name}
+    start = file.read(PREAMBLE.size + PAYLOAD)
+    if not MAGIC.startswith(start[: len(MAGIC)]):
+        file.close()
+        raise ValueError(f"{path}: expected a stream, got another file; fit the capture again.")
+    etag = _etag(file, size, start)
+    location = quote(os.fsencode(path.name))
+    headers = {"ETag": etag, "Accept-Ranges": "bytes", "Content-Location": location}
     part = _requested_bytes(request, etag, size)
     if part is not None and not part:
         file.close()
@@ -40,7 +48,7 @@ def stream_response(path: Path, request: Request) -> Response:
         part = range(size)
     else:
         headers["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{size}"
-    headers["Content-Length"] = str(len(part))
+    # Without the number of bytes: a fit may truncate the file meanwhile, to go on from there.
     return StreamingResponse(_chunks(file, part), status, headers, "application/octet-stream")
 
 
@@ -52,9 +60,10 @@ def _requested_bytes(request: Request, etag: str, size: int) -> range | None:
     return range(size)[int(match[1]) : int(match[2]) + 1 if match[2] else None]
 
 
-def _etag(file: BinaryIO, size: int) -> str:
-    """Return an entity tag of a file's inode and the checksums of its header and first frame."""
-    start = file.read(PREAMBLE.size + PAYLOAD)
+def _etag(file: BinaryIO, size: int, start: bytes) -> str:
+    """Return an entity tag of a file's inode and the checksums of its header and first frame;
+    `start` are its first bytes.
+    """
     length = (
         HEAD.unpack_from(start, PREAMBLE.size)[2] if len(start) == PREAMBLE.size + PAYLOAD else 0
     )

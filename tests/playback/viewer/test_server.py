@@ -14,6 +14,7 @@ import sys
 import webbrowser
 from concurrent.futures import ThreadPoolExecutor
 from threading import Lock
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -29,6 +30,7 @@ from morgs_mi.io.ply import write_ply
 from morgs_mi.playback.player import channel_image
 from morgs_mi.playback.player import render as render_channels
 from morgs_mi.playback.streams import open_stream
+from morgs_mi.playback.viewer import connections
 from morgs_mi.playback.viewer import exact as exact_images
 from morgs_mi.playback.viewer.access import refusal
 from morgs_mi.playback.viewer.recorded import RecordedImages
@@ -204,6 +206,73 @@ def test_viewer__answers_many_connections_at_once(url, clip):
     for connection in idle:
         connection.close()
     assert get(url)[0].status == 200
+
+
+def test_viewer__ends_connections_without_progress_and_beyond_a_limit(clip, monkeypatch):
+    monkeypatch.setattr(connections, "_PATIENCE", 0.5)
+    monkeypatch.setattr(connections, "MOST", 8)
+    with viewing(clip[0]) as url:
+
+        def begun() -> socket.socket:
+            connection = socket.create_connection(("127.0.0.1", urlsplit(url).port), timeout=5)
+            connection.sendall(b"GET / HT")
+            return connection
+
+        first = begun()
+        assert first.recv(1) == b"", "its head is not finished in time"
+        crowd = [begun() for _ in range(20)]
+        assert get(url)[0].status == 200, "an unfinished one made room"
+        slow = begun()
+        assert slow.send(b"TP/1.1\r\n") and slow.recv(1) == b"", "a few bytes are no progress"
+        for connection in (first, slow, *crowd):
+            connection.close()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="links and pipes")
+@pytest.mark.parametrize("name", ["stream.morgs", PROVISIONAL])
+@pytest.mark.parametrize("secret", [b"secret of the user", b"MORGS-MI secret", None])
+def test_viewer__serves_regular_files_of_its_folder_alone(tmp_path, name, secret):
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    write_stream(folder / "stream.morgs", 0)
+    (tmp_path / "secret").write_bytes(secret or b"")
+    with viewing(folder) as url:
+        (folder / name).unlink(missing_ok=True)
+        if secret is None:
+            os.mkfifo(folder / name)
+        else:
+            (folder / name).symlink_to(tmp_path / "secret")
+        for path in ("stream.morgs", exact(0, "color", rig()[0]), "recorded/0/0"):
+            assert all(b"secret" not in get(url, path)[1] for _ in range(2))
+        (folder / name).unlink()
+        write_stream(folder / "stream.morgs")
+        response, content = get(url, "stream.morgs")
+        assert (response.status, content) == (200, (folder / "stream.morgs").read_bytes())
+
+
+@pytest.mark.parametrize("name", ["日本語", "a\nb", "\udcff"])
+def test_viewer__serves_streams_of_any_name(tmp_path, name):
+    path = tmp_path / f"{name}.morgs"
+    write_stream(path)
+    with viewing(path) as url:
+        assert get(url, "stream.morgs")[1] == path.read_bytes()
+        path.unlink()
+        assert get(url, "stream.morgs")[0].status == 404
+
+
+def test_stream_response__ends_where_its_file_was_cut_off_meanwhile(clip, tmp_path, capfd):
+    path = tmp_path / "stream.morgs"
+    data = (clip[0] / "stream.morgs").read_bytes() + bytes(2**24)
+    path.write_bytes(data)
+    with viewing(path) as url:
+        with socket.create_connection(("127.0.0.1", urlsplit(url).port), timeout=30) as connection:
+            connection.sendall(b"GET /stream.morgs HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            answer = connection.recv(2**16)
+            os.truncate(path, 2**20)
+            while not answer.endswith(b"\r\n0\r\n\r\n"):
+                answer += connection.recv(2**20)
+        assert len(answer) < len(data)
+    assert "Traceback" not in capfd.readouterr().err
 
 
 # --------------------------------------------------------------------------------------------------
