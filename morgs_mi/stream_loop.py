@@ -23,6 +23,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.entries import STUDIO, studio_entry
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.interrupts import interrupts_raised
+from morgs_mi.core.memory import process_memory, release_memory
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.threads import in_background
@@ -51,6 +52,8 @@ from morgs_mi.method.objective import Observations, channels_of, observe
 from morgs_mi.method.ssim import Target
 
 _LOG = logging.getLogger(__name__)
+# Growth of the resident memory after which releasing it pays; it takes some milliseconds.
+_GROWTH = 1.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,6 +247,7 @@ class StreamLoop:
         self.state = StreamState()
         # Index and pending observation of the next frame.
         self._next_observation: tuple[int, Future[FrameObservation]] | None = None
+        self._resident = 0  # bytes, when memory was last released
 
     @classmethod
     def of(cls, capture: RecordedViews, config: StreamConfig | None = None) -> StreamLoop:
@@ -306,7 +310,13 @@ class StreamLoop:
             self._next_observation = frame + 1, in_background(observe_next)
         state, packet, report = step(self.setup, self.state, observation, progress, on_provisional)
         self.state = replace(state, history=history)
-        return packet, replace(report, seconds=time.perf_counter() - start_time)
+        memory = process_memory()
+        # A frame with more active Gaussians than all before takes buffers of another size.
+        if memory.get("resident", 0) > _GROWTH * self._resident:
+            release_memory()
+            memory = process_memory()
+            self._resident = memory["resident"]
+        return packet, replace(report, seconds=time.perf_counter() - start_time, memory=memory)
 
     def _observation_ahead(self, images: Frame) -> FrameObservation | None:
         """Return the observation that was made ahead of time if its images are the same; it is used

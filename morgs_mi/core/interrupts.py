@@ -1,5 +1,5 @@
-"""Ctrl-C and SIGTERM: one exception for both, also where a library has turned it into another or
-has swallowed it.
+"""Ctrl-C, SIGTERM and SIGHUP: one exception for all, also where a library has turned it into
+another or has swallowed it.
 
 Dr.Jit calls Python from C++, and raises a RuntimeError for whatever such a callback raises. An
 interruption is therefore looked for along the causes and contexts of an error. Its traceback refers
@@ -26,7 +26,8 @@ from typing import Any
 
 INTERRUPTED = 130
 """Exit status after an interruption."""
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+# SIGHUP: the terminal was closed.
+_SIGNALS = [signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
 _PAUSE = 0.05  # seconds until an interruption that was swallowed is raised again
 
 
@@ -55,8 +56,8 @@ def interrupts_raised() -> Iterator[None]:
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Raise `KeyboardInterrupt` at SIGTERM as at Ctrl-C, and again where a destructor or a callback
-    swallows it.
+    """Raise `KeyboardInterrupt` at SIGTERM and SIGHUP as at Ctrl-C, and again where a destructor or
+    a callback swallows it.
 
     In a thread that is not the main one, signals cannot be handled, and nothing is changed.
     """
@@ -67,10 +68,11 @@ def interruptible() -> Iterator[None]:
     hook = sys.unraisablehook
     timers: list[threading.Timer] = []
     try:
-        # A shell lets the processes that it starts in the background ignore Ctrl-C.
-        if handlers[signal.SIGINT] is not signal.SIG_IGN:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        for number, handler in handlers.items():
+            # A shell lets the processes that it starts in the background ignore Ctrl-C, and nohup
+            # all its processes SIGHUP.
+            if handler is not signal.SIG_IGN:
+                signal.signal(number, signal.default_int_handler)
         sys.unraisablehook = _repeating_hook(hook, timers)
         yield
         if any(timer.is_alive() for timer in timers):  # the block ended before it was raised again
@@ -81,6 +83,31 @@ def interruptible() -> Iterator[None]:
             timer.cancel()
         for number, handler in handlers.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def postponed() -> Iterator[None]:
+    """Raise an interruption within the block at its end, and let the processes that it starts
+    ignore Ctrl-C: their library would print the tracebacks of all its tasks.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers: list[int] = []
+    handlers = {number: signal.getsignal(number) for number in _SIGNALS}
+    block = getattr(signal, "pthread_sigmask", lambda *_: None)  # not on Windows
+    for number, handler in handlers.items():
+        if handler is not signal.SIG_IGN:
+            signal.signal(number, lambda number, _: numbers.append(number))
+    block(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        block(signal.SIG_UNBLOCK, [signal.SIGINT])
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+    if numbers:
+        raise KeyboardInterrupt
 
 
 def _repeating_hook(

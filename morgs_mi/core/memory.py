@@ -1,4 +1,4 @@
-"""Memory that NumPy and Dr.Jit exchange, and memory that is free.
+"""Memory that NumPy and Dr.Jit exchange, memory that is free, and memory that this process holds.
 
 Dr.Jit borrows NumPy's memory where it can, and reads it when a kernel runs: after the call that
 passed it, when the caller may have written to it. The package therefore passes copies.
@@ -6,6 +6,8 @@ passed it, when the caller may have written to it. The package therefore passes 
 
 from __future__ import annotations
 
+import ctypes
+from contextlib import suppress
 from pathlib import Path
 
 import drjit as dr
@@ -150,6 +152,22 @@ def _free_in_limit() -> float:
     if limit == resource.RLIM_INFINITY or not sizes:
         return float("inf")
     return float(limit - int(sizes[0]) * resource.getpagesize())
+
+
+def process_memory() -> dict[str, int]:
+    """Return the resident memory of this process and its peak so far, ``resident`` and ``peak``,
+    bytes; empty where the system does not report them.
+    """
+    names = {"VmRSS": "resident", "VmHWM": "peak"}
+    rows = (line.partition(":") for line in _lines("/proc/self/status"))
+    return {names[name]: 1024 * int(size.split()[0]) for name, _, size in rows if name in names}
+
+
+def release_memory() -> None:
+    """Return freed memory, which Dr.Jit and glibc keep for later, to the system."""
+    dr.flush_malloc_cache()
+    with suppress(AttributeError, OSError, TypeError):  # another C library
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def _lines(path: str) -> list[str]:

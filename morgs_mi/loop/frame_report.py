@@ -28,6 +28,8 @@ class FrameReport:
             of `Forecast` (see `fit.forecast`); empty with a single view.
         steps: number of optimisation steps.
         exposures: gain and bias of each view; empty if they are not estimated.
+        memory: of the process, bytes: ``resident`` after the frame, and the ``peak`` so far; empty
+            where the system does not report them.
     """
 
     frame: int
@@ -41,6 +43,7 @@ class FrameReport:
     validation: dict[str, Any] = field(default_factory=dict)
     steps: int = 0
     exposures: tuple[Exposure, ...] = ()
+    memory: dict[str, int] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         size = f"{self.num_gaussians} Gaussians, {self.num_bytes} bytes, {self.seconds:.1f} s"

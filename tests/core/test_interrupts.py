@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 import pytest
 
-from morgs_mi.core.interrupts import interruptible, interrupts_raised, is_interruption
+from morgs_mi.core.interrupts import interruptible, interrupts_raised, is_interruption, postponed
 
 
 def chained(kind: type[Exception], explicit: bool) -> BaseException:
@@ -116,6 +116,19 @@ def test_interruptible__raises_what_was_swallowed_at_the_end(heeds_interrupts: N
         in_a_destructor()
 
 
+def test_postponed__raises_at_its_end(heeds_interrupts: None) -> None:
+    stages = []
+
+    def interrupted() -> None:
+        with postponed():
+            plainly()
+            stages.append("done")
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert stages == ["done"]
+
+
 def test_interruptible__lets_a_background_process_ignore_ctrl_c() -> None:
     handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -142,7 +155,7 @@ sys.exit(main())
 """
 
 
-@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM", "SIGHUP"])
 @pytest.mark.parametrize("module", ["numpy", "drjit", "tyro"])
 def test_begin_command__ends_quietly_while_libraries_are_imported(module: str, number: str) -> None:
     script = STARTING.format(module=module, number=number)

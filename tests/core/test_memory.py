@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, FitConfig, StreamConfig, StreamLoop, cli, rasterize
-from morgs_mi.core.memory import check_memory, from_numpy, owned_copy
-from tests.scenes.changing_splats import splats
+from morgs_mi.core.memory import check_memory, from_numpy, owned_copy, process_memory
+from tests.quick import quick
+from tests.scenes.changing_splats import rig, splats
 
 
 @pytest.mark.parametrize("kind", ["Float", "Float64", "Int32", "UInt32", "Bool", "TensorXf"])
@@ -56,6 +57,20 @@ print(free_memory())
         [sys.executable, "-c", script], capture_output=True, text=True, check=True
     ).stdout
     assert 0 < float(output.splitlines()[-1]) < 4e9
+
+
+@pytest.mark.skipif(not process_memory(), reason="the system reports no memory")
+def test_push__returns_memory_that_is_freed_to_the_system():
+    loop = StreamLoop(rig()[:1], (), (), quick())
+    image = np.zeros((rig()[0].height, rig()[0].width, 3), np.uint8)
+    loop.push([image])
+    for _ in range(2):
+        freed = dr.arange(mi.Float, 10**8)
+        dr.eval(freed)
+        dr.sync_thread()
+        del freed
+        memory = loop.push([image])[1].memory
+        assert memory["peak"] - memory["resident"] > 3e8
 
 
 def test_check_memory__names_what_is_needed_and_free(monkeypatch):

@@ -60,7 +60,10 @@ def report_of(out: Path) -> dict:
     """Return the report without what differs between any two runs."""
     report = json.loads((out / "report.json").read_text())
     return report | {
-        "frames": [{k: v for k, v in row.items() if k != "seconds"} for row in report["frames"]]
+        "frames": [
+            {name: value for name, value in row.items() if name not in ("seconds", "memory")}
+            for row in report["frames"]
+        ]
     }
 
 

@@ -18,7 +18,8 @@ except ImportError:  # Windows, which has no such limit
     resource = None
 
 _LOG = logging.getLogger(__name__)
-_PATIENCE = 10.0  # seconds
+PATIENCE = 10.0
+"""Seconds without progress after which a connection ends."""
 _FILES = resource.getrlimit(resource.RLIMIT_NOFILE)[0] if resource else 1024
 MOST = max(4, min(_FILES // 5, 256))
 """Number of connections that stay open. Each has a socket and perhaps a file, and as many may wait
@@ -36,9 +37,10 @@ class Connection(H11Protocol):
         super().connection_made(transport)
         self._begin = self.loop.time()
         self._check_progress(None)
-        if len(self.connections) > MOST:
+        connections: set[Any] = self.connections
+        if len(connections) > MOST:
             _warn_of_limit()
-            waiting: list[Any] = [each for each in self.connections if not each._is_answered()]
+            waiting = [each for each in connections if not each._is_answered()]
             min(waiting, key=lambda each: each._begin).transport.abort()
 
     def _is_answered(self) -> bool:
@@ -52,7 +54,7 @@ class Connection(H11Protocol):
         if state == last and not (self._is_answered() and not state[1]):
             self.transport.abort()
         if not self.transport.is_closing():
-            self.loop.call_later(_PATIENCE, self._check_progress, state)
+            self.loop.call_later(PATIENCE, self._check_progress, state)
 
 
 @cache

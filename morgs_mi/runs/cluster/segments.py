@@ -270,7 +270,7 @@ class SegmentedRun:
         if start not in self.recordings:
             self._open(start, None)
         self.recordings[start].extend(map(decode_packet, part.packets), part.reports)
-        self.peaks[part.worker] = max(part.peak_bytes, self.peaks.get(part.worker, 0))
+        self.peaks[part.worker] = part.reports[-1].memory.get("peak", 0)
         self._warn({*part.messages})
         self._show_progress()
 

@@ -7,7 +7,6 @@ where the next one continues it, nothing is read twice.
 
 from __future__ import annotations
 
-import resource
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import chain, islice
@@ -107,7 +106,6 @@ class Part:
     packets: tuple[bytes, ...]  #: Encoded packets of the frames, re-emitted keyframes included.
     reports: tuple[FrameReport, ...]  #: Of the frames.
     worker: str  #: Address of the worker.
-    peak_bytes: int  #: Peak memory of the worker so far.
     messages: tuple[str, ...]  #: Warnings.
 
 
@@ -136,13 +134,7 @@ def fit_frames(fit: Fit, segment: Segment, stop: int) -> Part:
         segment = replace(segment, frame=stop, restart=restart)
         _OPEN[repr(fit), segment] = loop, capture, recorded
         contents = tuple(packet.encoded for packet in packets)
-        return Part(
-            segment, contents, tuple(reports), worker_name(), _peak_bytes(), tuple(messages)
-        )
-
-
-def _peak_bytes() -> int:
-    return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        return Part(segment, contents, tuple(reports), worker_name(), tuple(messages))
 
 
 def _first_frame(fit: Fit, segment: Segment) -> tuple[Packet, FrameReport]:

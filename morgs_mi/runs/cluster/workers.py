@@ -15,6 +15,7 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import CancelledError
 from contextlib import ExitStack, contextmanager, suppress
+from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
 
 import cv2
@@ -22,6 +23,7 @@ import drjit as dr
 import mitsuba as mi
 
 from morgs_mi.core.environment import versions
+from morgs_mi.core.interrupts import postponed
 
 if TYPE_CHECKING:
     from distributed import Client, LocalCluster
@@ -68,7 +70,9 @@ def open_client(scheduler: str | None = None, count: int | None = None) -> Itera
         stack.enter_context(dask.config.set(_SETTINGS))
         address: Any = scheduler
         if scheduler is None:
-            address = stack.enter_context(_local_cluster(count or cores()))
+            resource_tracker.ensure_running()  # it would let the workers have Ctrl-C again
+            with postponed():
+                address = stack.enter_context(_local_cluster(count or cores()))
         problem = "none"
         try:
             client = distributed.Client(address, timeout=TIMEOUT, set_as_default=False)

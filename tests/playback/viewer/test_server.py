@@ -209,7 +209,7 @@ def test_viewer__answers_many_connections_at_once(url, clip):
 
 
 def test_viewer__ends_connections_without_progress_and_beyond_a_limit(clip, monkeypatch):
-    monkeypatch.setattr(connections, "_PATIENCE", 0.5)
+    monkeypatch.setattr(connections, "PATIENCE", 0.5)
     monkeypatch.setattr(connections, "MOST", 8)
     with viewing(clip[0]) as url:
 
@@ -223,7 +223,8 @@ def test_viewer__ends_connections_without_progress_and_beyond_a_limit(clip, monk
         crowd = [begun() for _ in range(20)]
         assert get(url)[0].status == 200, "an unfinished one made room"
         slow = begun()
-        assert slow.send(b"TP/1.1\r\n") and slow.recv(1) == b"", "a few bytes are no progress"
+        slow.sendall(b"TP/1.1\r\n")
+        assert slow.recv(1) == b"", "a few bytes are no progress"
         for connection in (first, slow, *crowd):
             connection.close()
 
