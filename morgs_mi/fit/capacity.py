@@ -17,6 +17,8 @@ _PROJECTED = 40
 _FLOAT = 4
 # Bytes of a pixel of a view: its image as bytes and as floats, and its reference.
 _PIXEL = 30
+# Gaussians for each pixel: far more than images determine, and such a fit would take days.
+_MOST = 16
 # Bytes of a step in the order of the views.
 _STEP = 16
 
@@ -31,13 +33,18 @@ def check_capacity(place: str, cameras: Sequence[Camera], config: FitConfig) -> 
         config: settings.
 
     Raises:
-        ValueError: there is not.
+        ValueError: there is not, or there are too many Gaussians for the pixels.
     """
     sizes = {"num_gaussians": _gaussian_bytes(config.sh_degree), "first_frame_steps": _STEP}
     for name, size in sizes.items():
         count = getattr(config, name) or 0
         check_memory(place, size * count, f"`{name}={count}`", "set a smaller number")
     pixels = sum(camera.width * camera.height for camera in cameras)
+    if (config.num_gaussians or 0) > _MOST * pixels:
+        raise ValueError(
+            f"{place}: `num_gaussians` must be at most {_MOST * pixels}, {_MOST} for each pixel of "
+            f"the views, got {config.num_gaussians}; set a smaller number."
+        )
     views = f"{len(cameras)} views with {pixels} pixels"
     check_memory(
         place, _PIXEL * pixels, views, "fit smaller images (`downscale`), or fewer cameras"

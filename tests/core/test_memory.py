@@ -111,6 +111,12 @@ def test_check_memory__is_called_before_work_begins(door, monkeypatch):
         call()
 
 
+def test_StreamLoop__refuses_more_gaussians_than_pixels_determine():
+    config = StreamConfig(fit=FitConfig(num_gaussians=2000))
+    with pytest.raises(ValueError, match="`num_gaussians` must be at most 1024, 16 for each"):
+        StreamLoop([wide(8)], (), (), config)
+
+
 def test_synthesize__refuses_images_that_do_not_fit_in_memory(tmp_path, capsys):
     assert (
         cli.main(
