@@ -110,13 +110,12 @@ def step(
     observation = images
     if not isinstance(observation, FrameObservation):
         observation = observe_frame(setup, frame, state.history, observation)
-    present = observation.history.images
-    problems = _image_problems(setup, state, present)
     if state.coded is None:
         fitted = fitted_first_frame(setup, observation, frame_progress, on_provisional)
     else:
         fitted = _fit_later_frame(setup, state, observation, frame_progress)
     coded = decode(state.coded, fitted.packet)
+    present = observation.history.images
     missing = [camera.name for v, camera in enumerate(setup.cameras) if v not in present]
     report = FrameReport(
         frame=frame,
@@ -124,7 +123,7 @@ def step(
         num_bytes=fitted.packet.num_bytes,
         losses=fitted.losses,
         num_gaussians=len(coded),
-        status="; ".join([*([] if fitted.status == "ok" else [fitted.status]), *problems]) or "ok",
+        status=_status(setup, state, present, fitted.status),
         missing_views=tuple(missing),
         active=fitted.active,
         validation=fitted.validation,
@@ -135,18 +134,13 @@ def step(
     return next_state, fitted.packet, report
 
 
-def _image_problems(setup: Setup, state: StreamState, images: Images) -> list[str]:
-    """Return a sentence for each problem of a frame's images; those of frame 0 are logged, and
-    include poses that do not fit the images.
-    """
-    names = [camera.name for camera in setup.cameras]
-    problems = [*image_status(names, state.history.images, images)]
+def _status(setup: Setup, state: StreamState, images: Images, status: str) -> str:
+    """Return the status of a frame with the problems of its images, which are logged in frame 0."""
+    problems = image_status([camera.name for camera in setup.cameras], state.history.images, images)
     if state.coded is None:
-        for name in STUDIO["image checks"]:
-            problems += studio_entry("image checks", name)(views_of(setup, images))
         for problem in problems:
             _LOG.warning("frame 0: %s", problem)
-    return problems
+    return "; ".join([*([] if status == "ok" else [status]), *problems]) or "ok"
 
 
 def _fit_later_frame(
@@ -248,6 +242,8 @@ class StreamLoop:
         # Index and pending observation of the next frame.
         self._next_observation: tuple[int, Future[FrameObservation]] | None = None
         self._resident = 0  # bytes, when memory was last released
+        # Whether images in a list may be in another order than the cameras.
+        self._can_mistake_order = True
 
     @classmethod
     def of(cls, capture: RecordedViews, config: StreamConfig | None = None) -> StreamLoop:
@@ -260,9 +256,11 @@ class StreamLoop:
         views = capture.train_views
         cameras = [capture.cameras[v] for v in views]
         masks = [capture.masks[v] for v in views]
-        return cls(
+        loop = cls(
             cameras, capture.points, capture.point_colors, config, masks, capture.display_exposure
         )
+        loop._can_mistake_order = False
+        return loop
 
     def __repr__(self) -> str:
         count = len(self.setup.cameras)
@@ -301,6 +299,11 @@ class StreamLoop:
         if observation is None:
             observation = observe_frame(self.setup, frame, previous, images)
         history = observation.history
+        if not frame and self._can_mistake_order and not isinstance(images, Mapping):
+            for name in STUDIO["image checks"]:
+                views = views_of(self.setup, history.images)
+                for problem in studio_entry("image checks", name)(views):
+                    _LOG.warning("frame 0: %s", problem)
         if recorded is not None:
             history = extended_history(self.setup, frame, previous, recorded)
         if upcoming is not None:  # beside the fit, which starts below
