@@ -145,7 +145,7 @@ class Player {
         if (!this.started) this.start();
       },
       failed: (message) => {
-        if (this.started) say(`This stream is damaged: ${message}. The frames before that play.`);
+        if (this.started) this.sayDamage(message);
         else sayFailure(message);
       },
       playing: (playing) => {
@@ -189,7 +189,7 @@ class Player {
   }
 
   private sayDamage(damage: string): void {
-    say(`This stream is damaged: ${damage}. The frames before that play.`);
+    say(`This stream is damaged: ${damage}.${this.frames.length ? " The frames before that play." : ""}`);
   }
 
   private open(stream: Opened): void {
