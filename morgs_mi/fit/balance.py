@@ -49,7 +49,8 @@ class Balance:
     @property
     def sentence(self) -> str:
         """Sentence on the change of the cameras and its reason."""
-        change = f"exposures differ by up to {100 * self._largest_change:.1f} % of white"
+        largest = max(exposure.change for exposure in self.exposures)
+        change = f"exposures differ by up to {100 * largest:.1f} % of white"
         if np.isnan(self.recorded_psnr):
             return f"The cameras {'were balanced' if self.taken else 'stay as recorded'}: {change}."
         scores = (
@@ -59,10 +60,6 @@ class Balance:
         if self.taken:
             return f"The cameras were balanced: {change}, and {scores}."
         return f"The cameras stay as recorded: balanced ones are no clear gain, {scores}."
-
-    @property
-    def _largest_change(self) -> float:
-        return max(exposure.change for exposure in self.exposures)
 
 
 def balance_config(config: FitConfig) -> FitConfig:

@@ -18,7 +18,7 @@ same plan on every machine, and on a busy one.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -72,53 +72,29 @@ def plan_first_frame(views: Sequence[View], points: np.ndarray, config: FitConfi
     half_pixels = _pixels(half_sized(views))
 
     def seconds(plan: FitConfig) -> float:
-        return _seconds(plan, len(views), pixels, half_pixels)
+        late_seconds = _step_seconds(plan.planned_gaussians, pixels)
+        if not plan.density.rounds:
+            return plan.planned_steps * late_seconds
+        # A round of density control is a step in every view, at half the size.
+        early_seconds = _step_seconds(_GROWING * plan.planned_gaussians, half_pixels)
+        mean = LAST_ROUND * early_seconds + (1 - LAST_ROUND) * late_seconds
+        return plan.planned_steps * mean + plan.density.rounds * len(views) * early_seconds
 
     if config.num_gaussians is None:
-        plan = _with_affordable_gaussians(plan, seconds)
+        # The most Gaussians that fit into the time, of those that the images ask for.
+        most = plan.planned_gaussians
+        least = min(max(plan.detail.least_gaussians, most // _LEAST_SHARE), most)
+        too_many = bisect_left(
+            range(least + 1, most + 1),
+            True,
+            key=lambda n: seconds(replace(plan, num_gaussians=n)) > config.first_frame_seconds,
+        )
+        plan = replace(plan, num_gaussians=least + too_many)
     if config.first_frame_steps is None:
         affordable = int(plan.planned_steps * config.first_frame_seconds / seconds(plan))
         steps = max(_LEAST_STEPS, min(plan.planned_steps, affordable))
         plan = replace(plan, first_frame_steps=steps)
     return Plan(plan, seconds(plan))
-
-
-def _with_affordable_gaussians(
-    config: FitConfig, seconds: Callable[[FitConfig], float]
-) -> FitConfig:
-    """Return settings with the most Gaussians that fit into the time, of those that the images ask
-    for, or the least.
-
-    Args:
-        config: settings with the Gaussians that the images ask for.
-        seconds: returns the time of a plan.
-    """
-    most = config.planned_gaussians
-    least = min(max(config.detail.least_gaussians, most // _LEAST_SHARE), most)
-    too_many = bisect_left(
-        range(least + 1, most + 1),
-        True,
-        key=lambda n: seconds(replace(config, num_gaussians=n)) > config.first_frame_seconds,
-    )
-    return replace(config, num_gaussians=least + too_many)
-
-
-def _seconds(plan: FitConfig, views: int, pixels: float, half_pixels: float) -> float:
-    """Return the time of a plan. A round of density control is a step in every view, at half the
-    size.
-
-    Args:
-        plan: the plan.
-        views: number of views.
-        pixels: mean number of pixels of a view.
-        half_pixels: the same at half the size.
-    """
-    late_seconds = _step_seconds(plan.planned_gaussians, pixels)
-    if not plan.density.rounds:
-        return plan.planned_steps * late_seconds
-    early_seconds = _step_seconds(_GROWING * plan.planned_gaussians, half_pixels)
-    mean = LAST_ROUND * early_seconds + (1 - LAST_ROUND) * late_seconds
-    return plan.planned_steps * mean + plan.density.rounds * views * early_seconds
 
 
 def _step_seconds(count: float, pixels: float) -> float:

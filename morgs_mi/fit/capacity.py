@@ -35,7 +35,10 @@ def check_capacity(place: str, cameras: Sequence[Camera], config: FitConfig) -> 
     Raises:
         ValueError: there is not, or there are too many Gaussians for the pixels.
     """
-    sizes = {"num_gaussians": _gaussian_bytes(config.sh_degree), "first_frame_steps": _STEP}
+    rest = 3 * ((config.sh_degree + 1) ** 2 - 1)
+    floats = sum(rest if attribute.width < 0 else attribute.width for attribute in ATTRIBUTES)
+    gaussian_bytes = _FLOAT * (_ARRAYS * floats + _PROJECTED)
+    sizes = {"num_gaussians": gaussian_bytes, "first_frame_steps": _STEP}
     for name, size in sizes.items():
         count = getattr(config, name) or 0
         check_memory(place, size * count, f"`{name}={count}`", "set a smaller number")
@@ -49,12 +52,3 @@ def check_capacity(place: str, cameras: Sequence[Camera], config: FitConfig) -> 
     check_memory(
         place, _PIXEL * pixels, views, "fit smaller images (`downscale`), or fewer cameras"
     )
-
-
-def _gaussian_bytes(sh_degree: int) -> int:
-    """Return the bytes of a Gaussian in a fit."""
-    K = (sh_degree + 1) ** 2
-    floats = sum(
-        3 * (K - 1) if attribute.width < 0 else attribute.width for attribute in ATTRIBUTES
-    )
-    return _FLOAT * (_ARRAYS * floats + _PROJECTED)

@@ -100,8 +100,9 @@ def plan_growth(
     parent = np.concatenate([survivors, parents])
     is_parent = np.isin(parent, parents)
     scales = np.asarray(gaussians.scales)[parent]
-    is_large = is_parent & (scales.max(axis=1) > config.split_scale * extent)
-    is_halved = is_large & _is_long(scales)
+    _, second, longest = np.sort(scales, axis=1).T
+    is_large = is_parent & (longest > config.split_scale * extent)
+    is_halved = is_large & (longest > _LONG * second)
     is_shrunk = is_large & ~is_halved
     logits = np.where(is_parent & ~is_shrunk, _logit_changes(gaussians, parent, is_halved), 0)
     plan = _plan(gaussians, survivors, parents, np.where(is_shrunk, _LOG_SHRINK, 0), logits, rng)
@@ -114,12 +115,6 @@ def plan_growth(
 def _is_visible(gaussians: Gaussians, config: DensityConfig) -> np.ndarray:
     """Return the mask [N] of the Gaussians that are not pruned for their opacity."""
     return np.asarray(gaussians.opacities) >= config.min_opacity
-
-
-def _is_long(scales: np.ndarray) -> np.ndarray:
-    """Return the mask [M] of long Gaussians of scales [M, 3]."""
-    _, second, longest = np.sort(scales, axis=1).T
-    return longest > _LONG * second
 
 
 def _logit_changes(gaussians: Gaussians, parent: np.ndarray, is_halved: np.ndarray) -> np.ndarray:
@@ -204,9 +199,10 @@ def _plan(
     parent = np.concatenate([survivors, parents])
     source = np.concatenate([survivors, np.full(len(parents), -1)])
     shift = np.zeros((len(parent), 3))
-    shift[len(survivors) :] = _draw(
-        np.asarray(gaussians.quats)[parents], np.asarray(gaussians.scales)[parents], rng
-    )
+    # A random displacement from the density of each parent.
+    scales = np.asarray(gaussians.scales)[parents]
+    displacement = rng.standard_normal(scales.shape) * scales
+    shift[len(survivors) :] = _rotated(np.asarray(gaussians.quats)[parents], displacement)
     edits = {
         "means": shift,
         "log_scales": np.repeat(log_scale[:, None], 3, axis=1),
@@ -215,11 +211,6 @@ def _plan(
     return DensityPlan(
         parent, source, {name: edit.astype(np.float32) for name, edit in edits.items()}
     )
-
-
-def _draw(quats: np.ndarray, scales: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return one displacement [M, 3] from the density of each Gaussian."""
-    return _rotated(quats, rng.standard_normal(scales.shape) * scales)
 
 
 def _rotated(quats: np.ndarray, vectors: np.ndarray) -> np.ndarray:

@@ -81,22 +81,11 @@ def forecast(cameras: Sequence[Camera], points: np.ndarray) -> Forecast:
         zip(cameras, scene_depths(cameras, points), strict=True)
     ):
         others = [*cameras[:view], *cameras[view + 1 :]]
-        measures.append(_measures(camera, depth, others))
+        angles = angles_to(camera, depth, others)
+        surface = surface_of(camera, depth)
+        visible = np.array([seen_points(other, surface)[0] for other in others])
+        to_each = np.array([angles_between(surface, camera, other) for other in others])
+        nearest = np.where(visible, to_each, _UNSEEN).min(axis=0)
+        measures.append((angles.min(), visible[angles.argmin()].mean(), nearest.mean()))
     spacing, overlap, reach = np.mean(measures, axis=0)
     return Forecast(len(cameras), float(spacing), float(overlap), float(reach))
-
-
-def _measures(camera: Camera, depth: float, others: Sequence[Camera]) -> tuple[float, float, float]:
-    """Return the spacing, the overlap and the reach of a camera; see `Forecast`.
-
-    Args:
-        camera: the camera.
-        depth: of the scene in it, world units.
-        others: all other cameras, at least one.
-    """
-    angles = angles_to(camera, depth, others)
-    surface = surface_of(camera, depth)
-    visible = np.array([seen_points(other, surface)[0] for other in others])
-    to_each = np.array([angles_between(surface, camera, other) for other in others])
-    nearest = np.where(visible, to_each, _UNSEEN).min(axis=0)
-    return angles.min(), visible[angles.argmin()].mean(), nearest.mean()

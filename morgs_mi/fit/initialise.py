@@ -58,23 +58,19 @@ def from_points(
         )
     sh = np.zeros((n, (sh_degree + 1) ** 2, 3))
     sh[:, 0] = (colors - 0.5) / SH_C0
+    count = min(4, n)
+    distance = KDTree(points).query(points, k=count)[0].reshape(n, count)[:, 1:]
+    spacing = np.sqrt(np.mean(distance**2, axis=1)) if count > 1 else np.ones(n)
+    # Coincident points would have no size, and outliers would cover the view.
+    spacing = np.clip(spacing, 0.1 * np.median(spacing) + 1e-9, 10 * np.median(spacing) + 1e-9)
     return Gaussians.from_activated(
         points,
-        np.repeat(_spacing(points)[:, None], 3, axis=1),
+        np.repeat(spacing[:, None], 3, axis=1),
         np.tile([1.0, 0, 0, 0], (n, 1)),
         np.full(n, opacity),
         sh,
         **{a.name: np.full((n, *a.shape), a.initial) for a in ATTRIBUTES if a.initial is not None},
     )
-
-
-def _spacing(points: np.ndarray) -> np.ndarray:
-    """Return the distance of each of the points [P, 3] from its three nearest neighbours [P]."""
-    count = min(4, len(points))
-    distance = KDTree(points).query(points, k=count)[0].reshape(len(points), count)[:, 1:]
-    spacing = np.sqrt(np.mean(distance**2, axis=1)) if count > 1 else np.ones(len(points))
-    # Coincident points would have no size, and outliers would cover the view.
-    return np.clip(spacing, 0.1 * np.median(spacing) + 1e-9, 10 * np.median(spacing) + 1e-9)
 
 
 def initial_points(
@@ -144,19 +140,14 @@ def resample_points(points: Points, count: int, rng: np.random.Generator) -> Poi
         return positions[rows], colors[rows]
     if len(positions) < 2:
         return points
-    new_positions, new_colors = _points_between(points, count - len(positions), rng)
-    return np.concatenate([positions, new_positions]), np.concatenate([colors, new_colors])
-
-
-def _points_between(points: Points, count: int, rng: np.random.Generator) -> Points:
-    """Return points [count, 3] between random ones of the P >= 2 points and near neighbours."""
-    positions, colors = points
-    parent = rng.integers(0, len(positions), count)
+    num_new = count - len(positions)
+    parent = rng.integers(0, len(positions), num_new)
     neighbours = np.asarray(KDTree(positions).query(positions[parent], k=min(4, len(positions)))[1])
-    partner = neighbours[np.arange(count), rng.integers(1, neighbours.shape[1], count)]
-    blend = rng.uniform(0.2, 0.8, (count, 1))
+    partner = neighbours[np.arange(num_new), rng.integers(1, neighbours.shape[1], num_new)]
+    blend = rng.uniform(0.2, 0.8, (num_new, 1))
     new_positions, new_colors = (
-        (1 - blend) * values[parent] + blend * values[partner] for values in (positions, colors)
+        np.concatenate([values, (1 - blend) * values[parent] + blend * values[partner]])
+        for values in points
     )
     return new_positions, new_colors
 
@@ -245,7 +236,9 @@ def _free_pixels(
     """
     camera = view.camera
     pixels = rng.uniform(0, (camera.width, camera.height), (count, 2))
-    is_free = ~_shown_cells(camera, point_pixels)[_cells_of(camera, pixels)]
+    is_covered = np.zeros((_CELLS, _CELLS), bool)
+    is_covered[_cells_of(camera, point_pixels)] = True
+    is_free = ~is_covered[_cells_of(camera, pixels)]
     if view.mask is not None:
         columns, rows = pixels.astype(int).T
         is_free &= view.mask[rows, columns]
@@ -276,10 +269,3 @@ def _cells_of(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarra
     """Return the row and the column of the cell of each pixel position [n, 2]."""
     columns, rows = (pixels * _CELLS / (camera.width, camera.height)).astype(int).T
     return rows, columns
-
-
-def _shown_cells(camera: Camera, pixels: np.ndarray) -> np.ndarray:
-    """Return the cells of a view that have a pixel position, [_CELLS, _CELLS] bool."""
-    is_covered = np.zeros((_CELLS, _CELLS), bool)
-    is_covered[_cells_of(camera, pixels)] = True
-    return is_covered

@@ -28,7 +28,6 @@ from morgs_mi.method.objective import Observations, Prediction, channels_of, los
 from morgs_mi.method.residual import apply_residual, residual_parameters
 from morgs_mi.method.rigidity import Neighbours, find_neighbours
 from morgs_mi.method.ssim import Target
-from morgs_mi.render.active_view import ActiveView
 
 # Fraction of the epochs after which the round of density control is due, even if the loss still
 # falls: the residual has shown by then where Gaussians are missing, and enough steps are left to
@@ -147,7 +146,15 @@ class _LaterFrameFit:
         self._views = sorted(problem.active.views)
         count = len(self._views)
         self._order = [self._views[k] for k in view_order(count, config.epochs * count, rng)]
-        self._observations = _cropped_observations(problem)
+        # As tensors on the region of each active view.
+        self._observations: dict[int, Observations] = {
+            v: {"target": problem.targets[v]}
+            | {
+                name: from_numpy(mi.TensorXf, view.crop(array))
+                for name, array in problem.observations.get(v, {}).items()
+            }
+            for v, view in problem.active.views.items()
+        }
         self._previous = problem.active.select(problem.previous)
         self._start = problem.start
         self.source = np.arange(len(problem.active.indices))
@@ -278,16 +285,3 @@ class _LaterFrameFit:
             image, parameters, view.region, num_pixels, num_gaussians, problem.extent, gaussians
         )
         return losses_of(prediction, observations, objective)
-
-
-def _cropped_observations(problem: FrameProblem) -> dict[int, Observations]:
-    """Return the observations of each active view as tensors on its region, its target included."""
-    return {
-        v: {"target": problem.targets[v]}
-        | {n: _tensor(a, view) for n, a in problem.observations.get(v, {}).items()}
-        for v, view in problem.active.views.items()
-    }
-
-
-def _tensor(array: np.ndarray, view: ActiveView) -> Tensor:
-    return from_numpy(mi.TensorXf, view.crop(array))

@@ -149,13 +149,20 @@ def optimise(
             optimizer.set_learning_rate({name: factor * rate for name, rate in base_rates.items()})
         losses = losses_at(optimizer, view)
         total: Tensor = sum(weights.get(name, 1.0) * loss for name, loss in losses.items())
-        _backward(total, steps.observer)
+        term = None if steps.observer is None else steps.observer.term()
+        with render_lock:
+            dr.backward(total if term is None else total + term)
+        if steps.observer is not None:
+            steps.observer.collect()
         optimizer.step()
         for name, loss in losses.items():
             history.setdefault(name, []).append(dr.detach(loss))
         if steps.on_step is not None:
             steps.on_step(step + 1)
-    means = {name: _mean(values[-steps.averaged_steps :]) for name, values in history.items()}
+    means = {
+        name: float(np.mean([np.asarray(loss).item() for loss in losses[-steps.averaged_steps :]]))
+        for name, losses in history.items()
+    }
     broken_losses = [name for name, mean in means.items() if not np.isfinite(mean)]
     if broken_losses:
         raise FloatingPointError(
@@ -163,20 +170,6 @@ def optimise(
             "steps; lower the learning rates."
         )
     return means
-
-
-def _mean(losses: list[Tensor]) -> float:
-    """Return the mean of losses, which are computed here if they are still pending."""
-    return float(np.mean([np.asarray(loss).item() for loss in losses]))
-
-
-def _backward(total: Tensor, observer: Observer | None) -> None:
-    """Compute the gradients of a step, also those that an observer reads."""
-    term = None if observer is None else observer.term()
-    with render_lock:
-        dr.backward(total if term is None else total + term)
-    if observer is not None:
-        observer.collect()
 
 
 def view_order(num_views: int, steps: int, rng: np.random.Generator) -> list[int]:

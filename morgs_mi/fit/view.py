@@ -82,17 +82,13 @@ def withheld_blocks(
     visible = []
     withheld = []
     for camera, image, mask in (view.reduced(width) for view in views):
-        is_withheld = _random_blocks(image.shape[0], image.shape[1], rng)
+        rows, columns = (np.arange(size) // _BLOCK for size in image.shape[:2])
+        blocks = rng.random((rows[-1] + 1, columns[-1] + 1)) < 1 / _SHARE
+        is_withheld = blocks[rows][:, columns]
         valid = np.ones_like(is_withheld) if mask is None else mask
         visible.append(View(camera, image, valid & ~is_withheld))
         withheld.append(View(camera, image, valid & is_withheld))
     return visible, withheld
-
-
-def _random_blocks(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
-    """Return the mask of the pixels in some random blocks [H, W], bool."""
-    rows, columns = (np.arange(size) // _BLOCK for size in (height, width))
-    return (rng.random((rows[-1] + 1, columns[-1] + 1)) < 1 / _SHARE)[rows][:, columns]
 
 
 def squared_errors(gaussians: Gaussians, views: Sequence[View], render: RenderConfig) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from morgs_mi.core.progress import Progress
 from morgs_mi.core.random_streams import Stream, rng_of
-from morgs_mi.fit.balance import Balance, balance_cameras, balance_config
+from morgs_mi.fit.balance import balance_cameras, balance_config
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.loop.observation import Images, Setup, views_of
 from morgs_mi.method.exposure import Exposure
@@ -53,27 +53,18 @@ def estimate_correction(
         return Correction(), {}
     if len(images) < 2:
         return _correction(setup, {}), {}
-    balance = _balance(setup, images, progress)
-    exposures = dict(zip(images, balance.exposures, strict=True)) if balance.taken else {}
-    return _correction(setup, exposures), _entry(balance)
-
-
-def _correction(setup: Setup, exposures: Mapping[int, Exposure]) -> Correction:
-    """Return the correction of all views by exposures by view index, the identity without one."""
-    return Correction(tuple(exposures.get(v, Exposure()) for v in range(len(setup.cameras))))
-
-
-def _balance(setup: Setup, images: Images, progress: Progress) -> Balance:
-    """Return the balance of the cameras that have one of `images`."""
     config = setup.config
     rng = rng_of(config.seed, Stream.BALANCED_POINTS)
     views = views_of(setup, images)
     fit = balance_config(config.fit)
     problem = FirstFrameProblem.of(views, setup.cloud, fit, config.render, rng)
-    return balance_cameras(problem, config.fit, config.seed, progress)
-
-
-def _entry(balance: Balance) -> dict[str, Any]:
-    """Return the entry of the report on a balance."""
+    balance = balance_cameras(problem, config.fit, config.seed, progress)
+    exposures = dict(zip(images, balance.exposures, strict=True)) if balance.taken else {}
     scores = {"recorded_psnr": balance.recorded_psnr, "balanced_psnr": balance.balanced_psnr}
-    return {"exposure": {"sentence": balance.sentence, "taken": balance.taken, **scores}}
+    entry = {"sentence": balance.sentence, "taken": balance.taken, **scores}
+    return _correction(setup, exposures), {"exposure": entry}
+
+
+def _correction(setup: Setup, exposures: Mapping[int, Exposure]) -> Correction:
+    """Return the correction of all views by exposures by view index, the identity without one."""
+    return Correction(tuple(exposures.get(v, Exposure()) for v in range(len(setup.cameras))))

@@ -15,7 +15,6 @@ from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.fit.budget import plan_first_frame
 from morgs_mi.fit.dropping import adapted_to_images
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
-from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.forecast import forecast
 from morgs_mi.fit.initialise import MIN_POINTS
 from morgs_mi.fit.problem import FirstFrameProblem
@@ -55,6 +54,13 @@ def fitted_first_frame(
         if on_provisional is None
         else lambda gaussians: on_provisional(_packet(setup, gaussians))
     )
+    status = "ok"
+    if (count := len(setup.points)) < MIN_POINTS:
+        status = (
+            f"the capture has {count} points, too few: seeded {plan.config.first_count} random "
+            "ones inside the views"
+        )
+        _LOG.warning("frame 0: %s", status)
     expected = forecast(problem.cameras, problem.points).entries if len(views) > 1 else {}
     fitted = fit_first_frame(problem, fit_config, rng, progress.of(plan.stage), on_round)
     return FittedFrame(
@@ -62,25 +68,13 @@ def fitted_first_frame(
         correction=correction,
         losses=fitted.losses,
         steps=fitted.steps,
-        status=_start_status(setup, plan.config),
+        status=status,
         validation=expected | correction_entry,
     )
 
 
 def _packet(setup: Setup, gaussians: Gaussians) -> Packet:
     return keyframe_packet(gaussians, 0, setup.cameras, setup.config.codec)
-
-
-def _start_status(setup: Setup, config: FitConfig) -> str:
-    """Return a status about the points that the first frame starts from."""
-    if (count := len(setup.points)) >= MIN_POINTS:
-        return "ok"
-    status = (
-        f"the capture has {count} points, too few: seeded {config.first_count} random ones inside "
-        "the views"
-    )
-    _LOG.warning("frame 0: %s", status)
-    return status
 
 
 def with_first_confidence(

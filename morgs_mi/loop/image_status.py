@@ -39,33 +39,24 @@ def image_status(
     plain = [v for v, image in thumbnails.items() if _is_plain(image)]
     views = (v for v in thumbnails.keys() & previous.keys() if v not in plain)
     cuts = [v for v in views if _is_cut(_thumbnail(previous[v]), thumbnails[v])]
-    return (*_plain_status(names, thumbnails, plain), *_cut_status(names, len(thumbnails), cuts))
-
-
-def _plain_status(
-    names: Sequence[str], images: Mapping[int, np.ndarray], plain: Sequence[int]
-) -> tuple[str, ...]:
-    if not plain:
-        return ()
-    color = "black" if max(images[v].mean() for v in plain) < _BLACK else "of one colour"
-    return (
-        f"{_list(names, plain)}: the image is {color}; cut such frames off the recording, or "
-        "leave the camera out (--without)",
-    )
-
-
-def _cut_status(names: Sequence[str], count: int, views: Sequence[int]) -> tuple[str, ...]:
-    if not views:
-        return ()
-    if 2 * len(views) >= count:
-        return (
-            "the images show another scene than in the frame before; end the fit before this "
-            "frame (--frames), and fit the rest as another recording",
+    sentences = []
+    if plain:
+        color = "black" if max(thumbnails[v].mean() for v in plain) < _BLACK else "of one colour"
+        sentences.append(
+            f"{_list(names, plain)}: the image is {color}; cut such frames off the recording, or "
+            "leave the camera out (--without)"
         )
-    return (
-        f"{_list(names, views)}: the image shows something else than in the frame before; if the "
-        "camera was moved, or its clip has a cut, leave it out (--without)",
-    )
+    if cuts and 2 * len(cuts) >= len(thumbnails):
+        sentences.append(
+            "the images show another scene than in the frame before; end the fit before this "
+            "frame (--frames), and fit the rest as another recording"
+        )
+    elif cuts:
+        sentences.append(
+            f"{_list(names, cuts)}: the image shows something else than in the frame before; if "
+            "the camera was moved, or its clip has a cut, leave it out (--without)"
+        )
+    return tuple(sentences)
 
 
 def _list(names: Sequence[str], views: Sequence[int]) -> str:
