@@ -13,12 +13,11 @@ birth. Survivors come first in ascending order, births after them. Each Gaussian
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import blake2b
 from itertools import chain
-from math import prod
 
 import numpy as np
 
@@ -144,31 +143,58 @@ def residual_packet(
     """
     config = config or CodecConfig()
     grid = previous.grid
-    _check_attributes(previous, gaussians.sh_degree, optional_mask(gaussians.items()))
-    source = _checked(np.arange(len(grid)) if source is None else source, len(grid), len(gaussians))
+    N = len(grid)
+    degree = gaussians.sh_degree
+    optional = optional_mask(gaussians.items())
+    if (degree, optional) != (grid.degree, grid.optional):
+        raise ValueError(
+            f"residual_packet(): frame {previous.frame + 1} must have SH of degree {grid.degree} "
+            f"and the optional attributes {list(optional_names(grid.optional))} as the frame "
+            f"before, got degree {degree} and {list(optional_names(optional))}; write a keyframe "
+            "instead."
+        )
+    source = np.arange(N) if source is None else np.asarray(source)
+    is_birth = source < 0
+    survivors = source[~is_birth]
+    if (
+        source.shape != (len(gaussians),)
+        or not np.all(np.diff(survivors) > 0)
+        or np.any(np.diff(is_birth.astype(int)) < 0)
+        or np.any(survivors >= N)
+    ):
+        raise ValueError(
+            f"residual_packet(): `source` must be [{len(gaussians)}] with survivors of 0..{N - 1} "
+            f"in ascending order, then -1 for each birth, got {source.shape}; sort the Gaussians "
+            "in this order."
+        )
     fields = finite_fields(gaussians)
-    survivors = source[source >= 0]
-    coder = _coder(previous, fields, survivors, _offset_of(gaussians) if config.offset else None)
+    groups = split_groups(fields)
+
+    # Survivors without any difference are skipped.
+    previous_fields = stored_fields(previous.gaussians)
+    differs = np.zeros(len(survivors), bool)
+    for name, value in fields.items():
+        differences = value[: len(survivors)] != previous_fields[name][survivors]
+        differs |= differences.any(axis=tuple(range(1, differences.ndim)))
+    indices = np.flatnonzero(differs)
+    rows = survivors[indices]
+    new_groups = {name: value[indices] for name, value in groups.items()}
+    change = real_values(new_groups, grid.select(rows))
+    change -= grid.values[rows].T
+    offset = None
+    if config.offset:
+        has_offset = gaussians.offset is not None
+        offset = np.asarray(gaussians.offset) if has_offset else np.zeros((len(gaussians), 3))
+    coder = Coder(grid, survivors, rows, change, offset)
+
     births = len(gaussians) - len(survivors)
-    birth_grid = _birth_grid(fields, births, cameras, config) if births else None
+    birth_grid = None
+    if births:
+        birth_groups = {name: value[-births:] for name, value in groups.items()}
+        birth_grid = new_grid(birth_groups, cameras, config)
     coarseness, codes = _sized_codes(coder, birth_grid, config)
     arrays = {"parent": previous.digest, "head": np.array([births, coarseness], np.uint32), **codes}
     return Packet(PacketKind.RESIDUAL, previous.frame + 1, arrays)
-
-
-def _birth_grid(
-    fields: Mapping[str, np.ndarray], births: int, cameras: Sequence[Camera], config: CodecConfig
-) -> Grid:
-    """Return the last Gaussians of stored `fields`, which are new."""
-    groups = {name: value[-births:] for name, value in split_groups(fields).items()}
-    return new_grid(groups, cameras, config)
-
-
-def _offset_of(gaussians: Gaussians) -> np.ndarray:
-    """Return the offsets of Gaussians [N, 3], 0 where they have none."""
-    if gaussians.offset is None:
-        return np.zeros((len(gaussians), 3))
-    return np.asarray(gaussians.offset)
 
 
 def _sized_codes(
@@ -180,7 +206,16 @@ def _sized_codes(
     target = config.target_size
     coarseness = round(4 * np.log2(config.birth_precision))
     if target:
-        coarseness = _fitting(coder, coarseness, target)
+        # The least coarseness at which the changes are estimated to take `target` bytes.
+        high = _COARSEST
+        while coarseness < high:
+            middle = (coarseness + high) // 2
+            r = coder.rounded(middle)
+            bits = sum(map(column_bits, chain(coder.columns(r), coder.offsets(r, middle))))
+            if bits / 8 <= target:
+                high = middle
+            else:
+                coarseness = middle + 1
     codes = _codes(coder, coarseness, birth_grid)
     while target and coarseness < _COARSEST and sum(c.nbytes for c in codes.values()) > target:
         coarseness += 1
@@ -201,36 +236,28 @@ def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
     """
     where = packet.place or f"packet of frame {packet.frame}"
     try:
-        _check_names(packet)
-        _check_dtypes(packet)
         return _next_state(previous, packet)
     except ValueError as error:
         raise ValueError(f"{where}: {error}.") from None
 
 
-def _check_names(packet: Packet) -> None:
+def _next_state(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
+    """Return the state after a packet, if it may follow on `previous`."""
     is_residual = packet.kind == PacketKind.RESIDUAL
     names = {"head", "code", "parent"} if is_residual else {"head", "code"}
     optional = {"offset"} if is_residual else set()
     if packet.arrays.keys() - optional != names:
         raise ValueError(f"expected the arrays {sorted(names)}, got {sorted(packet.arrays)}")
-
-
-def _check_dtypes(packet: Packet) -> None:
     for name, array in packet.arrays.items():
         if array.ndim != 1 or array.dtype != _DTYPES[name]:
             raise ValueError(
                 f"`{name}` must be {_DTYPES[name]} [n], got {array.dtype} {list(array.shape)}"
             )
-
-
-def _next_state(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
-    """Return the state after a packet, if it may follow on `previous`."""
     if previous is not None and packet.frame <= previous.frame:
         raise ValueError(
             f"its frame must be above {previous.frame}, the frame of the state, got {packet.frame}"
         )
-    if packet.kind == PacketKind.KEYFRAME:
+    if not is_residual:
         first_id = 0 if previous is None else previous.first_id + max(previous.next_id, 1)
         return _decoded_keyframe(packet, first_id)
     if previous is None:
@@ -254,7 +281,12 @@ def coded_frames(packets: Iterable[Packet]) -> Iterator[CodedFrame]:
 def _decoded_keyframe(packet: Packet, first_id: int) -> CodedFrame:
     code = packet.arrays["code"]
     N, degree, optional, next_id = _head(packet, 4)
-    _check_optional(optional)
+    if unknown_bits := optional & ~KNOWN_OPTIONAL:
+        raise ValueError(
+            f"its mask of optional attributes must have no bits beyond {KNOWN_OPTIONAL:#b}, got "
+            f"{optional:#b} with the unknown {unknown_bits:#b}; read it with the release that "
+            "wrote it"
+        )
     _check_most(degree, 3, "its degree")
     _check_most(next_id, LIMIT - 1, "its next id")
     _check_words(code, N, N, degree, optional)
@@ -268,137 +300,68 @@ def _decoded_keyframe(packet: Packet, first_id: int) -> CodedFrame:
     )
 
 
-def _check_optional(mask: int) -> None:
-    if unknown_bits := mask & ~KNOWN_OPTIONAL:
-        raise ValueError(
-            f"its mask of optional attributes must have no bits beyond {KNOWN_OPTIONAL:#b}, got "
-            f"{mask:#b} with the unknown {unknown_bits:#b}; read it with the release that "
-            "wrote it"
-        )
-
-
 def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
-    births, coarseness = _residual_head(previous, packet)
+    births, coarseness = _head(packet, 2)
+    _check_most(coarseness, _COARSEST, "its coarseness")
+    _check_most(previous.next_id + births, LIMIT - 1, "its next id")
     code = packet.arrays["code"]
     grid = previous.grid
     reader = ColumnReader(code)
-    survivors, new = _taken_survivors(reader, grid, coarseness)
-    _check_words(code, births, len(survivors) + births, grid.degree, grid.optional)
-    motion = new.real("means").astype(np.float32) - np.asarray(previous.gaussians.means)[survivors]
-    offset = _taken_offset(packet, new, grid.values[survivors, grid.columns["means"]], coarseness)
+    values, dead = take_change(reader, grid, coarseness)
+    survivors = np.flatnonzero(~dead)
+    total = len(survivors) + births
+    _check_words(code, births, total, grid.degree, grid.optional)
+    new = replace(grid, values=values).select(survivors)
+    motion = np.zeros((total, 3), np.float32)
+    previous_means = np.asarray(previous.gaussians.means)[survivors]
+    motion[: len(survivors)] = new.real("means").astype(np.float32) - previous_means
+    offset = None
+    if "offset" in packet.arrays:
+        # Of the survivors whose means change, as `Coder.offsets` yields them.
+        at = grid.columns["means"]
+        rows = np.flatnonzero(np.any(new.values[:, at] != grid.values[survivors, at], axis=1))
+        offset_reader = ColumnReader(packet.arrays["offset"])
+        r = np.stack([offset_reader.take(len(rows)) for _ in range(3)], axis=1)
+        offset = np.zeros((total, 3), np.float32)
+        offset[rows] = r * offset_steps(new.select(rows), coarseness)
     if births:
         new = new.concatenate(_taken_grid(reader, births, grid.degree, grid.optional))
-        motion = _with_births(motion, births)
-        offset = None if offset is None else _with_births(offset, births)
+    new_ids = previous.next_id + np.arange(births, dtype=np.uint32)
     return replace(
         previous,
         frame=packet.frame,
-        ids=_next_ids(previous, survivors, births),
+        ids=np.concatenate([previous.ids[survivors], new_ids]),
         gaussians=new.gaussians(motion, offset),
         grid=new,
         next_id=previous.next_id + births,
     )
 
 
-def _residual_head(previous: CodedFrame, packet: Packet) -> tuple[int, int]:
-    """Return the number of births and the coarseness of a residual."""
-    births, coarseness = _head(packet, 2)
-    _check_most(coarseness, _COARSEST, "its coarseness")
-    _check_most(previous.next_id + births, LIMIT - 1, "its next id")
-    return births, coarseness
-
-
-def _taken_survivors(reader: ColumnReader, grid: Grid, coarseness: int) -> tuple[np.ndarray, Grid]:
-    """Return the indices of the survivors in `grid`, ascending, and the survivors after their
-    changes.
-    """
-    values, dead = take_change(reader, grid, coarseness)
-    survivors = np.flatnonzero(~dead)
-    return survivors, replace(grid, values=values).select(survivors)
-
-
-def _next_ids(previous: CodedFrame, survivors: np.ndarray, births: int) -> np.ndarray:
-    """Return the numbers of the survivors of a state and of births, uint32."""
-    new_ids = previous.next_id + np.arange(births, dtype=np.uint32)
-    return np.concatenate([previous.ids[survivors], new_ids]).astype(np.uint32)
-
-
-def _with_births(rows: np.ndarray, births: int) -> np.ndarray:
-    """Return rows [S, 3] of the survivors, followed by zeros for births."""
-    return np.pad(rows, ((0, births), (0, 0)))
-
-
-def _taken_offset(
-    packet: Packet, grid: Grid, previous_means: np.ndarray, coarseness: int
-) -> np.ndarray | None:
-    """Return the offsets of the survivors [S, 3], float32, or None if a packet has none.
-
-    Args:
-        packet: a residual.
-        grid: the survivors.
-        previous_means: integers of their means in the state before, int32 [S, 3].
-        coarseness: of the changes.
-    """
-    if "offset" not in packet.arrays:
-        return None
-    means = grid.values[:, grid.columns["means"]]
-    rows = np.flatnonzero(np.any(means != previous_means, axis=1))
-    offset = np.zeros((len(grid), 3), np.float32)
-    offset[rows] = _taken_offsets(packet.arrays["offset"], grid.select(rows), coarseness)
-    return offset
-
-
-def _taken_offsets(code: np.ndarray, grid: Grid, coarseness: int) -> np.ndarray:
-    """Return the offsets [M, 3] of the Gaussians whose means change, from `Coder.offsets`."""
-    reader = ColumnReader(code)
-    r = np.stack([reader.take(len(grid)) for _ in range(3)], axis=1)
-    return r * offset_steps(grid, coarseness)
-
-
-def _words(columns: Iterable[np.ndarray]) -> np.ndarray:
-    writer = ColumnWriter()
-    for column in columns:
-        writer.put(column)
-    return writer.words()
-
-
 def _put_grid(writer: ColumnWriter, grid: Grid) -> None:
     columns = np.concatenate(
         [grid.largest_components[:, None], grid.exponents, grid.values], axis=1, dtype=np.int64
     )
-    middle = _middle(columns)
+    middle = np.zeros(columns.shape[1], np.int64)
+    if len(columns):
+        middle = np.sort(columns, axis=0)[len(columns) // 2]
+        middle[np.abs(columns - middle).max(0) >= LIMIT] = 0
     writer.put(middle)
     # Small integers have a token of their own, large ones one per octave.
     for column in (columns - middle).T:
         writer.put(column)
 
 
-def _middle(columns: np.ndarray) -> np.ndarray:
-    """Return the medians of columns [N, C], or 0 where the difference would leave the limit."""
-    if not len(columns):
-        return np.zeros(columns.shape[1], np.int64)
-    middle = np.sort(columns, axis=0)[len(columns) // 2]
-    middle[np.abs(columns - middle).max(0, initial=0) >= LIMIT] = 0
-    return middle
-
-
 def _taken_grid(reader: ColumnReader, N: int, degree: int, optional: int) -> Grid:
     first = 1 + num_exponents(optional)  # column of the values
     middle = reader.take(num_integers(degree, optional))
-    largest = _taken_largest(reader, N, middle[0])
+    largest = reader.take(N) + middle[0]
+    if np.any((largest < 0) | (largest > 3)):
+        raise ValueError("the largest component of a quaternion must be 0 to 3")
     exponents = np.empty((N, first - 1), np.int8)
     values = np.empty((N, len(middle) - first), np.int32)
     _fill(exponents, reader, middle[1:first], 128, "exponent")
     _fill(values, reader, middle[first:], LIMIT, "value")
-    return Grid(values, exponents, largest, degree, optional)
-
-
-def _taken_largest(reader: ColumnReader, N: int, shift: int) -> np.ndarray:
-    """Return the largest components of N quaternions, uint8."""
-    largest = reader.take(N) + shift
-    if np.any((largest < 0) | (largest > 3)):
-        raise ValueError("the largest component of a quaternion must be 0 to 3")
-    return largest.astype(np.uint8)
+    return Grid(values, exponents, largest.astype(np.uint8), degree, optional)
 
 
 def _fill(
@@ -409,96 +372,23 @@ def _fill(
         column[:] = bounded(reader.take(len(columns)) + shift, limit, what)
 
 
-def _coder(
-    previous: CodedFrame,
-    fields: Mapping[str, np.ndarray],
-    survivors: np.ndarray,
-    offset: np.ndarray | None,
-) -> Coder:
-    """Return the coder of the changes to the next stored `fields`; survivors without any difference
-    are skipped.
-    """
-    grid = previous.grid
-    indices = np.flatnonzero(_differs(stored_fields(previous.gaussians), fields, survivors))
-    rows = survivors[indices]
-    groups = {name: value[indices] for name, value in split_groups(fields).items()}
-    change = real_values(groups, grid.select(rows))
-    change -= grid.values[rows].T
-    return Coder(grid, survivors, rows, change, offset)
-
-
-def _differs(
-    previous_fields: Mapping[str, np.ndarray],
-    fields: Mapping[str, np.ndarray],
-    survivors: np.ndarray,
-) -> np.ndarray:
-    """Return the mask [S] of the survivors of which a field is another one than before."""
-    differs = np.zeros(len(survivors), bool)
-    for name, value in fields.items():
-        differences = value[: len(survivors)] != previous_fields[name][survivors]
-        differs |= differences.reshape(len(survivors), prod(value.shape[1:])).any(1)
-    return differs
-
-
 def _codes(coder: Coder, coarseness: int, birth_grid: Grid | None) -> dict[str, np.ndarray]:
     """Return the words of the changes in steps of a coarseness, and of the births."""
     r = coder.rounded(coarseness)
     writer = ColumnWriter()
-    births = 0 if birth_grid is None else len(birth_grid)
     for column in coder.columns(r):
         writer.put(column)
+    births = 0
     if birth_grid is not None:
+        births = len(birth_grid)
         _put_grid(writer, birth_grid)
     codes = {"code": _padded(writer.words(), births, len(coder.survivors) + births, coder.grid)}
     if coder.offset is not None:
-        codes["offset"] = _words(coder.offsets(r, coarseness))
+        offset_writer = ColumnWriter()
+        for column in coder.offsets(r, coarseness):
+            offset_writer.put(column)
+        codes["offset"] = offset_writer.words()
     return codes
-
-
-def _fitting(coder: Coder, low: int, target: int) -> int:
-    """Return the least coarseness from `low` at which the changes are estimated to take `target`
-    bytes.
-    """
-    high = _COARSEST
-    while low < high:
-        middle = (low + high) // 2
-        r = coder.rounded(middle)
-        bits = sum(map(column_bits, chain(coder.columns(r), coder.offsets(r, middle))))
-        if bits / 8 <= target:
-            high = middle
-        else:
-            low = middle + 1
-    return low
-
-
-def _check_attributes(previous: CodedFrame, degree: int, optional: int) -> None:
-    grid = previous.grid
-    if (degree, optional) != (grid.degree, grid.optional):
-        names, new_names = (list(optional_names(mask)) for mask in (grid.optional, optional))
-        raise ValueError(
-            f"residual_packet(): frame {previous.frame + 1} must have SH of degree {grid.degree} "
-            f"and the optional attributes {names} as the frame before, got degree {degree} and "
-            f"{new_names}; write a keyframe instead."
-        )
-
-
-def _checked(source: np.ndarray, N: int, next_N: int) -> np.ndarray:
-    """Return the sources of the next Gaussians, if they are in order and refer to N Gaussians."""
-    source = np.asarray(source)
-    if source.shape != (next_N,) or not _is_ordered(source) or np.any(source >= N):
-        raise ValueError(
-            f"residual_packet(): `source` must be [{next_N}] with survivors of 0..{N - 1} in "
-            f"ascending order, then -1 for each birth, got {source.shape}; sort the Gaussians in "
-            "this order."
-        )
-    return source
-
-
-def _is_ordered(source: np.ndarray) -> bool:
-    """Return whether survivors ascend and births come last."""
-    births = source < 0
-    ascends = np.all(np.diff(source[~births]) > 0)
-    return bool(ascends and np.all(np.diff(births.astype(int)) >= 0))
 
 
 def _head(packet: Packet, count: int) -> list[int]:

@@ -26,13 +26,14 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import accumulate
 from math import prod
 
 import numpy as np
 
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.entropy import LIMIT
-from morgs_mi.core.attributes import ATTRIBUTES, BY_NAME, SIGMOID, Attribute
+from morgs_mi.core.attributes import ATTRIBUTES, SIGMOID, Attribute
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
@@ -117,12 +118,13 @@ class Grid:
             name: self._single(name).reshape(len(self), *_STORED[name].shape)
             for name in optional_names(self.optional)
         }
+        sh = [self._single(name) for name in ("sh_dc", "sh_rest") if name in self.columns]
         return Gaussians(
             means=self._single("means"),
             log_scales=self._single("log_scales"),
             quats=self._quats(),
             logit_opacities=self._single("logit_opacities")[:, 0],
-            sh_coeffs=self._sh_coeffs(),
+            sh_coeffs=np.concatenate(sh, 1).reshape(len(self), (self.degree + 1) ** 2, 3),
             motion=np.zeros((len(self), 3), np.float32) if motion is None else motion,
             offset=offset,
             **optional,
@@ -131,11 +133,6 @@ class Grid:
     def _single(self, name: str) -> np.ndarray:
         """Return the numbers of a group in float32 [N, its width]."""
         return self.real(name).astype(np.float32)
-
-    def _sh_coeffs(self) -> np.ndarray:
-        """Return the spherical harmonics, float32 [N, K, 3]."""
-        parts = [self._single(name) for name in ("sh_dc", "sh_rest") if name in self.columns]
-        return np.concatenate(parts, 1).reshape(len(self), (self.degree + 1) ** 2, 3)
 
     def _quats(self) -> np.ndarray:
         """Return the rotations as unit quaternions wxyz, float32 [N, 4]."""
@@ -168,17 +165,13 @@ def optional_names(mask: int) -> tuple[str, ...]:
 
 def columns_of(degree: int, optional: int) -> dict[str, slice]:
     """Return the columns of each group, in order; groups of no width are left out."""
-    widths = {name: _width(_STORED[name], degree) for name in (*_ALWAYS, *optional_names(optional))}
-    return _slices({name: width for name, width in widths.items() if width})
-
-
-def _width(row: Attribute, degree: int) -> int:
-    """Return the number of columns of a group; -1 in a shape is the number of SH coefficients
-    beyond the first.
-    """
-    return (
-        3 if row.name == "quats" else prod((degree + 1) ** 2 - 1 if n < 0 else n for n in row.shape)
-    )
+    widths = {}
+    for name in (*_ALWAYS, *optional_names(optional)):
+        shape = (3,) if name == "quats" else _STORED[name].shape
+        # -1 in a shape is the number of SH coefficients beyond the first.
+        if width := prod((degree + 1) ** 2 - 1 if n < 0 else n for n in shape):
+            widths[name] = width
+    return _slices(widths)
 
 
 def num_exponents(optional: int) -> int:
@@ -200,7 +193,7 @@ def _exponent_columns(optional: int) -> dict[str, slice]:
 
 
 def _slices(widths: Mapping[str, int]) -> dict[str, slice]:
-    ends = np.cumsum(list(widths.values())).tolist()
+    ends = accumulate(widths.values())
     return {
         name: slice(end - width, end)
         for (name, width), end in zip(widths.items(), ends, strict=True)
@@ -265,26 +258,15 @@ def new_grid(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: C
     chosen here.
     """
     raw = {name: np.asarray(value, np.float64) for name, value in raw.items()}
-    grid = _empty_grid(raw, _exponents(raw, cameras, config))
+    grid = Grid(
+        values=np.zeros((0, 0), np.int32),
+        exponents=_exponents(raw, cameras, config),
+        largest_components=np.abs(raw["quats"]).argmax(1).astype(np.uint8),
+        degree=round((1 + raw["sh_rest"].shape[1]) ** 0.5) - 1,
+        optional=optional_mask(raw),
+    )
     values = np.rint(real_values(raw, grid)).astype(np.int32)
     return replace(grid, values=np.ascontiguousarray(values.T))
-
-
-def _empty_grid(raw: Mapping[str, np.ndarray], exponents: np.ndarray) -> Grid:
-    """Return the grid of raw attributes by group, without its values."""
-    largest_components = np.abs(raw["quats"]).argmax(1).astype(np.uint8)
-    degree = round((1 + raw["sh_rest"].shape[1]) ** 0.5) - 1
-    no_values = np.zeros((0, 0), np.int32)
-    return Grid(no_values, exponents, largest_components, degree, optional_mask(raw))
-
-
-def _bounded_optional(name: str, values: np.ndarray) -> np.ndarray:
-    """Return the values of an optional attribute, clipped where its activation saturates."""
-    return (
-        np.clip(values, -_MAX_OPTIONAL, _MAX_OPTIONAL)
-        if BY_NAME[name].activation is SIGMOID
-        else values
-    )
 
 
 def real_values(raw: Mapping[str, np.ndarray], grid: Grid) -> np.ndarray:
@@ -292,21 +274,16 @@ def real_values(raw: Mapping[str, np.ndarray], grid: Grid) -> np.ndarray:
     steps of `grid`.
     """
     N = len(grid.largest_components)
-    numbers = _bounded_numbers(raw, grid)
+    numbers = {**raw, "quats": _quat_ratios(raw["quats"], grid.largest_components)}
+    numbers["logit_opacities"] = np.clip(raw["logit_opacities"], -_MAX_LOGIT, _MAX_LOGIT)
+    for name in optional_names(grid.optional):
+        if _STORED[name].activation is SIGMOID:  # which saturates
+            numbers[name] = np.clip(raw[name], -_MAX_OPTIONAL, _MAX_OPTIONAL)
     real = np.empty((max(at.stop for at in grid.columns.values()), N))
     for name, at in grid.columns.items():
         columns = numbers[name].reshape(N, at.stop - at.start).T
         np.divide(columns, grid.steps(name).T, out=real[at])
     return np.clip(real, -_MAX_VALUE, _MAX_VALUE, out=real)
-
-
-def _bounded_numbers(raw: Mapping[str, np.ndarray], grid: Grid) -> dict[str, np.ndarray]:
-    """Return the numbers of each group that are rounded to steps, within visible bounds."""
-    numbers = {name: _bounded_optional(name, raw[name]) for name in optional_names(grid.optional)}
-    numbers |= {name: raw[name] for name in ("means", "log_scales", "sh_dc", "sh_rest")}
-    numbers["quats"] = _quat_ratios(raw["quats"], grid.largest_components)
-    numbers["logit_opacities"] = np.clip(raw["logit_opacities"], -_MAX_LOGIT, _MAX_LOGIT)
-    return numbers
 
 
 def _quat_ratios(quats: np.ndarray, largest_components: np.ndarray) -> np.ndarray:
@@ -329,72 +306,34 @@ def _exponents(
     """Return quarter octaves int8 [N, E] of steps, which are twice the error that `config`
     tolerates.
     """
-    ones = np.ones(len(raw["means"]))
-    steps = _steps_of_groups(raw, cameras, config)
-    magnitudes = _magnitudes(raw)
-    columns = []
-    for name in (*_ALWAYS, *optional_names(optional_mask(raw))):
-        group = steps.get(name) or [(_generic_step(name, config), ones)]
-        for (step, factor), magnitude in zip(group, magnitudes.get(name) or [ones], strict=True):
-            columns.append(_quarter_octaves(step, factor, magnitude))
-    return np.clip(np.stack(columns, axis=1), -128, 127).astype(np.int8)
-
-
-def _quarter_octaves(step: float, factor: np.ndarray, magnitude: np.ndarray) -> np.ndarray:
-    """Return the exponents of steps [N], at which values of a magnitude [N] have at most
-    `_MAX_BITS`.
-    """
-    # The factor of a Gaussian in whole octaves, which take fewer bits than they save.
-    e = np.floor(4 * np.log2(step)) + 4 * np.floor(np.log2(factor))
-    finest = np.ceil(4 * (np.log2(np.maximum(magnitude, 1e-38)) - _MAX_BITS))
-    return np.maximum(e, finest)
-
-
-def _steps_of_groups(
-    raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: CodecConfig
-) -> dict[str, list[tuple[float, np.ndarray]]]:
-    """Return (step of all Gaussians, factor of each one [N]) for each exponent of a group, by
-    group.
-    """
     precision = config.quality * config.birth_precision
     error, color = (2 * _tolerated(name) / precision for name in ("means", "sh_dc"))
     pixel = _world_per_pixel(raw["means"], cameras)
     ones = np.ones(len(pixel))
-    sizes = _sizes_px(raw["log_scales"], pixel)
-    elongation = _elongation(sizes)
-    return {
-        "means": [(error, pixel)],
-        "log_scales": [(error, 1 / size) for size in sizes.T],
-        "quats": [(error / 2, 1 / elongation)],  # a turn by a changes tan(a / 2)
-        "logit_opacities": [(_generic_step("logit_opacities", config), ones)],
-        "sh_dc": [(color / SH_C0, ones)],
-        "sh_rest": [(color, ones)],
-    }
-
-
-def _sizes_px(log_scales: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-    """Return the sizes of splats [N, 3] in px, for sizes of a pixel [N] at them."""
-    return np.maximum(np.exp(np.minimum(log_scales, 80.0)) / pixel[:, None], _MIN_SIZE_PX)
-
-
-def _elongation(sizes: np.ndarray) -> np.ndarray:
-    """Return how far splats of sizes [N, 3] are from a ball, px [N]."""
+    sizes = np.exp(np.minimum(raw["log_scales"], 80.0)) / pixel[:, None]
+    sizes = np.maximum(sizes, _MIN_SIZE_PX)
     # A ball tolerates any turn.
-    return np.maximum(np.sqrt(sizes.max(1) ** 2 - sizes.min(1) ** 2), _MIN_SIZE_PX)
-
-
-def _magnitudes(raw: Mapping[str, np.ndarray]) -> dict[str, list[np.ndarray]]:
-    """Return the largest absolute values [N] for each exponent of a group, by group.
-
-    Close to a lens, and for huge splats, steps would be finer than float32, and the integers
-    without bound.
-    """
-    return {
-        "means": [np.abs(raw["means"]).max(1)],
-        "log_scales": list(np.abs(raw["log_scales"]).T),
-        "sh_dc": [np.abs(raw["sh_dc"]).max((1, 2))],
-        "sh_rest": [np.abs(raw["sh_rest"]).max((1, 2), initial=0)],
-    }
+    elongation = np.maximum(np.sqrt(sizes.max(1) ** 2 - sizes.min(1) ** 2), _MIN_SIZE_PX)
+    magnitudes = {name: np.abs(value) for name, value in raw.items()}
+    # Of each exponent: step of all Gaussians, factor and largest absolute value of each one [N].
+    rules = [
+        (error, pixel, magnitudes["means"].max(1)),
+        *zip([error] * 3, 1 / sizes.T, magnitudes["log_scales"].T, strict=True),
+        (error / 2, 1 / elongation, ones),  # quats: a turn by a changes tan(a / 2)
+        (_generic_step("logit_opacities", config), ones, ones),
+        (color / SH_C0, ones, magnitudes["sh_dc"].max((1, 2))),
+        (color, ones, magnitudes["sh_rest"].max((1, 2), initial=0)),
+        *((_generic_step(name, config), ones, ones) for name in optional_names(optional_mask(raw))),
+    ]
+    columns = []
+    for step, factor, magnitude in rules:
+        # The factor of a Gaussian in whole octaves, which take fewer bits than they save.
+        e = np.floor(4 * np.log2(step)) + 4 * np.floor(np.log2(factor))
+        # Close to a lens, and for huge splats, steps would be finer than float32, and the integers
+        # without bound.
+        finest = np.ceil(4 * (np.log2(np.maximum(magnitude, 1e-38)) - _MAX_BITS))
+        columns.append(np.maximum(e, finest))
+    return np.clip(np.stack(columns, axis=1), -128, 127).astype(np.int8)
 
 
 def _generic_step(name: str, config: CodecConfig) -> float:
@@ -420,15 +359,10 @@ def _world_per_pixel(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray
     """
     pixel = np.full(len(means), np.inf)
     for camera in cameras:
-        pixel = np.minimum(pixel, _pixel_sizes(means, camera))
+        view = np.asarray(camera.viewmat, np.float64)
+        depth = means @ view[2, :3] + view[2, 3]
+        focal = max(camera.K[0, 0], camera.K[1, 1])
+        pixel = np.minimum(pixel, np.where(depth > camera.near, depth, np.inf) / focal)
     sizes = pixel[np.isfinite(pixel)]
     # A Gaussian behind every camera is invisible but may come into view.
     return np.where(np.isfinite(pixel), pixel, np.median(sizes) if len(sizes) else 1e-3)
-
-
-def _pixel_sizes(means: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return the size of a pixel [N] at each mean, world units; infinite behind a camera."""
-    view = np.asarray(camera.viewmat, np.float64)
-    depth = means @ view[2, :3] + view[2, 3]
-    focal = max(camera.K[0, 0], camera.K[1, 1])
-    return np.where(depth > camera.near, depth, np.inf) / focal

@@ -42,26 +42,24 @@ class Coder:
         r = np.zeros((len(self.change), len(self.grid)), np.int32)
         steps = self.change / _step(coarseness)
         for name, at in self.grid.columns.items():
-            _remove_jitter(steps[at], _THRESHOLD_DC if name == "sh_dc" else _THRESHOLD)
+            threshold = _THRESHOLD_DC if name == "sh_dc" else _THRESHOLD
+            steps[at, np.max(np.abs(steps[at]), axis=0) < threshold] = 0
         r[:, self.rows] = np.clip(np.rint(steps, out=steps), 1 - LIMIT, LIMIT - 1, out=steps)
         return r
 
     def columns(self, r: np.ndarray) -> Iterator[np.ndarray]:
         """Yield the columns of changes `r` [C, N] and of the deaths; `take_change` reads them."""
         change_masks = {name: np.any(r[at], axis=0) for name, at in self.grid.columns.items()}
-        geometry = _flags(change_masks, _GEOMETRY, len(self.grid))
-        geometry = np.where(self._dead(), _DEAD, geometry)
-        appearance = _flags(change_masks, _APPEARANCE, len(self.grid))
-        for rows in _classes(self.grid):
-            yield from _flag_columns(geometry[rows], appearance[rows])
-            for name, at in self.grid.columns.items():
-                yield from r[at].take(rows[change_masks[name][rows]], axis=1)
-
-    def _dead(self) -> np.ndarray:
-        """Return the mask of the Gaussians that die, bool [N]."""
         dead = np.ones(len(self.grid), bool)
         dead[self.survivors] = False
-        return dead
+        geometry = np.where(dead, _DEAD, _flags(change_masks, _GEOMETRY, len(self.grid)))
+        appearance = _flags(change_masks, _APPEARANCE, len(self.grid))
+        for rows in _classes(self.grid):
+            yield geometry[rows]
+            for some in _shape_classes(geometry[rows]):
+                yield appearance[rows[some]]
+            for name, at in self.grid.columns.items():
+                yield from r[at].take(rows[change_masks[name][rows]], axis=1)
 
     def offsets(self, r: np.ndarray, coarseness: int) -> Iterator[np.ndarray]:
         """Yield the columns of the offsets of the survivors with changed means; none if they are
@@ -73,11 +71,6 @@ class Coder:
                 self.grid.select(self.survivors[rows]), coarseness
             )
             yield from np.clip(np.rint(real), 1 - LIMIT, LIMIT - 1).astype(np.int32).T
-
-
-def _remove_jitter(steps: np.ndarray, threshold: float) -> None:
-    """Set changes of a group [n, M] to 0 where all of them are below a threshold."""
-    steps[:, np.max(np.abs(steps), axis=0) < threshold] = 0
 
 
 def offset_steps(grid: Grid, coarseness: int) -> np.ndarray:
@@ -96,52 +89,28 @@ def take_change(reader: ColumnReader, grid: Grid, coarseness: int) -> tuple[np.n
     """
     values = grid.values.copy()
     dead = np.zeros(len(grid), bool)
-    step = float(_step(coarseness))
-    for rows in _classes(grid):
-        geometry, appearance = _taken_flags(reader, len(rows), grid)
-        dead[rows] = geometry == _DEAD
-        flags = _flags_by_name(geometry, appearance)
-        for name, at in grid.columns.items():
-            _add_changes(values.T[at], rows[flags[name] == 1], reader, step)
-    return values, dead
-
-
-def _add_changes(columns: np.ndarray, rows: np.ndarray, reader: ColumnReader, step: float) -> None:
-    """Add the changes of some rows, in steps, to columns of integers [n, N]."""
-    for column in columns:
-        change = np.rint(reader.take(len(rows)) * step).astype(np.int64)
-        column[rows] = bounded(column[rows] + change, LIMIT, "value")
-
-
-def _taken_flags(reader: ColumnReader, count: int, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Return the flags of the geometry and of the other groups of some Gaussians, int64 [count];
-    `_flag_columns` wrote them.
-    """
-    geometry = reader.take(count)
-    appearance = np.zeros(count, np.int64)
-    for some in _shape_classes(geometry):
-        appearance[some] = reader.take(int(some.sum()))
+    step = _step(coarseness)
     bits = sum(1 << bit for bit, name in enumerate(_APPEARANCE) if name in grid.columns)
-    if np.any((geometry < 0) | (geometry > _DEAD) | (appearance & ~bits != 0)):
-        raise ValueError("its flags name groups that do not exist")
-    return geometry, appearance
-
-
-def _flag_columns(geometry: np.ndarray, appearance: np.ndarray) -> list[np.ndarray]:
-    """Return the columns of flags [n]; dead Gaussians have none of the appearance."""
-    return [geometry, *(appearance[some] for some in _shape_classes(geometry))]
+    for rows in _classes(grid):
+        geometry = reader.take(len(rows))
+        appearance = np.zeros(len(rows), np.int64)
+        for some in _shape_classes(geometry):
+            appearance[some] = reader.take(int(some.sum()))
+        if np.any((geometry < 0) | (geometry > _DEAD) | (appearance & ~bits != 0)):
+            raise ValueError("its flags name groups that do not exist")
+        dead[rows] = geometry == _DEAD
+        flags = geometry % _DEAD + appearance * _DEAD  # bit k: the k-th of all groups changes
+        for name, at in grid.columns.items():
+            changed = rows[flags >> GROUPS.index(name) & 1 == 1]
+            for column in values.T[at]:
+                change = np.rint(reader.take(len(changed)) * step).astype(np.int64)
+                column[changed] = bounded(column[changed] + change, LIMIT, "value")
+    return values, dead
 
 
 def _shape_classes(geometry: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the masks of the Gaussians that keep their geometry, and of those that change it."""
     return geometry == 0, (geometry > 0) & (geometry < _DEAD)
-
-
-def _flags_by_name(geometry: np.ndarray, appearance: np.ndarray) -> dict[str, np.ndarray]:
-    """Return 1 where a group changes and 0 elsewhere, by name of the group."""
-    flags = {name: appearance >> bit & 1 for bit, name in enumerate(_APPEARANCE)}
-    is_alive = geometry < _DEAD
-    return flags | {name: (geometry >> bit & 1) & is_alive for bit, name in enumerate(_GEOMETRY)}
 
 
 def _flags(change_masks: dict[str, np.ndarray], names: tuple[str, ...], N: int) -> np.ndarray:
