@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property
 from pathlib import Path
-from types import MappingProxyType, TracebackType
+from types import MappingProxyType
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -95,29 +95,24 @@ class Packet:
             )
         if not 0 <= self.frame < 2**32:
             raise ValueError(f"Packet.encoded: `frame` must be in 0..2^32-1, got {self.frame}.")
+        rows = []
+        contents = []
         for name, array in self.arrays.items():
-            _check_dtype(name, array)
-        return _sealed(self.kind, self.frame, _payload(self.arrays))
+            if array.dtype.name not in _DTYPES:
+                raise ValueError(
+                    f"Packet.encoded: `{name}` must be one of {', '.join(_DTYPES)}, got "
+                    f"{array.dtype}; convert it."
+                )
+            rows.append([name, array.dtype.name, array.shape])
+            contents.append(array.astype(array.dtype.newbyteorder("<")).tobytes())
+        table = json.dumps(rows).encode()
+        payload = b"".join([_U32.pack(len(table)), table, *contents])
+        return _sealed(self.kind, self.frame, payload)
 
     @property
     def num_bytes(self) -> int:
         """Number of bytes that the packet takes in the file."""
         return len(self.encoded)
-
-
-def _check_dtype(name: str, array: np.ndarray) -> None:
-    if array.dtype.name not in _DTYPES:
-        raise ValueError(
-            f"Packet.encoded: `{name}` must be one of {', '.join(_DTYPES)}, got "
-            f"{array.dtype}; convert it."
-        )
-
-
-def _payload(arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Return a table of arrays and their bytes; `_arrays` reads them."""
-    table = json.dumps([[n, a.dtype.name, a.shape] for n, a in arrays.items()]).encode()
-    contents = (a.astype(a.dtype.newbyteorder("<")).tobytes() for a in arrays.values())
-    return b"".join([_U32.pack(len(table)), table, *contents])
 
 
 def encode_packet(packet: Packet) -> bytes:
@@ -245,12 +240,7 @@ class StreamWriter:
     def __enter__(self) -> StreamWriter:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def _append(self, data: bytes) -> int:
@@ -260,7 +250,10 @@ class StreamWriter:
                 rest = rest[self._file.write(rest) :]
             self._file.flush()
         except BaseException as error:  # Ctrl-C must leave complete packets too
-            self._remove_rest()
+            if self._owns_file:
+                with contextlib.suppress(OSError):  # a device cannot be truncated
+                    self._file.truncate(self.num_bytes)
+                    self._file.seek(self.num_bytes)
             if not isinstance(error, OSError):
                 raise
             raise OSError(
@@ -271,13 +264,6 @@ class StreamWriter:
             ) from error
         self.num_bytes += len(data)
         return len(data)
-
-    def _remove_rest(self) -> None:
-        """Truncate the file to its complete packets, as far as that is possible."""
-        if self._owns_file:
-            with contextlib.suppress(OSError):  # a device cannot be truncated
-                self._file.truncate(self.num_bytes)
-                self._file.seek(self.num_bytes)
 
 
 def _sealed(kind: int, frame: int, payload: bytes) -> bytes:
@@ -312,47 +298,32 @@ def _crc(head: bytes, payload: bytes | memoryview) -> int:
 
 
 def _arrays(payload: memoryview) -> dict[str, np.ndarray]:
+    """Return the arrays of a payload, in this machine's byte order."""
     (length,) = _U32.unpack_from(payload)
     at = _U32.size + length
+    table = load_json(payload[_U32.size : at], _MAX_TABLE)
+    if not isinstance(table, list) or any(
+        not isinstance(row, list) or len(row) != 3 for row in table
+    ):
+        raise ValueError("it must be a list of [name, dtype, shape]")
+    for name, dtype, shape in table:
+        is_shape = (
+            isinstance(shape, list)
+            and len(shape) <= _MAX_AXES
+            and all(type(n) is int and 0 <= n < 2**63 for n in shape)
+        )
+        if not isinstance(name, str) or dtype not in _DTYPES or not is_shape:
+            raise ValueError(f"`{name!s:.60}` is declared as {dtype!s:.60} {shape!s:.60}")
+    if len({name for name, *_ in table}) < len(table):
+        raise ValueError("two arrays have one name")
     arrays: dict[str, np.ndarray] = {}
-    for name, dtype, shape in _table(load_json(payload[_U32.size : at], _MAX_TABLE)):
-        end = at + math.prod(shape) * np.dtype(dtype).itemsize
+    for name, dtype, shape in table:
+        stored_dtype = np.dtype(dtype).newbyteorder("<")
+        end = at + math.prod(shape) * stored_dtype.itemsize
         if end > len(payload):
             raise ValueError(f"`{name}` {shape} would end at byte {end} of {len(payload)}")
-        arrays[name] = _array(payload[at:end], dtype, shape)
+        arrays[name] = np.frombuffer(payload[at:end], stored_dtype).reshape(shape).astype(dtype)
         at = end
     if at != len(payload):
         raise ValueError(f"it describes {at} bytes of {len(payload)}")
     return arrays
-
-
-def _array(data: memoryview, dtype: str, shape: list[int]) -> np.ndarray:
-    """Return an array of this machine's byte order from little-endian bytes."""
-    return np.frombuffer(data, np.dtype(dtype).newbyteorder("<")).reshape(shape).astype(dtype)
-
-
-def _table(rows: Any) -> list[tuple[str, str, list[int]]]:
-    """Return the rows of a table of arrays.
-
-    Raises:
-        ValueError: one of them is not the name, dtype and shape of an array, or two have one name.
-    """
-    if not isinstance(rows, list) or any(
-        not isinstance(row, list) or len(row) != 3 for row in rows
-    ):
-        raise ValueError("it must be a list of [name, dtype, shape]")
-    for name, dtype, shape in rows:
-        if not isinstance(name, str) or dtype not in _DTYPES or not _is_shape(shape):
-            raise ValueError(f"`{name!s:.60}` is declared as {dtype!s:.60} {shape!s:.60}")
-    if len({name for name, *_ in rows}) < len(rows):
-        raise ValueError("two arrays have one name")
-    return [tuple(row) for row in rows]
-
-
-def _is_shape(value: Any) -> bool:
-    """Return whether a value of JSON is the shape of an array."""
-    return (
-        isinstance(value, list)
-        and len(value) <= _MAX_AXES
-        and all(type(n) is int and 0 <= n < 2**63 for n in value)
-    )

@@ -42,17 +42,14 @@ class ColumnWriter:
     def put(self, values: np.ndarray) -> None:
         """Append a column [n] of integers between -LIMIT and LIMIT."""
         tokens, bits, rest = _tokens(values)
-        self._put_tokens(tokens)
-        for shift, some in _halves(bits):
-            half = (rest[some] >> shift) & (2**_LOW - 1)
-            counts = _value_counts(bits[some] - shift)
-            self._encoder.encode(half.astype(np.int32), _MODEL.Uniform(), counts)
-
-    def _put_tokens(self, tokens: np.ndarray) -> None:
         counts = _PRIOR.copy()
         for block in _blocks(len(tokens)):
             self._encoder.encode(tokens[block], _model(counts) if block.start else _FIRST)
             counts += _WEIGHT * np.bincount(tokens[block], minlength=_TOKENS)
+        for shift, some in _halves(bits):
+            half = (rest[some] >> shift) & (2**_LOW - 1)
+            num_values = _value_counts(bits[some] - shift)
+            self._encoder.encode(half.astype(np.int32), _MODEL.Uniform(), num_values)
 
     def words(self) -> np.ndarray:
         """Return the words of all columns so far, uint32."""
@@ -76,32 +73,25 @@ class ColumnReader:
         Raises:
             ValueError: the words do not encode such a column.
         """
+        tokens = np.zeros(count, np.int64)
+        counts = _PRIOR.copy()
         try:
-            tokens = self._take_tokens(count)
-            size = self._take_sizes((tokens + 1) // 2)
+            for block in _blocks(count):
+                model = _model(counts) if block.start else _FIRST
+                tokens[block] = self._decoder.decode(model, block.stop - block.start)
+                counts += _WEIGHT * np.bincount(tokens[block], minlength=_TOKENS)
+            size = (tokens + 1) // 2  # the magnitude m of the module
+            if np.any(size >= _DIRECT):
+                bits = np.where(size < _DIRECT, 0, size - 12)
+                rest = np.zeros(count, np.int64)
+                for shift, some in _halves(bits):
+                    num_values = _value_counts(bits[some] - shift)
+                    half = self._decoder.decode(_MODEL.Uniform(), num_values)
+                    rest[some] |= half.astype(np.int64) << shift
+                size = np.where(bits > 0, (1 << bits) + rest, size)
         except AssertionError as error:  # raised by constriction where no symbol has this code
             raise ValueError(f"its code is broken ({error})") from None
         return np.where(tokens % 2, size, -size)
-
-    def _take_tokens(self, count: int) -> np.ndarray:
-        tokens = np.zeros(count, np.int64)
-        counts = _PRIOR.copy()
-        for block in _blocks(count):
-            model = _model(counts) if block.start else _FIRST
-            tokens[block] = self._decoder.decode(model, block.stop - block.start)
-            counts += _WEIGHT * np.bincount(tokens[block], minlength=_TOKENS)
-        return tokens
-
-    def _take_sizes(self, m: np.ndarray) -> np.ndarray:
-        """Return the absolute values of integers with the magnitudes m [n] of the module."""
-        if not np.any(m >= _DIRECT):
-            return m
-        bits = np.where(m < _DIRECT, 0, m - 12)
-        rest = np.zeros(len(m), np.int64)
-        for shift, some in _halves(bits):
-            half = self._decoder.decode(_MODEL.Uniform(), _value_counts(bits[some] - shift))
-            rest[some] |= half.astype(np.int64) << shift
-        return np.where(bits > 0, (1 << bits) + rest, m)
 
 
 def column_bits(values: np.ndarray) -> float:

@@ -40,7 +40,17 @@ def header_json(cameras: Sequence[Camera], fps: float, metadata: Mapping[str, An
         ValueError: JSON cannot represent it, or a reader would refuse it.
     """
     fields = {
-        "cameras": [_camera_fields(camera) for camera in cameras],
+        "cameras": [
+            {
+                "name": camera.name,
+                "K": camera.K.tolist(),
+                "viewmat": np.asarray(camera.viewmat, dtype=np.float64).tolist(),
+                "width": camera.width,
+                "height": camera.height,
+                "near": camera.near,
+            }
+            for camera in cameras
+        ],
         "fps": float(fps),
         "metadata": dict(metadata),
     }
@@ -55,17 +65,6 @@ def header_json(cameras: Sequence[Camera], fps: float, metadata: Mapping[str, An
     except ValueError as error:
         raise ValueError(f"StreamWriter(): a reader would refuse the header: {error}.") from None
     return text
-
-
-def _camera_fields(camera: Camera) -> dict[str, Any]:
-    return {
-        "name": camera.name,
-        "K": camera.K.tolist(),
-        "viewmat": np.asarray(camera.viewmat, dtype=np.float64).tolist(),
-        "width": camera.width,
-        "height": camera.height,
-        "near": camera.near,
-    }
 
 
 def header_fields(payload: bytes | memoryview) -> tuple[tuple[Camera, ...], float, dict[str, Any]]:
@@ -98,6 +97,7 @@ def load_json(data: bytes | memoryview, most: int) -> Any:
     """
     if len(data) > most:
         raise ValueError(f"the JSON must have at most {most} bytes, got {len(data)}")
+    too_deep = f"the JSON must be nested at most {_MAX_LEVELS} levels deep"
     try:
         value = json.loads(
             str(data, "utf-8"), parse_constant=_finite, parse_float=_finite, parse_int=_short
@@ -107,23 +107,18 @@ def load_json(data: bytes | memoryview, most: int) -> Any:
     except json.JSONDecodeError as error:
         raise ValueError(f"the JSON is broken ({error})") from None
     except RecursionError:
-        value = None
-    else:
-        if _is_shallow(value):
-            return value
-    raise ValueError(f"the JSON must be nested at most {_MAX_LEVELS} levels deep")
-
-
-def _is_shallow(value: Any) -> bool:
-    """Return whether a value of JSON has at most `_MAX_LEVELS` levels."""
+        raise ValueError(too_deep) from None
     level = [value]
     for _ in range(_MAX_LEVELS):
-        level = [child for parent in level for child in _children(parent)]
-    return not level
-
-
-def _children(value: Any) -> Any:
-    return value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+        parents = [parent for parent in level if isinstance(parent, dict | list)]
+        level = [
+            child
+            for parent in parents
+            for child in (parent.values() if isinstance(parent, dict) else parent)
+        ]
+    if level:
+        raise ValueError(too_deep)
+    return value
 
 
 def _finite(text: str) -> float:
@@ -148,21 +143,15 @@ def camera_of_fields(fields: Any, where: str) -> Camera:
     name = _entry(fields, "name", str, where)
     if not name.isprintable():
         raise ValueError(f"`{where}.name` must be printable, got {name!r:.60}")
-    size = _image_size(fields, where)
-    near = _within(_entry(fields, "near", float, where), 1 / LARGEST, LARGEST, f"{where}.near")
-    K = _matrix(fields, "K", 3, where)
-    viewmat = _matrix(fields, "viewmat", 4, where)
-    return Camera(K, viewmat, *size, name=name, near=near)
-
-
-def _image_size(fields: dict[str, Any], where: str) -> tuple[int, int]:
-    """Return the width and the height of a camera's JSON object."""
     width, height = (
         _within(_entry(fields, key, int, where), 1, _MAX_PIXELS, f"{where}.{key}")
         for key in ("width", "height")
     )
     _within(width * height, 1, _MAX_PIXELS, f"{where}.width * height")
-    return width, height
+    near = _within(_entry(fields, "near", float, where), 1 / LARGEST, LARGEST, f"{where}.near")
+    K = _matrix(fields, "K", 3, where)
+    viewmat = _matrix(fields, "viewmat", 4, where)
+    return Camera(K, viewmat, width, height, name=name, near=near)
 
 
 def _matrix(fields: dict[str, Any], key: str, size: int, where: str) -> np.ndarray:

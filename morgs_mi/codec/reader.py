@@ -75,37 +75,31 @@ class StreamReader(FrameSource):
             source if isinstance(source, str | Path) else str(getattr(source, "name", "stream"))
         )
         with self._opened() as file:
-            data = self._header(file)
+            preamble = _read(file, PREAMBLE.size)
+            if not MAGIC.startswith(preamble[:8]):
+                raise ValueError(
+                    f"{self.path}: expected a stream that starts with {MAGIC!r}, got "
+                    f"{preamble[:8]!r}; check the path."
+                )
+            version = PREAMBLE.unpack(preamble)[1] if len(preamble) == PREAMBLE.size else VERSION
+            if version != VERSION:
+                raise ValueError(
+                    f"{self.path}: expected format version {VERSION}, got {version}; "
+                    "read it with the release that wrote it."
+                )
+            data = self._packet(file, 0, len(preamble))
+        if data is None:
+            raise TruncatedStreamError(self._sentence(0, len(preamble), "the header is missing"))
         with self._located(0, PREAMBLE.size):
-            self.cameras, self.fps, self.metadata = header_fields(_header_payload(data))
+            kind, _, payload = open_packet(data)
+            if kind != PacketKind.HEADER:
+                raise ValueError(f"the first packet must be the header, got kind {kind}")
+            self.cameras, self.fps, self.metadata = header_fields(payload)
         self._first = PREAMBLE.size + len(data)
         self._playable_entries: list[_Entry] | None = None
         self.skipped: list[int] = []
         if skip_damaged:
             self._playable_entries, self.skipped = self._playable()
-
-    def _header(self, file: BinaryIO) -> bytes:
-        """Return the bytes of the first packet of a file that begins as a stream."""
-        preamble = _read(file, PREAMBLE.size)
-        self._check_preamble(preamble)
-        data = self._packet(file, 0, len(preamble))
-        if data is None:
-            raise TruncatedStreamError(self._sentence(0, len(preamble), "the header is missing"))
-        return data
-
-    def _check_preamble(self, preamble: bytes) -> None:
-        """Raise an error about the first bytes of a file; fewer of them are no error."""
-        if not MAGIC.startswith(preamble[:8]):
-            raise ValueError(
-                f"{self.path}: expected a stream that starts with {MAGIC!r}, got "
-                f"{preamble[:8]!r}; check the path."
-            )
-        version = PREAMBLE.unpack(preamble)[1] if len(preamble) == PREAMBLE.size else VERSION
-        if version != VERSION:
-            raise ValueError(
-                f"{self.path}: expected format version {VERSION}, got {version}; "
-                "read it with the release that wrote it."
-            )
 
     def __repr__(self) -> str:
         frames = f"{self.metadata['num_frames']} frames, " if "num_frames" in self.metadata else ""
@@ -185,22 +179,18 @@ class StreamReader(FrameSource):
         with open_regular(self.path, self._follow) as file:
             if (entries := self._last_index(file)) is not None:
                 return entries
-            return self._complete_entries(file)
-
-    def _complete_entries(self, file: BinaryIO) -> list[_Entry]:
-        """Return the entries of the packets up to the file's end, from their heads."""
-        entries = []
-        size = file.seek(0, 2)
-        at = self._first
-        while at + PAYLOAD <= size:
-            file.seek(at)
-            kind, frame, length = HEAD.unpack(file.read(HEAD.size))
-            if kind not in (PacketKind.KEYFRAME, PacketKind.RESIDUAL, PacketKind.INDEX):
-                break  # such as a tail of zeros that a crash of the system leaves
-            if at + PAYLOAD + length <= size and kind != PacketKind.INDEX:
-                entries.append((kind, frame, at))
-            at += PAYLOAD + length
-        return entries
+            entries = []
+            size = file.seek(0, 2)
+            at = self._first
+            while at + PAYLOAD <= size:
+                file.seek(at)
+                kind, frame, length = HEAD.unpack(file.read(HEAD.size))
+                if kind not in (PacketKind.KEYFRAME, PacketKind.RESIDUAL, PacketKind.INDEX):
+                    break  # such as a tail of zeros that a crash of the system leaves
+                if at + PAYLOAD + length <= size and kind != PacketKind.INDEX:
+                    entries.append((kind, frame, at))
+                at += PAYLOAD + length
+            return entries
 
     def _check_is_file(self, use: str) -> None:
         if self._pipe is not None:
@@ -216,58 +206,48 @@ class StreamReader(FrameSource):
         plays = False
         with open_regular(self.path, self._follow) as file:
             for number, (kind, frame, offset) in enumerate(self.index(), start=1):
-                if self._is_intact(file, number, offset):
-                    frames.append(frame)
-                    plays = plays or kind == PacketKind.KEYFRAME
-                    if plays:
-                        entries.append((kind, frame, offset))
-                else:
+                file.seek(offset)
+                try:
+                    decode_packet(self._packet(file, number, offset) or b"")
+                except ValueError:
                     # A damaged head may name any frame. A keyframe that repeats the state of a
                     # frame is not needed.
                     frames.append(frame if frame == frames[-1] else frames[-1] + 1)
                     plays = plays and entries[-1][1] == frames[-1]
+                    continue
+                frames.append(frame)
+                plays = plays or kind == PacketKind.KEYFRAME
+                if plays:
+                    entries.append((kind, frame, offset))
         return entries, sorted({*frames[1:]} - {frame for _, frame, _ in entries})
-
-    def _is_intact(self, file: BinaryIO, number: int, at: int) -> bool:
-        file.seek(at)
-        try:
-            decode_packet(self._packet(file, number, at) or b"")
-        except ValueError:
-            return False
-        return True
 
     def _last_index(self, file: BinaryIO) -> list[_Entry] | None:
         """Return the entries of the index at the file's end, None if there is none."""
         size = file.seek(0, 2)
-        self._check_size(size)
-        file.seek(size - TRAILER.size)
-        at, magic = TRAILER.unpack(file.read(TRAILER.size))
-        if magic == INDEX_MAGIC and self._first <= at < size:
-            file.seek(at)
-            # A payload that looks like an index by chance.
-            with contextlib.suppress(ValueError, struct.error):
-                kind, entries = _index_packet(file.read(size - at))
-                if kind == PacketKind.INDEX and self._plausible(entries, at):
-                    return entries
-        return None
-
-    def _check_size(self, size: int) -> None:
         if size < self._first:
             problem = (
                 f"the header ended at byte {self._first}, now the file has {size} bytes: replaced "
                 "or truncated"
             )
             raise TruncatedStreamError(self._sentence(0, PREAMBLE.size, problem))
-
-    def _plausible(self, entries: list[_Entry], end: int) -> bool:
-        """Return whether entries name keyframes and residuals at ascending offsets of the packets
-        before byte `end`.
-        """
-        offsets = [self._first - 1, *(offset for *_, offset in entries), end]
+        file.seek(size - TRAILER.size)
+        at, magic = TRAILER.unpack(file.read(TRAILER.size))
+        if magic != INDEX_MAGIC or not self._first <= at < size:
+            return None
+        file.seek(at)
+        try:
+            packet_kind, _, payload = open_packet(file.read(size - at))
+            entries = list(ENTRY.iter_unpack(payload[: -TRAILER.size]))
+        except (ValueError, struct.error):  # a payload that looks like an index by chance
+            return None
         kinds = {kind for kind, *_ in entries}
-        return kinds <= {PacketKind.KEYFRAME, PacketKind.RESIDUAL} and all(
-            a < b for a, b in pairwise(offsets)
+        offsets = [self._first - 1, *(offset for *_, offset in entries), at]
+        is_index = (
+            packet_kind == PacketKind.INDEX
+            and kinds <= {PacketKind.KEYFRAME, PacketKind.RESIDUAL}
+            and all(a < b for a, b in pairwise(offsets))
         )
+        return entries if is_index else None
 
     def check(self) -> tuple[list[_Entry], int]:
         """Check every packet and return (kind, frame, offset) of all except the header, and the end
@@ -370,20 +350,6 @@ class StreamReader(FrameSource):
 
     def _place(self, number: int, at: int) -> str:
         return f"{self.path}: packet {number} at byte {at}"
-
-
-def _index_packet(data: bytes) -> tuple[int, list[_Entry]]:
-    """Return the kind of a packet, and the entries of its payload if it is an index."""
-    kind, _, payload = open_packet(data)
-    return kind, list(ENTRY.iter_unpack(payload[: -TRAILER.size]))
-
-
-def _header_payload(data: bytes) -> memoryview:
-    """Return the payload of the first packet, if that is a header."""
-    kind, _, payload = open_packet(data)
-    if kind != PacketKind.HEADER:
-        raise ValueError(f"the first packet must be the header, got kind {kind}")
-    return payload
 
 
 def _read(file: BinaryIO, count: int) -> bytes:
