@@ -8,6 +8,8 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.capture.points import dense_points, match_capture
 from morgs_mi.codec.container import Packet
@@ -76,51 +78,35 @@ def stream_capture(
     check_capacity(
         "stream_capture()", [capture.cameras[view] for view in capture.train_views], config.fit
     )
+    stages = Progress(progress)
     with locked_folder(out, "stream_capture()"):
-        return _stream(capture, out, config, resume, Progress(progress))
-
-
-def _stream(
-    capture: Capture, out: Path, config: StreamConfig, resume: bool, progress: Progress
-) -> list[FrameReport]:
-    """Fit a capture into a locked folder."""
-    frames = capture.partial_frames()
-    files = FitFiles.of(out)
-    first = next(frames)
-    metadata = stream_metadata(capture, first, config)
-    earlier = interrupted_fit(files, capture, metadata) if resume else None
-    if earlier is None:
-        prepared = Prepared.of(capture, config, progress)
-        loop = StreamLoop.of(prepared.capture, config)
-        frames = chain((first,), frames)
-        if prepared.refinement is not None:
-            frames = prepared.capture.partial_frames()
-    else:
-        prepared = Prepared(as_fitted(capture, earlier.stream))
-        loop = StreamLoop.of(prepared.capture, config)
-        frames = _resumed(loop, prepared.capture, earlier, progress)
-    with Recording(files, prepared.capture, metadata | prepared.metadata, earlier) as recording:
-        _fit_frames(loop, frames, prepared, recording, config, progress)
-    return recording.reports
-
-
-def _fit_frames(
-    loop: StreamLoop,
-    frames: Iterable[PartialFrame],
-    prepared: Prepared,
-    recording: Recording,
-    config: StreamConfig,
-    progress: Progress,
-) -> None:
-    """Fit frames and add them to a recording."""
-    train = prepared.capture.train_views
-    last = prepared.capture.num_frames - 1
-    later_frames = progress.of("Later frames")
-    for frame, upcoming in with_next(frames):
-        stage = later_frames.part(frame.index - 1, last) if frame.index else progress
-        packet, report = push_frame(loop, frame, train, stage.report, upcoming, recording.show)
-        report = prepared.completed(report, loop.gaussians, frame, config)
-        recording.push(packet, report, loop.state.coded)
+        files = FitFiles.of(out)
+        frames = capture.partial_frames()
+        first = next(frames)
+        metadata = stream_metadata(capture, first, config)
+        earlier = interrupted_fit(files, capture, metadata) if resume else None
+        if earlier is None:
+            prepared = Prepared.of(capture, config, stages)
+            loop = StreamLoop.of(prepared.capture, config)
+            frames = chain((first,), frames)
+            if prepared.refinement is not None:
+                frames = prepared.capture.partial_frames()
+        else:
+            prepared = Prepared(as_fitted(capture, earlier.stream))
+            loop = StreamLoop.of(prepared.capture, config)
+            frames = _resumed(loop, prepared.capture, earlier, stages)
+        train = prepared.capture.train_views
+        last = prepared.capture.num_frames - 1
+        later_frames = stages.of("Later frames")
+        with Recording(files, prepared.capture, metadata | prepared.metadata, earlier) as recording:
+            for frame, upcoming in with_next(frames):
+                stage = later_frames.part(frame.index - 1, last) if frame.index else stages
+                packet, report = push_frame(
+                    loop, frame, train, stage.report, upcoming, recording.show
+                )
+                report = prepared.completed(report, loop.gaussians, frame, config)
+                recording.push(packet, report, loop.state.coded)
+        return recording.reports
 
 
 def _resumed(
@@ -134,9 +120,14 @@ def _resumed(
     start = 0 if fit.skip_static or fit.exposure != "off" else last_frame
     frames = capture.partial_frames(start)
     count = last_frame + 1 - start
-    past = _counted(islice(frames, count), progress.of("Reading the fitted frames"), count)
-    images = (frame.comparable(train) for frame in past)
-    loop.resume(earlier.coded, images, earlier.reports[0].exposures)
+    reading = progress.of("Reading the fitted frames")
+
+    def images() -> Iterator[list[np.ndarray | None]]:
+        for done, frame in enumerate(islice(frames, count)):
+            reading(done, count)
+            yield frame.comparable(train)
+
+    loop.resume(earlier.coded, images(), earlier.reports[0].exposures)
     return frames
 
 
@@ -227,13 +218,8 @@ def push_frame(
     ahead = None if upcoming is None else [upcoming.images[view] for view in train]
     recorded = None if frame.recorded is None else frame.comparable(train)
     packet, report = loop.push(images, progress, ahead, recorded, on_provisional)
-    return packet, replace(report, status=_status(report, frame))
-
-
-def _status(report: FrameReport, frame: PartialFrame) -> str:
-    """Return the status of a fitted frame with the problems of its images."""
     problems = [report.status] if report.status != "ok" else []
-    return "; ".join([*problems, *frame.problems]) or "ok"
+    return packet, replace(report, status="; ".join([*problems, *frame.problems]) or "ok")
 
 
 def with_next(frames: Iterable[PartialFrame]) -> Iterator[tuple[PartialFrame, PartialFrame | None]]:
@@ -253,12 +239,3 @@ def with_next(frames: Iterable[PartialFrame]) -> Iterator[tuple[PartialFrame, Pa
         if problem is not None:
             raise problem
         frame = upcoming
-
-
-def _counted(
-    frames: Iterable[PartialFrame], progress: Progress, count: int
-) -> Iterator[PartialFrame]:
-    """Yield frames and report how many were there before."""
-    for done, frame in enumerate(frames):
-        progress(done, count)
-        yield frame

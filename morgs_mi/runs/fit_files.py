@@ -17,7 +17,7 @@ from __future__ import annotations
 import json
 import logging
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from itertools import takewhile
@@ -56,7 +56,6 @@ FILES = (STREAM, CAPTURE, REPORT)
 
 Entry = tuple[int, int, int]
 """(kind, frame, offset) of a packet."""
-Finished = Callable[[Sequence[Entry], int], tuple[Sequence[Entry], int]]
 
 
 class FitFiles(NamedTuple):
@@ -158,7 +157,10 @@ class Recording:
             self._writer = StreamWriter(stream, capture.cameras, capture.fps, metadata)
         else:
             self.reports += earlier.reports
-            self._writer = _continued_writer(files.stream, earlier, self._interval)
+            self._writer = StreamWriter.continued(files.stream, earlier.index, earlier.end)
+            if earlier.index[-1][0] == PacketKind.RESIDUAL:
+                for packet in due_keyframe(earlier.coded, self._interval):
+                    self._writer.write(packet)
         self._written = os.stat(self._written_files.stream)
         if self._written_files.description is not None:
             description = described_capture(capture, files.description if earlier else None)
@@ -244,15 +246,6 @@ class Recording:
             )
 
 
-def _continued_writer(stream: Path, earlier: Interrupted, interval: int) -> StreamWriter:
-    """Return a writer after the packets of an interrupted fit and a keyframe that is due."""
-    writer = StreamWriter.continued(stream, earlier.index, earlier.end)
-    if earlier.index[-1][0] == PacketKind.RESIDUAL:
-        for packet in due_keyframe(earlier.coded, interval):
-            writer.write(packet)
-    return writer
-
-
 @dataclass(frozen=True, eq=False)
 class Interrupted:
     """An interrupted fit, up to its last complete packet."""
@@ -270,17 +263,16 @@ def interrupted_fit(
     files: FitFiles,
     capture: Capture,
     metadata: Mapping[str, Any],
-    finished: Finished = lambda index, end: (index, end),
     first: int = 0,
 ) -> Interrupted | None:
-    """Return an interrupted fit, None if it has no complete packet yet.
+    """Return an interrupted fit, None if it has no complete packet yet, or none that it can
+    continue from.
 
     Args:
         files: its stream and its report.
         capture: what is fitted.
         metadata: header that the fit would write.
-        finished: returns the packets, and the end of the last one, from which the fit can continue.
-        first: frame of the first row of the report.
+        first: frame of the first row of the report: 0, or the start of a segment.
 
     Raises:
         ValueError: the stream or the report is damaged, or belongs to another capture or other
@@ -292,17 +284,11 @@ def interrupted_fit(
     except (FileNotFoundError, TruncatedStreamError):
         return None
     check_same_fit(stream, capture, metadata)
-    index, end = finished(*stream.check())
-    if not index:
+    index, end = stream.check()
+    # After the first frame of a segment alone, a fit would continue without its displacements.
+    if not index or (first and index[-1][1] == first):
         return None
     frame = index[-1][1]
-    states = _last_states(stream, frame)
-    reports = read_reports(files.report, range(first, frame + 1))
-    return Interrupted(stream, index, end, *states, reports)
-
-
-def _last_states(stream: StreamReader, frame: int) -> tuple[CodedFrame, CodedFrame | None, Packet]:
-    """Return the states after and before a frame, and the first packet of the frame."""
     coded = None
     previous_state = None
     last = None
@@ -314,7 +300,8 @@ def _last_states(stream: StreamReader, frame: int) -> tuple[CodedFrame, CodedFra
                 last = packet
     assert coded is not None
     assert last is not None
-    return coded, previous_state, last
+    reports = read_reports(files.report, range(first, frame + 1))
+    return Interrupted(stream, index, end, coded, previous_state, last, reports)
 
 
 def restart_of(previous_state: CodedFrame | None, last: Packet) -> tuple[bytes, ...]:
@@ -340,7 +327,12 @@ def check_same_fit(stream: StreamReader, capture: Capture, metadata: Mapping[str
     # Refined cameras differ from the calibrated ones, which are part of the fingerprint then.
     refined = metadata["config"]["fit"]["refine_cameras"] != "off"
     cameras = stream.cameras if refined else capture.cameras
-    old = json.loads(header_json(stream.cameras, stream.fps, _metadata_of_fit(stream)))
+    # Streams of earlier versions have paths in their headers.
+    excluded_names = ("capture", "distortions")
+    old_metadata = _without_folders(
+        {name: value for name, value in stream.metadata.items() if name not in excluded_names}
+    )
+    old = json.loads(header_json(stream.cameras, stream.fps, old_metadata))
     new = json.loads(header_json(cameras, capture.fps, metadata))
     if difference := _difference(old, new):
         name, old_value, new_value = difference
@@ -349,15 +341,6 @@ def check_same_fit(stream: StreamReader, capture: Capture, metadata: Mapping[str
             f"{shortened(new_value)}; give the same capture and settings, or start again without "
             "--resume."
         )
-
-
-def _metadata_of_fit(stream: StreamReader) -> dict[str, Any]:
-    """Return the metadata of a stream as `stream_metadata` returned them to its fit."""
-    # Streams of earlier versions have paths in their headers.
-    excluded_names = ("capture", "distortions")
-    return _without_folders(
-        {name: value for name, value in stream.metadata.items() if name not in excluded_names}
-    )
 
 
 def stream_metadata(capture: Capture, first: PartialFrame, config: StreamConfig) -> dict[str, Any]:
@@ -374,7 +357,10 @@ def stream_metadata(capture: Capture, first: PartialFrame, config: StreamConfig)
         "train_views": list(train),
         "num_frames": capture.num_frames,
         "key_views": [train[v] for v in key_views],
-        "config": asdict(config, dict_factory=_given),
+        # Without empty lists, such as terms that no module registers.
+        "config": asdict(
+            config, dict_factory=lambda items: {k: value for k, value in items if value != ()}
+        ),
         "versions": {"mitsuba": mi.__version__},
         "variant": mi.variant(),
     }
@@ -383,11 +369,6 @@ def stream_metadata(capture: Capture, first: PartialFrame, config: StreamConfig)
     if capture.display_exposure is not None:
         metadata["transfer"] = {"name": TRANSFER, "display_exposure": capture.display_exposure}
     return _without_folders(metadata)
-
-
-def _given(items: Sequence[tuple[str, Any]]) -> dict[str, Any]:
-    """Return a table of settings without empty lists, such as terms that no module registers."""
-    return {name: value for name, value in items if value != ()}
 
 
 def _without_folders(metadata: Mapping[str, Any]) -> dict[str, Any]:
@@ -443,36 +424,29 @@ def _difference(old: Any, new: Any, name: str = "") -> tuple[str, Any, Any] | No
 
 def read_reports(path: Path, frames: range) -> list[FrameReport]:
     """Return the reports of the first frames of a file, which are `frames`."""
-    reports = _first_reports(path, len(frames))
-    if [report.frame for report in reports] != list(frames):
-        raise ValueError(
-            f"{path}: expected the rows of {len(frames)} frames, got {len(reports)}; {_REMEDY}."
-        )
-    return reports
-
-
-def _first_reports(path: Path, count: int) -> list[FrameReport]:
     document = read_json(path) if path.exists() else {}
+    reports = []
     try:
-        return [_report(row) for row in document["frames"][:count]]
+        for row in document["frames"][: len(frames)]:
+            values = {
+                "seconds": float(row["seconds"]),
+                "missing_views": tuple(row["missing_views"]),
+                "exposures": tuple(
+                    Exposure(tuple(entry["gain"]), tuple(entry["bias"]))
+                    for entry in row.get("exposures", ())
+                ),
+            }
+            reports.append(FrameReport(**{**row, **values}))
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         description = f"a broken one ({error})" if path.exists() else "none"
         raise ValueError(
             f"{path}: expected the report of the fit, got {description}; {_REMEDY}."
         ) from None
-
-
-def _report(row: Mapping[str, Any]) -> FrameReport:
-    values = {
-        "seconds": float(row["seconds"]),
-        "missing_views": tuple(row["missing_views"]),
-        "exposures": tuple(map(_exposure, row.get("exposures", ()))),
-    }
-    return FrameReport(**{**row, **values})
-
-
-def _exposure(entry: Mapping[str, Any]) -> Exposure:
-    return Exposure(tuple(entry["gain"]), tuple(entry["bias"]))
+    if [report.frame for report in reports] != list(frames):
+        raise ValueError(
+            f"{path}: expected the rows of {len(frames)} frames, got {len(reports)}; {_REMEDY}."
+        )
+    return reports
 
 
 def due_keyframe(coded: CodedFrame | None, interval: int) -> list[Packet]:

@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, replace
-from functools import partial
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -37,7 +36,6 @@ from morgs_mi.runs.cluster.tasks import Fit, Part, Segment, Source, fit_frames
 from morgs_mi.runs.cluster.workers import installed, num_workers
 from morgs_mi.runs.fit_capture import Prepared
 from morgs_mi.runs.fit_files import (
-    Entry,
     FitFiles,
     Interrupted,
     Recording,
@@ -84,23 +82,6 @@ def _remove(folder: Path) -> None:
     shutil.rmtree(trash, ignore_errors=True)
 
 
-def _starts(num_frames: int, segments: int) -> list[int]:
-    """Return the first frames of segments of about the same length, and the number of frames."""
-    most = max(1, num_frames // _MIN_FRAMES)
-    if not 1 <= segments <= most:
-        raise ValueError(
-            f"SegmentedRun(): `segments` must be 1 to {most} for {num_frames} frames, "
-            f"{_MIN_FRAMES} for each, got {segments}."
-        )
-    return np.linspace(0, num_frames, segments + 1).round().astype(int).tolist()
-
-
-def _complete_part(start: int, index: Sequence[Entry], end: int) -> tuple[Sequence[Entry], int]:
-    """Return the packets, and the end of the last one, from which a segment can continue."""
-    # After the first frame of a segment alone, a fit would continue without its displacements.
-    return ([], 0) if start and index and index[-1][1] == start else (index, end)
-
-
 class SegmentedRun:
     """A fit of a capture in segments, side by side, into the files that `stream_capture` writes.
 
@@ -134,7 +115,16 @@ class SegmentedRun:
         self.out = Path(out)
         self.client = client
         self.on_stage: Report = on_stage or (lambda *_: None)
-        self.starts = _starts(capture.num_frames, segments.count)
+        num_frames = capture.num_frames
+        most = max(1, num_frames // _MIN_FRAMES)
+        if not 1 <= segments.count <= most:
+            raise ValueError(
+                f"SegmentedRun(): `segments` must be 1 to {most} for {num_frames} frames, "
+                f"{_MIN_FRAMES} for each, got {segments.count}."
+            )
+        # First frames of segments of about the same length, and the number of frames.
+        starts = np.linspace(0, num_frames, segments.count + 1)
+        self.starts: list[int] = starts.round().astype(int).tolist()
         self.task = Fit(Source.of(capture), config, segments, str(mi.variant()), installed())
         self.metadata = stream_metadata(capture, next(capture.partial_frames(0, 1)), config)
         if segments.count > 1:
@@ -175,31 +165,28 @@ class SegmentedRun:
         stop = min(COMMON_FRAMES, first.stop)
         prepared = None
         if not first.frame:
-            prepared = self._preparation(progress)
+            prepared = Prepared.of(self.capture, self.task.config, progress)
+            if prepared.capture is not self.capture:
+                points = (prepared.capture.points, prepared.capture.point_colors)
+                self.task = replace(self.task, points=points)
+            self._use(prepared.capture)
         else:
             self._use(as_fitted(self.capture, StreamReader(self._files(0).stream)))
         self._show_progress()
         if first.frame < stop:
             part = self._submitted([replace(first, stop=stop)])[0].result()
-            self.add_part(part if prepared is None else self._completed(part, prepared))
+            if prepared is not None:
+                gaussians = decode(None, decode_packet(part.packets[0])).gaussians
+                frame = next(prepared.capture.partial_frames(0, 1))
+                report = prepared.completed(part.reports[0], gaussians, frame, self.task.config)
+                part = replace(part, reports=(report, *part.reports[1:]))
+            self.add_part(part)
             first = replace(part.segment, stop=first.stop)
         self.task = replace(self.task, points=None, balance=self.recordings[0].reports[0].exposures)
-        common = self._common_model(stop - 1)
-        return [first, *(s if s.restart else replace(s, restart=(common,)) for s in segments[1:])]
-
-    def _preparation(self, progress: Progress) -> Prepared:
-        """Return the capture as it is to be fitted, and fit with its points and cameras."""
-        prepared = Prepared.of(self.capture, self.task.config, progress)
-        if prepared.capture is not self.capture:
-            points = (prepared.capture.points, prepared.capture.point_colors)
-            self.task = replace(self.task, points=points)
-        self._use(prepared.capture)
-        return prepared
-
-    def _common_model(self, frame: int) -> bytes:
-        """Return a frame of the first segment as an encoded keyframe."""
-        states = StreamReader(self._files(0).stream).states(frame)
-        return reemitted_keyframe(next(state for state in states if state.frame == frame)).encoded
+        states = StreamReader(self._files(0).stream).states(stop - 1)
+        common = next(state for state in states if state.frame == stop - 1)
+        restart = (reemitted_keyframe(common).encoded,)
+        return [first, *(s if s.restart else replace(s, restart=restart) for s in segments[1:])]
 
     def _fit_side_by_side(self, segments: Iterable[Segment]) -> None:
         """Fit what is missing of segments. Each worker continues the loop of one of them, until it
@@ -242,8 +229,7 @@ class SegmentedRun:
 
     def _earlier(self, start: int, stop: int) -> Segment:
         """Return a segment as an interrupted fit left it."""
-        finished = partial(_complete_part, start)
-        earlier = interrupted_fit(self._files(start), self.capture, self.metadata, finished, start)
+        earlier = interrupted_fit(self._files(start), self.capture, self.metadata, start)
         if earlier is None:
             return Segment(start, stop, start)
         self._open(start, earlier)
@@ -255,15 +241,6 @@ class SegmentedRun:
         recording = Recording(self._files(start), self.capture, self.metadata, earlier)
         self.recordings[start] = self.open_files.enter_context(recording)
 
-    def _completed(self, part: Part, prepared: Prepared) -> Part:
-        """Return the first part of the recording, with what was found about the cameras in its
-        first report.
-        """
-        gaussians = decode(None, decode_packet(part.packets[0])).gaussians
-        frame = next(prepared.capture.partial_frames(0, 1))
-        first = prepared.completed(part.reports[0], gaussians, frame, self.task.config)
-        return replace(part, reports=(first, *part.reports[1:]))
-
     def add_part(self, part: Part) -> None:
         """Add the frames of a task to the files of their segment."""
         start = part.segment.start
@@ -271,14 +248,10 @@ class SegmentedRun:
             self._open(start, None)
         self.recordings[start].extend(map(decode_packet, part.packets), part.reports)
         self.peaks[part.worker] = part.reports[-1].memory.get("peak", 0)
-        self._warn({*part.messages})
-        self._show_progress()
-
-    def _warn(self, messages: set[str]) -> None:
-        """Log the messages that have not been logged before."""
-        for message in messages - self.messages:
+        for message in {*part.messages} - self.messages:
             _LOG.warning(message)
-        self.messages |= messages
+        self.messages |= {*part.messages}
+        self._show_progress()
 
     def _show_progress(self) -> None:
         num_fitted = sum(len(recording.reports) for recording in self.recordings.values())
@@ -304,7 +277,12 @@ class SegmentedRun:
         assert new.description is not None
         files.settle()
         try:
-            self._write_stream(new.stream)
+            with StreamWriter(
+                new.stream, self.capture.cameras, self.capture.fps, self.metadata
+            ) as writer:
+                for start in starts:
+                    for packet in StreamReader(self._files(start).stream):
+                        writer.write(packet)
             rows = [asdict(report) for report in reports]
             workers = {"workers": self.peaks} if len(starts) > 1 else {}
             write_json(new.report, {**self.metadata, "frames": rows, **workers})
@@ -314,11 +292,3 @@ class SegmentedRun:
             files.settle()
         _remove(self.out / FOLDER)
         return reports
-
-    def _write_stream(self, path: Path) -> None:
-        """Write the packets of all segments into one stream."""
-        capture = self.capture
-        with StreamWriter(path, capture.cameras, capture.fps, self.metadata) as writer:
-            for start in self.starts[:-1]:
-                for packet in StreamReader(self._files(start).stream):
-                    writer.write(packet)

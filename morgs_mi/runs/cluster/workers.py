@@ -26,7 +26,7 @@ from morgs_mi.core.environment import versions
 from morgs_mi.core.interrupts import postponed
 
 if TYPE_CHECKING:
-    from distributed import Client, LocalCluster
+    from distributed import Client
 
 # Seconds after which a scheduler that does not answer counts as lost.
 TIMEOUT = 10
@@ -55,7 +55,13 @@ def open_client(scheduler: str | None = None, count: int | None = None) -> Itera
         ConnectionError: the scheduler does not answer, has no worker, or is lost later.
         ChildProcessError: the workers died that ran a task.
     """
-    _check_workers(scheduler, count)
+    if count is not None and count < 1:
+        raise ValueError(f"open_client(): `workers` must be at least 1, got {count}.")
+    if scheduler is not None and "://" not in scheduler:
+        raise ValueError(
+            "open_client(): `scheduler` must be an address such as tcp://host:8786, got "
+            f"{scheduler}."
+        )
     try:
         import dask.config
         import distributed
@@ -71,8 +77,16 @@ def open_client(scheduler: str | None = None, count: int | None = None) -> Itera
         address: Any = scheduler
         if scheduler is None:
             resource_tracker.ensure_running()  # it would let the workers have Ctrl-C again
+            count = count or cores()
             with postponed():
-                address = stack.enter_context(_local_cluster(count or cores()))
+                address = stack.enter_context(
+                    distributed.LocalCluster(
+                        n_workers=count,
+                        threads_per_worker=max(1, cores() // count),
+                        dashboard_address=":0",
+                        silence_logs=logging.CRITICAL,
+                    )
+                )
         problem = "none"
         try:
             client = distributed.Client(address, timeout=TIMEOUT, set_as_default=False)
@@ -85,28 +99,6 @@ def open_client(scheduler: str | None = None, count: int | None = None) -> Itera
             ) from None
         with _in_sentences(scheduler or "this machine"):
             yield client
-
-
-def _check_workers(scheduler: str | None, count: int | None) -> None:
-    if count is not None and count < 1:
-        raise ValueError(f"open_client(): `workers` must be at least 1, got {count}.")
-    if scheduler is not None and "://" not in scheduler:
-        raise ValueError(
-            "open_client(): `scheduler` must be an address such as tcp://host:8786, got "
-            f"{scheduler}."
-        )
-
-
-def _local_cluster(count: int) -> LocalCluster:
-    """Return workers on this machine, with equal shares of its cores."""
-    from distributed import LocalCluster
-
-    return LocalCluster(
-        n_workers=count,
-        threads_per_worker=max(1, cores() // count),
-        dashboard_address=":0",
-        silence_logs=logging.CRITICAL,
-    )
 
 
 @contextmanager
@@ -176,31 +168,22 @@ def prepared(variant: str, versions: tuple[tuple[str, str], ...]) -> Iterator[li
     Raises:
         ValueError: the worker has other versions than the client.
     """
-    _check_versions(versions)
-    messages: list[str] = []
-    with _BUSY, _logged(messages):
-        if mi.variant() != variant:
-            mi.set_variant(variant)
-        _use_threads()
-        yield messages
-
-
-def _check_versions(versions: tuple[tuple[str, str], ...]) -> None:
     for (name, expected), (_, version) in zip(versions, installed(), strict=True):
         if expected != version:
             raise ValueError(
                 f"{socket.gethostname()}: expected a worker with {name} {expected} like the "
                 f"client, got {version}; install the same versions on both."
             )
-
-
-def _use_threads() -> None:
-    """Use as many threads as the worker of this process has."""
-    worker = _worker()
-    threads = cores() if worker is None else worker.state.nthreads
-    if dr.thread_count() != threads:
-        dr.set_thread_count(threads)
-        cv2.setNumThreads(threads)
+    messages: list[str] = []
+    with _BUSY, _logged(messages):
+        if mi.variant() != variant:
+            mi.set_variant(variant)
+        worker = _worker()
+        threads = cores() if worker is None else worker.state.nthreads
+        if dr.thread_count() != threads:
+            dr.set_thread_count(threads)
+            cv2.setNumThreads(threads)
+        yield messages
 
 
 @contextmanager
