@@ -106,7 +106,16 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
             _flush_output()
             return 0
         with naming_output(), suggesting_command(options_type, prog, args):  # the help goes there
-            options = _parse(options_type, prog, args)
+            options: Any = tyro.cli(
+                options_type,
+                prog=prog,
+                args=args,
+                config=(
+                    tyro.conf.CascadeSubcommandArgs,
+                    tyro.conf.OmitSubcommandPrefixes,
+                    tyro.conf.PositionalMetavarFromFieldName,
+                ),
+            )
         command = options.command
         _set_up(options)
         with interruptible():
@@ -117,7 +126,16 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
         if isinstance(error, BrokenPipeError) and error.filename == STDOUT:
             _drop_output()
             return _CLOSED
-        print_warning(" ".join([_sentence(error, command), *_notes(error, [prog, *args])]))
+        sentence = "Interrupted."
+        if not is_interruption(error):
+            place = str(getattr(command, "capture", None) or "")
+            sentence = sentence_of(error, _option_names(command), place)
+        # In the notes of an error, `--resume` is the command line that continues.
+        resume = [] if "--resume" in args else ["--resume"]
+        command_line = shlex.join([prog, *args, *resume])
+        notes = getattr(error, "__notes__", [])
+        notes = [note.replace("`--resume`", f"`{command_line}`") for note in notes]
+        print_warning(" ".join([sentence, *notes]))
         # The error may come from parsing, before `options` exist.
         if "--debug" in args:
             ERR.print_exception()
@@ -128,36 +146,6 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
 def _flush_output() -> None:
     with naming_output():
         sys.stdout.flush()
-
-
-def _sentence(error: BaseException, command: Any) -> str:
-    """Return the message of an error of a command, which is None while it is not parsed."""
-    if is_interruption(error):
-        return "Interrupted."
-    place = str(getattr(command, "capture", None) or "")
-    return sentence_of(error, _option_names(command), place)
-
-
-def _notes(error: BaseException, words: list[str]) -> list[str]:
-    """Return the notes of an error, in which `--resume` is the command line that continues."""
-    resume = [] if "--resume" in words else ["--resume"]
-    command_line = shlex.join([*words, *resume])
-    notes = getattr(error, "__notes__", [])
-    return [note.replace("`--resume`", f"`{command_line}`") for note in notes]
-
-
-def _parse(options_type: type[Common], prog: str, args: Sequence[str]) -> Any:
-    """Return the options that arguments set."""
-    return tyro.cli(
-        options_type,
-        prog=prog,
-        args=args,
-        config=(
-            tyro.conf.CascadeSubcommandArgs,
-            tyro.conf.OmitSubcommandPrefixes,
-            tyro.conf.PositionalMetavarFromFieldName,
-        ),
-    )
 
 
 def _drop_output() -> None:

@@ -15,7 +15,6 @@ from rich.measure import Measurement
 from rich.progress import (
     BarColumn,
     Progress,
-    ProgressColumn,
     TaskID,
     TextColumn,
     TimeElapsedColumn,
@@ -114,7 +113,11 @@ def sentence_of(error: BaseException, names: Mapping[str, str], place: str = "")
 
     Arguments are those of `with_option_names`.
     """
-    text = with_option_names(" ".join(_message(error).split()), names, place)
+    message = str(error)
+    if isinstance(error, OSError) and error.errno is not None and error.strerror:
+        file = f"{error.filename}: " if error.filename else ""
+        message = f"{file}{error.strerror.rstrip('.')}."
+    text = with_option_names(" ".join(message.split()), names, place)
     if not isinstance(error, _EXPECTED):
         text = (
             f"Unexpected {type(error).__name__}: {text.rstrip('.')}; run the command with --debug "
@@ -125,13 +128,6 @@ def sentence_of(error: BaseException, names: Mapping[str, str], place: str = "")
     if isinstance(error, MemoryError):
         text = text or "Out of memory; process smaller images, or fewer frames or Gaussians."
     return text or f"{type(error).__name__}."
-
-
-def _message(error: BaseException) -> str:
-    """Return the message of an error, of a system error without its number."""
-    if isinstance(error, OSError) and error.errno is not None and error.strerror:
-        return f"{f'{error.filename}: ' if error.filename else ''}{error.strerror.rstrip('.')}."
-    return str(error)
 
 
 def with_option_names(sentence: str, names: Mapping[str, str], place: str = "") -> str:
@@ -148,25 +144,24 @@ def with_option_names(sentence: str, names: Mapping[str, str], place: str = "") 
         place: a path from the command line that a message may start with; it stays.
     """
     function = re.match(r"[\w.]+\(\): ", sentence)
-    start = function or _file_of_place(sentence, place)
+    start = function
+    if start is None and place:
+        # The place, or a file in it that has no such keys.
+        start = re.match(rf"{re.escape(place)}(?:/.*?)?(?<!\.json)(?<!\.toml): ", sentence)
     if start is None:
         return sentence
+
+    def option(match: re.Match[str]) -> str:
+        name, value = match.groups()
+        if name not in names:
+            return match[0]
+        return f"{names[name]} {value}" if value else names[name]
+
     text = sentence[start.end() :]
-    new_text = re.sub(r"`([\w.]+)(?:=(\w+))?`", lambda m: _option(names, *m.groups()) or m[0], text)
+    new_text = re.sub(r"`([\w.]+)(?:=(\w+))?`", option, text)
     if new_text == text:
         return sentence
     return new_text if function else start[0] + new_text
-
-
-def _file_of_place(sentence: str, place: str) -> re.Match[str] | None:
-    """Return the start of a sentence that names a place, or a file in it that has no such keys."""
-    pattern = rf"{re.escape(place)}(?:/.*?)?(?<!\.json)(?<!\.toml): "
-    return re.match(pattern, sentence) if place else None
-
-
-def _option(names: Mapping[str, str], name: str, value: str | None) -> str | None:
-    """Return the option that sets an argument, with its value if there is one."""
-    return " ".join([names[name], *([value] if value else [])]) if name in names else None
 
 
 @contextmanager
@@ -178,18 +173,15 @@ def progress() -> Iterator[Report]:
     if not ERR.is_terminal:
         yield _line_report()
         return
-    with Progress(*_columns(), console=ERR) as bars:
-        yield _bar_report(bars)
-
-
-def _columns() -> tuple[ProgressColumn, ...]:
-    return (
+    columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         TextColumn("{task.fields[count]}/{task.total:.0f}"),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
+    with Progress(*columns, console=ERR) as bars:
+        yield _bar_report(bars)
 
 
 def _bar_report(bars: Progress) -> Report:
@@ -219,15 +211,13 @@ def _line_report() -> Report:
         start, base = begin[stage]
         last = moment
         seconds = moment - start
-        estimate = _estimate(seconds, done - base, total - done)
+        # At the pace of the steps that are done.
+        estimate = ""
+        if done > base:
+            estimate = f", about {_clock(seconds * (total - done) / (done - base))} left"
         print_warning(f"{stage}: {int(done)}/{total:.0f}, {_clock(seconds)} elapsed{estimate}.")
 
     return report
-
-
-def _estimate(seconds: float, done: float, missing: float) -> str:
-    """Return the time that the missing steps take at the pace of the steps that are done."""
-    return f", about {_clock(seconds * missing / done)} left" if done > 0 else ""
 
 
 def _clock(seconds: float) -> str:

@@ -13,7 +13,6 @@ from tyro.conf import DisallowNone, Positional
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_result, print_table, print_warning, progress
 from morgs_mi.cli.settings import Flag, optional
-from morgs_mi.evaluate.results import Evaluation
 from morgs_mi.evaluate.tables import evaluation_summary, evaluation_tables
 from morgs_mi.runs.fit_files import FILES
 
@@ -40,67 +39,52 @@ class Eval:
     """
 
     def run(self) -> None:
+        from morgs_mi.core.entries import studio_entry
         from morgs_mi.core.environment import machine, versions
         from morgs_mi.core.files import json_finite, write_json
-
-        for output in (self.figures, self.json):
-            if output not in (None, Path("-")):
-                _check_not_of_fit(self.out, check_output(output))
-        result = self._evaluation()
-        scores = {**result.as_dict(), "machine": machine(), "versions": versions()}
-        if self.json == Path("-"):
-            print_result(json.dumps(json_finite(scores), indent=2))
-            return
-        _print_evaluation(result)
-        if self.json is not None:
-            write_json(self.json, scores)
-            print_result(f"All results: {self.json}")
-        if self.figures is not None:
-            print_result(f"Figures: {self.figures}")
-
-    def _evaluation(self) -> Evaluation:
-        """Return the evaluation, and draw the figures."""
-        from morgs_mi.core.entries import studio_entry
         from morgs_mi.evaluate.evaluate import evaluate_stream
         from morgs_mi.evaluate.figures import draw_stream
+        from morgs_mi.playback.streams import spans
 
-        network = (
-            None if self.lpips is None else studio_entry("image distances", "lpips")(self.lpips)
-        )
+        folder = self.out if self.out.is_dir() else self.out.parent
+        files_of_fit = [path.resolve() for path in (self.out, *(folder / name for name in FILES))]
+        for output in (self.figures, self.json):
+            if output in (None, Path("-")):
+                continue
+            if check_output(output).resolve() in files_of_fit:
+                raise ValueError(
+                    f"{output}: expected a new file, got one that the fit has written; choose "
+                    "another name."
+                )
+        network = None
+        if self.lpips is not None:
+            network = studio_entry("image distances", "lpips")(self.lpips)
         with progress() as report:
             frames = partial(report, "Evaluating frames")
             result = evaluate_stream(self.out, self.capture, frames, network, self.any_recording)
             if self.figures is not None:
                 drawing = partial(report, "Drawing frames")
                 draw_stream(self.out, self.figures, self.capture, drawing, self.any_recording)
-        return result
-
-
-def _check_not_of_fit(out: Path, output: Path) -> None:
-    """Raise `ValueError` if an output would replace a file that a fit needs."""
-    folder = out if out.is_dir() else out.parent
-    paths = [out, *(folder / name for name in FILES)]
-    if output.resolve() in [path.resolve() for path in paths]:
-        raise ValueError(
-            f"{output}: expected a new file, got one that the fit has written; choose another name."
-        )
-
-
-def _print_evaluation(result: Evaluation) -> None:
-    """Print an evaluation."""
-    from morgs_mi.playback.streams import spans
-
-    for table in evaluation_tables(result):
-        print_table(table)
-    for sentence in evaluation_summary(result):
-        print_result(sentence)
-    if result.without_images:
-        print_warning(
-            f"{result.stream}: frames {spans(result.without_images)} were fitted without any "
-            "image, or have none to compare with; fit them again."
-        )
-    if not result.complete:
-        print_warning(
-            f"{result.stream}: the fit was not finished, its stream holds {result.num_frames} "
-            "frames."
-        )
+        scores = {**result.as_dict(), "machine": machine(), "versions": versions()}
+        if self.json == Path("-"):
+            print_result(json.dumps(json_finite(scores), indent=2))
+            return
+        for table in evaluation_tables(result):
+            print_table(table)
+        for sentence in evaluation_summary(result):
+            print_result(sentence)
+        if result.without_images:
+            print_warning(
+                f"{result.stream}: frames {spans(result.without_images)} were fitted without any "
+                "image, or have none to compare with; fit them again."
+            )
+        if not result.complete:
+            print_warning(
+                f"{result.stream}: the fit was not finished, its stream holds {result.num_frames} "
+                "frames."
+            )
+        if self.json is not None:
+            write_json(self.json, scores)
+            print_result(f"All results: {self.json}")
+        if self.figures is not None:
+            print_result(f"Figures: {self.figures}")

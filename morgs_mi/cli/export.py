@@ -22,7 +22,6 @@ from morgs_mi.playback.export.formats import PLY, VIDEO, WEB, Format
 
 if TYPE_CHECKING:
     from morgs_mi.codec.frame_source import FrameSource
-    from morgs_mi.playback.export.paths import CameraPath
 
 _PATH = (
     "Camera path: between (through the rig's cameras), orbit (around the scene), or a JSON file "
@@ -84,10 +83,23 @@ class Flight(ExportKind):
     drawn = True
 
     def write(self, stream: FrameSource, output: Path, chosen: Format, report: Report) -> str:
-        from morgs_mi.playback.export.clips import flight, num_images, repeated_frames
+        from morgs_mi.playback.export.clips import (
+            flight,
+            frame_numbers,
+            named_path,
+            num_images,
+            repeated_frames,
+        )
         from morgs_mi.playback.export.frames import write_images
 
-        path = self._camera_path(stream)
+        numbers = frame_numbers(stream)
+        if self.freeze is not None and self.freeze not in numbers:
+            raise ValueError(
+                f"--freeze must be in {numbers[0]} to {numbers[-1]}, got {self.freeze}."
+            )
+        path = named_path(stream, self.path, self.degrees, self.least_seconds)
+        path = path if self.width is None else path.with_width(self.width)
+        path = path if self.seconds is None else path.with_duration(self.seconds)
         count = num_images(stream, path)
         frames = repeated_frames(stream, self.freeze, self.back_and_forth)
         images = flight(stream, path, self.channels, frames)
@@ -96,16 +108,6 @@ class Flight(ExportKind):
             images, stream.fps, output, lambda done: report("Rendering", done, count), stops
         )
         return f"{path.seconds:.1f} s, {path.keys[0].width}x{path.keys[0].height}"
-
-    def _camera_path(self, stream: FrameSource) -> CameraPath:
-        from morgs_mi.playback.export.clips import frame_numbers, named_path
-
-        frames = frame_numbers(stream)
-        if self.freeze is not None and self.freeze not in frames:
-            raise ValueError(f"--freeze must be in {frames[0]} to {frames[-1]}, got {self.freeze}.")
-        path = named_path(stream, self.path, self.degrees, self.least_seconds)
-        path = path if self.width is None else path.with_width(self.width)
-        return path if self.seconds is None else path.with_duration(self.seconds)
 
 
 @dataclass(frozen=True)

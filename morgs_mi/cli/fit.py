@@ -26,12 +26,9 @@ from morgs_mi.core.config_values import config_toml
 from morgs_mi.core.documentation import page
 from morgs_mi.core.fit_names import STREAM
 from morgs_mi.core.ranges import AtLeast, check_value
-from morgs_mi.loop.stream_config import StreamConfig
 
 if TYPE_CHECKING:
-    from morgs_mi.capture.capture import Capture
     from morgs_mi.loop.frame_report import FrameReport
-    from morgs_mi.runs.fit_files import Entry
 
 _SCHEDULER = f"Dask scheduler whose workers fit them, such as tcp://host:8786 ({page('cluster')})."
 
@@ -90,45 +87,37 @@ class Fit:
         reading = self.reading.read_config()
         capture = load_capture(self.capture, self.downscale, views, self.frames, reading)
         if self.segments is not None or self.scheduler is not None:
-            reports = self._fit_in_segments(capture, config)
+            from morgs_mi.runs.cluster.seams import SegmentConfig
+            from morgs_mi.runs.cluster.segments import SegmentedRun, noting_segments
+            from morgs_mi.runs.cluster.workers import cores, open_client
+
+            segments = SegmentConfig(self.segments or 1)
+            workers = min(segments.count, cores())
+            with (
+                noting_segments(self.out),
+                progress() as report,
+                open_client(self.scheduler, workers) as client,
+            ):
+                run = SegmentedRun(capture, self.out, client, config, segments, report)
+                reports = run.fit(self.resume)
         else:
-            reports = self._fit(capture, config)
+            from morgs_mi.runs.fit_capture import stream_capture
+
+            stream = self.out / STREAM
+            with progress() as report, _noting_frames(stream, capture.num_frames, self.resume):
+                reports = stream_capture(capture, self.out, config, self.resume, report)
         _print_summary(self.out / STREAM, reports)
-
-    def _fit(self, capture: Capture, config: StreamConfig) -> list[FrameReport]:
-        """Fit a capture from its first frame to its last."""
-        from morgs_mi.runs.fit_capture import stream_capture
-
-        assert self.out is not None
-        stream = self.out / STREAM
-        with progress() as report, _noting_frames(stream, capture.num_frames, self.resume):
-            return stream_capture(capture, self.out, config, self.resume, report)
-
-    def _fit_in_segments(self, capture: Capture, config: StreamConfig) -> list[FrameReport]:
-        """Fit a capture in segments."""
-        from morgs_mi.runs.cluster.seams import SegmentConfig
-        from morgs_mi.runs.cluster.segments import SegmentedRun, noting_segments
-        from morgs_mi.runs.cluster.workers import cores, open_client
-
-        assert self.out is not None
-        segments = SegmentConfig(self.segments or 1)
-        workers = min(segments.count, cores())
-        with (
-            noting_segments(self.out),
-            progress() as report,
-            open_client(self.scheduler, workers) as client,
-        ):
-            run = SegmentedRun(capture, self.out, client, config, segments, report)
-            return run.fit(self.resume)
 
 
 def _print_summary(stream: Path, reports: Sequence[FrameReport]) -> None:
     """Print the size of a stream and the time that its frames took."""
     first = reports[0]
+    seconds = [row.seconds for row in reports[1:]]
+    later = f", {sum(seconds) / len(seconds):.1f} s for each later one" if seconds else ""
     print_result(
         f"{stream}: {len(reports)} frames, {stream.stat().st_size / 1e6:.1f} MB, "
         f"{first.seconds:.1f} s for the first one ({first.num_gaussians} Gaussians, {first.steps} "
-        f"steps){_later_seconds(reports)}."
+        f"steps){later}."
     )
     for sentence in first_frame_sentences(first.validation):
         print_result(sentence)
@@ -138,11 +127,6 @@ def _print_summary(stream: Path, reports: Sequence[FrameReport]) -> None:
             f"{len(problems)} of {len(reports)} frames have a problem (status in report.json), "
             f"frame {row.frame}: {row.status.rstrip('.')}."
         )
-
-
-def _later_seconds(reports: Sequence[FrameReport]) -> str:
-    seconds = [row.seconds for row in reports[1:]]
-    return f", {sum(seconds) / len(seconds):.1f} s for each later one" if seconds else ""
 
 
 def first_frame_sentences(validation: Mapping[str, Any]) -> Iterator[str]:
@@ -175,13 +159,8 @@ def _noting_frames(stream: Path, count: int, resume: bool) -> Iterator[None]:
     except (KeyboardInterrupt, OSError) as error:
         with suppress(OSError, ValueError):
             if resume or stream.stat().st_mtime >= begin:
-                span = _span(StreamReader(stream).index(), count)
+                span = "no frame yet"
+                if index := StreamReader(stream).index():
+                    span = f"frames 0 to {index[-1][1]} of {count}; continue with `--resume`"
                 error.add_note(f"{stream} holds {span}.")
         raise
-
-
-def _span(index: Sequence[Entry], count: int) -> str:
-    """Return which of `count` frames a stream with these packets holds."""
-    if not index:
-        return "no frame yet"
-    return f"frames 0 to {index[-1][1]} of {count}; continue with `--resume`"

@@ -19,7 +19,6 @@ from morgs_mi.playback.export.formats import IMAGES, destination
 if TYPE_CHECKING:
     from morgs_mi.codec.frame_source import FrameSource
     from morgs_mi.core.camera import Camera
-    from morgs_mi.playback.export.paths import CameraPath
 
 # Index and channels of each image.
 _Images = Iterator[tuple[int, dict[str, Any]]]
@@ -94,22 +93,40 @@ class Render:
     """Skip damaged frames of a stream, and those after them up to the next intact keyframe."""
 
     def run(self) -> None:
+        from morgs_mi.playback.export.clips import flight, frame_numbers, named_path, num_images
         from morgs_mi.playback.export.frames import write_images
+        from morgs_mi.playback.player import render_stream
         from morgs_mi.playback.stream_header import find_camera
 
-        self._check()
+        if self.camera is not None and self.path is not None:
+            raise ValueError(
+                f"expected --camera or --path, got both, {self.camera} and {self.path}; leave out "
+                "one."
+            )
+        if self.insert is None and self.at is not None:
+            raise ValueError(
+                "--at selects frames of an inserted scene, got no scene; add --insert FILE."
+            )
+        if self.insert is not None and self.camera is None:
+            raise ValueError("--insert renders for one camera, got none; add --camera CAMERA.")
         stream = opened(self.out, self.drop_invalid, skip_damaged=self.skip_damaged)
         view = find_camera(stream, 0 if self.camera is None else self.camera)
         is_path = self.camera is None and self.insert is None
         stem = Path(self.path or "orbit").stem if is_path else view.name
         output, chosen = destination(stream.path, self.output, IMAGES, stem)
         single = chosen.folder and chosen.is_file(output)
+        channels = self.channels or (None if chosen.name == "exr" else ("color",))
         if self.insert is not None:
             images, count = self._inserted(stream, view, chosen.name)
         elif self.camera is not None or (self.path is None and single):
-            images, count = self._camera_images(stream, view, chosen.name)
+            view = view if self.width is None else view.with_width(self.width)
+            images = render_stream(stream, view, channels)
+            count = len(frame_numbers(stream))
         else:
-            images, count = self._path_images(stream, chosen.name)
+            path = named_path(stream, self.path or "orbit", self.degrees)
+            path = path if self.width is None else path.with_width(self.width)
+            images = flight(stream, path, channels)
+            count = num_images(stream, path)
         if single and count > 1:
             raise ValueError(
                 f"{output}: expected one image for one file, got {count}; name a folder."
@@ -123,45 +140,6 @@ class Render:
                 shown_exposure(stream, self.display_exposure),
             )
         print_result(f"{output}: {quantity(count, 'image')}.")
-
-    def _check(self) -> None:
-        """Refuse options that exclude each other."""
-        if self.camera is not None and self.path is not None:
-            raise ValueError(
-                f"expected --camera or --path, got both, {self.camera} and {self.path}; leave out "
-                "one."
-            )
-        if self.insert is None and self.at is not None:
-            raise ValueError(
-                "--at selects frames of an inserted scene, got no scene; add --insert FILE."
-            )
-        if self.insert is not None and self.camera is None:
-            raise ValueError("--insert renders for one camera, got none; add --camera CAMERA.")
-
-    def _camera_images(self, stream: FrameSource, view: Camera, format: str) -> tuple[_Images, int]:
-        """Return the rendered images of a camera, and their number."""
-        from morgs_mi.playback.export.clips import frame_numbers
-
-        return self._seen(stream, view, format), len(frame_numbers(stream))
-
-    def _path_images(self, stream: FrameSource, format: str) -> tuple[_Images, int]:
-        """Return the rendered images along the path, and their number."""
-        from morgs_mi.playback.export.clips import named_path, num_images
-
-        path = named_path(stream, self.path or "orbit", self.degrees)
-        return self._seen(stream, path, format), num_images(stream, path)
-
-    def _seen(self, stream: FrameSource, view: Camera | CameraPath, format: str) -> _Images:
-        """Return the rendered images of a camera or along a path."""
-        from morgs_mi.core.camera import Camera
-        from morgs_mi.playback.export.clips import flight
-        from morgs_mi.playback.player import render_stream
-
-        view = view if self.width is None else view.with_width(self.width)
-        channels = self.channels or (None if format == "exr" else ("color",))
-        if isinstance(view, Camera):
-            return render_stream(stream, view, channels)
-        return flight(stream, view, channels)
 
     def _inserted(self, stream: FrameSource, view: Camera, format: str) -> tuple[_Images, int]:
         """Return the rendered frames with the inserted scene, and their number."""

@@ -16,7 +16,6 @@ from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.config_values import apply_values, read_config, relocated
 from morgs_mi.core.documentation import page
 from morgs_mi.loop.stream_config import PresetName, StreamConfig, apply_preset
-from morgs_mi.method.motion_config import MotionConfig
 
 # The setting of every option. All others are set in a file.
 SETTINGS = {
@@ -101,10 +100,6 @@ def setting(option: str, config: StreamConfig | None = None, text: str | None = 
     )
 
 
-def _flag(option: str) -> str:
-    return f"--{option.replace('_', '-')}"
-
-
 def _offsets(words: list[str]) -> dict[str, float]:
     """Return the offset of each camera from the words of --offset, a camera and a number in turn.
 
@@ -120,17 +115,13 @@ def _offsets(words: list[str]) -> dict[str, float]:
     for name, number in zip(words[::2], words[1::2], strict=True):
         if name in offsets:
             raise ValueError(f"expected each camera once, got {name} twice.")
-        offsets[name] = _offset(name, number)
+        try:
+            offsets[name] = float(number)
+        except ValueError:
+            raise ValueError(
+                f"the offset of {name} must be a number of frames, got {number!r}."
+            ) from None
     return offsets
-
-
-def _offset(name: str, number: str) -> float:
-    try:
-        return float(number)
-    except ValueError:
-        raise ValueError(
-            f"the offset of {name} must be a number of frames, got {number!r}."
-        ) from None
 
 
 _OFFSETS = PrimitiveConstructorSpec(
@@ -232,7 +223,11 @@ class Settings:
     def option_names(self) -> dict[str, str]:
         """Return the options that were given, by their settings' keys and names."""
         values = self.given()
-        options = {key: _flag(option) for option, key in SETTINGS.items() if key in values}
+        options = {
+            key: f"--{option.replace('_', '-')}"
+            for option, key in SETTINGS.items()
+            if key in values
+        }
         return options | {key.rpartition(".")[2]: option for key, option in options.items()}
 
     def stream_config(self, base: StreamConfig | None = None) -> StreamConfig:
@@ -248,7 +243,11 @@ class Settings:
             config = apply_preset(config, self.preset)
         if self.config is not None:
             config = apply_values(config, read_config(self.config), str(self.config))
-        return apply_values(config, _nested(self.given()))
+        tables: dict[str, Any] = {}
+        for key, value in self.given().items():
+            *path, name = key.split(".")
+            reduce(lambda table, part: table.setdefault(part, {}), path, tables)[name] = value
+        return apply_values(config, tables)
 
     def check_methods(self, config: StreamConfig) -> None:
         """Check the methods that a config names, and load their networks, before a fit begins.
@@ -257,35 +256,23 @@ class Settings:
             FileNotFoundError: one of them names a missing file or folder.
             ValueError: one of them is unknown, or its network does not fit.
         """
-        for name, check in _method_checks(config.motion).items():
+        from morgs_mi.method.flow_sources.flow_registry import flow_source
+        from morgs_mi.method.mask_refiners.mask_registry import mask_refiner
+        from morgs_mi.method.motion_model import motion_model
+
+        motion = config.motion
+        checks: dict[str, Callable[[], Any]] = {
+            "flow_method": lambda: flow_source(motion.flow_method, motion.flow),
+            "mask_method": lambda: mask_refiner(motion.mask_method, motion.masks),
+            "model": lambda: motion_model(motion),
+        }
+        for name, check in checks.items():
             try:
                 check()
             except ValueError as error:
                 if self.config is None or f"motion.{name}" in self.given():
                     raise
                 raise relocated(error, str(self.config), "motion.", [name]) from None
-
-
-def _method_checks(motion: MotionConfig) -> dict[str, Callable[[], Any]]:
-    """Return functions that open the methods, by the names of their settings."""
-    from morgs_mi.method.flow_sources.flow_registry import flow_source
-    from morgs_mi.method.mask_refiners.mask_registry import mask_refiner
-    from morgs_mi.method.motion_model import motion_model
-
-    return {
-        "flow_method": lambda: flow_source(motion.flow_method, motion.flow),
-        "mask_method": lambda: mask_refiner(motion.mask_method, motion.masks),
-        "model": lambda: motion_model(motion),
-    }
-
-
-def _nested(values: dict[str, Any]) -> dict[str, Any]:
-    """Return values by key as one mapping per table."""
-    tables: dict[str, Any] = {}
-    for key, value in values.items():
-        *path, name = key.split(".")
-        reduce(lambda table, part: table.setdefault(part, {}), path, tables)[name] = value
-    return tables
 
 
 # As fields of a command: options without a prefix. None means "not given", so it cannot be passed.
