@@ -257,7 +257,7 @@ def _next_state(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
         raise ValueError(
             f"its frame must be above {previous.frame}, the frame of the state, got {packet.frame}"
         )
-    if not is_residual:
+    if packet.kind == PacketKind.KEYFRAME:
         first_id = 0 if previous is None else previous.first_id + max(previous.next_id, 1)
         return _decoded_keyframe(packet, first_id)
     if previous is None:
