@@ -1,9 +1,10 @@
 """The container of the stream: packets that are checked and appended one by one, and readable while
 they are written.
 
-    stream = magic [8], version uint32, packet* packet = kind uint32, frame uint32, length uint64,
-    crc uint32, payload [length] payload = table length uint32, table (JSON: name, dtype and shape
-    of each array), the arrays' bytes
+    stream  = magic [8], version uint32, packet*
+    packet  = kind uint32, frame uint32, length uint64, crc uint32, payload [length]
+    payload = table length uint32, table, the arrays' bytes
+    table   = JSON: name, dtype and shape of each array
 
 All numbers are little-endian. The CRC-32 covers the packet's first 16 bytes and its payload. Packet
 0 is the header, with a payload of JSON alone: cameras, frame rate and free metadata. A stream that
