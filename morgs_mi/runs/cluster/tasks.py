@@ -123,7 +123,21 @@ def fit_frames(fit: Fit, segment: Segment, stop: int) -> Part:
             packets.append(keyframe)
             reports.append(report)
             segment = replace(segment, frame=segment.start + 1, restart=(keyframe.encoded,))
-        loop, capture, recorded = _opened(fit, segment)
+        last = _OPEN.pop((repr(fit), segment), None)
+        _OPEN.clear()
+        if last is not None:
+            loop, capture, recorded = last
+        else:
+            capture = fit.open()
+            loop = StreamLoop.of(capture, fit.config)
+            recorded = capture.partial_frames(segment.start)
+            coded = segment.coded
+            if coded is not None:
+                # Exposures are relative to the first frame of the recording.
+                first = _images(capture, 0, 1) if segment.start else []
+                frames = islice(recorded, segment.frame - segment.start)
+                past = (past_frame.comparable(capture.train_views) for past_frame in frames)
+                loop.resume(coded, chain(first, past), fit.balance)
         restart = segment.restart
         for frame, upcoming in with_next(islice(recorded, stop - segment.frame)):
             last_state = loop.state.coded
@@ -157,27 +171,6 @@ def _first_frame(fit: Fit, segment: Segment) -> tuple[Packet, FrameReport]:
     assert loop.state.coded is not None
     keyframe = reemitted_keyframe(loop.state.coded)
     return keyframe, replace(report, seconds=seconds, num_bytes=keyframe.num_bytes)
-
-
-def _opened(fit: Fit, segment: Segment) -> tuple[StreamLoop, Capture, Iterator[PartialFrame]]:
-    """Return a loop before the next frame of a segment, with the capture and its frames from there
-    on.
-    """
-    last = _OPEN.pop((repr(fit), segment), None)
-    _OPEN.clear()
-    if last is not None:
-        return last
-    capture = fit.open()
-    loop = StreamLoop.of(capture, fit.config)
-    recorded = capture.partial_frames(segment.start)
-    coded = segment.coded
-    if coded is not None:
-        # Exposures are relative to the first frame of the recording.
-        first = _images(capture, 0, 1) if segment.start else []
-        frames = islice(recorded, segment.frame - segment.start)
-        past = (frame.comparable(capture.train_views) for frame in frames)
-        loop.resume(coded, chain(first, past), fit.balance)
-    return loop, capture, recorded
 
 
 def _images(capture: Capture, start: int, stop: int) -> list[list[np.ndarray | None]]:
