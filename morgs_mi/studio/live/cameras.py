@@ -114,9 +114,10 @@ class CameraFeed:
         """Return the bundle of the images that are there; None as long as an expected one is
         missing.
         """
+        numbers = [-1] * len(self._cameras) if after is None else after.numbers
         new = [
-            camera.newer(after.numbers[k] if after else -1)
-            for k, camera in enumerate(self._cameras)
+            [shot for shot in camera.shots if shot.number > number]
+            for camera, number in zip(self._cameras, numbers, strict=True)
         ]
         if after is not None and is_running:
             expected = self._expected(new, after, late)
@@ -126,12 +127,17 @@ class CameraFeed:
         if shots is None:
             return None
         pairs = zip(shots, self._cameras, strict=True)
+        skipped = [
+            shot.number - number - 1
+            for shot, number in zip(shots, numbers, strict=True)
+            if shot is not None
+        ]
         return Bundle(
             tuple(shot and shot.image for shot in shots),
             tuple((shot or camera.shots[-1]).number for shot, camera in pairs),
             max(shot.time for shot in shots if shot is not None),
             _skew(shots),
-            _dropped(shots, after),
+            0 if after is None else min(skipped),
         )
 
     def _expected(self, new: Sequence[Sequence[Shot]], bundle: Bundle, late: bool) -> list[bool]:
@@ -158,29 +164,22 @@ class CameraFeed:
         while silent := [k for k, camera in enumerate(self._cameras) if not camera.shots]:
             time_left = deadline - time.monotonic()
             for k in silent:
-                self._check_silent(k, time_left)
+                camera = self._cameras[k]
+                if camera.error is not None:
+                    raise camera.error
+                if camera.reason is not None or time_left <= 0:
+                    raise ValueError(
+                        f"CameraFeed(): expected images of {self.names[k]}, got none "
+                        f"({camera.reason or 'it is silent'}); check that it records, or wait for "
+                        f"it longer than {self._timeout:g} s (--timeout)."
+                    )
             self._change.wait(time_left)
-        self._wait_for_exposure()
-
-    def _wait_for_exposure(self) -> None:
-        """Wait for the warm-up, unless a camera ends."""
+        # The warm-up, unless a camera ends.
         end = time.monotonic() + self._warm_up
         while (time_left := end - time.monotonic()) > 0 and all(
             camera.reason is None for camera in self._cameras
         ):
             self._change.wait(time_left)
-
-    def _check_silent(self, k: int, time_left: float) -> None:
-        """Raise an error if a camera without an image has ended, or is not waited for any more."""
-        camera = self._cameras[k]
-        if camera.error is not None:
-            raise camera.error
-        if camera.reason is not None or time_left <= 0:
-            raise ValueError(
-                f"CameraFeed(): expected images of {self.names[k]}, got none "
-                f"({camera.reason or 'it is silent'}); check that it records, or wait for "
-                f"it longer than {self._timeout:g} s (--timeout)."
-            )
 
 
 class _Camera(Thread):
@@ -218,10 +217,6 @@ class _Camera(Thread):
                 self.reason = str(self.error or self._end_text)
                 self._change.notify_all()
 
-    def newer(self, number: int) -> list[Shot]:
-        """Return the stored shots after the one with a number."""
-        return [shot for shot in self.shots if shot.number > number]
-
 
 def _simultaneous(new: Sequence[Sequence[Shot]]) -> list[bool]:
     """Return for each camera whether its newest shot may be in a bundle with the newest of all."""
@@ -248,14 +243,3 @@ def _skew(shots: Sequence[Shot | None]) -> float:
     """Return the largest difference in time between two shots, s."""
     times = [shot.time for shot in shots if shot is not None]
     return max(times) - min(times)
-
-
-def _dropped(shots: Sequence[Shot | None], bundle: Bundle | None) -> int:
-    """Return the number of images that each camera delivered between two bundles."""
-    if bundle is None:
-        return 0
-    return min(
-        shot.number - last - 1
-        for shot, last in zip(shots, bundle.numbers, strict=True)
-        if shot is not None
-    )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -18,7 +18,6 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.capture.capture import Capture, PartialFrame
-from morgs_mi.capture.layouts.calibration import Calibration
 from morgs_mi.core.files import locked_folder
 from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
@@ -85,42 +84,28 @@ def fit_live(
     live = live or LiveConfig()
     live.check("fit_live()")
     check_outputs(out)
-    _check_no_capture(out / "capture")
-    calibration = _calibration(live)
-    names = calibration and [camera.name for camera in calibration.cameras]
-    report = on_stage or (lambda *_: None)
-    with locked_folder(out, "fit_live()"), closing(open_feed(sources, live, names)) as feed:
-        first = _first_images(feed, report)
-        capture = begin_capture(
-            out / "capture", feed.names, first.images, live, calibration, on_stage
-        )
-        return _fit(
-            _LiveFrames(feed, capture, first, live), out, config or LIVE_STREAM, on_frame, report
-        )
-
-
-def _calibration(live: LiveConfig) -> Calibration | None:
-    """Return the calibration that is given, of the cameras that are used."""
-    folder = live.calibration
-    return folder and read_calibration(folder).without(folder, live.without)
-
-
-def _check_no_capture(folder: Path) -> None:
+    folder = out / "capture"
     if folder.exists():
         raise FileExistsError(
             f"{folder}: expected no capture, got that of an earlier fit; choose another "
             "folder for this one."
         )
-
-
-def _first_images(feed: CameraFeed, report: Report) -> Bundle:
-    """Wait for the first images of the cameras and return them."""
-    report("Waiting for the cameras", 0, 1)
-    first = feed.newest()
-    if first is None:
-        raise ValueError("fit_live(): expected images of the cameras, got none.")
-    report("Waiting for the cameras", 1, 1)
-    return first
+    calibration = None
+    names = None
+    if live.calibration is not None:
+        calibration = read_calibration(live.calibration).without(live.calibration, live.without)
+        names = [camera.name for camera in calibration.cameras]
+    report = on_stage or (lambda *_: None)
+    with locked_folder(out, "fit_live()"), closing(open_feed(sources, live, names)) as feed:
+        report("Waiting for the cameras", 0, 1)
+        first = feed.newest()
+        if first is None:
+            raise ValueError("fit_live(): expected images of the cameras, got none.")
+        report("Waiting for the cameras", 1, 1)
+        capture = begin_capture(folder, feed.names, first.images, live, calibration, on_stage)
+        return _fit(
+            _LiveFrames(feed, capture, first, live), out, config or LIVE_STREAM, on_frame, report
+        )
 
 
 class _LiveFrames:
@@ -139,14 +124,14 @@ class _LiveFrames:
         self.capture = capture
         self.config = config
         self._feed = feed
-        self._first = first
+        self.first = first
         self._missing_names: set[str] = set()
 
     def __iter__(self) -> Iterator[tuple[Bundle, PartialFrame]]:
         """Yield whenever the next frame is asked for the newest images, as recorded and as
         processed.
         """
-        bundle = self._first
+        bundle = self.first
         frame = 0
         begin = float("inf")
         while bundle is not None and bundle.time - begin <= (self.config.seconds or float("inf")):
@@ -158,18 +143,22 @@ class _LiveFrames:
             if (bundle := self._feed.newest(bundle)) is None:
                 _LOG.warning("the fit ends after frame %d: %s", frame - 1, self._feed.ended())
 
-    def report(self, bundle: Bundle, frame: PartialFrame) -> LiveFrame:
-        """Return the report of a fitted frame."""
-        since = bundle.time - self._first.time
-        latency = time.monotonic() - bundle.time
-        return LiveFrame(frame.index, since, latency, bundle.skew, bundle.dropped, frame.problems)
-
     def _processed(self, bundle: Bundle, frame: int) -> PartialFrame:
-        """Return the processed images of a bundle; a camera that has none is logged once."""
+        """Return the processed images of a bundle; a camera that has none, or none of its size, is
+        logged once.
+        """
         names = self.capture.names
-        problems = {names[k]: self._problem(k, image) for k, image in enumerate(bundle.images)}
-        problems = {name: problem for name, problem in problems.items() if problem}
-        self._warn(frame, problems)
+        problems: dict[str, str] = {}
+        for k, image in enumerate(bundle.images):
+            recorded_size = self.capture.recorded_sizes[k]
+            if image is None:
+                problems[names[k]] = self._feed.problem(k)
+            elif (size := image.shape[1::-1]) != recorded_size:
+                sizes = (*recorded_size, *size)
+                problems[names[k]] = "expected an image of {}x{}, got {}x{}".format(*sizes)
+        for name in problems.keys() - self._missing_names:
+            _LOG.warning("frame %d: %s is left out: %s", frame, name, problems[name].rstrip("."))
+        self._missing_names = set(problems)
 
         def process(view: int) -> np.ndarray | None:
             image = bundle.images[view]
@@ -180,24 +169,6 @@ class _LiveFrames:
         images = map_in_threads(process, range(len(bundle.images)))
         sentences = tuple(f"{name}: {problem}" for name, problem in problems.items())
         return PartialFrame(frame, tuple(images), sentences)
-
-    def _warn(self, frame: int, problems: Mapping[str, str]) -> None:
-        """Log the problems of the cameras that had none in the frame before."""
-        for name in problems.keys() - self._missing_names:
-            _LOG.warning("frame %d: %s is left out: %s", frame, name, problems[name].rstrip("."))
-        self._missing_names = set(problems)
-
-    def _problem(self, view: int, image: np.ndarray | None) -> str:
-        """Return why a camera has no image, or none of its size; empty if it has one."""
-        if image is None:
-            return self._feed.problem(view)
-        size = image.shape[1::-1]
-        recorded_size = self.capture.recorded_sizes[view]
-        return (
-            ""
-            if size == recorded_size
-            else "expected an image of {}x{}, got {}x{}".format(*recorded_size, *size)
-        )
 
 
 def _fit(
@@ -225,7 +196,14 @@ def _fit(
                 )
                 report = prepared.completed(report, loop.gaussians, frame, config)
                 writing_task.result()
-                row = frames.report(bundle, frame)
+                row = LiveFrame(
+                    frame.index,
+                    bundle.time - frames.first.time,
+                    time.monotonic() - bundle.time,
+                    bundle.skew,
+                    bundle.dropped,
+                    frame.problems,
+                )
                 live = [asdict(r) for r in (*rows, row)]
                 recording.push(packet, report, loop.state.coded, live=live)
                 rows.append(row)

@@ -71,11 +71,27 @@ def begin_capture(
     try:
         write_images(folder, names, images, 0)
         write_json(folder / CAPTURE, {"fps": config.fps})
-        if calibration is None:
-            _calibrate(folder, on_stage)
+        if calibration is not None:
+            write_colmap(
+                folder / "sparse" / "0",
+                calibration.cameras,
+                calibration.points,
+                calibration.point_colors,
+                calibration.lenses,
+            )
         else:
-            _write_calibration(folder, calibration)
-        return _opened(folder, config)
+            try:
+                calibrate(folder, progress=on_stage)
+            except ValueError as error:
+                error.add_note(
+                    f"The images are in {folder}: calibrate them with morgs-mi calibrate, which "
+                    "has more options, and pass that folder with --calibration."
+                )
+                raise
+        # A camera may stop: later frames are read without its images.
+        return load_capture(
+            folder, config.downscale, config.test_view or None, reading=ReadConfig(gaps=True)
+        )
     except (OSError, ValueError) as error:
         # The fit can be started again; images that cannot be calibrated stay.
         if calibration is not None or isinstance(error, OSError):
@@ -95,40 +111,9 @@ def write_images(
     def write(view: int) -> None:
         image = images[view]
         if image is not None:
-            _write_image(folder / names[view] / f"{frame:04d}.png", image)
+            file = folder / names[view] / f"{frame:04d}.png"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_path(file, "fit_live()") as partial:
+                partial.write_bytes(png_bytes(image))
 
     map_in_threads(write, range(len(names)))
-
-
-def _write_image(file: Path, image: np.ndarray) -> None:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_path(file, "fit_live()") as partial:
-        partial.write_bytes(png_bytes(image))
-
-
-def _write_calibration(folder: Path, calibration: Calibration) -> None:
-    write_colmap(
-        folder / "sparse" / "0",
-        calibration.cameras,
-        calibration.points,
-        calibration.point_colors,
-        calibration.lenses,
-    )
-
-
-def _calibrate(folder: Path, on_stage: Report | None) -> None:
-    try:
-        calibrate(folder, progress=on_stage)
-    except ValueError as error:
-        error.add_note(
-            f"The images are in {folder}: calibrate them with morgs-mi calibrate, which has more "
-            "options, and pass that folder with --calibration."
-        )
-        raise
-
-
-def _opened(folder: Path, config: LiveConfig) -> Capture:
-    # A camera may stop: later frames are read without its images.
-    return load_capture(
-        folder, config.downscale, config.test_view or None, reading=ReadConfig(gaps=True)
-    )

@@ -60,16 +60,13 @@ class LiveConfig:
         Raises:
             ValueError: one is out of range.
         """
-        self._check_without(place)
-        check_ranges(self, place)
-        check_number(place, "fps", self.fps, _FPS)
-        for name in ("timeout", "warm_up"):
-            check_number(place, name, getattr(self, name), _SECONDS)
-
-    def _check_without(self, place: str) -> None:
         if self.without and self.calibration is None:
             raise ValueError(
                 f"{place}: `without` must name cameras of a calibration, got "
                 f"{', '.join(self.without)} and no calibration; name the sources that are used "
                 "(--camera)."
             )
+        check_ranges(self, place)
+        check_number(place, "fps", self.fps, _FPS)
+        for name in ("timeout", "warm_up"):
+            check_number(place, name, getattr(self, name), _SECONDS)

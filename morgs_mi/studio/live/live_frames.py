@@ -45,18 +45,22 @@ def live_frames(
         ValueError: the number of sources differs from the number of cameras, or an image from the
             size of the rig's.
     """
-    _check_count(rig, len(sources))
-    stop = Event()
-    streams = [_images(source, stop) for source in sources]
-    return prefetched(_frames(rig, streams), newest=newest, closed=stop)
-
-
-def _check_count(rig: Capture, count: int) -> None:
-    if count != len(rig.cameras):
+    if len(sources) != len(rig.cameras):
         raise ValueError(
             f"live_frames(): `sources` must be one for each of {len(rig.cameras)} cameras "
-            f"({', '.join(rig.names)}), got {count}."
+            f"({', '.join(rig.names)}), got {len(sources)}."
         )
+    stop = Event()
+    streams: list[Iterator[np.ndarray | None]] = []
+    for source in sources:
+        if is_video(source):
+            streams.append(play(source, ClipClock(), stop))
+        elif isinstance(source, int | str | Path):
+            # Reconnecting would make the other cameras wait for it.
+            streams.append(read_camera(source, stop, reconnect=False))
+        else:
+            streams.append(iter(source))
+    return prefetched(_frames(rig, streams), newest=newest, closed=stop)
 
 
 def _frames(rig: Capture, streams: Sequence[Iterator[np.ndarray | None]]) -> Iterator[PartialFrame]:
@@ -65,35 +69,22 @@ def _frames(rig: Capture, streams: Sequence[Iterator[np.ndarray | None]]) -> Ite
             images = [next(stream, None) for stream in streams]
             if all(image is None for image in images):
                 return
-            yield _frame(rig, index, images)
+            processed: list[np.ndarray | None] = []
+            problems: list[str] = []
+            for view, image in enumerate(images):
+                width, height = rig.recorded_sizes[view]
+                if image is None:
+                    processed.append(None)
+                    problems.append(f"{rig.names[view]}: no image")
+                elif image.shape != (height, width, 3) or image.dtype != np.uint8:
+                    raise ValueError(
+                        f"live_frames(): the images of {rig.names[view]} must be uint8 "
+                        f"[{height}, {width}, 3] as in its clip, got {image.dtype} "
+                        f"{list(image.shape)}; calibrate at the live size."
+                    )
+                else:
+                    processed.append(rig.process(view, image))
+            yield PartialFrame(index, tuple(processed), tuple(problems))
     finally:
         for stream in streams:
             close_images(stream)
-
-
-def _frame(rig: Capture, index: int, images: Sequence[np.ndarray | None]) -> PartialFrame:
-    """Return the frame of the images as they are recorded, one per camera."""
-    for view, image in enumerate(images):
-        _check_size(rig, view, image)
-    processed = (
-        None if image is None else rig.process(view, image) for view, image in enumerate(images)
-    )
-    names = (name for name, image in zip(rig.names, images, strict=True) if image is None)
-    return PartialFrame(index, tuple(processed), tuple(f"{name}: no image" for name in names))
-
-
-def _check_size(rig: Capture, view: int, image: np.ndarray | None) -> None:
-    width, height = rig.recorded_sizes[view]
-    if image is not None and (image.shape != (height, width, 3) or image.dtype != np.uint8):
-        raise ValueError(
-            f"live_frames(): the images of {rig.names[view]} must be uint8 [{height}, {width}, 3] "
-            f"as in its clip, got {image.dtype} {list(image.shape)}; calibrate at the live size."
-        )
-
-
-def _images(source: Source, stop: Event) -> Iterator[np.ndarray | None]:
-    if isinstance(source, int | str | Path):
-        if is_video(source):
-            return play(source, ClipClock(), stop)
-        return read_camera(source, stop, reconnect=False)  # the other cameras would wait for it
-    return iter(source)

@@ -47,32 +47,25 @@ def read_camera(
 def _until_end(
     source: int | str | Path, stop: Event, size: tuple[int, int] | None
 ) -> Iterator[np.ndarray | None]:
-    """Yield the images of a source, which is opened once; see `read_camera`."""
+    """Yield the images of a source, which is opened once, until several reads in succession have
+    failed; see `read_camera`.
+    """
     if stop.is_set():
         return
     stream = open_stream(source)
     if isinstance(source, int) and size is not None:
-        _request_size(stream, *size)
+        stream.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
+        stream.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
+    failures = 0
     try:
-        yield from _images(stream, stop)
+        while failures < _FAILURES and not stop.is_set():
+            is_read, image = stream.read()
+            failures = 0 if is_read else failures + 1
+            yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if is_read else None
+            if not is_read:
+                stop.wait(PAUSE)
     finally:
         stream.release()
-
-
-def _request_size(stream: cv2.VideoCapture, width: int, height: int) -> None:
-    stream.set(cv2.CAP_PROP_FRAME_WIDTH, width)
-    stream.set(cv2.CAP_PROP_FRAME_HEIGHT, height)
-
-
-def _images(stream: cv2.VideoCapture, stop: Event) -> Iterator[np.ndarray | None]:
-    """Yield the images of an open stream until several reads in succession have failed."""
-    failures = 0
-    while failures < _FAILURES and not stop.is_set():
-        is_read, image = stream.read()
-        failures = 0 if is_read else failures + 1
-        yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if is_read else None
-        if not is_read:
-            stop.wait(PAUSE)
 
 
 def open_stream(source: int | str | Path) -> cv2.VideoCapture:
@@ -81,20 +74,17 @@ def open_stream(source: int | str | Path) -> cv2.VideoCapture:
     Raises:
         OSError: it cannot be opened.
     """
-    stream = cv2.VideoCapture(source) if isinstance(source, int) else _ffmpeg_stream(str(source))
+    if isinstance(source, int):
+        stream = cv2.VideoCapture(source)
+    else:
+        # A connection is waited for only so long.
+        limit = int(1000 * _SILENCE)
+        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, limit, cv2.CAP_PROP_READ_TIMEOUT_MSEC, limit]
+        place = str(source)
+        stream = cv2.VideoCapture(place, cv2.CAP_FFMPEG, limits if "://" in place else [])
     if not stream.isOpened():
         raise OSError(
             f"open_stream(): cannot open the source {source}; check that it exists and is not in "
             "use."
         )
     return stream
-
-
-def _ffmpeg_stream(place: str) -> cv2.VideoCapture:
-    """Return OpenCV's reader of a path or URL, which waits only so long for a connection."""
-    limits = (
-        (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC) if "://" in place else ()
-    )
-    return cv2.VideoCapture(
-        place, cv2.CAP_FFMPEG, [n for key in limits for n in (key, int(1000 * _SILENCE))]
-    )

@@ -31,14 +31,29 @@ def open_feed(
         ValueError: there is no source, one occurs twice, their number differs from the number of
             names, or the settings repeat videos and there is none.
     """
-    _check_different(sources)
+    if not sources:
+        raise ValueError(
+            "open_feed(): `camera` must have a source per camera, got none; name them."
+        )
+    listed_sources = f"{len(sources)} ({', '.join(map(str, sources))})"
+    if len(set(sources)) < len(sources):
+        raise ValueError(
+            f"open_feed(): `camera` must have different sources, got {listed_sources}; name "
+            "each once."
+        )
     if names is None:
         names = [f"cam{k}" for k in range(len(sources))]
-    _check_count(sources, names)
+    if len(names) != len(sources):
+        raise ValueError(
+            f"open_feed(): `camera` must have a source for each of the {len(names)} calibrated "
+            f"cameras ({', '.join(names)}), got {listed_sources}; name them in that order."
+        )
     stop = Event()
     videos = [source for source in sources if is_video(source)]
-    if config.loop:
-        _check_videos(videos, sources)
+    if config.loop and not videos:
+        raise ValueError(
+            f"open_feed(): `loop` repeats videos, got none in {listed_sources}; leave it out."
+        )
     clock = ClipClock(len(videos))
 
     def images(source: Source) -> Iterator[np.ndarray | None]:
@@ -52,35 +67,3 @@ def open_feed(
     cameras = {name: images(source) for name, source in zip(names, sources, strict=True)}
     warm_up = 0.0 if len(videos) == len(sources) else config.warm_up
     return CameraFeed(cameras, config.timeout, warm_up, stop, end_text)
-
-
-def _check_different(sources: Sequence[Source]) -> None:
-    """Raise `ValueError` without a source, or if one occurs twice."""
-    if not sources:
-        raise ValueError(
-            "open_feed(): `camera` must have a source per camera, got none; name them."
-        )
-    if len(set(sources)) < len(sources):
-        raise ValueError(
-            f"open_feed(): `camera` must have different sources, got {_listed(sources)}; name "
-            "each once."
-        )
-
-
-def _check_count(sources: Sequence[Source], names: Sequence[str]) -> None:
-    if len(names) != len(sources):
-        raise ValueError(
-            f"open_feed(): `camera` must have a source for each of the {len(names)} calibrated "
-            f"cameras ({', '.join(names)}), got {_listed(sources)}; name them in that order."
-        )
-
-
-def _check_videos(videos: Sequence[Source], sources: Sequence[Source]) -> None:
-    if not videos:
-        raise ValueError(
-            f"open_feed(): `loop` repeats videos, got none in {_listed(sources)}; leave it out."
-        )
-
-
-def _listed(sources: Sequence[Source]) -> str:
-    return f"{len(sources)} ({', '.join(map(str, sources))})"
