@@ -13,7 +13,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 from xml.etree import ElementTree
@@ -75,41 +74,29 @@ def load_insert(path: str | Path) -> Build:
             the file, and the line of a Python file.
     """
     path = Path(path)
-    _check_file(path)
-    if path.suffix == ".xml":
-        entries = _xml_entries(path)
-        return lambda frame, time: entries
-    return partial(_built_entries, path, _build_function(path))
-
-
-def _check_file(path: Path) -> None:
     if path.suffix not in (".xml", ".py") or not path.is_file():
         kind = f"{path.suffix!r}" if path.is_file() else "none"
         raise ValueError(
             f"{path}: expected a scene to insert, FILE.xml or FILE.py, got {kind}; check the path."
         )
-
-
-def _build_function(path: Path) -> Callable[[int, float], Any]:
-    """Return the function `build` of a Python file."""
+    if path.suffix == ".xml":
+        entries = _xml_entries(path)
+        return lambda frame, time: entries
     build = getattr(module_of(path, "insert"), "build", None)
     if not callable(build):
         raise ValueError(
             f"{path}: expected a function `build(frame, time)` that returns the entries of a "
             "Mitsuba scene, found none; add it."
         )
-    return build
 
+    def build_entries(frame: int, time: float) -> dict[str, Any]:
+        with failures_in(path):
+            entries = build(frame, time)
+            if not isinstance(entries, dict):
+                raise TypeError(f"`build` must return a dict, got a {type(entries).__name__}")
+            return entries
 
-def _built_entries(
-    path: Path, build: Callable[[int, float], Any], frame: int, time: float
-) -> dict[str, Any]:
-    """Return the result of a file's `build`, which is a dict."""
-    with failures_in(path):
-        entries = build(frame, time)
-        if not isinstance(entries, dict):
-            raise TypeError(f"`build` must return a dict, got a {type(entries).__name__}")
-        return entries
+    return build_entries
 
 
 def inserted_channels(stream: FrameSource) -> tuple[str, ...]:
@@ -213,17 +200,6 @@ def _mean_color(gaussians: Gaussians, camera: Camera, clipped: float) -> list[fl
     )
 
 
-def _in_background_light(
-    entries: dict[str, Any], gaussians: Gaussians, camera: Camera, clipped: float
-) -> Any:
-    """Return the inserted scene with the light that comes from behind all Gaussians, as for
-    `captured_light`.
-    """
-    radiance = decode_light(np.array(_mean_color(gaussians, camera, clipped))).tolist()
-    lamp = {"type": "constant", "radiance": {"type": "rgb", "value": radiance}}
-    return mi.load_dict({"type": "scene", **entries, "captured light": lamp})
-
-
 def _integrator(entry: Any, light: Light, clipped: float) -> Any:
     """Return the integrator of the surfaces: the one of the inserted scene, if it has one.
 
@@ -262,7 +238,9 @@ def _render(
         dark = shadowed(gaussians, ratio)
         images = _plugin_images(dark, camera, surfaces, nested, channels, config.samples)
         if "surfaces" in channels:
-            images["surfaces"] = _surface_layer(dark, camera, surfaces, nested, config.samples)
+            sensor = _sensor(camera)
+            with traced(nested, rays_for(nested, dark), srgb=True):
+                images["surfaces"] = np.asarray(nested.render(surfaces, sensor, spp=config.samples))
     except RuntimeError as error:
         raise ValueError(f"The inserted scene: {_reason(error)}; correct it.") from error
     if {"splats", "shadow"} & set(channels):
@@ -270,33 +248,11 @@ def _render(
     return {name: images[name].astype(np.float32) for name in channels}
 
 
-def _surface_layer(
-    gaussians: Gaussians, camera: Camera, surfaces: Any, nested: Any, samples: int
-) -> np.ndarray:
-    """Return the layer `surfaces` [H, W, 4], in linear light."""
-    with traced(nested, rays_for(nested, gaussians), srgb=True):
-        return np.asarray(nested.render(surfaces, _sensor(camera), spp=samples))
-
-
 def _lit_scenes(
     entries: dict[str, Any], gaussians: Gaussians, camera: Camera, light: Light, clipped: float
 ) -> tuple[Any, Any]:
     """Return the inserted scene with the lights of its surfaces, and with those that throw shadows
     on the Gaussians.
-    """
-    scene = _inserted_scene(entries)
-    if scene.emitters():
-        return scene, scene
-    center = np.array(scene.bbox().center()).ravel()
-    lamp = captured_light(gaussians, camera, center, clipped)
-    lit_scene = mi.load_dict({"type": "scene", **entries, "captured light": lamp})
-    if light == "probe":
-        return lit_scene, lit_scene
-    return _in_background_light(entries, gaussians, camera, clipped), lit_scene
-
-
-def _inserted_scene(entries: dict[str, Any]) -> Any:
-    """Return the scene of the entries, with the light that it has itself.
 
     Raises:
         ValueError: it has no shapes, or they are not finite.
@@ -304,18 +260,23 @@ def _inserted_scene(entries: dict[str, Any]) -> Any:
     scene: Any = mi.load_dict({"type": "scene", **entries})
     if not (scene.shapes() or scene.emitters()):
         raise ValueError("The inserted scene: expected at least one shape, got none; add one.")
-    if scene.shapes():
-        _check_box(scene.bbox())
-    return scene
-
-
-def _check_box(box: Any) -> None:
-    """Raise `ValueError` unless the shapes in a box are finite and not too far away."""
-    if not bounded(np.array([box.min, box.max])):
+    box = scene.bbox()
+    if scene.shapes() and not bounded(np.array([box.min, box.max])):
         raise ValueError(
             f"The inserted scene: expected shapes within {LARGEST:g} world units, got {box.min} "
             f"to {box.max}; correct their places and sizes."
         )
+    if scene.emitters():
+        return scene, scene
+    center = np.array(box.center()).ravel()
+    lamp = captured_light(gaussians, camera, center, clipped)
+    lit_scene = mi.load_dict({"type": "scene", **entries, "captured light": lamp})
+    if light == "probe":
+        return lit_scene, lit_scene
+    # The surfaces get the light of the Gaussians by rays, and here what comes from behind them.
+    radiance = decode_light(np.array(_mean_color(gaussians, camera, clipped))).tolist()
+    lamp = {"type": "constant", "radiance": {"type": "rgb", "value": radiance}}
+    return mi.load_dict({"type": "scene", **entries, "captured light": lamp}), lit_scene
 
 
 def _splat_layers(
@@ -367,19 +328,14 @@ def _sensor(camera: Camera) -> Any:
 
 def _xml_entries(path: Path) -> dict[str, Any]:
     """Return the shapes, lights and integrator of a scene file."""
-    scene = _xml_scene(path)
+    try:
+        scene: Any = mi.load_file(str(path))
+    except RuntimeError as error:
+        raise ValueError(f"{path}: {_reason(error)}; correct the scene file.") from error
     parts = {part.id() or f"part{i}": part for i, part in enumerate(_parts(scene))}
     # Mitsuba adds an integrator to files without one.
     has_integrator = ElementTree.parse(path).find("integrator") is not None
     return {**parts, "integrator": scene.integrator()} if has_integrator else parts
-
-
-def _xml_scene(path: Path) -> Any:
-    """Return the Mitsuba scene of a file."""
-    try:
-        return mi.load_file(str(path))
-    except RuntimeError as error:
-        raise ValueError(f"{path}: {_reason(error)}; correct the scene file.") from error
 
 
 def _reason(error: RuntimeError) -> str:

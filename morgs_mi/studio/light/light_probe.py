@@ -129,29 +129,18 @@ def _face(
 
 def _resampled(faces: list[tuple[Camera, np.ndarray]], directions: np.ndarray) -> np.ndarray:
     """Return the colour [H, W, 3] in every direction, interpolated on the face that it meets."""
-    face_of = _face_indices(directions)
+    axis = np.abs(directions).argmax(-1)
+    largest = np.take_along_axis(directions, axis[..., None], axis=-1)[..., 0]
+    face_of = 2 * axis + (largest < 0)  # index in `_FACES`
     result = np.zeros((*directions.shape[:2], 3), np.float32)
     for k, (camera, color) in enumerate(faces):
         on_face = (face_of == k)[..., None]
         # What other faces show may be behind this camera.
         forward = np.asarray(camera.viewmat)[2, :3]
-        values = _interpolated(camera, color, np.where(on_face, directions, forward))
-        result = np.where(on_face, values, result)
+        pixels, _ = camera.project(camera.position + np.where(on_face, directions, forward))
+        x, y = (pixels[..., i].astype(np.float32) - 0.5 for i in range(2))
+        result = np.where(on_face, cv2.remap(color, x, y, cv2.INTER_LINEAR), result)
     return result
-
-
-def _face_indices(directions: np.ndarray) -> np.ndarray:
-    """Return the index in `_FACES` of the face that each direction [H, W, 3] meets."""
-    axis = np.abs(directions).argmax(-1)
-    largest = np.take_along_axis(directions, axis[..., None], axis=-1)[..., 0]
-    return 2 * axis + (largest < 0)
-
-
-def _interpolated(camera: Camera, color: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Return the colour [H, W, 3] of a camera's image in directions [H, W, 3] in front of it."""
-    pixels, _ = camera.project(camera.position + directions)
-    x, y = (pixels[..., i].astype(np.float32) - 0.5 for i in range(2))
-    return cv2.remap(color, x, y, cv2.INTER_LINEAR)
 
 
 def radiance(color: Any, clipped: float, srgb: bool = True) -> Any:

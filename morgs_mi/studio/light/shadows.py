@@ -8,7 +8,6 @@ nothing is in the way.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -18,11 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse import csr_array
 from scipy.spatial import KDTree
-from scipy.spatial.transform import Rotation
 
 from morgs_mi.core.checks import check_number, check_type, numbers
 from morgs_mi.core.color_space import SH_C0, decode_light, encode_light
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.geometry import covariances
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, UInt32
 from morgs_mi.studio.light.light_probe import check_point
@@ -70,9 +69,14 @@ def shadow_ratio(
     if not len(gaussians) or not shapes:
         return np.ones(len(gaussians), np.float32)
     with dr.suspend_grad():
-        blocked, total = _irradiances(
-            emitters, _Receivers(gaussians, eye), shared_scene(shapes, scene), int(samples)
-        )
+        receivers = _Receivers(gaussians, eye)
+        blockers = shared_scene(shapes, scene)
+        blocked = mi.Float(0)
+        total = mi.Float(0)
+        for emitter in emitters:
+            some, every = _irradiance(emitter, receivers, blockers, int(samples))
+            blocked = blocked + some
+            total = total + every
         return np.array(1 - dr.select(total > 0, blocked / total, 0))
 
 
@@ -86,7 +90,12 @@ def shadowed(gaussians: Gaussians, ratio: np.ndarray) -> Gaussians:
     Raises:
         ValueError: a ratio of another shape, or with numbers that are negative or not finite.
     """
-    ratio = _checked_ratio(ratio, len(gaussians))
+    ratio = numbers("shadowed()", "ratio", ratio).astype(np.float64)
+    if ratio.shape != (len(gaussians),) or not (np.isfinite(ratio) & (ratio >= 0)).all():
+        raise ValueError(
+            f"shadowed(): `ratio` must be [N] with N={len(gaussians)}, finite and not negative, "
+            f"got {list(ratio.shape)}; pass the result of shadow_ratio()."
+        )
     # The mean colours [N, 1, 3].
     mean = np.maximum(0.5 + SH_C0 * np.array(dr.detach(gaussians.sh_coeffs))[:, :1], 1e-6)
     factor = encode_light(ratio[:, None, None] * decode_light(mean)) / mean
@@ -99,17 +108,6 @@ def shadowed(gaussians: Gaussians, ratio: np.ndarray) -> Gaussians:
     )
 
 
-def _checked_ratio(ratio: np.ndarray, count: int) -> np.ndarray:
-    """Return the ratio as float64 [N]."""
-    ratio = numbers("shadowed()", "ratio", ratio).astype(np.float64)
-    if ratio.shape != (count,) or not (np.isfinite(ratio) & (ratio >= 0)).all():
-        raise ValueError(
-            f"shadowed(): `ratio` must be [N] with N={count}, finite and not negative, "
-            f"got {list(ratio.shape)}; pass the result of shadow_ratio()."
-        )
-    return ratio
-
-
 class _Receivers:
     """Centres and orientation of the Gaussians: `flat` is 0 in a round neighbourhood and 1 on a
     plane.
@@ -118,19 +116,15 @@ class _Receivers:
     def __init__(self, gaussians: Gaussians, eye: np.ndarray) -> None:
         means: np.ndarray = np.array(dr.detach(gaussians.means), np.float64)
         normals, flat = _orientation(gaussians, means)
+        is_back = np.sum(normals * (eye - means), axis=1) < 0
+        normals = np.where(is_back[:, None], -normals, normals)
         self.centers = mi.Point3f(_columns(means))
-        self.normals = mi.Vector3f(_columns(_facing(normals, eye - means)))
+        self.normals = mi.Vector3f(_columns(normals))
         self.flat = from_numpy(mi.Float, flat)
 
     def response(self, direction: Any) -> Float:
         """Return the received fraction of light from a direction."""
         return dr.lerp(0.5, dr.maximum(dr.dot(self.normals, direction), 0), self.flat)
-
-
-def _facing(normals: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Return the normals [N, 3], reversed where they point away from a direction [N, 3]."""
-    is_back = np.sum(normals * directions, axis=1) < 0
-    return np.where(is_back[:, None], -normals, normals)
 
 
 def _columns(rows: np.ndarray) -> list[Float]:
@@ -148,28 +142,12 @@ def _orientation(gaussians: Gaussians, means: np.ndarray) -> tuple[np.ndarray, n
     # The covariance of the mixture: the mean of its second moments, minus the second moment of its
     # centre.
     centered = means - means.mean(0)
-    moments = _covariances(gaussians) + _outer_products(centered)
+    centers = mixture @ centered
+    moments = covariances(gaussians) + centered[:, :, None] * centered[:, None]
     mean_moments = (mixture @ moments.reshape(-1, 9)).reshape(-1, 3, 3)
-    covariance = mean_moments - _outer_products(mixture @ centered)
+    covariance = mean_moments - centers[:, :, None] * centers[:, None]
     variances, directions = np.linalg.eigh(covariance)
     return directions[:, :, 0], 1 - variances[:, 0] / np.maximum(variances[:, 1], 1e-30)
-
-
-def _outer_products(vectors: np.ndarray) -> np.ndarray:
-    """Return the outer product of each vector [N, 3] with itself, [N, 3, 3]."""
-    return vectors[:, :, None] * vectors[:, None, :]
-
-
-def _covariances(gaussians: Gaussians) -> np.ndarray:
-    """Return the covariances [N, 3, 3], float64; quaternions of zero count as no rotation."""
-    axes = _rotations(gaussians) * np.array(dr.detach(gaussians.scales))[:, None]
-    return axes @ axes.transpose(0, 2, 1)
-
-
-def _rotations(gaussians: Gaussians) -> np.ndarray:
-    quats = np.array(dr.detach(gaussians.quats), np.float64)
-    quats = np.where(np.linalg.norm(quats, axis=1, keepdims=True) > 0, quats, [1, 0, 0, 0])
-    return Rotation.from_quat(quats, scalar_first=True).as_matrix()
 
 
 def _mixture(means: np.ndarray, opacities: np.ndarray) -> csr_array:
@@ -181,18 +159,6 @@ def _mixture(means: np.ndarray, opacities: np.ndarray) -> csr_array:
     weights /= weights.sum(1, keepdims=True)
     ends = np.arange(0, near.size + 1, near.shape[1])
     return csr_array((weights.ravel(), near.ravel(), ends), shape=(len(means), len(means)))
-
-
-def _irradiances(
-    emitters: Iterable[Any], receivers: _Receivers, blockers: Any, samples: int
-) -> tuple[Float, Float]:
-    """Return the same as `_irradiance` for all lights together."""
-    blocked, total = (mi.Float(0) for _ in range(2))
-    for emitter in emitters:
-        some, every = _irradiance(emitter, receivers, blockers, samples)
-        blocked = blocked + some
-        total = total + every
-    return blocked, total
 
 
 def _irradiance(
