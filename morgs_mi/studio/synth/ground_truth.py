@@ -72,7 +72,10 @@ def compute_ground_truth(
         before: the same in the previous frame; None in the first frame.
         after: the same in the next frame, which determines the mask of the first frame.
     """
-    points = _projectable(surface, camera)
+    # A point in front of the camera where there is no surface avoids a division by zero; its values
+    # are not used.
+    front = camera.position + np.asarray(camera.viewmat)[2, :3]
+    points = np.where((surface.ids >= 0)[..., None], surface.positions, front)
     pixels, depth = camera.project(points)
     other = move_with_objects(
         replace(surface, positions=points), poses, after if before is None else before
@@ -86,11 +89,3 @@ def compute_ground_truth(
         surface.ids.astype(np.int32),
         mask,
     )
-
-
-def _projectable(surface: SurfacePoints, camera: Camera) -> np.ndarray:
-    """Return the positions [..., 3] of surface points, and a point in front of the camera where
-    there is no surface: it avoids a division by zero, and its values are not used.
-    """
-    front = camera.position + np.asarray(camera.viewmat)[2, :3]
-    return np.where((surface.ids >= 0)[..., None], surface.positions, front)

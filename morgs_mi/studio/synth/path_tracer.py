@@ -14,7 +14,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import encode_light
 from morgs_mi.studio.synth.disturbances import undistorted
 from morgs_mi.studio.synth.ground_truth import SurfacePoints
-from morgs_mi.studio.synth.scene import Object, Pose, Scene
+from morgs_mi.studio.synth.scene import Pose, Scene
 
 # A hit within this share of a point's distance is its own surface: intersections are
 # single-precision.
@@ -45,54 +45,6 @@ def developed(linear: np.ndarray, noise: float, seed: int) -> np.ndarray:
     return srgb_bytes(linear, grain)
 
 
-def _load(name: str, content: dict[str, Any]) -> Any:
-    try:
-        return mi.load_dict(content, optimize=False)
-    except RuntimeError as error:
-        # Mitsuba's message begins with a line of its own source.
-        reason = re.sub(r"^\[\w+\.cpp:\d+\] ", "", str(error)).rstrip(".! ")
-        raise ValueError(
-            f"scene {name!r}: Mitsuba cannot load it: {reason}; correct the dictionary."
-        ) from error
-
-
-def _scene_content(scene: Scene) -> tuple[dict[str, Any], dict[str, int]]:
-    """Return a scene as a Mitsuba dictionary, and the index of the object of each shape in it."""
-    content: dict[str, Any] = {
-        "type": "scene",
-        **{name: light.shape for name, light in scene.lights.items()},
-    }
-    owners: dict[str, int] = {}
-    for index, (name, item) in enumerate(scene.objects.items()):
-        shapes = _shapes(name, item)
-        if item.pose is not None:
-            content[f"{name}_group"] = {"type": "shapegroup", **item.shapes}
-        content |= shapes
-        owners |= dict.fromkeys(shapes, index)
-    return content, owners
-
-
-def _shapes(name: str, item: Object) -> dict[str, Any]:
-    """Return the shapes of an object in Mitsuba: one instance of a group if it moves."""
-    if item.pose is None:
-        return {f"{name}_{part}": shape for part, shape in item.shapes.items()}
-    return {name: {"type": "instance", "group": {"type": "ref", "id": f"{name}_group"}}}
-
-
-def _sensor(camera: Camera, spp: int) -> Any:
-    sampler = {"type": "multijitter", "sample_count": spp}
-    return mi.load_dict({**camera.sensor(), "sampler": sampler})
-
-
-def _sampler(spp: int, seed: int, num_pixels: int) -> Any:
-    """Return a sampler of all samples of some pixels at once."""
-    sampler: Any = mi.load_dict({"type": "multijitter", "sample_count": spp})
-    spp = sampler.sample_count()  # rounded up by the sampler
-    sampler.set_samples_per_wavefront(spp)
-    sampler.seed(seed, num_pixels * spp)
-    return sampler
-
-
 def _pixel_corners(width: int, rows: np.ndarray) -> np.ndarray:
     """Return the upper left corners of the pixels of some rows of an image [R W, 2]."""
     return np.stack(np.meshgrid(np.arange(width), rows), axis=-1).reshape(-1, 2)
@@ -119,14 +71,45 @@ class PathTracer:
             ValueError: Mitsuba cannot load it.
         """
         self.scene = scene
-        content, owners = _scene_content(scene)
-        # The optimisation would merge meshes that share a material, even meshes of different
-        # objects.
-        self._scene: Any = _load(scene.name, content)
+        content: dict[str, Any] = {
+            "type": "scene",
+            **{name: light.shape for name, light in scene.lights.items()},
+        }
+        owners: dict[str, int] = {}  # the index of the object of each shape
+        for index, (name, item) in enumerate(scene.objects.items()):
+            if item.pose is None:
+                shapes = {f"{name}_{part}": shape for part, shape in item.shapes.items()}
+            else:  # one instance of a group
+                content[f"{name}_group"] = {"type": "shapegroup", **item.shapes}
+                reference = {"type": "ref", "id": f"{name}_group"}
+                shapes = {name: {"type": "instance", "group": reference}}
+            content |= shapes
+            owners |= dict.fromkeys(shapes, index)
+        try:
+            # The optimisation would merge meshes that share a material, even meshes of different
+            # objects.
+            self._scene: Any = mi.load_dict(content, optimize=False)
+        except RuntimeError as error:
+            # Mitsuba's message begins with a line of its own source.
+            reason = re.sub(r"^\[\w+\.cpp:\d+\] ", "", str(error)).rstrip(".! ")
+            raise ValueError(
+                f"scene {scene.name!r}: Mitsuba cannot load it: {reason}; correct the dictionary."
+            ) from error
         shapes = [shape for shape in self._scene.shapes() if shape.id() in owners]
         self._owners = [(mi.ShapePtr(shape), owners[shape.id()]) for shape in shapes]
         self._params: Any = mi.traverse(self._scene)
-        self._lamps = self._moving_lamps()
+        # Pose and transform of the lamps that have a pose, by parameter of the scene.
+        self._lamps: dict[str, tuple[Pose, np.ndarray]] = {}
+        for name, light in scene.lights.items():
+            if light.pose is not None:
+                key = f"{name}.to_world"
+                if key not in self._params:
+                    raise ValueError(
+                        f"scene {scene.name!r}, light {name!r}: a lamp with a pose must be a shape "
+                        "with an emitter, e.g. a rectangle; use one, or leave out the pose."
+                    )
+                transform = np.array(self._params[key].matrix, float).reshape(4, 4)
+                self._lamps[key] = (light.pose, transform)
         self._exposure = 1.0
         # Only lamps are sampled: 16 samples have as little noise as 64 samples with a sky, and are
         # seven times faster.
@@ -139,23 +122,6 @@ class PathTracer:
     def has_emitters(self) -> bool:
         """Whether the scene has an emitter."""
         return bool(self._scene.emitters())
-
-    def _moving_lamps(self) -> dict[str, tuple[Pose, np.ndarray]]:
-        """Return pose and transform of the lamps that have a pose, by parameter of the scene."""
-        return {
-            f"{name}.to_world": (light.pose, self._lamp_transform(name))
-            for name, light in self.scene.lights.items()
-            if light.pose is not None
-        }
-
-    def _lamp_transform(self, light: str) -> np.ndarray:
-        """Return the transform [4, 4] of a lamp's shape within the lamp's space."""
-        if f"{light}.to_world" not in self._params:
-            raise ValueError(
-                f"scene {self.scene.name!r}, light {light!r}: a lamp with a pose must be a shape "
-                "with an emitter, e.g. a rectangle; use one, or leave out the pose."
-            )
-        return np.array(self._params[f"{light}.to_world"].matrix, float).reshape(4, 4)
 
     def poses(self, time: float) -> list[np.ndarray]:
         """Return each object's pose [4, 4] at `time` in seconds."""
@@ -187,7 +153,8 @@ class PathTracer:
 
     def light(self, camera: Camera, spp: int, seed: int) -> np.ndarray:
         """Return the exposed light of a view, linear [H, W, 3]."""
-        sensor = _sensor(camera, spp)
+        sampler = {"type": "multijitter", "sample_count": spp}
+        sensor = mi.load_dict({**camera.sensor(), "sampler": sampler})
         render: Any = mi.render  # annotated with Dr.Jit's types, called with Python's
         linear = render(self._scene, sensor=sensor, integrator=self._integrator, spp=spp, seed=seed)
         return self._exposure * np.array(linear)[..., :3]
@@ -205,7 +172,11 @@ class PathTracer:
             seed: seed of the samples.
             lens: the distortion; None for a pinhole.
         """
-        sampler = _sampler(spp, seed, len(rows) * camera.width)
+        # All samples of the pixels at once.
+        sampler: Any = mi.load_dict({"type": "multijitter", "sample_count": spp})
+        spp = sampler.sample_count()  # rounded up by the sampler
+        sampler.set_samples_per_wavefront(spp)
+        sampler.seed(seed, len(rows) * camera.width * spp)
         # The samples of a pixel follow one another.
         corners = _pixel_corners(camera.width, rows)
         pixels = corners[:, None] + np.array(sampler.next_2d()).T.reshape(len(corners), -1, 2)
@@ -220,15 +191,11 @@ class PathTracer:
         position, directions = camera.rays(pixels)
         hit: Any = self._scene.ray_intersect(_rays(mi.Ray3f, position, directions))
         dr.eval(hit)  # otherwise every array below would trace the rays again
-        points = SurfacePoints(np.array(hit.p, float).T.copy(), self._object_ids(hit))
-        return points.reshaped(camera.height, camera.width)
-
-    def _object_ids(self, hit: Any) -> np.ndarray:
-        """Return the id of the object that each ray hits, -1 for none."""
         ids = np.full(dr.width(hit.p), -1, np.int32)
         for pointer, index in self._owners:
             ids[np.array((hit.shape == pointer) | (hit.instance == pointer))] = index
-        return ids
+        points = SurfacePoints(np.array(hit.p, float).T.copy(), ids)
+        return points.reshaped(camera.height, camera.width)
 
     def sees(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         """Return the mask of the surface points [P, 3] that a camera sees: inside its image, with
@@ -238,11 +205,7 @@ class PathTracer:
         distance = np.linalg.norm(offset, axis=-1)
         ray = _rays(mi.Ray3f, camera.position, offset / distance[:, None])
         ray.maxt = mi.Float((1 - _OWN_SURFACE) * distance)
-        return _in_image(camera, points) & ~np.array(self._scene.ray_test(ray))
-
-
-def _in_image(camera: Camera, points: np.ndarray) -> np.ndarray:
-    """Return the mask of the points [P, 3] that lie in front of a camera and inside its image."""
-    pixels, depth = camera.project(points)
-    mask = (pixels >= 0) & (pixels < (camera.width, camera.height))
-    return (depth > camera.near) & np.all(mask, axis=-1)
+        is_free = ~np.array(self._scene.ray_test(ray))
+        pixels, depth = camera.project(points)
+        mask = np.all((pixels >= 0) & (pixels < (camera.width, camera.height)), axis=-1)
+        return is_free & (depth > camera.near) & mask

@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib.util
 import inspect
 import sys
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import metadata
@@ -61,23 +61,20 @@ class Rig:
         """Return `count` cameras: ``cam00`` at the centre of the cap, the others evenly distributed
         around it.
         """
-        origins = np.asarray(self.center) + self.distance * self._outward(count)
-        return [
-            Camera.look_at(origin, self.center, (0, 1, 0), self.fov, width, height, f"cam{i:02d}")
-            for i, origin in enumerate(origins)
-        ]
-
-    def _outward(self, count: int) -> np.ndarray:
-        """Return the directions [count, 3] from the centre to the cameras."""
         # A sunflower spiral covers the cap evenly for any count.
         radius = np.sqrt(np.arange(count) / max(count - 1, 1))
         angle = np.arange(count) * np.pi * (3 - np.sqrt(5))
         azimuth = np.deg2rad(self.spread[0] * radius * np.cos(angle))
         polar = np.deg2rad(self.elevation + self.spread[1] * radius * np.sin(angle))
-        return np.stack(
+        outward = np.stack(
             [np.sin(azimuth) * np.cos(polar), np.sin(polar), np.cos(azimuth) * np.cos(polar)],
             axis=1,
         )
+        origins = np.asarray(self.center) + self.distance * outward
+        return [
+            Camera.look_at(origin, self.center, (0, 1, 0), self.fov, width, height, f"cam{i:02d}")
+            for i, origin in enumerate(origins)
+        ]
 
 
 @dataclass(frozen=True)
@@ -111,39 +108,42 @@ def load_scene(scene: str | Path, seed: int = 0) -> Scene:
         ValueError: there is no such scene, its file has no ``build(seed) -> Scene``, or running the
             file fails; the message names the file and its line.
     """
-    path = _scene_path(scene)
-    build = getattr(module_of(path, "scene"), "build", None)
-    if not callable(build):
-        raise ValueError(
-            f"load_scene(): {path} must define `build(seed) -> Scene`; add that function."
-        )
-    _check_signature(path, build)
-    with failures_in(path):
-        result = build(seed)
-    return _checked_scene(path, result)
-
-
-def _checked_scene(path: Path, scene: Any) -> Scene:
-    """Return the result of a file's `build`, which is a scene."""
-    if not isinstance(scene, Scene):
-        value_text = "None" if scene is None else f"a {type(scene).__name__}"
-        raise ValueError(
-            f"load_scene(): `build` in {path} must return a Scene, got {value_text}; return "
-            "Scene(...)."
-        )
-    return scene
-
-
-def _scene_path(scene: str | Path) -> Path:
-    """Return the Python file of a scene."""
-    files = _scene_files()
+    # The package's scenes, from the repository or from the installed data files.
+    checkout = Path(__file__).parents[3] / "scenes"
+    if checkout.is_dir():
+        files = {path.stem: path for path in checkout.glob("*.py")}
+    else:
+        installed = metadata.files("morgs-mi") or []
+        paths = (Path(str(f.locate())) for f in installed if f.match("morgs_mi/scenes/*.py"))
+        files = {path.stem: path for path in paths}
     path = Path(scene) if Path(scene).suffix == ".py" else files.get(str(scene))
     if path is None or not path.is_file():
         raise ValueError(
             f"load_scene(): no scene {str(scene)!r}; name one of {sorted(files)} or pass the path "
             "of a .py file."
         )
-    return path
+    build = getattr(module_of(path, "scene"), "build", None)
+    if not callable(build):
+        raise ValueError(
+            f"load_scene(): {path} must define `build(seed) -> Scene`; add that function."
+        )
+    signature = inspect.signature(build)
+    try:
+        signature.bind(seed)
+    except TypeError:
+        raise ValueError(
+            f"load_scene(): `build` in {path} must take the seed alone, `build(seed) -> Scene`, "
+            f"got `build{signature}`; give further parameters a default."
+        ) from None
+    with failures_in(path):
+        result = build(seed)
+    if not isinstance(result, Scene):
+        value_text = "None" if result is None else f"a {type(result).__name__}"
+        raise ValueError(
+            f"load_scene(): `build` in {path} must return a Scene, got {value_text}; return "
+            "Scene(...)."
+        )
+    return result
 
 
 def module_of(path: Path, kind: str) -> ModuleType:
@@ -165,37 +165,21 @@ def failures_in(path: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        raise ValueError(_error_text(error, path)) from error
-
-
-def _error_text(error: Exception, path: Path) -> str:
-    """Return a sentence about an error of the code in a file."""
-    line = _line_of(error, path)
-    reason = error.msg if isinstance(error, SyntaxError) else str(error)
-    place = f"{path}, line {line}" if line else str(path)
-    return f"{place}: {type(error).__name__}: {reason.rstrip('.')}; correct the scene file."
-
-
-def _line_of(error: Exception, path: Path) -> int | None:
-    """Return the line of a file at which an error was raised, if it is known."""
-    if isinstance(error, SyntaxError):  # which has no frame in the file
-        return error.lineno
-    # The file name of a frame is absolute.
-    frames = extract_tb(error.__traceback__)
-    lines = [frame.lineno for frame in frames if Path(frame.filename).resolve() == path.resolve()]
-    return lines[-1] if lines else None
-
-
-def _check_signature(path: Path, build: Callable[..., Any]) -> None:
-    """Raise `ValueError` if `build` cannot be called with a seed alone."""
-    signature = inspect.signature(build)
-    try:
-        signature.bind(0)
-    except TypeError:
+        if isinstance(error, SyntaxError):  # which has no frame in the file
+            line = error.lineno
+            reason = error.msg
+        else:
+            # The file name of a frame is absolute.
+            frames = extract_tb(error.__traceback__)
+            file = path.resolve()
+            lines = [frame.lineno for frame in frames if Path(frame.filename).resolve() == file]
+            line = lines[-1] if lines else None
+            reason = str(error)
+        place = f"{path}, line {line}" if line else str(path)
+        kind = type(error).__name__
         raise ValueError(
-            f"load_scene(): `build` in {path} must take the seed alone, `build(seed) -> Scene`, "
-            f"got `build{signature}`; give further parameters a default."
-        ) from None
+            f"{place}: {kind}: {reason.rstrip('.')}; correct the scene file."
+        ) from error
 
 
 def check_scene(scene: Scene, times: Sequence[float]) -> None:
@@ -212,48 +196,32 @@ def check_scene(scene: Scene, times: Sequence[float]) -> None:
     ):
         for name, item in items.items():
             where = f"scene {scene.name!r}, {kind} {name!r}"
-            _check_type(where, item, expected)
-            ids = _ids(name, item)
-            _check_new(where, ids, names)
+            if not isinstance(item, expected):
+                raise ValueError(
+                    f"{where}: expected {expected.__name__}(...), got a value of type "
+                    f"{type(item).__name__}; see {page('scenes')}."
+                )
+            # The names in Mitsuba.
+            if isinstance(item, Light):
+                ids = [name]
+            elif item.pose is None:
+                ids = [f"{name}_{part}" for part in item.shapes]
+            else:
+                ids = [name, f"{name}_group"]
+            for identifier in ids:
+                if identifier in names:
+                    raise ValueError(
+                        f"{where}: the name {identifier!r} is used twice; rename one of the two."
+                    )
             names.update(ids)
-            _check_shapes(where, item)
+            if isinstance(item, Light):
+                _check_node(where, item.shape)
+            else:
+                for part, shape in item.shapes.items():
+                    _check_node(f"{where}, shape {part!r}", shape)
             if item.pose is not None:
                 for time in times:
                     _check_pose(where, item.pose, time)
-
-
-def _check_type(where: str, item: Any, expected: type) -> None:
-    if not isinstance(item, expected):
-        raise ValueError(
-            f"{where}: expected {expected.__name__}(...), got a value of type "
-            f"{type(item).__name__}; see {page('scenes')}."
-        )
-
-
-def _check_new(where: str, ids: Sequence[str], names: Collection[str]) -> None:
-    """Raise `ValueError` if an object or a lamp has a name in Mitsuba that another has already."""
-    for identifier in ids:
-        if identifier in names:
-            raise ValueError(
-                f"{where}: the name {identifier!r} is used twice; rename one of the two."
-            )
-
-
-def _check_shapes(where: str, item: Object | Light) -> None:
-    shapes = item.shapes if isinstance(item, Object) else {"": item.shape}
-    for name, shape in shapes.items():
-        _check_node(f"{where}, shape {name!r}" if name else where, shape)
-
-
-def _ids(name: str, item: Object | Light) -> list[str]:
-    """Return the names of an object's or a lamp's shapes in Mitsuba."""
-    if isinstance(item, Object):
-        return (
-            [f"{name}_{part}" for part in item.shapes]
-            if item.pose is None
-            else [name, f"{name}_group"]
-        )
-    return [name]
 
 
 def _check_node(where: str, node: Any) -> None:
@@ -266,28 +234,26 @@ def _check_node(where: str, node: Any) -> None:
     for key, value in node.items():
         if value is None:
             raise ValueError(f"{where}: `{key}` must have a value, got None; leave it out.")
-        if key == "filename":
-            _check_file(where, value)
+        if key == "filename" and not Path(value).is_file():
+            raise FileNotFoundError(
+                f"{where}: its file {value} does not exist; for a file beside the scene, write "
+                f"str(Path(__file__).parent / {Path(value).name!r})."
+            )
+        if key == "filename" and not isinstance(value, str):
+            raise ValueError(
+                f"{where}: `filename` must be text, got a {type(value).__name__}; wrap it in str()."
+            )
         if isinstance(value, Mapping):
             _check_node(f"{where}, {key}", value)
 
 
-def _check_file(where: str, file: Any) -> None:
-    """Check the file name of a mesh or a texture."""
-    if not Path(file).is_file():
-        raise FileNotFoundError(
-            f"{where}: its file {file} does not exist; for a file beside the scene, write "
-            f"str(Path(__file__).parent / {Path(file).name!r})."
-        )
-    if not isinstance(file, str):
-        raise ValueError(
-            f"{where}: `filename` must be text, got a {type(file).__name__}; wrap it in str()."
-        )
-
-
 def _check_pose(where: str, pose: Pose, time: float) -> None:
     where = f"{where}: its pose at {time:.4g} s"
-    matrix = _matrix(where, pose, time)
+    try:
+        matrix = np.asarray(pose(time), np.float64)
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}".rstrip(".")
+        raise ValueError(f"{where} fails with {reason}; correct the function.") from error
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         value = f"the shape {matrix.shape}" if matrix.shape != (4, 4) else "NaN or infinity"
         raise ValueError(
@@ -295,15 +261,6 @@ def _check_pose(where: str, pose: Pose, time: float) -> None:
             "rotate()."
         )
     rigid(f"{where} is not rigid", matrix)
-
-
-def _matrix(where: str, pose: Pose, time: float) -> np.ndarray:
-    """Return the result of a scene's function for a pose."""
-    try:
-        return np.asarray(pose(time), np.float64)
-    except Exception as error:
-        reason = f"{type(error).__name__}: {error}".rstrip(".")
-        raise ValueError(f"{where} fails with {reason}; correct the function.") from error
 
 
 def translate(x: float, y: float, z: float) -> np.ndarray:
@@ -320,18 +277,3 @@ def rotate(axis: str, angle: float) -> np.ndarray:
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_euler(axis, angle).as_matrix()
     return matrix
-
-
-def _scene_files() -> dict[str, Path]:
-    """Return the package's scenes, from the repository or from the installed data files."""
-    checkout = Path(__file__).parents[3] / "scenes"
-    if checkout.is_dir():
-        return {path.stem: path for path in checkout.glob("*.py")}
-    return _installed_scene_files()
-
-
-def _installed_scene_files() -> dict[str, Path]:
-    installed = metadata.files("morgs-mi") or []
-    return {
-        Path(f).stem: Path(str(f.locate())) for f in installed if f.match("morgs_mi/scenes/*.py")
-    }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -53,21 +53,15 @@ def record_light(
         frame: index of the frame.
         config: samples per pixel, their seed and the frame rate.
     """
+    assert config.spp is not None
     if not own.rolling_shutter and not own.distortion:
-        assert config.spp is not None
         tracer.set_time((frame + own.time_offset) / config.fps)
         return tracer.light(camera, config.spp, config.seed)
-    return np.concatenate([*_bands(tracer, camera, own, frame, config)])
-
-
-def _bands(
-    tracer: PathTracer, camera: Camera, own: CameraDisturbance, frame: int, config: SynthConfig
-) -> Iterator[np.ndarray]:
-    """Yield the light of the rows that are read at one time; arguments as for `record_light`."""
-    assert config.spp is not None
     row_times = own.row_times(frame, camera.height)
     count = -(-camera.height // _BAND) if own.rolling_shutter else 1
+    bands = []
     for band, rows in enumerate(np.array_split(np.arange(camera.height), count)):
         tracer.set_time(row_times[rows].mean() / config.fps)
         seed = mixed_seed(config.seed, band)
-        yield tracer.light_of_rows(camera, rows, config.spp, seed, own.lens)
+        bands.append(tracer.light_of_rows(camera, rows, config.spp, seed, own.lens))
+    return np.concatenate(bands)

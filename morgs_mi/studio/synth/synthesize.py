@@ -19,7 +19,7 @@ import numpy as np
 
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
-from morgs_mi.capture.lens import Undistortion, undistortion
+from morgs_mi.capture.lens import undistortion
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.capture.truth import GroundTruth, Tracks, save_tracks, save_truth
 from morgs_mi.core.bounded import read_json
@@ -90,60 +90,39 @@ def synthesize(
             capture.
         OSError: a file cannot be written, or a mesh or texture of the scene does not exist.
     """
-    config = config or SynthConfig()
-    _check_resources(config)
-    scene = scene if isinstance(scene, Scene) else load_scene(scene, config.seed)
-    rig = _Rig.of(scene, config.completed(scene.recording))
-    check_lenses(rig.cameras, rig.disturbed)
-    check_scene(scene, rig.times())
-    _check_folder(Path(out), overwrite)
-    check_output(Path(out).resolve().parent)
-    with atomic_path(out, "synthesize()") as folder:
-        folder.mkdir(parents=True)
-        _write_capture(folder, scene, rig, progress)
-    return Path(out)
-
-
-def _write_capture(
-    folder: Path, scene: Scene, rig: _Rig, progress: Callable[[int, int], None] | None
-) -> None:
-    """Write all files of a capture."""
-    tracer = PathTracer(scene)
-    _check_views(tracer, rig.cameras)
-    clips = _write_clips(tracer, rig, folder, progress)
-    _write_truth(tracer, rig, folder / "truth")
-    _write_calibration(tracer, rig, clips, folder)
-    write_json(folder / CAPTURE, _settings(scene, rig.config))
-
-
-def _check_resources(config: SynthConfig) -> None:
-    """Raise `ValueError` if the variant, a setting or the size of the images does not fit."""
-    _check_variant()
-    config.check()
-    pixels = config.width * config.height
-    size = f"images of {config.width}x{config.height} pixels"
-    check_memory(
-        "synthesize()", _PIXEL_BYTES * pixels, size, "make them smaller (`width`, `height`)"
-    )
-
-
-def _check_variant() -> None:
     if not str(mi.variant()).startswith(("llvm", "cuda", "metal")):
         raise ValueError(
             f"synthesize(): a vectorised variant is needed, got {mi.variant()!r}; "
             'call mitsuba.set_variant("llvm_ad_rgb") first.'
         )
-
-
-def _settings(scene: Scene, config: SynthConfig) -> dict[str, Any]:
-    """Return the content of `capture.json`."""
-    return {
-        "scene": scene.name,
-        "test_view": 0,
-        **config.as_dict(),
-        "objects": list(scene.objects),
-        "versions": {name: metadata.version(name) for name in ("morgs-mi", "mitsuba", "drjit")},
-    }
+    config = config or SynthConfig()
+    config.check()
+    size = f"images of {config.width}x{config.height} pixels"
+    memory = _PIXEL_BYTES * config.width * config.height
+    check_memory("synthesize()", memory, size, "make them smaller (`width`, `height`)")
+    scene = scene if isinstance(scene, Scene) else load_scene(scene, config.seed)
+    rig = _Rig.of(scene, config.completed(scene.recording))
+    check_lenses(rig.cameras, rig.disturbed)
+    check_scene(scene, rig.times())
+    out = Path(out)
+    _check_folder(out, overwrite)
+    check_output(out.resolve().parent)
+    with atomic_path(out, "synthesize()") as folder:
+        folder.mkdir(parents=True)
+        tracer = PathTracer(scene)
+        _check_views(tracer, rig.cameras)
+        clips = _write_clips(tracer, rig, folder, progress)
+        _write_truth(tracer, rig, folder / "truth")
+        _write_calibration(tracer, rig, clips, folder)
+        settings = {
+            "scene": scene.name,
+            "test_view": 0,
+            **rig.config.as_dict(),
+            "objects": list(scene.objects),
+            "versions": {name: metadata.version(name) for name in ("morgs-mi", "mitsuba", "drjit")},
+        }
+        write_json(folder / CAPTURE, settings)
+    return out
 
 
 @dataclass(frozen=True)
@@ -185,45 +164,33 @@ def _write_clips(
 ) -> list[Path]:
     """Write the images of all cameras; return the clips that `load_capture` reads."""
     config = rig.config
+    noise = config.noise
+    assert noise is not None
     count = itertools.count(1)
 
-    def render_view(index: int) -> Iterator[np.ndarray]:
-        for image in _images(tracer, rig, index):
-            yield image
+    def images(index: int, camera: Camera) -> Iterator[np.ndarray]:
+        for frame in range(config.frames):
+            # The noise must differ between views and frames; otherwise it would look like a moving
+            # texture.
+            seed = mixed_seed(config.seed, index, frame)
+            disturbance = rig.disturbed[index]
+            light = record_light(tracer, camera, disturbance, frame, replace(config, seed=seed))
+            yield developed(light, noise, seed)
             if progress is not None:
                 progress(next(count), len(rig.cameras) * config.frames)
 
-    return [
-        _write_clip(folder, camera.name, render_view(index), config)
-        for index, camera in enumerate(rig.cameras)
-    ]
-
-
-def _write_clip(folder: Path, name: str, images: Iterator[np.ndarray], config: SynthConfig) -> Path:
-    """Write the images of one camera, and return the clip that `load_capture` reads."""
-    video = folder / f"{name}.mp4"
-    if not config.lossless:
-        write_video(video, images, config.fps, PLAYABLE)
-        return video
-    png = folder / "frames" / name
-    write_video(png, images, config.fps)
-    write_video(video, open_frames(png).frames(), config.fps, PLAYABLE)
-    return png
-
-
-def _images(tracer: PathTracer, rig: _Rig, index: int) -> Iterator[np.ndarray]:
-    """Yield the images of a camera."""
-    config = rig.config
-    disturbance = rig.disturbed[index]
-    assert config.noise is not None
-    for frame in range(config.frames):
-        # The noise must differ between views and frames; otherwise it would look like a moving
-        # texture.
-        seed = mixed_seed(config.seed, index, frame)
-        light = record_light(
-            tracer, rig.cameras[index], disturbance, frame, replace(config, seed=seed)
-        )
-        yield developed(light, config.noise, seed)
+    clips = []
+    for index, camera in enumerate(rig.cameras):
+        video = folder / f"{camera.name}.mp4"
+        if config.lossless:
+            png = folder / "frames" / camera.name
+            write_video(png, images(index, camera), config.fps)
+            write_video(video, open_frames(png).frames(), config.fps, PLAYABLE)
+            clips.append(png)
+        else:
+            write_video(video, images(index, camera), config.fps, PLAYABLE)
+            clips.append(video)
+    return clips
 
 
 def _check_views(tracer: PathTracer, cameras: Sequence[Camera]) -> None:
@@ -236,21 +203,17 @@ def _check_views(tracer: PathTracer, cameras: Sequence[Camera]) -> None:
             "it lights, e.g. `lights()` of morgs_mi.studio.synth.textures."
         )
     for camera in cameras:
-        _check_view(tracer, camera)
+        if not (tracer.surface_points(camera).ids >= 0).any():
+            raise ValueError(
+                f"scene {tracer.scene.name!r}: {camera.name} sees no object at 0 s; move the "
+                "objects, or the centre and distance of the rig."
+            )
     if not tracer.render(cameras[0], 1, 0).any():
         _LOG.warning(
             "scene %r: %s is black at 0 s: no lamp reaches the objects that it sees; check the "
             "sides to which lamps and surfaces face (a rectangle emits along its +z).",
             tracer.scene.name,
             cameras[0].name,
-        )
-
-
-def _check_view(tracer: PathTracer, camera: Camera) -> None:
-    if not (tracer.surface_points(camera).ids >= 0).any():
-        raise ValueError(
-            f"scene {tracer.scene.name!r}: {camera.name} sees no object at 0 s; move the "
-            "objects, or the centre and distance of the rig."
         )
 
 
@@ -301,7 +264,11 @@ def _sample_tracks(
                 points.append(np.stack(paths, axis=1))
                 owners.append(sample.ids)
     tracks = np.concatenate(points)
-    visible = _visible(tracer, cameras, times, tracks)
+    visible = {camera.name: np.zeros(tracks.shape[:2], bool) for camera in cameras}
+    for frame, time in enumerate(times):
+        tracer.set_time(time)
+        for camera in cameras:
+            visible[camera.name][:, frame] = tracer.sees(camera, tracks[:, frame])
     return Tracks(tracks, np.concatenate(owners), visible)
 
 
@@ -319,18 +286,6 @@ def _samples(
         yield visible.pick(rng.choice(pixels, min(most, len(pixels)), replace=False))
 
 
-def _visible(
-    tracer: PathTracer, cameras: Sequence[Camera], times: np.ndarray, tracks: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Return which points of the tracks [P, T, 3] each camera sees, [P, T] by its name."""
-    visible = {camera.name: np.zeros(tracks.shape[:2], bool) for camera in cameras}
-    for frame, time in enumerate(times):
-        tracer.set_time(time)
-        for camera in cameras:
-            visible[camera.name][:, frame] = tracer.sees(camera, tracks[:, frame])
-    return visible
-
-
 def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], folder: Path) -> None:
     """Write the cameras as `poses_bounds.npy` and as a COLMAP model with points from the training
     views.
@@ -346,15 +301,25 @@ def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], fol
     for index, (camera, disturbance) in enumerate(zip(cameras, rig.disturbed, strict=True)):
         tracer.set_time(disturbance.time_offset / rig.config.fps)
         lens = undistortion(camera, disturbance.lens)
-        pixels, positions, depths = _surface_pixels(tracer, camera, lens)
+        surface = tracer.surface_points(camera)
+        # The pixels with a surface that the lens shows.
+        pixels = np.flatnonzero((surface.ids >= 0) & (lens is None or lens.mask))
+        positions = surface.pick(pixels).positions
+        _, depths = camera.project(positions)
         # LLFF's percentiles, which readers of the file expect.
         bounds.append(np.percentile(depths, [0.1, 99.9]))
         if index == 0:
             continue  # the held-out view must not contribute points or colours
         most = _NUM_SFM_POINTS // (len(cameras) - 1)
         choice = rng.choice(len(pixels), min(most, len(pixels)), replace=False)
-        points.append(_noisy(positions[choice], depths[choice] / camera.K[0, 0], rng))
-        colors.append(_colors(clips[index], lens, pixels[choice]))
+        # Structure from motion has an error of about half a pixel; here it is the same along the
+        # ray.
+        pixel_width = depths[choice, None] / camera.K[0, 0]
+        noise = rng.normal(size=(len(choice), 3))
+        points.append(positions[choice] + noise * (0.5 * pixel_width))
+        image = next(open_frames(clips[index]).frames(0, 1))
+        image = image if lens is None else lens(image)
+        colors.append(image.reshape(-1, 3)[pixels[choice]] / 255)
     if not any(disturbance.distortion for disturbance in rig.disturbed):
         write_poses_bounds(folder / "poses_bounds.npy", cameras, np.array(bounds))
     write_colmap(
@@ -362,54 +327,22 @@ def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], fol
     )
 
 
-def _surface_pixels(
-    tracer: PathTracer, camera: Camera, lens: Undistortion | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the pixels [P] with a surface that a lens shows, and their positions [P, 3] and depths
-    [P].
-    """
-    surface = tracer.surface_points(camera)
-    pixels = np.flatnonzero((surface.ids >= 0) & (lens is None or lens.mask))
-    positions = surface.pick(pixels).positions
-    return pixels, positions, camera.project(positions)[1]
-
-
-def _noisy(points: np.ndarray, pixel: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return points [P, 3] with noise for a width of a pixel at each of them [P].
-
-    Structure from motion has an error of about half a pixel; here it is the same along the ray.
-    """
-    return points + rng.normal(size=points.shape) * (0.5 * pixel[:, None])
-
-
-def _colors(clip: Path, lens: Undistortion | None, pixels: np.ndarray) -> np.ndarray:
-    """Return the colours [P, 3] from 0 to 1 of some pixels in the first image of a clip."""
-    image = next(open_frames(clip).frames(0, 1))
-    image = image if lens is None else lens(image)
-    return image.reshape(-1, 3)[pixels] / 255
-
-
 def _check_folder(out: Path, overwrite: bool) -> None:
     """Raise `FileExistsError` if `out` must not be replaced."""
     if out.exists() and not out.is_dir():
         raise FileExistsError(f"synthesize(): {out} is a file; choose another folder.")
-    occupied = out.is_dir() and not all(is_added(file.name) for file in out.iterdir())
-    if occupied and not overwrite:
+    if not out.is_dir() or all(is_added(file.name) for file in out.iterdir()):
+        return
+    if not overwrite:
         raise FileExistsError(
             f"synthesize(): {out} is not empty; choose another folder, or set `overwrite`."
         )
-    if occupied and not _is_synthetic(out):
+    # Recordings and fits have a `capture.json` too.
+    if not {"scene", "spp"} <= set(stored_settings(out)):
         raise FileExistsError(
             f"synthesize(): {out} is not a synthetic capture, so it is not replaced; choose "
             "another folder."
         )
-
-
-def _is_synthetic(folder: Path) -> bool:
-    """Return whether a folder is a capture written by `synthesize`: recordings and fits have a
-    `capture.json` too.
-    """
-    return {"scene", "spp"} <= set(stored_settings(folder))
 
 
 def stored_settings(folder: Path) -> dict[str, Any]:

@@ -20,16 +20,11 @@ _SIZE = 512  # texels across
 def fractal(rng: np.random.Generator, size: int, finest: float) -> np.ndarray:
     """Return periodic 1/f noise [size, size] of unit variance, at most `finest` cycles across."""
     white = np.fft.rfft2(rng.standard_normal((size, size)))
-    noise = np.fft.irfft2(white * _amplitude(size, finest), s=(size, size))
+    frequency = np.hypot(np.fft.fftfreq(size, 1 / size)[:, None], np.fft.rfftfreq(size, 1 / size))
+    is_inside = (frequency >= 1) & (frequency <= finest)
+    amplitude = np.where(is_inside, 1 / np.maximum(frequency, 1), 0)
+    noise = np.fft.irfft2(white * amplitude, s=(size, size))
     return noise / noise.std()
-
-
-def _amplitude(size: int, finest: float) -> np.ndarray:
-    """Return the 1/f spectrum of `np.fft.rfft2` [size, size / 2 + 1]."""
-    rows = np.fft.fftfreq(size, 1 / size)
-    columns = np.fft.rfftfreq(size, 1 / size)
-    frequency = np.hypot(rows[:, None], columns)
-    return np.where((frequency >= 1) & (frequency <= finest), 1 / np.maximum(frequency, 1), 0)
 
 
 def pattern(seed: int, first: RGB, second: RGB, cells: int, finest: float) -> np.ndarray:
@@ -46,14 +41,10 @@ def pattern(seed: int, first: RGB, second: RGB, cells: int, finest: float) -> np
     rng = np.random.default_rng(seed)
     shade = fractal(rng, _SIZE, finest)[..., None]
     tint = np.stack([fractal(rng, _SIZE, finest) for _ in range(3)], axis=-1)
-    texture = _checker(first, second, cells) * np.exp(0.35 * shade + 0.10 * tint)
-    return np.clip(texture, 0.03, 0.85).astype(np.float32)
-
-
-def _checker(first: RGB, second: RGB, cells: int) -> np.ndarray:
-    """Return a checker of two colours [512, 512, 3]."""
     x = np.arange(_SIZE) * cells // _SIZE
-    return np.where(((x[:, None] + x) % 2)[..., None] == 1, first, second)
+    checker = np.where(((x[:, None] + x) % 2)[..., None] == 1, first, second)
+    texture = checker * np.exp(0.35 * shade + 0.10 * tint)
+    return np.clip(texture, 0.03, 0.85).astype(np.float32)
 
 
 def textured(
