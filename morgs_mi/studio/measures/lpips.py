@@ -63,24 +63,19 @@ class Lpips:
         """
         pair = unit_pair("Lpips", image, truth)
         H, W = pair[0].shape[:2]
-        outputs = self._network.run(dict(zip(_INPUTS, map(_blob, pair), strict=True)))
-        distance = next(iter(outputs.values()))
-        _check_distances(self.path, distance, W, H)
+        blobs = {
+            name: np.ascontiguousarray(2 * each.transpose(2, 0, 1)[None] - 1, np.float32)
+            for name, each in zip(_INPUTS, pair, strict=True)
+        }
+        distance = next(iter(self._network.run(blobs).values()))
+        if distance.size not in (1, H * W):
+            raise ValueError(
+                f"{self.path}: expected one distance, or one for each of {W}x{H} pixels, got "
+                f"{list(distance.shape)}; {_ADVICE}."
+            )
+        if not np.isfinite(distance).all():
+            raise ValueError(
+                f"{self.path}: expected finite distances, got NaN or infinity; export it in "
+                "float32."
+            )
         return distance.reshape((H, W) if distance.size > 1 else (1, 1))
-
-
-def _blob(image: np.ndarray) -> np.ndarray:
-    """Return an image [H, W, 3] from 0 to 1 as the network's input [1, 3, H, W]."""
-    return np.ascontiguousarray(2 * image.transpose(2, 0, 1)[None] - 1, np.float32)
-
-
-def _check_distances(path: Path, distance: np.ndarray, width: int, height: int) -> None:
-    if distance.size not in (1, height * width):
-        raise ValueError(
-            f"{path}: expected one distance, or one for each of {width}x{height} pixels, got "
-            f"{list(distance.shape)}; {_ADVICE}."
-        )
-    if not np.isfinite(distance).all():
-        raise ValueError(
-            f"{path}: expected finite distances, got NaN or infinity; export it in float32."
-        )

@@ -11,7 +11,6 @@ flow is resized back and scaled by the same factors.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -45,7 +44,25 @@ class FlowNetwork:
         self.low = low
         self.high = high
         self._net = OnnxNetwork(path, " or use its flow from files")
-        self._size = _image_size(path, list(self._net.inputs.values()))
+        shapes = list(self._net.inputs.values())
+        if (
+            len(shapes) != 2
+            or shapes[0] != shapes[1]
+            or len(shapes[0]) != 4
+            or shapes[0][0] not in (1, None)
+            or shapes[0][1] not in (3, None)
+        ):
+            raise ValueError(
+                f"{path}: expected a network with two images [1, 3, H, W] as its inputs, got "
+                f"{written_shapes(shapes)}; export it with one input per image."
+            )
+        height, width = shapes[0][2:]
+        if (height is None) != (width is None):
+            raise ValueError(
+                f"{path}: expected height and width both fixed or both open, got "
+                f"{written_shapes(shapes[:1])}."
+            )
+        self._size = None if height is None or width is None else (width, height)
 
     def __call__(self, image: np.ndarray, other: np.ndarray) -> np.ndarray:
         """Return the flow [H, W, 2] in pixels, float32, from `image` to `other` on the grid of
@@ -58,77 +75,40 @@ class FlowNetwork:
         Raises:
             ValueError: the network cannot run at this size, or does not return a flow.
         """
-        size = self._size
-        flow = self._padded(image, other) if size is None else self._resized(image, other, size)
+        height, width = image.shape[:2]
+        pair = (image, other)
+        if self._size is None:
+            down = -height % MULTIPLE
+            right = -width % MULTIPLE
+            top = down // 2
+            left = right // 2
+            border = (top, down - top, left, right - left, cv2.BORDER_REPLICATE)
+            padded_flow = self._run(*(cv2.copyMakeBorder(each, *border) for each in pair))
+            flow = padded_flow[top : top + height, left : left + width]
+        else:
+            images = (cv2.resize(each, self._size, interpolation=cv2.INTER_AREA) for each in pair)
+            flow = cv2.resize(self._run(*images), (width, height), interpolation=cv2.INTER_LINEAR)
+            flow = flow * np.array((width / self._size[0], height / self._size[1]), np.float32)
         if not np.isfinite(flow).all():
             raise ValueError(
                 f"{self.path}: expected a finite flow, got NaN or infinity; check the value range."
             )
         return flow
 
-    def _padded(self, image: np.ndarray, other: np.ndarray) -> np.ndarray:
-        height, width = image.shape[:2]
-        down = -height % MULTIPLE
-        right = -width % MULTIPLE
-        top = down // 2
-        left = right // 2
-        images = (
-            cv2.copyMakeBorder(each, top, down - top, left, right - left, cv2.BORDER_REPLICATE)
-            for each in (image, other)
-        )
-        return self._run(*images)[top : top + height, left : left + width]
-
-    def _resized(self, image: np.ndarray, other: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-        height, width = image.shape[:2]
-        images = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (image, other))
-        flow = cv2.resize(self._run(*images), (width, height), interpolation=cv2.INTER_LINEAR)
-        return flow * np.array((width / size[0], height / size[1]), np.float32)
-
     def _run(self, image: np.ndarray, other: np.ndarray) -> np.ndarray:
-        height, width = image.shape[:2]
-        blobs = (self._blob(each) for each in (image, other))
-        outputs = self._net.run(dict(zip(self._net.inputs, blobs, strict=True))).values()
-        flow = _last_flow(self.path, list(outputs), (1, 2, height, width))
-        return np.ascontiguousarray(np.moveaxis(flow[0], 0, 2), dtype=np.float32)
-
-    def _blob(self, image: np.ndarray) -> np.ndarray:
-        """Return an image as the network's input, [1, 3, H, W] float32."""
-        unit = unit_values(image, np.float32)
-        return np.ascontiguousarray(
-            np.moveaxis(self.low + (self.high - self.low) * unit, 2, 0)[None], np.float32
-        )
-
-
-def _last_flow(path: Path, outputs: Sequence[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
-    """Return the last output of a network that has the shape of a flow."""
-    # A network that returns the flow of each of its iterations returns the best one last.
-    flows = [output for output in outputs if output.shape == shape]
-    if not flows:
-        shapes = written_shapes([output.shape for output in outputs])
-        raise ValueError(f"{path}: expected an output {[*shape]}, the flow, got {shapes}.")
-    return flows[-1]
-
-
-def _is_image(shape: tuple[int | None, ...]) -> bool:
-    return len(shape) == 4 and shape[0] in (1, None) and shape[1] in (3, None)
-
-
-def _image_size(
-    path: str | Path, shapes: Sequence[tuple[int | None, ...]]
-) -> tuple[int, int] | None:
-    """Return the width and height of a network's two images, None if it takes any size."""
-    if len(shapes) != 2 or not all(map(_is_image, shapes)) or shapes[0] != shapes[1]:
-        raise ValueError(
-            f"{path}: expected a network with two images [1, 3, H, W] as its inputs, got "
-            f"{written_shapes(shapes)}; export it with one input per image."
-        )
-    height, width = shapes[0][2:]
-    if (height is None) != (width is None):
-        raise ValueError(
-            f"{path}: expected height and width both fixed or both open, got "
-            f"{written_shapes(shapes[:1])}."
-        )
-    return None if height is None or width is None else (width, height)
+        """Return the network's flow [H, W, 2] between two images of a size that it takes."""
+        blobs: dict[str, np.ndarray] = {}
+        for name, each in zip(self._net.inputs, (image, other), strict=True):
+            values = self.low + (self.high - self.low) * unit_values(each, np.float32)
+            blobs[name] = np.ascontiguousarray(np.moveaxis(values, 2, 0)[None], np.float32)
+        outputs = self._net.run(blobs).values()
+        shape = (1, 2, *image.shape[:2])
+        # A network that returns the flow of each of its iterations returns the best one last.
+        flows = [output for output in outputs if output.shape == shape]
+        if not flows:
+            shapes = written_shapes([output.shape for output in outputs])
+            raise ValueError(f"{self.path}: expected an output {[*shape]}, the flow, got {shapes}.")
+        return np.ascontiguousarray(np.moveaxis(flows[-1][0], 0, 2), dtype=np.float32)
 
 
 def onnx(path: str, config: FlowConfig) -> FlowSource:

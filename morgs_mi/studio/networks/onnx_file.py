@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -50,18 +49,46 @@ class OnnxNetwork:
         self._alternative = instead
         if not self.path.is_file():
             raise FileNotFoundError(f"{path}: expected an ONNX file, found none; check the path.")
-        onnxruntime = _onnxruntime(path)
-        self._runtime = f"onnxruntime {onnxruntime.__version__}"
         try:
-            self._session = _session(onnxruntime, str(path))
-            self.inputs = {value.name: _shape(value.shape) for value in self._session.get_inputs()}
+            import onnxruntime
+        except ImportError:
+            raise ValueError(
+                f"{path}: running a network needs the package onnxruntime; pip install "
+                "'morgs-mi[networks]'."
+            ) from None
+        self._runtime = f"onnxruntime {onnxruntime.__version__}"
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = _FATAL
+        # Which limits a worker to its share of the cores.
+        options.intra_op_num_threads = cv2.getNumThreads()
+        providers = ["CPUExecutionProvider"]
+        try:
+            # A fallback would try the same again, and print.
+            self._session = onnxruntime.InferenceSession(
+                str(path), options, providers=providers, enable_fallback=0
+            )
+            self.inputs: dict[str, tuple[int | None, ...]] = {
+                value.name: tuple(
+                    size if isinstance(size, int) and size > 0 else None for size in value.shape
+                )
+                for value in self._session.get_inputs()
+            }
             self.outputs = tuple(value.name for value in self._session.get_outputs())
         except Exception as error:  # its errors have no class in common
             raise ValueError(
                 f"{path}: {self._runtime} cannot load this network ({_reason(error)}); export it "
                 f"again{instead}."
             ) from error
-        _check_sizes(path, self.inputs.values())
+        large = [
+            shape
+            for shape in self.inputs.values()
+            if math.prod(size or 1 for size in shape) > _MAX_VALUES
+        ]
+        if large:
+            raise ValueError(
+                f"{path}: expected inputs of at most {_MAX_VALUES} values, got "
+                f"{written_shapes(large)}; export it for smaller images."
+            )
 
     def run(self, inputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Return all outputs by name, in their order.
@@ -81,56 +108,19 @@ class OnnxNetwork:
                 f"{self.path}: {self._runtime} cannot run this network on {shapes} "
                 f"({_reason(error)}); export it for these sizes{self._alternative}."
             ) from error
-        return _arrays(self.path, dict(zip(self.outputs, results, strict=True)))
-
-
-def _check_sizes(path: str | Path, shapes: Iterable[tuple[int | None, ...]]) -> None:
-    """Raise `ValueError` if an input of a network is too large."""
-    large = [shape for shape in shapes if math.prod(size or 1 for size in shape) > _MAX_VALUES]
-    if large:
-        raise ValueError(
-            f"{path}: expected inputs of at most {_MAX_VALUES} values, got "
-            f"{written_shapes(large)}; export it for smaller images."
-        )
-
-
-def _arrays(path: Path, results: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return a network's outputs, which are arrays of numbers."""
-    arrays = {
-        name: x
-        for name, x in results.items()
-        if isinstance(x, np.ndarray) and x.dtype.kind in "biuf"
-    }
-    if others := [name for name in results if name not in arrays]:
-        raise ValueError(
-            f"{path}: expected arrays of numbers, got others from {', '.join(others)}; "
-            "export again."
-        )
-    return arrays
-
-
-def _onnxruntime(path: str | Path) -> Any:
-    """Return the module `onnxruntime`, with which the network at `path` is to be run."""
-    try:
-        import onnxruntime
-    except ImportError:
-        raise ValueError(
-            f"{path}: running a network needs the package onnxruntime; pip install "
-            "'morgs-mi[networks]'."
-        ) from None
-    return onnxruntime
-
-
-def _session(onnxruntime: Any, path: str) -> Any:
-    """Return `onnxruntime`'s session of a network."""
-    options = onnxruntime.SessionOptions()
-    options.log_severity_level = _FATAL
-    # Which limits a worker to its share of the cores.
-    options.intra_op_num_threads = cv2.getNumThreads()
-    # A fallback would try the same again, and print.
-    return onnxruntime.InferenceSession(
-        path, options, providers=["CPUExecutionProvider"], enable_fallback=0
-    )
+        arrays: dict[str, np.ndarray] = {}
+        others: list[str] = []
+        for name, value in zip(self.outputs, results, strict=True):
+            if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+                arrays[name] = value
+            else:
+                others.append(name)
+        if others:
+            raise ValueError(
+                f"{self.path}: expected arrays of numbers, got others from {', '.join(others)}; "
+                "export again."
+            )
+        return arrays
 
 
 def imagenet_blob(image: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -154,11 +144,6 @@ def written_shapes(shapes: Iterable[tuple[int | None, ...]]) -> str:
         for shape in shapes
     )
     return " and ".join(texts) or "none"
-
-
-def _shape(sizes: Iterable[int | str | None]) -> tuple[int | None, ...]:
-    """Return a shape with None for sizes that have a name, or no number."""
-    return tuple(size if isinstance(size, int) and size > 0 else None for size in sizes)
 
 
 def _reason(error: Exception) -> str:

@@ -17,7 +17,7 @@ its box. The package contains no weights; docs/masks.md explains how to export t
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -61,8 +61,23 @@ class SegmentNetwork:
         self._count = count
         self._encoder = OnnxNetwork(encoder)
         self._decoder = OnnxNetwork(decoder)
-        self._size = _encoder_size(encoder, list(self._encoder.inputs.values()))
-        _check_decoder(decoder, self._decoder, self._encoder.outputs)
+        shapes = list(self._encoder.inputs.values())
+        if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] != 3:
+            raise ValueError(
+                f"{encoder}: expected an image encoder with one input [1, 3, {_SIZE}, {_SIZE}], "
+                f"got {written_shapes(shapes)}; give the encoder first, then the decoder."
+            )
+        height, width = (side or _SIZE for side in shapes[0][2:])
+        self._size = (width, height)
+        names = {*self._encoder.outputs, *_PROMPTS}
+        inputs = self._decoder.inputs
+        outputs = self._decoder.outputs
+        if not set(_PROMPTS[:2]) <= set(inputs) <= names or not set(_RESULTS) <= set(outputs):
+            raise ValueError(
+                f"{decoder}: expected a mask decoder with inputs among {', '.join(sorted(names))} "
+                f"and outputs {' and '.join(_RESULTS)}, got {', '.join(inputs)} and "
+                f"{', '.join(outputs)}; export both networks as described in {page('masks')}."
+            )
 
     def __call__(self, image: np.ndarray, mask: np.ndarray) -> np.ndarray:
         """Return the mask of the objects [H, W] bool; it is empty if `mask` is.
@@ -91,67 +106,33 @@ class SegmentNetwork:
         predicted IoU.
         """
         height, width = component.shape
-        inputs = {**features, **self._prompt(component)}
-        results = self._decoder.run({name: inputs[name] for name in self._decoder.inputs})
-        logits = _best_mask(self._decoder.path, *(results[name] for name in _RESULTS))
-        return cv2.resize(logits, (width, height), interpolation=cv2.INTER_LINEAR) > 0
-
-    def _prompt(self, component: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the decoder's inputs for a component."""
-        height, width = component.shape
         input_width, input_height = self._size
         points, labels = prompts(component)
         # The decoder adds half a pixel: its pixel centres have whole coordinates.
         scale = np.array((input_width / width, input_height / height), np.float32)
         coordinates = points * scale - np.float32(0.5)
         quarter = input_height // _MASK_SHRINK, input_width // _MASK_SHRINK
-        return {
+        inputs = {
+            **features,
             "point_coords": coordinates[None],
             "point_labels": labels[None],
             "mask_input": np.zeros((1, 1, *quarter), np.float32),
             "has_mask_input": np.zeros(1, np.float32),
         }
-
-
-def _encoder_size(path: str | Path, shapes: Sequence[tuple[int | None, ...]]) -> tuple[int, int]:
-    """Return the width and height of the encoder's image."""
-    if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] != 3:
-        raise ValueError(
-            f"{path}: expected an image encoder with one input [1, 3, {_SIZE}, {_SIZE}], "
-            f"got {written_shapes(shapes)}; give the encoder first, then the decoder."
-        )
-    height, width = (side or _SIZE for side in shapes[0][2:])
-    return width, height
-
-
-def _check_decoder(path: str | Path, decoder: OnnxNetwork, features: Sequence[str]) -> None:
-    """Raise `ValueError` if a network does not decode these features."""
-    names = {*features, *_PROMPTS}
-    inputs = set(decoder.inputs)
-    if not set(_PROMPTS[:2]) <= inputs <= names or not set(_RESULTS) <= set(decoder.outputs):
-        raise ValueError(
-            f"{path}: expected a mask decoder with inputs among {', '.join(sorted(names))} "
-            f"and outputs {' and '.join(_RESULTS)}, got {', '.join(decoder.inputs)} and "
-            f"{', '.join(decoder.outputs)}; export both networks as described in "
-            f"{page('masks')}."
-        )
-
-
-def _best_mask(path: Path, masks: np.ndarray, quality: np.ndarray) -> np.ndarray:
-    """Return the logits float32 [h, w] of the mask with the highest predicted IoU."""
-    _check_results(path, masks, quality)
-    logits = masks[0, np.argmax(quality[0])].astype(np.float32)
-    if not np.isfinite(logits).all():
-        raise ValueError(f"{path}: expected finite masks, got NaN or infinity; export in float32.")
-    return logits
-
-
-def _check_results(path: Path, masks: np.ndarray, quality: np.ndarray) -> None:
-    if masks.ndim != 4 or quality.shape != masks.shape[:2] or len(masks) != 1:
-        raise ValueError(
-            f"{path}: expected masks [1, M, H, W] and iou_predictions [1, M], "
-            f"got {list(masks.shape)} and {list(quality.shape)}."
-        )
+        path = self._decoder.path
+        results = self._decoder.run({name: inputs[name] for name in self._decoder.inputs})
+        masks, quality = (results[name] for name in _RESULTS)
+        if masks.ndim != 4 or quality.shape != masks.shape[:2] or len(masks) != 1:
+            raise ValueError(
+                f"{path}: expected masks [1, M, H, W] and iou_predictions [1, M], "
+                f"got {list(masks.shape)} and {list(quality.shape)}."
+            )
+        logits = masks[0, np.argmax(quality[0])].astype(np.float32)
+        if not np.isfinite(logits).all():
+            raise ValueError(
+                f"{path}: expected finite masks, got NaN or infinity; export in float32."
+            )
+        return cv2.resize(logits, (width, height), interpolation=cv2.INTER_LINEAR) > 0
 
 
 def prompts(
@@ -171,21 +152,10 @@ def prompts(
         Coordinates [P, 2] in pixels of the image, float32, pixel centres at +0.5, and labels [P],
         float32; first the box's corners, then the points.
     """
-    upper_left, lower_right = _box(component)
+    columns, rows = (np.flatnonzero(component.any(axis)) for axis in range(2))
+    upper_left = (columns[0], rows[0])
+    lower_right = (columns[-1] + 1, rows[-1] + 1)
     distance = max(np.subtract(lower_right, upper_left)) * spacing
-    points = _deep_points(component, count, distance)
-    labels = [_UPPER_LEFT, _LOWER_RIGHT] + [_ON_OBJECT] * len(points)
-    return np.array([upper_left, lower_right, *points], np.float32), np.array(labels, np.float32)
-
-
-def _box(component: np.ndarray) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Return the upper left and the lower right corner of a component's box, x and y."""
-    x, y = (np.flatnonzero(component.any(axis)) for axis in range(2))
-    return (x[0], y[0]), (x[-1] + 1, y[-1] + 1)
-
-
-def _deep_points(component: np.ndarray, count: int, distance: float) -> list[tuple[float, float]]:
-    """Return the deepest points of a component, at most `count`, with a distance between them."""
     depth = cv2.distanceTransform(np.pad(component, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
     y, x = np.mgrid[: component.shape[0], : component.shape[1]]
     points = []
@@ -193,7 +163,8 @@ def _deep_points(component: np.ndarray, count: int, distance: float) -> list[tup
         row, column = np.unravel_index(np.argmax(depth), depth.shape)
         points.append((column + 0.5, row + 0.5))
         depth = np.where(np.hypot(x - column, y - row) < distance, 0, depth)
-    return points
+    labels = [_UPPER_LEFT, _LOWER_RIGHT] + [_ON_OBJECT] * len(points)
+    return np.array([upper_left, lower_right, *points], np.float32), np.array(labels, np.float32)
 
 
 def _components(mask: np.ndarray, most: int) -> list[np.ndarray]:
