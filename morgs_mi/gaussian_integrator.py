@@ -75,7 +75,10 @@ def ellipsoids(gaussians: ActivatedGaussians) -> dict[str, Any]:
     values = {
         name: np.array(dr.detach(value)) for name, value in values.items() if value is not None
     }
-    data = _rows(*(values.pop(name) for name in names[:3]))
+    means, scales, quats = (values.pop(name) for name in names[:3])
+    # Mitsuba expects unit quaternions.
+    quats = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-30)
+    data = np.concatenate([means, scales, np.roll(quats, -1, axis=1)], axis=1)
     # Memory of Dr.Jit: a parameter that is borrowed from NumPy cannot be replaced in a function
     # under `dr.freeze`.
     return {"type": "ellipsoids"} | {
@@ -84,13 +87,6 @@ def ellipsoids(gaussians: ActivatedGaussians) -> dict[str, Any]:
         )
         for name, value in {"data": data, **values}.items()
     }
-
-
-def _rows(means: np.ndarray, scales: np.ndarray, quats: np.ndarray) -> np.ndarray:
-    """Return the rows [N, 10] of an `ellipsoids` shape."""
-    # Mitsuba expects unit quaternions.
-    quats = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-30)
-    return np.concatenate([means, scales, np.roll(quats, -1, axis=1)], axis=1)
 
 
 def integrator(plugin: str, props: Any) -> Any:

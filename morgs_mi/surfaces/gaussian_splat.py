@@ -105,25 +105,16 @@ def _shape_gaussians(shape: Any, attributes: list[str]) -> dict[str, Tensor]:
     for name in attributes:
         size = dr.width(params[name]) if name in params else 0
         if size not in [N * width for width in all_widths[name]]:
-            raise _attribute_error(shape, name, N)
+            expected = " or ".join(map(str, all_widths[name]))
+            content = f"{size} values" if name in params else f"only {sorted(params.keys())}"
+            raise ValueError(
+                f"gaussian_splat: the {shape.class_name()} {shape.id()!r} must have `{name}` [N, "
+                f"{expected}] with N={N}, got {content}; set it where the shape is defined, or "
+                "write its file by morgs_mi.write_ply(path, gaussians, layout='mitsuba')."
+            )
         tail = (size // N // 3, 3) if name == "sh_coeffs" else BY_ACTIVATED_NAME[name].shape
         part[name] = mi.TensorXf(params[name], (N, *tail))
     return part
-
-
-def _attribute_error(shape: Any, name: str, N: int) -> ValueError:
-    """Return the error about an attribute of N Gaussians that is missing or of another size."""
-    params: Any = mi.traverse(shape)
-    expected = " or ".join(map(str, shape_attribute_widths()[name]))
-    has_attribute = name in params
-    content = (
-        f"{dr.width(params[name])} values" if has_attribute else f"only {sorted(params.keys())}"
-    )
-    return ValueError(
-        f"gaussian_splat: the {shape.class_name()} {shape.id()!r} must have `{name}` [N, "
-        f"{expected}] with N={N}, got {content}; set it where the shape is defined, or "
-        "write its file by morgs_mi.write_ply(path, gaussians, layout='mitsuba')."
-    )
 
 
 class _ForwardPass(NamedTuple):
@@ -189,62 +180,9 @@ def _sensor_camera(sensor: Any, border: int) -> Camera:
     return AttachedCamera(K, viewmat, *size, view.name, view.near, intrinsics=(f, f, cx, cy))
 
 
-def _render_config(props: Any) -> RenderConfig:
-    """Return the settings of the rasteriser that the properties give."""
-    try:
-        return RenderConfig(**{name: props[name] for name in _SETTINGS if name in props})
-    except ValueError as error:
-        raise ValueError(f"gaussian_splat: {error}") from None
-
-
-def _color(value: Any) -> Any:
-    """Return one number or three as a colour."""
-    values = np.ravel(value)
-    if values.size not in (1, 3) or values.dtype.kind not in "fiu" or not bounded(values):
-        raise ValueError(
-            "gaussian_splat: `background` must be one or three finite numbers, got a "
-            f"{type(value).__name__}, {str(value)[:20]!r}; pass a colour such as "
-            "{'type': 'rgb', 'value': 1}."
-        )
-    return mi.Color3f(np.broadcast_to(values.astype(float), 3))
-
-
-def _check_integrator(surfaces: Any) -> None:
-    if surfaces is None:
-        return
-    if not isinstance(surfaces, mi.Integrator) or isinstance(surfaces, GaussianSplatIntegrator):
-        raise ValueError(
-            "gaussian_splat: `surfaces` must be an integrator of surfaces such as {'type': "
-            f"'path'}}, got {surfaces!r}; pass another one."
-        )
-    if not mi.is_rgb:
-        raise ValueError(
-            "gaussian_splat: with `surfaces`, expected a variant such as 'llvm_ad_rgb', got "
-            f"{mi.variant()!r}; call mi.set_variant() before the scene is loaded, because "
-            "Gaussians have RGB colours."
-        )
-
-
 def _sensor_of(scene: Any, sensor: Any) -> Any:
     """Return a sensor, which may be given by its number in the scene."""
     return scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-
-
-def _film(sensor: Any) -> Any:
-    film = sensor.film()
-    if mi.has_flag(film.flags(), mi.FilmFlags.Special):
-        raise ValueError(
-            f"gaussian_splat: expected an `hdrfilm`, got {film.class_name()}; replace it, "
-            "because only RGB is drawn."
-        )
-    return film
-
-
-def _crop(film: Any, border: int) -> tuple[int, int, int, int]:
-    """Return the pixels of a film's crop and the border around it, (x, y, width, height)."""
-    x, y = film.crop_offset()
-    width, height = film.crop_size() + 2 * border
-    return int(x), int(y), int(width), int(height)
 
 
 class GaussianSplatIntegrator(mi.CppADIntegrator):
@@ -316,13 +254,38 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
             if name in props:
                 check_value("gaussian_splat", name, props[name], kind)
         self.srgb_primitives = props.get("srgb_primitives", True)
-        self.config = _render_config(props)
+        try:
+            self.config = RenderConfig(**{name: props[name] for name in _SETTINGS if name in props})
+        except ValueError as error:
+            raise ValueError(f"gaussian_splat: {error}") from None
+        self.background = None
         background = props.get("background", None)
-        self.background = None if background is None else _color(background)
+        if background is not None:
+            values = np.ravel(background)
+            if values.size not in (1, 3) or values.dtype.kind not in "fiu" or not bounded(values):
+                raise ValueError(
+                    "gaussian_splat: `background` must be one or three finite numbers, got a "
+                    f"{type(background).__name__}, {str(background)[:20]!r}; pass a colour such "
+                    "as {'type': 'rgb', 'value': 1}."
+                )
+            self.background = mi.Color3f(np.broadcast_to(values.astype(float), 3))
         names = (name.strip() for name in props.get("aovs", "").split(","))
         self.aovs = list(dict.fromkeys(name for name in names if name))
         self.surfaces = props.get("surfaces", None)
-        _check_integrator(self.surfaces)
+        if self.surfaces is not None:
+            if not isinstance(self.surfaces, mi.Integrator) or isinstance(
+                self.surfaces, GaussianSplatIntegrator
+            ):
+                raise ValueError(
+                    "gaussian_splat: `surfaces` must be an integrator of surfaces such as "
+                    f"{{'type': 'path'}}, got {self.surfaces!r}; pass another one."
+                )
+            if not mi.is_rgb:
+                raise ValueError(
+                    "gaussian_splat: with `surfaces`, expected a variant such as 'llvm_ad_rgb', "
+                    f"got {mi.variant()!r}; call mi.set_variant() before the scene is loaded, "
+                    "because Gaussians have RGB colours."
+                )
         self.warnings: set[str] = set()
         self.forward_pass: _ForwardPass | None = None
         names = aov_attributes()
@@ -423,7 +386,12 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
         any.
         """
         sensor = _sensor_of(scene, sensor)
-        film = _film(sensor)
+        film = sensor.film()
+        if mi.has_flag(film.flags(), mi.FilmFlags.Special):
+            raise ValueError(
+                f"gaussian_splat: expected an `hdrfilm`, got {film.class_name()}; replace it, "
+                "because only RGB is drawn."
+            )
         border = film.rfilter().border_size() if film.sample_border() else 0
         views = _views(sensor)
         if len(views) > 1 and (border or self.surfaces is not None):
@@ -434,15 +402,23 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
             )
         cameras = [_sensor_camera(view, border) for view in views]
         has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
-        gaussians = _scene_gaussians(scene, self._attributes(), self.surfaces is not None)
+        required = (aov_attributes()[name] for name in self.aovs)
+        attributes = ["opacities", "sh_coeffs", *(name for name in required if name)]
+        gaussians = _scene_gaussians(scene, attributes, self.surfaces is not None)
         channels = ("color", *(["alpha"] if has_alpha else []), *self.aovs)
         # Cropped after rendering: the projection's linearisation depends on the extent of the whole
         # view.
-        crop = _crop(film, border)
+        x, y = map(int, film.crop_offset())
+        width, height = map(int, film.crop_size() + 2 * border)
+        crop = (x, y, width, height)
 
         self._warn(scene, gaussians)
-        pixels = SampledPixels(cameras[0], crop, sensor, seed, spp)
-        surfaces = self._surface_view(scene, pixels, gaussians)
+        surfaces = None
+        if self.surfaces is not None:
+            pixels = SampledPixels(cameras[0], crop, sensor, seed, spp)
+            surfaces = SurfaceView.of(
+                scene, self.surfaces, pixels, gaussians, self.srgb_primitives, self.config
+            )
         if surfaces is None:
             columns = self._splats(gaussians, cameras, channels, crop)
         else:
@@ -453,27 +429,12 @@ class GaussianSplatIntegrator(mi.CppADIntegrator):
 
         film.prepare(self.aov_names())
         block = film.create_block()
-        x, y, width, height = crop
         index = dr.arange(mi.UInt32, width * height)
         place = mi.Point2f(index % width, index // width)
         block.set_coalesce(False)  # useful for many samples per pixel only
         block.put(place + mi.Point2f(x, y) + (0.5 - border), values)
         film.put_block(block)
         return film, surfaces
-
-    def _surface_view(
-        self, scene: Any, pixels: SampledPixels, gaussians: Any
-    ) -> SurfaceView | None:
-        """Return the rendered surfaces; None if there are none."""
-        if self.surfaces is None:
-            return None
-        srgb = self.srgb_primitives
-        return SurfaceView.of(scene, self.surfaces, pixels, gaussians, srgb, self.config)
-
-    def _attributes(self) -> list[str]:
-        """Return the attributes of Gaussians that the channels need."""
-        required = (aov_attributes()[name] for name in self.aovs)
-        return ["opacities", "sh_coeffs", *(name for name in required if name)]
 
     def _splats(
         self,

@@ -164,22 +164,35 @@ class SplatRays:
     """
 
     def __init__(self, gaussians: ActivatedGaussians, config: RenderConfig | None = None) -> None:
-        _check_gaussians(gaussians)
+        if not hasattr(gaussians, "means") or not int(gaussians.means.shape[0]):
+            raise ValueError(
+                "SplatRays(): `gaussians` must be at least one Gaussian, got a "
+                f"{type(gaussians).__name__} without any; pass some."
+            )
         self._config = config or RenderConfig()
         names = ("means", "scales", "quats", "opacities", "sh_coeffs")
         means, scales, quats, opacities, coeffs = (_finite(gaussians, name) for name in names)
         scales = np.maximum(scales, np.maximum(_THINNEST * scales.max(1, keepdims=True), 1e-30))
-        axes = _axes(quats)
-        reach = _reach(opacities.ravel(), self._config.alpha_min)
+        # A quaternion of length 0 is the identity.
+        lengths = np.linalg.norm(quats, axis=1, keepdims=True)
+        quats = np.where(lengths > 0, quats, [1, 0, 0, 0])
+        axes = Rotation.from_quat(quats, scalar_first=True).as_matrix()
+        # Distances from the centre, in standard deviations, at which alpha is too small.
+        opacities = opacities.ravel()
+        reach = np.sqrt(2 * np.log(np.maximum(opacities / self._config.alpha_min, 1)))
         indices = np.flatnonzero(reach > 0)
         halves = reach[:, None] * np.linalg.norm(axes * scales[:, None], axis=2)
         self._tree, order = _Tree.of(means[indices], halves[indices])
         index = np.concatenate([indices, [0]])[order]
-        matrices = (axes / scales[:, None]).transpose(0, 2, 1)
-        opacities = np.where(order < len(indices), opacities.ravel()[index], 0)
-        rows = _packed_rows(matrices[index], means[index], opacities)
+        # Rows of four floats, which are read as one packet.
+        rows = np.zeros((len(index), 4, 4))
+        rows[:, :3, :3] = (axes / scales[:, None]).transpose(0, 2, 1)[index]
+        rows[:, :3, 3] = means[index]
+        rows[:, 3, 0] = np.where(order < len(indices), opacities[index], 0)
+        colors = np.zeros((*coeffs.shape[:2], 4))
+        colors[..., :3] = coeffs
         self._rows = from_numpy(mi.Float, rows)
-        self._coeffs = from_numpy(mi.Float, _packed_colors(coeffs)[index])
+        self._coeffs = from_numpy(mi.Float, colors[index])
         self._degree = round(sqrt(coeffs.shape[1])) - 1
 
     def transmittance(self, ray: Any, active: Bool = True) -> Float:
@@ -313,14 +326,6 @@ class SplatRays:
         return dr.maximum(total, 0)
 
 
-def _check_gaussians(gaussians: ActivatedGaussians) -> None:
-    if not hasattr(gaussians, "means") or not int(gaussians.means.shape[0]):
-        raise ValueError(
-            "SplatRays(): `gaussians` must be at least one Gaussian, got a "
-            f"{type(gaussians).__name__} without any; pass some."
-        )
-
-
 def _finite(gaussians: ActivatedGaussians, name: str) -> np.ndarray:
     """Return an attribute in float64, detached."""
     values = np.array(dr.detach(getattr(gaussians, name)), np.float64)
@@ -333,33 +338,6 @@ def _finite(gaussians: ActivatedGaussians, name: str) -> np.ndarray:
             f"{bad[0].tolist()} ({len(bad)} such values); remove these Gaussians."
         )
     return values
-
-
-def _reach(opacities: np.ndarray, alpha_min: float) -> np.ndarray:
-    """Return the distances from the centre, in standard deviations, at which alpha is too small."""
-    return np.sqrt(2 * np.log(np.maximum(opacities / alpha_min, 1)))
-
-
-def _axes(quats: np.ndarray) -> np.ndarray:
-    """Return the rotations [N, 3, 3] of quaternions; of one of length 0, the identity."""
-    quats = np.where(np.linalg.norm(quats, axis=1, keepdims=True) > 0, quats, [1, 0, 0, 0])
-    return Rotation.from_quat(quats, scalar_first=True).as_matrix()
-
-
-def _packed_rows(matrices: np.ndarray, means: np.ndarray, opacities: np.ndarray) -> np.ndarray:
-    """Return Gaussians as rows [L, 4, 4] of four floats each, which are read as one packet."""
-    rows = np.zeros((len(means), 4, 4))
-    rows[:, :3, :3] = matrices
-    rows[:, :3, 3] = means
-    rows[:, 3, 0] = opacities
-    return rows
-
-
-def _packed_colors(coeffs: np.ndarray) -> np.ndarray:
-    """Return SH coefficients as packets of four floats [N, K, 4]."""
-    packets = np.zeros((*coeffs.shape[:2], 4))
-    packets[..., :3] = coeffs
-    return packets
 
 
 def _longest_axis(points: np.ndarray) -> int:

@@ -77,23 +77,18 @@ def surface_scene(scene: Any) -> Any:
             "the scene, such as an `envmap` of morgs_mi.light_probe()."
         )
     for shape in surfaces:
-        _check_surface(shape)
+        if shape.is_medium_transition():
+            raise ValueError(
+                f"gaussian_splat: expected surfaces, got {shape.class_name()} {shape.id()!r}, the "
+                "boundary of a medium; remove the medium, because splats have no place in the "
+                "order of a volume's light."
+            )
+        if shape.bsdf() is None:
+            raise ValueError(
+                f"gaussian_splat: the {shape.class_name()} {shape.id()!r} must have a BSDF, got "
+                "none; set `bsdf` where the shape is defined."
+            )
     return shared_scene([*surfaces, *lights(scene)], scene)
-
-
-def _check_surface(shape: Any) -> None:
-    """Raise an error if a shape is the boundary of a medium, or has no BSDF."""
-    if shape.is_medium_transition():
-        raise ValueError(
-            f"gaussian_splat: expected surfaces, got {shape.class_name()} {shape.id()!r}, the "
-            "boundary of a medium; remove the medium, because splats have no place in the "
-            "order of a volume's light."
-        )
-    if shape.bsdf() is None:
-        raise ValueError(
-            f"gaussian_splat: the {shape.class_name()} {shape.id()!r} must have a BSDF, got "
-            "none; set `bsdf` where the shape is defined."
-        )
 
 
 def lights(scene: Any) -> list[Any]:
@@ -128,12 +123,6 @@ def _attached(thing: Any) -> list[str]:
     return [key for key in params.keys() if dr.grad_enabled(params[key])]  # noqa: SIM118
 
 
-def _attached_parameters(shape: Any) -> list[tuple[Any, str, Any]]:
-    """Return the parameters of a shape that are attached: the table, the key and the value."""
-    params: Any = mi.traverse(shape)
-    return [(params, key, params[key]) for key in _attached(shape)]
-
-
 @contextmanager
 def _detached(shapes: list[Any]) -> Iterator[None]:
     """Detach the parameters of shapes inside the context.
@@ -141,7 +130,13 @@ def _detached(shapes: list[Any]) -> Iterator[None]:
     Calls of Mitsuba's virtual functions are traced for all shapes that exist, of any scene. In
     forward mode `prb` would depend on shapes that its scene does not have, and fail.
     """
-    attached = [parameter for shape in shapes for parameter in _attached_parameters(shape)]
+    tables: list[Any] = [mi.traverse(shape) for shape in shapes]
+    attached = [
+        (params, key, params[key])
+        for params in tables
+        for key in params.keys()  # noqa: SIM118
+        if dr.grad_enabled(params[key])
+    ]
     for params, key, value in attached:
         params[key] = dr.detach(value)
     try:
@@ -237,7 +232,9 @@ class SurfaceView:
                     f"{integrator.aov_names()} alone; put a `path` into it."
                 )
             coverage, depth = coverage_and_depth(scene, sensor, pixels.camera, pixels.crop)
-            behind = _environment(scene, sensor) if _is_behind(scene, integrator) else None
+            behind = None
+            if scene.environment() is not None and not getattr(integrator, "hide_emitters", False):
+                behind = _environment(scene, sensor)
         dr.enable_grad(image, behind)
         return SurfaceView(
             scene, gaussians, integrator, pixels, sensor, image, coverage, depth, behind, rays, srgb
@@ -249,7 +246,7 @@ class SurfaceView:
             return
         with _detached(self.gaussians), traced(self.integrator, self.splats, self.srgb):
             tangent = self.integrator.render_forward(
-                self.scene, params, self.sensor, **self._samples(self.pixels.seed)
+                self.scene, params, self.sensor, seed=self.pixels.seed, spp=self.pixels.samples()
             )
         dr.set_grad(self.image, tangent)
         values = self._attached_environment()
@@ -269,7 +266,7 @@ class SurfaceView:
         grad = dr.grad(self.image)
         with traced(self.integrator, self.splats, self.srgb):
             self.integrator.render_backward(
-                self.scene, params, grad, self.sensor, **self._samples(seed)
+                self.scene, params, grad, self.sensor, seed=seed, spp=self.pixels.samples()
             )
         values = self._attached_environment()
         if values is not None:
@@ -288,7 +285,14 @@ class SurfaceView:
     def _differentiates(self) -> bool:
         """Return whether any parameter of the surfaces is differentiated."""
         attached = _attached(self.scene)
-        self._warn_of_positions(attached)
+        params: Any = mi.traverse(self.scene)
+        moving = [name for name in attached if params.flags(name) & mi.ParamFlags.Discontinuous]
+        if moving:
+            _log.warning(
+                "gaussian_splat: gradients of the surfaces' positions lack what changes with "
+                "their silhouettes and depth; do not optimise `%s` with it.",
+                "`, `".join(moving),
+            )
         if self.splats is not None and any(_attached(shape) for shape in self.gaussians):
             _log.warning(
                 "splat_path: gradients of the Gaussians are those of the splats that the camera "
@@ -296,19 +300,6 @@ class SurfaceView:
                 "light."
             )
         return bool(attached)
-
-    def _warn_of_positions(self, names: list[str]) -> None:
-        params = mi.traverse(self.scene)
-        moving = [name for name in names if params.flags(name) & mi.ParamFlags.Discontinuous]
-        if moving:
-            _log.warning(
-                "gaussian_splat: gradients of the surfaces' positions lack what changes with "
-                "their silhouettes and depth; do not optimise `%s` with it.",
-                "`, `".join(moving),
-            )
-
-    def _samples(self, seed: Any) -> dict[str, Any]:
-        return {"seed": seed, "spp": self.pixels.samples()}
 
     @property
     def mask(self) -> np.ndarray:
@@ -399,24 +390,15 @@ def _rectangle(
     """
     if not box.valid():  # no surface
         return np.zeros(2, int), [0, 0]
-    pixels, depth = camera.project(_corners(box))
+    ends = np.stack([np.ravel(box.min), np.ravel(box.max)])
+    corners = np.array([[x, y, z] for x in ends[:, 0] for y in ends[:, 1] for z in ends[:, 2]])
+    pixels, depth = camera.project(corners)
     low = np.zeros(2)
     high = np.array(crop[2:])
     if (depth >= camera.near).all():
         ends = np.stack([np.floor(pixels.min(0)) - 1, np.ceil(pixels.max(0)) + 1])
         low, high = np.clip(ends - np.array(crop[:2]), 0, high)
     return low.astype(int), (high - low).astype(int).tolist()
-
-
-def _corners(box: Any) -> np.ndarray:
-    """Return the corners [8, 3] of a bounding box."""
-    ends = np.stack([np.ravel(box.min), np.ravel(box.max)])
-    return np.array([[x, y, z] for x in ends[:, 0] for y in ends[:, 1] for z in ends[:, 2]])
-
-
-def _is_behind(scene: Any, integrator: Any) -> bool:
-    """Return whether a scene has an environment, and an integrator shows it."""
-    return scene.environment() is not None and not getattr(integrator, "hide_emitters", False)
 
 
 def _environment(scene: Any, sensor: Any) -> Any:
