@@ -8,8 +8,6 @@ require.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME, Attribute
 
 _OWN_RULE = {"color": 3, "depth": 1, "motion": 2, "guided_motion": 2}
@@ -41,13 +39,11 @@ def exr_names(channel: str) -> tuple[str, ...]:
     """Return the EXR names of a channel's floats: NAME.Y for one, NAME.X, NAME.Y, NAME.Z for 2 or
     3.
     """
-    return tuple(f"{channel}.{suffix}" for suffix in _suffixes(channel_sizes()[channel]))
-
-
-def _suffixes(size: int) -> Sequence[str]:
+    size = channel_sizes()[channel]
     if size == 1:
-        return "Y"
-    return "XYZ"[:size] if size <= 3 else [str(k) for k in range(size)]
+        return (f"{channel}.Y",)
+    suffixes = "XYZ"[:size] if size <= 3 else range(size)
+    return tuple(f"{channel}.{suffix}" for suffix in suffixes)
 
 
 def aov_attributes() -> dict[str, str | None]:

@@ -73,7 +73,12 @@ class _Blend(dr.CustomOp):
 
     def backward(self) -> None:
         layout = self.layout
-        grads = self._image_grads(cast(list[Float], self.grad_out()))
+        grads = cast(list[Float], self.grad_out())
+        # The transpose of `_outputs`.
+        if layout.alpha:
+            *grads, alpha, coverage = grads
+            grads = [*grads, alpha + coverage]
+        grads = [padded(v, self.region, size) for v, size in zip(grads, layout.sizes, strict=True)]
         columns = _gradients(self.blocks, self.lists, layout, self.images, grads)
         missing = layout.geometry + layout.columns - len(columns)
         self.set_grad_in("values", [mi.Float(0)] * missing + columns)
@@ -99,17 +104,6 @@ class _Blend(dr.CustomOp):
             for v, size in zip(images, self.layout.sizes, strict=True)
         ]
         return [*outputs, outputs[-1] + 0] if self.layout.alpha else outputs
-
-    def _image_grads(self, grads: list[Float]) -> list[Float]:
-        """Return the gradients of the images from the gradients of the outputs: the transpose of
-        `_outputs`.
-        """
-        if self.layout.alpha:
-            *grads, alpha, coverage = grads
-            grads = [*grads, alpha + coverage]
-        return [
-            padded(v, self.region, size) for v, size in zip(grads, self.layout.sizes, strict=True)
-        ]
 
     def name(self) -> str:
         return "morgs_mi.blend"
@@ -153,7 +147,10 @@ def _gradients(
         sums = _summed_by_rank(pairs, N, layout)
         stride = 4 * pair_packets(layout)
     else:
-        sums = _run(adjoint, layout, _rounded_up(N), *arrays)
+        # Rounded up to a quarter octave: each target size of a scatter-reduction compiles its own
+        # kernel.
+        step = max(1024, 1 << max(N.bit_length() - 3, 0))
+        sums = _run(adjoint, layout, -(-N // step) * step, *arrays)
     lane = lists.rank_of * stride
     start = 0 if layout.reaches_weights else layout.geometry
     return [
@@ -218,11 +215,3 @@ def _summed_by_rank(pairs: Float, N: int, layout: Layout) -> Float:
         dr.scatter(total, packet, lane + i, mode=dr.ReduceMode.NoConflicts)
     dr.eval(total)
     return total
-
-
-def _rounded_up(n: int) -> int:
-    """Return n rounded up to a quarter octave: each target size of a scatter-reduction compiles its
-    own kernel.
-    """
-    step = max(1024, 1 << max(n.bit_length() - 3, 0))
-    return -(-n // step) * step

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from math import prod
 from typing import Any
@@ -69,7 +69,9 @@ class Image:
         Raises:
             KeyError: the image was rendered without that channel.
         """
-        tensors = self._tensors()
+        tensors = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "others"}
+        tensors |= self.others
+        tensors = {name: tensor for name, tensor in tensors.items() if tensor is not None}
         if channel not in tensors:
             raise KeyError(
                 f"Image: expected a channel out of {', '.join(tensors)}, got {channel!r}; render "
@@ -85,11 +87,6 @@ class Image:
             return None
         color = np.clip(np.nan_to_num(np.array(dr.detach(self.color))), 0, 1)
         return png_bytes(np.rint(255 * color).astype(np.uint8))
-
-    def _tensors(self) -> dict[str, Tensor]:
-        tensors = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "others"}
-        tensors |= self.others
-        return {name: tensor for name, tensor in tensors.items() if tensor is not None}
 
     @staticmethod
     def _of(tensors: Mapping[str, Tensor]) -> Image:
@@ -166,23 +163,24 @@ def rasterize(
     """
     refuse_freezing("rasterize()")
     config = RenderConfig() if config is None else config
-    cameras = tuple(camera) if isinstance(camera, Sequence) else (camera,)
-    _check_gaussians(gaussians)
+    is_stack = isinstance(camera, Sequence)
+    cameras = tuple(camera) if is_stack else (camera,)
+    _check_gaussians(gaussians, channels, detach_weights)
     _check_cameras(cameras)
+    _check_background(background)
     check_type("rasterize()", "config", config, RenderConfig)
-    _check_names({"channels": channels, "detach_weights": detach_weights})
     for name, value, kind in (("region", region, Region), ("static_splats", static_splats, Splats)):
         if value is not None:
             check_type("rasterize()", name, value, kind)
+    of_one_view = {"region": region, "static_splats": static_splats, "depth_limit": depth_limit}
+    for name, value in of_one_view.items():
+        if is_stack and value is not None:
+            raise ValueError(
+                f"rasterize(): `{name}` must be None with a sequence of cameras, got a "
+                f"{type(value).__name__}; render one camera at a time."
+            )
     channels = tuple(dict.fromkeys(channels))
     sizes = {**channel_sizes(), "alpha": 1}
-    _check_variant()
-    _check_channels(channels, detach_weights)
-    _check_attributes(gaussians, channels)
-    _check_background(background)
-    _check_size(cameras)
-    if isinstance(camera, Sequence):
-        _check_alone({"region": region, "static_splats": static_splats, "depth_limit": depth_limit})
     view = cameras[0]
     if features is not None:
         features, sizes["features"] = _checked_features(features, gaussians)
@@ -191,8 +189,15 @@ def rasterize(
     if region is None:
         region = full_view(view.width, view.height, config, len(cameras))
     else:
-        _check_region(region, view, config)
-    is_stack = isinstance(camera, Sequence)
+        block = block_shape(config)
+        shape = (region.width, region.height, *region.block)
+        if shape != (view.width, view.height, *block):
+            raise ValueError(
+                f"rasterize(): `region` must be of a {view.width}x{view.height} view with "
+                f"{block[0]}x{block[1]} blocks like the camera's and the config's, got "
+                f"{shape[0]}x{shape[1]} with {shape[2]}x{shape[3]}; build it for this camera with "
+                "this config."
+            )
     stack = (len(cameras), view.height, view.width) if is_stack else region.shape(0)[:-1]
     blended = tuple(c for c in channels if c != "alpha")
     if dr.prod(gaussians.means.shape[:1]) == 0:
@@ -216,7 +221,14 @@ def rasterize(
         lists = build_lists(
             splats, [column for columns in values for column in columns], region, config, limits
         )
-    layout = _layout(channels, sizes, background, detach_weights, config, cut)
+    read_alpha = [name for name in channels if name == "alpha" or _reads_weight(name, background)]
+    layout = Layout(
+        tuple(Channel(sizes[name], name not in detach_weights) for name in blended),
+        bool(read_alpha),
+        any(name not in detach_weights for name in read_alpha),
+        config,
+        cut,
+    )
     outputs = blend(splats.geometry, values, region, lists, layout, limits)
     images = dict(zip((*blended, "alpha", "coverage"), outputs, strict=False))
     coverage = images.pop("coverage", None)
@@ -224,8 +236,10 @@ def rasterize(
         if _reads_weight(name, background):
             weight = dr.detach(coverage) if name in detach_weights else coverage
             weight = repeat_each(weight, sizes[name])
-            finish = _normalised if name in NORMALISED else _over(background)
-            images[name] = finish(images[name], weight)
+            if name in NORMALISED:  # 0 where nothing is drawn
+                images[name] = dr.select(weight > 0, images[name] / dr.maximum(weight, 1e-8), 0)
+            else:
+                images[name] = _over(background, images[name], weight)
     return Image._of(
         {name: _tensor(images[name], region, (*stack, sizes[name])) for name in channels}
     )
@@ -238,13 +252,10 @@ def _reads_weight(channel: str, background: Sequence[float] | Jit | None) -> boo
     return channel in NORMALISED or (channel == "color" and background is not None)
 
 
-def _normalised(values: Float, weight: Float) -> Float:
-    """Return the values divided by the sum of the weights; 0 where nothing is drawn."""
-    return dr.select(weight > 0, values / dr.maximum(weight, 1e-8), 0)
-
-
-def _over(background: Sequence[float] | Jit) -> Callable[[Float, Float], Float]:
-    """Return the function that composites a colour over the background."""
+def _over(background: Sequence[float] | Jit | None, values: Float, weight: Float) -> Float:
+    """Return a colour, of which the weights are summed in `weight`, composited over the
+    background.
+    """
     color: Any = background
     if dr.is_array_v(color):
         behind = color.array if dr.is_tensor_v(color) else dr.ravel(color)
@@ -252,16 +263,12 @@ def _over(background: Sequence[float] | Jit) -> Callable[[Float, Float], Float]:
         behind = from_numpy(mi.Float, np.asarray(color))
     # Numbers of their own: the gradient of one array would be added by all pixels to three places.
     red, green, blue = (dr.gather(mi.Float, behind, mi.UInt32(k)) for k in range(3))
-
-    def composited(values: Float, weight: Float) -> Float:
-        component = dr.arange(mi.UInt32, dr.width(weight)) % 3
-        return dr.fma(
-            1 - weight,
-            dr.select(component == 0, red, dr.select(component == 1, green, blue)),
-            values,
-        )
-
-    return composited
+    component = dr.arange(mi.UInt32, dr.width(weight)) % 3
+    return dr.fma(
+        1 - weight,
+        dr.select(component == 0, red, dr.select(component == 1, green, blue)),
+        values,
+    )
 
 
 def _project_views(
@@ -310,23 +317,6 @@ def _project_region(
     return project(gaussians, camera, channels, config, rows, features) if dr.width(rows) else None
 
 
-def _layout(
-    channels: tuple[str, ...],
-    sizes: Mapping[str, int],
-    background: Sequence[float] | Jit | None,
-    detach_weights: Sequence[str],
-    config: RenderConfig,
-    cut: bool,
-) -> Layout:
-    """Return the layout of the blend: its channels, and where their gradients go."""
-    read_alpha = [name for name in channels if name == "alpha" or _reads_weight(name, background)]
-    blended = tuple(
-        Channel(sizes[name], name not in detach_weights) for name in channels if name != "alpha"
-    )
-    attached = any(name not in detach_weights for name in read_alpha)
-    return Layout(blended, bool(read_alpha), attached, config, cut)
-
-
 def _tensor(values: Float, region: Region, shape: tuple[int, ...]) -> Tensor:
     """Return a channel's image; pixels of a region that lie outside the view are 0."""
     if region.weights is not None:
@@ -345,79 +335,31 @@ def _empty(
     images = {name: dr.zeros(mi.TensorXf, (*shape, sizes[name])) for name in channels}
     if background is not None and "color" in images:
         zeros = dr.zeros(mi.Float, prod((*shape, 3)))
-        images["color"] = _tensor(_over(background)(zeros, zeros), region, (*shape, 3))
+        images["color"] = _tensor(_over(background, zeros, zeros), region, (*shape, 3))
     return Image._of(images)
 
 
-def _check_region(region: Region, camera: Camera, config: RenderConfig) -> None:
-    block = block_shape(config)
-    shape = (region.width, region.height, *region.block)
-    if shape != (camera.width, camera.height, *block):
-        raise ValueError(
-            f"rasterize(): `region` must be of a {camera.width}x{camera.height} view with "
-            f"{block[0]}x{block[1]} blocks like the camera's and the config's, got "
-            f"{shape[0]}x{shape[1]} with {shape[2]}x{shape[3]}; build it for this camera with "
-            "this config."
-        )
-
-
-def _check_alone(arguments: Mapping[str, object]) -> None:
-    """Raise an error if what belongs to one view is given with a sequence of cameras."""
-    for name, value in arguments.items():
-        if value is not None:
-            raise ValueError(
-                f"rasterize(): `{name}` must be None with a sequence of cameras, got a "
-                f"{type(value).__name__}; render one camera at a time."
-            )
-
-
-def _check_gaussians(gaussians: ActivatedGaussians) -> None:
+def _check_gaussians(
+    gaussians: ActivatedGaussians, channels: Sequence[str], detach_weights: Sequence[str]
+) -> None:
+    """Raise an error if these are not Gaussians with the attributes of the channels, or the variant
+    has no derivatives.
+    """
     if not hasattr(gaussians, "means"):
         raise ValueError(
             f"rasterize(): `gaussians` must be Gaussians, got a {type(gaussians).__name__}; pass "
             "some."
         )
-
-
-def _check_cameras(cameras: Sequence[Camera]) -> None:
-    """Raise an error if these are not one or more cameras of the same size."""
-    if not cameras:
-        raise ValueError(
-            "rasterize(): `camera` must be one or more cameras, got an empty sequence; pass one."
-        )
-    for camera in cameras:
-        check_type("rasterize()", "camera", camera, Camera, OF_SENSOR)
-    _check_same_size(cameras)
-
-
-def _check_same_size(cameras: Sequence[Camera]) -> None:
-    sizes = list(dict.fromkeys((camera.width, camera.height) for camera in cameras))
-    if len(sizes) > 1:
-        sizes_text = " and ".join(f"{width}x{height}" for width, height in sizes[:2])
-        raise ValueError(
-            f"rasterize(): `camera` must be cameras of the same size, got {sizes_text}; render "
-            "one camera at a time."
-        )
-
-
-def _check_names(names: Mapping[str, Sequence[str]]) -> None:
-    for name, sequence in names.items():
-        if isinstance(sequence, str) or not isinstance(sequence, Sequence):
+    for name, names in (("channels", channels), ("detach_weights", detach_weights)):
+        if isinstance(names, str) or not isinstance(names, Sequence):
             raise ValueError(
-                f"rasterize(): `{name}` must be a sequence of names, got {sequence!r}; pass a "
-                "tuple."
+                f"rasterize(): `{name}` must be a sequence of names, got {names!r}; pass a tuple."
             )
-
-
-def _check_variant() -> None:
     if mi.variant() is None or not dr.is_jit_v(mi.Float) or not dr.is_diff_v(mi.Float):
         raise ValueError(
             f"rasterize(): expected a Mitsuba variant such as 'llvm_ad_rgb' or 'cuda_ad_rgb', "
             f"got {mi.variant()!r}; call mi.set_variant() first."
         )
-
-
-def _check_channels(channels: tuple[str, ...], detach_weights: Sequence[str]) -> None:
     choices = ("color", "alpha", "depth", "motion", "guided_motion", *attribute_channels())
     for name in (*channels, *detach_weights):
         if name not in choices and not (name == "features" and name not in channels):
@@ -425,10 +367,6 @@ def _check_channels(channels: tuple[str, ...], detach_weights: Sequence[str]) ->
                 f"rasterize(): `channels` must be out of {', '.join(choices)}, got {name!r}; use "
                 "one of these, or pass other values as `features`."
             )
-
-
-def _check_attributes(gaussians: ActivatedGaussians, channels: tuple[str, ...]) -> None:
-    """Raise an error if the Gaussians lack an attribute of a channel."""
     motions = dict.fromkeys(("motion", "guided_motion"), BY_ACTIVATED_NAME["motion"])
     for name, attribute in {**motions, **attribute_channels()}.items():
         if name in channels and getattr(gaussians, attribute.activated_name, None) is None:
@@ -436,6 +374,36 @@ def _check_attributes(gaussians: ActivatedGaussians, channels: tuple[str, ...]) 
                 f"rasterize(): channel {name!r} requires Gaussians with `{attribute.name}`, got "
                 "none; set it or remove the channel."
             )
+
+
+def _check_cameras(cameras: Sequence[Camera]) -> None:
+    """Raise an error if these are not one or more cameras of the same size, with images that have
+    too many pixels, or do not fit in memory.
+    """
+    if not cameras:
+        raise ValueError(
+            "rasterize(): `camera` must be one or more cameras, got an empty sequence; pass one."
+        )
+    for camera in cameras:
+        check_type("rasterize()", "camera", camera, Camera, OF_SENSOR)
+    sizes = list(dict.fromkeys(f"{camera.width}x{camera.height}" for camera in cameras))
+    if len(sizes) > 1:
+        raise ValueError(
+            f"rasterize(): `camera` must be cameras of the same size, got "
+            f"{' and '.join(sizes[:2])}; render one camera at a time."
+        )
+    V = len(cameras)
+    pixels = V * cameras[0].width * cameras[0].height
+    if pixels > 2**28:
+        raise ValueError(
+            f"rasterize(): the image must have at most 2^28 pixels, got "
+            f"{sizes[0] if V == 1 else f'{V} times {sizes[0]}'}; render it in tiles, one camera "
+            "each."
+        )
+    if pixels >= _LARGE:
+        images = f"{'an image' if V == 1 else f'{V} images'} of {sizes[0]} pixels"
+        remedy = "render a smaller one, or tiles, one camera each"
+        check_memory("rasterize()", _PIXEL_BYTES * pixels, images, remedy)
 
 
 def _check_background(background: Sequence[float] | Jit | None) -> None:
@@ -448,22 +416,6 @@ def _check_background(background: Sequence[float] | Jit | None) -> None:
             "rasterize(): `background` must be three finite numbers of at most 1e18, got "
             f"{background!r}; pass a colour or None."
         )
-
-
-def _check_size(cameras: Sequence[Camera]) -> None:
-    """Raise an error if the images have too many pixels, or do not fit in memory."""
-    V = len(cameras)
-    size = f"{cameras[0].width}x{cameras[0].height}"
-    pixels = V * cameras[0].width * cameras[0].height
-    if pixels > 2**28:
-        raise ValueError(
-            f"rasterize(): the image must have at most 2^28 pixels, got "
-            f"{size if V == 1 else f'{V} times {size}'}; render it in tiles, one camera each."
-        )
-    if pixels >= _LARGE:
-        images = f"an image of {size} pixels" if V == 1 else f"{V} images of {size} pixels"
-        remedy = "render a smaller one, or tiles, one camera each"
-        check_memory("rasterize()", _PIXEL_BYTES * pixels, images, remedy)
 
 
 def _checked_features(
@@ -493,12 +445,6 @@ def _checked_limits(
             f"rasterize(): `depth_limit` must be one depth per pixel, {list(expected)}, got "
             f"{problem}; use inf where there is no surface."
         )
-    _check_combination(limits, static_splats)
-    return dr.clip(limits.array, -FARTHEST, FARTHEST)
-
-
-def _check_combination(limits: Tensor, static_splats: Splats | None) -> None:
-    """Raise an error if depth limits are given with static splats, or have gradients enabled."""
     if static_splats is not None:
         raise ValueError(
             "rasterize(): `depth_limit` must be None where `static_splats` are given, got both; "
@@ -509,6 +455,7 @@ def _check_combination(limits: Tensor, static_splats: Splats | None) -> None:
             "rasterize(): `depth_limit` must not be attached to a gradient graph, because it gets "
             "no gradient, got one with gradients enabled; pass dr.detach(depth_limit)."
         )
+    return dr.clip(limits.array, -FARTHEST, FARTHEST)
 
 
 def _check_finite(
@@ -539,19 +486,14 @@ def _check_numbers(name: str, value: Tensor | None, most: float = np.inf) -> Non
     array = np.asarray(dr.detach(value))
     bad = np.argwhere(~(np.isfinite(array) & (np.abs(array) <= most)))
     if len(bad):
-        raise _number_error(name, array, bad)
-
-
-def _number_error(name: str, array: np.ndarray, bad: np.ndarray) -> ValueError:
-    """Return the error about the numbers of an attribute at the indices `bad` [B, ndim]."""
-    worst = array[tuple(bad[0])]
-    index = ", ".join(map(str, bad[0]))
-    remedy = (
-        "lower the learning rate"
-        if name == "camera.viewmat"
-        else "remove these Gaussians or lower the learning rate"
-    )
-    return ValueError(
-        f"rasterize(): `{name}` must be {'at most 1e18' if np.isfinite(worst) else 'finite'}, got "
-        f"{worst:g} at [{index}] ({len(bad)} such values); {remedy}."
-    )
+        worst = array[tuple(bad[0])]
+        index = ", ".join(map(str, bad[0]))
+        remedy = (
+            "lower the learning rate"
+            if name == "camera.viewmat"
+            else "remove these Gaussians or lower the learning rate"
+        )
+        raise ValueError(
+            f"rasterize(): `{name}` must be {'at most 1e18' if np.isfinite(worst) else 'finite'}, "
+            f"got {worst:g} at [{index}] ({len(bad)} such values); {remedy}."
+        )

@@ -110,7 +110,13 @@ class Region:
 
     def __init__(self, mask: np.ndarray, config: RenderConfig | None = None) -> None:
         check_type("Region()", "mask", mask, np.ndarray)
-        _check_mask(mask)
+        is_mask = mask.ndim == 2 and mask.dtype == bool
+        if not is_mask or not mask.any():
+            description = "none" if is_mask else f"{mask.dtype} {mask.shape}"
+            raise ValueError(
+                "Region(): `mask` must be bool [H, W] with at least one pixel set, got "
+                f"{description}; skip a view in which nothing is drawn."
+            )
         grid = BlockGrid.of(mask.shape[1], mask.shape[0], config or RenderConfig())
         self._build(grid, grid.covering(mask))
 
@@ -165,10 +171,14 @@ class Region:
         of tiles.
         """
         bw, bh = self.block
-        active = _in_tiles(blocks, self.across)
+        active = blocks.reshape(-1, DOWN, self.across, ACROSS).transpose(0, 2, 1, 3)
+        active = active.reshape(-1, ACROSS * DOWN)
         tiles = np.flatnonzero(active.any(1))
         tile, bit = np.nonzero(active[tiles])
-        row, column = _blocks_at(tiles[tile], bit, self.across)
+        row = tiles[tile] // self.across * DOWN + bit // ACROSS
+        column = tiles[tile] % self.across * ACROSS + bit % ACROSS
+        slots = np.full(len(active), NO_SLOT, np.uint32)
+        slots[tiles] = np.arange(len(tiles))
         self.drawn = blocks
         self._blocks = (row, column)
         self.num_blocks = len(row)
@@ -178,7 +188,7 @@ class Region:
             "bit": bit,
             **self._pixels(row, column),
             "tile_grid": [self.across, self.down],
-            "slot_of": _slots(len(active), tiles),
+            "slot_of": slots,
             "block_table": summed_area(blocks),
             "tile_table": summed_area(active.any(1).reshape(-1, self.across)),
         }
@@ -243,14 +253,23 @@ class Region:
             )
         row, column = self._blocks
         width, height = self.block
-        blocks = _whole_blocks(image, self.block)
+        # The blocks that lie in the image as a whole, [rows, height, columns, width, ...]. A view:
+        # a copy of large images would take most of the time.
+        down, across, *rest = image.strides
+        blocks = as_strided(
+            image,
+            (self.height // height, height, self.width // width, width, *image.shape[2:]),
+            (height * down, down, width * across, across, *rest),
+        )
         is_whole = (row < blocks.shape[0]) & (column < blocks.shape[2])
         if is_whole.all():
             return blocks[row, :, column]
         pixels = np.zeros((len(row), height, width, *image.shape[2:]), image.dtype)
         pixels[is_whole] = blocks[row[is_whole], :, column[is_whole]]
         for k in np.flatnonzero(~is_whole):
-            part = _block_of(image, row[k], column[k], self.block)
+            y = row[k] * height
+            x = column[k] * width
+            part = image[y : y + height, x : x + width]
             pixels[k, : part.shape[0], : part.shape[1]] = part
         return pixels
 
@@ -268,71 +287,18 @@ class Region:
     def paste(self, values: np.ndarray, image: np.ndarray) -> np.ndarray:
         """Return a copy of an image [H, W, ...] with this region's pixels replaced by `values`."""
         row, column = self._blocks
-        blocks = self._in_blocks(image).copy()
-        blocks[row, :, column] = values
-        return _as_image(blocks)[: self.height, : self.width]
-
-    def _in_blocks(self, image: np.ndarray) -> np.ndarray:
-        """Return an image [H, W, ...] as [rows, block_height, columns, block_width, ...], padded by
-        zeros.
-        """
         rows, columns = self.drawn.shape
         width, height = self.block
-        size = (rows * height, columns * width)
-        if image.shape[:2] != size:
-            image = _with_zeros(image, *size)
-        return image.reshape(rows, height, columns, width, *image.shape[2:])
-
-
-def _check_mask(mask: np.ndarray) -> None:
-    is_mask = mask.ndim == 2 and mask.dtype == bool
-    if not is_mask or not mask.any():
-        description = "none" if is_mask else f"{mask.dtype} {mask.shape}"
-        raise ValueError(
-            "Region(): `mask` must be bool [H, W] with at least one pixel set, got "
-            f"{description}; skip a view in which nothing is drawn."
-        )
-
-
-def _in_tiles(blocks: np.ndarray, across: int) -> np.ndarray:
-    """Return a grid of blocks as [tiles, blocks of a tile]."""
-    tiles = blocks.reshape(-1, DOWN, across, ACROSS).transpose(0, 2, 1, 3)
-    return tiles.reshape(-1, ACROSS * DOWN)
-
-
-def _blocks_at(tile: np.ndarray, bit: np.ndarray, across: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the row and the column of blocks in the grid, from their tiles and bits there."""
-    return tile // across * DOWN + bit // ACROSS, tile % across * ACROSS + bit % ACROSS
-
-
-def _slots(count: int, tiles: np.ndarray) -> np.ndarray:
-    """Return the slot of each of `count` tiles, the place in `tiles` of those that are drawn."""
-    slots = np.full(count, NO_SLOT, np.uint32)
-    slots[tiles] = np.arange(len(tiles))
-    return slots
-
-
-def _whole_blocks(image: np.ndarray, block: tuple[int, int]) -> np.ndarray:
-    """Return the blocks that lie in an image as a whole, [rows, height, columns, width, ...]."""
-    width, height = block
-    (down, across, *rest) = image.strides
-    shape = (image.shape[0] // height, height, image.shape[1] // width, width, *image.shape[2:])
-    # A view: a copy of large images would take most of the time.
-    return as_strided(image, shape, (height * down, down, width * across, across, *rest))
+        padded = _with_zeros(image, rows * height, columns * width)
+        blocks = padded.reshape(rows, height, columns, width, *image.shape[2:])
+        blocks[row, :, column] = values
+        return _as_image(blocks)[: self.height, : self.width]
 
 
 def _as_image(blocks: np.ndarray) -> np.ndarray:
     """Return blocks [rows, height, columns, width, ...] as an image."""
     rows, height, columns, width, *rest = blocks.shape
     return blocks.reshape(rows * height, columns * width, *rest)
-
-
-def _block_of(image: np.ndarray, row: int, column: int, block: tuple[int, int]) -> np.ndarray:
-    """Return the part of a block that lies in an image."""
-    width, height = block
-    y = row * height
-    x = column * width
-    return image[y : y + height, x : x + width]
 
 
 def joined(regions: Sequence[Region]) -> Region:

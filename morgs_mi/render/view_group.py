@@ -46,7 +46,11 @@ class ViewGroup:
 
     def __init__(self, views: Sequence[ActiveView]) -> None:
         self.views = tuple(views)
-        self.regions = tuple(view.region or _everything(view) for view in views)
+        self.regions = tuple(
+            view.region
+            or Region(np.ones((view.camera.height, view.camera.width), bool), view.config)
+            for view in views
+        )
         self.region = joined(self.regions)
 
     @property
@@ -99,12 +103,28 @@ class ViewGroup:
         splats: Splats | None = None
         for index, view in enumerate(self.views):
             if view.static_splats is not None:
-                view_splats = _colors_of_view(view.static_splats, index)
+                view_splats = replace(
+                    view.static_splats,
+                    view=dr.full(mi.UInt32, index, len(view.static_splats)),
+                    channels={"color": view.static_splats.channels["color"]},
+                )
                 splats = view_splats if splats is None else splats.concatenated_with(view_splats)
         if splats is None:
             return None
         rows = dr.compress(touches(splats, self.region))
-        return _selected(splats, rows) if dr.width(rows) else None
+        if not dr.width(rows):
+            return None
+        at = partial(_gathered, rows)
+        return replace(
+            splats,
+            shape=at(splats.shape),
+            channels={"color": at(splats.channels["color"])},
+            depths=at(splats.depths),
+            extent=at(splats.extent),
+            valid=at(splats.valid),
+            finite=at(splats.finite),
+            view=at(splats.view),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,32 +241,6 @@ def _num_channels(image: np.ndarray, size: tuple[int, ...]) -> int:
             f"{list(np.shape(image))}; resize it to the camera, or crop it to the region."
         )
     return C
-
-
-def _everything(view: ActiveView) -> Region:
-    """Return the region of all blocks of a view, block by block."""
-    return Region(np.ones((view.camera.height, view.camera.width), bool), view.config)
-
-
-def _colors_of_view(splats: Splats, index: int) -> Splats:
-    """Return splats with their colour alone, in the view `index`."""
-    view = dr.full(mi.UInt32, index, len(splats))
-    return replace(splats, view=view, channels={"color": splats.channels["color"]})
-
-
-def _selected(splats: Splats, rows: UInt32) -> Splats:
-    """Return the splats at `rows`."""
-    at = partial(_gathered, rows)
-    return replace(
-        splats,
-        shape=at(splats.shape),
-        channels={name: at(columns) for name, columns in splats.channels.items()},
-        depths=at(splats.depths),
-        extent=at(splats.extent),
-        valid=at(splats.valid),
-        finite=at(splats.finite),
-        view=None if splats.view is None else at(splats.view),
-    )
 
 
 def _gathered(rows: UInt32, values: Any) -> Any:
