@@ -69,9 +69,9 @@ class Image:
         Raises:
             KeyError: the image was rendered without that channel.
         """
-        tensors = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "others"}
-        tensors |= self.others
-        tensors = {name: tensor for name, tensor in tensors.items() if tensor is not None}
+        values = {**vars(self), **self.others}
+        del values["others"]
+        tensors = {name: value for name, value in values.items() if value is not None}
         if channel not in tensors:
             raise KeyError(
                 f"Image: expected a channel out of {', '.join(tensors)}, got {channel!r}; render "
@@ -253,9 +253,7 @@ def _reads_weight(channel: str, background: Sequence[float] | Jit | None) -> boo
 
 
 def _over(background: Sequence[float] | Jit | None, values: Float, weight: Float) -> Float:
-    """Return a colour, of which the weights are summed in `weight`, composited over the
-    background.
-    """
+    """Return a colour with the sum of its weights, composited over the background."""
     color: Any = background
     if dr.is_array_v(color):
         behind = color.array if dr.is_tensor_v(color) else dr.ravel(color)

@@ -289,8 +289,8 @@ class Region:
         row, column = self._blocks
         rows, columns = self.drawn.shape
         width, height = self.block
-        padded = _with_zeros(image, rows * height, columns * width)
-        blocks = padded.reshape(rows, height, columns, width, *image.shape[2:])
+        blocks = _with_zeros(image, rows * height, columns * width)
+        blocks = blocks.reshape(rows, height, columns, width, *image.shape[2:])
         blocks[row, :, column] = values
         return _as_image(blocks)[: self.height, : self.width]
 

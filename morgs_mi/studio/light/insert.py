@@ -80,7 +80,14 @@ def load_insert(path: str | Path) -> Build:
             f"{path}: expected a scene to insert, FILE.xml or FILE.py, got {kind}; check the path."
         )
     if path.suffix == ".xml":
-        entries = _xml_entries(path)
+        try:
+            scene: Any = mi.load_file(str(path))
+        except RuntimeError as error:
+            raise ValueError(f"{path}: {_reason(error)}; correct the scene file.") from error
+        entries = {part.id() or f"part{i}": part for i, part in enumerate(_parts(scene))}
+        # Mitsuba adds an integrator to files without one.
+        if ElementTree.parse(path).find("integrator") is not None:
+            entries["integrator"] = scene.integrator()
         return lambda frame, time: entries
     build = getattr(module_of(path, "insert"), "build", None)
     if not callable(build):
@@ -160,21 +167,19 @@ def render_inserted(
     config = config or InsertConfig()
     if config.clipped is None:
         config = replace(config, clipped=1.0 if "transfer" in stream.metadata else CLIPPED)
+    view = camera.square()
     for frame, gaussians in play(stream):
         if frames is None or frame in frames:
             entries = build(frame, frame / stream.fps)
-            images = _render(gaussians, camera.square(), entries, channels, config)
-            yield frame, {name: _resized(name, image, camera) for name, image in images.items()}
-
-
-def _resized(name: str, image: np.ndarray, camera: Camera) -> np.ndarray:
-    """Return an image [H', W, C] of a camera's `square` view with the camera's height H."""
-    scale = camera.height / image.shape[0]
-    if scale == 1:
-        return image
-    values = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
-    unit = np.array([1, scale] if name == "motion" else 1, np.float32)  # motion is in pixels
-    return values.reshape(camera.height, camera.width, -1) * unit
+            images = _render(gaussians, view, entries, channels, config)
+            if view.height != camera.height:
+                size = (camera.width, camera.height)
+                for name, image in images.items():
+                    values = cv2.resize(image, size, interpolation=cv2.INTER_LINEAR)
+                    images[name] = values.reshape(camera.height, camera.width, -1)
+                if "motion" in images:  # in pixels
+                    images["motion"] *= np.array([1, camera.height / view.height], np.float32)
+            yield frame, images
 
 
 def captured_light(
@@ -244,7 +249,11 @@ def _render(
     except RuntimeError as error:
         raise ValueError(f"The inserted scene: {_reason(error)}; correct it.") from error
     if {"splats", "shadow"} & set(channels):
-        images |= _splat_layers(gaussians, dark, camera)
+        image = rasterize(gaussians, camera)
+        bright = decode_light(np.asarray(image.color))
+        shaded = decode_light(np.asarray(rasterize(dark, camera).color))
+        images["splats"] = np.concatenate([bright, np.asarray(image.alpha)], axis=2)
+        images["shadow"] = np.where(bright > 0, shaded / np.maximum(bright, 1e-6), 1)
     return {name: images[name].astype(np.float32) for name in channels}
 
 
@@ -279,19 +288,6 @@ def _lit_scenes(
     return mi.load_dict({"type": "scene", **entries, "captured light": lamp}), lit_scene
 
 
-def _splat_layers(
-    gaussians: Gaussians, shadowed_gaussians: Gaussians, camera: Camera
-) -> dict[str, np.ndarray]:
-    """Return the layers `splats` [H, W, 4] and `shadow` [H, W, 3], in linear light."""
-    image = rasterize(gaussians, camera)
-    bright = decode_light(np.asarray(image.color))
-    dark = decode_light(np.asarray(rasterize(shadowed_gaussians, camera).color))
-    return {
-        "splats": np.concatenate([bright, np.asarray(image.alpha)], axis=2),
-        "shadow": np.where(bright > 0, dark / np.maximum(bright, 1e-6), 1),
-    }
-
-
 def _plugin_images(
     gaussians: Gaussians,
     camera: Camera,
@@ -324,18 +320,6 @@ def _plugin_images(
 
 def _sensor(camera: Camera) -> Any:
     return mi.load_dict(camera.sensor(pixel_format="rgba"))
-
-
-def _xml_entries(path: Path) -> dict[str, Any]:
-    """Return the shapes, lights and integrator of a scene file."""
-    try:
-        scene: Any = mi.load_file(str(path))
-    except RuntimeError as error:
-        raise ValueError(f"{path}: {_reason(error)}; correct the scene file.") from error
-    parts = {part.id() or f"part{i}": part for i, part in enumerate(_parts(scene))}
-    # Mitsuba adds an integrator to files without one.
-    has_integrator = ElementTree.parse(path).find("integrator") is not None
-    return {**parts, "integrator": scene.integrator()} if has_integrator else parts
 
 
 def _reason(error: RuntimeError) -> str:

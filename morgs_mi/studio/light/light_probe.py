@@ -83,11 +83,25 @@ def light_probe(
     center = numbers(place, "position", position).astype(np.float64)
     check_point(place, "position", center, "x, y and z")
     directions = _directions(int(height))
+    axis = np.abs(directions).argmax(-1)
+    largest = np.take_along_axis(directions, axis[..., None], axis=-1)[..., 0]
+    face_of = 2 * axis + (largest < 0)  # index in `_FACES`
     # A face has as many pixels per degree as the map.
     size = max(int(height) // 2, 4)
-    faces = [_face(gaussians, center, face, size, background, near) for face in _FACES]
-    color = from_numpy(mi.Float, _resampled(faces, directions))
-    light = radiance(dr.unravel(mi.Color3f, color), clipped)
+    width = size + 2 * _MARGIN
+    fov = np.rad2deg(2 * np.arctan(width / size))
+    color = np.zeros((*directions.shape[:2], 3), np.float32)
+    for k, (forward, up) in enumerate(_FACES):
+        camera = Camera.look_at(center, center + forward, up, fov, width, width)
+        camera = replace(camera, near=near)
+        image = np.asarray(rasterize(gaussians, camera, ("color",), background).color)
+        on_face = (face_of == k)[..., None]
+        # What other faces show may be behind this camera.
+        seen_directions = np.where(on_face, directions, np.asarray(camera.viewmat)[2, :3])
+        pixels, _ = camera.project(camera.position + seen_directions)
+        x, y = (pixels[..., i].astype(np.float32) - 0.5 for i in range(2))
+        color = np.where(on_face, cv2.remap(image, x, y, cv2.INTER_LINEAR), color)
+    light = radiance(dr.unravel(mi.Color3f, from_numpy(mi.Float, color)), clipped)
     return {"type": "envmap", "bitmap": mi.Bitmap(np.array(light).T.reshape(directions.shape))}
 
 
@@ -108,39 +122,6 @@ def _directions(height: int) -> np.ndarray:
     x = np.sin(theta) * np.sin(phi)
     z = -np.sin(theta) * np.cos(phi)
     return np.stack([x, np.broadcast_to(np.cos(theta), x.shape), z], axis=-1)
-
-
-def _face(
-    gaussians: ActivatedGaussians,
-    center: np.ndarray,
-    axes: tuple[tuple[int, ...], tuple[int, ...]],
-    size: int,
-    background: Sequence[float] | None,
-    near: float,
-) -> tuple[Camera, np.ndarray]:
-    """Return the camera of a face of the cube, with a margin, and its display-referred colour."""
-    forward, up = (np.array(axis, float) for axis in axes)
-    width = size + 2 * _MARGIN
-    fov = np.rad2deg(2 * np.arctan(width / size))
-    camera = Camera.look_at(center, center + forward, up, fov, width, width)
-    camera = replace(camera, near=near)
-    return camera, np.asarray(rasterize(gaussians, camera, ("color",), background).color)
-
-
-def _resampled(faces: list[tuple[Camera, np.ndarray]], directions: np.ndarray) -> np.ndarray:
-    """Return the colour [H, W, 3] in every direction, interpolated on the face that it meets."""
-    axis = np.abs(directions).argmax(-1)
-    largest = np.take_along_axis(directions, axis[..., None], axis=-1)[..., 0]
-    face_of = 2 * axis + (largest < 0)  # index in `_FACES`
-    result = np.zeros((*directions.shape[:2], 3), np.float32)
-    for k, (camera, color) in enumerate(faces):
-        on_face = (face_of == k)[..., None]
-        # What other faces show may be behind this camera.
-        forward = np.asarray(camera.viewmat)[2, :3]
-        pixels, _ = camera.project(camera.position + np.where(on_face, directions, forward))
-        x, y = (pixels[..., i].astype(np.float32) - 0.5 for i in range(2))
-        result = np.where(on_face, cv2.remap(color, x, y, cv2.INTER_LINEAR), result)
-    return result
 
 
 def radiance(color: Any, clipped: float, srgb: bool = True) -> Any:

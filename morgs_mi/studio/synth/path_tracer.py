@@ -21,18 +21,11 @@ from morgs_mi.studio.synth.scene import Pose, Scene
 _OWN_SURFACE = 1e-4
 
 
-def srgb_bytes(linear: np.ndarray, noise: np.ndarray | float = 0.0) -> np.ndarray:
-    """Return linear light [...] in [0, 1] as sRGB plus `noise`, clipped and rounded to uint8.
+def developed(linear: np.ndarray, noise: float, seed: int) -> np.ndarray:
+    """Return exposed light [H, W, 3] as an image, sRGB-encoded [H, W, 3], uint8.
 
     Mitsuba's bitmap conversion is not used because it dithers, and dither looks like noise in a
     static scene.
-    """
-    values = encode_light(np.clip(linear, 0, 1))
-    return np.rint(255 * np.clip(values + noise, 0, 1)).astype(np.uint8)
-
-
-def developed(linear: np.ndarray, noise: float, seed: int) -> np.ndarray:
-    """Return exposed light [H, W, 3] as an image, sRGB-encoded [H, W, 3], uint8.
 
     Args:
         linear: the light; 1 is white.
@@ -42,7 +35,8 @@ def developed(linear: np.ndarray, noise: float, seed: int) -> np.ndarray:
         seed: seed of the noise.
     """
     grain = noise * np.random.default_rng([seed, 1]).standard_normal(linear.shape) if noise else 0.0
-    return srgb_bytes(linear, grain)
+    values = encode_light(np.clip(linear, 0, 1))
+    return np.rint(255 * np.clip(values + grain, 0, 1)).astype(np.uint8)
 
 
 def _pixel_corners(width: int, rows: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.capture.lens import undistortion
 from morgs_mi.capture.outputs import check_output
-from morgs_mi.capture.truth import GroundTruth, Tracks, save_tracks, save_truth
+from morgs_mi.capture.truth import Tracks, save_tracks, save_truth
 from morgs_mi.core.bounded import read_json
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_path, write_json
@@ -223,25 +223,18 @@ def _write_truth(tracer: PathTracer, rig: _Rig, folder: Path) -> None:
     frames = np.arange(rig.config.frames)
     for camera, disturbance in zip(rig.cameras, rig.disturbed, strict=True):
         times = (frames + disturbance.time_offset) / fps
-        for frame, truth in enumerate(_truth_of_view(tracer, camera, times, fps)):
+        old_poses = None
+        for frame, time in enumerate(times):
+            tracer.set_time(time)
+            poses = tracer.poses(time)
+            surface = tracer.surface_points(camera)
+            next_poses = tracer.poses(time + 1 / fps)
+            truth = compute_ground_truth(camera, surface, poses, old_poses, next_poses)
             save_truth(folder, camera.name, frame, truth)
+            old_poses = poses
     rng = np.random.default_rng([rig.config.seed, 1])
     save_tracks(folder, _sample_tracks(tracer, rig.cameras, frames / fps, rng))
     save_disturbances(folder, dict(zip((c.name for c in rig.cameras), rig.disturbed, strict=True)))
-
-
-def _truth_of_view(
-    tracer: PathTracer, camera: Camera, times: np.ndarray, fps: float
-) -> Iterator[GroundTruth]:
-    """Yield the ground truth of a camera's frames at their times in seconds."""
-    old_poses = None
-    for time in times:
-        tracer.set_time(time)
-        poses = tracer.poses(time)
-        yield compute_ground_truth(
-            camera, tracer.surface_points(camera), poses, old_poses, tracer.poses(time + 1 / fps)
-        )
-        old_poses = poses
 
 
 def _sample_tracks(
