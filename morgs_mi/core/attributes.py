@@ -7,6 +7,7 @@ of `Gaussians` of that name.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
@@ -82,10 +83,7 @@ class Attribute:
         """The numbers of one Gaussian's value; -1 where that depends on the degree of the spherical
         harmonics.
         """
-        width = 1
-        for size in self.shape:
-            width = -1 if size < 0 or width < 0 else width * size
-        return width
+        return -1 if -1 in self.shape else math.prod(self.shape)
 
 
 # px, in the camera that magnifies a Gaussian most: a step of the stream, twice the error, is about

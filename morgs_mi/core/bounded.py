@@ -17,8 +17,7 @@ import tokenize
 import tomllib
 import zipfile
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -29,17 +28,17 @@ _FACTOR = 10
 _ALLOWANCE = 200_000_000
 # Errors of NumPy and zipfile for broken files. NumPy parses headers as Python.
 _BROKEN = (
-    *(
-        ValueError,
-        TypeError,
-        EOFError,
-        KeyError,
-        MemoryError,
-        RuntimeError,
-        OverflowError,
-        zipfile.BadZipFile,
-    ),
-    *(zlib.error, SyntaxError, tokenize.TokenError),
+    ValueError,
+    TypeError,
+    EOFError,
+    KeyError,
+    MemoryError,
+    RuntimeError,
+    OverflowError,
+    SyntaxError,
+    zipfile.BadZipFile,
+    zlib.error,
+    tokenize.TokenError,
 )
 MAX_TOML = 256_000
 """Most bytes of a TOML file."""
@@ -145,9 +144,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         OSError: there is no such file, or it cannot be read.
         ValueError: the file is broken, too large or nested too deeply.
     """
-    text = read_text(path, MAX_TOML)
-    with _syntax_errors(path, "TOML"):
-        return tomllib.loads(text)
+    return _parsed(path, MAX_TOML, "TOML", tomllib.loads)
 
 
 def read_json(path: str | Path) -> Any:
@@ -157,16 +154,16 @@ def read_json(path: str | Path) -> Any:
         OSError: there is no such file, or it cannot be read.
         ValueError: it is no regular file, is broken, too large or nested too deeply.
     """
-    text = read_text(path, MAX_JSON)
-    with _syntax_errors(path, "JSON"):
-        return json.loads(text)
+    return _parsed(path, MAX_JSON, "JSON", json.loads)
 
 
-@contextmanager
-def _syntax_errors(path: str | Path, language: str) -> Iterator[None]:
-    """Raise the errors of a parser as errors of the file."""
+def _parsed(path: str | Path, most: int, language: str, parse: Callable[[str], Any]) -> Any:
+    """Return the result of a parser for a text file, whose errors are raised as errors of the
+    file.
+    """
+    text = read_text(path, most)
     try:
-        yield
+        return parse(text)
     except (ValueError, RecursionError) as error:
         raise ValueError(
             f"{path}: expected {language}, got a broken file ({error}); write it again."
@@ -181,33 +178,34 @@ def read_array(path: str | Path, name: str | None = None) -> np.ndarray:
         ValueError: the file is broken, claims more numbers than it holds, or holds Python objects.
     """
     try:
-        return _parsed_array(read_bytes(path) if name is None else _member(path, f"{name}.npy"))
+        if name is None:
+            data = read_bytes(path)
+        else:
+            with zipfile.ZipFile(regular(path)) as archive:
+                size = archive.getinfo(f"{name}.npy").file_size
+                check_claim(path, size, f"{size} bytes of {name}.npy")
+                data = archive.read(f"{name}.npy")
+        stream = BytesIO(data)
+        read_header = (
+            np.lib.format.read_array_header_1_0
+            if np.lib.format.read_magic(stream) == (1, 0)
+            else np.lib.format.read_array_header_2_0
+        )
+        shape, in_columns, dtype = read_header(stream)
+        # NumPy would execute what such a file contains.
+        if dtype.hasobject:
+            raise ValueError("it holds Python objects, not numbers")
+        count = math.prod(shape)
+        num_bytes = len(data) - stream.tell()
+        if min(shape, default=0) < 0 or count * dtype.itemsize != num_bytes:
+            raise ValueError(f"its header claims {dtype} {shape}, but {num_bytes} bytes follow")
+        flat = np.frombuffer(data, dtype, count, stream.tell())
+        return flat.reshape(shape, order="F" if in_columns else "C")
     except _BROKEN as error:
         what = "a NumPy array" if name is None else f"an array `{name}` in a NumPy archive"
         raise ValueError(
             f"{path}: expected {what}, got a broken file ({error}); export it again."
         ) from None
-
-
-def _parsed_array(data: bytes) -> np.ndarray:
-    """Return the array in the bytes of a NumPy file."""
-    stream = BytesIO(data)
-    version = np.lib.format.read_magic(stream)
-    read_header = (
-        np.lib.format.read_array_header_1_0
-        if version == (1, 0)
-        else np.lib.format.read_array_header_2_0
-    )
-    shape, in_columns, dtype = read_header(stream)
-    # NumPy would execute what such a file contains.
-    if dtype.hasobject:
-        raise ValueError("it holds Python objects, not numbers")
-    count = math.prod(shape)
-    num_bytes = len(data) - stream.tell()
-    if min(shape, default=0) < 0 or count * dtype.itemsize != num_bytes:
-        raise ValueError(f"its header claims {dtype} {shape}, but {num_bytes} bytes follow")
-    flat = np.frombuffer(data, dtype, count, stream.tell())
-    return flat.reshape(shape, order="F" if in_columns else "C")
 
 
 def array_names(path: str | Path) -> list[str]:
@@ -223,10 +221,3 @@ def array_names(path: str | Path) -> list[str]:
         raise ValueError(
             f"{path}: expected a NumPy archive, got a broken file ({error}); export it again."
         ) from None
-
-
-def _member(path: str | Path, name: str) -> bytes:
-    with zipfile.ZipFile(regular(path)) as archive:
-        size = archive.getinfo(name).file_size
-        check_claim(path, size, f"{size} bytes of {name}")
-        return archive.read(name)

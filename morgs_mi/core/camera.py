@@ -63,21 +63,37 @@ class Camera:
 
     def __post_init__(self) -> None:
         where = f"Camera({self.name!r})" if self.name else "Camera()"
-        self._check_numbers(where)
-        K = _intrinsics(where, self.K)
-        viewmat = _extrinsics(where, self.viewmat)
-        _check_focal_lengths(where, K)
-        if isinstance(viewmat, np.ndarray):
-            viewmat = rigid(f"{where}, `viewmat`", viewmat)
-        _check_skew(where, K)
-        object.__setattr__(self, "K", K)
-        object.__setattr__(self, "viewmat", viewmat)
-
-    def _check_numbers(self, where: str) -> None:
         check_size(where, self.width, self.height)
         check_number(where, "near", self.near, "[1e-30, inf)")  # its reciprocal is a finite float32
         for name in ("delay", "readout"):
             check_number(where, name, getattr(self, name), "[-1, 1]")
+        K = numbers(where, "K", self.K).astype(np.float64)
+        if K.shape != (3, 3):
+            raise ValueError(
+                f"{where}: `K` must be [3, 3], got {K.shape}; pass one camera's intrinsics."
+            )
+        viewmat = self.viewmat
+        if not isinstance(viewmat, dr.ArrayBase):
+            viewmat = numbers(where, "viewmat", viewmat).astype(np.float64)
+        if tuple(viewmat.shape) != (4, 4):
+            raise ValueError(
+                f"{where}: `viewmat` must be [4, 4], got {tuple(viewmat.shape)}; pass one "
+                "world-to-camera matrix."
+            )
+        if not bounded(K) or not K[0, 0] > 0 or not K[1, 1] > 0:
+            raise ValueError(
+                f"{where}: `K` must be finite with positive focal lengths, got {K.tolist()}; "
+                "check the calibration."
+            )
+        if isinstance(viewmat, np.ndarray):
+            viewmat = rigid(f"{where}, `viewmat`", viewmat)
+        if K[0, 1] or K[1, 0] or not np.array_equal(K[2], (0, 0, 1)):
+            raise ValueError(
+                f"{where}: `K` must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}; "
+                "resample the images to a camera without skew."
+            )
+        object.__setattr__(self, "K", K)
+        object.__setattr__(self, "viewmat", viewmat)
 
     def __repr__(self) -> str:
         place = ", ".join(f"{x:.4g}" for x in self.position + 0.0)  # without -0
@@ -109,14 +125,29 @@ class Camera:
         where = "Camera.look_at()"
         check_size(where, width, height)
         check_number(where, "fov_x", fov_x, "(0, 180)")
-        vectors = {
-            key: _vector(where, key, value)
-            for key, value in (("origin", origin), ("target", target), ("up", up))
-        }
-        viewmat = _viewmat_towards(where, **vectors)
-        distance = float(np.linalg.norm(vectors["target"] - vectors["origin"]))
-        K = _intrinsics_of_fov(fov_x, width, height)
-        return cls(K, viewmat, width, height, name, near=min(0.01, distance / 100))
+        vectors: list[np.ndarray] = []
+        for key, value in (("origin", origin), ("target", target), ("up", up)):
+            vector = numbers(where, key, value).astype(np.float64)
+            if vector.shape != (3,):
+                raise ValueError(
+                    f"{where}: `{key}` must be [3], got {list(vector.shape)}; pass x, y and z."
+                )
+            vectors.append(vector)
+        origin, target, up = vectors
+        forward = target - origin
+        right = np.cross(forward, up)
+        distance = np.linalg.norm(forward)
+        if not np.linalg.norm(right) > 1e-12 * (distance * np.linalg.norm(up)):
+            raise ValueError(
+                f"{where}: `up` must not be parallel to the direction of view, got origin "
+                f"{origin.tolist()}, target {target.tolist()}, up {up.tolist()}; tilt it."
+            )
+        forward = forward / distance
+        right = right / np.linalg.norm(right)
+        R = np.stack([right, np.cross(forward, right), forward])
+        viewmat = np.vstack([np.column_stack([R, -R @ origin]), [0, 0, 0, 1.0]])
+        K = intrinsics_of_fov(fov_x, width, height)
+        return cls(K, viewmat, width, height, name, near=min(0.01, float(distance) / 100))
 
     @classmethod
     def from_sensor(cls, sensor: Any) -> Camera:
@@ -130,12 +161,18 @@ class Camera:
         """
         import mitsuba as mi
 
-        _check_perspective(sensor)
+        is_sensor = isinstance(sensor, mi.Sensor)
+        kind = sensor.class_name() if is_sensor else f"a {type(sensor).__name__}"
+        if kind != "PerspectiveCamera":
+            raise ValueError(
+                f"Camera.from_sensor(): `sensor` must be a `perspective` sensor, got {kind}; "
+                "splats are drawn only by pinhole cameras without lens distortion."
+            )
         params: Any = mi.traverse(sensor)
         width, height = (int(size) for size in sensor.film().size())
         names = ("x_fov", "principal_point_offset_x", "principal_point_offset_y", "near_clip")
         fov, *offset, near = (float(np.asarray(params[name]).item()) for name in names)
-        K = _intrinsics_of_fov(fov, width, height, *offset)
+        K = intrinsics_of_fov(fov, width, height, *offset)
         to_world = np.asarray(params["to_world"].matrix, float).reshape(4, 4)
         viewmat = _OPENCV_FROM_MITSUBA @ np.linalg.inv(to_world)
         return cls(K, viewmat, width, height, sensor.id(), near)
@@ -196,17 +233,13 @@ class Camera:
         """Return d(pixel) / d(point) [N, 2, 3] at world points [N, 3]; zero for points behind the
         near plane.
         """
-        return self._local_jacobian(self._local(points)) @ self._world_to_camera[:3, :3]
-
-    def _local_jacobian(self, local: np.ndarray) -> np.ndarray:
-        """Return d(pixel) / d(point) [N, 2, 3] at points in the camera's coordinates [N, 3]."""
-        x, y, z = local.T
+        x, y, z = self._local(points).T
         inverse = np.where(z > self.near, 1 / np.maximum(z, self.near), 0)
         fx = self.K[0, 0] * inverse
         fy = self.K[1, 1] * inverse
         zero = np.zeros_like(z)
         rows = [fx, zero, -fx * x * inverse, zero, fy, -fy * y * inverse]
-        return np.stack(rows, axis=1).reshape(-1, 2, 3)
+        return np.stack(rows, axis=1).reshape(-1, 2, 3) @ self._world_to_camera[:3, :3]
 
     def without_delays(self) -> Camera:
         """Return the same view with images of the instants themselves: no delay and no rolling
@@ -245,7 +278,14 @@ class Camera:
         """
         import mitsuba as mi
 
-        self._check_square()
+        fx = self.K[0, 0]
+        fy = self.K[1, 1]
+        if abs(fx / fy - 1) * self.height > 1:
+            raise ValueError(
+                "Camera.sensor(): `K` must have equal focal lengths, because Mitsuba's sensor "
+                f"has one, got {fx:g} and {fy:g}; render `camera.square()`, of "
+                f"{self.square().width}x{self.square().height} pixels, and resize the image."
+            )
         # Mitsuba adds its offset to the pixel's position, so the principal point moves the other
         # way.
         return {
@@ -257,102 +297,18 @@ class Camera:
             "principal_point_offset_y": float(0.5 - self.K[1, 2] / self.height),
             "near_clip": self.near,
             "far_clip": 1e4,
-            "film": self._film() | film,
-        }
-
-    def _check_square(self) -> None:
-        """Raise an error unless the focal lengths are equal, to a pixel of the image's height."""
-        fx = self.K[0, 0]
-        fy = self.K[1, 1]
-        if abs(fx / fy - 1) * self.height > 1:
-            raise ValueError(
-                "Camera.sensor(): `K` must have equal focal lengths, because Mitsuba's sensor "
-                f"has one, got {fx:g} and {fy:g}; render `camera.square()`, of "
-                f"{self.square().width}x{self.square().height} pixels, and resize the image."
-            )
-
-    def _film(self) -> dict[str, Any]:
-        """Return Mitsuba's dictionary of a film of this size."""
-        return {
-            "type": "hdrfilm",
-            "width": self.width,
-            "height": self.height,
-            "rfilter": {"type": "box"},
-            "component_format": "float32",
+            "film": {
+                "type": "hdrfilm",
+                "width": self.width,
+                "height": self.height,
+                "rfilter": {"type": "box"},
+                "component_format": "float32",
+                **film,
+            },
         }
 
 
-def _intrinsics(where: str, K: ArrayLike) -> np.ndarray:
-    """Return intrinsics as float64 if they are a matrix [3, 3]."""
-    K = numbers(where, "K", K).astype(np.float64)
-    if K.shape != (3, 3):
-        raise ValueError(
-            f"{where}: `K` must be [3, 3], got {K.shape}; pass one camera's intrinsics."
-        )
-    return K
-
-
-def _extrinsics(where: str, viewmat: np.ndarray | Tensor) -> np.ndarray | Tensor:
-    """Return extrinsics, as float64 unless they are a Dr.Jit tensor, if they are [4, 4]."""
-    if not isinstance(viewmat, dr.ArrayBase):
-        viewmat = numbers(where, "viewmat", viewmat).astype(np.float64)
-    if tuple(viewmat.shape) != (4, 4):
-        raise ValueError(
-            f"{where}: `viewmat` must be [4, 4], got {tuple(viewmat.shape)}; pass one "
-            "world-to-camera matrix."
-        )
-    return viewmat
-
-
-def _check_focal_lengths(where: str, K: np.ndarray) -> None:
-    if not bounded(K) or not K[0, 0] > 0 or not K[1, 1] > 0:
-        raise ValueError(
-            f"{where}: `K` must be finite with positive focal lengths, got {K.tolist()}; "
-            "check the calibration."
-        )
-
-
-def _check_skew(where: str, K: np.ndarray) -> None:
-    if K[0, 1] or K[1, 0] or not np.array_equal(K[2], (0, 0, 1)):
-        raise ValueError(
-            f"{where}: `K` must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}; "
-            "resample the images to a camera without skew."
-        )
-
-
-def _vector(where: str, name: str, value: ArrayLike) -> np.ndarray:
-    """Return an argument as float64 if it is a vector [3]."""
-    vector = numbers(where, name, value).astype(np.float64)
-    if vector.shape != (3,):
-        raise ValueError(
-            f"{where}: `{name}` must be [3], got {list(vector.shape)}; pass x, y and z."
-        )
-    return vector
-
-
-def _viewmat_towards(
-    where: str, origin: np.ndarray, target: np.ndarray, up: np.ndarray
-) -> np.ndarray:
-    """Return the extrinsics [4, 4] of the view from one point to another, with `up` upwards."""
-    forward = target - origin
-    right = np.cross(forward, up)
-    if not np.linalg.norm(right) > 1e-12 * (np.linalg.norm(forward) * np.linalg.norm(up)):
-        raise ValueError(
-            f"{where}: `up` must not be parallel to the direction of view, got origin "
-            f"{origin.tolist()}, target {target.tolist()}, up {up.tolist()}; tilt it."
-        )
-    R = _axes(forward, right)
-    return np.vstack([np.column_stack([R, -R @ origin]), [0, 0, 0, 1.0]])
-
-
-def _axes(forward: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return the axes [3, 3] of a camera as unit vectors: to the right, down and forward."""
-    forward = forward / np.linalg.norm(forward)
-    right = right / np.linalg.norm(right)
-    return np.stack([right, np.cross(forward, right), forward])
-
-
-def _intrinsics_of_fov(
+def intrinsics_of_fov(
     fov_x: float, width: int, height: int, offset_x: float = 0.0, offset_y: float = 0.0
 ) -> np.ndarray:
     """Return intrinsics [3, 3] of a field of view in degrees across, with Mitsuba's offsets."""
@@ -363,18 +319,6 @@ def _intrinsics_of_fov(
     )
 
 
-def _check_perspective(sensor: Any) -> None:
-    """Raise an error unless a value is a Mitsuba `perspective` sensor."""
-    import mitsuba as mi
-
-    kind = sensor.class_name() if isinstance(sensor, mi.Sensor) else f"a {type(sensor).__name__}"
-    if kind != "PerspectiveCamera":
-        raise ValueError(
-            f"Camera.from_sensor(): `sensor` must be a `perspective` sensor, got {kind}; "
-            "splats are drawn only by pinhole cameras without lens distortion."
-        )
-
-
 def rigid(where: str, matrix: np.ndarray) -> np.ndarray:
     """Return `matrix` [4, 4] (or [3, 4], completed) if it is a rotation and a translation.
 
@@ -382,13 +326,6 @@ def rigid(where: str, matrix: np.ndarray) -> np.ndarray:
         ValueError: it is not, in a sentence that begins with `where`.
     """
     matrix = np.asarray(matrix, dtype=np.float64)
-    _check_pose(where, matrix)
-    _check_axes(where, matrix[:3, :3])
-    _check_last_row(where, matrix[3:])
-    return np.vstack([matrix[:3], [0, 0, 0, 1.0]])
-
-
-def _check_pose(where: str, matrix: np.ndarray) -> None:
     if matrix.shape not in ((3, 4), (4, 4)):
         raise ValueError(
             f"{where}: the pose must be a matrix [4, 4], got {matrix.shape}; calibrate again."
@@ -398,21 +335,16 @@ def _check_pose(where: str, matrix: np.ndarray) -> None:
             f"{where}: the pose must be finite, with numbers of at most {LARGEST:g}, got "
             f"{matrix.tolist()}; calibrate again."
         )
-
-
-def _check_axes(where: str, R: np.ndarray) -> None:
+    R = matrix[:3, :3]
     # Files with six digits are off by 1e-6, scaled or sheared poses by far more than 1e-3.
     if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
         raise ValueError(
             f"{where}: the axes must be a right-handed orthonormal frame, got "
             f"{R.round(4).tolist()}; undo any scaling or mirroring of the poses."
         )
-
-
-def _check_last_row(where: str, rows: np.ndarray) -> None:
-    """Raise an error unless the rows after the third of a pose, if any, are [0, 0, 0, 1]."""
-    if not np.allclose(rows, (0, 0, 0, 1), atol=1e-6):
+    if not np.allclose(matrix[3:], (0, 0, 0, 1), atol=1e-6):
         raise ValueError(
-            f"{where}: the last row must be [0, 0, 0, 1], got {rows[0].tolist()}; transpose the "
+            f"{where}: the last row must be [0, 0, 0, 1], got {matrix[3].tolist()}; transpose the "
             "matrix if its translation is there."
         )
+    return np.vstack([matrix[:3], [0, 0, 0, 1.0]])

@@ -131,13 +131,6 @@ def check_points(
     colors = numbers(place, "point_colors", colors)
     if not points.size and not colors.size:
         return np.zeros((0, 3)), np.zeros((0, 3))
-    _check_point_shapes(place, points, colors)
-    _check_coordinates(place, points)
-    _check_colors(place, colors, most)
-    return points, colors
-
-
-def _check_point_shapes(place: str, points: np.ndarray, colors: np.ndarray) -> None:
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(
             f"{place}: `points` must be [P, 3], got {list(points.shape)}; pass one row for each "
@@ -148,18 +141,12 @@ def _check_point_shapes(place: str, points: np.ndarray, colors: np.ndarray) -> N
             f"{place}: `point_colors` must be {list(points.shape)} like `points`, got "
             f"{list(colors.shape)}; pass one colour for each point."
         )
-
-
-def _check_coordinates(place: str, points: np.ndarray) -> None:
-    is_bounded = np.abs(points) <= LARGEST
     requirement = f"`points` must be finite and at most {LARGEST:g}"
-    _check_rows(place, requirement, points, is_bounded, "remove this point")
-
-
-def _check_colors(place: str, colors: np.ndarray, most: float) -> None:
-    is_color = (colors >= 0) & (colors <= most)
+    _check_rows(place, requirement, points, np.abs(points) <= LARGEST, "remove this point")
     requirement = f"`point_colors` must be in [0, {most:g}]"
+    is_color = (colors >= 0) & (colors <= most)
     _check_rows(place, requirement, colors, is_color, "divide colours of 8 bits by 255")
+    return points, colors
 
 
 def _check_rows(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import is_dataclass, replace
 from difflib import get_close_matches
@@ -100,40 +100,23 @@ def _replaced(config: Any, values: Mapping[str, Any], source: str, prefix: str) 
     for name, value in values.items():
         key = f"{prefix}{name}"
         if name not in kinds:
-            near = _near_keys(prefix, name, kinds)
-            raise ValueError(f"{source}: `{key}` is unknown, expected {near}.")
-        changes[name] = _setting(getattr(config, name), value, kinds[name], source, key)
+            near = get_close_matches(name, kinds, 1) or kinds
+            keys = " or ".join(f"`{prefix}{name}`" for name in near)
+            raise ValueError(f"{source}: `{key}` is unknown, expected {keys}.")
+        kind = kinds[name]
+        configs = (arm for arm in arms_of(kind) if is_dataclass(arm) and isinstance(arm, type))
+        config_type = next(configs, None)
+        if config_type is not None and isinstance(value, Mapping):
+            nested = getattr(config, name)
+            nested = config_type() if nested is None else nested
+            changes[name] = _replaced(nested, value, source, f"{key}.")
+        else:
+            changes[name] = _converted(value, kind)
+            check_value(source, key, changes[name], kind)
     try:
         return replace(config, **changes)
     except ValueError as error:
         raise relocated(error, source, prefix, list(kinds)) from None
-
-
-def _setting(current: Any, value: Any, kind: Any, source: str, key: str) -> Any:
-    """Return the setting of a type that a value stands for, in place of the current one."""
-    nested = _nested_config(current, kind)
-    if nested is not None and isinstance(value, Mapping):
-        return _replaced(nested, value, source, f"{key}.")
-    setting = _converted(value, kind)
-    check_value(source, key, setting, kind)
-    return setting
-
-
-def _near_keys(prefix: str, name: str, names: Iterable[str]) -> str:
-    """Return the key with the most similar name, or all keys if none is similar."""
-    names = list(names)
-    return " or ".join(f"`{prefix}{n}`" for n in get_close_matches(name, names, 1) or names)
-
-
-def _nested_config(value: Any, kind: Any) -> Any:
-    """Return the value of a field whose type is or may be a config, which is the default one in
-    place of None; None for other types.
-    """
-    types = (arm for arm in arms_of(kind) if is_dataclass(arm) and isinstance(arm, type))
-    config_type = next(types, None)
-    if config_type is None:
-        return None
-    return config_type() if value is None else value
 
 
 def _converted(value: Any, kind: Any) -> Any:
@@ -164,25 +147,21 @@ def _arguments(arms: Sequence[Any], origin: type) -> tuple[Any, ...]:
 def _table(config: Any, key: str) -> Iterator[str]:
     """Yield the lines of a table: its own settings, then the tables inside it."""
     docs = field_docs(type(config))
-    values = {name: getattr(config, name) for name in types_of(type(config))}
+    kinds = types_of(type(config))
+    values = {name: getattr(config, name) for name in kinds}
     nested = {name: value for name, value in values.items() if is_dataclass(value)}
     for name, value in values.items():
         if name not in nested:
-            _check_no_word(config, name)
+            if value == _NONE and NoneType in arms_of(kinds[name]):
+                raise ValueError(
+                    f"config_toml(): `{name}` must not be the string 'none', which stands for None."
+                )
             yield from _comment(docs.get(name, ""))
             yield f"{name} = {_toml(value)}"
     for name, value in nested.items():
         path = f"{key}.{name}" if key else name
         yield from ("", *_comment(docs.get(name, "")), f"[{path}]")
         yield from _table(value, path)
-
-
-def _check_no_word(config: Any, name: str) -> None:
-    """Raise an error if an optional string is the word that stands for None in a file."""
-    if getattr(config, name) == _NONE and NoneType in arms_of(types_of(type(config))[name]):
-        raise ValueError(
-            f"config_toml(): `{name}` must not be the string 'none', which stands for None."
-        )
 
 
 def _comment(text: str) -> list[str]:

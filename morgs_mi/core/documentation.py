@@ -40,28 +40,18 @@ def field_docs(config_type: type) -> dict[str, str]:
     """Return the docstrings of a dataclass's fields by name; none without source code."""
     docs: dict[str, str] = {}
     for base in reversed(config_type.__mro__):
-        for node, sibling in pairwise(_body_of(base)):
-            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name):
-                text = _string_of(sibling)
-                if text is not None:
-                    docs[node.target.id] = inspect.cleandoc(text)
+        try:
+            (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        except (OSError, TypeError, SyntaxError):
+            continue
+        for pair in pairwise(getattr(definition, "body", ())):
+            match pair:
+                case (
+                    ast.AnnAssign(target=ast.Name(id=name)),
+                    ast.Expr(value=ast.Constant(value=str(text))),
+                ):
+                    docs[name] = inspect.cleandoc(text)
     return docs
-
-
-def _body_of(kind: type) -> list[ast.stmt]:
-    """Return the statements of the definition of a class; none without source code."""
-    try:
-        (definition,) = ast.parse(textwrap.dedent(inspect.getsource(kind))).body
-    except (OSError, TypeError, SyntaxError):
-        return []
-    return definition.body if isinstance(definition, ast.ClassDef) else []
-
-
-def _string_of(node: ast.stmt) -> str | None:
-    """Return the text of a statement that is only a string, or None."""
-    value = node.value if isinstance(node, ast.Expr) else None
-    text = value.value if isinstance(value, ast.Constant) else None
-    return text if isinstance(text, str) else None
 
 
 def documented(config_type: type[Class]) -> type[Class]:

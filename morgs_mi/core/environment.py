@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 from importlib import metadata
 from pathlib import Path
@@ -10,14 +9,19 @@ from typing import Any
 
 import mitsuba as mi
 
+from morgs_mi.core.threads import usable_cores
+
 
 def machine() -> dict[str, Any]:
     """Return the processor, its number of threads, the system and the Mitsuba variant."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        name = next(line.split(":")[1] for line in lines if line.startswith("model name")).strip()
+    except (OSError, StopIteration):
+        name = platform.processor()
     return {
-        "processor": _processor(),
-        "threads": len(os.sched_getaffinity(0))
-        if hasattr(os, "sched_getaffinity")
-        else os.cpu_count(),
+        "processor": name,
+        "threads": usable_cores(),
         "system": f"{platform.system()} {platform.release()} {platform.machine()}",
         "variant": mi.variant(),
     }
@@ -39,11 +43,3 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version()} | {
         name: installed.get(name, "not installed") for name in packages
     }
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor()

@@ -37,7 +37,7 @@ def atomic_path(path: str | os.PathLike[str], place: str) -> Generator[Path, Non
     partial = _hidden(final, "partial")
     old = _hidden(final, "old")
     replaces_folder = os.path.isdir(final)  # unlike Path's, never raises
-    if _is_special(final):
+    if os.path.exists(final) and not (replaces_folder or os.path.isfile(final)):
         raise FileExistsError(
             f"{place}: {path} is a device or a pipe, which would be replaced; name a file."
         )
@@ -52,7 +52,8 @@ def atomic_path(path: str | os.PathLike[str], place: str) -> Generator[Path, Non
         remark = ", the partial output was removed" if os.path.lexists(partial) else ""
         raise write_error(f"{place}: cannot write {path}{remark}", error, partial) from error
     finally:
-        _restore(old, final)
+        if os.path.exists(old) and not os.path.exists(final):
+            old.rename(final)
         _remove(partial)
         _remove(old)
 
@@ -60,17 +61,6 @@ def atomic_path(path: str | os.PathLike[str], place: str) -> Generator[Path, Non
 def _hidden(path: Path, use: str) -> Path:
     """Return a hidden path of this process beside another one."""
     return path.with_name(f".{use}-{os.getpid()}-{path.name}")
-
-
-def _restore(old: Path, final: Path) -> None:
-    """Rename `old` to `final` if nothing has replaced it."""
-    if os.path.exists(old) and not os.path.exists(final):
-        old.rename(final)
-
-
-def _is_special(path: Path) -> bool:
-    """Return whether `path` exists and is neither a file nor a folder."""
-    return os.path.exists(path) and not (os.path.isdir(path) or os.path.isfile(path))
 
 
 @contextmanager
@@ -109,34 +99,23 @@ def locked_folder(path: str | os.PathLike[str], place: str) -> Generator[None, N
     new_folders = [parent for parent in (folder, *folder.parents) if not os.path.lexists(parent)]
     with ExitStack() as undo:
         undo.callback(_remove_empty, new_folders)
-        lock = _opened_lock(path, place)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
+        except FileExistsError:
+            raise FileExistsError(f"{place}: {path} is a file; name a folder.") from None
+        except OSError as error:
+            raise write_error(f"{place}: cannot write into {path}", error, folder) from error
         undo.callback(os.close, lock)
         # A writer that has just ended may have removed the file between its opening and its
         # locking.
         if not _locked(lock) or not is_same_file(file, os.fstat(lock)):
-            raise _blocked_error(path)
+            raise BlockingIOError(
+                f"{path}: expected a folder into which nothing else is written, got one into which "
+                "another process is writing; wait until it has ended, or choose another folder."
+            )
         undo.callback(_remove_own, file, lock)
         yield
-
-
-def _blocked_error(path: str | os.PathLike[str]) -> BlockingIOError:
-    """Return the error about a folder that another writer has locked."""
-    return BlockingIOError(
-        f"{path}: expected a folder into which nothing else is written, got one into which "
-        "another process is writing; wait until it has ended, or choose another folder."
-    )
-
-
-def _opened_lock(path: str | os.PathLike[str], place: str) -> int:
-    """Return the opened lock file of a folder, which is created if it is missing."""
-    folder = Path(path)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        return os.open(folder / _LOCK, os.O_RDWR | os.O_CREAT, 0o666)
-    except FileExistsError:
-        raise FileExistsError(f"{place}: {path} is a file; name a folder.") from None
-    except OSError as error:
-        raise write_error(f"{place}: cannot write into {path}", error, folder) from error
 
 
 def is_same_file(path: str | os.PathLike[str], status: os.stat_result) -> bool:

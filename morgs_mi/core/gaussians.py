@@ -21,7 +21,6 @@ from morgs_mi.core.attributes import (
     BY_ACTIVATED_NAME,
     EXP,
     SIGMOID,
-    Attribute,
     sigmoid,
 )
 from morgs_mi.core.checks import numbers
@@ -166,37 +165,42 @@ class Gaussians:
     offset: Tensor | None = None
 
     def __post_init__(self) -> None:
-        self._convert_fields()
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if value is not None or f.default is MISSING:
+                object.__setattr__(self, f.name, float_tensor("Gaussians()", f.name, value))
         if len(self.means.shape) != 2:
             raise ValueError(
                 f"Gaussians(): `means` must be [N, 3], got {tuple(self.means.shape)}; pass one "
                 "row for each."
             )
-        for attribute in ATTRIBUTES:
-            if attribute.activated_name != "sh_coeffs":  # two rows in one tensor, checked below
-                _check_shape(attribute, getattr(self, attribute.name), len(self))
-        _check_sh_shape(tuple(self.sh_coeffs.shape), len(self))
-
-    def _convert_fields(self) -> None:
-        """Replace the fields that are not tensors by tensors."""
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if value is not None or f.default is MISSING:
-                object.__setattr__(self, f.name, float_tensor("Gaussians()", f.name, value))
+        N = len(self)
+        for attribute in BY_ACTIVATED_NAME.values():
+            value = getattr(self, attribute.name)
+            if value is not None and tuple(value.shape) != (N, *attribute.shape):
+                expected = ", ".join(["N", *map(str, attribute.shape)])
+                raise ValueError(
+                    f"Gaussians(): `{attribute.name}` must be [{expected}] with N={N}, got "
+                    f"{tuple(value.shape)}; all attributes describe the same Gaussians."
+                )
+        shape = tuple(self.sh_coeffs.shape)
+        if len(shape) != 3 or shape[0] != N or shape[2] != 3 or shape[1] not in (1, 4, 9, 16):
+            raise ValueError(
+                f"Gaussians(): `sh_coeffs` must be [N, K, 3] with N={N} and K in 1, 4, 9, 16, got "
+                f"{shape}; K is (degree + 1)^2 for degree 0 to 3."
+            )
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
 
     def __repr__(self) -> str:
         more = [name for name in self.items() if name in ("motion", "logit_confidence", "offset")]
-        parts = [f"N={len(self)}", f"SH degree {self.sh_degree}", f"box of {self._size}", *more]
+        size = "0"
+        if len(self):
+            means = np.asarray(dr.detach(self.means))
+            size = " x ".join(f"{side:.3g}" for side in np.ptp(means, axis=0))
+        parts = [f"N={len(self)}", f"SH degree {self.sh_degree}", f"box of {size}", *more]
         return f"Gaussians({', '.join(parts)})"
-
-    @property
-    def _size(self) -> str:
-        """Sides of the box around the means, as text."""
-        means = np.asarray(dr.detach(self.means))
-        return " x ".join(f"{side:.3g}" for side in np.ptp(means, axis=0)) if len(self) else "0"
 
     @classmethod
     def from_activated(
@@ -327,25 +331,6 @@ class Gaussians:
             )
         return Gaussians(
             **{k: np.concatenate([column[k] for column in columns]) for k in columns[0]}
-        )
-
-
-def _check_shape(attribute: Attribute, value: Tensor | None, N: int) -> None:
-    """Raise an error if an attribute is present, and not one row for each of N Gaussians."""
-    tail = attribute.shape
-    if value is not None and tuple(value.shape) != (N, *tail):
-        expected = ", ".join(["N", *map(str, tail)])
-        raise ValueError(
-            f"Gaussians(): `{attribute.name}` must be [{expected}] with N={N}, got "
-            f"{tuple(value.shape)}; all attributes describe the same Gaussians."
-        )
-
-
-def _check_sh_shape(shape: tuple[int, ...], N: int) -> None:
-    if len(shape) != 3 or shape[0] != N or shape[2] != 3 or shape[1] not in (1, 4, 9, 16):
-        raise ValueError(
-            f"Gaussians(): `sh_coeffs` must be [N, K, 3] with N={N} and K in 1, 4, 9, 16, got "
-            f"{shape}; K is (degree + 1)^2 for degree 0 to 3."
         )
 
 

@@ -64,25 +64,27 @@ def interruptible() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    handlers = {number: signal.getsignal(number) for number in _SIGNALS}
     hook = sys.unraisablehook
     timers: list[threading.Timer] = []
-    try:
-        for number, handler in handlers.items():
-            # A shell lets the processes that it starts in the background ignore Ctrl-C, and nohup
-            # all its processes SIGHUP.
-            if handler is not signal.SIG_IGN:
-                signal.signal(number, signal.default_int_handler)
-        sys.unraisablehook = _repeating_hook(hook, timers)
-        yield
-        if any(timer.is_alive() for timer in timers):  # the block ended before it was raised again
-            raise KeyboardInterrupt
-    finally:
-        sys.unraisablehook = hook
-        for timer in timers:
-            timer.cancel()
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+
+    def repeat(problem: Any) -> None:
+        """Repeat an interruption that Python is about to print and to ignore."""
+        if not isinstance(problem.exc_value, KeyboardInterrupt):
+            hook(problem)
+            return
+        timers.append(threading.Timer(_PAUSE, _interrupt_main_thread))
+        timers[-1].start()
+
+    with _handle_signals(signal.default_int_handler):
+        try:
+            sys.unraisablehook = repeat
+            yield
+            if any(timer.is_alive() for timer in timers):  # the block ended before the repetition
+                raise KeyboardInterrupt
+        finally:
+            sys.unraisablehook = hook
+            for timer in timers:
+                timer.cancel()
 
 
 @contextmanager
@@ -94,37 +96,31 @@ def postponed() -> Iterator[None]:
         yield
         return
     numbers: list[int] = []
-    handlers = {number: signal.getsignal(number) for number in _SIGNALS}
     block = getattr(signal, "pthread_sigmask", lambda *_: None)  # not on Windows
-    for number, handler in handlers.items():
-        if handler is not signal.SIG_IGN:
-            signal.signal(number, lambda number, _: numbers.append(number))
-    block(signal.SIG_BLOCK, [signal.SIGINT])
-    try:
-        yield
-    finally:
-        block(signal.SIG_UNBLOCK, [signal.SIGINT])
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
+    with _handle_signals(lambda number, _: numbers.append(number)):
+        block(signal.SIG_BLOCK, [signal.SIGINT])
+        try:
+            yield
+        finally:
+            block(signal.SIG_UNBLOCK, [signal.SIGINT])
     if numbers:
         raise KeyboardInterrupt
 
 
-def _repeating_hook(
-    hook: Callable[[Any], Any], timers: list[threading.Timer]
-) -> Callable[[Any], None]:
-    """Return a hook that repeats an interruption that Python is about to print and to ignore, by a
-    timer that it adds to `timers`; other errors go to `hook`.
+@contextmanager
+def _handle_signals(handle: Callable[[int, FrameType | None], Any]) -> Iterator[None]:
+    """Handle the signals by a function, except those that are ignored: a shell lets the processes
+    that it starts in the background ignore Ctrl-C, and nohup all its processes SIGHUP.
     """
-
-    def handle(problem: Any) -> None:
-        if not isinstance(problem.exc_value, KeyboardInterrupt):
-            hook(problem)
-            return
-        timers.append(threading.Timer(_PAUSE, _interrupt_main_thread))
-        timers[-1].start()
-
-    return handle
+    handlers = {number: signal.getsignal(number) for number in _SIGNALS}
+    try:
+        for number, handler in handlers.items():
+            if handler is not signal.SIG_IGN:
+                signal.signal(number, handle)
+        yield
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 def begin_command() -> None:
@@ -134,22 +130,19 @@ def begin_command() -> None:
     library raises anything. A standard stream that is closed becomes the null device; otherwise the
     next file that is opened would take its place, and receive what libraries print.
     """
-    if not _is_command():
+    program = next(iter(sys.argv), "")
+    is_module = program == "-m" and "morgs_mi" in sys.orig_argv
+    if Path(program).stem != "morgs-mi" and not is_module:
         return
-    _open_closed_streams()
+    for stream in ("stdin", "stdout", "stderr"):
+        if getattr(sys, stream) is None:
+            setattr(sys, stream, open(os.devnull, "r" if stream == "stdin" else "w"))  # noqa: SIM115
     if "--multiprocessing-fork" in sys.orig_argv:  # its parent alone reacts
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         return
     for number in _SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _end)
-
-
-def _open_closed_streams() -> None:
-    """Open the null device in place of each standard stream that is closed."""
-    for stream in ("stdin", "stdout", "stderr"):
-        if getattr(sys, stream) is None:
-            setattr(sys, stream, open(os.devnull, "r" if stream == "stdin" else "w"))  # noqa: SIM115
 
 
 def _release(error: BaseException) -> None:
@@ -176,12 +169,6 @@ def _chain(error: BaseException) -> list[BaseException]:
         if isinstance(link, BaseExceptionGroup):
             stack += link.exceptions
     return links
-
-
-def _is_command() -> bool:
-    """Return whether this process was started as ``morgs-mi`` or ``python -m morgs_mi``."""
-    program = next(iter(sys.argv), "")
-    return Path(program).stem == "morgs-mi" or (program == "-m" and "morgs_mi" in sys.orig_argv)
 
 
 def _end(number: int, frame: FrameType | None) -> None:

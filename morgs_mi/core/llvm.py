@@ -77,25 +77,15 @@ def works(path: Path) -> bool:
     with suppress(OSError):
         if key in cache.read_text().splitlines():
             return True
-    is_usable = _compiles(path)
-    if is_usable:
-        _append_line(cache, key)
-    return is_usable
-
-
-def _compiles(path: Path) -> bool:
-    """Return whether a separate process compiles a kernel with a library."""
     environment = os.environ | {VARIABLE: str(path)}
     trial = subprocess.run([sys.executable, "-c", _TRIAL], env=environment, capture_output=True)
-    return trial.returncode == 0
-
-
-def _append_line(path: Path, text: str) -> None:
-    """Append a line to a file as far as that is possible; its folder is created."""
+    if trial.returncode != 0:
+        return False
     with suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a") as file:
-            file.write(text + "\n")
+        cache.parent.mkdir(parents=True, exist_ok=True)
+        with cache.open("a") as file:
+            file.write(key + "\n")
+    return True
 
 
 def usable(path: Path) -> bool:
@@ -127,13 +117,10 @@ def choose_llvm(
     if choice:
         rest = f"{best} is used instead." if best else f"No other was found: {REMEDY}."
         return best, f"{VARIABLE}={choice} is not a libLLVM that Dr.Jit can use here. {rest}"
-    return best, "" if best else _lack_in_words(libraries)
-
-
-def _lack_in_words(libraries: list[Path]) -> str:
-    """Return the sentence for a machine without a usable library, which may have others."""
+    if best:
+        return best, ""
     remark = f" (only {', '.join(map(str, libraries))}, too old for this CPU)" if libraries else ""
-    return (
+    return None, (
         f"Dr.Jit's CPU backend needs LLVM {SAFE_MAJOR} or newer and none was found{remark}: "
         f"{REMEDY}."
     )
@@ -172,7 +159,7 @@ def ensure_llvm() -> None:
         warnings.warn(problem, RuntimeWarning, stacklevel=3)
     os.environ[VARIABLE] = str(path or _NOWHERE)
     # Dr.Jit reads the variable once, when it is imported.
-    major = _loaded_major()
+    major = sys.modules["drjit"].detail.llvm_version()[0] if "drjit" in sys.modules else 0
     if 0 < major < SAFE_MAJOR:
         warnings.warn(
             f"Dr.Jit was imported before morgs_mi and has loaded LLVM {major}, which can abort the "
@@ -180,11 +167,6 @@ def ensure_llvm() -> None:
             RuntimeWarning,
             stacklevel=3,
         )
-
-
-def _loaded_major() -> int:
-    """Return the version of the LLVM that Dr.Jit has loaded, or 0."""
-    return sys.modules["drjit"].detail.llvm_version()[0] if "drjit" in sys.modules else 0
 
 
 if __name__ == "__main__":

@@ -40,16 +40,12 @@ def from_numpy(kind: type[Jit], values: ArrayLike) -> Jit:
     refuse_freezing("from_numpy()")
     source = np.asarray(values)
     dtype = np.dtype(dr.type_v(kind).name.lower())
-    copy = _aligned_memory(source.size * dtype.itemsize).view(dtype).reshape(source.shape)
+    num_bytes = source.size * dtype.itemsize
+    memory = np.empty(num_bytes + _ALIGNMENT, np.uint8)
+    first = -memory.ctypes.data % _ALIGNMENT
+    copy = memory[first : first + num_bytes].view(dtype).reshape(source.shape)
     copy[...] = source
     return kind(copy if dr.is_tensor_v(kind) else copy.ravel())
-
-
-def _aligned_memory(count: int) -> np.ndarray:
-    """Return `count` aligned bytes with any content."""
-    memory = np.empty(count + _ALIGNMENT, np.uint8)
-    first = -memory.ctypes.data % _ALIGNMENT
-    return memory[first : first + count]
 
 
 def float_tensor(place: str, name: str, values: ArrayLike | Tensor) -> Tensor:

@@ -76,10 +76,23 @@ class ProgressBar:
         self._shown = seconds
         share = f"{done:.0f}" if total is None else f"{done:.0f}/{total:.0f}"
         text = f"{share}, {timedelta(seconds=round(seconds))}"
+        name = f"{self._title}: {self._stage}" if self._stage else self._title
         if self._is_notebook:
-            self._show_html(done, total, text)
+            from IPython.display import HTML, display  # type: ignore[import-not-found]
+
+            value = done if total else 0
+            content = HTML(
+                _HTML.format(title=html.escape(name), done=value, total=total or 1, text=text)
+            )
+            if self._output is None:
+                self._output = display(content, display_id=True)
+            else:
+                self._output.update(content)
         elif sys.stderr.isatty():
-            self._show_line(done, total, text)
+            bar_length = round(_WIDTH * done / total) if total else 0
+            end = "\n" if done == total else ""
+            sys.stderr.write(f"\r{name} {'━' * bar_length:{_WIDTH}} {text}{end}")
+            sys.stderr.flush()
 
     def report(self, stage: str, done: float, total: float) -> None:
         """Show that `done` of `total` is done in a stage; for calls that report stages."""
@@ -88,28 +101,6 @@ class ProgressBar:
             self._shown = -_PERIOD
             self._stage = stage
         self(done, total)
-
-    @property
-    def _name(self) -> str:
-        return f"{self._title}: {self._stage}" if self._stage else self._title
-
-    def _show_line(self, done: float, total: float | None, text: str) -> None:
-        bar_length = round(_WIDTH * done / total) if total else 0
-        end = "\n" if done == total else ""
-        sys.stderr.write(f"\r{self._name} {'━' * bar_length:{_WIDTH}} {text}{end}")
-        sys.stderr.flush()
-
-    def _show_html(self, done: float, total: float | None, text: str) -> None:
-        from IPython.display import HTML, display  # type: ignore[import-not-found]
-
-        value = done if total else 0
-        content = HTML(
-            _HTML.format(title=html.escape(self._name), done=value, total=total or 1, text=text)
-        )
-        if self._output is None:
-            self._output = display(content, display_id=True)
-        elif self._output is not None:
-            self._output.update(content)
 
 
 def is_notebook() -> bool:

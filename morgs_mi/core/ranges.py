@@ -128,8 +128,21 @@ def item_kinds(kinds: tuple[Any, ...], count: int) -> tuple[Any, ...]:
 
 def _fits(value: Any, kind: Any) -> bool:
     origin = get_origin(kind)
-    if origin in _GENERIC_CHECKS:
-        return _GENERIC_CHECKS[origin](value, get_args(kind))
+    args = get_args(kind)
+    if origin in (Union, UnionType):
+        return any(_fits(value, arm) for arm in args)
+    if origin is Annotated:
+        bounds = (bound for bound in args[1:] if isinstance(bound, _Bound))
+        return _fits(value, args[0]) and all(bound.holds(value, bound.limit) for bound in bounds)
+    if origin is Literal:
+        return any(type(value) is type(choice) and value == choice for choice in args)
+    if origin is tuple:
+        kinds = item_kinds(args, len(value)) if isinstance(value, tuple) else None
+        return kinds is not None and len(kinds) == len(value) and all(map(_fits, value, kinds))
+    if origin is dict:
+        return isinstance(value, dict) and all(
+            _fits(k, args[0]) and _fits(v, args[1]) for k, v in value.items()
+        )
     if kind is int:
         return _is_number(value, Integral) and -(2**63) <= int(value) < 2**64
     if kind is float:
@@ -148,43 +161,6 @@ def _is_finite(value: Real) -> bool:
         return False
 
 
-def _fits_union(value: Any, arms: tuple[Any, ...]) -> bool:
-    return any(_fits(value, arm) for arm in arms)
-
-
-def _fits_bounds(value: Any, args: tuple[Any, ...]) -> bool:
-    bounds = (bound for bound in args[1:] if isinstance(bound, _Bound))
-    return _fits(value, args[0]) and all(bound.holds(value, bound.limit) for bound in bounds)
-
-
-def _is_choice(value: Any, choices: tuple[Any, ...]) -> bool:
-    return any(type(value) is type(choice) and value == choice for choice in choices)
-
-
-def _fits_tuple(value: Any, args: tuple[Any, ...]) -> bool:
-    if not isinstance(value, tuple):
-        return False
-    kinds = item_kinds(args, len(value))
-    return len(kinds) == len(value) and all(map(_fits, value, kinds))
-
-
-def _fits_dict(value: Any, args: tuple[Any, ...]) -> bool:
-    return isinstance(value, dict) and all(
-        _fits(k, args[0]) and _fits(v, args[1]) for k, v in value.items()
-    )
-
-
-# By the origin of a type; each takes a value and the arguments of the type.
-_GENERIC_CHECKS: dict[Any, Callable[[Any, tuple[Any, ...]], bool]] = {
-    Union: _fits_union,
-    UnionType: _fits_union,
-    Annotated: _fits_bounds,
-    Literal: _is_choice,
-    tuple: _fits_tuple,
-    dict: _fits_dict,
-}
-
-
 def _in_words(kind: Any) -> str:
     """Return a type in words, such as "a finite number, at least 0 and below 1"."""
     if len(arms := arms_of(kind)) > 1:
@@ -196,21 +172,13 @@ def _in_words(kind: Any) -> str:
     if origin is Literal:
         return _joined(list(map(str, args)), "or")
     if origin is tuple:
-        return f"a list ({_items_in_words(args)})"
-    return _name_in_words(kind)
-
-
-def _items_in_words(args: tuple[Any, ...]) -> str:
-    if args[1:] == (...,):
-        return f"each {_in_words(args[0])}"
-    return ", ".join(map(_in_words, args))
-
-
-def _name_in_words(kind: Any) -> str:
+        repeats = args[1:] == (...,)
+        items = f"each {_in_words(args[0])}" if repeats else ", ".join(map(_in_words, args))
+        return f"a list ({items})"
     name = getattr(kind, "__name__", str(kind))
     if is_dataclass(kind):
         return f"a table ({name})"
-    return _WORDS.get(get_origin(kind) or kind, name)
+    return _WORDS.get(origin or kind, name)
 
 
 def _expected(value: Any, kind: Any) -> str:

@@ -140,8 +140,12 @@ def with_near_planes(
     """
     if near is not None:
         return tuple(replace(camera, near=near) for camera in cameras)
-    reliable = _reliable_depths(cameras, points)
-    depths = _NEAR_SHARE * np.where(np.isnan(reliable), _rig_depths(cameras), reliable)
+    depths = _rig_depths(cameras)
+    for i, camera in enumerate(cameras):
+        _, _, z = seen_points(replace(camera, near=_IN_FRONT), points)
+        if len(z) >= _RELIABLE_POINTS:
+            depths[i] = np.quantile(z, _RELIABLE_QUANTILE)
+    depths *= _NEAR_SHARE
     return tuple(
         replace(camera, near=float(depth)) if depth > 0 else camera
         for camera, depth in zip(cameras, depths, strict=True)
@@ -163,37 +167,19 @@ def check_near_planes(where: str, cameras: Sequence[Camera], points: np.ndarray)
         )
 
 
-def _reliable_depths(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
-    """Return the smallest reliable depth of the points in each view [V], world units; NaN with too
-    few points.
-    """
-    depths = [seen_points(replace(camera, near=_IN_FRONT), points)[2] for camera in cameras]
-    return np.array(
-        [
-            np.quantile(z, _RELIABLE_QUANTILE) if len(z) >= _RELIABLE_POINTS else np.nan
-            for z in depths
-        ]
-    )
-
-
 def _rig_depths(cameras: Sequence[Camera]) -> np.ndarray:
     """Return a depth within which each camera shares nothing with the others, by the rig alone [V];
     0 if unknown.
     """
     positions = _positions(cameras)
     focus = focus_depths(cameras)
-    nearest = _nearest_distances(positions)
+    distances = np.linalg.norm(positions[:, None] - positions, axis=-1)
+    np.fill_diagonal(distances, np.inf)
+    nearest = distances.min(axis=1)
     depths = np.where(np.isfinite(focus), np.minimum(focus, scene_extent(cameras)), nearest)
     # Cameras at one place are apart by rounding errors.
     rounding = 1e-9 * np.abs(positions).max()
     return np.where(np.isfinite(depths) & (depths > rounding), depths, 0)
-
-
-def _nearest_distances(positions: np.ndarray) -> np.ndarray:
-    """Return the distance of each of the positions [V, 3] from the nearest other one [V]."""
-    distances = np.linalg.norm(positions[:, None] - positions, axis=-1)
-    np.fill_diagonal(distances, np.inf)
-    return distances.min(axis=1)
 
 
 def choose_key_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:
@@ -206,14 +192,9 @@ def choose_key_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:
     positions = _positions(cameras)
     views = [int(np.argmin(_central_distances(positions)))]
     while len(views) < min(count, len(cameras)):
-        views.append(_farthest(positions, views))
+        distance = np.linalg.norm(positions[:, None] - positions[views], axis=-1).min(1)
+        views.append(int(np.argmax(distance)))
     return tuple(sorted(views))
-
-
-def _farthest(positions: np.ndarray, views: Sequence[int]) -> int:
-    """Return the index of the position [V, 3] that is farthest from the positions of some views."""
-    distance = np.linalg.norm(positions[:, None] - positions[views], axis=-1).min(1)
-    return int(np.argmax(distance))
 
 
 def mean_views(cameras: Sequence[Camera], points: np.ndarray) -> float:

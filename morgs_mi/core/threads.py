@@ -18,7 +18,7 @@ def map_in_threads(function: Callable[[Item], Result], items: Iterable[Item]) ->
     It pays for functions that spend their time in NumPy and OpenCV, which release the interpreter's
     lock.
     """
-    with ThreadPoolExecutor(_usable_cores()) as pool:
+    with ThreadPoolExecutor(usable_cores()) as pool:
         return list(pool.map(function, items))
 
 
@@ -30,7 +30,7 @@ def in_background(function: Callable[[], Result]) -> Future[Result]:
     return future
 
 
-def _usable_cores() -> int:
+def usable_cores() -> int:
     """Return the number of cores that this process may use, which ``taskset`` and containers
     restrict.
     """
