@@ -97,21 +97,14 @@ class ComparedFrame:
             if image is not None:
                 maps = render(self.state.gaussians, camera, clip.channels, clip.render)
                 truth = truth_for_camera(clip.recording, camera, self.state.frame)
-                moving = self._changed(index) if truth is None else truth.mask
+                moving = None if truth is None else truth.mask
+                last_image = None if self.last is None else self.last[index]
+                if last_image is not None and clip.recording.truth is None:
+                    moving = recorded_change(last_image, image)
                 light = None if clip.recording.display_exposure is None else self.recorded[index]
                 yield ComparedView(
                     self, index, maps, image, clip.recording.masks[index], moving, truth, light
                 )
-
-    def _changed(self, view: int) -> np.ndarray | None:
-        """Return the mask of pixels that changed since the last image; None without one, and beside
-        ground truth.
-        """
-        last_image = None if self.last is None else self.last[view]
-        image = self.images[view]
-        if last_image is None or image is None or self.clip.recording.truth is not None:
-            return None
-        return recorded_change(last_image, image)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,7 +4,7 @@ legends.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -12,7 +12,6 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.truth import GroundTruth
-from morgs_mi.codec.frame_source import FrameSource
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import exposed
 from morgs_mi.playback.player import (
@@ -82,7 +81,12 @@ def draw_stream(
     recorded = []
     rows: dict[str, list[list[np.ndarray]]] = {"motion": []}
     row_frames = _row_frames(frames)
-    playback = render_stream(stream, camera, ("color", "motion", *_learned_maps(stream)))
+    channels = ["color", "motion"]
+    if has_confidence(stream):
+        channels.append("confidence")
+    if has_offset(stream):
+        channels.append("offset")
+    playback = render_stream(stream, camera, channels)
     recorded_frames = recording.partial_frames(frames[0], frames[-1] + 1)
     for (index, images), frame in zip(playback, recorded_frames, strict=False):
         # Copies: views would keep all images of a long clip in memory.
@@ -96,8 +100,12 @@ def draw_stream(
         if progress is not None:
             progress(len(renders), len(frames))
     sheets = {"slice": _slices(still, column, recorded, renders)}
-    sheets |= {name: _with_legend(rows[name], _legend(name, scale)) for name in rows}
-    return _write_sheets(Path(folder), sheets)
+    for name, (first_row, *later_rows) in rows.items():
+        sheets[name] = contact_sheet([[*first_row, _legend(name, scale)], *later_rows])
+    paths = [Path(folder) / f"{name}.png" for name in sheets]
+    for path, sheet in zip(paths, sheets.values(), strict=True):
+        write_png(path, sheet)
+    return paths
 
 
 def _row_frames(frames: Sequence[int]) -> set[int]:
@@ -106,12 +114,6 @@ def _row_frames(frames: Sequence[int]) -> set[int]:
     later_frames = frames[1:] or frames
     last = len(later_frames) - 1
     return {later_frames[i] for i in np.linspace(0, last, min(_ROWS, last + 1)).astype(int)}
-
-
-def _learned_maps(stream: FrameSource) -> list[str]:
-    """Return the channels of the stream that are drawn beside colour and motion."""
-    maps = {"confidence": has_confidence(stream), "offset": has_offset(stream)}
-    return [name for name, stored in maps.items() if stored]
 
 
 def _rows(
@@ -139,14 +141,6 @@ def _legend(sheet: str, scale: float) -> np.ndarray:
     return motion_legend(scale)
 
 
-def _write_sheets(folder: Path, sheets: Mapping[str, np.ndarray]) -> list[Path]:
-    """Write images as PNG files and return their paths."""
-    paths = [folder / f"{name}.png" for name in sheets]
-    for path, sheet in zip(paths, sheets.values(), strict=True):
-        write_png(path, sheet)
-    return paths
-
-
 def motion_scale(capture: Capture, camera: Camera) -> float:
     """Return the 95th percentile of the true speed of moving pixels, px; without truth 3 % of the
     camera's width.
@@ -162,19 +156,16 @@ def _busiest_column(recording: Capture, view: int, frames: Sequence[int]) -> tup
     """Return the column of a view in which the recording changes most, and its last image."""
     change = np.zeros(recording.cameras[view].width)
     last = None
-    for image in _recorded_images(recording, view, frames):
+    for frame in recording.partial_frames(frames[0], frames[-1] + 1):
+        pixels = frame.images[view]
+        if pixels is None:
+            continue
+        image = pixels.astype(float)
         if last is not None:
             change += np.abs(image - last).sum((0, 2))
         last = image
     assert last is not None
     return int(change.argmax()), last.astype(np.uint8)
-
-
-def _recorded_images(recording: Capture, view: int, frames: Sequence[int]) -> Iterator[np.ndarray]:
-    """Yield the images of a view [H, W, 3] as floats, without those that were not recorded."""
-    for frame in recording.partial_frames(frames[0], frames[-1] + 1):
-        if (pixels := frame.images[view]) is not None:
-            yield pixels.astype(float)
 
 
 def _slices(
@@ -199,7 +190,3 @@ def _row(
         for name, values in maps.items()
         if values is not None
     ]
-
-
-def _with_legend(rows: list[list[np.ndarray]], legend: np.ndarray) -> np.ndarray:
-    return contact_sheet([[*rows[0], legend], *rows[1:]])

@@ -11,8 +11,7 @@ until the next. Otherwise it is the pixels in which the recording changed by mor
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -20,7 +19,6 @@ import numpy as np
 from morgs_mi.capture.truth import GroundTruth, load_tracks, load_truth
 from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.frame_source import FrameState
-from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import decode_light
 from morgs_mi.evaluate.comparison import ComparedClip, ComparedFrame, ComparedView
 from morgs_mi.evaluate.metrics import (
@@ -35,7 +33,7 @@ from morgs_mi.evaluate.metrics import (
     unit_pair,
 )
 from morgs_mi.evaluate.motion3d import evaluate_motion
-from morgs_mi.evaluate.results import Motion3DScores, PlaybackTimes, VariationScores, ViewScores
+from morgs_mi.evaluate.results import PlaybackTimes, VariationScores, ViewScores
 from morgs_mi.evaluate.temporal import StillVariation, slope
 from morgs_mi.method.exposure import follow_exposure
 from morgs_mi.playback.player import playback_speed
@@ -126,44 +124,30 @@ class Motion3D(Measure):
     def __init__(self, clip: ComparedClip) -> None:
         self._cameras = clip.recording.cameras
         self._truth = clip.recording.truth
-        folder = self._truth
-        self._tracks = (
-            load_tracks(folder)
-            if folder is not None and (folder / "tracks.npz").is_file()
-            else None
-        )
+        self._tracks = None
+        if self._truth is not None and (self._truth / "tracks.npz").is_file():
+            self._tracks = load_tracks(self._truth)
         self._last_state: FrameState | None = None
 
     def add_frame(self, frame: ComparedFrame) -> dict[str, Any]:
         last_state = self._last_state
-        self._last_state = frame.state
+        state = frame.state
+        self._last_state = state
+        tracks = self._tracks
         if frame.kind != PacketKind.RESIDUAL or last_state is None:
             return {"motion_3d": None}
-        return {"motion_3d": self._motion(last_state, frame.state)}
-
-    def _motion(self, last_state: FrameState, state: FrameState) -> Motion3DScores | None:
-        """Return the errors between two frames; None without truth."""
-        frame = state.frame
-        tracks = self._tracks
-        if tracks is None or self._truth is None or frame >= tracks.points.shape[1]:
-            return None
-        views = list(_true_views(self._cameras, self._truth, frame - 1))
+        if tracks is None or self._truth is None or state.frame >= tracks.points.shape[1]:
+            return {"motion_3d": None}
+        views = []
+        for camera in self._cameras:
+            truth = load_truth(self._truth, camera.name, state.frame - 1)
+            views.append((camera.resized(*truth.mask.shape[::-1]), truth))
         _, last_rows, rows = np.intersect1d(last_state.ids, state.ids, return_indices=True)
         old = last_state.gaussians.numpy()["means"][last_rows].astype(float)
         new = state.gaussians.numpy()["means"][rows].astype(float)
-        points = tracks.points[:, frame - 1], tracks.points[:, frame], tracks.ids
-        return evaluate_motion(
-            old, new - old, np.asarray(last_state.gaussians.opacities)[last_rows], points, views
-        )
-
-
-def _true_views(
-    cameras: Sequence[Camera], folder: Path, frame: int
-) -> Iterator[tuple[Camera, GroundTruth]]:
-    """Yield the cameras, on the pixel grid of their ground truth, and that."""
-    for camera in cameras:
-        truth = load_truth(folder, camera.name, frame)
-        yield camera.resized(*truth.mask.shape[::-1]), truth
+        opacities = np.asarray(last_state.gaussians.opacities)[last_rows]
+        points = tracks.points[:, state.frame - 1], tracks.points[:, state.frame], tracks.ids
+        return {"motion_3d": evaluate_motion(old, new - old, opacities, points, views)}
 
 
 class Speed(Measure):

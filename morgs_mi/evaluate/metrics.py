@@ -78,18 +78,14 @@ def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
         raise ValueError(
             f"ssim_map(): images must be at least {WINDOW}x{WINDOW} pixels, got {image.shape[:2]}."
         )
-    similarity = _similarity(image, truth)
-    return similarity.reshape(*similarity.shape[:2], -1).mean(-1)
-
-
-def _similarity(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Return the similarity of the windows, [H - 10, W - 10, ...]."""
     x = _blur(image)
     y = _blur(truth)
     var_x = _blur(image**2) - x**2
     var_y = _blur(truth**2) - y**2
     covariance = _blur(image * truth) - x * y
-    return (2 * x * y + C1) * (2 * covariance + C2) / ((x**2 + y**2 + C1) * (var_x + var_y + C2))
+    similarity = (2 * x * y + C1) * (2 * covariance + C2)
+    similarity /= (x**2 + y**2 + C1) * (var_x + var_y + C2)
+    return similarity.reshape(*similarity.shape[:2], -1).mean(-1)
 
 
 def delta_e_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -175,16 +171,10 @@ def _middle(length: int, count: int) -> slice:
 def _blur(image: np.ndarray) -> np.ndarray:
     """Return the average over the Gaussian window wherever it fits, [H - 10, W - 10, ...]."""
     half = WINDOW // 2
-    weights = _window()
+    weights = np.exp(-0.5 * (np.arange(-half, half + 1) / SIGMA) ** 2)
+    weights /= weights.sum()
     rows = correlate1d(image, weights, axis=0)[half:-half]
     return correlate1d(rows, weights, axis=1)[:, half:-half]
-
-
-def _window() -> np.ndarray:
-    """Return the weights of the window along one axis [11]."""
-    half = WINDOW // 2
-    weights = np.exp(-0.5 * (np.arange(-half, half + 1) / SIGMA) ** 2)
-    return weights / weights.sum()
 
 
 def unit_pair(
@@ -196,7 +186,7 @@ def unit_pair(
         ValueError: the sizes differ or the mask does not match; the message begins with `name`.
     """
     _check(name, image, truth, mask)
-    return _unit(image), _unit(truth)
+    return unit_values(np.asarray(image)), unit_values(np.asarray(truth))
 
 
 def _check(name: str, image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None) -> None:
@@ -209,7 +199,3 @@ def _check(name: str, image: np.ndarray, truth: np.ndarray, mask: np.ndarray | N
         raise ValueError(
             f"{name}(): `mask` must be bool {np.shape(image)[:2]}, got {mask.dtype} {mask.shape}."
         )
-
-
-def _unit(image: np.ndarray) -> np.ndarray:
-    return unit_values(np.asarray(image))

@@ -67,16 +67,12 @@ def evaluate_motion(
         if not longest:
             continue
         if index in rigid:
-            true[on] = _displacements(means[on], *rigid[index])
+            rotation, shift = rigid[index]
+            true[on] = means[on] @ (rotation - np.eye(3)).T + shift
         else:
             true[on] = local_motion(means[on], starts, ends)
         mask |= on & (np.linalg.norm(true, axis=-1) >= _LEAST_SHARE * longest)
     return compare_motion(displacements[mask], true[mask])
-
-
-def _displacements(points: np.ndarray, rotation: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """Return the displacements [M, 3] of points by a rigid motion."""
-    return points @ (rotation - np.eye(3)).T + shift
 
 
 def local_motion(points: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
@@ -130,27 +126,21 @@ def surface_ids(points: np.ndarray, views: Sequence[tuple[Camera, GroundTruth]])
     ids = np.full(len(points), -1, np.int64)
     several = np.zeros(len(points), bool)
     for camera, truth in views:
-        rows, pixel_ids = _visible_surfaces(points, camera, truth)
+        viewmat = np.asarray(camera.viewmat)
+        depth = points @ viewmat[2, :3] + viewmat[2, 3]
+        front = np.flatnonzero(depth > camera.near)
+        pixels = np.floor(camera.project(points[front])[0])
+        visible = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(-1)
+        front = front[visible]
+        column, row = pixels[visible].astype(int).T
+        distance = np.abs(truth.depth[row, column] - depth[front])
+        on = (truth.ids[row, column] >= 0) & (distance <= _DEPTH_TOLERANCE * depth[front])
+        rows = front[on]
+        pixel_ids = truth.ids[row, column][on]
         several[rows] |= (ids[rows] >= 0) & (ids[rows] != pixel_ids)
         ids[rows] = pixel_ids
     ids[several] = -1
     return ids
-
-
-def _visible_surfaces(
-    points: np.ndarray, camera: Camera, truth: GroundTruth
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows of the points on surfaces that a view shows, and the ids of the objects."""
-    viewmat = np.asarray(camera.viewmat)
-    depth = points @ viewmat[2, :3] + viewmat[2, 3]
-    front = np.flatnonzero(depth > camera.near)
-    pixels = np.floor(camera.project(points[front])[0])
-    visible = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(-1)
-    front = front[visible]
-    column, row = pixels[visible].astype(int).T
-    distance = np.abs(truth.depth[row, column] - depth[front])
-    on = (truth.ids[row, column] >= 0) & (distance <= _DEPTH_TOLERANCE * depth[front])
-    return front[on], truth.ids[row, column][on]
 
 
 def rigid_motions(
@@ -166,27 +156,22 @@ def rigid_motions(
         ends: the same points one frame later.
         ids: ids of their objects [P].
     """
-    objects = {int(i): (starts[ids == i], ends[ids == i]) for i in np.unique(ids)}
-    return {
-        index: motion
-        for index, (p, q) in objects.items()
-        if not np.array_equal(p, q) and len(p) >= 3 and (motion := _rigid_motion(p, q))
-    }
-
-
-def _rigid_motion(p: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the rotation and the shift from points p to q [P, 3]; None if they lie on one line or
-    are not rigid.
-    """
-    center = p.mean(0)
-    target = q.mean(0)
-    size = np.linalg.norm(p - center, axis=-1).max()
-    spread = np.linalg.svd((q - target).T @ (p - center) / len(p), compute_uv=False)
-    rotation = _rotation(p - center, q - target)
-    shift = target - rotation @ center
-    off = np.linalg.norm(p @ rotation.T + shift - q, axis=-1).max()
-    rigid = spread[1] > (_FLAT * size) ** 2 and off <= _RIGID * size
-    return (rotation, shift) if rigid else None
+    motions: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    for index in np.unique(ids):
+        p = starts[ids == index]
+        q = ends[ids == index]
+        if np.array_equal(p, q) or len(p) < 3:
+            continue
+        center = p.mean(0)
+        target = q.mean(0)
+        size = np.linalg.norm(p - center, axis=-1).max()
+        spread = np.linalg.svd((q - target).T @ (p - center) / len(p), compute_uv=False)
+        rotation = _rotation(p - center, q - target)
+        shift = target - rotation @ center
+        off = np.linalg.norm(p @ rotation.T + shift - q, axis=-1).max()
+        if spread[1] > (_FLAT * size) ** 2 and off <= _RIGID * size:
+            motions[int(index)] = (rotation, shift)
+    return motions
 
 
 def _rotation(p: np.ndarray, q: np.ndarray) -> np.ndarray:

@@ -34,14 +34,8 @@ class _Scores:
     @classmethod
     def mean(cls, scores: Sequence[Self]) -> Self:
         """Return the mean of each field over its known values."""
-        return cls(
-            **{name: known_mean([getattr(each, name) for each in scores]) for name in cls.names()}
-        )
-
-    @classmethod
-    def names(cls) -> tuple[str, ...]:
-        """Return the names of the fields."""
-        return tuple(field.name for field in fields(cls))
+        names = [field.name for field in fields(cls)]
+        return cls(**{name: known_mean([getattr(each, name) for each in scores]) for name in names})
 
 
 @dataclass(frozen=True)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from morgs_mi.evaluate.measures import REGIONS
-from morgs_mi.evaluate.results import Evaluation, Motion3DScores, Sizes, ViewScores
+from morgs_mi.evaluate.results import Evaluation
 
 # Title, name of the score and decimals.
-_Column = tuple[str, str, int]
-
 _METRICS = (("PSNR, dB", "psnr", 2), ("SSIM", "ssim", 4), ("dE2000", "delta_e", 2))
 _METRICS += (("LPIPS", "lpips", 4), ("flow error, px", "motion_error", 2))
 _FRAME = (("PSNR, dB", "psnr", 2), ("moving", "psnr_moving", 2), ("SSIM", "ssim", 4))
@@ -50,8 +48,15 @@ def _region_table(result: Evaluation) -> Table:
     """Return the mean scores of the whole images and of their regions, without unknown rows."""
     title = f"{_views(result)}: means, regions from {result.regions}"
     table = _table(title, "", "whole", "moving", "still")
-    for row in _region_rows(result.scores):
-        table.add_row(*row)
+    mean = result.scores
+    for title, name, digits in _METRICS:
+        values = [getattr(mean, name + region) for region in REGIONS]
+        if any(value == value for value in values):
+            table.add_row(title, *(figure(value, digits) for value in values))
+        if name == "psnr" and mean.psnr_matched == mean.psnr_matched:
+            table.add_row("PSNR, colours matched", figure(mean.psnr_matched, digits), "", "")
+    if mean.psnr_mu == mean.psnr_mu:
+        table.add_row("PSNR of the light, mu-law", figure(mean.psnr_mu, 2), "", "")
     if result.variation.render == result.variation.render:
         table.add_row("mTV x100", "", "", figure(result.variation.render, 3))
         table.add_row("mTV x100 of the recording", "", "", figure(result.variation.input, 3))
@@ -66,38 +71,20 @@ def _views(result: Evaluation) -> str:
     return f"{kind} view " + ", ".join(result.views)
 
 
-def _region_rows(mean: ViewScores) -> Iterator[tuple[str, ...]]:
-    for title, name, digits in _METRICS:
-        values = [getattr(mean, name + region) for region in REGIONS]
-        if any(value == value for value in values):
-            yield (title, *(figure(value, digits) for value in values))
-        if name == "psnr" and mean.psnr_matched == mean.psnr_matched:
-            yield "PSNR, colours matched", figure(mean.psnr_matched, digits), "", ""
-    if mean.psnr_mu == mean.psnr_mu:
-        yield "PSNR of the light, mu-law", figure(mean.psnr_mu, 2), "", ""
-
-
-def _known_columns(
-    columns: Sequence[_Column], rows: Collection[Mapping[str, float | None]]
-) -> list[_Column]:
-    """Return the columns in which a row has a value."""
-    return [column for column in columns if any(figure(row[column[1]], 0) != "-" for row in rows)]
-
-
-def _cells(row: Mapping[str, float | None], columns: Sequence[_Column]) -> list[str]:
-    return [figure(row[name], digits) for _, name, digits in columns]
-
-
 def _view_table(result: Evaluation) -> Table:
     """Return the scores of each view, and their means, without columns that have none."""
     rows = {
         name: asdict(scores) for name, scores in (*result.views.items(), ("mean", result.scores))
     }
-    columns = _known_columns(_VIEW, rows.values())
+    columns = [
+        (title, name, digits)
+        for title, name, digits in _VIEW
+        if any(figure(row[name], 0) != "-" for row in rows.values())
+    ]
     title = f"{_views(result)}, means over the frames"
     table = _table(title, "", *(title for title, *_ in columns))
     for name, row in rows.items():
-        table.add_row(name, *_cells(row, columns))
+        table.add_row(name, *(figure(row[score], digits) for _, score, digits in columns))
     return table
 
 
@@ -115,34 +102,24 @@ def evaluation_summary(result: Evaluation) -> Iterator[str]:
             f"{figure(result.scores.psnr_matched, 2)} dB after the gain and bias per channel that "
             "fit best."
         )
-    if result.motion_3d is not None and result.motion_3d.num_gaussians:
-        yield _motion_sentence(result.motion_3d)
+    motion = result.motion_3d
+    if motion is not None and motion.num_gaussians:
+        yield (
+            f"3D motion of {motion.num_gaussians:.0f} Gaussians on moving objects: error "
+            f"{motion.error:.4f} of {motion.true_length:.4f} units "
+            f"({100 * motion.relative_error:.0f} %), angle {motion.angle:.1f} degrees, length "
+            f"ratio {motion.length_ratio:.2f}."
+        )
     if (iou := result.scores.confidence_iou) == iou:
         yield f"Confidence over the true mask: IoU {iou:.2f}."
-    yield _size_sentence(result.sizes)
-    yield _time_sentence(result)
-
-
-def _motion_sentence(motion: Motion3DScores) -> str:
-    return (
-        f"3D motion of {motion.num_gaussians:.0f} Gaussians on moving objects: error "
-        f"{motion.error:.4f} of {motion.true_length:.4f} units "
-        f"({100 * motion.relative_error:.0f} %), angle {motion.angle:.1f} degrees, length "
-        f"ratio {motion.length_ratio:.2f}."
-    )
-
-
-def _size_sentence(sizes: Sizes) -> str:
-    return (
+    sizes = result.sizes
+    yield (
         f"Size: {sizes.file / 1e6:.2f} MB, {figure(sizes.per_keyframe / 1e3, 1)} kB per keyframe, "
         f"{figure(sizes.per_residual / 1e3, 1)} kB per residual."
     )
-
-
-def _time_sentence(result: Evaluation) -> str:
     seconds = result.seconds
     play = result.playback
-    return (
+    yield (
         f"Time: {figure(seconds.first, 1)} s for the first frame, "
         f"{figure(seconds.per_later_frame, 1)} s per later one, from images to packet; played at "
         f"{figure(play.fps, 0)} frames per second ({figure(play.decode_ms, 1)} ms to decode, "

@@ -48,15 +48,12 @@ class StillVariation:
         self._motion_counts = self._motion_counts + moving
         self._frames += 1
         if self._last is not None:
-            self._add_changes(
-                [np.abs(new - old).mean(-1) for new, old in zip(pair, self._last, strict=True)]
-            )
+            sums = self._sums or (0, 0)
+            self._sums = [
+                total + np.abs(new - old).mean(-1)
+                for total, new, old in zip(sums, pair, self._last, strict=True)
+            ]
         self._last = pair
-
-    def _add_changes(self, changes: list[np.ndarray]) -> None:
-        if self._sums:
-            changes = [total + change for total, change in zip(self._sums, changes, strict=True)]
-        self._sums = changes
 
     def result(self) -> VariationScores:
         """Return the mTV of I and of I', and the mask's share of the view; NaN without two frames
