@@ -60,24 +60,24 @@ def default_rig(frames: Sequence[Gaussians], axes: Axes = "y-down") -> tuple[Cam
             "one."
         )
     low, high, size = _extent(frames)
-    ring = _ring((low + high) / 2, _half_box(low, high, size), axes)
-    best = _most_detailed(next(gaussians for gaussians in frames if len(gaussians)), ring)
-    return ring[best:] + ring[:best]
-
-
-def _half_box(low: np.ndarray, high: np.ndarray, size: float) -> np.ndarray:
-    """Return half the sides [3] of the box that the first camera sees."""
     # A single Gaussian has no extent but its own, and one without extent is at least larger than
     # rounding errors.
     least = _LEAST_EXTENT * (1 + np.abs((low, high)).max())
-    return np.maximum(_MARGIN * 0.5 * (high - low) + 3 * size, least)
+    half = np.maximum(_MARGIN * 0.5 * (high - low) + 3 * size, least)
+    ring = _ring((low + high) / 2, half, axes)
+    some = thinned(next(gaussians for gaussians in frames if len(gaussians)))
+    best = int(np.argmax([_detail(some, camera.with_width(_THUMBNAIL)) for camera in ring]))
+    return ring[best:] + ring[:best]
 
 
 def _ring(center: np.ndarray, half: np.ndarray, axes: Axes) -> tuple[Camera, ...]:
     """Return the cameras around a box with half the sides `half` [3], the front one first."""
     up, forward = _DIRECTIONS[axes]
     # The first camera sees the box; the others keep its distance from the middle.
-    distance = _distance(half, up, forward)
+    tall = np.abs(up) @ half
+    wide = np.abs(np.cross(forward, up)) @ half
+    deep = np.abs(forward) @ half
+    distance = deep + max(wide, tall * _WIDTH / _HEIGHT) / np.tan(np.deg2rad(_FOV_X / 2))
     angles = np.linspace(0, 2 * np.pi, len(_NAMES), endpoint=False)
     arms = Rotation.from_rotvec(angles[:, None] * up).apply(-forward)
     return tuple(
@@ -86,25 +86,11 @@ def _ring(center: np.ndarray, half: np.ndarray, axes: Axes) -> tuple[Camera, ...
     )
 
 
-def _distance(half: np.ndarray, up: np.ndarray, forward: np.ndarray) -> float:
-    """Return the distance from the middle of a box at which a camera sees all of it."""
-    tall = np.abs(up) @ half
-    wide = np.abs(np.cross(forward, up)) @ half
-    deep = np.abs(forward) @ half
-    return deep + max(wide, tall * _WIDTH / _HEIGHT) / np.tan(np.deg2rad(_FOV_X / 2))
-
-
 def thinned(gaussians: Gaussians) -> Gaussians:
     """Return every k-th Gaussian, at most 30,000, enlarged to cover the same area."""
     k = len(gaussians) // _MOST + 1
     some = gaussians.select(np.arange(0, len(gaussians), k))
     return replace(some, log_scales=some.log_scales + 0.5 * np.log(k))
-
-
-def _most_detailed(gaussians: Gaussians, cameras: tuple[Camera, ...]) -> int:
-    """Return the index of the camera in whose view the Gaussians have the most detail."""
-    some = thinned(gaussians)
-    return int(np.argmax([_detail(some, camera.with_width(_THUMBNAIL)) for camera in cameras]))
 
 
 def _detail(gaussians: Gaussians, camera: Camera) -> float:
@@ -123,21 +109,15 @@ def _extent(frames: Sequence[Gaussians]) -> tuple[np.ndarray, np.ndarray, float]
         raise ValueError(
             "expected at least one Gaussian, got none; leave out files that are empty."
         )
-    logits = _column(raw, "logit_opacities")
-    low, high = _corners(means, 0.5 + 0.5 * np.tanh(0.5 * logits))
+    weights = 0.5 + 0.5 * np.tanh(0.5 * _column(raw, "logit_opacities")) + 1e-9
+    percents = (_PERCENT_OUTSIDE, 100 - _PERCENT_OUTSIDE)
+    corners = [
+        np.percentile(axis, percents, weights=weights, method="inverted_cdf") for axis in means.T
+    ]
+    low, high = np.array(corners).T
     sizes = np.concatenate([values["log_scales"].max(axis=1, initial=-69) for values in raw])
     return low, high, float(np.exp(np.median(sizes)))
 
 
 def _column(raw: list[dict[str, np.ndarray]], name: str) -> np.ndarray:
     return np.concatenate([values[name] for values in raw], dtype=np.float64)
-
-
-def _corners(means: np.ndarray, opacities: np.ndarray) -> np.ndarray:
-    """Return the lowest and the highest corner [2, 3] of the box around most of the opacity."""
-    percents = (_PERCENT_OUTSIDE, 100 - _PERCENT_OUTSIDE)
-    weights = opacities + 1e-9
-    corners = [
-        np.percentile(axis, percents, weights=weights, method="inverted_cdf") for axis in means.T
-    ]
-    return np.array(corners).T

@@ -123,35 +123,22 @@ def playback_speed(stream: FrameSource, camera: Camera, config: RenderConfig) ->
     Raises:
         ValueError: a broken packet.
     """
-    times = list(_frame_times(stream, camera, config))
+    times: list[tuple[float, float]] = []
+    start = time.perf_counter()
+    for _, gaussians in islice(play(stream), _MOST_TIMED_FRAMES):
+        decoding = time.perf_counter() - start
+        if not times:  # compiles kernels
+            render(gaussians, camera, ("color",), config)
+        start = time.perf_counter()
+        to_uint8(render(gaussians, camera, ("color",), config)["color"])
+        times.append((decoding, time.perf_counter() - start))
+        start = time.perf_counter()
     decode, draw = np.median(times[1:] or times or [(np.nan, np.nan)], axis=0)
     return {
         "fps": float(1 / (decode + draw)),
         "decode_ms": float(1e3 * decode),
         "render_ms": float(1e3 * draw),
     }
-
-
-def _frame_times(
-    stream: FrameSource, camera: Camera, config: RenderConfig
-) -> Iterator[tuple[float, float]]:
-    """Yield the seconds that each of the first frames takes to decode and to render."""
-    frames = islice(play(stream), _MOST_TIMED_FRAMES)
-    for count in range(_MOST_TIMED_FRAMES):
-        start = time.perf_counter()
-        _, gaussians = next(frames, (0, None))
-        if gaussians is None:
-            break
-        decoding = time.perf_counter() - start
-        if not count:
-            render(gaussians, camera, ("color",), config)
-        yield decoding, _seconds_to_draw(gaussians, camera, config)
-
-
-def _seconds_to_draw(gaussians: Gaussians, camera: Camera, config: RenderConfig) -> float:
-    start = time.perf_counter()
-    to_uint8(render(gaussians, camera, ("color",), config)["color"])
-    return time.perf_counter() - start
 
 
 def available_channels(gaussians: Gaussians) -> tuple[str, ...]:
@@ -178,11 +165,9 @@ def render(
         image = rasterize(gaussians, camera, names, config=config)
         images = {name: image[name] for name in names}
     if "offset" in channels:
-        images["offset"] = _offset_image(gaussians, camera, config)
+        offset = np.zeros((len(gaussians), 3)) if gaussians.offset is None else gaussians.offset
+        offset_image = rasterize(
+            replace(gaussians, motion=offset), camera, ("motion",), config=config
+        )
+        images["offset"] = offset_image.motion
     return {name: np.array(images[name]) for name in channels}
-
-
-def _offset_image(gaussians: Gaussians, camera: Camera, config: RenderConfig) -> Tensor:
-    offset = np.zeros((len(gaussians), 3)) if gaussians.offset is None else gaussians.offset
-    gaussians = replace(gaussians, motion=offset)
-    return rasterize(gaussians, camera, ("motion",), config=config).motion

@@ -73,11 +73,7 @@ def truth_for_camera(capture: Capture, camera: Camera, frame: int) -> GroundTrut
     """
     if capture.truth is None or not (capture.truth / camera.name / f"{frame:04d}.exr").is_file():
         return None
-    return _truth_on_grid(load_truth(capture.truth, camera.name, frame), camera)
-
-
-def _truth_on_grid(truth: GroundTruth, camera: Camera) -> GroundTruth:
-    """Return ground truth on the pixel grid of a camera, by the nearest neighbour."""
+    truth = load_truth(capture.truth, camera.name, frame)
     H, W = truth.mask.shape
     rows = _nearest_pixels(camera.height, H)[:, None]
     columns = _nearest_pixels(camera.width, W)
@@ -194,9 +190,23 @@ def open_stream_capture(
     """
     path = capture or fitted_capture(stream)
     recording = _recording(stream, path, frames)
-    _check_frames(stream, path, recording, frames)
+    if frames != list(range(frames[0], frames[-1] + 1)) or recording.num_frames <= frames[-1]:
+        raise ValueError(
+            f"{stream.path}: expected consecutive frames out of the {recording.num_frames} of "
+            f"{path}, got {frames}; pass the capture that was fitted (--capture)."
+        )
+    stream_fingerprint = None  # imported streams have none
     if not any_recording:
-        _check_recording(stream, recording)
+        stream_fingerprint = metadata_entry(stream, "fingerprint", None, str, NoneType)
+    if stream_fingerprint is not None:
+        refines = metadata_entry(stream, "config.fit.refine_cameras", "off", str) != "off"
+        images = next(recording.partial_frames(0, 1)).images
+        if fingerprint(recording, images, refines) != stream_fingerprint:
+            raise ValueError(
+                f"{recording.path}: expected the recording that {stream.path} was fitted to, got "
+                "other images in its first frame, or other points; pass that capture (--capture), "
+                "or compare with any recording (--any-recording)."
+            )
     # Other refined cameras change no image, and ground truth refers to the recording's cameras.
     if recording.display_exposure is not None:
         recording = replace(recording, display_exposure=stream_exposure(stream))
@@ -221,45 +231,16 @@ def _recording(stream: FrameSource, path: str | Path, frames: Sequence[int]) -> 
         )
     view = "auto" if test_view == "auto" else None
     recording = load_capture(path, downscale, view, frames[-1] + 1, reading)
-    _check_sizes(stream, path, recording)
-    return recording if test_view == "auto" else recording.holding_out(test_view)
-
-
-def _check_frames(
-    stream: FrameSource, path: str | Path, recording: Capture, frames: Sequence[int]
-) -> None:
-    if frames != list(range(frames[0], frames[-1] + 1)) or recording.num_frames <= frames[-1]:
-        raise ValueError(
-            f"{stream.path}: expected consecutive frames out of the {recording.num_frames} of "
-            f"{path}, got {frames}; pass the capture that was fitted (--capture)."
-        )
-
-
-def _check_sizes(stream: FrameSource, path: str | Path, recording: Capture) -> None:
-    sizes = _sizes(stream.cameras)
-    recorded_sizes = _sizes(recording.cameras)
+    sizes, recorded_sizes = (
+        {camera.name: (camera.width, camera.height) for camera in cameras}
+        for cameras in (stream.cameras, recording.cameras)
+    )
     if recorded_sizes != sizes:
         raise ValueError(
             f"{path}: expected the cameras that {stream.path} was fitted to, {sizes}, got "
             f"{recorded_sizes}; pass that capture (--capture)."
         )
-
-
-def _check_recording(stream: FrameSource, recording: Capture) -> None:
-    """Raise `ValueError` if a recording has not the fingerprint in a stream's header; imported
-    streams have none.
-    """
-    stream_fingerprint = metadata_entry(stream, "fingerprint", None, str, NoneType)
-    if stream_fingerprint is None:
-        return
-    refines = metadata_entry(stream, "config.fit.refine_cameras", "off", str) != "off"
-    images = next(recording.partial_frames(0, 1)).images
-    if fingerprint(recording, images, refines) != stream_fingerprint:
-        raise ValueError(
-            f"{recording.path}: expected the recording that {stream.path} was fitted to, got "
-            "other images in its first frame, or other points; pass that capture (--capture), or "
-            "compare with any recording (--any-recording)."
-        )
+    return recording if test_view == "auto" else recording.holding_out(test_view)
 
 
 def fitted_capture(stream: FrameSource) -> str:
@@ -270,7 +251,15 @@ def fitted_capture(stream: FrameSource) -> str:
         FileNotFoundError: it is not there any more.
         ValueError: no path is stored.
     """
-    paths = _capture_paths(stream)
+    capture_file = None
+    with suppress(OSError, ValueError):
+        capture_file = read_json(stream.path.with_name(CAPTURE))
+    entries = [
+        fields.get("capture")
+        for fields in (stream.metadata, capture_file)
+        if isinstance(fields, dict)
+    ]
+    paths = [path for path in entries if isinstance(path, str)]
     remedy = "name its folder with --capture"
     if not paths:
         raise ValueError(
@@ -282,20 +271,3 @@ def fitted_capture(stream: FrameSource) -> str:
     raise FileNotFoundError(
         f"{paths[0]}: expected the capture of {stream.path}, found none; if it has moved, {remedy}."
     )
-
-
-def _capture_paths(stream: FrameSource) -> list[str]:
-    """Return the paths of a stream's capture, in its header and in the file beside it."""
-    capture_file = None
-    with suppress(OSError, ValueError):
-        capture_file = read_json(stream.path.with_name(CAPTURE))
-    entries = [
-        fields.get("capture")
-        for fields in (stream.metadata, capture_file)
-        if isinstance(fields, dict)
-    ]
-    return [path for path in entries if isinstance(path, str)]
-
-
-def _sizes(cameras: Sequence[Camera]) -> dict[str, tuple[int, int]]:
-    return {camera.name: (camera.width, camera.height) for camera in cameras}

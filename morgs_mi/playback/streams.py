@@ -15,7 +15,6 @@ from morgs_mi.codec.frame_source import FrameSource, FrameState
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.fit_names import PROVISIONAL, STREAM
-from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.listing import listed
 from morgs_mi.io.splats import read_splats, suffix_of
@@ -66,7 +65,9 @@ class SplatFile(FrameSource):
             self.cameras = trained or default_rig([gaussians])
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
-        self._state = _still_frame(gaussians)
+        motion = np.zeros((len(gaussians), 3), np.float32)
+        ids = np.arange(len(gaussians), dtype=np.uint32)
+        self._state = FrameState(0, ids, replace(gaussians, motion=motion))
 
     def frame_numbers(self) -> list[int]:
         return [0]
@@ -81,13 +82,6 @@ class SplatFile(FrameSource):
         return stream_html(self)
 
 
-def _still_frame(gaussians: Gaussians) -> FrameState:
-    """Return Gaussians as a first frame without motion."""
-    motion = np.zeros((len(gaussians), 3), np.float32)
-    ids = np.arange(len(gaussians), dtype=np.uint32)
-    return FrameState(0, ids, replace(gaussians, motion=motion))
-
-
 def stream_path(out: str | Path) -> Path:
     """Return the path of a stream file or of a file with Gaussians; in the folder of a fit, of its
     ``stream.morgs``.
@@ -98,31 +92,24 @@ def stream_path(out: str | Path) -> Path:
     """
     path = Path(out)
     if path.is_dir() and not (path / STREAM).exists():
-        _refuse_other_folders(path)
+        if (path / "meta.json").is_file():
+            refuse_foreign(path / "meta.json")
+        if frames := [file.name for file in listed(path) if suffix_of(file)]:
+            raise ValueError(
+                f"{path}: got a folder with {len(frames)} files of Gaussians, not a stream; name "
+                f"one of them, such as {path / frames[0]}, or turn all into a stream with "
+                "`morgs-mi import`."
+            )
     path = path / STREAM if path.is_dir() else path
     if not path.is_file():
         raise FileNotFoundError(
             f"{path}: expected a stream, found none; check the path or fit a capture first."
         )
-    if _start(path) != MAGIC:
+    with path.open("rb") as file:
+        start = file.read(len(MAGIC))
+    if start != MAGIC:
         refuse_foreign(path)
     return path
-
-
-def _start(path: Path) -> bytes:
-    with path.open("rb") as file:
-        return file.read(len(MAGIC))
-
-
-def _refuse_other_folders(path: Path) -> None:
-    if (path / "meta.json").is_file():
-        refuse_foreign(path / "meta.json")
-    if frames := [file.name for file in listed(path) if suffix_of(file)]:
-        raise ValueError(
-            f"{path}: got a folder with {len(frames)} files of Gaussians, not a stream; name "
-            f"one of them, such as {path / frames[0]}, or turn all into a stream with "
-            "`morgs-mi import`."
-        )
 
 
 def open_stream(
@@ -162,32 +149,23 @@ def open_stream(
     if suffix_of(path):
         return SplatFile(path, most_invalid)
     stream = PlayableStream(path, skip_damaged)
-    if skip_damaged:
-        _warn_of_damage(stream)
-    return stream
-
-
-def _warn_of_damage(stream: StreamReader) -> None:
-    """Log the frames that a reader leaves out as damaged, and the end of a stream that was not
-    closed.
-    """
     problems = []
     if stream.skipped:
         problems.append(f"the damaged frames {spans(stream.skipped)} are skipped")
-    if not stream.closed():
+    if skip_damaged and not stream.closed():
         problems.append(
             f"it ends after {len(stream.index())} packets without an index, and may lack later "
             "frames"
         )
     if problems:
         _LOG.warning("%s: %s.", stream.path, "; ".join(problems))
+    return stream
 
 
 def spans(numbers: Sequence[int]) -> str:
     """Return ascending numbers as text, such as ``0 to 3, 7``."""
-    groups = groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])
-    return ", ".join(_span([number for _, number in group]) for _, group in groups)
-
-
-def _span(numbers: Sequence[int]) -> str:
-    return f"{numbers[0]} to {numbers[-1]}" if len(numbers) > 1 else f"{numbers[0]}"
+    parts = []
+    for _, group in groupby(enumerate(numbers), lambda pair: pair[1] - pair[0]):
+        first, *others = (number for _, number in group)
+        parts.append(f"{first} to {others[-1]}" if others else f"{first}")
+    return ", ".join(parts)

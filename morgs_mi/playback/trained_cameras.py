@@ -47,7 +47,10 @@ def trained_cameras(path: Path, gaussians: Gaussians) -> tuple[Path | None, tupl
         return None, ()
     some = thinned(gaussians)
     cameras = with_near_planes(cameras, some.numpy()["means"])
-    share, shares = _shares(some, cameras)
+    visible = np.stack([_seen(some, camera) for camera in cameras])
+    opacities = np.asarray(some.opacities, np.float64)
+    weights = opacities / opacities.sum()
+    share = visible.any(axis=0) @ weights
     if share < _LEAST_SEEN:
         _log.warning(
             "%s: its cameras see %.1f %% of the Gaussians of %s and are not used, as they seem to "
@@ -57,6 +60,7 @@ def trained_cameras(path: Path, gaussians: Gaussians) -> tuple[Path | None, tupl
             path.name,
         )
         return None, ()
+    shares = visible @ weights
     good = shares >= _LEAST_RELATIVE * shares.max()
     if not good.all():
         names = [cameras[i].name for i in np.flatnonzero(~good)]
@@ -67,41 +71,20 @@ def trained_cameras(path: Path, gaussians: Gaussians) -> tuple[Path | None, tupl
             len(names),
             len(cameras),
             path.name,
-            _first_names(names),
+            ", ".join(names[:3]) + (" and others" if len(names) > 3 else ""),
         )
     return file, tuple(cameras[i] for i in np.flatnonzero(good))
 
 
-def _first_names(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (" and others" if len(names) > 3 else "")
-
-
-def _shares(gaussians: Gaussians, cameras: tuple[Camera, ...]) -> tuple[float, np.ndarray]:
-    """Return the share of the Gaussians, weighted by opacity, that all V cameras together see, and
-    the share that each one sees [V].
-    """
-    visible = np.stack([_seen(gaussians, camera) for camera in cameras])
-    opacities = np.asarray(gaussians.opacities, np.float64)
-    weights = opacities / opacities.sum()
-    return visible.any(axis=0) @ weights, visible @ weights
-
-
 def _seen(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """Return which of N Gaussians a camera sees, bool [N]: none that are a dot in its image."""
-    visible, pixels, radii = _projections(gaussians, camera)
-    if not visible.any():
-        return visible
-    extent = np.ptp(pixels[visible], axis=0).max() + 2 * np.median(radii[visible])
-    return visible & (extent >= _LEAST_EXTENT * camera.width)
-
-
-def _projections(gaussians: Gaussians, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return which centres lie in a camera's image [N], their pixels [N, 2] and their radii in
-    pixels [N].
-    """
     raw = gaussians.numpy()
     with np.errstate(all="ignore"):
         pixels, depths = camera.project(raw["means"].astype(np.float64))
         in_image = (pixels > 0) & (pixels < [camera.width, camera.height])
         radii = camera.K[0, 0] * np.exp(raw["log_scales"].max(axis=1, initial=-69)) / depths
-    return (depths > camera.near) & in_image.all(axis=1), pixels, radii
+    visible = (depths > camera.near) & in_image.all(axis=1)
+    if not visible.any():
+        return visible
+    extent = np.ptp(pixels[visible], axis=0).max() + 2 * np.median(radii[visible])
+    return visible & (extent >= _LEAST_EXTENT * camera.width)

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from morgs_mi.core.color_space import byte_values
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.png import png_bytes
 
@@ -40,14 +41,8 @@ def to_uint8(image: np.ndarray) -> np.ndarray:
         raise ValueError(
             f"to_uint8(): `image` must be [H, W], [H, W, 1] or [H, W, 3], got {image.shape}."
         )
-    levels = image if image.dtype == np.uint8 else _levels(image)
+    levels = byte_values(np.nan_to_num(image, posinf=0, neginf=0))
     return np.broadcast_to(levels, (*image.shape[:2], 3)).copy()
-
-
-def _levels(values: np.ndarray) -> np.ndarray:
-    """Return values in [0, 1] as 0 to 255, rounded."""
-    unit = np.clip(np.nan_to_num(values, posinf=0, neginf=0), 0, 1)
-    return (unit * 255 + 0.5).astype(np.uint8)
 
 
 def grey_image(values: np.ndarray) -> np.ndarray:
@@ -71,27 +66,18 @@ def motion_image(motion: np.ndarray, scale_px: float) -> np.ndarray:
         ValueError: `motion` is not [H, W, 2], or the scale is not positive.
     """
     motion = np.asarray(motion, np.float32)
-    _check_motion(motion, scale_px)
-    valid = np.asarray(np.isfinite(motion).all(-1))
-    hsv = _hue_and_saturation(np.where(valid[..., None], motion, 0), scale_px)
-    image = to_uint8(cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB))
-    image[~valid] = UNDEFINED
-    return image
-
-
-def _check_motion(motion: np.ndarray, scale_px: float) -> None:
     if motion.ndim != 3 or motion.shape[2] != 2:
         raise ValueError(f"motion_image(): `motion` must be [H, W, 2], got {motion.shape}.")
     if not scale_px > 0:
         raise ValueError(f"motion_image(): `scale_px` must be positive, got {scale_px}.")
-
-
-def _hue_and_saturation(motion: np.ndarray, scale_px: float) -> np.ndarray:
-    """Return the colours of finite motion as hue in degrees, saturation and value [H, W, 3]."""
-    x, y = np.moveaxis(motion, -1, 0)
+    valid = np.asarray(np.isfinite(motion).all(-1))
+    x, y = np.moveaxis(np.where(valid[..., None], motion, 0), -1, 0)
     hue = np.rad2deg(np.arctan2(y, x)) % 360
     saturation = np.minimum(np.hypot(x, y) / scale_px, 1)
-    return np.stack([hue, saturation, np.ones_like(hue)], -1).astype(np.float32)
+    hsv = np.stack([hue, saturation, np.ones_like(hue)], -1).astype(np.float32)
+    image = to_uint8(cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB))
+    image[~valid] = UNDEFINED
+    return image
 
 
 def motion_legend(scale_px: float, size: int = 96) -> np.ndarray:
@@ -161,17 +147,14 @@ def depth_image(
     if not valid.any():
         return np.full((*depth.shape, 3), UNDEFINED, np.uint8)
     low, high = depth_range(depth)
+    near = near or low
     far = far or high
-    nearness = _nearness(np.where(valid, depth, far), near or low, far)
+    # 1 at the depth `near` and 0 at `far`.
+    span = max(1 / near - 1 / far, 1e-12)
+    nearness = (1 / np.where(valid, depth, far) - 1 / far) / span
     image = _apply_colour_map(nearness, cv2.COLORMAP_TURBO)
     image[~valid] = UNDEFINED
     return image
-
-
-def _nearness(depth: np.ndarray, near: float, far: float) -> np.ndarray:
-    """Return 1 at the depth `near` and 0 at `far`, linear in 1 / depth."""
-    span = max(1 / near - 1 / far, 1e-12)
-    return (1 / depth - 1 / far) / span
 
 
 def depth_range(depth: np.ndarray) -> tuple[float, float]:
