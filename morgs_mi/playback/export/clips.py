@@ -54,27 +54,6 @@ def select_frames(stream: FrameSource, span: str | None) -> list[int]:
     numbers = frame_numbers(stream)
     if span is None:
         return numbers
-    indices = _indices(span, numbers[0], numbers[-1])
-    if frames := [number for number in numbers if number in indices]:
-        return frames
-    raise ValueError(
-        f"select_frames(): `span` must select frames of {stream.path}, {numbers[0]} to "
-        f"{numbers[-1]}, got {span!r}."
-    )
-
-
-def _indices(span: str, first: int, last: int) -> range:
-    """Return the indices that a span selects in a stream with the frames `first` to `last`."""
-    start, stop, step = _numbers(span)
-    if ":" not in span:
-        stop = None if start is None else start + 1
-    low = first if start is None else start
-    high = last + 1 if stop is None else stop
-    return range(low, high, step or 1)
-
-
-def _numbers(span: str) -> tuple[int | None, ...]:
-    """Return start, stop and step of a span, None for each that is not given."""
     try:
         parts = [int(part) if part.strip() else None for part in span.split(":")]
         start, stop, step = (*parts, None, None)[:3]
@@ -84,7 +63,17 @@ def _numbers(span: str) -> tuple[int | None, ...]:
         raise ValueError(
             f"select_frames(): `span` must be like 12, 10:20 or 0:100:5, got {span!r}."
         ) from None
-    return start, stop, step
+    if len(parts) == 1:
+        stop = None if start is None else start + 1
+    low = numbers[0] if start is None else start
+    high = numbers[-1] + 1 if stop is None else stop
+    indices = range(low, high, step or 1)
+    if frames := [number for number in numbers if number in indices]:
+        return frames
+    raise ValueError(
+        f"select_frames(): `span` must select frames of {stream.path}, {numbers[0]} to "
+        f"{numbers[-1]}, got {span!r}."
+    )
 
 
 def write_ply_files(
@@ -127,28 +116,18 @@ def write_each(
     """
     selection = set(frames)
     is_file = Path(output).name.lower().endswith(suffix)
-    if is_file:
-        _check_single(output, len(selection))
+    if is_file and len(selection) > 1:
+        raise ValueError(
+            f"{output}: expected one frame for one file, got {len(selection)}; select one "
+            "(--frames), or name a folder."
+        )
+    # The clip is read up to the last of the frames.
+    chosen = islice((frame for frame in clip if frame[0] in selection), len(selection))
     with (atomic_path if is_file else atomic_folder)(output, "write_each()") as partial:
-        for count, (frame, gaussians) in enumerate(_selection(clip, selection), start=1):
+        for count, (frame, gaussians) in enumerate(chosen, start=1):
             write(partial if is_file else partial / f"{frame:04d}{suffix}", gaussians)
             if progress is not None:
                 progress(count, len(selection))
-
-
-def _check_single(output: str | Path, count: int) -> None:
-    if count > 1:
-        raise ValueError(
-            f"{output}: expected one frame for one file, got {count}; select one "
-            "(--frames), or name a folder."
-        )
-
-
-def _selection(
-    clip: Iterable[tuple[int, Gaussians]], selection: set[int]
-) -> Iterator[tuple[int, Gaussians]]:
-    """Return the frames of a clip that are selected; it is read up to the last of them."""
-    return islice((frame for frame in clip if frame[0] in selection), len(selection))
 
 
 def flight(
@@ -205,18 +184,13 @@ def named_path(
     if name == "between":
         return through_cameras(stream.cameras, clip)
     if name == "orbit":
-        return _orbit(stream, degrees, clip)
+        if degrees is None and stream.metadata.get(DEFAULT_RIG) is True:
+            degrees = _SWING
+        means = next(gaussians for _, gaussians in play(stream)).numpy()["means"]
+        return orbit(stream.cameras, focus(stream.cameras, means), degrees, clip)
     origin = stream_origin(stream)
     path = load_path(name, moved(stream.cameras, -origin))
     return replace(path, keys=moved(path.keys, origin))
-
-
-def _orbit(stream: FrameSource, degrees: float | None, seconds: float) -> CameraPath:
-    """Return the orbit around the point that the rig of a stream looks at."""
-    if degrees is None and stream.metadata.get(DEFAULT_RIG) is True:
-        degrees = _SWING
-    means = next(gaussians for _, gaussians in play(stream)).numpy()["means"]
-    return orbit(stream.cameras, focus(stream.cameras, means), degrees, seconds)
 
 
 def repeated_seconds(clip: float, least: float) -> float:
@@ -260,17 +234,12 @@ def _frames_backwards(stream: FrameSource) -> Iterator[Gaussians]:
     """
     inner_frames = frame_numbers(stream)[1:-1]
     while inner_frames:
-        block = _block(stream, inner_frames[-1])
+        # The frames from which the last one is decoded, and that one.
+        block: list[FrameState] = []
+        for state in stream.states(inner_frames[-1]):
+            block = [*(earlier for earlier in block if earlier.frame < state.frame), state]
+            if state.frame == inner_frames[-1]:
+                break
         # A keyframe has no motion of its own: it follows from the residual, in the block before.
         yield from (state.gaussians for state in block[:0:-1])
         inner_frames = [frame for frame in inner_frames if frame <= block[0].frame]
-
-
-def _block(stream: FrameSource, last: int) -> list[FrameState]:
-    """Return the frames from which a stream decodes the frame `last`, and that one."""
-    block: list[FrameState] = []
-    for state in stream.states(last):
-        block = [*(earlier for earlier in block if earlier.frame < state.frame), state]
-        if state.frame == last:
-            break
-    return block

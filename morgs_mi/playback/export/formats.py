@@ -73,13 +73,11 @@ def choose_format(formats: Sequence[Format], output: str | Path | None = None) -
     suffix = re.search(r"\.[a-z]\w*$", name := Path(output).name.lower())
     if suffix is None and (folders := [choice for choice in formats if choice.folder]):
         return folders[0]
+    outputs = list(dict.fromkeys(text for choice in formats for text in choice.outputs))
+    expected = " or ".join(filter(None, (", ".join(outputs[:-1]), outputs[-1])))
     raise ValueError(
-        f"{output}: the output must be {_outputs(formats)}, got {suffix[0] if suffix else name!r}."
+        f"{output}: the output must be {expected}, got {suffix[0] if suffix else name!r}."
     )
-
-
-def _outputs(formats: Sequence[Format]) -> str:
-    return _listed(list(dict.fromkeys(text for choice in formats for text in choice.outputs)))
 
 
 def destination(
@@ -104,17 +102,9 @@ def destination(
     path = check_output(output or stream.with_name(choice.default.format(stem)))
     if choice.is_file(path) and path.is_dir():
         raise ValueError(f"{path}: expected a file to write, got a folder; choose another name.")
-    _check_not_source(path, stream)
-    return path, choice
-
-
-def _check_not_source(output: Path, stream: Path) -> None:
-    if output.exists() and stream.exists() and output.samefile(stream):
+    if path.exists() and stream.exists() and path.samefile(stream):
         raise ValueError(
-            f"{output}: expected an output beside its source, got the source itself; choose "
+            f"{path}: expected an output beside its source, got the source itself; choose "
             "another name."
         )
-
-
-def _listed(names: Sequence[str]) -> str:
-    return " or ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
+    return path, choice

@@ -47,12 +47,19 @@ def write_images(
     if kind == "mp4":
         movie = (pad_to_even(_combined_image(images)) for _, images in frames)
         write_video(output, movie, fps, PLAYABLE)
-    elif Path(output).name.lower().endswith(f".{kind}"):
-        _write_file(frames, output, _WRITERS[kind])
-    else:
-        with atomic_folder(output, "write_images()") as folder:
-            for frame, images in frames:
-                _WRITERS[kind](folder / f"{frame:04d}.{kind}", images)
+        return
+    is_file = Path(output).name.lower().endswith(f".{kind}")
+    with (atomic_path if is_file else atomic_folder)(output, "write_images()") as partial:
+        for count, (frame, images) in enumerate(frames):
+            if is_file and count:
+                raise ValueError(
+                    f"{output}: expected one frame for one file, got several; name a folder."
+                )
+            path = partial if is_file else partial / f"{frame:04d}.{kind}"
+            if kind == "exr":
+                write_exr(path, exr_channels(images))
+            else:
+                write_png(path, _combined_image(images))
 
 
 def _display_frames(
@@ -65,32 +72,6 @@ def _display_frames(
         yield frame, images
         if progress is not None:
             progress(count)
-
-
-def _write_file(
-    frames: Iterable[_Frame],
-    output: str | Path,
-    write: Callable[[Path, Mapping[str, np.ndarray]], None],
-) -> None:
-    """Write the only frame into a file."""
-    with atomic_path(output, "write_images()") as partial:
-        for count, (_, images) in enumerate(frames):
-            if count:
-                raise ValueError(
-                    f"{output}: expected one frame for one file, got several; name a folder."
-                )
-            write(partial, images)
-
-
-def _write_png(path: Path, images: Mapping[str, np.ndarray]) -> None:
-    write_png(path, _combined_image(images))
-
-
-def _write_exr(path: Path, images: Mapping[str, np.ndarray]) -> None:
-    write_exr(path, exr_channels(images))
-
-
-_WRITERS = {"png": _write_png, "exr": _write_exr}
 
 
 def exr_channels(images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -116,13 +97,10 @@ def _exr_names(channel: str, components: int) -> list[str]:
         return ["A"]
     if channel in ("splats", "surfaces", "shadow"):  # layers of an inserted scene, see `insert`
         return [f"{channel}.{letter}" for letter in "RGBA"[:components]]
-    return [f"{channel}.{suffix}" for suffix in _suffixes(components)]
-
-
-def _suffixes(components: int) -> Iterable[str]:
     if components == 1:
-        return "Y"
-    return "XYZW"[:components] if components <= 4 else map(str, range(components))
+        return [f"{channel}.Y"]
+    suffixes = "XYZW"[:components] if components <= 4 else range(components)
+    return [f"{channel}.{suffix}" for suffix in suffixes]
 
 
 def pad_to_even(image: np.ndarray) -> np.ndarray:

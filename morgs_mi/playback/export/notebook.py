@@ -36,37 +36,19 @@ def stream_html(stream: FrameSource) -> str:
     try:
         camera = stream.cameras[0]
         size = stream.path.stat().st_size
-        style = _style(camera.width / camera.height)
+        aspect = camera.width / camera.height
+        style = _STYLE.format(width=min(_WIDTH, _HEIGHT * aspect), aspect=aspect)
         title = html.escape(stream_name(stream))
         if size <= LARGEST:
-            return _PLAYER.format(title=title, style=style, page=_quoted_page(stream))
-        image = base64.b64encode(_first_image(stream)).decode()
+            page = web_page(stream).decode().replace("&", "&amp;").replace('"', "&quot;")
+            return _PLAYER.format(title=title, style=style, page=page)
+        gaussians = next(gaussians for _, gaussians in play(stream))
+        color = render(gaussians, camera, ("color",), render_config(stream))["color"]
+        picture = channel_image("color", exposed(color, stream_exposure(stream)))
+        image = base64.b64encode(png_bytes(picture)).decode()
     except (OSError, ValueError, StopIteration) as error:
         message = str(error) or f"{stream.path}: expected at least one frame, got none."
         return f"<div>{html.escape(message)}</div>"
-    text = _advice(stream, size)
+    command = html.escape(f"morgs-mi export web {stream.path} page.html")
+    text = f"Frame 0 of {size / 1e6:.0f} MB. To play it, write a page with <code>{command}</code>."
     return _POSTER.format(title=title, style=style, image=image, text=text)
-
-
-def _style(aspect: float) -> str:
-    return _STYLE.format(width=min(_WIDTH, _HEIGHT * aspect), aspect=aspect)
-
-
-def _quoted_page(stream: FrameSource) -> str:
-    """Return the page that plays a stream, for an attribute of an element."""
-    return web_page(stream).decode().replace("&", "&amp;").replace('"', "&quot;")
-
-
-def _advice(stream: FrameSource, size: int) -> str:
-    command = f"morgs-mi export web {stream.path} page.html"
-    return (
-        f"Frame 0 of {size / 1e6:.0f} MB. To play it, write a page with "
-        f"<code>{html.escape(command)}</code>."
-    )
-
-
-def _first_image(stream: FrameSource) -> bytes:
-    """Return the first frame for the first camera as PNG."""
-    gaussians = next(gaussians for _, gaussians in play(stream))
-    color = render(gaussians, stream.cameras[0], ("color",), render_config(stream))["color"]
-    return png_bytes(channel_image("color", exposed(color, stream_exposure(stream))))

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from morgs_mi.core.bounded import read_json
-from morgs_mi.core.camera import Camera, rigid
+from morgs_mi.core.camera import Camera, intrinsics_of_fov, rigid
 from morgs_mi.core.rig import up_direction
 
 if TYPE_CHECKING:
@@ -50,15 +50,6 @@ class CameraPath:
     def __post_init__(self) -> None:
         times = np.asarray(self.times, np.float64)
         object.__setattr__(self, "times", times)
-        self._check_times(times)
-        sizes = {(key.width, key.height) for key in self.keys}
-        if len(sizes) > 1:
-            raise ValueError(
-                f"CameraPath(): `keys` must have the same image size, got {sorted(sizes)}; resize "
-                "them."
-            )
-
-    def _check_times(self, times: np.ndarray) -> None:
         if len(self.keys) < 2 or times.shape != (len(self.keys),):
             raise ValueError(
                 "CameraPath(): at least two key views with a time each were expected, got "
@@ -66,6 +57,12 @@ class CameraPath:
             )
         if times[0] != 0 or not np.all(np.diff(times) > 0):
             raise ValueError(f"CameraPath(): `times` must increase from 0, got {times.tolist()}.")
+        sizes = {(key.width, key.height) for key in self.keys}
+        if len(sizes) > 1:
+            raise ValueError(
+                f"CameraPath(): `keys` must have the same image size, got {sorted(sizes)}; resize "
+                "them."
+            )
 
     @property
     def seconds(self) -> float:
@@ -84,7 +81,10 @@ class CameraPath:
         """Return the view at a time in seconds: the nearest key outside of all keys."""
         time = float(np.clip(time, 0, self.seconds))
         positions, rotations, intrinsics = self._splines
-        viewmat = _view_matrix(rotations(time).as_matrix().T, positions(time))
+        rotation = rotations(time).as_matrix().T
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = rotation
+        viewmat[:3, 3] = -rotation @ positions(time)
         log_fx, log_fy, cx, cy = intrinsics(time)
         K = np.array([[np.exp(log_fx), 0, cx], [0, np.exp(log_fy), cy], [0, 0, 1]])
         return replace(self.keys[0], K=K, viewmat=viewmat, name="path")
@@ -108,26 +108,14 @@ class CameraPath:
 
         views = [np.asarray(key.viewmat, np.float64)[:3, :3].T for key in self.keys]
         positions = np.stack([key.position for key in self.keys])
+        K = np.stack([key.K for key in self.keys])
+        # With logarithms the focal lengths stay positive where the spline overshoots.
+        intrinsics = [np.log(K[:, 0, 0]), np.log(K[:, 1, 1]), K[:, 0, 2], K[:, 1, 2]]
         return (
             CubicSpline(self.times, positions),
             RotationSpline(self.times, Rotation.from_matrix(np.stack(views))),
-            CubicSpline(self.times, _log_intrinsics(self.keys)),
+            CubicSpline(self.times, np.stack(intrinsics, axis=1)),
         )
-
-
-def _view_matrix(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Return the matrix [4, 4] from world to camera for a rotation [3, 3] and a position [3]."""
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = rotation
-    viewmat[:3, 3] = -rotation @ position
-    return viewmat
-
-
-def _log_intrinsics(keys: Sequence[Camera]) -> np.ndarray:
-    """Return the logarithms of the focal lengths, and the principal points [K, 4]."""
-    K = np.stack([key.K for key in keys])
-    # With logarithms the focal lengths stay positive where the spline overshoots.
-    return np.stack([np.log(K[:, 0, 0]), np.log(K[:, 1, 1]), K[:, 0, 2], K[:, 1, 2]], axis=1)
 
 
 def focus(cameras: Sequence[Camera], means: np.ndarray) -> np.ndarray:
@@ -161,31 +149,22 @@ def orbit(
     """
     first = cameras[0]
     up = up_direction(cameras)
-    arm = _arm(first, center, up)
+    arm = first.position - center
+    if np.linalg.norm(np.cross(arm, up)) < 1e-3 * np.linalg.norm(arm) or not arm.any():
+        raise ValueError(
+            f"orbit(): the camera {first.name!r} must stand beside the scene, got it directly "
+            "above; use another path."
+        )
     degrees = _rig_width(cameras, center, up) if degrees is None else degrees
     if not 1 <= degrees <= 360:
         raise ValueError(f"orbit(): `degrees` must be 1 to 360, got {degrees:g}.")
-    rotations = Rotation.from_rotvec(np.deg2rad(_angles(degrees))[:, None] * up)
+    start = 0 if degrees == 360 else -degrees / 2
+    # The key views are about 10 degrees apart.
+    angles = np.linspace(start, start + degrees, max(5, round(degrees / 10) + 1))
+    rotations = Rotation.from_rotvec(np.deg2rad(angles)[:, None] * up)
     positions = center + rotations.apply(arm)
     keys = tuple(_look_at(position, center, up, first) for position in positions)
     return CameraPath(np.linspace(0, seconds, len(keys)), keys)
-
-
-def _arm(camera: Camera, center: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Return the vector [3] from the centre of an orbit to its first camera."""
-    arm = camera.position - center
-    if np.linalg.norm(np.cross(arm, up)) < 1e-3 * np.linalg.norm(arm) or not arm.any():
-        raise ValueError(
-            f"orbit(): the camera {camera.name!r} must stand beside the scene, got it directly "
-            "above; use another path."
-        )
-    return arm
-
-
-def _angles(degrees: float) -> np.ndarray:
-    """Return the angles of the key views of an orbit, about 10 degrees apart."""
-    start = 0 if degrees == 360 else -degrees / 2
-    return np.linspace(start, start + degrees, max(5, round(degrees / 10) + 1))
 
 
 def through_cameras(cameras: Sequence[Camera], seconds: float = 1) -> CameraPath:
@@ -202,26 +181,16 @@ def through_cameras(cameras: Sequence[Camera], seconds: float = 1) -> CameraPath
             "through_cameras(): at least two cameras were expected to move between, got "
             f"{len(cameras)}; use the path `orbit`."
         )
-    keys = _chain([camera.resized(cameras[0].width, cameras[0].height) for camera in cameras])
-    times = np.concatenate([[0], np.cumsum(_steps(keys))])
-    return CameraPath(times, tuple(keys)).with_duration(seconds)
-
-
-def _steps(keys: Sequence[Camera]) -> np.ndarray:
-    """Return the times [K - 1] from each key view to the next one, at a speed of 1."""
+    first, *candidates = [camera.resized(cameras[0].width, cameras[0].height) for camera in cameras]
+    keys = [first]
+    while candidates:
+        distances = [np.linalg.norm(camera.position - keys[-1].position) for camera in candidates]
+        keys.append(candidates.pop(int(np.argmin(distances))))
     steps = np.linalg.norm(np.diff([key.position for key in keys], axis=0), axis=-1)
     # A rotation between cameras at the same position takes time too.
-    return np.maximum(steps, 0.1 * steps.mean() if steps.any() else 1)
-
-
-def _chain(cameras: list[Camera]) -> list[Camera]:
-    """Return the cameras from the first one always to the nearest remaining one."""
-    chain = cameras[:1]
-    candidates = cameras[1:]
-    while candidates:
-        distances = [np.linalg.norm(camera.position - chain[-1].position) for camera in candidates]
-        chain.append(candidates.pop(int(np.argmin(distances))))
-    return chain
+    steps = np.maximum(steps, 0.1 * steps.mean() if steps.any() else 1)
+    times = np.concatenate([[0], np.cumsum(steps)])
+    return CameraPath(times, tuple(keys)).with_duration(seconds)
 
 
 def load_path(file: str | Path, cameras: Sequence[Camera]) -> CameraPath:
@@ -239,9 +208,17 @@ def load_path(file: str | Path, cameras: Sequence[Camera]) -> CameraPath:
     """
     if not Path(file).is_file():
         raise FileNotFoundError(f"{file}: expected a camera path, found none; check the path.")
+    document = read_json(file)
+    keys = document.get("keys") if isinstance(document, dict) else None
+    if not isinstance(keys, list) or not all(isinstance(key, dict) for key in keys):
+        raise ValueError(
+            f"{file}: expected a JSON object with a list `keys` of objects, got "
+            f"{_described(document)}; write the views of the camera path as `keys`."
+        )
     views = []
     times = []
-    for i, key in enumerate(_read_keys(file)):
+    for i, entry in enumerate(keys):
+        key = {**document, **entry}
         try:
             times.append(float(key["time"]))
             views.append(_key_view(key, cameras))
@@ -253,19 +230,6 @@ def load_path(file: str | Path, cameras: Sequence[Camera]) -> CameraPath:
         return CameraPath(np.asarray(times), tuple(views))
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None
-
-
-def _read_keys(file: str | Path) -> list[dict[str, Any]]:
-    """Return the key views of a JSON path, each with the values that are common to all."""
-    document = read_json(file)
-    keys = document.get("keys") if isinstance(document, dict) else None
-    if not isinstance(keys, list) or not all(isinstance(key, dict) for key in keys):
-        raise ValueError(
-            f"{file}: expected a JSON object with a list `keys` of objects, got "
-            f"{_described(document)}; write the views of the camera path as `keys`."
-        )
-    common = {name: value for name, value in document.items() if name != "keys"}
-    return [{**common, **key} for key in keys]
 
 
 def _described(document: Any) -> str:
@@ -282,42 +246,24 @@ def _key_view(key: Mapping[str, Any], cameras: Sequence[Camera]) -> Camera:
     first = cameras[0]
     like = first.resized(int(key.get("width", first.width)), int(key.get("height", first.height)))
     if "camera" in key:
-        return _camera_of_rig(cameras, key["camera"]).resized(like.width, like.height)
+        name = key["camera"]
+        by_name = {camera.name: camera for camera in cameras}
+        if name not in by_name:
+            raise ValueError(f"`camera` must be one of {', '.join(by_name)}, got {name!r}.")
+        return by_name[name].resized(like.width, like.height)
     if "fov_x" in key:
-        like = replace(like, K=_centered_intrinsics(like, float(key["fov_x"])))
+        like = replace(like, K=intrinsics_of_fov(float(key["fov_x"]), like.width, like.height))
     if "viewmat" in key:
         return replace(like, viewmat=rigid("`viewmat`", np.asarray(key["viewmat"], np.float64)))
-    return _view_of_target(key, cameras, like)
-
-
-def _camera_of_rig(cameras: Sequence[Camera], name: Any) -> Camera:
-    by_name = {camera.name: camera for camera in cameras}
-    if name not in by_name:
-        raise ValueError(f"`camera` must be one of {', '.join(by_name)}, got {name!r}.")
-    return by_name[name]
-
-
-def _centered_intrinsics(camera: Camera, fov_x: float) -> np.ndarray:
-    """Return the intrinsic matrix [3, 3] of a field of view in degrees, centred in the image."""
-    f = 0.5 * camera.width / np.tan(np.deg2rad(0.5 * fov_x))
-    return np.array([[f, 0, 0.5 * camera.width], [0, f, 0.5 * camera.height], [0, 0, 1]])
-
-
-def _view_of_target(key: Mapping[str, Any], cameras: Sequence[Camera], like: Camera) -> Camera:
-    """Return the view of a key with `position` and `target`."""
     position, target = (np.asarray(key[name], np.float64) for name in ("position", "target"))
     up = np.asarray(key["up"], np.float64) if "up" in key else up_direction(cameras)
-    if not _is_view(position, target, up):
+    are_vectors = all(vector.shape == (3,) for vector in (position, target, up))
+    if not are_vectors or not np.cross(target - position, up).any():
         raise ValueError(
             "`position`, `target` and `up` must have 3 numbers each, and the view must not be "
             "along `up`."
         )
     return _look_at(position, target, up, like)
-
-
-def _is_view(position: np.ndarray, target: np.ndarray, up: np.ndarray) -> bool:
-    vectors = (position, target, up)
-    return all(v.shape == (3,) for v in vectors) and bool(np.cross(target - position, up).any())
 
 
 def _rig_width(cameras: Sequence[Camera], center: np.ndarray, up: np.ndarray) -> float:

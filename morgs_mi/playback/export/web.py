@@ -158,39 +158,24 @@ def published_bytes(stream: FrameSource, progress: Progress | None = None) -> by
             progress(len(speeds))
     if not speeds:
         raise ValueError(f"{stream.path}: expected at least one frame to show, got none.")
-    metadata["motion_scale"] = _motion_scale(*np.hstack(speeds))
-    sink = io.BytesIO()
-    metadata |= _display_metadata(stream)
-    with StreamWriter(sink, stream.cameras, stream.fps, metadata) as writer:
-        for packet in packets:
-            writer.write(packet)
-    return sink.getvalue()
-
-
-def _display_metadata(stream: FrameSource) -> dict[str, Any]:
-    """Return what the page reads about made-up cameras, the origin and the display's exposure."""
-    metadata: dict[str, Any] = {}
+    speeds, weights = np.hstack(speeds)
+    metadata["motion_scale"] = MOTION_SCALE
+    if weights.any():
+        # Not the maximum: a few Gaussians that the fit has lost are several times as fast as the
+        # scene.
+        scale = np.percentile(speeds, 99, weights=weights, method="inverted_cdf")
+        metadata["motion_scale"] = max(_LEAST_SCALE, float(scale))
     if stream.metadata.get(DEFAULT_RIG) is True:
         metadata[DEFAULT_RIG] = True
     if (origin := stream_origin(stream)).any():
         metadata["origin"] = origin.tolist()
     if stops := stream_exposure(stream):
         metadata["transfer"] = {"name": TRANSFER, "display_exposure": stops}
-    return metadata
-
-
-def _motion_scale(speeds: np.ndarray, weights: np.ndarray) -> float:
-    """Return the speed that the page draws fully saturated: the 99th percentile of speeds [S] with
-    weights [S].
-
-    It is not the maximum, because a few Gaussians that the fit has lost are several times as fast
-    as the scene.
-    """
-    if not weights.any():
-        return MOTION_SCALE
-    return max(
-        _LEAST_SCALE, float(np.percentile(speeds, 99, weights=weights, method="inverted_cdf"))
-    )
+    sink = io.BytesIO()
+    with StreamWriter(sink, stream.cameras, stream.fps, metadata) as writer:
+        for packet in packets:
+            writer.write(packet)
+    return sink.getvalue()
 
 
 def _speeds(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarray:
@@ -206,16 +191,12 @@ def _speeds(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarray:
     rows = np.flatnonzero(motion.any(axis=1))
     rows = rows[:: len(rows) // _SAMPLES + 1]
     motion = motion[rows]
-    means = gaussians.numpy()["means"][rows]
-    weights = _weights(gaussians, rows)
-    return np.hstack([_view_speeds(camera, means, motion, weights) for camera in cameras])
-
-
-def _weights(gaussians: Gaussians, rows: np.ndarray) -> np.ndarray:
-    """Return the opacities of some Gaussians times their areas."""
-    log_sizes = gaussians.numpy()["log_scales"][rows].mean(axis=1)
+    raw = gaussians.numpy()
+    means = raw["means"][rows]
     # A stream may contain any scale; the bound keeps the weights finite.
-    return np.asarray(gaussians.opacities)[rows] * np.exp(2 * np.minimum(log_sizes, 20))
+    log_sizes = np.minimum(raw["log_scales"][rows].mean(axis=1), 20)
+    weights = np.asarray(gaussians.opacities)[rows] * np.exp(2 * log_sizes)
+    return np.hstack([_view_speeds(camera, means, motion, weights) for camera in cameras])
 
 
 def _view_speeds(
@@ -248,12 +229,8 @@ def _page(title: str, data: str, connect: str) -> bytes:
         "{notice}": (player / "NOTICE").read_text(encoding="utf-8").replace("--", "- "),
         "{data}": data + "\n" + _script("code", code),
     }
-    return _page_text(page, values).encode(errors="replace")
-
-
-def _page_text(page: str, values: dict[str, str]) -> str:
-    """Return a page with values in place of their names."""
-    return re.sub("|".join(map(re.escape, values)), lambda match: values[match[0]], page)
+    names = "|".join(map(re.escape, values))
+    return re.sub(names, lambda match: values[match[0]], page).encode(errors="replace")
 
 
 def _script(name: str, data: bytes) -> str:

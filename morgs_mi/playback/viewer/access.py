@@ -61,7 +61,9 @@ class Access:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         reason = refusal(Headers(scope=scope), self._name)
-        if reason is None and not self._has_token(scope["path"]):
+        start = scope["path"][: len(self._prefix) + 1]
+        has_token = secrets.compare_digest(start.encode(), f"{self._prefix}/".encode())
+        if reason is None and not has_token:
             reason = "expected the token of the printed link in the address"
 
         async def secured(message: Message) -> None:
@@ -71,10 +73,6 @@ class Access:
 
         app = self._app if reason is None else PlainTextResponse(f"morgs-mi view: {reason}.\n", 403)
         await app({**scope, "path": scope["path"][len(self._prefix) :]}, receive, secured)
-
-    def _has_token(self, path: str) -> bool:
-        start = path[: len(self._prefix) + 1]
-        return secrets.compare_digest(start.encode(), f"{self._prefix}/".encode())
 
 
 def _is_address(name: str) -> bool:

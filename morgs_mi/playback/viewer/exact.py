@@ -43,7 +43,12 @@ class ExactImages:
             OSError, ValueError: the stream is broken, or has no such frame or channel, or the image
                 is too large.
         """
-        _check_image(camera, motion_scale)
+        size = camera.width * camera.height
+        if not 1 / LARGEST <= motion_scale <= LARGEST or size > _MOST_PIXELS:
+            raise ValueError(
+                f"expected a motion from {1 / LARGEST:g} to {LARGEST:g}, at most {_MOST_PIXELS} "
+                f"pixels, got {motion_scale}, {size}."
+            )
         self._newest += 1
         number = self._newest
         async with self._lock:
@@ -54,28 +59,14 @@ class ExactImages:
 
     def _render(self, frame: int, channel: str, camera: Camera, motion_scale: float) -> bytes:
         stream = self._opened()
-        gaussians = self._gaussians(stream, frame)
+        # The last Gaussians stay decoded as long as the file is the same.
+        status = stream.path.stat()
+        key = (frame, stream.path, status.st_ino, status.st_mtime_ns)
+        if self._decoded is None or self._decoded[0] != key:
+            self._decoded = (key, stream.seek(frame).gaussians)
+        gaussians = self._decoded[1]
         if channel not in available_channels(gaussians):
             raise ValueError(f"{stream.path}: expected a channel of the stream, got {channel!r}.")
         values = render(gaussians, camera, (channel,), render_config(stream))[channel]
         values = exposed(values, stream_exposure(stream)) if channel == "color" else values
         return png_bytes(channel_image(channel, values, motion_scale))
-
-    def _gaussians(self, stream: FrameSource, frame: int) -> Gaussians:
-        """Return the Gaussians of a frame; the last ones stay decoded as long as the file is the
-        same.
-        """
-        status = stream.path.stat()
-        key = (frame, stream.path, status.st_ino, status.st_mtime_ns)
-        if self._decoded is None or self._decoded[0] != key:
-            self._decoded = (key, stream.seek(frame).gaussians)
-        return self._decoded[1]
-
-
-def _check_image(camera: Camera, motion_scale: float) -> None:
-    size = camera.width * camera.height
-    if not 1 / LARGEST <= motion_scale <= LARGEST or size > _MOST_PIXELS:
-        raise ValueError(
-            f"expected a motion from {1 / LARGEST:g} to {LARGEST:g}, at most {_MOST_PIXELS} "
-            f"pixels, got {motion_scale}, {size}."
-        )

@@ -54,22 +54,15 @@ class RecordedImages:
         with self._lock:
             # The capture of a live fit grows.
             if self._capture is None or frame >= self._capture.num_frames:
-                self._capture = self._open(stream, max(num_frames(stream), last + 1))
+                frames = list(range(max(num_frames(stream), last + 1)))
+                self._capture = open_stream_capture(stream, self._folder, frames).displayed()
                 self._view = -1
-            image = self._image(self._capture, view, frame)
+            if view != self._view or not self._next <= frame < self._next + _NEAR:
+                self._images = self._capture.images(view, frame)
+                self._view = view
+                self._next = frame
+            image = next(islice(self._images, frame - self._next, None), None)
+            self._next = frame + 1
         if not isinstance(image, np.ndarray):
             raise ValueError(f"{self._capture.path}: camera {view} has no image of frame {frame}.")
-        return image
-
-    def _open(self, stream: FrameSource, count: int) -> Capture:
-        return open_stream_capture(stream, self._folder, list(range(count))).displayed()
-
-    def _image(self, capture: Capture, view: int, frame: int) -> np.ndarray | Exception | None:
-        """Return an image of a capture, decoded after the last one where that is near before it."""
-        if view != self._view or not self._next <= frame < self._next + _NEAR:
-            self._images = capture.images(view, frame)
-            self._view = view
-            self._next = frame
-        image = next(islice(self._images, frame - self._next, None), None)
-        self._next = frame + 1
         return image

@@ -85,11 +85,19 @@ class Viewer:
             self._path.write_bytes(published_bytes(stream))
         self._recorded = RecordedImages(capture)
         self._exact = ExactImages(self._opened)
-        self._socket = _listening_socket(host, port)
+        try:
+            family = socket.AF_INET6 if ":" in host else socket.AF_INET
+            self._socket = socket.create_server((host, port), family=family)
+        except (OSError, OverflowError) as error:
+            raise ValueError(
+                f"{host}:{port}: cannot serve the page there ({error}); choose another --port."
+            ) from None
         address, port = self._socket.getsockname()[:2]
         self.is_public = not ip_address(address).is_loopback
         token = secrets.token_urlsafe() if self.is_public else ""
-        name = "localhost" if ip_address(address).is_unspecified else _name_in_link(host)
+        name = f"[{host}]" if ":" in host else host
+        if ip_address(address).is_unspecified:
+            name = "localhost"
         self.url = f"http://{name}:{port}/{token and token + '/'}"
         config = uvicorn.Config(Access(self._app(), host, token), **_OPTIONS)
         self._server = uvicorn.Server(config)
@@ -161,20 +169,6 @@ class Viewer:
             **request.path_params, camera=camera, motion_scale=float(query.get("scale", "nan"))
         )
         return Response(status_code=204) if png is None else Response(png, media_type="image/png")
-
-
-def _listening_socket(host: str, port: int) -> socket.socket:
-    try:
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        return socket.create_server((host, port), family=family)
-    except (OSError, OverflowError) as error:
-        raise ValueError(
-            f"{host}:{port}: cannot serve the page there ({error}); choose another --port."
-        ) from None
-
-
-def _name_in_link(host: str) -> str:
-    return f"[{host}]" if ":" in host else host
 
 
 async def _failed(_: Request, error: Exception) -> Response:

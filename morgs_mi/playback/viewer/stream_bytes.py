@@ -36,39 +36,26 @@ def stream_response(path: Path, request: Request) -> Response:
     if not MAGIC.startswith(start[: len(MAGIC)]):
         file.close()
         raise ValueError(f"{path}: expected a stream, got another file; fit the capture again.")
-    etag = _etag(file, size, start)
+    # The tag has the inode and the checksums of the header and of the first frame.
+    length = 0
+    if len(start) == PREAMBLE.size + PAYLOAD:
+        length = HEAD.unpack_from(start, PREAMBLE.size)[2]
+    file.seek(min(len(start) + length, size))
+    etag = f'"{os.fstat(file.fileno()).st_ino:x}-{start.hex()}-{file.read(PAYLOAD).hex()}"'
     location = quote(os.fsencode(path.name))
     headers = {"ETag": etag, "Accept-Ranges": "bytes", "Content-Location": location}
-    part = _requested_bytes(request, etag, size)
-    if part is not None and not part:
+    part = range(size)
+    status = 200
+    match = _RANGE.fullmatch(request.headers.get("range", ""))
+    if match is not None and request.headers.get("if-range", etag) == etag:
+        part = part[int(match[1]) : int(match[2]) + 1 if match[2] else None]
+        status = 206
+        headers["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{size}"
+    if status == 206 and not part:
         file.close()
         return PlainTextResponse("", 416, {"Content-Range": f"bytes */{size}"})
-    status = 200 if part is None else 206
-    if part is None:
-        part = range(size)
-    else:
-        headers["Content-Range"] = f"bytes {part.start}-{part.stop - 1}/{size}"
     # Without the number of bytes: a fit may truncate the file meanwhile, to go on from there.
     return StreamingResponse(_chunks(file, part), status, headers, "application/octet-stream")
-
-
-def _requested_bytes(request: Request, etag: str, size: int) -> range | None:
-    """Return the range that a request names, None if it is for the whole file."""
-    match = _RANGE.fullmatch(request.headers.get("range", ""))
-    if match is None or request.headers.get("if-range", etag) != etag:
-        return None
-    return range(size)[int(match[1]) : int(match[2]) + 1 if match[2] else None]
-
-
-def _etag(file: BinaryIO, size: int, start: bytes) -> str:
-    """Return an entity tag of a file's inode and the checksums of its header and first frame;
-    `start` are its first bytes.
-    """
-    length = (
-        HEAD.unpack_from(start, PREAMBLE.size)[2] if len(start) == PREAMBLE.size + PAYLOAD else 0
-    )
-    file.seek(min(len(start) + length, size))
-    return f'"{os.fstat(file.fileno()).st_ino:x}-{start.hex()}-{file.read(PAYLOAD).hex()}"'
 
 
 def _chunks(file: BinaryIO, part: range) -> Iterator[bytes]:
