@@ -179,9 +179,5 @@ def shape_attribute_widths() -> dict[str, tuple[int, ...]]:
     """Return the admissible numbers of floats per Gaussian of every attribute of a Mitsuba shape
     beside its `data`, by name.
     """
-    channels = {
-        attribute.activated_name: (attribute.width,)
-        for attribute in BY_ACTIVATED_NAME.values()
-        if attribute.channel
-    }
+    channels = {name: (row.width,) for name, row in BY_ACTIVATED_NAME.items() if row.channel}
     return {"opacities": (1,), "sh_coeffs": (3, 12, 27, 48), "motion": (3,), **channels}

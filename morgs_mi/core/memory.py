@@ -18,6 +18,11 @@ from numpy.typing import ArrayLike
 from morgs_mi.core.checks import numbers
 from morgs_mi.core.types import Jit, Tensor
 
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
+
 # Bytes: Dr.Jit aligns its own memory to as many.
 _ALIGNMENT = 64
 
@@ -120,34 +125,21 @@ def free_memory() -> float:
     """Return the bytes that this process may still use, by the machine, its control group and its
     own limit.
     """
-    return min(_free_in_machine(), _free_in_group(), _free_in_limit())
-
-
-def _free_in_machine() -> float:
+    free = [float("inf")]
     for line in _lines("/proc/meminfo"):
         if line.startswith("MemAvailable:"):
-            return 1024.0 * int(line.split()[1])
-    return float("inf")
-
-
-def _free_in_group() -> float:
-    """Return the free bytes of a container."""
+            free.append(1024.0 * int(line.split()[1]))
     limit = "".join(_lines("/sys/fs/cgroup/memory.max")).strip()
     usage = "".join(_lines("/sys/fs/cgroup/memory.current")).strip()
-    return float(limit) - float(usage) if limit.isdigit() and usage.isdigit() else float("inf")
-
-
-def _free_in_limit() -> float:
-    """Return the rest of the address space, which `ulimit -v` limits."""
-    try:
-        import resource
-    except ImportError:  # Windows
-        return float("inf")
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit.isdigit() and usage.isdigit():
+        free.append(float(limit) - float(usage))
+    # The address space, which `ulimit -v` limits.
     sizes = "".join(_lines("/proc/self/statm")).split()
-    if limit == resource.RLIM_INFINITY or not sizes:
-        return float("inf")
-    return float(limit - int(sizes[0]) * resource.getpagesize())
+    if resource is not None and sizes:
+        most = resource.getrlimit(resource.RLIMIT_AS)[0]
+        if most != resource.RLIM_INFINITY:
+            free.append(float(most - int(sizes[0]) * resource.getpagesize()))
+    return min(free)
 
 
 def process_memory() -> dict[str, int]:

@@ -157,15 +157,11 @@ def mean_over(values: np.ndarray, mask: np.ndarray | None = None) -> float:
     A map that is smaller than the mask is centred in it, like the map of `ssim_map`.
     """
     if mask is not None:
-        rows, columns = map(_middle, mask.shape, values.shape)
-        values = values[mask[rows, columns]]
+        height, width = values.shape[:2]
+        top = (mask.shape[0] - height) // 2
+        left = (mask.shape[1] - width) // 2
+        values = values[mask[top : top + height, left : left + width]]
     return float(values.mean()) if values.size else float("nan")
-
-
-def _middle(length: int, count: int) -> slice:
-    """Return the middle `count` of a number of rows or columns."""
-    start = (length - count) // 2
-    return slice(start, start + count)
 
 
 def _blur(image: np.ndarray) -> np.ndarray:

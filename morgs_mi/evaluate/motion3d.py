@@ -24,6 +24,7 @@ from scipy.spatial import KDTree
 
 from morgs_mi.capture.truth import GroundTruth
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.rig import seen_points
 from morgs_mi.evaluate.results import Motion3DScores
 
 _DEPTH_TOLERANCE = 0.01
@@ -126,16 +127,11 @@ def surface_ids(points: np.ndarray, views: Sequence[tuple[Camera, GroundTruth]])
     ids = np.full(len(points), -1, np.int64)
     several = np.zeros(len(points), bool)
     for camera, truth in views:
-        viewmat = np.asarray(camera.viewmat)
-        depth = points @ viewmat[2, :3] + viewmat[2, 3]
-        front = np.flatnonzero(depth > camera.near)
-        pixels = np.floor(camera.project(points[front])[0])
-        visible = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(-1)
-        front = front[visible]
-        column, row = pixels[visible].astype(int).T
-        distance = np.abs(truth.depth[row, column] - depth[front])
-        on = (truth.ids[row, column] >= 0) & (distance <= _DEPTH_TOLERANCE * depth[front])
-        rows = front[on]
+        visible, pixels, depths = seen_points(camera, points)
+        column, row = pixels.astype(int).T
+        distances = np.abs(truth.depth[row, column] - depths)
+        on = (truth.ids[row, column] >= 0) & (distances <= _DEPTH_TOLERANCE * depths)
+        rows = np.flatnonzero(visible)[on]
         pixel_ids = truth.ids[row, column][on]
         several[rows] |= (ids[rows] >= 0) & (ids[rows] != pixel_ids)
         ids[rows] = pixel_ids

@@ -219,8 +219,7 @@ def _recording(stream: FrameSource, path: str | Path, frames: Sequence[int]) -> 
     """
     values = metadata_entry(stream, "reading", {}, dict)
     # Older streams have settings that went.
-    names = ReadConfig.__dataclass_fields__.keys() & values
-    values = {name: values[name] for name in names}
+    values = {key: values[key] for key in ReadConfig.__dataclass_fields__.keys() & values}
     reading = apply_values(ReadConfig(), values, _place(stream, "reading"))
     downscale = metadata_entry(stream, "downscale", 1, int, float)
     test_view = metadata_entry(stream, "test_view", "auto", list, int, str, NoneType)

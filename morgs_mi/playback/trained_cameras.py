@@ -13,7 +13,7 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.rig import with_near_planes
+from morgs_mi.core.rig import seen_points, with_near_planes
 from morgs_mi.io.model_cameras import model_cameras
 from morgs_mi.playback.default_rig import thinned
 
@@ -79,12 +79,11 @@ def trained_cameras(path: Path, gaussians: Gaussians) -> tuple[Path | None, tupl
 def _seen(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     """Return which of N Gaussians a camera sees, bool [N]: none that are a dot in its image."""
     raw = gaussians.numpy()
-    with np.errstate(all="ignore"):
-        pixels, depths = camera.project(raw["means"].astype(np.float64))
-        in_image = (pixels > 0) & (pixels < [camera.width, camera.height])
-        radii = camera.K[0, 0] * np.exp(raw["log_scales"].max(axis=1, initial=-69)) / depths
-    visible = (depths > camera.near) & in_image.all(axis=1)
+    visible, pixels, depths = seen_points(camera, raw["means"])
     if not visible.any():
         return visible
-    extent = np.ptp(pixels[visible], axis=0).max() + 2 * np.median(radii[visible])
+    with np.errstate(all="ignore"):
+        sizes = np.exp(raw["log_scales"][visible].max(axis=1, initial=-69))
+        radii = camera.K[0, 0] * sizes / depths
+        extent = np.ptp(pixels, axis=0).max() + 2 * np.median(radii)
     return visible & (extent >= _LEAST_EXTENT * camera.width)

@@ -220,16 +220,10 @@ def _concatenate(images: list[np.ndarray], axis: int) -> np.ndarray:
     if not images:
         raise ValueError("side_by_side(), contact_sheet(): expected at least one image, got none.")
     largest = max(image.shape[1 - axis] for image in images)
-    first, *others = images
-    parts = [_padded(first, axis, 0, largest), *(_padded(i, axis, GAP, largest) for i in others)]
+    parts: list[np.ndarray] = []
+    for image in images:
+        border = [(0, 0)] * 3
+        border[axis] = (GAP if parts else 0, 0)
+        border[1 - axis] = (0, largest - image.shape[1 - axis])
+        parts.append(np.pad(image, border, constant_values=BACKGROUND))
     return np.concatenate(parts, axis)
-
-
-def _padded(image: np.ndarray, axis: int, gap: int, across: int) -> np.ndarray:
-    """Return an image with a gap before it along an axis, and of the size `across` along the other
-    one.
-    """
-    border = [(0, 0)] * 3
-    border[axis] = (gap, 0)
-    border[1 - axis] = (0, across - image.shape[1 - axis])
-    return np.pad(image, border, constant_values=BACKGROUND)

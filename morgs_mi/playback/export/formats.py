@@ -21,14 +21,6 @@ class Format:
     folder: bool = False
     ending: str = ""  #: End of the names of such folders; empty: of any name without a suffix.
 
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Outputs of this format in words."""
-        folder = f"a folder ending in {self.ending}" if self.ending else "a folder"
-        if not self.folder:
-            return (f"FILE.{self.name}",)
-        return (folder, f"FILE.{self.name} for one frame") if self.name else (folder,)
-
     def is_file(self, output: str | Path) -> bool:
         """Return whether an output of this format is a file."""
         return not self.folder or self._is_named(output)
@@ -73,7 +65,13 @@ def choose_format(formats: Sequence[Format], output: str | Path | None = None) -
     suffix = re.search(r"\.[a-z]\w*$", name := Path(output).name.lower())
     if suffix is None and (folders := [choice for choice in formats if choice.folder]):
         return folders[0]
-    outputs = list(dict.fromkeys(text for choice in formats for text in choice.outputs))
+    words: list[str] = []
+    for choice in formats:
+        if choice.folder:
+            words.append(f"a folder ending in {choice.ending}" if choice.ending else "a folder")
+        if choice.name:
+            words.append(f"FILE.{choice.name}" + (" for one frame" if choice.folder else ""))
+    outputs = list(dict.fromkeys(words))
     expected = " or ".join(filter(None, (", ".join(outputs[:-1]), outputs[-1])))
     raise ValueError(
         f"{output}: the output must be {expected}, got {suffix[0] if suffix else name!r}."

@@ -29,6 +29,7 @@ from morgs_mi.core.color_space import TRANSFER
 from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.core.fit_names import STREAM
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.rig import seen_points
 from morgs_mi.playback.default_rig import DEFAULT_RIG
 from morgs_mi.playback.player import MOTION_SCALE
 from morgs_mi.playback.stream_header import (
@@ -205,13 +206,11 @@ def _view_speeds(
     """Return the speeds of the Gaussians that a camera sees, and their weights on the screen
     [2, S].
     """
-    pixels, depths = camera.project(means)
-    in_image = (pixels > 0) & (pixels < (camera.width, camera.height))
-    visible = (depths > camera.near) & in_image.all(axis=1)
+    visible, _, depths = seen_points(camera, means)
     jacobians = camera.projection_jacobian(means[visible])
     motions = np.einsum("nij,nj->ni", jacobians, motion[visible])
     speeds = np.linalg.norm(motions, axis=1) / camera.width
-    return np.stack([speeds, weights[visible] / depths[visible] ** 2])
+    return np.stack([speeds, weights[visible] / depths**2])
 
 
 def _player() -> Traversable:
