@@ -146,19 +146,15 @@ def _fits(value: Any, kind: Any) -> bool:
     if kind is int:
         return _is_number(value, Integral) and -(2**63) <= int(value) < 2**64
     if kind is float:
-        return _is_number(value, Real) and _is_finite(value)
+        try:
+            return _is_number(value, Real) and isfinite(value)
+        except OverflowError:  # an integer of hundreds of digits
+            return False
     return isinstance(value, kind)
 
 
 def _is_number(value: Any, kind: type) -> bool:
     return isinstance(value, kind) and not isinstance(value, bool)
-
-
-def _is_finite(value: Real) -> bool:
-    try:
-        return isfinite(value)
-    except OverflowError:  # an integer of hundreds of digits
-        return False
 
 
 def _in_words(kind: Any) -> str:

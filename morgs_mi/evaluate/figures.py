@@ -102,9 +102,10 @@ def draw_stream(
     sheets = {"slice": _slices(still, column, recorded, renders)}
     for name, (first_row, *later_rows) in rows.items():
         sheets[name] = contact_sheet([[*first_row, _legend(name, scale)], *later_rows])
-    paths = [Path(folder) / f"{name}.png" for name in sheets]
-    for path, sheet in zip(paths, sheets.values(), strict=True):
-        write_png(path, sheet)
+    paths: list[Path] = []
+    for name, sheet in sheets.items():
+        paths.append(Path(folder) / f"{name}.png")
+        write_png(paths[-1], sheet)
     return paths
 
 
