@@ -169,9 +169,11 @@ class Player {
         lost = false;
         if (part !== null) this.take(part, server);
         else if (this.damage !== null) this.sayDamage(this.damage); // what is still being written grows within a second
-      } catch {
+      } catch (error) {
         lost = true;
-        say("The server of this page does not answer: start morgs-mi view again, or wait.");
+        // A TypeError: there is no answer.
+        const refusal = error instanceof TypeError ? null : (error as Error).message;
+        say(refusal ?? "The server of this page does not answer: start morgs-mi view again, or wait.");
       }
     }
   }

@@ -134,7 +134,7 @@ def test_page__starts_again_with_another_stream(browser, tmp_path):
             write_stream(tmp_path / "stream.morgs", 3, cameras=cameras)
         page.wait(f"{READY} && player.cameras.length === 2")
         (tmp_path / "stream.morgs").write_bytes(b"something else")
-        page.page.get_by_text("this is not a .morgs stream").wait_for()
+        page.page.get_by_text("expected a stream, got another file").wait_for()
         write_stream(tmp_path / "stream.morgs", 4, cameras=cameras)
         page.wait(f"{READY} && player.frames.length === 4")
         assert not page.page.locator("#message").is_visible()
