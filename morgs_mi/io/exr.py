@@ -36,27 +36,19 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
         ValueError: there is no channel, or the channels differ in shape.
         OSError: the file cannot be written.
     """
-    _check_shapes(channels)
-    pixels = {name: np.ascontiguousarray(channel, np.float32) for name, channel in channels.items()}
-    with atomic_path(path, "write_exr()") as partial:
-        _write(partial, pixels)
-
-
-def _write(path: Path, pixels: dict[str, np.ndarray]) -> None:
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    try:
-        OpenEXR.File(header, pixels).write(str(path))
-    except RuntimeError as error:
-        raise OSError(str(error)) from error
-
-
-def _check_shapes(channels: Mapping[str, np.ndarray]) -> None:
     shapes = {name: np.shape(channel) for name, channel in channels.items()}
     if len(set(shapes.values())) != 1 or any(len(shape) != 2 for shape in shapes.values()):
         raise ValueError(
             f"write_exr(): `channels` must share one shape [H, W], got {shapes}; pass one image "
             "each."
         )
+    pixels = {name: np.ascontiguousarray(channel, np.float32) for name, channel in channels.items()}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with atomic_path(path, "write_exr()") as partial:
+        try:
+            OpenEXR.File(header, pixels).write(str(partial))
+        except RuntimeError as error:
+            raise OSError(str(error)) from error
 
 
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:
@@ -171,33 +163,26 @@ def _check_size(path: str | Path) -> None:
     headers alone.
     """
     with Path(path).open("rb") as file:
-        sizes = list(map(_part_size, _headers(file)))
-    numbers = sum(width * height * channels for width, height, channels in sizes)
-    content = " and ".join(f"{w}x{h} pixels of {n} channels" for w, h, n in sizes)
-    check_claim(path, 4 * numbers, content)
-
-
-def _headers(file: BinaryIO) -> list[dict[bytes, bytes]]:
-    """Return the attributes of all parts."""
-    magic, version = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
-    if magic != _MAGIC:
-        raise ValueError("it does not begin with the number of an EXR file")
-    parts = [_header(file)]
-    # Headers of several parts end with an empty one.
-    while version & _MULTIPART and (header := _header(file)):
-        parts.append(header)
-    return parts
-
-
-def _part_size(part: Mapping[bytes, bytes]) -> tuple[int, int, int]:
-    """Return the largest width and height of the windows and the number of channels of a part."""
-    if missing := _REQUIRED - part.keys():
-        raise ValueError(f"its header lacks {b', '.join(sorted(missing)).decode()}")
-    windows = [struct.unpack("<4i", part[name]) for name in (b"dataWindow", b"displayWindow")]
-    if part.get(b"type", b"").startswith(b"deep"):
-        raise ValueError("it has deep pixels, which are not supported")
-    width, height = (max(window[i + 2] - window[i] + 1 for window in windows) for i in range(2))
-    return width, height, _count_channels(part[b"channels"])
+        magic, version = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
+        if magic != _MAGIC:
+            raise ValueError("it does not begin with the number of an EXR file")
+        parts = [_header(file)]
+        # Headers of several parts end with an empty one.
+        while version & _MULTIPART and (header := _header(file)):
+            parts.append(header)
+    numbers = 0
+    contents = []
+    for part in parts:
+        if missing := _REQUIRED - part.keys():
+            raise ValueError(f"its header lacks {b', '.join(sorted(missing)).decode()}")
+        windows = [struct.unpack("<4i", part[name]) for name in (b"dataWindow", b"displayWindow")]
+        if part.get(b"type", b"").startswith(b"deep"):
+            raise ValueError("it has deep pixels, which are not supported")
+        width, height = (max(window[i + 2] - window[i] + 1 for window in windows) for i in range(2))
+        channels = _count_channels(part[b"channels"])
+        numbers += width * height * channels
+        contents.append(f"{width}x{height} pixels of {channels} channels")
+    check_claim(path, 4 * numbers, " and ".join(contents))
 
 
 def _header(file: BinaryIO) -> dict[bytes, bytes]:

@@ -16,19 +16,14 @@ def clock(times: np.ndarray) -> tuple[np.ndarray, float] | None:
     """
     if len(times) < 3:
         return None
-    positions, period = _positions(times)
-    if np.abs(positions - np.arange(len(times))).max() <= _JITTER + _ROUNDING / period:
-        return None
-    return positions, 1 / period
-
-
-def _positions(times: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the positions of frames on a regular clock, and its period, s."""
     steps = np.diff(times)
     # Most frames are one period apart, and in step with the clock.
     period = float(steps[steps < 1.5 * np.median(steps)].mean())
     ticks = np.append(0, np.cumsum(np.maximum(1, np.rint(steps / period))))
-    return (times - np.median(times - period * ticks)) / period, period
+    positions = (times - np.median(times - period * ticks)) / period
+    if np.abs(positions - np.arange(len(times))).max() <= _JITTER + _ROUNDING / period:
+        return None
+    return positions, 1 / period
 
 
 def true_rate(fps: float, frames: float, duration: float) -> float:

@@ -72,21 +72,17 @@ def _tiff(data: memoryview) -> tuple[int, int]:
     large = 43 in bytes(data[2:4])  # BigTIFF: numbers of 8 bytes instead of 4
     size = [0, 0]
     value = 12 if large else 8
-    for at in _tiff_entries(data, order, large):
+    (start,) = struct.unpack_from(order + ("Q" if large else "I"), data, 8 if large else 4)
+    (count,) = struct.unpack_from(order + ("Q" if large else "H"), data, start)
+    first, length = (start + 8, 20) if large else (start + 2, 12)
+    # The entries of the first directory.
+    for at in range(first, min(first + length * count, len(data)), length):
         tag, kind = struct.unpack_from(order + "HH", data, at)
         if tag in _TIFF_SIZE and kind in _TIFF_TYPES:
             (size[_TIFF_SIZE[tag]],) = struct.unpack_from(
                 order + _TIFF_TYPES[kind], data, at + value
             )
     return size[0], size[1]
-
-
-def _tiff_entries(data: memoryview, order: str, large: bool) -> range:
-    """Return the places of the entries of the first directory."""
-    (start,) = struct.unpack_from(order + ("Q" if large else "I"), data, 8 if large else 4)
-    (count,) = struct.unpack_from(order + ("Q" if large else "H"), data, start)
-    first, length = (start + 8, 20) if large else (start + 2, 12)
-    return range(first, min(first + length * count, len(data)), length)
 
 
 _FORMATS = {

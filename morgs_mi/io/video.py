@@ -11,8 +11,9 @@ lie.
 from __future__ import annotations
 
 import logging
+import math
 import re
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -321,8 +322,14 @@ class FolderReader:
             FileNotFoundError: a file is missing.
             ValueError: there are none, or the first cannot be decoded.
         """
-        _check_files(files, gaps)
-        first = _read_image(_first_readable(files) if gaps else files[0])
+        if not files:
+            raise ValueError(
+                "FolderReader.of_files(): expected at least one image, got none; list the frames."
+            )
+        if not gaps and (missing := next((f for f in files if not f.is_file()), None)):
+            raise _no_image(missing)
+        readable = (f for f in files if not (gaps and isinstance(_image_or_error(f), Exception)))
+        first = _read_image(next(readable, files[0]))
         most = int(first.max()) if first.dtype == np.uint16 else None
         return cls(files[0].parent, tuple(files), first.shape[1], first.shape[0], most=most)
 
@@ -350,46 +357,30 @@ class FolderReader:
         """Yield the frames `indices`, with an error in place of each that is missing, broken or of
         another size.
         """
-        yield from map(self._frame, indices)
-
-    def _frame(self, index: int) -> ImageOrError:
-        if index >= self.num_frames:
-            return ValueError(
-                f"{self.path}: it has ended after {self.num_frames} images; record longer."
-            )
-        frame = _image_or_error(self.files[index])
-        if isinstance(frame, np.ndarray) and frame.shape[:2] != (self.height, self.width):
-            return self._size_error(index, frame)
-        if not isinstance(frame, np.ndarray) or frame.dtype != np.uint16:
-            return frame
-        if frame.max() > self.white:
-            return ValueError(
-                f"{self.files[index]}: expected values up to {self.white} as in the first images, "
-                f"got {frame.max()}; convert the images to 8 bits."
-            )
-        return cv2.convertScaleAbs(frame, alpha=255 / self.white)
-
-    def _size_error(self, index: int, frame: np.ndarray) -> ValueError:
-        return ValueError(
-            f"{self.files[index]}: expected {self.width}x{self.height} as in "
-            f"{self.files[0].name}, got {frame.shape[1]}x{frame.shape[0]}; extract the "
-            "frames again."
-        )
-
-
-def _check_files(files: Sequence[Path], gaps: bool) -> None:
-    if not files:
-        raise ValueError(
-            "FolderReader.of_files(): expected at least one image, got none; list the frames."
-        )
-    if not gaps and (missing := next((f for f in files if not f.is_file()), None)):
-        raise _no_image(missing)
-
-
-def _first_readable(files: Sequence[Path]) -> Path:
-    """Return the first image that is readable, or the first file if none is."""
-    readable = (file for file in files if not isinstance(_image_or_error(file), Exception))
-    return next(readable, files[0])
+        for index in indices:
+            if index >= self.num_frames:
+                yield ValueError(
+                    f"{self.path}: it has ended after {self.num_frames} images; record longer."
+                )
+                continue
+            file = self.files[index]
+            frame = _image_or_error(file)
+            if isinstance(frame, Exception):
+                yield frame
+            elif frame.shape[:2] != (self.height, self.width):
+                yield ValueError(
+                    f"{file}: expected {self.width}x{self.height} as in {self.files[0].name}, got "
+                    f"{frame.shape[1]}x{frame.shape[0]}; extract the frames again."
+                )
+            elif frame.dtype != np.uint16:
+                yield frame
+            elif frame.max() > self.white:
+                yield ValueError(
+                    f"{file}: expected values up to {self.white} as in the first images, got "
+                    f"{frame.max()}; convert the images to 8 bits."
+                )
+            else:
+                yield cv2.convertScaleAbs(frame, alpha=255 / self.white)
 
 
 def _check_span(path: Path, positions: np.ndarray, rate: float, times: np.ndarray) -> None:
@@ -458,42 +449,31 @@ def _with_white(readers: list[FrameReader]) -> list[FrameReader]:
 
 
 def _aligned_folders(folders: Sequence[Path]) -> dict[Clip, FrameReader]:
-    """Return the readers of folders of images, aligned by the numbers of their images."""
-    folder_files = {folder: _images(folder) for folder in folders}
-    ascending = {folder: sorted(files) for folder, files in folder_files.items()}
-    readers: dict[Clip, FrameReader] = {}
-    for group in counting_together(ascending):
-        numbers = _instants([folder_files[folder] for folder in group])
-        for folder in group:
-            files = folder_files[folder]
-            suffix = next(iter(files.values())).suffix
-            images = [files.get(n, folder / f"{n:04d}{suffix}") for n in numbers]
-            readers[folder] = replace(FolderReader.of_files(images, gaps=True), numbers=numbers)
-    return readers
-
-
-def _instants(group: Sequence[Mapping[int, Path]]) -> range:
-    """Return the numbers of the instants of folders that count together, given by their images by
-    number.
+    """Return the readers of folders of images, aligned by the numbers of their images.
 
     Raises:
-        ValueError: there are far more than images.
+        ValueError: there are far more instants than images.
     """
-    numbers = sorted(set().union(*group))
-    step = int(np.gcd.reduce(np.diff(numbers))) if len(numbers) > 1 else 1
-    if (numbers[-1] - numbers[0]) // step > 10 * len(numbers) + 1000:
-        raise _gap_error(group, numbers)
-    return range(numbers[0], numbers[-1] + 1, step)
-
-
-def _gap_error(group: Sequence[Mapping[int, Path]], numbers: Sequence[int]) -> ValueError:
-    """Return the error of the largest gap in the numbers of images."""
-    gap = int(np.argmax(np.diff(numbers)))
-    file = next(files[numbers[gap + 1]] for files in group if numbers[gap + 1] in files)
-    return ValueError(
-        f"{file}: expected images numbered without large gaps, got this after "
-        f"number {numbers[gap]} among {len(numbers)} images; rename or remove it."
-    )
+    files_by_number = {folder: _images(folder) for folder in folders}
+    readers: dict[Clip, FrameReader] = {}
+    for group in counting_together({f: sorted(files) for f, files in files_by_number.items()}):
+        clips = [files_by_number[folder] for folder in group]
+        numbers = sorted(set().union(*clips))
+        steps = np.diff(numbers)
+        step = math.gcd(*steps.tolist()) or 1
+        if (numbers[-1] - numbers[0]) // step > 10 * len(numbers) + 1000:
+            gap = int(np.argmax(steps))
+            file = next(files[numbers[gap + 1]] for files in clips if numbers[gap + 1] in files)
+            raise ValueError(
+                f"{file}: expected images numbered without large gaps, got this after "
+                f"number {numbers[gap]} among {len(numbers)} images; rename or remove it."
+            )
+        instants = range(numbers[0], numbers[-1] + 1, step)
+        for folder, files in zip(group, clips, strict=True):
+            suffix = next(iter(files.values())).suffix
+            images = [files.get(n, folder / f"{n:04d}{suffix}") for n in instants]
+            readers[folder] = replace(FolderReader.of_files(images, gaps=True), numbers=instants)
+    return readers
 
 
 def open_frames(path: str | Path | tuple[Path, ...], gaps: bool = False) -> FrameReader:
@@ -545,7 +525,10 @@ def _read_image(file: Path) -> np.ndarray:
     if not file.is_file():
         raise _no_image(file)
     if file.suffix.lower() == EXR_SUFFIX:
-        return _read_light(file)
+        try:
+            return read_light(file)
+        except OSError as error:
+            raise ValueError(str(error)) from None
     # The stored pixels, without EXIF's rotation: calibrations refer to them.
     image = decode_image(file, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if image.dtype not in (np.uint8, np.uint16):
@@ -554,13 +537,6 @@ def _read_image(file: Path) -> np.ndarray:
             "to EXR."
         )
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-
-
-def _read_light(file: Path) -> np.ndarray:
-    try:
-        return read_light(file)
-    except OSError as error:
-        raise ValueError(str(error)) from None
 
 
 def decode_image(file: Path, mode: int) -> np.ndarray:

@@ -44,13 +44,9 @@ def write_video(
         return
     with atomic_folder(path, "write_video()") as folder:
         for i, frame in enumerate(_checked(path, frames)):
-            _write_png(folder / f"{i:04d}.png", frame)
-
-
-def _write_png(path: Path, frame: np.ndarray) -> None:
-    # Not cv2.imwrite, which does not report why it failed.
-    png = cv2.imencode(".png", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))[1]
-    path.write_bytes(png.tobytes())
+            # Not cv2.imwrite, which does not report why it failed.
+            png = cv2.imencode(".png", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))[1]
+            (folder / f"{i:04d}.png").write_bytes(png.tobytes())
 
 
 def _write_file(
@@ -62,54 +58,42 @@ def _write_file(
         for frame in _checked(path, frames):
             if encoder is None:
                 height, width = frame.shape[:2]
-                _check_even(path, width, height)
-                encoder = _encoder(partial, width, height, fps, codec)
+                if width % 2 or height % 2:
+                    raise ValueError(
+                        f"write_video({path}): the width and height must be even, because OpenCV "
+                        f"drops an odd column or row, got {width}x{height}; crop, or write a "
+                        "folder of PNGs."
+                    )
+                fourcc = cv2.VideoWriter.fourcc(*codec)
+                encoder = cv2.VideoWriter(
+                    f"file:{partial}", cv2.CAP_FFMPEG, fourcc, fps, (width, height)
+                )
+                if not encoder.isOpened():
+                    raise OSError(
+                        f"OpenCV could not open it with the encoder {codec!r}; try the codec FFV1 "
+                        "or mp4v"
+                    )
             encoder.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
             count += 1
     finally:
         if encoder is not None:
             encoder.release()
     # OpenCV's writer reports no failure, not even a full disk, so the decodable frames are counted.
-    readable = _count_frames(partial)
+    stream = cv2.VideoCapture(f"file:{partial}", cv2.CAP_FFMPEG)
+    readable = 0
+    while stream.grab():
+        readable += 1
+    stream.release()
     if readable != count:
         raise OSError(f"{count} frames were written but {readable} can be read back")
-
-
-def _check_even(path: Path, width: int, height: int) -> None:
-    if width % 2 or height % 2:
-        raise ValueError(
-            f"write_video({path}): the width and height must be even, because OpenCV "
-            f"drops an odd column or row, got {width}x{height}; crop, or write a "
-            "folder of PNGs."
-        )
-
-
-def _encoder(partial: Path, width: int, height: int, fps: float, codec: str) -> cv2.VideoWriter:
-    fourcc = cv2.VideoWriter.fourcc(*codec)
-    encoder = cv2.VideoWriter(f"file:{partial}", cv2.CAP_FFMPEG, fourcc, fps, (width, height))
-    if not encoder.isOpened():
-        encoder.release()
-        raise OSError(
-            f"OpenCV could not open it with the encoder {codec!r}; try the codec FFV1 or mp4v"
-        )
-    return encoder
-
-
-def _count_frames(path: Path) -> int:
-    """Return the number of frames of a video that can be decoded."""
-    stream = cv2.VideoCapture(f"file:{path}", cv2.CAP_FFMPEG)
-    count = 0
-    while stream.grab():
-        count += 1
-    stream.release()
-    return count
 
 
 def _checked(path: Path, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
     shape = None
     for i, frame in enumerate(frames):
         shape = frame.shape if shape is None else shape
-        if not _is_image(frame) or frame.shape != shape:
+        is_image = frame.dtype == np.uint8 and frame.ndim == 3 and frame.shape[2] == 3
+        if not is_image or frame.shape != shape:
             raise ValueError(
                 f"write_video({path}): frame {i} must be uint8 [H, W, 3] of the first frame's size "
                 f"{shape[:2]}, got {frame.dtype} {frame.shape}; convert it first."
@@ -119,7 +103,3 @@ def _checked(path: Path, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
         raise ValueError(
             f"write_video({path}): at least one frame was expected, got none; pass frames."
         )
-
-
-def _is_image(frame: np.ndarray) -> bool:
-    return frame.dtype == np.uint8 and frame.ndim == 3 and frame.shape[2] == 3
