@@ -76,7 +76,11 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
     vertices["packed_color"] = _packed(colors, _COLOR_BITS)
     elements = [PlyElement.describe(chunks, "chunk"), PlyElement.describe(vertices, "vertex")]
     if raw["sh_coeffs"].shape[1] > 1:
-        elements.append(PlyElement.describe(_packed_rest(raw["sh_coeffs"][:, 1:]), "sh"))
+        names = rest_names(raw["sh_coeffs"].shape[1])
+        rest = raw["sh_coeffs"][:, 1:].transpose(0, 2, 1).reshape(len(colors), len(names))
+        steps = np.clip(np.floor((rest / (2 * _SH_RANGE) + 0.5) * 256), 0, 255).astype("u1")
+        rows = steps.view([(name, "u1") for name in names])[:, 0]
+        elements.append(PlyElement.describe(rows, "sh"))
     with atomic_path(path, "write_compressed_ply()") as partial:
         PlyData(elements, byte_order="<").write(str(partial))
 
@@ -99,14 +103,6 @@ def _chunks(raw: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarra
     return chunks, fractions
 
 
-def _packed_rest(coeffs: np.ndarray) -> np.ndarray:
-    """Return SH coefficients of degree 1 and higher [N, K - 1, 3] as rows of bytes [N]."""
-    rest = coeffs.transpose(0, 2, 1).reshape(len(coeffs), 3 * coeffs.shape[1])
-    steps = np.clip(np.floor((rest / (2 * _SH_RANGE) + 0.5) * 256), 0, 255).astype("u1")
-    names = [(f"f_rest_{i}", "u1") for i in range(steps.shape[1])]
-    return steps.view(names)[:, 0]
-
-
 def read_compressed_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
     """Return the Gaussians in a compressed PLY file of any tool, SH of degree 0 to 3.
 
@@ -127,64 +123,40 @@ def read_compressed_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussian
     vertices = elements["vertex"]
     rest = elements.get("sh", {})
     _check_columns(path, "vertex", vertices, _PACKED, "<u4")
-    _check_count(path, chunks, len(vertices["packed_position"]))
-    _check_rest(path, rest, len(vertices["packed_position"]))
-    position, scale = (
-        _between(path, chunks, key, _unpacked(vertices[f"packed_{key}"], _XYZ_BITS))
-        for key in ("position", "scale")
-    )
-    color = _unpacked(vertices["packed_color"], _COLOR_BITS)
-    coeffs = _coefficients(path, chunks, color[:, :3], rest)
-    quats = _unpacked_rotations(vertices["packed_rotation"])
-    with np.errstate(over="ignore"):  # infinite, and therefore invalid
-        gaussians = Gaussians.from_activated(position, np.exp(scale), quats, color[:, 3], coeffs)
-    return without_invalid(path, gaussians, most_invalid)
-
-
-def _check_count(path: str | Path, chunks: dict[str, np.ndarray], N: int) -> None:
-    """Check the number of chunks of N Gaussians."""
+    N = len(vertices["packed_position"])
     num_chunks = len(next(iter(chunks.values()), ()))
     if num_chunks != -(-N // _CHUNK):
         raise ValueError(
             f"{path}: expected {-(-N // _CHUNK)} chunks of {_CHUNK} for {N} Gaussians, got "
             f"{num_chunks}; the file is broken, export it again."
         )
-
-
-def _coefficients(
-    path: str | Path,
-    chunks: dict[str, np.ndarray],
-    fractions: np.ndarray,
-    rest: dict[str, np.ndarray],
-) -> np.ndarray:
-    """Return the SH coefficients [N, K, 3] of colours, fractions between bounds if chunks have
-    them, and of the element `sh`.
-    """
-    base = fractions if "min_r" not in chunks else _between(path, chunks, "color", fractions)
-    coeffs = np.empty((len(base), 1 + len(rest) // 3, 3), np.float32)
-    coeffs[:, 0] = (base - 0.5) / SH_C0
-    if rest:
-        coeffs[:, 1:] = _unpacked_rest(rest)
-    return coeffs
-
-
-def _check_rest(path: str | Path, rest: dict[str, np.ndarray], N: int) -> None:
-    """Check the columns of the element `sh` of N Gaussians."""
     if len(rest) not in SH_DEGREES or any(len(column) != N for column in rest.values()):
         raise ValueError(
             f"{path}: expected {N} rows of f_rest_0 to f_rest_8, 23 or 44 (SH of degree 1 to 3) "
             f"or none, got {len(next(iter(rest.values()), ()))} rows of {len(rest)} properties; "
             "the file is broken, export it again."
         )
-    _check_columns(path, "sh", rest, rest_names(1 + len(rest) // 3), "u1")
-
-
-def _unpacked_rest(rest: dict[str, np.ndarray]) -> np.ndarray:
-    """Return SH coefficients of degree 1 and higher, the inverse of `_packed_rest`."""
     K = 1 + len(rest) // 3
-    steps = np.stack([rest[name] for name in rest_names(K)], axis=1)
-    steps = steps.reshape(len(steps), 3, K - 1).transpose(0, 2, 1)
-    return (np.where(steps == 0, 0, np.where(steps == 255, 256, steps + 0.5)) / 128 - 1) * _SH_RANGE
+    _check_columns(path, "sh", rest, rest_names(K), "u1")
+    position, scale = (
+        _between(path, chunks, key, _unpacked(vertices[f"packed_{key}"], _XYZ_BITS))
+        for key in ("position", "scale")
+    )
+    color = _unpacked(vertices["packed_color"], _COLOR_BITS)
+    base = color[:, :3]
+    if "min_r" in chunks:
+        base = _between(path, chunks, "color", base)
+    coeffs = np.empty((N, K, 3), np.float32)
+    coeffs[:, 0] = (base - 0.5) / SH_C0
+    if rest:
+        steps = np.stack([rest[name] for name in rest_names(K)], axis=1)
+        steps = steps.reshape(N, 3, K - 1).transpose(0, 2, 1)
+        parts = np.where(steps == 0, 0, np.where(steps == 255, 256, steps + 0.5))
+        coeffs[:, 1:] = (parts / 128 - 1) * _SH_RANGE
+    quats = _unpacked_rotations(vertices["packed_rotation"])
+    with np.errstate(over="ignore"):  # infinite, and therefore invalid
+        gaussians = Gaussians.from_activated(position, np.exp(scale), quats, color[:, 3], coeffs)
+    return without_invalid(path, gaussians, most_invalid)
 
 
 def _within_chunks(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

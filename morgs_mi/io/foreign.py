@@ -7,6 +7,7 @@ The first bytes of a file decide before its name, because files are renamed.
 from __future__ import annotations
 
 import zlib
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,7 +59,14 @@ def refuse_foreign(path: str | Path) -> None:
     Raises:
         ValueError: it does; the sentence names the format and what converts it.
     """
-    kind = _format(Path(path))
+    path = Path(path)
+    head = b""
+    if path.is_file():
+        with path.open("rb") as file:
+            head = file.read(_HEAD)
+    name = path.name.lower()
+    name_format = next((kind for kind in _FORMATS if name.endswith(kind.endings)), None)
+    kind = _by_content(head, name_format, name) or name_format
     if kind is not None:
         raise ValueError(
             f"{path}: expected Gaussians as .ply, .compressed.ply or .splat, got {kind.name}, "
@@ -66,28 +74,14 @@ def refuse_foreign(path: str | Path) -> None:
         )
 
 
-def _format(path: Path) -> _Format | None:
-    """Return the format of a file that is not read, by its first bytes or else by its name; None:
-    no such format.
-    """
-    name = path.name.lower()
-    name_format = next((kind for kind in _FORMATS if name.endswith(kind.endings)), None)
-    return _by_content(_head(path), name_format, name) or name_format
-
-
-def _head(path: Path) -> bytes:
-    """Return the first bytes of a file, none if it is missing."""
-    if not path.is_file():
-        return b""
-    with path.open("rb") as file:
-        return file.read(_HEAD)
-
-
 def _by_content(head: bytes, name_format: _Format | None, name: str) -> _Format | None:
     """Return the format that begins with these bytes."""
-    if head[:4] == b"NGSP" or (head[:2] == b"\x1f\x8b" and _unzipped(head)[:4] == b"NGSP"):
+    if head[:4] == b"NGSP":
         return _SPZ
     if head[:2] == b"\x1f\x8b":
+        with suppress(zlib.error):
+            if zlib.decompressobj(wbits=31).decompress(head, 16)[:4] == b"NGSP":
+                return _SPZ
         return name_format or _ARCHIVE
     if head[:4] == b"PK\x03\x04":
         return _SOG if b"meta.json" in head else name_format or _ARCHIVE
@@ -100,11 +94,3 @@ def _by_content(head: bytes, name_format: _Format | None, name: str) -> _Format 
     if head[:4] in (b"ply\n", b"ply\r") and not name.endswith(".ply"):
         return _PLY
     return None
-
-
-def _unzipped(head: bytes) -> bytes:
-    """Return the first bytes of a gzip stream."""
-    try:
-        return zlib.decompressobj(wbits=31).decompress(head, 16)
-    except zlib.error:
-        return b""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -40,14 +39,27 @@ def without_invalid(path: str | Path, gaussians: Gaussians, most_invalid: float)
     """
     raw = gaussians.numpy()
     N = len(gaussians)
-    _warn_zero(path, raw["quats"])
-    valid = {name: _valid_rows(name, values) for name, values in raw.items()}
-    every = np.all([*valid.values()], axis=0)
+    zero = np.flatnonzero(~raw["quats"].any(axis=1))
+    if len(zero):
+        _log.warning(
+            "%s: %d of %d Gaussians have a rotation of 0 and are not rotated: %s.",
+            *(path, len(zero), N, _few(zero)),
+        )
+    every = np.ones(N, bool)
+    faults = []
+    for name, values in raw.items():
+        # Small sizes have negative logarithms without a bound.
+        limit = np.log(LARGEST) if name == "log_scales" else LARGEST
+        within = (values <= limit) & (values >= -LARGEST)
+        rows = np.logical_and.reduce(within, axis=tuple(range(1, values.ndim)))
+        if not rows.all():
+            faults.append(f"{_WORDS.get(name, name)} of {_few(np.flatnonzero(~rows))}")
+        every &= rows
     count = int(N - every.sum())
     _warn_far(path, raw["means"][every], raw["log_scales"][every])
     if not count:
         return gaussians
-    details = _details(valid)
+    details = "; ".join(faults)
     if count > most_invalid * N:
         raise ValueError(
             f"{path}: expected finite numbers of at most {LARGEST:g}, others in {count} of {N} "
@@ -72,33 +84,6 @@ def _warn_far(path: str | Path, means: np.ndarray, log_scales: np.ndarray) -> No
             "tenth of the Gaussians' sizes or more; subtract an origin before they are exported.",
             *(path, *middle),
         )
-
-
-def _warn_zero(path: str | Path, quats: np.ndarray) -> None:
-    """Warn of rotations [N, 4] of length 0."""
-    zero = np.flatnonzero(~quats.any(axis=1))
-    if len(zero):
-        _log.warning(
-            "%s: %d of %d Gaussians have a rotation of 0 and are not rotated: %s.",
-            *(path, len(zero), len(quats), _few(zero)),
-        )
-
-
-def _valid_rows(name: str, values: np.ndarray) -> np.ndarray:
-    """Return the mask [N] of valid values of an attribute."""
-    # Small sizes have negative logarithms without a bound.
-    limit = np.log(LARGEST) if name == "log_scales" else LARGEST
-    within = (values <= limit) & (values >= -LARGEST)
-    return np.logical_and.reduce(within, axis=tuple(range(1, values.ndim)))
-
-
-def _details(valid: Mapping[str, np.ndarray]) -> str:
-    """Return the invalid attributes and the first Gaussians that have them."""
-    return "; ".join(
-        f"{_WORDS.get(name, name)} of {_few(np.flatnonzero(~rows))}"
-        for name, rows in valid.items()
-        if not rows.all()
-    )
 
 
 def _few(rows: np.ndarray) -> str:

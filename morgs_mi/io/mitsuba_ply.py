@@ -49,24 +49,12 @@ def from_mitsuba(
     if not vertices.keys() >= {"sh_coeffs_0", "opacities_0"}:
         return vertices, {}
     K = sum(name.startswith("sh_coeffs_") for name in vertices) // 3
-    places = {**_COLUMNS, **_sh_places(K)}
+    places = _COLUMNS | {f"sh_coeffs_{i}": f"f_dc_{i}" for i in range(3)}
+    for k in range(1, K):
+        for c in range(3):
+            places[f"sh_coeffs_{3 * k + c}"] = f"f_rest_{c * (K - 1) + k - 1}"
     columns = {places[name]: values for name, values in vertices.items() if name in places}
     columns["opacity"] = SIGMOID.inverse(vertices["opacities_0"])
-    return columns, _raw_attributes(vertices)
-
-
-def _sh_places(K: int) -> dict[str, str]:
-    """Return the names of K SH coefficients in 3D Gaussian Splatting, by their names here."""
-    places = {f"sh_coeffs_{i}": f"f_dc_{i}" for i in range(3)}
-    return places | {
-        f"sh_coeffs_{3 * k + c}": f"f_rest_{c * (K - 1) + k - 1}"
-        for k in range(1, K)
-        for c in range(3)
-    }
-
-
-def _raw_attributes(vertices: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the raw attributes that 3D Gaussian Splatting does not have."""
     attributes: dict[str, np.ndarray] = {}
     for name, attribute in BY_ACTIVATED_NAME.items():
         names = [f"{name}_{i}" for i in range(attribute.width)]
@@ -74,4 +62,4 @@ def _raw_attributes(vertices: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
             table = np.stack([vertices[column] for column in names], axis=1)
             values = table.reshape(len(table), *attribute.shape)
             attributes[attribute.name] = attribute.activation.inverse(values)
-    return attributes
+    return columns, attributes

@@ -54,7 +54,10 @@ def _are_cameras(rows: Any) -> bool:
 
 def _camera(file: Path, index: int, row: dict[str, Any]) -> Camera:
     try:
-        viewmat = _viewmat(row)
+        R = np.asarray(row["rotation"], np.float64)
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = R.T
+        viewmat[:3, 3] = -R.T @ np.asarray(row["position"], np.float64)
         width, height, fx, fy = (float(row[key]) for key in ("width", "height", "fx", "fy"))
         K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
         return Camera(K, viewmat, round(width), round(height), str(row.get("img_name", index)))
@@ -62,12 +65,3 @@ def _camera(file: Path, index: int, row: dict[str, Any]) -> Camera:
         raise ValueError(
             f"{file}: entry {index}: expected a camera, got a broken one: {error}"
         ) from None
-
-
-def _viewmat(row: dict[str, Any]) -> np.ndarray:
-    """Return the world-to-camera matrix [4, 4]."""
-    R = np.asarray(row["rotation"], np.float64)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = R.T
-    viewmat[:3, 3] = -R.T @ np.asarray(row["position"], np.float64)
-    return viewmat

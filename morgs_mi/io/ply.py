@@ -76,25 +76,21 @@ def write_ply(
     if layout not in ("3dgs", "mitsuba"):
         raise ValueError(f"write_ply(): `layout` must be 3dgs or mitsuba, got {layout!r}.")
     raw = gaussians.numpy()
+    lengths = np.linalg.norm(raw["quats"], axis=1, keepdims=True)
+    unit_quats = raw["quats"] / np.maximum(lengths, 1e-30)
     columns = {
         _MEAN: raw["means"],
         _NORMAL: np.zeros_like(raw["means"]),
         **(mitsuba_columns(gaussians) if layout == "mitsuba" else _columns(raw)),
         _SCALE: raw["log_scales"],
-        _ROTATION: _rotations(raw["quats"]),
+        # A zero quaternion is no rotation.
+        _ROTATION: np.where(lengths > 0, unit_quats, (1, 0, 0, 0)),
     }
     names = [name for names in columns for name in names]
     table = np.concatenate([*columns.values()], axis=1, dtype=np.float32, casting="same_kind")
     vertices = table.astype("<f4").view([(name, "<f4") for name in names])[:, 0]
     with atomic_path(path, "write_ply()") as partial:
         PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(partial))
-
-
-def _rotations(quats: np.ndarray) -> np.ndarray:
-    """Return unit quaternions [N, 4]."""
-    lengths = np.linalg.norm(quats, axis=1, keepdims=True)
-    # A zero quaternion is no rotation.
-    return np.where(lengths > 0, quats / np.maximum(lengths, 1e-30), (1, 0, 0, 0))
 
 
 def _columns(raw: dict[str, np.ndarray]) -> dict[tuple[str, ...], np.ndarray]:
@@ -137,40 +133,32 @@ def read_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
         )
     vertices, more = from_mitsuba(vertices)
     vertices = as_3dgs(path, vertices)
-    _check_names(path, vertices)
-    K = (_degree(path, vertices) + 1) ** 2
+    expected = (*_MEAN, *_DC, "opacity", *_SCALE, *_ROTATION)
+    if missing := [name for name in expected if name not in vertices]:
+        raise ValueError(
+            f"{path}: expected Gaussians in the layout of 3D Gaussian Splatting, got vertices "
+            f"without {', '.join(missing)}, as of a mesh or a point cloud; export the Gaussians."
+        )
+    count = sum(name.startswith("f_rest_") for name in vertices)
+    K = 1 + count // 3
+    if count not in SH_DEGREES or not vertices.keys() >= {*rest_names(K)}:
+        raise ValueError(
+            f"{path}: expected f_rest_0 to f_rest_8, 23 or 44 (SH of degree 1 to 3) or none, got "
+            f"{count} of them; export the Gaussians with SH of degree 3 or less."
+        )
+    coeffs = np.empty((len(vertices["x"]), K, 3), np.float32)
+    coeffs[:, 0] = _table(vertices, _DC)
+    rest = _table(vertices, rest_names(K)).reshape(len(coeffs), 3, K - 1)
+    coeffs[:, 1:] = rest.transpose(0, 2, 1)
     gaussians = Gaussians(
         _table(vertices, _MEAN),
         _table(vertices, _SCALE),
         _table(vertices, _ROTATION),
         _table(vertices, ("opacity",))[:, 0],
-        _coefficients(vertices, K),
+        coeffs,
         **more,
     )
     return without_invalid(path, gaussians, most_invalid)
-
-
-def _check_names(path: str | Path, vertices: dict[str, np.ndarray]) -> None:
-    missing = [
-        name for name in (*_MEAN, *_DC, "opacity", *_SCALE, *_ROTATION) if name not in vertices
-    ]
-    if missing:
-        raise ValueError(
-            f"{path}: expected Gaussians in the layout of 3D Gaussian Splatting, got vertices "
-            f"without {', '.join(missing)}, as of a mesh or a point cloud; export the Gaussians."
-        )
-
-
-def _degree(path: str | Path, vertices: dict[str, np.ndarray]) -> int:
-    """Return the degree of the SH."""
-    count = sum(name.startswith("f_rest_") for name in vertices)
-    degree = SH_DEGREES.get(count)
-    if degree is None or not vertices.keys() >= {*rest_names((degree + 1) ** 2)}:
-        raise ValueError(
-            f"{path}: expected f_rest_0 to f_rest_8, 23 or 44 (SH of degree 1 to 3) or none, got "
-            f"{count} of them; export the Gaussians with SH of degree 3 or less."
-        )
-    return degree
 
 
 def _table(vertices: dict[str, np.ndarray], names: Sequence[str]) -> np.ndarray:
@@ -180,15 +168,6 @@ def _table(vertices: dict[str, np.ndarray], names: Sequence[str]) -> np.ndarray:
         for i, name in enumerate(names):
             values[:, i] = np.clip(vertices[name], *_BOUNDS.get(name, (None, None)))
     return values
-
-
-def _coefficients(vertices: dict[str, np.ndarray], K: int) -> np.ndarray:
-    """Return the SH coefficients [N, K, 3]."""
-    coeffs = np.empty((len(vertices["x"]), K, 3), np.float32)
-    coeffs[:, 0] = _table(vertices, _DC)
-    rest = _table(vertices, rest_names(K)).reshape(len(coeffs), 3, K - 1)
-    coeffs[:, 1:] = rest.transpose(0, 2, 1)
-    return coeffs
 
 
 def read_vertices(path: str | Path) -> dict[str, np.ndarray]:
@@ -292,46 +271,30 @@ def _read_properties(
         if properties.keys() == names:
             break
         dtype = element.dtype(order)
-        _check_length(file, order, element, dtype)
-        if element.name in names:
-            properties[element.name] = _read_rows(file, element, dtype, text=not order)
-        elif order:
-            file.seek(element.count * dtype.itemsize, 1)
+        count = element.count
+        # A number in a text takes a digit and a separator.
+        size = count * dtype.itemsize if order else 2 * count * len(element.properties) - 1
+        num_bytes = os.fstat(file.fileno()).st_size - file.tell()
+        if count < 0 or size > num_bytes:
+            raise ValueError(
+                f"{count} {element.name} need at least {size} bytes, {num_bytes} follow"
+            )
+        is_read = element.name in names
+        if order and not is_read:
+            file.seek(count * dtype.itemsize, 1)
+        elif not is_read:
+            next(islice(file, count, count), None)
         else:
-            next(islice(file, element.count, element.count), None)
+            if order:
+                table = np.fromfile(file, dtype, count)
+            elif count:
+                table = np.loadtxt(islice(file, count), dtype, ndmin=1)
+            else:
+                table = np.empty(0, dtype)
+            if len(table) < count:
+                raise ValueError(f"expected {count} rows of {element.name}, got {len(table)}")
+            properties[element.name] = {name: table[name] for name in table.dtype.names or ()}
     return properties
-
-
-def _check_length(file: BinaryIO, order: str, element: _Element, dtype: np.dtype) -> None:
-    """Check that the rest of the file can hold the rows of an element."""
-    num_bytes = os.fstat(file.fileno()).st_size - file.tell()
-    size = _least_size(order, element, dtype)
-    if element.count < 0 or size > num_bytes:
-        raise ValueError(
-            f"{element.count} {element.name} need at least {size} bytes, {num_bytes} follow"
-        )
-
-
-def _least_size(order: str, element: _Element, dtype: np.dtype) -> int:
-    """Return the bytes that the rows of an element take at least."""
-    # A number in a text takes a digit and a separator.
-    row = dtype.itemsize if order else 2 * len(element.properties)
-    return element.count * row - (not order)
-
-
-def _read_rows(
-    file: BinaryIO, element: _Element, dtype: np.dtype, text: bool
-) -> dict[str, np.ndarray]:
-    table = (
-        _read_text(file, element.count, dtype) if text else np.fromfile(file, dtype, element.count)
-    )
-    if len(table) < element.count:
-        raise ValueError(f"expected {element.count} rows of {element.name}, got {len(table)}")
-    return {name: table[name] for name in table.dtype.names or ()}
-
-
-def _read_text(file: BinaryIO, count: int, dtype: np.dtype) -> np.ndarray:
-    return np.loadtxt(islice(file, count), dtype, ndmin=1) if count else np.empty(0, dtype)
 
 
 def rest_names(K: int) -> tuple[str, ...]:

@@ -57,49 +57,35 @@ def as_3dgs(path: str | Path, vertices: Vertices) -> Vertices:
     """
     if vertices.keys().isdisjoint(_GAUSSIAN):
         return vertices
-    _refuse_instants(path, vertices)
-    _refuse_anchors(path, vertices)
-    _refuse_integers(path, vertices)
-    _name_unread(Path(path), vertices)
-    return _with_third_axis(path, _with_filter(vertices))
-
-
-def _refuse_anchors(path: str | Path, names: Iterable[str]) -> None:
-    if anchors := _matching(names, _ANCHOR):
-        raise ValueError(
-            f"{path}: expected Gaussians, got anchors of Scaffold-GS ({_listed(anchors)}), of "
-            "which a network makes the Gaussians of a view; export Gaussians with the program "
-            "that trained them."
-        )
-
-
-def _refuse_integers(path: str | Path, vertices: Vertices) -> None:
-    if integers := [
-        name for name in _matching(vertices, _READ) if vertices[name].dtype.kind != "f"
-    ]:
-        raise ValueError(
-            f"{path}: expected Gaussians with floats, got integers in {_listed(integers)}, which "
-            "stand for entries of a codebook; export the Gaussians uncompressed."
-        )
-
-
-def _refuse_instants(path: str | Path, vertices: Vertices) -> None:
-    """Raise an error if the Gaussians of several instants are in one file: all of them are never in
-    one image.
-    """
-    times = [name for name in _matching(vertices, _TIME) if _varies(vertices[name])]
-    motions = [name for name in _matching(vertices, _MOTION) if (vertices[name] != 0).any()]
-    if evidence := [*times, *motions, *_matching(vertices, _FOURTH)]:
+    # Not all Gaussians of several instants in one file are ever in one image.
+    times = [n for n, v in vertices.items() if _TIME.fullmatch(n) and (v != v[:1]).any()]
+    motions = [n for n, v in vertices.items() if _MOTION.fullmatch(n) and (v != 0).any()]
+    if evidence := [*times, *motions, *filter(_FOURTH.fullmatch, vertices)]:
         raise ValueError(
             f"{path}: expected the Gaussians of one instant, got several instants, as of "
             f"Spacetime Gaussians or 4D Gaussian Splatting ({_listed(evidence)}); export a .ply "
             "of each instant with the program that trained them, which `morgs-mi import` turns "
             "into a stream."
         )
-
-
-def _varies(values: np.ndarray) -> bool:
-    return bool((values != values[:1]).any())
+    if anchors := [*filter(_ANCHOR.fullmatch, vertices)]:
+        raise ValueError(
+            f"{path}: expected Gaussians, got anchors of Scaffold-GS ({_listed(anchors)}), of "
+            "which a network makes the Gaussians of a view; export Gaussians with the program "
+            "that trained them."
+        )
+    if integers := [n for n, v in vertices.items() if _READ.fullmatch(n) and v.dtype.kind != "f"]:
+        raise ValueError(
+            f"{path}: expected Gaussians with floats, got integers in {_listed(integers)}, which "
+            "stand for entries of a codebook; export the Gaussians uncompressed."
+        )
+    unread = [name for name in vertices if not (_READ.fullmatch(name) or _HARMLESS.fullmatch(name))]
+    folder = Path(path).parent
+    networks = [network.name for network in folder.glob("deformation*.pth")]
+    names = _listed([*unread, *networks])
+    if names and (folder, names) not in _named:
+        _named.add((folder, names))
+        _log.warning("%s: it is drawn without %s, which may change the image.", path, names)
+    return _with_third_axis(path, _with_filter(vertices))
 
 
 def _with_third_axis(path: str | Path, vertices: Vertices) -> Vertices:
@@ -144,20 +130,6 @@ def _scaled_logit(logit: np.ndarray, factor: np.ndarray) -> np.ndarray:
     """Return the logit of an opacity multiplied by a factor."""
     opacity = factor / (1 + np.exp(-logit))
     return np.log(opacity) - np.log1p(-opacity)
-
-
-def _matching(names: Iterable[str], pattern: re.Pattern[str]) -> list[str]:
-    return [name for name in names if pattern.fullmatch(name)]
-
-
-def _name_unread(path: Path, names: Iterable[str]) -> None:
-    """Name what may change the image and is not read, once for the files of a folder."""
-    unread = [name for name in names if not (_READ.fullmatch(name) or _HARMLESS.fullmatch(name))]
-    networks = [network.name for network in path.parent.glob("deformation*.pth")]
-    evidence = _listed([*unread, *networks])
-    if evidence and (path.parent, evidence) not in _named:
-        _named.add((path.parent, evidence))
-        _log.warning("%s: it is drawn without %s, which may change the image.", path, evidence)
 
 
 def _listed(names: Iterable[str]) -> str:

@@ -58,40 +58,27 @@ def read_splats(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
             f"{path}: expected a file with Gaussians, found none; check the path."
         )
     refuse_foreign(path)
-    suffix = _suffix(path)
-    if suffix == ".splat":
-        return _read_splat(Path(path), most_invalid)
-    is_compressed = suffix == ".compressed.ply" or _is_compressed(Path(path))
-    return (read_compressed_ply if is_compressed else read_ply)(path, most_invalid)
-
-
-def _suffix(path: str | Path) -> str:
     suffix = suffix_of(path)
     if suffix is None:
         raise ValueError(
             f"{path}: expected a file whose name ends in {', '.join(SUFFIXES)}, got "
             f"{Path(path).suffix!r}; convert it."
         )
-    return suffix
+    if suffix == ".splat":
+        return _read_splat(Path(path), most_invalid)
+    with Path(path).open("rb") as file:
+        header = file.read(4096).partition(b"end_header")[0]
+    is_compressed = suffix == ".compressed.ply" or b"packed_position" in header
+    return (read_compressed_ply if is_compressed else read_ply)(path, most_invalid)
 
 
-def _is_compressed(path: Path) -> bool:
-    with path.open("rb") as file:
-        return b"packed_position" in file.read(4096).partition(b"end_header")[0]
-
-
-def _check_multiple(path: Path) -> None:
-    """Check that a `.splat` file has whole records."""
+def _read_splat(path: Path, most_invalid: float) -> Gaussians:
     size = path.stat().st_size
     if size % _RECORD.itemsize:
         raise ValueError(
             f"{path}: expected {_RECORD.itemsize} bytes for each Gaussian, got {size} bytes, "
             "which is no multiple; the file is truncated or no .splat, export it again."
         )
-
-
-def _read_splat(path: Path, most_invalid: float) -> Gaussians:
-    _check_multiple(path)
     records = np.fromfile(path, _RECORD)
     scales = np.where(records["scales"] >= 0, records["scales"], np.nan)
     quats = (records["quats"] - 128.0) / 128
