@@ -276,11 +276,14 @@ def _best_match(
     """Return the match of `clips`, photos or frame folders with the most cameras; see
     `match_clips`.
     """
+    parts = [PurePosixPath(camera.name.replace("\\", "/")).parts[:-1] for camera in cameras]
+    folders = map(clips.get, {folder for place in parts for folder in place})
+    in_folders = any(isinstance(clip, Path) and clip.is_dir() for clip in folders)
     matches = []
     errors = []
     attempts: Sequence[tuple[Callable[[Path], Mapping[str, Clip]], bool]] = (
         (lambda _: clips, True),
-        (lambda _: {} if _in_folders(clips, cameras) else clips, False),
+        (lambda _: {} if in_folders else clips, False),
         (photos, False),
         (clips_by_frame, False),
         (clips_by_rig, True),
@@ -307,16 +310,6 @@ def _best_match(
     if any(isinstance(clip, tuple) and len(clip) > 1 for clip in best.clips.values()):
         check_frames(path, cast(Mapping[str, tuple[Path, ...]], best.clips))
     return best
-
-
-def _in_folders(clips: Mapping[str, Clip], cameras: Sequence[Camera]) -> bool:
-    """Return whether an image of the cameras is named as one in a folder of `clips`."""
-    names = {
-        part
-        for camera in cameras
-        for part in PurePosixPath(camera.name.replace("\\", "/")).parts[:-1]
-    }
-    return any(isinstance(clip, Path) and clip.is_dir() for clip in map(clips.get, names))
 
 
 def _matched(

@@ -229,42 +229,31 @@ class ImageSizes:
         Raises:
             ValueError: the file or the clip cannot be read.
         """
-        clip = self._file(self._folder / image.replace("\\", "/")) or self._clip(image)
+        clip: Clip | None = self._folder / image.replace("\\", "/")
+        if not clip.is_file():
+            folder = clip.parent
+            if folder not in self._files:
+                images = images_in(folder) if folder.is_dir() else ()
+                self._files[folder] = {file.stem: file for file in images}
+            clip = self._files[folder].get(clip.name)
         if clip is None:
-            return None
+            name = view_of_image(self._clips, image, by_folder=True)
+            if name is None:
+                return None
+            clip = self._clips[name]
         if clip not in self._sizes:
             self._sizes[clip] = _clip_size(clip)
         return self._sizes[clip]
 
-    def _file(self, image: Path) -> Path | None:
-        if image.is_file():
-            return image
-        folder = image.parent
-        if folder not in self._files:
-            images = images_in(folder) if folder.is_dir() else ()
-            self._files[folder] = {file.stem: file for file in images}
-        return self._files[folder].get(image.name)
-
-    def _clip(self, image: str) -> Clip | None:
-        name = view_of_image(self._clips, image, by_folder=True)
-        return None if name is None else self._clips[name]
-
 
 def _clip_size(clip: Clip) -> tuple[int, int]:
-    """Return the width and height of a clip or an image."""
-    if isinstance(clip, Path) and _is_image(clip):
-        if all(size := _header_size(clip)):
+    """Return the width and height of a clip or an image, by its header if it shows them."""
+    if isinstance(clip, Path) and clip.suffix.lower() in (*IMAGE_SUFFIXES, EXR_SUFFIX):
+        if clip.stat().st_size and all(size := image_size(np.memmap(clip, np.uint8, "r"))):
             return size
         clip = (clip,)
     reader = open_frames(clip)
     return reader.width, reader.height
-
-
-def _header_size(image: Path) -> tuple[int, int]:
-    """Return the width and height of an image by its header, 0 if it does not show them."""
-    if not image.stat().st_size:
-        return 0, 0
-    return image_size(np.memmap(image, np.uint8, "r"))
 
 
 def _folders(folder: Path) -> dict[str, Path]:
@@ -273,7 +262,7 @@ def _folders(folder: Path) -> dict[str, Path]:
 
 
 def _videos(folder: Path) -> dict[str, Path]:
-    return _by_stem(filter(_is_video, listed(folder)))
+    return _by_stem(f for f in listed(folder) if f.is_file() and f.suffix.lower() in VIDEO_SUFFIXES)
 
 
 def _by_stem(files: Iterable[Path]) -> dict[str, Path]:
@@ -298,19 +287,14 @@ def _merged(path: Path, places: Iterable[Mapping[str, Path]]) -> dict[str, Path]
     """
     result: dict[str, Path] = {}
     for clips in places:
-        _warn_repeats(path, result, clips)
+        if repeats := [name for name in clips if name in result]:
+            first, last = (paths[repeats[0]].relative_to(path) for paths in (result, clips))
+            _LOG.warning(
+                "%s: %s have two clips, such as %s and %s: the latter is used.",
+                *(path, ", ".join(repeats), first, last),
+            )
         result |= clips
     return result
-
-
-def _warn_repeats(path: Path, clips: Mapping[str, Path], later: Mapping[str, Path]) -> None:
-    """Warn if cameras have a clip among both."""
-    if repeats := [name for name in later if name in clips]:
-        first, last = (paths[repeats[0]].relative_to(path) for paths in (clips, later))
-        _LOG.warning(
-            "%s: %s have two clips, such as %s and %s: the latter is used.",
-            *(path, ", ".join(repeats), first, last),
-        )
 
 
 def _image_folder(folder: Path) -> Path | None:
@@ -321,11 +305,3 @@ def _image_folder(folder: Path) -> Path | None:
         if place.is_dir() and images_in(place):
             return place
     return None
-
-
-def _is_image(file: Path) -> bool:
-    return file.suffix.lower() in (*IMAGE_SUFFIXES, EXR_SUFFIX)
-
-
-def _is_video(file: Path) -> bool:
-    return file.is_file() and file.suffix.lower() in VIDEO_SUFFIXES

@@ -83,16 +83,11 @@ def _models(folder: Path) -> list[Path]:
             return [place]
         if inner:
             return _largest_first(inner)
-    return [folder] if _is_model(folder) else []
-
-
-def _is_model(folder: Path) -> bool:
-    """Return whether a capture folder has both files: a single name may have another meaning
-    there.
-    """
-    return any(
+    # In a capture itself, a single name may have another meaning.
+    is_model = any(
         all((folder / f"{name}.{kind}").exists() for name in _FILES) for kind in ("bin", "txt")
     )
+    return [folder] if is_model else []
 
 
 def _largest_first(models: Sequence[Path]) -> list[Path]:
@@ -214,26 +209,24 @@ def write_colmap(
     points = np.zeros((0, 3)) if points is None else np.asarray(points, np.float64)
     colors = np.full(points.shape, 0.5) if point_colors is None else np.asarray(point_colors)
     colors = np.rint(np.clip(colors, 0, 1) * 255).astype(int)
-    views = list(enumerate(zip(cameras, lenses, strict=True), start=1))
-    texts = {
-        "images": [
-            "# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and a line of points\n",
-            *(_image_lines(i, camera) for i, (camera, _) in views),
-        ],
-        "points3D": [
-            "# POINT3D_ID X Y Z R G B ERROR TRACK[]\n",
-            # The error of a point is not known, and its track is empty.
-            *(
-                _line(i, *xyz.tolist(), *rgb.tolist(), 0.0)
-                for i, (xyz, rgb) in enumerate(zip(points, colors, strict=True), start=1)
-            ),
-        ],
-        # The last one that is renamed, because readers look for it.
-        "cameras": [
-            "# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n",
-            *(_camera_line(i, camera, lens) for i, (camera, lens) in views),
-        ],
-    }
+    image_lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, and a line of points\n"]
+    camera_lines = ["# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]\n"]
+    for i, (camera, lens) in enumerate(zip(cameras, lenses, strict=True), start=1):
+        viewmat = np.asarray(camera.viewmat, np.float64)
+        x, y, z, w = Rotation.from_matrix(viewmat[:3, :3]).as_quat(canonical=True).tolist()
+        name = camera.name if Path(camera.name).suffix else f"{camera.name}.png"
+        image_lines.append(_line(i, w, x, y, z, *viewmat[:3, 3].tolist(), i, name))
+        image_lines.append("\n")  # no points
+        one_focal = lens.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+        focals = np.diag(camera.K)[: 1 if one_focal else 2].tolist()
+        params = (*focals, *camera.K[:2, 2].tolist(), *lens.distortion)
+        camera_lines.append(_line(i, lens.model, camera.width, camera.height, *params))
+    point_lines = ["# POINT3D_ID X Y Z R G B ERROR TRACK[]\n"]
+    for i, (xyz, rgb) in enumerate(zip(points, colors, strict=True), start=1):
+        # The error of a point is not known, and its track is empty.
+        point_lines.append(_line(i, *xyz.tolist(), *rgb.tolist(), 0.0))
+    # The cameras are the last file that is renamed, because readers look for it.
+    texts = {"images": image_lines, "points3D": point_lines, "cameras": camera_lines}
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=".partial-", dir=folder) as partial:
@@ -251,56 +244,32 @@ def _line(*fields: object) -> str:
     return " ".join(map(str, fields)) + "\n"
 
 
-def _camera_line(index: int, camera: Camera, lens: Lens) -> str:
-    one_focal = lens.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
-    focals = np.diag(camera.K)[: 1 if one_focal else 2].tolist()
-    center = camera.K[:2, 2].tolist()
-    return _line(index, lens.model, camera.width, camera.height, *focals, *center, *lens.distortion)
-
-
-def _image_lines(index: int, camera: Camera) -> str:
-    """Return the two lines of an image, whose second one has no points."""
-    viewmat = np.asarray(camera.viewmat, np.float64)
-    x, y, z, w = Rotation.from_matrix(viewmat[:3, :3]).as_quat(canonical=True).tolist()
-    name = camera.name if Path(camera.name).suffix else f"{camera.name}.png"
-    return _line(index, w, x, y, z, *viewmat[:3, 3].tolist(), index, name) + "\n"
-
-
 def _viewmat(pose: Sequence[float]) -> np.ndarray:
     """Return the world-to-camera matrix [4, 4] of a wxyz quaternion and a translation."""
     if not np.isfinite(pose).all():
         raise ValueError(f"the pose must be finite, got {[*pose]}; export the model again.")
     quat = np.array(pose[:4])
-    _check_unit(quat)
+    # COLMAP writes quaternions of length 1.
+    if not abs(np.linalg.norm(quat) - 1) <= 1e-2:
+        raise ValueError(
+            f"its quaternion must have length 1, got {quat.tolist()}; check the order of the "
+            "columns."
+        )
     viewmat = np.eye(4)
     viewmat[:3, :3] = Rotation.from_quat(quat[[1, 2, 3, 0]]).as_matrix()
     viewmat[:3, 3] = pose[4:]
     return viewmat
 
 
-def _check_unit(quat: np.ndarray) -> None:
-    """Check that a quaternion has length 1, as COLMAP writes them."""
-    if not abs(np.linalg.norm(quat) - 1) <= 1e-2:
-        raise ValueError(
-            f"its quaternion must have length 1, got {quat.tolist()}; check the order of the "
-            "columns."
-        )
-
-
-def _warn_several(folder: Path, others: Sequence[Path]) -> None:
-    """Warn that a capture has other models than the one that is used."""
-    counts = ", ".join(f"{model.name} has {count_images(model)}" for model in others)
-    _LOG.warning(
-        "%s: the largest of %d models, %s with %d images, is used; %s.",
-        *(folder.parent, 1 + len(others), folder.name, count_images(folder), counts),
-    )
-
-
 def _read_calibration(path: Path) -> Calibration:
     clips = required_clips(path)
     folder, *others = _models(path)
     if others:
-        _warn_several(folder, others)
+        counts = ", ".join(f"{model.name} has {count_images(model)}" for model in others)
+        _LOG.warning(
+            "%s: the largest of %d models, %s with %d images, is used; %s.",
+            *(folder.parent, 1 + len(others), folder.name, count_images(folder), counts),
+        )
     model = read_colmap(folder)
     match = match_clips(path, folder, clips, model.cameras, model.lenses)
     return replace(match.calibration, points=model.points, point_colors=model.point_colors)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -31,15 +31,11 @@ def count_images(folder: Path) -> int:
     """Return the number of images in the COLMAP model in `folder`; 0 if it cannot be read."""
     with suppress(OSError, ValueError):
         if (folder / "cameras.bin").exists():
-            return _count_binary_images(folder / "images.bin")
+            file = _Bytes(folder / "images.bin")
+            (count,) = file.take("Q")
+            return min(count, len(file.data) // _IMAGE_BYTES)
         return sum(1 for _ in text_images(folder / "images.txt"))
     return 0
-
-
-def _count_binary_images(path: Path) -> int:
-    file = _Bytes(path)
-    (count,) = file.take("Q")
-    return min(count, len(file.data) // _IMAGE_BYTES)
 
 
 # ---- text
@@ -66,15 +62,11 @@ def text_cameras(path: Path) -> Iterator[tuple[int, str, int, int, list[float]]]
     for number, line in _lines(path):
         if fields := line.split(maxsplit=_MAX_CAMERA_FIELDS):
             try:
-                camera = _text_camera(fields)
+                camera_id, width, height = (int(fields[k]) for k in (0, 2, 3))
+                params = [float(f) for f in fields[4:]]
             except (ValueError, IndexError):
                 raise _broken(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", line) from None
-            yield camera
-
-
-def _text_camera(fields: Sequence[str]) -> tuple[int, str, int, int, list[float]]:
-    camera_id, width, height = (int(fields[k]) for k in (0, 2, 3))
-    return camera_id, fields[1], width, height, [float(f) for f in fields[4:]]
+            yield camera_id, fields[1], width, height, params
 
 
 def text_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
@@ -83,47 +75,31 @@ def text_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
         if not line.strip():
             continue
         try:
-            image = _text_image(line)
+            fields = line.split(maxsplit=9)
+            camera_id = int(fields[8])
+            pose = [float(f) for f in fields[1:8]]
+            name = _BEFORE_NAME.sub("", line, count=1).rstrip() if fields[9] else ""
         except (ValueError, IndexError):
             raise _broken(
                 path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line
             ) from None
         number, line = next(lines, (number, ""))
-        if _count_words(line) % 3:
+        # line.split() would take many times the memory of a line of thousands of points.
+        visible = np.frombuffer(f" {line}".encode(), np.uint8) > 32
+        if np.count_nonzero(visible[1:] & ~visible[:-1]) % 3:
             raise _broken(path, number, "POINTS2D[] as (X, Y, POINT3D_ID), or a blank line", line)
-        yield image
-
-
-def _text_image(line: str) -> tuple[str, int, list[float]]:
-    fields = line.split(maxsplit=9)
-    camera_id = int(fields[8])
-    pose = [float(f) for f in fields[1:8]]
-    return _BEFORE_NAME.sub("", line, count=1).rstrip() if fields[9] else "", camera_id, pose
-
-
-def _count_words(line: str) -> int:
-    """Return the length of `line.split()`, which would take many times the memory of a line of
-    thousands of points.
-    """
-    visible = np.frombuffer(f" {line}".encode(), np.uint8) > 32
-    return int(np.count_nonzero(visible[1:] & ~visible[:-1]))
+        yield name, camera_id, pose
 
 
 def text_points(path: Path) -> Iterator[list[float]]:
     for number, line in _lines(path):
         if fields := line.split(maxsplit=8):
             try:
-                point = _text_point(fields)
+                xyz_rgb = [float(f) for f in fields[1:7]]
+                float(fields[7])  # the error, which must be a number
             except (ValueError, IndexError):
                 raise _broken(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK[]", line) from None
-            yield point
-
-
-def _text_point(fields: Sequence[str]) -> list[float]:
-    """Return the position and the colour of a point; its error is checked to be a number."""
-    xyz_rgb = [float(f) for f in fields[1:7]]
-    float(fields[7])
-    return xyz_rgb
+            yield xyz_rgb
 
 
 # ---- binary

@@ -6,6 +6,7 @@ A layout is a module that exposes a `LAYOUT`. A module outside of this package a
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 from morgs_mi.capture.layouts import colmap, nerfstudio, poses_bounds
@@ -34,9 +35,15 @@ def find_layout(path: Path) -> Layout:
     if layout := next((layout for layout in LAYOUTS if layout.find(path)), None):
         return layout
     if (path / STREAM).is_file():
+        description = None
+        with suppress(OSError, ValueError):
+            description = read_json(path / CAPTURE)
+        capture = description.get("capture") if isinstance(description, dict) else None
+        is_named = isinstance(capture, str)
+        advice = f", and `morgs-mi info {capture}` describes its capture" if is_named else ""
         raise FileNotFoundError(
             f"{path}: expected a capture, found a fit; `morgs-mi eval {path}` scores it, "
-            f"`morgs-mi view {path}` shows it{_fitted_capture(path)}."
+            f"`morgs-mi view {path}` shows it{advice}."
         )
     clips = required_clips(path)  # without clips the path itself is likely wrong
     static = all(isinstance(clip, tuple) for clip in clips.values())
@@ -47,18 +54,6 @@ def find_layout(path: Path) -> Layout:
     raise FileNotFoundError(
         f"{path}: expected a calibration ({', '.join(files)} or {last}), found none; run "
         f"`morgs-mi calibrate` on the folder.{recording if static else ''}"
-    )
-
-
-def _fitted_capture(path: Path) -> str:
-    """Return advice on the capture of a fit in the folder `path`; empty if it names none."""
-    try:
-        description = read_json(path / CAPTURE)
-    except (OSError, ValueError):
-        description = {}
-    capture = description.get("capture") if isinstance(description, dict) else None
-    return (
-        f", and `morgs-mi info {capture}` describes its capture" if isinstance(capture, str) else ""
     )
 
 

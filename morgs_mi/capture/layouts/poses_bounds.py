@@ -39,19 +39,15 @@ def read_poses_bounds(
     """
     path = Path(path)
     rows = _rows(path)
-    _check_one_per_name(path, rows, names)
-    cameras = tuple(
-        _camera(path, i, row, name) for i, (row, name) in enumerate(zip(rows, names, strict=True))
-    )
-    return cameras, rows[:, 15:].astype(np.float64)
-
-
-def _check_one_per_name(path: Path, rows: np.ndarray, names: Sequence[str]) -> None:
     if len(rows) != len(names):
         raise ValueError(
             f"{path}: expected one row per camera, got {len(rows)} rows for {len(names)} videos "
             f"({', '.join(names)}); remove the rows of missing videos."
         )
+    cameras = tuple(
+        _camera(path, i, row, name) for i, (row, name) in enumerate(zip(rows, names, strict=True))
+    )
+    return cameras, rows[:, 15:].astype(np.float64)
 
 
 def count_rows(path: Path) -> int:
@@ -74,20 +70,16 @@ def _camera(path: Path, index: int, row: np.ndarray, name: str) -> Camera:
     if not np.isfinite(row).all():
         raise ValueError(f"{where}: the pose must be finite, got {row.tolist()}; calibrate again.")
     pose = row[:15].reshape(3, 5).astype(np.float64)
-    viewmat = _viewmat(f"{where}, columns in the order down, right, back", pose)
-    height, width, focal = pose[:, 4]
+    down, right, back, centre, (height, width, focal) = pose.T
+    R = np.stack([right, down, -back])
+    viewmat = rigid(
+        f"{where}, columns in the order down, right, back", np.column_stack([R, -R @ centre])
+    )
     K = np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]])
     try:
         return Camera(K, viewmat, round(width), round(height), name)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from None
-
-
-def _viewmat(where: str, pose: np.ndarray) -> np.ndarray:
-    """Return the world-to-camera matrix [4, 4] of a row's pose [3, 5]."""
-    down, right, back, centre, _ = pose.T
-    R = np.stack([right, down, -back])
-    return rigid(where, np.column_stack([R, -R @ centre]))
 
 
 def write_poses_bounds(path: str | Path, cameras: Sequence[Camera], bounds: np.ndarray) -> None:
@@ -104,36 +96,25 @@ def write_poses_bounds(path: str | Path, cameras: Sequence[Camera], bounds: np.n
             f"write_poses_bounds(): `bounds` must be [C, 2] with C={len(cameras)}, got "
             f"{bounds.shape}."
         )
-    rows = [
-        [*_pose_row(camera), *near_far] for camera, near_far in zip(cameras, bounds, strict=True)
-    ]
+    rows = []
+    for camera, near_far in zip(cameras, bounds, strict=True):
+        K = camera.K
+        middle = np.array([camera.width, camera.height]) / 2
+        one_focal = np.allclose(K[0, 0], K[1, 1], rtol=1e-6)
+        if not one_focal or not np.allclose(K[:2, 2], middle, atol=1e-3):
+            raise ValueError(
+                f"write_poses_bounds(): camera {camera.name!r} must have one focal length and a "
+                f"centred principal point, got K={K.tolist()}; use write_colmap()."
+            )
+        right, down, forward = np.asarray(camera.viewmat, dtype=np.float64)[:3, :3]
+        hwf = [camera.height, camera.width, K[0, 0]]
+        pose = np.stack([down, right, -forward, camera.position, hwf], axis=1)
+        rows.append([*pose.ravel(), *near_far])
     # np.save() into a file does not report that the disk has no room for the last few kB.
     data = BytesIO()
     np.save(data, np.array(rows))
     with atomic_path(path, "write_poses_bounds()") as partial:
         partial.write_bytes(data.getvalue())
-
-
-def _pose_row(camera: Camera) -> np.ndarray:
-    """Return the pose and the intrinsics of a camera as in a row of the file [15].
-
-    Raises:
-        ValueError: the camera has two focal lengths or an off-centre principal point.
-    """
-    _check_intrinsics(camera)
-    right, down, forward = np.asarray(camera.viewmat, dtype=np.float64)[:3, :3]
-    hwf = [camera.height, camera.width, camera.K[0, 0]]
-    return np.stack([down, right, -forward, camera.position, hwf], axis=1).ravel()
-
-
-def _check_intrinsics(camera: Camera) -> None:
-    K = camera.K
-    middle = np.array([camera.width, camera.height]) / 2
-    if not np.allclose(K[0, 0], K[1, 1], rtol=1e-6) or not np.allclose(K[:2, 2], middle, atol=1e-3):
-        raise ValueError(
-            f"write_poses_bounds(): camera {camera.name!r} must have one focal length and a "
-            f"centred principal point, got K={K.tolist()}; use write_colmap()."
-        )
 
 
 def _read_calibration(path: Path) -> Calibration:
