@@ -11,7 +11,7 @@ the images.
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -124,60 +124,39 @@ def read_transforms(path: Path, clips: Mapping[str, Clip] | None = None) -> Tran
             the camera model is not supported.
     """
     meta = read_json(path)
-    frames = _frames(path, meta)
-    sizes = ImageSizes(path.parent, clips or {})
-    cameras = []
-    lenses = []
-    masks = []
-    for index, frame in enumerate(frames):
-        name = _image_name(f"{path}, frame {index}", frame)
-        where = f"{path}, frame {index} ({name})"
-        values = meta | frame
-        if not {"w", "h"} <= values.keys():
-            values |= _size(sizes, name, frames)
-        cameras.append(_camera(where, values, name))
-        lenses.append(_lens(where, values))
-        masks.append(_file(path, where, values, "mask_path"))
-    points = _file(path, str(path), meta, "ply_file_path")
-    warn_unread(path, _unread(meta, frames, lenses))
-    return Transforms(cameras, lenses, masks, points, _splits(path, meta))
-
-
-def _frames(path: Path, meta: Any) -> list[dict[str, Any]]:
     frames = meta.get("frames") if isinstance(meta, dict) else None
     if not frames or not _is_list(frames, dict):
         raise ValueError(
             f"{path}: expected an object with a list of `frames`, got none; export it again."
         )
-    return frames
-
-
-def _is_list(value: Any, kind: type) -> bool:
-    return isinstance(value, list) and all(isinstance(entry, kind) for entry in value)
-
-
-def _image_name(where: str, frame: Mapping[str, Any]) -> str:
-    name = frame.get("file_path")
-    if not isinstance(name, str) or not name:
-        raise ValueError(f"{where}: `file_path` must name a file, got {name!r}; export it again.")
-    return name
-
-
-def _unread(
-    meta: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], lenses: Sequence[Lens]
-) -> set[str]:
-    """Return the keys that are not read but may matter."""
+    sizes = ImageSizes(path.parent, clips or {})
+    cameras = []
+    lenses = []
+    masks = []
+    for index, frame in enumerate(frames):
+        name = frame.get("file_path")
+        if not isinstance(name, str) or not name:
+            raise ValueError(
+                f"{path}, frame {index}: `file_path` must name a file, got {name!r}; export it "
+                "again."
+            )
+        where = f"{path}, frame {index} ({name})"
+        values = meta | frame
+        if not {"w", "h"} <= values.keys():
+            # Of another image if it is missing: its camera is left out later.
+            names = [name, *(str(other.get("file_path")) for other in frames)]
+            size = next(filter(None, map(sizes.of, names)), ())
+            values |= zip(("w", "h"), size, strict=False)
+        cameras.append(_camera(where, values, name))
+        lenses.append(_lens(where, values))
+        masks.append(_file(path, where, values, "mask_path"))
+    points = _file(path, str(path), meta, "ply_file_path")
     unread = {key for values in (meta, *frames) for key in values} - _KEYS - _HARMLESS
     for frame, lens in zip(frames, lenses, strict=True):
         if lens.model == "OPENCV_FISHEYE":  # it has k1 to k4 alone
-            unread |= {
-                f"{key} of a fisheye" for key in ("p1", "p2") if frame.get(key, meta.get(key))
-            }
-    return unread
-
-
-def _splits(path: Path, meta: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Return the names of images by split."""
+            values = meta | frame
+            unread |= {f"{key} of a fisheye" for key in ("p1", "p2") if values.get(key)}
+    warn_unread(path, unread)
     splits = {split: meta[split] for split in _SPLITS if meta.get(split) is not None}
     for split, names in splits.items():
         if not _is_list(names, str):
@@ -185,16 +164,11 @@ def _splits(path: Path, meta: Mapping[str, Any]) -> dict[str, list[str]]:
                 f"{path}: `{split}` must be a list of names of images, got another value; correct "
                 "it."
             )
-    return splits
+    return Transforms(cameras, lenses, masks, points, splits)
 
 
-def _size(sizes: ImageSizes, name: str, frames: Sequence[Mapping[str, Any]]) -> dict[str, int]:
-    """Return `w` and `h` of an image, or another image's if it is missing: its camera is left out
-    later.
-    """
-    names = [name, *(str(frame.get("file_path")) for frame in frames)]
-    size = next(filter(None, map(sizes.of, names)), ())
-    return dict(zip(("w", "h"), size, strict=False))
+def _is_list(value: Any, kind: type) -> bool:
+    return isinstance(value, list) and all(isinstance(entry, kind) for entry in value)
 
 
 def _file(path: Path, where: str, values: Mapping[str, Any], key: str) -> Path | None:
@@ -215,20 +189,15 @@ def _camera(where: str, values: Mapping[str, Any], name: str) -> Camera:
     cx = _number(where, values, "cx", width / 2)
     cy = _number(where, values, "cy", height / 2)
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    viewmat = _viewmat(where, values)
-    try:
-        return Camera(K, viewmat, round(width), round(height), name)
-    except ValueError as error:
-        raise ValueError(f"{where}: {error}") from None
-
-
-def _viewmat(where: str, values: Mapping[str, Any]) -> np.ndarray:
-    """Return the world-to-camera matrix [4, 4]."""
     try:
         matrix = np.array(values.get("transform_matrix"), dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
-    return np.linalg.inv(rigid(where, matrix) @ _OPENGL_FROM_OPENCV)
+    viewmat = np.linalg.inv(rigid(where, matrix) @ _OPENGL_FROM_OPENCV)
+    try:
+        return Camera(K, viewmat, round(width), round(height), name)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
 
 
 def _focal_length(
@@ -247,13 +216,13 @@ def _focal_length(
 def _lens(where: str, values: Mapping[str, Any]) -> Lens:
     model = values.get("camera_model", "OPENCV")
     k1, k2, k3, k4, p1, p2 = (_number(where, values, key, 0.0) for key in _DISTORTION)
-    if _is_fisheye(where, values) or model == "OPENCV_FISHEYE":
+    fisheye = values.get("is_fisheye", False)
+    if fisheye not in (True, False):
+        raise ValueError(
+            f"{where}: `is_fisheye` must be true or false, got {repr(fisheye)[:80]}; correct it."
+        )
+    if fisheye or model == "OPENCV_FISHEYE":
         return Lens("OPENCV_FISHEYE", (k1, k2, k3, k4))
-    _check_perspective(where, model, k4)
-    return opencv_lens((k1, k2, p1, p2, k3))
-
-
-def _check_perspective(where: str, model: Any, k4: float) -> None:
     if model not in _PERSPECTIVE:
         raise ValueError(
             f"{where}: `camera_model` must be OPENCV_FISHEYE or one of {', '.join(_PERSPECTIVE)}, "
@@ -266,30 +235,18 @@ def _check_perspective(where: str, model: Any, k4: float) -> None:
             f"{where}: `k4` must be 0 in a perspective camera, got {k4}; undistort the images "
             "first."
         )
-
-
-def _is_fisheye(where: str, values: Mapping[str, Any]) -> bool:
-    fisheye = values.get("is_fisheye", False)
-    if fisheye not in (True, False):
-        raise ValueError(
-            f"{where}: `is_fisheye` must be true or false, got {repr(fisheye)[:80]}; correct it."
-        )
-    return fisheye
+    return opencv_lens((k1, k2, p1, p2, k3))
 
 
 def _number(where: str, values: Mapping[str, Any], key: str, default: float | None = None) -> float:
     value = values.get(key, default)
     if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) <= LARGEST:
-        raise _number_error(where, key, value)
+        got = "none" if value is None else repr(value)[:80]
+        raise ValueError(
+            f"{where}: `{key}` must be a finite number of at most {LARGEST:g}, here or at the top "
+            f"of the file, got {got}."
+        )
     return float(value)
-
-
-def _number_error(where: str, key: str, value: Any) -> ValueError:
-    got = "none" if value is None else repr(value)[:80]
-    return ValueError(
-        f"{where}: `{key}` must be a finite number of at most {LARGEST:g}, here or at the top "
-        f"of the file, got {got}."
-    )
 
 
 def read_points_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -305,32 +262,22 @@ def read_points_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
             f"{path}: expected the points' PLY file, found none; copy it or drop `ply_file_path`."
         )
     vertices = read_vertices(path)
-    points = _positions(path, vertices)
-    if not bounded(points):
-        raise ValueError(
-            f"{path}: the points must be finite and at most {LARGEST:g}, got others; export them "
-            "again."
-        )
-    return points, _colors(vertices)
-
-
-def _colors(vertices: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the colours of vertices [P, 3] in [0, 1], grey if they have none."""
-    if not {"red", "green", "blue"} <= vertices.keys():
-        return np.full((len(vertices["x"]), 3), 0.5, np.float32)
-    colors = np.stack([vertices[band] for band in ("red", "green", "blue")], axis=1)
-    scale = 255 if colors.dtype.kind in "iu" else 1
-    return colors.astype(np.float32) / np.float32(scale)
-
-
-def _positions(path: Path, vertices: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the positions of vertices [P, 3]."""
     if missing := set("xyz") - vertices.keys():
         raise ValueError(
             f"{path}: expected a PLY file with vertices x, y, z, got vertices without "
             f"{', '.join(sorted(missing))}; export it again."
         )
-    return np.stack([vertices[axis] for axis in "xyz"], axis=1)
+    points = np.stack([vertices[axis] for axis in "xyz"], axis=1)
+    if not bounded(points):
+        raise ValueError(
+            f"{path}: the points must be finite and at most {LARGEST:g}, got others; export them "
+            "again."
+        )
+    if not {"red", "green", "blue"} <= vertices.keys():
+        return points, np.full(points.shape, 0.5, np.float32)
+    colors = np.stack([vertices[band] for band in ("red", "green", "blue")], axis=1)
+    scale = 255 if colors.dtype.kind in "iu" else 1
+    return points, colors.astype(np.float32) / np.float32(scale)
 
 
 def _read_calibration(path: Path) -> Calibration:
@@ -339,16 +286,15 @@ def _read_calibration(path: Path) -> Calibration:
     content = read_transforms(source, clips)
     points, colors = read_points_ply(content.points) if content.points else (NO_POINTS, NO_POINTS)
     match = match_clips(path, source, clips, content.cameras, content.lenses)
-    masks = tuple(_distinct(content.masks[index] for index in images) for images in match.images)
+    masks = tuple(
+        tuple(dict.fromkeys(file for index in images if (file := content.masks[index])))
+        for images in match.images
+    )
     masks = masks if any(masks) else match.calibration.masks
     calibration = replace(match.calibration, points=points, point_colors=colors, masks=masks)
     return (
         _split(path, source, calibration, content, match.images) if content.splits else calibration
     )
-
-
-def _distinct(files: Iterable[Path | None]) -> tuple[Path, ...]:
-    return tuple(dict.fromkeys(file for file in files if file))
 
 
 def _split(
@@ -367,7 +313,13 @@ def _split(
     Raises:
         ValueError: no camera is left for training.
     """
-    training, held_out = _split_images(source, content)
+    names = [camera.name for camera in content.cameras]
+    splits = {
+        split: _images_named(source, split, split_names, names)
+        for split, split_names in content.splits.items()
+    }
+    held_out = splits.get("val_filenames", set()) | splits.get("test_filenames", set())
+    training = splits.get("train_filenames", set(range(len(names))) - held_out)
     views = tuple(view for view, indices in enumerate(images) if training.isdisjoint(indices))
     if len(views) == len(images):
         raise ValueError(
@@ -380,25 +332,20 @@ def _split(
     return calibration.without(path, extras)
 
 
-def _split_images(source: Path, content: Transforms) -> tuple[set[int], set[int]]:
-    """Return the indices of the images for training and of the held-out ones."""
-    names = [camera.name for camera in content.cameras]
-    splits = {
-        split: _images_named(source, split, split_names, names)
-        for split, split_names in content.splits.items()
-    }
-    held_out = splits.get("val_filenames", set()) | splits.get("test_filenames", set())
-    return splits.get("train_filenames", set(range(len(names))) - held_out), held_out
-
-
 def _images_named(
     source: Path, split: str, split_names: Sequence[str], names: Sequence[str]
 ) -> set[int]:
     """Return the indices of the images `names` that a split names, in full or by the end of one
     path alone.
     """
-    ends = _indices_by_end(names)
-    if unknown := [name for name in split_names if _parts(name) not in ends]:
+    whole: dict[tuple[str, ...], set[int]] = {}
+    ends: dict[tuple[str, ...], set[int]] = {}
+    for index, parts in enumerate(map(_parts, names)):
+        whole.setdefault(parts, set()).add(index)
+        for start in range(1, len(parts)):
+            ends.setdefault(parts[start:], set()).add(index)
+    indices = {end: same for end, same in ends.items() if len(same) == 1} | whole
+    if unknown := [name for name in split_names if _parts(name) not in indices]:
         _LOG.warning(
             "%s: `%s` names %d images without a frame, such as %s.",
             source,
@@ -406,18 +353,7 @@ def _images_named(
             len(unknown),
             unknown[0],
         )
-    return set().union(*(ends.get(_parts(name), set()) for name in split_names))
-
-
-def _indices_by_end(names: Sequence[str]) -> dict[tuple[str, ...], set[int]]:
-    """Return the indices of images by their paths, and by the ends that one path alone has."""
-    whole: dict[tuple[str, ...], set[int]] = {}
-    ends: dict[tuple[str, ...], set[int]] = {}
-    for index, parts in enumerate(map(_parts, names)):
-        whole.setdefault(parts, set()).add(index)
-        for start in range(1, len(parts)):
-            ends.setdefault(parts[start:], set()).add(index)
-    return {parts: indices for parts, indices in ends.items() if len(indices) == 1} | whole
+    return set().union(*(indices.get(_parts(name), set()) for name in split_names))
 
 
 def _parts(name: str) -> tuple[str, ...]:
