@@ -120,14 +120,16 @@ def timeline(
     offsets = [config.offset.get(name, 0) for name in names]
     clips = list(map(_clip_times, readers, positions, clocks.rates.tolist(), offsets))
     if config.gaps:
-        clips = list(map(_without_far, readers, clips, positions))
+        # Images that are far from their instants are left out.
+        for c, clip in enumerate(clips):
+            far = np.abs(_image_positions(readers[c], clip, positions[c]) - positions[c]) > _NEAR
+            clips[c] = replace(clip, frame_indices=np.where(far, -1, clip.frame_indices))
     _warn_apart(path, readers, clips, positions, exact)
-    return Timeline(
-        tuple(clips),
-        clocks.fps,
-        _is_unchanged(clips, config),
-        (*numbers.notes, *_notes(readers, clips)),
+    unchanged = not any(config.offset.values()) and all(
+        np.array_equal(clip.frame_indices, np.arange(len(clip.frame_indices))) for clip in clips
     )
+    notes = [note for clip_notes in map(_notes, readers, clips) for note in clip_notes]
+    return Timeline(tuple(clips), clocks.fps, unchanged, (*numbers.notes, *notes))
 
 
 def _instants(
@@ -142,8 +144,17 @@ def _instants(
     if config.trim or config.offset:
         clocks = _without_drift(exact, readers, max_frames)
         return clocks, _common_instants(path, names, readers, config, clocks)[:max_frames]
-    instants = np.arange(_num_frames(path, readers, max_frames, config.gaps), dtype=float)
-    _check_rates(path, readers, exact, instants)
+    num_frames = _num_frames(path, readers, max_frames, config.gaps)
+    # Frames with the same index must be simultaneous.
+    drift = np.ptp(exact.rates) * (num_frames - 1)
+    if drift > _NEAR:
+        rates = ", ".join(f"{r.path.name} {r.fps:.6g}" for r in readers if r.fps)
+        raise ValueError(
+            f"{path}: all cameras must have the same frame rate, got {rates}; images of one index "
+            f"are up to {drift:.1f} frames apart; use the lowest rate with --trim, or set the "
+            "true one as `fps` in capture.json."
+        )
+    instants = np.arange(num_frames, dtype=float)
     return replace(exact, rates=np.ones(len(readers))), instants
 
 
@@ -172,19 +183,6 @@ def _image_positions(reader: FrameReader, clip: ClipTimes, positions: np.ndarray
     return clip.frame_indices - clip.delay
 
 
-def _without_far(reader: FrameReader, clip: ClipTimes, positions: np.ndarray) -> ClipTimes:
-    """Return the frames without those that are far from the instants at `positions` [T]."""
-    far = np.abs(_image_positions(reader, clip, positions) - positions) > _NEAR
-    return replace(clip, frame_indices=np.where(far, -1, clip.frame_indices))
-
-
-def _is_unchanged(clips: Sequence[ClipTimes], config: ReadConfig) -> bool:
-    """Return whether instant t is frame t of every clip."""
-    return not any(config.offset.values()) and all(
-        np.array_equal(clip.frame_indices, np.arange(len(clip.frame_indices))) for clip in clips
-    )
-
-
 def _warn_apart(
     path: Path,
     readers: Sequence[FrameReader],
@@ -198,17 +196,11 @@ def _warn_apart(
     places = np.array(list(map(_image_positions, readers, clips, positions)))
     times = (places - clocks.offsets[:, None]) / clocks.rates[:, None]
     has_frame = np.stack([clip.frame_indices >= 0 for clip in clips])
-    spread = _spread(np.where(has_frame, times, np.nan)) / clocks.fps
+    latest = np.where(has_frame, times, -np.inf).max(axis=0)
+    earliest = np.where(has_frame, times, np.inf).min(axis=0)
+    spread = float(np.max(latest - earliest, initial=0)) / clocks.fps
     if spread > 1e-3:
         _LOG.warning("%s: images of one instant are up to %.1f ms apart.", path, 1e3 * spread)
-
-
-def _spread(times: np.ndarray) -> float:
-    """Return the largest distance of the times [C, T] of one instant, of which NaN are left out."""
-    images = times[:, np.isfinite(times).any(0)]
-    if not images.size:
-        return 0.0
-    return float((np.nanmax(images, axis=0) - np.nanmin(images, axis=0)).max())
 
 
 @dataclass(frozen=True)
@@ -235,10 +227,13 @@ def _clocks(
     clip_fps = [fps or reader.fps for reader in readers]
     lowest = min((rate for rate in clip_fps if rate), default=fps or _DEFAULT_FPS)
     rates = np.array([(rate or lowest) / lowest for rate in clip_fps])
-    offsets = np.array(
-        [_position(r, config.offset.get(name, 0)) for name, r in zip(names, readers, strict=True)],
-        float,
-    )
+    offsets = np.array([config.offset.get(name, 0) for name in names], float)
+    for c, reader in enumerate(readers):
+        if reader.positions is not None:
+            # Of a frame before the first or after the last one, too.
+            index = round(config.offset.get(names[c], 0))
+            nearest = min(max(index, 0), len(reader.positions) - 1)
+            offsets[c] = round(reader.positions[nearest]) + index - nearest
     fps = lowest / numbers.interval
     return _Clocks(offsets + numbers.offsets * rates, rates * numbers.rates, fps)
 
@@ -272,27 +267,13 @@ def _common_instants(
     first = np.ceil(np.max(-clocks.offsets / clocks.rates))
     last = np.floor(np.min((lengths - 1 - clocks.offsets) / clocks.rates))
     if last < first:
-        table = _spans(names, lengths, clocks)
+        per_second = clocks.rates * clocks.fps
+        starts = (0 - clocks.offsets) / per_second
+        stops = (lengths - clocks.offsets) / per_second
+        spans = zip(names, starts, stops, strict=True)
+        table = ", ".join(f"{name} {start:.2f} to {stop:.2f} s" for name, start, stop in spans)
         raise ValueError(f"{path}: the clips have no instant in common, {table}; check `offset`.")
     return np.arange(first, last + 1)
-
-
-def _spans(names: Sequence[str], lengths: np.ndarray, clocks: _Clocks) -> str:
-    """Return the times that the clips cover, for messages; `lengths` [C] in frames."""
-    per_second = clocks.rates * clocks.fps
-    starts = (0 - clocks.offsets) / per_second
-    stops = (lengths - clocks.offsets) / per_second
-    spans = zip(names, starts, stops, strict=True)
-    return ", ".join(f"{name} {start:.2f} to {stop:.2f} s" for name, start, stop in spans)
-
-
-def _position(reader: FrameReader, offset: float) -> float:
-    """Return the position of a frame of a clip, before its first or after its last one, too."""
-    if reader.positions is None:
-        return offset
-    index = round(offset)
-    nearest = min(max(index, 0), len(reader.positions) - 1)
-    return round(reader.positions[nearest]) + index - nearest
 
 
 def nearest_frames(reader: FrameReader, positions: np.ndarray) -> np.ndarray:
@@ -302,33 +283,20 @@ def nearest_frames(reader: FrameReader, positions: np.ndarray) -> np.ndarray:
     return np.searchsorted((reader.positions[1:] + reader.positions[:-1]) / 2, positions)
 
 
-def _notes(readers: Sequence[FrameReader], clips: Sequence[ClipTimes]) -> list[str]:
-    """Return a note on each clip of variable frame rate."""
-    return [
-        _note(reader, clip.frame_indices)
-        for reader, clip in zip(readers, clips, strict=True)
-        if reader.positions is not None
-    ]
-
-
-def _note(reader: FrameReader, indices: np.ndarray) -> str:
-    """Return a note on the irregular times of a clip and the frames that show its instants."""
+def _notes(reader: FrameReader, clip: ClipTimes) -> tuple[str, ...]:
+    """Return a note on a clip of variable frame rate."""
+    if reader.positions is None:
+        return ()
+    assert reader.fps
+    indices = clip.frame_indices
     frames = indices[indices >= 0]
     repeats = len(frames) - len(np.unique(frames))
-    missing = len(indices) - len(frames)
-    return (
-        f"{reader.path.name}: variable frame rate, {_irregular_times(reader)}; each instant has "
-        f"the frame nearest in time: {repeats} repeat one, {missing} have none."
-    )
-
-
-def _irregular_times(reader: FrameReader) -> str:
-    assert reader.positions is not None
-    assert reader.fps
     late = np.abs(reader.positions - np.rint(reader.positions)).max() / reader.fps
     return (
-        f"{len(reader.positions)} frames in {_periods(reader)} periods of "
-        f"{1e3 / reader.fps:.1f} ms, up to {1e3 * late:.1f} ms off"
+        f"{reader.path.name}: variable frame rate, {len(reader.positions)} frames in "
+        f"{_periods(reader)} periods of {1e3 / reader.fps:.1f} ms, up to {1e3 * late:.1f} ms off; "
+        f"each instant has the frame nearest in time: {repeats} repeat one, "
+        f"{len(indices) - len(frames)} have none.",
     )
 
 
@@ -366,22 +334,17 @@ def _check_even(reader: FrameReader, required: int) -> None:
     """Check that frame t of a clip shows instant t, for the first `required` frames."""
     if reader.positions is None:
         return
+    assert reader.fps
     positions = reader.positions[:required]
     late = positions - np.arange(len(positions))
-    if np.abs(late).max() > _NEAR:
-        raise _rate_error(reader, late)
-
-
-def _rate_error(reader: FrameReader, late: np.ndarray) -> ValueError:
-    """Return the error of a clip whose frames are late by `late` periods [T]."""
     frame = int(np.argmax(np.abs(late) > _NEAR))
-    assert reader.fps
-    return ValueError(
-        f"{reader.path}: expected a constant frame rate, got a variable one: frame {frame} is "
-        f"{1e3 * abs(late[frame]) / reader.fps:.0f} ms "
-        f"{'late' if late[frame] > 0 else 'early'}; use the frames nearest in time (--trim), "
-        "leave the camera out where it has none (--gaps), or convert the clip."
-    )
+    if abs(late[frame]) > _NEAR:
+        raise ValueError(
+            f"{reader.path}: expected a constant frame rate, got a variable one: frame {frame} is "
+            f"{1e3 * abs(late[frame]) / reader.fps:.0f} ms "
+            f"{'late' if late[frame] > 0 else 'early'}; use the frames nearest in time (--trim), "
+            "leave the camera out where it has none (--gaps), or convert the clip."
+        )
 
 
 def _num_frames(
@@ -398,12 +361,6 @@ def _num_frames(
     shortest = min(reader.num_frames for reader in readers)
     if max_frames is not None and max_frames <= shortest:
         return max_frames
-    _check_lengths(path, readers, shortest)
-    return shortest
-
-
-def _check_lengths(path: Path, readers: Sequence[FrameReader], shortest: int) -> None:
-    """Check that all clips have the length of the shortest one."""
     if any(reader.num_frames > shortest for reader in readers):
         table = ", ".join(f"{reader.path.name} {reader.num_frames}" for reader in readers)
         raise ValueError(
@@ -411,22 +368,7 @@ def _check_lengths(path: Path, readers: Sequence[FrameReader], shortest: int) ->
             f"frames with `max_frames={shortest}`, the instants that all clips cover with --trim, "
             "align the clips with --offset, or leave cameras out with --without."
         )
-
-
-def _check_rates(
-    path: Path, readers: Sequence[FrameReader], clocks: _Clocks, instants: np.ndarray
-) -> None:
-    """Check that frames with the same index are simultaneous, for `instants` of clips with equal
-    offsets.
-    """
-    drift = np.ptp(clocks.rates) * (len(instants) - 1)
-    if drift > _NEAR:
-        rates = ", ".join(f"{r.path.name} {r.fps:.6g}" for r in readers if r.fps)
-        raise ValueError(
-            f"{path}: all cameras must have the same frame rate, got {rates}; images of one index "
-            f"are up to {drift:.1f} frames apart; use the lowest rate with --trim, or set the "
-            "true one as `fps` in capture.json."
-        )
+    return shortest
 
 
 def read_settings(path: Path) -> dict[str, Any]:
@@ -441,35 +383,24 @@ def read_settings(path: Path) -> dict[str, Any]:
     """
     if not path.exists():
         return {}
-    settings = _json_object(path)
+    settings = read_json(path)
+    if not isinstance(settings, dict):
+        raise ValueError(
+            f"{path}: expected a JSON object, got {type(settings).__name__}; correct it."
+        )
     if "scene" not in settings:  # a synthetic capture describes itself
         warn_unread(path, settings.keys() - _SETTINGS)
     for name, interval in _INTERVALS.items():
         if (value := settings.get(name)) is not None:
             check_number(str(path), name, value, interval)
-    _check_readout(path, settings.get("readout", 0.0))
-    _check_test_view(path, settings.get("test_view"))
-    return settings
-
-
-def _json_object(path: Path) -> dict[str, Any]:
-    content = read_json(path)
-    if not isinstance(content, dict):
-        raise ValueError(
-            f"{path}: expected a JSON object, got {type(content).__name__}; correct it."
-        )
-    return content
-
-
-def _check_readout(path: Path, readout: Any) -> None:
+    readout = settings.get("readout", 0.0)
     for value in readout.values() if isinstance(readout, dict) else [readout]:
         check_number(str(path), "readout", value, "[-1, 1]")
-
-
-def _check_test_view(path: Path, view: Any) -> None:
+    view = settings.get("test_view")
     indices = view if isinstance(view, list) else [view]
     if view is not None and any(type(index) is not int for index in indices):
         raise ValueError(
             f"{path}: `test_view` must be a camera's index, a list of them, or null, got "
             f"{view!r}; correct it."
         )
+    return settings
