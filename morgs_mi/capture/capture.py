@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, cast
@@ -21,7 +21,7 @@ from morgs_mi.capture.held_out import TestViews, held_out_by, held_out_views
 from morgs_mi.capture.layouts.clips import EXAMPLE, check_names
 from morgs_mi.capture.layouts.layout_registry import find_layout
 from morgs_mi.capture.lens import Lens, undistortion
-from morgs_mi.capture.timeline import ClipTimes, ReadConfig, Timeline, read_settings, timeline
+from morgs_mi.capture.timeline import ClipTimes, ReadConfig, read_settings, timeline
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_points
 from morgs_mi.core.color_space import display_stops
@@ -192,7 +192,13 @@ class Capture:
             radial_terms,
             strict=True,
         )
-        sources = tuple(_refined_source(*view) for view in views)
+        sources = tuple(
+            replace(
+                source,
+                undistortion=undistortion(camera, source.lens, (refined, Lens("RADIAL", terms))),
+            )
+            for source, camera, refined, terms in views
+        )
         masks = _masks(sources, rig.cameras)
         return replace(rig, masks=masks, _sources=sources, distortions=radial_terms)
 
@@ -278,7 +284,9 @@ class Capture:
         missing: set[str] = set()
         try:
             for index, results in enumerate(zip(*streams, strict=True), start=start):
-                errors = _errors(self.names, results)
+                images = tuple(None if isinstance(f, Exception) else f for f in results)
+                pairs = zip(self.names, results, strict=True)
+                errors = {name: f for name, f in pairs if isinstance(f, Exception)}
                 if strict and errors:
                     raise next(iter(errors.values()))
                 for name in errors.keys() - missing:
@@ -288,57 +296,31 @@ class Capture:
                 unread = bool(errors) and not (
                     self.reading.gaps and os.path.exists(self._sources[0].reader.path)
                 )
-                yield self._at_instant(_partial_frame(index, results, errors, unread))
+                problems = tuple(f"{name}: {error}" for name, error in errors.items())
+                recorded = None
+                if index == 0 and any(source.delay for source in self._sources):
+                    recorded = images
+                    images = self._at_first_instant(images)
+                yield PartialFrame(index, images, problems, recorded, unread)
         finally:
             for stream in streams:
                 stream.close()
-
-    def _at_instant(self, frame: PartialFrame) -> PartialFrame:
-        """Return the frame, the first one with images at its instant."""
-        if frame.index or not any(source.delay for source in self._sources):
-            return frame
-        return replace(frame, images=self._at_first_instant(frame.images), recorded=frame.images)
 
     def _at_first_instant(
         self, images: Sequence[np.ndarray | None]
     ) -> tuple[np.ndarray | None, ...]:
         """Return the images of the first frame, interpolated at its instant.
 
-        The motion in the first frame is unknown, so delays cannot be rendered.
+        The motion in the first frame is unknown, so delays cannot be rendered. An image that cannot
+        be interpolated stays as it is.
         """
-        views = zip(images, self._sources, self.cameras, strict=True)
-        return tuple(_first_image(*view) for view in views)
-
-
-def _refined_source(
-    source: CameraSource, camera: Camera, refined: Camera, terms: tuple[float, float]
-) -> CameraSource:
-    """Return the source of a calibrated camera with the undistortion of a refined one."""
-    stage = (refined, Lens("RADIAL", terms))
-    return replace(source, undistortion=undistortion(camera, source.lens, stage))
-
-
-def _errors(names: Sequence[str], results: Sequence[ImageOrError]) -> dict[str, Exception]:
-    """Return the errors among the images of one frame, by their cameras' names."""
-    return {n: f for n, f in zip(names, results, strict=True) if isinstance(f, Exception)}
-
-
-def _first_image(
-    image: np.ndarray | None, source: CameraSource, camera: Camera
-) -> np.ndarray | None:
-    """Return the first image of a camera at its instant, `image` if it cannot be interpolated."""
-    if image is None or not source.delay:
-        return image
-    result = next(source.at_instants().images(camera, 0, 1))
-    return image if isinstance(result, Exception) else result
-
-
-def _partial_frame(
-    index: int, results: Sequence[ImageOrError], errors: Mapping[str, Exception], unread: bool
-) -> PartialFrame:
-    images = tuple(None if isinstance(f, Exception) else f for f in results)
-    problems = tuple(f"{name}: {error}" for name, error in errors.items())
-    return PartialFrame(index, images, problems, unread=unread)
+        first_images = list(images)
+        for view, source in enumerate(self._sources):
+            if first_images[view] is not None and source.delay:
+                result = next(source.at_instants().images(self.cameras[view], 0, 1))
+                if isinstance(result, np.ndarray):
+                    first_images[view] = result
+        return tuple(first_images)
 
 
 def _masks(
@@ -397,8 +379,13 @@ def load_capture(
             broken, or an argument is out of range.
     """
     path = Path(path)
-    _check_folder(path)
-    _check_arguments(downscale, max_frames)
+    if not path.is_dir():
+        kind = "a file" if path.is_file() else "none"
+        raise FileNotFoundError(f"{path}: expected a capture folder, found {kind}; check the path.")
+    if not downscale >= 1:
+        raise ValueError(f"load_capture(): `downscale` must be at least 1, got {downscale}.")
+    if max_frames is not None and max_frames < 1:
+        raise ValueError(f"load_capture(): `max_frames` must be at least 1, got {max_frames}.")
     reading = reading or ReadConfig()
     settings = read_settings(path / CAPTURE)
     layout = find_layout(path)
@@ -423,30 +410,25 @@ def load_capture(
         point_colors=calibration.point_colors,
         masks=_masks(sources, cameras),
         test_views=held_out_by(path, test_view, settings, every, calibration),
-        truth=_truth_folder(path, common),
+        # The frames of the ground truth are numbered like the frames of the clips.
+        truth=path / "truth" if common.unchanged and (path / "truth").is_dir() else None,
         _sources=sources,
         downscale=downscale,
         layout=layout.name,
         reading=reading,
-        notes=_notes(common, sources, calibration.clips),
+        notes=(
+            *common.notes,
+            *(note for source in sources for note in source.notes),
+            *_photos(calibration.clips),
+        ),
         origin=calibration.origin,
     )
     if any(reader.has_light for reader in readers):
-        capture = _with_exposure(capture, settings.get("display_exposure"))
+        stops = settings.get("display_exposure")
+        if stops is None:
+            stops = display_stops(next(capture.partial_frames(0, 1)).images)
+        capture = replace(capture, display_exposure=stops)
     return capture
-
-
-def _check_folder(path: Path) -> None:
-    if not path.is_dir():
-        kind = "a file" if path.is_file() else "none"
-        raise FileNotFoundError(f"{path}: expected a capture folder, found {kind}; check the path.")
-
-
-def _check_arguments(downscale: float, max_frames: int | None) -> None:
-    if not downscale >= 1:
-        raise ValueError(f"load_capture(): `downscale` must be at least 1, got {downscale}.")
-    if max_frames is not None and max_frames < 1:
-        raise ValueError(f"load_capture(): `max_frames` must be at least 1, got {max_frames}.")
 
 
 def _at_clip_sizes(
@@ -464,14 +446,6 @@ def _at_clip_sizes(
     return recorded
 
 
-def _with_exposure(capture: Capture, stops: float | None) -> Capture:
-    """Return a capture of linear light that a display brightens by `stops`, None: by its first
-    images.
-    """
-    stops = display_stops(next(capture.partial_frames(0, 1)).images) if stops is None else stops
-    return replace(capture, display_exposure=stops)
-
-
 def _readouts(
     path: Path, every: Sequence[str], names: Sequence[str], settings: dict[str, Any]
 ) -> list[float]:
@@ -485,19 +459,6 @@ def _readouts(
         return [readout] * len(names)
     check_names(path / CAPTURE, "readout", readout, every)
     return [readout.get(name, 0.0) for name in names]
-
-
-def _truth_folder(path: Path, common: Timeline) -> Path | None:
-    # The frames of the ground truth are numbered like the frames of the clips.
-    return path / "truth" if common.unchanged and (path / "truth").is_dir() else None
-
-
-def _notes(
-    common: Timeline, sources: Sequence[CameraSource], clips: Sequence[Clip]
-) -> tuple[str, ...]:
-    """Return the notes on the timeline, on the masks and on photos."""
-    masks = (note for source in sources for note in source.notes)
-    return (*common.notes, *masks, *_photos(clips))
 
 
 def _photos(clips: Sequence[Clip]) -> tuple[str, ...]:
@@ -514,18 +475,17 @@ def _downscaled_cameras(
     clips: Sequence[ClipTimes],
     readouts: Sequence[float],
 ) -> list[Camera]:
-    """Return the downscaled cameras of clips, with their delays and readouts."""
-    cameras = [
-        _resized(camera, downscale, times, readout)
-        for camera, times, readout in zip(recorded, clips, readouts, strict=True)
-    ]
-    _check_downscale(downscale, cameras, recorded)
-    return cameras
-
-
-def _check_downscale(
-    downscale: float, cameras: Sequence[Camera], recorded: Sequence[Camera]
-) -> None:
+    """Return the downscaled cameras of clips, with their delays and readouts: `readouts` are in
+    frames of the clips, the cameras' in instants.
+    """
+    cameras = []
+    for camera, times, readout in zip(recorded, clips, readouts, strict=True):
+        if downscale != 1:
+            camera = camera.resized(
+                max(1, round(camera.width / downscale)), max(1, round(camera.height / downscale))
+            )
+        delay = times.delay / times.rate
+        cameras.append(replace(camera, delay=delay, readout=readout / times.rate))
     if downscale > 1 and _shortest_side(cameras) < MIN_SIDE:
         largest = _shortest_side(recorded) / MIN_SIDE
         remedy = f"use at most {np.floor(100 * largest) / 100:g}" if largest >= 1 else "use 1"
@@ -533,18 +493,8 @@ def _check_downscale(
             f"load_capture(): `downscale` must leave images of at least {MIN_SIDE} pixels on each "
             f"side, got {downscale:g}; {remedy}."
         )
+    return cameras
 
 
 def _shortest_side(cameras: Sequence[Camera]) -> int:
     return min(min(camera.width, camera.height) for camera in cameras)
-
-
-def _resized(camera: Camera, downscale: float, times: ClipTimes, readout: float) -> Camera:
-    """Return a clip's camera, downscaled; its delay and `readout` are in frames of the clip, the
-    result's in instants.
-    """
-    if downscale != 1:
-        camera = camera.resized(
-            max(1, round(camera.width / downscale)), max(1, round(camera.height / downscale))
-        )
-    return replace(camera, delay=times.delay / times.rate, readout=readout / times.rate)
