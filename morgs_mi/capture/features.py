@@ -7,8 +7,9 @@ matches. `guided_matching` uses them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import cv2
 import numpy as np
@@ -84,7 +85,12 @@ def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features
         return _no_features()
     height, width = image.shape[:2]
     size = reduced_size(width, height, _DETECTION_PIXELS)
-    keypoints, descriptors = _sift(image, mask, size)
+    grey = cv2.cvtColor(cv2.resize(image, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+    if mask is not None:
+        mask = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    # Without precise upscaling OpenCV's features are off by a quarter of a pixel.
+    sift = cv2.SIFT.create(nfeatures=MAX_FEATURES, enable_precise_upscale=True)
+    keypoints, descriptors = sift.detectAndCompute(grey, mask)
     if descriptors is None:
         return _no_features()
     pixel_scale = width / size[0], height / size[1]
@@ -93,7 +99,9 @@ def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features
     # 2012).
     descriptors = np.sqrt(descriptors / descriptors.sum(1, keepdims=True))
     colors = values_at(image, points).astype(np.float32) / 255
-    return Features(points, descriptors, colors, _patch_axes(keypoints) * pixel_scale)
+    angles, sizes = np.array([(np.deg2rad(k.angle), k.size) for k in keypoints]).T
+    axes = 0.5 * sizes[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return Features(points, descriptors, colors, axes * pixel_scale)
 
 
 def _no_features() -> Features:
@@ -113,24 +121,6 @@ def reduced_size(width: int, height: int, pixels: float) -> tuple[int, int]:
     return round(width * scale), round(height * scale)
 
 
-def _sift(
-    image: np.ndarray, mask: np.ndarray | None, size: tuple[int, int]
-) -> tuple[Sequence[cv2.KeyPoint], np.ndarray | None]:
-    """Return the keypoints of an image, in pixels of the reduced `size`, and their descriptors."""
-    grey = cv2.cvtColor(cv2.resize(image, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
-    if mask is not None:
-        mask = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    # Without precise upscaling OpenCV's features are off by a quarter of a pixel.
-    sift = cv2.SIFT.create(nfeatures=MAX_FEATURES, enable_precise_upscale=True)
-    return sift.detectAndCompute(grey, mask)
-
-
-def _patch_axes(keypoints: Sequence[cv2.KeyPoint]) -> np.ndarray:
-    """Return the axes of the keypoints' patches [K, 2], as in `Features`."""
-    angles, sizes = np.array([(np.deg2rad(k.angle), k.size) for k in keypoints]).T
-    return 0.5 * sizes[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
-
-
 def match_views(features: Sequence[Features], cameras: Sequence[Camera]) -> list[Match]:
     """Return the matches between all pairs of up to 24 views, or of each view and its 8 nearest
     ones.
@@ -142,22 +132,18 @@ def match_views(features: Sequence[Features], cameras: Sequence[Camera]) -> list
         features: per view.
         cameras: per view.
     """
-    neighbours = len(cameras) if len(cameras) <= _ALL_PAIRS else _NEIGHBOURS
-    matches = (
-        Match((i, j), _matches(features[i], features[j])) for i, j in _pairs(cameras, neighbours)
-    )
-    return [match for match in matches if len(match.features)]
-
-
-def _pairs(cameras: Sequence[Camera], neighbours: int) -> Iterator[tuple[int, int]]:
     count = len(cameras)
+    neighbours = count if count <= _ALL_PAIRS else _NEIGHBOURS
     positions = np.array([camera.position for camera in cameras])
     distances = np.linalg.norm(positions[:, None] - positions, axis=2)
     ranks = distances.argsort(axis=1).argsort(axis=1)
-    for i in range(count):
-        for j in range(i + 1, count):
-            if min(ranks[i, j], ranks[j, i]) <= neighbours:
-                yield i, j
+    matches = []
+    for i, j in combinations(range(count), 2):
+        if min(ranks[i, j], ranks[j, i]) <= neighbours:
+            pairs = _matches(features[i], features[j])
+            if len(pairs):
+                matches.append(Match((i, j), pairs))
+    return matches
 
 
 def _matches(a: Features, b: Features) -> np.ndarray:
@@ -168,17 +154,15 @@ def _matches(a: Features, b: Features) -> np.ndarray:
     pairs = mutual_neighbours(descriptor_distances(a, b))
     if len(pairs) < _MIN_MATCHES:
         return none
-    inliers = _epipolar_inliers(a.points[pairs[:, 0]], b.points[pairs[:, 1]])
-    return pairs[inliers] if np.count_nonzero(inliers) >= _MIN_MATCHES else none
-
-
-def _epipolar_inliers(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Return the mask [M] of the matched pixels [M, 2] that fit one epipolar geometry."""
+    x = a.points[pairs[:, 0]]
+    y = b.points[pairs[:, 1]]
     try:
         _, inliers = cv2.findFundamentalMat(x, y, cv2.USAC_MAGSAC, 2.0, 0.999, 5000)
     except cv2.error:  # raised for some matches that fit no geometry
-        inliers = None
-    return np.zeros(len(x), bool) if inliers is None else inliers.ravel() > 0
+        return none
+    if inliers is None or np.count_nonzero(inliers) < _MIN_MATCHES:
+        return none
+    return pairs[inliers.ravel() > 0]
 
 
 def descriptor_distances(a: Features, b: Features) -> np.ndarray:
@@ -193,14 +177,9 @@ def mutual_neighbours(distances: np.ndarray) -> np.ndarray:
     forth = distances.argmin(1)
     back = distances.argmin(0)
     rows = np.arange(len(forth))
-    good = (back[forth] == rows) & _are_distinct(distances)
-    return np.stack([rows, forth], axis=1)[good]
-
-
-def _are_distinct(distances: np.ndarray) -> np.ndarray:
-    """Return the mask of rows [K] whose nearest neighbour passes Lowe's ratio test."""
     first, second = np.partition(distances, 1, axis=1)[:, :2].T
-    return first < _RATIO * second
+    good = (back[forth] == rows) & (first < _RATIO * second)
+    return np.stack([rows, forth], axis=1)[good]
 
 
 def reprojection_errors(
@@ -246,15 +225,10 @@ def triangulate(
     if not tracks.count:
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
     points = intersect(tracks.ids, tracks.views, tracks.pixels, cameras, tracks.count)
-    good = _largest_errors(points, tracks, cameras) <= max_error
+    distances = _distances(points[tracks.ids], tracks.views, tracks.pixels, cameras)
+    good = _largest(distances, tracks.ids, len(points)) <= max_error
     good &= _widest_angles(points, tracks.ids, tracks.views, cameras) >= min_angle
     return points[good].astype(np.float32), tracks.mean_colors()[good].astype(np.float32)
-
-
-def _largest_errors(points: np.ndarray, tracks: Tracks, cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the largest distance of each point's projections from its features [P], px."""
-    distances = _distances(points[tracks.ids], tracks.views, tracks.pixels, cameras)
-    return _largest(distances, tracks.ids, len(points))
 
 
 def _largest(values: np.ndarray, track: np.ndarray, count: int) -> np.ndarray:
@@ -268,31 +242,23 @@ def join_matches(matches: Sequence[Match], features: Sequence[Features]) -> Trac
     """Return the tracks of features that are matched directly or through other features, all in
     different views.
     """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     starts = np.concatenate([[0], np.cumsum([len(f.points) for f in features])]).astype(int)
     edges = [match.features + starts[list(match.views)] for match in matches]
-    track = _components(np.concatenate([np.zeros((0, 2), int), *edges]), starts[-1])
+    rows, columns = np.concatenate([np.zeros((0, 2), int), *edges]).T
+    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(starts[-1], starts[-1]))
+    track = connected_components(graph, directed=False)[1]
     views = np.repeat(np.arange(len(features)), np.diff(starts))
-    members = np.flatnonzero(_valid_tracks(track, views)[track])
+    # Tracks with at least two features, all in different views.
+    sizes = np.bincount(track)
+    distinct = np.bincount(np.unique(np.stack([track, views]), axis=1)[0], minlength=len(sizes))
+    members = np.flatnonzero(((sizes >= 2) & (distinct == sizes))[track])
     _, track = np.unique(track[members], return_inverse=True)
     pixels = np.concatenate([f.points for f in features])[members]
     colors = np.concatenate([f.colors for f in features])[members]
     return Tracks(track, views[members], pixels, colors)
-
-
-def _components(edges: np.ndarray, count: int) -> np.ndarray:
-    """Return the connected component of each of `count` nodes of a graph, int [count]."""
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
-    return connected_components(graph, directed=False)[1]
-
-
-def _valid_tracks(track: np.ndarray, views: np.ndarray) -> np.ndarray:
-    """Return the mask of tracks that have at least two features, all in different views."""
-    sizes = np.bincount(track)
-    distinct = np.bincount(np.unique(np.stack([track, views]), axis=1)[0], minlength=len(sizes))
-    return (sizes >= 2) & (distinct == sizes)
 
 
 def intersect(
@@ -305,7 +271,10 @@ def intersect(
     """
     V, middle, scale = _relative_poses(cameras)
     V = V[views]
-    x = _at_depth_one(pixels, views, cameras)
+    x = np.empty_like(pixels)  # at depth 1
+    for view in np.unique(views):
+        of_view = views == view
+        x[of_view] = image_coordinates(cameras[view], pixels[of_view])
     rows = x[:, :, None] * V[:, 2:3] - V[:, :2]
     system = np.zeros((count, 4, 4))
     np.add.at(system, track, np.einsum("kri,krj->kij", rows, rows))
@@ -334,15 +303,6 @@ def intersect_pairs(
     """
     count = len(pixels) // 2
     return intersect(np.tile(np.arange(count), 2), np.repeat(views, count), pixels, cameras, count)
-
-
-def _at_depth_one(pixels: np.ndarray, views: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the image coordinates of pixels at depth 1 [n, 2], each in its camera's frame."""
-    x = np.empty_like(pixels)
-    for view in np.unique(views):
-        of_view = views == view
-        x[of_view] = image_coordinates(cameras[view], pixels[of_view])
-    return x
 
 
 def _distances(

@@ -111,39 +111,6 @@ def _depth_range(
     return middle / _BLIND, middle * _BLIND
 
 
-def _plane_axes(a: Camera, b: Camera) -> np.ndarray:
-    """Return the axes of the plane that two views are rectified to, rows right, down and forward
-    [3, 3].
-    """
-    right = b.position - a.position
-    right = right / float(np.linalg.norm(right))
-    forward = a.viewmat[2, :3] + b.viewmat[2, :3]
-    forward = forward - forward @ right * right
-    forward /= max(float(np.linalg.norm(forward)), 1e-12)
-    return np.stack([right, np.cross(forward, right), forward])
-
-
-def _to_plane(camera: Camera, axes: np.ndarray, focal: float) -> np.ndarray:
-    """Return the homography [3, 3] from a view's pixels to a plane."""
-    return np.diag([focal, focal, 1]) @ axes @ camera.viewmat[:3, :3].T @ np.linalg.inv(camera.K)
-
-
-def _corners(camera: Camera) -> np.ndarray:
-    """Return the corners of an image in homogeneous pixels [4, 3]."""
-    return np.array([[x, y, 1] for x in (0, camera.width) for y in (0, camera.height)])
-
-
-def _overlap(a: np.ndarray, b: np.ndarray) -> tuple[tuple[float, float, float], tuple[int, int]]:
-    """Return the corners and the size, as in `_Rectified`, of images with the rows that both views
-    have, from the corners of the views on the plane [4, 2].
-    """
-    top = max(a[:, 1].min(), b[:, 1].min())
-    bottom = min(a[:, 1].max(), b[:, 1].max())
-    width = max(np.ptp(a[:, 0]), np.ptp(b[:, 0]))
-    size = int(np.ceil(width)), int(np.ceil(bottom - top))
-    return (a[:, 0].min(), b[:, 0].min(), top), size
-
-
 @dataclass(frozen=True)
 class _Rectified:
     """Two views on one plane along the line between their cameras."""
@@ -162,16 +129,35 @@ class _Rectified:
         """Return the rectification of two views, None if no plane shows both, e.g. with one camera
         behind the other.
         """
-        axes = _plane_axes(a, b)
+        right = b.position - a.position
+        right = right / float(np.linalg.norm(right))
+        forward = a.viewmat[2, :3] + b.viewmat[2, :3]
+        forward = forward - forward @ right * right
+        forward /= max(float(np.linalg.norm(forward)), 1e-12)
+        axes = np.stack([right, np.cross(forward, right), forward])
         focal = float(a.K[0, 0] + b.K[0, 0]) / 2
-        to_plane = [_to_plane(camera, axes, focal) for camera in (a, b)]
-        corners = [_corners(camera) @ H.T for camera, H in zip((a, b), to_plane, strict=True)]
+        to_plane = []  # homographies from the pixels
+        corners = []  # of the images, in homogeneous pixels [4, 3]
+        for camera in (a, b):
+            H = np.diag([focal, focal, 1]) @ axes
+            H = H @ camera.viewmat[:3, :3].T @ np.linalg.inv(camera.K)
+            places = [[x, y, 1] for x in (0, camera.width) for y in (0, camera.height)]
+            to_plane.append(H)
+            corners.append(np.array(places) @ H.T)
         if any(rays[:, 2].min() < _LEAST_DEPTH for rays in corners):
             return None
-        (left, right, top), size = _overlap(*(rays[:, :2] / rays[:, 2:] for rays in corners))
-        homographies = _shift(-left, -top) @ to_plane[0], _shift(-right, -top) @ to_plane[1]
+        # The images have the rows that both views have.
+        (ax, ay), (bx, by) = ((rays[:, :2] / rays[:, 2:]).T for rays in corners)
+        top = max(ay.min(), by.min())
+        bottom = min(ay.max(), by.max())
+        size = int(np.ceil(max(np.ptp(ax), np.ptp(bx)))), int(np.ceil(bottom - top))
+        starts = (ax.min(), bx.min(), top)
+        homographies = (
+            _shift(-starts[0], -top) @ to_plane[0],
+            _shift(-starts[1], -top) @ to_plane[1],
+        )
         baseline = float(np.linalg.norm(b.position - a.position))
-        return cls(axes, focal, baseline, homographies, (left, right, top), size)
+        return cls(axes, focal, baseline, homographies, starts, size)
 
     @property
     def shift(self) -> float:
@@ -280,26 +266,16 @@ def _some_confirmed(points: np.ndarray, others: Sequence[_View]) -> np.ndarray:
     for start in range(0, len(points), _POINTS):
         if len(confirmed) < _POINTS:
             part = points[start : start + _POINTS]
-            confirmed = np.concatenate([confirmed, part[_confirmed(part, others)]])
+            # Points that have their colour in a valid pixel of another view.
+            good = np.zeros(len(part), bool)
+            for view in others:
+                visible, pixels, _ = seen_points(view.camera, part[:, :3])
+                columns, rows = pixels.astype(int).T
+                errors = np.abs(view.blurred[rows, columns] / 255.0 - part[visible, 3:])
+                is_valid = view.valid[rows, columns] > 0
+                good[visible] |= is_valid & (errors.max(axis=1) < _MAX_COLOR)
+            confirmed = np.concatenate([confirmed, part[good]])
     return confirmed[:_POINTS]
-
-
-def _confirmed(points: np.ndarray, others: Sequence[_View]) -> np.ndarray:
-    """Return the mask of points with colours [P, 6] that have their colour in a valid pixel of
-    another view.
-    """
-    confirmed = np.zeros(len(points), bool)
-    for view in others:
-        visible, pixels, _ = seen_points(view.camera, points[:, :3])
-        confirmed[visible] |= _has_colors(view, pixels.astype(int), points[visible, 3:])
-    return confirmed
-
-
-def _has_colors(view: _View, pixels: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    """Return the mask of the pixels [P, 2] of a view that are valid and have the colours [P, 3]."""
-    columns, rows = pixels.T
-    same = np.abs(view.blurred[rows, columns] / 255.0 - colors).max(axis=1) < _MAX_COLOR
-    return same & (view.valid[rows, columns] > 0)
 
 
 def _shift(x: float, y: float) -> np.ndarray:
