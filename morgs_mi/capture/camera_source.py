@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -89,18 +89,14 @@ class CameraSource:
                 camera, self.frame_indices[start:stop], self.shares[start:stop]
             )
             return
-        for image in self._recorded_images(start, stop):
-            yield self.process(image, camera) if isinstance(image, np.ndarray) else image
-
-    def _recorded_images(self, start: int, stop: int) -> Iterator[ImageOrError]:
-        """Yield the recorded images of the instants start..stop-1, or errors."""
         indices = self.frame_indices[start:stop]
         frames = self.reader.pick(indices[indices >= 0].tolist())
         for instant, index in enumerate(indices, start):
-            if index >= 0:
-                yield next(frames)
-            else:
+            if index < 0:
                 yield ValueError(f"{self.reader.path}: no frame at instant {instant}.")
+                continue
+            image = next(frames)
+            yield self.process(image, camera) if isinstance(image, np.ndarray) else image
 
     def _interpolated(
         self, camera: Camera, indices: np.ndarray, shares: np.ndarray
@@ -120,27 +116,31 @@ class CameraSource:
         """Return a recorded image undistorted, downscaled to the size of `camera` and
         colour-corrected.
         """
-        if self.undistortion:
-            image = _pinhole_image(image, self.undistortion)
-        image = _downscaled(image, camera)
+        if self.undistortion and image.dtype == np.uint8:
+            image = self.undistortion(image)
+        elif self.undistortion:
+            # The cubic filter rings less in encoded values, in which lamps are less far from their
+            # surroundings.
+            image = np.maximum(decode_light(self.undistortion(encode_light(image))), 0)
+        size = (camera.width, camera.height)
+        if image.shape[1::-1] != size:
+            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         return (
             image if self.display_exposure is None else display_image(image, self.display_exposure)
         )
 
     def mask(self, camera: Camera) -> np.ndarray | None:
         """Return the mask of the valid pixels of `camera` [H, W] bool, or None if all are valid."""
-        valid = self._valid_pixels()
+        valid = self.recorded_mask
+        if self.undistortion is not None:
+            valid = self.undistortion.mask
+            if self.recorded_mask is not None:
+                # Other pixels must not contribute; cubic weights can also be negative.
+                weights = self.undistortion(self.recorded_mask.astype(np.float32))
+                valid = valid & (np.abs(weights - 1) < 1e-3)
         if valid is None or valid.all():
             return None
         return scaled_mask(valid, camera.width, camera.height)
-
-    def _valid_pixels(self) -> np.ndarray | None:
-        """Return the mask of the valid pixels after the undistortion."""
-        if self.undistortion is None or self.recorded_mask is None:
-            return self.recorded_mask if self.undistortion is None else self.undistortion.mask
-        # Other pixels must not contribute; cubic weights can also be negative.
-        weights = self.undistortion(self.recorded_mask.astype(np.float32))
-        return self.undistortion.mask & (np.abs(weights - 1) < 1e-3)
 
 
 def at_clip_size(camera: Camera, reader: FrameReader) -> Camera:
@@ -152,11 +152,6 @@ def at_clip_size(camera: Camera, reader: FrameReader) -> Camera:
     """
     if (reader.width, reader.height) == (camera.width, camera.height):
         return camera
-    _check_aspect(camera, reader)
-    return camera.resized(reader.width, reader.height)
-
-
-def _check_aspect(camera: Camera, reader: FrameReader) -> None:
     # Both sides were rounded to whole pixels.
     difference = abs(camera.width * reader.height - camera.height * reader.width)
     if difference > min(camera.width, camera.height):
@@ -165,17 +160,4 @@ def _check_aspect(camera: Camera, reader: FrameReader) -> None:
             f"{camera.name}, or a scaled version of it, got {reader.width}x{reader.height}; "
             "calibrate at the recorded size."
         )
-
-
-def _pinhole_image(image: np.ndarray, maps: Undistortion) -> np.ndarray:
-    if image.dtype == np.uint8:
-        return maps(image)
-    # The cubic filter rings less in encoded values, in which lamps are less far from their
-    # surroundings.
-    return np.maximum(decode_light(maps(encode_light(image))), 0)
-
-
-def _downscaled(image: np.ndarray, camera: Camera) -> np.ndarray:
-    if image.shape[:2] == (camera.height, camera.width):
-        return image
-    return cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    return camera.resized(reader.width, reader.height)

@@ -17,8 +17,6 @@ import numpy as np
 from morgs_mi.io.numbering import counting_together
 from morgs_mi.io.video import FolderReader, FrameReader
 
-_Numbers = Mapping[int, range]
-
 
 @dataclass(frozen=True)
 class ImageNumbers:
@@ -54,89 +52,53 @@ def align_numbers(
         ValueError: numbers of cameras that count together differ and no option resolves it, or none
             are common.
     """
-    numbers = _numbers(readers)
+    numbers = {
+        c: r.numbers
+        for c, r in enumerate(readers)
+        if isinstance(r, FolderReader) and r.numbers is not None
+    }
     groups = counting_together(numbers)
-    notes = _separate(names, numbers, groups)
+    notes: tuple[str, ...] = ()
+    if len(groups) > 1 and any(len(clip_numbers) > 1 for clip_numbers in numbers.values()):
+        table = "; ".join(_table(names, numbers, group[:1]) for group in groups)
+        notes = (
+            f"The numbers of the images do not overlap: {table}. Cameras with such numbers begin "
+            "at the same time.",
+        )
     by_position = ImageNumbers(np.zeros(len(readers)), np.ones(len(readers)), notes=notes)
-    different = [group for group in groups if _differ(numbers, group)]
+    different = [
+        group for group in groups if len({(numbers[c][0], numbers[c].step) for c in group}) > 1
+    ]
     if not different:
         return by_position
     table = "; ".join(_table(names, numbers, group) for group in different)
     if offset and not trim:
         note = f"Images are aligned by their positions and --offset, not by their numbers: {table}."
         return replace(by_position, notes=(*notes, note))
-    common = _common(numbers, different)
+    group = {c: numbers[c] for c in different[0]}
+    common = sorted(set.intersection(*map(set, group.values()))) if len(different) == 1 else []
     if not trim or not common:
-        raise _numbers_error(path, table, len(common), names[different[0][0]])
+        remedy = f"the {len(common)} common ones with --trim, " if common else ""
+        raise ValueError(
+            f"{path}: images with the same number must be simultaneous and all cameras must have "
+            f"the same numbers, got {table}; use {remedy}all numbers with --gaps, which leaves "
+            "out the cameras that lack an image, or the positions of the images in place of "
+            f"their numbers with --offset {names[different[0][0]]} 0."
+        )
     note = (
         f"Images with the same number are simultaneous: {table}. Used are {_range(common)}, which "
         "all cameras have."
     )
-    return _aligned(readers, {c: numbers[c] for c in different[0]}, common[0], (*notes, note))
+    steps = [clip.step for clip in group.values()]
+    # Other clips start with the first of these numbers.
+    first = min(clip[0] for clip in group.values())
+    clips = [group.get(c, range(first, first + 1, min(steps))) for c in range(len(readers))]
+    offsets = np.array([(common[0] - clip[0]) / clip.step for clip in clips])
+    rates = np.array([lcm(*steps) / clip.step for clip in clips])
+    return ImageNumbers(offsets, rates, lcm(*steps) / min(steps), (*notes, note))
 
 
-def _numbers(readers: Sequence[FrameReader]) -> dict[int, range]:
-    """Return the numbers of the images by the index of the clip, of clips with numbers."""
-    return {
-        c: r.numbers
-        for c, r in enumerate(readers)
-        if isinstance(r, FolderReader) and r.numbers is not None
-    }
-
-
-def _differ(numbers: _Numbers, group: Sequence[int]) -> bool:
-    return len({(numbers[c][0], numbers[c].step) for c in group}) > 1
-
-
-def _common(numbers: _Numbers, groups: Sequence[Sequence[int]]) -> list[int]:
-    """Return the numbers that all cameras of a group have, none of several groups."""
-    if len(groups) > 1:
-        return []
-    return sorted(set.intersection(*(set(numbers[c]) for c in groups[0])))
-
-
-def _numbers_error(path: Path, table: str, common: int, name: str) -> ValueError:
-    """Return the error of cameras whose numbers differ; `common` ones could be used, and `name` is
-    the camera of the example.
-    """
-    remedy = f"the {common} common ones with --trim, " if common else ""
-    return ValueError(
-        f"{path}: images with the same number must be simultaneous and all cameras must have "
-        f"the same numbers, got {table}; use {remedy}all numbers with --gaps, which leaves "
-        "out the cameras that lack an image, or the positions of the images in place of "
-        f"their numbers with --offset {name} 0."
-    )
-
-
-def _aligned(
-    readers: Sequence[FrameReader], numbers: _Numbers, begin: int, notes: tuple[str, ...]
-) -> ImageNumbers:
-    """Return the alignment to common numbers that start with `begin`; other clips start with the
-    first of `numbers`.
-    """
-    step = lcm(*(clip_numbers.step for clip_numbers in numbers.values()))
-    finest = min(clip_numbers.step for clip_numbers in numbers.values())
-    first = min(clip_numbers[0] for clip_numbers in numbers.values())
-    clips = [numbers.get(c, range(first, first + 1, finest)) for c in range(len(readers))]
-    offsets = np.array([(begin - clip[0]) / clip.step for clip in clips])
-    rates = np.array([step / clip.step for clip in clips])
-    return ImageNumbers(offsets, rates, step / finest, notes)
-
-
-def _separate(
-    names: Sequence[str], numbers: _Numbers, groups: Sequence[Sequence[int]]
-) -> tuple[str, ...]:
-    """Return a note on cameras that count separately, none if there are none or single images."""
-    if len(groups) < 2 or all(len(clip_numbers) == 1 for clip_numbers in numbers.values()):
-        return ()
-    table = "; ".join(_table(names, numbers, group[:1]) for group in groups)
-    return (
-        f"The numbers of the images do not overlap: {table}. Cameras with such numbers begin at "
-        "the same time.",
-    )
-
-
-def _table(names: Sequence[str], numbers: _Numbers, group: Sequence[int]) -> str:
+def _table(names: Sequence[str], numbers: Mapping[int, range], group: Sequence[int]) -> str:
     """Return the numbers of the cameras in a group."""
     return ", ".join(f"{names[c]} {_range(numbers[c])}" for c in group)
 

@@ -26,20 +26,16 @@ def used_in_clip(
     """
     opaque, *notes = opaque_pixels(reader, name)
     mask, note = used_pixels(masks, reader.width, reader.height, name)
-    both = _both(mask, opaque)
-    if both is not None and not both.any():
+    if mask is None:
+        mask = opaque
+    elif opaque is not None:
+        mask = mask & opaque
+    if mask is not None and not mask.any():
         raise ValueError(
             f"{masks[0]}: expected pixels that are used, got a mask of transparent ones; correct "
             "it."
         )
-    return both, [text for text in (*notes, note) if text]
-
-
-def _both(a: np.ndarray | None, b: np.ndarray | None) -> np.ndarray | None:
-    """Return the mask of the pixels that are in two masks, None for a mask of all pixels."""
-    if a is None or b is None:
-        return b if a is None else a
-    return a & b
+    return mask, [text for text in (*notes, note) if text]
 
 
 def opaque_pixels(reader: FrameReader, name: str) -> tuple[np.ndarray | None, str]:
@@ -52,7 +48,9 @@ def opaque_pixels(reader: FrameReader, name: str) -> tuple[np.ndarray | None, st
     """
     if not isinstance(reader, FolderReader):
         return None, ""
-    mask, *others = _opaque_masks(reader)
+    indices = sorted({0, reader.num_frames // 2, reader.num_frames - 1})
+    shape = (reader.height, reader.width)
+    mask, *others = (_opaque(reader.files[i], shape) for i in indices)
     if any(not np.array_equal(mask, other) for other in others):
         return None, f"{name}: the alpha channel of its images changes over time and is ignored."
     if mask.all():
@@ -62,12 +60,6 @@ def opaque_pixels(reader: FrameReader, name: str) -> tuple[np.ndarray | None, st
             f"{reader.path}: expected opaque pixels, got an alpha channel without any; remove it."
         )
     return mask, f"{name}: {_unused(mask)} % of its pixels are transparent and masked out."
-
-
-def _opaque_masks(reader: FolderReader) -> list[np.ndarray]:
-    """Return the masks of the opaque pixels of the first, the middle and the last image."""
-    indices = sorted({0, reader.num_frames // 2, reader.num_frames - 1})
-    return [_opaque(reader.files[i], (reader.height, reader.width)) for i in indices]
 
 
 def used_pixels(
@@ -87,46 +79,39 @@ def used_pixels(
         ValueError: an image cannot be read or has another aspect ratio, or all pixels are masked
             out.
     """
-    mask, varies = _intersection(files, width, height)
-    if mask.all():
+    used_mask = np.ones((height, width), bool)
+    varies = False  # whether a later image masks out more than those before it
+    for file in files:
+        if not file.is_file():
+            raise FileNotFoundError(
+                f"{file}: expected a mask, found none; copy it, or drop `mask_path`."
+            )
+        image = np.atleast_3d(decode_image(file, cv2.IMREAD_UNCHANGED)) > 0
+        # Neither black nor transparent.
+        mask = np.any(image[..., :3], axis=2) & np.all(image[..., 3:], axis=2)
+        rows, columns = mask.shape
+        if abs(columns * height - rows * width) > min(columns, rows, width, height):
+            raise ValueError(
+                f"{file}: expected a mask of {width}x{height} pixels as the clip has, or a scaled "
+                f"version of it, got {columns}x{rows}; make it again."
+            )
+        mask = scaled_mask(mask, width, height)
+        varies = varies or (file != files[0] and bool((used_mask & ~mask).any()))
+        used_mask &= mask
+    if used_mask.all():
         return None, ""
-    if not mask.any():
+    if not used_mask.any():
         raise ValueError(
             f"{files[0]}: expected pixels that are used, got a black mask of {name}; correct it."
         )
     several = f": all that any of {len(files)} different masks has black"
     origin = several if varies else f" by {files[0].name}"
-    return mask, f"{name}: {_unused(mask)} % of its pixels are masked out{origin}."
-
-
-def _intersection(files: Sequence[Path], width: int, height: int) -> tuple[np.ndarray, bool]:
-    """Return the mask [H, W] of the pixels that are black in no image, and whether a later image
-    masks out more than those before it.
-    """
-    combined_mask = np.ones((height, width), bool)
-    varies = False
-    for file in files:
-        mask = _not_black(file)
-        _check_aspect(file, mask, width, height)
-        mask = scaled_mask(mask, width, height)
-        varies = varies or (file != files[0] and bool((combined_mask & ~mask).any()))
-        combined_mask &= mask
-    return combined_mask, varies
+    return used_mask, f"{name}: {_unused(used_mask)} % of its pixels are masked out{origin}."
 
 
 def _unused(mask: np.ndarray) -> str:
     """Return the percentage of pixels that a mask leaves out."""
     return f"{100 * (1 - mask.mean()):.1f}"
-
-
-def _not_black(file: Path) -> np.ndarray:
-    """Return the mask [H, W] of the pixels of an image that are neither black nor transparent."""
-    if not file.is_file():
-        raise FileNotFoundError(
-            f"{file}: expected a mask, found none; copy it, or drop `mask_path`."
-        )
-    image = np.atleast_3d(decode_image(file, cv2.IMREAD_UNCHANGED)) > 0
-    return np.any(image[..., :3], axis=2) & np.all(image[..., 3:], axis=2)
 
 
 def _opaque(file: Path, shape: tuple[int, int]) -> np.ndarray:
@@ -155,16 +140,6 @@ def _opaque_in_file(file: Path) -> np.ndarray | None:
         return None
     image = decode_image(file, cv2.IMREAD_UNCHANGED)
     return image[..., 3] == np.iinfo(image.dtype).max if image.shape[2:] == (4,) else None
-
-
-def _check_aspect(file: Path, mask: np.ndarray, width: int, height: int) -> None:
-    """Check that a mask has the size of its clip or is a scaled version."""
-    rows, columns = mask.shape
-    if abs(columns * height - rows * width) > min(columns, rows, width, height):
-        raise ValueError(
-            f"{file}: expected a mask of {width}x{height} pixels as the clip has, or a scaled "
-            f"version of it, got {columns}x{rows}; make it again."
-        )
 
 
 def scaled_mask(mask: np.ndarray, width: int, height: int) -> np.ndarray:
