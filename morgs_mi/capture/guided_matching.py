@@ -35,20 +35,19 @@ def match_guided(
     features: Sequence[Features], cameras: Sequence[Camera], pairs: Iterable[tuple[int, int]]
 ) -> list[Match]:
     """Return the matches of pairs of views, found with the poses of their cameras."""
-    matches = (
-        Match((i, j), _matches(features[i], features[j], cameras[i], cameras[j])) for i, j in pairs
-    )
-    return [match for match in matches if len(match.features)]
-
-
-def _matches(a: Features, b: Features, first: Camera, second: Camera) -> np.ndarray:
-    """Return the matched features of two views [M, 2]."""
-    if min(len(a.points), len(b.points)) < 2:
-        return np.zeros((0, 2), int)
-    distances = descriptor_distances(a, b)
-    near = _line_distances(a.points, b.points, first, second) <= _BAND
-    pairs = mutual_neighbours(np.where(near & (distances <= _MAX_DISTANCE), distances, 2.0))
-    return pairs[_patches_agree(a, b, pairs, first, second)]
+    matches = []
+    for i, j in pairs:
+        a = features[i]
+        b = features[j]
+        if min(len(a.points), len(b.points)) < 2:
+            continue
+        distances = descriptor_distances(a, b)
+        near = _line_distances(a.points, b.points, cameras[i], cameras[j]) <= _BAND
+        rows = mutual_neighbours(np.where(near & (distances <= _MAX_DISTANCE), distances, 2.0))
+        rows = rows[_patches_agree(a, b, rows, cameras[i], cameras[j])]
+        if len(rows):
+            matches.append(Match((i, j), rows))
+    return matches
 
 
 def _line_distances(x: np.ndarray, y: np.ndarray, a: Camera, b: Camera) -> np.ndarray:

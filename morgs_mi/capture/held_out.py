@@ -76,17 +76,15 @@ def _indices(
     """Return the ascending indices of cameras; `place` is where they were requested."""
     if views is None:
         return ()
-    entries = [views] if isinstance(views, int | str) else list(views)
-    return tuple(sorted({_index(place, view, names) for view in entries}))
-
-
-def _index(place: Path, view: int | str, names: Sequence[str]) -> int:
-    """Return the index of a camera given by index or name."""
-    if view in names:
-        return names.index(view)
-    if str(view).isdecimal() and int(view) < len(names):
-        return int(view)
-    raise ValueError(
-        f"{place}: `test_view` must be an index in 0..{len(names) - 1}, one of "
-        f"{', '.join(names)}, or none for no held-out camera, got {view}."
-    )
+    indices = set()
+    for view in [views] if isinstance(views, int | str) else views:
+        if view in names:
+            indices.add(names.index(view))
+        elif str(view).isdecimal() and int(view) < len(names):
+            indices.add(int(view))
+        else:
+            raise ValueError(
+                f"{place}: `test_view` must be an index in 0..{len(names) - 1}, one of "
+                f"{', '.join(names)}, or none for no held-out camera, got {view}."
+            )
+    return tuple(sorted(indices))

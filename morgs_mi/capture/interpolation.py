@@ -51,23 +51,15 @@ def _contribution(
     image: np.ndarray, flow: np.ndarray, back: np.ndarray, share: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return a frame moved by a share of its flow, multiplied by its weights, and the weights."""
-    places = _origins(flow, share)
-    reliable = _sampled(consistency_mask(flow, back).astype(np.float32), places, cv2.INTER_LINEAR)
-    weights = np.float32(1 - share) * (reliable[..., None] + np.float32(_LEAST_WEIGHT))
-    return weights * _sampled(image.astype(np.float32), places, cv2.INTER_CUBIC), weights
-
-
-def _origins(flow: np.ndarray, share: float) -> np.ndarray:
-    """Return the points p of a frame with p + share flow(p) = x for every pixel x, in pixels
-    [H, W, 2].
-    """
     pixels = np.stack(
         np.meshgrid(*(np.arange(n, dtype=np.float32) for n in flow.shape[1::-1])), axis=-1
     )
-    places = pixels
+    places = pixels  # the points p of the frame with p + share flow(p) = x for every pixel x
     for _ in range(_ROUNDS):
         places = pixels - np.float32(share) * _sampled(flow, places, cv2.INTER_LINEAR)
-    return places
+    reliable = _sampled(consistency_mask(flow, back).astype(np.float32), places, cv2.INTER_LINEAR)
+    weights = np.float32(1 - share) * (reliable[..., None] + np.float32(_LEAST_WEIGHT))
+    return weights * _sampled(image.astype(np.float32), places, cv2.INTER_CUBIC), weights
 
 
 def _sampled(image: np.ndarray, places: np.ndarray, how: int) -> np.ndarray:

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -55,22 +53,13 @@ def lens_and_intrinsics(model: str, params: Sequence[float]) -> tuple[Lens, np.n
         ValueError: the model is not supported, or the number of parameters does not match the
             model.
     """
-    _check_parameters(model, params)
-    focals, _ = MODELS[model]
-    fx = params[0]
-    fy = params[focals - 1]
-    cx, cy = params[focals : focals + 2]
-    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
-    return Lens(model, tuple(map(float, params[focals + 2 :]))), K
-
-
-def _check_parameters(model: str, params: Sequence[float]) -> None:
     if model not in MODELS:
         raise ValueError(
             f"the camera model must be one of {', '.join(MODELS)}, got {model}; "
             "undistort the images with COLMAP's image_undistorter first."
         )
-    count = 2 + sum(MODELS[model])
+    focals, coefficients = MODELS[model]
+    count = 2 + focals + coefficients
     if len(params) != count:
         raise ValueError(
             f"the camera model {model} takes {count} parameters, got {len(params)}; write the "
@@ -81,6 +70,11 @@ def _check_parameters(model: str, params: Sequence[float]) -> None:
             f"its parameters must be finite and at most {LARGEST:g}, got {[*params]}; calibrate "
             "again."
         )
+    fx = params[0]
+    fy = params[focals - 1]
+    cx, cy = params[focals : focals + 2]
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
+    return Lens(model, tuple(map(float, params[focals + 2 :]))), K
 
 
 def opencv_lens(coefficients: Sequence[float]) -> Lens:
@@ -130,34 +124,24 @@ def undistortion(
     stages += [refined] if refined is not None and any(refined[1].distortion) else []
     if not stages:
         return None
-    x, y, mask = reduce(_chain, (_maps(*stage) for stage in stages))
+    x, y, mask = _maps(*stages[0])
+    for stage in stages[1:]:
+        columns, rows, valid = _maps(*stage)
+        x, y = (
+            cv2.remap(v, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            for v in (x, y)
+        )
+        recorded = cv2.remap(mask.astype(np.float32), columns, rows, cv2.INTER_LINEAR)
+        mask = valid & (recorded > 1 - 1e-3)
     # Fixed point halves the memory of a rig's maps; its 1/32 px is far below the error of any
     # calibration.
     return Undistortion(cv2.convertMaps(x, y, cv2.CV_16SC2), mask)
 
 
-class _Maps(NamedTuple):
-    """Columns and rows [H, W] px at which a lens shows a pinhole camera's pixels, and the mask of
-    valid ones.
+def _maps(camera: Camera, lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the columns and rows [H, W] px at which a lens shows a pinhole camera's pixels, and
+    the mask of valid ones.
     """
-
-    columns: np.ndarray
-    rows: np.ndarray
-    mask: np.ndarray
-
-
-def _chain(first: _Maps, second: _Maps) -> _Maps:
-    """Return the maps of a lens whose images are undistorted by `second` after `first`."""
-    x, y = (
-        cv2.remap(v, second.columns, second.rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        for v in (first.columns, first.rows)
-    )
-    valid = first.mask.astype(np.float32)
-    valid = cv2.remap(valid, second.columns, second.rows, cv2.INTER_LINEAR) > 1 - 1e-3
-    return _Maps(x, y, second.mask & valid)
-
-
-def _maps(camera: Camera, lens: Lens) -> _Maps:
     K = camera.K.copy()
     K[:2, 2] -= 0.5
     size = (camera.width, camera.height)
@@ -165,7 +149,7 @@ def _maps(camera: Camera, lens: Lens) -> _Maps:
     build = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
     x, y = build(K, lens.opencv_coefficients, np.eye(3), K, size, cv2.CV_32FC1)
     mask = (x >= -0.5) & (x <= camera.width - 0.5) & (y >= -0.5) & (y <= camera.height - 0.5)
-    return _Maps(x, y, mask & ~_folded(x, y, camera))
+    return x, y, mask & ~_folded(x, y, camera)
 
 
 def _folded(x: np.ndarray, y: np.ndarray, camera: Camera) -> np.ndarray:
@@ -181,17 +165,12 @@ def _folded(x: np.ndarray, y: np.ndarray, camera: Camera) -> np.ndarray:
         return np.zeros(x.shape, bool)
     (x_down, x_right), (y_down, y_right) = map(np.gradient, coarse)
     fold = x_right * y_down - x_down * y_right <= 0
-    radius = _radius(camera)
-    return radius >= np.min(radius[::step, ::step][fold], initial=np.inf)
-
-
-def _radius(camera: Camera) -> np.ndarray:
-    """Return the distance of each pixel from the optical axis at depth 1 [H, W]."""
-    # x depends on the column only, y on the row only.
+    # Distance from the optical axis at depth 1: x depends on the column only, y on the row only.
     columns, rows = (np.arange(n) + 0.5 for n in (camera.width, camera.height))
     across = image_coordinates(camera, np.stack([columns, columns], axis=1))[:, 0]
     down = image_coordinates(camera, np.stack([rows, rows], axis=1))[:, 1]
-    return np.hypot(across, down[:, None])
+    radius = np.hypot(across, down[:, None])
+    return radius >= np.min(radius[::step, ::step][fold], initial=np.inf)
 
 
 def image_coordinates(camera: Camera, pixels: np.ndarray) -> np.ndarray:

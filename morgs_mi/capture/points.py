@@ -8,7 +8,7 @@ downscaled. Smaller images have fewer and less exact features.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -50,7 +50,7 @@ def match_capture(
     capture = capture.displayed().at_recorded_size()
     images = next(capture.partial_frames(0, 1)).images
     count = len(capture.cameras)
-    progress = progress or _no_progress
+    progress = progress or (lambda done, count: None)
     features = []
     for done, (image, mask) in enumerate(zip(images, capture.masks, strict=True)):
         progress(done, count)
@@ -58,10 +58,6 @@ def match_capture(
     matches = match_views(features, capture.cameras)
     progress(count, count)
     return SharedFeatures(tuple(features), tuple(matches))
-
-
-def _no_progress(done: int, count: int) -> None:
-    pass
 
 
 def triangulate_points(capture: Capture, shared: SharedFeatures) -> Capture:
@@ -72,7 +68,13 @@ def triangulate_points(capture: Capture, shared: SharedFeatures) -> Capture:
     """
     cameras = capture.at_recorded_size().cameras
     matches = [match for match in shared.matches if not set(capture.test_views) & set(match.views)]
-    matches += match_guided(shared.features, cameras, _unmatched(capture.train_views, matches))
+    # Unmatched pairs of views that match few others.
+    matched_pairs = {match.views for match in matches}
+    partners = Counter(view for pair in matched_pairs for view in pair)
+    few = {view for view in capture.train_views if partners[view] < _MIN_PARTNERS}
+    pairs = combinations(capture.train_views, 2)
+    unmatched = [pair for pair in pairs if pair not in matched_pairs and few & set(pair)]
+    matches += match_guided(shared.features, cameras, unmatched)
     points, colors = triangulate(matches, shared.features, cameras, MAX_ERROR)
     return replace(capture, points=points, point_colors=colors)
 
@@ -100,13 +102,3 @@ def dense_points(capture: Capture, shared: SharedFeatures, seed: int = 0) -> Cap
     points = np.concatenate([sparse.points, points])
     colors = np.concatenate([sparse.point_colors, colors])
     return replace(capture, points=points, point_colors=colors)
-
-
-def _unmatched(views: Sequence[int], matches: Sequence[Match]) -> list[tuple[int, int]]:
-    """Return the unmatched pairs of views that match few others."""
-    matched_pairs = {match.views for match in matches}
-    partners = Counter(view for pair in matched_pairs for view in pair)
-    few = {view for view in views if partners[view] < _MIN_PARTNERS}
-    return [
-        pair for pair in combinations(views, 2) if pair not in matched_pairs and few & set(pair)
-    ]

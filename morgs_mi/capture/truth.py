@@ -7,7 +7,7 @@ the clip.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -80,22 +80,18 @@ def load_truth(folder: str | Path, camera: str, frame: int) -> GroundTruth:
     """
     path = _path(folder, camera, frame)
     channels = read_exr(path)
-    _check_channels(path, channels)
+    missing = {"motion.X", "motion.Y", "depth.Y", "id.Y", "mask.Y"} - channels.keys()
+    if missing:
+        raise ValueError(
+            f"load_truth(): {path} lacks the channels {sorted(missing)}; synthesise the capture "
+            "again."
+        )
     return GroundTruth(
         np.stack([channels["motion.X"], channels["motion.Y"]], axis=-1),
         channels["depth.Y"],
         channels["id.Y"].astype(np.int32),
         channels["mask.Y"] > 0.5,
     )
-
-
-def _check_channels(path: Path, channels: Collection[str]) -> None:
-    missing = {"motion.X", "motion.Y", "depth.Y", "id.Y", "mask.Y"} - set(channels)
-    if missing:
-        raise ValueError(
-            f"load_truth(): {path} lacks the channels {sorted(missing)}; synthesise the capture "
-            "again."
-        )
 
 
 def load_tracks(folder: str | Path) -> Tracks:
