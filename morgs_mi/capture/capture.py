@@ -233,7 +233,24 @@ class Capture:
             "reading": {**asdict(self.reading), "without": list(self.reading.without)},
             "notes": list(self.notes),
             "origin": list(self.origin),
-            "cameras": [_camera_metadata(*view) for view in views],
+            "cameras": [
+                {
+                    "name": camera.name,
+                    "first_frame": int(source.frame_indices[0]),
+                    "recorded_size": [source.reader.width, source.reader.height],
+                    "size": [camera.width, camera.height],
+                    "K": camera.K.tolist(),
+                    "lens": source.lens.model,
+                    "distortion": list(source.lens.distortion),
+                    "undistortion": "none"
+                    if source.undistortion is None
+                    else "cubic, same intrinsics",
+                    "valid_share": 1.0 if mask is None else float(mask.mean()),
+                    **({"delay": camera.delay} if camera.delay else {}),
+                    **({"readout": camera.readout} if camera.readout else {}),
+                }
+                for camera, source, mask in views
+            ],
         }
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
@@ -328,25 +345,6 @@ def _masks(
 ) -> tuple[np.ndarray | None, ...]:
     """Return the masks of the valid pixels of cameras, None where all are valid."""
     return tuple(source.mask(camera) for source, camera in zip(sources, cameras, strict=True))
-
-
-def _camera_metadata(
-    camera: Camera, source: CameraSource, mask: np.ndarray | None
-) -> dict[str, Any]:
-    """Return the reading of a camera's images in JSON types."""
-    return {
-        "name": camera.name,
-        "first_frame": int(source.frame_indices[0]),
-        "recorded_size": [source.reader.width, source.reader.height],
-        "size": [camera.width, camera.height],
-        "K": camera.K.tolist(),
-        "lens": source.lens.model,
-        "distortion": list(source.lens.distortion),
-        "undistortion": "none" if source.undistortion is None else "cubic, same intrinsics",
-        "valid_share": 1.0 if mask is None else float(mask.mean()),
-        **({"delay": camera.delay} if camera.delay else {}),
-        **({"readout": camera.readout} if camera.readout else {}),
-    }
 
 
 def load_capture(

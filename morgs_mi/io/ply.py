@@ -78,32 +78,23 @@ def write_ply(
     raw = gaussians.numpy()
     lengths = np.linalg.norm(raw["quats"], axis=1, keepdims=True)
     unit_quats = raw["quats"] / np.maximum(lengths, 1e-30)
-    columns = {
-        _MEAN: raw["means"],
-        _NORMAL: np.zeros_like(raw["means"]),
-        **(mitsuba_columns(gaussians) if layout == "mitsuba" else _columns(raw)),
-        _SCALE: raw["log_scales"],
-        # A zero quaternion is no rotation.
-        _ROTATION: np.where(lengths > 0, unit_quats, (1, 0, 0, 0)),
-    }
+    # A zero quaternion is no rotation.
+    rotations = np.where(lengths > 0, unit_quats, (1, 0, 0, 0))
+    columns = {_MEAN: raw["means"], _NORMAL: np.zeros_like(raw["means"])}
+    if layout == "mitsuba":
+        columns |= mitsuba_columns(gaussians)
+    else:
+        N, K = raw["sh_coeffs"].shape[:2]
+        columns[_DC] = raw["sh_coeffs"][:, 0]
+        rest = raw["sh_coeffs"][:, 1:].transpose(0, 2, 1).reshape(N, 3 * (K - 1))
+        columns[rest_names(K)] = rest
+        columns[("opacity",)] = raw["logit_opacities"][:, None]
+    columns |= {_SCALE: raw["log_scales"], _ROTATION: rotations}
     names = [name for names in columns for name in names]
     table = np.concatenate([*columns.values()], axis=1, dtype=np.float32, casting="same_kind")
     vertices = table.astype("<f4").view([(name, "<f4") for name in names])[:, 0]
     with atomic_path(path, "write_ply()") as partial:
         PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(partial))
-
-
-def _columns(raw: dict[str, np.ndarray]) -> dict[tuple[str, ...], np.ndarray]:
-    """Return colours and opacities as columns [N, names] by their names, in the order of the
-    layout.
-    """
-    N, K = raw["sh_coeffs"].shape[:2]
-    rest = raw["sh_coeffs"][:, 1:].transpose(0, 2, 1).reshape(N, 3 * (K - 1))
-    return {
-        _DC: raw["sh_coeffs"][:, 0],
-        rest_names(K): rest,
-        ("opacity",): raw["logit_opacities"][:, None],
-    }
 
 
 def read_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
@@ -228,15 +219,6 @@ class _Element:
     count: int
     properties: list[list[str]]
 
-    def dtype(self, order: str) -> np.dtype:
-        """Return the type of a row in the byte order `order`."""
-        if any(words[1] == "list" for words in self.properties):
-            raise ValueError(
-                f"the element {self.name} has lists before the end of what is read, write it "
-                "without them"
-            )
-        return np.dtype([(words[2], order + _TYPES[words[1]]) for words in self.properties])
-
 
 def _read_header(file: BinaryIO) -> tuple[str, list[_Element]]:
     """Return the byte order, empty for text, and the elements."""
@@ -270,7 +252,12 @@ def _read_properties(
     for element in elements:
         if properties.keys() == names:
             break
-        dtype = element.dtype(order)
+        if any(words[1] == "list" for words in element.properties):
+            raise ValueError(
+                f"the element {element.name} has lists before the end of what is read, write it "
+                "without them"
+            )
+        dtype = np.dtype([(words[2], order + _TYPES[words[1]]) for words in element.properties])
         count = element.count
         # A number in a text takes a digit and a separator.
         size = count * dtype.itemsize if order else 2 * count * len(element.properties) - 1

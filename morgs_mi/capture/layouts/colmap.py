@@ -15,7 +15,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -129,29 +128,22 @@ def read_colmap(folder: str | Path) -> ColmapModel:
     return ColmapModel(cameras, lenses, *points)
 
 
-class _Intrinsics(NamedTuple):
-    lens: Lens
-    K: np.ndarray
-    width: int
-    height: int
-
-
-def _intrinsics(path: Path) -> dict[int, _Intrinsics]:
-    """Return the cameras of a model by their ids."""
-    intrinsics: dict[int, _Intrinsics] = {}
+def _intrinsics(path: Path) -> dict[int, tuple[Lens, np.ndarray, int, int]]:
+    """Return the lens, K, width and height of the cameras of a model by their ids."""
+    intrinsics = {}
     rows = (binary_cameras if path.suffix == ".bin" else text_cameras)(path)
     for camera_id, model, width, height, params in rows:
         try:
             lens, K = lens_and_intrinsics(model, params)
         except ValueError as error:
             raise ValueError(f"{path}: camera {camera_id}: {error}") from None
-        intrinsics[camera_id] = _Intrinsics(lens, K, width, height)
+        intrinsics[camera_id] = (lens, K, width, height)
         check_claim(path, _CAMERA_BYTES * len(intrinsics), f"{len(intrinsics)} cameras")
     return intrinsics
 
 
 def _views(
-    path: Path, cameras_path: Path, intrinsics: Mapping[int, _Intrinsics]
+    path: Path, cameras_path: Path, intrinsics: Mapping[int, tuple[Lens, np.ndarray, int, int]]
 ) -> list[tuple[Camera, Lens]]:
     """Return the camera and the lens of each image of a model."""
     views: list[tuple[Camera, Lens]] = []
