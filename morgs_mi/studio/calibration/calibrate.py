@@ -36,7 +36,7 @@ from morgs_mi.core.checks import check_number
 from morgs_mi.core.color_space import display_image, display_stops
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.ranges import check_ranges
-from morgs_mi.io.video import FrameReader, open_clips
+from morgs_mi.io.video import open_clips
 from morgs_mi.studio.calibration.checks.mistakes import same_poses
 from morgs_mi.studio.calibration.checks.rig_check import CameraCheck
 from morgs_mi.studio.calibration.colmap_library import import_pycolmap
@@ -163,7 +163,13 @@ def calibrate(
     check_number("calibrate()", "seed", config.seed, _SEEDS)
     check_ranges(config, "calibrate()")
     report = progress or (lambda stage, done, total: None)
-    _check_folder(path, overwrite)
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path}: expected a folder of clips, found none; check the path.")
+    if (path / "sparse").exists() and not overwrite:
+        raise FileExistsError(
+            f"{path / 'sparse'}: expected no model, got one; remove it, or overwrite it "
+            "(--overwrite)."
+        )
     report("Reading frames", 0, 1)
     images, masks = _frames(path, config, without)
     report("Reading frames", 1, 1)
@@ -172,84 +178,52 @@ def calibrate(
         report("Mapping", 0, 1)
         best = map_views(path, tuple(images), Path(scratch), config.seed)
         report("Mapping", 1, 1)
-        result = _result(path, best)
+        result = CalibrationResult(
+            path / "sparse" / "0",
+            tuple(check.name for check in best.checks if check.fits is not None),
+            tuple(check.name for check in best.checks if check.fits is None),
+            best.model.num_points3D(),
+            best.error,
+            best.checks,
+            best.mapper,
+            best.principal_points,
+        )
         if result.left_out and not config.partial:
-            raise _incomplete(path, result)
-        _name_photos(best.model, path)
+            raise ValueError(
+                f"{path}: expected to register all {len(result.checks)} cameras, got "
+                f"{len(result.cameras)}, without {', '.join(result.left_out)}: move these so that "
+                f"neighbours see the same objects, {_MORE_TEXTURE}, calibrate on another frame "
+                "(--frame), or accept the partial model (--partial)."
+            )
+        # Images of a folder of photos are named after their files, which other programs open by
+        # these names.
+        files = {} if clips_by_camera(path) else photos(path)
+        for image in map(best.model.image, best.model.reg_image_ids()):
+            if (name := Path(image.name).stem) in files:
+                image.name = files[name][0].name
         with atomic_path(path / "sparse", "calibrate()") as folder:
             _write_model(best.model, folder / "0")
     return result
-
-
-def _check_folder(path: Path, overwrite: bool) -> None:
-    """Check that there is a folder of clips, and that its model may be written."""
-    if not path.is_dir():
-        raise FileNotFoundError(f"{path}: expected a folder of clips, found none; check the path.")
-    if (path / "sparse").exists() and not overwrite:
-        raise FileExistsError(
-            f"{path / 'sparse'}: expected no model, got one; remove it, or overwrite it "
-            "(--overwrite)."
-        )
-
-
-def _result(path: Path, best: Candidate) -> CalibrationResult:
-    """Return the result of the calibration of a folder with its best model."""
-    return CalibrationResult(
-        path / "sparse" / "0",
-        tuple(check.name for check in best.checks if check.fits is not None),
-        tuple(check.name for check in best.checks if check.fits is None),
-        best.model.num_points3D(),
-        best.error,
-        best.checks,
-        best.mapper,
-        best.principal_points,
-    )
-
-
-def _incomplete(path: Path, result: CalibrationResult) -> ValueError:
-    """Return the error of a model that lacks some of the cameras."""
-    return ValueError(
-        f"{path}: expected to register all {len(result.checks)} cameras, got "
-        f"{len(result.cameras)}, without {', '.join(result.left_out)}: move these so that "
-        f"neighbours see the same objects, {_MORE_TEXTURE}, calibrate on another frame (--frame), "
-        "or accept the partial model (--partial)."
-    )
 
 
 def _checks(model: Any, names: Sequence[str]) -> tuple[CameraCheck, ...]:
     """Return the result of each camera from its points in COLMAP's model."""
     images = {Path(model.image(i).name).stem: model.image(i) for i in model.reg_image_ids()}
     checks = {name: _check(name, images.get(name), model) for name in names}
-    for name, twin in _twins(images):
-        advice = (
-            f"it has the same pose as {twin}: one clip seems to be a copy of the other; replace it"
-        )
-        checks[name] = replace(checks[name], fits=False, advice=advice)
-    return tuple(checks.values())
-
-
-def _twins(images: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield the names of each image and of another one with the same pose."""
-    cameras = [_posed_camera(*item) for item in images.items()]
+    poses = [
+        np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for image in images.values()
+    ]
+    cameras = [Camera(np.eye(3), pose, 1, 1) for pose in poses]  # with any intrinsics
+    posed_names = [*images]
     for i, j in same_poses(cameras):
-        yield cameras[i].name, cameras[j].name
-        yield cameras[j].name, cameras[i].name
-
-
-def _posed_camera(name: str, image: Any) -> Camera:
-    """Return a camera with the pose of an image, and any intrinsics."""
-    pose = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
-    return Camera(np.eye(3), pose, 1, 1, name)
-
-
-def _name_photos(model: Any, path: Path) -> None:
-    """Name the images of a folder of photos after their files, which other programs open by these
-    names.
-    """
-    files = {} if clips_by_camera(path) else photos(path)
-    for image in map(model.image, model.reg_image_ids()):
-        if (name := Path(image.name).stem) in files:
-            image.name = files[name][0].name
+        for view, twin in ((i, j), (j, i)):
+            name = posed_names[view]
+            advice = (
+                f"it has the same pose as {posed_names[twin]}: one clip seems to be a copy of the "
+                "other; replace it"
+            )
+            checks[name] = replace(checks[name], fits=False, advice=advice)
+    return tuple(checks.values())
 
 
 def _write_model(model: Any, folder: Path) -> None:
@@ -279,25 +253,22 @@ def _check(name: str, image: Any | None, model: Any) -> CameraCheck:
     if image is None:
         advice = f"it could not be registered and has no pose: {_MORE_TEXTURE}"
         return CameraCheck(name, 0, float("nan"), None, advice)
-    errors = [_error(p, image, model) for p in image.points2D if p.has_point3D()]
+    errors = []
+    for point in image.points2D:
+        if point.has_point3D():
+            pixel = image.project_point(model.point3D(point.point3D_id).xyz)
+            # No pixel: the point lies behind the camera.
+            errors.append(np.inf if pixel is None else np.linalg.norm(pixel - point.xy))
     error = float(np.median(errors)) if errors else float("nan")
-    advice = _advice(len(errors), error)
+    advice = ""
+    if len(errors) < _MIN_POINTS:
+        advice = (
+            f"only {len(errors)} points, {_MIN_POINTS} are needed for a reliable pose: "
+            f"{_MORE_TEXTURE}"
+        )
+    elif error > MAX_ERROR:
+        advice = "its points do not fit: try a camera model with more parameters (--camera-model)"
     return CameraCheck(name, len(errors), error, not advice, advice)
-
-
-def _advice(count: int, error: float) -> str:
-    """Return the remedy for a camera with few points or a large error, px; otherwise nothing."""
-    if count < _MIN_POINTS:
-        return f"only {count} points, {_MIN_POINTS} are needed for a reliable pose: {_MORE_TEXTURE}"
-    if error > MAX_ERROR:
-        return "its points do not fit: try a camera model with more parameters (--camera-model)"
-    return ""
-
-
-def _error(point: Any, image: Any, model: Any) -> float:
-    """Return the reprojection error of a point in an image, px; infinite behind its camera."""
-    pixel = image.project_point(model.point3D(point.point3D_id).xyz)
-    return np.inf if pixel is None else float(np.linalg.norm(pixel - point.xy))
 
 
 def _frames(
@@ -308,17 +279,25 @@ def _frames(
     """
     clips = _clips(path, without)
     readers = dict(zip(clips, open_clips([*clips.values()]), strict=True))
-    _check_lengths(path, readers, config.frame)
-    frames = {name: _frame(reader, config.frame) for name, reader in readers.items()}
+    # The last instant of each clip, in frames of a constant rate.
+    last_frames = {
+        name: reader.num_held - 1 if reader.positions is None else round(reader.positions[-1])
+        for name, reader in readers.items()
+    }
+    short = [name for name, last in last_frames.items() if not 0 <= config.frame <= last]
+    if short:
+        raise ValueError(
+            f"{path}: frame {config.frame} is not in the clips of {', '.join(short)}; choose "
+            "another."
+        )
+    frames = {}
+    for name, reader in readers.items():
+        position = int(nearest_frames(reader, np.array([config.frame]))[0])
+        frames[name] = next(reader.frames(position, position + 1))
     stops = display_stops(frames.values())
     images = {name: display_image(image, stops) for name, image in frames.items()}
-    return images, _masks(readers)
-
-
-def _masks(readers: dict[str, FrameReader]) -> dict[str, np.ndarray]:
-    """Return the mask of opaque pixels of each clip with transparent ones."""
     masks = {name: opaque_pixels(reader, name)[0] for name, reader in readers.items()}
-    return {name: mask for name, mask in masks.items() if mask is not None}
+    return images, {name: mask for name, mask in masks.items() if mask is not None}
 
 
 def _clips(path: Path, without: Sequence[str]) -> dict[str, Path | tuple[Path]]:
@@ -337,26 +316,6 @@ def _clips(path: Path, without: Sequence[str]) -> dict[str, Path | tuple[Path]]:
             f"or make {EXAMPLE}"
         )
     return clips
-
-
-def _check_lengths(path: Path, readers: dict[str, FrameReader], frame: int) -> None:
-    """Check that all clips have a frame."""
-    short = [n for n, reader in readers.items() if not 0 <= frame <= _last_position(reader)]
-    if short:
-        raise ValueError(
-            f"{path}: frame {frame} is not in the clips of {', '.join(short)}; choose another."
-        )
-
-
-def _frame(reader: FrameReader, frame: int) -> np.ndarray:
-    """Return the image of a clip that is nearest to a frame of a constant rate."""
-    position = int(nearest_frames(reader, np.array([frame]))[0])
-    return next(reader.frames(position, position + 1))
-
-
-def _last_position(reader: FrameReader) -> int:
-    """Return the last instant of a clip, in frames of a constant rate."""
-    return reader.num_held - 1 if reader.positions is None else round(reader.positions[-1])
 
 
 def match_views(
@@ -382,76 +341,59 @@ def match_views(
     """
     pycolmap = import_pycolmap()
 
-    _write_images(scratch / _IMAGES, images)
+    (scratch / _IMAGES).mkdir()
+    names_by_size: dict[tuple[int, ...], list[str]] = {}
+    for name, image in images.items():
+        _write_png(scratch / _IMAGES / f"{name}.png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+        names_by_size.setdefault(image.shape[:2], []).append(f"{name}.png")
     reader = pycolmap.ImageReaderOptions(camera_model=config.camera_model)
     if masks:
-        _write_masks(scratch / _MASKS, images, masks)
+        (scratch / _MASKS).mkdir()
+        for name, image in images.items():  # COLMAP needs a mask for every image
+            opaque = masks.get(name, np.ones(image.shape[:2], bool))
+            _write_png(scratch / _MASKS / f"{name}.png.png", 255 * opaque.astype(np.uint8))
         reader.mask_path = scratch / _MASKS
     pycolmap.set_random_seed(config.seed)
-    pycolmap.Database.open(scratch / _DATABASE).close()
-    names_by_size = _names_by_size(images)
+    database = scratch / _DATABASE
+    pycolmap.Database.open(database).close()
+    inputs = database, scratch / _IMAGES
+    mode = pycolmap.CameraMode.SINGLE if config.shared_intrinsics else pycolmap.CameraMode.PER_IMAGE
     for done, (size, names) in enumerate(names_by_size.items()):  # each makes a camera of its own
         report("Finding features", done, len(names_by_size))
-        _extract_features(scratch, names, max(size), config, reader)
+        extraction = pycolmap.FeatureExtractionOptions(max_image_size=max(size))
+        extraction.sift.peak_threshold = _PEAK
+        # Else threads number them in any order.
+        pycolmap.import_images(*inputs, mode, names, reader)
+        pycolmap.extract_features(*inputs, names, mode, reader, extraction, pycolmap.Device.cpu)
     report("Finding features", len(names_by_size), len(names_by_size))
-    _check_features(path, scratch / _DATABASE)
+    with closing(pycolmap.Database.open(database)) as db:
+        views = {Path(i.name).stem: i.image_id for i in db.read_all_images()}
+        counts = {name: db.num_keypoints_for_image(view) for name, view in views.items()}
+    if poor := {name: count for name, count in counts.items() if count < _MIN_FEATURES}:
+        table = ", ".join(f"{count} in {name}" for name, count in poor.items())
+        raise ValueError(
+            f"{path}: expected at least {_MIN_FEATURES} features in every view, got {table}: too "
+            f"dark, blurred or uniform; {_MORE_TEXTURE}, or calibrate on another frame (--frame)."
+        )
     report("Matching views", 0, 1)
-    _match_features(scratch / _DATABASE, config.seed)
-    report("Matching views", 1, 1)
-    _check_pairs(path, scratch / _DATABASE)
-
-
-def _write_images(folder: Path, images: dict[str, np.ndarray]) -> None:
-    """Write the images of all views into a new folder."""
-    folder.mkdir()
-    for name, image in images.items():
-        _write_png(folder / f"{name}.png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-
-
-def _write_masks(folder: Path, images: dict[str, np.ndarray], masks: dict[str, np.ndarray]) -> None:
-    """Write a mask for every image, which COLMAP needs, into a new folder."""
-    folder.mkdir()
-    for name, image in images.items():
-        opaque = masks.get(name, np.ones(image.shape[:2], bool))
-        _write_png(folder / f"{name}.png.png", 255 * opaque.astype(np.uint8))
-
-
-def _names_by_size(images: dict[str, np.ndarray]) -> dict[tuple[int, ...], list[str]]:
-    """Return the names of the files with the images of each size [H, W]."""
-    names: dict[tuple[int, ...], list[str]] = {}
-    for name, image in images.items():
-        names.setdefault(image.shape[:2], []).append(f"{name}.png")
-    return names
-
-
-def _extract_features(
-    scratch: Path, names: list[str], max_side: int, config: CalibrateConfig, reader: Any
-) -> None:
-    """Write the features of images of one size, and their camera or cameras, into the database."""
-    pycolmap = import_pycolmap()
-
-    inputs = scratch / _DATABASE, scratch / _IMAGES
-    mode = pycolmap.CameraMode.SINGLE if config.shared_intrinsics else pycolmap.CameraMode.PER_IMAGE
-    extraction = pycolmap.FeatureExtractionOptions(max_image_size=max_side)
-    extraction.sift.peak_threshold = _PEAK
-    # Else threads number them in any order.
-    pycolmap.import_images(*inputs, mode, names, reader)
-    pycolmap.extract_features(*inputs, names, mode, reader, extraction, pycolmap.Device.cpu)
-
-
-def _match_features(database: Path, seed: int) -> None:
-    """Write the verified matches of all pairs of views into the database."""
-    pycolmap = import_pycolmap()
-
     # Without a seed of its own, the verification keeps other matches on each run, and may lose a
     # view with few of them.
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = seed
+    verification.ransac.random_seed = config.seed
     # Guided matching takes several times as long, and its poses are no better by matches of other
     # features.
     pycolmap.match_exhaustive(
         database, verification_options=verification, device=pycolmap.Device.cpu
     )
+    report("Matching views", 1, 1)
+    with closing(pycolmap.Database.open(database)) as db:
+        _, geometries = db.read_two_view_geometries()
+    if not any(len(geometry.inlier_matches) for geometry in geometries):
+        raise ValueError(
+            f"{path}: no two of the {len(counts)} views match: they may show different objects, "
+            "be too far apart (more than about 30 degrees), or not be simultaneous; move the "
+            f"cameras closer, or {_MORE_TEXTURE}."
+        )
 
 
 def map_views(path: Path, names: Sequence[str], scratch: Path, seed: int) -> Candidate:
@@ -488,16 +430,7 @@ def map_views(path: Path, names: Sequence[str], scratch: Path, seed: int) -> Can
 
 
 def _mapped(names: Sequence[str], scratch: Path, seed: int) -> list[Candidate]:
-    """Return the models of both mappers."""
-    return [
-        Candidate(mapper, model, _checks(model, names))
-        for mapper, models in _models_by_mapper(scratch, seed).items()
-        for model in models.values()
-    ]
-
-
-def _models_by_mapper(scratch: Path, seed: int) -> dict[Mapper, dict[int, Any]]:
-    """Return the reconstructions of both mappers.
+    """Return the models of both mappers.
 
     Threads of a mapper share its random samples, which makes other models on some runs; one thread
     takes as long.
@@ -507,40 +440,28 @@ def _models_by_mapper(scratch: Path, seed: int) -> dict[Mapper, dict[int, Any]]:
     inputs = scratch / _DATABASE, scratch / _IMAGES, scratch
     settings = {"random_seed": seed, "num_threads": 1}
     incremental = pycolmap.IncrementalPipelineOptions(min_model_size=2, **settings)
-    return {
+    models_by_mapper: dict[Mapper, dict[int, Any]] = {
         "incremental": pycolmap.incremental_mapping(*inputs, incremental),
         "global": pycolmap.global_mapping(*inputs, pycolmap.GlobalPipelineOptions(**settings)),
     }
+    return [
+        Candidate(mapper, model, _checks(model, names))
+        for mapper, models in models_by_mapper.items()
+        for model in models.values()
+    ]
 
 
 def _with_principal_points(candidate: Candidate, names: Sequence[str]) -> Candidate:
     """Return the model with a camera and a principal point for each image, or as it is if that fits
     no better.
     """
-    model = _with_own_cameras(candidate.model)
-    _adjust_principal_points(model)
-    old_error, new_error = (_median_error(model) for model in (candidate.model, model))
-    if not new_error < (1 - _LEAST_DECREASE) * old_error:
-        return candidate
-    return Candidate(candidate.mapper, model, _checks(model, names), principal_points=True)
-
-
-def _adjust_principal_points(model: Any) -> None:
-    """Change the poses, points and principal points of a model by a bundle adjustment."""
     pycolmap = import_pycolmap()
 
+    model = _with_own_cameras(candidate.model)
     config = pycolmap.BundleAdjustmentConfig()
     for image in model.reg_image_ids():
         config.add_image(image)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    options = _principal_point_options()
-    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
-
-
-def _principal_point_options() -> Any:
-    """Return the settings of a bundle adjustment of poses, points and principal points."""
-    pycolmap = import_pycolmap()
-
     options = pycolmap.BundleAdjustmentOptions(
         refine_focal_length=False,
         refine_extra_params=False,
@@ -548,7 +469,11 @@ def _principal_point_options() -> Any:
         print_summary=False,
     )
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    return options
+    pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    old_error, new_error = (_median_error(model) for model in (candidate.model, model))
+    if not new_error < (1 - _LEAST_DECREASE) * old_error:
+        return candidate
+    return Candidate(candidate.mapper, model, _checks(model, names), principal_points=True)
 
 
 def _with_own_cameras(model: Any) -> Any:
@@ -557,23 +482,16 @@ def _with_own_cameras(model: Any) -> Any:
 
     copy = pycolmap.Reconstruction()
     for i in model.reg_image_ids():
-        _add_image(copy, i, model)
+        image = model.image(i)
+        camera = pycolmap.Camera(model.camera(image.camera_id).todict())
+        camera.camera_id = i
+        copy.add_camera_with_trivial_rig(camera)
+        keypoints = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
+        image_copy = pycolmap.Image(image_id=i, camera_id=i, name=image.name, keypoints=keypoints)
+        copy.add_image_with_trivial_frame(image_copy, image.cam_from_world())
     for point in model.points3D.values():
         copy.add_point3D(point.xyz, point.track, point.color)
     return copy
-
-
-def _add_image(copy: Any, i: int, model: Any) -> None:
-    """Add an image of a model, with a camera of its own, to a copy of the model."""
-    pycolmap = import_pycolmap()
-
-    image = model.image(i)
-    camera = pycolmap.Camera(model.camera(image.camera_id).todict())
-    camera.camera_id = i
-    copy.add_camera_with_trivial_rig(camera)
-    keypoints = np.array([point.xy for point in image.points2D]).reshape(-1, 2)
-    image_copy = pycolmap.Image(image_id=i, camera_id=i, name=image.name, keypoints=keypoints)
-    copy.add_image_with_trivial_frame(image_copy, image.cam_from_world())
 
 
 def _median_error(model: Any) -> float:
@@ -581,39 +499,6 @@ def _median_error(model: Any) -> float:
     model.update_point_3d_errors()
     errors = [point.error for point in model.points3D.values()]
     return float(np.median(errors)) if errors else 0.0
-
-
-def _check_features(path: Path, database: Path) -> None:
-    counts = _feature_counts(database)
-    if poor := {name: count for name, count in counts.items() if count < _MIN_FEATURES}:
-        table = ", ".join(f"{count} in {name}" for name, count in poor.items())
-        raise ValueError(
-            f"{path}: expected at least {_MIN_FEATURES} features in every view, got {table}: too "
-            f"dark, blurred or uniform; {_MORE_TEXTURE}, or calibrate on another frame (--frame)."
-        )
-
-
-def _feature_counts(database: Path) -> dict[str, int]:
-    """Return the number of features of each view by name."""
-    pycolmap = import_pycolmap()
-
-    with closing(pycolmap.Database.open(database)) as db:
-        images = db.read_all_images()
-        return {Path(i.name).stem: db.num_keypoints_for_image(i.image_id) for i in images}
-
-
-def _check_pairs(path: Path, database: Path) -> None:
-    pycolmap = import_pycolmap()
-
-    with closing(pycolmap.Database.open(database)) as db:
-        count = len(db.read_all_images())
-        _, geometries = db.read_two_view_geometries()
-    if not any(len(geometry.inlier_matches) for geometry in geometries):
-        raise ValueError(
-            f"{path}: no two of the {count} views match: they may show different objects, be too "
-            "far apart (more than about 30 degrees), or not be simultaneous; move the cameras "
-            f"closer, or {_MORE_TEXTURE}."
-        )
 
 
 @contextmanager
