@@ -141,9 +141,15 @@ def offset_equations(
     moving = (np.asarray(gaussians.motion) != 0).any(axis=1)
     d = np.asarray(gaussians.motion, np.float64)[moving]
     means = np.asarray(gaussians.means, np.float64)[moving]
-    products = [_products(gaussians, *each, blur) for each in zip(views, targets, strict=True)]
+    products = []
+    for view, target in zip(views, targets, strict=True):
+        error = blurred(target.difference(view.render(gaussians, ("color",)).color), blur)
+        gradient = image_gradient(blurred(target.image(), blur))
+        products.append(gradient_products(gaussians, view, error, gradient))
     A, b = (np.stack([each[moving] for each in kind]) for kind in zip(*products, strict=True))
-    H, b = _by_position(A, b, np.stack([v.camera.projection_jacobian(means) for v in views]))
+    J = np.stack([view.camera.projection_jacobian(means) for view in views])
+    H = np.einsum("vkai,vkab,vkbj->vkij", J, A, J)
+    b = np.einsum("vkai,vka->vki", J, b)
     c = np.einsum("vkij,kj->vki", H, d)
     weights = np.einsum("vki,kij->vkj", c, _inverses(H[train].sum(axis=0)))
     parts = np.einsum("vki,ki->vk", weights, b[train].sum(axis=0)) - np.einsum("vki,ki->vk", b, d)
@@ -152,11 +158,6 @@ def offset_equations(
     matrix = np.diag(diagonal)
     matrix[:, train] -= np.einsum("vki,wki->vw", weights, c[train])
     return OffsetEquations(matrix, parts.sum(axis=1), groups @ groups.T, diagonal, train)
-
-
-def _by_position(A: np.ndarray, b: np.ndarray, J: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return J^T A J [V, n, 3, 3] and J^T b [V, n, 3] of each view and Gaussian."""
-    return np.einsum("vkai,vkab,vkbj->vkij", J, A, J), np.einsum("vkai,vka->vki", J, b)
 
 
 def _inverses(curvatures: np.ndarray) -> np.ndarray:
@@ -173,13 +174,3 @@ def _grouped(parts: np.ndarray, means: np.ndarray) -> np.ndarray:
         return parts
     _, labels = KDTree(means[::_GROUP]).query(means)
     return np.stack([np.bincount(labels, row) for row in parts])
-
-
-def _products(
-    gaussians: Gaussians, view: ActiveView, target: Target, blur: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return A [N, 2, 2] and b [N, 2] of a view."""
-    error = target.difference(view.render(gaussians, ("color",)).color)
-    return gradient_products(
-        gaussians, view, blurred(error, blur), image_gradient(blurred(target.image(), blur))
-    )

@@ -37,7 +37,6 @@ from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.view import View
-from morgs_mi.io.video import ImageOrError
 from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.flow_registry import FramePair
 from morgs_mi.method.lift import lift_flow
@@ -117,25 +116,32 @@ def estimate_time_offsets(
     if len(capture.cameras) < 2:
         raise ValueError(f"{capture.path}: expected at least 2 cameras to compare clocks, got 1.")
     clips = _Clips.of(capture)
-    largest = _largest_offset(clips)
-    instants = np.linspace(largest, clips.num_frames - 2 - largest, _INSTANTS).round().astype(int)
-    rounds = _Rounds(clips, instants, seed, progress)
-    offsets, step, equations = _aligned(rounds, largest)
-    reference = capture.reference_view
-    part = _found_back(rounds, offsets - step, equations, reference)
-    errors = np.minimum(equations.errors(reference) / part, UNKNOWN)
-    return _relative(capture, offsets, errors, float(np.abs(step).max()))
-
-
-def _largest_offset(clips: _Clips) -> int:
-    """Return the largest offset in frames that clips can show."""
     largest = min(_LARGEST, (clips.num_frames - 2) // 2)
     if largest < 1:
         raise ValueError(
             f"{clips.path}: expected at least 4 frames to compare clocks, got "
             f"{clips.num_frames}; record longer."
         )
-    return largest
+    instants = np.linspace(largest, clips.num_frames - 2 - largest, _INSTANTS).round().astype(int)
+    rounds = _Rounds(clips, instants, seed, progress)
+    offsets, step, equations = _aligned(rounds, largest)
+    reference = capture.reference_view
+    part = _found_back(rounds, offsets - step, equations, reference)
+    errors = np.minimum(equations.errors(reference) / part, UNKNOWN)
+    settings = capture.reading.offset
+    clocks = offsets - [camera.delay for camera in capture.cameras]
+    options = {
+        name: round(float(settings.get(name, 0.0) - (clock - clocks[reference])), 3) + 0.0
+        for name, clock in zip(capture.names, clocks, strict=True)
+    }
+    change = float(np.abs(step).max())
+    return TimeOffsets(
+        options,
+        dict(zip(capture.names, np.round(errors, 3).tolist(), strict=True)),
+        capture.names[reference],
+        change,
+        change < _TOLERANCE,
+    )
 
 
 def _aligned(rounds: _Rounds, largest: int) -> tuple[np.ndarray, np.ndarray, OffsetEquations]:
@@ -150,18 +156,13 @@ def _aligned(rounds: _Rounds, largest: int) -> tuple[np.ndarray, np.ndarray, Off
         solution = equations.solution()
         change = solution - previous
         share = _share(step[train], change[train]) if blur in _BLUR_OF_ROUND[:index] else 1.0
-        result = _next_offsets(offsets, equations.solution(share), largest)
+        longest_step = np.clip(equations.solution(share), -_LONGEST_STEP, _LONGEST_STEP)
+        result = np.clip(offsets + longest_step, -largest, largest)
         step = result - offsets
         offsets = result
         if not blur and np.abs(step).max() < _TOLERANCE:
             break
     return offsets, step, equations
-
-
-def _next_offsets(offsets: np.ndarray, solution: np.ndarray, largest: int) -> np.ndarray:
-    """Return the offsets [V] after a step, both within their bounds."""
-    step = np.clip(solution, -_LONGEST_STEP, _LONGEST_STEP)
-    return np.clip(offsets + step, -largest, largest)
 
 
 def _share(step: np.ndarray, change: np.ndarray) -> float:
@@ -198,26 +199,20 @@ class _Rounds:
         """Return the sum of the equations of all instants, with images interpolated by offsets [V]
         and blurred.
         """
-        equations = reduce(add, [self._instant_equations(i - offsets, blur) for i in self.instants])
+        parts = []
+        for instant in self.instants:
+            parts.append(_equations_at(self.clips, instant - offsets, blur, self.seed))
+            self.done += 1
+            if self.progress is not None:
+                # There are fewer fits if a round is left out.
+                self.progress(self.done, (len(_BLUR_OF_ROUND) + 1) * len(self.instants))
+        equations = reduce(add, parts)
         if not equations.own.any():
             raise ValueError(
                 f"{self.clips.path}: expected motion in the first {self.clips.num_frames} frames, "
                 "found none; record something that moves."
             )
         return equations
-
-    def _instant_equations(self, times: np.ndarray, blur: float) -> OffsetEquations:
-        """Return the equations of an instant, and report the fit."""
-        equations = _equations_at(self.clips, times, blur, self.seed)
-        self.done += 1
-        if self.progress is not None:
-            self.progress(self.done, self._most_fits)
-        return equations
-
-    @property
-    def _most_fits(self) -> int:
-        """Number of the fits if no round is left out."""
-        return (len(_BLUR_OF_ROUND) + 1) * len(self.instants)
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,7 +222,7 @@ class _Clips:
     path: Path  # folder of the capture
     cameras: tuple[Camera, ...]  # V views
     masks: tuple[np.ndarray | None, ...]  # valid pixels of each [H, W], or None
-    images: tuple[tuple[np.ndarray, ...], ...]  # per view and frame uint8 [H, W, 3]
+    images: list[list[np.ndarray]]  # per view and frame uint8 [H, W, 3]
     train: list[int]  # indices of the training views
     points: np.ndarray  # [P, 3], world units
     point_colors: np.ndarray  # [P, 3] in [0, 1]
@@ -235,16 +230,26 @@ class _Clips:
     @classmethod
     def of(cls, capture: Capture) -> _Clips:
         display = capture.displayed()
-        clips = [_clip(display, view) for view in range(len(capture.cameras))]
+        clips = []
+        for view in range(len(capture.cameras)):
+            clips.append([])
+            for image in display.images(view, 0, _FRAMES):
+                if isinstance(image, Exception):
+                    raise image
+                clips[-1].append(image)
         views = zip(capture.cameras, (clip[0] for clip in clips), capture.masks, strict=True)
         small, _, masks = zip(*(View(*view).reduced(_WIDTH) for view in views), strict=True)
         # The images are whole frames: with the capture's delays they would be displaced twice.
         cameras = tuple(camera.without_delays() for camera in small)
+        images = []
+        for clip, camera in zip(clips, cameras, strict=True):
+            size = (camera.width, camera.height)
+            images.append([cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in clip])
         return cls(
             capture.path,
             cameras,
             masks,
-            tuple(_reduced(*each) for each in zip(clips, cameras, strict=True)),
+            images,
             list(capture.train_views),
             capture.points,
             capture.point_colors,
@@ -259,39 +264,19 @@ class _Clips:
         """Return the image of each view at its own time [V], in frames."""
         times = np.clip(times, 0, self.num_frames - 1)
         first = np.minimum(np.floor(times).astype(int), self.num_frames - 2)
-        views = zip(self.images, first, times - first, strict=True)
-        return [_image_at(*view) for view in views]
-
-
-def _image_at(clip: Sequence[np.ndarray], frame: int, share: float) -> np.ndarray:
-    """Return the image of a clip at a share of the time from a frame to the next one."""
-    if share in (0, 1):
-        return clip[frame + round(share)]
-    return image_between(clip[frame], clip[frame + 1], share)
-
-
-def _clip(capture: Capture, view: int) -> list[np.ndarray]:
-    """Return the first images of a view."""
-    return [_checked(image) for image in capture.images(view, 0, _FRAMES)]
-
-
-def _reduced(clip: Sequence[np.ndarray], camera: Camera) -> tuple[np.ndarray, ...]:
-    """Return the images of a clip in the size of a camera."""
-    size = (camera.width, camera.height)
-    images = (cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in clip)
-    return tuple(map(np.asarray, images))
-
-
-def _checked(image: ImageOrError) -> np.ndarray:
-    if isinstance(image, Exception):
-        raise image
-    return image
+        return [
+            clip[frame + round(share)]
+            if share in (0, 1)
+            else image_between(clip[frame], clip[frame + 1], share)
+            for clip, frame, share in zip(self.images, first, times - first, strict=True)
+        ]
 
 
 def _equations_at(clips: _Clips, times: np.ndarray, blur: float, seed: int) -> OffsetEquations:
     """Return the equations of an instant, which each view shows at its own time [V]."""
     images = clips.at(times)
-    pairs = _frame_pairs(clips, images, clips.at(times + 1))
+    next_images = clips.at(times + 1)
+    pairs = {v: FramePair(next_images[v], images[v], valid=clips.masks[v]) for v in clips.train}
     targets = [Target(image, mask) for image, mask in zip(images, clips.masks, strict=True)]
     gaussians = _fitted(clips, images, 2 if blur else 1, seed)
     views = [ActiveView(camera) for camera in clips.cameras]
@@ -299,13 +284,6 @@ def _equations_at(clips: _Clips, times: np.ndarray, blur: float, seed: int) -> O
     gaussians = replace(gaussians, motion=flow.displacement)
     train = np.isin(np.arange(len(views)), clips.train)
     return offset_equations(gaussians, views, targets, train, blur)
-
-
-def _frame_pairs(
-    clips: _Clips, images: Sequence[np.ndarray], next_images: Sequence[np.ndarray]
-) -> dict[int, FramePair]:
-    """Return the images of two frames in each training view."""
-    return {v: FramePair(next_images[v], images[v], valid=clips.masks[v]) for v in clips.train}
 
 
 def _fitted(clips: _Clips, images: Sequence[np.ndarray], divisor: int, seed: int) -> Gaussians:
@@ -317,47 +295,15 @@ def _fitted(clips: _Clips, images: Sequence[np.ndarray], divisor: int, seed: int
         divisor: divisor of the numbers of Gaussians and steps.
         seed: seed of the fit.
     """
-    fit = _fit_config(divisor)
-    views = [View(clips.cameras[v], images[v], clips.masks[v]) for v in clips.train]
-    rng = rng_of(seed, Stream.TIMING)
-    points = (clips.points, clips.point_colors)
-    problem = FirstFrameProblem.of(views, points, fit, RenderConfig(), rng)
-    return fit_first_frame(problem, fit, rng).gaussians
-
-
-def _fit_config(divisor: int) -> FitConfig:
-    """Return the settings of a fit, with the numbers of Gaussians and steps divided."""
-    return FitConfig(
+    fit = FitConfig(
         sh_degree=0,
         num_gaussians=GAUSSIANS // divisor,
         first_frame_steps=STEPS // divisor,
         dropping=0.0,
         density=DensityConfig(rounds=0),
     )
-
-
-def _relative(
-    capture: Capture, offsets: np.ndarray, errors: np.ndarray, change: float
-) -> TimeOffsets:
-    """Return the result with the offsets relative to the reference, in addition to the capture's
-    offsets.
-    """
-    clocks = offsets - [camera.delay for camera in capture.cameras]
-    return TimeOffsets(
-        _options(capture, clocks),
-        dict(zip(capture.names, np.round(errors, 3).tolist(), strict=True)),
-        capture.names[capture.reference_view],
-        change,
-        change < _TOLERANCE,
-    )
-
-
-def _options(capture: Capture, clocks: np.ndarray) -> dict[str, float]:
-    """Return the setting `offset` that aligns cameras with clocks [V], in frames."""
-    settings = capture.reading.offset
-    reference = clocks[capture.reference_view]
-    options = {
-        name: settings.get(name, 0.0) - (clock - reference)
-        for name, clock in zip(capture.names, clocks, strict=True)
-    }
-    return {name: round(float(offset), 3) + 0.0 for name, offset in options.items()}
+    views = [View(clips.cameras[v], images[v], clips.masks[v]) for v in clips.train]
+    rng = rng_of(seed, Stream.TIMING)
+    points = (clips.points, clips.point_colors)
+    problem = FirstFrameProblem.of(views, points, fit, RenderConfig(), rng)
+    return fit_first_frame(problem, fit, rng).gaussians
