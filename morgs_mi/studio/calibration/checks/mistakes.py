@@ -62,17 +62,14 @@ _LEAST_FACTOR = 0.1
 def same_poses(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     """Return the pairs of cameras with the same pose."""
     positions = np.array([camera.position for camera in cameras])
+    rotations = np.array([np.asarray(camera.viewmat, np.float64)[:3, :3] for camera in cameras])
     near = _SAME * np.linalg.norm(positions - positions.mean(0), axis=1).max()
-    pairs = combinations(range(len(cameras)), 2)
-    return [(i, j) for i, j in pairs if _have_same_pose(cameras[i], cameras[j], near)]
-
-
-def _have_same_pose(a: Camera, b: Camera, near: float) -> bool:
-    """Return whether two cameras have the same rotation, and positions up to `near` apart."""
-    if not np.linalg.norm(a.position - b.position) <= near:
-        return False
-    rotations = [np.asarray(camera.viewmat, np.float64)[:3, :3] for camera in (a, b)]
-    return bool(np.abs(rotations[0] - rotations[1]).max() < _SAME)
+    return [
+        (i, j)
+        for i, j in combinations(range(len(cameras)), 2)
+        if np.linalg.norm(positions[i] - positions[j]) <= near
+        and np.abs(rotations[i] - rotations[j]).max() < _SAME
+    ]
 
 
 def rig_candidates(
@@ -84,41 +81,41 @@ def rig_candidates(
         capture: the capture.
         wrong: the views with poses that do not fit; their order may be wrong.
     """
+    cameras = capture.cameras
     if capture.layout == poses_bounds.LAYOUT.name:
-        yield from _other_rows(capture)
+        alphabetical = sorted(capture.names)
+        order = ", ".join(alphabetical[:4])
+        yield (
+            [cameras[alphabetical.index(name)] for name in capture.names],
+            f"the rows seem to be in alphabetical order ({order}, ...); put them in numerical "
+            "order",
+        )
+        yield (
+            _turned(cameras, _UPRIGHT),
+            "the columns seem to be the camera's right, up and backward axes; expected down, "
+            "right, backward",
+        )
     else:
         layout = layout_called(capture.layout)
         poses = layout.poses if layout else PoseConvention()
-        yield from _other_conventions(capture.cameras, poses) if poses else ()
-    if len(capture.cameras) <= _MAX_EXCHANGED:
-        yield from _exchanges(capture.cameras)
+        yield from _other_conventions(cameras, poses) if poses else ()
+    if len(cameras) <= _MAX_EXCHANGED:
+        for i, j in combinations(range(len(cameras)), 2):
+            names = f"{cameras[i].name} and {cameras[j].name}"
+            yield (
+                _reordered(cameras, {i: j, j: i}),
+                f"the clips of {names}, or their poses, seem to be swapped; exchange them",
+            )
     if 3 <= len(wrong) <= _MAX_PERMUTED:
-        yield from _permutations(capture.cameras, wrong)
-
-
-def _exchanges(cameras: Sequence[Camera]) -> Iterator[tuple[Sequence[Camera], str]]:
-    """Yield the cameras for each exchange of two poses."""
-    for i, j in combinations(range(len(cameras)), 2):
-        names = f"{cameras[i].name} and {cameras[j].name}"
-        yield (
-            _reordered(cameras, {i: j, j: i}),
-            f"the clips of {names}, or their poses, seem to be swapped; exchange them",
-        )
-
-
-def _permutations(
-    cameras: Sequence[Camera], wrong: Sequence[int]
-) -> Iterator[tuple[Sequence[Camera], str]]:
-    """Yield the cameras for each order of the poses of the views `wrong`."""
-    for order in permutations(wrong):
-        sources = dict(zip(wrong, order, strict=True))
-        names = ", ".join(
-            f"{cameras[view].name} has that of {cameras[k].name}" for view, k in sources.items()
-        )
-        yield (
-            _reordered(cameras, sources),
-            f"the poses seem to be in another order ({names}); reorder them",
-        )
+        for order in permutations(wrong):
+            sources = dict(zip(wrong, order, strict=True))
+            names = ", ".join(
+                f"{cameras[view].name} has that of {cameras[k].name}" for view, k in sources.items()
+            )
+            yield (
+                _reordered(cameras, sources),
+                f"the poses seem to be in another order ({names}); reorder them",
+            )
 
 
 def _reordered(cameras: Sequence[Camera], sources: Mapping[int, int]) -> list[Camera]:
@@ -131,18 +128,14 @@ def camera_candidates(camera: Camera) -> Iterator[tuple[Camera, str]]:
     pose = np.asarray(camera.viewmat, np.float64)
     for rotation, sentence in _CAMERA_MISTAKES:
         yield replace(camera, viewmat=rotation @ pose), sentence
-    yield replace(camera, viewmat=_HALF_TURN @ pose, K=_turned_intrinsics(camera)), _UPSIDE_DOWN
+    # A turned pose keeps the principal point; a turned image has the opposite one.
+    opposite = (camera.width, camera.height, 2) - camera.K[:, 2]
+    K = np.column_stack([camera.K[:, :2], opposite])
+    yield replace(camera, viewmat=_HALF_TURN @ pose, K=K), _UPSIDE_DOWN
     yield (
         replace(camera, viewmat=np.linalg.inv(pose)),
         "its pose is inverted, the other poses are not: invert it",
     )
-
-
-def _turned_intrinsics(camera: Camera) -> np.ndarray:
-    """Return the matrix K of a camera whose images are turned by 180 degrees."""
-    # A turned pose keeps the principal point; a turned image has the opposite one.
-    opposite = (camera.width, camera.height, 2) - camera.K[:, 2]
-    return np.column_stack([camera.K[:, :2], opposite])
 
 
 def focal_candidates(
@@ -156,7 +149,21 @@ def focal_candidates(
         scaled: returns what has a factor on its focal lengths.
         error: error of what is scaled, px.
     """
-    factor = _best_factor(lambda factor: error(scaled(factor)))
+
+    def error_of(octaves: float) -> float:
+        # The search cannot compare infinite errors.
+        return min(error(scaled(float(2.0**octaves))), 1e9)
+
+    steps = np.arange(-_FACTOR_OCTAVES, _FACTOR_OCTAVES + _FACTOR_STEP, _FACTOR_STEP)
+    start = min(steps, key=error_of)
+    bounds = (start - _FACTOR_STEP, start + _FACTOR_STEP)
+    # Imported here because it slows down the start of every command.
+    from scipy.optimize import minimize_scalar
+
+    minimum: Any = minimize_scalar(
+        error_of, bounds=bounds, method="bounded", options={"xatol": 3e-3}
+    )
+    factor = float(2.0**minimum.x)
     if abs(factor - 1) <= _LEAST_FACTOR:
         return []
     sentence = (
@@ -166,46 +173,9 @@ def focal_candidates(
     return [(scaled(factor), sentence)]
 
 
-def _best_factor(error: Callable[[float], float]) -> float:
-    """Return the factor from 1/4 to 4 with the least error: the best step, then refined."""
-
-    def of_octaves(octaves: float) -> float:
-        # The search cannot compare infinite errors.
-        return min(error(float(2.0**octaves)), 1e9)
-
-    steps = np.arange(-_FACTOR_OCTAVES, _FACTOR_OCTAVES + _FACTOR_STEP, _FACTOR_STEP)
-    start = min(steps, key=of_octaves)
-    bounds = (start - _FACTOR_STEP, start + _FACTOR_STEP)
-    # Imported here because it slows down the start of every command.
-    from scipy.optimize import minimize_scalar
-
-    minimum: Any = minimize_scalar(
-        of_octaves, bounds=bounds, method="bounded", options={"xatol": 3e-3}
-    )
-    return float(2.0**minimum.x)
-
-
 def with_focal_factor(camera: Camera, factor: float) -> Camera:
     """Return the camera with its focal lengths multiplied by `factor`."""
     return replace(camera, K=camera.K @ np.diag([factor, factor, 1.0]))
-
-
-def _other_rows(capture: Capture) -> list[tuple[Sequence[Camera], str]]:
-    """Return the alternatives for poses in the rows of `poses_bounds.npy`."""
-    alphabetical = sorted(capture.names)
-    order = ", ".join(alphabetical[:4])
-    return [
-        (
-            [capture.cameras[alphabetical.index(name)] for name in capture.names],
-            f"the rows seem to be in alphabetical order ({order}, ...); put them in numerical "
-            "order",
-        ),
-        (
-            _turned(capture.cameras, _UPRIGHT),
-            "the columns seem to be the camera's right, up and backward axes; expected down, "
-            "right, backward",
-        ),
-    ]
 
 
 def _turned(cameras: Sequence[Camera], rotation: np.ndarray) -> list[Camera]:

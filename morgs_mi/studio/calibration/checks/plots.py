@@ -63,14 +63,6 @@ def write_rig(path: Path, capture: Capture) -> None:
         OSError: the file cannot be written.
     """
     check_plot(path)
-    data = _plot(path.suffix[1:].lower(), capture)
-    with atomic_path(path, "write_rig()") as partial:
-        partial.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(data)
-
-
-def _plot(suffix: str, capture: Capture) -> bytes:
-    """Return the file of the plot of a capture's rig."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
@@ -81,8 +73,10 @@ def _plot(suffix: str, capture: Capture) -> bytes:
         figure = Figure(figsize=(_WIDTH, _HEIGHT), layout="constrained")
         points = (capture.points, capture.point_colors)
         draw_rig(figure, capture.cameras, points, capture.test_views)
-        figure.savefig(data, format=suffix, dpi=_DPI)
-    return data.getvalue()
+        figure.savefig(data, format=path.suffix[1:].lower(), dpi=_DPI)
+    with atomic_path(path, "write_rig()") as partial:
+        partial.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_bytes(data.getvalue())
 
 
 def draw_rig(
@@ -128,10 +122,17 @@ def _draw_projection(
 ) -> None:
     """Draw frusta [V, 5, 3], each with a name and a colour, and points on a plane [2, 3]."""
     axes.scatter(*(plane @ places.T), s=1, c=np.clip(colors, 0, 1), rasterized=True)
-    for frustum, label in zip(frusta @ plane.T, labels, strict=True):
-        _draw_frustum(axes, frustum, *label)
+    for frustum, (name, color) in zip(frusta @ plane.T, labels, strict=True):
+        axes.plot(*frustum[_EDGES].T, color=color, linewidth=1)
+        axes.plot(*frustum[0], "o", color=color, markersize=4)
+        axes.annotate(name, frustum[0], xytext=(4, 4), textcoords="offset points", fontsize=8)
     core = np.percentile(places, [1, 99], axis=0) if len(places) else np.zeros((0, 3))
-    _frame(axes, np.concatenate([frusta.reshape(-1, 3), core]) @ plane.T)
+    corners = np.concatenate([frusta.reshape(-1, 3), core]) @ plane.T
+    # The panel is a square around them with a margin.
+    half = 0.6 * max(np.ptp(corners, axis=0).max(), 1e-12)
+    xlim, ylim = (corners.min(0) + corners.max(0))[:, None] / 2 + (-half, half)
+    axes.set(xlim=xlim, ylim=ylim, aspect="equal", axisbelow=True)
+    axes.grid(color="0.9")
 
 
 def _around_middle(
@@ -143,30 +144,15 @@ def _around_middle(
     positions = np.array([camera.position for camera in cameras])
     middle = positions.mean(0)
     radius = np.linalg.norm(positions - middle, axis=1).max() or 1.0
-    frusta = np.array([_frustum(camera, 0.25 * radius) for camera in cameras])
+    # The centre of each camera, and the corners of its image at a depth.
+    depths = np.full(4, 0.25 * radius)
+    frusta = []
+    for camera in cameras:
+        corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (camera.width, camera.height)
+        frusta.append(np.vstack([camera.position, camera.unproject(corners, depths)]))
     places, colors = (values[:: max(1, len(values) // _MAX_POINTS)] for values in (points, colors))
     near = np.linalg.norm(places - middle, axis=1) < 8 * radius
-    return frusta - middle, places[near] - middle, colors[near]
-
-
-def _draw_frustum(axes: Any, frustum: np.ndarray, name: str, color: str) -> None:
-    """Draw a frustum [5, 2] with the camera's name."""
-    axes.plot(*frustum[_EDGES].T, color=color, linewidth=1)
-    axes.plot(*frustum[0], "o", color=color, markersize=4)
-    axes.annotate(name, frustum[0], xytext=(4, 4), textcoords="offset points", fontsize=8)
-
-
-def _frame(axes: Any, corners: np.ndarray) -> None:
-    """Set the limits of a panel to a square around positions [n, 2], and draw its grid."""
-    xlim, ylim = _square(corners)
-    axes.set(xlim=xlim, ylim=ylim, aspect="equal", axisbelow=True)
-    axes.grid(color="0.9")
-
-
-def _square(corners: np.ndarray) -> np.ndarray:
-    """Return the limits [2, 2] of a square with positions [n, 2] and a margin."""
-    half = 0.6 * max(np.ptp(corners, axis=0).max(), 1e-12)
-    return (corners.min(0) + corners.max(0))[:, None] / 2 + (-half, half)
+    return np.array(frusta) - middle, places[near] - middle, colors[near]
 
 
 def _draw_world_axes(axes: Any, plane: np.ndarray) -> None:
@@ -187,23 +173,13 @@ def _draw_world_axes(axes: Any, plane: np.ndarray) -> None:
 def _directions(cameras: Sequence[Camera]) -> np.ndarray:
     """Return the rig's right, forward and up [3, 3], orthonormal."""
     up = up_direction(cameras)
-    candidates = _forward_candidates(cameras, up)
+    rotations = np.array([np.asarray(camera.viewmat, np.float64)[:3, :3] for camera in cameras])
+    # Forward is the first of these that is not vertical. Cameras all around a scene have no common
+    # forward direction: use the first camera's direction.
+    candidates = np.array([rotations[:, 2].mean(0), rotations[0, 2], np.cross(up, rotations[0, 0])])
     level = candidates - np.outer(candidates @ up, up)
     forward = next(vector / length for vector in level if (length := np.linalg.norm(vector)) > 1e-3)
     return np.stack([np.cross(forward, up), forward, up])
-
-
-def _forward_candidates(cameras: Sequence[Camera], up: np.ndarray) -> np.ndarray:
-    """Return directions [3, 3] of which the first one that is not vertical is the rig's forward."""
-    rotations = np.array([np.asarray(camera.viewmat, np.float64)[:3, :3] for camera in cameras])
-    # Cameras all around a scene have no common forward direction: use the first camera's direction.
-    return np.array([rotations[:, 2].mean(0), rotations[0, 2], np.cross(up, rotations[0, 0])])
-
-
-def _frustum(camera: Camera, depth: float) -> np.ndarray:
-    """Return the camera's centre and the corners of its image at `depth` [5, 3], world units."""
-    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (camera.width, camera.height)
-    return np.vstack([camera.position, camera.unproject(corners, np.full(4, depth))])
 
 
 def _label(axes: Any, title: str, xlabel: str, ylabel: str) -> None:

@@ -94,8 +94,28 @@ def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
         checks = _checks_of_mistake(pairs, cameras)
         advice = f"the poses do not fit the images: {explanation}."
     else:
-        checks = _with_reasons(_with_copies(checks, pairs), pairs, group)
-        advice = _summary(checks)
+        checks = [
+            replace(check, advice=_explain_camera(view, check, pairs.sampled(), group))
+            if check.fits is False and not check.advice
+            else check
+            for view, check in enumerate(_with_copies(checks, pairs))
+        ]
+        wrong = ", ".join(c.name for c in checks if c.fits is False)
+        not_checked = ", ".join(c.name for c in checks if c.fits is None)
+        count = sum(c.fits is True for c in checks)
+        advice = "the poses fit the images"
+        if wrong:
+            advice = f"the poses of {wrong} do not fit the images"
+        elif not count:
+            advice = (
+                "too few matches to check the poses: the views have little overlap, or the scene "
+                "has little texture"
+            )
+        elif not_checked:
+            advice = f"the poses of {count} of {len(checks)} cameras fit the images"
+        if not_checked and (wrong or count):
+            advice += f"; not checked: {not_checked}"
+        advice += "."
     verdicts = [check.fits for check in checks]
     fits = False if False in verdicts else None if None in verdicts else True
     return RigCheck(len(errors), len(shared.matches), _median(errors), tuple(checks), fits, advice)
@@ -134,23 +154,30 @@ def _checks_of_mistake(pairs: _Pairs, corrected: Sequence[Camera]) -> list[Camer
 
 def _with_copies(checks: Sequence[CameraCheck], pairs: _Pairs) -> list[CameraCheck]:
     """Return the results with the reasons for cameras with the pose or the clip of another one."""
-    reasons = _pose_copies(checks, pairs.cameras)
-    reasons |= _clip_copies(checks, pairs.shared, set(reasons))
+    pose_reasons: dict[int, str] = {}
+    for pair in same_poses(pairs.cameras):
+        # If one of the two fits, the pose is its own.
+        for view in [view for view in pair if not checks[view].fits] or pair:
+            pose_reasons.setdefault(
+                view,
+                f"it has the same pose as {checks[sum(pair) - view].name}: give each camera its "
+                "own, or leave the copy out (--without)",
+            )
+    reasons = dict(pose_reasons)
+    shared = pairs.shared
+    for match in shared.matches:
+        a, b = (
+            shared.features[view].points[rows]
+            for view, rows in zip(match.views, match.features.T, strict=True)
+        )
+        is_copy = np.median(np.linalg.norm(a - b, axis=1)) < _SAME_IMAGE
+        for view in match.views if is_copy else ():
+            if view in pose_reasons or not checks[view].fits:
+                other = checks[sum(match.views) - view].name
+                reasons[view] = f"its clip is a copy of the clip of {other}; replace one of them"
     return [
         replace(c, fits=False, advice=reasons[view]) if view in reasons else c
         for view, c in enumerate(checks)
-    ]
-
-
-def _with_reasons(
-    checks: Sequence[CameraCheck], pairs: _Pairs, group: set[int]
-) -> list[CameraCheck]:
-    """Return the results with the mistake, and a remedy, of each pose that does not fit."""
-    return [
-        replace(check, advice=_explain_camera(view, check, pairs.sampled(), group))
-        if check.fits is False and not check.advice
-        else check
-        for view, check in enumerate(checks)
     ]
 
 
@@ -204,17 +231,13 @@ class _Pairs:
         """
         group = {view for match in self.shared.matches for view in match.views}
         while group:
-            shares = {view: self._wrong_share(view, group) for view in sorted(group)}
+            errors = {view: self.of_view(view, group) for view in sorted(group)}
+            shares = {v: np.mean(e > MAX_ERROR) if len(e) else 1.0 for v, e in errors.items()}
             worst = max(shares, key=lambda view: shares[view])
             if shares[worst] <= 0.5:
                 break
             group = group - {worst}
         return group
-
-    def _wrong_share(self, view: int, group: set[int]) -> float:
-        """Return the share of large errors among a view's matches with a group; 1 without any."""
-        errors = self.of_view(view, group)
-        return float(np.mean(errors > MAX_ERROR)) if len(errors) else 1.0
 
 
 def _is_shared(match: Match, view: int, partners: Collection[int] | None) -> bool:
@@ -235,23 +258,16 @@ def _check(view: int, pairs: _Pairs, group: set[int]) -> CameraCheck:
     all_errors = pairs.of_view(view)
     group_errors = pairs.of_view(view, group)
     error = _median(group_errors if len(group_errors) else all_errors)
-    advice = _obstacle(len(all_errors), len(group_errors), group)
+    count = len(group_errors) or len(all_errors)
+    advice = ""
+    if not count:
+        advice = f"no matches with any other camera: {_NO_OVERLAP}"
+    elif group and not len(group_errors):
+        advice = "matches only with cameras that do not fit: correct those first"
+    elif count < _MIN_MATCHES:
+        advice = f"only {count} matches, {_MIN_MATCHES} are needed: {_NO_OVERLAP}"
     fits = None if advice else error <= MAX_ERROR
     return CameraCheck(pairs.cameras[view].name, len(all_errors), error, fits, advice)
-
-
-def _obstacle(all_matches: int, group_matches: int, group: set[int]) -> str:
-    """Return the reason why the numbers of a view's matches with all views and with a group do not
-    suffice to check its pose, and a remedy; empty if they do.
-    """
-    count = group_matches or all_matches
-    if not count:
-        return f"no matches with any other camera: {_NO_OVERLAP}"
-    if group and not group_matches:
-        return "matches only with cameras that do not fit: correct those first"
-    if count < _MIN_MATCHES:
-        return f"only {count} matches, {_MIN_MATCHES} are needed: {_NO_OVERLAP}"
-    return ""
 
 
 def _correct_rig(
@@ -261,7 +277,13 @@ def _correct_rig(
     none explains all.
     """
     error = pairs.worst()
-    candidates = _rig_factors(pairs)
+    # The pairs with the most matches determine a factor on all focal lengths.
+    largest = pairs.sampled(_FACTOR_PAIRS).shared
+    candidates = focal_candidates(
+        "the focal lengths of all cameras seem",
+        lambda factor: [with_focal_factor(camera, factor) for camera in pairs.cameras],
+        lambda cameras: _median(np.concatenate(_Pairs.of(largest, cameras).errors)),
+    )
     if error > _GOOD_ERROR:
         wrong = [view for view, check in enumerate(checks) if check.fits is False]
         candidates = [*rig_candidates(capture, wrong), *candidates]
@@ -269,55 +291,6 @@ def _correct_rig(
     if not min(errors, default=np.inf) <= min(error / _GAIN, MAX_ERROR):
         return None
     return candidates[int(np.argmin(errors))]
-
-
-def _rig_factors(pairs: _Pairs) -> list[tuple[Sequence[Camera], str]]:
-    """Return the candidates with a factor on all focal lengths, which the pairs with the most
-    matches determine.
-    """
-    largest = pairs.sampled(_FACTOR_PAIRS).shared
-    return focal_candidates(
-        "the focal lengths of all cameras seem",
-        lambda factor: [with_focal_factor(camera, factor) for camera in pairs.cameras],
-        lambda cameras: _median(np.concatenate(_Pairs.of(largest, cameras).errors)),
-    )
-
-
-def _pose_copies(checks: Sequence[CameraCheck], cameras: Sequence[Camera]) -> dict[int, str]:
-    """Return the reason for each camera with the pose of another one."""
-    reasons: dict[int, str] = {}
-    remedy = "give each camera its own, or leave the copy out (--without)"
-    for pair in same_poses(cameras):
-        # If one of the two fits, the pose is its own.
-        for view in [view for view in pair if not checks[view].fits] or pair:
-            other = _other(checks, pair, view)
-            reasons.setdefault(view, f"it has the same pose as {other}: {remedy}")
-    return reasons
-
-
-def _other(checks: Sequence[CameraCheck], pair: tuple[int, int], view: int) -> str:
-    """Return the name of the camera that is in a pair of views with `view`."""
-    return checks[sum(pair) - view].name
-
-
-def _clip_copies(
-    checks: Sequence[CameraCheck], shared: SharedFeatures, suspects: set[int]
-) -> dict[int, str]:
-    """Return the reason for each camera with the clip of another one, among the views `suspects`
-    and those that do not fit.
-    """
-    reasons: dict[int, str] = {}
-    for match in shared.matches:
-        a, b = (
-            shared.features[view].points[rows]
-            for view, rows in zip(match.views, match.features.T, strict=True)
-        )
-        is_copy = np.median(np.linalg.norm(a - b, axis=1)) < _SAME_IMAGE
-        for view in match.views if is_copy else ():
-            if view in suspects or not checks[view].fits:
-                other = _other(checks, match.views, view)
-                reasons[view] = f"its clip is a copy of the clip of {other}; replace one of them"
-    return reasons
 
 
 def _explain_camera(view: int, check: CameraCheck, pairs: _Pairs, group: set[int]) -> str:
@@ -342,23 +315,3 @@ def _explain_camera(view: int, check: CameraCheck, pairs: _Pairs, group: set[int
         f"{cause}: check its place in the order of the cameras, its axes and the image size of "
         "the calibration, or calibrate again (morgs-mi calibrate)"
     )
-
-
-def _summary(checks: Sequence[CameraCheck]) -> str:
-    """Return a sentence on the poses that fit, do not fit, and were not checked."""
-    wrong, open_ = (_names(checks, fits) for fits in (False, None))
-    count = sum(c.fits is True for c in checks)
-    if not wrong and not count:
-        return (
-            "too few matches to check the poses: the views have little overlap, or the scene has "
-            "little texture."
-        )
-    text = f"the poses of {wrong} do not fit the images" if wrong else "the poses fit the images"
-    if open_ and not wrong:
-        text = f"the poses of {count} of {len(checks)} cameras fit the images"
-    return f"{text}; not checked: {open_}." if open_ else f"{text}."
-
-
-def _names(checks: Sequence[CameraCheck], fits: bool | None) -> str:
-    """Return the names of the cameras with a result."""
-    return ", ".join(c.name for c in checks if c.fits is fits)
