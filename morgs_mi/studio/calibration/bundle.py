@@ -30,6 +30,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from scipy.linalg import block_diag
 
 from morgs_mi.capture.features import Tracks, intersect
 from morgs_mi.core.camera import Camera
@@ -109,7 +110,16 @@ def _initial_estimate(cameras: Sequence[Camera], tracks: Tracks) -> _Estimate:
 def _estimate(
     cameras: Sequence[Camera], tracks: Tracks, changes: np.ndarray, points: np.ndarray
 ) -> _Estimate:
-    return _Estimate(changes, points, _errors(cameras, changes, points, tracks))
+    """Return the estimate with the errors of its projections, which are large behind a camera."""
+    errors = np.empty_like(tracks.pixels)
+    depths = np.empty(len(tracks.ids))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for rows, camera, change in _changed_views(cameras, changes, tracks):
+            pixels, depths[rows] = camera.project(points[tracks.ids[rows]])
+            errors[rows] = distorted(camera, pixels, change[9:])
+        errors -= tracks.pixels
+    errors = np.where((depths[:, None] > 0) & np.isfinite(errors), errors, 1e6)
+    return _Estimate(changes, points, errors)
 
 
 def likely_deviations(
@@ -132,30 +142,14 @@ def likely_deviations(
 
 def changed_camera(camera: Camera, changes: np.ndarray) -> Camera:
     """Return a camera with the changes [11] of the module docstring, without the distortion."""
-    return replace(
-        camera,
-        K=_changed_intrinsics(camera, changes[6], changes[7:9]),
-        viewmat=_changed_pose(camera, changes[:3], changes[3:6]),
-    )
-
-
-def _changed_intrinsics(camera: Camera, focal: float, displacement: np.ndarray) -> np.ndarray:
-    """Return the matrix K of a camera with a relative change of its focal lengths and a
-    displacement [2] of its principal point in image widths.
-    """
     K = camera.K.copy()
-    K[[0, 1], [0, 1]] *= 1 + focal
-    K[:2, 2] += displacement * camera.width
-    return K
-
-
-def _changed_pose(camera: Camera, rotation: np.ndarray, displacement: np.ndarray) -> np.ndarray:
-    """Return the `viewmat` [4, 4] of a camera with a small rotation [3] and a displacement [3]."""
-    turn = cv2.Rodrigues(np.asarray(rotation, np.float64))[0]
+    K[[0, 1], [0, 1]] *= 1 + changes[6]
+    K[:2, 2] += changes[7:9] * camera.width
+    turn = cv2.Rodrigues(np.asarray(changes[:3], np.float64))[0]
     V = np.eye(4)
     V[:3, :3] = turn @ np.asarray(camera.viewmat)[:3, :3]
-    V[:3, 3] = -V[:3, :3] @ (camera.position + displacement)
-    return V
+    V[:3, 3] = -V[:3, :3] @ (camera.position + changes[3:6])
+    return replace(camera, K=K, viewmat=V)
 
 
 def prior_deviations(extent: float, priors: CameraPriors) -> np.ndarray:
@@ -218,34 +212,20 @@ def camera_jacobian(
     front = x[:, 2] > camera.near
     from_centre = camera.project(points[front])[0] - camera.K[:2, 2]
     J = np.zeros((len(x), 2, CHANGES))
-    J[:, :, :6] = _pose_jacobian(R, x, by_point)
-    J[front, :, 6:] = _intrinsics_jacobian(camera, factor, from_centre)
+    J[:, :, :3] = by_point @ R.T @ -_cross(x)
+    J[:, :, 3:6] = -by_point
+    J[front, :, 6] = from_centre / factor
+    J[front, 0, 7] = camera.width
+    J[front, 1, 8] = camera.width
+    square = _square_radius(camera, from_centre)
+    J[front, :, 9] = from_centre * square
+    J[front, :, 10] = from_centre * square**2
     if distortion is not None and distortion.any():
         scale, by_pixel = _distortion_jacobian(camera, from_centre, distortion)
         J[front, :, :7] = by_pixel @ J[front, :, :7]
         by_point[front] = by_pixel @ by_point[front]
         J[front, :, 6] = from_centre * scale / factor
     return J, by_point
-
-
-def _pose_jacobian(R: np.ndarray, x: np.ndarray, by_point: np.ndarray) -> np.ndarray:
-    """Return the derivatives [n, 2, 6] by w and d of pixels with derivatives by the points, which
-    are at x [n, 3] in the axes of a camera with the rotation R.
-    """
-    return np.concatenate([by_point @ R.T @ -_cross(x), -by_point], axis=2)
-
-
-def _intrinsics_jacobian(camera: Camera, factor: float, from_centre: np.ndarray) -> np.ndarray:
-    """Return the derivatives [n, 2, 5] by s, p and k of undistorted pixels at positions [n, 2]
-    relative to the principal point.
-    """
-    square = _square_radius(camera, from_centre)
-    J = np.zeros((len(from_centre), 2, 5))
-    J[:, :, 0] = from_centre / factor
-    J[:, [0, 1], [1, 2]] = camera.width
-    J[:, :, 3] = from_centre * square
-    J[:, :, 4] = from_centre * square**2
-    return J
 
 
 def _distortion_jacobian(
@@ -315,7 +295,11 @@ class NormalEquations:
             points: [P, 3], world units.
         """
         rows = np.zeros((8, *self._right.shape))
-        rows[:7] = np.einsum("pij,pvki->jvk", _similarity_jacobian(points), self._coupling)
+        # Derivatives of the points by a rotation about their mean, a displacement and a factor.
+        from_centre = points - points.mean(axis=0)
+        shifts = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+        similarity = np.concatenate([-_cross(from_centre), shifts, from_centre[..., None]], axis=2)
+        rows[:7] = np.einsum("pij,pvki->jvk", similarity, self._coupling)
         rows[7, :, 6] = 1
         return rows.reshape(8, -1)
 
@@ -339,50 +323,15 @@ class NormalEquations:
         cameras = _damped(self._cameras + np.diag(precision), damping)
         points = _damped(self._points, damping)
         right = (self._right + precision * changes).ravel()
-        matrix, right = self._without_points(cameras, points, right)
-        frame = np.zeros((0, right.size)) if frame is None else frame
-        step = _solved(matrix, -right, frame, -frame @ changes.ravel())
-        rest = -self._right_points - np.einsum("pij,i->pj", self._flat_coupling(), step)
-        return step.reshape(changes.shape), np.linalg.solve(points, rest[..., None])[..., 0]
-
-    def _without_points(
-        self, cameras: np.ndarray, points: np.ndarray, right: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the matrix [V 11, V 11] and the right side [V 11] after elimination of the points.
-
-        Args:
-            cameras: blocks [V, 11, 11] of the matrix.
-            points: blocks [P, 3, 3] of the matrix.
-            right: right side [V 11] before the elimination.
-        """
-        coupling = self._flat_coupling()
+        coupling = self._coupling.reshape(len(points), right.size, 3)
         solved = coupling @ np.linalg.inv(points)
         by_points = np.tensordot(solved, coupling, axes=((0, 2), (0, 2)))
-        return (
-            _block_diagonal(cameras) - by_points,
-            right - np.einsum("pij,pj->i", solved, self._right_points),
-        )
-
-    def _flat_coupling(self) -> np.ndarray:
-        """Return the blocks [P, V 11, 3] of the matrix that couple cameras and points."""
-        return self._coupling.reshape(len(self._points), self._right.size, 3)
-
-
-def _similarity_jacobian(points: np.ndarray) -> np.ndarray:
-    """Return the derivatives [P, 3, 7] of points [P, 3] by a rotation about their mean, a
-    displacement and a factor.
-    """
-    from_centre = points - points.mean(axis=0)
-    shifts = np.broadcast_to(np.eye(3), (len(points), 3, 3))
-    return np.concatenate([-_cross(from_centre), shifts, from_centre[..., None]], axis=2)
-
-
-def _block_diagonal(blocks: np.ndarray) -> np.ndarray:
-    """Return the matrix [n k, n k] of blocks [n, k, k]."""
-    count, size, _ = blocks.shape
-    matrix = np.zeros((count, size, count, size))
-    matrix[np.arange(count), :, np.arange(count)] = blocks
-    return matrix.reshape(count * size, -1)
+        matrix = np.asarray(block_diag(*cameras)) - by_points
+        right = right - np.einsum("pij,pj->i", solved, self._right_points)
+        frame = np.zeros((0, right.size)) if frame is None else frame
+        step = _solved(matrix, -right, frame, -frame @ changes.ravel())
+        rest = -self._right_points - np.einsum("pij,i->pj", coupling, step)
+        return step.reshape(changes.shape), np.linalg.solve(points, rest[..., None])[..., 0]
 
 
 def _solved(A: np.ndarray, b: np.ndarray, rows: np.ndarray, value: np.ndarray) -> np.ndarray:
@@ -399,9 +348,7 @@ def _solved(A: np.ndarray, b: np.ndarray, rows: np.ndarray, value: np.ndarray) -
 
 def _cross(vectors: np.ndarray) -> np.ndarray:
     """Return the matrices [n, 3, 3] of the cross products by vectors [n, 3] from the left."""
-    cross = np.zeros((len(vectors), 3, 3))
-    cross[:, [2, 0, 1], [1, 2, 0]] = vectors
-    return cross - cross.transpose(0, 2, 1)
+    return np.cross(np.eye(3), vectors[:, None])
 
 
 def _damped(blocks: np.ndarray, damping: float) -> np.ndarray:
@@ -438,20 +385,6 @@ def _equations(
     return equations
 
 
-def _errors(
-    cameras: Sequence[Camera], changes: np.ndarray, points: np.ndarray, tracks: Tracks
-) -> np.ndarray:
-    """Return the projections minus the features [n, 2], px; large behind a camera."""
-    errors = np.empty_like(tracks.pixels)
-    depths = np.empty(len(tracks.ids))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        for rows, camera, change in _changed_views(cameras, changes, tracks):
-            pixels, depths[rows] = camera.project(points[tracks.ids[rows]])
-            errors[rows] = distorted(camera, pixels, change[9:])
-        errors -= tracks.pixels
-    return np.where((depths[:, None] > 0) & np.isfinite(errors), errors, 1e6)
-
-
 def _scale(errors: np.ndarray) -> float:
     """Return the standard deviation of the errors along one axis, px."""
     # The median length of a normal error in two dimensions is 1.18 deviations.
@@ -460,9 +393,5 @@ def _scale(errors: np.ndarray) -> float:
 
 def _loss(estimate: _Estimate, scale: float, deviations: np.ndarray) -> float:
     priors = np.sum((estimate.changes / deviations) ** 2)
-    return float(_cauchy_loss(estimate.errors, scale) + priors)
-
-
-def _cauchy_loss(errors: np.ndarray, scale: float) -> float:
-    squares = (errors**2).sum(axis=1) / (_CAUCHY * scale) ** 2
-    return _CAUCHY**2 * np.log1p(squares).sum()
+    squares = (estimate.errors**2).sum(axis=1) / (_CAUCHY * scale) ** 2
+    return float(_CAUCHY**2 * np.log1p(squares).sum() + priors)

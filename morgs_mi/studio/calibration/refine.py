@@ -35,14 +35,14 @@ from typing import Any
 import numpy as np
 
 from morgs_mi.capture.capture import Capture, PartialFrame
-from morgs_mi.capture.features import Tracks, detect, intersect, join_matches, match_views
+from morgs_mi.capture.features import detect, intersect, join_matches, match_views
 from morgs_mi.capture.lens import Lens, undistortion
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.rig import scene_extent, seen_points
 from morgs_mi.fit.first_frame import fit_first_frame
-from morgs_mi.fit.fit_config import FitConfig, LearningRates
+from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.view import LEAST_GAIN, View, mean_psnr, withheld_blocks
 from morgs_mi.loop.stream_config import StreamConfig
@@ -148,7 +148,13 @@ class Refinement:
         if not views:
             return result
         calibrated_psnr = mean_psnr(gaussians, views, config.render)
-        registered = _registered_views(capture, gaussians, views, config)
+        extent = scene_extent([capture.cameras[v] for v in capture.train_views])
+        cameras = [
+            register_camera(gaussians, view, extent, config.fit, config.render) for view in views
+        ]
+        registered = [
+            view._replace(camera=camera) for view, camera in zip(views, cameras, strict=True)
+        ]
         registered_psnr = mean_psnr(gaussians, registered, config.render)
         return result | {
             "held_out": {"calibrated_psnr": calibrated_psnr, "registered_psnr": registered_psnr}
@@ -159,17 +165,6 @@ def _view(capture: Capture, images: Sequence[np.ndarray | None], view: int) -> V
     """Return a view of a capture with its image, or None without an image."""
     image = images[view]
     return None if image is None else View(capture.cameras[view], image, capture.masks[view])
-
-
-def _registered_views(
-    capture: Capture, gaussians: Gaussians, views: Sequence[View], config: StreamConfig
-) -> list[View]:
-    """Return views of a capture with registered cameras."""
-    extent = scene_extent([capture.cameras[v] for v in capture.train_views])
-    cameras = [
-        register_camera(gaussians, view, extent, config.fit, config.render) for view in views
-    ]
-    return [view._replace(camera=camera) for view, camera in zip(views, cameras, strict=True)]
 
 
 def refine_cameras(
@@ -205,21 +200,13 @@ def refine_cameras(
 
     estimates.append(problem.refined(bundle_changes, deviations, report))
     scores = problem.scores(estimates, report) if len(estimates) > 1 else [float("nan")]
-    changes, refinement = _best(problem, estimates, scores, tracks)
-    return problem.changed_capture(changes) if refinement.taken else capture, refinement
-
-
-def _best(
-    problem: _Problem, estimates: Sequence[np.ndarray], scores: Sequence[float], tracks: int
-) -> tuple[np.ndarray, Refinement]:
-    """Return the changes [V, 11] with the best score, apart from the calibrated cameras, and the
-    result.
-    """
+    # The best estimate, apart from the calibrated cameras.
     best = problem.has_rival + int(np.argmax(scores[problem.has_rival :]))
     calibrated = scores[0] if problem.has_rival else float("nan")
     is_better = not scores[best] < calibrated + LEAST_GAIN
     sizes = problem.sizes(estimates[best])
-    return estimates[best], Refinement(is_better, calibrated, scores[best], tracks, *sizes)
+    refinement = Refinement(is_better, calibrated, scores[best], tracks, *sizes)
+    return problem.changed_capture(estimates[best]) if is_better else capture, refinement
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,7 +225,13 @@ class _Problem:
     @classmethod
     def of(cls, capture: Capture, config: FitConfig, render: RenderConfig, seed: int) -> _Problem:
         """Return the problem of the first frame of a capture; raises as `refine_cameras`."""
-        train = _training_views(capture)
+        images = next(capture.displayed().partial_frames(0, 1)).images
+        train = {v: view for v in capture.train_views if (view := _view(capture, images, v))}
+        if len(train) < 2:
+            raise ValueError(
+                "refine_cameras(): expected images of at least two training views, got "
+                f"{len(train)}; record more, or set `refine_cameras` to off."
+            )
         rng = rng_of(seed, Stream.WITHHELD_BLOCKS)
         views, withheld_views = withheld_blocks(list(train.values()), config.short_fits.width, rng)
         extent = scene_extent([view.camera for view in train.values()])
@@ -304,11 +297,18 @@ class _Problem:
         """Return the largest change of a rotation, degrees, a position, a focal length, and a pixel
         by the lens.
         """
+        shifts = []
+        for camera, change in zip(self.cameras, changes, strict=True):
+            corners = np.array(
+                [(x, y) for x in (0, camera.width) for y in (0, camera.height)], float
+            )
+            moved_corners = distorted(camera, corners, change[9:])
+            shifts.append(float(_largest_norm(moved_corners - corners) / camera.width))
         return (
             float(np.rad2deg(_largest_norm(changes[:, :3]))),
             float(_largest_norm(changes[:, 3:6])),
             float(np.abs(changes[:, 6]).max()),
-            max(_largest_shift(*pair) for pair in zip(self.cameras, changes, strict=True)),
+            max(shifts),
         )
 
     def changed_capture(self, changes: np.ndarray) -> Capture:
@@ -322,14 +322,12 @@ class _Problem:
             rows[v][9:].tolist() if v in rows else (0.0, 0.0) for v in range(len(cameras))
         ]
         rig = self.capture.with_cameras(cameras, distortions)
-        return replace(rig, points=self._points(changes))
-
-    def _points(self, changes: np.ndarray) -> np.ndarray:
-        return _moved(self.capture.points, self.cameras, changes)
+        return replace(rig, points=_moved(self.capture.points, self.cameras, changes))
 
     def _begun(self, changes: np.ndarray) -> FirstFrameProblem:
         """Return the problem of a short fit with changed cameras."""
-        points = (self._points(changes), self.capture.point_colors)
+        moved_points = _moved(self.capture.points, self.cameras, changes)
+        points = (moved_points, self.capture.point_colors)
         rng = rng_of(self.seed, Stream.REFINED_POINTS)
         return FirstFrameProblem.of(
             _changed(self.views, changes), points, _short(self.config), self.render, rng
@@ -339,18 +337,6 @@ class _Problem:
         return fit_first_frame(
             problem, _short(self.config, is_later), rng_of(self.seed, Stream.REFINEMENT)
         ).gaussians
-
-
-def _training_views(capture: Capture) -> dict[int, View]:
-    """Return the training views with an image of the first frame, by index."""
-    images = next(capture.displayed().partial_frames(0, 1)).images
-    views = {v: view for v in capture.train_views if (view := _view(capture, images, v))}
-    if len(views) < 2:
-        raise ValueError(
-            "refine_cameras(): expected images of at least two training views, got "
-            f"{len(views)}; record more, or set `refine_cameras` to off."
-        )
-    return views
 
 
 def register_camera(
@@ -395,30 +381,19 @@ def _registration(
     error = np.inf
     for _ in range(_REGISTRATION_STEPS):
         camera = changed_camera(view.camera, changes[0])
-        observations = _shifts(gaussians, camera, target, blur, render)
-        if not observations[2] < error:
+        G, b, new_error = _shifts(gaussians, camera, target, blur, render)
+        if not new_error < error:
             break
         best = changes
-        error = observations[2]
+        error = new_error
         of_camera, _ = camera_jacobian(camera, 1 + changes[0, 6], means)
-        step = _registration_step(of_camera, observations, changes, deviations)
+        equations = NormalEquations(1, 0)
+        equations.add_camera(0, of_camera, G / error / _ALIKE, b / error / _ALIKE)
+        step, _ = equations.step(changes, deviations, 0.0)
         changes = changes + step
         if np.abs(of_camera @ step[0]).mean() < _LEAST_SHIFT:
             break
     return best
-
-
-def _registration_step(
-    of_camera: np.ndarray,
-    observations: tuple[np.ndarray, np.ndarray, float],
-    changes: np.ndarray,
-    deviations: np.ndarray,
-) -> np.ndarray:
-    """Return the Gauss-Newton step [1, 11] of a camera; observations as from `_shifts`."""
-    G, b, error = observations
-    equations = NormalEquations(1, 0)
-    equations.add_camera(0, of_camera, G / error / _ALIKE, b / error / _ALIKE)
-    return equations.step(changes, deviations, 0.0)[0]
 
 
 def _matched(
@@ -431,47 +406,33 @@ def _matched(
     """
     recording = capture.displayed().at_recorded_size()
     cameras = [recording.cameras[v] for v in train]
-    tracks = _tracks(recording, train)
+    images = next(recording.partial_frames(0, 1)).images
+    features = [detect(images[v], recording.masks[v]) for v in train]
+    tracks = join_matches(match_views(features, cameras), features)
     if np.bincount(tracks.views, minlength=len(train)).min() < _MIN_TRACKS:
         return np.zeros((len(train), CHANGES)), 0, deviations
     deviations = likely_deviations(cameras, tracks, deviations)
     return bundle_adjust(cameras, tracks, deviations)[0], tracks.count, deviations
 
 
-def _tracks(recording: Capture, train: Sequence[int]) -> Tracks:
-    """Return the tracks of features between some views of the first frame."""
-    images = next(recording.partial_frames(0, 1)).images
-    features = [detect(images[v], recording.masks[v]) for v in train]
-    return join_matches(match_views(features, [recording.cameras[v] for v in train]), features)
-
-
 def _changed(views: Sequence[View], changes: np.ndarray) -> list[View]:
     """Return views with changed cameras, and images and masks without the cameras' distortion."""
-    return [_changed_view(*view, change) for view, change in zip(views, changes, strict=True)]
-
-
-def _changed_view(
-    camera: Camera, image: np.ndarray, mask: np.ndarray | None, change: np.ndarray
-) -> View:
-    camera = changed_camera(camera, change)
-    correction = undistortion(camera, Lens("RADIAL", tuple(change[9:])))
-    if correction is None:
-        return View(camera, image, mask)
-    valid = correction.mask
-    if mask is not None:
-        valid = valid & (correction(mask.astype(np.float32)) > _VALID)
-    return View(camera, correction(image), valid)
+    changed_views = []
+    for (camera, image, mask), change in zip(views, changes, strict=True):
+        camera = changed_camera(camera, change)
+        correction = undistortion(camera, Lens("RADIAL", tuple(change[9:])))
+        if correction is not None:
+            valid = correction.mask
+            if mask is not None:
+                valid = valid & (correction(mask.astype(np.float32)) > _VALID)
+            image = correction(image)
+            mask = valid
+        changed_views.append(View(camera, image, mask))
+    return changed_views
 
 
 def _largest_norm(vectors: np.ndarray) -> float:
     return np.linalg.norm(vectors, axis=1).max()
-
-
-def _largest_shift(camera: Camera, change: np.ndarray) -> float:
-    """Return the largest shift of a pixel by the distortion of a camera's change, image widths."""
-    corners = np.array([(x, y) for x in (0, camera.width) for y in (0, camera.height)], float)
-    shifts = distorted(camera, corners, change[9:]) - corners
-    return float(_largest_norm(shifts) / camera.width)
 
 
 def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -> np.ndarray:
@@ -479,31 +440,19 @@ def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -
     changed cameras.
     """
     hits = [seen_points(camera, points)[:2] for camera in cameras]
-    counts = np.sum([mask for mask, _ in hits], axis=0)
+    masks = np.array([mask for mask, _ in hits])
+    counts = masks.sum(axis=0)
     if not counts.any():
         return points
-    intersections = _intersections(hits, cameras, changes)
-    is_determined = (counts >= 2) & np.isfinite(intersections).all(axis=1)
-    return np.where(is_determined[:, None], intersections, points).astype(np.float32)
-
-
-def _intersections(
-    hits: Sequence[tuple[np.ndarray, np.ndarray]], cameras: Sequence[Camera], changes: np.ndarray
-) -> np.ndarray:
-    """Return the points [P, 3] that changed cameras see at the same pixels.
-
-    Args:
-        hits: per view the mask [P] of the points in it, and their pixels [n, 2].
-        cameras: V views before the changes.
-        changes: changes of the cameras [V, 11].
-    """
     rig = [changed_camera(*pair) for pair in zip(cameras, changes, strict=True)]
     pixels = [
-        undistorted(c, pixels, change[9:])
-        for c, (_, pixels), change in zip(rig, hits, changes, strict=True)
+        undistorted(camera, seen_pixels, change[9:])
+        for camera, (_, seen_pixels), change in zip(rig, hits, changes, strict=True)
     ]
-    views, ids = np.nonzero([mask for mask, _ in hits])
-    return intersect(ids, views, np.concatenate(pixels), rig, len(hits[0][0]))
+    views, ids = np.nonzero(masks)
+    intersections = intersect(ids, views, np.concatenate(pixels), rig, len(points))
+    is_determined = (counts >= 2) & np.isfinite(intersections).all(axis=1)
+    return np.where(is_determined[:, None], intersections, points).astype(np.float32)
 
 
 def _short(config: FitConfig, is_later: bool = False) -> FitConfig:
@@ -514,21 +463,18 @@ def _short(config: FitConfig, is_later: bool = False) -> FitConfig:
     """
     how = config.short_fits
     rates = config.first_frame_rates
+    if is_later:
+        factors = _LATER_RATES.items()
+        rates = replace(rates, **{name: factor * getattr(rates, name) for name, factor in factors})
     return replace(
         config,
         sh_degree=0,
         num_gaussians=how.gaussians,
         first_frame_steps=how.steps // 2 if is_later else how.steps,
-        first_frame_rates=_later(rates) if is_later else rates,
+        first_frame_rates=rates,
         dropping=0.0,
         density=replace(config.density, rounds=0),
     )
-
-
-def _later(rates: LearningRates) -> LearningRates:
-    """Return the learning rates of the rounds after the first."""
-    factors = _LATER_RATES.items()
-    return replace(rates, **{name: factor * getattr(rates, name) for name, factor in factors})
 
 
 def _joint_step(
@@ -545,32 +491,16 @@ def _joint_step(
     means = np.asarray(gaussians.means, np.float64)
     changed_views = _changed(views, changes)
     shifts = [_shifts(gaussians, view.camera, view.target, blur, render) for view in changed_views]
-    equations = _joint_equations([view.camera for view in changed_views], changes, means, shifts)
+    variance = _ALIKE * np.mean([error for *_, error in shifts])
+    equations = NormalEquations(len(views), len(means))
+    for v, (view, (G, b, _)) in enumerate(zip(changed_views, shifts, strict=True)):
+        jacobian = camera_jacobian(view.camera, 1 + changes[v, 6], means)
+        equations.add(v, slice(None), jacobian, G / variance, b / variance)
     of_changes, of_means = equations.step(changes, deviations, _DAMPING, equations.frame(means))
     longest = _LONGEST * scene_extent([view.camera for view in views])
-    means = means + _shortened(of_means, longest)
+    lengths = np.linalg.norm(of_means, axis=1, keepdims=True)
+    means = means + of_means * np.minimum(1, longest / np.maximum(lengths, 1e-30))
     return replace(gaussians, means=means.astype(np.float32)), changes + of_changes
-
-
-def _joint_equations(
-    cameras: Sequence[Camera],
-    changes: np.ndarray,
-    means: np.ndarray,
-    shifts: Sequence[tuple[np.ndarray, np.ndarray, float]],
-) -> NormalEquations:
-    """Return the equations of V changed cameras and N means; `shifts` as from `_shifts`."""
-    variance = _ALIKE * np.mean([error for *_, error in shifts])
-    equations = NormalEquations(len(cameras), len(means))
-    for v, (camera, (G, b, _)) in enumerate(zip(cameras, shifts, strict=True)):
-        jacobian = camera_jacobian(camera, 1 + changes[v, 6], means)
-        equations.add(v, slice(None), jacobian, G / variance, b / variance)
-    return equations
-
-
-def _shortened(steps: np.ndarray, longest: float) -> np.ndarray:
-    """Return steps [N, 3] of at most a length."""
-    lengths = np.linalg.norm(steps, axis=1, keepdims=True)
-    return steps * np.minimum(1, longest / np.maximum(lengths, 1e-30))
 
 
 def _shifts(
