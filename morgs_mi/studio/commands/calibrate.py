@@ -6,12 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from rich.table import Table
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from morgs_mi.cli.console import print_result, print_table, print_warning, progress
 from morgs_mi.cli.settings import Flag, Without
-from morgs_mi.studio.calibration.calibrate import CalibrateConfig, CalibrationResult
+from morgs_mi.studio.calibration.calibrate import CalibrateConfig
 from morgs_mi.studio.commands.info import advice_lines, check_cells, check_table
 
 
@@ -40,26 +39,15 @@ class Calibrate:
                 lambda *stage: report(*stage),
                 self.without,
             )
-        print_table(_pose_table(result))
+        table = check_table(str(result.model), ("camera", "points", "error, px", "pose"))
+        for check in result.checks:
+            table.add_row(check.name, *check_cells(check))
+        print_table(table)
         for line in advice_lines(result.checks):
             print_warning(line)
-        print_result(_summary(result))
-
-
-def _pose_table(result: CalibrationResult) -> Table:
-    table = check_table(str(result.model), ("camera", "points", "error, px", "pose"))
-    for check in result.checks:
-        table.add_row(check.name, *check_cells(check))
-    return table
-
-
-def _summary(result: CalibrationResult) -> str:
-    """Return a summary of a calibration in one sentence."""
-    how = f"{result.mapper} mapping" + (
-        ", with a principal point for each" if result.principal_points else ""
-    )
-    return (
-        f"{result.model}: {len(result.cameras)} cameras, {result.points} points, mean "
-        f"reprojection error {result.error:.2f} px, by {how}; scale and up direction of its "
-        "world are arbitrary."
-    )
+        points = ", with a principal point for each" if result.principal_points else ""
+        print_result(
+            f"{result.model}: {len(result.cameras)} cameras, {result.points} points, mean "
+            f"reprojection error {result.error:.2f} px, by {result.mapper} mapping{points}; scale "
+            "and up direction of its world are arbitrary."
+        )

@@ -12,7 +12,7 @@ from tyro.conf import DisallowNone, Positional
 from morgs_mi.cli.console import print_result, print_table, progress
 from morgs_mi.cli.settings import Settings, optional, setting
 from morgs_mi.evaluate.tables import figure
-from morgs_mi.studio.demo import DemoConfig, DemoReport
+from morgs_mi.studio.demo import DemoConfig
 
 _DEFAULT = DemoConfig()
 # Titles and digits of the compared scores, by name.
@@ -64,36 +64,28 @@ class Demo:
         config = replace(_DEFAULT, scene=self.scene, clip=clip, stream=stream)
         with progress() as report:
             result = run_demo(self.out, config, report)
-        print_table(_comparison_table(result))
-        print_result(_summary(result))
+        # A row for each fit: its mean scores over the frames that both have.
+        frames = result.compared_frames
+        table = Table(
+            title=f"held-out view, frames {f'{frames[0]} to {frames[-1]}' if frames else 'none'}"
+        )
+        for column in ("", *(title for title, _ in _SCORES.values())):
+            table.add_column(column, justify="right" if column else "left")
+        for name, title in (("full", "with motion"), ("plain", "without")):
+            row = result.comparison[name]
+            cells = (figure(row[key], digits) for key, (_, digits) in _SCORES.items())
+            table.add_row(title, *cells)
+        print_table(table)
+        full = result.full
+        print_result(
+            f"Held-out PSNR {figure(full.frames[0].scores.psnr, 2)} dB in the first frame, "
+            f"{figure(full.frames[-1].scores.psnr, 2)} dB in the last of {full.num_frames}; "
+            f"{figure(full.seconds.per_later_frame, 1)} s and "
+            f"{figure(full.sizes.per_residual / 1e6, 2)} MB per later frame; "
+            f"{result.seconds['total']:.0f} s in all."
+        )
         print_result(
             f"Video and contact sheet: {self.out / 'side_by_side.mp4'}, "
             f"{self.out / 'contact_sheet.png'}"
         )
         print_result(f"All results: {self.out / 'report.json'}")
-
-
-def _comparison_table(result: DemoReport) -> Table:
-    """Return a row for each fit: its mean scores over the frames that both have."""
-    frames = result.compared_frames
-    table = Table(
-        title=f"held-out view, frames {f'{frames[0]} to {frames[-1]}' if frames else 'none'}"
-    )
-    for column in ("", *(title for title, _ in _SCORES.values())):
-        table.add_column(column, justify="right" if column else "left")
-    for name, title in (("full", "with motion"), ("plain", "without")):
-        row = result.comparison[name]
-        table.add_row(title, *(figure(row[key], digits) for key, (_, digits) in _SCORES.items()))
-    return table
-
-
-def _summary(result: DemoReport) -> str:
-    """Return the quality, time and size of the fit with motion in one sentence."""
-    full = result.full
-    return (
-        f"Held-out PSNR {figure(full.frames[0].scores.psnr, 2)} dB in the first frame, "
-        f"{figure(full.frames[-1].scores.psnr, 2)} dB in the last of {full.num_frames}; "
-        f"{figure(full.seconds.per_later_frame, 1)} s and "
-        f"{figure(full.sizes.per_residual / 1e6, 2)} MB per later frame; "
-        f"{result.seconds['total']:.0f} s in all."
-    )

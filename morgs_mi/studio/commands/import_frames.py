@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from tyro.conf import DisallowNone, Positional, arg
 
@@ -14,9 +14,6 @@ from morgs_mi.cli.opening import DropInvalid
 from morgs_mi.cli.settings import setting
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.playback.default_rig import Axes
-
-if TYPE_CHECKING:
-    from morgs_mi.studio.import_frames import Imported
 
 _PATHS = (
     "Frames: a folder with a .ply, .compressed.ply or .splat file for each, or the files in the "
@@ -54,31 +51,23 @@ class Import:
                 "morgs-mi import: expected FRAMES and OUT, got fewer; see morgs-mi import --help."
             )
         *frames, out = self.paths
-        with progress() as report:
-            result = import_frames(
-                frames,
-                check_output(out),
-                self.fps,
-                self._codec_config(),
-                self.axes,
-                lambda done, of: report("Importing", done, of),
-                most_invalid=1.0 if self.drop_invalid else 0.0,
-            )
-        print_result(_summary(result))
-
-    def _codec_config(self) -> CodecConfig:
         options = {
             name: value
             for name in ("quality", "target_size")
             if (value := getattr(self, name)) is not None
         }
-        return replace(CodecConfig(), keyframe_interval=self.keyframe_interval, **options)
-
-
-def _summary(result: Imported) -> str:
-    """Return a summary of an import in one sentence."""
-    sets = "one set" if result.num_keyframes == 1 else f"{result.num_keyframes} sets"
-    return (
-        f"{result.path}: {result.num_frames} frames, {sets} of Gaussians, "
-        f"{result.num_bytes / 1e6:.2f} MB."
-    )
+        with progress() as report:
+            result = import_frames(
+                frames,
+                check_output(out),
+                self.fps,
+                replace(CodecConfig(), keyframe_interval=self.keyframe_interval, **options),
+                self.axes,
+                lambda done, of: report("Importing", done, of),
+                most_invalid=1.0 if self.drop_invalid else 0.0,
+            )
+        sets = "one set" if result.num_keyframes == 1 else f"{result.num_keyframes} sets"
+        print_result(
+            f"{result.path}: {result.num_frames} frames, {sets} of Gaussians, "
+            f"{result.num_bytes / 1e6:.2f} MB."
+        )

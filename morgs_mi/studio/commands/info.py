@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.outputs import check_output
-from morgs_mi.capture.points import SharedFeatures, match_capture, triangulate_points
+from morgs_mi.capture.points import match_capture, triangulate_points
 from morgs_mi.cli.console import print_result, print_table, progress
 from morgs_mi.cli.settings import Flag, GivenReading, Reading, optional
 from morgs_mi.fit.forecast import forecast
@@ -70,91 +69,74 @@ class Info:
         points = f"{len(capture.points)} points" if len(capture.points) else "without points"
         rig_check = None
         if self.check:
-            shared = _shared_features(capture)
+            with progress() as report:
+                shared = match_capture(capture, partial(report, "Matching views"))
             rig_check = check_rig(capture, shared)
             if not len(capture.points):
                 capture = triangulate_points(capture, shared)
                 points += f" ({len(capture.points)} can be triangulated)"
-        _print_lines(_content_lines(capture, points, rig_check))
+        train_cameras = [capture.cameras[v] for v in capture.train_views]
+        if len(train_cameras) > 1:
+            print_result(forecast(train_cameras, capture.points).sentence)
+        if rig_check is not None:
+            error = f"median {rig_check.error:.2f} px over " if rig_check.matches else ""
+            print_result(
+                f"Reprojection check: {error}{rig_check.matches} matches in {rig_check.pairs} "
+                f"pairs; {rig_check.advice}"
+            )
+            for line in advice_lines(rig_check.cameras):
+                print_result(line)
+        truth = "with ground truth" if capture.truth else "without ground truth"
+        print_result(f"{capture.num_frames} frames at {capture.fps:g} fps, {points}, {truth}.")
+        for note in capture.notes:
+            print_result(note)
         print_table(_camera_table(capture, rig_check))
         if self.time:
-            _print_lines(_time_lines(_time_offsets(capture)))
+            with progress() as report:
+                offsets = estimate_time_offsets(capture, partial(report, "Comparing clocks"))
+            for line in _time_lines(offsets):
+                print_result(line)
         if self.plot is not None:
             write_rig(self.plot, capture)
             print_result(f"Plot of the rig: {self.plot}")
-
-
-def _shared_features(capture: Capture) -> SharedFeatures:
-    with progress() as report:
-        return match_capture(capture, partial(report, "Matching views"))
-
-
-def _time_offsets(capture: Capture) -> TimeOffsets:
-    with progress() as report:
-        return estimate_time_offsets(capture, partial(report, "Comparing clocks"))
-
-
-def _print_lines(lines: Iterable[str]) -> None:
-    for line in lines:
-        print_result(line)
-
-
-def _content_lines(capture: Capture, points: str, rig_check: RigCheck | None) -> list[str]:
-    """Return what follows from the capture's poses, what it contains and its notes."""
-    truth = "with ground truth" if capture.truth else "without ground truth"
-    return [
-        *_forecast_lines(capture),
-        *_check_lines(rig_check),
-        f"{capture.num_frames} frames at {capture.fps:g} fps, {points}, {truth}.",
-        *capture.notes,
-    ]
 
 
 def _camera_table(capture: Capture, rig_check: RigCheck | None) -> Table:
     """Return a row per camera: size, intrinsics, use, and how well its pose fits the matches."""
     table = check_table(f"{capture.path}: {capture.layout}", ("", "camera", *_COLUMNS))
     for index, camera in enumerate(capture.cameras):
+        K = camera.K
+        fx = f"{K[0, 0]:.1f}"
+        fy = f"{K[1, 1]:.1f}"
+        mask = capture.masks[index]
         table.add_row(
             str(index),
             camera.name,
             f"{camera.width}x{camera.height}",
-            *_intrinsics_cells(camera.K),
-            _share_of_pixels(capture.masks[index]),
+            fx if fx == fy else f"{fx} {fy}",
+            f"{K[0, 2]:.1f} {K[1, 2]:.1f}",
+            "100 %" if mask is None else f"{100 * mask.mean():.0f} %",
             "test" if index in capture.test_views else "train",
             *check_cells(rig_check.cameras[index] if rig_check else None),
         )
     return table
 
 
-def _intrinsics_cells(K: np.ndarray) -> tuple[str, str]:
-    """Return the focal length, or both if they differ, and the principal point as text."""
-    fx = f"{K[0, 0]:.1f}"
-    fy = f"{K[1, 1]:.1f}"
-    return fx if fx == fy else f"{fx} {fy}", f"{K[0, 2]:.1f} {K[1, 2]:.1f}"
-
-
-def _share_of_pixels(mask: np.ndarray | None) -> str:
-    """Return the share of the pixels in a mask as text."""
-    return "100 %" if mask is None else f"{100 * mask.mean():.0f} %"
-
-
-def _check_lines(rig_check: RigCheck | None) -> list[str]:
-    """Return the result of the reprojection check and its advice."""
-    if rig_check is None:
-        return []
-    error = f"median {rig_check.error:.2f} px over " if rig_check.matches else ""
-    result = (
-        f"Reprojection check: {error}{rig_check.matches} matches in {rig_check.pairs} pairs; "
-        f"{rig_check.advice}"
-    )
-    return [result, *advice_lines(rig_check.cameras)]
-
-
 def _time_lines(offsets: TimeOffsets) -> list[str]:
     """Return the time offsets as the options that align the clips, and how certain they are."""
     errors = {name: error for name, error in offsets.errors.items() if name != offsets.reference}
     measured_errors = {name: error for name, error in errors.items() if error < _NOT_FOUND}
-    lines = _offset_lines(offsets, measured_errors)
+    lines = []
+    if measured_errors:
+        options = " ".join(f"{name} {offsets.offsets[name]:.2f}" for name in measured_errors)
+        worst = max(measured_errors, key=lambda name: measured_errors[name])
+        lines = [
+            f"Clocks: pass --offset {options} for the time of {offsets.reference}.",
+            f"Standard errors of these offsets: up to {errors[worst]:.2f} frames ({worst}).",
+        ]
+    doubts = [f"{name} ({e:.2f})" for name, e in measured_errors.items() if e > _UNCERTAIN]
+    if doubts:
+        lines.append(f"Uncertain: {', '.join(doubts)}. {_UNCERTAIN_WHY}")
     if len(measured_errors) < len(errors):
         names = ", ".join(name for name in errors if name not in measured_errors)
         lines.append(f"Clocks not found: {names}; keep what is known of them. {_UNCERTAIN_WHY}")
@@ -164,31 +146,6 @@ def _time_lines(offsets: TimeOffsets) -> list[str]:
             "enough."
         )
     return lines
-
-
-def _offset_lines(offsets: TimeOffsets, errors: Mapping[str, float]) -> list[str]:
-    """Return the offsets of the cameras with these standard errors, and which are uncertain."""
-    if not errors:
-        return []
-    options = " ".join(f"{name} {offsets.offsets[name]:.2f}" for name in errors)
-    worst = max(errors, key=lambda name: errors[name])
-    lines = [
-        f"Clocks: pass --offset {options} for the time of {offsets.reference}.",
-        f"Standard errors of these offsets: up to {errors[worst]:.2f} frames ({worst}).",
-    ]
-    return lines + _doubt_lines(errors)
-
-
-def _doubt_lines(errors: Mapping[str, float]) -> list[str]:
-    """Return the cameras whose offsets are uncertain."""
-    doubts = [f"{name} ({error:.2f})" for name, error in errors.items() if error > _UNCERTAIN]
-    return [f"Uncertain: {', '.join(doubts)}. {_UNCERTAIN_WHY}"] if doubts else []
-
-
-def _forecast_lines(capture: Capture) -> list[str]:
-    """Return the expected quality of views between the training cameras, if there are several."""
-    cameras = [capture.cameras[v] for v in capture.train_views]
-    return [forecast(cameras, capture.points).sentence] if len(cameras) > 1 else []
 
 
 def check_table(title: str, columns: Sequence[str]) -> Table:

@@ -105,15 +105,12 @@ class _Lines:
         self._drops += row.dropped
         if (time_now := time.monotonic()) - self._last < _PERIOD:
             return
-        print_warning(self._text(row))
-        self._last = time_now
-        self._drops = 0
-
-    def _text(self, row: LiveFrame) -> str:
-        return (
+        print_warning(
             f"Frame {row.frame}: {row.time:.1f} s after the first, latency {row.latency:.2f} s, "
             f"{self._drops} frames dropped, skew {1e3 * row.skew:.0f} ms."
         )
+        self._last = time_now
+        self._drops = 0
 
 
 def _summary(out: Path, rows: Sequence[LiveFrame]) -> str:
@@ -122,17 +119,14 @@ def _summary(out: Path, rows: Sequence[LiveFrame]) -> str:
     drops = sum(row.dropped for row in rows)
     text = (
         f"{stream}: fitted {len(rows)} of {len(rows) + drops} frames ({drops} dropped) in "
-        f"{rows[-1].time:.1f} s, "
+        f"{rows[-1].time:.1f} s, {stream.stat().st_size / 1e6:.1f} MB, {rows[0].latency:.1f} s "
+        "for the first one"
     )
-    text += f"{stream.stat().st_size / 1e6:.1f} MB, {rows[0].latency:.1f} s for the first one"
-    return f"{text}{_delays(rows)}." if len(rows) > 1 else f"{text}."
-
-
-def _delays(rows: Sequence[LiveFrame]) -> str:
-    """Return the latency of the frames after the first one and the skew as text."""
-    latency = np.mean([row.latency for row in rows[1:]])
-    skew = max(row.skew for row in rows)
-    return f", mean latency of the others {latency:.2f} s, largest skew {1e3 * skew:.0f} ms"
+    if len(rows) > 1:
+        latency = np.mean([row.latency for row in rows[1:]])
+        skew = max(row.skew for row in rows)
+        text += f", mean latency of the others {latency:.2f} s, largest skew {1e3 * skew:.0f} ms"
+    return f"{text}."
 
 
 def start_viewer(out: Path, browser: bool) -> subprocess.Popen[bytes]:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
@@ -13,9 +12,6 @@ from tyro.conf import DisallowNone, Positional
 
 from morgs_mi.cli.console import print_result, print_table, progress
 from morgs_mi.cli.settings import HeldOut, Settings, held_out, optional
-
-if TYPE_CHECKING:
-    from morgs_mi.studio.sweep import Scores
 
 
 @dataclass(frozen=True)
@@ -45,8 +41,9 @@ class Sweep:
 
     def run(self) -> None:
         from morgs_mi.capture.capture import load_capture
+        from morgs_mi.evaluate.tables import figure
         from morgs_mi.studio.calibration.checks.plots import check_plot
-        from morgs_mi.studio.sweep import sweep, write_sweep_plot
+        from morgs_mi.studio.sweep import SCORES, mean_scores, sweep, write_sweep_plot
 
         if self.plot is not None:
             check_plot(self.plot)
@@ -54,21 +51,13 @@ class Sweep:
         capture = load_capture(self.capture, self.downscale, held_out(self.test_view), self.frames)
         with progress() as report:
             rows = sweep(capture, self.out, self.epochs, self.seeds, config, report)
-        print_table(_table(rows))
+        titles = (title for title, _ in SCORES.values())
+        table = Table("epochs", *titles, box=SIMPLE_HEAD, title="means over the seeds")
+        for row in mean_scores(rows):
+            cells = (figure(row[name], digits) for name, (_, digits) in SCORES.items())
+            table.add_row(figure(row["epochs"], 0), *cells)
+        print_table(table)
         print_result(f"All fits: {self.out / 'sweep.json'}")
         if self.plot is not None:
             write_sweep_plot(self.plot, rows)
             print_result(f"Plot: {self.plot}")
-
-
-def _table(rows: Sequence[Scores]) -> Table:
-    """Return the mean scores of each number of epochs."""
-    from morgs_mi.evaluate.tables import figure
-    from morgs_mi.studio.sweep import SCORES, mean_scores
-
-    titles = (title for title, _ in SCORES.values())
-    table = Table("epochs", *titles, box=SIMPLE_HEAD, title="means over the seeds")
-    for row in mean_scores(rows):
-        cells = (figure(row[name], digits) for name, (_, digits) in SCORES.items())
-        table.add_row(figure(row["epochs"], 0), *cells)
-    return table

@@ -40,12 +40,8 @@ class Synth:
                 overwrite=self.overwrite,
                 progress=lambda done, total: report("Path-tracing", done, total),
             )
-        print_result(self._summary())
-
-    def _summary(self) -> str:
-        """Return the content of the capture in one sentence."""
         config = self.config
         images = "PNG files and videos" if config.lossless else "videos"
         cameras = len(list((self.out / "truth").glob("cam*")))
         size = f"{config.frames} frames of {config.width}x{config.height}"
-        return f"{self.out}: {cameras} cameras, {size} as {images}, with ground truth."
+        print_result(f"{self.out}: {cameras} cameras, {size} as {images}, with ground truth.")
