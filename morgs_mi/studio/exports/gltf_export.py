@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +69,50 @@ def glb(gaussians: Gaussians, axes: np.ndarray | None = None) -> bytes:
         )
     columns = _attributes(gaussians if axes is None else rotated(gaussians, axes))
     binary = b"".join(column.tobytes() for column in columns.values())
-    document = _padded_json(_document(columns, axes))
+    node: dict[str, Any] = {"mesh": 0}
+    if axes is not None:
+        # Rotation back to the capture's axes: x_world = M x_gltf.
+        node["extras"] = {"world_from_gltf": np.asarray(axes, float).T.tolist()}
+    accessors = [
+        {
+            "bufferView": i,
+            "componentType": _FLOAT,
+            "count": len(column),
+            "type": _TYPES[column.shape[1]],
+        }
+        for i, column in enumerate(columns.values())
+    ]
+    means = columns["POSITION"]
+    accessors[0] |= {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
+    sizes = [column.nbytes for column in columns.values()]
+    starts = np.cumsum([0, *sizes])
+    splats = {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }
+    primitive = {
+        "mode": _POINTS,
+        "attributes": {name: i for i, name in enumerate(columns)},
+        "extensions": {_NAME: splats},
+    }
+    content = {
+        "asset": {"version": "2.0", "generator": "morgs_mi"},
+        "extensionsUsed": [_NAME],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [node],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": int(start), "byteLength": size, "target": _ARRAY_BUFFER}
+            for start, size in zip(starts[:-1], sizes, strict=True)
+        ],
+        "buffers": [{"byteLength": int(starts[-1])}],
+    }
+    document = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
+    document += b" " * (-len(document) % 4)
     size = 12 + 8 + len(document) + 8 + len(binary)
     if size >= 2**32:
         raise ValueError(
@@ -81,12 +123,6 @@ def glb(gaussians: Gaussians, axes: np.ndarray | None = None) -> bytes:
     return head + _chunk(b"JSON", document) + _chunk(b"BIN\0", binary)
 
 
-def _padded_json(document: dict[str, Any]) -> bytes:
-    """Return a document as JSON, with spaces up to a multiple of 4 bytes."""
-    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
-    return text + b" " * (-len(text) % 4)
-
-
 def _chunk(kind: bytes, data: bytes) -> bytes:
     return struct.pack("<I4s", len(data), kind) + data
 
@@ -95,83 +131,19 @@ def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
     raw = gaussians.numpy()
     opacities = np.asarray(gaussians.opacities, np.float32)
     alpha = np.clip(opacities, 0, 1)[:, None]
+    coefficients = raw["sh_coeffs"]
+    # Mean colour in linear light.
+    color = decode_light(np.clip(0.5 + SH_C0 * coefficients[:, 0], 0, 1))
     columns = {
         "POSITION": raw["means"],
         f"{_NAME}:ROTATION": np.roll(unit_quats(gaussians), -1, axis=1),
         f"{_NAME}:SCALE": np.exp(raw["log_scales"]),
         f"{_NAME}:OPACITY": alpha,
-        **_harmonics(raw["sh_coeffs"], gaussians.sh_degree),
-        "COLOR_0": np.concatenate([_linear_color(raw["sh_coeffs"]), alpha], axis=1),
+        **{
+            f"{_NAME}:SH_DEGREE_{degree}_COEF_{n}": coefficients[:, degree * degree + n]
+            for degree in range(gaussians.sh_degree + 1)
+            for n in range(2 * degree + 1)
+        },
+        "COLOR_0": np.concatenate([color, alpha], axis=1),
     }
     return {name: np.ascontiguousarray(column, "<f4") for name, column in columns.items()}
-
-
-def _linear_color(coefficients: np.ndarray) -> np.ndarray:
-    """Return the mean colour [N, 3] in linear light."""
-    return decode_light(np.clip(0.5 + SH_C0 * coefficients[:, 0], 0, 1))
-
-
-def _harmonics(coefficients: np.ndarray, max_degree: int) -> dict[str, np.ndarray]:
-    """Return the coefficients [N, (degree + 1)^2, 3] of the spherical harmonics by attribute."""
-    return {
-        f"{_NAME}:SH_DEGREE_{degree}_COEF_{n}": coefficients[:, degree * degree + n]
-        for degree in range(max_degree + 1)
-        for n in range(2 * degree + 1)
-    }
-
-
-def _document(columns: dict[str, np.ndarray], axes: np.ndarray | None) -> dict[str, Any]:
-    return {
-        "asset": {"version": "2.0", "generator": "morgs_mi"},
-        "extensionsUsed": [_NAME],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [_node(axes)],
-        "meshes": [{"primitives": [_primitive(columns)]}],
-        "accessors": _accessors(columns),
-        **_buffers([column.nbytes for column in columns.values()]),
-    }
-
-
-def _node(axes: np.ndarray | None) -> dict[str, Any]:
-    if axes is None:
-        return {"mesh": 0}
-    # Rotation back to the capture's axes: x_world = M x_gltf.
-    return {"mesh": 0, "extras": {"world_from_gltf": np.asarray(axes, float).T.tolist()}}
-
-
-def _primitive(names: Iterable[str]) -> dict[str, Any]:
-    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
-    return {
-        "mode": _POINTS,
-        "attributes": {name: i for i, name in enumerate(names)},
-        "extensions": {_NAME: {**splats, "sortingMethod": "cameraDistance"}},
-    }
-
-
-def _accessors(columns: dict[str, np.ndarray]) -> list[dict[str, Any]]:
-    accessors = [_accessor(i, column.shape) for i, column in enumerate(columns.values())]
-    means = columns["POSITION"]
-    accessors[0] |= {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
-    return accessors
-
-
-def _accessor(index: int, shape: tuple[int, ...]) -> dict[str, Any]:
-    return {
-        "bufferView": index,
-        "componentType": _FLOAT,
-        "count": shape[0],
-        "type": _TYPES[shape[1]],
-    }
-
-
-def _buffers(sizes: Sequence[int]) -> dict[str, Any]:
-    """Return the buffer and a view of it for each array, from their sizes in bytes."""
-    starts = np.cumsum([0, *sizes])
-    return {
-        "bufferViews": [
-            {"buffer": 0, "byteOffset": int(start), "byteLength": size, "target": _ARRAY_BUFFER}
-            for start, size in zip(starts[:-1], sizes, strict=True)
-        ],
-        "buffers": [{"byteLength": int(starts[-1])}],
-    }

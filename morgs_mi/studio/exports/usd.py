@@ -160,17 +160,13 @@ def _sets(states: Iterator[FrameState], axes: np.ndarray) -> dict[int, _Set]:
             parts.append(
                 (state.ids[births], _values(rotated(state.gaussians.select(births), axes)))
             )
-    return {first_id: _joined(*starts[first_id], parts) for first_id, parts in parts_of.items()}
-
-
-def _joined(
-    start: int, degree: int, parts: Sequence[tuple[np.ndarray, dict[str, np.ndarray]]]
-) -> _Set:
-    """Return the set of the Gaussians that several frames add, from their ids and attributes."""
-    ids = np.concatenate([np.zeros(0, np.uint32), *(ids for ids, _ in parts)])
-    names = _TYPES if parts else ()
-    births = {name: np.concatenate([values[name] for _, values in parts]) for name in names}
-    return _Set(start, degree, ids, births)
+    sets = {}
+    for first_id, parts in parts_of.items():
+        ids = np.concatenate([np.zeros(0, np.uint32), *(ids for ids, _ in parts)])
+        names = _TYPES if parts else ()
+        births = {name: np.concatenate([values[name] for _, values in parts]) for name in names}
+        sets[first_id] = _Set(*starts[first_id], ids, births)
+    return sets
 
 
 def _values(gaussians: Gaussians) -> dict[str, np.ndarray]:
@@ -238,15 +234,11 @@ class _Samples:
         return values.nbytes
 
     def _set(self, time: int, values: np.ndarray) -> None:
-        self.attribute.Set(self.array.FromNumpy(_rows(values, self.dtype)), time)
-
-
-def _rows(values: np.ndarray, dtype: type) -> np.ndarray:
-    """Return the values of an attribute as rows of a type, within its range."""
-    rows = values.reshape(-1, values.shape[-1]) if values.ndim > 1 else values
-    if dtype is np.float16:
-        rows = np.clip(rows, -_LARGEST_HALF, _LARGEST_HALF)
-    return np.ascontiguousarray(rows, dtype)
+        rows = values.reshape(-1, values.shape[-1]) if values.ndim > 1 else values
+        if self.dtype is np.float16:
+            rows = np.clip(rows, -_LARGEST_HALF, _LARGEST_HALF)
+        rows = np.ascontiguousarray(rows, self.dtype)
+        self.attribute.Set(self.array.FromNumpy(rows), time)
 
 
 def _samples(pxr: Any, prim: Any, name: str, half: bool) -> _Samples:
@@ -272,7 +264,10 @@ def _describe(
     """Write the metadata of the stage and its root prim."""
     pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.y)
     pxr.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    _set_times(stage, stream.fps, frames)
+    stage.SetTimeCodesPerSecond(stream.fps)
+    stage.SetFramesPerSecond(stream.fps)
+    stage.SetStartTimeCode(frames[0])
+    stage.SetEndTimeCode(frames[-1])
     xform = pxr.UsdGeom.Xform.Define(stage, "/Stream")
     if (origin := stream_origin(stream)).any():
         xform.AddTranslateOp().Set(pxr.Gf.Vec3d(*(axes @ origin)))
@@ -281,13 +276,6 @@ def _describe(
     # Rotation back to the capture's axes, of row vectors: x_world = x_usd M.
     root.SetCustomDataByKey("world_from_usd", pxr.Gf.Matrix3d(np.asarray(axes, np.float64)))
     stage.SetDefaultPrim(root)
-
-
-def _set_times(stage: Any, fps: float, frames: Sequence[int]) -> None:
-    stage.SetTimeCodesPerSecond(fps)
-    stage.SetFramesPerSecond(fps)
-    stage.SetStartTimeCode(frames[0])
-    stage.SetEndTimeCode(frames[-1])
 
 
 def _fields(
@@ -299,33 +287,24 @@ def _fields(
     for number, ((first_id, gaussians), end) in enumerate(zip(sets.items(), ends, strict=True)):
         path = f"/Stream/Gaussians{number or ''}"
         splats = pxr.UsdVol.ParticleField3DGaussianSplat.Define(stage, path)
-        _set_hints(pxr, splats, gaussians.degree, half)
-        _set_visibility(splats, frames[0], gaussians.start, end)
-        fields[first_id] = _Field(pxr, splats.GetPrim(), gaussians, half)
+        prim = splats.GetPrim()
+        prim.GetAttribute(_DEGREE).Set(gaussians.degree)
+        splats.CreateProjectionModeHintAttr("perspective")
+        splats.CreateSortingModeHintAttr("zDepth")
+        # As far as the schema goes: it does not state the space of the coefficients.
+        prim.GetAttribute(_COEFFICIENTS + ("h" if half else "")).SetColorSpace(
+            pxr.Gf.ColorSpaceNames.SRGBRec709
+        )
+        # The prim is visible until the next set starts.
+        visibility = splats.CreateVisibilityAttr
+        if gaussians.start > frames[0]:
+            visibility().Set("invisible", frames[0])
+            visibility().Set("inherited", gaussians.start)
+        if end is not None:
+            visibility().Set("inherited", gaussians.start)
+            visibility().Set("invisible", end)
+        fields[first_id] = _Field(pxr, prim, gaussians, half)
     return fields
-
-
-def _set_visibility(splats: Any, first: int, start: int, end: int | None) -> None:
-    """Show a prim from the frame `start` on until `end`; `first` is the first frame of all."""
-    visibility = splats.CreateVisibilityAttr
-    if start > first:
-        visibility().Set("invisible", first)
-        visibility().Set("inherited", start)
-    if end is not None:
-        visibility().Set("inherited", start)
-        visibility().Set("invisible", end)
-
-
-def _set_hints(pxr: Any, splats: Any, degree: int, half: bool) -> None:
-    """Write how the Gaussians of a prim are to be drawn."""
-    prim = splats.GetPrim()
-    prim.GetAttribute(_DEGREE).Set(degree)
-    splats.CreateProjectionModeHintAttr("perspective")
-    splats.CreateSortingModeHintAttr("zDepth")
-    # As far as the schema goes: it does not state the space of the coefficients.
-    prim.GetAttribute(_COEFFICIENTS + ("h" if half else "")).SetColorSpace(
-        pxr.Gf.ColorSpaceNames.SRGBRec709
-    )
 
 
 @contextmanager
@@ -352,14 +331,10 @@ def _pxr() -> Any:
             "write_usd(): expected the package usd-core, found none; install it with pip install "
             "'morgs-mi[usd]'."
         ) from error
-    _check_schema(modules)
-    return modules
-
-
-def _check_schema(pxr: Any) -> None:
-    if not hasattr(pxr.UsdVol, "ParticleField3DGaussianSplat"):
-        version = ".".join(map(str, pxr.Usd.GetVersion()[1:]))
+    if not hasattr(modules.UsdVol, "ParticleField3DGaussianSplat"):
+        version = ".".join(map(str, modules.Usd.GetVersion()[1:]))
         raise ValueError(
             f"write_usd(): expected OpenUSD 26.3 or newer, got {version}; install it with pip "
             "install 'morgs-mi[usd]'."
         )
+    return modules
